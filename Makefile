@@ -1,0 +1,42 @@
+# The two commands a newcomer types:  make demo   make test
+PYTHON ?= python3
+VENV   ?= .venv
+RUN    := $(VENV)/bin/python
+READY  := $(VENV)/.ready
+
+.PHONY: demo test lint types arrows unit pictures lock clean help
+
+help:        ## list the targets
+	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
+
+$(READY): pyproject.toml requirements.lock
+	$(PYTHON) -m venv $(VENV)
+	$(VENV)/bin/pip install --quiet --constraint requirements.lock --editable '.[plots,test]'
+	@touch $@
+
+demo: $(READY)  ## fly the 700 s step demonstration on simulated hardware and print its report
+	$(RUN) -m flight run config/step_demo.yaml --out runs/demo
+	$(RUN) -m flight report runs/demo
+
+test: lint types arrows unit  ## every check
+
+lint: $(READY)  ## style
+	$(VENV)/bin/ruff check .
+
+types: $(READY)  ## strict types
+	$(VENV)/bin/mypy
+
+arrows: $(READY)  ## the architecture's import arrows
+	$(VENV)/bin/lint-imports --no-cache
+
+unit: $(READY)  ## the tests, on all cores
+	$(RUN) -m pytest -n auto
+
+pictures: $(READY)  ## the README's pictures
+	$(RUN) -m tests.pictures
+
+lock: $(READY)  ## write down the versions in use
+	$(VENV)/bin/pip freeze --exclude-editable > requirements.lock
+
+clean:       ## forget the virtual environment and the runs
+	rm -rf $(VENV) runs build *.egg-info

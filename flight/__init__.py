@@ -1,0 +1,1 @@
+"""The on-board application: what the satellite does."""

@@ -1,0 +1,29 @@
+"""The exceptions of the flight application; each carries its facts as attributes."""
+
+from __future__ import annotations
+
+
+class FlightError(Exception):
+    """Anything the flight application refuses or cannot do."""
+
+
+class UsageError(FlightError):
+    """A mistake of the user's: one clear line, exit status 2, never a traceback."""
+
+
+class ConfigError(UsageError):
+    """A configuration value that cannot be flown.
+
+    Attributes:
+        where: file, line and dotted name of the value, as far as known.
+        problem: what is wrong and what would be right.
+    """
+
+    def __init__(self, where: str, problem: str) -> None:
+        super().__init__(f"{where}: {problem}")
+        self.where = where
+        self.problem = problem
+
+
+class PlanningError(FlightError):
+    """No path could be made; says why."""

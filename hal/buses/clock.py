@@ -1,0 +1,64 @@
+"""The real clock: absolute monotonic deadlines, and tickers on threads of their own."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+from hal.interfaces.wires import Ticker
+
+
+class SystemClock:
+    """CLOCK_MONOTONIC of the machine."""
+
+    def now_ns(self) -> int:
+        """Return the monotonic time."""
+        return time.monotonic_ns()
+
+    def sleep_until_ns(self, deadline_ns: int) -> None:
+        """Sleep to an absolute deadline.
+
+        CPython sleeps with clock_nanosleep; a signal that interrupts it resumes it, so one call is enough,
+        but the conversion to float seconds can end a few ns early: the loop closes that gap.
+        """
+        while (left := deadline_ns - time.monotonic_ns()) > 0:
+            time.sleep(left * 1e-9)
+
+    def ticker(self, name: str, period_ns: int, job: Callable[[], None]) -> Ticker:
+        """Run `job` on a daemon thread every `period_ns`."""
+        return ThreadTicker(name, period_ns, job)
+
+    def utc_ns(self) -> int:
+        """Return UTC as nanoseconds since 1970."""
+        return time.time_ns()
+
+
+class ThreadTicker:
+    """A job on a daemon thread, run every period and whenever kicked."""
+
+    def __init__(self, name: str, period_ns: int, job: Callable[[], None]) -> None:
+        self._period = period_ns * 1e-9
+        self._job = job
+        self._wake = threading.Event()
+        self._stopped = False
+        self._thread = threading.Thread(target=self._serve, name=name, daemon=True)
+        self._thread.start()
+
+    def kick(self) -> None:
+        """Wake the thread now."""
+        self._wake.set()
+
+    def stop(self) -> None:
+        """Let the job finish and end the thread."""
+        self._stopped = True
+        self._wake.set()
+        if threading.current_thread() is not self._thread:
+            self._thread.join(timeout=2.0)
+
+    def _serve(self) -> None:
+        while not self._stopped:
+            self._wake.wait(self._period)
+            self._wake.clear()
+            if not self._stopped:
+                self._job()

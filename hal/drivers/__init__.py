@@ -1,0 +1,1 @@
+"""Drivers: each knows one part's registers or packets, and speaks over a bus Protocol."""

@@ -1,0 +1,83 @@
+"""Protocols at the wire: clock, serial port, I2C bus. hal binds them to Linux, sim_hal to emulators.
+
+The swap between flight and simulation happens here and nowhere above: every simulated run exercises
+the driver that flies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+
+class Ticker(Protocol):
+    """A small job that a clock runs again and again beside the control loop."""
+
+    def kick(self) -> None:
+        """Run the job as soon as possible, without waiting for its next period."""
+
+    def stop(self) -> None:
+        """Run the job no more; returns when it is not running. Safe to call twice."""
+
+
+class Clock(Protocol):
+    """Monotonic time, in integer nanoseconds. The only source of time there is."""
+
+    def now_ns(self) -> int:
+        """Return the monotonic time."""
+
+    def sleep_until_ns(self, deadline_ns: int) -> None:
+        """Return at or after the deadline; at once if it has passed."""
+
+    def ticker(self, name: str, period_ns: int, job: Callable[[], None]) -> Ticker:
+        """Run `job` every `period_ns`, beside the caller: on a thread in real time, in turn in simulation.
+
+        A job must not raise and must not block for long; it must be safe beside the control loop.
+        """
+
+    def utc_ns(self) -> int:
+        """Return UTC as nanoseconds since 1970: a label for telemetry, never an input of control."""
+
+
+class SerialPort(Protocol):
+    """A byte line. Receiving never blocks; each chunk carries the host time of its last byte."""
+
+    baud_rate: int
+
+    def receive(self) -> list[tuple[int, bytes]]:
+        """Return what came since the last call as (arrival_ns, bytes), oldest first; [] when nothing did.
+
+        Raises NotResponding when the port itself is gone.
+        """
+
+    def send(self, data: bytes) -> None:
+        """Queue bytes for sending. Raises NotResponding when the port is gone."""
+
+    def set_baud_rate(self, baud_rate: int) -> None:
+        """Change the line's speed."""
+
+    def close(self) -> None:
+        """Close the port. Safe to call twice."""
+
+
+class I2cBus(Protocol):
+    """The part of smbus2's interface that the drivers use; one transaction a call.
+
+    Every call raises OSError (with the errno of the kernel's I2C fault codes) when the bus or the part does
+    not answer, and returns within the bus's time-out whatever happens. Safe to call from several threads.
+    """
+
+    def read_byte_data(self, address: int, register: int) -> int:
+        """Read one byte."""
+
+    def write_byte_data(self, address: int, register: int, value: int) -> None:
+        """Write one byte."""
+
+    def read_i2c_block_data(self, address: int, register: int, length: int) -> list[int]:
+        """Read `length` <= 32 bytes."""
+
+    def write_i2c_block_data(self, address: int, register: int, values: Sequence[int]) -> None:
+        """Write up to 32 bytes."""
+
+    def close(self) -> None:
+        """Close the bus. Safe to call twice."""

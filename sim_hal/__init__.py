@@ -1,0 +1,1 @@
+"""What the devices would feel, and devices that answer on the wire."""
