@@ -1,0 +1,220 @@
+"""Reading a configuration: YAML in, a validated `flight.settings.Config` out, or one clear line.
+
+Every complaint names the file, the line, the value and what would be right; an unknown key is answered with
+the nearest right one. Numbers follow YAML 1.2 (1e-5 is a number); keys may stand only once; NaN is refused.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+import yaml
+
+from flight.errors import ConfigError
+from flight.settings import Config
+
+T = TypeVar("T")
+S = TypeVar("S", bound=msgspec.Struct)
+Lines = dict[str, int]
+
+_FLOAT = re.compile(
+    r"^[-+]?(\.[0-9]+|[0-9]+\.[0-9]*|[0-9]+(?=[eE]))([eE][-+]?[0-9]+)?$"
+    r"|^[-+]?\.(inf|Inf|INF)$|^\.(nan|NaN|NAN)$"
+)
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML's safe loader with the numbers of YAML 1.2: pyyaml alone takes 1e-5 for a word."""
+
+    yaml_implicit_resolvers = {  # noqa: RUF012 - the shape pyyaml wants
+        first: [entry for entry in entries if entry[0] != "tag:yaml.org,2002:float"]
+        for first, entries in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
+
+
+_Loader.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+0123456789."))
+
+
+def load(path: Path) -> Config:
+    """Read and validate a configuration file. Raises ConfigError."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(str(path), f"cannot be read: {error}") from error
+    return parse(text, str(path))
+
+
+def parse(text: str, name: str = "configuration") -> Config:
+    """Validate configuration text; `name` stands for the file in complaints. Raises ConfigError."""
+    tree, lines = _read_yaml(text, name)
+    config = convert(tree, Config, name, lines)
+    _check_sense(config, name, lines)
+    return config
+
+
+def simulation_section(text: str, name: str, shape: type[T]) -> T | None:
+    """Return the `simulation` section of configuration text as `shape`, None when there is none.
+
+    The section's shape belongs to the simulator, which this package does not know. Raises ConfigError.
+    """
+    tree, lines = _read_yaml(text, name)
+    if tree.get("simulation") is None:
+        return None
+    return convert(tree["simulation"], shape, name, lines, prefix="simulation")
+
+
+def replace(section: S, **changes: Any) -> S:
+    """Return a section with some values changed."""
+    return msgspec.structs.replace(section, **changes)
+
+
+def convert(tree: Any, shape: type[T], name: str, lines: Lines, prefix: str = "") -> T:
+    """Turn plain YAML values into `shape`, naming file, line and value in any complaint."""
+    try:
+        return msgspec.convert(tree, shape)
+    except msgspec.ValidationError as error:
+        message, _, path = str(error).partition(" - at `$")
+        dotted = _join(prefix, path.rstrip("`").lstrip("."))
+        unknown = re.match(r"Object contains unknown field `(.+)`", message)
+        if unknown:
+            dotted = _join(dotted, unknown.group(1))
+            message = "is an unknown key" + _nearest(unknown.group(1), shape, path.rstrip("`"))
+        else:
+            value = _lookup(tree, path.rstrip("`"))
+            message = f"is {value!r}: {message[0].lower()}{message[1:]}" if value is not _ABSENT else message
+        raise ConfigError(_place(name, dotted, lines), f"`{dotted or 'configuration'}` {message}") from error
+
+
+def _read_yaml(text: str, name: str) -> tuple[dict[str, Any], Lines]:
+    """Return the plain values and the line of every dotted name."""
+    lines: Lines = {}
+    try:
+        loader = _Loader(text)
+        node = loader.get_single_node()
+        _walk(node, "", lines, name)
+        tree = loader.construct_document(node) if node is not None else None
+    except (yaml.YAMLError, ValueError) as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f"{name}:{mark.line + 1}" if mark else name
+        problem = getattr(error, "problem", None) or str(error).splitlines()[0]
+        raise ConfigError(where, f"is not YAML: {problem}") from error
+    except RecursionError as error:
+        raise ConfigError(name, "is nested too deeply") from error
+    if not isinstance(tree, dict):
+        raise ConfigError(name, "must be a mapping of sections, see config/step_demo.yaml")
+    _refuse_not_finite(tree, "", name, lines)
+    return tree, lines
+
+
+def _walk(node: yaml.Node | None, dotted: str, lines: Lines, name: str) -> None:
+    """Note the line of every value; refuse a key that stands twice (pyyaml would keep the last)."""
+    if isinstance(node, yaml.MappingNode):
+        for key, value in node.value:
+            child = _join(dotted, str(key.value))
+            if child in lines:
+                where = f"{name}:{key.start_mark.line + 1}"
+                raise ConfigError(where, f"`{child}` stands twice, first in line {lines[child]}")
+            lines[child] = key.start_mark.line + 1
+            _walk(value, child, lines, name)
+    elif isinstance(node, yaml.SequenceNode):
+        for index, value in enumerate(node.value):
+            lines[f"{dotted}[{index}]"] = value.start_mark.line + 1
+            _walk(value, f"{dotted}[{index}]", lines, name)
+
+
+def _refuse_not_finite(value: Any, dotted: str, name: str, lines: Lines) -> None:
+    if isinstance(value, dict):
+        for key, child in value.items():
+            _refuse_not_finite(child, _join(dotted, str(key)), name, lines)
+    elif isinstance(value, list):
+        for index, child in enumerate(value):
+            _refuse_not_finite(child, f"{dotted}[{index}]", name, lines)
+    elif isinstance(value, float) and not math.isfinite(value):
+        raise ConfigError(_place(name, dotted, lines), f"`{dotted}` is {value!r}: must be a finite number")
+
+
+_ABSENT = object()
+
+
+def _lookup(tree: Any, path: str) -> Any:
+    """Return the value at a msgspec path such as `.coils.channels[1]`."""
+    for key, index in re.findall(r"\.([^.\[]+)|\[(\d+|\.\.\.)\]", path):
+        try:
+            tree = tree[key] if key else tree[int(index)]
+        except (KeyError, IndexError, TypeError, ValueError):
+            return _ABSENT
+    return tree if not isinstance(tree, dict) else _ABSENT
+
+
+def _nearest(key: str, shape: Any, path: str) -> str:
+    """Suggest the right name for an unknown key of the struct found along `path`."""
+    for step in re.findall(r"\.([^.\[]+)", path):
+        fields = {f.encode_name: f.type for f in msgspec.structs.fields(shape)}
+        shape = _struct_of(fields.get(step))
+        if shape is None:
+            return ""
+    names = [f.encode_name for f in msgspec.structs.fields(shape)]
+    close = difflib.get_close_matches(key, names, n=1, cutoff=0.5)
+    return f", did you mean `{close[0]}`?" if close else f"; known keys: {', '.join(names)}"
+
+
+def _struct_of(annotation: Any) -> Any:
+    """Return the struct inside an annotation such as `Camera | None` or `tuple[Step, ...]`."""
+    if isinstance(annotation, type) and issubclass(annotation, msgspec.Struct):
+        return annotation
+    for inner in getattr(annotation, "__args__", ()):
+        if (found := _struct_of(inner)) is not None:
+            return found
+    return None
+
+
+def _join(prefix: str, key: str) -> str:
+    return f"{prefix}.{key}" if prefix and key and not key.startswith("[") else prefix + key
+
+
+def _place(name: str, dotted: str, lines: Lines) -> str:
+    """Return file:line of the value or of the nearest section above it."""
+    while dotted and dotted not in lines:
+        dotted = re.sub(r"(\.[^.\[]+|\[[^\]]*\]|^[^.\[]+)$", "", dotted)
+    return f"{name}:{lines[dotted]}" if dotted else name
+
+
+def _check_sense(config: Config, name: str, lines: Lines) -> None:
+    """Refuse values that are each possible but make no sense together."""
+
+    def refuse(dotted: str, problem: str) -> None:
+        raise ConfigError(_place(name, dotted, lines), f"`{dotted}` {problem}")
+
+    times = [step.at for step in config.steps]
+    if times[0] != 0.0:
+        refuse("steps[0].at", f"is {times[0]!r}: the first target must be given at 0")
+    for index in range(1, len(times)):
+        if times[index] <= times[index - 1]:
+            refuse(f"steps[{index}].at", f"is {times[index]!r}: targets must stand in order of time")
+    if config.duration <= times[-1]:
+        refuse("duration", f"is {config.duration!r}: the last target is given at {times[-1]!r} s")
+    used = [c for pair in config.coils.channels for c in pair] + list(config.coils.enable_channels or ())
+    if len(set(used)) != len(used):
+        refuse("coils.channels", f"{used} use a channel of the PWM chip twice")
+    if config.power_monitor is not None and config.power_monitor.address == config.coils.address:
+        refuse(
+            "power_monitor.address",
+            f"is 0x{config.power_monitor.address:02x}, the PWM chip's: both leave the factory at 0x40, "
+            "set the monitor's address pins (0x45) and say so here",
+        )
+    if config.guidance.replan_period >= config.guidance.horizon:
+        refuse("guidance.replan_period", "must be shorter than `guidance.horizon`")
+    if config.camera is not None and config.camera.exposure >= config.camera.period:
+        refuse("camera.exposure", "must be shorter than `camera.period`")
+    for dotted, quaternion in (
+        ("inertial_unit.mounting", config.inertial_unit.mounting),
+        ("camera.mounting", config.camera.mounting if config.camera else (0.0, 0.0, 0.0, 1.0)),
+    ):
+        norm = math.sqrt(sum(c * c for c in quaternion))
+        if abs(norm - 1.0) > 1e-6:
+            refuse(dotted, f"has length {norm:.6g}: a quaternion must have length 1")

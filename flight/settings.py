@@ -1,0 +1,159 @@
+"""The shape of a flight configuration: every section, every value, its unit and its bounds.
+
+A configuration says what the flight application believes and how its devices are wired. What the simulated
+world really does stands in its `simulation` section, whose shape is sim_hal's own (`sim_hal.settings`).
+SI units unless the name says otherwise.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta
+
+Positive = Annotated[float, Meta(gt=0.0)]
+NotNegative = Annotated[float, Meta(ge=0.0)]
+Q2 = Annotated[float, Meta(ge=-0.7, le=0.7)]
+Address = Annotated[int, Meta(ge=0x08, le=0x77)]
+Sign = Literal[-1, 1]
+Channel = Annotated[int, Meta(ge=0, le=15)]
+Vector3 = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+
+class Section(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
+    """One section of the configuration; unknown keys are refused."""
+
+
+class Plant(Section, frozen=True, kw_only=True):
+    """What the flight application believes about the body and its actuator (Sease Table 5.1, 5.3, 5.4)."""
+
+    inertia: Positive
+    coil_turns: Annotated[int, Meta(gt=0)]
+    coil_area: Positive
+    field: Positive
+    thread_stiffness: NotNegative = 0.0
+    thread_damping: NotNegative = 0.0
+
+
+class InertialUnit(Section, frozen=True, kw_only=True):
+    """The VN-100 and its line."""
+
+    device: str = "/dev/knightcube-imu"
+    baud_rate: Literal[9600, 19200, 38400, 57600, 115200, 230400, 460800, 921600] = 115200
+    output: Literal["binary", "ascii"] = "binary"
+    rate_hz: Literal[1, 2, 4, 5, 10, 20, 25, 40, 50, 100, 200] = 40
+    mounting: Quaternion = (0.0, 0.0, 0.0, 1.0)
+    field_range: Positive = 6.0e-4
+    max_age: Positive = 0.1
+    angle_noise: Positive = 2.02e-3
+    rate_noise: Positive = 1.01e-4
+
+
+class Coils(Section, frozen=True, kw_only=True):
+    """The PWM chip, the H-bridges and the coils behind them."""
+
+    bus: Annotated[int, Meta(ge=0)] = 1
+    address: Address = 0x40
+    channels: tuple[tuple[Channel, Channel], tuple[Channel, Channel], tuple[Channel, Channel]] = (
+        (0, 1),
+        (2, 3),
+        (4, 5),
+    )
+    enable_channels: tuple[Channel, Channel, Channel] | None = None
+    signs: tuple[Sign, Sign, Sign] = (1, 1, 1)
+    resistance: tuple[Positive, Positive, Positive]
+    supply_voltage: Positive
+    current_limit: Positive
+    stale_after: Annotated[float, Meta(gt=0.0, le=0.4)] = 0.25
+
+
+class PowerMonitor(Section, frozen=True, kw_only=True):
+    """The INA219 in the coils' supply."""
+
+    address: Address = 0x45
+    shunt: Positive = 0.1
+
+
+class Camera(Section, frozen=True, kw_only=True):
+    """The star camera: what flight must know to read its frames."""
+
+    columns: Annotated[int, Meta(ge=64, le=8192)] = 1024
+    rows: Annotated[int, Meta(ge=64, le=8192)] = 1024
+    field_of_view_deg: Annotated[float, Meta(gt=1.0, lt=120.0)] = 20.0
+    exposure: Annotated[float, Meta(gt=0.0, le=10.0)] = 1.0
+    period: Positive = 5.0
+    bits: Annotated[int, Meta(ge=8, le=16)] = 16
+    gain: Positive = 1.0
+    read_noise: Positive = 10.0
+    psf_sigma: Positive = 1.0
+    mounting: Quaternion = (0.0, 0.0, 0.0, 1.0)
+    max_age: Positive = 12.0
+
+
+class Executive(Section, frozen=True, kw_only=True):
+    """Rates of the loop and bounds of its workers."""
+
+    control_rate_hz: Annotated[float, Meta(ge=1.0, le=200.0)] = 40.0
+    planner_timeout: Positive = 2.0
+    vision_timeout: Positive = 10.0
+
+
+class Estimation(Section, frozen=True, kw_only=True):
+    """The linear filter of angle, rate and disturbance about the thread."""
+
+    current_noise: NotNegative = 2.0e-3
+    disturbance_walk: Positive = 5.0e-4
+    gate_sigma: Annotated[float, Meta(ge=3.0)] = 5.0
+    history: Positive = 6.0
+
+
+class Guidance(Section, frozen=True, kw_only=True):
+    """Virtual motion camouflage (Sease 5.8-5.15)."""
+
+    horizon: Positive = 10.0
+    replan_period: Positive = 5.0
+    late_after: Positive = 1.0
+    max_horizon: Positive = 60.0
+    nodes: Annotated[int, Meta(ge=8, le=40)] | None = None
+
+
+class Control(Section, frozen=True, kw_only=True):
+    """The LQ tracker's weights (Sease 5.30-5.32): Q = state_weight I, R = control_weight."""
+
+    state_weight: Positive = 20.0
+    control_weight: Positive = 1.0
+
+
+class Step(Section, frozen=True, kw_only=True):
+    """One commanded attitude: from `at` seconds of mission time, hold q2 at rest."""
+
+    at: NotNegative
+    q2: Q2
+
+
+class Telemetry(Section, frozen=True, kw_only=True):
+    """Sizes of the flight log."""
+
+    segment_bytes: Annotated[int, Meta(ge=4096)] = 16 * 1024 * 1024
+    budget_bytes: Annotated[int, Meta(ge=16384)] = 1024 * 1024 * 1024
+
+
+class Config(Section, frozen=True, kw_only=True):
+    """A whole configuration."""
+
+    name: Annotated[str, Meta(min_length=1, max_length=64)]
+    plant: Plant
+    inertial_unit: InertialUnit
+    coils: Coils
+    power_monitor: PowerMonitor | None = None
+    camera: Camera | None
+    executive: Executive = Executive()
+    estimation: Estimation = Estimation()
+    guidance: Guidance = Guidance()
+    control: Control = Control()
+    steps: Annotated[tuple[Step, ...], Meta(min_length=1)]
+    duration: Positive
+    telemetry: Telemetry = Telemetry()
+    simulation: dict[str, Any] | None = None
