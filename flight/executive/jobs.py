@@ -1,0 +1,56 @@
+"""Jobs beside the control loop: what a worker is, what its result is, and who runs it.
+
+The control thread hands a job over and later collects finished results; it never waits. Two runners keep this
+contract: `lockstep.LockStepRunner` in simulated time and `processes.ProcessRunner` in real time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+Outcome = Literal["done", "failed", "timed-out", "died"]
+
+
+@dataclass(frozen=True, slots=True)
+class Worker:
+    """One kind of job: a function of one argument at the top level of a module.
+
+    Attributes:
+        name: short name for telemetry.
+        function: runs in a process of its own in real time, so argument and result must pickle.
+        latency_ns: how long a result takes to arrive in lock-step simulation.
+        timeout_ns: in real time, a job that takes longer is killed.
+    """
+
+    name: str
+    function: Callable[[Any], Any]
+    latency_ns: int
+    timeout_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class JobResult:
+    """What became of a job. `value` is the function's result when the outcome is "done"."""
+
+    worker: str
+    outcome: Outcome
+    value: Any
+    error: str
+    submitted_ns: int
+    delivered_ns: int
+    execution_ns: int
+
+
+class JobRunner(Protocol):
+    """Runs the jobs of several workers, at most one at a time for each."""
+
+    def submit(self, worker: str, argument: Any) -> bool:
+        """Hand a job over; False when that worker is still busy. Never waits."""
+
+    def collect(self) -> list[JobResult]:
+        """Return the results that have arrived. Never waits."""
+
+    def close(self) -> None:
+        """Stop the workers. Safe to call twice."""
