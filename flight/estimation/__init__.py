@@ -1,0 +1,1 @@
+"""Measurements in, one state estimate with its covariance out."""
