@@ -1,0 +1,1 @@
+"""Control: from the state and the path to a coil current."""

@@ -1,0 +1,171 @@
+"""Which path is flown: new plans are accepted by rule, the last good one is flown on, then its end is held.
+
+A plan that is late, not finite, beyond the limits, out of order, for another target or not starting where
+the body then was is refused with its reason; refusing changes nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from flight.errors import UsageError
+from flight.guidance.path import PolynomialPath, Sample
+from flight.guidance.vmc import Q2_LIMIT, Plan
+from flight.plant import SingleAxisPlant, q2_of
+
+_CHECKED_POINTS = 600
+
+
+class GuidanceState(StrEnum):
+    """What `Guidance.sample` gives: a path under way, an attitude held, or nothing yet."""
+
+    NONE = "none"
+    FOLLOWING = "following"
+    HOLDING = "holding"
+
+
+@dataclass(frozen=True, slots=True)
+class AcceptanceRules:
+    """What a plan must keep to be flown.
+
+    Attributes:
+        late_after: s from its origin to its arrival.
+        angle_tolerance: rad, rate_tolerance: rad/s, between its start and the estimate at its origin.
+        q2_limit: bound of |q2|; a planner that overshoots by 1e-3 of it is forgiven.
+        current_excess: relative, over the plant's limit, everywhere.
+    """
+
+    late_after: float = 1.0
+    angle_tolerance: float = 0.05
+    rate_tolerance: float = 0.02
+    q2_limit: float = Q2_LIMIT
+    current_excess: float = 1e-3
+
+    def __post_init__(self) -> None:
+        """Refuse bounds that are not positive and finite; raises UsageError."""
+        for name in ("late_after", "angle_tolerance", "rate_tolerance", "q2_limit", "current_excess"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise UsageError(f"guidance {name} is {value}: it must be finite and positive")
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Whether a plan is flown, and why not: `reason` is empty when it is."""
+
+    accepted: bool
+    reason: str = ""
+
+
+class Guidance:
+    """Owns the path being flown and the target wanted."""
+
+    def __init__(self, plant: SingleAxisPlant, rules: AcceptanceRules | None = None) -> None:
+        self._plant = plant
+        self._rules = rules or AcceptanceRules()
+        self._path: PolynomialPath | None = None
+        self._planned_ns: int | None = None
+        self._target_q2: float | None = None
+
+    @property
+    def target_q2(self) -> float | None:
+        """The attitude wanted, as q2; None before the first."""
+        return self._target_q2
+
+    @property
+    def path(self) -> PolynomialPath | None:
+        """The path being flown or held."""
+        return self._path
+
+    def aim(self, target_q2: float) -> None:
+        """Want another attitude; the present path is flown until a plan for it is accepted.
+
+        Raises UsageError when it is not finite or beyond the limit of q2.
+        """
+        if not abs(target_q2) <= self._rules.q2_limit:  # NaN compares false
+            raise UsageError(f"target q2 is {target_q2}: it must lie within +-{self._rules.q2_limit}")
+        self._target_q2 = target_q2
+
+    def hold(self, angle: float, now_ns: int) -> None:
+        """Hold `angle` rad from now on; plans made earlier than now are then out of order.
+
+        Raises UsageError when it is not finite.
+        """
+        if not math.isfinite(angle):
+            raise UsageError(f"the angle to hold is {angle}: it must be finite")
+        self._path = PolynomialPath.holding(angle, now_ns)
+        self._planned_ns = now_ns - 1
+
+    def offer(
+        self, plan: Plan, origin_ns: int, now_ns: int, estimate_angle: float, estimate_rate: float
+    ) -> Verdict:
+        """Fly `plan` from `origin_ns` if it keeps the rules; estimates in rad, rad/s at its origin."""
+        reason = (
+            self._untimely(origin_ns, now_ns)
+            or self._unwanted(plan)
+            or self._unflyable(plan.path)
+            or self._displaced(plan.path, estimate_angle, estimate_rate)
+        )
+        if reason:
+            return Verdict(False, reason)
+        self._path = plan.path.starting_at(origin_ns)
+        self._planned_ns = origin_ns
+        return Verdict(True)
+
+    def sample(self, now_ns: int) -> Sample | None:
+        """Return the motion wanted now; None when there is no path yet."""
+        return None if self._path is None else self._path.sample(now_ns)
+
+    def state(self, now_ns: int) -> GuidanceState:
+        """Return what is being done now."""
+        if self._path is None:
+            return GuidanceState.NONE
+        return GuidanceState.HOLDING if self._path.has_ended(now_ns) else GuidanceState.FOLLOWING
+
+    def _untimely(self, origin_ns: int, now_ns: int) -> str:
+        age = (now_ns - origin_ns) * 1e-9
+        if age < 0.0:
+            return f"its origin lies {-age:.3f} s in the future"
+        if age > self._rules.late_after:
+            return f"late: {age:.3f} s after its origin, {self._rules.late_after} s allowed"
+        if self._planned_ns is not None and origin_ns <= self._planned_ns:
+            return "out of order: the path being flown is not older"
+        return ""
+
+    def _unwanted(self, plan: Plan) -> str:
+        if self._target_q2 is None:
+            return "no target is wanted"
+        end_q2 = q2_of(plan.path.end_angle)
+        if not (abs(plan.target_q2 - self._target_q2) <= 1e-6 and abs(end_q2 - self._target_q2) <= 1e-6):
+            return f"it ends at q2 {end_q2:.4f}, wanted is {self._target_q2:.4f}"
+        return ""
+
+    def _unflyable(self, path: PolynomialPath) -> str:
+        if not (math.isfinite(path.horizon) and path.horizon > 0.0):
+            return f"not finite: its horizon is {path.horizon} s"
+        # Just inside the end: at the end itself the hold has begun.
+        times = path.horizon * np.linspace(0.0, 1.0 - 1e-12, _CHECKED_POINTS)
+        angle, rate, acceleration = path.motion(times)
+        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+            current = self._plant.currents(angle, rate, acceleration)
+            peak_q2 = float(np.abs(np.sin(0.5 * angle)).max())
+        peak = float(np.abs(current).max())
+        if not (math.isfinite(peak) and math.isfinite(peak_q2)):
+            return "not finite somewhere along the path"
+        if peak > self._plant.current_limit * (1.0 + self._rules.current_excess):
+            return f"needs {peak:.4f} A, the limit is {self._plant.current_limit} A"
+        if peak_q2 > self._rules.q2_limit * (1.0 + 1e-3):
+            return f"reaches |q2| {peak_q2:.4f}, the limit is {self._rules.q2_limit}"
+        return ""
+
+    def _displaced(self, path: PolynomialPath, angle: float, rate: float) -> str:
+        start = path.sample(path.origin_ns)
+        if not abs(start.angle - angle) <= self._rules.angle_tolerance:
+            return f"starts at {start.angle:.4f} rad, the body was at {angle:.4f} rad"
+        if not abs(start.rate - rate) <= self._rules.rate_tolerance:
+            return f"starts at {start.rate:.4f} rad/s, the body moved at {rate:.4f} rad/s"
+        return ""

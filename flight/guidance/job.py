@@ -1,0 +1,38 @@
+"""The planner worker's job: one state and one target in, one plan out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from flight.guidance.vmc import NODES, Plan, plan
+from flight.plant import SingleAxisPlant
+
+
+@dataclass(frozen=True, slots=True)
+class PlanJob:
+    """From (q2, rad/s) at `origin_ns` to (q2, rad/s) within `horizon` s; `number` counts the jobs."""
+
+    number: int
+    origin_ns: int
+    plant: SingleAxisPlant
+    start_q2: float
+    start_rate: float
+    end_q2: float
+    end_rate: float
+    horizon: float
+    max_horizon: float
+    nodes: int = NODES
+
+
+def run(job: PlanJob) -> Plan:
+    """Plan; at the top level of a module, so that a worker process can import it. Raises PlanningError."""
+    return plan(
+        job.plant,
+        job.start_q2,
+        job.start_rate,
+        job.end_q2,
+        job.end_rate,
+        job.horizon,
+        nodes=job.nodes,
+        max_stretch=max(job.max_horizon / job.horizon, 1.0),
+    )
