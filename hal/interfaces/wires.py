@@ -7,7 +7,10 @@ the driver that flies.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Protocol
+
+from hal.interfaces.devices import FrameSource
 
 
 class Ticker(Protocol):
@@ -81,3 +84,12 @@ class I2cBus(Protocol):
 
     def close(self) -> None:
         """Close the bus. Safe to call twice."""
+
+
+@dataclass(frozen=True, slots=True)
+class Wires:
+    """What drivers are plugged into: one serial line, one I2C bus, and a camera or none."""
+
+    serial: SerialPort
+    i2c: I2cBus
+    frames: FrameSource | None

@@ -1,0 +1,119 @@
+"""A serial port of Linux through pyserial: a thread waits for bytes and stamps them as they come."""
+
+from __future__ import annotations
+
+import termios
+import threading
+from collections import deque
+
+import serial
+
+from hal.interfaces.errors import NotResponding
+from hal.interfaces.wires import Clock
+
+_READ_TIMEOUT_S = 0.1  # only how soon the thread sees that the port is to close
+_WRITE_TIMEOUT_S = 0.5
+_PENDING_LIMIT = 1 << 16
+
+# What pyserial lets through besides its own (which are OSErrors): see its posix back end.
+_PORT_ERRORS = (OSError, termios.error, ValueError, TypeError)
+
+
+class PySerialPort:
+    """An exclusive, raw 8N1 line without flow control; implements `hal.interfaces.wires.SerialPort`.
+
+    The modem lines are neither read nor set by us, so a pseudo-terminal serves as well.
+
+    Attributes:
+        baud_rate: bits a second.
+        lost_bytes: bytes dropped, oldest first, because nobody called `receive` for too long.
+    """
+
+    def __init__(self, device: str, baud_rate: int, clock: Clock) -> None:
+        """Open the port. Raises NotResponding, with the cure, when it cannot be."""
+        self.baud_rate = baud_rate
+        self.lost_bytes = 0
+        self._device = device
+        self._clock = clock
+        self._pending: deque[tuple[int, bytes]] = deque()
+        self._pending_bytes = 0
+        self._lock = threading.Lock()
+        self._failure = ""
+        self._closing = False
+        try:
+            self._serial = serial.Serial(
+                device, baud_rate, timeout=_READ_TIMEOUT_S, write_timeout=_WRITE_TIMEOUT_S, exclusive=True
+            )
+        except _PORT_ERRORS as error:
+            raise NotResponding(
+                device,
+                f"cannot be opened at {baud_rate} baud ({error}): is the device plugged in, the name right, "
+                "the port free, and may this user open it (group dialout)?",
+            ) from error
+        self._thread = threading.Thread(target=self._read, name=f"serial {device}", daemon=True)
+        self._thread.start()
+
+    def receive(self) -> list[tuple[int, bytes]]:
+        """Return what came since the last call as (arrival_ns, bytes), oldest first.
+
+        Raises NotResponding when the port is gone, after all that came before has been handed out.
+        """
+        with self._lock:
+            chunks = list(self._pending)
+            self._pending.clear()
+            self._pending_bytes = 0
+        if not chunks and self._failure:
+            raise NotResponding(self._device, self._failure)
+        return chunks
+
+    def send(self, data: bytes) -> None:
+        """Hand bytes to the kernel. Raises NotResponding when the port is gone or takes no more."""
+        if self._failure:
+            raise NotResponding(self._device, self._failure)
+        try:
+            self._serial.write(data)
+        except _PORT_ERRORS as error:
+            message = f"writing failed ({error}): is the device still there?"
+            raise NotResponding(self._device, message) from error
+
+    def set_baud_rate(self, baud_rate: int) -> None:
+        """Change the line's speed. Raises NotResponding when the port does not take it."""
+        try:
+            self._serial.baudrate = baud_rate
+        except _PORT_ERRORS as error:
+            raise NotResponding(self._device, f"does not take {baud_rate} baud ({error})") from error
+        self.baud_rate = baud_rate
+
+    def close(self) -> None:
+        """Stop the thread and close the port. Safe to call twice."""
+        if self._closing:
+            return
+        self._closing = True
+        if self._serial.is_open:
+            self._serial.cancel_read()
+        self._thread.join(timeout=2.0)
+        self._serial.close()
+        self._failure = self._failure or "the port was closed"
+
+    def _read(self) -> None:
+        while not self._closing:
+            try:
+                # The first byte wakes the thread; what lies ready behind it comes along.
+                data = self._serial.read(1)
+                if data:
+                    data += self._serial.read(self._serial.in_waiting)
+            except _PORT_ERRORS as error:
+                if not self._closing:
+                    self._failure = f"reading failed ({error}): is the device still there?"
+                return
+            if data:
+                self._keep(self._clock.now_ns(), data)
+
+    def _keep(self, arrival_ns: int, data: bytes) -> None:
+        with self._lock:
+            self._pending.append((arrival_ns, data))
+            self._pending_bytes += len(data)
+            while self._pending_bytes > _PENDING_LIMIT:
+                _, oldest = self._pending.popleft()
+                self._pending_bytes -= len(oldest)
+                self.lost_bytes += len(oldest)

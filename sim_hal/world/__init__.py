@@ -1,0 +1,1 @@
+"""The physical world that the devices act on and feel."""

@@ -1,0 +1,1 @@
+"""The VN-100 end to end: bytes, driver, emulator, line."""
