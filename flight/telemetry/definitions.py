@@ -1,7 +1,7 @@
 """The one table of telemetry: every packet, every field, its type, unit and meaning.
 
-The packer, the parser, the ground database, the CSV export and the documentation are made from it. A packet is
-never changed in place once it has flown: a field is appended and the packet's version raised.
+The packer, the parser, the ground database, the CSV export and the documentation are made from it. A packet
+is never changed in place once it has flown: a field is appended and the packet's version raised.
 """
 
 from __future__ import annotations
@@ -51,6 +51,10 @@ RUN = Packet(
         Field("simulated", "u1", "-", "1 when the devices are emulated"),
         Field("realtime", "u1", "-", "1 when flown on the machine's clock, 0 in lock-step"),
         Field("control_period_ns", "u8", "ns", "period of the control rate group"),
+        Field("duration", "f8", "s", "planned length of the run, NaN when open"),
+        Field("coil_resistance", "f8", "ohm", "resistance of each coil, NaN where none is fitted", 3),
+        Field("supply_voltage", "f8", "V", "coil supply after losses, as configured"),
+        Field("current_limit", "f8", "A", "largest current that a coil may carry"),
     ),
 )
 
@@ -138,7 +142,7 @@ STREAK = Packet(
         Field("sequence", "u4", "-", "the camera's count"),
         Field("exposure_start_ns", "i8", "ns", "mission time of the exposure's start"),
         Field("exposure", "f8", "s", "exposure time"),
-        Field("status", "S32", "-", "rate, too-short, too-few, ambiguous, black, frozen, failed"),
+        Field("status", "S32", "-", "rate, ambiguous, too-short, too-few, failed, black, saturated, frozen"),
         Field("streaks", "u2", "-", "streaks found"),
         Field("used", "u2", "-", "streaks used in the rate"),
         Field("length", "f8", "px", "median length of the streaks"),

@@ -1,0 +1,1 @@
+"""Telemetry: CCSDS packets from one definition table, the flight log, its reader, its documentation."""

@@ -1,0 +1,1 @@
+"""Tests of packets, scanner, flight log, reader, export and documentation."""
