@@ -1,0 +1,55 @@
+"""The report of a run: the thesis's performance figures, tables, pictures. Reads packets only."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from flight.errors import UsageError
+from flight.report.summary import summarise
+from flight.report.text import format_report
+from flight.telemetry.reader import Run
+
+if TYPE_CHECKING:
+    from flight.guidance.vmc import Plan
+    from flight.plant import SingleAxisPlant
+
+__all__ = ["draw", "draw_path", "format_report", "summarise"]
+
+
+def draw(run: Run, folder: Path) -> list[Path]:
+    """Draw the run's pictures into `folder`; returns the files.
+
+    Raises UsageError when matplotlib is not installed or the folder cannot be written.
+    """
+    with _drawing(folder):
+        from flight.report.figures import draw_figures  # noqa: PLC0415  # an extra, never on board
+
+        folder.mkdir(parents=True, exist_ok=True)
+        return draw_figures(run, folder)
+
+
+def draw_path(plan: Plan, plant: SingleAxisPlant, file: Path) -> None:
+    """Draw one planned path as a PNG.
+
+    Raises UsageError when matplotlib is not installed or the file cannot be written.
+    """
+    with _drawing(file):
+        from flight.report.path_figure import save_path  # noqa: PLC0415  # an extra, never on board
+
+        save_path(plan, plant, file)
+
+
+@contextmanager
+def _drawing(place: Path) -> Iterator[None]:
+    """Turn the lack of matplotlib, or of a place to write, into one clear line."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] != "matplotlib":
+            raise
+        raise UsageError("pictures need matplotlib: pip install '.[plots]'") from error
+    except OSError as error:
+        raise UsageError(f"{place}: no pictures can be written there: {error.strerror or error}") from error

@@ -1,0 +1,1 @@
+"""Tests of the report: figures of performance, summary, text, pictures."""
