@@ -1,0 +1,160 @@
+"""An I2C bus of Linux through smbus2: one file descriptor, one lock, one bounded wait.
+
+A call waits for the transaction before it and then no longer than the adapter's own time-out, which is set
+here (ioctl I2C_TIMEOUT). The adapter repeats nothing by itself (I2C_RETRIES 0): drivers count each failure.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import threading
+from collections.abc import Callable, Sequence
+from fcntl import ioctl
+from pathlib import Path
+from typing import TypeVar
+
+from smbus2 import I2cFunc, SMBus
+
+from hal.interfaces.errors import NotResponding, OutOfRange, Refused
+
+_Answer = TypeVar("_Answer")
+
+I2C_RETRIES = 0x0701
+I2C_TIMEOUT = 0x0702
+_TIMEOUT_UNIT_NS = 10_000_000
+_BLOCK_LIMIT = 32
+
+# What the kernel's fault codes mean on a bus (Documentation/i2c/fault-codes).
+_MEANING = {
+    errno.EREMOTEIO: "no acknowledge",
+    errno.ENXIO: "no acknowledge of the address",
+    errno.ETIMEDOUT: "time-out, the clock line may be held low",
+    errno.EAGAIN: "arbitration lost",
+    errno.EBUSY: "the address is held by a kernel driver",
+    errno.EBADF: "the bus has been closed",
+}
+# After these the line is in order and the descriptor is worth keeping.
+_LINE_IN_ORDER = frozenset({errno.EREMOTEIO, errno.ENXIO, errno.EAGAIN, errno.EBUSY})
+
+
+class LinuxI2cBus:
+    """One /dev/i2c-N, safe to share between drivers and threads; reopened after the line has failed."""
+
+    def __init__(self, device: int | str, timeout_ns: int = 20_000_000) -> None:
+        """Open bus number N, or the device file of a udev name.
+
+        The kernel counts the time-out in steps of 10 ms; it is rounded up. Raises NotResponding when there is
+        no such bus, Refused when it may not be opened or cannot do block transfers.
+        """
+        if timeout_ns <= 0:
+            raise OutOfRange("i2c bus", "time-out", timeout_ns * 1e-9, 0.01, 1.0, "s")
+        self.name = f"/dev/i2c-{device}" if isinstance(device, int) else device
+        self._timeout_units = -(-timeout_ns // _TIMEOUT_UNIT_NS)
+        # A transaction is at most two messages, each of which may run into the time-out.
+        self._patience = 2.0 * self._timeout_units * _TIMEOUT_UNIT_NS * 1e-9
+        self._lock = threading.Lock()
+        self._bus: SMBus | None = None
+        self._closed = False
+        try:
+            self._bus = self._open()
+        except FileNotFoundError as error:
+            raise NotResponding(self.name, _how_to_find_a_bus()) from error
+        except PermissionError as error:
+            raise Refused(self.name, "no permission: add the user to the group that owns it (i2c)") from error
+        except OSError as error:
+            raise NotResponding(self.name, f"not a usable I2C bus: {error.strerror}") from error
+        if self._bus.funcs & I2cFunc.SMBUS_I2C_BLOCK != I2cFunc.SMBUS_I2C_BLOCK:
+            self.close()
+            raise Refused(self.name, "the adapter cannot do I2C block transfers; choose another bus")
+
+    def read_byte_data(self, address: int, register: int) -> int:
+        """Read one byte."""
+        return self._transact(address, lambda bus: bus.read_byte_data(address, register))
+
+    def write_byte_data(self, address: int, register: int, value: int) -> None:
+        """Write one byte."""
+        self._transact(address, lambda bus: bus.write_byte_data(address, register, value))
+
+    def read_i2c_block_data(self, address: int, register: int, length: int) -> list[int]:
+        """Read `length` <= 32 bytes."""
+        _check_length(length)
+        answer = self._transact(address, lambda bus: bus.read_i2c_block_data(address, register, length))
+        if len(answer) != length:
+            raise OSError(errno.EIO, f"{len(answer)} bytes, not {length}, from 0x{address:02x}, {self.name}")
+        return answer
+
+    def write_i2c_block_data(self, address: int, register: int, values: Sequence[int]) -> None:
+        """Write up to 32 bytes."""
+        _check_length(len(values))
+        self._transact(address, lambda bus: bus.write_i2c_block_data(address, register, list(values)))
+
+    def close(self) -> None:
+        """Close the bus. Safe to call twice."""
+        self._closed = True
+        # Without the lock after a bounded wait: a hung transaction must not keep the program from ending.
+        locked = self._lock.acquire(timeout=self._patience)
+        self._drop()
+        if locked:
+            self._lock.release()
+
+    def _open(self) -> SMBus:
+        bus = SMBus()
+        try:
+            bus.open(self.name)
+            if bus.fd is not None:
+                ioctl(bus.fd, I2C_TIMEOUT, self._timeout_units)
+                ioctl(bus.fd, I2C_RETRIES, 0)
+        except OSError:
+            bus.close()
+            raise
+        return bus
+
+    def _drop(self) -> None:
+        if self._bus is not None:
+            self._bus.close()
+            self._bus = None
+
+    def _transact(self, address: int, action: Callable[[SMBus], _Answer]) -> _Answer:
+        if not self._lock.acquire(timeout=self._patience):
+            raise OSError(errno.ETIMEDOUT, f"{self.name} is held by a transaction that does not end")
+        try:
+            if self._closed:
+                raise OSError(errno.EBADF, os.strerror(errno.EBADF))
+            if self._bus is None:
+                self._bus = self._open()
+            return action(self._bus)
+        except OSError as error:
+            code = error.errno or errno.EIO
+            if code not in _LINE_IN_ORDER:
+                self._drop()
+            meaning = _MEANING.get(code, os.strerror(code))
+            raise OSError(code, f"{meaning}, address 0x{address:02x} on {self.name}") from error
+        finally:
+            self._lock.release()
+
+
+def adapters(folder: Path = Path("/sys/bus/i2c/devices")) -> list[tuple[int, str]]:
+    """Return the (number, name) of every I2C adapter that the kernel knows."""
+    found = []
+    for entry in folder.glob("i2c-*"):
+        number = entry.name.removeprefix("i2c-")
+        if number.isdigit() and (entry / "name").is_file():
+            found.append((int(number), (entry / "name").read_text(encoding="utf-8").strip()))
+    return sorted(found)
+
+
+def _how_to_find_a_bus() -> str:
+    known = adapters()
+    if not known:
+        return "no such bus, and the kernel knows no adapter: enable one in the firmware, modprobe i2c-dev"
+    listing = ", ".join(f"i2c-{number} ({name})" for number, name in known)
+    return (
+        f"no such bus; the kernel knows {listing}. Is i2c-dev loaded? Numbers change between boots: let a"
+        ' udev rule on SUBSYSTEM=="i2c-dev", ATTR{name} make a lasting name with SYMLINK+= and give that'
+    )
+
+
+def _check_length(length: int) -> None:
+    if not 1 <= length <= _BLOCK_LIMIT:
+        raise ValueError(f"a block of {length} bytes: SMBus carries 1 to {_BLOCK_LIMIT}")

@@ -1,0 +1,169 @@
+"""The INA219: current of all coils together, bus voltage and power (TI SBOS448G).
+
+The current is shunt voltage over shunt resistance; the chip's Calibration register, which a brown-out clears,
+is not used. Each conversion averages 128 samples in 68 ms, not a whole number of the 20 ms periods in which
+the supply current is chopped, so it may be 18 % off; the mean of five, 7 % (a test computes both).
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections import deque
+
+from hal.interfaces.errors import DeviceError, NotResponding, OutOfRange, Refused
+from hal.interfaces.readings import PowerReading
+from hal.interfaces.wires import Clock, I2cBus
+
+CONFIG, SHUNT, BUS, POWER = 0x00, 0x01, 0x02, 0x03
+
+AVERAGE_128 = 0b1111
+CONTINUOUS = 0b111
+SHUNT_STEP_V = 10e-6
+BUS_STEP_V = 4e-3
+CONVERSION_READY = 0b10
+OVERFLOW = 0b01
+
+_SHUNT_RANGES_V = (0.04, 0.08, 0.16, 0.32)  # in the order of the PG bits
+_SILENCE_NS = 1_000_000_000
+
+
+def range_for(maximum_current: float, shunt_ohm: float) -> int:
+    """Return the PG bits of the narrowest shunt range that holds a current in A.
+
+    Raises OutOfRange when none does.
+    """
+    for bits, full_scale in enumerate(_SHUNT_RANGES_V):
+        # 0.8 A in 0.1 ohm is 80 mV, whatever its last bit says.
+        if maximum_current * shunt_ohm <= full_scale * (1.0 + 1e-12):
+            return bits
+    raise OutOfRange("ina219", "maximum current", maximum_current, 0.0, _SHUNT_RANGES_V[-1] / shunt_ohm, "A")
+
+
+def config_for(range_bits: int) -> int:
+    """Return the Config word: 16 V bus range, the shunt range, 128 samples for both, continuous."""
+    return range_bits << 11 | AVERAGE_128 << 7 | AVERAGE_128 << 3 | CONTINUOUS
+
+
+class Ina219:
+    """One monitor, read on a job of the clock; the job sets it up, and again after a brown-out."""
+
+    def __init__(
+        self,
+        bus: I2cBus,
+        address: int,
+        clock: Clock,
+        shunt_ohm: float = 0.1,
+        period_ns: int = 200_000_000,
+        maximum_current: float = 0.8,
+        averaged: int = 5,
+    ) -> None:
+        """Start reading every `period_ns`; a reading is the mean of the last `averaged` conversions.
+
+        Raises OutOfRange for a shunt or a current that the chip cannot measure.
+        """
+        for quantity, value, unit in (("shunt", shunt_ohm, "ohm"), ("maximum current", maximum_current, "A")):
+            if not 0.0 < value < math.inf:
+                raise OutOfRange("ina219", quantity, value, 0.0, math.inf, unit)
+        if averaged < 1:
+            raise OutOfRange("ina219", "averaged conversions", averaged, 1, 100, "")
+        self.name = f"ina219 at 0x{address:02x}"
+        self._bus = bus
+        self._address = address
+        self._clock = clock
+        self._ohm = shunt_ohm
+        self._range_bits = range_for(maximum_current, shunt_ohm)
+        self._config = config_for(self._range_bits)
+        self._lock = threading.Lock()
+        self._conversions: deque[tuple[float, float]] = deque(maxlen=averaged)
+        self._latest: PowerReading | None = None
+        self._error = ""
+        self._set_up_before = False
+        self._heard_ns = clock.now_ns()
+        self._ticker = clock.ticker("ina219", period_ns, self._serve)
+
+    def latest(self) -> PowerReading | None:
+        """Return the newest reading, None before the first."""
+        with self._lock:
+            return self._latest
+
+    def error(self) -> str:
+        """Return the last failure while it lasts, empty when readings come."""
+        with self._lock:
+            return self._error
+
+    def close(self) -> None:
+        """Stop reading. Safe to call twice."""
+        self._ticker.stop()
+
+    def _serve(self) -> None:
+        try:
+            conversion = self._convert()
+        except DeviceError as error:
+            # A mean must not bridge a gap: the current may have changed meanwhile.
+            self._conversions.clear()
+            with self._lock:
+                self._error = str(error)
+            return
+        if conversion is None:
+            return
+        self._conversions.append(conversion)
+        count = len(self._conversions)
+        voltage = math.fsum(volts for volts, _ in self._conversions) / count
+        current = math.fsum(amps for _, amps in self._conversions) / count
+        with self._lock:
+            self._latest = PowerReading(self._clock.now_ns(), voltage, current, voltage * current)
+            self._error = ""
+
+    def _convert(self) -> tuple[float, float] | None:
+        """Return bus voltage in V and current in A of a new conversion, None while there is none."""
+        if self._read(CONFIG) != self._config:
+            self._set_up()
+            return None
+        self._set_up_before = True
+        bus = self._read(BUS)
+        if not bus & CONVERSION_READY:
+            silence = self._clock.now_ns() - self._heard_ns
+            if silence > _SILENCE_NS:
+                raise NotResponding(self.name, f"no conversion for {silence * 1e-9:.1f} s; check its supply")
+            return None
+        shunt = self._read(SHUNT)
+        self._read(POWER)  # clears "ready", so that no conversion is counted twice
+        self._heard_ns = self._clock.now_ns()
+        signed = shunt - 0x10000 if shunt & 0x8000 else shunt
+        full_scale = _SHUNT_RANGES_V[self._range_bits]
+        if bus & OVERFLOW or abs(signed) >= round(full_scale / SHUNT_STEP_V):
+            bound = full_scale / self._ohm
+            current = signed * SHUNT_STEP_V / self._ohm
+            raise OutOfRange(self.name, "overflow: coil current", current, -bound, bound, "A")
+        return (bus >> 3) * BUS_STEP_V, signed * SHUNT_STEP_V / self._ohm
+
+    def _set_up(self) -> None:
+        self._write(CONFIG, self._config)
+        found = self._read(CONFIG)
+        if found != self._config:
+            raise Refused(
+                self.name,
+                f"Config reads 0x{found:04x} after 0x{self._config:04x} was written: is another part at this"
+                " address?",
+            )
+        self._heard_ns = self._clock.now_ns()
+        lost, self._set_up_before = self._set_up_before, True
+        if lost:
+            raise NotResponding(self.name, "had lost its set-up (brown-out?); set up again")
+
+    def _read(self, register: int) -> int:
+        try:
+            high, low = self._bus.read_i2c_block_data(self._address, register, 2)
+        except OSError as error:
+            raise self._silent(error) from error
+        return high << 8 | low
+
+    def _write(self, register: int, word: int) -> None:
+        try:
+            self._bus.write_i2c_block_data(self._address, register, [word >> 8, word & 0xFF])
+        except OSError as error:
+            raise self._silent(error) from error
+
+    def _silent(self, error: OSError) -> DeviceError:
+        return NotResponding(self.name, f"{error.strerror}; check its power, wiring and address")

@@ -1,0 +1,189 @@
+"""An I2C bus in memory: parts that hold registers, and the faults that a wire can have.
+
+A transaction is what smbus2 makes of a call: address, register byte and data, or a repeated start and a read.
+Its duration on the wire (0.6 ms for 24 bytes at 400 kHz) is not modelled; a hang lasts the bus's time-out.
+"""
+
+from __future__ import annotations
+
+import errno
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+
+class I2cPart(Protocol):
+    """A part on the bus."""
+
+    def answers(self, address: int) -> bool:
+        """Tell whether the part acknowledges this address (0 is the general call)."""
+
+    def write(self, address: int, data: bytes) -> None:
+        """Take the bytes of a write, from the address to the STOP or repeated START."""
+
+    def read(self, count: int) -> bytes:
+        """Give bytes from where the register pointer stands."""
+
+
+@dataclass(slots=True)
+class _Fault:
+    """One fault in waiting; `code` 0 is a bit flip, `left` None lasts until `clear_faults`."""
+
+    code: int
+    text: str
+    address: int | None
+    left: int | None
+    after: int = 0
+    index: int = 0
+    mask: int = 0
+
+
+class EmulatedI2cBus:
+    """The drivers' bus (hal.interfaces.wires.I2cBus) over emulated parts. Safe for several threads."""
+
+    def __init__(
+        self,
+        parts: Sequence[I2cPart] = (),
+        timeout_ns: int = 20_000_000,
+        wait: Callable[[int], None] | None = None,
+    ) -> None:
+        """Put parts on a bus; `wait` lets the nanoseconds of a time-out pass, without it none do."""
+        self._parts = list(parts)
+        self._timeout_ns = timeout_ns
+        self._wait = wait
+        self._faults: list[_Fault] = []
+        self._closed = False
+        # Re-entrant: while a hang lasts, simulated time may run other jobs of the same thread.
+        self._lock = threading.RLock()
+        self.transactions = 0
+
+    def attach(self, part: I2cPart) -> None:
+        """Put one more part on the bus."""
+        with self._lock:
+            self._parts.append(part)
+
+    def detach(self, part: I2cPart) -> None:
+        """Take a part off the bus; its address is acknowledged no more."""
+        with self._lock:
+            self._parts.remove(part)
+
+    def read_byte_data(self, address: int, register: int) -> int:
+        """Read one byte."""
+        return self._read(address, register, 1)[0]
+
+    def write_byte_data(self, address: int, register: int, value: int) -> None:
+        """Write one byte."""
+        self.send(address, bytes((register, value)))
+
+    def read_i2c_block_data(self, address: int, register: int, length: int) -> list[int]:
+        """Read `length` <= 32 bytes."""
+        _check_length(length)
+        return list(self._read(address, register, length))
+
+    def write_i2c_block_data(self, address: int, register: int, values: Sequence[int]) -> None:
+        """Write up to 32 bytes."""
+        _check_length(len(values))
+        self.send(address, bytes((register, *values)))
+
+    def close(self) -> None:
+        """Close the bus. Safe to call twice."""
+        self._closed = True
+
+    def send(self, address: int, data: bytes) -> None:
+        """Write bytes as they are, as i2c_rdwr would: 0x06 alone to address 0 is the software reset."""
+        with self._lock:
+            parts, fault = self._begin(address)
+            if fault is not None:
+                if fault.code:
+                    if fault.after:
+                        self._deliver(parts, address, data[: fault.after])
+                    self._fail(fault, address)
+                data = _flipped(data, 1 + fault.index, fault.mask)
+            self._deliver(parts, address, data)
+
+    def nack(self, address: int, times: int | None = 1, after: int = 0) -> None:
+        """Let a part refuse `times` transactions (None: until cleared), a write after `after` bytes taken.
+
+        The register byte counts as the first of them.
+        """
+        self._add(_Fault(errno.EREMOTEIO, "no acknowledge", address, times, after=after))
+
+    def hang(self, times: int | None = None) -> None:
+        """Hold the clock line low: each transaction takes the time-out and fails."""
+        self._add(_Fault(errno.ETIMEDOUT, "time-out, the clock line is held low", None, times))
+
+    def lose_arbitration(self, times: int | None = 1) -> None:
+        """Let another master win."""
+        self._add(_Fault(errno.EAGAIN, "arbitration lost", None, times))
+
+    def flip_bits(self, address: int, index: int, mask: int, times: int | None = 1) -> None:
+        """Invert the bits of `mask` in byte `index` of the data written or read, silently."""
+        self._add(_Fault(0, "bits flipped", address, times, index=index, mask=mask))
+
+    def clear_faults(self) -> None:
+        """Let the bus be in order again."""
+        with self._lock:
+            self._faults.clear()
+
+    def _add(self, fault: _Fault) -> None:
+        with self._lock:
+            self._faults.append(fault)
+
+    def _read(self, address: int, register: int, count: int) -> bytes:
+        with self._lock:
+            parts, fault = self._begin(address)
+            if fault is not None and fault.code:
+                self._fail(fault, address)
+            self._deliver(parts, address, bytes((register,)))
+            # Outputs are open drain: of several parts that answer, the zeros win.
+            data = bytes(map(_wired_and, zip(*(part.read(count) for part in parts), strict=True)))
+            return data if fault is None else _flipped(data, fault.index, fault.mask)
+
+    def _begin(self, address: int) -> tuple[list[I2cPart], _Fault | None]:
+        if self._closed:
+            raise OSError(errno.EBADF, "the emulated bus has been closed")
+        self.transactions += 1
+        fault = self._due_fault(address) if self._faults else None
+        parts = [part for part in self._parts if part.answers(address)]
+        if not parts and (fault is None or fault.code != errno.ETIMEDOUT):
+            raise OSError(errno.EREMOTEIO, f"no acknowledge, address 0x{address:02x} on the emulated bus")
+        return parts, fault
+
+    def _due_fault(self, address: int) -> _Fault | None:
+        for fault in self._faults:
+            if fault.address is None or fault.address == address:
+                if fault.left is not None:
+                    fault.left -= 1
+                    if fault.left <= 0:
+                        self._faults.remove(fault)
+                return fault
+        return None
+
+    def _fail(self, fault: _Fault, address: int) -> None:
+        if fault.code == errno.ETIMEDOUT and self._wait is not None:
+            self._wait(self._timeout_ns)
+        raise OSError(fault.code, f"{fault.text}, address 0x{address:02x} on the emulated bus")
+
+    @staticmethod
+    def _deliver(parts: list[I2cPart], address: int, data: bytes) -> None:
+        for part in parts:
+            part.write(address, data)
+
+
+def _wired_and(column: tuple[int, ...]) -> int:
+    value = 0xFF
+    for byte in column:
+        value &= byte
+    return value
+
+
+def _flipped(data: bytes, index: int, mask: int) -> bytes:
+    if index >= len(data):
+        return data
+    return data[:index] + bytes((data[index] ^ mask,)) + data[index + 1 :]
+
+
+def _check_length(length: int) -> None:
+    if not 1 <= length <= 32:
+        raise ValueError(f"a block of {length} bytes: SMBus carries 1 to 32")

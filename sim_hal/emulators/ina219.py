@@ -1,0 +1,142 @@
+"""An INA219 that holds registers and converts in its own time (TI SBOS448G).
+
+What it converts is the mean over its conversion window of what the circuit says it carried; a conversion is
+worked out when the bus asks for its result. Not modelled: noise, gain error, the input filter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+CONFIG = 0x00
+POWER = 0x03
+CALIBRATION = 0x05
+
+POWER_ON_CONFIG = 0x399F
+_RESET = 0x8000
+_BUS_32V = 0x2000
+_SHUNT_STEP_V = 10e-6
+_BUS_STEP_V = 4e-3
+_READY, _OVERFLOW = 0b10, 0b01
+
+# Nanoseconds by ADC code: 9 to 12 bits, then 12 bits averaged 2 to 128 times.
+_SINGLE_NS = (84_000, 148_000, 276_000, 532_000)
+_AVERAGED_NS = (532_000, 1_060_000, 2_130_000, 4_260_000, 8_510_000, 17_020_000, 34_050_000, 68_100_000)
+
+
+def conversion_ns(code: int) -> int:
+    """Return how long one conversion with a 4-bit ADC code takes."""
+    return _AVERAGED_NS[code & 7] if code & 8 else _SINGLE_NS[code & 3]
+
+
+class EmulatedIna219:
+    """One monitor; `measure(start_ns, end_ns)` gives mean bus voltage (V) and current (A) of a window."""
+
+    def __init__(
+        self,
+        address: int,
+        now_ns: Callable[[], int],
+        measure: Callable[[int, int], tuple[float, float]],
+        shunt_ohm: float = 0.1,
+    ) -> None:
+        self.address = address
+        self._now_ns = now_ns
+        self._measure = measure
+        self._ohm = shunt_ohm
+        self._power_on()
+
+    def brown_out(self) -> None:
+        """Let the supply fail for an instant: every register is back at its power-on value."""
+        self._power_on()
+
+    def register(self, register: int) -> int:
+        """Return a register's word without any effect of reading it."""
+        self._convert()
+        current, power, overflow = self._products()
+        bus = self._bus << 3 | (_READY if self._ready else 0) | (_OVERFLOW if overflow else 0)
+        words = (self._config, self._shunt, bus, power, current, self._calibration)
+        return words[register] & 0xFFFF if register < len(words) else 0
+
+    def answers(self, address: int) -> bool:
+        """Tell whether the chip acknowledges this address."""
+        return address == self.address
+
+    def write(self, address: int, data: bytes) -> None:
+        """Take a register pointer, and a word (big-endian) for Config or Calibration."""
+        self._pointer = data[0]
+        if len(data) < 3:
+            return
+        word = data[1] << 8 | data[2]
+        if self._pointer == CONFIG:
+            self._convert()
+            self._configure(word)
+        elif self._pointer == CALIBRATION:
+            self._calibration = word & 0xFFFE
+
+    def read(self, count: int) -> bytes:
+        """Give the pointed-at word, big-endian; beyond it the line floats high."""
+        word = self.register(self._pointer)
+        if self._pointer == POWER:
+            self._ready = False
+        return word.to_bytes(2, "big")[:count] + b"\xff" * (count - 2)
+
+    def _power_on(self) -> None:
+        self._pointer = 0
+        self._calibration = 0
+        self._shunt = 0
+        self._bus = 0
+        self._ready = False
+        self._configure(POWER_ON_CONFIG)
+
+    def _configure(self, word: int) -> None:
+        if word & _RESET:
+            self._power_on()
+            return
+        self._config = word & ~0x4000
+        mode = word & 0b111
+        shunt_wanted, bus_wanted = mode & 0b001, mode & 0b010
+        self._continuous = bool(mode & 0b100)
+        self._shunt_ns = conversion_ns(word >> 3 & 0xF) if shunt_wanted else 0
+        self._bus_ns = conversion_ns(word >> 7 & 0xF) if bus_wanted else 0
+        self._begin_ns = self._now_ns()
+        self._done = 0
+        # Power-down and "ADC off" leave the flag as it is.
+        if shunt_wanted or bus_wanted:
+            self._ready = False
+
+    def _convert(self) -> None:
+        """Take over the newest conversion that has ended by now: first the shunt, then the bus."""
+        cycle_ns = self._shunt_ns + self._bus_ns
+        if cycle_ns == 0:
+            return
+        ended = (self._now_ns() - self._begin_ns) // cycle_ns
+        if not self._continuous:
+            ended = min(ended, 1)
+        if ended <= self._done:
+            return
+        self._done = ended
+        self._ready = True
+        start = self._begin_ns + (ended - 1) * cycle_ns
+        middle = start + self._shunt_ns
+        if self._shunt_ns:
+            _, amps = self._measure(start, middle)
+            gain = 1 << (self._config >> 11 & 0b11)
+            code = self._config >> 3 & 0xF
+            self._shunt = _digitised(amps * self._ohm / _SHUNT_STEP_V, code, -4000 * gain, 4000 * gain)
+        if self._bus_ns:
+            volts, _ = self._measure(middle, middle + self._bus_ns)
+            top = 8000 if self._config & _BUS_32V else 4000
+            self._bus = _digitised(volts / _BUS_STEP_V, self._config >> 7 & 0xF, 0, top)
+
+    def _products(self) -> tuple[int, int, bool]:
+        """Return Current, Power and whether either is beyond its register."""
+        current = abs(self._shunt) * self._calibration // 4096
+        power = current * self._bus // 5000
+        overflow = current > 0x7FFF or power > 0xFFFF
+        return (-current if self._shunt < 0 else current), power, overflow
+
+
+def _digitised(steps: float, code: int, low: int, high: int) -> int:
+    """Return a voltage, given in 12-bit steps, as its register value: coarser for fewer bits, clipped."""
+    coarse = 1 if code & 8 else 1 << (3 - (code & 3))
+    return min(high, max(low, round(steps / coarse) * coarse))

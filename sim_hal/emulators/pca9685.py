@@ -1,0 +1,242 @@
+"""A PCA9685 that holds registers (NXP data sheet): what the outputs do follows from them alone.
+
+What the data sheet forbids or leaves open is done in the way that does least, and noted in `violations`.
+Not modelled: oscillator tolerance and the phase of the counter; a change takes effect at the STOP.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from hal.drivers.pca9685 import (
+    ALL_LED_OFF_H,
+    AUTO_INCREMENT,
+    CHANNELS,
+    COUNTS,
+    FULL,
+    LED0_ON_L,
+    MODE1,
+    MODE2,
+    OSCILLATOR_HZ,
+    OSCILLATOR_START_NS,
+    PRE_SCALE,
+    RESTART,
+    SLEEP,
+)
+
+_ALL_LED_ON_L = 0xFA
+_TEST_MODE = 0xFF
+_LED_END = LED0_ON_L + 4 * CHANNELS
+_EXTERNAL_CLOCK = 0x40
+_ALL_CALL = 0x01
+_INVERT = 0x10
+_UPDATE_ON_ACK = 0x08
+_SOFTWARE_RESET = b"\x06"
+_ALL_CHANNELS = (1 << CHANNELS) - 1
+# Where SUBADR1..3 and ALLCALLADR stand, and the MODE1 bit that makes the chip answer there.
+_EXTRA_ADDRESSES = ((0x02, 0x08), (0x03, 0x04), (0x04, 0x02), (0x05, _ALL_CALL))
+
+
+def _writable_bits() -> bytes:
+    """Return the bits of each register that a write reaches; reserved ones read zero."""
+    bits = bytearray(256)
+    bits[MODE1] = 0x7F
+    bits[MODE2] = 0x1F
+    bits[0x02:0x06] = b"\xfe" * 4
+    bits[LED0_ON_L:_LED_END] = b"\xff\x1f\xff\x1f" * CHANNELS
+    bits[PRE_SCALE] = 0xFF
+    return bytes(bits)
+
+
+def _power_on_values() -> bytes:
+    values = bytearray(256)
+    values[MODE1] = SLEEP | _ALL_CALL
+    values[MODE2] = 0x04
+    values[0x02:0x06] = b"\xe2\xe4\xe8\xe0"
+    values[LED0_ON_L:_LED_END] = b"\x00\x00\x00\x10" * CHANNELS
+    values[PRE_SCALE] = 0x1E
+    return bytes(values)
+
+
+_WRITABLE = _writable_bits()
+_POWER_ON = _power_on_values()
+
+
+class EmulatedPca9685:
+    """One chip.
+
+    Attributes:
+        on_stop: called after each write that may have changed outputs, with the mask of the channels written
+            (0 when only the modes changed).
+        output_enable: the OE pin held active; inactive, every output is low (OUTNE 00).
+        violations: what the bus master did against the data sheet.
+    """
+
+    def __init__(self, address: int, now_ns: Callable[[], int]) -> None:
+        self.address = address
+        self.on_stop: Callable[[int], None] | None = None
+        self.output_enable = True
+        self.violations: set[str] = set()
+        self._now_ns = now_ns
+        self._registers = bytearray()
+        self._addresses: set[int] = set()
+        self._halted = 0  # channels that sleep has stopped, until RESTART or a new write
+        self._power_on()
+
+    def brown_out(self) -> None:
+        """Let the supply fail for an instant: every register is back at its power-on value."""
+        self._power_on()
+        self._stop(_ALL_CHANNELS)
+
+    def register(self, register: int) -> int:
+        """Return a register's content, as a read of it gives."""
+        restart = RESTART if register == MODE1 and self._restart else 0
+        return self._registers[register] | restart
+
+    @property
+    def frequency(self) -> float:
+        """The PWM frequency in Hz, 0 while the oscillator is off."""
+        # No clock is wired to the EXTCLK pin.
+        if self._registers[MODE1] & (SLEEP | _EXTERNAL_CLOCK):
+            return 0.0
+        return OSCILLATOR_HZ / (COUNTS * (self._registers[PRE_SCALE] + 1))
+
+    def high(self, channel: int) -> tuple[int, int]:
+        """Return when in a period an output is high: (first count, how many counts, 0 .. 4096)."""
+        if not self.output_enable:
+            return 0, 0
+        start, length = self._pulse(channel)
+        if self._registers[MODE2] & _INVERT:
+            return (start + length) % COUNTS, COUNTS - length
+        return start, length
+
+    def duty(self, channel: int) -> float:
+        """Return the mean of an output over a period, 0 .. 1."""
+        return self.high(channel)[1] / COUNTS
+
+    def answers(self, address: int) -> bool:
+        """Tell whether the chip acknowledges: its own, the general call, enabled ALLCALL and SUBADRs."""
+        return address in self._addresses
+
+    def write(self, address: int, data: bytes) -> None:
+        """Take the bytes of one write."""
+        if address == 0:
+            if data == _SOFTWARE_RESET:
+                self._power_on()
+                self._stop(_ALL_CHANNELS)
+            return
+        self._pointer = pointer = data[0]
+        count = len(data) - 1
+        if count == 0:
+            return
+        if self._registers[MODE1] & AUTO_INCREMENT and pointer >= LED0_ON_L and pointer + count <= _LED_END:
+            written = self._store_run(pointer, data[1:])
+        else:
+            written = 0
+            for value in data[1:]:
+                written |= self._store(self._pointer, value)
+                self._advance()
+        # A write to a channel takes the place of RESTART; with OCH set, only one of all its four registers.
+        if written and (count >= 4 or not self._registers[MODE2] & _UPDATE_ON_ACK):
+            self._halted &= ~written
+            self._restart = False
+        self._stop(written)
+
+    def read(self, count: int) -> bytes:
+        """Give bytes from the register pointer on."""
+        given = bytearray()
+        for _ in range(count):
+            given.append(self.register(self._pointer))
+            self._advance()
+        return bytes(given)
+
+    def _power_on(self) -> None:
+        self._registers = bytearray(_POWER_ON)
+        self._pointer = 0
+        self._restart = False
+        self._halted = 0
+        self._awake_ns = self._now_ns()
+        self._find_addresses()
+
+    def _pulse(self, channel: int) -> tuple[int, int]:
+        registers = self._registers
+        base = LED0_ON_L + 4 * channel
+        off_high = registers[base + 3]
+        if off_high & FULL or registers[MODE1] & (SLEEP | _EXTERNAL_CLOCK) or self._halted >> channel & 1:
+            return 0, 0
+        on_high = registers[base + 1]
+        if on_high & FULL:
+            return 0, COUNTS
+        on = on_high << 8 | registers[base]
+        length = ((off_high << 8 | registers[base + 2]) - on) % COUNTS
+        if length == 0:
+            self.violations.add(f"LED{channel}: ON count = OFF count = {on}")
+        return on, length
+
+    def _store_run(self, pointer: int, values: bytes) -> int:
+        end = pointer + len(values)
+        self._registers[pointer:end] = bytes(map(int.__and__, values, _WRITABLE[pointer:end]))
+        self._pointer = end if end < _LED_END else 0
+        first, last = (pointer - LED0_ON_L) >> 2, (end - 1 - LED0_ON_L) >> 2
+        return (1 << last + 1) - (1 << first)
+
+    def _store(self, register: int, value: int) -> int:
+        """Write one register; return the mask of the channels touched."""
+        if LED0_ON_L <= register < _LED_END:
+            self._registers[register] = value & _WRITABLE[register]
+            return 1 << ((register - LED0_ON_L) >> 2)
+        if _ALL_LED_ON_L <= register <= ALL_LED_OFF_H:
+            offset = register - _ALL_LED_ON_L + LED0_ON_L
+            self._registers[offset:_LED_END:4] = bytes((value & _WRITABLE[offset],)) * CHANNELS
+            return _ALL_CHANNELS
+        if register == MODE1:
+            self._store_mode1(value)
+        elif register == PRE_SCALE:
+            if self._registers[MODE1] & SLEEP:
+                self._registers[PRE_SCALE] = max(3, value)
+            else:
+                self.violations.add("PRE_SCALE written while awake")
+        elif register == _TEST_MODE:
+            self.violations.add("TestMode written")
+        else:
+            self._registers[register] = value & _WRITABLE[register]
+        self._find_addresses()
+        return 0
+
+    def _store_mode1(self, value: int) -> None:
+        before = self._registers[MODE1]
+        # EXTCLK can be set only while asleep, and nothing but a reset clears it.
+        external = before & _EXTERNAL_CLOCK or value & before << 2 & _EXTERNAL_CLOCK
+        self._registers[MODE1] = value & ~(RESTART | _EXTERNAL_CLOCK) | external
+        if value & SLEEP and not before & SLEEP:
+            running = sum(
+                1 << channel
+                for channel in range(CHANNELS)
+                if not self._registers[LED0_ON_L + 4 * channel + 3] & FULL
+            )
+            self._halted |= running
+            self._restart = self._restart or running != 0
+        elif before & SLEEP and not value & SLEEP:
+            self._awake_ns = self._now_ns()
+        if value & RESTART and self._restart and not value & SLEEP:
+            if before & SLEEP or self._now_ns() - self._awake_ns < OSCILLATOR_START_NS:
+                self.violations.add("RESTART within 500 us of waking")
+            else:
+                self._restart = False
+                self._halted = 0
+
+    def _advance(self) -> None:
+        if self._registers[MODE1] & AUTO_INCREMENT:
+            following = self._pointer + 1
+            self._pointer = 0 if following in {_LED_END, _TEST_MODE} else following & 0xFF
+
+    def _find_addresses(self) -> None:
+        self._addresses = {0, self.address} | {
+            self._registers[register] >> 1
+            for register, enabled in _EXTRA_ADDRESSES
+            if self._registers[MODE1] & enabled
+        }
+
+    def _stop(self, written: int) -> None:
+        if self.on_stop is not None:
+            self.on_stop(written)
