@@ -21,7 +21,7 @@ demo: $(READY)  ## fly the 700 s step demonstration on simulated hardware and pr
 test: lint types arrows unit  ## every check
 
 lint: $(READY)  ## style
-	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff check . && $(VENV)/bin/ruff format --check --quiet .
 
 types: $(READY)  ## strict types
 	$(VENV)/bin/mypy

@@ -87,7 +87,9 @@ class Camera(Section, frozen=True, kw_only=True):
     bits: Annotated[int, Meta(ge=8, le=16)] = 16
     gain: Positive = 1.0
     read_noise: Positive = 10.0
+    saturation: Positive | None = None
     psf_sigma: Positive = 1.0
+    endpoint_bias: float | None = None
     mounting: Quaternion = (0.0, 0.0, 0.0, 1.0)
     max_age: Positive = 12.0
 

@@ -3,9 +3,9 @@
 The angle theta = 2 asin q2 is used rather than q2 because its kinematics are linear (Sease 5.9 is not):
 theta' = omega, omega' = u + d, with u the acceleration that the plant model gives for the known current and d
 what the model does not know (the thread's torque), a random walk. Each measurement is applied at its own
-time: one that arrives late is put where it belongs and those after it are applied again. A rate from a streaked
-image is the mean over its exposure: the angle at the exposure's start is kept as one more state until its end
-(stochastic cloning, Roumeliotis and Burdick 2002), so that a body that accelerates is no contradiction.
+time: one that arrives late is put where it belongs and those after it are applied again. A rate from a
+streaked image is the mean over its exposure: the angle at the exposure's start is kept as one more state
+until its end (stochastic cloning, Roumeliotis and Burdick 2002): acceleration is no contradiction.
 """
 
 from __future__ import annotations

@@ -52,5 +52,9 @@ class JobRunner(Protocol):
     def collect(self) -> list[JobResult]:
         """Return the results that have arrived. Never waits."""
 
+    @property
+    def borrowed_ns(self) -> int:
+        """Time that jobs have taken from the calling thread: none where they have processes of their own."""
+
     def close(self) -> None:
         """Stop the workers. Safe to call twice."""

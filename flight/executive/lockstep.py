@@ -14,7 +14,11 @@ from hal.interfaces.wires import Clock
 
 
 class LockStepRunner:
-    """A JobRunner on simulated time."""
+    """A JobRunner on simulated time.
+
+    Attributes:
+        borrowed_ns: time that the jobs have taken from the calling thread.
+    """
 
     def __init__(
         self, clock: Clock, workers: Sequence[Worker], stopwatch: Callable[[], int] = time.perf_counter_ns
@@ -23,6 +27,7 @@ class LockStepRunner:
         self._workers = {worker.name: worker for worker in workers}
         self._stopwatch = stopwatch
         self._under_way: dict[str, JobResult] = {}
+        self.borrowed_ns = 0
 
     def submit(self, worker: str, argument: Any) -> bool:
         """Do the job and keep its result until its latency has passed."""
@@ -37,8 +42,10 @@ class LockStepRunner:
             value = spec.function(argument)
         except Exception as failure:  # noqa: BLE001 - containment boundary: the worker runner
             outcome, error = "failed", f"{type(failure).__name__}: {failure}"
+        spent_ns = self._stopwatch() - begun
+        self.borrowed_ns += spent_ns
         self._under_way[worker] = JobResult(
-            worker, outcome, value, error, now_ns, now_ns + spec.latency_ns, self._stopwatch() - begun
+            worker, outcome, value, error, now_ns, now_ns + spec.latency_ns, spent_ns
         )
         return True
 

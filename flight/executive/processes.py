@@ -131,6 +131,8 @@ class _WorkerProcess:
 class ProcessRunner:
     """A JobRunner whose workers are processes."""
 
+    borrowed_ns = 0
+
     def __init__(self, clock: Clock, workers: Sequence[Worker]) -> None:
         self._clock = clock
         self._processes = {worker.name: _WorkerProcess(worker) for worker in workers}

@@ -61,6 +61,7 @@ class PwmTorqueCoils:
         self._wire = threading.RLock()
         self._serving = False
         self._written = _ZERO
+        self._written_ns = -1
         self._served = -1  # the number whose counts are on the wire
         self._lost = False
         self._check_ns = 0
@@ -145,6 +146,7 @@ class PwmTorqueCoils:
             return CoilState(
                 command=np.array(self._command),
                 current=np.array(list(map(self._mean_current, range(3), self._written))),
+                written_ns=self._written_ns,
                 saturated=self._saturated,
                 command_ns=self._command_ns,
                 stale=self._stale,
@@ -248,7 +250,7 @@ class PwmTorqueCoils:
 
     def _configure(self) -> None:
         self._pca.configure()
-        self._written = _ZERO
+        self._note(_ZERO)
         self._check_ns = self._clock.now_ns() + _CHECK_PERIOD_NS
 
     def _write_newest(self) -> None:
@@ -263,7 +265,8 @@ class PwmTorqueCoils:
                     raise
                 self._wait()
             else:
-                self._written, self._served = counts, number
+                self._note(counts)
+                self._served = number
                 if number == self._number:
                     return
 
@@ -283,8 +286,14 @@ class PwmTorqueCoils:
         except NotResponding as error:
             self._count(error)
             return False
-        self._written = _ZERO
+        self._note(_ZERO)
         return True
+
+    def _note(self, counts: _Counts) -> None:
+        """Keep what the chip has acknowledged; a repetition does not change since when."""
+        with self._mailbox:
+            if counts != self._written:
+                self._written, self._written_ns = counts, self._clock.now_ns()
 
     def _count(self, error: DeviceError) -> None:
         self._faults += 1

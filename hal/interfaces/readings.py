@@ -88,6 +88,7 @@ class CoilState:
     Attributes:
         command: (3,) A, as asked for, finite.
         current: (3,) A, as written after saturation and the resolution of the PWM chip; zeros when off.
+        written_ns: host clock since when that current is on the wire, -1 before the first.
         saturated: whether any axis was limited.
         command_ns: host clock of the newest command, -1 before the first.
         stale: the command was too old and the driver has let the coils decay to zero.
@@ -97,6 +98,7 @@ class CoilState:
 
     command: FloatArray
     current: FloatArray
+    written_ns: int
     saturated: bool
     command_ns: int
     stale: bool

@@ -205,5 +205,3 @@ SENTENCE_FRAME = len("$VN") + len("*XX\r\n")
 def report_length(report: Report) -> int:
     """Return the bytes of one sentence with an 8-bit checksum."""
     return SENTENCE_FRAME + len(",".join([report.header, *report.text(STILL)]))
-
-

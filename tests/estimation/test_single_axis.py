@@ -1,4 +1,4 @@
-"""The filter about the thread is consistent, puts late measurements where they belong, and refuses outliers."""
+"""The filter is consistent, puts late measurements where they belong, and refuses outliers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ANGLE_SIGMA, RATE_SIGMA = 2.02e-3, 1.01e-4
 def simulate(
     rng: np.random.Generator, cycles: int, stiffness: float = 1e-5
 ) -> tuple[FloatArray, list[float], list[Measurement]]:
-    """Return true (angle, rate) (cycles, 2), the commands, and noisy measurements of a plant with a thread."""
+    """Return true (angle, rate) (cycles, 2), commands and noisy measurements of a plant with a thread."""
     angle, rate = rng.normal(0.0, 0.3), rng.normal(0.0, 0.02)
     truth, commands, measurements = np.empty((cycles, 2)), [], []
     for cycle in range(cycles):
@@ -49,7 +49,7 @@ def run(filter_: SingleAxisFilter, commands: list[float], measurements: list[Mea
 
 
 def test_its_errors_are_as_large_as_its_covariance_says() -> None:
-    """NEES of angle and rate over 40 runs lies in the 99.9 % band of chi-square with 80 degrees of freedom."""
+    """NEES of angle and rate over 40 runs lies in the 99.9 % band of chi-square(80)."""
     rng = np.random.default_rng(7)
     nees = []
     for _ in range(40):

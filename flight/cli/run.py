@@ -1,0 +1,103 @@
+"""`flight run`: fly a configuration."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TextIO
+
+from flight.loop import Progress
+from flight.telemetry.reader import read_run
+
+
+def add_to(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command to the command line."""
+    parser = commands.add_parser(
+        "run",
+        help="fly a configuration",
+        description="Fly a configuration: on real devices, or on simulated ones where it has a simulation "
+        "section. Simulated flights run as fast as they can; --realtime flies them on the machine's clock, "
+        "the devices in a process of their own. Ctrl-C ends a flight, coils at zero, log whole.",
+    )
+    parser.add_argument("config", type=Path, metavar="CONFIG", help="YAML file, see config/step_demo.yaml")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the run (default runs/NAME-TIME)")
+    parser.add_argument("--duration", type=float, metavar="S", help="fly so many seconds instead")
+    parser.add_argument("--seed", type=_seed, metavar="N", help="seed of the simulation instead")
+    parser.add_argument(
+        "--realtime", action="store_true", help="fly simulated devices on the machine's clock"
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object when done")
+    parser.set_defaults(command=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Fly, showing progress on standard error when it is a terminal."""
+    from flight.app import Order, fly  # noqa: PLC0415 - devices are of no use to the other commands
+
+    # The label of a folder, not an input of anything.
+    label = datetime.now(UTC).strftime("%Y%m%d-%H%M%S")
+    out = options.out or Path("runs") / f"{options.config.stem}-{label}"
+    order = Order(options.config, out, options.realtime, options.duration, options.seed)
+    begun = time.perf_counter()
+    with_line = sys.stderr.isatty()
+    outcome = fly(order, progress_line(sys.stderr) if with_line else None)
+    if with_line:
+        sys.stderr.write("\r\x1b[K")
+    elapsed = time.perf_counter() - begun
+    flown = read_run(outcome.folder)
+    seconds = float(flown["control"]["time_ns"][-1]) * 1e-9 if len(flown["control"]) else 0.0
+    if options.json:
+        facts = {
+            "folder": str(outcome.folder),
+            "reason": outcome.reason,
+            "interrupted": outcome.interrupted,
+            "mission_time_s": seconds,
+            "elapsed_s": elapsed,
+            "packets": sum(log.counts.get("control", 0) for log in flown.logs.values()),
+            "log_error": outcome.log_error or None,
+        }
+        sys.stdout.write(json.dumps(facts) + "\n")
+    else:
+        sys.stdout.write(
+            f"flown: {seconds:.0f} s in {elapsed:.1f} s, {outcome.reason}\n"
+            f"log:   {outcome.folder}\n"
+            f"next:  python -m flight report {outcome.folder}\n"
+        )
+    if outcome.log_error:
+        sys.stderr.write(f"flight: {outcome.log_error}\n")
+        return 1
+    return 0
+
+
+def progress_line(stream: TextIO) -> Callable[[Progress], None]:
+    """Return what writes one line again and again, a few times a second at most."""
+    last = 0.0
+
+    def show(progress: Progress) -> None:
+        nonlocal last
+        now = time.perf_counter()
+        if now - last < 0.2:
+            return
+        last = now
+        q2 = "  -   " if progress.q2 is None else f"{progress.q2:+.4f}"
+        of = f"/{progress.duration:.0f}"
+        stream.write(
+            f"\r\x1b[K{progress.mission_time:6.0f}{of} s  q2 {q2} -> {progress.target_q2:+.2f}  "
+            f"coil {1e3 * progress.current:+6.1f} mA  {progress.state}  "
+            f"slips {progress.slips}  events {progress.events}"
+        )
+        stream.flush()
+
+    return show
+
+
+def _seed(text: str) -> int:
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"{text} is below zero")
+    return value

@@ -1,0 +1,1 @@
+"""What the rate groups do: each task owns one concern of the loop."""

@@ -1,0 +1,30 @@
+"""The commanded attitudes over mission time: the steps of a demonstration."""
+
+from __future__ import annotations
+
+import bisect
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """Hold `q2` with rate `rate` (rad/s) from mission time `at_ns` on."""
+
+    index: int
+    at_ns: int
+    q2: float
+    rate: float = 0.0
+
+
+class TargetSequence:
+    """Targets in order of time."""
+
+    def __init__(self, steps: Sequence[tuple[float, float]]) -> None:
+        """Take (mission time in s, q2) of each step; the first stands at 0."""
+        self._targets = [Target(i, round(at * 1e9), q2) for i, (at, q2) in enumerate(steps)]
+        self._times = [target.at_ns for target in self._targets]
+
+    def at(self, mission_time_ns: int) -> Target:
+        """Return the target in force."""
+        return self._targets[max(bisect.bisect_right(self._times, mission_time_ns) - 1, 0)]

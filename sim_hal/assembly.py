@@ -1,0 +1,199 @@
+"""Simulated hardware for a configuration: the world and the emulated devices in it.
+
+What leads out of it ends in the same Protocols as Linux's, so the drivers that fly are those simulated.
+Before the release the body is held still at its first attitude, as a hand would hold it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from flight.arrays import FloatArray, Image
+from flight.catalogue import load
+from flight.settings import Camera, Config
+from hal.drivers.coil_settings import CoilSettings, CoilWiring
+from sim_hal.emulators.device import EmulatedDevice, SerialEnd
+from sim_hal.emulators.i2c_bus import EmulatedI2cBus
+from sim_hal.emulators.ina219 import EmulatedIna219
+from sim_hal.emulators.pca9685 import EmulatedPca9685
+from sim_hal.emulators.star_camera import EmulatedStarCamera, Expose
+from sim_hal.emulators.vn100 import Vn100Emulator, Vn100EmulatorSettings
+from sim_hal.emulators.vn100_sensors import NoiseProfile
+from sim_hal.faults import FaultTimeline
+from sim_hal.settings import Simulation, Sky
+from sim_hal.star_camera import StarCameraModel, render
+from sim_hal.truth import TruthRecorder
+from sim_hal.world.coil_circuit import CoilCircuit
+from sim_hal.world.simulation import TimedSimulation
+from sim_hal.world.testbed import Testbed, TestbedModel
+
+BUS_VOLTAGE = 5.0
+"""V in the coils' supply, before the losses of the bridge [ch. 5: a 5 V power bus]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Hardware:
+    """All of it; drivers are plugged into `bus` and `camera`, the rest is for faults and for looking."""
+
+    simulation: TimedSimulation
+    world: Testbed
+    unit: Vn100Emulator
+    bus: EmulatedI2cBus
+    pwm: EmulatedPca9685
+    monitor: EmulatedIna219 | None
+    circuit: CoilCircuit
+    camera: EmulatedStarCamera | None
+    truth: TruthRecorder | None
+    faults: FaultTimeline
+
+    def release(self, epoch_ns: int) -> None:
+        """Let the body go at `epoch_ns`: mission time zero."""
+        self.world.release_at(epoch_ns)
+        if self.truth is not None:
+            self.truth.begin(epoch_ns)
+
+
+def assemble(
+    config: Config,
+    section: Simulation,
+    now_ns: Callable[[], int],
+    line: SerialEnd,
+    truth: TruthRecorder | None = None,
+    expose: Expose | None = None,
+    wait: Callable[[int], None] | None = None,
+) -> Hardware:
+    """Build the hardware of `config` in the world of its simulation `section`.
+
+    `now_ns` tells the simulation's time; `line` is the serial line's device end; `expose` replaces the
+    camera's renderer (in real time it works beside the devices); `wait` lets time pass while the bus hangs.
+    """
+    unit_seed, circuit_seed = np.random.SeedSequence(section.seed).spawn(2)
+    resistance = section.truth.resistance or config.coils.resistance
+    supply = section.truth.supply_voltage or config.coils.supply_voltage
+
+    pwm = EmulatedPca9685(config.coils.address, now_ns)
+    circuit = CoilCircuit(
+        pwm,
+        _coil_settings(config, resistance, supply),
+        np.random.default_rng(circuit_seed),
+        now_ns,
+        uncertainty=section.current_noise,
+        bus_voltage=BUS_VOLTAGE,
+    )
+    world = Testbed(
+        TestbedModel(
+            inertia=section.truth.inertia or config.plant.inertia,
+            dipole_per_ampere=config.plant.coil_turns * config.plant.coil_area,
+            field=section.truth.field or config.plant.field,
+            stiffness=section.thread.stiffness,
+            damping=section.thread.damping,
+            resistance=resistance,
+            supply_voltage=supply,
+        ),
+        angle=2.0 * float(np.arcsin(section.release.q2)),
+        release_rate=section.release.rate,
+        currents=circuit.currents,
+        start_ns=now_ns(),
+    )
+    unit = Vn100Emulator(
+        world.motion,
+        line,
+        np.random.default_rng(unit_seed),
+        Vn100EmulatorSettings(
+            noise=NoiseProfile(
+                attitude_bound=section.imu.quaternion_noise, rate_bound=section.imu.rate_noise
+            ),
+            mounting=np.array(config.inertial_unit.mounting),
+            clock_ppm=section.imu.clock_ppm,
+        ),
+        now_ns=now_ns(),
+    )
+    monitor = None
+    parts: list[EmulatedPca9685 | EmulatedIna219] = [pwm]
+    if config.power_monitor is not None:
+        monitor = EmulatedIna219(
+            config.power_monitor.address, now_ns, circuit.mean_supply, config.power_monitor.shunt
+        )
+        parts.append(monitor)
+    bus = EmulatedI2cBus(parts, wait=wait)
+    camera = None
+    if config.camera is not None:
+        make = expose or inline_exposure(StarRenderer(config.camera, section.sky, section.seed))
+        readout_ns = round(section.sky.readout * 1e9)
+        mounting = np.array(config.camera.mounting)
+        camera = EmulatedStarCamera(world.motion, make, now_ns, readout_ns, mounting)
+    devices: list[EmulatedDevice] = [unit]
+    if camera is not None:
+        devices.append(camera)
+    faults = FaultTimeline()
+    devices.append(faults)
+    if truth is not None:
+        truth.watch(world)
+        devices.append(truth)
+    simulation = TimedSimulation(world.advance_to, devices)
+    return Hardware(simulation, world, unit, bus, pwm, monitor, circuit, camera, truth, faults)
+
+
+def camera_model(camera: Camera, sky: Sky) -> StarCameraModel:
+    """Return the optics and detector of an emulated camera."""
+    return StarCameraModel(
+        columns=camera.columns,
+        rows=camera.rows,
+        field_of_view=float(np.deg2rad(camera.field_of_view_deg)),
+        aperture=sky.aperture,
+        read_noise=camera.read_noise,
+        dark_current=sky.dark_current,
+        gain=camera.gain,
+        pedestal=sky.pedestal,
+        bits=camera.bits,
+        full_well=sky.full_well,
+        psf_sigma=camera.psf_sigma,
+    )
+
+
+class StarRenderer:
+    """Makes the frames of one camera; frame k is the same whoever makes it, and whenever."""
+
+    def __init__(self, camera: Camera, sky: Sky, seed: int) -> None:
+        self._model = camera_model(camera, sky)
+        catalogue = load().brighter_than(sky.magnitude_limit)
+        self._directions = catalogue.directions_at(sky.year)
+        self._magnitudes = catalogue.magnitude
+        self._seed = seed
+
+    def render(self, sequence: int, times: FloatArray, attitudes: FloatArray) -> Image:
+        """Return frame `sequence`, exposed along `attitudes` (k, 4) at `times` (k,) s."""
+        generator = np.random.default_rng([self._seed, sequence])
+        return render(self._model, self._directions, self._magnitudes, times, attitudes, generator)
+
+
+def inline_exposure(renderer: StarRenderer) -> Expose:
+    """Have frames made on the spot: right for lock-step."""
+
+    def expose(sequence: int, times: FloatArray, attitudes: FloatArray) -> Future[Image]:
+        future: Future[Image] = Future()
+        future.set_result(renderer.render(sequence, times, attitudes))
+        return future
+
+    return expose
+
+
+def _coil_settings(config: Config, resistance: tuple[float, float, float], supply: float) -> CoilSettings:
+    """Return the coils as they truly are."""
+    wiring = partial(_wiring, config, resistance)
+    return CoilSettings(
+        (wiring(0), wiring(1), wiring(2)),
+        supply_voltage=supply,
+        current_limit=config.coils.current_limit,
+    )
+
+
+def _wiring(config: Config, resistance: tuple[float, float, float], axis: int) -> CoilWiring:
+    a, b = config.coils.channels[axis]
+    enable = config.coils.enable_channels[axis] if config.coils.enable_channels else None
+    return CoilWiring(a, b, resistance[axis], config.coils.signs[axis], enable)

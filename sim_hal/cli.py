@@ -1,0 +1,155 @@
+"""The command line of the emulated devices."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import FrameType
+
+import numpy as np
+
+from hal.buses.clock import SystemClock
+from hal.interfaces.wires import Clock
+from sim_hal import serve_command
+from sim_hal.emulators.pty_line import PtyLine
+from sim_hal.emulators.vn100 import Vn100Emulator, Vn100EmulatorSettings
+from sim_hal.emulators.vn100_registers import BAUD_RATES
+from sim_hal.emulators.vn100_sensors import PROFILES
+from sim_hal.world.motion import Motion, about_thread
+
+_LONGEST_WAIT_NS = 50_000_000
+
+_VN100_EXAMPLES = """\
+examples:
+  python -m sim_hal emulate vn100
+      a unit that swings by 20 degrees on its thread; prints the device to open
+  python -m sim_hal emulate vn100 --rate-deg-s 3 --link /tmp/vn100
+      a steady turn, under a name that stays the same
+  python -m sim_hal emulate vn100 --json --duration 60
+      one JSON object that says what is served, for a minute
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; return the exit status: 0 done, 1 failed, 2 wrong use."""
+    options = _parser().parse_args(arguments)
+    command: Callable[[argparse.Namespace], int] = options.command
+    return command(options)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m sim_hal", description="Devices that answer on the wire.")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    emulate = commands.add_parser("emulate", help="serve one emulated device", description="Serve a device.")
+    devices = emulate.add_subparsers(required=True, metavar="DEVICE")
+    _add_vn100(devices)
+    serve_command.add_to(commands)
+    return parser
+
+
+def _add_vn100(devices: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    vn100 = devices.add_parser(
+        "vn100",
+        help="a VectorNav VN-100 on a pseudo-terminal",
+        description="Serve a VN-100 on a pseudo-terminal, in real time, until interrupted.",
+        epilog=_VN100_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = vn100.add_argument
+    add("--rate-deg-s", type=_number, metavar="R", help="turn steadily at R degrees a second")
+    add("--amplitude-deg", type=_number, default=20.0, metavar="A", help="else swing by A (default 20)")
+    add("--period-s", type=_positive, default=20.0, metavar="S", help="period of the swing (default 20)")
+    add("--field", type=_number, default=4.5e-4, metavar="T", help="tesla (default 4.5e-4)")
+    add("--baud", type=int, choices=BAUD_RATES, default=115200, help="the unit's speed (default 115200)")
+    add("--noise", choices=sorted(PROFILES), default="thesis", help="noise profile (default thesis)")
+    add("--seed", type=_seed, default=1, help="of the noise (default 1)")
+    add("--link", type=Path, metavar="PATH", help="make PATH a symbolic link to the device")
+    add("--duration", type=_positive, metavar="S", help="end after S seconds")
+    add("--json", action="store_true", help="print one JSON object instead of the device's name")
+    vn100.set_defaults(command=_emulate_vn100)
+
+
+def _number(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"{text} is not a finite number")
+    return value
+
+
+def _positive(text: str) -> float:
+    value = _number(text)
+    if value <= 0.0:
+        raise argparse.ArgumentTypeError(f"{text} is not above zero")
+    return value
+
+
+def _seed(text: str) -> int:
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"{text} is below zero")
+    return value
+
+
+def _emulate_vn100(options: argparse.Namespace) -> int:
+    clock = SystemClock()
+    rng = np.random.default_rng(options.seed)
+    if options.link is not None and options.link.exists() and not options.link.is_symlink():
+        sys.stderr.write(f"sim_hal: --link {options.link} is there and no symbolic link: name another\n")
+        return 2
+    try:
+        line = PtyLine(options.baud, rng, options.link)
+    except OSError as error:
+        sys.stderr.write(f"sim_hal: the pseudo-terminal cannot be served: {error}\n")
+        return 1
+    settings = Vn100EmulatorSettings(noise=PROFILES[options.noise])
+    emulator = Vn100Emulator(_demonstration(options, clock.now_ns()), line, rng, settings, clock.now_ns())
+    emulator.set_baud_rate(options.baud)
+    facts = {"device": line.name, "baud_rate": options.baud, "link": options.link and str(options.link)}
+    sys.stdout.write((json.dumps(facts) if options.json else line.name) + "\n")
+    sys.stdout.flush()
+    try:
+        serve(emulator, line, clock, options.duration)
+    finally:
+        line.close()
+    return 0
+
+
+def _demonstration(options: argparse.Namespace, start_ns: int) -> Callable[[int], Motion]:
+    """Return the motion on the thread that the options ask for: a steady turn or a swing."""
+    amplitude, pulse = math.radians(options.amplitude_deg), 2.0 * math.pi / options.period_s
+
+    def motion(time_ns: int) -> Motion:
+        seconds = (time_ns - start_ns) * 1e-9
+        if options.rate_deg_s is not None:
+            rate = math.radians(options.rate_deg_s)
+            return about_thread(time_ns, rate * seconds, rate, options.field)
+        angle = amplitude * math.sin(pulse * seconds)
+        return about_thread(time_ns, angle, amplitude * pulse * math.cos(pulse * seconds), options.field)
+
+    return motion
+
+
+def serve(emulator: Vn100Emulator, line: PtyLine, clock: Clock, duration: float | None = None) -> None:
+    """Let the emulator live on the line in real time, for `duration` s or until SIGINT or SIGTERM."""
+    stopped = False
+
+    def stop(_signal: int, _frame: FrameType | None) -> None:
+        nonlocal stopped
+        stopped = True
+
+    previous = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    end_ns = None if duration is None else clock.now_ns() + round(duration * 1e9)
+    try:
+        while not stopped and (end_ns is None or clock.now_ns() < end_ns):
+            now_ns = clock.now_ns()
+            line.exchange(now_ns)
+            emulator.advance(now_ns)
+            line.wait(now_ns, min(emulator.next_event_ns(), now_ns + _LONGEST_WAIT_NS))
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)

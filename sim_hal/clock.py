@@ -1,0 +1,114 @@
+"""Simulated time: sleeping advances the world to the deadline and returns at once.
+
+Tickers run in turn as simulated time passes them, in the order in which they were made, so a flight is the
+same bit for bit each time. A job that itself sleeps (a driver waiting for its chip) lets time pass for the
+world, but no other ticker runs meanwhile.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+from hal.interfaces.wires import Ticker
+
+
+class TimedWorld(Protocol):
+    """What a SimClock carries along."""
+
+    def next_event_ns(self) -> int:
+        """Return when something next happens by itself."""
+
+    def advance_to(self, time_ns: int) -> None:
+        """Let everything happen that is due at or before `time_ns`."""
+
+
+class SimClock:
+    """A Clock that jumps. Time begins at 0; `utc_start_ns` is the label of that instant."""
+
+    def __init__(self, utc_start_ns: int = 0) -> None:
+        self._now_ns = 0
+        self._utc_start_ns = utc_start_ns
+        self._world: TimedWorld | None = None
+        self._tickers: list[_SimTicker] = []
+        self._running_jobs = False
+
+    def attach(self, world: TimedWorld) -> None:
+        """Carry this world along from now on."""
+        self._world = world
+
+    def now_ns(self) -> int:
+        """Return the simulated time."""
+        return self._now_ns
+
+    def sleep_until_ns(self, deadline_ns: int) -> None:
+        """Advance the world, event by event, to the deadline."""
+        while self._now_ns < deadline_ns:
+            next_ns = deadline_ns
+            if not self._running_jobs:
+                for ticker in self._tickers:
+                    next_ns = min(next_ns, ticker.due_ns)
+            self._advance_world(max(next_ns, self._now_ns))
+            if not self._running_jobs:
+                self._run_due_jobs()
+
+    def ticker(self, name: str, period_ns: int, job: Callable[[], None]) -> Ticker:
+        """Run `job` every `period_ns` of simulated time, the first time one period from now."""
+        made = _SimTicker(self, name, period_ns, job)
+        self._tickers.append(made)
+        return made
+
+    def utc_ns(self) -> int:
+        """Return the label of now."""
+        return self._utc_start_ns + self._now_ns
+
+    def _advance_world(self, time_ns: int) -> None:
+        world = self._world
+        if world is not None:
+            while (event_ns := world.next_event_ns()) <= time_ns:
+                self._now_ns = max(self._now_ns, event_ns)
+                world.advance_to(event_ns)
+            world.advance_to(time_ns)
+        self._now_ns = max(self._now_ns, time_ns)
+
+    def _run_due_jobs(self) -> None:
+        self._running_jobs = True
+        try:
+            for ticker in list(self._tickers):
+                if ticker.due_ns <= self._now_ns:
+                    ticker.due_ns = self._now_ns + ticker.period_ns
+                    ticker.run()
+        finally:
+            self._running_jobs = False
+
+
+class _SimTicker:
+    """A job on simulated time; a kick runs it on the spot."""
+
+    def __init__(self, clock: SimClock, name: str, period_ns: int, job: Callable[[], None]) -> None:
+        self.name = name
+        self.period_ns = period_ns
+        self.due_ns = clock.now_ns() + period_ns
+        self._clock = clock
+        self._job = job
+        self._busy = False
+
+    def kick(self) -> None:
+        """Run the job now; its period starts again, as a thread's wait does."""
+        self.due_ns = self._clock.now_ns() + self.period_ns
+        self.run()
+
+    def run(self) -> None:
+        """Run the job, unless it is this job that asks."""
+        if self._busy:
+            return
+        self._busy = True
+        try:
+            self._job()
+        finally:
+            self._busy = False
+
+    def stop(self) -> None:
+        """Run no more."""
+        if self in self._clock._tickers:
+            self._clock._tickers.remove(self)

@@ -1,0 +1,127 @@
+"""A star camera that exposes while the body really moves, and delivers its frame after a read-out.
+
+While an exposure lasts the attitude is sampled every 10 ms; the renderer then integrates the stars' light
+along it. `expose` gives a future, so that in real time a frame is made beside the devices that keep time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass
+
+import numpy as np
+
+from flight.arrays import FloatArray, Image
+from flight.quaternion import multiply
+from hal.interfaces.errors import NotResponding
+from hal.interfaces.readings import Frame
+from sim_hal.emulators.device import NEVER
+from sim_hal.world.motion import Motion
+
+SAMPLE_NS = 10_000_000
+
+Expose = Callable[[int, FloatArray, FloatArray], "Future[Image]"]
+"""Takes the frame's number, times (k,) s from the start and camera attitudes (k, 4); promises an image."""
+
+
+@dataclass(slots=True)
+class _Exposure:
+    sequence: int
+    start_ns: int
+    length_ns: int
+    times: list[int]
+    attitudes: list[FloatArray]
+    image: Future[Image] | None = None
+
+    @property
+    def end_ns(self) -> int:
+        return self.start_ns + self.length_ns
+
+
+class EmulatedStarCamera:
+    """A FrameSource and an emulated device. Faults: "off", "black", "frozen", "saturated"."""
+
+    def __init__(
+        self,
+        motion: Callable[[int], Motion],
+        expose: Expose,
+        now_ns: Callable[[], int],
+        readout_ns: int,
+        mounting: FloatArray,
+    ) -> None:
+        self._motion = motion
+        self._expose = expose
+        self._now_ns = now_ns
+        self._readout_ns = readout_ns
+        self._mounting = mounting
+        self._sequence = 0
+        self._exposure: _Exposure | None = None
+        self._last: Frame | None = None
+        self.fault = ""
+
+    def trigger(self, exposure_ns: int) -> None:
+        """Start an exposure; one that is under way is abandoned, as a camera's reset does."""
+        if self.fault == "off":
+            raise NotResponding("camera", "does not answer the trigger")
+        self._sequence += 1
+        self._exposure = _Exposure(self._sequence, self._now_ns(), exposure_ns, [], [])
+        self.advance(self._now_ns())
+
+    def poll(self) -> Frame | None:
+        """Return the frame once its read-out is over."""
+        exposure = self._exposure
+        now_ns = self._now_ns()
+        if exposure is None or exposure.image is None or now_ns < exposure.end_ns + self._readout_ns:
+            return None
+        if not exposure.image.done():
+            return None
+        self._exposure = None
+        if self.fault == "off":
+            return None
+        frame = Frame(
+            exposure.sequence, exposure.start_ns, exposure.length_ns, now_ns, exposure.image.result()
+        )
+        frame = self._spoil(frame)
+        self._last = frame
+        return frame
+
+    def next_event_ns(self) -> int:
+        """Return the time of the next attitude sample."""
+        exposure = self._exposure
+        if exposure is None or exposure.image is not None:
+            return NEVER
+        if not exposure.times:
+            return exposure.start_ns
+        return min(exposure.times[-1] + SAMPLE_NS, exposure.end_ns)
+
+    def advance(self, now_ns: int) -> None:
+        """Sample the attitude; at the end of the exposure have the image made."""
+        while (event_ns := self.next_event_ns()) <= now_ns:
+            exposure = self._exposure
+            assert exposure is not None
+            exposure.times.append(event_ns)
+            exposure.attitudes.append(multiply(self._mounting, self._motion(event_ns).quaternion))
+            if event_ns >= exposure.end_ns:
+                times = (np.array(exposure.times) - exposure.start_ns) * 1e-9
+                exposure.image = self._expose(exposure.sequence, times, np.array(exposure.attitudes))
+
+    def close(self) -> None:
+        """Drop what is under way."""
+        self._exposure = None
+
+    def _spoil(self, frame: Frame) -> Frame:
+        """Apply the fault that is set."""
+        if self.fault == "frozen" and self._last is not None:
+            return Frame(
+                self._last.sequence,
+                frame.exposure_start_ns,
+                frame.exposure_ns,
+                frame.arrival_ns,
+                self._last.pixels,
+            )
+        if self.fault in {"black", "saturated"}:
+            level = 0 if self.fault == "black" else np.iinfo(frame.pixels.dtype).max
+            pixels = np.full_like(frame.pixels, level)
+            return Frame(frame.sequence, frame.exposure_start_ns, frame.exposure_ns, frame.arrival_ns, pixels)
+        return frame

@@ -1,0 +1,32 @@
+"""A time line of faults: actions on the emulated devices at instants of the simulation."""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+from collections.abc import Callable
+
+from sim_hal.emulators.device import NEVER
+
+Action = Callable[[], None]
+
+
+class FaultTimeline:
+    """An emulated device that breaks others and mends them again."""
+
+    def __init__(self) -> None:
+        self._order = itertools.count()
+        self._actions: list[tuple[int, int, Action]] = []
+
+    def at(self, time_ns: int, action: Action) -> None:
+        """Do `action` at `time_ns` of the simulation."""
+        heapq.heappush(self._actions, (time_ns, next(self._order), action))
+
+    def next_event_ns(self) -> int:
+        """Return when the next action is due."""
+        return self._actions[0][0] if self._actions else NEVER
+
+    def advance(self, now_ns: int) -> None:
+        """Do what is due."""
+        while self._actions and self._actions[0][0] <= now_ns:
+            heapq.heappop(self._actions)[2]()

@@ -1,0 +1,60 @@
+"""Simulated hardware in lock-step: the clock jumps, the devices answer in memory, runs repeat bit for bit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+
+from flight.settings import Config
+from flight.telemetry.log import FlightLog
+from hal.interfaces.wires import Wires
+from sim_hal.assembly import Hardware, assemble
+from sim_hal.clock import SimClock
+from sim_hal.emulators.serial_line import SerialLine
+from sim_hal.settings import Simulation
+from sim_hal.truth import TruthRecorder
+
+_LINE_STREAM = 0x11E
+"""Sets the line's faults apart from all other draws of the same seed."""
+
+
+@dataclass(frozen=True, slots=True)
+class LockStep:
+    """What the flight application needs, and the hardware for whoever injects faults."""
+
+    clock: SimClock
+    wires: Wires
+    release: Callable[[int], None]
+    hardware: Hardware
+    line: SerialLine
+
+
+def utc_ns(label: str) -> int:
+    """Return nanoseconds since 1970 of an ISO 8601 time. Raises ValueError."""
+    return round(datetime.fromisoformat(label).timestamp()) * 1_000_000_000
+
+
+def build(config: Config, section: Simulation, truth: TruthRecorder | None, clock: SimClock) -> LockStep:
+    """Put the simulated hardware on a clock."""
+    generator = np.random.default_rng([section.seed, _LINE_STREAM])
+    line = SerialLine(clock.now_ns, config.inertial_unit.baud_rate, generator)
+    hardware = assemble(config, section, clock.now_ns, line.device, truth)
+    clock.attach(hardware.simulation)
+    wires = Wires(line.host, hardware.bus, hardware.camera)
+    return LockStep(clock, wires, hardware.release, hardware, line)
+
+
+@contextmanager
+def opened(config: Config, section: Simulation, folder: Path) -> Iterator[LockStep]:
+    """Simulate in lock-step; the truth goes into a log in `folder`, which is closed at the end."""
+    clock = SimClock(utc_ns(section.utc))
+    log = FlightLog(folder, "truth", clock=clock, sync_period_ns=None)
+    try:
+        yield build(config, section, TruthRecorder(log), clock)
+    finally:
+        log.close()

@@ -1,0 +1,83 @@
+"""The shape of a configuration's `simulation` section: what the simulated world really does.
+
+A value that is left out is what the flight application believes; one that stands here makes the world differ
+from that belief. SI units unless the name says otherwise.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+from msgspec import Meta
+
+Positive = Annotated[float, Meta(gt=0.0)]
+NotNegative = Annotated[float, Meta(ge=0.0)]
+
+
+class Section(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
+    """One section; unknown keys are refused."""
+
+
+class Release(Section, frozen=True, kw_only=True):
+    """How the body is let go: q2 and rate about the thread at mission time zero."""
+
+    q2: Annotated[float, Meta(ge=-0.7, le=0.7)]
+    rate: Annotated[float, Meta(ge=-10.0, le=10.0)] = 0.0
+
+
+class Thread(Section, frozen=True, kw_only=True):
+    """The thread: N m/rad and N m s/rad."""
+
+    stiffness: NotNegative = 0.0
+    damping: NotNegative = 0.0
+
+
+class ImuNoise(Section, frozen=True, kw_only=True):
+    """Noise of the inertial unit: uniform bounds on the quaternion and the rate, and a constant gyro bias."""
+
+    quaternion_noise: NotNegative = 0.0
+    rate_noise: NotNegative = 0.0
+    clock_ppm: Annotated[float, Meta(ge=-100.0, le=100.0)] = 0.0
+
+
+class Latency(Section, frozen=True, kw_only=True):
+    """How long results of the workers take to arrive in lock-step, s."""
+
+    planner: NotNegative = 0.05
+    vision: NotNegative = 0.25
+
+
+class Truth(Section, frozen=True, kw_only=True):
+    """Constants of the world that differ from the flight application's belief."""
+
+    inertia: Positive | None = None
+    field: Positive | None = None
+    resistance: tuple[Positive, Positive, Positive] | None = None
+    supply_voltage: Positive | None = None
+
+
+class Sky(Section, frozen=True, kw_only=True):
+    """What the emulated star camera sees and how it sees it (Sease ch. 2)."""
+
+    magnitude_limit: Annotated[float, Meta(ge=0.0, le=8.5)] = 8.5
+    year: Annotated[float, Meta(ge=1900.0, le=2100.0)] = 2026.5
+    aperture: Positive = 0.025
+    dark_current: NotNegative = 50.0
+    pedestal: NotNegative = 100.0
+    full_well: Positive = 20000.0
+    readout: NotNegative = 0.05
+
+
+class Simulation(Section, frozen=True, kw_only=True):
+    """The whole section."""
+
+    seed: Annotated[int, Meta(ge=0)] = 1
+    utc: str = "2026-01-01T00:00:00Z"
+    release: Release
+    thread: Thread = Thread()
+    current_noise: NotNegative = 0.0
+    imu: ImuNoise = ImuNoise()
+    sky: Sky = Sky()
+    truth: Truth = Truth()
+    latency: Latency = Latency()

@@ -1,0 +1,66 @@
+"""What really happened: the world's state at 40 Hz, as packets in a log of its own."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from flight.telemetry.definitions import TRUTH
+from flight.telemetry.packets import Packer
+from sim_hal.emulators.device import NEVER
+from sim_hal.world.testbed import Testbed
+
+PERIOD_NS = 25_000_000
+
+
+class PacketLog(Protocol):
+    """Where packets go."""
+
+    def write(self, packet: bytes) -> None:
+        """Keep a packet."""
+
+
+class TruthRecorder:
+    """An emulated device that only looks."""
+
+    def __init__(self, log: PacketLog) -> None:
+        self._log = log
+        self._packer = Packer()
+        self._world: Testbed | None = None
+        self._epoch_ns = 0
+        self._due_ns = NEVER
+
+    def watch(self, world: Testbed) -> None:
+        """Look at this world."""
+        self._world = world
+
+    def begin(self, epoch_ns: int) -> None:
+        """Record from mission time zero on."""
+        self._epoch_ns = epoch_ns
+        self._due_ns = epoch_ns
+
+    def next_event_ns(self) -> int:
+        """Return when the next record is due."""
+        return self._due_ns
+
+    def advance(self, now_ns: int) -> None:
+        """Write the records that are due."""
+        while self._due_ns <= now_ns:
+            self._write(self._due_ns)
+            self._due_ns += PERIOD_NS
+
+    def _write(self, time_ns: int) -> None:
+        world = self._world
+        if world is None:
+            return
+        motion = world.motion(time_ns)
+        self._log.write(
+            self._packer.pack(
+                TRUTH,
+                time_ns - self._epoch_ns,
+                quaternion=motion.quaternion.tolist(),
+                rate=motion.rate.tolist(),
+                current=world.felt_current.tolist(),
+                energy=world.energy,
+                supply_energy=world.supply_energy,
+            )
+        )

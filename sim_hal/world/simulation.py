@@ -1,0 +1,28 @@
+"""The world and the emulated devices together, advanced event by event on one time line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from sim_hal.emulators.device import NEVER, EmulatedDevice
+
+
+class TimedSimulation:
+    """Carries the world to each device's next event, then lets that device act."""
+
+    def __init__(self, advance_world: Callable[[int], None], devices: Sequence[EmulatedDevice]) -> None:
+        self._advance_world = advance_world
+        self._devices = tuple(devices)
+
+    def next_event_ns(self) -> int:
+        """Return when the first device next does something by itself."""
+        return min((device.next_event_ns() for device in self._devices), default=NEVER)
+
+    def advance_to(self, time_ns: int) -> None:
+        """Let everything happen that is due at or before `time_ns`, in order."""
+        while (event_ns := self.next_event_ns()) <= time_ns:
+            self._advance_world(event_ns)
+            for device in self._devices:
+                if device.next_event_ns() <= event_ns:
+                    device.advance(event_ns)
+        self._advance_world(time_ns)

@@ -1,0 +1,1 @@
+"""Tests of the flight application's pure mathematics."""

@@ -1,0 +1,69 @@
+"""Short flights on simulated hardware, with faults at the wire, for the scenario tests."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+from flight import app
+from flight import config as configuration
+from flight.loop import SECOND_NS, FlightLoop, RunLabel
+from flight.settings import Config
+from flight.telemetry.packets import to_text
+from flight.telemetry.reader import Run, read_run
+from sim_hal import lockstep
+from sim_hal.lockstep import LockStep
+from sim_hal.settings import Simulation
+
+CONFIG = Path(__file__).resolve().parents[2] / "config" / "step_demo.yaml"
+TEXT = CONFIG.read_text(encoding="utf-8")
+
+
+@dataclass(frozen=True)
+class Rigged:
+    """A flight about to begin: `at` schedules an action at a mission time in s."""
+
+    lock: LockStep
+    loop: FlightLoop
+    epoch_ns: int
+
+    def at(self, seconds: float, action: Callable[[], None]) -> None:
+        self.lock.hardware.faults.at(self.epoch_ns + round(seconds * SECOND_NS), action)
+
+
+def demo_config(duration: float, camera: bool = True) -> Config:
+    """Return the step demonstration, cut to `duration` s."""
+    config = configuration.parse(TEXT)
+    steps = tuple(step for step in config.steps if step.at < duration)
+    changed = configuration.replace(config, duration=duration, steps=steps)
+    return changed if camera else configuration.replace(changed, camera=None)
+
+
+def fly(
+    config: Config,
+    folder: Path,
+    prepare: Callable[[Rigged], None] = lambda _: None,
+    seed: int = 1,
+) -> Run:
+    """Fly a configuration in lock-step and return what it left; `prepare` may schedule faults."""
+    folder.mkdir(parents=True, exist_ok=True)
+    section = configuration.simulation_section(TEXT, CONFIG.name, Simulation)
+    assert section is not None
+    section = configuration.replace(section, seed=seed)
+    with ExitStack() as stack:
+        lock = stack.enter_context(lockstep.opened(config, section, folder))
+        latency = round(section.latency.planner * SECOND_NS), round(section.latency.vision * SECOND_NS)
+        rig = app.Rig(lock.clock, lock.wires, lock.release, False, seed, latency)
+        loop, _ = app.prepare(config, rig, folder, stack)
+        epoch_ns = app.next_whole_second(lock.clock)
+        lock.release(epoch_ns)
+        prepare(Rigged(lock, loop, epoch_ns))
+        loop.run(epoch_ns, RunLabel(TEXT, seed, True, False))
+    return read_run(folder)
+
+
+def event_names(run: Run) -> list[str]:
+    """Return the names of a run's events, in order."""
+    return [to_text(name) for name in run["event"]["name"]]

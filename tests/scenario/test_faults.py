@@ -1,0 +1,211 @@
+"""Whatever comes over the wires, control is kept or the coils are at zero, told and logged."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flight.arrays import FloatArray
+from flight.telemetry.reader import Run
+from sim_hal.emulators.serial_line import SOUND, LineFaults
+from tests.scenario.flights import Rigged, demo_config, event_names, fly
+
+BEGIN, END, DURATION = 6.0, 9.0, 20.0
+
+
+def true_current(run: Run, since: float, until: float) -> FloatArray:
+    """Return the largest current that any coil carried at each sample of an interval of the truth."""
+    truth = run["truth"]
+    time = truth["time_ns"] * 1e-9
+    largest: FloatArray = np.abs(truth["current"]).max(axis=1)
+    return largest[(time >= since) & (time < until)]
+
+
+def assert_whole(run: Run) -> None:
+    """Every packet that was written is there, in order, to the end of the flight."""
+    for log in run.logs.values():
+        assert log.intact
+    assert len(run["control"]) == round(DURATION / 0.025)
+    assert run["control"]["time_ns"][-1] == pytest.approx((DURATION - 0.025) * 1e9)
+
+
+def line(faults: LineFaults) -> Callable[[Rigged], None]:
+    """Return what spoils the unit's line between BEGIN and END."""
+
+    def prepare(rigged: Rigged) -> None:
+        wire = rigged.lock.line.to_host
+        rigged.at(BEGIN, lambda: setattr(wire, "faults", faults))
+        rigged.at(END, lambda: setattr(wire, "faults", SOUND))
+
+    return prepare
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    return fly(demo_config(DURATION, camera=False), tmp_path_factory.mktemp("sound"))
+
+
+def test_a_sound_flight_raises_no_alarm(sound: Run) -> None:
+    assert event_names(sound) == ["started", "target", "stopped"]
+    assert_whole(sound)
+    assert true_current(sound, BEGIN, END).max() > 0.0
+
+
+@pytest.mark.parametrize(
+    ("faults", "events"),
+    [
+        (LineFaults(silent=True), ["imu-silent", "control-lost", "imu-recovered", "control-regained"]),
+        (LineFaults(garbage=True), ["imu-corrupt", "control-lost", "control-regained"]),
+    ],
+    ids=["silence", "garbage"],
+)
+def test_a_line_without_packets_loses_control_and_the_coils_are_off_until_they_come_again(
+    tmp_path: Path, faults: LineFaults, events: list[str]
+) -> None:
+    run = fly(demo_config(DURATION, camera=False), tmp_path, line(faults))
+    names = event_names(run)
+    assert [name for name in dict.fromkeys(names) if name in events] == events
+    assert true_current(run, BEGIN + 0.2, END).max() == 0.0
+    assert true_current(run, END + 0.3, DURATION).max() > 0.0
+    assert_whole(run)
+    final = 2 * np.arcsin(run["truth"]["quaternion"][-1, 1]) - 2 * np.arcsin(-0.3)
+    assert abs(final) < np.radians(4.5)
+
+
+@pytest.mark.parametrize(
+    "faults",
+    [LineFaults(cut_probability=0.3), LineFaults(flip_probability=3e-4)],
+    ids=["cut packets", "flipped bits"],
+)
+def test_some_bad_packets_are_told_and_flown_through(tmp_path: Path, faults: LineFaults) -> None:
+    run = fly(demo_config(DURATION, camera=False), tmp_path, line(faults))
+    names = event_names(run)
+    assert "imu-corrupt" in names
+    assert "task-failed" not in names
+    assert_whole(run)
+    assert run["housekeeping"]["imu_bad_checksum"][-1] + run["housekeeping"]["imu_discarded_bytes"][-1] > 0
+    error = np.abs(run["control"]["rate"] - run["truth"]["rate"][: len(run["control"]), 1])
+    assert np.nanmax(error[40:]) < 0.01, "no corrupt value reached the estimate"
+
+
+def test_noise_on_an_idle_line_is_corruption_not_silence(tmp_path: Path) -> None:
+    def prepare(rigged: Rigged) -> None:
+        wire = rigged.lock.line.to_host
+        rigged.at(BEGIN, lambda: setattr(wire, "faults", LineFaults(silent=True)))
+        for k in range(100):
+            # The line's own noise has no sender, so it passes where the unit's bytes are lost.
+            def spark(k: int = k) -> None:
+                wire.faults = SOUND
+                wire.noise(40, rigged.lock.clock.now_ns(), 115200)
+                wire.faults = LineFaults(silent=True)
+
+            rigged.at(BEGIN + 0.03 * k, spark)
+        rigged.at(END, lambda: setattr(wire, "faults", SOUND))
+
+    run = fly(demo_config(DURATION, camera=False), tmp_path, prepare)
+    names = event_names(run)
+    assert "imu-corrupt" in names
+    assert "imu-silent" not in names
+    assert true_current(run, BEGIN + 0.2, END).max() == 0.0
+
+
+def test_an_unplugged_port_is_told_and_the_coils_go_to_zero(tmp_path: Path) -> None:
+    def prepare(rigged: Rigged) -> None:
+        host = rigged.lock.line.host
+        rigged.at(BEGIN, lambda: setattr(host, "unplugged", True))
+        rigged.at(END, lambda: setattr(host, "unplugged", False))
+
+    run = fly(demo_config(DURATION, camera=False), tmp_path, prepare)
+    names = event_names(run)
+    assert names.index("imu-line-lost") < names.index("control-lost") < names.index("control-regained")
+    assert true_current(run, BEGIN + 0.2, END).max() == 0.0
+    assert_whole(run)
+
+
+@pytest.mark.parametrize("fault", ["nack", "hang", "lose_arbitration"])
+def test_a_bus_that_fails_is_told_and_flown_again_when_it_is_back(tmp_path: Path, fault: str) -> None:
+    def prepare(rigged: Rigged) -> None:
+        bus = rigged.lock.hardware.bus
+        begin = {
+            "nack": lambda: bus.nack(0x40, times=None),
+            "hang": lambda: bus.hang(times=None),
+            "lose_arbitration": lambda: bus.lose_arbitration(times=None),
+        }[fault]
+        rigged.at(BEGIN, begin)
+        rigged.at(END, bus.clear_faults)
+
+    run = fly(demo_config(DURATION, camera=False), tmp_path, prepare)
+    names = event_names(run)
+    assert names.index("coil-fault") < names.index("coil-recovered")
+    assert run["housekeeping"]["coil_faults"][-1] > 0
+    assert_whole(run)
+    final = 2 * np.arcsin(run["truth"]["quaternion"][-1, 1]) - 2 * np.arcsin(-0.3)
+    assert abs(final) < np.radians(4.5)
+
+
+def test_a_brown_out_of_the_pwm_chip_is_mended(tmp_path: Path) -> None:
+    run = fly(
+        demo_config(DURATION, camera=False),
+        tmp_path,
+        lambda rigged: rigged.at(BEGIN, rigged.lock.hardware.pwm.brown_out),
+    )
+    assert true_current(run, BEGIN + 2.0, BEGIN + 6.0).max() > 0.0
+    assert_whole(run)
+
+
+@pytest.mark.parametrize(
+    ("fault", "event"),
+    [("black", "camera-black"), ("saturated", "camera-black"), ("frozen", "camera-frozen")],
+)
+def test_a_camera_that_shows_nothing_true_is_told_and_gives_no_rate(
+    tmp_path: Path, fault: str, event: str
+) -> None:
+    def prepare(rigged: Rigged) -> None:
+        camera = rigged.lock.hardware.camera
+        rigged.at(2.0, lambda: setattr(camera, "fault", fault))
+
+    run = fly(demo_config(12.0), tmp_path, prepare)
+    names = event_names(run)
+    assert event in names
+    streaks = run["streak"]
+    assert streaks["accepted"][1:].sum() == 0
+    assert np.isnan(streaks["rate"][1:]).all()
+
+
+def test_a_camera_that_is_off_is_told_and_the_flight_goes_on(tmp_path: Path) -> None:
+    def prepare(rigged: Rigged) -> None:
+        camera = rigged.lock.hardware.camera
+        rigged.at(2.0, lambda: setattr(camera, "fault", "off"))
+
+    run = fly(demo_config(12.0), tmp_path, prepare)
+    assert "camera-lost" in event_names(run)
+    assert len(run["streak"]) == 1
+    assert run["control"]["state"][-1] == 1
+
+
+def test_a_stall_of_the_loop_is_counted_once_and_flown_through(tmp_path: Path) -> None:
+    """A second's stall: 40 slots slip, one event, no burst, and the coils have decayed meanwhile."""
+
+    def prepare(rigged: Rigged) -> None:
+        camera, clock = rigged.lock.hardware.camera, rigged.lock.clock
+        assert camera is not None
+        poll, stalled = camera.poll, list[bool]()
+
+        def stall() -> object:
+            if clock.now_ns() > rigged.epoch_ns + 4_000_000_000 and not stalled:
+                stalled.append(True)
+                clock.sleep_until_ns(clock.now_ns() + 1_000_000_000)
+            return poll()
+
+        camera.poll = stall  # type: ignore[method-assign,assignment]  # the stall is the test
+
+    run = fly(demo_config(8.0), tmp_path, prepare)
+    names = event_names(run)
+    assert names.count("cycle-slip") == 1
+    cycles = run["control"]["cycle"]
+    assert np.diff(cycles.astype(int)).max() in {40, 41}
+    assert (np.diff(run["control"]["time_ns"]) >= 25_000_000).all()
+    assert true_current(run, 4.6, 5.0).max() == 0.0, "a command half a second old is no command"

@@ -1,0 +1,80 @@
+"""Simulated time jumps, but nothing that is due on the way is missed or out of order."""
+
+from __future__ import annotations
+
+from sim_hal.clock import SimClock
+
+MS = 1_000_000
+
+
+class Beeper:
+    """A world in which something happens every 10 ms."""
+
+    def __init__(self, notes: list[tuple[str, int]]) -> None:
+        self._notes = notes
+        self._next = 10 * MS
+        self.time = 0
+
+    def next_event_ns(self) -> int:
+        return self._next
+
+    def advance_to(self, time_ns: int) -> None:
+        assert time_ns >= self.time
+        self.time = time_ns
+        while self._next <= time_ns:
+            self._notes.append(("beep", self._next))
+            self._next += 10 * MS
+
+
+def test_sleeping_takes_the_world_and_the_tickers_along_in_order() -> None:
+    clock, notes = SimClock(), list[tuple[str, int]]()
+    clock.attach(Beeper(notes))
+    clock.ticker("tick", 15 * MS, lambda: notes.append(("tick", clock.now_ns())))
+    clock.sleep_until_ns(45 * MS)
+    assert notes == [
+        ("beep", 10 * MS),
+        ("tick", 15 * MS),
+        ("beep", 20 * MS),
+        ("beep", 30 * MS),
+        ("tick", 30 * MS),
+        ("beep", 40 * MS),
+        ("tick", 45 * MS),
+    ]
+
+
+def test_a_deadline_in_the_past_changes_nothing() -> None:
+    clock = SimClock()
+    clock.sleep_until_ns(5 * MS)
+    clock.sleep_until_ns(3 * MS)
+    assert clock.now_ns() == 5 * MS
+
+
+def test_a_kick_runs_the_job_at_once_and_starts_its_period_again() -> None:
+    clock, runs = SimClock(), list[int]()
+    ticker = clock.ticker("job", 20 * MS, lambda: runs.append(clock.now_ns()))
+    clock.sleep_until_ns(15 * MS)
+    ticker.kick()
+    clock.sleep_until_ns(34 * MS)
+    assert runs == [15 * MS]
+    clock.sleep_until_ns(35 * MS)
+    assert runs == [15 * MS, 35 * MS]
+    ticker.stop()
+    clock.sleep_until_ns(100 * MS)
+    assert len(runs) == 2
+
+
+def test_a_job_that_sleeps_lets_the_world_go_on_but_no_other_job() -> None:
+    clock, notes = SimClock(), list[tuple[str, int]]()
+    clock.attach(Beeper(notes))
+    clock.ticker("sleeper", 12 * MS, lambda: clock.sleep_until_ns(clock.now_ns() + 10 * MS))
+    clock.ticker("other", 14 * MS, lambda: notes.append(("other", clock.now_ns())))
+    clock.sleep_until_ns(15 * MS)
+    assert notes[:2] == [("beep", 10 * MS), ("beep", 20 * MS)]
+    assert notes[2] == ("other", 22 * MS)
+    assert clock.now_ns() == 22 * MS
+
+
+def test_utc_is_the_label_of_the_start_plus_the_time_since() -> None:
+    clock = SimClock(utc_start_ns=5)
+    clock.sleep_until_ns(7)
+    assert clock.utc_ns() == 12
