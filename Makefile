@@ -15,6 +15,7 @@ $(READY): pyproject.toml requirements.lock
 	@touch $@
 
 demo: $(READY)  ## fly the 700 s step demonstration on simulated hardware and print its report
+	@rm -rf runs/demo
 	$(RUN) -m flight run config/step_demo.yaml --out runs/demo
 	$(RUN) -m flight report runs/demo
 

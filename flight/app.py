@@ -34,7 +34,7 @@ from hal.buses.serial_port import PySerialPort
 from hal.drivers.coil_settings import CoilSettings, CoilWiring
 from hal.drivers.coils import PwmTorqueCoils
 from hal.drivers.ina219 import Ina219
-from hal.drivers.pca9685 import Pca9685
+from hal.drivers.pca9685 import Pca9685, switch_off
 from hal.drivers.vn100.driver import Vn100, Vn100Settings
 from hal.interfaces.wires import Clock, Wires
 
@@ -158,10 +158,11 @@ def _linux_rig(config: Config, stack: ExitStack) -> Rig:
     if config.camera is not None:
         raise ConfigError("camera", "no driver for a real camera yet: say `camera: none`")
     clock = SystemClock()
-    serial = PySerialPort(config.inertial_unit.device, config.inertial_unit.baud_rate, clock)
-    stack.callback(serial.close)
     i2c = LinuxI2cBus(config.coils.bus)
     stack.callback(i2c.close)
+    switch_off(i2c, config.coils.address)  # before anything else can fail
+    serial = PySerialPort(config.inertial_unit.device, config.inertial_unit.baud_rate, clock)
+    stack.callback(serial.close)
     return Rig(clock, Wires(serial, i2c, None), lambda _: None, True, 0)
 
 

@@ -52,6 +52,9 @@ def load(path: Path) -> Config:
 def parse(text: str, name: str = "configuration") -> Config:
     """Validate configuration text; `name` stands for the file in complaints. Raises ConfigError."""
     tree, lines = _read_yaml(text, name)
+    for fitted_or_not in ("camera", "power_monitor"):
+        if tree.get(fitted_or_not) == "none":
+            tree[fitted_or_not] = None
     config = convert(tree, Config, name, lines)
     _check_sense(config, name, lines)
     return config

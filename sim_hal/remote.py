@@ -30,6 +30,9 @@ from hal.interfaces.readings import Frame
 from hal.interfaces.wires import Wires
 from sim_hal.server import LENGTH
 
+PATIENCE_S = 5.0
+"""How long the devices outlive a flight process that died."""
+
 _ANSWER_S = 0.1
 _START_S = 20.0
 
@@ -184,6 +187,8 @@ def served(config_path: Path, seed: int, folder: Path) -> Iterator[Served]:
             str(folder),
             "--seed",
             str(seed),
+            "--patience",
+            str(PATIENCE_S),
         ],
         stdout=subprocess.PIPE,
         stdin=subprocess.DEVNULL,

@@ -28,6 +28,9 @@ def add_to(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> Non
     parser.add_argument("config", type=Path, metavar="CONFIG", help="YAML file with a simulation section")
     parser.add_argument("--folder", type=Path, required=True, metavar="DIR", help="where the truth is logged")
     parser.add_argument("--seed", type=int, metavar="N", help="seed of the simulation instead")
+    parser.add_argument(
+        "--patience", type=float, metavar="S", help="end S seconds after the last client has left"
+    )
     parser.set_defaults(command=serve)
 
 
@@ -56,7 +59,7 @@ def serve(options: argparse.Namespace) -> int:
         }
         sys.stdout.write(json.dumps(facts) + "\n")
         sys.stdout.flush()
-        server.serve()
+        server.serve(None if options.patience is None else round(options.patience * 1e9))
     finally:
         server.close()
     return 0

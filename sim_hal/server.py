@@ -7,6 +7,7 @@ beside the socket. Frames are rendered by a helper process, so that the devices 
 
 from __future__ import annotations
 
+import ctypes
 import os
 import selectors
 import signal
@@ -38,12 +39,14 @@ SOCKET_NAME = "devices.sock"
 LENGTH = struct.Struct("<I")
 _LONGEST_WAIT_NS = 20_000_000
 _FRAME_SLOTS = 4
+_PR_SET_PDEATHSIG = 1
 
 _renderer: list[StarRenderer] = []
 
 
 def _prepare_renderer(camera: Camera, sky: Sky, seed: int) -> None:
-    """Load the sky once in the rendering process."""
+    """Load the sky once in the rendering process, which ends with the server whatever becomes of that."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _renderer.append(StarRenderer(camera, sky, seed))
 
@@ -103,6 +106,7 @@ class DeviceServer:
             config, section, self._clock.now_ns, self._pty, TruthRecorder(self._log), self._expose
         )
         self._frames_sent = 0
+        self._served_anybody = False
         self._selector = selectors.DefaultSelector()
         self._connections: dict[int, _Connection] = {}
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -117,10 +121,17 @@ class DeviceServer:
         """End `serve`; a signal handler."""
         self._stopped = True
 
-    def serve(self) -> None:
-        """Keep the devices' time and answer, until stopped."""
+    def serve(self, patience_ns: int | None = None) -> None:
+        """Keep the devices' time and answer, until stopped or `patience_ns` after the last client left."""
+        left_ns: int | None = None
         while not self._stopped:
             now_ns = self._clock.now_ns()
+            if self._connections or not self._served_anybody:
+                left_ns = None
+            elif left_ns is None:
+                left_ns = now_ns
+            elif patience_ns is not None and now_ns - left_ns > patience_ns:
+                return
             self._pty.exchange(now_ns)
             self.hardware.simulation.advance_to(now_ns)
             self._deliver_frame()
@@ -152,6 +163,7 @@ class DeviceServer:
 
     def _accept(self) -> None:
         line, _ = self._listener.accept()
+        self._served_anybody = True
         self._connections[line.fileno()] = _Connection(line)
         self._selector.register(line, selectors.EVENT_READ)
 

@@ -3,7 +3,8 @@
 Definitions: sample 0 is the step's command. The step runs from the target before (the first from where the
 body was) to its own target. Rise: from 10 to 90 % of the step. Overshoot: beyond the target, in % of the
 step. Settling: the last entry into +-5 % of the step about the target. Steady state: the largest error over
-the last 30 s, in degrees of theta = 2 asin q2. Crossings are interpolated between samples.
+the last 30 s, in degrees of theta = 2 asin q2, of a target that stands for a minute at least. Crossings are
+interpolated between samples.
 """
 
 from __future__ import annotations
@@ -90,6 +91,9 @@ def response(time: FloatArray, q2: FloatArray, command: Command) -> Response:
 
 
 def _steady_state(t: FloatArray, y: FloatArray, command: Command) -> float:
+    """Return the largest error over the last 30 s; NaN when the step may still be under way then."""
+    if command.duration < 2.0 * STEADY_STATE_S:
+        return math.nan
     last = y[t >= command.duration - STEADY_STATE_S]
     error = _angle(last) - _angle(np.array([command.target]))
     return float(np.degrees(np.max(np.abs(error)))) if len(last) else math.nan

@@ -122,8 +122,10 @@ def _remarks(command: Command, found: Response | None) -> list[str]:
         return [f"step {command.index}: not complete, not judged"]
     if math.isnan(found.settling_s):
         return [f"step {command.index}: the target stays where it was, only the steady state is judged"]
+    short = math.isnan(found.steady_state_deg)
+    remarks = [f"step {command.index}: too short for a steady state to be judged"] if short else []
     never = {"rise_s": "reached 90 %", "settling_s": "settled"}
-    return [
+    return remarks + [
         f"step {command.index}: never {what}"
         for name, what in never.items()
         if math.isinf(getattr(found, name))

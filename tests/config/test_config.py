@@ -76,6 +76,10 @@ def test_numbers_without_a_point_are_numbers() -> None:
     assert config.parse(text).plant.inertia == 2e-3
 
 
+def test_a_testbed_without_a_camera_says_none() -> None:
+    assert config.load(FOLDER / "testbed.yaml").camera is None
+
+
 def test_a_missing_file_and_a_list_are_clear_errors(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="cannot be read"):
         config.load(tmp_path / "nothing.yaml")

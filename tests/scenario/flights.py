@@ -47,13 +47,17 @@ def fly(
     prepare: Callable[[Rigged], None] = lambda _: None,
     seed: int = 1,
 ) -> Run:
-    """Fly a configuration in lock-step and return what it left; `prepare` may schedule faults."""
+    """Fly a configuration in lock-step and return what it left; `prepare` may schedule faults.
+
+    However the flight ended, the coils are at zero when the devices have been closed.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     section = configuration.simulation_section(TEXT, CONFIG.name, Simulation)
     assert section is not None
     section = configuration.replace(section, seed=seed)
     with ExitStack() as stack:
         lock = stack.enter_context(lockstep.opened(config, section, folder))
+        stack.callback(lambda: _assert_off(lock))
         latency = round(section.latency.planner * SECOND_NS), round(section.latency.vision * SECOND_NS)
         rig = app.Rig(lock.clock, lock.wires, lock.release, False, seed, latency)
         loop, _ = app.prepare(config, rig, folder, stack)
@@ -62,6 +66,12 @@ def fly(
         prepare(Rigged(lock, loop, epoch_ns))
         loop.run(epoch_ns, RunLabel(TEXT, seed, True, False))
     return read_run(folder)
+
+
+def _assert_off(lock: LockStep) -> None:
+    pwm = lock.hardware.pwm
+    assert not lock.hardware.circuit.currents().any()
+    assert all(pwm.duty(channel) == 0.0 for channel in range(16)), "both inputs of each bridge are low"
 
 
 def event_names(run: Run) -> list[str]:
