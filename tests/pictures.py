@@ -62,7 +62,12 @@ def _draw_frame(path: Path) -> None:
     pixels = StarRenderer(camera, Sky(), 1).render(1, times, attitudes)
     pinhole = Pinhole.from_field_of_view(camera.columns, camera.rows, np.deg2rad(camera.field_of_view_deg))
     found = estimate_rate(
-        pixels, pinhole, camera.exposure, StreakSettings(), prior_rate=np.array([0.0, RATE, 0.0]), prior_sigma=1e-3
+        pixels,
+        pinhole,
+        camera.exposure,
+        StreakSettings(),
+        prior_rate=np.array([0.0, RATE, 0.0]),
+        prior_sigma=1e-3,
     )
     assert found.status is StreakStatus.RATE
     assert found.rate is not None

@@ -103,7 +103,18 @@ def test_a_signal_ends_a_flight_with_its_log_whole(tmp_path: Path, number: signa
 
 def test_plan_tells_a_stretched_horizon_and_draws_it(tmp_path: Path) -> None:
     picture = tmp_path / "path.png"
-    words: list[str | Path] = ["plan", "--from", "0.4", "--from-rate", "0.015", "--to", "-0.3", "--picture", picture, "--json"]
+    words: list[str | Path] = [
+        "plan",
+        "--from",
+        "0.4",
+        "--from-rate",
+        "0.015",
+        "--to",
+        "-0.3",
+        "--picture",
+        picture,
+        "--json",
+    ]
     done = command(*words)
     assert done.returncode == 0, done.stderr
     facts = json.loads(done.stdout)
