@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
+import resource
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -25,13 +25,19 @@ def command(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False, timeout=240)
 
 
+def children_cpu_s() -> float:
+    """Return the processor time of all child processes that have ended."""
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return usage.ru_utime + usage.ru_stime
+
+
 @pytest.fixture(scope="module")
 def demonstration(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, float]:
     folder = tmp_path_factory.mktemp("demonstration") / "run"
-    begun = time.perf_counter()
+    begun = children_cpu_s()
     done = command("run", CONFIG, "--out", folder)
     assert done.returncode == 0, done.stderr
-    return read_run(folder), time.perf_counter() - begun
+    return read_run(folder), children_cpu_s() - begun
 
 
 @pytest.fixture(scope="module")
@@ -105,15 +111,17 @@ def test_the_streak_rates_are_right_and_enter_the_estimate(demonstration: tuple[
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-def test_flight_and_report_take_less_than_a_minute(demonstration: tuple[Run, float], tmp_path: Path) -> None:
-    """The bound of the step is 60 s on two free cores; here other tests have one of them."""
+def test_flight_and_report_take_less_than_a_minute_of_one_core(
+    demonstration: tuple[Run, float], tmp_path: Path
+) -> None:
+    """Processor time, which other tests beside this one do not lengthen as they do the clock's."""
     run, flown_s = demonstration
-    begun = time.perf_counter()
+    begun = children_cpu_s()
     done = command("report", run.folder, "--figures", tmp_path / "figures")
     assert done.returncode == 0, done.stderr
     assert "steady-state error" in done.stdout
     assert len(list((tmp_path / "figures").glob("*.png"))) == 7
-    assert flown_s + time.perf_counter() - begun < 60.0
+    assert flown_s + children_cpu_s() - begun < 60.0
 
 
 def test_the_same_seed_gives_the_same_log_bit_for_bit_and_another_seed_does_not(tmp_path: Path) -> None:
