@@ -42,6 +42,9 @@ IMU_CORRUPT = EventKind(
 IMU_IMPLAUSIBLE = EventKind(12, "imu-implausible", Severity.WARNING, "values out of range or not finite")
 IMU_LINE_LOST = EventKind(13, "imu-line-lost", Severity.FAULT, "the serial port is gone")
 IMU_RECOVERED = EventKind(14, "imu-recovered", Severity.INFORMATION, "good packets come again")
+IMU_UNUSABLE = EventKind(
+    16, "imu-unusable", Severity.FAULT, "bytes come from the inertial unit, but no reading in them"
+)
 IMU_REFUSED = EventKind(
     15, "imu-refused", Severity.WARNING, "measurements disagree with the estimate and are left out"
 )

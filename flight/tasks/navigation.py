@@ -47,14 +47,16 @@ class Navigation:
         self._since_ns = 0
         self._last_good_ns = 0
         self._link = unit.link()
-        self._restarts = 0
+        self._heard_since_ns = 0
         self._silent = Condition(event_log, events.IMU_SILENT, events.IMU_RECOVERED)
+        self._unusable = Condition(event_log, events.IMU_UNUSABLE, events.IMU_RECOVERED)
         self._lost = Condition(event_log, events.IMU_LINE_LOST, events.IMU_RECOVERED)
 
     def begin(self, time_ns: int) -> None:
         """Use samples from `time_ns` on only: the body is released then."""
         self._since_ns = time_ns
         self._last_good_ns = time_ns
+        self._heard_since_ns = time_ns
         self._link = self._unit.link()
 
     def link(self) -> ImuLink:
@@ -126,14 +128,17 @@ class Navigation:
     def _watch_line(self, now_ns: int) -> None:
         link, before = self._unit.link(), self._link
         self._link = link
+        limit_ns = self._settings.max_age_ns
         quiet_ns = now_ns - max(link.last_byte_ns, self._since_ns)
-        self._silent.update(
-            quiet_ns > self._settings.max_age_ns,
-            now_ns,
-            f"no byte for {quiet_ns * 1e-9:.2f} s"
-            if quiet_ns > self._settings.max_age_ns
-            else "bytes come again",
-        )
+        silent = quiet_ns > limit_ns
+        text = f"no byte for {quiet_ns * 1e-9:.2f} s" if silent else "bytes come again"
+        self._silent.update(silent, now_ns, text)
+        if silent:
+            self._heard_since_ns = now_ns
+        without_ns = now_ns - max(self._last_good_ns, self._heard_since_ns)
+        unusable = without_ns > limit_ns
+        text = f"no reading in {without_ns * 1e-9:.2f} s of bytes: has the unit started anew?"
+        self._unusable.update(unusable, now_ns, text if unusable else "readings come again")
         bad = link.bad_checksum - before.bad_checksum
         stray = link.discarded_bytes - before.discarded_bytes
         if bad or stray:

@@ -58,7 +58,7 @@ def test_a_sound_flight_raises_no_alarm(sound: Run) -> None:
     ("faults", "events"),
     [
         (LineFaults(silent=True), ["imu-silent", "control-lost", "imu-recovered", "control-regained"]),
-        (LineFaults(garbage=True), ["imu-corrupt", "control-lost", "control-regained"]),
+        (LineFaults(garbage=True), ["imu-corrupt", "control-lost", "imu-unusable", "control-regained"]),
     ],
     ids=["silence", "garbage"],
 )
@@ -110,6 +110,21 @@ def test_noise_on_an_idle_line_is_corruption_not_silence(tmp_path: Path) -> None
     assert "imu-corrupt" in names
     assert "imu-silent" not in names
     assert true_current(run, BEGIN + 0.2, END).max() == 0.0
+
+
+def test_a_unit_that_starts_anew_is_told_apart_from_noise_and_silence(tmp_path: Path) -> None:
+    """After its reset the unit sends the ASCII lines it was born with: packets, but no readings."""
+
+    def prepare(rigged: Rigged) -> None:
+        host = rigged.lock.line.host
+        rigged.at(BEGIN, lambda: host.send(b"$VNRST*4D\r\n"))
+
+    run = fly(demo_config(DURATION, camera=False), tmp_path, prepare)
+    names = event_names(run)
+    assert "imu-unusable" in names
+    assert "imu-corrupt" not in names
+    assert true_current(run, BEGIN + 0.3, DURATION).max() == 0.0
+    assert_whole(run)
 
 
 def test_an_unplugged_port_is_told_and_the_coils_go_to_zero(tmp_path: Path) -> None:
