@@ -46,6 +46,7 @@ def fly(
     folder: Path,
     prepare: Callable[[Rigged], None] = lambda _: None,
     seed: int = 1,
+    planner_latency: float | None = None,
 ) -> Run:
     """Fly a configuration in lock-step and return what it left; `prepare` may schedule faults.
 
@@ -58,7 +59,8 @@ def fly(
     with ExitStack() as stack:
         lock = stack.enter_context(lockstep.opened(config, section, folder))
         stack.callback(lambda: _assert_off(lock))
-        latency = round(section.latency.planner * SECOND_NS), round(section.latency.vision * SECOND_NS)
+        planner_s = section.latency.planner if planner_latency is None else planner_latency
+        latency = round(planner_s * SECOND_NS), round(section.latency.vision * SECOND_NS)
         rig = app.Rig(lock.clock, lock.wires, lock.release, False, seed, latency)
         loop, _ = app.prepare(config, rig, folder, stack)
         epoch_ns = app.next_whole_second(lock.clock)

@@ -1,0 +1,109 @@
+"""A bad plan is never flown: the last good one is, and then its end is held."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flight import config as configuration
+from flight.errors import PlanningError
+from flight.guidance import job as plan_job
+from flight.guidance.job import PlanJob
+from flight.guidance.path import PolynomialPath
+from flight.guidance.vmc import Plan
+from flight.guidance.vmc import plan as make_plan
+from flight.settings import Step
+from flight.telemetry.packets import to_text
+from tests.scenario.flights import demo_config, event_names, fly
+
+DURATION = 24.0
+GOOD_PLANS = 2
+"""The second is made at 5 s and ends at 15 s."""
+
+Spoil = Callable[[PlanJob, Plan], Plan]
+
+
+def fail(job: PlanJob, plan: Plan) -> Plan:
+    raise PlanningError("none today")
+
+
+def break_down(job: PlanJob, plan: Plan) -> Plan:
+    raise ZeroDivisionError("a defect of the planner")
+
+
+def turn_to_nan(job: PlanJob, plan: Plan) -> Plan:
+    return replace(plan, path=PolynomialPath.through(np.full(24, np.nan), plan.horizon))
+
+
+def go_beyond_the_limit(job: PlanJob, plan: Plan) -> Plan:
+    return replace(plan, path=PolynomialPath.through(plan.node_q2, 0.02 * plan.horizon))
+
+
+def start_elsewhere(job: PlanJob, plan: Plan) -> Plan:
+    return make_plan(job.plant, job.start_q2 + 0.1, 0.0, job.end_q2, 0.0, 10.0)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "event"),
+    [
+        (fail, "planner-failed"),
+        (break_down, "planner-failed"),
+        (turn_to_nan, "plan-refused"),
+        (go_beyond_the_limit, "plan-refused"),
+        (start_elsewhere, "plan-refused"),
+    ],
+    ids=lambda value: getattr(value, "__name__", value),
+)
+def test_after_two_good_plans_only_bad_ones_come(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spoil: Spoil, event: str
+) -> None:
+    good = plan_job.run
+    monkeypatch.setattr(
+        plan_job, "run", lambda job: good(job) if job.number <= GOOD_PLANS else spoil(job, good(job))
+    )
+    run = fly(demo_config(DURATION, camera=False), tmp_path)
+    names = event_names(run)
+    assert names.index(event) < names.index("holding")
+    plans = run["plan"]
+    assert plans["accepted"].tolist() == [1] * GOOD_PLANS + [0] * (len(plans) - GOOD_PLANS)
+    control = run["control"]
+    time = control["time_ns"] * 1e-9
+    assert (control["plan"][time > 5.2] == GOOD_PLANS).all()
+    assert (control["state"][(time > 5.2) & (time < 15.0)] == 1).all(), "the last good path is flown"
+    assert (control["state"][time > 15.2] == 2).all(), "its end is held"
+    final = 2 * np.arcsin(run["truth"]["quaternion"][-1, 1]) - 2 * np.arcsin(-0.3)
+    assert abs(final) < np.radians(4.5)
+
+
+def test_with_a_good_planner_none_of_these_alarms_rings(tmp_path: Path) -> None:
+    run = fly(demo_config(DURATION, camera=False), tmp_path)
+    assert event_names(run) == ["started", "target", "stopped"]
+    assert run["plan"]["accepted"].all()
+
+
+def test_late_plans_are_refused_and_without_any_path_the_coils_stay_off(tmp_path: Path) -> None:
+    run = fly(demo_config(12.0, camera=False), tmp_path, planner_latency=1.5)
+    assert not run["plan"]["accepted"].any()
+    assert to_text(run["plan"]["status"][0]).startswith("late")
+    assert not run["truth"]["current"].any()
+
+
+def test_a_planner_that_is_just_in_time_is_flown(tmp_path: Path) -> None:
+    run = fly(demo_config(12.0, camera=False), tmp_path, planner_latency=0.9)
+    assert run["plan"]["accepted"].all()
+
+
+def test_an_infeasible_step_is_stretched_told_and_flown(tmp_path: Path) -> None:
+    """From +0.3 back to -0.3 at rest needs more than 10 s under 0.148 A."""
+    steps = (Step(at=0.0, q2=0.3), Step(at=25.0, q2=-0.3))
+    run = fly(configuration.replace(demo_config(60.0, camera=False), steps=steps), tmp_path)
+    assert "plan-stretched" in event_names(run)
+    stretched = run["plan"][run["plan"]["status"] == b"stretched"]
+    assert (stretched["horizon"] > 10.0).all()
+    assert (stretched["peak_current"] <= 1.001 * 0.148).all()
+    final = 2 * np.arcsin(run["truth"]["quaternion"][-1, 1]) - 2 * np.arcsin(-0.3)
+    assert abs(final) < np.radians(4.5)
