@@ -24,13 +24,17 @@ class TimedWorld(Protocol):
 
 
 class SimClock:
-    """A Clock that jumps. Time begins at 0; `utc_start_ns` is the label of that instant."""
+    """A Clock that jumps. Time begins at `start_ns`; `utc_start_ns` is the label of time 0.
 
-    def __init__(self, utc_start_ns: int = 0) -> None:
-        self._now_ns = 0
+    Attributes:
+        tickers: those that run, in the order in which they were made.
+    """
+
+    def __init__(self, utc_start_ns: int = 0, start_ns: int = 0) -> None:
+        self._now_ns = start_ns
         self._utc_start_ns = utc_start_ns
         self._world: TimedWorld | None = None
-        self._tickers: list[_SimTicker] = []
+        self.tickers: list[SimTicker] = []
         self._running_jobs = False
 
     def attach(self, world: TimedWorld) -> None:
@@ -46,7 +50,7 @@ class SimClock:
         while self._now_ns < deadline_ns:
             next_ns = deadline_ns
             if not self._running_jobs:
-                for ticker in self._tickers:
+                for ticker in self.tickers:
                     next_ns = min(next_ns, ticker.due_ns)
             self._advance_world(max(next_ns, self._now_ns))
             if not self._running_jobs:
@@ -54,8 +58,8 @@ class SimClock:
 
     def ticker(self, name: str, period_ns: int, job: Callable[[], None]) -> Ticker:
         """Run `job` every `period_ns` of simulated time, the first time one period from now."""
-        made = _SimTicker(self, name, period_ns, job)
-        self._tickers.append(made)
+        made = SimTicker(self, name, period_ns, job)
+        self.tickers.append(made)
         return made
 
     def utc_ns(self) -> int:
@@ -74,7 +78,7 @@ class SimClock:
     def _run_due_jobs(self) -> None:
         self._running_jobs = True
         try:
-            for ticker in list(self._tickers):
+            for ticker in list(self.tickers):
                 if ticker.due_ns <= self._now_ns:
                     ticker.due_ns = self._now_ns + ticker.period_ns
                     ticker.run()
@@ -82,7 +86,7 @@ class SimClock:
             self._running_jobs = False
 
 
-class _SimTicker:
+class SimTicker:
     """A job on simulated time; a kick runs it on the spot."""
 
     def __init__(self, clock: SimClock, name: str, period_ns: int, job: Callable[[], None]) -> None:
@@ -110,5 +114,5 @@ class _SimTicker:
 
     def stop(self) -> None:
         """Run no more."""
-        if self in self._clock._tickers:
-            self._clock._tickers.remove(self)
+        if self in self._clock.tickers:
+            self._clock.tickers.remove(self)
