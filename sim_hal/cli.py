@@ -110,10 +110,13 @@ def _emulate_vn100(options: argparse.Namespace) -> int:
     emulator = Vn100Emulator(_demonstration(options, clock.now_ns()), line, rng, settings, clock.now_ns())
     emulator.set_baud_rate(options.baud)
     facts = {"device": line.name, "baud_rate": options.baud, "link": options.link and str(options.link)}
-    sys.stdout.write((json.dumps(facts) if options.json else line.name) + "\n")
-    sys.stdout.flush()
+
+    def announce() -> None:
+        sys.stdout.write((json.dumps(facts) if options.json else line.name) + "\n")
+        sys.stdout.flush()
+
     try:
-        serve(emulator, line, clock, options.duration)
+        serve(emulator, line, clock, announce, options.duration)
     finally:
         line.close()
     return 0
@@ -134,8 +137,17 @@ def _demonstration(options: argparse.Namespace, start_ns: int) -> Callable[[int]
     return motion
 
 
-def serve(emulator: Vn100Emulator, line: PtyLine, clock: Clock, duration: float | None = None) -> None:
-    """Let the emulator live on the line in real time, for `duration` s or until SIGINT or SIGTERM."""
+def serve(
+    emulator: Vn100Emulator,
+    line: PtyLine,
+    clock: Clock,
+    announce: Callable[[], None],
+    duration: float | None = None,
+) -> None:
+    """Let the emulator live on the line in real time, for `duration` s or until SIGINT or SIGTERM.
+
+    `announce` is called once it can be stopped politely: whoever is told may stop it at once.
+    """
     stopped = False
 
     def stop(_signal: int, _frame: FrameType | None) -> None:
@@ -145,6 +157,7 @@ def serve(emulator: Vn100Emulator, line: PtyLine, clock: Clock, duration: float 
     previous = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     end_ns = None if duration is None else clock.now_ns() + round(duration * 1e9)
     try:
+        announce()
         while not stopped and (end_ns is None or clock.now_ns() < end_ns):
             now_ns = clock.now_ns()
             line.exchange(now_ns)
