@@ -11,6 +11,7 @@ import signal
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -90,6 +91,12 @@ def fly(order: Order, progress: Callable[[Progress], None] | None = None) -> Out
             rig.release(epoch_ns)
             reason = loop.run(epoch_ns, label)
     return Outcome(order.out, reason, bool(received), flight_log.error())
+
+
+def default_folder(config_path: Path) -> Path:
+    """Return the folder of a run that was given none: its configuration's name and the time, as labels."""
+    now = datetime.fromtimestamp(SystemClock().utc_ns() * 1e-9, UTC)
+    return Path("runs") / f"{config_path.stem}-{now:%Y%m%d-%H%M%S}"
 
 
 def prepare(config: Config, rig: Rig, folder: Path, stack: ExitStack) -> tuple[FlightLoop, FlightLog]:

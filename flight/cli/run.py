@@ -7,7 +7,6 @@ import json
 import sys
 import time
 from collections.abc import Callable
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TextIO
 
@@ -37,11 +36,9 @@ def add_to(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> Non
 
 def run(options: argparse.Namespace) -> int:
     """Fly, showing progress on standard error when it is a terminal."""
-    from flight.app import Order, fly  # noqa: PLC0415 - devices are of no use to the other commands
+    from flight.app import Order, default_folder, fly  # noqa: PLC0415 - no other command needs devices
 
-    # The label of a folder, not an input of anything.
-    label = datetime.now(UTC).strftime("%Y%m%d-%H%M%S")
-    out = options.out or Path("runs") / f"{options.config.stem}-{label}"
+    out = options.out or default_folder(options.config)
     order = Order(options.config, out, options.realtime, options.duration, options.seed)
     begun = time.perf_counter()
     with_line = sys.stderr.isatty()
