@@ -11,7 +11,7 @@ help:        ## list the targets
 
 $(READY): pyproject.toml requirements.lock
 	$(PYTHON) -m venv $(VENV)
-	$(VENV)/bin/pip install --quiet --constraint requirements.lock --editable '.[plots,test]'
+	$(VENV)/bin/pip install --quiet --constraint requirements.lock --editable '.[plots,images,test]'
 	@touch $@
 
 demo: $(READY)  ## fly the 700 s step demonstration on simulated hardware and print its report

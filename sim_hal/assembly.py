@@ -126,7 +126,8 @@ def assemble(
         make = expose or inline_exposure(StarRenderer(config.camera, section.sky, section.seed))
         readout_ns = round(section.sky.readout * 1e9)
         mounting = np.array(config.camera.mounting)
-        camera = EmulatedStarCamera(world.motion, make, now_ns, readout_ns, mounting)
+        scan_ns = round(section.sky.line_time * config.camera.rows * 1e9)
+        camera = EmulatedStarCamera(world.motion, make, now_ns, readout_ns, mounting, scan_ns)
     devices: list[EmulatedDevice] = [unit]
     if camera is not None:
         devices.append(camera)
@@ -153,6 +154,7 @@ def camera_model(camera: Camera, sky: Sky) -> StarCameraModel:
         bits=camera.bits,
         full_well=sky.full_well,
         psf_sigma=camera.psf_sigma,
+        line_time=sky.line_time,
     )
 
 

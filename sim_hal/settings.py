@@ -67,6 +67,7 @@ class Sky(Section, frozen=True, kw_only=True):
     pedestal: NotNegative = 100.0
     full_well: Positive = 20000.0
     readout: NotNegative = 0.05
+    line_time: NotNegative = 0.0
 
 
 class Simulation(Section, frozen=True, kw_only=True):

@@ -30,13 +30,14 @@ class _Exposure:
     sequence: int
     start_ns: int
     length_ns: int
+    scan_ns: int
     times: list[int]
     attitudes: list[FloatArray]
     image: Future[Image] | None = None
 
     @property
     def end_ns(self) -> int:
-        return self.start_ns + self.length_ns
+        return self.start_ns + self.length_ns + self.scan_ns
 
 
 class EmulatedStarCamera:
@@ -49,12 +50,15 @@ class EmulatedStarCamera:
         now_ns: Callable[[], int],
         readout_ns: int,
         mounting: FloatArray,
+        scan_ns: int = 0,
     ) -> None:
+        """Take the camera's wiring; `scan_ns` is how much later the last row of a rolling shutter exposes."""
         self._motion = motion
         self._expose = expose
         self._now_ns = now_ns
         self._readout_ns = readout_ns
         self._mounting = mounting
+        self._scan_ns = scan_ns
         self._sequence = 0
         self._exposure: _Exposure | None = None
         self._last: Frame | None = None
@@ -65,7 +69,7 @@ class EmulatedStarCamera:
         if self.fault == "off":
             raise NotResponding("camera", "does not answer the trigger")
         self._sequence += 1
-        self._exposure = _Exposure(self._sequence, self._now_ns(), exposure_ns, [], [])
+        self._exposure = _Exposure(self._sequence, self._now_ns(), exposure_ns, self._scan_ns, [], [])
         self.advance(self._now_ns())
 
     def poll(self) -> Frame | None:

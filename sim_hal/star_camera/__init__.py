@@ -6,7 +6,8 @@
 
 `times` and `quaternions` are the camera's attitude over the exposure, sampled as finely as it was simulated.
 `model` holds the camera's numbers, `attitude_history` interpolates the attitude, `point_spread` says how a
-point's light falls on the pixels, `exposure` gathers it along each source's path, `detector` makes counts.
+point's light falls on the pixels, `exposure` gathers it along each source's path, `rolling_shutter` does so
+when each row has its own time (`line_time`), `detector` makes counts.
 """
 
 from sim_hal.star_camera.image import SourceTrack, expected_electrons, render

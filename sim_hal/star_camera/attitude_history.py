@@ -49,12 +49,12 @@ class AttitudeHistory:
             raise OutOfRange(DEVICE, "turn between two attitude samples", greatest, 0.0, GREATEST_TURN, "rad")
 
     @property
-    def exposure(self) -> float:
+    def span(self) -> float:
         """The time from the first sample to the last, s."""
         return float(self.times[-1] - self.times[0])
 
     def at(self, times: FloatArray) -> FloatArray:
-        """Return the attitudes (m, 4) at `times` (m,) within the exposure."""
+        """Return the attitudes (m, 4) at `times` (m,); beyond an end the turn there goes on."""
         return _interpolate(self.times, self.quaternions, times)
 
     def matrices_at(self, times: FloatArray) -> FloatArray:

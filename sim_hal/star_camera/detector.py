@@ -30,12 +30,21 @@ def counts(
         light = electrons.copy()
         column, row, current = np.array(model.hot_pixels).T
         np.add.at(light, (row.astype(int), column.astype(int)), (current * exposure).astype(np.float32))
+    if any(model.background_gradient):
+        light = light + _stray_light(model)
     draw = _uniform if model.noise == "uniform" else _poisson
     signal = draw(model, light, exposure, rng)
     signal *= np.float32(1.0 / model.gain)
     signal += np.float32(model.pedestal + 0.5)  # truncation below then rounds to the nearest count
     np.clip(signal, 0.0, model.highest_count, out=signal)
     return np.asarray(signal.astype(model.count_type))
+
+
+def _stray_light(model: StarCameraModel) -> Float32Array:
+    """Return e- (rows, columns) that grow evenly across and down, from none in the darkest corner."""
+    across, down = model.background_gradient
+    light = across * np.arange(model.columns) + down * np.arange(model.rows)[:, None]
+    return np.asarray(model.gain * (light - light.min()), dtype=np.float32)
 
 
 def _poisson(

@@ -25,10 +25,29 @@ Vectors = Callable[[FloatArray], FloatArray]
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """A short stretch of the exposure: sample times (m,) s, and the share of the exposure each stands for."""
+    """A short stretch of the exposure and its samples (m,).
 
-    times: FloatArray
-    shares: FloatArray
+    Attributes:
+        starts: s, where the piece of smooth motion begins that the sample stands for a part of.
+        ends: s, where that piece ends.
+        nodes: the sample's place in the piece, 0 .. 1.
+        weights: the part of the piece that it stands for; of each piece they add up to 1.
+    """
+
+    starts: FloatArray
+    ends: FloatArray
+    nodes: FloatArray
+    weights: FloatArray
+
+    @property
+    def times(self) -> FloatArray:
+        """The times (m,) of the samples, s."""
+        return self.starts + self.nodes * (self.ends - self.starts)
+
+    @property
+    def durations(self) -> FloatArray:
+        """How long each sample (m,) stands for, s."""
+        return self.weights * (self.ends - self.starts)
 
 
 def expose(
@@ -43,9 +62,10 @@ def expose(
 
     `electrons` (n,) is what each source gives over the whole exposure, `knots[0]` to `knots[-1]`.
     """
-    for span in spans(knots, _path_lengths(camera, spread, vectors(knots)), spread):
+    rate = electrons / (knots[-1] - knots[0])
+    for span in spans(knots, path_lengths(camera, spread, vectors(knots)), spread):
         points = camera.project(vectors(span.times))
-        _deposit(image, spread, points, span.shares[:, None] * electrons)
+        _deposit(image, spread, points, span.durations[:, None] * rate)
 
 
 def spans(knots: FloatArray, lengths: FloatArray, spread: PointSpread) -> Iterator[Span]:
@@ -54,22 +74,27 @@ def spans(knots: FloatArray, lengths: FloatArray, spread: PointSpread) -> Iterat
     `lengths` (j - 1,) px is the longest path between consecutive `knots` (j,). Long stretches are divided,
     short ones taken together; no sample ever stands for both sides of a knot.
     """
-    exposure = knots[-1] - knots[0]
-    times: list[FloatArray] = []
-    shares: list[FloatArray] = []
+    pieces: list[tuple[float, float, FloatArray, FloatArray]] = []
     covered = 0.0
     for start, end, length in zip(knots[:-1].tolist(), knots[1:].tolist(), lengths.tolist(), strict=True):
-        pieces = max(1, math.ceil(length / spread.patch))
-        step, advance = (end - start) / pieces, length / pieces
+        count = max(1, math.ceil(length / spread.patch))
+        step, advance = (end - start) / count, length / count
         nodes, weights = _gauss_legendre(spread.quadrature(advance))
-        for piece in range(pieces):
-            if times and covered + advance > spread.patch:
-                yield Span(np.concatenate(times), np.concatenate(shares))
-                times, shares, covered = [], [], 0.0
-            times.append(start + (piece + nodes) * step)
-            shares.append(weights * (step / exposure))
+        for number in range(count):
+            if pieces and covered + advance > spread.patch:
+                yield _span(pieces)
+                pieces, covered = [], 0.0
+            pieces.append((start + number * step, start + (number + 1) * step, nodes, weights))
             covered += advance
-    yield Span(np.concatenate(times), np.concatenate(shares))
+    yield _span(pieces)
+
+
+def _span(pieces: list[tuple[float, float, FloatArray, FloatArray]]) -> Span:
+    starts, ends, nodes, weights = zip(*pieces, strict=True)
+    counts = [len(part) for part in nodes]
+    return Span(
+        np.repeat(starts, counts), np.repeat(ends, counts), np.concatenate(nodes), np.concatenate(weights)
+    )
 
 
 @lru_cache(maxsize=128)
@@ -79,17 +104,17 @@ def _gauss_legendre(count: int) -> tuple[FloatArray, FloatArray]:
     return 0.5 * (nodes + 1.0), 0.5 * weights
 
 
-def _path_lengths(camera: Pinhole, spread: PointSpread, vectors: FloatArray) -> FloatArray:
+def path_lengths(camera: Pinhole, spread: PointSpread, vectors: FloatArray) -> FloatArray:
     """Return the longest path (j - 1,) px between knots, of the sources that are then on the detector."""
     points = camera.project(vectors)
     start, end = points[:-1], points[1:]
     low, high = np.minimum(start, end), np.maximum(start, end)
-    on = _touches(low, high, camera.columns, camera.rows, spread.reach + 2)
+    on = touches(low, high, camera.columns, camera.rows, spread.reach + 2)
     length = np.hypot(end[..., 0] - start[..., 0], end[..., 1] - start[..., 1])
     return np.asarray(np.max(np.where(on, length, 0.0), axis=1, initial=0.0))
 
 
-def _touches(low: FloatArray, high: FloatArray, columns: int, rows: int, margin: int) -> BoolArray:
+def touches(low: FloatArray, high: FloatArray, columns: int, rows: int, margin: float) -> BoolArray:
     """Tell which boxes, corners (..., 2), come within `margin` px of the detector; one at NaN does not."""
     x = (high[..., 0] >= -margin) & (low[..., 0] <= columns - 1 + margin)
     y = (high[..., 1] >= -margin) & (low[..., 1] <= rows - 1 + margin)
@@ -101,7 +126,7 @@ def _deposit(image: Float32Array, spread: PointSpread, points: FloatArray, elect
     rows, columns = image.shape
     low = np.floor(points.min(axis=0) + 0.5)
     high = np.floor(points.max(axis=0) + 0.5)
-    seen = np.flatnonzero(_touches(low, high, columns, rows, spread.reach))
+    seen = np.flatnonzero(touches(low, high, columns, rows, spread.reach))
     if not seen.size:
         return
     corner = low[seen] - spread.reach
@@ -117,6 +142,16 @@ def _deposit(image: Float32Array, spread: PointSpread, points: FloatArray, elect
     split = int(np.count_nonzero(whole))
     _add_whole(image, patches[:split], origin[:split])
     _add_cut(image, patches[split:], origin[split:])
+
+
+def add_patches(image: Float32Array, patches: Float32Array, corner: FloatArray) -> None:
+    """Add square `patches` (n, size, size), their top-left pixels at `corner` (n, 2) as x, y, to `image`."""
+    rows, columns = image.shape
+    size = patches.shape[1]
+    whole = np.all((corner >= 0.0) & (corner <= (columns - size, rows - size)), axis=1)
+    origin = corner.astype(np.intp)
+    _add_whole(image, patches[whole], origin[whole])
+    _add_cut(image, patches[~whole], origin[~whole])
 
 
 def _add_whole(image: Float32Array, patches: Float32Array, origin: IntArray) -> None:

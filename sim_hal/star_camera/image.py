@@ -15,6 +15,7 @@ from sim_hal.star_camera.attitude_history import AttitudeHistory
 from sim_hal.star_camera.exposure import Vectors, expose
 from sim_hal.star_camera.model import StarCameraModel
 from sim_hal.star_camera.point_spread import Float32Array, bilinear_gaussian, integrated_gaussian
+from sim_hal.star_camera.rolling_shutter import OwnTimes, RollingShutter, expose_rolling
 
 SMOOTHNESS = 0.01
 """px at the boresight: departures from smooth motion larger than this are followed sample by sample."""
@@ -50,9 +51,11 @@ class SourceTrack:
         object.__setattr__(self, "directions", directions)
 
     def directions_at(self, times: FloatArray) -> FloatArray:
-        """Return unit vectors (m, 3) at `times` (m,)."""
-        along = [np.interp(times, self.times, component) for component in self.directions.T]
-        chord = np.stack(along, axis=-1)
+        """Return unit vectors (m, 3) at `times` (m,); beyond an end the motion there goes on."""
+        before = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 2)
+        share = (times - self.times[before]) / (self.times[before + 1] - self.times[before])
+        start, end = self.directions[before], self.directions[before + 1]
+        chord = start + share[:, None] * (end - start)
         return np.asarray(chord / np.linalg.norm(chord, axis=-1, keepdims=True))
 
 
@@ -67,9 +70,10 @@ def expected_electrons(
     """Return the light (rows, columns) in e- of an exposure: no noise, no dark current, no saturation.
 
     `directions` (n, 3) are ICRS unit vectors, `magnitudes` (n,) Johnson V; `times` (k,) s and `quaternions`
-    (k, 4), ICRS into camera, are the attitude from the start to the end of the exposure. Sease 2.1-2.9 and
-    2.12, corrected. Raises ValueError for arrays of the wrong shape or not finite, OutOfRange for an attitude
-    that cannot be.
+    (k, 4), ICRS into camera, are the attitude from the start to the end of the exposure; with a rolling
+    shutter from the start of the first row's until `model.rows` line times after that exposure's end. Sease
+    2.1-2.9 and 2.12, corrected. Raises ValueError for arrays of the wrong shape or not finite, OutOfRange
+    for an attitude that cannot be.
     """
     history = AttitudeHistory(times, quaternions)
     return _light(model, directions, magnitudes, history, extra).astype(np.float64)
@@ -90,7 +94,7 @@ def render(
     """
     history = AttitudeHistory(times, quaternions)
     light = _light(model, directions, magnitudes, history, extra)
-    return detector.counts(model, light, history.exposure, rng)
+    return detector.counts(model, light, model.exposure_within(history.span), rng)
 
 
 def _light(
@@ -103,16 +107,27 @@ def _light(
     directions, magnitude = _checked(directions, magnitudes)
     camera = model.pinhole
     spread = (integrated_gaussian if model.psf == "integrated" else bilinear_gaussian)(model.psf_sigma)
+    exposure = model.exposure_within(history.span)
+    shutter = RollingShutter(float(history.times[0]), exposure, model.line_time)
     knots = history.knots(SMOOTHNESS / camera.focal_length, LONGEST_TURN)
     image = np.zeros((model.rows, model.columns), dtype=np.float32)
     near = _near_the_field(camera, directions, history.matrices_at(knots)[:, 2], spread.reach + 2)
-    electrons = model.electrons(magnitude[near], history.exposure)
-    expose(image, camera, spread, _stars_seen_by(history, directions[near]), electrons, knots)
+    stars, electrons = directions[near], model.electrons(magnitude[near], exposure)
+    if model.line_time > 0.0:
+        own = _at_own_times(history, lambda _, sources: stars[sources])
+        expose_rolling(image, camera, spread, own, electrons, knots, shutter)
+    else:
+        expose(image, camera, spread, _stars_seen_by(history, stars), electrons, knots)
     for track in extra:
         _check_cover(track, history)
         inside = track.times[(track.times > knots[0]) & (track.times < knots[-1])]
-        electrons = model.electrons([track.magnitude], history.exposure)
-        expose(image, camera, spread, _track_seen_by(history, track), electrons, np.union1d(knots, inside))
+        bends = np.union1d(knots, inside)
+        electrons = model.electrons([track.magnitude], exposure)
+        own = _at_own_times(history, _directions_of(track))
+        if model.line_time > 0.0:
+            expose_rolling(image, camera, spread, own, electrons, bends, shutter)
+        else:
+            expose(image, camera, spread, _track_seen_by(own), electrons, bends)
     return image
 
 
@@ -125,12 +140,25 @@ def _stars_seen_by(history: AttitudeHistory, directions: FloatArray) -> Vectors:
     return vectors
 
 
-def _track_seen_by(history: AttitudeHistory, track: SourceTrack) -> Vectors:
-    def vectors(times: FloatArray) -> FloatArray:
-        seen: FloatArray = history.matrices_at(times) @ track.directions_at(times)[..., None]
-        return np.swapaxes(seen, 1, 2)
+def _at_own_times(history: AttitudeHistory, directions: OwnTimes) -> OwnTimes:
+    """Return `directions` (..., 3), ICRS, of sources at their own times, as the camera then sees them."""
+
+    def vectors(times: FloatArray, sources: IntArray) -> FloatArray:
+        matrices = history.matrices_at(times.reshape(-1)).reshape(*times.shape, 3, 3)
+        return np.asarray((matrices @ directions(times, sources)[..., None])[..., 0])
 
     return vectors
+
+
+def _track_seen_by(own: OwnTimes) -> Vectors:
+    return lambda times: own(times[:, None], np.zeros(1, dtype=np.int64))
+
+
+def _directions_of(track: SourceTrack) -> OwnTimes:
+    def directions(times: FloatArray, _: IntArray) -> FloatArray:
+        return track.directions_at(times.reshape(-1)).reshape(*times.shape, 3)
+
+    return directions
 
 
 def _near_the_field(camera: Pinhole, directions: FloatArray, boresights: FloatArray, margin: int) -> IntArray:

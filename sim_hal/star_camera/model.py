@@ -32,6 +32,7 @@ _LIMITS: dict[str, tuple[float, float, str]] = {
     "bits": (1, 16, "bit"),
     "full_well": (1.0, 1e9, "e-"),
     "psf_sigma": (0.2, 20.0, "px"),
+    "line_time": (0.0, 0.01, "s"),
 }
 
 
@@ -56,6 +57,8 @@ class StarCameraModel:
             3 x 3 kernel, as in the thesis (2.5, 2.6, 2.9).
         noise: "poisson" (with Gaussian read noise), or "uniform": the thesis's own draw (text at 2.11).
         hot_pixels: pixels of a dark current of their own.
+        line_time: s from one row's exposure to the next one's; 0 is a global shutter.
+        background_gradient: counts/px along x and along y of stray light, none in the darkest corner.
     """
 
     columns: int = 1024
@@ -73,6 +76,8 @@ class StarCameraModel:
     psf: Literal["integrated", "bilinear"] = "integrated"
     noise: Literal["poisson", "uniform"] = "poisson"
     hot_pixels: tuple[HotPixel, ...] = ()
+    line_time: float = 0.0
+    background_gradient: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         for name, (low, high, unit) in _LIMITS.items():
@@ -82,6 +87,9 @@ class StarCameraModel:
         for name, choices in (("psf", ("integrated", "bilinear")), ("noise", ("poisson", "uniform"))):
             if getattr(self, name) not in choices:
                 raise ValueError(f"{DEVICE}: {name} = {getattr(self, name)!r}: use {' or '.join(choices)}")
+        for slope in self.background_gradient:
+            if not -100.0 <= slope <= 100.0:
+                raise OutOfRange(DEVICE, "background_gradient", slope, -100.0, 100.0, "counts/px")
         for column, row, current in self.hot_pixels:
             if not 0 <= column < self.columns:
                 raise OutOfRange(DEVICE, "hot pixel's column", column, 0, self.columns - 1, "px")
@@ -104,6 +112,17 @@ class StarCameraModel:
     def count_type(self) -> type[np.uint8] | type[np.uint16]:
         """The smallest unsigned integer that holds a count."""
         return np.uint8 if self.bits <= 8 else np.uint16
+
+    def exposure_within(self, span: float) -> float:
+        """Return each row's exposure, s, when from the first row's start `span` s pass for them all.
+
+        A rolling shutter takes rows times the line time beside the exposure. Raises OutOfRange when no time
+        is left to expose.
+        """
+        readout = self.rows * self.line_time
+        if not span > readout:
+            raise OutOfRange(DEVICE, "the attitude history's length", span, readout, math.inf, "s")
+        return span - readout
 
     def electrons(self, magnitudes: npt.ArrayLike, exposure: float) -> FloatArray:
         """Return the e- of sources of Johnson V `magnitudes` in `exposure` s (Sease 2.8, Pogson's scale)."""

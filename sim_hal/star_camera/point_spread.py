@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr
 
-from flight.arrays import FloatArray
+from flight.arrays import FloatArray, IntArray
 
 Float32Array = npt.NDArray[np.float32]
 
@@ -38,11 +38,18 @@ class PointSpread:
     def shares(self, positions: FloatArray, size: int) -> Float32Array:
         """Return the light (..., size) on pixels 0 .. size - 1 in a line, of points at `positions` (...)."""
         table = _table(self, size)
-        scaled = positions * STEPS
-        entry = scaled.astype(np.intp)
-        beyond = (scaled - entry).astype(np.float32)[..., None]
+        entry, beyond = _entries(positions)
         shares = table[entry]
-        shares += beyond * (table[entry + 1] - shares)
+        shares += beyond[..., None] * (table[entry + 1] - shares)
+        return np.asarray(shares)
+
+    def own_shares(self, positions: FloatArray) -> Float32Array:
+        """Return the light (..., size) on pixels 0 .. size - 1, each of its own point of `positions`."""
+        pixel = np.arange(positions.shape[-1])
+        table = _table(self, len(pixel))
+        entry, beyond = _entries(positions)
+        shares = table[entry, pixel]
+        shares += beyond * (table[entry + 1, pixel] - shares)
         return np.asarray(shares)
 
 
@@ -75,6 +82,13 @@ def bilinear_gaussian(sigma: float) -> PointSpread:
         return 1 if length < 1e-3 else math.ceil(2.0 + 8.0 * length)
 
     return PointSpread(profile, 2, 8.0, quadrature)
+
+
+def _entries(positions: FloatArray) -> tuple[IntArray, Float32Array]:
+    """Return the table's entry before each of `positions`, and how far beyond it that lies, 0 .. 1."""
+    scaled = positions * STEPS
+    entry = scaled.astype(np.intp)
+    return entry, (scaled - entry).astype(np.float32)
 
 
 @lru_cache(maxsize=32)

@@ -9,6 +9,7 @@ import pytest
 from scipy.special import ndtr
 
 from flight.arrays import FloatArray, Image
+from hal.interfaces.errors import OutOfRange
 from sim_hal.star_camera import StarCameraModel, expected_electrons, render, scatter_hot_pixels
 from sim_hal.star_camera.detector import counts
 from tests.star_camera.scenes import at_pixels, still, turning
@@ -198,3 +199,22 @@ def test_hot_pixels_are_scattered_reproducibly() -> None:
 def test_a_source_brighter_than_any_number_of_wells_does_not_overflow() -> None:
     frame = render(DEEP, at_pixels(DEEP, [40.0, 40.0]), [-60.0], *still(), np.random.default_rng(1))
     assert int(frame[40, 40]) == pytest.approx(60_100, abs=60)
+
+
+@pytest.mark.parametrize("slopes", [(2.0, 0.0), (0.0, -1.5), (0.5, 0.25)])
+def test_stray_light_grows_across_the_frame_and_brings_its_own_noise(slopes: tuple[float, float]) -> None:
+    """In counts a pixel from the darkest corner on; at 2 e- a count its variance is half its mean."""
+    model = replace(DEEP, background_gradient=slopes, gain=2.0)
+    across, down = slopes
+    stray = across * np.arange(96) + down * np.arange(96)[:, None]
+    stray -= stray.min()
+    _check_moments(
+        _frames(model, np.zeros((96, 96)), 200),
+        100.0 + 25.0 + stray,
+        150.0 / 4.0 + stray / 2.0 + 1.0 / 12.0,
+    )
+
+
+def test_a_gradient_that_cannot_be_is_refused() -> None:
+    with pytest.raises(OutOfRange, match="background_gradient"):
+        replace(DEEP, background_gradient=(0.0, float("nan")))

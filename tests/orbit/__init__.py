@@ -1,0 +1,1 @@
+"""Tests of orbits, Sun, shadow, exclusion and resident space objects."""
