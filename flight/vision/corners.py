@@ -1,8 +1,9 @@
-"""Corner detection on a small image: the endpoints of a streak answer like corners (Sease 3.1-3.8).
+"""Corner detection by the structure tensor: the endpoints of a streak answer like corners (Sease 3.1-3.8).
 
 Structure tensor from Gaussian derivatives, its products summed under a Gaussian window (3.5 corrected:
-without the window the tensor has rank 1 and its smaller eigenvalue is always zero), and the Harris response.
-All functions take and give images (rows, columns); x runs along columns, y along rows.
+without the window the tensor has rank 1 and its smaller eigenvalue is always zero), its smaller eigenvalue
+and the Harris response. All functions take and give images (rows, columns); x runs along columns, y along
+rows.
 """
 
 from __future__ import annotations
@@ -58,6 +59,23 @@ def harris_response(tensor: StructureTensor, k: float = 0.15) -> FloatArray:
     """Return Det(A) - k Tr(A)^2, positive where both eigenvalues are large (3.7, 3.8)."""
     trace = tensor.xx + tensor.yy
     return np.asarray(tensor.xx * tensor.yy - tensor.xy**2 - k * trace**2)
+
+
+def minimum_eigenvalue(tensor: StructureTensor) -> FloatArray:
+    """Return the smaller eigenvalue of the tensor at every pixel (3.6), never negative."""
+    half_trace = 0.5 * (tensor.xx + tensor.yy)
+    larger = half_trace + np.hypot(0.5 * (tensor.xx - tensor.yy), tensor.xy)
+    determinant = tensor.xx * tensor.yy - tensor.xy**2
+    # The product of both over the larger: their difference would cancel where it is small.
+    return np.asarray(np.maximum(determinant, 0.0) / np.where(larger > 0.0, larger, 1.0))
+
+
+def smoothed(image: Image, sigma: float) -> FloatArray:
+    """Return the image smoothed by a Gaussian of `sigma` px (3.3); as it is when `sigma` is zero."""
+    if sigma <= 0.0:
+        return np.asarray(image, dtype=np.float64)
+    kernel = gaussian_kernel(sigma, kernel_radius(sigma))
+    return _separable(image, kernel / kernel.sum(), kernel / kernel.sum())
 
 
 def kernel_radius(sigma: float) -> int:

@@ -48,18 +48,18 @@ def centre_of_intensity(image: FloatArray, pixel: IntArray, half_width: int) -> 
     return np.array([x + window.sum(axis=0) @ i / total, y + window.sum(axis=1) @ i / total])
 
 
-def find_endpoints(
-    response: FloatArray, mask: BoolArray, relative: float, half_width: int
-) -> FloatArray | None:
-    """Return the two endpoints (2, 2) of a streak, or None when its cornerness has any other number of peaks.
+def find_corners(
+    response: FloatArray, mask: BoolArray, relative: float, half_width: int, intensity: FloatArray
+) -> FloatArray:
+    """Return the corners (n, 2) of a region: its peaks of cornerness, each to a fraction of a pixel.
 
-    More than two betray noise, crossing streaks or something that is no star (chapter 3). The centre of
-    intensity is taken of the response: of the image it lies up to 2 px inside the streak.
+    The centre is that of `intensity`: the response itself, or the image, which is the thesis's own and lies
+    up to 2 px inside the streak. A streak has two; more betray noise, crossing streaks or something that is
+    no star (chapter 3).
     """
     peaks = local_maxima(response, mask, relative)
-    if len(peaks) != 2:
-        return None
-    return np.stack([centre_of_intensity(response, peak, half_width) for peak in peaks])
+    centres = [centre_of_intensity(intensity, peak, half_width) for peak in peaks]
+    return np.array(centres).reshape(-1, 2)
 
 
 def extend(endpoints: FloatArray, outward: FloatArray, bias: float) -> FloatArray:

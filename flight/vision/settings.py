@@ -1,9 +1,15 @@
-"""The settings of streak processing: one frozen dataclass, defaults for the demonstration's camera."""
+"""The settings of streak processing: one frozen dataclass, defaults for the demonstration's camera.
+
+Each corner detector has settings of its own, tuned on frames of `tests.vision.frames`: the thresholds for the
+most streaks kept, the error of an endpoint by `python -m tests.bench.endpoint_bias`.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
+
+DetectorName = Literal["harris", "minimum-eigenvalue", "trajkovic-4", "trajkovic-8"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,13 +26,18 @@ class StreakSettings:
             4095).
         saturated_fraction: of the pixels, from which the frame is called saturated.
         gain: electrons per count, for the photon noise of bright streaks.
-        detector: name of the corner detector in `flight.vision.streaks.DETECTORS`.
+        detector: name of the corner detector in `flight.vision.detectors`; the settings below that depend on
+            it are Harris's by default, the others' come from `of`.
+        smoothing_sigma: px, Gaussian smoothing of a region before the detector; 0 for none.
         derivative_sigma, window_sigma: px, of the Gaussian derivative and of the structure tensor's window.
         harris_k: k of 3.8.
-        peak_relative: least cornerness of an endpoint over the streak's largest; it grows as brightness to
-            the fourth power, so 0.005 allows a brightness ratio of 3.8 between the ends (a rate that changes
-            within the exposure).
+        coarse_relative, fine_relative: T1 and T2 of Trajkovic's detector, parts of the largest simple
+            cornerness in the region at half and at full scale.
+        peak_relative: least cornerness of an endpoint over the streak's largest; Harris's grows as brightness
+            to the fourth power, the others' as its square, so that 0.005 and 0.07 both allow a brightness
+            ratio of 3.8 between the ends (a rate that changes within the exposure).
         intensity_half_width: px, N of 3.15.
+        centre_of: what the centre of intensity is taken of: the cornerness, or the image as in the thesis.
         endpoint_bias: px, outward along the streak; of the detector, its sigmas and the camera's point
             spread: measure with `python -m tests.bench.endpoint_bias`.
         endpoint_bias_sigma: px, how well it is known; enters the covariance as an error common to all
@@ -48,12 +59,16 @@ class StreakSettings:
     saturation: float | None = None
     saturated_fraction: float = 0.25
     gain: float = 1.0
-    detector: Literal["harris"] = "harris"
+    detector: DetectorName = "harris"
+    smoothing_sigma: float = 0.0
     derivative_sigma: float = 1.0
     window_sigma: float = 1.5
     harris_k: float = 0.15
+    coarse_relative: float = 0.05
+    fine_relative: float = 0.05
     peak_relative: float = 0.005
     intensity_half_width: int = 3
+    centre_of: Literal["response", "image"] = "response"
     endpoint_bias: float = 0.035
     endpoint_bias_sigma: float = 0.02
     endpoint_floor: float = 0.03
@@ -64,3 +79,35 @@ class StreakSettings:
     axis_tolerance: float = 1.0
     outlier_sigmas: float = 4.0
     sign_sigmas: float = 3.0
+
+    @classmethod
+    def of(cls, detector: DetectorName, **changes: Any) -> StreakSettings:
+        """Return the settings measured for `detector` at a PSF sigma of 1 px, with `changes` on top."""
+        return cls(**{"detector": detector, **_OF_DETECTOR[detector], **changes})
+
+
+_OF_DETECTOR: dict[DetectorName, dict[str, Any]] = {
+    # A point spread of 0.7 and of 1.5 px needs an endpoint_bias of -0.14 and 0.40 with Harris, 0.34 and 0.71
+    # with the minimum eigenvalue, 1.23 and 1.68 with Trajkovic-4, 0.93 and 1.24 with Trajkovic-8.
+    "harris": {},
+    "minimum-eigenvalue": {"peak_relative": 0.2, "intensity_half_width": 4, "endpoint_bias": 0.45},
+    # The four neighbours see a slanting streak as a row of corners: only smoothing and a high threshold
+    # leave the ends, and of about half of all streaks only.
+    "trajkovic-4": {
+        "smoothing_sigma": 1.0,
+        "peak_relative": 0.4,
+        "intensity_half_width": 2,
+        "endpoint_bias": 1.35,
+        "endpoint_bias_sigma": 0.16,
+        "endpoint_floor": 0.13,
+    },
+    "trajkovic-8": {
+        "smoothing_sigma": 1.0,
+        "peak_relative": 0.3,
+        "intensity_half_width": 2,
+        "endpoint_bias": 1.01,
+        "endpoint_bias_sigma": 0.07,
+        "endpoint_floor": 0.1,
+    },
+}
+DETECTOR_NAMES: tuple[DetectorName, ...] = tuple(_OF_DETECTOR)

@@ -6,15 +6,14 @@ and the image without background are kept in the result, for an estimator that g
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from flight.arrays import BoolArray, FloatArray, Image
+from flight.arrays import BoolArray, FloatArray, Image, IntArray
 from flight.vision.background import Background, estimate_background, saturation_level
-from flight.vision.corners import harris_response, structure_tensor
-from flight.vision.endpoints import find_endpoints
+from flight.vision.detectors import cornerness
+from flight.vision.endpoints import find_corners
 from flight.vision.segmentation import (
     Regions,
     find_regions,
@@ -43,11 +42,15 @@ class Streaks:
             means nothing.
         sigma: (n,) px, expected error of an endpoint.
         flux: (n,) counts.
+        candidate: (n,) index of each streak's region among the candidates.
+        crowded: the candidates with more than two corners, refused as streaks: index and corners (k, 2) px.
     """
 
     endpoints: FloatArray
     sigma: FloatArray
     flux: FloatArray
+    candidate: IntArray
+    crowded: tuple[tuple[int, FloatArray], ...]
 
     @property
     def lengths(self) -> FloatArray:
@@ -77,16 +80,6 @@ class Segmented:
     hot_pixels: int
 
 
-def harris_cornerness(image: FloatArray, settings: StreakSettings) -> FloatArray:
-    """Return the Harris response of a region's image (3.8)."""
-    tensor = structure_tensor(image, settings.derivative_sigma, settings.window_sigma)
-    return harris_response(tensor, settings.harris_k)
-
-
-# A corner detector: the image of one region, background removed, to its cornerness, same shape.
-DETECTORS: dict[str, Callable[[FloatArray, StreakSettings], FloatArray]] = {"harris": harris_cornerness}
-
-
 def segment_frame(pixels: Image, settings: StreakSettings) -> Segmented:
     """Return the regions of a frame (rows, columns) and which of them may be streaks."""
     background = estimate_background(pixels)
@@ -99,8 +92,8 @@ def segment_frame(pixels: Image, settings: StreakSettings) -> Segmented:
     regions = find_regions(mask, signal, settings.least_area)
     usable = (
         (regions.length >= _LENGTH_MARGIN * settings.least_length)
-        & ~_near_border(regions, pixels.shape, settings.border)
-        & ~_saturated(regions, pixels, saturation_level(pixels, settings.saturation))
+        & ~near_border(regions, pixels.shape, settings.border)
+        & ~saturated(regions, pixels, saturation_level(pixels, settings.saturation))
     )
     candidates = regions.select(usable)
     strength = candidates.length / expected_sigma(candidates, background, settings)
@@ -110,20 +103,25 @@ def segment_frame(pixels: Image, settings: StreakSettings) -> Segmented:
 
 def measure_streaks(segmented: Segmented, settings: StreakSettings) -> Streaks:
     """Return the streaks among the candidates: those whose cornerness has exactly two peaks."""
-    cornerness = DETECTORS[settings.detector]
     sigma = expected_sigma(segmented.candidates, segmented.background, settings)
     found: list[int] = []
     endpoints: list[FloatArray] = []
+    crowded: list[tuple[int, FloatArray]] = []
     for index in range(len(segmented.candidates)):
-        image, mask, corner = _cut_out(segmented, index)
-        ends = find_endpoints(
-            cornerness(image, settings), mask, settings.peak_relative, settings.intensity_half_width
+        image, mask, corner = cut_out(segmented, index)
+        response = cornerness(image, settings)
+        intensity = response if settings.centre_of == "response" else image
+        corners = find_corners(
+            response, mask, settings.peak_relative, settings.intensity_half_width, intensity
         )
-        if ends is not None:
+        if len(corners) == 2:
             found.append(index)
-            endpoints.append(ends + corner)
+            endpoints.append(corners + corner)
+        elif len(corners) > 2:
+            crowded.append((index, corners + corner))
     stacked = np.array(endpoints).reshape(-1, 2, 2)
-    return Streaks(stacked, sigma[found], segmented.candidates.flux[found])
+    chosen = np.array(found, dtype=np.int64)
+    return Streaks(stacked, sigma[chosen], segmented.candidates.flux[chosen], chosen, tuple(crowded))
 
 
 def expected_sigma(regions: Regions, background: Background, settings: StreakSettings) -> FloatArray:
@@ -135,7 +133,7 @@ def expected_sigma(regions: Regions, background: Background, settings: StreakSet
     )
 
 
-def _cut_out(segmented: Segmented, index: int) -> tuple[FloatArray, BoolArray, FloatArray]:
+def cut_out(segmented: Segmented, index: int) -> tuple[FloatArray, BoolArray, FloatArray]:
     """Return a candidate's image and mask with room around, other regions blanked, and its corner (x, y)."""
     rows, columns = segmented.signal.shape
     top, bottom, left, right = segmented.candidates.boxes[index]
@@ -147,7 +145,7 @@ def _cut_out(segmented: Segmented, index: int) -> tuple[FloatArray, BoolArray, F
     return image, mask, np.array([left, top], dtype=float)
 
 
-def _near_border(regions: Regions, shape: tuple[int, ...], border: int) -> BoolArray:
+def near_border(regions: Regions, shape: tuple[int, ...], border: int) -> BoolArray:
     """Return which regions (n,) come within `border` px of the frame's border: their ends may lie outside."""
     top, bottom, left, right = regions.boxes.T
     return np.asarray(
@@ -155,7 +153,7 @@ def _near_border(regions: Regions, shape: tuple[int, ...], border: int) -> BoolA
     )
 
 
-def _saturated(regions: Regions, pixels: Image, saturation: float) -> BoolArray:
+def saturated(regions: Regions, pixels: Image, saturation: float) -> BoolArray:
     """Return which regions (n,) hold a clipped pixel: their shape is not the point spread's."""
     row, column = positions(pixels >= saturation)
     return np.isin(regions.label, regions.labels[row, column])

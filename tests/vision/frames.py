@@ -84,7 +84,7 @@ def true_endpoints(camera: Camera, directions: FloatArray, rotation: FloatArray)
     return np.stack([first, last], axis=1)
 
 
-def _deposit(image: FloatArray, path: FloatArray, electrons: float, sigma: float) -> None:
+def deposit(image: FloatArray, path: FloatArray, electrons: float, sigma: float) -> None:
     """Add `electrons` evenly over the points (m, 2) of `path`, each through a pixel-integrated Gaussian."""
     reach = int(np.ceil(6.0 * sigma))
     rows, columns = image.shape
@@ -125,7 +125,7 @@ def expose(
         fraction = time + 0.5 * growth * (time**2 - 0.25)
         path = camera.pinhole.project(_along(directions[star], rotation, fraction))
         for part in np.array_split(path, chunks):
-            _deposit(image, part, electrons[star] * len(part) / steps, camera.psf_sigma)
+            deposit(image, part, electrons[star] * len(part) / steps, camera.psf_sigma)
     return image
 
 

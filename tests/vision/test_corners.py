@@ -1,4 +1,4 @@
-"""Gaussian derivatives, the structure tensor and the Harris response."""
+"""Gaussian derivatives, the structure tensor, the Harris response and the smaller eigenvalue."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from flight.vision.corners import (
     gradient,
     harris_response,
     kernel_radius,
+    minimum_eigenvalue,
+    smoothed,
     structure_tensor,
 )
 
@@ -79,3 +81,30 @@ def test_an_edge_answers_negative_and_a_corner_positive() -> None:
     response = harris_response(structure_tensor(image, 1.0, 1.5))
     assert response[20, 35] < 0.0
     assert response[20, 20] > 0.0
+
+
+def test_the_smaller_eigenvalue_is_numpys_of_the_summed_tensor() -> None:
+    image = np.random.default_rng(4).normal(size=(20, 20))
+    tensor = structure_tensor(image, 1.0, 1.5)
+    matrices = np.stack([np.stack([tensor.xx, tensor.xy], -1), np.stack([tensor.xy, tensor.yy], -1)], -2)
+    np.testing.assert_allclose(minimum_eigenvalue(tensor), np.linalg.eigvalsh(matrices)[..., 0], rtol=1e-9)
+
+
+def test_the_smaller_eigenvalue_vanishes_on_an_edge_and_in_the_flat() -> None:
+    image = np.zeros((40, 40))
+    image[20:] = 1.0
+    response = minimum_eigenvalue(structure_tensor(image, 1.0, 1.5))
+    np.testing.assert_allclose(response, 0.0, atol=1e-15)
+    image[:, :20] = 0.0
+    corner = minimum_eigenvalue(structure_tensor(image, 1.0, 1.5))
+    assert corner[20, 20] > 1e-3
+    assert corner[20, 20] > 10.0 * corner[20, 35]
+
+
+def test_smoothing_keeps_the_light_and_none_keeps_the_image() -> None:
+    image = np.zeros((31, 31))
+    image[15, 15] = 7.0
+    blurred = smoothed(image, 1.3)
+    np.testing.assert_allclose(blurred.sum(), 7.0, rtol=1e-12)
+    assert blurred[15, 15] < 1.0
+    np.testing.assert_array_equal(smoothed(image, 0.0), image)
