@@ -1,0 +1,118 @@
+"""The result of a fit: what it says of the stars, and whether it says a rate."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from flight.arrays import FloatArray
+from flight.vision.likelihood.agreement import disagreement, opinions
+from flight.vision.likelihood.chains import in_chains
+from flight.vision.likelihood.fitting import ExposedCamera, Fit
+from flight.vision.likelihood.matched_filter import FaintStars
+from flight.vision.likelihood.motion import paths, sensitivities
+from flight.vision.likelihood.normal_equations import ALONE, Evaluation
+from flight.vision.likelihood.result import MotionResult
+from flight.vision.likelihood.scene import Scene, path_lengths, window_times
+from flight.vision.likelihood.solution import shared_covariance
+from flight.vision.streak_rate import StreakStatus
+
+# Rounds of conjugate gradients for the covariance.
+_CONJUGATE = 12
+# Turn, growth, x and y among what is shared and a star's own.
+_GEOMETRY = np.array([0, 1, 2, 3, 4, 5, 7, 8])
+_LIGHT = 9
+# Share of the stars that may seem pieces of longer streaks by chance.
+_MOST_CHAINED = 0.45
+
+
+def with_stars(seen: MotionResult, camera: ExposedCamera, last: Fit) -> MotionResult:
+    """Return `seen` with the stars of the fit, their ends, and their covariances."""
+    settings, scene, joint = camera.settings, last.scene, last.solution.joint
+    n = len(scene.stars)
+    geometry = joint[:, _GEOMETRY[:, None], _GEOMETRY]
+    endpoints, covariances = np.empty((n, 2, 2)), np.empty((n, 2, 2, 2))
+    for end, times in enumerate(_times(camera, scene, scene.stars).T):
+        endpoints[:, end] = paths(camera.pinhole, scene.motion, scene.stars, times).position
+        change = sensitivities(camera.pinhole, scene.motion, scene.stars, times)
+        covariances[:, end] = change @ geometry @ change.swapaxes(1, 2)
+    significance = scene.light / np.sqrt(np.maximum(joint[:, _LIGHT, _LIGHT], 1e-30))
+    used = scene.trusted & (significance > settings.faint_sigmas)
+    length = path_lengths(camera.pinhole, scene.motion, scene.stars)
+    moments = (endpoints[:, 0], scene.stars, endpoints[:, 1])
+    spread = float(np.sqrt(np.median(np.trace(covariances[:, 0], axis1=1, axis2=2)))) if n else float("nan")
+    return replace(
+        seen,
+        length=float(np.median(length[used])) if used.any() else float("nan"),
+        endpoints=endpoints,
+        used=used,
+        stars=scene.stars,
+        star_covariance=joint[:, 7:9, 7:9],
+        endpoint_covariance=covariances,
+        directions=np.stack([camera.pinhole.unit_vectors(points) for points in moments], axis=1),
+        flux=scene.light,
+        significance=significance,
+        psf_sigma=scene.sigma,
+        misfit=_misfit(last.evaluation, significance),
+        rate_model=settings.rate_model,
+        residual=spread / camera.pinhole.focal_length,
+    )
+
+
+def with_rate(told: MotionResult, camera: ExposedCamera, last: Fit, faint: FaintStars) -> MotionResult:
+    """Return `told` with the rate, or with why there is none."""
+    settings, scene = camera.settings, last.scene
+    if told.used_count < settings.least_stars:
+        return replace(told, status=StreakStatus.TOO_FEW)
+    exact = shared_covariance(last.evaluation, camera.free, _CONJUGATE)
+    covariance = (last.solution.covariance if exact is None else exact)[:3, :3]
+    turn = scene.motion.turn
+    size = float(np.linalg.norm(turn))
+    deviation = float(np.sqrt(turn @ covariance @ turn)) / size
+    if told.length < settings.least_length or not size > settings.least_significance * deviation:
+        return replace(told, status=StreakStatus.TOO_SHORT)
+    if not last.settled or not told.misfit < settings.worst_misfit or _in_pieces(told, camera, scene, faint):
+        return replace(told, status=StreakStatus.FAILED)
+    growing = settings.rate_model == "accelerating"
+    said = opinions(last.evaluation, scene, camera.free)
+    spread = 1.0 if said is None else disagreement(said, told.used)
+    return replace(
+        told,
+        status=StreakStatus.AMBIGUOUS,
+        rate=turn / told.exposure,
+        # What the model does not explain makes it less certain; what fits too well, no more.
+        covariance=covariance * max(told.misfit, spread, 1.0) / told.exposure**2,
+        acceleration=scene.motion.growth / told.exposure**2 if growing else None,
+    )
+
+
+def with_faint(told: MotionResult, camera: ExposedCamera, scene: Scene, faint: FaintStars) -> MotionResult:
+    """Return `told` with the streaks that were only found along the motion."""
+    times = _times(camera, scene, faint.stars)
+    ends = [paths(camera.pinhole, scene.motion, faint.stars, time).position for time in times.T]
+    return replace(
+        told,
+        faint_endpoints=np.stack(ends, axis=1),
+        faint_flux=faint.light,
+        faint_significance=faint.significance,
+    )
+
+
+def _in_pieces(told: MotionResult, camera: ExposedCamera, scene: Scene, faint: FaintStars) -> bool:
+    """Tell whether the stars used look like pieces of longer streaks."""
+    stars = np.concatenate([scene.stars, faint.stars])
+    light = np.concatenate([scene.light, faint.light])
+    chained = in_chains(camera.pinhole, scene.motion, stars, light)[: len(scene.stars)][told.used]
+    return float(np.mean(chained)) > _MOST_CHAINED
+
+
+def _times(camera: ExposedCamera, scene: Scene, stars: FloatArray) -> FloatArray:
+    return window_times(camera.pinhole, scene.motion, camera.shutter, stars)
+
+
+def _misfit(evaluation: Evaluation, significance: FloatArray) -> float:
+    """Return the median chi-square per degree of freedom of the ten most significant stars."""
+    leading = np.argsort(-significance, kind="stable")[:10]
+    freedom = np.maximum(evaluation.pixels[leading] - ALONE - 1.0, 1.0)
+    return float(np.median(evaluation.chi2[leading] / freedom))

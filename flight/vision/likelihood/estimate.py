@@ -1,0 +1,133 @@
+"""The motion over one exposure from all pixels of all its streaks, from the frame to a covariance.
+
+Regions give a first guess, the brightest stars a first fit, the motion a matched filter for the faint; the
+joint fit of the bright with the faint accounted for gives the answer. Pure and deterministic, made for a
+worker process. One frame cannot tell omega from -omega; a prior (gyro, or the last estimate) decides.
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import replace
+
+import numpy as np
+
+from flight.arrays import FloatArray, Image
+from flight.errors import FlightError
+from flight.pinhole import Pinhole
+from flight.vision.background import FrameState, frame_state
+from flight.vision.likelihood.blobs import Blobs, find_blobs
+from flight.vision.likelihood.description import with_faint, with_rate, with_stars
+from flight.vision.likelihood.exposed_frame import expose_frame, saturation_count
+from flight.vision.likelihood.fitting import ExposedCamera, first_fit, last_fit, still_fit
+from flight.vision.likelihood.result import MotionResult
+from flight.vision.likelihood.settings import LikelihoodSettings
+from flight.vision.likelihood.shutter import Shutter
+from flight.vision.streak_rate import StreakStatus, direction_of_time
+
+_MOST_BLOBS = 48
+# Median length, px, of regions below which a frame without an agreed motion is one of stars at rest.
+_AT_REST = 4.0
+
+
+def estimate_motion(
+    pixels: Image,
+    pinhole: Pinhole,
+    exposure: float,
+    settings: LikelihoodSettings,
+    prior_rate: FloatArray | None = None,
+    prior_sigma: float = 0.0,
+    previous_checksum: int | None = None,
+) -> MotionResult:
+    """Return the rate over one exposure, with its covariance, and the stars of the frame `pixels`.
+
+    Args:
+        pixels: (rows, columns) of an unsigned integer type, as the camera gave them.
+        pinhole: the camera, of the same shape.
+        exposure: s.
+        settings: of the camera and the fit.
+        prior_rate: (3,) rad/s, camera frame: tells the direction of rotation; None when unknown.
+        prior_sigma: rad/s, standard deviation of each component of `prior_rate`.
+        previous_checksum: of the frame before: the same pixels again are a frozen camera.
+
+    Raises FlightError for a frame, exposure or prior that cannot be meant. What the scene does is told as a
+    status.
+    """
+    _refuse_nonsense(pixels, pinhole, exposure, prior_rate, prior_sigma)
+    checksum = zlib.crc32(pixels.tobytes())
+    saturation = settings.saturation if settings.saturation is not None else saturation_count(pixels)
+    state = frame_state(pixels, saturation, settings.saturated_fraction)
+    if state is not FrameState.USABLE:
+        return MotionResult(StreakStatus(state.value), checksum, exposure)
+    if checksum == previous_checksum:
+        return MotionResult(StreakStatus.FROZEN, checksum, exposure)
+    frame = expose_frame(pixels, saturation, settings.gain)
+    camera = ExposedCamera(frame, pinhole, _shutter(pinhole, exposure, settings), settings)
+    blobs = find_blobs(frame, settings.threshold_sigmas, _MOST_BLOBS)
+    seen = MotionResult(StreakStatus.FAILED, checksum, exposure, hot_pixels=frame.hot_pixels)
+    if len(blobs) < settings.least_stars:
+        return replace(seen, status=StreakStatus.TOO_FEW)
+    first = first_fit(camera, blobs)
+    if first is None:
+        return _without_rate(seen, camera, blobs)
+    last, faint = last_fit(camera, first)
+    if last is None:
+        return seen
+    told = with_faint(with_stars(seen, camera, last), camera, last.scene, faint)
+    result = with_rate(told, camera, last, faint)
+    return _in_time(result, prior_rate, prior_sigma, settings.sign_sigmas)
+
+
+def _shutter(pinhole: Pinhole, exposure: float, settings: LikelihoodSettings) -> Shutter:
+    return Shutter(settings.line_time / exposure, pinhole.centre[1])
+
+
+def _without_rate(seen: MotionResult, camera: ExposedCamera, blobs: Blobs) -> MotionResult:
+    """Return `seen` for a frame without an agreed motion: stars at rest, or a failure."""
+    length = float(np.median(blobs.length))
+    if length >= _AT_REST:
+        return replace(seen, status=StreakStatus.FAILED, length=length)
+    resting = still_fit(camera, blobs)
+    if resting is None:
+        return replace(seen, status=StreakStatus.TOO_SHORT, length=length)
+    return replace(with_stars(seen, camera, resting), status=StreakStatus.TOO_SHORT)
+
+
+def _in_time(
+    result: MotionResult, prior_rate: FloatArray | None, prior_sigma: float, sigmas: float
+) -> MotionResult:
+    """Return an ambiguous `result` in the direction of time that the prior tells, if it can."""
+    if result.rate is None or prior_rate is None:
+        return result
+    sign = direction_of_time(result.rate, np.asarray(prior_rate, dtype=float), prior_sigma, sigmas)
+    if sign == 0:
+        return result
+    if sign > 0:
+        return replace(result, status=StreakStatus.RATE)
+    return replace(
+        result,
+        status=StreakStatus.RATE,
+        rate=-result.rate,
+        endpoints=result.endpoints[:, ::-1],
+        endpoint_covariance=result.endpoint_covariance[:, ::-1],
+        directions=result.directions[:, ::-1],
+        faint_endpoints=result.faint_endpoints[:, ::-1],
+        # Backwards in time the rate changes sign, its change does not.
+    )
+
+
+def _refuse_nonsense(
+    pixels: Image, pinhole: Pinhole, exposure: float, prior_rate: FloatArray | None, prior_sigma: float
+) -> None:
+    """Raise FlightError for arguments that cannot be meant."""
+    expected = (pinhole.rows, pinhole.columns)
+    if pixels.shape != expected:
+        raise FlightError(f"frame of shape {pixels.shape}, the camera has {expected}: set the camera's size")
+    if not np.issubdtype(pixels.dtype, np.unsignedinteger):
+        raise FlightError(f"frame of {pixels.dtype}: give the unsigned integers that the camera gave")
+    if not (np.isfinite(exposure) and exposure > 0.0):
+        raise FlightError(f"exposure of {exposure} s: must be finite and positive")
+    if prior_rate is not None and not (np.shape(prior_rate) == (3,) and np.all(np.isfinite(prior_rate))):
+        raise FlightError(f"prior rate {prior_rate}: must be three finite values in rad/s, or None")
+    if not prior_sigma >= 0.0:
+        raise FlightError(f"prior sigma {prior_sigma} rad/s: must not be negative or NaN")

@@ -1,0 +1,55 @@
+"""The settings of the maximum-likelihood estimator; the defaults serve the demonstration's camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+RateModel = Literal["constant", "accelerating"]
+
+
+@dataclass(frozen=True, slots=True)
+class LikelihoodSettings:
+    """How a frame is turned into a motion.
+
+    Attributes:
+        gain: electrons a count.
+        saturation: counts at which a pixel clips; None takes the frame's highest count when several pixels
+            share it, else the top of the integer type.
+        saturated_fraction: of the pixels, from which the frame is called saturated.
+        psf_sigma: px, where the fit of the point spread starts.
+        rate_model: `constant`, or `accelerating`: the rate's change over the exposure is fitted too.
+        line_time: s from the start of one row's exposure to the next's (rolling shutter); 0 is global.
+        threshold_sigmas: of the 3 x 3 sum, for the first guess.
+        most_stars: the brightest are fitted, no more: they hold most of the information.
+        most_neighbours: faint stars on the bright ones' pixels that are fitted with them.
+        most_faint: so many more are found along the known motion and taken out of the others' windows.
+        faint_sigmas: significance from which a streak along the known motion is believed.
+        reach: widths of the point spread to either side of a path that are fitted.
+        clip: sigmas of a residual that is no noise.
+        least_stars: fewer fix no rate.
+        least_length: px, median path below which no rate is given.
+        least_significance: of the rate in its standard deviations, below which no rate is given.
+        worst_misfit: chi-square per degree of freedom above which the motion is not believed.
+        sign_sigmas: the prior's projection on the axis must exceed so many of its sigmas to decide the
+            direction of time.
+    """
+
+    gain: float = 1.0
+    saturation: float | None = None
+    saturated_fraction: float = 0.25
+    psf_sigma: float = 1.0
+    rate_model: RateModel = "constant"
+    line_time: float = 0.0
+    threshold_sigmas: float = 4.5
+    most_stars: int = 24
+    most_neighbours: int = 80
+    most_faint: int = 400
+    faint_sigmas: float = 6.0
+    reach: float = 4.0
+    clip: float = 5.0
+    least_stars: int = 3
+    least_length: float = 3.0
+    least_significance: float = 5.0
+    worst_misfit: float = 4.0
+    sign_sigmas: float = 3.0
