@@ -3,22 +3,25 @@
 What an indicator singles out is not yet an object: two stars whose streaks overlap, or a piece of a faint
 one, deviate as well (Table 4.4: "overlapping streak"). So the pixels are asked whether stars explain them.
 Regions with more than two corners, which the thesis throws away, may be stars or an object that crosses a
-star; bright points in a frame whose stars are streaks are tracked objects (Figure 4.5). All of it needs only
-the rotation of the camera, whichever estimator it is from.
+star; bright points in a frame whose stars are streaks are tracked objects (Figure 4.5). What is merged with
+stars, saturated or odd in any other way is searched once its stars are taken away (`flight.vision.merged`).
+All of it needs only the rotation of the camera, whichever estimator it is from.
 """
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
 
-from flight.arrays import BoolArray, FloatArray, Image
+from flight.arrays import BoolArray, FloatArray, Image, IntArray
 from flight.errors import FlightError
 from flight.pinhole import Pinhole
 from flight.vision.endpoints import chord_outward, extend
+from flight.vision.merged import brightest_left, cut_patch, fit_stars
 from flight.vision.rate_fit import fit_rotation
 from flight.vision.rso_indicators import INDICATORS, Indicators, evaluate, star_ends
 from flight.vision.segmentation import Regions, positions
@@ -37,6 +40,12 @@ from flight.vision.streaks import (
 _LEAST_CROSSING_PX = 10.0
 # Bright parts shorter than this are points.
 _LEAST_LINE_PX = 4.0
+# A streak with an indicator beyond so many standard deviations is looked at by its pixels, though none fired.
+_STRANGE = 5.0
+# A star's ends, fitted to its pixels, are nearer than this to where the rotation puts them, px.
+_FITTED_PX = 1.0
+# A region so far from the frame's border ends within.
+_BORDER_PX = 2
 
 
 class Verdict(Enum):
@@ -59,6 +68,9 @@ class ObjectSettings:
         psf_sigma: px, of the camera.
         most_streaks: how many regions are examined; the rate needs fewer.
         most_points: how many short regions are examined.
+        most_merged: how many regions are searched for an object among the light of their stars.
+        least_share: of a region's light that an object beside stars must have: with an error of the rotation
+            of 2 % the end of a bright star's streak sticks out by that much.
         most_corners: regions with more are left unclear.
         point_significance: least counts of a short region over the noise of its area.
         improvement: least gain in chi-square of an object over stars.
@@ -71,6 +83,8 @@ class ObjectSettings:
     psf_sigma: float = 1.0
     most_streaks: int = 80
     most_points: int = 20
+    most_merged: int = 12
+    least_share: float = 0.04
     most_corners: int = 6
     point_significance: float = 20.0
     improvement: float = 300.0
@@ -84,7 +98,7 @@ class SpaceObject:
 
     Attributes:
         endpoints: (2, 2) px, in the order of time for which the motion among the stars is the slower.
-        fired: names of the indicators that singled it out; none when it crosses a star.
+        fired: names of the indicators that singled it out; none when it was found by its pixels alone.
         flux: counts.
         improvement: of chi-square over stars.
         relative_rate: rad/s, its motion among the stars.
@@ -159,7 +173,7 @@ def examine(
     """Return the objects among segmented regions; the camera turns by `rotation` (3,) rad in `exposure` s."""
     judge = _Judge(segmented, rotation, pinhole, exposure, settings, objects)
     ends = extend(streaks.endpoints, chord_outward(streaks.endpoints), settings.endpoint_bias)
-    short, short_sigma = _short_regions(segmented, rotation, pinhole, settings, objects)
+    short, short_sigma, short_label = _short_regions(segmented, rotation, pinhole, settings, objects)
     indicators = evaluate(
         np.concatenate([ends, short]),
         np.concatenate([streaks.sigma, short_sigma]),
@@ -168,18 +182,25 @@ def examine(
         objects.bounds,
         objects.strict,
     )
+    labels = np.concatenate([segmented.candidates.label[streaks.candidate], short_label])
     found: list[SpaceObject] = []
-    verdicts = []
-    for streak, fired in zip(indicators.endpoints, indicators.fired, strict=True):
+    verdicts, crowded, settled, strange = [], [], [], []
+    each = zip(labels, indicators.endpoints, indicators.deviations, indicators.fired, strict=True)
+    for label, streak, deviation, fired in each:
         names = tuple(name for name, fires in zip(INDICATORS, fired, strict=True) if fires)
         verdict, candidate = judge.streak(streak, names)
         verdicts.append(verdict)
         found += [candidate] if candidate is not None else []
-    crowded = []
-    for _, corners in streaks.crowded:
+        if verdict is Verdict.OBJECT or np.abs(deviation).max() <= _STRANGE:
+            settled.append(label)
+        else:
+            strange.append(label)
+    for index, corners in streaks.crowded:
         verdict, candidate = judge.crowd(corners)
         crowded.append(verdict)
         found += [candidate] if candidate is not None else []
+        settled += [segmented.candidates.label[index]] if verdict is Verdict.OBJECT else []
+    found += judge.merged(np.array(settled, dtype=np.int64), np.array(strange, dtype=np.int64))
     found.sort(key=lambda candidate: -candidate.flux)
     return ObjectReport(indicators, tuple(verdicts), tuple(crowded), tuple(found), rotation)
 
@@ -230,7 +251,52 @@ class _Judge:
             return Verdict.OBJECT, self._candidate(ends, (), light, found)
         return self._stars_or_unclear(light), None
 
-    def _light(self, corners: FloatArray) -> StarLight:
+    def merged(self, settled: IntArray, strange: IntArray) -> list[SpaceObject]:
+        """Return the objects in the regions whose labels are not `settled`; the `strange` come first."""
+        regions = self.segmented.regions
+        noise = float(np.median(self.segmented.background.noise))
+        chosen = (
+            ~np.isin(regions.label, settled)
+            & (regions.flux >= self.objects.point_significance * noise * np.sqrt(regions.area))
+            & ~near_border(regions, self.segmented.signal.shape, _BORDER_PX)
+        )
+        indices = np.flatnonzero(chosen)
+        order = np.lexsort((-regions.flux[indices], ~np.isin(regions.label[indices], strange)))
+        tried = [self._merged(int(index)) for index in indices[order[: self.objects.most_merged]]]
+        return [found for found in tried if found is not None]
+
+    def _merged(self, index: int) -> SpaceObject | None:
+        """Return the object among the stars of region number `index`, None when there is none."""
+        patch = cut_patch(
+            self.segmented,
+            self.segmented.regions,
+            index,
+            self.objects.psf_sigma,
+            self.settings.gain,
+            self.settings.saturation or np.inf,
+        )
+        alone = self._left_as_object(brightest_left(patch, patch.signal), ())
+        if alone is not None:
+            return alone
+        stars, left = fit_stars(patch, self.rotation, self.pinhole)
+        beside = self._left_as_object(brightest_left(patch, left), stars)
+        enough = self.objects.least_share * float(self.segmented.regions.flux[index])
+        return beside if beside is not None and beside.flux >= enough else None
+
+    def _left_as_object(self, ends: FloatArray | None, stars: Sequence[FloatArray]) -> SpaceObject | None:
+        """Return what lies between `ends` (2, 2) px, beside stars on known paths, if it is an object."""
+        if ends is None or self._moves_like_a_star(ends, _FITTED_PX):
+            return None
+        try:
+            light = self._light(ends, stars)
+            found = light.explain(ends)
+        except FlightError:
+            return None
+        if not self._is_object(light, found, self.objects.crossing_improvement):
+            return None
+        return self._candidate(ends, (), light, found)
+
+    def _light(self, corners: FloatArray, known: Sequence[FloatArray] = ()) -> StarLight:
         return StarLight(
             self.segmented,
             corners,
@@ -239,6 +305,7 @@ class _Judge:
             self.objects.psf_sigma,
             self.settings.gain,
             self.settings.saturation or np.inf,
+            known,
         )
 
     def _is_object(self, light: StarLight, found: Explanation, improvement: float) -> bool:
@@ -252,11 +319,11 @@ class _Judge:
     def _stars_or_unclear(self, light: StarLight) -> Verdict:
         return Verdict.STARS if light.chi_square <= self.objects.worst_fit * light.pixels else Verdict.UNCLEAR
 
-    def _moves_like_a_star(self, ends: FloatArray) -> bool:
-        """Return whether the ends (2, 2) lie as a star's would, within two pixels."""
+    def _moves_like_a_star(self, ends: FloatArray, within: float = 2.0) -> bool:
+        """Return whether the ends (2, 2) lie as a star's would, `within` so many px."""
         star = self.pinhole.project(star_ends(self.pinhole.unit_vectors(ends[None]), self.rotation))[0]
         missed = min(np.abs(star - ends).max(), np.abs(star[::-1] - ends).max())
-        return bool(missed < 2.0)
+        return bool(missed < within)
 
     def _candidate(
         self, ends: FloatArray, fired: tuple[str, ...], light: StarLight, found: Explanation
@@ -286,10 +353,11 @@ def _short_regions(
     pinhole: Pinhole,
     settings: StreakSettings,
     objects: ObjectSettings,
-) -> tuple[FloatArray, FloatArray]:
-    """Return ends (n, 2, 2) and errors (n,) px of bright regions too short for corners, where stars are not.
+) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Return ends (n, 2, 2), errors (n,) px and labels (n,) of bright regions too short for corners.
 
-    The ends are those of the uniform line with the region's moments, a point's are one.
+    Only where stars are not short. The ends are those of the uniform line with the region's moments, a
+    point's are one.
     """
     regions = segmented.regions
     noise = float(np.median(segmented.background.noise))
@@ -306,7 +374,7 @@ def _short_regions(
     expected = pinhole.project(star_ends(pinhole.unit_vectors(ends), rotation))
     # Near the axis stars are points too.
     streaked: BoolArray = np.linalg.norm(expected[:, 1] - expected[:, 0], axis=-1) >= settings.least_length
-    return ends[streaked], sigma[streaked]
+    return ends[streaked], sigma[streaked], short.label[streaked]
 
 
 def _line_of(segmented: Segmented, regions: Regions, index: int) -> FloatArray:

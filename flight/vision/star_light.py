@@ -10,6 +10,7 @@ star's streak are the light of stars; what no star path covers, or what ends whe
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,8 +30,10 @@ _LONGEST_CHAIN = 5.0
 _STEP_PX = 1.0
 # Light farther than this from all paths says nothing about them: in sigmas of the point spread.
 _REACH = 3.0
+# A point's light ends here, in sigmas: 6e-7 of it lies beyond.
+_FARTHEST = 5.0
 # The shape of a bright streak is known to this part of its brightness: ends, point spread, evenness.
-_SHAPE_ERROR = 0.1
+SHAPE_ERROR = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,12 +69,13 @@ class StarLight:
         psf_sigma: float,
         gain: float,
         saturation: float,
+        known: Sequence[FloatArray] = (),
     ) -> None:
         """Take the pixels along all star paths and all lines between the `corners` (k, 2) px, k at least 2.
 
         Stars may start or stop at each corner and pass the corners' middle anywhere on their path. Pixels
-        within 5 % of `saturation` counts say nothing; `gain` is in e-/count. Raises FlightError when the
-        brightnesses cannot be solved for.
+        within 5 % of `saturation` counts say nothing; `gain` is in e-/count. Stars on `known` paths (m, 2) px
+        may have lit them as well. Raises FlightError when the brightnesses cannot be solved for.
         """
         stars = _star_paths(corners, rotation, pinhole)
         lines = [
@@ -84,10 +88,10 @@ class StarLight:
         noise = float(np.median(segmented.background.noise))
         light = np.maximum(signal, 0.0)
         clipped = signal + float(np.median(segmented.background.level)) >= 0.95 * saturation
-        error = np.sqrt(noise**2 + light / gain + (_SHAPE_ERROR * light) ** 2)
+        error = np.sqrt(noise**2 + light / gain + (SHAPE_ERROR * light) ** 2)
         self._weight = np.where(clipped, 0.0, 1.0 / error)
         self._target = signal * self._weight
-        self._stars = np.stack([self._weighted_image(path) for path in stars], axis=1)
+        self._stars = np.stack([self._weighted_image(path) for path in (*stars, *known)], axis=1)
         self.pixels = len(self._near)
         self._brightness, self.chi_square = _brightnesses(self._stars, self._target)
 
@@ -115,9 +119,7 @@ class StarLight:
     def _weighted_image(self, path: FloatArray) -> FloatArray:
         """Return the light (p,) over its error that one count along `path` (m, 2) gives to the pixels."""
         (left, top), (right, bottom) = self._near.min(axis=0), self._near.max(axis=0)
-        x = _within_pixels(left, right, path[:, 0], self._psf_sigma)
-        y = _within_pixels(top, bottom, path[:, 1], self._psf_sigma)
-        light = y @ x.T / len(path)
+        light = spread_over(path - (left, top), right - left + 1, bottom - top + 1, self._psf_sigma)
         return np.asarray(light[self._near[:, 1] - top, self._near[:, 0] - left] * self._weight)
 
 
@@ -197,17 +199,71 @@ def _steps(length: float) -> int:
 
 def _pixels_near(paths: list[FloatArray], reach: float, rows: int, columns: int) -> IntArray:
     """Return the pixels (p, 2), (x, y), within about `reach` px of any of the paths."""
-    points = np.unique(np.rint(np.concatenate(paths)), axis=0)
-    points = points[np.all(np.isfinite(points), axis=-1)].astype(np.int64)
+    points = np.rint(np.concatenate(paths))
     r = int(np.ceil(reach))
+    inside = np.all((points >= -r) & (points < (columns + r, rows + r)), axis=-1)
     x, y = np.meshgrid(np.arange(-r, r + 1), np.arange(-r, r + 1))
     disc = np.stack([x[x**2 + y**2 <= reach**2], y[x**2 + y**2 <= reach**2]], axis=-1)
-    near = np.unique((points[:, None] + disc).reshape(-1, 2), axis=0)
-    inside = np.all((near >= 0) & (near < (columns, rows)), axis=-1)
-    return np.asarray(near[inside])
+    points = points[inside].astype(np.int64)
+    # On a map of the frame's part, with room for what lies off the frame: no sorting.
+    first = points.min(axis=0, initial=columns + rows) - r
+    width, height = np.maximum(points.max(axis=0, initial=0) + r + 1 - first, 1)
+    marked = np.zeros((height, width), dtype=np.bool_)
+    for step in disc:
+        column, row = (points + step - first).T
+        marked[row, column] = True
+    row, column = np.nonzero(marked)
+    near = np.stack([column, row], axis=-1) + first
+    return np.asarray(near[np.all((near >= 0) & (near < (columns, rows)), axis=-1)])
 
 
-def _within_pixels(first: int, last: int, centres: FloatArray, sigma: float) -> FloatArray:
-    """Return the parts (pixels, m) of normal densities about `centres` (m,) that fall on each pixel."""
-    edges = np.arange(first, last + 2)[:, None] - 0.5
-    return np.diff(ndtr((edges - centres) / sigma), axis=0)
+def spread_over(path: FloatArray, columns: int, rows: int, sigma: float) -> FloatArray:
+    """Return one count spread evenly over `path` (m, 2) px and by a Gaussian, as (rows, columns) get it."""
+    x, y = _within_pixels(columns, path[:, 0], sigma), _within_pixels(rows, path[:, 1], sigma)
+    return np.asarray(y.T @ x / len(path))
+
+
+def spread_with_slopes(
+    path: FloatArray, shares: FloatArray, columns: int, rows: int, sigma: float
+) -> list[FloatArray]:
+    """Return what `spread_over` does, and its change with x and with y, 1/px, of what moves the path.
+
+    Each row of `shares` (k, m) is one thing that moves, and by how much of it each point does; two slopes of
+    each follow the light.
+    """
+    x, y = _within_pixels(columns, path[:, 0], sigma), _within_pixels(rows, path[:, 1], sigma)
+    dx, dy = _slopes_within(columns, path[:, 0], sigma), _slopes_within(rows, path[:, 1], sigma)
+    images = [y.T @ x]
+    for share in shares:
+        images += [y.T @ (share[:, None] * dx), dy.T @ (share[:, None] * x)]
+    return [image / len(path) for image in images]
+
+
+def _within_pixels(count: int, centres: FloatArray, sigma: float) -> FloatArray:
+    """Return the parts (m, count) of normal densities about `centres` (m,) that fall on each pixel."""
+    first, edges = _edges(centres, sigma)
+    return _placed(np.diff(ndtr(edges), axis=1), first, count)
+
+
+def _slopes_within(count: int, centres: FloatArray, sigma: float) -> FloatArray:
+    """Return how `_within_pixels` changes with the centres, 1/px."""
+    first, edges = _edges(centres, sigma)
+    density = np.exp(-0.5 * edges**2) / (np.sqrt(2.0 * np.pi) * sigma)
+    return _placed(-np.diff(density, axis=1), first, count)
+
+
+def _edges(centres: FloatArray, sigma: float) -> tuple[IntArray, FloatArray]:
+    """Return the first pixel (m,) near each centre, and the edges (m, k) of the pixels there, in sigmas."""
+    reach = int(np.ceil(_FARTHEST * sigma))
+    first = np.rint(centres).astype(np.int64) - reach
+    edges = first[:, None] + np.arange(2 * reach + 2) - 0.5
+    return first, (edges - centres[:, None]) / sigma
+
+
+def _placed(values: FloatArray, first: IntArray, count: int) -> FloatArray:
+    """Return `values` (m, k) of the pixels from `first` (m,) on as (m, count); what lies off is dropped."""
+    number, width = values.shape
+    start = np.clip(first, -width, count) + width
+    placed = np.zeros((number, count + 2 * width))
+    placed[np.arange(number)[:, None], start[:, None] + np.arange(width)] = values
+    return placed[:, width : width + count]

@@ -143,6 +143,30 @@ def test_an_object_that_crosses_a_star_is_found() -> None:
     assert found.fired == ()
 
 
+@pytest.mark.parametrize("along", [8.0, 25.0])
+@pytest.mark.parametrize("magnitude", [4.0, 6.0])
+def test_a_tracked_object_on_a_star_s_streak_is_found(along: float, magnitude: float) -> None:
+    """The region of the two is long, and saturated at magnitude 4."""
+    directions, magnitudes = star_field(_CAMERA, 5, _FAINTEST)
+    directions = np.concatenate([directions, _PLACE[None]])
+    image = expose(_CAMERA, directions, np.append(magnitudes, 5.0), _ROTATION, 1.0)
+    star = -np.cross(_ROTATION, _PLACE)[:2]
+    way = star / np.linalg.norm(star)
+    place = np.array([270.0, 230.0]) + along * way + 2.0 * np.array([-way[1], way[0]])
+    direction = _CAMERA.pinhole.unit_vectors(place[None])[0]
+    add_object(image, _CAMERA, object_path(_CAMERA, direction, _ROTATION, _ROTATION), magnitude, 1.0)
+    found = _only(_detect(read_out(_CAMERA, image, 1.0, np.random.default_rng(7)), _ROTATION))
+    np.testing.assert_allclose(found.endpoints, [place, place], atol=0.3)
+
+
+def test_a_bright_star_whose_core_is_saturated_is_no_object() -> None:
+    directions, magnitudes = star_field(_CAMERA, 5, _FAINTEST)
+    directions = np.concatenate([directions, _PLACE[None]])
+    image = expose(_CAMERA, directions, np.append(magnitudes, 0.5), _ROTATION, 1.0)
+    report = _detect(read_out(_CAMERA, image, 1.0, np.random.default_rng(7)), _ROTATION)
+    assert report.objects == ()
+
+
 def test_a_piece_of_a_faint_star_is_no_object() -> None:
     """At the limit of segmentation a streak falls into pieces; their light is a star's."""
     directions, magnitudes = star_field(_CAMERA, 5, 5.5)
