@@ -1,0 +1,12 @@
+"""All campaigns by name."""
+
+from __future__ import annotations
+
+from tests.campaigns.campaign import Campaign
+from tests.campaigns.rso import RSO_SLEW, RSO_TRACK
+from tests.campaigns.rso_orbits import RSO_ORBITS
+from tests.campaigns.streaks import STREAKS
+
+CAMPAIGNS: dict[str, Campaign] = {
+    campaign.name: campaign for campaign in (STREAKS, RSO_SLEW, RSO_TRACK, RSO_ORBITS)
+}
