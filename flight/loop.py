@@ -38,6 +38,7 @@ from flight.tasks.targets import TargetSequence
 from flight.telemetry.definitions import RUN
 from flight.telemetry.recorder import Recorder
 from flight.vision import job as vision_job
+from flight.vision.likelihood.settings import LikelihoodSettings
 from flight.vision.settings import StreakSettings
 from hal.interfaces.devices import FrameSource, InertialUnit, PowerMonitor, TorqueCoils
 from hal.interfaces.wires import Clock
@@ -287,10 +288,16 @@ def _imaging_settings(camera: Camera) -> ImagingSettings:
         exposure_ns=round(camera.exposure * SECOND_NS),
         max_age_ns=round(camera.max_age * SECOND_NS),
         mounting=np.array(camera.mounting),
-        streaks=_streak_settings(camera),
+        estimator=_estimator(camera),
     )
 
 
-def _streak_settings(camera: Camera) -> StreakSettings:
-    settings = StreakSettings(saturation=camera.saturation or float(2**camera.bits - 1), gain=camera.gain)
+def _estimator(camera: Camera) -> StreakSettings | LikelihoodSettings:
+    """Return the settings of the estimator that the configuration chose, for its camera."""
+    saturation = camera.saturation or float(2**camera.bits - 1)
+    if camera.estimator == "likelihood":
+        return LikelihoodSettings(
+            gain=camera.gain, saturation=saturation, psf_sigma=camera.psf_sigma, line_time=camera.line_time
+        )
+    settings = StreakSettings.of(camera.estimator, saturation=saturation, gain=camera.gain)
     return settings if camera.endpoint_bias is None else replace(settings, endpoint_bias=camera.endpoint_bias)

@@ -18,6 +18,7 @@ Q2 = Annotated[float, Meta(ge=-0.7, le=0.7)]
 Address = Annotated[int, Meta(ge=0x08, le=0x77)]
 Sign = Literal[-1, 1]
 Channel = Annotated[int, Meta(ge=0, le=15)]
+Estimator = Literal["likelihood", "harris", "minimum-eigenvalue", "trajkovic-4", "trajkovic-8"]
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
@@ -89,6 +90,8 @@ class Camera(Section, frozen=True, kw_only=True):
     read_noise: Positive = 10.0
     saturation: Positive | None = None
     psf_sigma: Positive = 1.0
+    line_time: NotNegative = 0.0
+    estimator: Estimator = "harris"
     endpoint_bias: float | None = None
     mounting: Quaternion = (0.0, 0.0, 0.0, 1.0)
     max_age: Positive = 12.0

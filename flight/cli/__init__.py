@@ -1,37 +1,40 @@
-"""The command line: one module a command; a mistake of the user's is one line and exit status 2."""
+"""The command line: one module a command; a mistake of the user's is one line and exit status 2.
+
+Only the module of the command that was typed is imported: a board that flies has no use for the others.
+"""
 
 from __future__ import annotations
 
 import argparse
+import importlib
 import sys
 from collections.abc import Sequence
 
 from flight import __version__
-from flight.cli import export, plan, report, run
 from flight.errors import FlightError, UsageError
 from hal.interfaces.errors import DeviceError
+
+COMMANDS = {
+    "run": "fly a configuration",
+    "report": "tell what a run achieved",
+    "export": "write a run's packets as CSV",
+    "plan": "plan a single path",
+    "rate": "body rate from a picture of streaked stars",
+}
 
 _EXAMPLES = """\
 examples:
   python -m flight run config/step_demo.yaml --out runs/demo
   python -m flight report runs/demo
   python -m flight plan --from 0.4 --to -0.3 --picture path.png
+  python -m flight rate frame.png --fov 20 --exposure 0.2 --overlay found.png
 """
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; return the exit status: 0 done, 1 ran and failed, 2 wrong use."""
-    parser = argparse.ArgumentParser(
-        prog="python -m flight",
-        description="The on-board application of the KnightCube.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("--version", action="version", version=f"knightcube-flight {__version__}")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for command in (run, report, export, plan):
-        command.add_to(commands)
-    options = parser.parse_args(arguments)
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    options = _parser(words).parse_args(words)
     try:
         status: int = options.command(options)
     except UsageError as error:
@@ -41,6 +44,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         return 1  # whoever read our output has read enough
     return status
+
+
+def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m flight",
+        description="The on-board application of the KnightCube.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"knightcube-flight {__version__}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    for name, purpose in COMMANDS.items():
+        command = commands.add_parser(name, help=purpose)
+        if words[:1] == [name]:
+            importlib.import_module(f"flight.cli.{name}").configure(command)
+    return parser
 
 
 def _complain(message: str, status: int) -> int:

@@ -11,12 +11,10 @@ from flight.telemetry.export import export as export_packets
 from flight.telemetry.reader import read_run
 
 
-def add_to(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command to the command line."""
-    parser = commands.add_parser(
-        "export",
-        help="write a run's packets as CSV",
-        description="Write one CSV file for each kind of packet; fields and units are in docs/telemetry.md.",
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Tell the parser what this command takes."""
+    parser.description = (
+        "Write one CSV file for each kind of packet; fields and units are in docs/telemetry.md."
     )
     parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the files (default RUN/csv)")

@@ -19,15 +19,13 @@ from flight.plant import SingleAxisPlant
 _DEFAULT_CONFIG = Path("config/step_demo.yaml")
 
 
-def add_to(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command to the command line."""
-    parser = commands.add_parser(
-        "plan",
-        help="plan a single path",
-        description="Plan the least-energy slew between two attitudes by virtual motion camouflage; print it "
-        "or draw it. A horizon that is too short is stretched to the shortest feasible one.",
-        epilog="example: python -m flight plan --from 0.4 --from-rate 0.015 --to -0.3 --picture path.png",
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Tell the parser what this command takes."""
+    parser.description = (
+        "Plan the least-energy slew between two attitudes by virtual motion camouflage; print it "
+        "or draw it. A horizon that is too short is stretched to the shortest feasible one."
     )
+    parser.epilog = "example: python -m flight plan --from 0.4 --from-rate 0.015 --to -0.3 --picture path.png"
     parser.add_argument(
         "--from", dest="start", type=_number, required=True, metavar="Q2", help="q2 at the start"
     )

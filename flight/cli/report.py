@@ -12,13 +12,11 @@ from flight.errors import UsageError
 from flight.telemetry.reader import read_run
 
 
-def add_to(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command to the command line."""
-    parser = commands.add_parser(
-        "report",
-        help="tell what a run achieved",
-        description="Print a run's performance against Table 5.3 of the thesis, and draw its figures. "
-        "Judged on the simulation's truth where there is one, on the estimate otherwise.",
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Tell the parser what this command takes."""
+    parser.description = (
+        "Print a run's performance against Table 5.3 of the thesis, and draw its figures. "
+        "Judged on the simulation's truth where there is one, on the estimate otherwise."
     )
     parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead, and draw nothing")

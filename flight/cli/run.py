@@ -14,14 +14,12 @@ from flight.loop import Progress
 from flight.telemetry.reader import read_run
 
 
-def add_to(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the command to the command line."""
-    parser = commands.add_parser(
-        "run",
-        help="fly a configuration",
-        description="Fly a configuration: on real devices, or on simulated ones where it has a simulation "
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Tell the parser what this command takes."""
+    parser.description = (
+        "Fly a configuration: on real devices, or on simulated ones where it has a simulation "
         "section. Simulated flights run as fast as they can; --realtime flies them on the machine's clock, "
-        "the devices in a process of their own. Ctrl-C ends a flight, coils at zero, log whole.",
+        "the devices in a process of their own. Ctrl-C ends a flight, coils at zero, log whole."
     )
     parser.add_argument("config", type=Path, metavar="CONFIG", help="YAML file, see config/step_demo.yaml")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the run (default runs/NAME-TIME)")

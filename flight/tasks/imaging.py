@@ -20,9 +20,10 @@ from flight.quaternion import attitude_matrix
 from flight.tasks.navigation import Navigation
 from flight.telemetry.definitions import STREAK
 from flight.telemetry.recorder import Recorder
-from flight.vision.job import StreakJob
+from flight.vision.job import Found, StreakJob
+from flight.vision.likelihood.settings import LikelihoodSettings
 from flight.vision.settings import StreakSettings
-from flight.vision.streak_rate import StreakResult, StreakStatus
+from flight.vision.streak_rate import StreakStatus
 from hal.interfaces.devices import FrameSource
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.readings import Frame
@@ -38,7 +39,7 @@ class ImagingSettings:
     exposure_ns: int
     max_age_ns: int
     mounting: FloatArray
-    streaks: StreakSettings
+    estimator: StreakSettings | LikelihoodSettings
 
 
 class Imaging:
@@ -110,7 +111,7 @@ class Imaging:
             self._events.tell(events.VISION_FAILED, now_ns, f"{result.outcome}: {result.error}")
             self._record(frame, StreakStatus.FAILED.value, None, now_ns, False)
             return
-        found: StreakResult = result.value
+        found: Found = result.value
         self._last_checksum = found.checksum
         if found.status is StreakStatus.FROZEN:
             self._events.tell(
@@ -136,13 +137,13 @@ class Imaging:
             frame.pixels,
             self._settings.pinhole,
             frame.exposure_ns * 1e-9,
-            self._settings.streaks,
+            self._settings.estimator,
             prior,
             sigma,
             self._last_checksum,
         )
 
-    def _use(self, frame: Frame, found: StreakResult, now_ns: int) -> bool:
+    def _use(self, frame: Frame, found: Found, now_ns: int) -> bool:
         """Give the mean rate about the thread over the exposure to navigation."""
         start_ns = frame.exposure_start_ns
         if self._navigation.past_rate(start_ns) is None:
@@ -158,16 +159,14 @@ class Imaging:
             self._events.tell(events.STREAK_REFUSED, now_ns, text)
         return accepted
 
-    def _in_body(self, found: StreakResult) -> tuple[FloatArray, FloatArray]:
+    def _in_body(self, found: Found) -> tuple[FloatArray, FloatArray]:
         """Return rate and covariance in body axes; NaN when there is none."""
         if found.rate is None or found.covariance is None:
             return np.full(3, np.nan), np.full((3, 3), np.nan)
         turn = self._body_to_camera.T
         return turn @ found.rate, turn @ found.covariance @ turn.T
 
-    def _record(
-        self, frame: Frame, status: str, found: StreakResult | None, now_ns: int, accepted: bool
-    ) -> None:
+    def _record(self, frame: Frame, status: str, found: Found | None, now_ns: int, accepted: bool) -> None:
         nan = np.full(3, np.nan), np.full((3, 3), np.nan)
         rate, c = self._in_body(found) if found is not None else nan
         self._recorder.record(
