@@ -49,6 +49,8 @@ class StreakSettings:
         least_streaks: fewer give no rate.
         axis_tolerance: px, error of an endpoint allowed in the search for the axis.
         outlier_sigmas: robust standard deviations from which a streak is dropped (RSO, overlap, fragment).
+        worst_residual: px, rms of an endpoint above which the streaks do not share one rotation: fragments
+            that agree by chance leave 1 to 4, stars 0.6 at most (frames of the campaign `streaks`).
         sign_sigmas: the prior's projection on the axis must exceed so many of its sigmas to decide the
             direction.
     """
@@ -78,6 +80,7 @@ class StreakSettings:
     least_streaks: int = 4
     axis_tolerance: float = 1.0
     outlier_sigmas: float = 4.0
+    worst_residual: float = 0.9
     sign_sigmas: float = 3.0
 
     @classmethod

@@ -136,7 +136,7 @@ def _rate(
     if len(streaks) < settings.least_streaks:
         return replace(seen, status=StreakStatus.TOO_FEW)
     fit = fit_rotation(streaks.endpoints, streaks.sigma, pinhole, settings)
-    if fit is None:
+    if fit is None or fit.residual * pinhole.focal_length > settings.worst_residual:
         return seen
     ends = fit.endpoints[fit.used]
     length = float(np.median(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=-1)))
