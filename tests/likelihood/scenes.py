@@ -77,14 +77,18 @@ def taken(
     camera: StarCameraModel = CAMERA,
     faintest: float = 8.5,
 ) -> Scene:
-    """Return a random field under turn + growth t; growth must be along the turn."""
+    """Return a random field under turn + growth t; growth must be along the turn.
+
+    With a rolling shutter the motion goes on for as long as rows are read.
+    """
     middle = quaternion.normalise(rng.standard_normal(4))
-    time = np.linspace(-0.5, 0.5, 41 if growth.any() else 3)
+    open_for = 1.0 + camera.rows * camera.line_time / exposure
+    time = open_for * np.linspace(-0.5, 0.5, 41 if growth.any() else 3)
     vectors = time[:, None] * turn + 0.5 * time[:, None] ** 2 * growth
     attitudes = quaternion.multiply(quaternion.from_rotation_vector(vectors), middle)
     stars = catalogue.load().brighter_than(faintest)
     directions = stars.directions_at(EPOCH)
-    pixels = render(camera, directions, stars.magnitude, (time + 0.5) * exposure, attitudes, rng)
+    pixels = render(camera, directions, stars.magnitude, (time - time[0]) * exposure, attitudes, rng)
     seen = directions @ quaternion.attitude_matrix(middle).T
     front = seen[:, 2] > 0.5
     places, magnitudes = camera.pinhole.project(seen[front]), stars.magnitude[front]

@@ -128,6 +128,22 @@ def test_a_rate_that_changes_misfits_the_constant_model_and_fits_the_acceleratin
     assert along == pytest.approx(0.3, abs=0.02)
 
 
+def test_a_rolling_shutter_is_part_of_the_model_and_spoils_the_rate_when_it_is_not() -> None:
+    """20 microseconds a line on streaks of 100 px in 0.2 s: lengths are off by a per cent."""
+    camera = replace(CAMERA, line_time=2e-5)
+    turn = turn_of(np.radians(90.0), 102.0, 0.2)
+    scene = taken(np.random.default_rng(21), turn, np.zeros(3), 0.2, camera)
+    rolling = _estimated(scene, replace(_SETTINGS, line_time=2e-5))
+    assert rolling.rate is not None
+    assert rolling.covariance is not None
+    assert _squared(rolling.rate - scene.rate, rolling.covariance) < 16.3
+    blind = _estimated(scene)
+    assert blind.rate is not None
+    size = np.linalg.norm(scene.rate)
+    assert abs(np.linalg.norm(rolling.rate) / size - 1.0) < 0.002
+    assert abs(np.linalg.norm(blind.rate) / size - 1.0) > 0.005
+
+
 def test_a_frame_of_noise_a_dead_and_a_frozen_one_are_told() -> None:
     noise = np.random.default_rng(19).normal(100.0, 10.0, (1024, 1024)).astype(np.uint16)
     found = estimate_motion(noise, CAMERA.pinhole, 1.0, _SETTINGS)

@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from flight.arrays import FloatArray
+from flight.arrays import BoolArray, FloatArray, IntArray
 from flight.vision.likelihood.agreement import disagreement, opinions
 from flight.vision.likelihood.chains import in_chains
+from flight.vision.likelihood.ends import true_ends
 from flight.vision.likelihood.fitting import ExposedCamera, Fit
 from flight.vision.likelihood.matched_filter import FaintStars
 from flight.vision.likelihood.motion import paths, sensitivities
@@ -25,20 +26,29 @@ _GEOMETRY = np.array([0, 1, 2, 3, 4, 5, 7, 8])
 _LIGHT = 9
 # Share of the stars that may seem pieces of longer streaks by chance.
 _MOST_CHAINED = 0.45
+# The last step, in standard deviations, from which a fit has not settled.
+_RESTLESS = 2.0
+# Share of the ends on the detector that must be where the motion puts them.
+_LEAST_TRUE_ENDS = 0.7
+# Two streaks so close, px, are one.
+_SAME = 1.5
 
 
 def with_stars(seen: MotionResult, camera: ExposedCamera, last: Fit) -> MotionResult:
     """Return `seen` with the stars of the fit, their ends, and their covariances."""
-    settings, scene, joint = camera.settings, last.scene, last.solution.joint
-    n = len(scene.stars)
+    settings, joint = camera.settings, last.solution.joint
+    significance = last.scene.light / np.sqrt(np.maximum(joint[:, _LIGHT, _LIGHT], 1e-30))
+    kept = np.flatnonzero(significance > settings.faint_sigmas)
+    kept = kept[_distinct(last.scene.stars[kept], last.scene.light[kept])]
+    scene, joint, significance = last.scene.select(kept), joint[kept], significance[kept]
+    n = len(kept)
     geometry = joint[:, _GEOMETRY[:, None], _GEOMETRY]
     endpoints, covariances = np.empty((n, 2, 2)), np.empty((n, 2, 2, 2))
     for end, times in enumerate(_times(camera, scene, scene.stars).T):
         endpoints[:, end] = paths(camera.pinhole, scene.motion, scene.stars, times).position
         change = sensitivities(camera.pinhole, scene.motion, scene.stars, times)
         covariances[:, end] = change @ geometry @ change.swapaxes(1, 2)
-    significance = scene.light / np.sqrt(np.maximum(joint[:, _LIGHT, _LIGHT], 1e-30))
-    used = scene.trusted & (significance > settings.faint_sigmas)
+    used = scene.trusted
     length = path_lengths(camera.pinhole, scene.motion, scene.stars)
     moments = (endpoints[:, 0], scene.stars, endpoints[:, 1])
     spread = float(np.sqrt(np.median(np.trace(covariances[:, 0], axis1=1, axis2=2)))) if n else float("nan")
@@ -54,7 +64,7 @@ def with_stars(seen: MotionResult, camera: ExposedCamera, last: Fit) -> MotionRe
         flux=scene.light,
         significance=significance,
         psf_sigma=scene.sigma,
-        misfit=_misfit(last.evaluation, significance),
+        misfit=_misfit(last.evaluation, kept, significance),
         rate_model=settings.rate_model,
         residual=spread / camera.pinhole.focal_length,
     )
@@ -72,17 +82,22 @@ def with_rate(told: MotionResult, camera: ExposedCamera, last: Fit, faint: Faint
     deviation = float(np.sqrt(turn @ covariance @ turn)) / size
     if told.length < settings.least_length or not size > settings.least_significance * deviation:
         return replace(told, status=StreakStatus.TOO_SHORT)
-    if not last.settled or not told.misfit < settings.worst_misfit or _in_pieces(told, camera, scene, faint):
+    if (
+        last.restless > _RESTLESS
+        or not told.misfit < settings.worst_misfit
+        or _in_pieces(camera, scene, faint)
+    ):
         return replace(told, status=StreakStatus.FAILED)
     growing = settings.rate_model == "accelerating"
     said = opinions(last.evaluation, scene, camera.free)
-    spread = 1.0 if said is None else disagreement(said, told.used)
+    spread = 1.0 if said is None else disagreement(said, scene.trusted)
     return replace(
         told,
         status=StreakStatus.AMBIGUOUS,
         rate=turn / told.exposure,
-        # What the model does not explain makes it less certain; what fits too well, no more.
-        covariance=covariance * max(told.misfit, spread, 1.0) / told.exposure**2,
+        # What the model does not explain makes it less certain; what fits too well, no more. A fit that goes
+        # to and fro, as pixels are left out and taken in, is known no better than that.
+        covariance=covariance * max(told.misfit, spread, 1.0) * (1.0 + last.restless**2) / told.exposure**2,
         acceleration=scene.motion.growth / told.exposure**2 if growing else None,
     )
 
@@ -99,20 +114,33 @@ def with_faint(told: MotionResult, camera: ExposedCamera, scene: Scene, faint: F
     )
 
 
-def _in_pieces(told: MotionResult, camera: ExposedCamera, scene: Scene, faint: FaintStars) -> bool:
-    """Tell whether the stars used look like pieces of longer streaks."""
+def _in_pieces(camera: ExposedCamera, scene: Scene, faint: FaintStars) -> bool:
+    """Tell whether the stars that decide are pieces of longer streaks, or longer than what is seen."""
     stars = np.concatenate([scene.stars, faint.stars])
     light = np.concatenate([scene.light, faint.light])
-    chained = in_chains(camera.pinhole, scene.motion, stars, light)[: len(scene.stars)][told.used]
-    return float(np.mean(chained)) > _MOST_CHAINED
+    chained = in_chains(camera.pinhole, scene.motion, stars, light)[: len(scene.stars)]
+    if float(np.mean(chained[scene.trusted])) > _MOST_CHAINED:
+        return True
+    deciding = scene.select(scene.trusted)
+    times = _times(camera, deciding, deciding.stars)
+    ends = true_ends(camera.frame, camera.pinhole, scene.motion, deciding.stars, deciding.light, times)
+    return len(ends) > 0 and float(np.mean(ends)) < _LEAST_TRUE_ENDS
 
 
 def _times(camera: ExposedCamera, scene: Scene, stars: FloatArray) -> FloatArray:
     return window_times(camera.pinhole, scene.motion, camera.shutter, stars)
 
 
-def _misfit(evaluation: Evaluation, significance: FloatArray) -> float:
+def _distinct(stars: FloatArray, light: FloatArray) -> BoolArray:
+    """Tell which stars (n, 2) have no brighter one in the same place: a fit may move one into another."""
+    near = np.linalg.norm(stars[:, None] - stars, axis=2) < _SAME
+    return np.asarray(~(near & (light > light[:, None])).any(axis=1))
+
+
+def _misfit(evaluation: Evaluation, kept: IntArray, significance: FloatArray) -> float:
     """Return the median chi-square per degree of freedom of the ten most significant stars."""
-    leading = np.argsort(-significance, kind="stable")[:10]
+    leading = kept[np.argsort(-significance, kind="stable")[:10]]
+    if not len(leading):
+        return float("nan")
     freedom = np.maximum(evaluation.pixels[leading] - ALONE - 1.0, 1.0)
     return float(np.median(evaluation.chi2[leading] / freedom))

@@ -10,12 +10,13 @@ from flight.arrays import BoolArray
 from flight.pinhole import Pinhole
 from flight.vision.likelihood.agreement import Opinions, agreeing, opinions
 from flight.vision.likelihood.blobs import Blobs
+from flight.vision.likelihood.ends import true_ends
 from flight.vision.likelihood.exposed_frame import ExposedFrame
 from flight.vision.likelihood.first_guess import guess_motions
 from flight.vision.likelihood.matched_filter import FaintStars, close_by, find_faint
 from flight.vision.likelihood.motion import Motion, paths
 from flight.vision.likelihood.normal_equations import ALONE, Evaluation, evaluate, light_of
-from flight.vision.likelihood.scene import Scene, path_lengths
+from flight.vision.likelihood.scene import Scene, path_lengths, window_times
 from flight.vision.likelihood.settings import LikelihoodSettings
 from flight.vision.likelihood.shutter import Shutter
 from flight.vision.likelihood.solution import Solution, moved, solve
@@ -32,10 +33,18 @@ _FIRST_TOLERANCE = 0.1
 _LAST_TOLERANCE = 0.003
 # Converged: no shared parameter moves by more than this part of its standard deviation.
 _SETTLED = 0.2
-# A hypothesis with so many stars, half of which fit so well (chi-square a pixel), needs no rival.
-_GOOD_MISFIT = 3.0
+# A hypothesis with so many stars, this part of which it explains, needs no rival.
 _MANY = 5
+_MOST = 0.6
 _WORST_FIRST = 12.0
+# A star is explained when no more than this part of its light is left; none counts more than so many sigmas.
+_LEFT_OVER = 0.01
+_ENOUGH = 200.0
+# Regions longer than a hypothesis allows speak against it, but may be two streaks in one.
+_CONTRADICTION = 0.6
+_CALM = 2.0
+# Ends in place of a hypothesis of the wrong turn: it may have one of the two of each streak.
+_BY_CHANCE = 0.4
 _WIDEST = 6.0
 _CONJUGATE = 12
 # A star is trusted within so many deviations; ends (px) and width (px) are never modelled better than this.
@@ -73,12 +82,16 @@ class ExposedCamera:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """A scene after its last step, with the equations of the step before it, and whether it has settled."""
+    """A scene after its last step, with the equations of that step.
+
+    Attributes:
+        restless: the last step of what is shared, in standard deviations; 0 when it was as good as none.
+    """
 
     scene: Scene
     solution: Solution
     evaluation: Evaluation
-    settled: bool
+    restless: float
 
 
 def first_fit(camera: ExposedCamera, blobs: Blobs) -> Scene | None:
@@ -94,10 +107,12 @@ def first_fit(camera: ExposedCamera, blobs: Blobs) -> Scene | None:
         done = _iterate(camera, scene, free, _FIRST_ROUNDS, 0.0, _FIRST_TOLERANCE)
         if done is None:
             continue
-        explained = _explained(done) * (1.0 - guess.contradicted) ** 2
+        evidence, share = _borne_out(done)
+        ends = _ending(camera, done.scene)
+        explained = evidence * (1.0 - _CONTRADICTION * guess.contradicted) * max(ends - _BY_CHANCE, 0.02)
         if best is None or explained > best[0]:
             best = explained, done
-        if done.settled and _misfit(done.evaluation) < _GOOD_MISFIT and count >= _MANY:
+        if done.restless <= _SETTLED and min(share, ends) > _MOST and count >= _MANY:
             break
     if best is None or _misfit(best[1].evaluation) > _WORST_FIRST:
         return None
@@ -115,10 +130,24 @@ def still_fit(camera: ExposedCamera, blobs: Blobs) -> Fit | None:
     return _iterate(camera, scene, free, _FIRST_ROUNDS, camera.settings.clip, _LAST_TOLERANCE)
 
 
-def _explained(done: Fit) -> float:
-    """Return how much more of the frame's light a fit explains, in chi-square, than it leaves over."""
+def _ending(camera: ExposedCamera, scene: Scene) -> float:
+    """Return what part of the streaks' ends is seen where it should be; 1 when none can be told."""
+    times = window_times(camera.pinhole, scene.motion, camera.shutter, scene.stars)
+    ends = true_ends(camera.frame, camera.pinhole, scene.motion, scene.stars, scene.light, times)
+    return float(np.mean(ends)) if len(ends) else 1.0
+
+
+def _borne_out(done: Fit) -> tuple[float, float]:
+    """Return how much light a fit explains, in sigmas squared, and what part of the stars.
+
+    A turn of the wrong size leaves an end of each streak over, or makes one of nothing: a good part of its
+    light. No single star outweighs the rest.
+    """
     light = done.scene.light**2 / np.maximum(done.solution.joint[:, 9, 9], 1e-30)
-    return float(np.sum(light) - np.sum(np.maximum(done.evaluation.chi2 - done.evaluation.pixels, 0.0)))
+    left = done.evaluation.chi2 - done.evaluation.pixels
+    good = left < _LEFT_OVER * light + done.evaluation.pixels
+    calm = 1.0 if done.restless < _CALM else 0.3
+    return calm * float(np.sum(np.minimum(light, _ENOUGH**2)[good])), float(np.mean(good))
 
 
 def _iterate(
@@ -133,7 +162,7 @@ def _iterate(
     """Return the fit after at most `rounds` steps, None when the stars do not fix the motion."""
     windows = camera.windows(scene)
     cut_at = scene
-    settled = False
+    restless = np.inf
     solution, evaluation = None, None
     for _ in range(rounds):
         evaluation = camera.evaluate(scene, windows, clip)
@@ -146,14 +175,14 @@ def _iterate(
         if float(np.linalg.norm(scene.motion.turn)) > np.pi:
             return None
         deviation = np.sqrt(np.diag(solution.covariance)[free])
-        settled = bool(np.all(np.abs(solution.shared[free]) <= _SETTLED * deviation)) or wanted < tolerance
-        if settled:
+        restless = float(np.max(np.abs(solution.shared[free]) / deviation)) if wanted > tolerance else 0.0
+        if restless <= _SETTLED:
             break
         if _drifted(camera, cut_at, scene):
             windows, cut_at = camera.windows(scene), scene
     if solution is None or evaluation is None:
         return None
-    return Fit(scene, solution, evaluation, settled)
+    return Fit(scene, solution, evaluation, restless)
 
 
 def _drifted(camera: ExposedCamera, before: Scene, after: Scene) -> bool:
