@@ -19,7 +19,6 @@ Address = Annotated[int, Meta(ge=0x08, le=0x77)]
 Sign = Literal[-1, 1]
 Channel = Annotated[int, Meta(ge=0, le=15)]
 Estimator = Literal["likelihood", "harris", "minimum-eigenvalue", "trajkovic-4", "trajkovic-8"]
-Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
 

@@ -32,6 +32,8 @@ from sim_hal.world.coil_circuit import CoilCircuit
 from sim_hal.world.simulation import TimedSimulation
 from sim_hal.world.testbed import Testbed, TestbedModel
 
+_LINE_STREAM = 0x11E
+
 BUS_VOLTAGE = 5.0
 """V in the coils' supply, before the losses of the bridge [ch. 5: a 5 V power bus]."""
 
@@ -138,6 +140,11 @@ def assemble(
         devices.append(truth)
     simulation = TimedSimulation(world.advance_to, devices)
     return Hardware(simulation, world, unit, bus, pwm, monitor, circuit, camera, truth, faults)
+
+
+def line_generator(seed: int) -> np.random.Generator:
+    """Return the draws of the serial line's faults, apart from all others of the same seed."""
+    return np.random.default_rng([seed, _LINE_STREAM])
 
 
 def camera_model(camera: Camera, sky: Sky) -> StarCameraModel:

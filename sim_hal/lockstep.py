@@ -8,19 +8,14 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-import numpy as np
-
 from flight.settings import Config
 from flight.telemetry.log import FlightLog
 from hal.interfaces.wires import Wires
-from sim_hal.assembly import Hardware, assemble
+from sim_hal.assembly import Hardware, assemble, line_generator
 from sim_hal.clock import SimClock
 from sim_hal.emulators.serial_line import SerialLine
 from sim_hal.settings import Simulation
 from sim_hal.truth import TruthRecorder
-
-_LINE_STREAM = 0x11E
-"""Sets the line's faults apart from all other draws of the same seed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,8 +36,7 @@ def utc_ns(label: str) -> int:
 
 def build(config: Config, section: Simulation, truth: TruthRecorder | None, clock: SimClock) -> LockStep:
     """Put the simulated hardware on a clock."""
-    generator = np.random.default_rng([section.seed, _LINE_STREAM])
-    line = SerialLine(clock.now_ns, config.inertial_unit.baud_rate, generator)
+    line = SerialLine(clock.now_ns, config.inertial_unit.baud_rate, line_generator(section.seed))
     hardware = assemble(config, section, clock.now_ns, line.device, truth)
     clock.attach(hardware.simulation)
     wires = Wires(line.host, hardware.bus, hardware.camera)

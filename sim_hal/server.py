@@ -22,7 +22,6 @@ from types import FrameType
 from typing import Any
 
 import msgspec
-import numpy as np
 
 from flight.arrays import FloatArray, Image
 from flight.settings import Camera, Config
@@ -30,7 +29,7 @@ from flight.telemetry.log import FlightLog
 from hal.buses.clock import SystemClock
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.readings import Frame
-from sim_hal.assembly import Hardware, StarRenderer, assemble
+from sim_hal.assembly import Hardware, StarRenderer, assemble, line_generator
 from sim_hal.emulators.pty_line import PtyLine
 from sim_hal.settings import Simulation, Sky
 from sim_hal.truth import TruthRecorder
@@ -100,8 +99,7 @@ class DeviceServer:
         self._stopped = False
         self._log = FlightLog(folder, "truth", clock=self._clock)
         self._pool = _renderer_pool(config, section)
-        line_generator = np.random.default_rng([section.seed, 0x11E])
-        self._pty = PtyLine(config.inertial_unit.baud_rate, line_generator)
+        self._pty = PtyLine(config.inertial_unit.baud_rate, line_generator(section.seed))
         self.hardware: Hardware = assemble(
             config, section, self._clock.now_ns, self._pty, TruthRecorder(self._log), self._expose
         )

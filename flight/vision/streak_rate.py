@@ -103,7 +103,7 @@ def estimate_rate(
     Raises FlightError for a frame, exposure or prior that cannot be meant. What the scene does is told as a
     status.
     """
-    _refuse_nonsense(pixels, pinhole, exposure, prior_rate, prior_sigma)
+    refuse_nonsense(pixels, pinhole, exposure, prior_rate, prior_sigma)
     checksum = zlib.crc32(pixels.tobytes())
     state = frame_state(pixels, saturation_level(pixels, settings.saturation), settings.saturated_fraction)
     if state is not FrameState.USABLE:
@@ -186,7 +186,7 @@ def _typical_length(regions: Regions, settings: StreakSettings) -> float:
     return float(np.median(regions.length[brightest]))
 
 
-def _refuse_nonsense(
+def refuse_nonsense(
     pixels: Image, pinhole: Pinhole, exposure: float, prior_rate: FloatArray | None, prior_sigma: float
 ) -> None:
     """Raise FlightError for arguments that cannot be meant."""

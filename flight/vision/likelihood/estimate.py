@@ -13,7 +13,6 @@ from dataclasses import replace
 import numpy as np
 
 from flight.arrays import FloatArray, Image
-from flight.errors import FlightError
 from flight.pinhole import Pinhole
 from flight.vision.background import FrameState, frame_state
 from flight.vision.likelihood.blobs import Blobs, find_blobs
@@ -23,7 +22,7 @@ from flight.vision.likelihood.fitting import ExposedCamera, first_fit, last_fit,
 from flight.vision.likelihood.result import MotionResult
 from flight.vision.likelihood.settings import LikelihoodSettings
 from flight.vision.likelihood.shutter import Shutter
-from flight.vision.streak_rate import StreakStatus, direction_of_time
+from flight.vision.streak_rate import StreakStatus, direction_of_time, refuse_nonsense
 
 _MOST_BLOBS = 48
 # Median length, px, of regions below which a frame without an agreed motion is one of stars at rest.
@@ -53,7 +52,7 @@ def estimate_motion(
     Raises FlightError for a frame, exposure or prior that cannot be meant. What the scene does is told as a
     status.
     """
-    _refuse_nonsense(pixels, pinhole, exposure, prior_rate, prior_sigma)
+    refuse_nonsense(pixels, pinhole, exposure, prior_rate, prior_sigma)
     checksum = zlib.crc32(pixels.tobytes())
     saturation = settings.saturation if settings.saturation is not None else saturation_count(pixels)
     state = frame_state(pixels, saturation, settings.saturated_fraction)
@@ -114,20 +113,3 @@ def _in_time(
         faint_endpoints=result.faint_endpoints[:, ::-1],
         # Backwards in time the rate changes sign, its change does not.
     )
-
-
-def _refuse_nonsense(
-    pixels: Image, pinhole: Pinhole, exposure: float, prior_rate: FloatArray | None, prior_sigma: float
-) -> None:
-    """Raise FlightError for arguments that cannot be meant."""
-    expected = (pinhole.rows, pinhole.columns)
-    if pixels.shape != expected:
-        raise FlightError(f"frame of shape {pixels.shape}, the camera has {expected}: set the camera's size")
-    if not np.issubdtype(pixels.dtype, np.unsignedinteger):
-        raise FlightError(f"frame of {pixels.dtype}: give the unsigned integers that the camera gave")
-    if not (np.isfinite(exposure) and exposure > 0.0):
-        raise FlightError(f"exposure of {exposure} s: must be finite and positive")
-    if prior_rate is not None and not (np.shape(prior_rate) == (3,) and np.all(np.isfinite(prior_rate))):
-        raise FlightError(f"prior rate {prior_rate}: must be three finite values in rad/s, or None")
-    if not prior_sigma >= 0.0:
-        raise FlightError(f"prior sigma {prior_sigma} rad/s: must not be negative or NaN")
