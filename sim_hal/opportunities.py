@@ -16,12 +16,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from flight import quaternion
+from flight import quaternion, sun
 from flight.arrays import BoolArray, FloatArray
 from flight.pinhole import Pinhole
 from hal.interfaces.errors import OutOfRange
 from sim_hal.rso import ResidentSpaceObject, directions
-from sim_hal.world import sun
 from sim_hal.world.exclusion import (
     boresights,
     earth_in_field,

@@ -18,10 +18,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flight import sun
 from flight.arrays import FloatArray
 from hal.interfaces.errors import OutOfRange
 from sim_hal.star_camera import SourceTrack
-from sim_hal.world import sun
 from sim_hal.world.exclusion import hidden_by_earth
 from sim_hal.world.orbit import Orbit
 from sim_hal.world.shadow import Shadow, sunlit_share

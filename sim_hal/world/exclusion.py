@@ -12,8 +12,8 @@ import numpy as np
 from flight import quaternion
 from flight.arrays import BoolArray, FloatArray
 from flight.pinhole import Pinhole
+from flight.sun import SUN_RADIUS
 from sim_hal.world.orbit import EARTH_RADIUS
-from sim_hal.world.sun import SUN_RADIUS
 
 
 def boresights(attitudes: FloatArray, mounting: FloatArray = quaternion.IDENTITY) -> FloatArray:

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from flight import quaternion
+from flight import quaternion, sun
 from flight.arrays import FloatArray
 from hal.interfaces.errors import OutOfRange
 from sim_hal.opportunities import (
@@ -22,7 +22,6 @@ from sim_hal.opportunities import (
 )
 from sim_hal.rso import TRACK_ERROR, ResidentSpaceObject, directions, source_tracks
 from sim_hal.star_camera import StarCameraModel, expected_electrons
-from sim_hal.world import sun
 from sim_hal.world.orbit import EARTH_RADIUS, KeplerianElements, propagate
 from sim_hal.world.shadow import sunlit_share
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sim_hal.world import sun
+from flight import sun
 
 ARCSECOND = np.radians(1.0 / 3600.0)
 OBLIQUITY = np.radians(23.4393)

@@ -39,3 +39,13 @@ def position(julian_date: npt.ArrayLike) -> FloatArray:
     across = np.sin(longitude)
     unit = np.stack([np.cos(longitude), np.cos(obliquity) * across, np.sin(obliquity) * across], axis=-1)
     return np.asarray(ASTRONOMICAL_UNIT * distance[..., None] * unit)
+
+
+def earth_velocity(julian_date: float) -> FloatArray:
+    """Return the Earth's velocity about the Sun (3,), ICRS, in m/s, at a Julian date TT.
+
+    The slope of `position` over a day, turned round: to 0.1 % of the speed. What it leaves out, the Sun's own
+    motion about the barycentre (13 m/s) and a satellite's about the Earth (7.6 km/s), is the user's to add.
+    """
+    before, after = position(np.array([julian_date - 0.5, julian_date + 0.5]))
+    return np.asarray((before - after) / DAY)
