@@ -1,0 +1,27 @@
+"""Stars in a frame: points with honest errors, from a camera of any kind.
+
+    found = detect(pixels, DetectionSettings()).stars()
+    found.points, found.covariance, found.flux        # brightest first
+
+`sky` measures the background and finds what stands above it, `areas` puts that together, `peaks` chooses
+what is worth a measurement, `first_look` tells the frame's own point spread and noise (`noise_model`), and
+`measurement` fits each star with them (`psf_fit`, `blending`) or takes the centre of mass
+(`window_centroid`); `detect` composes. `nearby` measures about predicted places only. `frame_kind`
+says whether the frame is one of points or of streaks, which are `flight.vision`'s.
+"""
+
+from flight.startracker.detection.detect import detect, kind_of_frame
+from flight.startracker.detection.detections import Detections, FrameKind, FrameShape, Quality
+from flight.startracker.detection.nearby import measure_near
+from flight.startracker.detection.settings import DetectionSettings
+
+__all__ = [
+    "DetectionSettings",
+    "Detections",
+    "FrameKind",
+    "FrameShape",
+    "Quality",
+    "detect",
+    "kind_of_frame",
+    "measure_near",
+]
