@@ -119,13 +119,43 @@ def test_a_gradient_and_eight_bits_are_no_obstacle() -> None:
 def test_a_rate_that_changes_misfits_the_constant_model_and_fits_the_accelerating_one() -> None:
     turn = turn_of(np.radians(90.0), 102.0, 0.7)
     scene = taken(np.random.default_rng(18), turn, 0.3 * turn, 0.5)
-    constant = _estimated(scene)
+    constant = _estimated(scene, replace(_SETTINGS, rate_model="constant"))
     accelerating = _estimated(scene, replace(_SETTINGS, rate_model="accelerating"))
     assert accelerating.misfit < 1.2
     assert constant.misfit > 1.3 * accelerating.misfit
     assert accelerating.acceleration is not None
     along = accelerating.acceleration @ turn / np.linalg.norm(turn) * 0.5**2 / np.linalg.norm(turn)
     assert along == pytest.approx(0.3, abs=0.02)
+
+
+@pytest.mark.parametrize("growth", [0.0, 0.1])
+def test_the_pixels_decide_whether_the_rate_changes(growth: float) -> None:
+    """Left to choose, the fit takes the model that the frame was taken under; its covariance is honest."""
+    turn = turn_of(np.radians(60.0), 102.0, 0.4)
+    scene = taken(np.random.default_rng(24), turn, growth * turn, 0.2)
+    found = _estimated(scene)
+    assert found.rate_model == ("accelerating" if growth else "constant")
+    assert (found.acceleration is None) is (growth == 0.0)
+    assert found.rate is not None
+    assert found.covariance is not None
+    assert _squared(found.rate - scene.rate, found.covariance) < 16.3
+
+
+def test_a_rate_that_doubles_within_the_exposure_is_beyond_the_model_and_refused() -> None:
+    turn = turn_of(np.radians(60.0), 50.0, 0.4)
+    found = _estimated(taken(np.random.default_rng(25), turn, 1.0 * turn, 0.2))
+    assert found.rate is None
+
+
+def test_streaks_of_half_the_field_are_fitted_though_few_are_whole() -> None:
+    """The turn is found by a scan along the circles about the axis, where the regions' lengths mislead."""
+    scene = real_sky(26, np.radians(75.0), 512.0, 0.2)
+    found = _estimated(scene)
+    assert found.rate is not None
+    assert found.covariance is not None
+    error = found.rate - scene.rate
+    assert _squared(error, found.covariance) < 16.3
+    assert _squared(error, scene.bound().covariance) < 9.0 * 3.0
 
 
 def test_a_rolling_shutter_is_part_of_the_model_and_spoils_the_rate_when_it_is_not() -> None:

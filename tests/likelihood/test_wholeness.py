@@ -37,7 +37,7 @@ def test_ends_are_true_under_the_true_turn_only(factor: float) -> None:
 def test_pieces_of_streaks_form_chains_and_whole_ones_do_not() -> None:
     scene = real_sky(32, np.radians(45.0), 120.0, 0.2, faintest=5.5)
     frame = expose_frame(scene.pixels, SATURATION, 1.0)
-    nothing = np.zeros(frame.signal.size, dtype=np.float32)
+    nothing = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.float32)
     turn = scene.rate * scene.exposure
     whole, pieces = (
         find_faint(frame, nothing, CAMERA.pinhole, Motion.steady(part * turn), 8.0, 200)

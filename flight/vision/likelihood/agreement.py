@@ -16,6 +16,9 @@ from flight.vision.likelihood.normal_equations import SHARED, Evaluation
 from flight.vision.likelihood.scene import Scene
 from flight.vision.likelihood.solution import eliminate
 
+# The error of a median over that of a mean.
+_MEDIAN = 1.25
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Opinions:
@@ -59,7 +62,9 @@ def agreeing(said: Opinions, floors: FloatArray, sigmas: float) -> BoolArray:
         order = np.argsort(change)
         weight = np.cumsum(1.0 / spread[order])
         middle = change[order][np.searchsorted(weight, 0.5 * weight[-1])]
-        agree &= np.abs(change - middle) <= sigmas * spread
+        # The median of few is itself uncertain: a star that knows more than all others is not to yield to it.
+        error = _MEDIAN * np.sqrt(len(spread)) / np.sum(1.0 / spread)
+        agree &= np.abs(change - middle) <= sigmas * np.hypot(spread, error)
     return agree
 
 
@@ -69,4 +74,6 @@ def disagreement(said: Opinions, which: BoolArray) -> float:
     if len(change) < 3:
         return 1.0
     mean = np.sum(weight * change, axis=0) / weight.sum(axis=0)
-    return float(np.max(np.sum(weight * (change - mean) ** 2, axis=0) / (len(change) - 1)))
+    found = np.sum(weight * (change - mean) ** 2, axis=0) / (len(change) - 1)
+    # The largest of several is larger than one, by about a standard deviation.
+    return float(np.max(found) / (1.0 + np.sqrt(2.0 / (len(change) - 1))))

@@ -8,7 +8,7 @@ import numpy as np
 from scipy import ndimage
 
 from flight.arrays import BoolArray, FloatArray, IntArray
-from flight.vision.likelihood.exposed_frame import ExposedFrame
+from flight.vision.likelihood.exposed_frame import ExposedFrame, Float32Array
 from flight.vision.segmentation import box_sum, positions
 
 _EIGHT_NEIGHBOURS = np.ones((3, 3), dtype=np.int64)
@@ -48,7 +48,7 @@ class Blobs:
 def find_blobs(frame: ExposedFrame, sigmas: float, most: int) -> Blobs:
     """Return the `most` brightest regions whose 3 x 3 sum exceeds `sigmas` of its noise."""
     signal, floor = frame.signal.reshape(frame.shape), frame.floor.reshape(frame.shape)
-    mask = box_sum(signal) > np.float32(3.0 * sigmas) * np.sqrt(floor)
+    mask = _above(box_sum(signal), floor, 3.0 * sigmas)
     labels, count = ndimage.label(mask, structure=_EIGHT_NEIGHBOURS)
     row, column = positions(mask)
     number = labels[row, column]
@@ -63,6 +63,14 @@ def find_blobs(frame: ExposedFrame, sigmas: float, most: int) -> Blobs:
     owner = rank[number]
     kept = owner >= 0
     return _measured(frame, owner[kept], column[kept], row[kept], light[kept], len(chosen))
+
+
+def _above(sums: Float32Array, floor: Float32Array, sigmas: float) -> BoolArray:
+    """Tell where `sums` exceed `sigmas` times the root of `floor`, all (rows, columns)."""
+    mask = sums > np.float32(sigmas * np.sqrt(floor.min()))
+    row, column = positions(mask)
+    mask[row, column] = sums[row, column] > np.float32(sigmas) * np.sqrt(floor[row, column])
+    return mask
 
 
 def _measured(

@@ -10,11 +10,11 @@ from flight.arrays import BoolArray, FloatArray, IntArray
 from flight.vision.likelihood.agreement import disagreement, opinions
 from flight.vision.likelihood.chains import in_chains
 from flight.vision.likelihood.ends import true_ends
-from flight.vision.likelihood.fitting import ExposedCamera, Fit
 from flight.vision.likelihood.matched_filter import FaintStars
 from flight.vision.likelihood.motion import paths, sensitivities
 from flight.vision.likelihood.normal_equations import ALONE, Evaluation
 from flight.vision.likelihood.result import MotionResult
+from flight.vision.likelihood.rounds import ExposedCamera, Fit
 from flight.vision.likelihood.scene import Scene, path_lengths, window_times
 from flight.vision.likelihood.solution import shared_covariance
 from flight.vision.streak_rate import StreakStatus
@@ -65,7 +65,7 @@ def with_stars(seen: MotionResult, camera: ExposedCamera, last: Fit) -> MotionRe
         significance=significance,
         psf_sigma=scene.sigma,
         misfit=_misfit(last.evaluation, kept, significance),
-        rate_model=settings.rate_model,
+        rate_model="accelerating" if last.free[3] else "constant",
         residual=spread / camera.pinhole.focal_length,
     )
 
@@ -75,7 +75,7 @@ def with_rate(told: MotionResult, camera: ExposedCamera, last: Fit, faint: Faint
     settings, scene = camera.settings, last.scene
     if told.used_count < settings.least_stars:
         return replace(told, status=StreakStatus.TOO_FEW)
-    exact = shared_covariance(last.evaluation, camera.free, _CONJUGATE)
+    exact = shared_covariance(last.evaluation, last.free, _CONJUGATE)
     covariance = (last.solution.covariance if exact is None else exact)[:3, :3]
     turn = scene.motion.turn
     size = float(np.linalg.norm(turn))
@@ -88,8 +88,7 @@ def with_rate(told: MotionResult, camera: ExposedCamera, last: Fit, faint: Faint
         or _in_pieces(camera, scene, faint)
     ):
         return replace(told, status=StreakStatus.FAILED)
-    growing = settings.rate_model == "accelerating"
-    said = opinions(last.evaluation, scene, camera.free)
+    said = opinions(last.evaluation, scene, last.free)
     spread = 1.0 if said is None else disagreement(said, scene.trusted)
     return replace(
         told,
@@ -98,7 +97,7 @@ def with_rate(told: MotionResult, camera: ExposedCamera, last: Fit, faint: Faint
         # What the model does not explain makes it less certain; what fits too well, no more. A fit that goes
         # to and fro, as pixels are left out and taken in, is known no better than that.
         covariance=covariance * max(told.misfit, spread, 1.0) * (1.0 + last.restless**2) / told.exposure**2,
-        acceleration=scene.motion.growth / told.exposure**2 if growing else None,
+        acceleration=scene.motion.growth / told.exposure**2 if last.free[3] else None,
     )
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import zlib
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 
@@ -18,15 +19,22 @@ from flight.vision.background import FrameState, frame_state
 from flight.vision.likelihood.blobs import Blobs, find_blobs
 from flight.vision.likelihood.description import with_faint, with_rate, with_stars
 from flight.vision.likelihood.exposed_frame import expose_frame, saturation_count
-from flight.vision.likelihood.fitting import ExposedCamera, first_fit, last_fit, still_fit
+from flight.vision.likelihood.fitting import last_fit
+from flight.vision.likelihood.hypotheses import first_fits, still_fit
 from flight.vision.likelihood.result import MotionResult
+from flight.vision.likelihood.rounds import ExposedCamera
 from flight.vision.likelihood.settings import LikelihoodSettings
 from flight.vision.likelihood.shutter import Shutter
 from flight.vision.streak_rate import StreakStatus, direction_of_time, refuse_nonsense
 
 _MOST_BLOBS = 48
+# So many motions are fitted in full before the frame is given up.
+_MOST_MOTIONS = 2
 # Median length, px, of regions below which a frame without an agreed motion is one of stars at rest.
 _AT_REST = 4.0
+# The same of the brightest regions, below which no streak of the least length can be among them.
+_SPOT = 2.2
+_BRIGHTEST = 12
 
 
 def estimate_motion(
@@ -61,24 +69,42 @@ def estimate_motion(
     if checksum == previous_checksum:
         return MotionResult(StreakStatus.FROZEN, checksum, exposure)
     frame = expose_frame(pixels, saturation, settings.gain)
-    camera = ExposedCamera(frame, pinhole, _shutter(pinhole, exposure, settings), settings)
+    growing = settings.rate_model == "accelerating"
+    camera = ExposedCamera(frame, pinhole, _shutter(pinhole, exposure, settings), settings, growing)
     blobs = find_blobs(frame, settings.threshold_sigmas, _MOST_BLOBS)
+    near = None if prior_rate is None else float(np.linalg.norm(prior_rate)) * exposure
     seen = MotionResult(StreakStatus.FAILED, checksum, exposure, hot_pixels=frame.hot_pixels)
     if len(blobs) < settings.least_stars:
         return replace(seen, status=StreakStatus.TOO_FEW)
-    first = first_fit(camera, blobs)
-    if first is None:
+    told = None if _resting(blobs) else _told(camera, seen, blobs, near)
+    if told is None:
         return _without_rate(seen, camera, blobs)
-    last, faint = last_fit(camera, first)
-    if last is None:
-        return seen
-    told = with_faint(with_stars(seen, camera, last), camera, last.scene, faint)
-    result = with_rate(told, camera, last, faint)
-    return _in_time(result, prior_rate, prior_sigma, settings.sign_sigmas)
+    return _in_time(told, prior_rate, prior_sigma, settings.sign_sigmas)
+
+
+def _told(camera: ExposedCamera, seen: MotionResult, blobs: Blobs, near: float | None) -> MotionResult | None:
+    """Return what the first motion that stands every test says, else the likeliest; None without one."""
+    best: MotionResult | None = None
+    for first in islice(first_fits(camera, blobs, near), _MOST_MOTIONS):
+        last, faint = last_fit(camera, first)
+        if last is None:
+            told = seen
+        else:
+            told = with_faint(with_stars(seen, camera, last), camera, last.scene, faint)
+            told = with_rate(told, camera, last, faint)
+        if told.status is not StreakStatus.FAILED:
+            return told
+        best = best or told
+    return best
 
 
 def _shutter(pinhole: Pinhole, exposure: float, settings: LikelihoodSettings) -> Shutter:
     return Shutter(settings.line_time / exposure, pinhole.centre[1])
+
+
+def _resting(blobs: Blobs) -> bool:
+    """Tell whether the brightest regions, most of them at least, are spots: no motion is looked for then."""
+    return float(np.median(blobs.length[:_BRIGHTEST])) < _SPOT
 
 
 def _without_rate(seen: MotionResult, camera: ExposedCamera, blobs: Blobs) -> MotionResult:

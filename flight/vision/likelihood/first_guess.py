@@ -9,13 +9,16 @@ Fragments of one star lie on one circle about the axis, and vote joined.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from flight.arrays import BoolArray, FloatArray, IntArray
 from flight.pinhole import Pinhole
+from flight.vision.likelihood.angle_scan import SCANNED_STARS, Circles, scan_angles
 from flight.vision.likelihood.blobs import Blobs
+from flight.vision.likelihood.exposed_frame import ExposedFrame
 from flight.vision.likelihood.motion import Motion, paths
 
 _PROPOSERS = 16
@@ -94,19 +97,41 @@ def _turning(axes: FloatArray, equation: FloatArray, flow: FloatArray) -> FloatA
     return np.asarray(axes @ equation.T / np.maximum(speed, 1e-9))
 
 
-def guess_motions(blobs: Blobs, pinhole: Pinhole, most: int) -> list[Guess]:
-    """Return guesses, the likeliest first, each of at most `most` stars; none when no axis is agreed on."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Turning:
+    """An axis (3,), which regions (n,) run along it, and they as arcs about it."""
+
+    axis: FloatArray
+    agree: BoolArray
+    arcs: _Arcs
+
+
+def find_turning(blobs: Blobs, pinhole: Pinhole) -> Turning | None:
+    """Return the axis that the regions agree on, None without one."""
     found = guess_axis(blobs, pinhole)
-    if found is None:
-        return []
-    axis, agree = found
-    arcs = _arcs(blobs, pinhole, axis)
+    return None if found is None else Turning(*found, _arcs(blobs, pinhole, found[0]))
+
+
+def voted_motions(turning: Turning, blobs: Blobs, pinhole: Pinhole, most: int) -> list[Guess]:
+    """Return guesses by the regions' lengths, the likeliest first, each of at most `most` stars."""
     guesses = []
-    for angle, contradicted in _angles(arcs, blobs, agree):
-        stars, light = _stars(arcs, blobs, agree, pinhole, angle, most)
+    for angle, contradicted in _angles(turning.arcs, blobs, turning.agree):
+        stars, light = _stars(turning.arcs, blobs, turning.agree, pinhole, angle, most)
         if len(light):
-            guesses.append(Guess(axis * angle, stars, light, contradicted))
+            guesses.append(Guess(turning.axis * angle, stars, light, contradicted))
     return guesses
+
+
+def scanned_motions(
+    turning: Turning, frame: ExposedFrame, pinhole: Pinhole, most: int, near: float | None
+) -> Iterator[Guess]:
+    """Yield guesses by the light along the circles about the axis, those `near` an angle (rad) first."""
+    arcs = turning.arcs
+    chosen = np.flatnonzero(turning.agree)[:SCANNED_STARS]
+    circles = Circles(arcs.frame, arcs.height[chosen], arcs.middle[chosen])
+    for turned in scan_angles(frame, pinhole, circles, _MOST_HYPOTHESES, near):
+        if len(turned.light):
+            yield Guess(turning.axis * turned.angle, turned.stars[:most], turned.light[:most], 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

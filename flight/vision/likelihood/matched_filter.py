@@ -7,22 +7,26 @@ from the strongest peak on, each is believed only as far as it exceeds what thos
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import ndtr
 
-from flight.arrays import BoolArray, FloatArray, IntArray
+from flight.arrays import BoolArray, FloatArray, Image, IntArray
 from flight.pinhole import Pinhole
 from flight.vision.likelihood.chains import apart, circles
 from flight.vision.likelihood.exposed_frame import ExposedFrame, Float32Array
 from flight.vision.likelihood.motion import Motion, paths
-from flight.vision.segmentation import box_sum, positions
+from flight.vision.segmentation import box_sum
 
 # Spacing of the circles, px, and of the samples along them.
-_ACROSS = 1.25
-_ALONG = 2.5
+_ACROSS = 1.8
+_ALONG = 4.0
+# Samples are rounded to this part of their noise.
+_ROUNDING = 30.0
+# Circles worked on at a time, so that they stay in the processor's cache.
+_CHUNK = 32
 # A streak needs this part of itself on the detector.
 _LEAST_SEEN = 0.35
 # Width of the point spread and the pixel together that the filter supposes, px.
@@ -36,10 +40,21 @@ _FARTHEST = 5
 # The part of a streak's light that falls in the three pixels across.
 _CAPTURED = 0.83
 # Noise of a sum of samples over a pixel's and the root of their number: nine pixels each, which overlap.
-_SAMPLE_NOISE = 3.5
+_SAMPLE_NOISE = 3.1
 # A peak under another's shoulder must hold so much of what is there on its own.
 _OWN_SHARE = 0.45
-_MOST_PEAKS = 1500
+_MOST_PEAKS = 1000
+# A summit is no lower than these: rows and columns from it, those first that rule most out.
+_NEIGHBOURS = sorted(
+    ((down, beside) for down in (-1, 0, 1) for beside in (-2, -1, 0, 1, 2) if (down, beside) != (0, 0)),
+    key=lambda step: abs(step[0]) + abs(step[1]),
+)
+
+
+# The response of circles beside a star's own, every so many parts of a px.
+_PER_PX = 50.0
+_PROFILE = ndtr((np.arange(400) / _PER_PX + 1.5) / _WIDTH) - ndtr((np.arange(400) / _PER_PX - 1.5) / _WIDTH)
+_PROFILE /= _PROFILE[0]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,33 +67,46 @@ class FaintStars:
 
 
 def find_faint(
-    frame: ExposedFrame, modelled: Float32Array, pinhole: Pinhole, motion: Motion, sigmas: float, most: int
+    frame: ExposedFrame,
+    modelled: tuple[IntArray, Float32Array],
+    pinhole: Pinhole,
+    motion: Motion,
+    sigmas: float,
+    most: int,
 ) -> FaintStars:
-    """Return the `most` strongest streaks along `motion` in the frame less `modelled` (rows * columns)."""
+    """Return the `most` strongest streaks along `motion` in the frame less `modelled`: pixels (m,), light."""
     middle = paths(pinhole, motion, np.array([pinhole.centre]), np.zeros(1)).velocity
     reach = float(np.linalg.norm(motion.turn)) * float(np.sin(pinhole.half_diagonal)) * pinhole.focal_length
     if max(float(np.hypot(*middle[0])), reach) < _LEAST_LENGTH:
         return FaintStars(np.empty((0, 2)), np.empty(0), np.empty(0))
-    variance = frame.floor + np.maximum(modelled, 0.0) * np.float32(1.0 / frame.gain)
-    difference = frame.signal - modelled
-    difference[frame.bad] = 0.0
-    # Where a bright star was taken out, what is left is mostly its own noise.
-    difference *= frame.floor / variance
-    grid = _circles(pinhole, motion)
-    sums = box_sum(difference.reshape(frame.shape))
-    samples = np.where(grid.inside, sums.reshape(-1)[grid.index], np.float32(0.0))
-    response, count = _running(samples, grid)
-    noise = _SAMPLE_NOISE * float(np.sqrt(np.median(frame.floor[::97]))) * np.sqrt(np.maximum(count, 1.0))
-    noise[count < _LEAST_SEEN * grid.length] = np.inf
-    row, column, height = _cleaned(response, noise, grid, sigmas, most)
-    own = noise[np.rint(row).astype(int), np.rint(column).astype(int) % noise.shape[1]]
+    circles = _circles(pinhole, motion)
+    usual = _SAMPLE_NOISE * float(np.sqrt(np.median(frame.floor[::97])))
+    sums = box_sum(_left_over(frame, modelled))
+    response, count = _filtered(sums, pinhole, circles, usual / _ROUNDING)
+    # The noise for every number of samples; too few tell nothing.
+    noise = usual * np.sqrt(np.arange(max(round(circles.length), 1) + 1.0))
+    noise[: math.ceil(_LEAST_SEEN * circles.length)] = np.inf
+    row, column, height = _cleaned(response, count, noise, circles, sigmas, most)
+    own = noise[count[np.rint(row).astype(int), _wrapped(column, response)]]
     order = np.argsort(-height / own, kind="stable")
     row, column, height, own = row[order], column[order], height[order], own[order]
-    stars = _pixels(pinhole, grid, row, column - _off_centre(grid))
+    stars = _pixels(pinhole, circles, row, column - _off_centre(circles))
     seen = np.isfinite(stars).all(axis=1)
-    travelled = grid.angle * np.interp(row, np.arange(len(grid.speed)), grid.speed)
-    light = height / (3.0 * _CAPTURED * grid.length) * travelled
+    travelled = circles.angle * np.interp(row, np.arange(len(circles.speed)), circles.speed)
+    light = height / (3.0 * _CAPTURED * circles.length) * travelled
     return FaintStars(stars[seen], light[seen], (height / own)[seen])
+
+
+def _left_over(frame: ExposedFrame, modelled: tuple[IntArray, Float32Array]) -> Float32Array:
+    """Return the frame (rows, columns) less `modelled` light; pixels that tell nothing are zero."""
+    left = frame.signal.copy()
+    pixels, light = modelled
+    floor = frame.floor[pixels]
+    # Where a bright star was taken out, what is left is mostly its own noise.
+    share = floor / (floor + np.maximum(light, np.float32(0.0)) * np.float32(1.0 / frame.gain))
+    left[pixels] = (left[pixels] - light) * share
+    left[np.flatnonzero(frame.bad)] = 0.0
+    return left.reshape(frame.shape)
 
 
 def close_by(
@@ -97,15 +125,13 @@ def close_by(
 class _Circles:
     """Samples (r, c) on circles about the axis.
 
-    `frame` (3, 3) has two axes across and the axis as rows; `polar` (r,) and `azimuth` (c,) rad; `index` and
-    `inside` say where in the flat frame; `length` samples make a streak; `speed` (r,) px per rad.
+    `frame` (3, 3) has two axes across and the axis as rows; `polar` (r,) and `azimuth` (c,) rad; `length`
+    samples make a streak of `angle` rad; `speed` (r,) px per rad.
     """
 
     frame: FloatArray
     polar: FloatArray
     azimuth: FloatArray
-    index: IntArray
-    inside: BoolArray
     length: float
     angle: float
     speed: FloatArray
@@ -132,34 +158,62 @@ def _circles(pinhole: Pinhole, motion: Motion) -> _Circles:
     )
     widest = min(widest + 0.5 * angle, np.pi)
     azimuth = np.arange(-widest, widest, step)
-    cosine, sine = np.cos(polar)[:, None], np.sin(polar)[:, None]
-    local = (sine * np.cos(azimuth), sine * np.sin(azimuth), cosine)
-    x, y, z = (frame[0, k] * local[0] + frame[1, k] * local[1] + frame[2, k] * local[2] for k in range(3))
-    scale = pinhole.focal_length / np.where(z > 0.1, z, np.inf)
-    column = np.rint(scale * x + pinhole.centre[0]).astype(np.int64)
-    row = np.rint(scale * y + pinhole.centre[1]).astype(np.int64)
-    inside = (
-        (z > 0.1) & (column >= 1) & (column < pinhole.columns - 1) & (row >= 1) & (row < pinhole.rows - 1)
-    )
-    index = np.where(inside, row * pinhole.columns + column, 0)
-    return _Circles(
-        frame, polar, azimuth, index, inside, angle / step, angle, np.sin(polar) * pinhole.focal_length
-    )
+    return _Circles(frame, polar, azimuth, angle / step, angle, np.sin(polar) * pinhole.focal_length)
 
 
-def _running(samples: Float32Array, circles: _Circles) -> tuple[FloatArray, FloatArray]:
-    """Return the sums (r, c) of samples within half a streak of each, and how many of them exist."""
+def _filtered(
+    sums: Float32Array, pinhole: Pinhole, circles: _Circles, unit: float
+) -> tuple[Float32Array, IntArray]:
+    """Return the running sums (r, c) of samples of `sums` within half a streak, and how many samples exist.
+
+    `sums` is zero along the border, where all that is outside is sampled; it is rounded to `unit` counts.
+    """
     width = max(round(circles.length), 1)
+    before, after = width // 2, width - width // 2
     full = abs(float(circles.azimuth[-1] - circles.azimuth[0])) > 2.0 * np.pi - 0.05
-
-    def summed(values: npt.NDArray[np.float32]) -> FloatArray:
-        before, after = width // 2, width - width // 2
-        mode = "wrap" if full else "constant"
-        padded = np.pad(values, ((0, 0), (before + 1, after)), mode=mode)  # type: ignore[call-overload]  # str
-        total = np.cumsum(padded, axis=1, dtype=np.float64)
-        return np.asarray(total[:, width : width + values.shape[1]] - total[:, : values.shape[1]])
-
-    return summed(samples), summed(circles.inside.astype(np.float32))
+    shape = len(circles.polar), len(circles.azimuth)
+    # Directions over the sine of the polar angle: one part for the azimuth, one for the circle.
+    turning = circles.frame[:2].T @ np.stack([np.cos(circles.azimuth), np.sin(circles.azimuth)])
+    rising = circles.frame[2][:, None] / np.tan(circles.polar)
+    around, aloft = turning.astype(np.float32), rising.astype(np.float32)
+    last = np.float32(pinhole.columns - 1), np.float32(pinhole.rows - 1)
+    response, count = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.int64)
+    flat = sums.reshape(-1)
+    # Samples, and whether they exist, with room for half a streak to either side.
+    padded = np.zeros((2, _CHUNK, shape[1] + width + 1), dtype=np.int64)
+    middle = slice(before + 1, before + 1 + shape[1])
+    total = np.empty_like(padded)
+    for start in range(0, shape[0], _CHUNK):
+        part = slice(start, start + _CHUNK)
+        rows = len(response[part])
+        depth = around[2] + aloft[2, part, None]
+        np.maximum(depth, np.float32(1e-3), out=depth)
+        np.divide(np.float32(pinhole.focal_length), depth, out=depth)
+        places = []
+        for axis, limit in ((0, last[0]), (1, last[1])):
+            place = around[axis] + aloft[axis, part, None]
+            place *= depth
+            place += np.float32(pinhole.centre[axis])
+            np.rint(place, out=place)
+            places.append(np.clip(place, np.float32(0.0), limit, out=place))
+        column, row = places
+        inside = (column > 0.0) & (column < last[0]) & (row > 0.0) & (row < last[1])
+        index = row.astype(np.int64)
+        index *= pinhole.columns
+        index += column.astype(np.int64)
+        samples = flat.take(index)
+        samples *= np.float32(1.0 / unit)
+        # Whole numbers add up several times faster than others, and exactly.
+        padded[0, :rows, middle] = np.rint(samples, out=samples)
+        padded[1, :rows, middle] = inside
+        if full:
+            padded[:, :, : before + 1] = padded[:, :, shape[1] : shape[1] + before + 1]
+            padded[:, :, middle.stop :] = padded[:, :, before + 1 : before + 1 + after]
+        np.cumsum(padded, axis=2, out=total)
+        held = total[:, :rows, width : width + shape[1]] - total[:, :rows, : shape[1]]
+        np.multiply(held[0], unit, out=response[part], casting="same_kind")
+        count[part] = held[1]
+    return response, count
 
 
 def _off_centre(circles: _Circles) -> float:
@@ -168,33 +222,59 @@ def _off_centre(circles: _Circles) -> float:
 
 
 def _cleaned(
-    response: FloatArray, noise: FloatArray, circles: _Circles, sigmas: float, most: int
+    response: Float32Array, count: Image, noise: FloatArray, circles: _Circles, sigmas: float, most: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return rows, columns (between samples) and heights of the stars whose responses add up to `response`.
 
     Passes find the peaks that rise above what is left, solve the heights of all found together (their
-    responses overlap), and take them out.
+    responses overlap), and take them out. `noise` is by `count` of samples. What does not exceed it at first
+    never will: all passes look at few places.
     """
+    flat = response.reshape(-1)
+    place = np.flatnonzero(flat > sigmas * noise.min())
+    deviation = noise[count.reshape(-1)[place]]
+    high = flat[place] > sigmas * deviation
+    place, deviation = place[high], deviation[high]
+    left = flat[place].astype(np.float64)
+    significance = np.zeros(response.shape, dtype=np.float32)
     row, column, height = (np.empty(0) for _ in range(3))
-    left = response
     for last in (False,) * (_PASSES - 1) + (True,):
-        new_row, new_column = _peaks(left / noise, circles, sigmas)
+        significance.reshape(-1)[place] = left / deviation
+        new_row, new_column = _peaks(significance, place[left > sigmas * deviation], circles, sigmas)
         room = most - len(row)
         if not len(new_row) or room <= 0:
             break
         row, column = np.append(row, new_row[:room]), np.append(column, new_column[:room])
         height = _heights(response, row, column, circles)
-        kept = height > sigmas * noise[np.rint(row).astype(int), np.rint(column).astype(int) % noise.shape[1]]
+        kept = height > sigmas * noise[count[np.rint(row).astype(int), _wrapped(column, response)]]
         row, column, height = row[kept], column[kept], height[kept]
         if last:
             break
-        left = response.copy()
-        for r, c, h in zip(row, column, height, strict=True):
-            _take_out(left, circles, float(r), float(c), float(h))
+        left = flat[place] - _given(place, response.shape[1], circles, row, column, height)
     return row, column, height
 
 
-def _heights(response: FloatArray, row: FloatArray, column: FloatArray, circles: _Circles) -> FloatArray:
+def _wrapped(column: FloatArray, response: Float32Array) -> IntArray:
+    return np.asarray(np.rint(column).astype(int) % response.shape[1])
+
+
+def _given(
+    place: IntArray, columns: int, circles: _Circles, row: FloatArray, column: FloatArray, height: FloatArray
+) -> FloatArray:
+    """Return what stars (k,) of `height` put at the flat places (p,), ascending."""
+    first = np.searchsorted(place, (row.astype(int) - _FARTHEST + 1) * columns)
+    count = np.searchsorted(place, (row.astype(int) + _FARTHEST + 1) * columns) - first
+    star = np.repeat(np.arange(len(row)), count)
+    which = np.arange(len(star)) + np.repeat(first - np.cumsum(count) + count, count)
+    at_row, at_column = np.divmod(place[which], columns)
+    triangle = 1.0 - np.abs(at_column - column[star]) / circles.length
+    near = np.flatnonzero(triangle > 0.0)
+    star, which = star[near], which[near]
+    across = _profile((at_row[near] - row[star]) * _ACROSS)
+    return np.asarray(np.bincount(which, height[star] * triangle[near] * across, len(place)), dtype=float)
+
+
+def _heights(response: Float32Array, row: FloatArray, column: FloatArray, circles: _Circles) -> FloatArray:
     """Return the heights (k,) whose overlapping responses best give `response` at the stars' places."""
     beside = np.abs(column[:, None] - column)
     overlap = np.maximum(1.0 - beside / circles.length, 0.0)
@@ -204,52 +284,63 @@ def _heights(response: FloatArray, row: FloatArray, column: FloatArray, circles:
     overlap *= across
     # A ridge, for stars that almost coincide; the scale it takes from all others is given back.
     overlap[np.diag_indices(len(row))] += _RIDGE
-    seen = response[np.rint(row).astype(int), np.rint(column).astype(int) % response.shape[1]]
+    seen = response[np.rint(row).astype(int), _wrapped(column, response)]
     return np.asarray(np.linalg.solve(overlap, (1.0 + _RIDGE) * seen))
 
 
 def _profile(distance: FloatArray) -> FloatArray:
     """Return the response of circles `distance` px beside a star's own, 1 at the star."""
-    edge = 1.5 / _WIDTH
-    share = ndtr(distance / _WIDTH + edge) - ndtr(distance / _WIDTH - edge)
-    return np.asarray(share / (2.0 * ndtr(edge) - 1.0))
+    index = np.minimum(np.abs(distance) * _PER_PX + 0.5, len(_PROFILE) - 1.0).astype(np.int64)
+    return np.asarray(_PROFILE[index])
 
 
-def _take_out(left: FloatArray, circles: _Circles, row: float, column: float, height: float) -> None:
-    rows, columns = left.shape
-    r = np.arange(max(int(row) - 4, 0), min(int(row) + 6, rows))
-    c = np.arange(max(int(column - circles.length), 0), min(int(column + circles.length) + 2, columns))
-    triangle = np.maximum(1.0 - np.abs(c - column) / circles.length, 0.0)
-    left[r[0] : r[-1] + 1, c[0] : c[-1] + 1] -= height * _profile((r - row) * _ACROSS)[:, None] * triangle
+def _peaks(
+    significance: Float32Array, place: IntArray, circles: _Circles, sigmas: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return rows and columns, between samples, of the peaks, strongest first, that stand on their own.
 
-
-def _peaks(significance: FloatArray, circles: _Circles, sigmas: float) -> tuple[FloatArray, FloatArray]:
-    """Return rows and columns, between samples, of the peaks, strongest first, that stand on their own."""
-    row, column = positions(significance > sigmas)
-    value = significance[row, column]
-    summit = np.ones(len(row), dtype=np.bool_)
-    for down in (-1, 0, 1):
-        for beside in (-2, -1, 0, 1, 2):
-            r = np.clip(row + down, 0, significance.shape[0] - 1)
-            c = np.clip(column + beside, 0, significance.shape[1] - 1)
-            summit &= significance[r, c] <= value
-    row, column, value = row[summit], column[summit], value[summit]
+    Only the flat places (p,) are looked at; all others are lower.
+    """
+    flat, columns = significance.reshape(-1), significance.shape[1]
+    value = flat[place]
+    # Past the last column comes the next circle's first: on full circles nearly the neighbour it should be.
+    for down, beside in _NEIGHBOURS:
+        summit = flat.take(place + (down * columns + beside), mode="wrap") <= value
+        place, value = place[summit], value[summit]
+    row, column = np.divmod(place, columns)
     order = np.argsort(-value, kind="stable")[:_MOST_PEAKS]
     row, column, value = row[order], column[order], value[order]
+    kept = _standing(row, column, value.astype(np.float64), circles, sigmas)
+    row, column = row[kept], column[kept]
+    return _refined(significance, row, column, 0), _refined(significance, row, column, 1)
+
+
+def _standing(
+    row: IntArray, column: IntArray, value: FloatArray, circles: _Circles, sigmas: float
+) -> BoolArray:
+    """Tell which peaks (n,), strongest first, rise above the shoulders of those kept before them."""
+    by_row = np.argsort(row, kind="stable")
+    first = np.searchsorted(row[by_row], row - _FARTHEST + 1)
+    count = np.searchsorted(row[by_row], row + _FARTHEST) - first
+    stronger = np.repeat(np.arange(len(row)), count)
+    weaker = by_row[np.arange(len(stronger)) + np.repeat(first - np.cumsum(count) + count, count)]
+    share = 1.0 - np.abs(column[stronger] - column[weaker]) / circles.length
+    shading = np.flatnonzero((stronger < weaker) & (share > 0.0))
+    stronger, weaker = stronger[shading], weaker[shading]
+    share = share[shading] * _profile((row[stronger] - row[weaker]) * _ACROSS)
+    begin = np.searchsorted(stronger, np.arange(len(row) + 1))
     own = value.copy()
     kept = np.zeros(len(row), dtype=np.bool_)
     for k in range(len(row)):
         if own[k] < sigmas or own[k] < _OWN_SHARE * value[k]:
             continue
         kept[k] = True
-        later = k + 1 + np.flatnonzero(np.abs(row[k + 1 :] - row[k]) < _FARTHEST)
-        triangle = np.maximum(1.0 - np.abs(column[later] - column[k]) / circles.length, 0.0)
-        own[later] -= own[k] * triangle * _profile((row[later] - row[k]) * _ACROSS)
-    row, column = row[kept], column[kept]
-    return _refined(significance, row, column, 0), _refined(significance, row, column, 1)
+        shaded = slice(begin[k], begin[k + 1])
+        own[weaker[shaded]] -= own[k] * share[shaded]
+    return kept
 
 
-def _refined(significance: FloatArray, row: IntArray, column: IntArray, axis: int) -> FloatArray:
+def _refined(significance: Float32Array, row: IntArray, column: IntArray, axis: int) -> FloatArray:
     """Return the peaks' places along `axis`, between samples: the vertex of a parabola."""
     place = (row, column)[axis]
     size = significance.shape[axis]

@@ -13,13 +13,10 @@ import numpy as np
 from flight.arrays import BoolArray, FloatArray, IntArray
 from flight.pinhole import Pinhole
 from flight.vision.likelihood import spot_model, streak_model
-from flight.vision.likelihood.exposed_frame import ExposedFrame
 from flight.vision.likelihood.scene import Scene
 from flight.vision.likelihood.shutter import Shutter
-from flight.vision.likelihood.spot_model import Patches
 from flight.vision.likelihood.streak_model import Float32Array
-from flight.vision.likelihood.strips import Strips
-from flight.vision.likelihood.windows import Windows
+from flight.vision.likelihood.windows import Sight, Windows
 
 SHARED = 7
 """Turn (3), growth (3), width of the point spread."""
@@ -40,103 +37,92 @@ class Evaluation:
         information: (n, SHARED + ALONE, SHARED + ALONE), of each star's pixels.
         gradient: (n, SHARED + ALONE).
         chi2, pixels: (n,) of each star's pixels: sum of squared residuals over their variance, and how many.
-        clipped: (n,) share of the star's light on pixels left out.
-        linear: the light's derivatives on all windows; used: how many pixels of the frame they lie on.
+        crowds: the light's derivatives on the pixels that stars share; used: how many pixels are in use.
+        kept: which pixels of the strips and of the patches were not left out.
     """
 
     information: FloatArray
     gradient: FloatArray
     chi2: FloatArray
     pixels: FloatArray
-    clipped: FloatArray
-    linear: list[Linear]
+    crowds: list[Crowd]
     used: int
+    kept: tuple[BoolArray, BoolArray]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Linear:
-    """Derivatives of the light on some blocks of pixels.
+class Crowd:
+    """Derivatives of stars' light on pixels (e,) that other stars share, in order of their blocks (b,).
 
     Attributes:
-        star: (b,) whose block it is; index (b, p) into the pixels in use; weight (b, p), inside (b, p).
-        images: (b, i, p), which `matrix` (b, i, SHARED + ALONE) mixes to derivatives.
+        star: (b,) whose block it is; `matrix` (b, i, SHARED + ALONE) mixes images to derivatives.
+        block, slot: (e,) of each pixel; first: (b,) where each block's pixels begin.
+        weight: (e,); images: (e, i).
     """
 
     star: IntArray
-    index: IntArray
-    inside: BoolArray
+    matrix: FloatArray
+    block: IntArray
+    first: IntArray
+    slot: IntArray
     weight: Float32Array
     images: Float32Array
-    matrix: FloatArray
 
 
 def evaluate(
-    frame: ExposedFrame,
-    pinhole: Pinhole,
-    shutter: Shutter,
-    scene: Scene,
-    windows: Windows,
-    clip: float,
-    growing: bool,
+    pinhole: Pinhole, shutter: Shutter, scene: Scene, windows: Windows, clip: float, growing: bool
 ) -> Evaluation:
     """Return the normal equations of `scene` on its windows.
 
     Pixels whose residual exceeds `clip` sigma (and a tenth of the model) are left out; 0 leaves none.
     """
-    strips, patches = windows.strips, windows.patches
-    long, spot = scene.stars[windows.long], scene.stars[windows.spot]
-    images = streak_model.images(pinhole, scene.motion, shutter, long, scene.width, strips)
-    spots, change = spot_model.derivatives(pinhole, scene.motion, shutter, spot, scene.sigma, patches)
+    strips = windows.strips
+    images, spots, change = _shapes(pinhole, shutter, scene, windows)
     of_block = windows.long[strips.star]
     streak_light = images[:, 0] * scene.light[of_block, None, None].astype(np.float32)
     streak_light += scene.sky[of_block, None, None].astype(np.float32)
     spot_light = spots * scene.light[windows.spot, None, None] + scene.sky[windows.spot, None, None]
-    total = frame.modelled(
-        (strips.index, streak_light * strips.inside), (patches.index, spot_light * patches.inside)
-    )
+    total = windows.total(streak_light, spot_light)
     n, size = len(scene.stars), SHARED + ALONE
-    number, used = _numbered(frame, strips, patches)
+    weights, residuals = zip(
+        windows.on_strips.residual(total, clip), windows.on_patches.residual(total, clip), strict=True
+    )
     out = Evaluation(
-        np.zeros((n, size, size)), np.zeros((n, size)), np.zeros(n), np.zeros(n), np.zeros(n), [], used
+        np.zeros((n, size, size)),
+        np.zeros((n, size)),
+        np.zeros(n),
+        np.zeros(n),
+        [],
+        len(windows.pixels),
+        (weights[0] > 0.0, weights[1] > 0.0),
     )
     if len(strips.star):
-        weight, residual = frame.residual(strips.index, strips.inside, total, clip)
         matrix = _block_parameters(pinhole, shutter, scene, windows, growing)
         matrix[:, :, :SHARED] *= scene.trusted[of_block, None, None]
-        _count(out, of_block, weight, residual, streak_light, strips.inside)
-        _add(out, of_block, number[strips.index], strips.inside, weight, residual, images, matrix)
-    if len(spot):
-        weight, residual = frame.residual(patches.index, patches.inside, total, clip)
-        _count(out, windows.spot, weight, residual, spot_light, patches.inside)
+        _add(out, of_block, windows.on_strips, weights[0], residuals[0], images, matrix)
+    if len(windows.spot):
         spot_images = _spot_images(scene, windows, spots, change)
-        matrix = np.tile(np.eye(size), (len(spot), 1, 1))
+        matrix = np.tile(np.eye(size), (len(windows.spot), 1, 1))
         matrix[:, :, :SHARED] *= scene.trusted[windows.spot, None, None]
-        _add(out, windows.spot, number[patches.index], patches.inside, weight, residual, spot_images, matrix)
+        _add(out, windows.spot, windows.on_patches, weights[1], residuals[1], spot_images, matrix)
     return out
 
 
-def _numbered(frame: ExposedFrame, strips: Strips, patches: Patches) -> tuple[IntArray, int]:
-    """Return a number for each pixel of the frame that is in use, and how many there are."""
-    use = np.zeros(frame.signal.size, dtype=np.bool_)
-    use[strips.index] = True
-    use[patches.index] = True
-    where = np.flatnonzero(use)
-    number = np.zeros(frame.signal.size, dtype=np.int64)
-    number[where] = np.arange(len(where))
-    return number, len(where)
+def light_of(pinhole: Pinhole, shutter: Shutter, scene: Scene, windows: Windows) -> Float32Array:
+    """Return the light of all stars of `scene` on the pixels in use of its windows, sky left out."""
+    images, spots, _ = _shapes(pinhole, shutter, scene, windows)
+    streaks = images[:, 0] * scene.light[windows.long[windows.strips.star], None, None].astype(np.float32)
+    return windows.total(streaks, spots * scene.light[windows.spot, None, None])
 
 
-def light_of(
-    frame: ExposedFrame, pinhole: Pinhole, shutter: Shutter, scene: Scene, windows: Windows
-) -> Float32Array:
-    """Return the light (rows * columns) of all stars of `scene`, sky left out."""
-    strips, patches = windows.strips, windows.patches
+def _shapes(
+    pinhole: Pinhole, shutter: Shutter, scene: Scene, windows: Windows
+) -> tuple[Float32Array, FloatArray, FloatArray]:
+    """Return the images of the strips, the spots' light and its derivatives, all of stars of light 1."""
     long, spot = scene.stars[windows.long], scene.stars[windows.spot]
-    images = streak_model.images(pinhole, scene.motion, shutter, long, scene.width, strips)
-    spots, _ = spot_model.derivatives(pinhole, scene.motion, shutter, spot, scene.sigma, patches)
-    streaks = images[:, 0] * scene.light[windows.long[strips.star], None, None].astype(np.float32)
-    spots = spots * scene.light[windows.spot, None, None]
-    return frame.modelled((strips.index, streaks * strips.inside), (patches.index, spots * patches.inside))
+    images = streak_model.images(pinhole, scene.motion, shutter, long, scene.width, windows.strips)
+    spots, change = spot_model.derivatives(pinhole, scene.motion, shutter, spot, scene.sigma, windows.patches)
+    return images, spots, change
 
 
 def _block_parameters(
@@ -160,14 +146,13 @@ def _block_parameters(
 def _add(
     out: Evaluation,
     star: IntArray,
-    index: IntArray,
-    inside: BoolArray,
+    sight: Sight,
     weight: Float32Array,
     residual: Float32Array,
     images: Float32Array,
     matrix: FloatArray,
 ) -> None:
-    """Add blocks of pixels to the normal equations."""
+    """Add blocks of pixels, in order of their stars, to the normal equations."""
     blocks = len(images)
     flat = images.reshape(blocks, images.shape[1], -1)
     weight, residual = weight.reshape(blocks, -1), residual.reshape(blocks, -1)
@@ -175,10 +160,30 @@ def _add(
     gram = (weighted @ flat.swapaxes(1, 2)).astype(np.float64)
     slope = (weighted @ residual[..., None]).astype(np.float64)
     turned = matrix.swapaxes(1, 2)
-    np.add.at(out.information, star, turned @ gram @ matrix)
-    np.add.at(out.gradient, star, (turned @ slope)[..., 0])
-    out.linear.append(
-        Linear(star, index.reshape(blocks, -1), inside.reshape(blocks, -1), weight, flat, matrix)
+    first = np.flatnonzero(np.diff(star, prepend=-1))
+    owner = star[first]
+    out.information[owner] += np.add.reduceat(turned @ gram @ matrix, first)
+    out.gradient[owner] += np.add.reduceat((turned @ slope)[..., 0], first)
+    out.chi2[owner] += np.add.reduceat(np.einsum("bp,bp,bp->b", weight, residual, residual), first)
+    out.pixels[owner] += np.add.reduceat((weight > 0.0).sum(axis=1), first)
+    if len(sight.crowded):
+        out.crowds.append(_crowd(star, sight, weight, flat, matrix))
+
+
+def _crowd(
+    star: IntArray, sight: Sight, weight: Float32Array, images: Float32Array, matrix: FloatArray
+) -> Crowd:
+    block, place = np.divmod(sight.crowded, images.shape[2])
+    first = np.flatnonzero(np.diff(block, prepend=-1))
+    held = block[first]
+    return Crowd(
+        star[held],
+        matrix[held],
+        np.repeat(np.arange(len(held)), np.diff(first, append=len(block))),
+        first,
+        sight.slot.reshape(-1)[sight.crowded],
+        weight.reshape(-1)[sight.crowded],
+        images[block, :, place],
     )
 
 
@@ -200,41 +205,24 @@ def apply_information(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the information of all stars together times (shared (SHARED,), alone (n, ALONE)).
 
-    Unlike the blocks of `Evaluation.information`, it knows that stars share pixels.
+    To the blocks of `Evaluation.information` comes what stars that share pixels know of each other.
     """
     n = len(alone)
-    vector = np.concatenate([np.tile(shared, (n, 1)), alone], axis=1)
+    vector = np.concatenate([np.broadcast_to(shared, (n, SHARED)), alone], axis=1)
+    out = (evaluation.information @ vector[..., None])[..., 0]
     change = np.zeros(evaluation.used)
-    for part in evaluation.linear:
-        mixture = np.einsum("bip,bp->bi", part.matrix, vector[part.star]).astype(np.float32)
-        light = (mixture[:, None, :] @ part.images)[:, 0] * part.inside
-        change += np.bincount(part.index.reshape(-1), light.reshape(-1), evaluation.used)
-    change32 = change.astype(np.float32)
-    out = np.zeros((n, SHARED + ALONE))
-    for part in evaluation.linear:
-        felt = part.weight * change32[part.index]
-        slope = (part.images @ felt[..., None])[..., 0].astype(np.float64)
-        np.add.at(out, part.star, np.einsum("bip,bi->bp", part.matrix, slope))
+    lights = []
+    for crowd in evaluation.crowds:
+        mixture = (crowd.matrix @ vector[crowd.star][..., None])[..., 0].astype(np.float32)
+        lights.append(np.einsum("ei,ei->e", mixture[crowd.block], crowd.images))
+        change += np.bincount(crowd.slot, lights[-1], evaluation.used)
+    for crowd, light in zip(evaluation.crowds, lights, strict=True):
+        felt = crowd.weight * (change[crowd.slot] - light).astype(np.float32)
+        slope = np.add.reduceat(crowd.images * felt[:, None], crowd.first).astype(np.float64)
+        np.add.at(out, crowd.star, (slope[:, None] @ crowd.matrix)[:, 0])
     return out[:, :SHARED].sum(axis=0), out[:, SHARED:] + prior_information(evaluation) * alone
 
 
 def prior_information(evaluation: Evaluation) -> FloatArray:
     """Return the information (n, ALONE) that keeps what the pixels do not tell finite."""
     return np.broadcast_to(np.array([_LOOSE**-2, _LOOSE**-2, 0.0, _SKY**-2]), (len(evaluation.chi2), ALONE))
-
-
-def _count(
-    out: Evaluation,
-    star: IntArray,
-    weight: Float32Array,
-    residual: Float32Array,
-    light: Float32Array | FloatArray,
-    inside: BoolArray,
-) -> None:
-    n, axes = len(out.chi2), (1, 2)
-    used = weight > 0.0
-    out.chi2[:] += np.bincount(star, (weight * residual * residual).sum(axis=axes), n)
-    out.pixels[:] += np.bincount(star, used.sum(axis=axes), n)
-    lit = np.bincount(star, (light * inside).sum(axis=axes), n)
-    lost = np.bincount(star, (light * (inside & ~used)).sum(axis=axes), n)
-    out.clipped[:] += lost / np.where(lit > 0.0, lit, np.inf)

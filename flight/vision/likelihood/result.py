@@ -39,7 +39,7 @@ class MotionResult:
         faint_flux: (m,) counts; faint_significance (m,).
         psf_sigma: px, fitted.
         misfit: chi-square per degree of freedom, median of the bright stars: 1 where the rate model holds.
-        rate_model: which was fitted.
+        rate_model: which was fitted, `constant` or `accelerating`.
         acceleration: (3,) rad/s^2 if fitted, else None.
         start_to_end: (4,) attitude change over the exposure, A(q) v_start = v_end; None when no rate.
     """

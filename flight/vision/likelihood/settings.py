@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-RateModel = Literal["constant", "accelerating"]
+RateModel = Literal["auto", "constant", "accelerating"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,7 +18,8 @@ class LikelihoodSettings:
             share it, else the top of the integer type.
         saturated_fraction: of the pixels, from which the frame is called saturated.
         psf_sigma: px, where the fit of the point spread starts.
-        rate_model: `constant`, or `accelerating`: the rate's change over the exposure is fitted too.
+        rate_model: `constant`; `accelerating`: the rate's change over the exposure is fitted too; `auto`: the
+            pixels decide.
         line_time: s from the start of one row's exposure to the next's (rolling shutter); 0 is global.
         threshold_sigmas: of the 3 x 3 sum, for the first guess.
         most_stars: the brightest are fitted, no more: they hold most of the information.
@@ -39,14 +40,14 @@ class LikelihoodSettings:
     saturation: float | None = None
     saturated_fraction: float = 0.25
     psf_sigma: float = 1.0
-    rate_model: RateModel = "constant"
+    rate_model: RateModel = "auto"
     line_time: float = 0.0
     threshold_sigmas: float = 4.5
     most_stars: int = 24
     most_neighbours: int = 80
     most_faint: int = 400
     faint_sigmas: float = 6.0
-    reach: float = 4.0
+    reach: float = 3.6
     clip: float = 5.0
     least_stars: int = 3
     least_length: float = 3.0

@@ -23,8 +23,8 @@ from flight.vision.likelihood.normal_equations import (
 )
 from flight.vision.likelihood.scene import Scene
 
-# Conjugate gradients stop at this part of the first step's norm.
-_CONVERGED = 1e-3
+# Conjugate gradients stop at this part of the first step's squared norm: covariances are then as exact.
+_CONVERGED = 1e-2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -192,11 +192,12 @@ def moved(scene: Scene, solution: Solution, pinhole: Pinhole, longest: float) ->
     Also returned is by how many px what is shared asked to move an end, or the width.
     """
     n = len(scene.stars)
-    ends = 0.0
-    for time in (-0.5, 0.5):
-        change = sensitivities(pinhole, scene.motion, scene.stars, np.full(n, time))
-        along = np.einsum("nij,j->ni", change[:, :, :6], solution.shared[:6])
-        ends = max(ends, float(np.hypot(along[:, 0], along[:, 1]).max(initial=0.0)))
+    growing = bool(solution.shared[3:6].any())
+    change = sensitivities(
+        pinhole, scene.motion, np.tile(scene.stars, (2, 1)), np.repeat([-0.5, 0.5], n), growing
+    )
+    along = change[:, :, :6] @ solution.shared[:6]
+    ends = float(np.hypot(along[:, 0], along[:, 1]).max(initial=0.0))
     share = min(1.0, longest / max(ends, 1e-9), 0.3 * scene.width / max(abs(solution.shared[6]), 1e-9))
     step = solution.alone * share
     far = np.hypot(step[:, 0], step[:, 1])

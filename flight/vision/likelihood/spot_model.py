@@ -20,6 +20,7 @@ from flight.vision.likelihood.shutter import Shutter
 INSTANTS = 10
 """Gauss-Legendre nodes: two widths of the point spread between them is still exact to 1e-4."""
 
+_NODE, _WEIGHT = np.polynomial.legendre.leggauss(INSTANTS)
 _BELL = 1.0 / math.sqrt(2.0 * math.pi)
 
 
@@ -58,15 +59,16 @@ def derivatives(
     By turn (3), growth (3), x, y, and `sigma` px of the point spread.
     """
     count = len(stars)
-    node, weight = np.polynomial.legendre.leggauss(INSTANTS)
+    if not count:
+        return np.empty(patches.index.shape), np.empty((0, 9, *patches.index.shape[1:]))
     delay = shutter.delay(stars[:, 1])
-    time = (0.5 * node + delay[:, None]).reshape(-1)
+    time = (0.5 * _NODE + delay[:, None]).reshape(-1)
     repeated = np.repeat(stars, INSTANTS, axis=0)
     place = paths(pinhole, motion, repeated, time).position.reshape(count, INSTANTS, 2)
     change = sensitivities(pinhole, motion, repeated, time).reshape(count, INSTANTS, 2, 8)
     x, dx, sx = _profile(patches.column, place[..., 0], sigma)
     y, dy, sy = _profile(patches.row, place[..., 1], sigma)
-    y, dy, sy = (0.5 * weight[:, None] * part for part in (y, dy, sy))
+    y, dy, sy = (0.5 * _WEIGHT[:, None] * part for part in (y, dy, sy))
     down = y.swapaxes(1, 2)
     light = down @ x
     out = np.empty((count, 9, *light.shape[1:]))

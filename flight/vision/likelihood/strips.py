@@ -1,7 +1,7 @@
 """Which pixels a streak falls on: lines of pixels across its path.
 
 A path that runs more along the rows of the frame than across them is cut column by column, any other row by
-row; each line holds the pixels about its crossing. Eight lines make a block, over which the motion's
+row; each line holds the pixels about its crossing. Ten lines make a block, over which the motion's
 sensitivity is linear. Long turns are divided in time, each part keeping the pixels nearest to it. The pixels
 stay as the fit moves; only their distances from the path are computed again.
 """
@@ -18,7 +18,7 @@ from flight.arrays import BoolArray, FloatArray, IntArray
 from flight.pinhole import Pinhole
 from flight.vision.likelihood.motion import Motion, Paths, paths
 
-LINES = 8
+LINES = 10
 """Lines in a block."""
 
 # A part of a path turns by no more than this, rad, so that it stays monotonic along its major axis.
@@ -139,19 +139,21 @@ def _pixels(
     line = lines.line[..., None]
     limit = np.where(wide, pinhole.rows, pinhole.columns)
     column, row = np.where(wide, line, minor), np.where(wide, minor, line)
-    dx, dy = column - position[..., :1], row - position[..., 1:]
-    aside = dy * tangent[..., :1] - dx * tangent[..., 1:]
-    bent = path.acceleration.reshape(*shape, 2)
-    bend = (bent[..., 1] * tangent[..., 0] - bent[..., 0] * tangent[..., 1]) / speed**2
-    ahead = (dx * tangent[..., :1] + dy * tangent[..., 1:]) / np.maximum(1.0 - bend[..., None] * aside, 0.5)
-    foot = lines.time[..., None] + ahead / speed[..., None]
+    # Distances are wanted to a hundredth of a px.
+    here, way, pace = (np.asarray(part, dtype=np.float32) for part in (position, tangent, speed))
+    dx, dy = column.astype(np.float32) - here[..., :1], row.astype(np.float32) - here[..., 1:]
+    aside = dy * way[..., :1] - dx * way[..., 1:]
+    bent = path.acceleration.reshape(*shape, 2).astype(np.float32)
+    bend = (bent[..., 1] * way[..., 0] - bent[..., 0] * way[..., 1]) / pace**2
+    ahead = (dx * way[..., :1] + dy * way[..., 1:]) / np.maximum(1.0 - bend[..., None] * aside, 0.5)
+    foot = lines.time[..., None].astype(np.float32) + ahead / pace[..., None]
     across = np.abs(aside - 0.5 * bend[..., None] * ahead**2)
-    room = width / speed[..., None]
+    room = width / pace[..., None]
     start, stop = low[lines.part][:, None, None], high[lines.part][:, None, None]
     open_start, open_stop = outer[lines.part, 0][:, None, None], outer[lines.part, 1][:, None, None]
     inside = lines.real[..., None] & (minor >= 0) & (minor < limit) & (across <= width)
     # Between two parts a pixel may be lost, but none is counted twice.
-    seam = _SEAM / speed[..., None]
+    seam = _SEAM / pace[..., None]
     inside &= foot >= start + np.where(open_start, -room, seam)
     inside &= foot < stop - np.where(open_stop, -room, seam)
     used = inside.any(axis=(1, 2))

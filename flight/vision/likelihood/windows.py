@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flight.arrays import IntArray
+from flight.arrays import BoolArray, FloatArray, IntArray
 from flight.pinhole import Pinhole
+from flight.vision.likelihood.exposed_frame import ExposedFrame, Float32Array
 from flight.vision.likelihood.scene import Scene, path_lengths, window_times
 from flight.vision.likelihood.shutter import Shutter
 from flight.vision.likelihood.spot_model import Patches, cut_patches
@@ -15,6 +16,51 @@ from flight.vision.likelihood.strips import Strips, cut_strips
 
 # Paths shorter than this many widths are summed instant by instant.
 _SPOT_WIDTHS = 8.0
+# Predicted light within so many sigmas of saturation is left out: chosen by the model, not by the noise.
+_MARGIN = 3.0
+_UNRESOLVED = 0.1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sight:
+    """What the frame shows on some blocks of pixels, all arrays (b, ...) alike.
+
+    Attributes:
+        slot: number of the pixel among those in use, the same for every star that shares it.
+        inside: whether the pixel exists, tells something, and is meant.
+        signal, floor, ceiling: of the frame.
+        gain: electrons a count.
+        crowded: (e,) flat positions of the pixels that other stars share.
+    """
+
+    slot: IntArray
+    inside: BoolArray
+    signal: Float32Array
+    floor: Float32Array
+    ceiling: Float32Array
+    gain: float
+    crowded: IntArray
+
+    def residual(self, total: Float32Array, clip: float) -> tuple[Float32Array, Float32Array]:
+        """Return weights (1/variance, 0 where left out) and residuals under the light `total` by slot.
+
+        Residuals of more than `clip` sigma and a tenth of the model are no noise: left out; 0 leaves none out
+        for that.
+        """
+        model = total.take(self.slot)
+        variance = np.maximum(model, np.float32(0.0))
+        variance *= np.float32(1.0 / self.gain)
+        variance += self.floor
+        residual = self.signal - model
+        deviation = np.sqrt(variance)
+        good = self.inside & (model + np.float32(_MARGIN) * deviation < self.ceiling)
+        if clip > 0.0:
+            deviation *= np.float32(clip)
+            deviation += np.float32(_UNRESOLVED) * model
+            good &= np.abs(residual) <= deviation
+        weight = np.where(good, np.float32(1.0) / variance, np.float32(0.0))
+        residual[~good] = 0.0
+        return weight, residual
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -24,16 +70,42 @@ class Windows:
     Attributes:
         long, spot: stars (a,), (b,) of each kind, indices into the scene.
         strips, patches: their pixels; star i of the strips is `long[i]`.
+        pixels: (m,) flat indices of the pixels in use, by slot.
+        on_strips, on_patches: what the frame shows there.
     """
 
     long: IntArray
     spot: IntArray
     strips: Strips
     patches: Patches
+    pixels: IntArray
+    on_strips: Sight
+    on_patches: Sight
+
+    def total(self, on_strips: Float32Array, on_patches: FloatArray) -> Float32Array:
+        """Return the light (m,) of all stars on the pixels in use, from that on each star's own."""
+        slots = np.concatenate([self.on_strips.slot.reshape(-1), self.on_patches.slot.reshape(-1)])
+        light = np.concatenate(
+            [
+                (on_strips * self.strips.inside).reshape(-1),
+                (on_patches * self.patches.inside).reshape(-1).astype(np.float32),
+            ]
+        )
+        return np.bincount(slots, light, len(self.pixels)).astype(np.float32)
+
+    def only(self, on_strips: BoolArray, on_patches: BoolArray) -> Windows:
+        """Return the windows with only these pixels meant."""
+        return replace(
+            self,
+            on_strips=replace(self.on_strips, inside=on_strips),
+            on_patches=replace(self.on_patches, inside=on_patches),
+        )
 
 
-def cut_windows(pinhole: Pinhole, shutter: Shutter, scene: Scene, reach: float) -> Windows:
-    """Return the pixels within `reach` widths of the stars' paths."""
+def cut_windows(
+    frame: ExposedFrame, pinhole: Pinhole, shutter: Shutter, scene: Scene, reach: float
+) -> Windows:
+    """Return the pixels of `frame` within `reach` widths of the stars' paths."""
     length = path_lengths(pinhole, scene.motion, scene.stars)
     limit = _SPOT_WIDTHS * scene.width
     long, spot = np.flatnonzero(length >= limit), np.flatnonzero(length < limit)
@@ -42,4 +114,39 @@ def cut_windows(pinhole: Pinhole, shutter: Shutter, scene: Scene, reach: float) 
     strips = cut_strips(pinhole, scene.motion, scene.stars[long], times, room)
     longest = float(length[spot].max(initial=0.0))
     patches = cut_patches(pinhole, scene.stars[spot], int(np.ceil(room + 0.5 * longest)))
-    return Windows(long, spot, strips, patches)
+    use = np.zeros(frame.signal.size, dtype=np.bool_)
+    use[strips.index] = True
+    use[patches.index] = True
+    pixels = np.flatnonzero(use)
+    number = np.zeros(frame.signal.size, dtype=np.int64)
+    number[pixels] = np.arange(len(pixels))
+    slots = number[strips.index], number[patches.index]
+    sharing = np.zeros(len(pixels), dtype=np.int64)
+    for part, slot in ((strips, slots[0]), (patches, slots[1])):
+        sharing += np.bincount(slot[part.inside], minlength=len(pixels))
+    shared = sharing > 1
+    return Windows(
+        long,
+        spot,
+        strips,
+        patches,
+        pixels,
+        _sight(frame, strips.index, strips.inside, slots[0], shared),
+        _sight(frame, patches.index, patches.inside, slots[1], shared),
+    )
+
+
+def _sight(
+    frame: ExposedFrame, index: IntArray, inside: BoolArray, slot: IntArray, shared: BoolArray
+) -> Sight:
+    signal = frame.signal[index]
+    return Sight(
+        slot,
+        inside & ~frame.bad[index],
+        signal,
+        frame.floor[index],
+        # The background's level is what a pixel's counts exceed its signal by.
+        np.float32(frame.top) - frame.counts[index] + signal,
+        frame.gain,
+        np.flatnonzero(shared[slot] & inside),
+    )

@@ -1,0 +1,176 @@
+"""Rounds of the fit: evaluate, solve, move, until what all stars share has settled."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flight.arrays import BoolArray
+from flight.pinhole import Pinhole
+from flight.vision.likelihood.exposed_frame import ExposedFrame
+from flight.vision.likelihood.motion import paths
+from flight.vision.likelihood.normal_equations import ALONE, SHARED, Evaluation, evaluate
+from flight.vision.likelihood.scene import Scene
+from flight.vision.likelihood.settings import LikelihoodSettings
+from flight.vision.likelihood.shutter import Shutter
+from flight.vision.likelihood.solution import Solution, moved, solve
+from flight.vision.likelihood.windows import Windows, cut_windows
+
+_LONGEST_STEP = 3.0
+# An end so far, px, from where its window was cut has left the window's middle.
+_DRIFT = 1.0
+# Faint ones may be farther from it.
+_FAINT_DRIFT = 2.5
+# Converged: no shared parameter moves by more than this part of its standard deviation. The step is
+# taken, and what it leaves is of second order.
+SETTLED = 0.4
+# Out of patience, a step that is not so much shorter than the one before ends the rounds.
+_LEAST_PROGRESS = 0.7
+# After so many looks at what is no noise it is settled which pixels are left out.
+_LOOKS = 1
+# The rate changes when the score of its change exceeds this: once in 10,000 constant rates (chi-square of 3).
+_CHANGING = 21.1
+GROWING = np.ones(SHARED, dtype=np.bool_)
+_WIDEST = 6.0
+
+
+@dataclass(frozen=True, slots=True)
+class Rounds:
+    """How a scene is fitted.
+
+    Attributes:
+        rounds: at most.
+        clipped: whether what is no noise is left out.
+        tolerance: steps of an end or the width that are as good as none, px; settled: in deviations.
+        conjugate: gradients at most for the pixels that stars share.
+        patience: rounds that are spent whether or not they bring the fit on.
+    """
+
+    rounds: int
+    clipped: bool
+    tolerance: float
+    settled: float
+    conjugate: int
+    patience: int
+
+
+FIRST = Rounds(8, clipped=False, tolerance=0.1, settled=SETTLED, conjugate=4, patience=2)
+ROUGH = Rounds(3, clipped=True, tolerance=0.003, settled=1.5, conjugate=12, patience=3)
+LAST = Rounds(8, clipped=True, tolerance=0.003, settled=SETTLED, conjugate=12, patience=4)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExposedCamera:
+    """A frame with all that is known of how it was taken; `growing` tells whether the rate may change."""
+
+    frame: ExposedFrame
+    pinhole: Pinhole
+    shutter: Shutter
+    settings: LikelihoodSettings
+    growing: bool = False
+
+    @property
+    def free(self) -> BoolArray:
+        """Which shared parameters are fitted."""
+        return np.array([True] * 3 + [self.growing] * 3 + [True])
+
+    @property
+    def undecided(self) -> bool:
+        """Whether the pixels are yet to show that the rate changes."""
+        return self.settings.rate_model == "auto" and not self.growing
+
+    def windows(self, scene: Scene) -> Windows:
+        """Return the pixels about the scene's streaks."""
+        return cut_windows(self.frame, self.pinhole, self.shutter, scene, self.settings.reach)
+
+    def evaluate(self, scene: Scene, windows: Windows, clip: float) -> Evaluation:
+        """Return the normal equations."""
+        growth = self.growing or (self.undecided and clip > 0.0)
+        return evaluate(self.pinhole, self.shutter, scene, windows, clip, growth)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """A scene after its last step, with the equations of that step.
+
+    Attributes:
+        windows: its pixels; free: (SHARED,) which shared parameters were fitted.
+        restless: the last step of what is shared, in standard deviations; 0 when the fit has settled.
+    """
+
+    scene: Scene
+    solution: Solution
+    evaluation: Evaluation
+    restless: float
+    windows: Windows
+    free: BoolArray
+
+    def grows(self) -> bool:
+        """Tell whether the pixels show that the rate changes: a score test of the constant one."""
+        solution = solve(self.evaluation, self.scene, GROWING, LAST.conjugate)
+        if solution is None:
+            return False
+        growth, covariance = solution.shared[3:6], solution.covariance[3:6, 3:6]
+        return float(growth @ np.linalg.solve(covariance, growth)) > _CHANGING
+
+
+def iterate(
+    camera: ExposedCamera, scene: Scene, free: BoolArray, how: Rounds, windows: Windows | None = None
+) -> Fit | None:
+    """Return the fit after some rounds, None when the stars do not fix the motion."""
+    whole, cut_at = windows or camera.windows(scene), scene
+    windows = whole
+    restless, asked = np.inf, np.inf
+    solution, evaluation = None, None
+    for turn in range(how.rounds):
+        evaluation = camera.evaluate(scene, windows, camera.settings.clip if how.clipped else 0.0)
+        solution = solve(evaluation, scene, free, how.conjugate)
+        if solution is None:
+            return None
+        scene, wanted = moved(scene, solution, camera.pinhole, _LONGEST_STEP)
+        if not _possible(scene):
+            return None
+        deviation = np.sqrt(np.maximum(np.diag(solution.covariance)[free], 1e-30))
+        restless = float(np.max(np.abs(solution.shared[free]) / deviation))
+        if restless <= how.settled or wanted <= how.tolerance:
+            restless = 0.0
+            break
+        if turn >= how.patience and wanted > _LEAST_PROGRESS * asked:
+            break
+        asked = wanted
+        if _drifted(camera, cut_at, scene):
+            windows = whole = camera.windows(scene)
+            cut_at = scene
+        elif how.clipped and turn >= _LOOKS:
+            # Pixels that come and go as they are left out and taken in would keep the fit from settling.
+            windows = whole.only(*evaluation.kept)
+    if solution is None or evaluation is None:
+        return None
+    return Fit(scene, solution, evaluation, restless, whole, free)
+
+
+def _possible(scene: Scene) -> bool:
+    return (
+        0.3 < scene.width < _WIDEST
+        and bool(np.all(np.isfinite(scene.stars)))
+        and float(np.linalg.norm(scene.motion.turn)) <= np.pi
+    )
+
+
+def _drifted(camera: ExposedCamera, before: Scene, after: Scene) -> bool:
+    """Tell whether an end of a streak has left the middle of its window; faint ones matter less."""
+    allowed = np.where(after.trusted, _DRIFT, _FAINT_DRIFT)
+    for time in (-0.5, 0.5):
+        at = np.full(len(before.stars), time)
+        there = paths(camera.pinhole, after.motion, after.stars, at).position
+        was = paths(camera.pinhole, before.motion, before.stars, at).position
+        if np.any(np.abs(there - was).max(axis=1) > allowed):
+            return True
+    return False
+
+
+def misfit(evaluation: Evaluation) -> float:
+    """Return the median chi-square a pixel of the stars."""
+    freedom = np.maximum(evaluation.pixels - ALONE - 1.0, 1.0)
+    return float(np.median(evaluation.chi2 / freedom))
