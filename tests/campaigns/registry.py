@@ -3,11 +3,20 @@
 from __future__ import annotations
 
 from tests.campaigns.campaign import Campaign
+from tests.campaigns.consistency import CONSISTENCY
 from tests.campaigns.failures import FAILURES
 from tests.campaigns.rso import RSO_SLEW, RSO_TRACK
 from tests.campaigns.rso_orbits import RSO_ORBITS
 from tests.campaigns.streaks import STREAKS
 
 CAMPAIGNS: dict[str, Campaign] = {
-    campaign.name: campaign for campaign in (STREAKS, FAILURES, RSO_SLEW, RSO_TRACK, RSO_ORBITS)
+    campaign.name: campaign
+    for campaign in (
+        STREAKS,
+        FAILURES,
+        RSO_SLEW,
+        RSO_TRACK,
+        RSO_ORBITS,
+        CONSISTENCY,
+    )
 }

@@ -1,0 +1,296 @@
+"""Attitude, rate, gyro bias and disturbance from measurements that may come late: a MEKF with a memory.
+
+Each measurement is applied at its own time: one that arrives late is put where it belongs and those after it
+are applied again. A rate from a streaked image is the mean over its exposure: the attitude at the exposure's
+start is kept until its end. On the testbed's thread the same filter runs suspended: it takes of every
+measurement what it says about the thread, and all else stays exactly what it was; the thread's torsion
+and damping are known, or estimated beside the disturbance, from which they differ in that they go with the
+angle and the rate.
+"""
+
+from __future__ import annotations
+
+import bisect
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import chdtri
+
+from flight.arrays import FloatArray
+from flight.estimation.estimate import BIAS, DISTURBANCE, RATE, TURN, Estimate
+from flight.estimation.measurements import (
+    AttitudeMeasurement,
+    MeanRateMeasurement,
+    Measurement,
+    RateMeasurement,
+)
+from flight.estimation.mekf import (
+    SIZE,
+    ProcessNoise,
+    State,
+    carry,
+    correct,
+    innovation,
+    keep_attitude,
+    normalised_square,
+    release_attitude,
+)
+from flight.estimation.rigid_body import RigidBody, Torquing
+from flight.estimation.turn import exponential, twist
+
+
+@dataclass(frozen=True, slots=True)
+class FilterSettings:
+    """Noise and bounds of the filter.
+
+    Attributes:
+        current_noise: A, standard deviation of a driven coil's current about its command, one draw a cycle.
+        control_period: s, the length of such a cycle.
+        disturbance_walk: rad/s^2 per sqrt(s), the random walk of the unmodelled acceleration.
+        disturbance_start: rad/s^2, standard deviation of that acceleration at the start.
+        bias_walk: rad/s per sqrt(s), the random walk of the gyro's bias.
+        bias_start: rad/s, standard deviation of that bias at the start.
+        torsion_start: 1/s^2, standard deviation of the thread's torsion at the start, zero when it is known.
+        damping_start: 1/s, of its damping, likewise.
+        gain_start: of the coils' gain, likewise.
+        rate_walk: rad/s per sqrt(s), white acceleration beside that of the coils.
+        gate_sigma: a measurement is refused that is less likely than this many sigma of one component.
+        history_ns: how late a measurement may come and still be used.
+    """
+
+    current_noise: float
+    control_period: float
+    disturbance_walk: float
+    disturbance_start: float = 0.02
+    bias_walk: float = 1e-7
+    bias_start: float = 1e-3
+    torsion_start: float = 0.0
+    damping_start: float = 0.0
+    gain_start: float = 0.0
+    rate_walk: float = 0.0
+    gate_sigma: float = 5.0
+    history_ns: int = 6_000_000_000
+
+
+@dataclass(slots=True)
+class _Checkpoint:
+    """A measurement, whether it passed the gate, and the state just after it."""
+
+    measurement: Measurement
+    used: bool
+    state: State
+    covariance: FloatArray
+
+
+class AttitudeFilter:
+    """Holds the estimate, its recent measurements and the recent commands.
+
+    Attributes:
+        refused: how many measurements did not pass their gate.
+        late: how many came too late to be put where they belong.
+        restarts: how often it gave up its estimate.
+        nis: normalised innovation squared of the measurement last given, NaN when there was none.
+    """
+
+    REJECTIONS_TO_RESTART = 40
+    """After so many refusals of attitudes, or of rates, in a row it is the filter that is wrong."""
+
+    def __init__(self, body: RigidBody, settings: FilterSettings) -> None:
+        self._body = body
+        self._settings = settings
+        free = np.array([0.0, 1.0, 0.0]) if body.suspended else np.ones(3)
+        self._free = free
+        self._noise = ProcessNoise(
+            settings.current_noise**2 * settings.control_period,
+            np.diag(settings.rate_walk**2 * free),
+            np.array(
+                [
+                    *settings.bias_walk**2 * free,
+                    *settings.disturbance_walk**2 * free,
+                ]
+            ),
+        )
+        self._gate = _gate(settings.gate_sigma, 1 if body.suspended else 3)
+        self._history: list[_Checkpoint] = []
+        self._command_times: list[int] = []
+        self._commands: list[Torquing] = []
+        self._idle = body.torquing(np.zeros(3))
+        self._refused_in_a_row: dict[type[Measurement], int] = {}
+        self.refused = 0
+        self.late = 0
+        self.restarts = 0
+        self.nis = math.nan
+
+    def command(self, time_ns: int, currents: FloatArray, field: FloatArray | None = None) -> None:
+        """Note the coil currents (3,) A in force from `time_ns` on, and the field (3,) T, reference axes.
+
+        Commands come in order of time, each before the measurements taken under it. Without `field` the
+        body's own is meant.
+        """
+        torquing = self._body.torquing(currents, field)
+        if self._commands and self._commands[-1] == torquing:
+            return
+        self._command_times.append(time_ns)
+        self._commands.append(torquing)
+        oldest = bisect.bisect_right(self._command_times, time_ns - self._settings.history_ns) - 1
+        if oldest > 64:  # now and then, not each cycle
+            del self._command_times[:oldest], self._commands[:oldest]
+
+    def start(self, attitude: AttitudeMeasurement, rate: RateMeasurement) -> None:
+        """Begin from one attitude and one rate; of a suspended body, from what they say about the thread."""
+        settings, free = self._settings, self._free
+        a, b, c, d = attitude.quaternion.tolist()
+        quaternion = exponential(0.0, twist((a, b, c, d)), 0.0) if self._body.suspended else (a, b, c, d)
+        x, y, z = (free * rate.rate).tolist()
+        turn_variance = attitude.covariance * np.outer(free, free)
+        rate_variance = rate.covariance * np.outer(free, free)
+        bias_variance = np.diag(settings.bias_start**2 * free)
+        covariance = np.zeros((SIZE, SIZE))
+        covariance[TURN, TURN] = turn_variance
+        # The gyro gives the sum of rate and bias: what one has too much the other has too little.
+        covariance[RATE, RATE] = rate_variance + bias_variance
+        covariance[RATE, BIAS] = covariance[BIAS, RATE] = -bias_variance
+        covariance[BIAS, BIAS] = bias_variance
+        covariance[DISTURBANCE, DISTURBANCE] = np.diag(settings.disturbance_start**2 * free)
+        if self._body.suspended:
+            covariance[12, 12], covariance[13, 13] = settings.torsion_start**2, settings.damping_start**2
+        covariance[14, 14] = settings.gain_start**2
+        state = State(quaternion, (x, y, z), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), self._body.parameters)
+        newest: Measurement = attitude if attitude.time_ns >= rate.time_ns else rate
+        self._history = [_Checkpoint(newest, True, state, covariance)]
+        self._refused_in_a_row = {}
+
+    @property
+    def started(self) -> bool:
+        """Whether there is an estimate at all."""
+        return bool(self._history)
+
+    def measure(self, measurement: Measurement) -> bool:
+        """Apply a measurement at its own time; tell whether it passed the gate (or was too late)."""
+        self.nis = math.nan
+        if self._history and measurement.begin_ns >= self._history[-1].measurement.time_ns:
+            used = self._apply([measurement], measurement)
+        elif (index := self._index_before(measurement.begin_ns)) > 0:
+            used = self._insert(index, measurement)
+        else:
+            self.late += 1
+            return False
+        self._count(type(measurement), used)
+        self._forget(measurement.time_ns)
+        return used
+
+    def at(self, time_ns: int) -> Estimate:
+        """Return the estimate propagated to `time_ns`; the filter itself stays where it is."""
+        newest = next((c for c in reversed(self._history) if c.used), self._history[-1])
+        return self._estimate(self._history[-1], time_ns, newest.measurement.time_ns)
+
+    def past(self, time_ns: int) -> Estimate | None:
+        """Return the estimate as it stood at a past time, None when that is before all it remembers."""
+        index = bisect.bisect_right(self._history, time_ns, key=_time_of)
+        if index == 0:
+            return None
+        then = self._history[index - 1]
+        return self._estimate(then, time_ns, then.measurement.time_ns)
+
+    def _estimate(self, then: _Checkpoint, time_ns: int, measured_ns: int) -> Estimate:
+        state, covariance = self._propagate(then.state, then.covariance, _time_of(then), time_ns)
+        return Estimate(
+            time_ns,
+            np.array(state.quaternion),
+            np.array(state.rate),
+            np.array(state.bias),
+            np.array(state.disturbance),
+            state.parameters,
+            covariance,
+            measured_ns,
+        )
+
+    def _insert(self, index: int, measurement: Measurement) -> bool:
+        """Go back to the first `index` checkpoints; apply what came after once more, with `measurement`."""
+        later = [checkpoint.measurement for checkpoint in self._history[index:]]
+        place = bisect.bisect_right(later, measurement.time_ns, key=lambda other: other.time_ns)
+        later.insert(place, measurement)
+        del self._history[index:]
+        return self._apply(later, measurement)
+
+    def _index_before(self, begin_ns: int) -> int:
+        """Return how many checkpoints stand up to `begin_ns`, or up to the begin of a mean that spans it."""
+        while True:
+            index = bisect.bisect_right(self._history, begin_ns, key=_time_of)
+            spanning = [c.measurement.begin_ns for c in self._history[index:]]
+            earliest = min(spanning, default=begin_ns)
+            if earliest >= begin_ns:
+                return index
+            begin_ns = earliest
+
+    def _apply(self, measurements: list[Measurement], asked: Measurement) -> bool:
+        """Apply measurements in order of time from the last checkpoint on; tell whether `asked` was used."""
+        last = self._history[-1]
+        state, covariance, time_ns = last.state, last.covariance, _time_of(last)
+        exposures = [m for m in measurements if isinstance(m, MeanRateMeasurement)]
+        exposures.sort(key=lambda m: m.since_ns, reverse=True)
+        asked_used = False
+        for measurement in measurements:
+            while exposures and exposures[-1].since_ns <= measurement.time_ns:
+                exposure = exposures.pop()
+                state, covariance = self._propagate(state, covariance, time_ns, exposure.since_ns)
+                state, covariance = keep_attitude(state, covariance, exposure)
+                time_ns = exposure.since_ns
+            state, covariance = self._propagate(state, covariance, time_ns, measurement.time_ns)
+            time_ns = measurement.time_ns
+            found = innovation(state, measurement, self._body.suspended)
+            nis, gain = normalised_square(found, covariance)
+            used = 0.0 <= nis <= self._gate  # a NaN does not pass
+            if used:
+                state, covariance = correct(state, covariance, found, gain)
+            if isinstance(measurement, MeanRateMeasurement):
+                state, covariance = release_attitude(state, covariance, measurement)
+            alone = state._replace(kept=()) if state.kept else state
+            self._history.append(_Checkpoint(measurement, used, alone, covariance[:SIZE, :SIZE]))
+            if measurement is asked:
+                asked_used, self.nis = used, nis
+        return asked_used
+
+    def _propagate(
+        self, state: State, covariance: FloatArray, from_ns: int, to_ns: int
+    ) -> tuple[State, FloatArray]:
+        """Carry state and covariance over the commands in force between two times, forward only."""
+        time_ns = from_ns
+        index = max(bisect.bisect_right(self._command_times, from_ns) - 1, 0)
+        while time_ns < to_ns:
+            torquing = self._commands[index] if self._commands else self._idle
+            more = index + 1 < len(self._commands)
+            until_ns = min(to_ns, self._command_times[index + 1]) if more else to_ns
+            if until_ns > time_ns:
+                duration = (until_ns - time_ns) * 1e-9
+                state, covariance = carry(self._body, self._noise, state, covariance, torquing, duration)
+                time_ns = until_ns
+            index += more
+        return state, covariance
+
+    def _count(self, kind: type[Measurement], used: bool) -> None:
+        """Count refusals. Mean rates come too seldom to tell who is wrong, and restart nothing."""
+        in_a_row = 0 if used else self._refused_in_a_row.get(kind, 0) + 1
+        self._refused_in_a_row[kind] = in_a_row
+        self.refused += not used
+        if kind is not MeanRateMeasurement and in_a_row >= self.REJECTIONS_TO_RESTART:
+            self._history.clear()
+            self._refused_in_a_row = {}
+            self.restarts += 1
+
+    def _forget(self, now_ns: int) -> None:
+        """Drop what is too old to be of use, now and then."""
+        horizon_ns = now_ns - self._settings.history_ns
+        if len(self._history) > 2 and _time_of(self._history[0]) < horizon_ns - 1_000_000_000:
+            keep = bisect.bisect_left(self._history, horizon_ns, key=_time_of)
+            del self._history[: min(keep, len(self._history) - 1)]
+
+
+def _time_of(checkpoint: _Checkpoint) -> int:
+    return checkpoint.measurement.time_ns
+
+
+def _gate(sigma: float, degrees: int) -> float:
+    """Return the chi-square bound of `degrees` that is passed as seldom as `sigma` of one component."""
+    return float(chdtri(degrees, math.erfc(sigma / math.sqrt(2.0))))

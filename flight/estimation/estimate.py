@@ -1,0 +1,93 @@
+"""What the filter hands out: attitude, rate, gyro bias and disturbance with their covariance."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from flight.arrays import FloatArray
+from flight.estimation.rigid_body import NOMINAL, Parameters
+from flight.quaternion import angle_about_axis_y
+
+TURN, RATE, BIAS, DISTURBANCE, PARAMETERS = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15)
+"""Where the parts of the error stand in the covariance (15, 15)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ThreadEstimate:
+    """The state about the thread at `time_ns`: rad, rad/s, rad/s^2, and its covariance (3, 3).
+
+    `measured_ns` is the time of the newest measurement in it: its age says whether to trust it.
+    """
+
+    time_ns: int
+    angle: float
+    rate: float
+    disturbance: float
+    covariance: FloatArray
+    measured_ns: int
+
+    @property
+    def q2(self) -> float:
+        """The second quaternion component."""
+        return math.sin(0.5 * self.angle)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """The state at `time_ns`.
+
+    Attributes:
+        quaternion: (4,) reference into body.
+        rate: (3,) rad/s, body axes.
+        bias: (3,) rad/s, of the gyro.
+        disturbance: (3,) rad/s^2, angular acceleration that the model does not account for.
+        parameters: of the model: the thread's torsion and damping, the coils' gain.
+        covariance: (15, 15) of small turns about the body's axes, rate, and so on (TURN, RATE, ...).
+        measured_ns: the time of the newest measurement in it: its age says whether to trust it.
+    """
+
+    time_ns: int
+    quaternion: FloatArray
+    rate: FloatArray
+    bias: FloatArray
+    disturbance: FloatArray
+    parameters: Parameters
+    covariance: FloatArray
+    measured_ns: int
+
+    @property
+    def angle(self) -> float:
+        """The turn about the thread, body y, rad."""
+        return angle_about_axis_y(self.quaternion)
+
+    @property
+    def q2(self) -> float:
+        """The second quaternion component of that turn."""
+        return math.sin(0.5 * self.angle)
+
+    def about_thread(self, believed: Parameters = NOMINAL) -> ThreadEstimate:
+        """Return what it says of the turn about the thread; exact for a body that is suspended.
+
+        The disturbance is what a plant with the `believed` torsion and damping leaves out: by how much that
+        thread pulls less than the one estimated is counted in. The coils' gain is the plant's own affair.
+        """
+        angle, rate = self.angle, float(self.rate[1])
+        torsion, damping = (
+            self.parameters.torsion - believed.torsion,
+            self.parameters.damping - believed.damping,
+        )
+        rows = np.zeros((3, len(self.covariance)))
+        rows[0, 1] = rows[1, 4] = rows[2, 10] = 1.0
+        rows[2, 1], rows[2, 4] = -torsion, -damping
+        rows[2, PARAMETERS] = -angle, -rate, 0.0
+        return ThreadEstimate(
+            self.time_ns,
+            angle,
+            rate,
+            float(self.disturbance[1]) - torsion * angle - damping * rate,
+            rows @ self.covariance @ rows.T,
+            self.measured_ns,
+        )

@@ -1,0 +1,56 @@
+"""What the filter takes in: attitudes, rates of the gyro, mean rates over an exposure; each with its time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from flight.arrays import FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AttitudeMeasurement:
+    """An attitude: quaternion (4,) reference into body, covariance (3, 3) rad^2 of small turns, body axes."""
+
+    time_ns: int
+    quaternion: FloatArray
+    covariance: FloatArray
+
+    @property
+    def begin_ns(self) -> int:
+        """The first time it says something about."""
+        return self.time_ns
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RateMeasurement:
+    """A gyro's body rate (3,) rad/s, bias included, and its covariance (3, 3)."""
+
+    time_ns: int
+    rate: FloatArray
+    covariance: FloatArray
+
+    @property
+    def begin_ns(self) -> int:
+        """The first time it says something about."""
+        return self.time_ns
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeanRateMeasurement:
+    """The mean body rate (3,) rad/s of an exposure, free of the gyro's bias, and its covariance (3, 3).
+
+    It is the one constant rate that turns the attitude at `since_ns` into that at `time_ns`.
+    """
+
+    since_ns: int
+    time_ns: int
+    rate: FloatArray
+    covariance: FloatArray
+
+    @property
+    def begin_ns(self) -> int:
+        """The first time it says something about."""
+        return self.since_ns
+
+
+Measurement = AttitudeMeasurement | RateMeasurement | MeanRateMeasurement
