@@ -16,7 +16,7 @@ import msgspec
 import yaml
 
 from flight.errors import ConfigError
-from flight.settings import Config
+from flight.settings import Camera, Config
 
 T = TypeVar("T")
 S = TypeVar("S", bound=msgspec.Struct)
@@ -42,11 +42,7 @@ _Loader.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+0123456
 
 def load(path: Path) -> Config:
     """Read and validate a configuration file. Raises ConfigError."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(str(path), f"cannot be read: {error}") from error
-    return parse(text, str(path))
+    return parse(_read(path), str(path))
 
 
 def parse(text: str, name: str = "configuration") -> Config:
@@ -58,6 +54,21 @@ def parse(text: str, name: str = "configuration") -> Config:
     config = convert(tree, Config, name, lines)
     _check_sense(config, name, lines)
     return config
+
+
+def load_camera(path: Path) -> Camera:
+    """Read the camera of a whole configuration, or of a file that holds nothing but a `camera` section.
+
+    Raises ConfigError, also when there is no camera.
+    """
+    text = _read(path)
+    tree, lines = _read_yaml(text, str(path))
+    if set(tree) == {"camera"} and tree["camera"] != "none":
+        return convert(tree["camera"], Camera, str(path), lines, prefix="camera")
+    camera = parse(text, str(path)).camera
+    if camera is None:
+        raise ConfigError(str(path), "`camera` is none: give a configuration with a camera")
+    return camera
 
 
 def simulation_section(text: str, name: str, shape: type[T]) -> T | None:
@@ -91,6 +102,13 @@ def convert(tree: Any, shape: type[T], name: str, lines: Lines, prefix: str = ""
             value = _lookup(tree, path.rstrip("`"))
             message = f"is {value!r}: {message[0].lower()}{message[1:]}" if value is not _ABSENT else message
         raise ConfigError(_place(name, dotted, lines), f"`{dotted or 'configuration'}` {message}") from error
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(str(path), f"cannot be read: {error}") from error
 
 
 def _read_yaml(text: str, name: str) -> tuple[dict[str, Any], Lines]:

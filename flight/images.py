@@ -1,6 +1,7 @@
 """Image files as arrays: PNG, TIFF and JPEG through Pillow, FITS by `flight.fits`; and pictures to draw upon.
 
     pixels = read_image(Path("night.fits"))      # (rows, columns), the counts as they stand in the file
+    pixels = read_raw(Path("night.raw"), columns=1280, rows=960, bits=16)      # bare pixels
     write_picture(Path("found.png"), grey_stretch(pixels))
 
 Row 0 is the file's first row. FITS viewers show it at the bottom, the others at the top: a sky read from the
@@ -48,6 +49,26 @@ def read_image(path: Path) -> Image:
     except OSError as error:
         raise UsageError(f"{path}: cannot be read: {error.strerror or error}") from error
     return fits.primary_image(content, str(path)) if content else _through_pillow(path)
+
+
+def read_raw(path: Path, columns: int, rows: int, bits: int) -> Image:
+    """Return the image (rows, columns) of a file of bare pixels, row by row: 8 bits, or 16 little-endian.
+
+    What stands before the pixels, a header of whatever kind, is passed over: the file's last bytes count.
+    Raises UsageError when the file is missing or too short.
+    """
+    kind = np.dtype("<u2") if bits == 16 else np.dtype("u1")
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read: {error.strerror or error}") from error
+    wanted = columns * rows * kind.itemsize
+    if len(content) < wanted:
+        raise UsageError(
+            f"{path}: {len(content)} bytes, but {columns} x {rows} pixels of {bits} bits are {wanted}"
+        )
+    pixels = np.frombuffer(content, kind, columns * rows, len(content) - wanted)
+    return pixels.reshape(rows, columns).astype(kind.newbyteorder("="))
 
 
 def grey_stretch(image: Image, low: float = 1.0, high: float = 99.7) -> npt.NDArray[np.uint8]:

@@ -27,6 +27,15 @@ class Pinhole:
         return cls(columns, rows, 0.5 * columns / np.tan(0.5 * field_of_view))
 
     @property
+    def ideal(self) -> Pinhole:
+        """The camera itself: it has no lens."""
+        return self
+
+    def rescaled(self, factor: float) -> Pinhole:
+        """Return the camera with its focal length multiplied by `factor`."""
+        return Pinhole(self.columns, self.rows, self.focal_length * factor)
+
+    @property
     def centre(self) -> tuple[float, float]:
         """The pixel (x, y) on the boresight: (columns - 1)/2, (rows - 1)/2."""
         return 0.5 * (self.columns - 1), 0.5 * (self.rows - 1)

@@ -20,6 +20,7 @@ COMMANDS = {
     "export": "write a run's packets as CSV",
     "plan": "plan a single path",
     "rate": "body rate from a picture of streaked stars",
+    "solve": "where a picture of the sky looks, and which stars it shows",
 }
 
 _EXAMPLES = """\
@@ -28,6 +29,7 @@ examples:
   python -m flight report runs/demo
   python -m flight plan --from 0.4 --to -0.3 --picture path.png
   python -m flight rate frame.png --fov 20 --exposure 0.2 --overlay found.png
+  python -m flight solve night.jpg --fov 11.4 --overlay solved.png
 """
 
 

@@ -13,8 +13,9 @@ import numpy as np
 
 from flight import config as configuration
 from flight.arrays import FloatArray, Image
+from flight.cli.pictures import add_picture, positive, read_picture
 from flight.errors import UsageError
-from flight.images import grey_stretch, read_image, write_picture
+from flight.images import grey_stretch, write_picture
 from flight.pinhole import Pinhole
 from flight.settings import Camera
 from flight.vision.likelihood.estimate import estimate_motion
@@ -37,9 +38,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "One picture cannot tell the direction of time: --prior says about which way it turned."
     )
     parser.epilog = "example: python -m flight rate frame.png --fov 20 --exposure 0.2 --overlay found.png"
-    parser.add_argument("image", type=Path, metavar="IMAGE")
-    parser.add_argument("--fov", type=_positive, metavar="DEG", help="field of view across the columns")
-    parser.add_argument("--exposure", type=_positive, metavar="S", help="exposure time")
+    add_picture(parser)
+    parser.add_argument("--fov", type=positive, metavar="DEG", help="field of view across the columns")
+    parser.add_argument("--exposure", type=positive, metavar="S", help="exposure time")
     parser.add_argument("--camera", type=Path, metavar="YAML", help="configuration whose camera this is")
     parser.add_argument("--prior", type=float, nargs=3, metavar=("X", "Y", "Z"), help="rough rate, rad/s")
     parser.add_argument(
@@ -55,12 +56,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Estimate, print, draw; exit status 1 when the picture gives no rate."""
-    pixels = read_image(options.image)
+    pixels = read_picture(options)
     if not np.issubdtype(pixels.dtype, np.unsignedinteger):
         raise UsageError(f"{options.image}: pixels of {pixels.dtype}: give unsigned integers of 8 or 16 bits")
-    camera = configuration.load(options.camera).camera if options.camera else None
-    if options.camera and camera is None:
-        raise UsageError(f"{options.camera} has no camera: its section says none")
+    camera = configuration.load_camera(options.camera) if options.camera else None
     pinhole, exposure = _geometry(options, camera, pixels)
     prior = None if options.prior is None else np.array(options.prior)
     found = _estimate(options.method, pixels, pinhole, exposure, camera, prior)
@@ -163,10 +162,3 @@ def _text(found: StreakResult | MotionResult, objects: tuple[SpaceObject, ...]) 
         rate = 1e3 * item.relative_rate
         lines.append(f"object:        at {x:.1f}, {y:.1f} px, {rate:.3f} mrad/s among the stars")
     return "\n".join(lines) + "\n"
-
-
-def _positive(text: str) -> float:
-    value = float(text)
-    if not (math.isfinite(value) and value > 0.0):
-        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
-    return value

@@ -5,6 +5,7 @@ from __future__ import annotations
 from tests.campaigns.campaign import Campaign
 from tests.campaigns.consistency import CONSISTENCY
 from tests.campaigns.failures import FAILURES
+from tests.campaigns.lost_in_space import LOST_IN_SPACE
 from tests.campaigns.rso import RSO_SLEW, RSO_TRACK
 from tests.campaigns.rso_orbits import RSO_ORBITS
 from tests.campaigns.streaks import STREAKS
@@ -18,5 +19,6 @@ CAMPAIGNS: dict[str, Campaign] = {
         RSO_TRACK,
         RSO_ORBITS,
         CONSISTENCY,
+        LOST_IN_SPACE,
     )
 }

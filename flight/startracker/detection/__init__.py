@@ -3,17 +3,18 @@
     found = detect(pixels, DetectionSettings()).stars()
     found.points, found.covariance, found.flux        # brightest first
 
-`sky` measures the background and finds what stands above it, `areas` puts that together, `peaks` chooses
+`sky` measures the background and finds what stands above it, `areas` puts that together: that is the
+`survey`, which tells points from streaks (`frame_kind`); streaks are `flight.vision`'s. `peaks` chooses
 what is worth a measurement, `first_look` tells the frame's own point spread and noise (`noise_model`), and
 `measurement` fits each star with them (`psf_fit`, `blending`) or takes the centre of mass
-(`window_centroid`); `detect` composes. `nearby` measures about predicted places only. `frame_kind`
-says whether the frame is one of points or of streaks, which are `flight.vision`'s.
+(`window_centroid`); `detect` composes. `nearby` measures about predicted places only.
 """
 
-from flight.startracker.detection.detect import detect, kind_of_frame
+from flight.startracker.detection.detect import detect, measure_areas
 from flight.startracker.detection.detections import Detections, FrameKind, FrameShape, Quality
 from flight.startracker.detection.nearby import measure_near
 from flight.startracker.detection.settings import DetectionSettings
+from flight.startracker.detection.survey import Survey, kind_of_frame, survey
 
 __all__ = [
     "DetectionSettings",
@@ -21,7 +22,10 @@ __all__ = [
     "FrameKind",
     "FrameShape",
     "Quality",
+    "Survey",
     "detect",
     "kind_of_frame",
+    "measure_areas",
     "measure_near",
+    "survey",
 ]

@@ -1,18 +1,19 @@
-"""Stars of a whole frame: `detect`, and what kind of frame it is: `kind_of_frame`."""
+"""Stars of a whole frame."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from flight.arrays import BoolArray, FloatArray, Image, IntArray
-from flight.startracker.detection.areas import Areas, cluttered, find_areas
-from flight.startracker.detection.detections import REFUSED, Detections, FrameKind, FrameShape, Quality
+from flight.startracker.detection.areas import Areas, cluttered
+from flight.startracker.detection.detections import REFUSED, Detections, FrameKind, Quality
 from flight.startracker.detection.first_look import FrameSpread, Shapes, first_look, frame_spread
 from flight.startracker.detection.frame_kind import frame_shape, is_streak
 from flight.startracker.detection.measurement import Measured, measure
 from flight.startracker.detection.peaks import Peaks, find_peaks, worth_measuring
 from flight.startracker.detection.settings import DetectionSettings
-from flight.startracker.detection.sky import Sky, find_bright, in_counts, measure_sky
+from flight.startracker.detection.sky import Sky
+from flight.startracker.detection.survey import Survey, survey
 from flight.startracker.detection.targets import Targets
 
 # So many times the stars wanted are measured: some will prove to be none.
@@ -38,15 +39,17 @@ def detect(pixels: Image, settings: DetectionSettings | None = None) -> Detectio
 
     Raises ValueError when `pixels` is no finite frame of real numbers, 16 x 16 or larger.
     """
-    pixels, unit = in_counts(pixels)
-    settings = (settings or DetectionSettings()).in_units_of(unit)
-    sky = measure_sky(pixels)
-    areas = find_areas(pixels, sky, find_bright(pixels, sky, settings.threshold_sigmas), settings.saturation)
+    return measure_areas(survey(pixels, settings))
+
+
+def measure_areas(seen: Survey) -> Detections:
+    """Return the sources of a survey's areas, brightest first."""
+    pixels, settings, areas = seen.pixels, seen.settings, seen.areas
     peaks = worth_measuring(find_peaks(areas), pixels.shape, int(_MEASURED_FOR_ONE * settings.most_stars))
     if not len(peaks):
         return Detections.none(settings.psf_sigma or np.nan)
-    targets = _targets(pixels, sky, areas, peaks)
-    flags = _flags_of_areas(sky, areas, peaks)
+    targets = _targets(pixels, seen.sky, areas, peaks)
+    flags = _flags_of_areas(seen.sky, areas, peaks)
     shapes = first_look(targets)
     spread = frame_spread(shapes, plain_ones(flags == 0, targets), settings)
     found = measure(targets, shapes, spread, settings)
@@ -55,19 +58,7 @@ def detect(pixels: Image, settings: DetectionSettings | None = None) -> Detectio
     quality = quality | Quality.CLUTTER * among_odd(odd, found.points)
     real = confirmed(found, targets, settings) | ((quality & REFUSED) != 0)
     whole = assemble(found, shapes, quality, targets, spread, np.full(len(peaks), -1)).select(real)
-    return _brightest(whole.in_order(), settings.most_stars).scaled(unit)
-
-
-def kind_of_frame(pixels: Image, settings: DetectionSettings | None = None) -> FrameShape:
-    """Return whether a frame (rows, columns) shows points, streaks or neither, and how long they are.
-
-    Raises ValueError as `detect`.
-    """
-    pixels, unit = in_counts(pixels)
-    settings = (settings or DetectionSettings()).in_units_of(unit)
-    sky = measure_sky(pixels)
-    bright = find_bright(pixels, sky, settings.threshold_sigmas)
-    return frame_shape(find_areas(pixels, sky, bright, settings.saturation))
+    return _brightest(whole.in_order(), settings.most_stars).scaled(seen.unit)
 
 
 def quality_of(found: Measured, shapes: Shapes, spread: FrameSpread, targets: Targets) -> IntArray:
