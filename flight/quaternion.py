@@ -7,11 +7,19 @@ corrected (the upper left block is minus the cross-product matrix). Nothing else
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from typing import Any
+
 import numpy as np
 
 from flight.arrays import FloatArray
 
 IDENTITY: FloatArray = np.array([0.0, 0.0, 0.0, 1.0])
+
+
+def _components(q: FloatArray) -> Iterable[Any]:
+    """Return the components of q (..., 4): four arrays (...), or of one quaternion the faster floats."""
+    return q.tolist() if q.ndim == 1 else np.moveaxis(q, -1, 0)
 
 
 def normalise(q: FloatArray) -> FloatArray:
@@ -26,26 +34,29 @@ def conjugate(q: FloatArray) -> FloatArray:
 
 def multiply(p: FloatArray, q: FloatArray) -> FloatArray:
     """Return the rotation q followed by p, (..., 4): A(result) = A(p) A(q)."""
-    p1, p2, p3, p4 = np.moveaxis(np.asarray(p), -1, 0)
-    q1, q2, q3, q4 = np.moveaxis(np.asarray(q), -1, 0)
-    return np.stack(
-        [
-            p4 * q1 + p3 * q2 - p2 * q3 + p1 * q4,
-            -p3 * q1 + p4 * q2 + p1 * q3 + p2 * q4,
-            p2 * q1 - p1 * q2 + p4 * q3 + p3 * q4,
-            -p1 * q1 - p2 * q2 - p3 * q3 + p4 * q4,
-        ],
-        axis=-1,
-    )
+    p, q = np.asarray(p), np.asarray(q)
+    p1, p2, p3, p4 = _components(p)
+    q1, q2, q3, q4 = _components(q)
+    product = [
+        p4 * q1 + p3 * q2 - p2 * q3 + p1 * q4,
+        -p3 * q1 + p4 * q2 + p1 * q3 + p2 * q4,
+        p2 * q1 - p1 * q2 + p4 * q3 + p3 * q4,
+        -p1 * q1 - p2 * q2 - p3 * q3 + p4 * q4,
+    ]
+    return np.array(product) if p.ndim == q.ndim == 1 else np.stack(product, axis=-1)
 
 
 def attitude_matrix(q: FloatArray) -> FloatArray:
     """Return A(q), (..., 3, 3), reference into body (Sease 4.8 corrected)."""
-    q1, q2, q3, q4 = np.moveaxis(np.asarray(q), -1, 0)
-    row1 = [q1**2 - q2**2 - q3**2 + q4**2, 2 * (q1 * q2 + q3 * q4), 2 * (q1 * q3 - q2 * q4)]
-    row2 = [2 * (q1 * q2 - q3 * q4), -(q1**2) + q2**2 - q3**2 + q4**2, 2 * (q2 * q3 + q1 * q4)]
-    row3 = [2 * (q1 * q3 + q2 * q4), 2 * (q2 * q3 - q1 * q4), -(q1**2) - q2**2 + q3**2 + q4**2]
-    return np.stack([np.stack(row, axis=-1) for row in (row1, row2, row3)], axis=-2)
+    q = np.asarray(q)
+    q1, q2, q3, q4 = _components(q)
+    s1, s2, s3, s4 = q1 * q1, q2 * q2, q3 * q3, q4 * q4
+    rows = [
+        [s1 - s2 - s3 + s4, 2 * (q1 * q2 + q3 * q4), 2 * (q1 * q3 - q2 * q4)],
+        [2 * (q1 * q2 - q3 * q4), -s1 + s2 - s3 + s4, 2 * (q2 * q3 + q1 * q4)],
+        [2 * (q1 * q3 + q2 * q4), 2 * (q2 * q3 - q1 * q4), -s1 - s2 + s3 + s4],
+    ]
+    return np.array(rows) if q.ndim == 1 else np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def from_matrix(matrix: FloatArray) -> FloatArray:

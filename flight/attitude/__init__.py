@@ -1,5 +1,8 @@
 """Directions to an attitude: solvers of Wahba's problem.
 
-`wahba` holds what all of them share (the attitude profile matrix, the loss, the covariance, which directions
-fix an attitude), each other module one solver with the same signature: `esoq2`.
+    observed, reference, sigma -> sightings -> B -> a solver's quaternion -> settle -> AttitudeFix
+
+`wahba` checks the directions, holds their sums and settles an attitude on the least loss with its covariance;
+`profile` is what solvers take from the profile matrix B; each other module is one solver of the same
+signature; `solvers` has them by name.
 """

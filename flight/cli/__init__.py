@@ -21,6 +21,7 @@ COMMANDS = {
     "plan": "plan a single path",
     "rate": "body rate from a picture of streaked stars",
     "solve": "where a picture of the sky looks, and which stars it shows",
+    "calibrate": "a camera's lens from pictures of the sky",
 }
 
 _EXAMPLES = """\

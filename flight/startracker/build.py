@@ -71,6 +71,12 @@ def proper_motion(stars: GuideStars) -> npt.NDArray[np.float32]:
     return np.asarray(moved, dtype=np.float32)
 
 
+def ensure_default_index() -> None:
+    """Make the default index now if it is missing, so that nobody waits for it in flight."""
+    if not PATH.exists():
+        default_index()
+
+
 @cache
 def default_index() -> SkyIndex:
     """Return the default index, read once a process; made and kept in the cache folder if missing."""

@@ -14,7 +14,7 @@ import os
 import struct
 import zlib
 from dataclasses import dataclass, fields
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -73,7 +73,8 @@ class SkyIndex:
 def save(sky: SkyIndex, path: Path) -> None:
     """Write the index to `path`, whole or not at all."""
     payload = _payload(sky)
-    temporary = path.with_name(path.name + ".new")
+    # Two processes may make it at once: each its own, and the last one stays.
+    temporary = path.with_name(f"{path.name}.{os.getpid()}.new")
     temporary.write_bytes(payload)
     temporary.replace(path)
 
@@ -131,6 +132,12 @@ def load(path: Path = PATH) -> SkyIndex:
         for name, (kind, shape, offset) in contents["columns"].items()
     }
     return _index(columns, float(contents["epoch"]))
+
+
+@cache
+def load_once(path: Path) -> SkyIndex:
+    """Return the index of a file, read once a process. Raises ConfigError as `load`."""
+    return load(path)
 
 
 def _index(columns: dict[str, npt.NDArray[Any]], epoch: float) -> SkyIndex:

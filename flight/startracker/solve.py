@@ -106,10 +106,9 @@ def solve_frame(
         rate_prior: tells the direction of time, which one frame does not.
     """
     if attitude_prior is not None and _at_rest(rate_prior, camera, exposure):
-        near = points_near(pixels, camera, sky, settings, attitude_prior)
-        solution = solve_near(near, camera, scale, sky, settings, attitude_prior)
-        if solution is not None:
-            return solution
+        near = solve_near(pixels, camera, scale, sky, settings, attitude_prior)
+        if near is not None:
+            return near
     seen = survey(pixels, settings.detection)
     if seen.shape.kind is not FrameKind.STREAKS:
         found = measure_areas(seen).stars()
@@ -131,15 +130,27 @@ def solve_points(
     prior: AttitudePrior | None = None,
 ) -> FrameSolution:
     """Return the attitude of a frame of points, as detected."""
-    seen = FrameSolution(
-        SolveStatus.NO_STARS,
-        "no star stands above the noise",
-        FrameKind.POINTS,
-        camera,
-        found.points,
-        found.covariance,
+    return solve_places(
+        found.points, found.covariance, FrameKind.POINTS, camera, scale, sky, settings, prior, found.flux
     )
-    return _identify(seen, found.flux, scale, sky, settings, prior) if len(found) else seen
+
+
+def solve_places(
+    points: FloatArray,
+    covariance: FloatArray,
+    kind: FrameKind,
+    camera: CameraModel,
+    scale: tuple[float, float],
+    sky: SkyIndex,
+    settings: SolveSettings,
+    prior: AttitudePrior | None = None,
+    flux: FloatArray | None = None,
+) -> FrameSolution:
+    """Return the attitude from places (n, 2) px of stars, brightest first, and covariances (n, 2, 2)."""
+    seen = FrameSolution(
+        SolveStatus.NO_STARS, "no star stands above the noise", kind, camera, points, covariance
+    )
+    return _identify(seen, flux, scale, sky, settings, prior) if len(points) else seen
 
 
 def solve_motion(
@@ -181,14 +192,15 @@ def points_near(
 
 
 def solve_near(
-    found: Detections,
+    pixels: Image,
     camera: CameraModel,
     scale: tuple[float, float],
     sky: SkyIndex,
     settings: SolveSettings,
     prior: AttitudePrior,
 ) -> FrameSolution | None:
-    """Return the attitude from stars measured about their predicted places, None where they do not agree."""
+    """Return the attitude from stars about their predicted places alone, None where they do not agree."""
+    found = points_near(pixels, camera, sky, settings, prior)
     if not len(found):
         return None
     seen = FrameSolution(
@@ -219,7 +231,7 @@ def _far(found: CameraModel, believed: CameraModel) -> bool:
 
 def _identify(
     seen: FrameSolution,
-    flux: FloatArray,
+    flux: FloatArray | None,
     scale: tuple[float, float],
     sky: SkyIndex,
     settings: SolveSettings,
@@ -234,7 +246,7 @@ def _identify(
     return _told(seen, identify(stars, sky, settings.identification), sky, settings)
 
 
-def star_field(seen: FrameSolution, flux: FloatArray, scale: tuple[float, float]) -> StarField:
+def star_field(seen: FrameSolution, flux: FloatArray | None, scale: tuple[float, float]) -> StarField:
     """Return the directions of the points of `seen`, with their errors, for identification."""
     camera = seen.camera
     direction = camera.unit_vectors(seen.points)
@@ -242,7 +254,8 @@ def star_field(seen: FrameSolution, flux: FloatArray, scale: tuple[float, float]
     # A pixel off the boresight is seen shorter: by cos^2 along the radius and cos across it.
     sigma = pixels / camera.focal_length * direction[:, 2] ** 1.5
     half_width = 0.5 * camera.columns / camera.focal_length, 0.5 * camera.rows / camera.focal_length
-    return StarField(direction, sigma, half_width, scale, -2.5 * np.log10(flux))
+    magnitude = None if flux is None else -2.5 * np.log10(flux)
+    return StarField(direction, sigma, half_width, scale, magnitude)
 
 
 def _told(
