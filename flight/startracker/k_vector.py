@@ -55,7 +55,9 @@ class KVector:
         if not len(self.key):
             return np.zeros(len(value), dtype=np.int64)
         last = len(self.count) - 2
-        cell = np.clip((value - self.origin) / self.slope, 0.0, last).astype(np.int64)
+        with np.errstate(over="ignore"):
+            # Far beyond the keys the quotient is infinite, which the clip takes for the last cell.
+            cell = np.clip((value - self.origin) / self.slope, 0.0, last).astype(np.int64)
         # The quotient may round over the line's value that bounds the cell.
         cell = np.maximum(cell - (self.origin + self.slope * cell > value), 0)
         cell = np.minimum(cell + (self.origin + self.slope * (cell + 1) <= value), last)
@@ -84,7 +86,7 @@ def build(key: npt.NDArray[Any], cells: int | None = None) -> KVector:
         raise ValueError(f"cells = {cells}: at least one")
     if not len(key):
         return KVector(key, np.zeros(number + 1, dtype=np.uint32), 1.0, 0.0)
-    margin = (number + 4) * np.finfo(np.float64).eps * max(abs(wide[0]), abs(wide[-1]), 1e-300)
+    margin = (number + 4) * np.finfo(np.float64).eps * max(abs(wide[0]), abs(wide[-1]), 1e-200)
     slope = (wide[-1] - wide[0] + 2.0 * margin) / number
     origin = wide[0] - margin
     count = np.searchsorted(wide, origin + slope * np.arange(number + 1)).astype(np.uint32)
