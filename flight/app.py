@@ -27,6 +27,7 @@ from flight.frames import NED_TO_TESTBED, attitude_map
 from flight.loop import SECOND_NS, Devices, FlightLoop, Progress, RunLabel, workers
 from flight.quaternion import attitude_matrix
 from flight.settings import Config
+from flight.startracker.build import ensure_default_index
 from flight.telemetry.log import FlightLog
 from flight.telemetry.recorder import Recorder
 from hal.buses.clock import SystemClock
@@ -105,6 +106,9 @@ def prepare(config: Config, rig: Rig, folder: Path, stack: ExitStack) -> tuple[F
     flight_log = _open_log(folder, "flight", rig.clock, config, sync_ns, stack)
     performance_log = _open_log(folder, "performance", rig.clock, config, sync_ns, stack)
     devices = _open_devices(config, rig, stack)
+    tracker = config.camera.star_tracker if config.camera is not None else None
+    if tracker is not None and tracker.index is None:
+        ensure_default_index()
     jobs = _open_jobs(config, rig, stack)
     recorder = Recorder(flight_log, performance_log)
     return FlightLoop(config, rig.clock, devices, jobs, recorder, flight_log.error), flight_log

@@ -76,6 +76,9 @@ VISION_FAILED = EventKind(54, "vision-failed", Severity.WARNING, "vision gave no
 STREAK_REFUSED = EventKind(
     55, "streak-refused", Severity.WARNING, "a rate from streaks disagrees with the estimate"
 )
+STARS_REFUSED = EventKind(
+    56, "stars-refused", Severity.WARNING, "the stars' attitude disagrees with the estimate"
+)
 LOG_FAULT = EventKind(60, "log-fault", Severity.FAULT, "the flight log cannot be written")
 
 EVENTS: tuple[EventKind, ...] = tuple(

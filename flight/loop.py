@@ -9,12 +9,15 @@ import time
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from flight import __version__, events
-from flight.control.lq_tracker import LqTracker
-from flight.estimation.single_axis import FilterSettings, SingleAxisFilter
+from flight.camera import camera_model
+from flight.control.choice import controller_of
+from flight.estimation.attitude_filter import AttitudeFilter, FilterSettings
+from flight.estimation.rigid_body import Parameters, RigidBody
 from flight.events import EventLog
 from flight.executive.executive import Executive
 from flight.executive.jobs import JobRunner, Worker
@@ -22,9 +25,12 @@ from flight.executive.rate_group import Cycle, RateGroup
 from flight.guidance import job as plan_job
 from flight.guidance.guidance import AcceptanceRules, Guidance
 from flight.guidance.vmc import NODES
-from flight.pinhole import Pinhole
 from flight.plant import SingleAxisPlant
 from flight.settings import Camera, Config
+from flight.startracker import frame_job
+from flight.startracker.detection import DetectionSettings
+from flight.startracker.frame_job import TrackerSettings
+from flight.startracker.solve import SolveSettings
 from flight.tasks import imaging as imaging_task
 from flight.tasks import planning as planning_task
 from flight.tasks.control_cycle import ControlCycle, Rooms
@@ -32,12 +38,11 @@ from flight.tasks.housekeeping import Housekeeping, Watched
 from flight.tasks.imaging import Imaging, ImagingSettings
 from flight.tasks.navigation import Navigation, NavigationSettings
 from flight.tasks.performance import CONTROL, PerformanceObserver
-from flight.tasks.planning import Planning, PlanningSettings
+from flight.tasks.planning import Planning, PlanningSettings, Strategy
 from flight.tasks.steering import Steering
 from flight.tasks.targets import TargetSequence
 from flight.telemetry.definitions import RUN
 from flight.telemetry.recorder import Recorder
-from flight.vision import job as vision_job
 from flight.vision.likelihood.settings import LikelihoodSettings
 from flight.vision.settings import StreakSettings
 from hal.interfaces.devices import FrameSource, InertialUnit, PowerMonitor, TorqueCoils
@@ -102,7 +107,7 @@ def workers(config: Config, planner_latency_ns: int = 0, vision_latency_ns: int 
     vision_timeout_ns = round(config.executive.vision_timeout * SECOND_NS)
     made = [Worker(planning_task.WORKER, plan_job.run, planner_latency_ns, planner_timeout_ns)]
     if config.camera is not None:
-        made.append(Worker(imaging_task.WORKER, vision_job.run, vision_latency_ns, vision_timeout_ns))
+        made.append(Worker(imaging_task.WORKER, frame_job.run, vision_latency_ns, vision_timeout_ns))
     return made
 
 
@@ -127,20 +132,19 @@ class FlightLoop:
         self._progress: Callable[[Progress], None] | None = None
         plant = plant_of(config)
         self._navigation = _navigation(config, plant, devices.unit, recorder, self._events)
-        guidance = Guidance(plant, AcceptanceRules(late_after=config.guidance.late_after))
-        tracker = LqTracker(plant, config.control.state_weight, config.control.control_weight)
-        self._steering = Steering(guidance, tracker, devices.coils, self._events)
-        planning_settings = PlanningSettings(
-            config.guidance.horizon,
-            config.guidance.max_horizon,
-            round(config.guidance.late_after * SECOND_NS),
-            config.guidance.nodes or NODES,
+        planning_settings = _planning_settings(config)
+        guidance = Guidance(
+            plant,
+            AcceptanceRules(late_after=config.guidance.late_after),
+            arrives=planning_settings.strategy is not Strategy.RECEDING,
         )
+        controller = controller_of(config.control, plant, 1.0 / config.executive.control_rate_hz)
+        self._steering = Steering(guidance, controller, devices.coils, self._events)
         self._planning = Planning(plant, planning_settings, guidance, jobs, recorder, self._events)
         self._imaging = (
             Imaging(
                 devices.camera,
-                _imaging_settings(config.camera),
+                _imaging_settings(config.camera, self._unrest(plant)),
                 self._navigation,
                 jobs,
                 recorder,
@@ -152,7 +156,7 @@ class FlightLoop:
         observer = PerformanceObserver(clock, devices.coils, recorder, self._events)
         self._observer = observer
         rooms = Rooms(self._navigation, self._steering, self._planning, self._imaging, devices.coils, jobs)
-        targets = TargetSequence([(step.at, step.q2) for step in config.steps])
+        targets = TargetSequence([(step.at, step.q2, step.rate) for step in config.steps])
         self._control = ControlCycle(rooms, targets, recorder, self._events, observer)
         self._housekeeping = Housekeeping(
             Watched(
@@ -216,6 +220,11 @@ class FlightLoop:
         groups.append(RateGroup("housekeeping", SECOND_NS, self._keep_house))
         return groups
 
+    def _unrest(self, plant: SingleAxisPlant) -> float:
+        """Return the density of the angular acceleration that the coils' uncertain current makes."""
+        noise = plant.torque_constant / plant.inertia * self._config.estimation.current_noise
+        return noise**2 / self._config.executive.control_rate_hz
+
     def _keep_house(self, cycle: Cycle) -> None:
         self._housekeeping.run(cycle)
         self._tell_performance(cycle.start_ns)
@@ -262,39 +271,85 @@ class FlightLoop:
 def _navigation(
     config: Config, plant: SingleAxisPlant, unit: InertialUnit, recorder: Recorder, event_log: EventLog
 ) -> Navigation:
-    filter_ = SingleAxisFilter(
-        plant,
+    section, believed = config.estimation, config.plant
+    body = RigidBody(
+        np.eye(3) * plant.inertia,
+        believed.coil_turns * believed.coil_area,
+        np.array([0.0, 0.0, -believed.field]),
+        suspended=True,
+        stiffness=plant.stiffness,
+        damping=plant.damping,
+    )
+    filter_ = AttitudeFilter(
+        body,
         FilterSettings(
-            current_noise=config.estimation.current_noise,
+            current_noise=section.current_noise,
             control_period=1.0 / config.executive.control_rate_hz,
-            disturbance_walk=config.estimation.disturbance_walk,
-            gate_sigma=config.estimation.gate_sigma,
-            history_ns=round(config.estimation.history * SECOND_NS),
+            disturbance_walk=section.disturbance_walk,
+            bias_start=section.bias_start,
+            torsion_start=section.torsion_start,
+            damping_start=section.damping_start,
+            gain_start=section.gain_start,
+            gate_sigma=section.gate_sigma,
+            history_ns=round(section.history * SECOND_NS),
         ),
     )
     settings = NavigationSettings(
         config.inertial_unit.angle_noise,
         config.inertial_unit.rate_noise,
         round(config.inertial_unit.max_age * SECOND_NS),
+        round(section.coast * SECOND_NS),
+        Parameters(plant.stiffness / plant.inertia, plant.damping / plant.inertia),
     )
     return Navigation(unit, filter_, settings, recorder, event_log)
 
 
-def _imaging_settings(camera: Camera) -> ImagingSettings:
+def _planning_settings(config: Config) -> PlanningSettings:
+    section = config.guidance
+    return PlanningSettings(
+        horizon=section.horizon,
+        max_horizon=section.max_horizon,
+        late_after_ns=round(section.late_after * SECOND_NS),
+        nodes=section.nodes or NODES,
+        strategy=Strategy(section.strategy),
+        time_price=section.time_price,
+        current_share=section.current_share,
+    )
+
+
+def _imaging_settings(camera: Camera, unrest: float) -> ImagingSettings:
     return ImagingSettings(
-        pinhole=Pinhole.from_field_of_view(
-            camera.columns, camera.rows, float(np.deg2rad(camera.field_of_view_deg))
-        ),
+        camera=camera_model(camera),
         exposure_ns=round(camera.exposure * SECOND_NS),
         max_age_ns=round(camera.max_age * SECOND_NS),
         mounting=np.array(camera.mounting),
         estimator=_estimator(camera),
+        tracker=_tracker(camera),
+        unrest=unrest,
     )
+
+
+def _tracker(camera: Camera) -> TrackerSettings | None:
+    """Return what the star tracker must know of the configured camera, None where it is not wanted."""
+    section = camera.star_tracker
+    if section is None:
+        return None
+    detection = DetectionSettings(
+        psf_sigma=camera.psf_sigma, gain=camera.gain, saturation=_saturation(camera)
+    )
+    spread = 1.0 + section.scale_error
+    scale = (1.0 / spread, spread)
+    index = Path(section.index) if section.index is not None else None
+    return TrackerSettings(SolveSettings(detection=detection), scale, index)
+
+
+def _saturation(camera: Camera) -> float:
+    return camera.saturation or float(2**camera.bits - 1)
 
 
 def _estimator(camera: Camera) -> StreakSettings | LikelihoodSettings:
     """Return the settings of the estimator that the configuration chose, for its camera."""
-    saturation = camera.saturation or float(2**camera.bits - 1)
+    saturation = _saturation(camera)
     if camera.estimator == "likelihood":
         return LikelihoodSettings(
             gain=camera.gain, saturation=saturation, psf_sigma=camera.psf_sigma, line_time=camera.line_time

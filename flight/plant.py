@@ -1,8 +1,8 @@
 """The single-axis plant: a rigid body on a thread, turned by one torque coil in a fixed horizontal field.
 
-Sease 2013, 5.4 with the thread added: J w' = n A B I cos(theta) - k theta - c w, where theta is the turn
-about the thread and q2 = sin(theta/2) (5.5, 5.6). Planner, tracker and estimator share these relations, so
-that what is planned is what is tracked.
+Sease 2013, 5.4 with the thread and a constant disturbance d added: J (w' - d) = n A B I cos(theta) - k theta
+- c w, where theta is the turn about the thread and q2 = sin(theta/2) (5.5, 5.6). Planner, tracker and
+estimator share these relations, so that what is planned is what is tracked.
 
 Singular names (`current`) take floats and use `math`: they run in the 40 Hz loop. Plural names
 (`currents`) take arrays of one shape.
@@ -21,6 +21,9 @@ from flight.errors import UsageError
 SQUARE_Q2_WITHOUT_AUTHORITY = 0.5
 """cos(theta) = 1 - 2 q2^2 is zero here: the coil's axis lies along the field (5.15 corrected)."""
 
+Q2_LIMIT = 0.68
+"""No path leads beyond: cos(theta) is 0.075 there; at 0.707 no current turns the body at all."""
+
 
 @dataclass(frozen=True, slots=True)
 class SingleAxisPlant:
@@ -33,6 +36,7 @@ class SingleAxisPlant:
         current_limit: largest |I|, A.
         stiffness: k of the thread, N m/rad.
         damping: c, N m s/rad.
+        disturbance: d, rad/s^2: the acceleration that nothing else here explains, as the estimator gives it.
     """
 
     inertia: float
@@ -41,6 +45,7 @@ class SingleAxisPlant:
     current_limit: float
     stiffness: float = 0.0
     damping: float = 0.0
+    disturbance: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse constants that no body has; raises UsageError."""
@@ -52,26 +57,32 @@ class SingleAxisPlant:
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):
                 raise UsageError(f"plant {name} is {value}: it must be finite and not negative")
+        if not math.isfinite(self.disturbance):
+            raise UsageError(f"plant disturbance is {self.disturbance}: it must be finite")
 
     def current(self, angle: float, rate: float, acceleration: float) -> float:
         """Return the current in A that gives `acceleration` rad/s^2 at `angle` rad and `rate` rad/s (5.5)."""
-        torque = self.inertia * acceleration + self.stiffness * angle + self.damping * rate
+        torque = (
+            self.inertia * (acceleration - self.disturbance) + self.stiffness * angle + self.damping * rate
+        )
         return torque / (self.torque_constant * math.cos(angle))
 
     def acceleration(self, angle: float, rate: float, current: float) -> float:
         """Return the angular acceleration in rad/s^2 under `current` A (5.4)."""
         torque = self.torque_constant * current * math.cos(angle) - self.stiffness * angle
-        return (torque - self.damping * rate) / self.inertia
+        return (torque - self.damping * rate) / self.inertia + self.disturbance
 
     def currents(self, angle: FloatArray, rate: FloatArray, acceleration: FloatArray) -> FloatArray:
         """Return `current` for arrays (n,)."""
-        torque = self.inertia * acceleration + self.stiffness * angle + self.damping * rate
+        torque = (
+            self.inertia * (acceleration - self.disturbance) + self.stiffness * angle + self.damping * rate
+        )
         return np.asarray(torque / (self.torque_constant * np.cos(angle)))
 
     def accelerations(self, angle: FloatArray, rate: FloatArray, current: FloatArray) -> FloatArray:
         """Return `acceleration` for arrays (n,)."""
         torque = self.torque_constant * current * np.cos(angle) - self.stiffness * angle
-        return np.asarray((torque - self.damping * rate) / self.inertia)
+        return np.asarray((torque - self.damping * rate) / self.inertia + self.disturbance)
 
 
 def angle_of(q2: float) -> float:
@@ -115,7 +126,7 @@ def current_and_slopes(
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return the current (n,) in A and its partial derivatives by q2, q2' and q2'' (n,) each.
 
-    5.6 with the exact w' in place of a differentiated polynomial of w, and the thread.
+    5.6 with the exact w' in place of a differentiated polynomial of w, the thread and the disturbance.
     """
     square = 1.0 - q2 * q2
     by_acceleration = 2.0 / np.sqrt(square)  # dw'/dq2'', and dw/dq2' as well
@@ -125,7 +136,7 @@ def current_and_slopes(
     scale = 1.0 / (plant.torque_constant * cosine)
 
     acceleration = by_acceleration * (q2_acceleration + q2_rate * swing)
-    torque = plant.inertia * acceleration
+    torque = plant.inertia * (acceleration - plant.disturbance)
     torque_by_q2 = plant.inertia * (
         acceleration * q2 / square + by_acceleration * (q2_rate * turn * (1.0 + q2 * q2) / square)
     )

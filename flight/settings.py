@@ -76,12 +76,32 @@ class PowerMonitor(Section, frozen=True, kw_only=True):
     shunt: Positive = 0.1
 
 
+class CameraLens(Section, frozen=True, kw_only=True):
+    """What `python -m flight calibrate` found: px, the pixel (x, y) on the axis, and radial distortion."""
+
+    focal_length: Positive
+    centre: tuple[float, float]
+    k1: float = 0.0
+    k2: float = 0.0
+
+
+class StarTracker(Section, frozen=True, kw_only=True):
+    """The star tracker: its sky index (default: the one in the cache folder), and its trust in the lens.
+
+    `scale_error` is the part by which the focal length may be wrong; 0 for a calibrated camera.
+    """
+
+    index: str | None = None
+    scale_error: Annotated[float, Meta(ge=0.0, lt=0.5)] = 0.0
+
+
 class Camera(Section, frozen=True, kw_only=True):
     """The star camera: what flight must know to read its frames."""
 
     columns: Annotated[int, Meta(ge=64, le=8192)] = 1024
     rows: Annotated[int, Meta(ge=64, le=8192)] = 1024
     field_of_view_deg: Annotated[float, Meta(gt=1.0, lt=120.0)] = 20.0
+    lens: CameraLens | None = None
     exposure: Annotated[float, Meta(gt=0.0, le=10.0)] = 1.0
     period: Positive = 5.0
     bits: Annotated[int, Meta(ge=8, le=16)] = 16
@@ -90,7 +110,8 @@ class Camera(Section, frozen=True, kw_only=True):
     saturation: Positive | None = None
     psf_sigma: Positive = 1.0
     line_time: NotNegative = 0.0
-    estimator: Estimator = "harris"
+    estimator: Estimator = "likelihood"
+    star_tracker: StarTracker | None = None
     endpoint_bias: float | None = None
     mounting: Quaternion = (0.0, 0.0, 0.0, 1.0)
     max_age: Positive = 12.0
@@ -105,18 +126,30 @@ class Executive(Section, frozen=True, kw_only=True):
 
 
 class Estimation(Section, frozen=True, kw_only=True):
-    """The linear filter of angle, rate and disturbance about the thread."""
+    """The multiplicative Kalman filter of attitude, rate, gyro bias and disturbance about the thread.
+
+    `*_start` are standard deviations at the start of what is estimated besides: the gyro's bias, rad/s; the
+    thread's torsion, 1/s^2, and damping, 1/s, beyond the plant's; the coils' gain. Zero: known.
+    """
 
     current_noise: NotNegative = 2.0e-3
-    disturbance_walk: Positive = 5.0e-4
-    gate_sigma: Annotated[float, Meta(ge=3.0)] = 5.0
+    disturbance_walk: Positive = 5.0e-5
+    bias_start: Positive = 1.0e-3
+    torsion_start: NotNegative = 0.02
+    damping_start: NotNegative = 4.0e-3
+    gain_start: NotNegative = 0.15
+    gate_sigma: Annotated[float, Meta(ge=3.0)] = 15.0
     history: Positive = 6.0
+    coast: Positive = 1.2
 
 
 class Guidance(Section, frozen=True, kw_only=True):
-    """Virtual motion camouflage (Sease 5.8-5.15)."""
+    """Virtual motion camouflage (Sease 5.8-5.15); `flight.tasks.planning` explains the strategies."""
 
+    strategy: Literal["goal", "receding", "step"] = "goal"
     horizon: Positive = 10.0
+    time_price: Positive | None = None
+    current_share: Annotated[float, Meta(ge=0.5, le=1.0)] = 0.95
     replan_period: Positive = 5.0
     late_after: Positive = 1.0
     max_horizon: Positive = 60.0
@@ -124,17 +157,27 @@ class Guidance(Section, frozen=True, kw_only=True):
 
 
 class Control(Section, frozen=True, kw_only=True):
-    """The LQ tracker's weights (Sease 5.30-5.32): Q = state_weight I, R = control_weight."""
+    """The controller.
 
-    state_weight: Positive = 20.0
+    `lq` and `thesis` take the weights of Sease 5.30-5.32, Q = state_weight I and R = control_weight; `pid`
+    and `adaptive` the bandwidth and what follows it.
+    """
+
+    tracker: Literal["lq", "thesis", "pid", "adaptive"] = "lq"
+    state_weight: Positive = 2.0
     control_weight: Positive = 1.0
+    bandwidth: Positive = 1.0
+    target_weight: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
+    adaptation: Positive = 1.0
+    reference_bandwidth: Positive | None = None
 
 
 class Step(Section, frozen=True, kw_only=True):
-    """One commanded attitude: from `at` seconds of mission time, hold q2 at rest."""
+    """One commanded attitude: from `at` seconds of mission time reach q2 at `rate` rad/s; zero holds it."""
 
     at: NotNegative
     q2: Q2
+    rate: Annotated[float, Meta(ge=-0.1, le=0.1)] = 0.0
 
 
 class Telemetry(Section, frozen=True, kw_only=True):

@@ -111,6 +111,7 @@ def assemble(
                 attitude_bound=section.imu.quaternion_noise, rate_bound=section.imu.rate_noise
             ),
             mounting=np.array(config.inertial_unit.mounting),
+            gyro_bias=np.array(section.imu.gyro_bias),
             clock_ppm=section.imu.clock_ppm,
         ),
         now_ns=now_ns(),

@@ -38,6 +38,7 @@ class ImuNoise(Section, frozen=True, kw_only=True):
 
     quaternion_noise: NotNegative = 0.0
     rate_noise: NotNegative = 0.0
+    gyro_bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
     clock_ppm: Annotated[float, Meta(ge=-100.0, le=100.0)] = 0.0
 
 

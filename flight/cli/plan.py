@@ -33,6 +33,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--from-rate", type=_number, default=0.0, metavar="W", help="rad/s at the start")
     parser.add_argument("--to-rate", type=_number, default=0.0, metavar="W", help="rad/s at the end")
     parser.add_argument("--horizon", type=_number, metavar="S", help="seconds (default: the configuration's)")
+    parser.add_argument(
+        "--time-price",
+        type=_number,
+        metavar="W",
+        help="what a second is worth: the horizon of least energy plus price times time",
+    )
     parser.add_argument("--nodes", type=int, metavar="N", help=f"nodes of the path (default {NODES})")
     parser.add_argument(
         "--config",
@@ -60,6 +66,7 @@ def run(options: argparse.Namespace) -> int:
         options.to_rate,
         horizon,
         nodes=options.nodes or config.guidance.nodes or NODES,
+        time_price=options.time_price,
     )
     solved_s = time.perf_counter() - begun
     if options.json:

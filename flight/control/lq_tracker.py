@@ -8,6 +8,13 @@ Sease 2013, 5.16-5.32. With p the path and q the body, 5.17-5.20 give e = sin(th
 
 e'' = v is solved for w' and the plant gives the current; v = -K (e', e) with K from the Riccati equation.
 
+Two things go beyond the thesis, whose own loop is had with `as_in_thesis`. The estimated disturbance is fed
+forward: its estimator integrates what the model did not foresee, so that no constant torque leaves an offset,
+and it is told the current that was written, limits included, so that nothing winds up while the coil
+saturates. And an error is taken back no faster than the coil can brake: at the rate s e, s = K_e / K_e', up
+to a distance, and beyond it at sqrt(2 A |e| - (A / s)^2), from which a constant braking A leads there (the
+proximate time-optimal servo, Workman 1987, here continuous in slope too). A linear law overshoots there.
+
 e is monotone in d only to 90 degrees. Beyond `largest_error` d is held there, its sign kept: the tracker
 then turns the body back at a bounded demand instead of giving up its grip as sin(d) falls again.
 """
@@ -15,11 +22,11 @@ then turns the body back at a bounded demand instead of giving up its grip as si
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import solve_continuous_are
 
+from flight.control.controller import CoilCommand, attitude_error
 from flight.errors import UsageError
 from flight.guidance.path import Sample
 from flight.plant import SingleAxisPlant
@@ -27,26 +34,8 @@ from flight.plant import SingleAxisPlant
 LARGEST_ERROR = 1.0
 LEAST_AUTHORITY = 0.05
 
-
-@dataclass(frozen=True, slots=True)
-class TrackerCommand:
-    """What the tracker wants of the coil.
-
-    Attributes:
-        current: A, within the limit.
-        demanded: A, before the limit; zero without authority.
-        saturated: the limit was in force.
-        authority: cos(theta) was large enough to do anything; when False the current is zero.
-        error: theta_p - theta in rad, as measured, in [-pi, pi].
-        held: the error was beyond the largest and taken as that.
-    """
-
-    current: float
-    demanded: float
-    saturated: bool
-    authority: bool
-    error: float
-    held: bool
+_BRAKING_SHARE = 0.8
+_LEAST_BRAKING = 0.05
 
 
 class LqTracker:
@@ -63,11 +52,12 @@ class LqTracker:
         input_weight: float = 1.0,
         largest_error: float = LARGEST_ERROR,
         least_authority: float = LEAST_AUTHORITY,
+        as_in_thesis: bool = False,
     ) -> None:
         """Solve the Riccati equation for Q = state_weight I and R = input_weight (5.28-5.32).
 
-        `largest_error` is in rad, below pi/2; `least_authority` bounds |cos(theta)|. Raises UsageError when
-        a value is outside its range.
+        `largest_error` is in rad, below pi/2; `least_authority` bounds |cos(theta)|; `as_in_thesis` leaves
+        disturbance and braking out of account. Raises UsageError when a value is outside its range.
         """
         for name, value in (("Q", state_weight), ("R", input_weight)):
             if not (math.isfinite(value) and value > 0.0):
@@ -79,28 +69,48 @@ class LqTracker:
         self._plant = plant
         self._largest_error = largest_error
         self._least_authority = least_authority
+        self._as_in_thesis = as_in_thesis
+        self._strength = plant.torque_constant * plant.current_limit / plant.inertia
         self.rate_gain, self.error_gain = lq_gains(state_weight, input_weight)
 
-    def command(self, wanted: Sample, angle: float, rate: float) -> TrackerCommand:
-        """Return the command at `angle` rad and `rate` rad/s.
+    def command(self, wanted: Sample, angle: float, rate: float, disturbance: float = 0.0) -> CoilCommand:
+        """Return the command at `angle` rad, `rate` rad/s under `disturbance` rad/s^2, all estimated.
 
         Raises UsageError when an input is not finite.
         """
-        lag = wanted.rate - rate
-        if not math.isfinite(angle + lag + wanted.angle + wanted.acceleration):
-            raise UsageError(f"tracker input is not finite: {wanted}, angle {angle}, rate {rate}")
-        error = math.remainder(wanted.angle - angle, 2.0 * math.pi)
+        error = attitude_error(wanted, angle, rate, disturbance)
         if abs(math.cos(angle)) < self._least_authority:
-            return TrackerCommand(0.0, 0.0, False, False, error, False)
+            return CoilCommand.without_authority(error)
         held = abs(error) > self._largest_error
         used = math.copysign(self._largest_error, error) if held else error
         sine, cosine = math.sin(used), math.cos(used)
-        v = -(self.rate_gain * cosine * lag + self.error_gain * sine)
-        acceleration = wanted.acceleration - (v + sine * lag * lag) / cosine
+        lag = wanted.rate - rate
+        if self._as_in_thesis:
+            v = -(self.rate_gain * cosine * lag + self.error_gain * sine)
+            acceleration = wanted.acceleration - (v + sine * lag * lag) / cosine
+        else:
+            approach = self._approach(sine, self._braking(wanted.angle, angle, disturbance))
+            v = -self.rate_gain * (cosine * lag + approach)
+            acceleration = wanted.acceleration - (v + sine * lag * lag) / cosine - disturbance
         demanded = self._plant.current(angle, rate, acceleration)
-        limit = self._plant.current_limit
-        current = min(max(demanded, -limit), limit)
-        return TrackerCommand(current, demanded, current != demanded, True, error, held)
+        return CoilCommand.within(self._plant.current_limit, demanded, error, held)
+
+    def _braking(self, wanted_angle: float, angle: float, disturbance: float) -> float:
+        """Return the deceleration to count on between here and the path, rad/s^2."""
+        authority = max(min(math.cos(angle), math.cos(wanted_angle)), 0.0)
+        taken = abs(disturbance - self._plant.stiffness * angle / self._plant.inertia)
+        return max(_BRAKING_SHARE * self._strength * authority - taken, _LEAST_BRAKING * self._strength)
+
+    def _approach(self, error: float, braking: float) -> float:
+        """Return the rate at which to take `error` back, 1/s, of its sign."""
+        slope = self.error_gain / self.rate_gain
+        reach = braking / slope
+        if abs(error) * slope <= reach:
+            return slope * error
+        return math.copysign(math.sqrt(2.0 * braking * abs(error) - reach * reach), error)
+
+    def reset(self) -> None:
+        """Do nothing: no call depends on the one before."""
 
 
 def lq_gains(state_weight: float, input_weight: float) -> tuple[float, float]:

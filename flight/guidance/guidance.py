@@ -7,17 +7,19 @@ the body then was is refused with its reason; refusing changes nothing.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
 
 from flight.errors import UsageError
 from flight.guidance.path import PolynomialPath, Sample
-from flight.guidance.vmc import Q2_LIMIT, Plan
-from flight.plant import SingleAxisPlant, q2_of
+from flight.guidance.vmc import Plan
+from flight.plant import Q2_LIMIT, SingleAxisPlant, q2_of
 
 _CHECKED_POINTS = 600
+_SAME = 1e-6
+"""Of q2 and rad/s: how near an end must be to the target."""
 
 
 class GuidanceState(StrEnum):
@@ -64,12 +66,21 @@ class Verdict:
 class Guidance:
     """Owns the path being flown and the target wanted."""
 
-    def __init__(self, plant: SingleAxisPlant, rules: AcceptanceRules | None = None) -> None:
+    def __init__(
+        self, plant: SingleAxisPlant, rules: AcceptanceRules | None = None, arrives: bool = True
+    ) -> None:
+        """Take the plant whose limit holds; `arrives`: a path is meant to end, and its end to be held.
+
+        Where it is not, as on a receding horizon, a path that ends tells of plans that did not come.
+        """
         self._plant = plant
         self._rules = rules or AcceptanceRules()
+        self._arrives = arrives
         self._path: PolynomialPath | None = None
         self._planned_ns: int | None = None
         self._target_q2: float | None = None
+        self._target_rate = 0.0
+        self._aimed_ns = 0
 
     @property
     def target_q2(self) -> float | None:
@@ -81,14 +92,18 @@ class Guidance:
         """The path being flown or held."""
         return self._path
 
-    def aim(self, target_q2: float) -> None:
-        """Want another attitude; the present path is flown until a plan for it is accepted.
+    def aim(self, target_q2: float, target_rate: float = 0.0, now_ns: int = 0) -> None:
+        """Want another attitude, at `target_rate` rad/s; the present path is flown until a plan for it comes.
 
-        Raises UsageError when it is not finite or beyond the limit of q2.
+        Raises UsageError when one is not finite or q2 is beyond its limit.
         """
         if not abs(target_q2) <= self._rules.q2_limit:  # NaN compares false
             raise UsageError(f"target q2 is {target_q2}: it must lie within +-{self._rules.q2_limit}")
+        if not math.isfinite(target_rate):
+            raise UsageError(f"target rate is {target_rate}: it must be finite")
         self._target_q2 = target_q2
+        self._target_rate = target_rate
+        self._aimed_ns = now_ns
 
     def hold(self, angle: float, now_ns: int) -> None:
         """Hold `angle` rad from now on; plans made earlier than now are then out of order.
@@ -101,13 +116,22 @@ class Guidance:
         self._planned_ns = now_ns - 1
 
     def offer(
-        self, plan: Plan, origin_ns: int, now_ns: int, estimate_angle: float, estimate_rate: float
+        self,
+        plan: Plan,
+        origin_ns: int,
+        now_ns: int,
+        estimate_angle: float,
+        estimate_rate: float,
+        disturbance: float = 0.0,
     ) -> Verdict:
-        """Fly `plan` from `origin_ns` if it keeps the rules; estimates in rad, rad/s at its origin."""
+        """Fly `plan` from `origin_ns` if it keeps the rules.
+
+        Estimates in rad and rad/s at its origin; `disturbance` in rad/s^2 is what it had to allow for.
+        """
         reason = (
             self._untimely(origin_ns, now_ns)
             or self._unwanted(plan)
-            or self._unflyable(plan.path)
+            or self._unflyable(plan.path, replace(self._plant, disturbance=disturbance))
             or self._displaced(plan.path, estimate_angle, estimate_rate)
         )
         if reason:
@@ -126,6 +150,28 @@ class Guidance:
             return GuidanceState.NONE
         return GuidanceState.HOLDING if self._path.has_ended(now_ns) else GuidanceState.FOLLOWING
 
+    def is_adrift(self, now_ns: int) -> bool:
+        """Tell whether an attitude is held that nobody wanted held: no plan came in time."""
+        if self._path is None or not self._path.has_ended(now_ns):
+            return False
+        if not self._arrives:
+            return True
+        waited = (now_ns - self._aimed_ns) * 1e-9
+        return not self._reaches_target(self._path) and waited > self._rules.late_after
+
+    def remains(self, now_ns: int) -> PolynomialPath | None:
+        """Return the path under way to the present target, its origin counted from `now_ns`; None without."""
+        path = self._path
+        if path is None or path.has_ended(now_ns) or not self._reaches_target(path):
+            return None
+        return path.starting_at(path.origin_ns - now_ns)
+
+    def _reaches_target(self, path: PolynomialPath) -> bool:
+        if self._target_q2 is None:
+            return False
+        near = abs(q2_of(path.end_angle) - self._target_q2) <= _SAME
+        return near and abs(path.end_rate - self._target_rate) <= _SAME
+
     def _untimely(self, origin_ns: int, now_ns: int) -> str:
         age = (now_ns - origin_ns) * 1e-9
         if age < 0.0:
@@ -139,25 +185,25 @@ class Guidance:
     def _unwanted(self, plan: Plan) -> str:
         if self._target_q2 is None:
             return "no target is wanted"
-        end_q2 = q2_of(plan.path.end_angle)
-        if not (abs(plan.target_q2 - self._target_q2) <= 1e-6 and abs(end_q2 - self._target_q2) <= 1e-6):
-            return f"it ends at q2 {end_q2:.4f}, wanted is {self._target_q2:.4f}"
+        if not (abs(plan.target_q2 - self._target_q2) <= _SAME and self._reaches_target(plan.path)):
+            ends = f"q2 {q2_of(plan.path.end_angle):.4f} at {plan.path.end_rate:.4f} rad/s"
+            return f"it ends at {ends}, wanted is {self._target_q2:.4f} at {self._target_rate:.4f} rad/s"
         return ""
 
-    def _unflyable(self, path: PolynomialPath) -> str:
+    def _unflyable(self, path: PolynomialPath, plant: SingleAxisPlant) -> str:
         if not (math.isfinite(path.horizon) and path.horizon > 0.0):
             return f"not finite: its horizon is {path.horizon} s"
         # Just inside the end: at the end itself the hold has begun.
         times = path.horizon * np.linspace(0.0, 1.0 - 1e-12, _CHECKED_POINTS)
         angle, rate, acceleration = path.motion(times)
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-            current = self._plant.currents(angle, rate, acceleration)
+            current = plant.currents(angle, rate, acceleration)
             peak_q2 = float(np.abs(np.sin(0.5 * angle)).max())
         peak = float(np.abs(current).max())
         if not (math.isfinite(peak) and math.isfinite(peak_q2)):
             return "not finite somewhere along the path"
-        if peak > self._plant.current_limit * (1.0 + self._rules.current_excess):
-            return f"needs {peak:.4f} A, the limit is {self._plant.current_limit} A"
+        if peak > plant.current_limit * (1.0 + self._rules.current_excess):
+            return f"needs {peak:.4f} A, the limit is {plant.current_limit} A"
         if peak_q2 > self._rules.q2_limit * (1.0 + 1e-3):
             return f"reaches |q2| {peak_q2:.4f}, the limit is {self._rules.q2_limit}"
         return ""

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from flight.guidance.path import PolynomialPath
 from flight.guidance.vmc import NODES, Plan, plan
 from flight.plant import SingleAxisPlant
 
 
 @dataclass(frozen=True, slots=True)
 class PlanJob:
-    """From (q2, rad/s) at `origin_ns` to (q2, rad/s) within `horizon` s; `number` counts the jobs."""
+    """From (q2, rad/s) at `origin_ns` to (q2, rad/s) within `horizon` s; `number` counts the jobs.
+
+    With `time_price` in W the horizon is the planner's to choose, `horizon` a first guess. `last` is the path
+    flown until now, its origin counted from `origin_ns`.
+    """
 
     number: int
     origin_ns: int
@@ -22,6 +27,8 @@ class PlanJob:
     horizon: float
     max_horizon: float
     nodes: int = NODES
+    time_price: float | None = None
+    last: PolynomialPath | None = None
 
 
 def run(job: PlanJob) -> Plan:
@@ -35,4 +42,6 @@ def run(job: PlanJob) -> Plan:
         job.horizon,
         nodes=job.nodes,
         max_stretch=max(job.max_horizon / job.horizon, 1.0),
+        time_price=job.time_price,
+        last=job.last,
     )

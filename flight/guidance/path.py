@@ -2,11 +2,12 @@
 
 q2 is one polynomial in time, as the planner left it; angle, rate and acceleration follow from q2 exactly
 (Sease 5.9; 5.13 corrected), so that the current of the path between nodes is the current that was limited.
-Past its end a path holds its last attitude at rest.
+Past its end a path holds its last attitude, or coasts on at its end's rate as far as the coil has authority.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -15,7 +16,10 @@ from numpy.polynomial import chebyshev
 
 from flight.arrays import FloatArray
 from flight.guidance.lgl import lgl_rule
-from flight.plant import acceleration_of, angle_of, motion_of, rate_of
+from flight.plant import Q2_LIMIT, acceleration_of, angle_of, motion_of, rate_of
+
+FARTHEST = angle_of(Q2_LIMIT)
+"""rad: where a coast ends."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,24 +39,31 @@ class PolynomialPath:
         origin_ns: monotonic time of its start.
         horizon: s; zero for an attitude that is only held.
         series: Chebyshev coefficients of (q2, q2' in 1/s, q2'' in 1/s^2), highest degree first.
-        end_angle: theta in rad held after the horizon.
+        end_angle: theta in rad at the horizon.
+        end_rate: theta' in rad/s kept after the horizon; zero holds the end.
     """
 
     origin_ns: int
     horizon: float
     series: tuple[tuple[float, float, float], ...]
     end_angle: float
+    end_rate: float = 0.0
 
     @classmethod
-    def through(cls, node_q2: FloatArray, horizon: float, origin_ns: int = 0) -> PolynomialPath:
-        """Return the polynomial path through q2 (N,) on the N Legendre-Gauss-Lobatto nodes of `horizon` s."""
+    def through(
+        cls, node_q2: FloatArray, horizon: float, origin_ns: int = 0, end_rate: float = 0.0
+    ) -> PolynomialPath:
+        """Return the polynomial path through q2 (N,) on the N Legendre-Gauss-Lobatto nodes of `horizon` s.
+
+        `end_rate` is kept after the horizon, rad/s.
+        """
         count = node_q2.size
         columns = np.zeros((count, 3))
         columns[:, 0] = _chebyshev_fit(count) @ node_q2
         columns[:-1, 1] = chebyshev.chebder(columns[:, 0], scl=2.0 / horizon)
         columns[:-2, 2] = chebyshev.chebder(columns[:-1, 1], scl=2.0 / horizon)
         series = tuple((q2, rate, acceleration) for q2, rate, acceleration in columns[::-1].tolist())
-        return cls(origin_ns, horizon, series, angle_of(float(node_q2[-1])))
+        return cls(origin_ns, horizon, series, angle_of(float(node_q2[-1])), end_rate)
 
     @classmethod
     def holding(cls, angle: float, origin_ns: int = 0) -> PolynomialPath:
@@ -64,14 +75,14 @@ class PolynomialPath:
         return replace(self, origin_ns=origin_ns)
 
     def has_ended(self, now_ns: int) -> bool:
-        """Tell whether the path only holds its end by now."""
+        """Tell whether the horizon is over by now."""
         return (now_ns - self.origin_ns) * 1e-9 >= self.horizon
 
     def sample(self, now_ns: int) -> Sample:
-        """Return the motion wanted at `now_ns`: before the origin the start's, after the end a hold."""
+        """Return the motion wanted at `now_ns`: before the origin the start's, after the end a coast."""
         elapsed = (now_ns - self.origin_ns) * 1e-9
         if elapsed >= self.horizon:
-            return Sample(self.end_angle, 0.0, 0.0)
+            return self._coast(elapsed - self.horizon)
         s = 2.0 * max(elapsed, 0.0) / self.horizon - 1.0
         # Clenshaw's recurrence on three series at once; plain floats beat arrays of twenty.
         twice = 2.0 * s
@@ -86,8 +97,11 @@ class PolynomialPath:
 
     def motion(self, times: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return theta, theta', theta'' (n,) at `times` (n,) s after the origin, NaN where |q2| passes 1."""
-        angle = np.full(times.shape, self.end_angle)
-        rate, acceleration = np.zeros(times.shape), np.zeros(times.shape)
+        coasted = self.end_angle + self.end_rate * (times - self.horizon)
+        farthest = max(FARTHEST, abs(self.end_angle))
+        angle = np.clip(coasted, -farthest, farthest)
+        rate = np.where(angle == coasted, self.end_rate, 0.0)
+        acceleration = np.zeros(times.shape)
         under_way = times < self.horizon
         if under_way.any():
             s = 2.0 * np.maximum(times[under_way], 0.0) / self.horizon - 1.0
@@ -97,6 +111,14 @@ class PolynomialPath:
                 moving = motion_of(q2, q2_rate, q2_acceleration)
             angle[under_way], rate[under_way], acceleration[under_way] = moving
         return angle, rate, acceleration
+
+    def _coast(self, since: float) -> Sample:
+        """Return the motion `since` s after the horizon."""
+        angle = self.end_angle + self.end_rate * since
+        farthest = max(FARTHEST, abs(self.end_angle))
+        if abs(angle) > farthest:
+            return Sample(math.copysign(farthest, angle), 0.0, 0.0)
+        return Sample(angle, self.end_rate, 0.0)
 
 
 @lru_cache(maxsize=8)

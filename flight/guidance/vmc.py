@@ -2,7 +2,8 @@
 
 The free path control parameters are optimised with NLopt under |I| <= Imax and |q2| <= a bound at every
 time. When no path within the asked horizon keeps the limits, the horizon is stretched to the shortest that
-does and the plan says so. Energy is the integral of R I^2 in J, without the factor 1/2 of 5.1.
+does and the plan says so; with a price of time the horizon is what the price makes best. Energy is the
+integral of R I^2 in J, without the factor 1/2 of 5.1.
 
 Pure and deterministic: the same arguments give the same plan, in any process.
 """
@@ -10,7 +11,6 @@ Pure and deterministic: the same arguments give the same plan, in any process.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -18,36 +18,28 @@ import numpy as np
 
 from flight.arrays import FloatArray
 from flight.errors import PlanningError
+from flight.guidance.lgl import lgl_rule
 from flight.guidance.path import PolynomialPath
+from flight.guidance.prey import CubicPrey
 from flight.guidance.vmc_family import Boundary, Family
-from flight.guidance.vmc_program import LIMIT_TOLERANCE, Program, Trial
-from flight.plant import SQUARE_Q2_WITHOUT_AUTHORITY, SingleAxisPlant, q2_rate_of
+from flight.guidance.vmc_horizon import Search
+from flight.guidance.vmc_program import Program, Trial
+from flight.plant import Q2_LIMIT, SQUARE_Q2_WITHOUT_AUTHORITY, SingleAxisPlant, q2_rate_of
 
 NODES = 24
 """At 24 nodes the cost is within 1e-4 of the true optimum from 1.1 of the shortest horizon on, a stretched
-horizon within 1.3 % of the shortest; 16 nodes take half the time and leave 2.5 %."""
+horizon within 1.5 % of the shortest; 16 nodes take half the time and leave 2.5 %."""
 
 REFERENCE = 2.0
-Q2_LIMIT = 0.68
-"""cos(theta) is 0.075 there; at 0.707 no current turns the body at all (5.15 corrected)."""
-
 MAX_STRETCH = 6.0
 NODES_RANGE = (8, 40)
 HORIZON_RANGE = (1e-3, 1e5)
 FASTEST = 100.0
-
-_WORTH_TRYING = 2.0
-"""The unlimited optimum is nearly a cubic in theta, which peaks at 1.5 of the bang-bang current for the same
-time: well above this, no path keeps the limit."""
-
-_STRETCH_FROM = 1.7
-_STRETCH_TO = 1.4
-_STRETCHES = 10
-_RETRY = 1.4
+LEAST_PRICED = 1.0
 
 
 class PlanStatus(StrEnum):
-    """Whether the asked horizon could be kept."""
+    """Whether the asked horizon could be kept; a price of time asks for none, its plans are optimal."""
 
     OPTIMAL = "optimal"
     STRETCHED = "stretched"
@@ -60,7 +52,7 @@ class Plan:
     Attributes:
         path: to be flown; its origin is zero until guidance starts it.
         status: optimal at the asked horizon, or stretched to the shortest feasible one.
-        horizon_asked, horizon: s.
+        horizon_asked, horizon: s; with a price of time they are the same.
         energy: integral of R I^2, J.
         peak_current: largest |I| on a dense grid, A.
         evaluations: of the cost.
@@ -95,6 +87,8 @@ def plan(
     reference: float = REFERENCE,
     q2_limit: float = Q2_LIMIT,
     max_stretch: float = MAX_STRETCH,
+    time_price: float | None = None,
+    last: PolynomialPath | None = None,
 ) -> Plan:
     """Return the least-energy path between two states in `horizon` s, or in the shortest feasible time.
 
@@ -102,69 +96,56 @@ def plan(
     the horizon is stretched to `max_stretch` times the asked one at most. A stretched horizon lies about
     0.3 % above the shortest of the paths on `nodes` nodes, within 1.5 % of the bang-bang time.
 
+    With `time_price` in W the path is that of the least energy plus price times horizon, from LEAST_PRICED s
+    to `max_stretch` times `horizon`, which is then a first guess. `last` is the path flown until now, its
+    origin counted from the new start (so not positive): what is left of it is where the optimiser begins.
+
     Raises PlanningError when an argument is not finite or outside its limits, or when no horizon allowed is
     feasible.
     """
     states = {"start_q2": start_q2, "start_rate": start_rate, "end_q2": end_q2, "end_rate": end_rate}
     _check(states, horizon, nodes, reference, q2_limit, max_stretch)
+    if time_price is not None and not (math.isfinite(time_price) and time_price > 0.0):
+        raise PlanningError(f"time_price is {time_price} W: it must be finite and positive")
     boundary = Boundary(start_q2, q2_rate_of(start_q2, start_rate), end_q2, q2_rate_of(end_q2, end_rate))
 
     def program_at(time: float) -> Program:
         return Program(plant, Family.around(boundary, time, reference, nodes), q2_limit, time)
 
-    program = program_at(horizon)
-    trial = _within(program, horizon)
-    evaluations = program.evaluations
+    search = Search(program_at, _remains(last, nodes))
+    longest = max_stretch * horizon
+    if time_price is None:
+        program, trial = search.within(horizon, longest)
+    else:
+        program, trial = search.priced(horizon, min(LEAST_PRICED, longest), longest, time_price)
     if trial is None:
-        longest = max_stretch * horizon
-        program, trial, spent = _beyond(program_at, horizon, longest)
-        evaluations += spent
-        if trial is None:
-            raise PlanningError(
-                f"no path from q2 {start_q2:.4f} at {start_rate:.4f} rad/s to {end_q2:.4f} at {end_rate:.4f} "
-                f"rad/s keeps |I| <= {plant.current_limit} A and |q2| <= {q2_limit} within {longest:.1f} s"
-            )
-    # The shortest feasible horizon may prove to be the asked one, where the first program did not converge.
-    kept = trial.horizon <= horizon * (1.0 + 1e-9)
-    status = PlanStatus.OPTIMAL if kept else PlanStatus.STRETCHED
-    return _assemble(program, trial, boundary, reference, status, horizon, evaluations)
+        raise PlanningError(
+            f"no path from q2 {start_q2:.4f} at {start_rate:.4f} rad/s to {end_q2:.4f} at {end_rate:.4f} "
+            f"rad/s keeps |I| <= {plant.current_limit} A and |q2| <= {q2_limit} within {longest:.1f} s"
+        )
+    asked = horizon if time_price is None else trial.horizon
+    return _assemble(program, trial, boundary, reference, asked, search.evaluations, end_rate)
 
 
-def _within(program: Program, horizon: float) -> Trial | None:
-    """Return the least-energy path at the asked horizon, or None when none is found."""
-    relaxed = program.unlimited(horizon)
-    if relaxed is None:
-        return None
-    worst = float(np.abs(program.ratios(relaxed)).max())
-    if worst <= 1.0 + LIMIT_TOLERANCE:
-        return relaxed
-    return program.limited(relaxed) if worst < _WORTH_TRYING else None
+def _remains(last: PolynomialPath | None, nodes: int) -> FloatArray | None:
+    """Return how far (N,) what is left of `last` lies from its own prey on the nodes; None when nothing is.
 
-
-def _beyond(
-    program_at: Callable[[float], Program], asked: float, longest: float
-) -> tuple[Program, Trial | None, int]:
-    """Return the shortest feasible path between two horizons, its program, and the evaluations spent.
-
-    Current scales with 1/T^2 for a slew at rest: unlimited solutions lead to a horizon near the shortest
-    feasible one, from where the program with a free horizon starts. Should it fail, it starts later.
+    Laid on another prey it is a path between that prey's states: the start need not lie on `last`.
     """
-    time, evaluations = asked, 0
-    for _ in range(_STRETCHES):
-        program = program_at(time)
-        relaxed = program.unlimited(time)
-        trial, growth = None, _RETRY
-        if relaxed is not None:
-            worst = float(np.abs(program.ratios(relaxed)[0]).max())
-            if worst < _STRETCH_FROM or time == longest:
-                trial = program.limited(relaxed, (asked, longest))
-            else:
-                growth = math.sqrt(worst / _STRETCH_TO)
-        evaluations += program.evaluations
-        if trial is not None or time == longest:
-            break
-        time = min(longest, time * growth)
-    return program, trial, evaluations
+    if last is None:
+        return None
+    elapsed = -1e-9 * last.origin_ns
+    left = last.horizon - elapsed
+    if not 0.0 < left <= last.horizon:
+        return None
+    times = 0.5 * left * (lgl_rule(nodes).nodes + 1.0)
+    # Just inside the end: at the end itself the coast has begun.
+    angle, rate, _ = last.motion(elapsed + times * (1.0 - 1e-12))
+    q2 = np.sin(0.5 * angle)
+    slope = 0.5 * rate * np.cos(0.5 * angle)
+    prey = CubicPrey.between(float(q2[0]), float(slope[0]), float(q2[-1]), float(slope[-1]), left)
+    apart = q2 - prey.q2(times)
+    return apart if np.isfinite(apart).all() else None
 
 
 def _assemble(
@@ -172,9 +153,9 @@ def _assemble(
     trial: Trial,
     boundary: Boundary,
     reference: float,
-    status: PlanStatus,
     asked: float,
     evaluations: int,
+    end_rate: float,
 ) -> Plan:
     """Return the plan that flies `trial`; raises PlanningError when it is not finite."""
     energy, _, _ = program.energy(trial)
@@ -184,9 +165,10 @@ def _assemble(
         raise PlanningError("the optimiser returned a path that is not finite")
     times = 0.5 * trial.horizon * (program.family.grid.rule.nodes + 1.0)
     prey = boundary.prey(trial.horizon).q2(times)
+    kept = trial.horizon <= asked * (1.0 + 1e-9)
     return Plan(
-        path=PolynomialPath.through(node_q2, trial.horizon),
-        status=status,
+        path=PolynomialPath.through(node_q2, trial.horizon, end_rate=end_rate),
+        status=PlanStatus.OPTIMAL if kept else PlanStatus.STRETCHED,
         horizon_asked=asked,
         horizon=trial.horizon,
         energy=energy,

@@ -1,8 +1,9 @@
 """The programs of virtual motion camouflage, on NLopt's SLSQP with exact gradients (Sease 5.8, 5.14).
 
-Two programs share cost and limits: the least energy at a fixed horizon, and the shortest horizon. The
-limits hold at every time, not on the nodes only: they are imposed at those points of a dense grid where a
-solution without them broke them, until none does (the exchange method of semi-infinite programming).
+Two programs share cost and limits: the least energy at a fixed horizon, and the least of energy and time at
+a price of time. The limits hold at every time, not on the nodes only: they are imposed at those points of a
+dense grid where a solution without them broke them, until none does (the exchange method of semi-infinite
+programming).
 """
 
 from __future__ import annotations
@@ -20,16 +21,16 @@ from flight.plant import SQUARE_Q2_WITHOUT_AUTHORITY, SingleAxisPlant, current_a
 LIMIT_TOLERANCE = 3e-4
 """Relative: what a limit may be exceeded by on the dense grid; leaves room under 1e-3 between its points."""
 
-ENERGY_WEIGHT = 0.14
-"""Of R I^2 against R Imax^2 in the shortest-horizon program. Zero would give the family's very shortest
-path, all bang, whose cost is up to 1 % above the true optimum's at that horizon; this stops about 0.3 %
-later, where the cost is within 0.25 %."""
+IMPOSED_MARGIN = 2e-4
+"""Relative: how far within a limit it is imposed, so that the peaks between the imposed points keep it too;
+without it each exchange creeps up on the limit."""
 
 # NLopt 2.11 has a runtime_error of its own, older bindings raise Python's.
 _SOLVER_STOPS = (nlopt.RoundoffLimited, RuntimeError, getattr(nlopt, "runtime_error", RuntimeError))
 _CONVERGED = (nlopt.SUCCESS, nlopt.FTOL_REACHED, nlopt.XTOL_REACHED)
 _EXCHANGES = 10
 _EVALUATIONS = 60
+_FREE_TOLERANCE = 1e-5
 _IMPOSE_ABOVE = 0.5
 _IMPOSE_EVERY = 16
 
@@ -40,6 +41,15 @@ class Trial:
 
     parameters: FloatArray
     horizon: float
+
+
+@dataclass(frozen=True, slots=True)
+class FreeHorizon:
+    """A horizon to be found between `least` and `greatest` s, each second at `price` W."""
+
+    least: float
+    greatest: float
+    price: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +90,15 @@ class Program:
     def current_limit(self) -> float:
         """The plant's, A."""
         return self._plant.current_limit
+
+    @property
+    def bang_power(self) -> float:
+        """R Imax^2, W: what the coil takes at its limit."""
+        return self._bang
+
+    def prey(self, horizon: float) -> Trial:
+        """Return the prey path itself over `horizon` s: every path control parameter one."""
+        return Trial(np.zeros(self.family.size), horizon)
 
     def _whitened(self, family: Family, horizon: float) -> Family:
         """Return the family with the unit matrix for the energy's Gauss-Newton Hessian at the prey.
@@ -135,25 +154,24 @@ class Program:
         current, _ = self._current(trajectory, trial.horizon)
         return np.stack([current / self._plant.current_limit, trajectory[0] / self._q2_limit])
 
-    def unlimited(self, horizon: float) -> Trial | None:
-        """Return the least-energy path over `horizon` s with no limit imposed; None when none was found."""
-        trial, converged = self._minimise(Trial(np.zeros(self.family.size), horizon), None, None)
+    def beside_prey(self, apart: FloatArray, horizon: float) -> Trial:
+        """Return the path that lies `apart` (N,) from the prey on the nodes, ends and end slopes aside."""
+        return Trial(np.asarray(np.linalg.solve(self.family.basis[2:-2], apart[2:-2]), dtype=float), horizon)
+
+    def unlimited(self, start: Trial) -> Trial | None:
+        """Return the least-energy path over the horizon of `start`, limits aside; None when none is found."""
+        trial, converged = self._minimise(start, None, None)
         if converged:
             return trial
         # NLopt ends a problem that is solved from the start as limited by rounding. The whitened gradient
         # tells that from a failure: half its square is the energy still to be saved.
         _, gradient, _ = self.energy(trial)
-        return trial if 0.5 * float(gradient @ gradient) <= self._energy_tolerance(horizon) else None
+        return trial if 0.5 * float(gradient @ gradient) <= self._energy_tolerance(trial.horizon) else None
 
-    def _energy_tolerance(self, horizon: float) -> float:
-        """Return what energy is solved to, J: 1e-8 of what the coil can spend in the time."""
-        return 1e-8 * self._bang * horizon
-
-    def limited(self, start: Trial, horizons: tuple[float, float] | None = None) -> Trial | None:
+    def limited(self, start: Trial, free: FreeHorizon | None = None) -> Trial | None:
         """Return the least-energy path within the limits, from `start`; None when none was found.
 
-        With `horizons` (least, greatest) in s the horizon is free: the shortest feasible one, energy
-        breaking the tie as ENERGY_WEIGHT says.
+        With `free` the horizon is free and its price is added to the energy.
         """
         ratios = self.ratios(start)
         every = np.arange(ratios.shape[1]) % _IMPOSE_EVERY == _IMPOSE_EVERY // 2
@@ -161,7 +179,7 @@ class Program:
         trial = start
         for _ in range(_EXCHANGES):
             limits = Limits.at(chosen, ratios)
-            trial, converged = self._minimise(trial, limits, horizons)
+            trial, converged = self._minimise(trial, limits, free)
             latest = self.ratios(trial)
             worst = float(np.abs(latest).max())
             if worst <= 1.0 + LIMIT_TOLERANCE:
@@ -173,18 +191,19 @@ class Program:
             chosen = chosen | added
         return None
 
-    def _minimise(
-        self, start: Trial, limits: Limits | None, horizons: tuple[float, float] | None
-    ) -> tuple[Trial, bool]:
-        """Run SLSQP once from `start`, over (parameters, log-horizon) with `horizons`; tell if it converged.
+    def _energy_tolerance(self, horizon: float) -> float:
+        """Return what energy is solved to, J: 1e-8 of what the coil can spend in the time."""
+        return 1e-8 * self._bang * horizon
 
-        The objective of a free horizon is E + T / (T0 p), p = ENERGY_WEIGHT / (R Imax^2 T0), and its second
-        variable log(T/T0) / sqrt(p): every variable then has a curvature of about one.
+    def _minimise(self, start: Trial, limits: Limits | None, free: FreeHorizon | None) -> tuple[Trial, bool]:
+        """Run SLSQP once from `start`, over (parameters[, log-horizon]); tell if it converged.
+
+        The second variable is log(T/T0) over a scale that gives the price of time, like the whitened energy,
+        a curvature of about one.
         """
         size, origin = self.family.size, start.horizon
-        price = ENERGY_WEIGHT / (self._bang * origin)
-        root = math.sqrt(price)
-        free = horizons is not None
+        root = 1.0 / math.sqrt(free.price * origin) if free else 0.0
+        price = free.price if free else 0.0
         last = np.append(start.parameters, 0.0) if free else start.parameters
 
         def trial_of(x: FloatArray) -> Trial:
@@ -199,26 +218,26 @@ class Program:
             if gradient.size:
                 gradient[:size] = by_parameters
                 if free:
-                    gradient[size] = root * trial.horizon * (by_horizon + 1.0 / (origin * price))
-            return energy + (trial.horizon / (origin * price) if free else 0.0)
+                    gradient[size] = root * trial.horizon * (by_horizon + price)
+            return energy + price * trial.horizon
 
         solver = nlopt.opt(nlopt.LD_SLSQP, last.size)
         solver.set_min_objective(objective)
-        # 1e-5 of a free horizon's objective is a horizon to 0.01 % or better.
-        solver.set_ftol_abs(1e-5 / price if free else self._energy_tolerance(origin))
+        # A part of 1e-5 of a free horizon's objective is a horizon to 0.01 % or better.
+        solver.set_ftol_abs(_FREE_TOLERANCE * price * origin if free else self._energy_tolerance(origin))
         solver.set_maxeval(_EVALUATIONS)
-        if horizons is not None:
-            low, high = (math.log(bound / origin) / root for bound in horizons)
+        if free is not None:
+            low, high = (math.log(bound / origin) / root for bound in (free.least, free.greatest))
             solver.set_lower_bounds(np.append(np.full(size, -np.inf), low))
             solver.set_upper_bounds(np.append(np.full(size, np.inf), high))
             last[size] = min(max(0.0, low), high)
-        if limits is not None:
+        if limits is not None and limits.index.size:
             points = self.family.observed(self.family.grid.dense.take(limits.index))
 
             def constraints(result: FloatArray, x: FloatArray, gradient: FloatArray) -> None:
                 trial = trial_of(x)
                 value, by_parameters, by_horizon = self.excess(limits, points, trial)
-                result[:] = value
+                result[:] = value + IMPOSED_MARGIN
                 if gradient.size:
                     gradient[:, :size] = by_parameters
                     if free:

@@ -1,4 +1,4 @@
-"""How good the estimate and the rates from streaks were, against the truth of the simulation."""
+"""How good the estimate, the rates and the stars' attitudes were, against the truth of the simulation."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from flight.arrays import FloatArray
+from flight.quaternion import conjugate, multiply, normalise, to_rotation_vector
 from flight.report.signals import seconds
 from flight.telemetry.packets import PacketArray, to_text
 from flight.telemetry.reader import Run
@@ -66,6 +67,37 @@ def streaks(run: Run) -> Object:
         found["compared"] = int(known.sum())
         found["rms_error"] = np.sqrt(np.mean(error[known] ** 2, axis=0)).tolist()
         found["normalised"] = _normalised(error[known], covariance_matrices(rated["covariance"][known]))
+    return found
+
+
+def star_attitudes(run: Run) -> Object:
+    """Return what the star tracker made of the frames, and how far its attitudes were from the truth.
+
+    `rms_error` is about the body's axes in rad, `normalised` the mean of e' P^-1 e / 3, as for the streaks.
+    """
+    packets, truth = run["stars"], run["truth"]
+    solved = packets[np.all(np.isfinite(packets["quaternion"]), axis=1)]
+    found: Object = {
+        "frames": len(packets),
+        "solved": len(solved),
+        "tracked": int(np.sum(solved["tracked"] == 1)),
+        "accepted": int(np.sum(packets["accepted"] == 1)),
+        "status": dict(Counter(to_text(status) for status in packets["status"])),
+        "matched": float(np.median(solved["matched"])) if len(solved) else None,
+        "compared": 0,
+        "rms_error": None,
+        "normalised": None,
+    }
+    time, middle = seconds(truth), solved["middle_ns"] / 1e9
+    covered = (middle >= time[0]) & (middle <= time[-1]) if len(time) > 1 else np.zeros(len(solved), bool)
+    if covered.any():
+        # Over the truth's short steps a straight line and the great circle are the same.
+        columns = [np.interp(middle[covered], time, column) for column in truth["quaternion"].T]
+        true = normalise(np.stack(columns, axis=-1))
+        error = to_rotation_vector(multiply(solved["quaternion"][covered], conjugate(true)))
+        found["compared"] = int(covered.sum())
+        found["rms_error"] = np.sqrt(np.mean(error**2, axis=0)).tolist()
+        found["normalised"] = _normalised(error, covariance_matrices(solved["covariance"][covered]))
     return found
 
 

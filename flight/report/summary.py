@@ -14,7 +14,7 @@ from flight.arrays import FloatArray
 from flight.report import performance as limits
 from flight.report.operations import cycles, events, jobs, logs, planner, rate_groups
 from flight.report.performance import Command, Response, commands, response
-from flight.report.sensing import estimate_errors, streaks
+from flight.report.sensing import estimate_errors, star_attitudes, streaks
 from flight.report.signals import Attitude, coil_power, estimated_attitude, seconds, true_attitude
 from flight.telemetry.packets import PacketArray, to_text
 from flight.telemetry.reader import Run
@@ -41,6 +41,7 @@ def summarise(run: Run) -> Object:
         "planner": planner(run["plan"]),
         "estimate": estimate_errors(run),
         "streaks": streaks(run),
+        "stars": star_attitudes(run),
         "events": events(run["event"]),
         "logs": logs(run),
         "notes": notes,

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
 Object = dict[str, Any]
 
+ARCSECONDS = 648_000.0 / math.pi
 _SEVERITIES = ("information", "warning", "fault")
 
 
@@ -180,6 +182,22 @@ def _sensing(summary: Object) -> list[str]:
         lines.append(
             f"  rms error x, y, z {errors} mrad/s of {streaks['compared']} rates; "
             f"mean e' P^-1 e / 3 = {number(streaks['normalised'])}"
+        )
+    return lines + _stars(summary["stars"])
+
+
+def _stars(stars: Object) -> list[str]:
+    if not stars["frames"]:
+        return []
+    lines = [
+        f"Stars:   {stars['frames']} frames ({_tally(stars['status'])}), {stars['tracked']} tracked, "
+        f"{number(stars['matched'], 0)} stars matched in the median, {stars['accepted']} into the estimate"
+    ]
+    if stars["rms_error"] is not None:
+        errors = ", ".join(number(error, 2, ARCSECONDS) for error in stars["rms_error"])
+        lines.append(
+            f"  rms error about x, y, z {errors} arcsec of {stars['compared']} attitudes; "
+            f"mean e' P^-1 e / 3 = {number(stars['normalised'])}"
         )
     return lines
 

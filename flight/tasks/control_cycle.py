@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from flight import events
-from flight.estimation.single_axis import Estimate
+from flight.estimation.estimate import ThreadEstimate
 from flight.events import EventLog
 from flight.executive.jobs import JobRunner
 from flight.executive.rate_group import Cycle
@@ -54,7 +54,7 @@ class ControlCycle:
         self._ever_started = False
         self._blind = True
         self.target: Target | None = None
-        self.estimate: Estimate | None = None
+        self.estimate: ThreadEstimate | None = None
 
     def run(self, cycle: Cycle) -> None:
         """Run one cycle."""
@@ -62,13 +62,13 @@ class ControlCycle:
         target = self._command_target(now_ns)
         # What the last command came to be on the wire, and when: the coils' thread may have needed a moment.
         in_force = rooms.coils.state()
-        rooms.navigation.commanded(in_force.written_ns, float(in_force.current[0]))
+        rooms.navigation.commanded(in_force.written_ns, in_force.current)
         rooms.navigation.update(now_ns)
         if rooms.imaging is not None:
             rooms.imaging.serve(now_ns)
         self.estimate = rooms.navigation.estimate(now_ns)
         if self.estimate is not None and self._blind:
-            rooms.planning.request()  # from where the body is by now, not from an old path
+            rooms.planning.request(now_ns)  # from where the body is by now, not from an old path
         self._blind = self.estimate is None
         self._ever_started = self._ever_started or self.estimate is not None
         self._collect(now_ns)
@@ -84,7 +84,7 @@ class ControlCycle:
             self.target = target
             self._recorder.record(TARGET, now_ns, index=target.index, q2=target.q2, rate=target.rate)
             self._events.tell(events.TARGET, now_ns, f"step {target.index}: q2 = {target.q2:+.2f}")
-            self._rooms.planning.aim(target)
+            self._rooms.planning.aim(target, now_ns)
         return target
 
     def _collect(self, now_ns: int) -> None:

@@ -1,4 +1,4 @@
-"""Imaging: triggers the star camera, hands frames to the vision worker, and its rates to navigation.
+"""Imaging: triggers the star camera, hands frames to the vision worker, its findings to navigation.
 
 A frame is known to be of a living camera by its sequence number, its pixels and its age.
 """
@@ -12,15 +12,18 @@ import numpy as np
 
 from flight import events
 from flight.arrays import FloatArray
+from flight.estimation.estimate import RATE, TURN, Estimate
 from flight.events import Condition, EventLog
 from flight.executive.jobs import JobResult, JobRunner
 from flight.executive.rate_group import Cycle
-from flight.pinhole import Pinhole
-from flight.quaternion import attitude_matrix
+from flight.lens import CameraModel
+from flight.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
+from flight.startracker.frame_job import Found, FrameFound, FrameJob, TrackerSettings
+from flight.startracker.solution import FrameSolution
+from flight.startracker.solve import AttitudePrior, RatePrior
 from flight.tasks.navigation import Navigation
-from flight.telemetry.definitions import STREAK
+from flight.telemetry.definitions import STARS, STREAK
 from flight.telemetry.recorder import Recorder
-from flight.vision.job import Found, StreakJob
 from flight.vision.likelihood.settings import LikelihoodSettings
 from flight.vision.settings import StreakSettings
 from flight.vision.streak_rate import StreakStatus
@@ -29,17 +32,29 @@ from hal.interfaces.errors import DeviceError
 from hal.interfaces.readings import Frame
 
 WORKER = "vision"
+# rad, of the mounting between the camera and the inertial unit that the estimate is of.
+_LEAST_PRIOR_SIGMA = 5e-4
+# Simpson's rule over the exposure: its middle, where nothing differs, left out.
+_NODES, _WEIGHTS = (0.0, 0.25, 0.75, 1.0), (1.0 / 12.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 12.0)
+_NAN = np.full(3, np.nan), np.full((3, 3), np.nan)
 
 
 @dataclass(frozen=True, slots=True)
 class ImagingSettings:
-    """The camera as vision must know it; `mounting` (4,) takes the body's axes to the camera's."""
+    """The camera as vision must know it.
 
-    pinhole: Pinhole
+    Attributes:
+        mounting: (4,) takes the body's axes to the camera's.
+        unrest: rad^2/s^3, density of the white angular acceleration that shakes the body.
+    """
+
+    camera: CameraModel
     exposure_ns: int
     max_age_ns: int
     mounting: FloatArray
     estimator: StreakSettings | LikelihoodSettings
+    tracker: TrackerSettings | None
+    unrest: float
 
 
 class Imaging:
@@ -94,7 +109,7 @@ class Imaging:
         if frame.sequence <= self._last_sequence:
             text = f"frame {frame.sequence} comes again"
             self._events.tell(events.CAMERA_FROZEN, now_ns, text)
-            self._record(frame, StreakStatus.FROZEN.value, None, now_ns, False)
+            self._record_rate(frame, StreakStatus.FROZEN.value, None, now_ns, False)
             return
         self._last_sequence = frame.sequence
         if self._jobs.submit(WORKER, self._job(frame)):
@@ -109,18 +124,21 @@ class Imaging:
             return
         if result.outcome != "done":
             self._events.tell(events.VISION_FAILED, now_ns, f"{result.outcome}: {result.error}")
-            self._record(frame, StreakStatus.FAILED.value, None, now_ns, False)
+            self._record_rate(frame, StreakStatus.FAILED.value, None, now_ns, False)
             return
-        found: Found = result.value
-        self._last_checksum = found.checksum
-        if found.status is StreakStatus.FROZEN:
+        found: FrameFound = result.value
+        motion = found.motion
+        self._last_checksum = motion.checksum
+        if motion.status is StreakStatus.FROZEN:
             self._events.tell(
                 events.CAMERA_FROZEN, now_ns, f"frame {frame.sequence} has the pixels of the last"
             )
-        elif found.status in {StreakStatus.BLACK, StreakStatus.SATURATED}:
-            self._events.tell(events.CAMERA_BLACK, now_ns, f"frame {frame.sequence} is {found.status.value}")
-        accepted = found.status is StreakStatus.RATE and self._use(frame, found, now_ns)
-        self._record(frame, found.status.value, found, now_ns, accepted)
+        elif motion.status in {StreakStatus.BLACK, StreakStatus.SATURATED}:
+            self._events.tell(events.CAMERA_BLACK, now_ns, f"frame {frame.sequence} is {motion.status.value}")
+        accepted = motion.status is StreakStatus.RATE and self._use_rate(frame, motion, now_ns)
+        self._record_rate(frame, motion.status.value, motion, now_ns, accepted)
+        if found.solution is not None:
+            self._use_stars(frame, found.solution, now_ns)
 
     def _poll(self, now_ns: int) -> Frame | None:
         try:
@@ -129,29 +147,35 @@ class Imaging:
             self._lost.update(True, now_ns, str(error))
             return None
 
-    def _job(self, frame: Frame) -> StreakJob:
-        past = self._navigation.past_rate(frame.exposure_start_ns + frame.exposure_ns // 2)
-        rate, sigma = past if past is not None else (0.0, math.inf)
-        prior = self._body_to_camera @ np.array([0.0, rate, 0.0]) if past is not None else None
-        return StreakJob(
+    def _job(self, frame: Frame) -> FrameJob:
+        past = self._navigation.past(_middle_ns(frame))
+        return FrameJob(
             frame.pixels,
-            self._settings.pinhole,
+            self._settings.camera,
             frame.exposure_ns * 1e-9,
             self._settings.estimator,
-            prior,
-            sigma,
+            self._settings.tracker,
+            self._rate_prior(past) if past is not None else None,
+            self._attitude_prior(past) if past is not None else None,
             self._last_checksum,
         )
 
-    def _use(self, frame: Frame, found: Found, now_ns: int) -> bool:
-        """Give the mean rate about the thread over the exposure to navigation."""
+    def _rate_prior(self, past: Estimate) -> RatePrior:
+        widest = float(np.linalg.eigvalsh(past.covariance[RATE, RATE])[-1])
+        return RatePrior(self._body_to_camera @ past.rate, math.sqrt(max(widest, 0.0)))
+
+    def _attitude_prior(self, past: Estimate) -> AttitudePrior:
+        widest = float(np.linalg.eigvalsh(past.covariance[TURN, TURN])[-1])
+        sigma = math.sqrt(max(widest, 0.0) + _LEAST_PRIOR_SIGMA**2)
+        return AttitudePrior(multiply(self._settings.mounting, past.quaternion), sigma)
+
+    def _use_rate(self, frame: Frame, found: Found, now_ns: int) -> bool:
+        """Give the mean body rate over the exposure to navigation."""
         start_ns = frame.exposure_start_ns
-        if self._navigation.past_rate(start_ns) is None:
+        if self._navigation.past(start_ns) is None:
             return False  # exposed before there was an estimate
-        rate, covariance = self._in_body(found)
-        accepted = self._navigation.take_mean_rate(
-            start_ns, start_ns + frame.exposure_ns, float(rate[1]), float(covariance[1, 1])
-        )
+        rate, covariance = self._rate_in_body(found)
+        accepted = self._navigation.take_mean_rate(start_ns, start_ns + frame.exposure_ns, rate, covariance)
         if accepted:
             self.accepted += 1
         else:
@@ -159,16 +183,64 @@ class Imaging:
             self._events.tell(events.STREAK_REFUSED, now_ns, text)
         return accepted
 
-    def _in_body(self, found: Found) -> tuple[FloatArray, FloatArray]:
+    def _use_stars(self, frame: Frame, solution: FrameSolution, now_ns: int) -> None:
+        """Give the attitude at mid-exposure to navigation, and tell of it."""
+        accepted = False
+        middle_ns = _middle_ns(frame)
+        quaternion, covariance = np.full(4, np.nan), _NAN[1]
+        if solution.fix is not None:
+            turn = self._body_to_camera.T
+            quaternion = multiply(conjugate(self._settings.mounting), solution.fix.quaternion)
+            covariance = turn @ solution.fix.covariance @ turn.T + self._blur(frame)
+            known = self._navigation.past(middle_ns) is not None
+            accepted = known and self._navigation.take_attitude(middle_ns, quaternion, covariance)
+            if known and not accepted:
+                text = f"frame {frame.sequence}: {len(solution.matched)} stars"
+                self._events.tell(events.STARS_REFUSED, now_ns, text)
+        self._recorder.record(
+            STARS,
+            now_ns,
+            sequence=frame.sequence,
+            middle_ns=middle_ns - self._recorder.epoch_ns,
+            status=solution.status.value,
+            tracked=int(solution.tracked),
+            found=len(solution.points),
+            matched=len(solution.matched),
+            quaternion=quaternion.tolist(),
+            covariance=_packed(covariance),
+            log10_false_alarm=solution.log10_false_alarm,
+            accepted=int(accepted),
+        )
+
+    def _blur(self, frame: Frame) -> FloatArray:
+        """Return by how much the stars' mean attitude may differ from that of mid-exposure, (3, 3) rad^2.
+
+        An acceleration draws the mean off the middle: as the estimate knows it, that much is in doubt, and
+        what shakes the body unknown to it: white acceleration of density q moves the mean of T seconds from
+        their middle by a variance of q T^3 / 320.
+        """
+        duration = frame.exposure_ns * 1e-9
+        known = np.zeros(3)
+        middle = self._navigation.past(_middle_ns(frame))
+        if middle is not None:
+            back = conjugate(middle.quaternion)
+            for part, weight in zip(_NODES, _WEIGHTS, strict=True):
+                past = self._navigation.past(frame.exposure_start_ns + round(part * frame.exposure_ns))
+                if past is not None:
+                    known += weight * to_rotation_vector(multiply(past.quaternion, back))
+        return np.outer(known, known) + np.eye(3) * self._settings.unrest * duration**3 / 320.0
+
+    def _rate_in_body(self, found: Found) -> tuple[FloatArray, FloatArray]:
         """Return rate and covariance in body axes; NaN when there is none."""
         if found.rate is None or found.covariance is None:
-            return np.full(3, np.nan), np.full((3, 3), np.nan)
+            return _NAN
         turn = self._body_to_camera.T
         return turn @ found.rate, turn @ found.covariance @ turn.T
 
-    def _record(self, frame: Frame, status: str, found: Found | None, now_ns: int, accepted: bool) -> None:
-        nan = np.full(3, np.nan), np.full((3, 3), np.nan)
-        rate, c = self._in_body(found) if found is not None else nan
+    def _record_rate(
+        self, frame: Frame, status: str, found: Found | None, now_ns: int, accepted: bool
+    ) -> None:
+        rate, covariance = self._rate_in_body(found) if found is not None else _NAN
         self._recorder.record(
             STREAK,
             now_ns,
@@ -180,7 +252,16 @@ class Imaging:
             used=found.used_count if found else 0,
             length=found.length if found else math.nan,
             rate=rate.tolist(),
-            covariance=[c[0, 0], c[1, 1], c[2, 2], c[0, 1], c[0, 2], c[1, 2]],
+            covariance=_packed(covariance),
             residual=found.residual if found else math.nan,
             accepted=int(accepted),
         )
+
+
+def _middle_ns(frame: Frame) -> int:
+    return frame.exposure_start_ns + frame.exposure_ns // 2
+
+
+def _packed(c: FloatArray) -> list[float]:
+    """Return xx yy zz xy xz yz of a symmetric matrix (3, 3)."""
+    return [float(c[0, 0]), float(c[1, 1]), float(c[2, 2]), float(c[0, 1]), float(c[0, 2]), float(c[1, 2])]

@@ -1,4 +1,4 @@
-"""Navigation: the inertial unit's samples and the rates from streaks into one estimate, or into none.
+"""Navigation: the inertial unit's samples, streaks' rates and stars' attitudes into one estimate, or none.
 
 It also watches the unit's line and tells silence from corruption: bytes that stand still are silence, bytes
 that make no packets are corruption, packets with impossible values are implausible.
@@ -8,8 +8,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from flight import events
-from flight.estimation.single_axis import ANGLE, RATE, Estimate, Measurement, SingleAxisFilter
+from flight.arrays import FloatArray
+from flight.estimation.attitude_filter import AttitudeFilter
+from flight.estimation.estimate import Estimate, ThreadEstimate
+from flight.estimation.measurements import (
+    AttitudeMeasurement,
+    MeanRateMeasurement,
+    Measurement,
+    RateMeasurement,
+)
+from flight.estimation.rigid_body import Parameters
 from flight.events import Condition, EventLog
 from flight.quaternion import angle_about_axis_y
 from flight.telemetry.definitions import IMU
@@ -21,11 +32,22 @@ from hal.interfaces.readings import ImuLink, ImuReading
 
 @dataclass(frozen=True, slots=True)
 class NavigationSettings:
-    """Standard deviations of the unit's angle (rad) and rate (rad/s); age in ns past which all is lost."""
+    """Noise of the unit, two ages, and what planner and controller know of the thread.
+
+    Without a reading for `max_age_ns` the unit is told to be silent; the estimate is carried on by the model
+    and trusted until it is `coast_ns` old.
+
+    Attributes:
+        angle_noise: rad, standard deviation of the unit's attitude about each axis.
+        rate_noise: rad/s, of its rate.
+        believed: torsion and damping of the thread in the plant: the disturbance told is the rest.
+    """
 
     angle_noise: float
     rate_noise: float
     max_age_ns: int
+    coast_ns: int
+    believed: Parameters
 
 
 class Navigation:
@@ -34,7 +56,7 @@ class Navigation:
     def __init__(
         self,
         unit: InertialUnit,
-        filter_: SingleAxisFilter,
+        filter_: AttitudeFilter,
         settings: NavigationSettings,
         recorder: Recorder,
         event_log: EventLog,
@@ -42,6 +64,8 @@ class Navigation:
         self._unit = unit
         self._filter = filter_
         self._settings = settings
+        self._angle_covariance: FloatArray = np.eye(3) * settings.angle_noise**2
+        self._rate_covariance: FloatArray = np.eye(3) * settings.rate_noise**2
         self._recorder = recorder
         self._events = event_log
         self._since_ns = 0
@@ -63,9 +87,9 @@ class Navigation:
         """Return the unit's counters."""
         return self._link
 
-    def commanded(self, time_ns: int, current: float) -> None:
-        """Tell the filter which current is in force about the thread from `time_ns` on."""
-        self._filter.command(time_ns, current)
+    def commanded(self, time_ns: int, currents: FloatArray) -> None:
+        """Tell the filter which currents (3,) A are in force in the coils from `time_ns` on."""
+        self._filter.command(time_ns, currents)
 
     def update(self, now_ns: int) -> None:
         """Take in what the unit has sent."""
@@ -81,23 +105,38 @@ class Navigation:
                 self._last_good_ns = now_ns
         self._watch_line(now_ns)
 
-    def estimate(self, now_ns: int) -> Estimate | None:
-        """Return the estimate for now, None when there is none to be trusted."""
+    def attitude(self, now_ns: int) -> Estimate | None:
+        """Return the whole estimate for now, None when there is none to be trusted."""
         if not self._filter.started:
             return None
         estimate = self._filter.at(now_ns)
-        return estimate if now_ns - estimate.measured_ns <= self._settings.max_age_ns else None
+        return estimate if now_ns - estimate.measured_ns <= self._settings.coast_ns else None
 
-    def past_rate(self, time_ns: int) -> tuple[float, float] | None:
-        """Return the rate about the thread at a past time and its standard deviation."""
-        past = self._filter.past(time_ns)
-        return None if past is None else (past.rate, float(past.covariance[RATE, RATE]) ** 0.5)
+    def estimate(self, now_ns: int) -> ThreadEstimate | None:
+        """Return what it says of the turn about the thread, None when it is not to be trusted."""
+        estimate = self.attitude(now_ns)
+        return None if estimate is None else estimate.about_thread(self._settings.believed)
 
-    def take_mean_rate(self, since_ns: int, until_ns: int, rate: float, variance: float) -> bool:
-        """Put the mean rate over an exposure where it belongs in time; tell whether it passed the gate."""
-        return self._filter.started and self._filter.measure(
-            Measurement(until_ns, RATE, rate, variance, since_ns)
-        )
+    def past(self, time_ns: int) -> Estimate | None:
+        """Return the whole estimate as it stood at a past time, None when that is not remembered."""
+        return self._filter.past(time_ns) if self._filter.started else None
+
+    def take_mean_rate(self, since_ns: int, until_ns: int, rate: FloatArray, covariance: FloatArray) -> bool:
+        """Put the mean body rate (3,) over an exposure, covariance (3, 3), where it belongs in time.
+
+        Tells whether it passed the gate.
+        """
+        return self._take_late(MeanRateMeasurement(since_ns, until_ns, rate, covariance))
+
+    def take_attitude(self, time_ns: int, quaternion: FloatArray, covariance: FloatArray) -> bool:
+        """Put an attitude (4,), covariance (3, 3) of turns about the body's axes, where it belongs in time.
+
+        Tells whether it passed the gate.
+        """
+        return self._take_late(AttitudeMeasurement(time_ns, quaternion, covariance))
+
+    def _take_late(self, measurement: Measurement) -> bool:
+        return self._filter.started and self._filter.measure(measurement)
 
     def _take(self, reading: ImuReading) -> None:
         self._recorder.record(
@@ -110,19 +149,21 @@ class Navigation:
             field=reading.field.tolist(),
             acceleration=reading.acceleration.tolist(),
         )
-        angle = Measurement(
-            reading.time_ns, ANGLE, angle_about_axis_y(reading.quaternion), self._settings.angle_noise**2
-        )
-        rate = Measurement(reading.time_ns, RATE, float(reading.rate[1]), self._settings.rate_noise**2)
+        time_ns = reading.time_ns
+        attitude = AttitudeMeasurement(time_ns, reading.quaternion, self._angle_covariance)
+        rate = RateMeasurement(time_ns, reading.rate, self._rate_covariance)
         if not self._filter.started:
-            self._filter.start(angle, rate)
+            self._filter.start(attitude, rate)
             return
-        agreed = self._filter.measure(angle) and self._filter.started and self._filter.measure(rate)
+        # Each for itself: a gyro that is right keeps the rate while the attitude is in doubt.
+        agreed = self._filter.measure(attitude)
+        agreed = self._filter.started and self._filter.measure(rate) and agreed
         if not agreed:
             self._events.tell(
                 events.IMU_REFUSED,
                 reading.arrival_ns,
-                f"angle {angle.value:.4f} rad, rate {rate.value:.5f} rad/s disagree with the estimate",
+                f"angle {angle_about_axis_y(reading.quaternion):.4f} rad, rate {reading.rate[1]:.5f} rad/s "
+                "disagree with the estimate",
             )
 
     def _watch_line(self, now_ns: int) -> None:

@@ -1,42 +1,73 @@
-"""Planning: asks the worker for a path every few seconds and at each new target, and offers it to guidance.
+"""Planning: asks the worker for paths and offers them to guidance.
 
-The horizon recedes: each plan starts from the newest estimate and reaches the target a whole horizon later
-(Sease ch. 5, Optimal Path Planning).
+Three strategies. GOAL plans a step at its command for a goal time, and again every few seconds from the
+newest estimate for what is left until then: each new plan is the optimal rest of the step. When little is
+left the path is flown to its end, which is held; a body that is carried off its path is planned for again.
+RECEDING is the thesis's: each plan reaches the target a whole horizon after it is made (Sease ch. 5, Optimal
+Path Planning). STEP makes no plan: the controller is shown the target itself.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from enum import StrEnum
 
 from flight import events
-from flight.estimation.single_axis import Estimate
+from flight.estimation.estimate import ThreadEstimate
 from flight.events import EventLog
 from flight.executive.jobs import JobResult, JobRunner
 from flight.executive.rate_group import Cycle
 from flight.guidance.guidance import Guidance
 from flight.guidance.job import PlanJob
+from flight.guidance.path import FARTHEST
 from flight.guidance.vmc import NODES, Plan, PlanStatus
-from flight.plant import SingleAxisPlant, angle_of
+from flight.plant import SingleAxisPlant, angle_of, q2_of
 from flight.tasks.targets import Target
 from flight.telemetry.definitions import MAX_NODES, PLAN
 from flight.telemetry.recorder import Recorder
 
 WORKER = "planner"
+_AGAIN_NS = 1_000_000_000
+
+
+class Strategy(StrEnum):
+    """What a path is planned towards."""
+
+    GOAL = "goal"
+    RECEDING = "receding"
+    STEP = "step"
 
 
 @dataclass(frozen=True, slots=True)
 class PlanningSettings:
-    """Horizon asked for and the longest allowed, s; ns after which a plan is late; nodes of the path."""
+    """How paths are asked for.
+
+    Attributes:
+        horizon: s, asked for at a new target; a first guess where time has a price.
+        max_horizon: s, the longest allowed.
+        late_after_ns: after which a plan is late.
+        nodes: of the path.
+        strategy: see the module.
+        time_price: W, what a second of a slew is worth; None for the horizon as it is.
+        current_share: of the coil's limit that a plan may use; the rest is the controller's.
+        least_horizon: s before the goal from which on no plan is made any more.
+        displaced: rad off the path from which on there is a new plan.
+    """
 
     horizon: float
     max_horizon: float
     late_after_ns: int
     nodes: int = NODES
+    strategy: Strategy = Strategy.GOAL
+    time_price: float | None = None
+    current_share: float = 1.0
+    least_horizon: float = 2.0
+    displaced: float = 0.05
 
 
 class Planning:
-    """Owns the job that is under way and the wish for the next one."""
+    """Owns the job that is under way, the wish for the next one and the goal time."""
 
     def __init__(
         self,
@@ -47,7 +78,7 @@ class Planning:
         recorder: Recorder,
         event_log: EventLog,
     ) -> None:
-        self._plant = plant
+        self._plant = replace(plant, current_limit=plant.current_limit * settings.current_share)
         self._settings = settings
         self._guidance = guidance
         self._jobs = jobs
@@ -55,50 +86,102 @@ class Planning:
         self._events = event_log
         self._wanted = False
         self._job: PlanJob | None = None
+        self._goal_ns: int | None = None
+        self._due_ns: int | None = None
+        self._asked_ns = 0
         self._count = 0
         self.flown = 0
         self.accepted = 0
         self.refused = 0
 
-    def aim(self, target: Target) -> None:
+    def aim(self, target: Target, now_ns: int) -> None:
         """Want another attitude, and a plan for it at once; the present path is flown until that comes."""
-        self._guidance.aim(target.q2)
+        self._guidance.aim(target.q2, target.rate, now_ns)
+        self._goal_ns = self._due_ns = None
         self._wanted = True
+        if self._settings.strategy is Strategy.STEP:
+            self._guidance.hold(angle_of(target.q2), now_ns)
 
-    def request(self) -> None:
+    def request(self, now_ns: int) -> None:
         """Want a plan as soon as there is an estimate to start from and the worker is free."""
         self._wanted = True
+        if self._is_near_goal(now_ns):
+            self._goal_ns = None
 
     def replan(self, cycle: Cycle) -> None:
         """Want a plan because its time has come: the task of the replanning rate group."""
         if self._job is None:
-            self._wanted = True
+            self._wanted = self._wanted or not self._is_near_goal(cycle.start_ns)
         elif cycle.start_ns - self._job.origin_ns > self._settings.late_after_ns:
             self._events.tell(
                 events.PLANNER_BUSY, cycle.start_ns, f"plan {self._job.number} is not finished yet"
             )
             self._wanted = True
 
-    def serve(self, estimate: Estimate | None, target: Target, now_ns: int) -> None:
+    def serve(self, estimate: ThreadEstimate | None, target: Target, now_ns: int) -> None:
         """Hand the wanted job over."""
-        if not self._wanted or estimate is None or self._job is not None:
+        if estimate is None or self._settings.strategy is Strategy.STEP:
             return
-        job = PlanJob(
-            self._count + 1,
-            now_ns,
-            self._plant,
-            estimate.q2,
-            estimate.rate,
-            target.q2,
-            target.rate,
-            self._settings.horizon,
-            self._settings.max_horizon,
-            self._settings.nodes,
-        )
+        if self._is_displaced(estimate.angle, now_ns):
+            self.request(now_ns)
+        if self._is_near_goal(now_ns):
+            self._wanted = False  # by the time the worker was free the goal was near
+        if not self._wanted or self._job is not None:
+            return
+        job = self._job_from(estimate, target, now_ns)
         if self._jobs.submit(WORKER, job):
             self._wanted = False
             self._count = job.number
             self._job = job
+            self._asked_ns = now_ns
+
+    def _job_from(self, estimate: ThreadEstimate, target: Target, now_ns: int) -> PlanJob:
+        settings, goal_ns = self._settings, self._goal_ns
+        towards_goal = settings.strategy is Strategy.GOAL
+        begun = goal_ns is not None
+        horizon = (goal_ns - now_ns) * 1e-9 if goal_ns is not None else settings.horizon
+        end_q2 = self._due_q2(target, now_ns, horizon) if towards_goal else target.q2
+        if end_q2 != self._guidance.target_q2:
+            self._guidance.aim(end_q2, target.rate, now_ns)
+        return PlanJob(
+            self._count + 1,
+            now_ns,
+            replace(self._plant, disturbance=estimate.disturbance) if towards_goal else self._plant,
+            estimate.q2,
+            estimate.rate,
+            end_q2,
+            target.rate,
+            horizon,
+            settings.max_horizon,
+            settings.nodes,
+            None if begun else settings.time_price,
+            self._guidance.remains(now_ns) if begun else None,
+        )
+
+    def _due_q2(self, target: Target, now_ns: int, horizon: float) -> float:
+        """Return q2 to be reached in `horizon` s: a target that moves has moved on since it was first due."""
+        if target.rate == 0.0 or self._due_ns is None:
+            return target.q2
+        late = horizon - (self._due_ns - now_ns) * 1e-9
+        angle = angle_of(target.q2) + target.rate * max(late, 0.0)
+        return q2_of(min(max(angle, -FARTHEST), FARTHEST))
+
+    def _is_near_goal(self, now_ns: int) -> bool:
+        """Tell whether too little is left until the goal to plan for it."""
+        if self._settings.strategy is not Strategy.GOAL or self._goal_ns is None:
+            return False
+        return self._goal_ns - now_ns < self._settings.least_horizon * 1e9
+
+    def _is_displaced(self, angle: float, now_ns: int) -> bool:
+        """Tell whether the body is off its path, so that the path is of no more use; not each cycle anew."""
+        sample = self._guidance.sample(now_ns)
+        if self._settings.strategy is not Strategy.GOAL or sample is None:
+            return False
+        return (
+            self._goal_ns is not None
+            and now_ns - self._asked_ns > _AGAIN_NS
+            and abs(math.remainder(angle - sample.angle, 2.0 * math.pi)) > self._settings.displaced
+        )
 
     def finish(self, result: JobResult, now_ns: int) -> None:
         """Offer the worker's plan to guidance, which flies it or says why not."""
@@ -111,7 +194,14 @@ class Planning:
             self._record(job, None, result.outcome, False, now_ns)
             return
         plan: Plan = result.value
-        verdict = self._guidance.offer(plan, job.origin_ns, now_ns, angle_of(job.start_q2), job.start_rate)
+        verdict = self._guidance.offer(
+            plan,
+            job.origin_ns,
+            now_ns,
+            angle_of(job.start_q2),
+            job.start_rate,
+            job.plant.disturbance,
+        )
         reason = verdict.reason
         if reason:
             self.refused += 1
@@ -119,6 +209,9 @@ class Planning:
         else:
             self.accepted += 1
             self.flown = job.number
+            if self._settings.strategy is Strategy.GOAL:
+                self._goal_ns = job.origin_ns + round(plan.horizon * 1e9)
+                self._due_ns = self._due_ns or self._goal_ns
             if plan.status is PlanStatus.STRETCHED:
                 text = (
                     f"plan {job.number}: {plan.horizon_asked:g} s is too short, flying {plan.horizon:.2f} s"

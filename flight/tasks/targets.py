@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """Hold `q2` with rate `rate` (rad/s) from mission time `at_ns` on."""
+    """From mission time `at_ns` on reach `q2` at `rate` rad/s and keep that rate: zero holds the attitude."""
 
     index: int
     at_ns: int
@@ -20,9 +20,9 @@ class Target:
 class TargetSequence:
     """Targets in order of time."""
 
-    def __init__(self, steps: Sequence[tuple[float, float]]) -> None:
-        """Take (mission time in s, q2) of each step; the first stands at 0."""
-        self._targets = [Target(i, round(at * 1e9), q2) for i, (at, q2) in enumerate(steps)]
+    def __init__(self, steps: Sequence[tuple[float, float, float]]) -> None:
+        """Take (mission time in s, q2, rate in rad/s) of each step; the first stands at 0."""
+        self._targets = [Target(i, round(at * 1e9), q2, rate) for i, (at, q2, rate) in enumerate(steps)]
         self._times = [target.at_ns for target in self._targets]
 
     def at(self, mission_time_ns: int) -> Target:

@@ -153,6 +153,25 @@ STREAK = Packet(
     ),
 )
 
+STARS = Packet(
+    "stars",
+    0x122,
+    "each frame",
+    "Which stars one frame shows, and the attitude that they give",
+    (
+        Field("sequence", "u4", "-", "the camera's count"),
+        Field("middle_ns", "i8", "ns", "mission time of the exposure's middle"),
+        Field("status", "S32", "-", "solved, no-stars, too-few-stars, no-match, ambiguous"),
+        Field("tracked", "u1", "-", "1 when the estimate told where to look, 0 lost in space"),
+        Field("found", "u2", "-", "what was taken for a star"),
+        Field("matched", "u2", "-", "of them guide stars"),
+        Field("quaternion", "f8", "-", "reference into body, scalar last; NaN when none", 4),
+        Field("covariance", "f8", "rad^2", "xx yy zz xy xz yz of small turns, body axes; NaN when none", 6),
+        Field("log10_false_alarm", "f8", "-", "log10 of the chance matches expected in the whole sky"),
+        Field("accepted", "u1", "-", "1 when it entered the estimate"),
+    ),
+)
+
 EVENT = Packet(
     "event",
     0x130,
@@ -252,6 +271,7 @@ PACKETS: tuple[Packet, ...] = (
     TARGET,
     PLAN,
     STREAK,
+    STARS,
     EVENT,
     HOUSEKEEPING,
     TRUTH,

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from tests.campaigns.campaign import Campaign
 from tests.campaigns.consistency import CONSISTENCY
+from tests.campaigns.controllers import CONTROLLERS_CAMPAIGN
 from tests.campaigns.failures import FAILURES
 from tests.campaigns.lost_in_space import LOST_IN_SPACE
 from tests.campaigns.rso import RSO_SLEW, RSO_TRACK
 from tests.campaigns.rso_orbits import RSO_ORBITS
+from tests.campaigns.step_robust import STEP_ROBUST
 from tests.campaigns.streaks import STREAKS
 
 CAMPAIGNS: dict[str, Campaign] = {
@@ -20,5 +22,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         RSO_ORBITS,
         CONSISTENCY,
         LOST_IN_SPACE,
+        CONTROLLERS_CAMPAIGN,
+        STEP_ROBUST,
     )
 }

@@ -80,7 +80,7 @@ def test_a_picture_without_stars_gives_no_rate_and_exit_status_1(tmp_path: Path)
     [
         (["nothing.png", "--fov", "20", "--exposure", "1"], "nothing.png: cannot be read"),
         (["{picture}", "--fov", "20"], "give --fov and --exposure"),
-        (["{picture}", "--camera", "config/testbed.yaml"], "has no camera"),
+        (["{picture}", "--camera", "config/testbed.yaml"], "give a configuration with a camera"),
         (["{picture}", "--fov", "170", "--exposure", "1"], "--fov 170.0"),
     ],
 )

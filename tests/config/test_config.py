@@ -24,13 +24,21 @@ def test_every_configuration_in_the_repository_is_valid(path: Path) -> None:
     assert (section is None) == (loaded.simulation is None)
 
 
-def test_the_demonstration_is_the_thesis() -> None:
-    loaded = config.load(FOLDER / "step_demo.yaml")
+@pytest.mark.parametrize("name", ["step_demo.yaml", "step_thesis.yaml"])
+def test_the_demonstration_is_the_thesis(name: str) -> None:
+    loaded = config.load(FOLDER / name)
     assert [step.at for step in loaded.steps] == [100.0 * k for k in range(7)]
     assert [step.q2 for step in loaded.steps] == pytest.approx([-0.3 + 0.1 * k for k in range(7)])
     assert (loaded.duration, loaded.guidance.horizon, loaded.guidance.replan_period) == (700.0, 10.0, 5.0)
-    assert (loaded.control.state_weight, loaded.control.control_weight) == (20.0, 1.0)
     assert loaded.coils.current_limit == 0.148
+
+
+def test_the_thesis_loop_stays_as_it_was_in_the_same_world() -> None:
+    demo, thesis = (config.load(FOLDER / name) for name in ("step_demo.yaml", "step_thesis.yaml"))
+    assert (thesis.control.tracker, thesis.guidance.strategy) == ("thesis", "receding")
+    assert (thesis.control.state_weight, thesis.control.control_weight) == (20.0, 1.0)
+    assert thesis.simulation == demo.simulation
+    assert (thesis.plant, thesis.inertial_unit, thesis.coils) == (demo.plant, demo.inertial_unit, demo.coils)
 
 
 @pytest.mark.parametrize(

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flight.control.lq_tracker import LqTracker, lq_gains
@@ -21,6 +22,7 @@ STRONG = SingleAxisPlant(1.05e-3, 2.916e-4, 23.0, 100.0, 1e-5, 2e-6)
 REST = Sample(0.0, 0.0, 0.0)
 
 
+@settings(deadline=None)
 @given(st.floats(0.01, 1e4), st.floats(0.01, 1e3))
 def test_gains_are_those_of_the_closed_form(state_weight: float, input_weight: float) -> None:
     """For a double integrator K_e = sqrt(Q/R), K_e' = sqrt(Q/R + 2 K_e)."""
@@ -141,6 +143,7 @@ def test_saturation_is_explicit() -> None:
     assert weak.current == weak.demanded > 0.0
 
 
+@settings(deadline=None)
 @given(st.floats(1.01, math.pi - 0.01), st.sampled_from([-1.0, 1.0]))
 def test_beyond_the_largest_error_the_pull_stays_and_keeps_its_sign(size: float, sign: float) -> None:
     """sin(d) falls again after 90 degrees; the command does not."""
@@ -184,6 +187,6 @@ def test_an_input_that_is_not_finite_is_refused(position: int, value: float) -> 
         ({"least_authority": 0.0}, "least_authority"),
     ],
 )
-def test_impossible_settings_are_refused_by_name(options: dict[str, float], name: str) -> None:
+def test_impossible_settings_are_refused_by_name(options: dict[str, Any], name: str) -> None:
     with pytest.raises(UsageError, match=name):
         LqTracker(PLANT, **options)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from flight.arrays import FloatArray
-from flight.estimation.single_axis import ANGLE, RATE, FilterSettings, Measurement, SingleAxisFilter
 from flight.plant import SingleAxisPlant
+from tests.estimation.single_axis import ANGLE, RATE, FilterSettings, Measurement, SingleAxisFilter
 
 PLANT = SingleAxisPlant(inertia=1.05e-3, torque_constant=2.916e-4, resistance=23.0, current_limit=0.148)
 SETTINGS = FilterSettings(current_noise=2.02e-3, control_period=0.025, disturbance_walk=5e-4)

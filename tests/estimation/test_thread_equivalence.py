@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from flight.arrays import FloatArray
-from flight.estimation import single_axis
 from flight.estimation.attitude_filter import AttitudeFilter, FilterSettings
 from flight.estimation.measurements import (
     AttitudeMeasurement,
@@ -17,6 +16,7 @@ from flight.estimation.measurements import (
     RateMeasurement,
 )
 from flight.quaternion import about_axis_y
+from tests.estimation import single_axis
 from tests.estimation.flights import SUSPENDED
 from tests.estimation.test_single_axis import PERIOD, PLANT, SETTINGS, simulate
 

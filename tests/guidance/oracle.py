@@ -17,7 +17,7 @@ from flight.arrays import FloatArray
 
 @dataclass(frozen=True)
 class Slew:
-    """A slew between two moving states: angles rad, rates rad/s, the plant's numbers in SI."""
+    """A slew between two moving states: rad, rad/s; the plant in SI, its disturbance in rad/s^2."""
 
     start_angle: float
     start_rate: float
@@ -30,6 +30,7 @@ class Slew:
     current_limit: float
     stiffness: float = 0.0
     damping: float = 0.0
+    disturbance: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -66,6 +67,7 @@ class _InteriorPoint:
         self.gain = slew.torque_constant * slew.current_limit / slew.inertia
         self.spring = slew.stiffness / slew.inertia
         self.drag = slew.damping / slew.inertia
+        self.constant = slew.disturbance
         self.weights = np.full(self.n, self.h)
         self.weights[[0, -1]] *= 0.5
         time = np.linspace(0.0, slew.horizon, self.n)
@@ -89,7 +91,10 @@ class _InteriorPoint:
 
     def _acceleration(self) -> FloatArray:
         return np.asarray(
-            self.gain * self.u * np.cos(self.theta) - self.spring * self.theta - self.drag * self.omega
+            self.gain * self.u * np.cos(self.theta)
+            - self.spring * self.theta
+            - self.drag * self.omega
+            + self.constant
         )
 
     def _defects(self) -> FloatArray:

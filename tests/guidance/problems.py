@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ import pytest
 from flight.guidance.vmc import Plan, plan
 from flight.plant import SingleAxisPlant, angle_of
 from tests.guidance.oracle import Slew
+from tests.guidance.shortest import shortest_time
 
 KNIGHTCUBE = SingleAxisPlant(1.05e-3, 80 * 0.0081 * 4.5e-4, 23.0, 0.148)
 OPTIMUM_FILE = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "optimum.json"
@@ -28,10 +30,10 @@ class Problem:
     end_rate: float
     horizon: float
 
-    def planned(self, **options: float) -> Plan:
+    def planned(self, **options: Any) -> Plan:
         """Return the planner's answer."""
         states = self.start_q2, self.start_rate, self.end_q2, self.end_rate
-        return plan(self.plant, *states, self.horizon, **options)  # type: ignore[arg-type]  # nodes is an int
+        return plan(self.plant, *states, self.horizon, **options)
 
     def slew(self, horizon: float) -> Slew:
         """Return the same slew for the oracle, over `horizon` s."""
@@ -48,6 +50,7 @@ class Problem:
             plant.current_limit,
             plant.stiffness,
             plant.damping,
+            plant.disturbance,
         )
 
 
@@ -115,4 +118,30 @@ def random_problems(count: int, seed: int, horizons: tuple[float, float] = (6.0,
         start_q2, end_q2 = rng.uniform(-0.45, 0.45, 2).tolist()
         start_rate = float(rng.normal(0.0, 0.02))
         problems.append(Problem(plant, start_q2, start_rate, end_q2, 0.0, float(rng.uniform(*horizons))))
+    return problems
+
+
+def feasible_problems(
+    count: int, seed: int, share: tuple[float, float] = (1.1, 2.5)
+) -> list[tuple[Problem, float]]:
+    """Return slews whose horizon is `share` of the shortest feasible one, and that shortest horizon in s.
+
+    A third each without and with two threads, a disturbance on half, a moving end on half.
+    """
+    rng = np.random.default_rng(seed)
+    problems: list[tuple[Problem, float]] = []
+    while len(problems) < count:
+        stiffness = float(rng.choice([0.0, 1e-5, 2e-5]))
+        disturbance = float(rng.choice([0.0, rng.normal(0.0, 2e-3)]))
+        plant = replace(
+            KNIGHTCUBE, stiffness=stiffness, damping=2e-6 if stiffness else 0.0, disturbance=disturbance
+        )
+        start_q2, end_q2 = rng.uniform(-0.45, 0.45, 2).tolist()
+        start_rate = float(rng.normal(0.0, 0.02))
+        end_rate = float(rng.choice([0.0, rng.normal(0.0, 0.01)]))
+        factor = float(rng.uniform(*share))
+        drawn = Problem(plant, start_q2, start_rate, end_q2, end_rate, 1.0)
+        shortest = shortest_time(drawn.slew(1.0))
+        if 1.0 < shortest < 20.0:  # a slew of less than a second is none
+            problems.append((replace(drawn, horizon=factor * shortest), shortest))
     return problems

@@ -164,3 +164,48 @@ def test_an_impossible_hold_or_rule_is_refused(guidance: Guidance) -> None:
         guidance.hold(math.nan, 0)
     with pytest.raises(UsageError, match="late_after"):
         AcceptanceRules(late_after=math.nan)
+
+
+def test_an_end_that_is_the_target_is_held_without_alarm_unless_paths_should_not_end(good: Plan) -> None:
+    for arrives in (True, False):
+        guidance = Guidance(KNIGHTCUBE, arrives=arrives)
+        guidance.aim(TARGET)
+        assert guidance.offer(good, 0, 0, START, 0.0).accepted
+        assert not guidance.is_adrift(9 * SECOND)
+        assert guidance.is_adrift(11 * SECOND) is not arrives
+
+
+def test_holding_the_old_target_is_adrift_once_a_plan_for_the_new_one_is_late(guidance: Guidance) -> None:
+    guidance.aim(0.3, 0.0, 120 * SECOND)
+    assert not guidance.is_adrift(120 * SECOND + SECOND // 2)
+    assert guidance.is_adrift(121 * SECOND + SECOND // 2)
+
+
+def test_what_remains_of_a_path_counts_from_now_and_is_nothing_for_another_target(
+    guidance: Guidance, good: Plan
+) -> None:
+    assert guidance.remains(103 * SECOND) == good.path.starting_at(-3 * SECOND)
+    assert guidance.remains(111 * SECOND) is None
+    guidance.aim(0.3)
+    assert guidance.remains(103 * SECOND) is None
+
+
+def test_a_plan_that_ends_at_another_rate_is_never_flown(guidance: Guidance) -> None:
+    moving = plan(KNIGHTCUBE, 0.1, 0.0, TARGET, 0.01, 10.0)
+    assert "wanted is" in refused(guidance, moving, 101, 101, START, 0.0)
+    guidance.aim(TARGET, 0.01)
+    assert guidance.offer(moving, 101 * SECOND, 101 * SECOND, START, 0.0).accepted
+    with pytest.raises(UsageError, match="rate"):
+        guidance.aim(TARGET, math.nan)
+
+
+def test_the_limit_is_judged_under_the_disturbance_that_the_plan_allowed_for() -> None:
+    """A push of 0.03 rad/s^2 takes 108 mA to hold against: with it this path is within the limit."""
+    pushed = replace(KNIGHTCUBE, disturbance=0.03)
+    helped = plan(pushed, 0.1, 0.0, 0.2, 0.0, 5.5)
+    guidance = Guidance(KNIGHTCUBE)
+    guidance.aim(0.2)
+    assert guidance.offer(helped, 0, 0, START, 0.0, disturbance=0.03).accepted
+    other = Guidance(KNIGHTCUBE)
+    other.aim(0.2)
+    assert "limit is" in other.offer(helped, 0, 0, START, 0.0, disturbance=-0.03).reason

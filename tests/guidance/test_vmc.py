@@ -267,16 +267,16 @@ def test_what_cannot_be_planned_is_refused_with_its_reason(
         plan(KNIGHTCUBE, *arguments, **options)  # type: ignore[arg-type]  # nodes is an int
 
 
-def test_the_median_plan_takes_under_15_ms() -> None:
-    """The steps and the twenty known problems; measured figures come from `python -m tests.bench.plan`."""
+def test_the_median_plan_takes_under_3_ms_of_processor_time() -> None:
+    """The steps and the twenty known problems; measured figures come from `python -m tests.bench plan`."""
     problems = [*STEPS, THESIS, *(known.problem for known in known_optima())]
     spans = []
     for problem in problems:
         problem.planned()
-        begun = time.perf_counter()
+        begun = time.process_time()
         problem.planned()
-        spans.append(time.perf_counter() - begun)
-    assert np.median(spans) < 0.015
+        spans.append(time.process_time() - begun)
+    assert np.median(spans) < 0.003
 
 
 def test_the_planner_starts_without_scipys_optimisers() -> None:

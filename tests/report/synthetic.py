@@ -23,6 +23,7 @@ RELEASE_Q2 = 0.2
 TARGETS = (-0.3, -0.2, -0.1, 0.0, 0.1, 0.2, 0.3)
 DAMPING, FREQUENCY = 0.7, 0.5
 RATE_BIAS = 1e-4  # of the estimate, rad/s
+STAR_ERROR = 3e-5  # of each star attitude about the thread, rad, alternating in sign
 STREAK_ERROR = 2e-4  # of each streak rate about the thread, rad/s, alternating in sign
 
 
@@ -90,6 +91,7 @@ def make_run(folder: Path, recipe: Recipe | None = None) -> Path:
         if i and i % frame == 0:
             exposed = rate[i - round(recipe.rate_hz) : i + 1]
             logs["flight"].write(_streak(packer, stamp, i // frame, exposed))
+            logs["flight"].write(_stars(packer, stamp, i // frame, q2[i]))
         logs["flight"].write(_control(packer, stamp, i, q2[i], rate[i], current[i]))
         if recipe.truth:
             logs["truth"].write(_truth(packer, stamp, q2[i], rate[i], current[i], spent[i]))
@@ -202,6 +204,26 @@ def _streak(packer: Packer, stamp: int, sequence: int, rates: FloatArray) -> byt
         rate=(0.0, mean + error, 0.0),
         covariance=(variance, variance, variance, 0.0, 0.0, 0.0),
         residual=1e-5,
+        accepted=True,
+    )
+
+
+def _stars(packer: Packer, stamp: int, sequence: int, q2: float) -> bytes:
+    """Return an attitude off the true one by `STAR_ERROR` about the thread, with just that variance."""
+    half = np.arcsin(q2) + 0.5 * (STAR_ERROR if sequence % 2 == 0 else -STAR_ERROR)
+    variance = STAR_ERROR**2 / 3.0
+    return packer.pack(
+        table.STARS,
+        stamp,
+        sequence=sequence,
+        middle_ns=stamp,
+        status="solved",
+        tracked=True,
+        found=30,
+        matched=25,
+        quaternion=(0.0, np.sin(half), 0.0, np.cos(half)),
+        covariance=(variance, variance, variance, 0.0, 0.0, 0.0),
+        log10_false_alarm=-50.0,
         accepted=True,
     )
 

@@ -23,6 +23,7 @@ from tests.report.synthetic import (
     DAMPING,
     RATE_BIAS,
     RESISTANCE,
+    STAR_ERROR,
     STREAK_ERROR,
     TARGETS,
     VOLTAGE,
@@ -207,6 +208,11 @@ def test_estimate_and_streaks_are_held_against_the_truth(full: Run) -> None:
     assert streaks["frames"] == streaks["rates"] == streaks["accepted"] == streaks["compared"] == 140
     assert streaks["rms_error"] == pytest.approx([0.0, STREAK_ERROR, 0.0], rel=1e-6, abs=1e-9)
     assert streaks["normalised"] == pytest.approx(1.0, rel=1e-4)
+    stars = summary["stars"]
+    assert stars["frames"] == stars["solved"] == stars["tracked"] == stars["accepted"] == 140
+    assert stars["compared"] >= 139
+    assert stars["rms_error"] == pytest.approx([0.0, STAR_ERROR, 0.0], rel=1e-3, abs=1e-9)
+    assert stars["normalised"] == pytest.approx(1.0, rel=1e-3)
 
 
 def test_the_mean_rate_over_an_exposure_is_the_turn_over_its_time() -> None:

@@ -41,32 +41,48 @@ def demo_config(duration: float, camera: bool = True) -> Config:
     return changed if camera else configuration.replace(changed, camera=None)
 
 
+def demo_world() -> Simulation:
+    """Return the world of the step demonstration."""
+    section = configuration.simulation_section(TEXT, CONFIG.name, Simulation)
+    assert section is not None
+    return section
+
+
+def thesis_config(duration: float) -> Config:
+    """Return the demonstration as the thesis flies it: receding horizon, its tracker; no camera."""
+    config = demo_config(duration, camera=False)
+    guidance = configuration.replace(config.guidance, strategy="receding", current_share=1.0)
+    control = configuration.replace(config.control, tracker="thesis", state_weight=20.0)
+    estimation = configuration.replace(config.estimation, gate_sigma=5.0, coast=0.1)
+    return configuration.replace(config, guidance=guidance, control=control, estimation=estimation)
+
+
 def fly(
     config: Config,
     folder: Path,
     prepare: Callable[[Rigged], None] = lambda _: None,
     seed: int = 1,
     planner_latency: float | None = None,
+    section: Simulation | None = None,
 ) -> Run:
     """Fly a configuration in lock-step and return what it left; `prepare` may schedule faults.
 
+    `section` is the world to fly in, with its own seed; by default the demonstration's.
     However the flight ended, the coils are at zero when the devices have been closed.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    section = configuration.simulation_section(TEXT, CONFIG.name, Simulation)
-    assert section is not None
-    section = configuration.replace(section, seed=seed)
+    section = section or configuration.replace(demo_world(), seed=seed)
     with ExitStack() as stack:
         lock = stack.enter_context(lockstep.opened(config, section, folder))
         stack.callback(lambda: _assert_off(lock))
         planner_s = section.latency.planner if planner_latency is None else planner_latency
         latency = round(planner_s * SECOND_NS), round(section.latency.vision * SECOND_NS)
-        rig = app.Rig(lock.clock, lock.wires, lock.release, False, seed, latency)
+        rig = app.Rig(lock.clock, lock.wires, lock.release, False, section.seed, latency)
         loop, _ = app.prepare(config, rig, folder, stack)
         epoch_ns = app.next_whole_second(lock.clock)
         lock.release(epoch_ns)
         prepare(Rigged(lock, loop, epoch_ns))
-        loop.run(epoch_ns, RunLabel(TEXT, seed, True, False))
+        loop.run(epoch_ns, RunLabel(TEXT, section.seed, True, False))
     return read_run(folder)
 
 

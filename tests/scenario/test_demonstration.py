@@ -14,7 +14,8 @@ import pytest
 
 from flight import report
 from flight.telemetry.reader import Run, read_run
-from tests.scenario.flights import CONFIG, demo_config, fly
+from tests.campaigns.controllers import clairvoyant_power
+from tests.scenario.flights import CONFIG, demo_config, demo_world, fly
 
 ROOT = CONFIG.parents[1]
 
@@ -68,6 +69,19 @@ def test_it_keeps_within_table_5_3_on_the_true_attitude(summary: dict[str, Any])
     assert max(step["rise_s"] for step in steps[1:]) < 8.0
     assert max(step["settling_s"] for step in steps) < 30.0
     assert summary["power"]["average_w"] < 0.10
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_it_is_as_good_as_the_physics_lets_it_be(summary: dict[str, Any]) -> None:
+    """On the true attitude, all noise on; the power beside the optimum of one who knows the plant."""
+    steps = summary["steps"]
+    assert max(step["steady_state_deg"] for step in steps) <= 0.05
+    assert max(step["overshoot_percent"] for step in steps) <= 0.5
+    assert max(step["rise_s"] for step in steps[1:]) <= 6.5
+    assert max(step["settling_s"] for step in steps) <= 9.0
+    floor = clairvoyant_power(demo_config(700.0), demo_world())
+    assert summary["power"]["average_w"] <= 1.05 * floor
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +17,9 @@ from flight.guidance.job import PlanJob
 from flight.guidance.path import PolynomialPath
 from flight.guidance.vmc import Plan
 from flight.guidance.vmc import plan as make_plan
-from flight.settings import Step
+from flight.settings import Config, Step
 from flight.telemetry.packets import to_text
-from tests.scenario.flights import demo_config, event_names, fly
+from tests.scenario.flights import demo_config, event_names, fly, thesis_config
 
 DURATION = 24.0
 GOOD_PLANS = 2
@@ -65,7 +66,7 @@ def test_after_two_good_plans_only_bad_ones_come(
     monkeypatch.setattr(
         plan_job, "run", lambda job: good(job) if job.number <= GOOD_PLANS else spoil(job, good(job))
     )
-    run = fly(demo_config(DURATION, camera=False), tmp_path)
+    run = fly(thesis_config(DURATION), tmp_path)
     names = event_names(run)
     assert names.index(event) < names.index("holding")
     plans = run["plan"]
@@ -79,8 +80,39 @@ def test_after_two_good_plans_only_bad_ones_come(
     assert abs(final) < np.radians(4.5)
 
 
-def test_with_a_good_planner_none_of_these_alarms_rings(tmp_path: Path) -> None:
+@pytest.mark.parametrize("spoil", [fail, turn_to_nan])
+def test_on_a_goal_horizon_one_good_plan_is_enough_to_arrive(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spoil: Spoil
+) -> None:
+    """The first path leads to the target; to hold its end is what is wanted then, and no alarm."""
+    good = plan_job.run
+    monkeypatch.setattr(plan_job, "run", lambda job: good(job) if job.number == 1 else spoil(job, good(job)))
     run = fly(demo_config(DURATION, camera=False), tmp_path)
+    assert "holding" not in event_names(run)
+    assert run["plan"]["accepted"].tolist() == [1, 0]
+    final = 2 * np.arcsin(run["truth"]["quaternion"][-1, 1]) - 2 * np.arcsin(-0.3)
+    assert abs(final) < np.radians(0.1)
+
+
+def test_a_new_target_without_a_plan_for_it_is_told_while_the_old_attitude_is_held(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    good = plan_job.run
+    monkeypatch.setattr(
+        plan_job, "run", lambda job: good(job) if job.end_q2 < -0.25 else fail(job, good(job))
+    )
+    steps = (Step(at=0.0, q2=-0.3), Step(at=15.0, q2=-0.2))
+    run = fly(configuration.replace(demo_config(20.0, camera=False), steps=steps), tmp_path)
+    names = event_names(run)
+    assert names.count("holding") == 1
+    assert names.index("planner-failed") < names.index("holding")
+
+
+@pytest.mark.parametrize("configured", [thesis_config, partial(demo_config, camera=False)])
+def test_with_a_good_planner_none_of_these_alarms_rings(
+    tmp_path: Path, configured: Callable[[float], Config]
+) -> None:
+    run = fly(configured(DURATION), tmp_path)
     assert event_names(run) == ["started", "target", "stopped"]
     assert run["plan"]["accepted"].all()
 

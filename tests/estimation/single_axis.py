@@ -1,5 +1,6 @@
-"""A linear Kalman filter of the turn about the thread: angle, rate and disturbance acceleration.
+"""A linear Kalman filter of the turn about the thread, the oracle of the three-axis one.
 
+Its states are angle, rate and disturbance.
 The angle theta = 2 asin q2 is used rather than q2 because its kinematics are linear (Sease 5.9 is not):
 theta' = omega, omega' = u + d, with u the acceleration that the plant model gives for the known current and d
 what the model does not know (the thread's torque), a random walk. Each measurement is applied at its own

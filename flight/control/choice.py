@@ -1,0 +1,22 @@
+"""The controllers by name: which one a configuration means."""
+
+from __future__ import annotations
+
+from flight.control.adaptive import AdaptiveController, AdaptiveSettings
+from flight.control.controller import Controller
+from flight.control.lq_tracker import LqTracker
+from flight.control.pid import PidController
+from flight.plant import SingleAxisPlant
+from flight.settings import Control
+
+
+def controller_of(section: Control, plant: SingleAxisPlant, period: float) -> Controller:
+    """Return the controller that `section` chooses for `plant`, commanded every `period` s."""
+    if section.tracker == "pid":
+        return PidController(plant, period, section.bandwidth, section.target_weight)
+    if section.tracker == "adaptive":
+        settings = AdaptiveSettings(section.bandwidth, section.adaptation, section.reference_bandwidth)
+        return AdaptiveController(plant, period, settings)
+    return LqTracker(
+        plant, section.state_weight, section.control_weight, as_in_thesis=section.tracker == "thesis"
+    )

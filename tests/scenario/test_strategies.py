@@ -1,0 +1,105 @@
+"""The ways to be led to a target: towards a goal time, at a price of time, moving, or by a step."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flight import config as configuration
+from flight.arrays import FloatArray
+from flight.plant import angle_of
+from flight.settings import Config, Step
+from flight.telemetry.reader import Run
+from tests.scenario.flights import Rigged, demo_config, event_names, fly, thesis_config
+
+
+def configured(duration: float, steps: tuple[Step, ...], **guidance: Any) -> Config:
+    """Return the demonstration with other steps and other guidance, without a camera."""
+    config = configuration.replace(demo_config(duration, camera=False), steps=steps)
+    return configuration.replace(config, guidance=configuration.replace(config.guidance, **guidance))
+
+
+def true_angle(run: Run) -> tuple[FloatArray, FloatArray]:
+    """Return mission time in s and the true turn about the thread in rad."""
+    truth = run["truth"]
+    return truth["time_ns"] * 1e-9, 2.0 * np.arcsin(truth["quaternion"][:, 1])
+
+
+def test_towards_a_goal_the_horizon_shrinks_and_the_end_is_held(tmp_path: Path) -> None:
+    run = fly(demo_config(24.0, camera=False), tmp_path)
+    assert run["plan"]["horizon"] == pytest.approx([10.0, 5.0], abs=0.03)
+    assert run["plan"]["cost"][1] < run["plan"]["cost"][0]
+    assert event_names(run) == ["started", "target", "stopped"]
+    time, angle = true_angle(run)
+    assert np.degrees(np.abs(angle[time > 12.0] - angle_of(-0.3))).max() < 0.1
+
+
+def test_as_in_the_thesis_the_horizon_recedes(tmp_path: Path) -> None:
+    run = fly(thesis_config(24.0), tmp_path)
+    assert run["plan"]["horizon"].tolist() == [10.0] * 5
+
+
+def test_a_price_of_time_sets_the_goal_which_then_stands(tmp_path: Path) -> None:
+    """Twice the price is a horizon shorter by the fourth root of two; later plans keep the first goal."""
+    steps = (Step(at=0.0, q2=0.2), Step(at=20.0, q2=0.1))
+    horizons = []
+    for price in (0.04, 0.08):
+        config = configured(45.0, steps, time_price=price, replan_period=2.0)
+        plans = fly(config, tmp_path / str(price))["plan"]
+        second = plans[plans["target_q2"] == 0.1]
+        goals = second["origin_ns"] * 1e-9 + second["horizon"]
+        assert len(goals) >= 3
+        np.testing.assert_allclose(goals, goals[0], atol=1e-6)
+        horizons.append(second["horizon"][0])
+    assert horizons[0] / horizons[1] == pytest.approx(2.0**0.25, rel=0.05)
+
+
+def test_a_moving_target_is_met_at_its_rate_and_followed(tmp_path: Path) -> None:
+    run = fly(configured(40.0, (Step(at=0.0, q2=-0.2, rate=0.008),)), tmp_path)
+    time, angle = true_angle(run)
+    wanted = angle_of(-0.2) + 0.008 * (time - 10.0)
+    assert np.degrees(np.abs(angle - wanted)[time > 12.0]).max() < 0.1
+    assert "holding" not in event_names(run)
+
+
+def test_a_body_that_is_pushed_off_its_hold_is_planned_for_again(tmp_path: Path) -> None:
+    def push(rigged: Rigged) -> None:
+        world = rigged.lock.hardware.world
+
+        def kick() -> None:
+            world.rate += 0.25
+
+        rigged.at(20.0, kick)
+
+    run = fly(demo_config(45.0, camera=False), tmp_path, push)
+    plans = run["plan"]
+    late = plans[plans["origin_ns"] > 20e9]
+    assert len(late) >= 1
+    assert late["accepted"].any()
+    time, angle = true_angle(run)
+    assert np.degrees(np.abs(angle - angle_of(-0.3))[time > 20.0].max()) > 5.0
+    assert np.degrees(np.abs(angle - angle_of(-0.3))[time > 40.0]).max() < 0.1
+
+
+@pytest.mark.parametrize(
+    "control",
+    [
+        {"tracker": "lq"},
+        {"tracker": "pid", "bandwidth": 0.76},
+        {"tracker": "adaptive", "bandwidth": 1.0, "adaptation": 10.0, "reference_bandwidth": 0.55},
+    ],
+    ids=lambda control: control["tracker"],
+)
+def test_without_a_path_every_controller_is_shown_the_target_itself(
+    tmp_path: Path, control: dict[str, Any]
+) -> None:
+    config = configured(60.0, (Step(at=0.0, q2=0.1),), strategy="step")
+    config = configuration.replace(config, control=configuration.replace(config.control, **control))
+    run = fly(config, tmp_path)
+    assert len(run["plan"]) == 0
+    assert event_names(run) == ["started", "target", "stopped"]
+    time, angle = true_angle(run)
+    assert np.degrees(np.abs(angle - angle_of(0.1))[time > 50.0]).max() < 0.2
