@@ -340,7 +340,8 @@ def _tracker(camera: Camera) -> TrackerSettings | None:
     spread = 1.0 + section.scale_error
     scale = (1.0 / spread, spread)
     index = Path(section.index) if section.index is not None else None
-    return TrackerSettings(SolveSettings(detection=detection), scale, index)
+    velocity = None if section.velocity is None else np.array(section.velocity)
+    return TrackerSettings(SolveSettings(detection=detection, velocity=velocity), scale, index)
 
 
 def _saturation(camera: Camera) -> float:

@@ -88,11 +88,13 @@ class CameraLens(Section, frozen=True, kw_only=True):
 class StarTracker(Section, frozen=True, kw_only=True):
     """The star tracker: its sky index (default: the one in the cache folder), and its trust in the lens.
 
-    `scale_error` is the part by which the focal length may be wrong; 0 for a calibrated camera.
+    `scale_error` is the part by which the focal length may be wrong; 0 for a calibrated camera. `velocity`,
+    m/s with respect to the Sun in the axes of the attitude, is that of stellar aberration; none on a testbed.
     """
 
     index: str | None = None
     scale_error: Annotated[float, Meta(ge=0.0, lt=0.5)] = 0.0
+    velocity: tuple[float, float, float] | None = None
 
 
 class Camera(Section, frozen=True, kw_only=True):

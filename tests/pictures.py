@@ -13,23 +13,34 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from flight import catalogue
 from flight import config as configuration
 from flight.app import Order, fly
+from flight.camera import camera_model
 from flight.guidance.vmc import plan
+from flight.images import grey_stretch, write_picture
 from flight.loop import plant_of
-from flight.pinhole import Pinhole
-from flight.quaternion import about_axis_y
+from flight.quaternion import about_axis_y, from_rotation_vector, multiply
 from flight.report import draw, draw_path
+from flight.startracker.build import default_index
+from flight.startracker.pointing import Pointing
+from flight.startracker.sky_picture import draw_solution
+from flight.startracker.solution import SolveStatus
+from flight.startracker.solve import SolveSettings, solve_frame
 from flight.telemetry.reader import read_run
-from flight.vision.settings import StreakSettings
-from flight.vision.streak_rate import StreakStatus, estimate_rate
+from flight.vision.likelihood.estimate import estimate_motion
+from flight.vision.likelihood.settings import LikelihoodSettings
+from flight.vision.streak_rate import StreakStatus
 from sim_hal.assembly import StarRenderer
 from sim_hal.settings import Sky
+from sim_hal.star_camera import StarCameraModel, render
 
 ROOT = Path(__file__).resolve().parents[1]
 CONFIG = ROOT / "config" / "step_demo.yaml"
 RATE = 0.03
 """rad/s: the peak of a 0.1 step."""
+ORION_DEG = 84.0, -2.0, 15.0
+"""Right ascension, declination and roll of the solved picture."""
 
 
 def main() -> int:
@@ -48,7 +59,8 @@ def main() -> int:
     plant = plant_of(config)
     draw_path(plan(plant, 0.4, 0.015, -0.3, 0.0, 10.0), plant, folder / "path.png")
     _draw_frame(folder / "frame.png")
-    for name in ("overview.png", "paths.png", "path.png", "frame.png"):
+    _draw_solved(folder / "solved.png")
+    for name in ("overview.png", "paths.png", "path.png", "frame.png", "solved.png"):
         sys.stdout.write(f"{folder / name}\n")
     return 0
 
@@ -60,14 +72,13 @@ def _draw_frame(path: Path) -> None:
     times = np.linspace(0.0, camera.exposure, 101)
     attitudes = np.array([about_axis_y(-0.3 + RATE * t) for t in times])
     pixels = StarRenderer(camera, Sky(), 1).render(1, times, attitudes)
-    pinhole = Pinhole.from_field_of_view(camera.columns, camera.rows, np.deg2rad(camera.field_of_view_deg))
-    found = estimate_rate(
+    found = estimate_motion(
         pixels,
-        pinhole,
+        camera_model(camera).ideal,
         camera.exposure,
-        StreakSettings(),
-        prior_rate=np.array([0.0, RATE, 0.0]),
-        prior_sigma=1e-3,
+        LikelihoodSettings(gain=camera.gain, saturation=camera.saturation),
+        np.array([0.0, RATE, 0.0]),
+        1e-3,
     )
     assert found.status is StreakStatus.RATE
     assert found.rate is not None
@@ -78,12 +89,28 @@ def _draw_frame(path: Path) -> None:
     for ends in found.endpoints[found.used]:
         axes.plot(ends[:, 0], ends[:, 1], "o", markersize=5, markerfacecolor="none", color="#D55E00")
     axes.set_title(
-        f"true rate {1e3 * RATE:.2f} mrad/s, from {found.used_count} streaks "
-        f"{1e3 * found.rate[1]:.2f} mrad/s about y (negative image)",
+        f"true rate {1e3 * RATE:.3f} mrad/s, from {found.used_count} streaks "
+        f"{1e3 * found.rate[1]:.3f} mrad/s about y (negative image)",
         fontsize=10,
     )
     axes.set_axis_off()
     figure.savefig(path, dpi=90, facecolor="white")
+
+
+def _draw_solved(path: Path) -> None:
+    """Draw Orion, drawn out to streaks, with the stars that were told from it and their names."""
+    rng = np.random.default_rng(2026)
+    camera = StarCameraModel()
+    attitude = Pointing(*np.radians(ORION_DEG)).quaternion()
+    times = np.linspace(0.0, 0.5, 3)
+    turn = np.array([0.008, 0.006, 0.01])
+    attitudes = multiply(from_rotation_vector((times[:, None] - 0.25) * 2.0 * turn), attitude)
+    stars = catalogue.load()
+    pixels = render(camera, stars.directions_at(2026.5), stars.magnitude, times, attitudes, rng)
+    sky = default_index()
+    found = solve_frame(pixels, camera.pinhole, (0.95, 1.05), 0.5, sky, SolveSettings())
+    assert found.status is SolveStatus.SOLVED
+    write_picture(path, draw_solution(grey_stretch(pixels), found, sky))
 
 
 if __name__ == "__main__":

@@ -7,6 +7,8 @@ import json
 import math
 import sys
 import time
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +32,7 @@ from flight.startracker.sky_index import SkyIndex
 from flight.startracker.sky_picture import draw_solution
 from flight.startracker.solution import FrameSolution
 from flight.startracker.solve import RatePrior, SolveSettings, solve_frame
+from flight.sun import DAY, J2000, earth_velocity
 from flight.vision.likelihood.settings import LikelihoodSettings
 from flight.vision.streak_rate import StreakStatus
 
@@ -60,6 +63,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--exposure", type=positive, metavar="S", help="exposure time, for the rate of streaks"
     )
     parser.add_argument("--prior", type=float, nargs=3, metavar=("X", "Y", "Z"), help="rough rate, rad/s")
+    parser.add_argument(
+        "--date", type=_date, metavar="UTC", help="when, such as 2026-11-21: proper motion, aberration"
+    )
     parser.add_argument("--index", type=Path, metavar="FILE", help="another sky index")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--overlay", type=Path, metavar="PNG", help="draw what was found on the picture")
@@ -71,6 +77,9 @@ def run(options: argparse.Namespace) -> int:
     pixels = read_picture(options)
     camera, scale, exposure, settings = _belief(options, pixels)
     sky = sky_index.load(options.index) if options.index else default_index()
+    if options.date is not None:
+        sky = sky.at(options.date.year)
+        settings = replace(settings, velocity=earth_velocity(options.date.julian_date))
     prior = None if options.prior is None else RatePrior(np.array(options.prior), 0.0)
     begin = time.perf_counter()
     solution = solve_frame(pixels, camera, scale, exposure or 1.0, sky, settings, rate_prior=prior)
@@ -84,6 +93,24 @@ def run(options: argparse.Namespace) -> int:
         if not options.json:
             sys.stdout.write(f"picture:          {options.overlay}\n")
     return 0 if solution.fix is not None else 1
+
+
+@dataclass(frozen=True, slots=True)
+class Date:
+    """An instant, as the Julian year of a catalogue's epoch and as a Julian date."""
+
+    year: float
+    julian_date: float
+
+
+def _date(text: str) -> Date:
+    try:
+        instant = datetime.fromisoformat(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text!r}: give a date such as 2026-11-21T20:15:00") from error
+    instant = instant.replace(tzinfo=UTC) if instant.tzinfo is None else instant
+    julian_date = J2000 + (instant - datetime(2000, 1, 1, 12, tzinfo=UTC)).total_seconds() / DAY
+    return Date(2000.0 + (julian_date - J2000) / 365.25, julian_date)
 
 
 def _belief(

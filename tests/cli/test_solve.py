@@ -61,6 +61,15 @@ def test_streaks_give_the_rate_when_the_exposure_is_known(tmp_path: Path) -> Non
     assert "give --exposure for the rate" in told.stdout
 
 
+def test_the_date_takes_aberration_off(picture: Path) -> None:
+    """The stars were drawn without it: believing in it moves the answer by the Earth's 20.5", at most."""
+    without = json.loads(command("solve", picture, "--fov", "12", "--json").stdout)
+    with_it = command("solve", picture, "--fov", "12", "--date", "2026-07-02T12:00", "--json")
+    facts = json.loads(with_it.stdout)
+    moved = np.degrees(angle_between(np.array(facts["quaternion"]), np.array(without["quaternion"]))) * 3600.0
+    assert 2.0 < moved < 21.0
+
+
 def test_bare_pixels_behind_a_header_are_read(resting: SkyFrame, tmp_path: Path) -> None:
     path = tmp_path / "frame.raw"
     path.write_bytes(b"a header of some bytes" + resting.pixels.astype("<u2").tobytes())
@@ -93,6 +102,7 @@ def test_a_picture_without_stars_is_not_solved_and_says_why(tmp_path: Path) -> N
     ("words", "complaint"),
     [
         (["--fov", "200"], "1 to 120 degrees"),
+        (["--date", "yesterday"], "such as 2026-11-21"),
         (["--fov", "wide"], "is not a number"),
         (["--raw", "1024x1024"], "such as 1280x960x16"),
         (["--raw", "9000x9000x16"], "pixels of 16 bits are 162000000"),
