@@ -7,9 +7,10 @@ import pytest
 
 from flight.arrays import FloatArray
 from flight.vision.likelihood.chains import in_chains
-from flight.vision.likelihood.ends import true_ends
+from flight.vision.likelihood.ends import true_ends, unbroken
 from flight.vision.likelihood.estimate import estimate_motion
 from flight.vision.likelihood.exposed_frame import expose_frame
+from flight.vision.likelihood.frame_scan import frame_angles
 from flight.vision.likelihood.matched_filter import find_faint
 from flight.vision.likelihood.motion import Motion
 from flight.vision.likelihood.settings import LikelihoodSettings
@@ -32,6 +33,39 @@ def test_ends_are_true_under_the_true_turn_only(factor: float) -> None:
     turn = scene.rate * scene.exposure
     assert _share_of_true_ends(scene, turn) > 0.8
     assert _share_of_true_ends(scene, factor * turn) < 0.5
+
+
+@pytest.mark.parametrize(("factor", "least", "most"), [(1.0, 0.9, 1.0), (1.6, 0.0, 0.4)])
+def test_light_lies_all_along_the_true_path_and_not_along_one_too_long(
+    factor: float, least: float, most: float
+) -> None:
+    scene = real_sky(33, np.radians(70.0), 200.0, 0.2)
+    frame = expose_frame(scene.pixels, SATURATION, 1.0)
+    times, motion = np.tile([-0.5, 0.5], (12, 1)), Motion.steady(factor * scene.rate * scene.exposure)
+    whole = unbroken(frame, CAMERA.pinhole, motion, scene.stars[:12], factor * scene.electrons[:12], times)
+    assert len(whole) >= 8
+    assert least <= np.mean(whole) <= most
+
+
+@pytest.mark.parametrize(("theta", "length"), [(90.0, 450.0), (60.0, 300.0), (20.0, 120.0)])
+def test_the_light_of_the_whole_frame_tells_the_angle_about_a_roughly_known_axis(
+    theta: float, length: float
+) -> None:
+    scene = real_sky(34, np.radians(theta), length, 0.2)
+    frame = expose_frame(scene.pixels, SATURATION, 1.0)
+    turn = scene.rate * scene.exposure
+    told = frame_angles(frame, CAMERA.pinhole, turn + 0.002 * np.linalg.norm(turn), 2)
+    assert abs(told[0] / np.linalg.norm(turn) - 1.0) < 0.08
+
+
+def test_hardly_any_streak_is_found_where_there_is_only_noise_near_the_axis_too() -> None:
+    """Close samples on slow circles share pixels: their noise does not average out."""
+    noise = np.random.default_rng(5).normal(500.0, 10.5, (1024, 1024))
+    frame = expose_frame(np.rint(noise).astype(np.uint16), SATURATION, 1.0)
+    nothing = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.float32)
+    turn = 0.2 * np.array([np.sin(0.1), 0.0, np.cos(0.1)])
+    found = find_faint(frame, nothing, CAMERA.pinhole, Motion.steady(turn), 6.0, 200)
+    assert len(found.light) <= 1
 
 
 def test_pieces_of_streaks_form_chains_and_whole_ones_do_not() -> None:

@@ -26,6 +26,8 @@ SCANNED_STARS = 14
 _STEP = 2.0
 _FACTOR = 1.04
 _SHORTEST = 6
+# So many of the likeliest angles are weighed against one that is told.
+_WEIGHED = 3
 # A crossing star adds no more than so many times the region's own light to a sample.
 _CAP = 2.0
 # No star counts more than so many sigmas.
@@ -76,11 +78,14 @@ def scan_angles(
     # A bright star has much more to say than others, but may be two.
     scale = _weights(gain)
     score = gain @ scale
-    peak = np.flatnonzero(score >= np.maximum(np.append(score[1:], 0.0), np.append(0.0, score[:-1])))
-    peak = peak[np.argsort(-score[peak], kind="stable")][:most]
+    # Where the border cuts all that would tell, longer turns explain no more: the shortest stands for them.
+    before, after = np.append(0.0, score[:-1]), np.append(score[1:], 0.0)
+    peak = np.flatnonzero((score > before) & (score >= after))
+    peak = peak[np.argsort(-score[peak], kind="stable")]
     if near is not None:
+        peak = peak[:_WEIGHED]
         peak = peak[np.argsort(np.abs(widths[peak] * boxes.step - near), kind="stable")]
-    for index in peak:
+    for index in peak[:most]:
         yield _sharpened(boxes, pinhole, circles, scale, int(widths[index]))
 
 

@@ -40,3 +40,15 @@ def in_chains(pinhole: Pinhole, motion: Motion, stars: FloatArray, light: FloatA
     ratio = light[:, None] / np.maximum(light, 1e-9)
     joined = (aside < _ASIDE) & (turns > _NEXT[0]) & (turns < _NEXT[1])
     return np.asarray((joined & (ratio < _ALIKE) & (ratio > 1.0 / _ALIKE)).any(axis=1))
+
+
+def close_by(
+    pinhole: Pinhole, motion: Motion, stars: FloatArray, others: FloatArray, distance: float
+) -> BoolArray:
+    """Tell which of `stars` (n, 2) draw streaks within `distance` px of a streak of `others` (m, 2)."""
+    polar, azimuth = circles(pinhole, motion, stars)
+    other_polar, other_azimuth = circles(pinhole, motion, others)
+    beside = np.abs(polar[:, None] - other_polar) * pinhole.focal_length < distance
+    room = distance / (pinhole.focal_length * np.maximum(np.sin(other_polar), 1e-3))
+    angle = float(np.linalg.norm(motion.turn))
+    return np.asarray((beside & (apart(azimuth, other_azimuth) < angle + room)).any(axis=1))

@@ -8,8 +8,6 @@ import numpy as np
 
 from flight.arrays import BoolArray, FloatArray, IntArray
 from flight.vision.likelihood.agreement import disagreement, opinions
-from flight.vision.likelihood.chains import in_chains
-from flight.vision.likelihood.ends import true_ends
 from flight.vision.likelihood.matched_filter import FaintStars
 from flight.vision.likelihood.motion import paths, sensitivities
 from flight.vision.likelihood.normal_equations import ALONE, Evaluation
@@ -17,6 +15,7 @@ from flight.vision.likelihood.result import MotionResult
 from flight.vision.likelihood.rounds import ExposedCamera, Fit
 from flight.vision.likelihood.scene import Scene, path_lengths, window_times
 from flight.vision.likelihood.solution import shared_covariance
+from flight.vision.likelihood.wholeness import Wholeness
 from flight.vision.streak_rate import StreakStatus
 
 # Rounds of conjugate gradients for the covariance.
@@ -24,12 +23,8 @@ _CONJUGATE = 12
 # Turn, growth, x and y among what is shared and a star's own.
 _GEOMETRY = np.array([0, 1, 2, 3, 4, 5, 7, 8])
 _LIGHT = 9
-# Share of the stars that may seem pieces of longer streaks by chance.
-_MOST_CHAINED = 0.45
 # The last step, in standard deviations, from which a fit has not settled.
 _RESTLESS = 2.0
-# Share of the ends on the detector that must be where the motion puts them.
-_LEAST_TRUE_ENDS = 0.7
 # Two streaks so close, px, are one.
 _SAME = 1.5
 
@@ -70,7 +65,7 @@ def with_stars(seen: MotionResult, camera: ExposedCamera, last: Fit) -> MotionRe
     )
 
 
-def with_rate(told: MotionResult, camera: ExposedCamera, last: Fit, faint: FaintStars) -> MotionResult:
+def with_rate(told: MotionResult, camera: ExposedCamera, last: Fit, whole: Wholeness) -> MotionResult:
     """Return `told` with the rate, or with why there is none."""
     settings, scene = camera.settings, last.scene
     if told.used_count < settings.least_stars:
@@ -82,21 +77,20 @@ def with_rate(told: MotionResult, camera: ExposedCamera, last: Fit, faint: Faint
     deviation = float(np.sqrt(turn @ covariance @ turn)) / size
     if told.length < settings.least_length or not size > settings.least_significance * deviation:
         return replace(told, status=StreakStatus.TOO_SHORT)
-    if (
-        last.restless > _RESTLESS
-        or not told.misfit < settings.worst_misfit
-        or _in_pieces(camera, scene, faint)
-    ):
+    if last.restless > _RESTLESS or not told.misfit < settings.worst_misfit or whole is Wholeness.BROKEN:
         return replace(told, status=StreakStatus.FAILED)
     said = opinions(last.evaluation, scene, last.free)
     spread = 1.0 if said is None else disagreement(said, scene.trusted)
+    # What made others disagree is as likely to hide, less of it, in the light of those that agree.
+    asked = min(settings.most_stars, len(scene.trusted))
+    spread = max(told.misfit, spread, 1.0) * asked / max(int(np.count_nonzero(scene.trusted)), 1)
     return replace(
         told,
         status=StreakStatus.AMBIGUOUS,
         rate=turn / told.exposure,
         # What the model does not explain makes it less certain; what fits too well, no more. A fit that goes
         # to and fro, as pixels are left out and taken in, is known no better than that.
-        covariance=covariance * max(told.misfit, spread, 1.0) * (1.0 + last.restless**2) / told.exposure**2,
+        covariance=covariance * spread * (1.0 + last.restless**2) / told.exposure**2,
         acceleration=scene.motion.growth / told.exposure**2 if last.free[3] else None,
     )
 
@@ -111,19 +105,6 @@ def with_faint(told: MotionResult, camera: ExposedCamera, scene: Scene, faint: F
         faint_flux=faint.light,
         faint_significance=faint.significance,
     )
-
-
-def _in_pieces(camera: ExposedCamera, scene: Scene, faint: FaintStars) -> bool:
-    """Tell whether the stars that decide are pieces of longer streaks, or longer than what is seen."""
-    stars = np.concatenate([scene.stars, faint.stars])
-    light = np.concatenate([scene.light, faint.light])
-    chained = in_chains(camera.pinhole, scene.motion, stars, light)[: len(scene.stars)]
-    if float(np.mean(chained[scene.trusted])) > _MOST_CHAINED:
-        return True
-    deciding = scene.select(scene.trusted)
-    times = _times(camera, deciding, deciding.stars)
-    ends = true_ends(camera.frame, camera.pinhole, scene.motion, deciding.stars, deciding.light, times)
-    return len(ends) > 0 and float(np.mean(ends)) < _LEAST_TRUE_ENDS
 
 
 def _times(camera: ExposedCamera, scene: Scene, stars: FloatArray) -> FloatArray:

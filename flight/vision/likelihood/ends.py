@@ -1,7 +1,8 @@
-"""Whether streaks end where the motion says: light up to each end, and none beyond.
+"""Whether streaks are as long as the motion says: light from end to end, and none beyond.
 
 The fit sees only a few pixels beyond the ends. A turn too small by a fifth can fit what it is given, one end
-of every streak and the middle; the frame beyond the other end tells.
+of every streak and the middle; the frame beyond the other end tells. A turn too large has stretches without
+light, which a fit makes little of that lays several streaks end to end, or the far end outside the frame.
 """
 
 from __future__ import annotations
@@ -19,11 +20,18 @@ _STRETCH = 0.1
 _LEAST_STRETCH = 8.0
 _FROM_END = 4.0
 _SAMPLES = 24
+# Within the path as many stretches are looked at.
+_WITHIN = 10
+_WITHIN_SAMPLES = 10
 _ASIDE = np.array([-1.0, 0.0, 1.0])
 # The part of a streak's light per px of length that each of the middle three pixels across has.
 _MIDDLE = 0.287
 _HALF = 0.5
 _LEAST_VALID = 0.7
+# A stretch tells of light when what is expected exceeds so many deviations of its mean.
+_TELLING = 4.0
+# So much of a streak may be dark for reasons of its own.
+_DARK = 0.15
 
 
 def true_ends(
@@ -45,31 +53,57 @@ def true_ends(
         return np.empty(0)
     stars, light, times, length = stars[long], light[long], times[long], length[long]
     stretch = np.maximum(_STRETCH * length, _LEAST_STRETCH)
+    expected = _MIDDLE * light / length
     verdicts = []
     for end, outward in ((0, -1.0), (1, 1.0)):
-        within = _brightness(frame, pinhole, motion, stars, times[:, end], -outward, stretch)
-        beyond = _brightness(frame, pinhole, motion, stars, times[:, end], outward, stretch)
-        expected = _MIDDLE * light / length
+        away = _FROM_END + np.linspace(0.0, 1.0, _SAMPLES) * stretch[:, None]
+        velocity = paths(pinhole, motion, stars, times[:, end]).velocity
+        delay = outward * away / np.maximum(np.hypot(velocity[:, 0], velocity[:, 1]), 1e-3)[:, None]
+        within, _ = _brightness(frame, pinhole, motion, stars, times[:, end, None] - delay)
+        beyond, _ = _brightness(frame, pinhole, motion, stars, times[:, end, None] + delay)
         told = np.isfinite(within) & np.isfinite(beyond)
         verdicts.append(((within > _HALF * expected) & (beyond < _HALF * expected))[told])
     return np.concatenate(verdicts).astype(float)
 
 
-def _brightness(
+def unbroken(
     frame: ExposedFrame,
     pinhole: Pinhole,
     motion: Motion,
     stars: FloatArray,
-    end: FloatArray,
-    outward: float,
-    stretch: FloatArray,
+    light: FloatArray,
+    times: FloatArray,
 ) -> FloatArray:
-    """Return the mean counts (n,) of the pixels along a stretch off an end; NaN where too few are seen."""
-    velocity = paths(pinhole, motion, stars, end).velocity
-    speed = np.maximum(np.hypot(velocity[:, 0], velocity[:, 1]), 1e-3)
-    distance = _FROM_END + np.linspace(0.0, 1.0, _SAMPLES) * stretch[:, None]
-    time = end[:, None] + outward * distance / speed[:, None]
-    there = paths(pinhole, motion, np.repeat(stars, _SAMPLES, axis=0), time.reshape(-1))
+    """Return 1 for each star that is bright all along its path on the detector, else 0, in one row (k,).
+
+    Arguments as of `true_ends`; stars too short or too faint to tell are left out.
+    """
+    length = path_lengths(pinhole, motion, stars)
+    long = length > _WITHIN * _LEAST_STRETCH
+    if not long.any():
+        return np.empty(0)
+    stars, light, times, length = stars[long], light[long], times[long], length[long]
+    share = (np.arange(_WITHIN * _WITHIN_SAMPLES) + 0.5) / (_WITHIN * _WITHIN_SAMPLES)
+    time = times[:, :1] + (times[:, 1:] - times[:, :1]) * share
+    each = np.repeat(stars, _WITHIN, axis=0)
+    mean, deviation = _brightness(frame, pinhole, motion, each, time.reshape(len(each), _WITHIN_SAMPLES))
+    expected = np.repeat(_MIDDLE * light / length, _WITHIN)
+    told = np.isfinite(mean) & (expected > _TELLING * deviation)
+    dark = (told & (mean < _HALF * expected)).reshape(-1, _WITHIN).sum(axis=1)
+    told_of = told.reshape(-1, _WITHIN).sum(axis=1)
+    judged = told_of > 0
+    return np.asarray(dark[judged] <= _DARK * told_of[judged], dtype=float)
+
+
+def _brightness(
+    frame: ExposedFrame, pinhole: Pinhole, motion: Motion, stars: FloatArray, time: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the mean counts (n,) of pixels about a stretch of the path, at `time` (n, s), and its deviation.
+
+    NaN where too few are seen.
+    """
+    samples = time.shape[1]
+    there = paths(pinhole, motion, np.repeat(stars, samples, axis=0), time.reshape(-1))
     way = there.velocity / np.maximum(np.linalg.norm(there.velocity, axis=1, keepdims=True), 1e-3)
     normal = np.stack([-way[:, 1], way[:, 0]], axis=-1)
     points = there.position[:, None] + _ASIDE[:, None] * normal[:, None]
@@ -77,7 +111,9 @@ def _brightness(
     seen = pinhole.contains(pixel.astype(float))
     index = np.where(seen, pixel[..., 1] * pinhole.columns + pixel[..., 0], 0)
     seen &= ~frame.bad[index]
-    values = np.where(seen, frame.signal[index], 0.0).reshape(len(stars), -1).sum(axis=1)
     count = seen.reshape(len(stars), -1).sum(axis=1)
-    enough = count >= _LEAST_VALID * _SAMPLES * len(_ASIDE)
-    return np.where(enough, values / np.maximum(count, 1), np.nan)
+    enough = count >= _LEAST_VALID * samples * len(_ASIDE)
+    total = np.where(seen, frame.signal[index], 0.0).reshape(len(stars), -1).sum(axis=1)
+    variance = np.where(seen, frame.floor[index], 0.0).reshape(len(stars), -1).sum(axis=1)
+    count = np.maximum(count, 1)
+    return np.where(enough, total / count, np.nan), np.sqrt(variance) / count

@@ -8,7 +8,7 @@ worker process. One frame cannot tell omega from -omega; a prior (gyro, or the l
 from __future__ import annotations
 
 import zlib
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import islice
 
 import numpy as np
@@ -20,16 +20,21 @@ from flight.vision.likelihood.blobs import Blobs, find_blobs
 from flight.vision.likelihood.description import with_faint, with_rate, with_stars
 from flight.vision.likelihood.exposed_frame import expose_frame, saturation_count
 from flight.vision.likelihood.fitting import last_fit
-from flight.vision.likelihood.hypotheses import first_fits, still_fit
+from flight.vision.likelihood.frame_scan import frame_angles
+from flight.vision.likelihood.hypotheses import alike, first_fits, rescanned_fits, still_fit
 from flight.vision.likelihood.result import MotionResult
-from flight.vision.likelihood.rounds import ExposedCamera
+from flight.vision.likelihood.rounds import ExposedCamera, Fit
 from flight.vision.likelihood.settings import LikelihoodSettings
 from flight.vision.likelihood.shutter import Shutter
+from flight.vision.likelihood.wholeness import Wholeness, wholeness
 from flight.vision.streak_rate import StreakStatus, direction_of_time, refuse_nonsense
 
 _MOST_BLOBS = 48
 # So many motions are fitted in full before the frame is given up.
 _MOST_MOTIONS = 2
+# So many angles of the whole frame's light are tried, and told apart to this part.
+_MOST_ANGLES = 2
+_SAME_ANGLE = 0.05
 # Median length, px, of regions below which a frame without an agreed motion is one of stars at rest.
 _AT_REST = 4.0
 # The same of the brightest regions, below which no streak of the least length can be among them.
@@ -84,18 +89,57 @@ def estimate_motion(
 
 def _told(camera: ExposedCamera, seen: MotionResult, blobs: Blobs, near: float | None) -> MotionResult | None:
     """Return what the first motion that stands every test says, else the likeliest; None without one."""
-    best: MotionResult | None = None
+    candidates: list[_Told] = []
     for first in islice(first_fits(camera, blobs, near), _MOST_MOTIONS):
-        last, faint = last_fit(camera, first)
-        if last is None:
-            told = seen
-        else:
-            told = with_faint(with_stars(seen, camera, last), camera, last.scene, faint)
-            told = with_rate(told, camera, last, faint)
-        if told.status is not StreakStatus.FAILED:
-            return told
-        best = best or told
-    return best
+        said = _fitted(camera, seen, first)
+        if said.whole is Wholeness.WHOLE and not any(other.stands for other in candidates):
+            return said.result
+        candidates.append(said)
+    if not candidates:
+        return None
+    # The axis is often right, known well from pieces of streaks, where the angle is not. A doubted motion to
+    # which the light of the whole frame leads again has two witnesses.
+    angles = frame_angles(camera.frame, camera.pinhole, candidates[0].turn, _MOST_ANGLES)
+    for said in candidates:
+        if said.stands and _witnessed(said.turn, angles):
+            return said.result
+    for first in rescanned_fits(camera, candidates[0].turn, angles):
+        said = _fitted(camera, seen, first)
+        again = any(other.stands and alike(said.turn, other.turn) for other in candidates)
+        if said.whole is Wholeness.WHOLE or (said.stands and (again or _witnessed(said.turn, angles))):
+            return said.result
+    return replace(candidates[0].result, status=StreakStatus.FAILED, rate=None, covariance=None)
+
+
+def _witnessed(turn: FloatArray, angles: list[float]) -> bool:
+    """Tell whether `turn` (3,) is by the likeliest of the frame's `angles`."""
+    size = float(np.linalg.norm(turn))
+    return bool(angles) and abs(size - angles[0]) < _SAME_ANGLE * size
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Told:
+    """What a motion says: the result, its turn (3,), and whether its streaks are whole."""
+
+    result: MotionResult
+    turn: FloatArray
+    whole: Wholeness
+
+    @property
+    def stands(self) -> bool:
+        return self.whole is not Wholeness.BROKEN
+
+
+def _fitted(camera: ExposedCamera, seen: MotionResult, first: Fit) -> _Told:
+    """Return what the joint fit from `first` says; a fit that failed is broken."""
+    last, faint = last_fit(camera, first)
+    if last is None:
+        return _Told(seen, first.scene.motion.turn, Wholeness.BROKEN)
+    whole = wholeness(camera, last.scene, faint)
+    told = with_faint(with_stars(seen, camera, last), camera, last.scene, faint)
+    told = with_rate(told, camera, last, whole)
+    failed = told.status is StreakStatus.FAILED
+    return _Told(told, last.scene.motion.turn, Wholeness.BROKEN if failed else whole)
 
 
 def _shutter(pinhole: Pinhole, exposure: float, settings: LikelihoodSettings) -> Shutter:

@@ -8,7 +8,8 @@ import numpy as np
 
 from flight.arrays import BoolArray, IntArray
 from flight.vision.likelihood.agreement import Opinions, agreeing, opinions
-from flight.vision.likelihood.matched_filter import FaintStars, close_by, find_faint
+from flight.vision.likelihood.chains import close_by
+from flight.vision.likelihood.matched_filter import FaintStars, find_faint
 from flight.vision.likelihood.motion import Motion
 from flight.vision.likelihood.normal_equations import light_of
 from flight.vision.likelihood.rounds import (
@@ -30,12 +31,39 @@ _END_FLOOR = 0.01
 _WIDTH_FLOOR = 0.002
 # Streaks so many reaches beside a bright one's are fitted with it: farther ones touch only its window's edge.
 _NEAR = 1.4
+# Ends that move by more px than this from the first fit to the last make the stars to be found again.
+_FAR = 6.0
+_MOST_REPEATS = 2
 # How wrong the light of a faint star found along the motion may be on a pixel, as part of it.
 _DOUBT = 0.35
 
 
 def last_fit(camera: ExposedCamera, first: Fit) -> tuple[Fit | None, FaintStars]:
     """Return the joint fit of the brightest stars, and the faint ones that it left to the matched filter.
+
+    Where it comes far from `first`, the stars found along that motion are not where they seemed: once more.
+    """
+    for _ in range(_MOST_REPEATS):
+        done, faint = _fit_from(camera, first)
+        if done is None or not _far(camera, first.scene, done.scene):
+            break
+        leading = np.flatnonzero(done.scene.trusted)
+        leading = leading[np.argsort(-done.scene.light[leading], kind="stable")[: len(first.scene.light)]]
+        scene = done.scene.select(leading)
+        first = replace(done, scene=scene, windows=camera.windows(scene))
+    return done, faint
+
+
+def _far(camera: ExposedCamera, before: Scene, after: Scene) -> bool:
+    """Tell whether the ends of the streaks have moved by more than the fit sees."""
+    changed = float(np.linalg.norm(after.motion.turn - before.motion.turn))
+    turn = float(np.linalg.norm(after.motion.turn))
+    length = float(np.median(path_lengths(camera.pinhole, after.motion, before.stars)))
+    return length * changed / max(turn, 1e-12) > _FAR
+
+
+def _fit_from(camera: ExposedCamera, first: Fit) -> tuple[Fit | None, FaintStars]:
+    """Return the joint fit of the stars that are found along the motion of `first`, and the faint ones left.
 
     Of the models of the rate the fit takes the constant one unless told otherwise, or shown by the pixels.
     """

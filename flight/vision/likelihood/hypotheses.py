@@ -8,10 +8,14 @@ from itertools import islice
 
 import numpy as np
 
+from flight.arrays import FloatArray
+from flight.vision.likelihood.angle_scan import SCANNED_STARS, Circles, scan_angles
 from flight.vision.likelihood.blobs import Blobs
-from flight.vision.likelihood.ends import true_ends
+from flight.vision.likelihood.ends import true_ends, unbroken
 from flight.vision.likelihood.first_guess import Guess, find_turning, scanned_motions, voted_motions
+from flight.vision.likelihood.matched_filter import find_faint
 from flight.vision.likelihood.motion import Motion
+from flight.vision.likelihood.polar_grid import polar_grid
 from flight.vision.likelihood.rounds import (
     FIRST,
     LAST,
@@ -40,6 +44,8 @@ _ENOUGH = 200.0
 # Regions longer than a hypothesis allows speak against it, but may be two streaks in one.
 _CONTRADICTION = 0.6
 _CALM = 2.0
+# Motions that differ by less than this part are one.
+_SAME_MOTION = 0.005
 # Ends in place of a hypothesis of the wrong turn: it may have one of the two of each streak.
 _BY_CHANCE = 0.4
 
@@ -50,18 +56,48 @@ def first_fits(camera: ExposedCamera, blobs: Blobs, near: float | None) -> Itera
     `near` rad is a turn that something else tells, None when nothing does.
     """
     rivals: list[tuple[float, Fit]] = []
+    yielded: list[FloatArray] = []
     for guess in islice(_guesses(camera, blobs, near), _MOST_GUESSES):
         tried = _tried(camera, guess)
         if tried is None:
             continue
         explained, convincing, done = tried
+        if any(alike(done.scene.motion.turn, other) for other in yielded):
+            continue
         if convincing and all(explained > rival for rival, _ in rivals):
+            yielded.append(done.scene.motion.turn)
             yield done
         elif misfit(done.evaluation) <= _WORST_FIRST:
             rivals.append((explained, done))
     rivals.sort(key=lambda rival: -rival[0])
     for _, done in rivals:
-        yield done
+        if not any(alike(done.scene.motion.turn, other) for other in yielded):
+            yielded.append(done.scene.motion.turn)
+            yield done
+
+
+def rescanned_fits(camera: ExposedCamera, turn: FloatArray, angles: list[float]) -> Iterator[Fit]:
+    """Yield fits of the brightest stars about the axis of `turn` (3,), near each of `angles` (rad)."""
+    settings, pinhole = camera.settings, camera.pinhole
+    nothing = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.float32)
+    frame = polar_grid(pinhole, Motion.steady(turn)).frame
+    for angle in angles:
+        motion = Motion.steady(frame[2] * angle)
+        found = find_faint(camera.frame, nothing, pinhole, motion, settings.faint_sigmas, settings.most_faint)
+        bright = np.argsort(-found.light, kind="stable")[:SCANNED_STARS]
+        x, y, z = frame @ pinhole.unit_vectors(found.stars[bright]).T
+        circles = Circles(frame, z, np.arctan2(y, x))
+        for turned in islice(scan_angles(camera.frame, pinhole, circles, 1, angle), 1):
+            stars, light = turned.stars[:_FIRST_STARS], turned.light[:_FIRST_STARS]
+            tried = _tried(camera, Guess(frame[2] * turned.angle, stars, light, 0.0)) if len(light) else None
+            if tried is not None:
+                yield tried[2]
+
+
+def alike(one: FloatArray, other: FloatArray) -> bool:
+    """Tell whether two turns (3,) are one motion, forwards or backwards in time."""
+    apart = min(np.linalg.norm(one - other), np.linalg.norm(one + other))
+    return float(apart) < _SAME_MOTION * float(np.linalg.norm(one))
 
 
 def _guesses(camera: ExposedCamera, blobs: Blobs, near: float | None) -> Iterator[Guess]:
@@ -105,10 +141,13 @@ def still_fit(camera: ExposedCamera, blobs: Blobs) -> Fit | None:
 
 
 def _ending(camera: ExposedCamera, scene: Scene) -> float:
-    """Return what part of the streaks' ends is seen where it should be; 1 when none can be told."""
+    """Return what part of the ends is where it should be, or of the streaks unbroken, whichever is less.
+
+    1 when none can be told.
+    """
     times = window_times(camera.pinhole, scene.motion, camera.shutter, scene.stars)
-    ends = true_ends(camera.frame, camera.pinhole, scene.motion, scene.stars, scene.light, times)
-    return float(np.mean(ends)) if len(ends) else 1.0
+    seen = camera.frame, camera.pinhole, scene.motion, scene.stars, scene.light, times
+    return min(float(np.mean(told)) if len(told) else 1.0 for told in (true_ends(*seen), unbroken(*seen)))
 
 
 def _borne_out(done: Fit) -> tuple[float, float]:

@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import fdtri
 
 from flight.arrays import BoolArray
 from flight.pinhole import Pinhole
+from flight.vision.likelihood.agreement import agreed_step
 from flight.vision.likelihood.exposed_frame import ExposedFrame
 from flight.vision.likelihood.motion import paths
 from flight.vision.likelihood.normal_equations import ALONE, SHARED, Evaluation, evaluate
@@ -29,8 +31,10 @@ SETTLED = 0.4
 _LEAST_PROGRESS = 0.7
 # After so many looks at what is no noise it is settled which pixels are left out.
 _LOOKS = 1
-# The rate changes when the score of its change exceeds this: once in 10,000 constant rates (chi-square of 3).
-_CHANGING = 21.1
+# A constant rate seems to change once in so many.
+_BY_CHANCE = 1e-4
+# The parameters of the change.
+_GROWTHS = 3
 GROWING = np.ones(SHARED, dtype=np.bool_)
 _WIDEST = 6.0
 
@@ -57,7 +61,7 @@ class Rounds:
 
 FIRST = Rounds(8, clipped=False, tolerance=0.1, settled=SETTLED, conjugate=4, patience=2)
 ROUGH = Rounds(3, clipped=True, tolerance=0.003, settled=1.5, conjugate=12, patience=3)
-LAST = Rounds(8, clipped=True, tolerance=0.003, settled=SETTLED, conjugate=12, patience=4)
+LAST = Rounds(10, clipped=True, tolerance=0.003, settled=SETTLED, conjugate=12, patience=4)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,12 +111,19 @@ class Fit:
     free: BoolArray
 
     def grows(self) -> bool:
-        """Tell whether the pixels show that the rate changes: a score test of the constant one."""
+        """Tell whether the pixels show that the rate changes: a score test of the constant one.
+
+        The stars' agreement on the change is held against their spread (Hotelling).
+        """
         solution = solve(self.evaluation, self.scene, GROWING, LAST.conjugate)
         if solution is None:
             return False
-        growth, covariance = solution.shared[3:6], solution.covariance[3:6, 3:6]
-        return float(growth @ np.linalg.solve(covariance, growth)) > _CHANGING
+        told, stars = agreed_step(self.evaluation, solution.shared)
+        freedom = stars - _GROWTHS
+        if freedom < 1:
+            return False
+        limit = float(fdtri(_GROWTHS, freedom, 1.0 - _BY_CHANCE)) * _GROWTHS * (stars - 1) / freedom
+        return told > limit
 
 
 def iterate(
@@ -121,7 +132,7 @@ def iterate(
     """Return the fit after some rounds, None when the stars do not fix the motion."""
     whole, cut_at = windows or camera.windows(scene), scene
     windows = whole
-    restless, asked = np.inf, np.inf
+    restless, asked, before = np.inf, np.inf, np.zeros(SHARED)
     solution, evaluation = None, None
     for turn in range(how.rounds):
         evaluation = camera.evaluate(scene, windows, camera.settings.clip if how.clipped else 0.0)
@@ -136,9 +147,13 @@ def iterate(
         if restless <= how.settled or wanted <= how.tolerance:
             restless = 0.0
             break
-        if turn >= how.patience and wanted > _LEAST_PROGRESS * asked:
+        # Steps that lead on in one direction are a long way; those to and fro lead nowhere.
+        onward = (
+            float(np.sum(solution.shared * before / np.maximum(np.diag(solution.covariance), 1e-30))) > 0.0
+        )
+        if turn >= how.patience and wanted > _LEAST_PROGRESS * asked and not onward:
             break
-        asked = wanted
+        asked, before = wanted, solution.shared
         if _drifted(camera, cut_at, scene):
             windows = whole = camera.windows(scene)
             cut_at = scene

@@ -45,7 +45,7 @@ class LikelihoodSettings:
     threshold_sigmas: float = 4.5
     most_stars: int = 24
     most_neighbours: int = 80
-    most_faint: int = 400
+    most_faint: int = 800
     faint_sigmas: float = 6.0
     reach: float = 3.6
     clip: float = 5.0

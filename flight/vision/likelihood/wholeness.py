@@ -1,0 +1,53 @@
+"""Whether a motion makes whole streaks of the light: not pieces of longer ones, nor several end to end."""
+
+from __future__ import annotations
+
+from enum import Enum
+
+import numpy as np
+
+from flight.vision.likelihood.chains import in_chains
+from flight.vision.likelihood.ends import true_ends, unbroken
+from flight.vision.likelihood.matched_filter import FaintStars
+from flight.vision.likelihood.rounds import ExposedCamera
+from flight.vision.likelihood.scene import Scene, window_times
+
+# Share of the stars that may seem pieces of longer streaks by chance.
+_MOST_CHAINED = 0.45
+# Share of the ends on the detector that are where the motion puts them: without doubt, and at least.
+_TRUE_ENDS = (0.75, 0.6)
+# Share of the stars that are dark along a good part of their path, which one may be for reasons of its own.
+_BROKEN = (0.12, 0.35)
+
+
+class Wholeness(Enum):
+    """What the streaks' ends and the light between them say of a motion."""
+
+    WHOLE = "whole"
+    DOUBTED = "doubted"
+    BROKEN = "broken"
+
+
+def wholeness(camera: ExposedCamera, scene: Scene, faint: FaintStars) -> Wholeness:
+    """Return whether the stars that decide are as long as their light; doubted when some of them are not.
+
+    In a crowded frame what passes for a star may be several: a few that are dark here or there do not speak
+    against the motion, but ask for another witness.
+    """
+    stars = np.concatenate([scene.stars, faint.stars])
+    light = np.concatenate([scene.light, faint.light])
+    chained = in_chains(camera.pinhole, scene.motion, stars, light)[: len(scene.stars)]
+    if float(np.mean(chained[scene.trusted])) > _MOST_CHAINED:
+        return Wholeness.BROKEN
+    deciding = scene.select(scene.trusted)
+    times = window_times(camera.pinhole, deciding.motion, camera.shutter, deciding.stars)
+    seen = camera.frame, camera.pinhole, scene.motion, deciding.stars, deciding.light, times
+    ends, lit = true_ends(*seen), unbroken(*seen)
+    right = float(np.mean(ends)) if len(ends) else 1.0
+    dark = np.count_nonzero(lit == 0.0)
+    for worst, (least_ends, most_broken) in zip(
+        (Wholeness.BROKEN, Wholeness.DOUBTED), zip(_TRUE_ENDS[::-1], _BROKEN[::-1], strict=True), strict=True
+    ):
+        if right < least_ends or dark > max(1.0, most_broken * len(lit)):
+            return worst
+    return Wholeness.WHOLE
