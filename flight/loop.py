@@ -138,7 +138,8 @@ class FlightLoop:
             AcceptanceRules(late_after=config.guidance.late_after),
             arrives=planning_settings.strategy is not Strategy.RECEDING,
         )
-        controller = controller_of(config.control, plant, 1.0 / config.executive.control_rate_hz)
+        period = 1.0 / config.executive.control_rate_hz
+        controller = controller_of(config.control, plant, period, config.identification)
         self._steering = Steering(guidance, controller, devices.coils, self._events)
         self._planning = Planning(plant, planning_settings, guidance, jobs, recorder, self._events)
         self._imaging = (
@@ -290,6 +291,8 @@ def _navigation(
             torsion_start=section.torsion_start,
             damping_start=section.damping_start,
             gain_start=section.gain_start,
+            latency_start=section.latency_start,
+            latency_walk=section.latency_walk,
             gate_sigma=section.gate_sigma,
             history_ns=round(section.history * SECOND_NS),
         ),

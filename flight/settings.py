@@ -131,7 +131,8 @@ class Estimation(Section, frozen=True, kw_only=True):
     """The multiplicative Kalman filter of attitude, rate, gyro bias and disturbance about the thread.
 
     `*_start` are standard deviations at the start of what is estimated besides: the gyro's bias, rad/s; the
-    thread's torsion, 1/s^2, and damping, 1/s, beyond the plant's; the coils' gain. Zero: known.
+    thread's torsion, 1/s^2, and damping, 1/s, beyond the plant's; the coils' gain; and the age, s, that the
+    inertial unit's samples have at their stamp, which may walk by `latency_walk`, s per sqrt(s). Zero: known.
     """
 
     current_noise: NotNegative = 2.0e-3
@@ -140,6 +141,8 @@ class Estimation(Section, frozen=True, kw_only=True):
     torsion_start: NotNegative = 0.02
     damping_start: NotNegative = 4.0e-3
     gain_start: NotNegative = 0.15
+    latency_start: NotNegative = 0.03
+    latency_walk: NotNegative = 3.0e-3
     gate_sigma: Annotated[float, Meta(ge=3.0)] = 15.0
     history: Positive = 6.0
     coast: Positive = 1.2
@@ -162,16 +165,32 @@ class Control(Section, frozen=True, kw_only=True):
     """The controller.
 
     `lq` and `thesis` take the weights of Sease 5.30-5.32, Q = state_weight I and R = control_weight; `pid`
-    and `adaptive` the bandwidth and what follows it.
+    and `adaptive` the bandwidth and what follows it. `excitation` is flown by `python -m flight identify`.
     """
 
-    tracker: Literal["lq", "thesis", "pid", "adaptive"] = "lq"
+    tracker: Literal["lq", "thesis", "pid", "adaptive", "excitation"] = "lq"
     state_weight: Positive = 2.0
     control_weight: Positive = 1.0
     bandwidth: Positive = 1.0
     target_weight: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
     adaptation: Positive = 1.0
     reference_bandwidth: Positive | None = None
+
+
+class Identification(Section, frozen=True, kw_only=True):
+    """How `python -m flight identify` moves the body, and how well the plant is known beforehand.
+
+    `*_error` are relative standard deviations of what stands in `plant`: the inertia, the coils' dipole per
+    ampere (turns, area and what the resistance makes of it), the field; and of the magnetometer's scale.
+    """
+
+    current_share: Annotated[float, Meta(gt=0.0, le=0.9)] = 0.6
+    largest_q2: Annotated[float, Meta(ge=0.05, le=0.5)] = 0.4
+    swing: Positive = 45.0
+    inertia_error: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.1
+    dipole_error: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.05
+    field_error: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.1
+    magnetometer_error: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.02
 
 
 class Step(Section, frozen=True, kw_only=True):
@@ -202,6 +221,7 @@ class Config(Section, frozen=True, kw_only=True):
     estimation: Estimation = Estimation()
     guidance: Guidance = Guidance()
     control: Control = Control()
+    identification: Identification = Identification()
     steps: Annotated[tuple[Step, ...], Meta(min_length=1)]
     duration: Positive
     telemetry: Telemetry = Telemetry()

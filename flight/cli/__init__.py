@@ -19,6 +19,7 @@ COMMANDS = {
     "report": "tell what a run achieved",
     "export": "write a run's packets as CSV",
     "plan": "plan a single path",
+    "identify": "the body's constants from a short flight",
     "rate": "body rate from a picture of streaked stars",
     "solve": "where a picture of the sky looks, and which stars it shows",
     "calibrate": "a camera's lens from pictures of the sky",

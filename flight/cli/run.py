@@ -24,7 +24,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("config", type=Path, metavar="CONFIG", help="YAML file, see config/step_demo.yaml")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the run (default runs/NAME-TIME)")
     parser.add_argument("--duration", type=float, metavar="S", help="fly so many seconds instead")
-    parser.add_argument("--seed", type=_seed, metavar="N", help="seed of the simulation instead")
+    parser.add_argument("--seed", type=seed_number, metavar="N", help="seed of the simulation instead")
     parser.add_argument(
         "--realtime", action="store_true", help="fly simulated devices on the machine's clock"
     )
@@ -91,7 +91,8 @@ def progress_line(stream: TextIO) -> Callable[[Progress], None]:
     return show
 
 
-def _seed(text: str) -> int:
+def seed_number(text: str) -> int:
+    """Return the seed that an argument gives. Raises ArgumentTypeError below zero."""
     value = int(text)
     if value < 0:
         raise argparse.ArgumentTypeError(f"{text} is below zero")

@@ -6,12 +6,23 @@ from flight.control.adaptive import AdaptiveController, AdaptiveSettings
 from flight.control.controller import Controller
 from flight.control.lq_tracker import LqTracker
 from flight.control.pid import PidController
+from flight.identification.excitation import ExcitationController, ExcitationSettings
 from flight.plant import SingleAxisPlant
-from flight.settings import Control
+from flight.settings import Control, Identification
 
 
-def controller_of(section: Control, plant: SingleAxisPlant, period: float) -> Controller:
+def controller_of(
+    section: Control,
+    plant: SingleAxisPlant,
+    period: float,
+    identification: Identification = Identification(),  # noqa: B008 - frozen
+) -> Controller:
     """Return the controller that `section` chooses for `plant`, commanded every `period` s."""
+    if section.tracker == "excitation":
+        move = identification
+        return ExcitationController(
+            plant, period, ExcitationSettings(move.current_share, move.largest_q2, move.swing)
+        )
     if section.tracker == "pid":
         return PidController(plant, period, section.bandwidth, section.target_weight)
     if section.tracker == "adaptive":

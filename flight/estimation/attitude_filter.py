@@ -2,7 +2,8 @@
 
 Each measurement is applied at its own time: one that arrives late is put where it belongs and those after it
 are applied again. A rate from a streaked image is the mean over its exposure: the attitude at the exposure's
-start is kept until its end. On the testbed's thread the same filter runs suspended: it takes of every
+start is kept until its end. The age that the inertial unit's samples have at their stamp may be estimated too
+(`flight.estimation.latency`). On the testbed's thread the same filter runs suspended: it takes of every
 measurement what it says about the thread, and all else stays exactly what it was; the thread's torsion
 and damping are known, or estimated beside the disturbance, from which they differ in that they go with the
 angle and the rate.
@@ -18,7 +19,8 @@ import numpy as np
 from scipy.special import chdtri
 
 from flight.arrays import FloatArray
-from flight.estimation.estimate import BIAS, DISTURBANCE, RATE, TURN, Estimate
+from flight.estimation.estimate import BIAS, DISTURBANCE, LATENCY, RATE, TURN, Estimate
+from flight.estimation.latency import LONGEST_LATENCY, Motion, considered, motion
 from flight.estimation.measurements import (
     AttitudeMeasurement,
     MeanRateMeasurement,
@@ -54,6 +56,8 @@ class FilterSettings:
         torsion_start: 1/s^2, standard deviation of the thread's torsion at the start, zero when it is known.
         damping_start: 1/s, of its damping, likewise.
         gain_start: of the coils' gain, likewise.
+        latency_start: s, of the age that the inertial unit's samples have at their stamp, likewise.
+        latency_walk: s per sqrt(s), the random walk of that age.
         rate_walk: rad/s per sqrt(s), white acceleration beside that of the coils.
         gate_sigma: a measurement is refused that is less likely than this many sigma of one component.
         history_ns: how late a measurement may come and still be used.
@@ -68,6 +72,8 @@ class FilterSettings:
     torsion_start: float = 0.0
     damping_start: float = 0.0
     gain_start: float = 0.0
+    latency_start: float = 0.0
+    latency_walk: float = 0.0
     rate_walk: float = 0.0
     gate_sigma: float = 5.0
     history_ns: int = 6_000_000_000
@@ -95,6 +101,8 @@ class AttitudeFilter:
 
     REJECTIONS_TO_RESTART = 40
     """After so many refusals of attitudes, or of rates, in a row it is the filter that is wrong."""
+    REJECTIONS_AT_THE_START = 3
+    """So many are enough when it has taken in no more than it refuses: it began with what is no more true."""
 
     def __init__(self, body: RigidBody, settings: FilterSettings) -> None:
         self._body = body
@@ -110,6 +118,7 @@ class AttitudeFilter:
                     *settings.disturbance_walk**2 * free,
                 ]
             ),
+            settings.latency_walk**2,
         )
         self._gate = _gate(settings.gate_sigma, 1 if body.suspended else 3)
         self._history: list[_Checkpoint] = []
@@ -117,6 +126,7 @@ class AttitudeFilter:
         self._commands: list[Torquing] = []
         self._idle = body.torquing(np.zeros(3))
         self._refused_in_a_row: dict[type[Measurement], int] = {}
+        self._taken: dict[type[Measurement], int] = {}
         self.refused = 0
         self.late = 0
         self.restarts = 0
@@ -158,13 +168,25 @@ class AttitudeFilter:
         covariance[14, 14] = settings.gain_start**2
         state = State(quaternion, (x, y, z), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), self._body.parameters)
         newest: Measurement = attitude if attitude.time_ns >= rate.time_ns else rate
+        # The older both are, the further the body has gone on: the errors of all three go together.
+        age = np.zeros(SIZE)
+        age[TURN], age[RATE] = (x, y, z), self._motion(state, covariance, newest.time_ns).acceleration
+        age[LATENCY] = 1.0
+        covariance += settings.latency_start**2 * np.outer(age, age)
         self._history = [_Checkpoint(newest, True, state, covariance)]
         self._refused_in_a_row = {}
+        self._taken = {}
 
     @property
     def started(self) -> bool:
         """Whether there is an estimate at all."""
         return bool(self._history)
+
+    @property
+    def measured_ns(self) -> int:
+        """When a measurement was last taken in."""
+        newest = next((c for c in reversed(self._history) if c.used), self._history[-1])
+        return _time_of(newest)
 
     def measure(self, measurement: Measurement) -> bool:
         """Apply a measurement at its own time; tell whether it passed the gate (or was too late)."""
@@ -180,10 +202,15 @@ class AttitudeFilter:
         self._forget(measurement.time_ns)
         return used
 
+    @property
+    def latency(self) -> float:
+        """By how much the inertial unit's samples are older than they say, s, within reason."""
+        found = self._history[-1].state.latency if self._history else 0.0
+        return min(max(found, 0.0), LONGEST_LATENCY)
+
     def at(self, time_ns: int) -> Estimate:
         """Return the estimate propagated to `time_ns`; the filter itself stays where it is."""
-        newest = next((c for c in reversed(self._history) if c.used), self._history[-1])
-        return self._estimate(self._history[-1], time_ns, newest.measurement.time_ns)
+        return self._estimate(self._history[-1], time_ns, self.measured_ns)
 
     def past(self, time_ns: int) -> Estimate | None:
         """Return the estimate as it stood at a past time, None when that is before all it remembers."""
@@ -204,6 +231,7 @@ class AttitudeFilter:
             state.parameters,
             covariance,
             measured_ns,
+            state.latency,
         )
 
     def _insert(self, index: int, measurement: Measurement) -> bool:
@@ -239,9 +267,14 @@ class AttitudeFilter:
                 time_ns = exposure.since_ns
             state, covariance = self._propagate(state, covariance, time_ns, measurement.time_ns)
             time_ns = measurement.time_ns
-            found = innovation(state, measurement, self._body.suspended)
+            aging = None
+            if isinstance(measurement, RateMeasurement) and measurement.latency is not None:
+                aging = self._motion(state, covariance, time_ns)
+            found = innovation(state, measurement, self._body.suspended, aging)
             nis, gain = normalised_square(found, covariance)
             used = 0.0 <= nis <= self._gate  # a NaN does not pass
+            if aging is not None:
+                gain = considered(gain)
             if used:
                 state, covariance = correct(state, covariance, found, gain)
             if isinstance(measurement, MeanRateMeasurement):
@@ -269,12 +302,31 @@ class AttitudeFilter:
             index += more
         return state, covariance
 
+    def _motion(self, state: State, covariance: FloatArray, time_ns: int) -> Motion:
+        """Return how the rate changes about the time of a sample whose age is not known for sure."""
+        half_ns = round(0.5e9 * math.sqrt(covariance[LATENCY, LATENCY]))
+        before, after = (
+            self._body.linearise(
+                state.quaternion, state.rate, state.parameters, self._torquing(time_ns + shift), 0.0
+            )
+            for shift in (-half_ns, half_ns)
+        )
+        return motion(before, after, state.disturbance, covariance)
+
+    def _torquing(self, time_ns: int) -> Torquing:
+        """Return what the coils do at a time."""
+        index = max(bisect.bisect_right(self._command_times, time_ns) - 1, 0)
+        return self._commands[index] if self._commands else self._idle
+
     def _count(self, kind: type[Measurement], used: bool) -> None:
         """Count refusals. Mean rates come too seldom to tell who is wrong, and restart nothing."""
         in_a_row = 0 if used else self._refused_in_a_row.get(kind, 0) + 1
         self._refused_in_a_row[kind] = in_a_row
         self.refused += not used
-        if kind is not MeanRateMeasurement and in_a_row >= self.REJECTIONS_TO_RESTART:
+        taken = self._taken.get(kind, 0) + used
+        self._taken[kind] = taken
+        enough = min(max(taken, self.REJECTIONS_AT_THE_START), self.REJECTIONS_TO_RESTART)
+        if kind is not MeanRateMeasurement and in_a_row >= enough:
             self._history.clear()
             self._refused_in_a_row = {}
             self.restarts += 1

@@ -12,7 +12,12 @@ from flight.estimation.rigid_body import NOMINAL, Parameters
 from flight.quaternion import angle_about_axis_y
 
 TURN, RATE, BIAS, DISTURBANCE, PARAMETERS = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15)
-"""Where the parts of the error stand in the covariance (15, 15)."""
+LATENCY = 15
+"""Where the parts of the error stand in the covariance (16, 16)."""
+
+
+LEAST_GAIN, MOST_GAIN = 0.5, 2.0
+"""An estimate beyond is that of a filter which is still finding itself: no current is reckoned with it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,8 +50,9 @@ class Estimate:
         bias: (3,) rad/s, of the gyro.
         disturbance: (3,) rad/s^2, angular acceleration that the model does not account for.
         parameters: of the model: the thread's torsion and damping, the coils' gain.
-        covariance: (15, 15) of small turns about the body's axes, rate, and so on (TURN, RATE, ...).
+        covariance: (16, 16) of small turns about the body's axes, rate, and so on (TURN, RATE, ...).
         measured_ns: the time of the newest measurement in it: its age says whether to trust it.
+        latency: s, by which the inertial unit's samples are older than they say.
     """
 
     time_ns: int
@@ -57,6 +63,7 @@ class Estimate:
     parameters: Parameters
     covariance: FloatArray
     measured_ns: int
+    latency: float = 0.0
 
     @property
     def angle(self) -> float:
@@ -71,23 +78,23 @@ class Estimate:
     def about_thread(self, believed: Parameters = NOMINAL) -> ThreadEstimate:
         """Return what it says of the turn about the thread; exact for a body that is suspended.
 
-        The disturbance is what a plant with the `believed` torsion and damping leaves out: by how much that
-        thread pulls less than the one estimated is counted in. The coils' gain is the plant's own affair.
+        The disturbance is what a plant with the `believed` parameters leaves out of a hold: the current by
+        which that plant would hold the body against it is the one that does.
         """
         angle, rate = self.angle, float(self.rate[1])
-        torsion, damping = (
-            self.parameters.torsion - believed.torsion,
-            self.parameters.damping - believed.damping,
-        )
+        torsion, damping, gain = self.parameters
+        scale = believed.gain / min(max(gain, LEAST_GAIN), MOST_GAIN)
+        torque = scale * (float(self.disturbance[1]) - torsion * angle - damping * rate)
         rows = np.zeros((3, len(self.covariance)))
-        rows[0, 1] = rows[1, 4] = rows[2, 10] = 1.0
-        rows[2, 1], rows[2, 4] = -torsion, -damping
-        rows[2, PARAMETERS] = -angle, -rate, 0.0
+        rows[0, 1] = rows[1, 4] = 1.0
+        rows[2, 10] = scale
+        rows[2, 1], rows[2, 4] = believed.torsion - scale * torsion, believed.damping - scale * damping
+        rows[2, PARAMETERS] = -scale * angle, -scale * rate, -torque * scale / believed.gain
         return ThreadEstimate(
             self.time_ns,
             angle,
             rate,
-            float(self.disturbance[1]) - torsion * angle - damping * rate,
+            torque + believed.torsion * angle + believed.damping * rate,
             rows @ self.covariance @ rows.T,
             self.measured_ns,
         )

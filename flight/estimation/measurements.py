@@ -1,4 +1,8 @@
-"""What the filter takes in: attitudes, rates of the gyro, mean rates over an exposure; each with its time."""
+"""What the filter takes in: attitudes, rates of the gyro, mean rates over an exposure; each with its time.
+
+`latency` is for a unit whose samples are older than their stamp says, by how much the filter is estimating:
+the s that have been taken off the stamp to make `time_ns`. None: the time is known.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +18,7 @@ class AttitudeMeasurement:
     time_ns: int
     quaternion: FloatArray
     covariance: FloatArray
+    latency: float | None = None
 
     @property
     def begin_ns(self) -> int:
@@ -28,6 +33,7 @@ class RateMeasurement:
     time_ns: int
     rate: FloatArray
     covariance: FloatArray
+    latency: float | None = None
 
     @property
     def begin_ns(self) -> int:

@@ -15,7 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from flight.arrays import FloatArray
-from flight.estimation.estimate import DISTURBANCE, PARAMETERS, RATE, TURN
+from flight.estimation.estimate import DISTURBANCE, LATENCY, PARAMETERS, RATE, TURN
+from flight.estimation.latency import Motion, aged
 from flight.estimation.measurements import (
     AttitudeMeasurement,
     MeanRateMeasurement,
@@ -35,13 +36,16 @@ from flight.estimation.turn import (
     twist,
 )
 
-SIZE = 15
+SIZE = 16
 LONGEST_STEP = 0.025
 """s: also without measurements no step is longer than in the loop."""
 
 
 class State(NamedTuple):
-    """The estimate as tuples; `kept` are attitudes at starts of exposures, as they came."""
+    """The estimate as tuples; `kept` are attitudes at starts of exposures, as they came.
+
+    `latency` is by how much the inertial unit's samples are older than they say, s.
+    """
 
     quaternion: Quaternion
     rate: Vector
@@ -49,18 +53,20 @@ class State(NamedTuple):
     disturbance: Vector
     parameters: Parameters
     kept: tuple[tuple[MeanRateMeasurement, Quaternion], ...] = ()
+    latency: float = 0.0
 
 
 class ProcessNoise(NamedTuple):
     """What drives the state beside the model: spectral densities.
 
     `current` of one driven coil, A^2 s; `rate` (3, 3) rad^2/s^3; `walks` (6,) of bias (rad^2/s^3)
-    and disturbance (rad^2/s^5).
+    and disturbance (rad^2/s^5); `latency` of that, s.
     """
 
     current: float
     rate: FloatArray
     walks: FloatArray
+    latency: float = 0.0
 
 
 class Innovation(NamedTuple):
@@ -108,6 +114,7 @@ def _step(
         state.disturbance,
         state.parameters,
         state.kept,
+        state.latency,
     )
     transition = _transition(state.rate, model, dt)
     if state.kept:
@@ -145,6 +152,7 @@ def _add_noise(
     covariance[RATE, RATE] += dt * density
     stride = len(covariance) + 1
     covariance.reshape(-1)[6 * stride : 12 * stride : stride] += dt * noise.walks
+    covariance[LATENCY, LATENCY] += dt * noise.latency
 
 
 def keep_attitude(
@@ -167,24 +175,35 @@ def release_attitude(
     return state._replace(kept=kept), covariance[np.ix_(pick, pick)]
 
 
-def innovation(state: State, measurement: Measurement, suspended: bool) -> Innovation:
-    """Return what `measurement` says beyond `state`; of a suspended body, about the thread alone."""
-    size = SIZE + 3 * len(state.kept)
+def innovation(
+    state: State, measurement: Measurement, suspended: bool, motion: Motion | None = None
+) -> Innovation:
+    """Return what `measurement` says beyond `state`; of a suspended body, about the thread alone.
+
+    `motion` is asked for a rate whose time is not known for sure.
+    """
+    size, noise = SIZE + 3 * len(state.kept), measurement.covariance
     if isinstance(measurement, RateMeasurement):
         x, y, z = measurement.rate.tolist()
         (wx, wy, wz), (bx, by, bz) = state.rate, state.bias
         value: Vector = (x - wx - bx, y - wy - by, z - wz - bz)
         rows = _rows("rate", size)
+        if measurement.latency is not None and motion is not None:
+            more = state.latency - measurement.latency
+            value, rows = aged(more, motion.acceleration, value, rows)
+            noise = noise + motion.uncertainty
     elif isinstance(measurement, AttitudeMeasurement):
         a, b, c, d = measurement.quaternion.tolist()
         between = compose((a, b, c, d), inverse(state.quaternion))
         value = (0.0, twist(between), 0.0) if suspended else logarithm(between)
         rows = _rows("turn", size)
+        if measurement.latency is not None:
+            value, rows = aged(state.latency - measurement.latency, state.rate, value, rows)
     else:
         value, rows = _mean_rate(state, measurement, size)
     if suspended:
-        return Innovation(value[1:2], rows[1:2], measurement.covariance[1:2, 1:2])
-    return Innovation(value, rows, measurement.covariance)
+        return Innovation(value[1:2], rows[1:2], noise[1:2, 1:2])
+    return Innovation(value, rows, noise)
 
 
 def _mean_rate(state: State, measurement: MeanRateMeasurement, size: int) -> tuple[Vector, FloatArray]:
@@ -243,6 +262,7 @@ def correct(
             (measurement, compose(exponential(*error[first : first + 3]), quaternion))
             for first, (measurement, quaternion) in zip(range(SIZE, len(error), 3), state.kept, strict=True)
         ),
+        state.latency + error[LATENCY],
     )
     return corrected, covariance
 

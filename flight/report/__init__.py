@@ -14,9 +14,11 @@ from flight.telemetry.reader import Run
 
 if TYPE_CHECKING:
     from flight.guidance.vmc import Plan
+    from flight.identification.fit import Fit
+    from flight.identification.record import Record
     from flight.plant import SingleAxisPlant
 
-__all__ = ["draw", "draw_path", "format_report", "summarise"]
+__all__ = ["draw", "draw_fit", "draw_path", "format_report", "summarise"]
 
 
 def draw(run: Run, folder: Path) -> list[Path]:
@@ -40,6 +42,17 @@ def draw_path(plan: Plan, plant: SingleAxisPlant, file: Path) -> None:
         from flight.report.path_figure import save_path  # noqa: PLC0415  # an extra, never on board
 
         save_path(plan, plant, file)
+
+
+def draw_fit(record: Record, found: Fit, file: Path) -> None:
+    """Draw an identification's measured and predicted motion as a PNG.
+
+    Raises UsageError when matplotlib is not installed or the file cannot be written.
+    """
+    with _drawing(file):
+        from flight.identification.picture import save_fit  # noqa: PLC0415  # an extra, never on board
+
+        save_fit(record, found, file)
 
 
 @contextmanager

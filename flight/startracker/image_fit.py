@@ -68,11 +68,7 @@ def fit_in_image(
     for _ in range(_MOST_STEPS):
         seen, predicted = stretched(observed, scale), reference @ matrix.T
         residual = np.einsum("nij,nj->ni", whitener, seen - predicted).ravel()
-        slope = np.empty((len(points), 2, parameters))
-        slope[:, :, :3] = -whitener @ cross_matrices(predicted)
-        if free_scale:
-            slope[:, :, 3] = np.einsum("nij,nj->ni", whitener, scale_slope(seen))
-        flat = slope.reshape(-1, parameters)
+        flat = _slope(whitener, seen, predicted, free_scale)
         try:
             inverse = np.linalg.inv(flat.T @ flat)
         except np.linalg.LinAlgError as error:
@@ -90,6 +86,15 @@ def fit_in_image(
     turn = np.ascontiguousarray(inverse[:3, :3], dtype=np.float64)
     fix = AttitudeFix(from_matrix(matrix), turn, 0.5 * float(squares.sum()))
     return ImageFit(fix, scale, float(np.sqrt(inverse[3, 3])) if free_scale else 0.0, squares)
+
+
+def _slope(whitener: FloatArray, seen: FloatArray, predicted: FloatArray, free_scale: bool) -> FloatArray:
+    """Return d(whitened residuals)/d(turn, ln scale), (2n, 3 or 4)."""
+    turn = -whitener @ cross_matrices(predicted)
+    if not free_scale:
+        return np.asarray(turn.reshape(-1, 3))
+    scale = np.einsum("nij,nj->ni", whitener, scale_slope(seen))
+    return np.concatenate([turn, scale[:, :, None]], axis=2).reshape(-1, 4)
 
 
 def _whitener(

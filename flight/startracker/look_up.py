@@ -129,15 +129,8 @@ def look_up(
     lowest = size * (steps.lowest / steps.middle)[step] * (1.0 - slack)
     highest = size * (steps.highest / steps.middle)[step] * (1.0 + slack)
     query, short, middle, begin, end = _runs(sky, ratio, slack, left, lowest, highest)
-    count = end - begin
-    read = np.cumsum(count)
-    total = int(read[-1]) if len(read) else 0
-    if total > most:
-        kept = int(np.searchsorted(read, most))
-        count, read, begin = count[:kept], read[:kept], begin[:kept]
-        total = int(read[-1]) if kept else 0
-    run = np.repeat(np.arange(len(count)), count)
-    entry = np.arange(total) + (begin - read + count)[run]
+    entry, run = _entries(begin, end, most)
+    total = len(entry)
     # In units of the finest division of a ratio, from its middle.
     wanted = ratio * (CELLS * FINE) - 0.5
     off_short = (short * FINE - wanted[query, 0])[run] + sky.triangles.shape[entry, 0]
@@ -149,6 +142,17 @@ def look_up(
     scale = longest / size[query] * steps.middle[step[query]]
     star = sky.triangles.corners[entry].astype(np.int64)
     return Finds(corners[query], star, scale), total
+
+
+def _entries(begin: IntArray, end: IntArray, most: int) -> tuple[IntArray, IntArray]:
+    """Return the entries (k,) of the first runs that have no more than `most`, and the run of each."""
+    count = end - begin
+    read = np.cumsum(count)
+    if len(read) and read[-1] > most:
+        kept = int(np.searchsorted(read, most))
+        count, read, begin = count[:kept], read[:kept], begin[:kept]
+    run = np.repeat(np.arange(len(count)), count)
+    return np.arange(len(run)) + (begin - read + count)[run], run
 
 
 def _forms(

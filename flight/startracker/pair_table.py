@@ -19,8 +19,7 @@ from flight.startracker import k_vector, table_file
 from flight.startracker.guide_stars import GuideStars
 from flight.startracker.k_vector import KVector, members
 
-VERSION = 1
-MAGIC = b"KCPAIRS1"
+KIND = table_file.Kind(b"KCPAIRS1", 1, "pair table", "make it again")
 _PAIRS_A_CELL = 4
 
 
@@ -101,11 +100,11 @@ def save(table: PairTable, path: Path) -> None:
         "stars": float(table.stars),
         "widest": table.widest,
     }
-    table_file.save(path, MAGIC, VERSION, columns, facts)
+    table_file.save(path, KIND, columns, facts)
 
 
 def load(path: Path) -> PairTable:
     """Return the table of a file, mapped. Raises ConfigError when it is missing, damaged or outdated."""
-    columns, facts = table_file.load(path, MAGIC, VERSION)
+    columns, facts = table_file.load(path, KIND)
     key = KVector(columns["angle"], columns["count"], facts["slope"], facts["origin"])
     return PairTable(columns["first"], columns["second"], key, int(facts["stars"]), facts["widest"])

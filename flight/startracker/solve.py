@@ -28,6 +28,7 @@ from flight.startracker.field import StarField
 from flight.startracker.identification import Identification, Status
 from flight.startracker.image_fit import fit_in_image
 from flight.startracker.lost_in_space import IdentificationSettings, identify
+from flight.startracker.mid_exposure import lateness
 from flight.startracker.sky_index import SkyIndex
 from flight.startracker.solution import FrameSolution, SolveStatus
 from flight.startracker.tracking import track
@@ -174,7 +175,11 @@ def solve_motion(
     if not len(chosen):
         return seen
     seen = replace(seen, points=motion.stars[chosen], covariance=motion.star_covariance[chosen])
-    return _identify(seen, motion.flux[chosen], scale, sky, settings, prior)
+    solution = _identify(seen, motion.flux[chosen], scale, sky, settings, prior)
+    if solution.fix is None:
+        return solution
+    covariance = solution.fix.covariance + lateness(motion)
+    return replace(solution, fix=replace(solution.fix, covariance=covariance))
 
 
 def points_near(

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import json
 import mmap
+import os
 import struct
 import zlib
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +27,30 @@ _HEADER = struct.Struct("<8sIII")
 _ALIGNMENT = 64
 
 
-def save(path: Path, magic: bytes, version: int, columns: Columns, facts: Facts) -> None:
-    """Write columns and numbers to `path`, whole or not at all. Raises ValueError if magic is not 8 bytes."""
-    if len(magic) != 8:
-        raise ValueError(f"magic {magic!r}: 8 bytes name a kind of table")
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """A kind of table.
+
+    Attributes:
+        magic: 8 bytes that a file of it begins with.
+        version: of its columns.
+        name: that a person knows it by.
+        cure: what to do when a file of it is of no use.
+    """
+
+    magic: bytes
+    version: int
+    name: str
+    cure: str
+
+    def __post_init__(self) -> None:
+        """Raise ValueError when the magic is not of 8 bytes."""
+        if len(self.magic) != 8:
+            raise ValueError(f"magic {self.magic!r}: 8 bytes name a kind of table")
+
+
+def save(path: Path, kind: Kind, columns: Columns, facts: Facts) -> None:
+    """Write columns and numbers to `path`, whole or not at all."""
     little = {name: _little(column) for name, column in columns.items()}
     contents: dict[str, Any] = {"facts": facts, "columns": {}}
     offset = 0
@@ -40,28 +62,30 @@ def save(path: Path, magic: bytes, version: int, columns: Columns, facts: Facts)
     body = bytearray(table)
     for column in little.values():
         body += column.tobytes() + b"\0" * (-column.nbytes % _ALIGNMENT)
-    temporary = path.with_name(path.name + ".new")
-    temporary.write_bytes(_HEADER.pack(magic, version, zlib.crc32(body), len(table)) + bytes(body))
+    # Two processes may make it at once: each its own, and the last one stays.
+    temporary = path.with_name(f"{path.name}.{os.getpid()}.new")
+    temporary.write_bytes(_HEADER.pack(kind.magic, kind.version, zlib.crc32(body), len(table)) + bytes(body))
     temporary.replace(path)
 
 
-def load(path: Path, magic: bytes, version: int) -> tuple[Columns, Facts]:
+def load(path: Path, kind: Kind) -> tuple[Columns, Facts]:
     """Return the columns, read-only and mapped, and the numbers.
 
     Raises ConfigError when the file is missing, damaged, of another kind or of another version.
     """
+    name, cure = kind.name, kind.cure
     try:
         with path.open("rb") as file:
             mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     except (OSError, ValueError) as error:
-        raise ConfigError(str(path), f"no table can be read here ({error}); make it again") from error
-    if len(mapped) < _HEADER.size or mapped[: len(magic)] != magic:
-        raise ConfigError(str(path), f"this is no table of the kind {magic.decode()}; make it again")
-    _, found, checksum, length = _HEADER.unpack_from(mapped)
-    if found != version:
-        raise ConfigError(str(path), f"a table of version {found}, {version} is wanted; make it again")
+        raise ConfigError(str(path), f"no {name} can be read here ({error}); {cure}") from error
+    if len(mapped) < _HEADER.size or mapped[: len(kind.magic)] != kind.magic:
+        raise ConfigError(str(path), f"this is no {name}; {cure}")
+    _, version, checksum, length = _HEADER.unpack_from(mapped)
+    if version != kind.version:
+        raise ConfigError(str(path), f"a {name} of version {version}, {kind.version} is wanted; {cure}")
     if zlib.crc32(memoryview(mapped)[_HEADER.size :]) != checksum:
-        raise ConfigError(str(path), "the table is damaged, its CRC-32 is wrong; make it again")
+        raise ConfigError(str(path), f"the {name} is damaged, its CRC-32 is wrong; {cure}")
     contents = json.loads(mapped[_HEADER.size : _HEADER.size + length])
     begin = _HEADER.size + length
     columns = {

@@ -6,7 +6,7 @@ A frame is known to be of a living camera by its sequence number, its pixels and
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from flight.executive.rate_group import Cycle
 from flight.lens import CameraModel
 from flight.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
 from flight.startracker.frame_job import Found, FrameFound, FrameJob, TrackerSettings
+from flight.startracker.mid_exposure import NODES, doubt, reading_of
 from flight.startracker.solution import FrameSolution
 from flight.startracker.solve import AttitudePrior, RatePrior
 from flight.tasks.navigation import Navigation
@@ -34,8 +35,6 @@ from hal.interfaces.readings import Frame
 WORKER = "vision"
 # rad, of the mounting between the camera and the inertial unit that the estimate is of.
 _LEAST_PRIOR_SIGMA = 5e-4
-# Simpson's rule over the exposure: its middle, where nothing differs, left out.
-_NODES, _WEIGHTS = (0.0, 0.25, 0.75, 1.0), (1.0 / 12.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 12.0)
 _NAN = np.full(3, np.nan), np.full((3, 3), np.nan)
 
 
@@ -138,7 +137,7 @@ class Imaging:
         accepted = motion.status is StreakStatus.RATE and self._use_rate(frame, motion, now_ns)
         self._record_rate(frame, motion.status.value, motion, now_ns, accepted)
         if found.solution is not None:
-            self._use_stars(frame, found.solution, now_ns)
+            self._use_stars(frame, found, found.solution, now_ns)
 
     def _poll(self, now_ns: int) -> Frame | None:
         try:
@@ -153,12 +152,19 @@ class Imaging:
             frame.pixels,
             self._settings.camera,
             frame.exposure_ns * 1e-9,
-            self._settings.estimator,
+            self._estimator(past),
             self._settings.tracker,
             self._rate_prior(past) if past is not None else None,
             self._attitude_prior(past) if past is not None else None,
             self._last_checksum,
         )
+
+    def _estimator(self, past: Estimate | None) -> StreakSettings | LikelihoodSettings:
+        estimator = self._settings.estimator
+        if past is None and isinstance(estimator, LikelihoodSettings):
+            # Nobody knows how the rate changes, which draws the stars off mid-exposure: the pixels must tell.
+            return replace(estimator, rate_model="accelerating")
+        return estimator
 
     def _rate_prior(self, past: Estimate) -> RatePrior:
         widest = float(np.linalg.eigvalsh(past.covariance[RATE, RATE])[-1])
@@ -183,7 +189,7 @@ class Imaging:
             self._events.tell(events.STREAK_REFUSED, now_ns, text)
         return accepted
 
-    def _use_stars(self, frame: Frame, solution: FrameSolution, now_ns: int) -> None:
+    def _use_stars(self, frame: Frame, found: FrameFound, solution: FrameSolution, now_ns: int) -> None:
         """Give the attitude at mid-exposure to navigation, and tell of it."""
         accepted = False
         middle_ns = _middle_ns(frame)
@@ -191,7 +197,7 @@ class Imaging:
         if solution.fix is not None:
             turn = self._body_to_camera.T
             quaternion = multiply(conjugate(self._settings.mounting), solution.fix.quaternion)
-            covariance = turn @ solution.fix.covariance @ turn.T + self._blur(frame)
+            covariance = turn @ solution.fix.covariance @ turn.T + self._off_middle(frame, found.motion)
             known = self._navigation.past(middle_ns) is not None
             accepted = known and self._navigation.take_attitude(middle_ns, quaternion, covariance)
             if known and not accepted:
@@ -212,23 +218,17 @@ class Imaging:
             accepted=int(accepted),
         )
 
-    def _blur(self, frame: Frame) -> FloatArray:
-        """Return by how much the stars' mean attitude may differ from that of mid-exposure, (3, 3) rad^2.
-
-        An acceleration draws the mean off the middle: as the estimate knows it, that much is in doubt, and
-        what shakes the body unknown to it: white acceleration of density q moves the mean of T seconds from
-        their middle by a variance of q T^3 / 320.
-        """
-        duration = frame.exposure_ns * 1e-9
-        known = np.zeros(3)
+    def _off_middle(self, frame: Frame, motion: Found) -> FloatArray:
+        """Return by how much the stars' attitude may differ from that of mid-exposure, (3, 3) rad^2."""
+        turns = np.zeros((len(NODES), 3))
         middle = self._navigation.past(_middle_ns(frame))
         if middle is not None:
             back = conjugate(middle.quaternion)
-            for part, weight in zip(_NODES, _WEIGHTS, strict=True):
+            for number, part in enumerate(NODES):
                 past = self._navigation.past(frame.exposure_start_ns + round(part * frame.exposure_ns))
                 if past is not None:
-                    known += weight * to_rotation_vector(multiply(past.quaternion, back))
-        return np.outer(known, known) + np.eye(3) * self._settings.unrest * duration**3 / 320.0
+                    turns[number] = to_rotation_vector(multiply(past.quaternion, back))
+        return doubt(reading_of(motion), turns, self._settings.unrest, frame.exposure_ns * 1e-9)
 
     def _rate_in_body(self, found: Found) -> tuple[FloatArray, FloatArray]:
         """Return rate and covariance in body axes; NaN when there is none."""

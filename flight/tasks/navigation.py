@@ -107,10 +107,10 @@ class Navigation:
 
     def attitude(self, now_ns: int) -> Estimate | None:
         """Return the whole estimate for now, None when there is none to be trusted."""
-        if not self._filter.started:
+        # Carried on over a long silence it would cost more with every cycle, and be of no use.
+        if not self._filter.started or now_ns - self._filter.measured_ns > self._settings.coast_ns:
             return None
-        estimate = self._filter.at(now_ns)
-        return estimate if now_ns - estimate.measured_ns <= self._settings.coast_ns else None
+        return self._filter.at(now_ns)
 
     def estimate(self, now_ns: int) -> ThreadEstimate | None:
         """Return what it says of the turn about the thread, None when it is not to be trusted."""
@@ -149,9 +149,10 @@ class Navigation:
             field=reading.field.tolist(),
             acceleration=reading.acceleration.tolist(),
         )
-        time_ns = reading.time_ns
-        attitude = AttitudeMeasurement(time_ns, reading.quaternion, self._angle_covariance)
-        rate = RateMeasurement(time_ns, reading.rate, self._rate_covariance)
+        latency = self._filter.latency
+        time_ns = reading.time_ns - round(latency * 1e9)
+        attitude = AttitudeMeasurement(time_ns, reading.quaternion, self._angle_covariance, latency)
+        rate = RateMeasurement(time_ns, reading.rate, self._rate_covariance, latency)
         if not self._filter.started:
             self._filter.start(attitude, rate)
             return

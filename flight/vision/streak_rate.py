@@ -49,6 +49,7 @@ class StreakResult:
             none.
         endpoints: (found, 2, 2) px, compensated when there is a rate; first ends are then simultaneous and,
             when the status is `rate`, earlier.
+        sigma: (found,) px, expected error of an endpoint, small for the bright.
         used: (found,) which streaks the rate is from.
         rate: (3,) rad/s, camera frame, mean over the exposure, of the camera with respect to the stars; None
             when none.
@@ -62,6 +63,7 @@ class StreakResult:
     exposure: float
     length: float = float("nan")
     endpoints: FloatArray = field(default_factory=lambda: np.empty((0, 2, 2)))
+    sigma: FloatArray = field(default_factory=lambda: np.empty(0))
     used: BoolArray = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
     rate: FloatArray | None = None
     covariance: FloatArray | None = None
@@ -130,6 +132,7 @@ def _rate(
     seen = replace(
         seen,
         endpoints=streaks.endpoints,
+        sigma=streaks.sigma,
         used=np.zeros(len(streaks), dtype=np.bool_),
         length=float(np.median(streaks.lengths)) if len(streaks) else float("nan"),
     )

@@ -73,10 +73,13 @@ def our_answers(lists: Sequence[StarList], sky: SkyIndex) -> list[Answer]:
     return answers
 
 
-def peer_answers(peer: str, python: str, lists: Sequence[StarList]) -> tuple[list[Answer], float] | None:
-    """Return a peer's answers and its resident megabytes; None where it is not installed."""
+def peer_answers(peer: str, python: str, jobs: Sequence[dict[str, Any]]) -> tuple[list[Answer], float] | None:
+    """Return a peer's answers to jobs as `star_peers` takes them, and its resident megabytes.
+
+    None where it is not installed.
+    """
     with tempfile.NamedTemporaryFile("w", suffix=".json") as file:
-        json.dump([_told(drawn) for drawn in lists], file)
+        json.dump(jobs, file)
         file.flush()
         worker = Path(__file__).with_name("star_peers.py")
         done = subprocess.run(
@@ -226,7 +229,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
         shown = {
             name: lists[: _PEERS_RANDOM if "random" in name else None] for name, lists in everything.items()
         }
-        flat = [drawn for lists in shown.values() for drawn in lists]
+        flat = [_told(drawn) for lists in shown.values() for drawn in lists]
         said = peer_answers(peer, options.peer_python, flat)
         if said is None:
             continue

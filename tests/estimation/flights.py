@@ -44,8 +44,11 @@ class Flight:
     parameters: Parameters
 
 
-def fly(seed: int, cycles: int, suspended: bool) -> Flight:
-    """Return a flight with noise of the unit and of the coils, a gyro bias and a thread or a drag."""
+def fly(seed: int, cycles: int, suspended: bool, amplitude: float = 0.05) -> Flight:
+    """Return a flight with noise of the unit and of the coils, a gyro bias and a thread or a drag.
+
+    `amplitude` A is that of the currents.
+    """
     rng = np.random.default_rng(seed)
     world = SuspendedWorld(rng) if suspended else FreeWorld(rng)
     bias = rng.normal(0.0, 1e-3, 3)
@@ -61,7 +64,7 @@ def fly(seed: int, cycles: int, suspended: bool) -> Flight:
                 RateMeasurement(cycle * CYCLE_NS, felt, RATE_COVARIANCE),
             )
         )
-        swing = 0.05 * math.sin(0.015 * cycle)
+        swing = amplitude * math.sin(0.015 * cycle)
         command = np.array([swing, 0.0, 0.0]) if suspended else np.array([swing, -swing, 0.5 * swing])
         flight.commands.append(command)
         world.command(command)

@@ -113,16 +113,17 @@ def test_thread_and_coil_are_found_and_told_from_a_steady_torque() -> None:
 
 
 def test_about_the_thread_the_disturbance_is_what_the_believed_plant_leaves_out() -> None:
-    """Its sum with the believed thread's pull is the same for each belief."""
+    """The current by which each belief would hold the body against it is the one that does."""
     flight = fly(5, 400, True)
     filter_ = begin(flight, True)
     follow(filter_, flight)
     last = filter_.at(400 * CYCLE_NS)
-    for believed in (Parameters(), Parameters(0.01, 2e-3), last.parameters):
+    true = last.parameters
+    pull = true.torsion * last.angle + true.damping * last.rate[1] - last.disturbance[1]
+    for believed in (Parameters(), Parameters(0.01, 2e-3, 1.2), true):
         there = last.about_thread(believed)
-        total = there.disturbance - believed.torsion * there.angle - believed.damping * there.rate
-        pull = last.parameters.torsion * last.angle + last.parameters.damping * last.rate[1]
-        assert total == pytest.approx(last.disturbance[1] - pull, abs=1e-15)
+        against = believed.torsion * there.angle + believed.damping * there.rate - there.disturbance
+        assert against / believed.gain == pytest.approx(pull / true.gain, abs=1e-15)
         assert np.linalg.eigvalsh(there.covariance)[0] > 0.0
     assert last.about_thread().q2 == last.q2 == pytest.approx(abs(last.quaternion[1]) * np.sign(last.angle))
     own = last.about_thread(last.parameters)
@@ -211,6 +212,25 @@ def test_when_attitudes_disagree_for_a_second_it_is_the_filter_that_starts_anew(
     filter_.start(*flight.samples[90])
     follow(filter_, flight, 91)
     assert filter_.refused == 40
+
+
+def test_a_start_on_a_sample_from_before_the_release_is_given_up_at_once() -> None:
+    """A late line tells of the held body first; three rates that all disagree outweigh the one begun with."""
+    flight = fly(16, 40, True)
+    thrown = RateMeasurement(0, np.array([0.0, 0.3, 0.0]), RATE_COVARIANCE)
+    filter_ = AttitudeFilter(SUSPENDED, SETTINGS)
+    filter_.start(flight.samples[0][0], thrown)
+    for cycle in range(1, 5):
+        attitude, rate = flight.samples[cycle]
+        if filter_.started:
+            filter_.measure(attitude)
+            filter_.measure(rate)
+        else:
+            filter_.start(attitude, rate)
+    assert filter_.restarts == 1
+    follow(filter_, flight, 5)
+    last = filter_.at(39 * CYCLE_NS)
+    assert abs(last.rate[1] - flight.rates[39][1]) < 4.0 * np.sqrt(last.covariance[RATE, RATE][1, 1])
 
 
 def test_a_camera_that_is_wrong_for_ever_restarts_nothing() -> None:

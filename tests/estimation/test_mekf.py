@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flight.arrays import FloatArray
+from flight.estimation.latency import Motion
 from flight.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement, RateMeasurement
 from flight.estimation.mekf import (
     SIZE,
@@ -44,13 +47,14 @@ def moved(state: State, error: FloatArray) -> State:
         (state.disturbance[0] + e[9], state.disturbance[1] + e[10], state.disturbance[2] + e[11]),
         Parameters(*(p + d for p, d in zip(state.parameters, e[12:15], strict=True))),
         state.kept,
+        state.latency + e[15],
     )
 
 
 def difference(a: State, b: State) -> FloatArray:
-    """Return the error (15,) of b, by which it is off a."""
+    """Return the error (16,) of b, by which it is off a."""
     turn = logarithm(compose(a.quaternion, inverse(b.quaternion)))
-    mine, theirs = (np.array([*s.rate, *s.bias, *s.disturbance, *s.parameters]) for s in (a, b))
+    mine, theirs = (np.array([*s.rate, *s.bias, *s.disturbance, *s.parameters, s.latency]) for s in (a, b))
     return np.concatenate([turn, mine - theirs])
 
 
@@ -96,8 +100,11 @@ def test_the_rows_of_each_measurement_are_its_derivatives() -> None:
     earlier = compose(exponential(-0.25, 0.35, -0.15), STATE.quaternion)
     state = STATE._replace(kept=((exposure, earlier),))
     attitude = AttitudeMeasurement(10**9, np.array(STATE.quaternion), TURN_COVARIANCE)
-    for measurement in (attitude, RateMeasurement(10**9, np.zeros(3), RATE_COVARIANCE), exposure):
-        rows = innovation(state, measurement, False).rows
+    rate = RateMeasurement(10**9, np.zeros(3), RATE_COVARIANCE)
+    aged = (replace(attitude, latency=state.latency), replace(rate, latency=state.latency))
+    aging = Motion((0.02, -0.04, 0.03), np.zeros((3, 3)))
+    for measurement in (attitude, rate, exposure, *aged):
+        rows = innovation(state, measurement, False, aging).rows
         step = 1e-6
         for column in range(SIZE + 3):
             values = []
@@ -105,7 +112,7 @@ def test_the_rows_of_each_measurement_are_its_derivatives() -> None:
                 x, y, z = bump[SIZE:].tolist()
                 kept = ((exposure, compose(exponential(x, y, z), earlier)),)
                 there = moved(state, bump[:SIZE])._replace(kept=kept)
-                values.append(np.array(innovation(there, measurement, False).value))
+                values.append(np.array(innovation(there, measurement, False, aging).value))
             slope = (values[0] - values[1]) / (2.0 * step)
             np.testing.assert_allclose(rows[:, column], -slope, atol=1e-8)
 

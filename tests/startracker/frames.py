@@ -8,10 +8,12 @@ import numpy as np
 
 from flight import catalogue
 from flight.arrays import FloatArray, Image
+from flight.pinhole import Pinhole
 from flight.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
 from flight.startracker.build import default_index
 from flight.startracker.sky_index import SkyIndex
-from flight.vision.bound import rate_bound
+from flight.vision.bound import rate_bound, star_information
+from flight.vision.likelihood.motion import Motion
 from sim_hal.star_camera import StarCameraModel, render
 
 EPOCH = 2026.5
@@ -45,6 +47,37 @@ class SkyFrame:
         axis = self.rate / np.linalg.norm(self.rate)
         return float(np.sqrt(axis @ bound.covariance @ axis))
 
+    def attitude_bound(self, most: int = 60) -> FloatArray:
+        """Return the Cramer-Rao bound of the attitude at mid-exposure, covariance (3, 3) rad^2.
+
+        From the `most` brightest stars, whose places are independent: the shape of the point spread is known,
+        and the turn over the exposure, odd in time, tells nothing of its middle while the rate is constant.
+        """
+        camera = self.camera
+        floor = camera.read_noise**2 + camera.dark_current * self.exposure + 1.0 / 12.0
+        motion = Motion.steady(self.rate * self.exposure)
+        total = np.zeros((3, 3))
+        for star, light in zip(self.stars[:most], self.electrons[:most], strict=True):
+            # After the turn and the point spread: x, y, electrons, background.
+            alone = star_information(camera.pinhole, motion, star, float(light), camera.psf_sigma, floor)[
+                4:, 4:
+            ]
+            if not alone.any():
+                continue
+            place = (
+                alone[:2, :2] - alone[:2, 2:] @ np.linalg.pinv(alone[2:, 2:], hermitian=True) @ alone[2:, :2]
+            )
+            slope = _slope(camera.pinhole, star)
+            total += slope.T @ place @ slope
+        return np.asarray(np.linalg.inv(total), dtype=np.float64)
+
+
+def _slope(camera: Pinhole, star: FloatArray) -> FloatArray:
+    """Return d(pixel)/d(turn about the camera's axes), (2, 3) px/rad, by differences."""
+    direction = camera.unit_vectors(star)
+    step = 1e-5 * np.cross(np.eye(3), direction)
+    return np.asarray((camera.project(direction - step) - camera.project(direction + step)).T / 2e-5)
+
 
 def sky() -> SkyIndex:
     """Return the default index, of the frames' epoch."""
@@ -52,14 +85,18 @@ def sky() -> SkyIndex:
 
 
 def sky_frame(
-    rng: np.random.Generator, streak_px: float, exposure: float, camera: StarCameraModel = NARROW
+    rng: np.random.Generator,
+    streak_px: float,
+    exposure: float,
+    camera: StarCameraModel = NARROW,
+    theta_deg: tuple[float, float] = (30.0, 90.0),
 ) -> SkyFrame:
     """Return a random field of the real sky with streaks of about `streak_px` at the boresight.
 
-    The axis is 30 to 90 deg off the boresight.
+    The axis is as far off the boresight as `theta_deg` says, lowest to highest.
     """
     attitude = normalise(rng.standard_normal(4))
-    theta, roll = rng.uniform(np.radians(30.0), np.radians(90.0)), rng.uniform(0.0, 2.0 * np.pi)
+    theta, roll = rng.uniform(*np.radians(theta_deg)), rng.uniform(0.0, 2.0 * np.pi)
     axis = np.array([np.sin(theta) * np.cos(roll), np.sin(theta) * np.sin(roll), np.cos(theta)])
     turn = axis * streak_px / (camera.pinhole.focal_length * np.sin(theta))
     times = np.linspace(-0.5, 0.5, 3)

@@ -28,6 +28,6 @@ def identify(field: StarField, sky: KnownSky, settings: ClassicalSettings = DEFA
 
 def _propose(view: View, sky: KnownSky, settings: ClassicalSettings) -> Iterator[Candidates]:
     triangles = sorted(combinations(range(view.stars), 3), key=lambda corners: corners[::-1])
-    for corners in triangles[: settings.patterns]:
+    for corners in triangles[: settings.joins]:
         found = matching_triangles(view, sky, corners, settings.tolerance)
         yield Candidates(np.tile(corners, (len(found), 1)), found)

@@ -9,6 +9,7 @@ makes them rare.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import islice
 
 import numpy as np
 
@@ -29,7 +30,7 @@ def identify(field: StarField, sky: KnownSky, settings: ClassicalSettings = DEFA
 
 def propose(view: View, sky: KnownSky, settings: ClassicalSettings) -> Iterator[Candidates]:
     """Yield the pyramids that match, triangle by triangle."""
-    for corners in list(cycled_triangles(view.stars))[: settings.patterns]:
+    for corners in islice(cycled_triangles(view.stars), settings.joins):
         found = matching_triangles(view, sky, corners, settings.tolerance)
         if len(found):
             yield _pyramids(view, sky, corners, found, settings.tolerance)

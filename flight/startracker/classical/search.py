@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -40,6 +40,7 @@ class Candidates:
 
 _LEAST_BASE = 10.0
 """Of a candidate's first two stars, in sigmas of a direction."""
+_LEAST_JOINS = 4
 Propose = Callable[[View, KnownSky, ClassicalSettings], Iterator[Candidates]]
 
 
@@ -48,9 +49,10 @@ def search(field: StarField, sky: KnownSky, settings: ClassicalSettings, propose
 
     Raises FieldUnknown when the scale of the field is known too badly.
     """
-    steps = views(field, settings)
     if len(field) < settings.verification.least_matches:
         return nothing(field, Status.TOO_FEW_STARS)
+    steps = list(views(field, settings))
+    settings = replace(settings, joins=max(_LEAST_JOINS, settings.joins // len(steps)))
     for view in steps:
         spent = 0
         for candidates in propose(view, sky, settings):

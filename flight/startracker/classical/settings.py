@@ -14,7 +14,9 @@ class ClassicalSettings:
     Attributes:
         brightest: observed stars of which patterns are made.
         tolerance: of an angle, an area or a moment, in its sigmas.
-        patterns: pairs of stars, triangles or pivots that are looked up at most.
+        patterns: triangles or pivots that are looked up in a table at most.
+        joins: triangles made of pairs at most, over all scales together: each takes half a millisecond, and a
+            list of no sky takes them all.
         candidates: of all patterns together, that are laid over the field at most: the budget of work.
         screened: observed stars, the brightest, that a candidate is laid over before it is verified.
         verified: candidates of a pattern that the whole field verifies at most.
@@ -26,6 +28,7 @@ class ClassicalSettings:
     brightest: int = 11
     tolerance: float = 3.0
     patterns: int = 80
+    joins: int = 24
     candidates: int = 2500
     screened: int = 14
     verified: int = 4

@@ -1,0 +1,150 @@
+"""The stars in flight: honest attitudes from real skies, whether the flight knows where it looks or not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flight import config as configuration
+from flight.arrays import FloatArray
+from flight.quaternion import conjugate, from_rotation_vector, multiply, to_rotation_vector
+from flight.telemetry.reader import Run
+from sim_hal.emulators.serial_line import SOUND, LineFaults
+from tests.scenario.flights import Rigged, demo_config, event_names, fly
+
+_LOST, _TRACKED = 0, 1
+# Of three degrees of freedom, passed by chance once in 1e5; twice the sigma left to streaks of 300 px.
+_MOST_MISMATCH = 4.0 * 25.9
+
+
+def errors(run: Run) -> tuple[FloatArray, FloatArray]:
+    """Return the error (n, 3) of each star attitude against the truth, and its covariance (n, 3, 3)."""
+    stars, truth = run["stars"], run["truth"]
+    at = np.searchsorted(truth["time_ns"], stars["middle_ns"])
+    # The truth is told every 25 ms, on which the middle of the exposure falls.
+    np.testing.assert_array_equal(truth["time_ns"][at], stars["middle_ns"])
+    error = to_rotation_vector(multiply(stars["quaternion"], conjugate(truth["quaternion"][at])))
+    xx, yy, zz, xy, xz, yz = stars["covariance"].T
+    packed = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    return error, np.moveaxis(packed, -1, 0)
+
+
+def mismatch(run: Run) -> FloatArray:
+    """Return the squared error of each star attitude over its covariance, of three degrees of freedom."""
+    error, covariance = errors(run)
+    return np.asarray(np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance), error))
+
+
+def assert_solved(run: Run) -> None:
+    """Every attitude came from identified stars and is right, as its covariance has it."""
+    assert set(run["stars"]["status"].tolist()) == {b"solved"}
+    assert mismatch(run).max() < _MOST_MISMATCH
+
+
+def unit_silent(rigged: Rigged, begin: float, end: float) -> None:
+    """Have the inertial unit fall silent between two mission times; from before the flight if at none."""
+    wire = rigged.lock.line.to_host
+
+    def silence() -> None:
+        wire.faults = LineFaults(silent=True)
+
+    def speak() -> None:
+        wire.faults = SOUND
+
+    if begin <= 0.0:
+        silence()
+    else:
+        rigged.at(begin, silence)
+    rigged.at(end, speak)
+
+
+@pytest.fixture(scope="module")
+def demonstration(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """Fly the first 30 s: the release at 0.1 rad/s, streaks of 300 px, and rest on the first target."""
+    return fly(demo_config(30.0), tmp_path_factory.mktemp("stars"))
+
+
+def test_every_frame_of_the_demonstration_gives_an_attitude_that_the_estimate_takes(
+    demonstration: Run,
+) -> None:
+    stars = demonstration["stars"]
+    assert len(stars) == 6
+    assert_solved(demonstration)
+    assert (stars["tracked"] == _TRACKED).all()
+    assert stars["accepted"].all()
+    assert event_names(demonstration) == ["started", "target", "stopped"]
+    statuses = demonstration["streak"]["status"].tolist()
+    assert statuses[0] == b"rate", "streaks first"
+    assert statuses[-1] == b"too-short", "points at rest"
+
+
+def test_the_attitudes_of_the_demonstration_are_as_good_as_they_say(demonstration: Run) -> None:
+    """The mean square over the variance; about the thread, where alone the body is shaken, not too small."""
+    error, covariance = errors(demonstration)
+    about_thread = np.mean(error[:, 1] ** 2 / covariance[:, 1, 1])
+    assert 0.05 < about_thread < 4.0
+    assert mismatch(demonstration).mean() / 3.0 < 2.5
+    at_rest = np.degrees(np.linalg.norm(error[3:], axis=1)) * 3600.0
+    assert at_rest.max() < 10.0
+
+
+def test_a_flight_that_begins_blind_is_lost_in_space_and_finds_itself(tmp_path: Path) -> None:
+    """Without the unit there is no estimate to tell where to look, nor one that could take the attitude."""
+    run = fly(demo_config(8.0), tmp_path, lambda rigged: unit_silent(rigged, 0.0, 4.0))
+    assert_solved(run)
+    assert run["stars"]["tracked"].tolist() == [_LOST, _TRACKED]
+    assert run["stars"]["accepted"].tolist() == [0, 1]
+
+
+def test_after_a_blackout_the_first_frame_is_found_anywhere_and_the_next_is_tracked(tmp_path: Path) -> None:
+    """Ten seconds of dark and of silence: the model alone no longer knows where the camera looks."""
+
+    def prepare(rigged: Rigged) -> None:
+        unit_silent(rigged, 4.0, 18.0)
+        camera = rigged.lock.hardware.camera
+        rigged.at(4.0, lambda: setattr(camera, "fault", "black"))
+        rigged.at(14.0, lambda: setattr(camera, "fault", ""))
+
+    run = fly(demo_config(23.0), tmp_path, prepare)
+    names = event_names(run)
+    assert names.index("camera-black") < names.index("control-regained")
+    assert_solved(run)
+    stars = run["stars"]
+    assert stars["sequence"].tolist() == [1, 4, 5], "black frames show no stars"
+    assert stars["tracked"].tolist() == [_TRACKED, _LOST, _TRACKED]
+    assert stars["accepted"][-1]
+
+
+def test_a_camera_knocked_out_of_place_is_found_out_and_misleads_nobody(tmp_path: Path) -> None:
+    """Its stars are identified, in another place than expected, and their attitude is refused and told."""
+
+    def knock(rigged: Rigged) -> None:
+        camera = rigged.lock.hardware.camera
+        assert camera is not None
+        off = from_rotation_vector(np.radians([0.0, 3.0, 0.0]))
+        camera._mounting = multiply(off, camera._mounting)
+
+    run = fly(demo_config(18.0), tmp_path, lambda rigged: rigged.at(8.0, lambda: knock(rigged)))
+    stars = run["stars"]
+    assert set(stars["status"].tolist()) == {b"solved"}
+    assert stars["accepted"].tolist() == [1, 1, 0, 0]
+    assert stars["tracked"].tolist() == [_TRACKED, _TRACKED, _LOST, _LOST]
+    error, _ = errors(run)
+    assert np.degrees(error[2:, 1]) == pytest.approx([3.0, 3.0], abs=0.01)
+    assert event_names(run).count("stars-refused") == 2
+    angle = 2.0 * np.arcsin(run["truth"]["quaternion"][-1, 1])
+    assert run["control"]["angle"][-1] == pytest.approx(angle, abs=np.radians(0.2))
+
+
+def test_the_thesis_s_corner_detectors_fly_with_the_stars_too(tmp_path: Path) -> None:
+    config = demo_config(13.0)
+    assert config.camera is not None
+    camera = configuration.replace(config.camera, estimator="harris")
+    run = fly(configuration.replace(config, camera=camera), tmp_path)
+    assert_solved(run)
+    assert run["stars"]["accepted"].all()
+    assert run["streak"]["status"].tolist() == [b"rate", b"rate", b"too-short"]
+    assert run["streak"]["accepted"].tolist() == [1, 1, 0]
+    assert event_names(run) == ["started", "target", "stopped"]
