@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from flight import report
 from flight.telemetry.reader import Run, read_run
@@ -120,7 +121,8 @@ def test_the_streak_rates_are_right_and_enter_the_estimate(demonstration: tuple[
     mean = (np.interp(start + 1e9, truth_time, angle) - np.interp(start, truth_time, angle)) / 1.0
     error = streaks["rate"][:, 1] - mean
     assert np.abs(error / mean).max() < 0.01
-    assert np.mean(error**2 / streaks["covariance"][:, 1]) < 3.0
+    # Chi-square of as many rates, by chance beyond one time in ten thousand.
+    assert np.sum(error**2 / streaks["covariance"][:, 1]) < chi2.ppf(1.0 - 1e-4, len(streaks))
 
 
 @pytest.mark.slow
