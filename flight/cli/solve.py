@@ -26,6 +26,7 @@ from flight.pinhole import Pinhole
 from flight.settings import Camera
 from flight.startracker import sky_index
 from flight.startracker.build import default_index
+from flight.startracker.classical.methods import DEFAULT_METHOD, METHODS, method_of
 from flight.startracker.detection import DetectionSettings
 from flight.startracker.pointing import Pointing
 from flight.startracker.sky_index import SkyIndex
@@ -67,6 +68,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--date", type=_date, metavar="UTC", help="when, such as 2026-11-21: proper motion, aberration"
     )
     parser.add_argument("--index", type=Path, metavar="FILE", help="another sky index")
+    parser.add_argument(
+        "--method",
+        choices=tuple(METHODS),
+        default=DEFAULT_METHOD,
+        help="of identification; all but the default want the field to 1.8 %%: see --fov-error",
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--overlay", type=Path, metavar="PNG", help="draw what was found on the picture")
     parser.set_defaults(command=run)
@@ -80,6 +87,8 @@ def run(options: argparse.Namespace) -> int:
     if options.date is not None:
         sky = sky.at(options.date.year)
         settings = replace(settings, velocity=earth_velocity(options.date.julian_date))
+    if options.method != DEFAULT_METHOD:
+        settings = replace(settings, method=method_of(options.method))
     prior = None if options.prior is None else RatePrior(np.array(options.prior), 0.0)
     begin = time.perf_counter()
     solution = solve_frame(pixels, camera, scale, exposure or 1.0, sky, settings, rate_prior=prior)

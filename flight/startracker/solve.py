@@ -7,6 +7,7 @@ tells where to look, only there, and the whole sky if that fails. The attitude i
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -59,12 +60,14 @@ class SolveSettings:
         detection: of points.
         likelihood: of streaks.
         identification: of both.
+        method: of identification, in place of the default one.
         velocity: (3,) m/s of the camera about the Sun, for aberration; None leaves it out.
     """
 
     detection: DetectionSettings = field(default_factory=DetectionSettings)
     likelihood: LikelihoodSettings = field(default_factory=LikelihoodSettings)
     identification: IdentificationSettings = field(default_factory=IdentificationSettings)
+    method: Callable[[StarField, SkyIndex], Identification] | None = None
     velocity: FloatArray | None = None
 
 
@@ -248,6 +251,8 @@ def _identify(
         near = track(stars, sky, prior.quaternion, prior.sigma)
         if near.status is Status.IDENTIFIED:
             return _told(replace(seen, tracked=True), near, sky, settings)
+    if settings.method is not None:
+        return _told(seen, settings.method(stars, sky), sky, settings)
     return _told(seen, identify(stars, sky, settings.identification), sky, settings)
 
 

@@ -70,6 +70,17 @@ def test_the_date_takes_aberration_off(picture: Path) -> None:
     assert 2.0 < moved < 21.0
 
 
+def test_a_classical_method_finds_the_same_place(picture: Path) -> None:
+    default = json.loads(command("solve", picture, "--fov", "12", "--json").stdout)
+    done = command("solve", picture, "--fov", "12", "--fov-error", "0.1", "--method", "pyramid", "--json")
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)["quaternion"]
+    assert angle_between(np.array(found), np.array(default["quaternion"])) < np.radians(5.0 / 3600.0)
+    unknown = command("solve", picture, "--method", "pyramid")
+    assert unknown.returncode != 0
+    assert "Traceback" not in unknown.stderr
+
+
 def test_bare_pixels_behind_a_header_are_read(resting: SkyFrame, tmp_path: Path) -> None:
     path = tmp_path / "frame.raw"
     path.write_bytes(b"a header of some bytes" + resting.pixels.astype("<u2").tobytes())

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flight.arrays import FloatArray
+from flight.estimation.estimate import ThreadEstimate as Estimate
 from flight.plant import SingleAxisPlant
 
 ANGLE, RATE = 0, 1
@@ -40,26 +41,6 @@ class Measurement:
     def begin_ns(self) -> int:
         """The first time it says something about."""
         return self.time_ns if self.since_ns is None else self.since_ns
-
-
-@dataclass(frozen=True, slots=True)
-class Estimate:
-    """The state about the thread at `time_ns`: rad, rad/s, rad/s^2, and its covariance (3, 3).
-
-    `measured_ns` is the time of the newest measurement in it: its age says whether to trust it.
-    """
-
-    time_ns: int
-    angle: float
-    rate: float
-    disturbance: float
-    covariance: FloatArray
-    measured_ns: int
-
-    @property
-    def q2(self) -> float:
-        """The second quaternion component."""
-        return math.sin(0.5 * self.angle)
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,6 +17,7 @@ from flight.startracker.classical import (
 from flight.startracker.classical.known_sky import KnownSky
 from flight.startracker.field import StarField
 from flight.startracker.identification import Identification
+from flight.startracker.sky_index import SkyIndex
 
 DEFAULT_METHOD = "default"
 
@@ -37,6 +38,16 @@ class Method:
 
 def _default(field: StarField, sky: KnownSky) -> Identification:
     return lost_in_space.identify(field, sky.index)
+
+
+def method_of(name: str) -> Callable[[StarField, SkyIndex], Identification]:
+    """Return the method `name` of METHODS as `SolveSettings` takes it: its tables are made for each field."""
+    method = METHODS[name]
+
+    def identify(field: StarField, index: SkyIndex) -> Identification:
+        return method.identify(field, KnownSky(index, field.half_width))
+
+    return identify
 
 
 METHODS: dict[str, Method] = {

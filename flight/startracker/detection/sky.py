@@ -18,7 +18,6 @@ from flight.vision.background import estimate_background
 
 Float32Array = npt.NDArray[np.float32]
 
-KERNEL_SUM = 16.0
 KERNEL_NORM = 6.0
 """Root of the sum of squares of the smoothing kernel: the noise of white noise of 1."""
 LEAST_SIDE = 16
