@@ -14,6 +14,9 @@ from flight.vision.likelihood.frame_scan import frame_angles
 from flight.vision.likelihood.matched_filter import find_faint
 from flight.vision.likelihood.motion import Motion
 from flight.vision.likelihood.settings import LikelihoodSettings
+from sim_hal.star_camera import StarCameraModel
+from tests.campaigns import failures
+from tests.campaigns.scenes import FIELD
 from tests.likelihood.scenes import CAMERA, SATURATION, Scene, real_sky
 
 _SETTINGS = LikelihoodSettings(saturation=SATURATION)
@@ -81,6 +84,16 @@ def test_pieces_of_streaks_form_chains_and_whole_ones_do_not() -> None:
     in_pieces = in_chains(CAMERA.pinhole, Motion.steady(0.4 * turn), pieces.stars, pieces.light)
     assert np.mean(in_whole) < 0.3
     assert np.mean(in_pieces[:20]) > 0.6
+
+
+def test_a_turn_that_only_streaks_cut_by_the_border_agree_on_is_not_believed() -> None:
+    """Run 216 of the campaign `failures`, seed 2026: 1.37 of the turn fits all but the whole streaks."""
+    case = failures.cases(217, 2026)[216]
+    camera = StarCameraModel(field_of_view=FIELD)
+    scene, _ = failures.expose(case, camera)
+    settings = LikelihoodSettings(saturation=float(camera.highest_count), gain=camera.gain)
+    found = estimate_motion(scene.pixels, camera.pinhole, scene.exposure, settings, scene.rate, 0.0)
+    assert found.rate is None or np.linalg.norm(found.rate - scene.rate) < 0.003 * np.linalg.norm(scene.rate)
 
 
 def test_the_covariance_is_that_of_the_errors() -> None:

@@ -9,6 +9,7 @@ import numpy as np
 from flight.vision.likelihood.chains import in_chains
 from flight.vision.likelihood.ends import true_ends, unbroken
 from flight.vision.likelihood.matched_filter import FaintStars
+from flight.vision.likelihood.motion import paths
 from flight.vision.likelihood.rounds import ExposedCamera
 from flight.vision.likelihood.scene import Scene, window_times
 
@@ -18,6 +19,8 @@ _MOST_CHAINED = 0.45
 _TRUE_ENDS = (0.75, 0.6)
 # Share of the stars that are dark along a good part of their path, which one may be for reasons of its own.
 _BROKEN = (0.12, 0.35)
+# Share of the light of streaks that lie in the frame from end to end which the motion must have on its side.
+_WHOLE_LIGHT = 0.5
 
 
 class Wholeness(Enum):
@@ -32,7 +35,8 @@ def wholeness(camera: ExposedCamera, scene: Scene, faint: FaintStars) -> Wholene
     """Return whether the stars that decide are as long as their light; doubted when some of them are not.
 
     In a crowded frame what passes for a star may be several: a few that are dark here or there do not speak
-    against the motion, but ask for another witness.
+    against the motion, but ask for another witness. So does a motion that most of the streaks disown which
+    show both ends, the only ones that tell by what angle the stars turned.
     """
     stars = np.concatenate([scene.stars, faint.stars])
     light = np.concatenate([scene.light, faint.light])
@@ -50,4 +54,16 @@ def wholeness(camera: ExposedCamera, scene: Scene, faint: FaintStars) -> Wholene
     ):
         if right < least_ends or dark > max(1.0, most_broken * len(lit)):
             return worst
-    return Wholeness.WHOLE
+    return Wholeness.DOUBTED if _disowned(camera, scene) else Wholeness.WHOLE
+
+
+def _disowned(camera: ExposedCamera, scene: Scene) -> bool:
+    """Tell whether most light of the bright streaks that show both ends is not of stars that agree."""
+    times = window_times(camera.pinhole, scene.motion, camera.shutter, scene.stars)
+    inside = np.ones(len(scene.stars), dtype=np.bool_)
+    for time in times.T:
+        inside &= camera.pinhole.contains(paths(camera.pinhole, scene.motion, scene.stars, time).position)
+    # Fainter stars were never asked.
+    bright = inside & (scene.light >= scene.light[scene.trusted].min())
+    light = scene.light[bright]
+    return float(light[scene.trusted[bright]].sum()) < _WHOLE_LIGHT * float(light.sum())
