@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import zlib
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import chain, islice
 
 import numpy as np
 
@@ -89,26 +89,27 @@ def estimate_motion(
 
 def _told(camera: ExposedCamera, seen: MotionResult, blobs: Blobs, near: float | None) -> MotionResult | None:
     """Return what the first motion that stands every test says, else the likeliest; None without one."""
-    candidates: list[_Told] = []
-    for first in islice(first_fits(camera, blobs, near), _MOST_MOTIONS):
-        said = _fitted(camera, seen, first)
-        if said.whole is Wholeness.WHOLE and not any(other.stands for other in candidates):
-            return said.result
-        candidates.append(said)
-    if not candidates:
+    rivals = islice(first_fits(camera, blobs, near), _MOST_MOTIONS)
+    first = next(rivals, None)
+    if first is None:
         return None
-    # The axis is often right, known well from pieces of streaks, where the angle is not. A doubted motion to
-    # which the light of the whole frame leads again has two witnesses.
-    angles = frame_angles(camera.frame, camera.pinhole, candidates[0].turn, _MOST_ANGLES)
-    for said in candidates:
-        if said.stands and _witnessed(said.turn, angles):
-            return said.result
-    for first in rescanned_fits(camera, candidates[0].turn, angles):
-        said = _fitted(camera, seen, first)
+    leading = _fitted(camera, seen, first)
+    if leading.whole is Wholeness.WHOLE:
+        return leading.result
+    # A doubted motion to which the light of the whole frame leads again has two witnesses. To ask it costs
+    # less than to fit a rival, and the axis is often right, known well from pieces of streaks, where the
+    # angle is not.
+    angles = frame_angles(camera.frame, camera.pinhole, leading.turn, _MOST_ANGLES)
+    if leading.stands and _witnessed(leading.turn, angles):
+        return leading.result
+    candidates = [leading]
+    for fit in chain(rescanned_fits(camera, leading.turn, angles), rivals):
+        said = _fitted(camera, seen, fit)
         again = any(other.stands and alike(said.turn, other.turn) for other in candidates)
         if said.whole is Wholeness.WHOLE or (said.stands and (again or _witnessed(said.turn, angles))):
             return said.result
-    return replace(candidates[0].result, status=StreakStatus.FAILED, rate=None, covariance=None)
+        candidates.append(said)
+    return replace(leading.result, status=StreakStatus.FAILED, rate=None, covariance=None)
 
 
 def _witnessed(turn: FloatArray, angles: list[float]) -> bool:
