@@ -32,12 +32,17 @@ def apart(azimuth: FloatArray, other: FloatArray) -> FloatArray:
     return np.asarray(np.abs(np.remainder(azimuth[:, None] - other + np.pi, 2.0 * np.pi) - np.pi))
 
 
-def in_chains(pinhole: Pinhole, motion: Motion, stars: FloatArray, light: FloatArray) -> BoolArray:
-    """Tell which stars (n, 2) of `light` (n,) have another like them before or behind on their circle."""
+def in_chains(
+    pinhole: Pinhole, motion: Motion, stars: FloatArray, light: FloatArray, asked: int | None = None
+) -> BoolArray:
+    """Tell which stars (n, 2) of `light` (n,) have another like them before or behind on their circle.
+
+    Only the first `asked` of them are told of, when that is given.
+    """
     polar, azimuth = circles(pinhole, motion, stars)
-    turns = apart(azimuth, azimuth) / max(float(np.linalg.norm(motion.turn)), 1e-12)
-    aside = np.abs(polar[:, None] - polar) * pinhole.focal_length
-    ratio = light[:, None] / np.maximum(light, 1e-9)
+    turns = apart(azimuth[:asked], azimuth) / max(float(np.linalg.norm(motion.turn)), 1e-12)
+    aside = np.abs(polar[:asked, None] - polar) * pinhole.focal_length
+    ratio = light[:asked, None] / np.maximum(light, 1e-9)
     joined = (aside < _ASIDE) & (turns > _NEXT[0]) & (turns < _NEXT[1])
     return np.asarray((joined & (ratio < _ALIKE) & (ratio > 1.0 / _ALIKE)).any(axis=1))
 

@@ -9,7 +9,7 @@ import numpy as np
 from flight.arrays import BoolArray, FloatArray, IntArray
 from flight.vision.likelihood.agreement import disagreement, opinions
 from flight.vision.likelihood.matched_filter import FaintStars
-from flight.vision.likelihood.motion import paths, sensitivities
+from flight.vision.likelihood.motion import positions, sensitivities
 from flight.vision.likelihood.normal_equations import ALONE, Evaluation
 from flight.vision.likelihood.result import MotionResult
 from flight.vision.likelihood.rounds import ExposedCamera, Fit
@@ -40,7 +40,7 @@ def with_stars(seen: MotionResult, camera: ExposedCamera, last: Fit) -> MotionRe
     geometry = joint[:, _GEOMETRY[:, None], _GEOMETRY]
     endpoints, covariances = np.empty((n, 2, 2)), np.empty((n, 2, 2, 2))
     for end, times in enumerate(_times(camera, scene, scene.stars).T):
-        endpoints[:, end] = paths(camera.pinhole, scene.motion, scene.stars, times).position
+        endpoints[:, end] = positions(camera.pinhole, scene.motion, scene.stars, times)
         change = sensitivities(camera.pinhole, scene.motion, scene.stars, times)
         covariances[:, end] = change @ geometry @ change.swapaxes(1, 2)
     used = scene.trusted
@@ -98,7 +98,7 @@ def with_rate(told: MotionResult, camera: ExposedCamera, last: Fit, whole: Whole
 def with_faint(told: MotionResult, camera: ExposedCamera, scene: Scene, faint: FaintStars) -> MotionResult:
     """Return `told` with the streaks that were only found along the motion."""
     times = _times(camera, scene, faint.stars)
-    ends = [paths(camera.pinhole, scene.motion, faint.stars, time).position for time in times.T]
+    ends = [positions(camera.pinhole, scene.motion, faint.stars, time) for time in times.T]
     return replace(
         told,
         faint_endpoints=np.stack(ends, axis=1),

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flight.arrays import BoolArray, Image, IntArray
-from flight.vision.background import estimate_background
+from flight.vision.background import at_least, estimate_background
 from flight.vision.segmentation import positions
 
 Float32Array = npt.NDArray[np.float32]
@@ -53,7 +53,7 @@ def expose_frame(pixels: Image, saturation: float | None, gain: float) -> Expose
     np.subtract(pixels, signal, out=signal)
     floor = background.map(np.square(background.noise))
     top = saturation_count(pixels) if saturation is None else saturation
-    bad = pixels >= top
+    bad = at_least(pixels, top)
     hot = find_hot_pixels(signal, floor)
     signal[hot] = 0.0
     bad[hot] = True

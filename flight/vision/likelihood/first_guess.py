@@ -19,7 +19,7 @@ from flight.pinhole import Pinhole
 from flight.vision.likelihood.angle_scan import SCANNED_STARS, Circles, scan_angles
 from flight.vision.likelihood.blobs import Blobs
 from flight.vision.likelihood.exposed_frame import ExposedFrame
-from flight.vision.likelihood.motion import Motion, paths
+from flight.vision.likelihood.motion import image_flow
 
 _PROPOSERS = 16
 _PARALLEL = 1e-9
@@ -82,13 +82,6 @@ def guess_axis(blobs: Blobs, pinhole: Pinhole) -> tuple[FloatArray, BoolArray] |
         rows = equation[agree] / np.maximum(speed * tolerance[agree], 1e-9)[:, None]
         axis = np.linalg.svd(rows)[2][-1]
     return axis, agree
-
-
-def image_flow(pinhole: Pinhole, points: FloatArray) -> FloatArray:
-    """Return B (n, 2, 3), px per rad: the velocity of stars at `points` (n, 2) is B times the turn."""
-    rest = np.zeros(len(points))
-    columns = [paths(pinhole, Motion.steady(unit), points, rest).velocity for unit in np.eye(3)]
-    return np.stack(columns, axis=-1)
 
 
 def _turning(axes: FloatArray, equation: FloatArray, flow: FloatArray) -> FloatArray:
@@ -173,10 +166,7 @@ def _arcs(blobs: Blobs, pinhole: Pinhole, axis: FloatArray) -> _Arcs:
     square = np.bincount(owner, light * azimuth**2, n) / flux - mean**2
     height = np.bincount(owner, light * z, n) / flux
     speed = np.linalg.norm(image_flow(pinhole, blobs.centre) @ axis, axis=-1)
-    order = np.lexsort((azimuth, owner))
-    start = np.searchsorted(owner[order], np.arange(n))
-    stop = np.append(start[1:], len(owner)) - 1
-    low, high = order[start], order[stop]
+    low, high = _outermost(azimuth, owner, n)
     # A uniform arc has its length squared over twelve, and the point spread's own variance.
     width = np.sqrt(np.maximum(12.0 * (square - 1.1 / np.maximum(speed, 1.0) ** 2), 0.0))
     return _Arcs(
@@ -190,6 +180,18 @@ def _arcs(blobs: Blobs, pinhole: Pinhole, axis: FloatArray) -> _Arcs:
         _at_border(blobs, pinhole, low),
         _at_border(blobs, pinhole, high),
     )
+
+
+def _outermost(azimuth: FloatArray, owner: IntArray, n: int) -> tuple[IntArray, IntArray]:
+    """Return which pixel of each of `n` regions has the lowest azimuth, and which the highest."""
+    order = np.argsort(owner.astype(np.int16), kind="stable")
+    theirs, whose = azimuth[order], owner[order]
+    start = np.searchsorted(whose, np.arange(n))
+    found = []
+    for extreme in (np.minimum.reduceat(theirs, start), np.maximum.reduceat(theirs, start)):
+        pixel = np.flatnonzero(theirs == extreme[whose])
+        found.append(order[pixel[np.searchsorted(whose[pixel], np.arange(n))]])
+    return found[0], found[1]
 
 
 def _at_border(blobs: Blobs, pinhole: Pinhole, pixel: IntArray) -> BoolArray:

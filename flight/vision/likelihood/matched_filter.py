@@ -33,6 +33,9 @@ _ROUNDING = 30.0
 _PASSES = 3
 _RIDGE = 0.01
 _TINY = 1e-6
+# Heights are solved for to this part of them, by so many conjugate gradients at most.
+_SOLVED = 1e-4
+_MOST_GRADIENTS = 200
 # Shorter streaks, px, are no lines that a filter could follow.
 _LEAST_LENGTH = 6.0
 # The part of a streak's light that falls in the three pixels across.
@@ -156,34 +159,76 @@ def _given(
     height: FloatArray,
 ) -> FloatArray:
     """Return what stars (k,) of `height` put at the flat places (p,), ascending."""
-    columns = held.light.shape[1]
-    first = np.searchsorted(place, (row.astype(int) - FARTHEST + 1) * columns)
-    count = np.searchsorted(place, (row.astype(int) + FARTHEST + 1) * columns) - first
-    star = np.repeat(np.arange(len(row)), count)
-    which = np.arange(len(star)) + np.repeat(first - np.cumsum(count) + count, count)
-    at_row, at_column = np.divmod(place[which], columns)
-    near = np.flatnonzero(np.abs(at_column - column[star]) < grid.length)
-    star, which, at_row, at_column = star[near], which[near], at_row[near], at_column[near]
-    common = shared(at_column, column[star], held.span[at_row], grid.length)
-    across = profile((at_row - row[star]) * ACROSS)
-    return np.asarray(np.bincount(which, height[star] * common * across, len(place)), dtype=float)
+    rows, columns = held.light.shape
+    # On each circle near a star's its response is one stretch of places.
+    circle = row.astype(np.int64)[:, None] + np.arange(1 - FARTHEST, FARTHEST + 1)
+    weight = height[:, None] * profile((circle - row[:, None]) * ACROSS)
+    weight = np.where((circle >= 0) & (circle < rows), weight, 0.0)
+    circle = np.clip(circle, 0, rows - 1)
+    low = np.maximum(np.ceil(column - grid.length), 0.0).astype(np.int64)
+    high = np.minimum(np.floor(column + grid.length), columns - 1.0).astype(np.int64)
+    first = np.searchsorted(place, (circle * columns + low[:, None]).reshape(-1))
+    count = np.searchsorted(place, (circle * columns + high[:, None]).reshape(-1), side="right") - first
+    told = np.flatnonzero((count > 0) & (weight.reshape(-1) > 0.0))
+    first, count = first[told], count[told]
+    which = np.arange(count.sum()) + np.repeat(first - np.cumsum(count) + count, count)
+    circle = circle.reshape(-1)[told]
+    star = told // weight.shape[1]
+    at = (place[which] - np.repeat(circle * columns, count)).astype(np.float64)
+    common = shared(
+        at, np.repeat(column[star], count), np.repeat(held.span[circle], count, axis=0), grid.length
+    )
+    common *= np.repeat(weight.reshape(-1)[told], count)
+    return np.asarray(np.bincount(which, common, len(place)), dtype=float)
 
 
 def _heights(held: RunningSums, row: FloatArray, column: FloatArray, grid: PolarGrid) -> FloatArray:
     """Return the heights (k,) whose overlapping responses best give what is `held` at the stars' places."""
     middle = np.rint(row).astype(int)
-    one, other = np.nonzero(
-        (np.abs(column[:, None] - column) < grid.length) & (np.abs(row[:, None] - row) < FARTHEST)
-    )
-    overlap = np.zeros((len(row), len(row)))
+    one, other = _neighbours(row, column, grid.length)
     span = held.span[middle]
     common = np.stack(
         [np.maximum(span[one, 0], span[other, 0]), np.minimum(span[one, 1], span[other, 1])], axis=-1
     )
-    overlap[one, other] = shared(column[one], column[other], common, grid.length)
-    overlap[one, other] *= profile((row[one] - row[other]) * ACROSS)
+    overlap = shared(column[one], column[other], common, grid.length) * profile(
+        (row[one] - row[other]) * ACROSS
+    )
     # A ridge, for stars that almost coincide; the scale it takes from all others is given back.
-    overlap[np.diag_indices(len(row))] *= 1.0 + _RIDGE
-    overlap[np.diag_indices(len(row))] += _TINY
-    seen = held.light[middle, _wrapped(column, held.light)]
-    return np.asarray(np.linalg.solve(overlap, (1.0 + _RIDGE) * seen))
+    overlap[one == other] *= 1.0 + _RIDGE
+    overlap[one == other] += _TINY
+    seen = (1.0 + _RIDGE) * held.light[middle, _wrapped(column, held.light)].astype(np.float64)
+    return _solved(one, other, overlap, seen)
+
+
+def _neighbours(row: FloatArray, column: FloatArray, length: float) -> tuple[IntArray, IntArray]:
+    """Return the pairs of stars (k,), each with itself among them, whose responses may overlap."""
+    order = np.argsort(row, kind="stable")
+    first = np.searchsorted(row[order], row - FARTHEST, side="right")
+    count = np.searchsorted(row[order], row + FARTHEST) - first
+    one = np.repeat(np.arange(len(row)), count)
+    other = order[np.arange(len(one)) + np.repeat(first - np.cumsum(count) + count, count)]
+    near = np.flatnonzero(np.abs(column[one] - column[other]) < length)
+    return one[near], other[near]
+
+
+def _solved(one: IntArray, other: IntArray, overlap: FloatArray, right: FloatArray) -> FloatArray:
+    """Return the solution (k,) of the equations whose elements `overlap` (e,) stand at `one`, `other`.
+
+    Conjugate gradients: each star meets few others.
+    """
+    k = len(right)
+    scale = 1.0 / np.sqrt(overlap[one == other])
+    matrix = overlap * scale[one] * scale[other]
+    x, residual = np.zeros(k), right * scale
+    direction, size = residual, float(residual @ residual)
+    enough = _SOLVED**2 * size
+    for _ in range(_MOST_GRADIENTS):
+        if size <= enough:
+            break
+        image = np.bincount(one, matrix * direction[other], k)
+        length = size / float(direction @ image)
+        x = x + length * direction
+        residual = residual - length * image
+        size, before = float(residual @ residual), size
+        direction = residual + size / before * direction
+    return np.asarray(x * scale)

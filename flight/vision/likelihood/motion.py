@@ -8,7 +8,6 @@ A star is named by its pixel at mid-exposure.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,25 +56,29 @@ class Paths:
 
 def paths(pinhole: Pinhole, motion: Motion, stars: FloatArray, time: FloatArray) -> Paths:
     """Return where the stars that are at pixels `stars` (m, 2) at mid-exposure are at `time` (m,)."""
-    x, y, z = _rotated(motion, _columns(pinhole, stars), time)
-    focal = pinhole.focal_length
+    v = _rotated(motion, _directions(pinhole, stars), time)
     w = _rate(motion, time)
-    vx, vy, vz = _cross((x, y, z), w)  # -omega x v
-    ax, ay, az = _cross((vx, vy, vz), w)
+    velocity = _cross(v, w)  # -omega x v
+    acceleration = _cross(velocity, w)
     if not motion.constant:
-        extra = _cross((x, y, z), tuple(motion.growth))
-        ax, ay, az = ax + extra[0], ay + extra[1], az + extra[2]
-    inverse = 1.0 / z
-    px, py = x * inverse, y * inverse
-    qx, qy = (vx - px * vz) * inverse, (vy - py * vz) * inverse
-    rx = (ax - px * az - 2.0 * qx * vz) * inverse
-    ry = (ay - py * az - 2.0 * qy * vz) * inverse
-    centre = pinhole.centre
-    return Paths(
-        np.stack([focal * px + centre[0], focal * py + centre[1]], axis=-1),
-        focal * np.stack([qx, qy], axis=-1),
-        focal * np.stack([rx, ry], axis=-1),
-    )
+        acceleration += _cross(v, motion.growth[:, None])
+    focal = pinhole.focal_length
+    inverse = 1.0 / v[2]
+    there = v[:2] * inverse
+    pace = (velocity[:2] - there * velocity[2]) * inverse
+    bent = (acceleration[:2] - there * acceleration[2] - 2.0 * pace * velocity[2]) * inverse
+    return Paths(_pixels(pinhole, there), (focal * pace).T, (focal * bent).T)
+
+
+def positions(pinhole: Pinhole, motion: Motion, stars: FloatArray, time: FloatArray) -> FloatArray:
+    """Return the positions (m, 2) of `paths`, and nothing else."""
+    v = _rotated(motion, _directions(pinhole, stars), time)
+    return _pixels(pinhole, v[:2] / v[2])
+
+
+def image_flow(pinhole: Pinhole, points: FloatArray) -> FloatArray:
+    """Return B (n, 2, 3), px per rad: the velocity of stars at `points` (n, 2) is B times the turn."""
+    return _flow(pinhole, _directions(pinhole, points)[:2]).transpose(2, 0, 1)
 
 
 def sensitivities(
@@ -86,92 +89,95 @@ def sensitivities(
     Exact in the turn and the star; in the growth to second order of the angle turned, and left zero unless
     `growing`.
     """
-    v = _rotated(motion, _columns(pinhole, stars), time)
-    focal = pinhole.focal_length
-    x, y, z = v
-    scale = focal / z
-    px, py = x / z * scale, y / z * scale
-    out = np.zeros((len(time), 2, 8))
+    v = _rotated(motion, _directions(pinhole, stars), time)
+    there = v[:2] / v[2]
+    out = np.zeros((2, 8, len(time)))
+    # A change of turn or growth is a small rotation psi against the camera, the integral of the rotation from
+    # t' to t over t'. It moves the star by v x psi: the flow of its place, times psi.
+    flow = _flow(pinhole, there)
+    # The mean rate since mid-exposure: what changes beyond it is of higher order.
+    mean = motion.turn[:, None] + 0.5 * time * motion.growth[:, None]
+    angle = np.sqrt(np.sum(mean * mean, axis=0))
+    axis = mean / np.maximum(angle, _TINY)
+    phi = angle * time
+    sine = time * np.sinc(phi / np.pi)
+    versine = 0.5 * time * phi * np.sinc(0.5 * phi / np.pi) ** 2
+    about = _cross(flow, axis)
+    out[:, :3] = sine * flow - versine * about
+    out[:, :3] += (((time - sine) * np.sum(flow * axis, axis=1))[:, None]) * axis
+    if growing:
+        out[:, 3:6] = (0.5 * time**2) * flow - (time**3 / 6.0 * angle) * about
+    for column, unit in ((6, np.array([[1.0], [0.0], [0.0]])), (7, np.array([[0.0], [1.0], [0.0]]))):
+        beside = _rotated(motion, unit, time)
+        out[:, column] = (beside[:2] - there * beside[2]) / v[2]
+    return out.transpose(2, 0, 1)
 
-    def put(column: int, change: _Vector) -> None:
-        out[:, 0, column] = change[0] * scale - px * change[2]
-        out[:, 1, column] = change[1] * scale - py * change[2]
 
-    for column, psi in _attitude_changes(motion, time, growing):
-        put(column, _cross(v, psi))
-    one, none = np.full(len(time), 1.0 / focal), np.zeros(len(time))
-    put(6, _rotated(motion, (one, none, none), time))
-    put(7, _rotated(motion, (none, one, none), time))
+# Below, vectors are (..., 3, m), components before points: they then lie together in memory. What is returned
+# above is a transposed view of such arrays.
+
+
+def _flow(pinhole: Pinhole, there: FloatArray) -> FloatArray:
+    """Return (2, 3, m) px per rad, by which small rotations move what is at `there` (2, m), x/z and y/z."""
+    x, y = there
+    xy = x * y
+    out = np.empty((2, 3, len(x)))
+    out[0, 0], out[0, 1], out[0, 2] = xy, -1.0 - x * x, y
+    out[1, 0], out[1, 1], out[1, 2] = 1.0 + y * y, -xy, -x
+    out *= pinhole.focal_length
     return out
 
 
-def _attitude_changes(motion: Motion, time: FloatArray, growing: bool) -> Iterator[tuple[int, _Vector]]:
-    """Return by which small rotation, against the camera, each of turn and growth changes the attitude."""
-    # The mean rate since mid-exposure: what changes beyond it is of higher order.
-    mean = [turn + 0.5 * time * growth for turn, growth in zip(motion.turn, motion.growth, strict=True)]
-    angle = np.sqrt(mean[0] ** 2 + mean[1] ** 2 + mean[2] ** 2)
-    inverse = 1.0 / np.maximum(angle, _TINY)
-    axis = [component * inverse for component in mean]
-    phi = angle * time
-    # Integral of the rotation from t' to t over t': the change of attitude that a change of rate makes.
-    sine = time * np.sinc(phi / np.pi)
-    versine = 0.5 * time * phi * np.sinc(0.5 * phi / np.pi) ** 2
-    for j in range(3):
-        along = (time - sine) * axis[j]
-        psi = [along * component for component in axis]
-        psi[j] = psi[j] + sine
-        after, before = (j + 1) % 3, (j + 2) % 3
-        # axis x unit vector j has the components below, and none along j.
-        psi[after] = psi[after] - versine * axis[before]
-        psi[before] = psi[before] + versine * axis[after]
-        yield j, (psi[0], psi[1], psi[2])
-        if growing:
-            half, sixth = 0.5 * time**2, time**3 / 6.0
-            bent = [np.zeros_like(time), np.zeros_like(time), np.zeros_like(time)]
-            bent[j] = half
-            bent[after] = -sixth * mean[before]
-            bent[before] = sixth * mean[after]
-            yield 3 + j, (bent[0], bent[1], bent[2])
+def _directions(pinhole: Pinhole, stars: FloatArray) -> FloatArray:
+    """Return directions (3, m), not normalised (z is 1), of pixels (m, 2)."""
+    out = np.ones((3, len(stars)))
+    out[:2] = stars.T
+    out[:2] -= np.array(pinhole.centre)[:, None]
+    out[:2] /= pinhole.focal_length
+    return out
 
 
-_Vector = tuple[FloatArray, FloatArray, FloatArray]
+def _pixels(pinhole: Pinhole, there: FloatArray) -> FloatArray:
+    """Return the pixels (m, 2) of x/z and y/z (2, m)."""
+    pixel = pinhole.focal_length * there
+    pixel += np.array(pinhole.centre)[:, None]
+    return pixel.T
 
 
-def _columns(pinhole: Pinhole, stars: FloatArray) -> _Vector:
-    """Return directions, not normalised (z is 1), of pixels (m, 2), by component."""
-    centre = pinhole.centre
-    x = (stars[:, 0] - centre[0]) / pinhole.focal_length
-    y = (stars[:, 1] - centre[1]) / pinhole.focal_length
-    return x, y, np.ones(len(stars))
+def _rate(motion: Motion, time: FloatArray) -> FloatArray:
+    """Return the turn's rate (3, 1), or (3, m) where it changes with `time`."""
+    if motion.constant:
+        return motion.turn[:, None]
+    return motion.turn[:, None] + motion.growth[:, None] * time
 
 
-def _rate(motion: Motion, time: FloatArray) -> _Vector:
-    x, y, z = (turn + growth * time for turn, growth in zip(motion.turn, motion.growth, strict=True))
-    return x, y, z
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return a x b of vectors (..., 3, m) and (3, m), or of one vector (3, 1)."""
+    if b.shape[1] == 1:
+        x, y, z = b[:, 0]
+        return np.asarray(np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]) @ a)
+    after, before = [1, 2, 0], [2, 0, 1]
+    return np.asarray(a[..., after, :] * b[before] - a[..., before, :] * b[after])
 
 
-def _cross(a: _Vector, b: _Vector) -> _Vector:
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+def _rotated(motion: Motion, v: FloatArray, time: FloatArray) -> FloatArray:
+    """Return fixed directions (3, m) in the camera's axes at `time`.
 
-
-def _rotated(motion: Motion, v: _Vector, time: FloatArray) -> _Vector:
-    """Return fixed directions in the camera's axes at `time`: v cos - (a x v) sin + a (a.v)(1 - cos)."""
+    They are v cos - (a x v) sin + a (a.v)(1 - cos), about the unit vector a of the rotation until then.
+    """
     if motion.constant:
         angle = float(np.linalg.norm(motion.turn))
-        a: _Vector = tuple(motion.turn / max(angle, _TINY))
+        a = (motion.turn / max(angle, _TINY))[:, None]
         phi = angle * time
+        along = (a * a.T) @ v
     else:
         twist = np.cross(motion.turn, motion.growth) / 12.0
-        parts = np.stack([motion.turn, 0.5 * motion.growth, twist])
-        vector = np.stack([time, time**2, time**3], axis=-1) @ parts
-        phi = np.sqrt(np.sum(vector**2, axis=-1))
-        unit = vector / np.maximum(phi, _TINY)[:, None]
-        a = unit[:, 0], unit[:, 1], unit[:, 2]
-    cosine, sine = np.cos(phi), np.sin(phi)
-    along = (a[0] * v[0] + a[1] * v[1] + a[2] * v[2]) * (1.0 - cosine)
-    c = _cross(v, a)  # -(a x v)
-    return (
-        v[0] * cosine + c[0] * sine + a[0] * along,
-        v[1] * cosine + c[1] * sine + a[1] * along,
-        v[2] * cosine + c[2] * sine + a[2] * along,
-    )
+        parts = np.stack([motion.turn, 0.5 * motion.growth, twist], axis=1)
+        vector = parts @ np.stack([time, time**2, time**3])
+        phi = np.sqrt(np.sum(vector**2, axis=0))
+        a = vector / np.maximum(phi, _TINY)
+        along = a * np.sum(a * v, axis=0)
+    out = (v - along) * np.cos(phi)
+    out += _cross(v, a) * np.sin(phi)
+    out += along
+    return np.asarray(out)

@@ -37,7 +37,7 @@ class Evaluation:
         information: (n, SHARED + ALONE, SHARED + ALONE), of each star's pixels.
         gradient: (n, SHARED + ALONE).
         chi2, pixels: (n,) of each star's pixels: sum of squared residuals over their variance, and how many.
-        crowds: the light's derivatives on the pixels that stars share; used: how many pixels are in use.
+        crowds: the light's derivatives on the pixels that stars share; shared: how many those are.
         kept: which pixels of the strips and of the patches were not left out.
     """
 
@@ -46,7 +46,7 @@ class Evaluation:
     chi2: FloatArray
     pixels: FloatArray
     crowds: list[Crowd]
-    used: int
+    shared: int
     kept: tuple[BoolArray, BoolArray]
 
 
@@ -57,7 +57,7 @@ class Crowd:
     Attributes:
         star: (b,) whose block it is; `matrix` (b, i, SHARED + ALONE) mixes images to derivatives.
         block, slot: (e,) of each pixel; first: (b,) where each block's pixels begin.
-        weight: (e,); images: (e, i).
+        weight: (e,); images: (i, e).
     """
 
     star: IntArray
@@ -93,7 +93,7 @@ def evaluate(
         np.zeros(n),
         np.zeros(n),
         [],
-        len(windows.pixels),
+        windows.shared,
         (weights[0] > 0.0, weights[1] > 0.0),
     )
     if len(strips.star):
@@ -181,9 +181,9 @@ def _crowd(
         matrix[held],
         np.repeat(np.arange(len(held)), np.diff(first, append=len(block))),
         first,
-        sight.slot.reshape(-1)[sight.crowded],
+        sight.common,
         weight.reshape(-1)[sight.crowded],
-        images[block, :, place],
+        np.ascontiguousarray(images[block, :, place].T),
     )
 
 
@@ -210,15 +210,15 @@ def apply_information(
     n = len(alone)
     vector = np.concatenate([np.broadcast_to(shared, (n, SHARED)), alone], axis=1)
     out = (evaluation.information @ vector[..., None])[..., 0]
-    change = np.zeros(evaluation.used)
+    change = np.zeros(evaluation.shared)
     lights = []
     for crowd in evaluation.crowds:
-        mixture = (crowd.matrix @ vector[crowd.star][..., None])[..., 0].astype(np.float32)
-        lights.append(np.einsum("ei,ei->e", mixture[crowd.block], crowd.images))
-        change += np.bincount(crowd.slot, lights[-1], evaluation.used)
+        mixture = (crowd.matrix @ vector[crowd.star][..., None])[..., 0].T.astype(np.float32)
+        lights.append(np.einsum("ie,ie->e", mixture.take(crowd.block, axis=1), crowd.images))
+        change += np.bincount(crowd.slot, lights[-1], evaluation.shared)
     for crowd, light in zip(evaluation.crowds, lights, strict=True):
         felt = crowd.weight * (change[crowd.slot] - light).astype(np.float32)
-        slope = np.add.reduceat(crowd.images * felt[:, None], crowd.first).astype(np.float64)
+        slope = np.add.reduceat(crowd.images * felt, crowd.first, axis=1).T.astype(np.float64)
         np.add.at(out, crowd.star, (slope[:, None] @ crowd.matrix)[:, 0])
     return out[:, :SHARED].sum(axis=0), out[:, SHARED:] + prior_information(evaluation) * alone
 

@@ -18,7 +18,7 @@ ACROSS = 1.8
 # Spacing of the samples along them, px.
 _ALONG = 4.0
 # Circles worked on at a time, so that they stay in the processor's cache.
-_CHUNK = 32
+_CHUNK = 64
 _NEAREST = 0.003
 # Pixels to a side of what is summed for a sample.
 _BOX = 3.0

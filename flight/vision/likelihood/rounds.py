@@ -11,7 +11,7 @@ from flight.arrays import BoolArray
 from flight.pinhole import Pinhole
 from flight.vision.likelihood.agreement import agreed_step
 from flight.vision.likelihood.exposed_frame import ExposedFrame
-from flight.vision.likelihood.motion import paths
+from flight.vision.likelihood.motion import positions
 from flight.vision.likelihood.normal_equations import ALONE, SHARED, Evaluation, evaluate
 from flight.vision.likelihood.scene import Scene
 from flight.vision.likelihood.settings import LikelihoodSettings
@@ -22,7 +22,8 @@ from flight.vision.likelihood.windows import Windows, cut_windows
 _LONGEST_STEP = 3.0
 # An end so far, px, from where its window was cut has left the window's middle.
 _DRIFT = 1.0
-# Faint ones may be farther from it.
+# Ends of stars without a say may be farther from it; after the first round by any distance: all windows are
+# not cut again for those whose light hardly fixes their place.
 _FAINT_DRIFT = 2.5
 # Converged: no shared parameter moves by more than this part of its standard deviation. The step is
 # taken, and what it leaves is of second order.
@@ -33,6 +34,8 @@ _LEAST_PROGRESS = 0.7
 _LOOKS = 1
 # A constant rate seems to change once in so many.
 _BY_CHANCE = 1e-4
+# What is below this part of the limit needs no closer look.
+_FAR_BELOW = 0.5
 # The parameters of the change.
 _GROWTHS = 3
 GROWING = np.ones(SHARED, dtype=np.bool_)
@@ -115,15 +118,19 @@ class Fit:
 
         The stars' agreement on the change is held against their spread (Hotelling).
         """
-        solution = solve(self.evaluation, self.scene, GROWING, LAST.conjugate)
-        if solution is None:
-            return False
-        told, stars = agreed_step(self.evaluation, solution.shared)
-        freedom = stars - _GROWTHS
-        if freedom < 1:
-            return False
-        limit = float(fdtri(_GROWTHS, freedom, 1.0 - _BY_CHANCE)) * _GROWTHS * (stars - 1) / freedom
-        return told > limit
+        # As if no stars shared pixels first: mostly that says enough.
+        for conjugate, share in ((0, _FAR_BELOW), (LAST.conjugate, 1.0)):
+            solution = solve(self.evaluation, self.scene, GROWING, conjugate)
+            if solution is None:
+                return False
+            told, stars = agreed_step(self.evaluation, solution.shared)
+            freedom = stars - _GROWTHS
+            if freedom < 1:
+                return False
+            limit = float(fdtri(_GROWTHS, freedom, 1.0 - _BY_CHANCE)) * _GROWTHS * (stars - 1) / freedom
+            if told <= share * limit:
+                return False
+        return True
 
 
 def iterate(
@@ -154,7 +161,7 @@ def iterate(
         if turn >= how.patience and wanted > _LEAST_PROGRESS * asked and not onward:
             break
         asked, before = wanted, solution.shared
-        if _drifted(camera, cut_at, scene):
+        if _drifted(camera, cut_at, scene, _FAINT_DRIFT if turn == 0 else np.inf):
             windows = whole = camera.windows(scene)
             cut_at = scene
         elif how.clipped and turn >= _LOOKS:
@@ -173,16 +180,14 @@ def _possible(scene: Scene) -> bool:
     )
 
 
-def _drifted(camera: ExposedCamera, before: Scene, after: Scene) -> bool:
-    """Tell whether an end of a streak has left the middle of its window; faint ones matter less."""
-    allowed = np.where(after.trusted, _DRIFT, _FAINT_DRIFT)
-    for time in (-0.5, 0.5):
-        at = np.full(len(before.stars), time)
-        there = paths(camera.pinhole, after.motion, after.stars, at).position
-        was = paths(camera.pinhole, before.motion, before.stars, at).position
-        if np.any(np.abs(there - was).max(axis=1) > allowed):
-            return True
-    return False
+def _drifted(camera: ExposedCamera, before: Scene, after: Scene, faint: float) -> bool:
+    """Tell whether an end of a streak has left its window's middle; those without a say by `faint` px."""
+    n = len(before.stars)
+    at = np.repeat([-0.5, 0.5], n)
+    there = positions(camera.pinhole, after.motion, np.tile(after.stars, (2, 1)), at)
+    was = positions(camera.pinhole, before.motion, np.tile(before.stars, (2, 1)), at)
+    far = np.abs(there - was).max(axis=1).reshape(2, n).max(axis=0)
+    return bool(np.any(far > np.where(after.trusted, _DRIFT, faint)))
 
 
 def misfit(evaluation: Evaluation) -> float:

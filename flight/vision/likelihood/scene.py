@@ -8,7 +8,7 @@ import numpy as np
 
 from flight.arrays import BoolArray, FloatArray, IntArray
 from flight.pinhole import Pinhole
-from flight.vision.likelihood.motion import Motion, paths
+from flight.vision.likelihood.motion import Motion, positions
 from flight.vision.likelihood.shutter import Shutter
 
 _PIXEL_VARIANCE = 1.0 / 12.0
@@ -68,7 +68,7 @@ def window_times(pinhole: Pinhole, motion: Motion, shutter: Shutter, stars: Floa
     # The row of each end depends on its time: a contraction, since readout is slow beside the star.
     for _ in range(4):
         for end, nominal in enumerate((-0.5, 0.5)):
-            row = paths(pinhole, motion, stars, times[:, end]).position[:, 1]
+            row = positions(pinhole, motion, stars, times[:, end])[:, 1]
             times[:, end] = nominal + shutter.delay(np.clip(row, 0.0, pinhole.rows - 1.0))
     return times
 
@@ -77,6 +77,6 @@ def path_lengths(pinhole: Pinhole, motion: Motion, stars: FloatArray) -> FloatAr
     """Return the length (n,) px of the paths of `stars` (n, 2)."""
     samples = 9
     time = np.tile(np.linspace(-0.5, 0.5, samples), len(stars))
-    there = paths(pinhole, motion, np.repeat(stars, samples, axis=0), time).position.reshape(-1, samples, 2)
+    there = positions(pinhole, motion, np.repeat(stars, samples, axis=0), time).reshape(-1, samples, 2)
     step = np.diff(there, axis=1)
     return np.asarray(np.hypot(step[..., 0], step[..., 1]).sum(axis=1))

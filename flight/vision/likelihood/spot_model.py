@@ -14,7 +14,7 @@ from scipy.special import ndtr
 
 from flight.arrays import BoolArray, FloatArray, IntArray
 from flight.pinhole import Pinhole
-from flight.vision.likelihood.motion import Motion, paths, sensitivities
+from flight.vision.likelihood.motion import Motion, positions, sensitivities
 from flight.vision.likelihood.shutter import Shutter
 
 INSTANTS = 10
@@ -64,7 +64,7 @@ def derivatives(
     delay = shutter.delay(stars[:, 1])
     time = (0.5 * _NODE + delay[:, None]).reshape(-1)
     repeated = np.repeat(stars, INSTANTS, axis=0)
-    place = paths(pinhole, motion, repeated, time).position.reshape(count, INSTANTS, 2)
+    place = positions(pinhole, motion, repeated, time).reshape(count, INSTANTS, 2)
     change = sensitivities(pinhole, motion, repeated, time).reshape(count, INSTANTS, 2, 8)
     x, dx, sx = _profile(patches.column, place[..., 0], sigma)
     y, dy, sy = _profile(patches.row, place[..., 1], sigma)

@@ -37,6 +37,8 @@ IMAGES = 7
 
 _ENDS = 5.5
 """Widths from an end beyond which its profile is 0 or 1."""
+_OBLIQUE = 7.0
+"""Widths by which a pixel may lie ahead of where its line crosses the path."""
 _STEP = 1e-4
 _SLOWEST = 1e-3
 _BELL = 1.0 / math.sqrt(2.0 * math.pi)
@@ -110,15 +112,16 @@ def _ends(
     """Cut the light in `out[:, 0]` at both ends of the exposure, and fill in what changes with them."""
     out[:, 3:6] = 0.0
     rows = strips.row
+    outer = shutter.delay(rows[..., [0, -1]])
     for end, image in ((-0.5, 3), (0.5, 4)):
         sign = -1.0 if end > 0.0 else 1.0
-        edge = end + shutter.delay(rows)
-        # A row-dependent end is a slanted cut of the path: the pixel's window is exact, row by row.
-        distance = (time - edge) * (sign * speed / width)[..., None].astype(np.float32)
-        near = np.flatnonzero(np.min(distance, axis=(1, 2)) < _ENDS)
+        closest = sign * (strips.time - end) + np.min(-sign * outer, axis=-1)
+        near = np.flatnonzero(np.min(closest * speed, axis=1) < (_ENDS + _OBLIQUE) * width)
         if not near.size:
             continue
-        u = distance[near].astype(np.float64)
+        # A row-dependent end is a slanted cut of the path: the pixel's window is exact, row by row.
+        edge = np.float32(end) + shutter.delay(rows[near])
+        u = (time[near] - edge) * (sign * speed[near] / width)[..., None]
         bell = _BELL * np.exp(-0.5 * u * u)
         before = out[near, 0]
         out[near, image] = before * bell / width

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from flight.arrays import BoolArray, FloatArray, IntArray
 from flight.pinhole import Pinhole
-from flight.vision.likelihood.motion import Motion, Paths, paths
+from flight.vision.likelihood.motion import Motion, Paths, paths, positions
 
 LINES = 10
 """Lines in a block."""
@@ -60,8 +60,8 @@ def cut_strips(
     begin = low - reach / _speed(paths(pinhole, motion, stars[part], low))
     end = high + reach / _speed(paths(pinhole, motion, stars[part], high))
     sampled = begin[:, None] + (end - begin)[:, None] * np.linspace(0.0, 1.0, _SAMPLES)
-    there = paths(pinhole, motion, np.repeat(stars[part], _SAMPLES, axis=0), sampled.reshape(-1))
-    place = there.position.reshape(-1, _SAMPLES, 2)
+    there = positions(pinhole, motion, np.repeat(stars[part], _SAMPLES, axis=0), sampled.reshape(-1))
+    place = there.reshape(-1, _SAMPLES, 2)
     span = np.abs(place[:, -1] - place[:, 0])
     along_rows = span[:, 0] >= span[:, 1]
     major = np.where(along_rows[:, None], place[:, :, 0], place[:, :, 1])

@@ -9,7 +9,7 @@ import numpy as np
 from flight.vision.likelihood.chains import in_chains
 from flight.vision.likelihood.ends import true_ends, unbroken
 from flight.vision.likelihood.matched_filter import FaintStars
-from flight.vision.likelihood.motion import paths
+from flight.vision.likelihood.motion import positions
 from flight.vision.likelihood.rounds import ExposedCamera
 from flight.vision.likelihood.scene import Scene, window_times
 
@@ -40,7 +40,7 @@ def wholeness(camera: ExposedCamera, scene: Scene, faint: FaintStars) -> Wholene
     """
     stars = np.concatenate([scene.stars, faint.stars])
     light = np.concatenate([scene.light, faint.light])
-    chained = in_chains(camera.pinhole, scene.motion, stars, light)[: len(scene.stars)]
+    chained = in_chains(camera.pinhole, scene.motion, stars, light, len(scene.stars))
     if float(np.mean(chained[scene.trusted])) > _MOST_CHAINED:
         return Wholeness.BROKEN
     deciding = scene.select(scene.trusted)
@@ -62,7 +62,7 @@ def _disowned(camera: ExposedCamera, scene: Scene) -> bool:
     times = window_times(camera.pinhole, scene.motion, camera.shutter, scene.stars)
     inside = np.ones(len(scene.stars), dtype=np.bool_)
     for time in times.T:
-        inside &= camera.pinhole.contains(paths(camera.pinhole, scene.motion, scene.stars, time).position)
+        inside &= camera.pinhole.contains(positions(camera.pinhole, scene.motion, scene.stars, time))
     # Fainter stars were never asked.
     bright = inside & (scene.light >= scene.light[scene.trusted].min())
     light = scene.light[bright]

@@ -30,7 +30,8 @@ class Sight:
         inside: whether the pixel exists, tells something, and is meant.
         signal, floor, ceiling: of the frame.
         gain: electrons a count.
-        crowded: (e,) flat positions of the pixels that other stars share.
+        crowded: (e,) flat positions of the pixels that other stars share; common: (e,) their numbers among
+            all that are shared.
     """
 
     slot: IntArray
@@ -40,6 +41,7 @@ class Sight:
     ceiling: Float32Array
     gain: float
     crowded: IntArray
+    common: IntArray
 
     def residual(self, total: Float32Array, clip: float) -> tuple[Float32Array, Float32Array]:
         """Return weights (1/variance, 0 where left out) and residuals under the light `total` by slot.
@@ -72,6 +74,7 @@ class Windows:
         strips, patches: their pixels; star i of the strips is `long[i]`.
         pixels: (m,) flat indices of the pixels in use, by slot.
         on_strips, on_patches: what the frame shows there.
+        shared: how many pixels are of several stars.
     """
 
     long: IntArray
@@ -81,6 +84,7 @@ class Windows:
     pixels: IntArray
     on_strips: Sight
     on_patches: Sight
+    shared: int
 
     def total(self, on_strips: Float32Array, on_patches: FloatArray) -> Float32Array:
         """Return the light (m,) of all stars on the pixels in use, from that on each star's own."""
@@ -114,39 +118,49 @@ def cut_windows(
     strips = cut_strips(pinhole, scene.motion, scene.stars[long], times, room)
     longest = float(length[spot].max(initial=0.0))
     patches = cut_patches(pinhole, scene.stars[spot], int(np.ceil(room + 0.5 * longest)))
-    use = np.zeros(frame.signal.size, dtype=np.bool_)
-    use[strips.index] = True
-    use[patches.index] = True
-    pixels = np.flatnonzero(use)
-    number = np.zeros(frame.signal.size, dtype=np.int64)
-    number[pixels] = np.arange(len(pixels))
-    slots = number[strips.index], number[patches.index]
-    sharing = np.zeros(len(pixels), dtype=np.int64)
-    for part, slot in ((strips, slots[0]), (patches, slots[1])):
-        sharing += np.bincount(slot[part.inside], minlength=len(pixels))
-    shared = sharing > 1
+    index = np.concatenate([strips.index.reshape(-1), patches.index.reshape(-1)])
+    inside = np.concatenate([strips.inside.reshape(-1), patches.inside.reshape(-1)])
+    # Each pixel is told by the last place that names it; only memory of pixels in use is touched.
+    number = np.empty(frame.signal.size, dtype=np.int32)
+    number[index] = np.arange(len(index), dtype=np.int32)
+    last = number[index]
+    own = last == np.arange(len(index), dtype=np.int32)
+    pixels = index[own]
+    slot = (np.cumsum(own) - 1)[last]
+    shared = np.bincount(slot[inside], minlength=len(pixels)) > 1
+    crowded = shared[slot] & inside
+    common = np.cumsum(shared) - 1
+    cut = strips.index.size
     return Windows(
         long,
         spot,
         strips,
         patches,
         pixels,
-        _sight(frame, strips.index, strips.inside, slots[0], shared),
-        _sight(frame, patches.index, patches.inside, slots[1], shared),
+        _sight(frame, strips.index, strips.inside, slot[:cut], crowded[:cut], common),
+        _sight(frame, patches.index, patches.inside, slot[cut:], crowded[cut:], common),
+        int(np.count_nonzero(shared)),
     )
 
 
 def _sight(
-    frame: ExposedFrame, index: IntArray, inside: BoolArray, slot: IntArray, shared: BoolArray
+    frame: ExposedFrame,
+    index: IntArray,
+    inside: BoolArray,
+    slot: IntArray,
+    crowded: BoolArray,
+    common: IntArray,
 ) -> Sight:
     signal = frame.signal[index]
+    places = np.flatnonzero(crowded)
     return Sight(
-        slot,
+        slot.reshape(index.shape),
         inside & ~frame.bad[index],
         signal,
         frame.floor[index],
         # The background's level is what a pixel's counts exceed its signal by.
         np.float32(frame.top) - frame.counts[index] + signal,
         frame.gain,
-        np.flatnonzero(shared[slot] & inside),
+        places,
+        common[slot[places]],
     )
