@@ -19,6 +19,7 @@ import numpy as np
 from flight import quaternion, sun
 from flight.arrays import BoolArray, FloatArray
 from flight.pinhole import Pinhole
+from flight.shadow import Shadow, sunlit_share
 from hal.interfaces.errors import OutOfRange
 from sim_hal.rso import ResidentSpaceObject, directions
 from sim_hal.world.exclusion import (
@@ -29,7 +30,6 @@ from sim_hal.world.exclusion import (
     sun_in_field,
 )
 from sim_hal.world.orbit import KeplerianElements, Orbit, propagate
-from sim_hal.world.shadow import Shadow, sunlit_share
 
 DEVICE = "observation opportunities"
 ORBITS = 10

@@ -20,11 +20,11 @@ import numpy as np
 
 from flight import sun
 from flight.arrays import FloatArray
+from flight.shadow import Shadow, sunlit_share
 from hal.interfaces.errors import OutOfRange
 from sim_hal.star_camera import SourceTrack
 from sim_hal.world.exclusion import hidden_by_earth
 from sim_hal.world.orbit import Orbit
-from sim_hal.world.shadow import Shadow, sunlit_share
 
 DEVICE = "resident space object"
 TRACK_ERROR = 1e-7

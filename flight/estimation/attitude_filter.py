@@ -1,8 +1,9 @@
 """Attitude, rate, gyro bias and disturbance from measurements that may come late: a MEKF with a memory.
 
 Each measurement is applied at its own time: one that arrives late is put where it belongs and those after it
-are applied again. A rate from a streaked image is the mean over its exposure: the attitude at the exposure's
-start is kept until its end. The age that the inertial unit's samples have at their stamp may be estimated too
+are applied again, at once or a few at a time beside the estimate that goes on (`flight.estimation.replay`). A
+rate from a streaked image is the mean over its exposure: the attitude at the exposure's start is kept until
+its end. The age that the inertial unit's samples have at their stamp may be estimated too
 (`flight.estimation.latency`). On the testbed's thread the same filter runs suspended: it takes of every
 measurement what it says about the thread, and all else stays exactly what it was; the thread's torsion
 and damping are known, or estimated beside the disturbance, from which they differ in that they go with the
@@ -13,32 +14,26 @@ from __future__ import annotations
 
 import bisect
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import chdtri
 
 from flight.arrays import FloatArray
-from flight.estimation.estimate import BIAS, DISTURBANCE, LATENCY, RATE, TURN, Estimate
-from flight.estimation.latency import LONGEST_LATENCY, Motion, considered, motion
+from flight.estimation.commands import CommandHistory
+from flight.estimation.estimate import BIAS, DISTURBANCE, FIELD_BIAS, LATENCY, RATE, TURN, Estimate
+from flight.estimation.latency import LONGEST_LATENCY
 from flight.estimation.measurements import (
     AttitudeMeasurement,
     MeanRateMeasurement,
     Measurement,
     RateMeasurement,
 )
-from flight.estimation.mekf import (
-    SIZE,
-    ProcessNoise,
-    State,
-    carry,
-    correct,
-    innovation,
-    keep_attitude,
-    normalised_square,
-    release_attitude,
-)
-from flight.estimation.rigid_body import RigidBody, Torquing
+from flight.estimation.propagation import LONGEST_STEP, ProcessNoise
+from flight.estimation.replay import Checkpoint, Model, Replay
+from flight.estimation.rigid_body import RigidBody
+from flight.estimation.state import SIZE, State
 from flight.estimation.turn import exponential, twist
 
 
@@ -58,9 +53,12 @@ class FilterSettings:
         gain_start: of the coils' gain, likewise.
         latency_start: s, of the age that the inertial unit's samples have at their stamp, likewise.
         latency_walk: s per sqrt(s), the random walk of that age.
+        field_bias_start: T, standard deviation of the magnetometer's bias at the start, zero without one.
+        field_bias_walk: T per sqrt(s), the random walk of that bias, and of the field model's error with it.
         rate_walk: rad/s per sqrt(s), white acceleration beside that of the coils.
         gate_sigma: a measurement is refused that is less likely than this many sigma of one component.
         history_ns: how late a measurement may come and still be used.
+        longest_step: s, between measurements; a body that turns slowly may take longer ones.
     """
 
     current_noise: float
@@ -74,19 +72,26 @@ class FilterSettings:
     gain_start: float = 0.0
     latency_start: float = 0.0
     latency_walk: float = 0.0
+    field_bias_start: float = 0.0
+    field_bias_walk: float = 0.0
     rate_walk: float = 0.0
     gate_sigma: float = 5.0
     history_ns: int = 6_000_000_000
+    longest_step: float = LONGEST_STEP
 
 
-@dataclass(slots=True)
-class _Checkpoint:
-    """A measurement, whether it passed the gate, and the state just after it."""
+Told = Callable[[list[bool]], None]
+"""Is told of measurements that came late which of them passed the gate."""
 
-    measurement: Measurement
-    used: bool
-    state: State
-    covariance: FloatArray
+
+@dataclass(slots=True, eq=False)
+class _CatchingUp:
+    """A branch from the checkpoint `base` on, with measurements that came late, and who is to be told."""
+
+    base: Checkpoint
+    replay: Replay
+    late: Sequence[Measurement]
+    told: Told
 
 
 class AttitudeFilter:
@@ -109,7 +114,7 @@ class AttitudeFilter:
         self._settings = settings
         free = np.array([0.0, 1.0, 0.0]) if body.suspended else np.ones(3)
         self._free = free
-        self._noise = ProcessNoise(
+        noise = ProcessNoise(
             settings.current_noise**2 * settings.control_period,
             np.diag(settings.rate_walk**2 * free),
             np.array(
@@ -119,12 +124,13 @@ class AttitudeFilter:
                 ]
             ),
             settings.latency_walk**2,
+            settings.field_bias_walk**2,
         )
-        self._gate = _gate(settings.gate_sigma, 1 if body.suspended else 3)
-        self._history: list[_Checkpoint] = []
-        self._command_times: list[int] = []
-        self._commands: list[Torquing] = []
-        self._idle = body.torquing(np.zeros(3))
+        self._commands = CommandHistory(body, settings.history_ns)
+        gate = {degrees: _gate(settings.gate_sigma, degrees) for degrees in (1, 2, 3)}
+        self._model = Model(body, noise, self._commands, settings.longest_step, gate)
+        self._history: list[Checkpoint] = []
+        self._catching_up: _CatchingUp | None = None
         self._refused_in_a_row: dict[type[Measurement], int] = {}
         self._taken: dict[type[Measurement], int] = {}
         self.refused = 0
@@ -138,14 +144,7 @@ class AttitudeFilter:
         Commands come in order of time, each before the measurements taken under it. Without `field` the
         body's own is meant.
         """
-        torquing = self._body.torquing(currents, field)
-        if self._commands and self._commands[-1] == torquing:
-            return
-        self._command_times.append(time_ns)
-        self._commands.append(torquing)
-        oldest = bisect.bisect_right(self._command_times, time_ns - self._settings.history_ns) - 1
-        if oldest > 64:  # now and then, not each cycle
-            del self._command_times[:oldest], self._commands[:oldest]
+        self._commands.note(time_ns, currents, field)
 
     def start(self, attitude: AttitudeMeasurement, rate: RateMeasurement) -> None:
         """Begin from one attitude and one rate; of a suspended body, from what they say about the thread."""
@@ -166,14 +165,16 @@ class AttitudeFilter:
         if self._body.suspended:
             covariance[12, 12], covariance[13, 13] = settings.torsion_start**2, settings.damping_start**2
         covariance[14, 14] = settings.gain_start**2
+        covariance[FIELD_BIAS, FIELD_BIAS] = settings.field_bias_start**2 * np.eye(3)
         state = State(quaternion, (x, y, z), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), self._body.parameters)
         newest: Measurement = attitude if attitude.time_ns >= rate.time_ns else rate
         # The older both are, the further the body has gone on: the errors of all three go together.
         age = np.zeros(SIZE)
-        age[TURN], age[RATE] = (x, y, z), self._motion(state, covariance, newest.time_ns).acceleration
+        age[TURN], age[RATE] = (x, y, z), self._model.motion(state, covariance, newest.time_ns).acceleration
         age[LATENCY] = 1.0
         covariance += settings.latency_start**2 * np.outer(age, age)
-        self._history = [_Checkpoint(newest, True, state, covariance)]
+        self._history = [Checkpoint(newest, True, state, covariance)]
+        self._give_up_branch()
         self._refused_in_a_row = {}
         self._taken = {}
 
@@ -191,7 +192,12 @@ class AttitudeFilter:
     def measure(self, measurement: Measurement) -> bool:
         """Apply a measurement at its own time; tell whether it passed the gate (or was too late)."""
         self.nis = math.nan
-        if self._history and measurement.begin_ns >= self._history[-1].measurement.time_ns:
+        if self._catching_up is not None:
+            if self._is_newest(measurement) and not isinstance(measurement, MeanRateMeasurement):
+                self._catching_up.replay.add(measurement)
+            else:
+                self.catch_up()
+        if self._is_newest(measurement):
             used = self._apply([measurement], measurement)
         elif (index := self._index_before(measurement.begin_ns)) > 0:
             used = self._insert(index, measurement)
@@ -201,6 +207,43 @@ class AttitudeFilter:
         self._count(type(measurement), used)
         self._forget(measurement.time_ns)
         return used
+
+    def _is_newest(self, measurement: Measurement) -> bool:
+        return bool(self._history) and measurement.begin_ns >= self._history[-1].time_ns
+
+    def measure_in_turn(self, late: Sequence[Measurement], told: Told) -> None:
+        """Put measurements that came late where they belong, a part of the work at each `catch_up`.
+
+        `told` is called when that is done, with which of them passed the gate; until then the estimate is
+        that without them.
+        """
+        if self._catching_up is not None:
+            self.catch_up()
+        index = self._index_before(min(m.begin_ns for m in late)) if self._history else 0
+        if index == 0:
+            self.late += len(late)
+            told([False] * len(late))
+            return
+        base = self._history[index - 1]
+        again = [*(c.measurement for c in self._history[index:]), *late]
+        again.sort(key=lambda m: m.time_ns)
+        self._catching_up = _CatchingUp(base, Replay(self._model, base, again), late, told)
+
+    def catch_up(self, most: int | None = None) -> None:
+        """Go on with what `measure_in_turn` began, by `most` measurements, or to its end."""
+        branch = self._catching_up
+        if branch is None:
+            return
+        branch.replay.go_on(most)
+        if not branch.replay.done:
+            return
+        self._catching_up = None
+        place = next(i for i in range(len(self._history) - 1, -1, -1) if self._history[i] is branch.base)
+        self._history[place + 1 :] = branch.replay.taken
+        used = [next(c.used for c in branch.replay.taken if c.measurement is m) for m in branch.late]
+        for measurement, passed in zip(branch.late, used, strict=True):
+            self._count(type(measurement), passed)
+        branch.told(used)
 
     @property
     def latency(self) -> float:
@@ -220,8 +263,8 @@ class AttitudeFilter:
         then = self._history[index - 1]
         return self._estimate(then, time_ns, then.measurement.time_ns)
 
-    def _estimate(self, then: _Checkpoint, time_ns: int, measured_ns: int) -> Estimate:
-        state, covariance = self._propagate(then.state, then.covariance, _time_of(then), time_ns)
+    def _estimate(self, then: Checkpoint, time_ns: int, measured_ns: int) -> Estimate:
+        state, covariance = self._model.propagate(then.state, then.covariance, _time_of(then), time_ns)
         return Estimate(
             time_ns,
             np.array(state.quaternion),
@@ -232,6 +275,7 @@ class AttitudeFilter:
             covariance,
             measured_ns,
             state.latency,
+            np.array(state.field_bias),
         )
 
     def _insert(self, index: int, measurement: Measurement) -> bool:
@@ -254,69 +298,12 @@ class AttitudeFilter:
 
     def _apply(self, measurements: list[Measurement], asked: Measurement) -> bool:
         """Apply measurements in order of time from the last checkpoint on; tell whether `asked` was used."""
-        last = self._history[-1]
-        state, covariance, time_ns = last.state, last.covariance, _time_of(last)
-        exposures = [m for m in measurements if isinstance(m, MeanRateMeasurement)]
-        exposures.sort(key=lambda m: m.since_ns, reverse=True)
-        asked_used = False
-        for measurement in measurements:
-            while exposures and exposures[-1].since_ns <= measurement.time_ns:
-                exposure = exposures.pop()
-                state, covariance = self._propagate(state, covariance, time_ns, exposure.since_ns)
-                state, covariance = keep_attitude(state, covariance, exposure)
-                time_ns = exposure.since_ns
-            state, covariance = self._propagate(state, covariance, time_ns, measurement.time_ns)
-            time_ns = measurement.time_ns
-            aging = None
-            if isinstance(measurement, RateMeasurement) and measurement.latency is not None:
-                aging = self._motion(state, covariance, time_ns)
-            found = innovation(state, measurement, self._body.suspended, aging)
-            nis, gain = normalised_square(found, covariance)
-            used = 0.0 <= nis <= self._gate  # a NaN does not pass
-            if aging is not None:
-                gain = considered(gain)
-            if used:
-                state, covariance = correct(state, covariance, found, gain)
-            if isinstance(measurement, MeanRateMeasurement):
-                state, covariance = release_attitude(state, covariance, measurement)
-            alone = state._replace(kept=()) if state.kept else state
-            self._history.append(_Checkpoint(measurement, used, alone, covariance[:SIZE, :SIZE]))
-            if measurement is asked:
-                asked_used, self.nis = used, nis
-        return asked_used
-
-    def _propagate(
-        self, state: State, covariance: FloatArray, from_ns: int, to_ns: int
-    ) -> tuple[State, FloatArray]:
-        """Carry state and covariance over the commands in force between two times, forward only."""
-        time_ns = from_ns
-        index = max(bisect.bisect_right(self._command_times, from_ns) - 1, 0)
-        while time_ns < to_ns:
-            torquing = self._commands[index] if self._commands else self._idle
-            more = index + 1 < len(self._commands)
-            until_ns = min(to_ns, self._command_times[index + 1]) if more else to_ns
-            if until_ns > time_ns:
-                duration = (until_ns - time_ns) * 1e-9
-                state, covariance = carry(self._body, self._noise, state, covariance, torquing, duration)
-                time_ns = until_ns
-            index += more
-        return state, covariance
-
-    def _motion(self, state: State, covariance: FloatArray, time_ns: int) -> Motion:
-        """Return how the rate changes about the time of a sample whose age is not known for sure."""
-        half_ns = round(0.5e9 * math.sqrt(covariance[LATENCY, LATENCY]))
-        before, after = (
-            self._body.linearise(
-                state.quaternion, state.rate, state.parameters, self._torquing(time_ns + shift), 0.0
-            )
-            for shift in (-half_ns, half_ns)
-        )
-        return motion(before, after, state.disturbance, covariance)
-
-    def _torquing(self, time_ns: int) -> Torquing:
-        """Return what the coils do at a time."""
-        index = max(bisect.bisect_right(self._command_times, time_ns) - 1, 0)
-        return self._commands[index] if self._commands else self._idle
+        replay = Replay(self._model, self._history[-1], measurements)
+        replay.go_on()
+        self._history += replay.taken
+        mine = next(c for c in replay.taken if c.measurement is asked)
+        self.nis = mine.nis
+        return mine.used
 
     def _count(self, kind: type[Measurement], used: bool) -> None:
         """Count refusals. Mean rates come too seldom to tell who is wrong, and restart nothing."""
@@ -330,16 +317,24 @@ class AttitudeFilter:
             self._history.clear()
             self._refused_in_a_row = {}
             self.restarts += 1
+            self._give_up_branch()
+
+    def _give_up_branch(self) -> None:
+        branch, self._catching_up = self._catching_up, None
+        if branch is not None:
+            branch.told([False] * len(branch.late))
 
     def _forget(self, now_ns: int) -> None:
-        """Drop what is too old to be of use, now and then."""
+        """Drop what is too old to be of use, now and then; not what a branch stands on."""
+        if self._catching_up is not None:
+            return
         horizon_ns = now_ns - self._settings.history_ns
         if len(self._history) > 2 and _time_of(self._history[0]) < horizon_ns - 1_000_000_000:
             keep = bisect.bisect_left(self._history, horizon_ns, key=_time_of)
             del self._history[: min(keep, len(self._history) - 1)]
 
 
-def _time_of(checkpoint: _Checkpoint) -> int:
+def _time_of(checkpoint: Checkpoint) -> int:
     return checkpoint.measurement.time_ns
 
 

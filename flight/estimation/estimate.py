@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -13,7 +13,8 @@ from flight.quaternion import angle_about_axis_y
 
 TURN, RATE, BIAS, DISTURBANCE, PARAMETERS = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15)
 LATENCY = 15
-"""Where the parts of the error stand in the covariance (16, 16)."""
+FIELD_BIAS = slice(16, 19)
+"""Where the parts of the error stand in the covariance (19, 19)."""
 
 
 LEAST_GAIN, MOST_GAIN = 0.5, 2.0
@@ -50,9 +51,10 @@ class Estimate:
         bias: (3,) rad/s, of the gyro.
         disturbance: (3,) rad/s^2, angular acceleration that the model does not account for.
         parameters: of the model: the thread's torsion and damping, the coils' gain.
-        covariance: (16, 16) of small turns about the body's axes, rate, and so on (TURN, RATE, ...).
+        covariance: (19, 19) of small turns about the body's axes, rate, and so on (TURN, RATE, ...).
         measured_ns: the time of the newest measurement in it: its age says whether to trust it.
         latency: s, by which the inertial unit's samples are older than they say.
+        field_bias: (3,) T, what the magnetometer reads too much, body axes.
     """
 
     time_ns: int
@@ -64,6 +66,7 @@ class Estimate:
     covariance: FloatArray
     measured_ns: int
     latency: float = 0.0
+    field_bias: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     @property
     def angle(self) -> float:

@@ -13,9 +13,13 @@ import numpy as np
 from flight import events
 from flight.arrays import FloatArray
 from flight.estimation.estimate import RATE, TURN, Estimate
-from flight.events import Condition, EventLog
+from flight.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement
+from flight.events import EventLog
 from flight.executive.jobs import JobResult, JobRunner
 from flight.executive.rate_group import Cycle
+from flight.health import facts
+from flight.health.facts import Facts
+from flight.health.streams import Streams
 from flight.lens import CameraModel
 from flight.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
 from flight.startracker.frame_job import Found, FrameFound, FrameJob, TrackerSettings
@@ -67,6 +71,8 @@ class Imaging:
         jobs: JobRunner,
         recorder: Recorder,
         event_log: EventLog,
+        facts_: Facts,
+        streams: Streams,
     ) -> None:
         self._camera = camera
         self._settings = settings
@@ -79,9 +85,15 @@ class Imaging:
         self._last_sequence = -1
         self._last_checksum: int | None = None
         self._last_frame_ns = 0
-        self._lost = Condition(event_log, events.CAMERA_LOST, events.CAMERA_RECOVERED)
+        self._facts = facts_
+        self._streams = streams
+        self._busy_since_ns = 0
         self.frames = 0
         self.accepted = 0
+
+    def busy_since_ns(self) -> int | None:
+        """Return since when a frame is being worked on, None when none is."""
+        return None if self._frame is None else self._busy_since_ns
 
     def begin(self, time_ns: int) -> None:
         """Count the camera's age from here."""
@@ -92,7 +104,7 @@ class Imaging:
         try:
             self._camera.trigger(self._settings.exposure_ns)
         except DeviceError as error:
-            self._lost.update(True, cycle.start_ns, str(error))
+            self._facts.state(facts.CAMERA_LOST, True, cycle.start_ns, str(error))
 
     def serve(self, now_ns: int) -> None:
         """Take in a finished frame, if there is one, and hand it to the worker."""
@@ -100,19 +112,26 @@ class Imaging:
         age_ns = now_ns - self._last_frame_ns
         if frame is None:
             if age_ns > self._settings.max_age_ns:
-                self._lost.update(True, now_ns, f"no frame for {age_ns * 1e-9:.1f} s")
+                self._facts.state(facts.CAMERA_LOST, True, now_ns, f"no frame for {age_ns * 1e-9:.1f} s")
             return
-        self._lost.update(False, now_ns, f"frame {frame.sequence} has come")
-        self._last_frame_ns = now_ns
-        self.frames += 1
         if frame.sequence <= self._last_sequence:
+            # A camera that repeats itself is no camera that gives frames: its age goes on.
             text = f"frame {frame.sequence} comes again"
             self._events.tell(events.CAMERA_FROZEN, now_ns, text)
             self._record_rate(frame, StreakStatus.FROZEN.value, None, now_ns, False)
             return
+        # Old is what shows old light, however fresh it arrived.
+        self._last_frame_ns = frame.exposure_start_ns + frame.exposure_ns
+        age_ns = now_ns - self._last_frame_ns
+        late = age_ns > self._settings.max_age_ns
+        text = f"frame {frame.sequence} comes {age_ns * 1e-9:.1f} s after its exposure"
+        self._facts.state(facts.CAMERA_LOST, late, now_ns, text)
+        self._streams.note("camera", self._last_frame_ns)
+        self.frames += 1
         self._last_sequence = frame.sequence
         if self._jobs.submit(WORKER, self._job(frame)):
             self._frame = frame
+            self._busy_since_ns = now_ns
         else:
             self._events.tell(events.VISION_FAILED, now_ns, "the worker has not finished the last frame")
 
@@ -134,16 +153,27 @@ class Imaging:
             )
         elif motion.status in {StreakStatus.BLACK, StreakStatus.SATURATED}:
             self._events.tell(events.CAMERA_BLACK, now_ns, f"frame {frame.sequence} is {motion.status.value}")
-        accepted = motion.status is StreakStatus.RATE and self._use_rate(frame, motion, now_ns)
-        self._record_rate(frame, motion.status.value, motion, now_ns, accepted)
-        if found.solution is not None:
-            self._use_stars(frame, found, found.solution, now_ns)
+        rate, attitude = self._mean_rate(frame, motion), self._attitude(frame, found)
+        known = self._navigation.past(_middle_ns(frame)) is not None
+        late = [m for m in (rate, attitude if known else None) if m is not None]
+
+        def told(accepted: list[bool]) -> None:
+            took = dict(zip(map(type, late), accepted, strict=True))
+            self._tell_rate(frame, motion, rate, now_ns, took.get(MeanRateMeasurement, False))
+            if found.solution is not None:
+                taken = took.get(AttitudeMeasurement)
+                self._tell_stars(frame, found.solution, attitude, now_ns, taken)
+
+        if late:
+            self._navigation.take_late(late, told)
+        else:
+            told([])
 
     def _poll(self, now_ns: int) -> Frame | None:
         try:
             return self._camera.poll()
         except DeviceError as error:
-            self._lost.update(True, now_ns, str(error))
+            self._facts.state(facts.CAMERA_LOST, True, now_ns, str(error))
             return None
 
     def _job(self, frame: Frame) -> FrameJob:
@@ -175,39 +205,52 @@ class Imaging:
         sigma = math.sqrt(max(widest, 0.0) + _LEAST_PRIOR_SIGMA**2)
         return AttitudePrior(multiply(self._settings.mounting, past.quaternion), sigma)
 
-    def _use_rate(self, frame: Frame, found: Found, now_ns: int) -> bool:
-        """Give the mean body rate over the exposure to navigation."""
+    def _mean_rate(self, frame: Frame, motion: Found) -> MeanRateMeasurement | None:
+        """Return the mean body rate over the exposure, None without one or before there was an estimate."""
         start_ns = frame.exposure_start_ns
-        if self._navigation.past(start_ns) is None:
-            return False  # exposed before there was an estimate
-        rate, covariance = self._rate_in_body(found)
-        accepted = self._navigation.take_mean_rate(start_ns, start_ns + frame.exposure_ns, rate, covariance)
-        if accepted:
-            self.accepted += 1
-        else:
-            text = f"frame {frame.sequence}: {rate[1]:.5f} rad/s +- {math.sqrt(covariance[1, 1]):.1e}"
-            self._events.tell(events.STREAK_REFUSED, now_ns, text)
-        return accepted
+        if motion.status is not StreakStatus.RATE or self._navigation.past(start_ns) is None:
+            return None
+        return MeanRateMeasurement(start_ns, start_ns + frame.exposure_ns, *self._rate_in_body(motion))
 
-    def _use_stars(self, frame: Frame, found: FrameFound, solution: FrameSolution, now_ns: int) -> None:
-        """Give the attitude at mid-exposure to navigation, and tell of it."""
-        accepted = False
-        middle_ns = _middle_ns(frame)
-        quaternion, covariance = np.full(4, np.nan), _NAN[1]
-        if solution.fix is not None:
-            turn = self._body_to_camera.T
-            quaternion = multiply(conjugate(self._settings.mounting), solution.fix.quaternion)
-            covariance = turn @ solution.fix.covariance @ turn.T + self._off_middle(frame, found.motion)
-            known = self._navigation.past(middle_ns) is not None
-            accepted = known and self._navigation.take_attitude(middle_ns, quaternion, covariance)
-            if known and not accepted:
-                text = f"frame {frame.sequence}: {len(solution.matched)} stars"
-                self._events.tell(events.STARS_REFUSED, now_ns, text)
+    def _tell_rate(
+        self, frame: Frame, motion: Found, rate: MeanRateMeasurement | None, now_ns: int, accepted: bool
+    ) -> None:
+        self.accepted += accepted
+        if rate is not None and not accepted:
+            sigma = math.sqrt(rate.covariance[1, 1])
+            text = f"frame {frame.sequence}: {rate.rate[1]:.5f} rad/s +- {sigma:.1e}"
+            self._events.tell(events.STREAK_REFUSED, now_ns, text)
+        self._record_rate(frame, motion.status.value, motion, now_ns, accepted)
+
+    def _attitude(self, frame: Frame, found: FrameFound) -> AttitudeMeasurement | None:
+        """Return the attitude at mid-exposure, None when the stars do not tell it."""
+        fix = found.solution.fix if found.solution is not None else None
+        if fix is None:
+            return None
+        turn = self._body_to_camera.T
+        covariance = turn @ fix.covariance @ turn.T + self._off_middle(frame, found.motion)
+        quaternion = multiply(conjugate(self._settings.mounting), fix.quaternion)
+        return AttitudeMeasurement(_middle_ns(frame), quaternion, covariance)
+
+    def _tell_stars(
+        self,
+        frame: Frame,
+        solution: FrameSolution,
+        attitude: AttitudeMeasurement | None,
+        now_ns: int,
+        accepted: bool | None,
+    ) -> None:
+        """Record what the stars said; `accepted` None when nobody was asked to take it."""
+        if accepted is False:
+            text = f"frame {frame.sequence}: {len(solution.matched)} stars"
+            self._events.tell(events.STARS_REFUSED, now_ns, text)
+        quaternion = np.full(4, np.nan) if attitude is None else attitude.quaternion
+        covariance = _NAN[1] if attitude is None else attitude.covariance
         self._recorder.record(
             STARS,
             now_ns,
             sequence=frame.sequence,
-            middle_ns=middle_ns - self._recorder.epoch_ns,
+            middle_ns=_middle_ns(frame) - self._recorder.epoch_ns,
             status=solution.status.value,
             tracked=int(solution.tracked),
             found=len(solution.points),
@@ -215,7 +258,7 @@ class Imaging:
             quaternion=quaternion.tolist(),
             covariance=_packed(covariance),
             log10_false_alarm=solution.log10_false_alarm,
-            accepted=int(accepted),
+            accepted=int(bool(accepted)),
         )
 
     def _off_middle(self, frame: Frame, motion: Found) -> FloatArray:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from enum import Enum
 
 import numpy as np
 
@@ -20,6 +21,20 @@ CURRENT_UNCERTAINTY = 3.5e-3
 """A; the thesis's bound on what a coil carries beside what it was told to."""
 
 _HISTORY_NS = 500_000_000
+_LOW, _HIGH = (0, 0), (0, COUNTS)
+
+
+class Condition(Enum):
+    """What is wrong with a coil or its bridge; of a leg stuck the other one still follows its input."""
+
+    SOUND = "sound"
+    OPEN = "open"
+    SHORTED = "shorted"
+    REVERSED = "reversed"
+    A_HIGH = "A stuck high"
+    A_LOW = "A stuck low"
+    B_HIGH = "B stuck high"
+    B_LOW = "B stuck low"
 
 
 class CoilCircuit:
@@ -53,8 +68,12 @@ class CoilCircuit:
         self._now_ns = now_ns
         self._uncertainty = uncertainty
         self._bus_voltage = truth.supply_voltage if bus_voltage is None else bus_voltage
+        self._supply_voltage = truth.supply_voltage
+        self._conditions = [Condition.SOUND] * 3
+        self._short_ohm = [1.0, 1.0, 1.0]
         self._counts = [0, 0, 0]
         self._values = [0.0, 0.0, 0.0]
+        self._drawn = [0.0, 0.0, 0.0]  # from the supply, by each bridge
         self._currents: FloatArray = np.zeros(3)
         # (time, charge in A ns that the supply has given by then, current since then), oldest first.
         self._history: deque[tuple[int, float, float]] = deque([(now_ns(), 0.0, 0.0)])
@@ -65,19 +84,30 @@ class CoilCircuit:
         """Return the mean currents (3,) in A of the present PWM setting."""
         return self._currents
 
+    def become(self, axis: int, condition: Condition, short_ohm: float = 5.0) -> None:
+        """Let a coil break, or be mended; a shorted one leaves `short_ohm` to its bridge."""
+        self._conditions[axis] = condition
+        self._short_ohm[axis] = short_ohm
+        self.update(self._coils[axis][1])
+
     def update(self, written: int) -> None:
         """Follow the chip after a STOP; `written` is the mask of the channels that were written."""
         draws = self._generator.random(3).tolist() if written else (0.5, 0.5, 0.5)
         for axis, (coil, channels, step, limit) in enumerate(self._coils):
-            counts = self._driven(coil.channel_a, coil.channel_b, coil.enable_channel)
+            condition = self._conditions[axis]
+            counts = self._driven(coil.channel_a, coil.channel_b, coil.enable_channel, condition)
             if counts == self._counts[axis] and not written & channels:
                 continue
             self._counts[axis] = counts
-            if counts:
+            current = 0.0
+            if counts and condition is not Condition.OPEN:
                 current = counts * step + self._uncertainty * (2.0 * draws[axis] - 1.0)
-                self._values[axis] = min(limit, max(-limit, current))
-            else:
-                self._values[axis] = 0.0
+                current = min(limit, max(-limit, current))
+            self._drawn[axis] = abs(current)
+            if condition is Condition.SHORTED:
+                self._drawn[axis] = abs(counts) / COUNTS * self._supply_voltage / self._short_ohm[axis]
+                current = 0.0
+            self._values[axis] = -current if condition is Condition.REVERSED else current
         self._currents = np.array(self._values)
         self._remember()
 
@@ -89,10 +119,17 @@ class CoilCircuit:
         charge = self._charge(end_ns) - self._charge(start_ns)
         return self._bus_voltage, charge / (end_ns - start_ns)
 
-    def _driven(self, channel_a: int, channel_b: int, enable: int | None) -> int:
+    def _driven(self, channel_a: int, channel_b: int, enable: int | None, condition: Condition) -> int:
         """Return for how many counts of a period, signed, the coil is driven."""
         high = self._chip.high
         a, b = high(channel_a), high(channel_b)
+        match condition:
+            case Condition.A_HIGH | Condition.A_LOW:
+                a = _HIGH if condition is Condition.A_HIGH else _LOW
+            case Condition.B_HIGH | Condition.B_LOW:
+                b = _HIGH if condition is Condition.B_HIGH else _LOW
+            case _:
+                pass
         if enable is None:
             # The part that both have in common drops out of the difference: it brakes.
             return a[1] - b[1]
@@ -102,8 +139,7 @@ class CoilCircuit:
     def _remember(self) -> None:
         now = self._now_ns()
         last_ns, charge, current = self._history[-1]
-        x, y, z = self._values
-        self._history.append((now, charge + current * (now - last_ns), abs(x) + abs(y) + abs(z)))
+        self._history.append((now, charge + current * (now - last_ns), sum(self._drawn)))
         while len(self._history) > 1 and self._history[1][0] < now - _HISTORY_NS:
             self._history.popleft()
 

@@ -11,9 +11,9 @@ import numpy as np
 
 from flight import quaternion
 from flight.arrays import BoolArray, FloatArray
+from flight.earth import EARTH_RADIUS
 from flight.pinhole import Pinhole
 from flight.sun import SUN_RADIUS
-from sim_hal.world.orbit import EARTH_RADIUS
 
 
 def boresights(attitudes: FloatArray, mounting: FloatArray = quaternion.IDENTITY) -> FloatArray:

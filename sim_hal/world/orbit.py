@@ -13,14 +13,8 @@ import numpy as np
 from scipy.integrate import OdeSolution, solve_ivp
 
 from flight.arrays import FloatArray
+from flight.earth import EARTH_RADIUS, GRAVITATIONAL_PARAMETER, J2
 from hal.interfaces.errors import OutOfRange
-
-GRAVITATIONAL_PARAMETER = 3.986004418e14
-"""m^3/s^2, of the Earth (EGM2008; IERS Conventions 2010, Table 1.1)."""
-EARTH_RADIUS = 6_378_136.6
-"""m, equatorial (IERS Conventions 2010, Table 1.1)."""
-J2 = 1.0826359e-3
-"""The Earth's dynamical form factor (IERS Conventions 2010, Table 1.1)."""
 
 DEVICE = "orbit"
 _TOLERANCE = 1e-12

@@ -9,20 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flight.arrays import FloatArray
+from flight.estimation.innovation import innovation
 from flight.estimation.latency import Motion
 from flight.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement, RateMeasurement
-from flight.estimation.mekf import (
-    SIZE,
-    ProcessNoise,
-    State,
-    carry,
-    correct,
-    innovation,
-    keep_attitude,
-    normalised_square,
-    release_attitude,
-)
+from flight.estimation.mekf import correct, keep_attitude, normalised_square, release_attitude
+from flight.estimation.propagation import ProcessNoise, carry
 from flight.estimation.rigid_body import Parameters
+from flight.estimation.state import SIZE, State
 from flight.estimation.turn import compose, exponential, inverse, logarithm
 from tests.estimation.flights import FREE, RATE_COVARIANCE, SUSPENDED, TURN_COVARIANCE
 
@@ -48,13 +41,16 @@ def moved(state: State, error: FloatArray) -> State:
         Parameters(*(p + d for p, d in zip(state.parameters, e[12:15], strict=True))),
         state.kept,
         state.latency + e[15],
+        (state.field_bias[0] + e[16], state.field_bias[1] + e[17], state.field_bias[2] + e[18]),
     )
 
 
 def difference(a: State, b: State) -> FloatArray:
-    """Return the error (16,) of b, by which it is off a."""
+    """Return the error (19,) of b, by which it is off a."""
     turn = logarithm(compose(a.quaternion, inverse(b.quaternion)))
-    mine, theirs = (np.array([*s.rate, *s.bias, *s.disturbance, *s.parameters, s.latency]) for s in (a, b))
+    mine, theirs = (
+        np.array([*s.rate, *s.bias, *s.disturbance, *s.parameters, s.latency, *s.field_bias]) for s in (a, b)
+    )
     return np.concatenate([turn, mine - theirs])
 
 

@@ -7,10 +7,10 @@ import pytest
 
 from flight import quaternion
 from flight.arrays import FloatArray
+from flight.earth import EARTH_RADIUS
 from flight.pinhole import Pinhole
 from flight.sun import ASTRONOMICAL_UNIT
 from sim_hal.world.exclusion import boresights, earth_in_field, hidden_by_earth, in_field, sun_in_field
-from sim_hal.world.orbit import EARTH_RADIUS
 
 HALF = np.radians(10.0)
 CAMERA = np.array([[0.0, EARTH_RADIUS + 380e3, 0.0]])

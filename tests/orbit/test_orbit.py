@@ -11,11 +11,9 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 
 from flight.arrays import FloatArray
+from flight.earth import EARTH_RADIUS, GRAVITATIONAL_PARAMETER, J2
 from hal.interfaces.errors import OutOfRange
 from sim_hal.world.orbit import (
-    EARTH_RADIUS,
-    GRAVITATIONAL_PARAMETER,
-    J2,
     KeplerianElements,
     Orbit,
     propagate,

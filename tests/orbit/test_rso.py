@@ -10,6 +10,8 @@ import pytest
 
 from flight import quaternion, sun
 from flight.arrays import FloatArray
+from flight.earth import EARTH_RADIUS
+from flight.shadow import sunlit_share
 from hal.interfaces.errors import OutOfRange
 from sim_hal.opportunities import (
     Scenario,
@@ -22,8 +24,7 @@ from sim_hal.opportunities import (
 )
 from sim_hal.rso import TRACK_ERROR, ResidentSpaceObject, directions, source_tracks
 from sim_hal.star_camera import StarCameraModel, expected_electrons
-from sim_hal.world.orbit import EARTH_RADIUS, KeplerianElements, propagate
-from sim_hal.world.shadow import sunlit_share
+from sim_hal.world.orbit import KeplerianElements, propagate
 
 EPOCH = 2_461_041.5
 """2026 January 1.0."""

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from flight.arrays import FloatArray
+from flight.earth import EARTH_RADIUS
+from flight.shadow import eclipsed, sunlit_share
 from flight.sun import ASTRONOMICAL_UNIT, SUN_RADIUS
-from sim_hal.world.orbit import EARTH_RADIUS
-from sim_hal.world.shadow import eclipsed, sunlit_share
 
 SUN = np.array([ASTRONOMICAL_UNIT, 0.0, 0.0])
 

@@ -11,8 +11,8 @@ from typing import Literal
 import numpy as np
 
 from flight.arrays import BoolArray, FloatArray
+from flight.earth import EARTH_RADIUS
 from flight.sun import SUN_RADIUS
-from sim_hal.world.orbit import EARTH_RADIUS
 
 Shadow = Literal["conical", "cylindrical"]
 

@@ -1,0 +1,85 @@
+"""What sensors that look at a scene should find: nadir, the Sun, and the limb's curve."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flight.arrays import FloatArray
+from flight.directions import tangent_basis
+from flight.earth import semi_axes
+from sim_hal.earth_camera.model import EarthCameraModel
+from sim_hal.earth_camera.scene import EarthScene
+from sim_hal.earth_camera.sun_disc import towards_sun
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LimbTruth:
+    """Points of the limb on the detector, in the order in which they go round the Earth.
+
+    Attributes:
+        points: pixels (n, 2).
+        directions: unit vectors (n, 3) in camera axes.
+        solar_cosines: cosine (n,) of the Sun's distance from the zenith where each line of sight touches:
+            above 0 the ground there has day; the air is lit some degrees further.
+    """
+
+    points: FloatArray
+    directions: FloatArray
+    solar_cosines: FloatArray
+
+
+def nadir(scene: EarthScene) -> FloatArray:
+    """Return the unit vector (3,) in camera axes to the Earth's centre."""
+    return np.asarray(scene.camera_matrix @ (-scene.position / np.linalg.norm(scene.position)))
+
+
+def sun_direction(scene: EarthScene) -> FloatArray:
+    """Return the unit vector (3,) in camera axes from the camera to the Sun, seen or not."""
+    return towards_sun(scene)[0]
+
+
+def sun_point(scene: EarthScene, model: EarthCameraModel) -> FloatArray:
+    """Return the pixel (2,) of the Sun's centre, maybe off the detector; NaN where the lens sees nothing."""
+    return np.asarray(model.lens.project(sun_direction(scene)[None, :])[0])
+
+
+def limb_directions(
+    scene: EarthScene, count: int = 720, height: float = 0.0
+) -> tuple[FloatArray, FloatArray]:
+    """Return unit vectors (count, 3), in camera axes, round the limb, and solar cosines (count,) there.
+
+    The lines from the camera that touch the ellipsoid `height` m above the WGS 84 one: in axes scaled so that
+    it is the unit sphere they touch it in a circle of the plane q p = 1, p the camera's position. Raises
+    ValueError when the camera is not outside.
+    """
+    axes = semi_axes(height)
+    origin = scene.in_earth(scene.position) / axes
+    square = float(origin @ origin)
+    if square <= 1.0:
+        raise ValueError(f"limb at {height} m: the camera is not above that height")
+    centre = origin / square
+    angle = np.arange(count) * (2.0 * np.pi / count)
+    ring = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ tangent_basis(origin / np.sqrt(square))
+    touching = centre + np.sqrt(1.0 - 1.0 / square) * ring
+    lines = (touching - origin) * axes @ scene.earth_matrix @ scene.camera_matrix.T
+    normals = touching / axes
+    sun = scene.in_earth(scene.sun / np.linalg.norm(scene.sun))
+    cosines = normals @ sun / np.linalg.norm(normals, axis=1)
+    return np.asarray(lines / np.linalg.norm(lines, axis=1, keepdims=True)), np.asarray(cosines)
+
+
+def limb_truth(
+    scene: EarthScene, model: EarthCameraModel, count: int = 3600, height: float | None = None
+) -> LimbTruth:
+    """Return the limb on the detector, of `count` points all round the Earth those that are imaged.
+
+    `height` m above the ellipsoid is by default the atmosphere's apparent limb height.
+    """
+    if height is None:
+        height = scene.atmosphere.apparent_limb_height
+    directions, cosines = limb_directions(scene, count, height)
+    points = model.lens.project(directions)
+    seen = model.lens.contains(points)
+    return LimbTruth(points[seen], directions[seen], cosines[seen])

@@ -1,0 +1,1 @@
+"""Tests of the Earth and Sun camera's simulator."""

@@ -1,0 +1,1 @@
+"""Tests of the Sun sensor: frames and strings."""
