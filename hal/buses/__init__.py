@@ -1,1 +1,1 @@
-"""Buses of a Linux board: serial port, I2C bus, clock; each behind a Protocol of `hal.interfaces`."""
+"""Buses of a Linux board: serial port, I2C, video device, clock; each behind a Protocol of hal.interfaces."""

@@ -5,8 +5,10 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
-from hal.interfaces.wires import Ticker
+if TYPE_CHECKING:  # at run time the Protocols would bring numpy in, which the guardian does without
+    from hal.interfaces.wires import Ticker
 
 
 class SystemClock:

@@ -1,4 +1,8 @@
-"""A serial port of Linux through pyserial: a thread waits for bytes and stamps them as they come."""
+"""A serial port of Linux through pyserial: a thread waits for bytes and stamps them as they come.
+
+The same thread opens the port again when it has gone: an adapter that was pulled out and plugged in comes
+back under the name that udev gives it.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +18,7 @@ from hal.interfaces.wires import Clock
 _READ_TIMEOUT_S = 0.1  # only how soon the thread sees that the port is to close
 _WRITE_TIMEOUT_S = 0.5
 _PENDING_LIMIT = 1 << 16
+_REOPEN_S = 0.25
 
 # What pyserial lets through besides its own (which are OSErrors): see its posix back end.
 _PORT_ERRORS = (OSError, termios.error, ValueError, TypeError)
@@ -39,11 +44,9 @@ class PySerialPort:
         self._pending_bytes = 0
         self._lock = threading.Lock()
         self._failure = ""
-        self._closing = False
+        self._closing = threading.Event()
         try:
-            self._serial = serial.Serial(
-                device, baud_rate, timeout=_READ_TIMEOUT_S, write_timeout=_WRITE_TIMEOUT_S, exclusive=True
-            )
+            self._serial = self._open()
         except _PORT_ERRORS as error:
             raise NotResponding(
                 device,
@@ -78,36 +81,58 @@ class PySerialPort:
 
     def set_baud_rate(self, baud_rate: int) -> None:
         """Change the line's speed. Raises NotResponding when the port does not take it."""
+        # Kept whatever happens: a port that is gone is opened again at this speed.
+        self.baud_rate = baud_rate
         try:
             self._serial.baudrate = baud_rate
         except _PORT_ERRORS as error:
             raise NotResponding(self._device, f"does not take {baud_rate} baud ({error})") from error
-        self.baud_rate = baud_rate
 
     def close(self) -> None:
         """Stop the thread and close the port. Safe to call twice."""
-        if self._closing:
+        if self._closing.is_set():
             return
-        self._closing = True
+        self._closing.set()
         if self._serial.is_open:
             self._serial.cancel_read()
         self._thread.join(timeout=2.0)
         self._serial.close()
         self._failure = self._failure or "the port was closed"
 
+    def _open(self) -> serial.Serial:
+        return serial.Serial(
+            self._device,
+            self.baud_rate,
+            timeout=_READ_TIMEOUT_S,
+            write_timeout=_WRITE_TIMEOUT_S,
+            exclusive=True,
+        )
+
     def _read(self) -> None:
-        while not self._closing:
+        while not self._closing.is_set():
             try:
                 # The first byte wakes the thread; what lies ready behind it comes along.
                 data = self._serial.read(1)
                 if data:
                     data += self._serial.read(self._serial.in_waiting)
             except _PORT_ERRORS as error:
-                if not self._closing:
+                if not self._closing.is_set():
                     self._failure = f"reading failed ({error}): is the device still there?"
-                return
+                    self._open_again()
+                continue
             if data:
                 self._keep(self._clock.now_ns(), data)
+
+    def _open_again(self) -> None:
+        """Try until the port is back or to be closed; nobody else waits for that."""
+        self._serial.close()
+        while not self._closing.wait(_REOPEN_S):
+            try:
+                self._serial = self._open()
+            except _PORT_ERRORS:
+                continue
+            self._failure = ""
+            return
 
     def _keep(self, arrival_ns: int, data: bytes) -> None:
         with self._lock:

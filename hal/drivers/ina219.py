@@ -113,7 +113,9 @@ class Ina219:
         current = math.fsum(amps for _, amps in self._conversions) / count
         with self._lock:
             self._latest = PowerReading(self._clock.now_ns(), voltage, current, voltage * current)
-            self._error = ""
+            # A failure is told until the mean is whole again: who looks once a second must not miss it.
+            if count == self._conversions.maxlen:
+                self._error = ""
 
     def _convert(self) -> tuple[float, float] | None:
         """Return bus voltage in V and current in A of a new conversion, None while there is none."""

@@ -100,6 +100,15 @@ class Pca9685:
         """Tell whether the chip still holds its set-up, lost in a brown-out. Raises NotResponding."""
         return all(found == wanted for _, wanted, found in self._set_up())
 
+    def holds(self, first: int, counts: Sequence[PwmCounts]) -> bool:
+        """Tell whether up to 8 neighbouring channels hold these counts. Raises NotResponding."""
+        wanted = _values(counts)
+        try:
+            held = self._bus.read_i2c_block_data(self._address, LED0_ON_L + 4 * first, len(wanted))
+        except OSError as error:
+            raise self._silent(error) from error
+        return held == wanted
+
     def write_channels(self, first: int, counts: Sequence[PwmCounts]) -> None:
         """Write up to 8 neighbouring channels in one block; their outputs change together, at its end.
 
@@ -107,14 +116,12 @@ class Pca9685:
         """
         if not (1 <= len(counts) <= BLOCK_CHANNELS and 0 <= first <= CHANNELS - len(counts)):
             raise OutOfRange(self.name, "last channel", first + len(counts) - 1, 0, CHANNELS - 1, "")
-        values: list[int] = []
         for on, off in counts:
             if on == off or not (0 <= on <= COUNTS and 0 <= off <= COUNTS):
                 quantity = f"OFF count with ON count {on} (never equal)"
                 raise OutOfRange(self.name, quantity, off, 0, COUNTS, "counts")
-            values += (on & 0xFF, on >> 8, off & 0xFF, off >> 8)
         try:
-            self._bus.write_i2c_block_data(self._address, LED0_ON_L + 4 * first, values)
+            self._bus.write_i2c_block_data(self._address, LED0_ON_L + 4 * first, _values(counts))
         except OSError as error:
             raise self._silent(error) from error
 
@@ -144,6 +151,11 @@ class Pca9685:
 
     def _silent(self, error: OSError) -> DeviceError:
         return NotResponding(self.name, f"{error.strerror}; check its power, wiring and address")
+
+
+def _values(counts: Sequence[PwmCounts]) -> list[int]:
+    """Return what the four registers of each channel hold."""
+    return [byte for on, off in counts for byte in (on & 0xFF, on >> 8, off & 0xFF, off >> 8)]
 
 
 def _name(address: int) -> str:

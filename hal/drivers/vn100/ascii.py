@@ -85,7 +85,7 @@ def parse(line: bytes, *, allow_none: bool = False) -> Sentence | None:
     `XX` in place of a checksum passes only with `allow_none`: a unit never sends it.
     """
     text = line.rstrip(b"\r\n")
-    body, star, digits = text[1:].rpartition(b"*")
+    body, star, digits = text[1:].partition(b"*")  # a sentence has one star
     if not (text.startswith(b"$VN") and star and body.isascii() and len(body) >= 5):
         return None
     checksum = _verify(body, digits, allow_none)

@@ -7,36 +7,26 @@ composes, take it to the mission's reference frame and the body's axes (`flight.
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass
 
-import numpy as np
-
-from hal.drivers.vn100.ascii import AsciiLine, Sentence, build, error_meaning, measurement
-from hal.drivers.vn100.codec import BinaryPacket, Layout, layout_of
+from hal.drivers.vn100.ascii import AsciiLine, error_meaning, measurement
+from hal.drivers.vn100.codec import BinaryPacket, Layout
+from hal.drivers.vn100.recovery import Recovery
+from hal.drivers.vn100.set_up import PASSING_ERRORS, Question, set_up
+from hal.drivers.vn100.settings import DEVICE, OUTPUT_SET, Vn100Settings, check
 from hal.drivers.vn100.stream import StreamParser
-from hal.interfaces.errors import CorruptData, DeviceError, NotResponding, OutOfRange, Refused
-from hal.interfaces.readings import FloatArray, ImuLink, ImuReading
+from hal.interfaces.errors import CorruptData, DeviceError, NotResponding, Refused
+from hal.interfaces.readings import ImuLink, ImuReading
 from hal.interfaces.wires import Clock, SerialPort
 
-DEVICE = "vn100"
-IMU_RATE_HZ = 800
-ASCII_RATES_HZ = (1, 2, 4, 5, 10, 20, 25, 40, 50, 100, 200)
-TESLA_PER_GAUSS = 1e-4
-STANDARD_GRAVITY = 9.80665
+__all__ = ["OUTPUT_SET", "Vn100", "Vn100Settings"]
 
-# TimeStartup, Quaternion, AngularRate, Accel of group 1 and Mag of group 3: all of a reading in 67 bytes.
-OUTPUT_SET = {0: 0x0131, 2: 0x0100}
-_QMR_LENGTH = 137  # with a CRC16
-_LINE_LOAD_LIMIT = 0.8  # the rest is left for answers
+TESLA_PER_GAUSS = 1e-4
 _LONGEST_PACKET = 128  # more than any output set that 40 Hz asks for; bounds the wait on a false start
 _POLL_STEP_NS = 1_000_000
 _UNIT_NORM_TOLERANCE = 1e-2
-
-# The unit met our bytes, or itself, in a bad moment: worth another try. All other codes are a no.
-_PASSING_ERRORS = frozenset({-1, 0x01, 0x02, 0x03, 0x0A, 0x0B, 0xFF})
 
 # Where a packet may carry each quantity, in order of preference.
 _SOURCES = (
@@ -48,48 +38,17 @@ _SOURCES = (
 _TIMES = ("common.time_startup", "time.time_startup")
 
 
-@dataclass(frozen=True, slots=True)
-class Vn100Settings:
-    """How the unit is mounted, and what is asked of it.
-
-    Attributes:
-        attitude_map: (4, 4), takes the unit's quaternion (NED into sensor) to ours (reference into body).
-        mounting: (3, 3) rotation matrix, sensor axes into body axes.
-        rate_hz: samples a second; binary rates divide 800, ASCII rates are register 7's.
-        output: binary packets, or ASCII VNQMR lines (which carry no device time).
-        unit_port: the unit's own serial port that the cable is on, 1 or 2.
-        rate_range, field_range, acceleration_range: rad/s, T, m/s^2, per axis; beyond is refused. The field's
-            default is the 6 G of the testbed's unit; present-day units state 2.5 G.
-        configure: False leaves the unit as it is; any output that carries a whole reading is then taken.
-        response_timeout_ns: the wait for an answer, each try.
-        tries: how often a command is sent before the unit counts as silent.
-    """
-
-    attitude_map: FloatArray = field(default_factory=lambda: np.eye(4))
-    mounting: FloatArray = field(default_factory=lambda: np.eye(3))
-    rate_hz: int = 40
-    output: Literal["binary", "ascii"] = "binary"
-    unit_port: int = 1
-    rate_range: float = math.radians(2000.0)
-    field_range: float = 6e-4
-    acceleration_range: float = 16.0 * STANDARD_GRAVITY
-    configure: bool = True
-    response_timeout_ns: int = 100_000_000
-    tries: int = 3
-
-
 class Vn100:
     """A VN-100 on a serial port; implements `hal.interfaces.devices.InertialUnit`.
 
     Attributes:
-        resets: how often the device's time went backwards: the unit started anew, and runs on its saved
-            settings until `configure` is called again.
+        resets: how often the device's time went backwards: the unit started anew.
         unit_error: the text of the last error that the unit reported, empty when none.
     """
 
     def __init__(self, port: SerialPort, clock: Clock, settings: Vn100Settings) -> None:
         """Take the line. Raises Refused or OutOfRange when the unit or the line cannot do what is asked."""
-        _check(settings, port.baud_rate)
+        check(settings, port.baud_rate)
         self.resets = 0
         self.unit_error = ""
         self._port = port
@@ -98,7 +57,10 @@ class Vn100:
         self._byte_ns = 10e9 / port.baud_rate
         self._parser = StreamParser(self._byte_ns, _LONGEST_PACKET)
         self._places: dict[bytes, _Places | None] = {}
+        self._recovery = Recovery(port, settings)
         self._device_ns = 0
+        self._sample: tuple[tuple[float, ...], ...] = ()
+        self._alike = 0
         self._out_of_range = 0
         self._not_finite = 0
         self._last_byte_ns = -1
@@ -112,38 +74,30 @@ class Vn100:
         """
         if not self._settings.configure:
             return
-        self._ask("ASY", 0)
-        model = self._ask("RRG", 1)
-        if not model or not model[0].startswith("VN-100"):
-            raise Refused(DEVICE, f"the unit calls itself {','.join(model)!r}: this line needs a VN-100")
-        self._write(6, 0)
-        # The unit's own learning of hard and soft iron would take the coils' field for the unit's.
-        self._write(44, 0, 1, 5)
-        # Boxcar filters as long as one 40 Hz period (magnetometer, accelerometer, gyro), on both outputs.
-        self._write(85, 20, 20, 20, 4, 0, 3, 3, 3, 3, 0)
-        self._switch_off(76)
-        self._switch_off(77)
-        if self._settings.output == "binary":
-            groups = f"{sum(1 << bit for bit in OUTPUT_SET):02X}"
-            words = (f"{OUTPUT_SET[bit]:04X}" for bit in sorted(OUTPUT_SET))
-            divisor = IMU_RATE_HZ // self._settings.rate_hz
-            self._write(75, self._settings.unit_port, divisor, groups, *words)
-        else:
-            self._switch_off(75)
-            # CRC16 on the lines too: 8 bits of XOR let two flips in one column pass.
-            self._write(30, 0, 0, 0, 0, 3, 0, 1)
-            self._write(7, self._settings.rate_hz)
-            self._write(6, 8)
-        self._ask("ASY", 1)
+        # Without its output between the answers there is less to mistake.
+        self._ask(Question("ASY", (0,)))
+        dialogue = set_up(self._settings)
+        question = next(dialogue)
+        with contextlib.suppress(StopIteration):
+            while True:
+                question = dialogue.send(self._ask(question))
 
     def poll(self) -> list[ImuReading]:
         """Return the samples since the last call, oldest first. Never blocks.
 
-        Raises NotResponding when the line itself is gone. Corrupt and implausible packets are counted in
-        `link`.
+        A unit that gives none is looked for and set up anew, a question a call. Raises NotResponding when the
+        line itself is gone. Corrupt and implausible packets are counted in `link`.
         """
-        readings = (self._reading(item) for item in self._receive())
-        return [reading for reading in readings if reading is not None]
+        items = self._receive()
+        found = (self._reading(item) for item in items)
+        readings = [reading for reading in found if reading is not None]
+        if self._settings.configure:
+            sentences = [item.sentence for item in items if not isinstance(item, BinaryPacket)]
+            parser = self._parser
+            self._recovery.advance(
+                self._clock.now_ns(), len(readings), sentences, parser.packets, parser.bytes_received
+            )
+        return readings
 
     def link(self) -> ImuLink:
         """Return the line's counters; `packets` are all packets and lines whose checksum held."""
@@ -159,6 +113,11 @@ class Vn100:
             self._last_packet_ns,
         )
 
+    @property
+    def recoveries(self) -> int:
+        """How often a lost unit was found and set up anew."""
+        return self._recovery.completed
+
     def close(self) -> None:
         """Release the line."""
         self._port.close()
@@ -172,48 +131,33 @@ class Vn100:
             self._last_packet_ns = items[-1].arrival_ns
         return items
 
-    def _write(self, register: int, *values: object) -> None:
-        echo = self._ask("WRG", register, *values)
-        asked = [str(value) for value in values]
-        base16 = 75 <= register <= 77
-        if len(echo) != len(asked) or not all(_same(a, b, base16) for a, b in zip(asked, echo, strict=True)):
-            wanted, found = ",".join(asked), ",".join(echo)
-            raise Refused(DEVICE, f"register {register} was to be {wanted}, the unit answered {found}")
-
-    def _switch_off(self, register: int) -> None:
-        """Switch a binary output off; what the unit remembers of the fields is its own affair."""
-        echo = self._ask("WRG", register, 0, 20, "01", "0001")
-        if not echo or not _same("0", echo[0], True):
-            raise Refused(DEVICE, f"register {register} was to be off, the unit answered {','.join(echo)}")
-
-    def _ask(self, command: str, *fields: object) -> tuple[str, ...]:
-        """Send a command until its answer comes; return the answer's fields after those that identify it."""
+    def _ask(self, question: Question) -> tuple[str, ...]:
+        """Send a command until its answer comes; return the answer's fields after the first."""
         before = self.link()
         self.unit_error = ""
         for _ in range(self._settings.tries):
-            self._port.send(build(command, *fields))
-            answer = self._await(command, fields)
+            self._port.send(question.words())
+            answer = self._await(question)
             if answer is not None:
                 return answer
-        raise self._no_answer(f"$VN{command},{','.join(map(str, fields))}", before)
+        raise self._no_answer(question.text(), before)
 
-    def _await(self, command: str, fields: Sequence[object]) -> tuple[str, ...] | None:
+    def _await(self, question: Question) -> tuple[str, ...] | None:
         """Return the answer, or None when the time is up or the try was in vain."""
         deadline_ns = self._clock.now_ns() + self._settings.response_timeout_ns
         while True:
             for item in self._receive():
                 if isinstance(item, BinaryPacket):
                     continue
-                if _answers(item.sentence, command, fields[0]):
-                    return item.sentence.fields[1:]
-                error = error_meaning(item.sentence)
-                if error is not None:
-                    code, meaning = error
-                    self.unit_error = f"error {code:02X}, {meaning}"
-                    if code in _PASSING_ERRORS:
+                answer = question.answer(item.sentence)
+                if answer is not None:
+                    return answer
+                complaint = question.complaint(item.sentence)
+                if complaint is not None:
+                    code, self.unit_error = complaint
+                    if code in PASSING_ERRORS:
                         return None
-                    asked = ",".join((command, *map(str, fields)))
-                    raise Refused(DEVICE, f"$VN{asked} was answered with {self.unit_error}")
+                    raise Refused(DEVICE, f"{question.text()} was answered with {self.unit_error}")
             now_ns = self._clock.now_ns()
             if now_ns >= deadline_ns:
                 return None
@@ -251,9 +195,12 @@ class Vn100:
             self._not_finite += 1
             return None
         settings = self._settings
+        self._alike = self._alike + 1 if sample[1:] == self._sample else 0
+        self._sample = sample[1:]
         norm = math.hypot(*q)
         if (
-            abs(norm - 1.0) > _UNIT_NORM_TOLERANCE
+            0 < settings.stuck_after <= self._alike
+            or abs(norm - 1.0) > _UNIT_NORM_TOLERANCE
             or max(map(abs, rate)) > settings.rate_range
             or max(map(abs, mag)) > settings.field_range / TESLA_PER_GAUSS
             or max(map(abs, accel)) > settings.acceleration_range
@@ -287,6 +234,7 @@ class Vn100:
             device_ns = int(values[places.time])
             if device_ns < self._device_ns:
                 self.resets += 1
+                self._recovery.reset()
             self._device_ns = device_ns
         q, rate, mag, accel = places.sensors
         return device_ns, values[q], values[rate], values[mag], values[accel]
@@ -314,25 +262,6 @@ class _Places:
     sensors: tuple[slice, slice, slice, slice]
 
 
-def _check(settings: Vn100Settings, baud_rate: int) -> None:
-    if settings.output == "binary":
-        possible = tuple(rate for rate in range(1, IMU_RATE_HZ + 1) if IMU_RATE_HZ % rate == 0)
-        length = layout_of(OUTPUT_SET).length
-    else:
-        possible, length = ASCII_RATES_HZ, _QMR_LENGTH
-    if settings.rate_hz not in possible:
-        raise Refused(
-            DEVICE,
-            f"rate_hz = {settings.rate_hz} is no {settings.output} output rate of the unit; "
-            f"it has {', '.join(map(str, possible))}",
-        )
-    load = settings.rate_hz * length * 10 / baud_rate
-    if load > _LINE_LOAD_LIMIT:
-        raise OutOfRange(DEVICE, f"line load at {baud_rate} baud", load, 0.0, _LINE_LOAD_LIMIT, "of the line")
-    if settings.unit_port not in {1, 2}:
-        raise Refused(DEVICE, f"unit_port = {settings.unit_port}: the unit has serial ports 1 and 2")
-
-
 def _places(layout: Layout) -> _Places | None:
     """Return where a packet carries a reading; None when it lacks any part but the time."""
     sensors: list[slice] = []
@@ -345,19 +274,3 @@ def _places(layout: Layout) -> _Places | None:
     q, rate, mag, accel = sensors
     # Of MagPres, the first three are the field.
     return _Places(time, (q, rate, slice(mag.start, mag.start + 3), accel))
-
-
-def _answers(sentence: Sentence, command: str, first: object) -> bool:
-    """Tell whether a sentence answers a command whose first field is `first`; numbers may be zero-padded."""
-    if sentence.command != command or not sentence.fields:
-        return False
-    return _same(str(first), sentence.fields[0], False)
-
-
-def _same(asked: str, echoed: str, base16: bool) -> bool:
-    if asked == echoed:
-        return True
-    try:
-        return int(asked, 16) == int(echoed, 16) if base16 else float(asked) == float(echoed)
-    except ValueError:
-        return False

@@ -1,0 +1,277 @@
+"""A GenICam camera (USB3 Vision, GigE Vision) through Aravis, each exposure started by a software trigger.
+
+Aravis (https://aravisproject.github.io/aravis) is a library of the system that Python reaches by
+introspection; it is imported when a camera of this kind is opened, and needed nowhere else.
+
+An exposure is taken to begin half-way between sending the trigger and its acknowledge: within about a
+millisecond on USB. The camera's own clock is not asked, for its relation to the host's is not known.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import importlib.util
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from hal.drivers.camera import CameraCounts, FrameNumbers
+from hal.interfaces.errors import NotResponding, OutOfRange, Refused
+from hal.interfaces.readings import Frame
+from hal.interfaces.wires import Clock
+
+PIXEL_KINDS: dict[str, np.dtype[Any]] = {
+    "Mono8": np.dtype("u1"),
+    "Mono10": np.dtype("<u2"),
+    "Mono12": np.dtype("<u2"),
+    "Mono16": np.dtype("<u2"),
+}
+"""Grey pixel formats that are not packed (GenICam PFNC 2.4, table "Mono"): low bits of 8 or 16."""
+
+CURE = (
+    "needs Aravis: apt install gir1.2-aravis-0.8 python3-gi, the virtual environment made with "
+    "--system-site-packages; or apt install libusb-1.0-0 and pip install 'knightcube-flight[genicam]'"
+)
+FAKE_PREFIX = "Fake"
+"""Aravis' own camera without hardware is called Fake_1."""
+
+# GigE Vision numbers its frames in 16 bits and leaves out 0; USB3 Vision has 64 bits.
+_FRAME_IDS = (1 << 16) - 1
+_MICROSECOND_NS = 1_000
+
+
+@dataclass(frozen=True, slots=True)
+class AravisSettings:
+    """What is asked of the camera.
+
+    Attributes:
+        name: as `arv-tool-0.8` lists it, such as "FLIR-1E10015B2E2F" or "Fake_1".
+        columns, rows: of the region in the middle of the sensor that is read.
+        pixel_format: a key of PIXEL_KINDS.
+        exposure_ns: the usual one.
+        gain: in the camera's own unit (dB as a rule), None to leave it.
+        buffers: how many frames Aravis may hold.
+    """
+
+    name: str
+    columns: int
+    rows: int
+    pixel_format: str
+    exposure_ns: int
+    gain: float | None = None
+    buffers: int = 4
+
+
+class AravisCamera:
+    """A `hal.drivers.camera.CameraDevice`."""
+
+    def __init__(self, settings: AravisSettings, clock: Clock) -> None:
+        """Take what is asked; nothing is opened, or imported, yet."""
+        self.name = settings.name
+        self.counts = CameraCounts()
+        self._settings = settings
+        self._clock = clock
+        self._kind = PIXEL_KINDS[settings.pixel_format]
+        self._numbers = FrameNumbers(_FRAME_IDS)
+        self._last: int | None = None
+        self._camera: Any = None
+        self._stream: Any = None
+        self._success: Any = None
+        self._bounds = 1, 1 << 62
+        self._asked_ns = 0
+        self._exposure_ns = 0  # what the camera made of it
+        self._start_ns: int | None = None
+        self._lost = False
+
+    def open(self) -> None:
+        """Open the camera and arm it. Raises NotResponding, Refused or OutOfRange, with the cure."""
+        self.close()
+        aravis = library(self.name)
+        if self.name.startswith(FAKE_PREFIX):
+            aravis.enable_interface("Fake")
+        try:
+            self._camera = aravis.Camera.new(self.name)
+        except _glib_error() as error:
+            aravis.update_device_list()
+            found = [aravis.get_device_id(index) for index in range(aravis.get_n_devices())]
+            raise NotResponding(
+                self.name,
+                f"{error}; there is {', '.join(found) or 'no camera at all'}: is it plugged in, and "
+                "may this user open it (udev rule for USB3 Vision)?",
+            ) from error
+        with self._told("setting it up"):
+            self._set_up(aravis, self._camera)
+
+    def check(self, exposure_ns: int) -> None:
+        """Raise OutOfRange for an exposure that the camera cannot make."""
+        low, high = self._bounds
+        if not low <= exposure_ns <= high:
+            raise OutOfRange(self.name, "exposure", exposure_ns * 1e-9, low * 1e-9, high * 1e-9, "s")
+
+    def expose(self, exposure_ns: int, trigger_ns: int) -> None:
+        """Trigger the exposure; what has come before it is given back. Raises DeviceError."""
+        camera, stream = self._opened()
+        with self._told("triggering"):
+            while (buffer := stream.try_pop_buffer()) is not None:
+                self._number_of(buffer)
+                stream.push_buffer(buffer)
+            if exposure_ns != self._asked_ns:
+                self._set_exposure(camera, exposure_ns)
+            before_ns = self._clock.now_ns()
+            camera.software_trigger()
+            self._start_ns = (before_ns + self._clock.now_ns()) // 2
+
+    def collect(self) -> Frame | None:
+        """Return the triggered frame once, None until it has come. Raises NotResponding."""
+        _, stream = self._opened()
+        if self._lost:
+            raise NotResponding(self.name, "gone: was it unplugged?")
+        while (buffer := stream.try_pop_buffer()) is not None:
+            frame = self._judge(buffer)
+            stream.push_buffer(buffer)
+            if frame is not None:
+                self._start_ns = None
+                return frame
+        return None
+
+    def close(self) -> None:
+        """Stop and release the camera. Safe to call when it is not open."""
+        camera, self._camera, self._stream, self._start_ns = self._camera, None, None, None
+        if camera is not None:
+            with contextlib.suppress(_glib_error()):  # a camera that is gone has stopped
+                camera.stop_acquisition()
+
+    def _opened(self) -> tuple[Any, Any]:
+        if self._camera is None or self._stream is None:
+            raise NotResponding(self.name, "is not open")
+        return self._camera, self._stream
+
+    @contextlib.contextmanager
+    def _told(self, doing: str) -> Iterator[None]:
+        """Turn Aravis' errors into a DeviceError that says what was being done."""
+        try:
+            yield
+        except _glib_error() as error:
+            raise NotResponding(self.name, f"failed while {doing}: {error}") from error
+
+    def _set_up(self, aravis: Any, camera: Any) -> None:
+        settings = self._settings
+        if not camera.is_software_trigger_supported():
+            raise Refused(self.name, f"{camera.get_model_name()} takes no software trigger")
+        offered = camera.dup_available_pixel_formats_as_strings()
+        if settings.pixel_format not in offered:
+            raise Refused(
+                self.name, f"has no pixel format {settings.pixel_format}; it offers {', '.join(offered)}"
+            )
+        camera.set_pixel_format_from_string(settings.pixel_format)
+        self._set_region(camera)
+        self._set_gain(aravis, camera)
+        if camera.is_exposure_auto_available():
+            camera.set_exposure_time_auto(aravis.Auto.OFF)
+        low, high = camera.get_exposure_time_bounds()
+        self._bounds = round(low * _MICROSECOND_NS), round(high * _MICROSECOND_NS)
+        self.check(settings.exposure_ns)
+        self._set_exposure(camera, settings.exposure_ns)
+        camera.set_acquisition_mode(aravis.AcquisitionMode.CONTINUOUS)
+        camera.set_trigger("Software")
+        self._start_stream(aravis, camera)
+
+    def _start_stream(self, aravis: Any, camera: Any) -> None:
+        stream = camera.create_stream(None, None)
+        if stream is None:
+            raise NotResponding(self.name, "opens no stream: has another program the camera?")
+        payload = camera.get_payload()
+        for _ in range(self._settings.buffers):
+            stream.push_buffer(aravis.Buffer.new_allocate(payload))
+        self._lost = False
+        camera.get_device().connect("control-lost", self._on_lost)
+        camera.start_acquisition()
+        self._stream = stream
+        self._success = aravis.BufferStatus.SUCCESS
+        self._numbers.begin_again()
+        self._last = None
+
+    def _on_lost(self, _: Any) -> None:
+        self._lost = True
+
+    def _set_region(self, camera: Any) -> None:
+        """Read the middle of the sensor, or left of it and above where the camera's steps want it."""
+        columns, rows = self._settings.columns, self._settings.rows
+        width, height = camera.get_sensor_size()
+        if columns > width or rows > height:
+            raise Refused(
+                self.name, f"its sensor has {width} x {height} pixels; {columns} x {rows} are asked for"
+            )
+        step_x, step_y = camera.get_x_offset_increment(), camera.get_y_offset_increment()
+        x, y = (width - columns) // 2, (height - rows) // 2
+        camera.set_region(x - x % max(step_x, 1), y - y % max(step_y, 1), columns, rows)
+        region = camera.get_region()
+        if (region[2], region[3]) != (columns, rows):
+            raise Refused(
+                self.name, f"reads {region[2]} x {region[3]} pixels, not {columns} x {rows}: see its steps"
+            )
+
+    def _set_gain(self, aravis: Any, camera: Any) -> None:
+        gain = self._settings.gain
+        if camera.is_gain_auto_available():
+            camera.set_gain_auto(aravis.Auto.OFF)
+        if gain is None:
+            return
+        if not camera.is_gain_available():
+            raise Refused(self.name, "has no gain to set: leave `gain` out")
+        low, high = camera.get_gain_bounds()
+        if not low <= gain <= high:
+            raise OutOfRange(self.name, "gain", gain, low, high, "")
+        camera.set_gain(gain)
+
+    def _set_exposure(self, camera: Any, exposure_ns: int) -> None:
+        camera.set_exposure_time(exposure_ns / _MICROSECOND_NS)
+        self._asked_ns = exposure_ns
+        self._exposure_ns = round(camera.get_exposure_time() * _MICROSECOND_NS)
+
+    def _number_of(self, buffer: Any) -> int:
+        number = self._numbers.number(buffer.get_frame_id())
+        if self._last is not None:
+            self.counts.missed += max(0, number - self._last - 1)
+        self._last = number
+        return number
+
+    def _judge(self, buffer: Any) -> Frame | None:
+        """Return the frame of a buffer if it is the triggered one."""
+        now_ns = self._clock.now_ns()
+        number = self._number_of(buffer)
+        if buffer.get_status() != self._success:
+            self.counts.spoiled += 1
+            return None
+        # What comes before the exposure can be over is not of it: a camera that also runs free.
+        if self._start_ns is None or now_ns < self._start_ns + self._exposure_ns:
+            return None
+        rows, columns = self._settings.rows, self._settings.columns
+        data = buffer.get_data()
+        if len(data) < rows * columns * self._kind.itemsize:
+            self.counts.short += 1
+            return None
+        pixels = np.frombuffer(data, self._kind, rows * columns).reshape(rows, columns)
+        native = pixels.astype(self._kind.newbyteorder("="), copy=False)
+        return Frame(number, self._start_ns, self._exposure_ns, now_ns, native)
+
+
+def library(name: str) -> Any:
+    """Return Aravis. Raises Refused, with the cure, when it is not installed."""
+    try:
+        if importlib.util.find_spec("aravis") is not None:
+            importlib.import_module("aravis")  # PyPI's: tells introspection where its library lies
+        gi = importlib.import_module("gi")
+        gi.require_version("Aravis", "0.8")
+        importlib.import_module("gi.repository.GLib")
+        return importlib.import_module("gi.repository.Aravis")
+    except (ImportError, ValueError, OSError) as error:
+        raise Refused(name, f"{CURE} ({error})") from error
+
+
+def _glib_error() -> type[Exception]:
+    kind: type[Exception] = importlib.import_module("gi.repository.GLib").Error
+    return kind

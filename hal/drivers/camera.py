@@ -1,0 +1,226 @@
+"""A camera served beside the control loop: a `FrameSource` over a device that may take its time.
+
+Triggering, fetching, setting controls and opening a camera again may each take milliseconds to seconds (a
+USB control transfer that goes unanswered: five). All of it happens on a job of the clock; `trigger` and
+`poll`, which the control loop calls, only exchange words with that job.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from typing import Protocol
+
+from hal.interfaces.errors import DeviceError, NotResponding, Refused
+from hal.interfaces.readings import Frame
+from hal.interfaces.wires import Clock
+
+PERIOD_NS = 10_000_000
+RETRY_NS = 1_000_000_000
+PATIENCE_NS = 3_000_000_000
+_MOST_EXPOSURES = 6
+
+
+@dataclass(slots=True)
+class CameraCounts:
+    """What became of the frames since start; the numbers only grow.
+
+    Attributes:
+        delivered: frames handed on.
+        spoiled: frames that the device itself flagged as damaged.
+        short: frames that came with less than all their pixels.
+        contradictory: frames that followed each other faster than their exposure allows.
+        missed: frames that the sequence numbers say were taken, and that never came.
+        openings: how often the camera was opened.
+    """
+
+    delivered: int = 0
+    spoiled: int = 0
+    short: int = 0
+    contradictory: int = 0
+    missed: int = 0
+    openings: int = 0
+
+
+class CameraDevice(Protocol):
+    """A camera as its driver knows it; all calls come from one thread at a time.
+
+    `check` is the exception: it must be safe beside the others.
+    """
+
+    name: str
+    counts: CameraCounts
+
+    def open(self) -> None:
+        """Open and set the camera up. Raises DeviceError, with the cure."""
+
+    def check(self, exposure_ns: int) -> None:
+        """Raise OutOfRange for an exposure that the camera cannot make."""
+
+    def expose(self, exposure_ns: int, trigger_ns: int) -> None:
+        """Begin to wait for an exposure that starts no sooner than the trigger. Raises DeviceError."""
+
+    def collect(self) -> Frame | None:
+        """Return that exposure's frame once, None until it has come. Never waits. Raises DeviceError."""
+
+    def close(self) -> None:
+        """Release the camera. Safe to call when it is not open."""
+
+
+class ServedCamera:
+    """Implements `hal.interfaces.devices.FrameSource`; opens a camera that went away again and again.
+
+    Attributes:
+        name: of the device.
+        counts: what became of its frames.
+    """
+
+    def __init__(self, device: CameraDevice, clock: Clock, patience_ns: int = PATIENCE_NS) -> None:
+        """Open the camera and serve it. Raises DeviceError when it cannot be opened.
+
+        A camera that has not delivered `patience_ns` and six exposures after a trigger is opened anew: one
+        that runs free may be in an exposure, and may take more of them before a new setting holds.
+        """
+        self.name = device.name
+        self.counts = device.counts
+        self._device = device
+        self._clock = clock
+        self._patience_ns = patience_ns
+        self._lock = threading.Lock()
+        self._asked: tuple[int, int] | None = None  # exposure, trigger: not yet told to the device
+        self._frame: Frame | None = None
+        self._failure: DeviceError | None = None
+        self._deadline_ns: int | None = None
+        self._open = False
+        self._retry_ns = clock.now_ns()
+        self._closed = False
+        self._open_device()
+        self._ticker = clock.ticker(f"camera {device.name}", PERIOD_NS, self._serve)
+
+    def trigger(self, exposure_ns: int) -> None:
+        """Start one exposure now; one that is under way is abandoned.
+
+        Raises NotResponding while the camera is gone, OutOfRange for an exposure that it cannot make.
+        """
+        self._device.check(exposure_ns)
+        with self._lock:
+            self._raise_failure()
+            self._asked = exposure_ns, self._clock.now_ns()
+        self._ticker.kick()
+
+    def poll(self) -> Frame | None:
+        """Return the newest finished frame once, None when there is no new one. Never blocks.
+
+        Raises the DeviceError that keeps frames from coming, while it lasts.
+        """
+        with self._lock:
+            frame, self._frame = self._frame, None
+            if frame is None:
+                self._raise_failure()
+            return frame
+
+    def close(self) -> None:
+        """Release the camera. Safe to call twice."""
+        with self._lock:
+            if self._closed:
+                return
+            self._closed = True
+            self._failure = NotResponding(self.name, "the camera was closed")
+        self._ticker.stop()
+        self._device.close()
+
+    def _raise_failure(self) -> None:
+        if self._failure is not None:
+            # Anew each time: an exception that is raised again and again grows its traceback.
+            raise type(self._failure)(self._failure.device, self._failure.message)
+
+    def _serve(self) -> None:
+        """Do what there is to do: the job of the ticker."""
+        if not self._open and not self._reopened():
+            return
+        try:
+            frame = self._advance()
+        except DeviceError as error:
+            self._drop(error)
+            return
+        if frame is not None:
+            self._deadline_ns = None
+            with self._lock:
+                if self._asked is None:  # else it was abandoned while the device was busy
+                    self._frame = frame
+                    self.counts.delivered += 1
+
+    def _advance(self) -> Frame | None:
+        with self._lock:
+            asked, self._asked = self._asked, None
+        if asked is not None:
+            exposure_ns, trigger_ns = asked
+            self._deadline_ns = trigger_ns + _MOST_EXPOSURES * exposure_ns + self._patience_ns
+            self._device.expose(exposure_ns, trigger_ns)
+        frame = self._device.collect()
+        if frame is None and self._deadline_ns is not None and self._clock.now_ns() > self._deadline_ns:
+            raise NotResponding(self.name, "no frame came after the trigger: is it the camera or its cable?")
+        return frame
+
+    def _reopened(self) -> bool:
+        """Try to open the camera when it is time to, and tell whether it is open."""
+        now_ns = self._clock.now_ns()
+        if now_ns < self._retry_ns or self._closed:
+            return False
+        self._retry_ns = now_ns + RETRY_NS
+        try:
+            self._open_device()
+        except DeviceError as error:
+            self._drop(error)
+            return False
+        with self._lock:
+            self._failure = None
+        return True
+
+    def _open_device(self) -> None:
+        try:
+            self._device.open()
+        except DeviceError:
+            self._device.close()
+            raise
+        self.counts.openings += 1
+        self._open = True
+
+    def _drop(self, error: DeviceError) -> None:
+        """Let go of a camera that fails; what was asked of it is forgotten."""
+        self._device.close()
+        self._open = False
+        self._deadline_ns = None
+        self._retry_ns = self._clock.now_ns() + RETRY_NS
+        kind = Refused if isinstance(error, Refused) else NotResponding
+        with self._lock:
+            self._asked = None
+            if not self._closed:
+                self._failure = kind(error.device, error.message)
+
+
+class FrameNumbers:
+    """The camera's own count made to go on where it wraps around or begins again.
+
+    A number that stands still stays still, and one that goes back a little stays back: by that a frozen
+    camera is known.
+    """
+
+    def __init__(self, modulus: int) -> None:
+        """Take the number after the highest that the camera counts to."""
+        self._modulus = modulus
+        self._last = -1
+        self._offset = 0
+
+    def begin_again(self) -> None:
+        """Go on from the last number whatever the camera's next one is: it was opened anew."""
+        self._offset = self._last + 1
+
+    def number(self, count: int) -> int:
+        """Return the frame's number."""
+        number = count + self._offset
+        if number < self._last - self._modulus // 2:
+            self._offset += self._modulus
+            number += self._modulus
+        self._last = max(self._last, number)
+        return number

@@ -1,0 +1,277 @@
+"""The kernel's side of /dev/videoN, replaced: a free-running camera that answers the ioctls of V4L2.
+
+Its buffers lie in a memfd, which the binding really maps; the rules of the queue are those of the kernel
+(Linux Media userspace API, "Streaming I/O (Memory Mapping)"): what is out of order gets the errno of there.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import itertools
+import mmap
+import os
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hal.buses import videodev2 as v4l2
+from hal.buses.v4l2 import fourcc
+
+MILLISECOND_NS = 1_000_000
+
+
+@dataclass(slots=True)
+class Knob:
+    """A control: its bounds and its value."""
+
+    minimum: int
+    maximum: int
+    value: int
+    name: bytes = b"knob"
+
+
+class IoctlCamera:
+    """Callable in place of fcntl.ioctl.
+
+    Attributes:
+        sizes: of the formats that it has, {fourcc: (columns, rows)}.
+        padding: bytes after each row.
+        shortest_ns: time from frame to frame, longer where the exposure is.
+        readout_ns: from the end of an exposure to the frame's end.
+        lag: frames from a control's change to the first that has it.
+        stamp_source, clock_flag, stamp_offset_ns: what the stamps claim, and by how much they lie.
+        stamps_packets: stamps are of the first packet whatever they claim, as those of uvcvideo.
+        spoil, shorten: numbers of frames that come flagged, or with half their bytes.
+        frozen: the sequence number stands still.
+        belies_exposure: frames come at `shortest_ns` however long they should be exposed.
+        stopped: no more frames come.
+        held_ns: by how much frames come late.
+        draws: frames have a pattern, each another; else what lay there.
+    """
+
+    def __init__(self, folder: Path, now_ns: Callable[[], int]) -> None:
+        self.path = folder / "camera"
+        self._now_ns = now_ns
+        self._memory = os.memfd_create("camera")
+        self.driver, self.card = b"double", b"Grey camera"
+        self.capabilities = v4l2.CAP_VIDEO_CAPTURE | v4l2.CAP_STREAMING
+        self.sizes = {"GREY": (64, 48), "Y10": (64, 48), "Y16": (64, 48)}
+        self.padding = 0
+        self.shortest_ns = 20 * MILLISECOND_NS
+        self.readout_ns = 5 * MILLISECOND_NS
+        self.lag = 1
+        self.stamp_source, self.clock_flag = v4l2.STAMP_START_OF_EXPOSURE, v4l2.STAMP_MONOTONIC
+        self.stamp_offset_ns = 0
+        self.stamps_packets = False
+        self.spoil: set[int] = set()
+        self.shorten: set[int] = set()
+        self.frozen = self.belies_exposure = self.stopped = False
+        self.held_ns = 0
+        self.first_sequence = 0
+        self.knobs = {
+            v4l2.EXPOSURE_AUTO: Knob(0, 3, 3),
+            v4l2.EXPOSURE_ABSOLUTE: Knob(1, 5000, 157),
+            v4l2.GAIN: Knob(0, 100, 10),
+        }
+        self.exposures: dict[int, tuple[int, int]] = {}
+        self.level = itertools.count(1)
+        self.draws = True
+        self.interval_asked_ns = 0
+        self.plug()
+
+    def plug(self) -> None:
+        """Be there, just switched on."""
+        self.plugged = True
+        self.path.symlink_to(f"/proc/self/fd/{self._memory}")
+        self._forget()
+
+    def unplug(self) -> None:
+        """Be gone: every call fails, and so does opening."""
+        self.plugged = False
+        self.path.unlink()
+
+    def close(self) -> None:
+        """Release the memory."""
+        os.close(self._memory)
+
+    def _forget(self) -> None:
+        self._kind = "GREY"
+        self._count = 0
+        self._streaming = False
+        self._free: deque[int] = deque()
+        self._filled: deque[v4l2.Buffer] = deque()
+        self._pending: list[tuple[int, int]] = []  # frames until it holds, exposure
+
+    def __call__(self, _: int, request: int, argument: Any) -> int:
+        """Answer one ioctl as the kernel would; raises OSError as it would."""
+        if not self.plugged:
+            raise OSError(errno.ENODEV, os.strerror(errno.ENODEV))
+        answers: dict[int, Callable[[Any], None]] = {
+            v4l2.QUERYCAP: self._querycap,
+            v4l2.ENUM_FMT: self._enum_fmt,
+            v4l2.S_FMT: self._s_fmt,
+            v4l2.G_PARM: self._g_parm,
+            v4l2.S_PARM: self._s_parm,
+            v4l2.REQBUFS: self._reqbufs,
+            v4l2.QUERYBUF: self._querybuf,
+            v4l2.QBUF: self._qbuf,
+            v4l2.DQBUF: self._dqbuf,
+            v4l2.STREAMON: self._streamon,
+            v4l2.STREAMOFF: self._streamoff,
+            v4l2.QUERYCTRL: self._queryctrl,
+            v4l2.G_CTRL: self._g_ctrl,
+            v4l2.S_CTRL: self._s_ctrl,
+        }
+        if request not in answers:
+            raise OSError(errno.ENOTTY, f"request 0x{request:08x}")
+        self._run()
+        answers[request](argument)
+        return 0
+
+    @property
+    def _row_bytes(self) -> int:
+        return self.sizes[self._kind][0] * (1 if self._kind == "GREY" else 2) + self.padding
+
+    @property
+    def _image_bytes(self) -> int:
+        return self._row_bytes * self.sizes[self._kind][1]
+
+    @property
+    def _slot_bytes(self) -> int:
+        return -(-self._image_bytes // mmap.PAGESIZE) * mmap.PAGESIZE
+
+    def _querycap(self, answer: v4l2.Capability) -> None:
+        answer.driver, answer.card = self.driver, self.card
+        answer.capabilities = self.capabilities | 0x2 | v4l2.CAP_DEVICE_CAPS  # the whole device's: output too
+        answer.device_caps = self.capabilities
+
+    def _enum_fmt(self, answer: v4l2.FormatDescription) -> None:
+        _require(answer.index < len(self.sizes), errno.EINVAL)
+        answer.pixelformat = fourcc(list(self.sizes)[answer.index])
+
+    def _s_fmt(self, answer: v4l2.Format) -> None:
+        _require(self._count == 0, errno.EBUSY)
+        _require(answer.type == v4l2.VIDEO_CAPTURE, errno.EINVAL)
+        pix = answer.fmt.pix
+        self._kind = next(
+            (kind for kind in self.sizes if fourcc(kind) == pix.pixelformat), next(iter(self.sizes))
+        )
+        pix.width, pix.height = self.sizes[self._kind]
+        pix.pixelformat, pix.bytesperline = fourcc(self._kind), self._row_bytes
+        pix.sizeimage = self._image_bytes
+
+    def _g_parm(self, answer: v4l2.StreamParameters) -> None:
+        answer.capability = v4l2.CAP_TIME_PER_FRAME
+
+    def _s_parm(self, answer: v4l2.StreamParameters) -> None:
+        _require(not self._streaming, errno.EBUSY)
+        time = answer.timeperframe
+        self.interval_asked_ns = time.numerator * 10**9 // time.denominator
+
+    def _reqbufs(self, answer: v4l2.RequestBuffers) -> None:
+        _require(not self._streaming, errno.EBUSY)
+        answer.count = self._count = min(answer.count, 8)
+        os.ftruncate(self._memory, self._count * self._slot_bytes)
+
+    def _querybuf(self, answer: v4l2.Buffer) -> None:
+        _require(answer.index < self._count, errno.EINVAL)
+        answer.length, answer.m.offset = self._image_bytes, answer.index * self._slot_bytes
+
+    def _qbuf(self, argument: v4l2.Buffer) -> None:
+        lying = [*self._free, *(buffer.index for buffer in self._filled)]
+        _require(argument.index < self._count and argument.index not in lying, errno.EINVAL)
+        self._free.append(argument.index)
+
+    def _dqbuf(self, answer: v4l2.Buffer) -> None:
+        _require(self._streaming, errno.EINVAL)
+        _require(bool(self._filled), errno.EAGAIN)
+        ctypes.pointer(answer)[0] = self._filled.popleft()
+
+    def _streamon(self, _: ctypes.c_int) -> None:
+        _require(self._count > 0, errno.EINVAL)
+        self._streaming = True
+        self._sequence = self.first_sequence
+        self._next_ns = self._now_ns() + 3 * MILLISECOND_NS
+        known = self.knobs.get(v4l2.EXPOSURE_ABSOLUTE)
+        self._exposure = known.value if known else 100
+
+    def _streamoff(self, _: ctypes.c_int) -> None:
+        self._forget()
+
+    def _queryctrl(self, answer: v4l2.QueryControl) -> None:
+        _require(answer.id in self.knobs, errno.EINVAL)
+        knob = self.knobs[answer.id]
+        answer.name, answer.step = knob.name, 1
+        answer.minimum, answer.maximum = knob.minimum, knob.maximum
+
+    def _g_ctrl(self, answer: v4l2.Control) -> None:
+        _require(answer.id in self.knobs, errno.EINVAL)
+        answer.value = self.knobs[answer.id].value
+
+    def _s_ctrl(self, argument: v4l2.Control) -> None:
+        _require(argument.id in self.knobs, errno.EINVAL)
+        knob = self.knobs[argument.id]
+        _require(knob.minimum <= argument.value <= knob.maximum, errno.ERANGE)
+        if argument.id == v4l2.EXPOSURE_ABSOLUTE:
+            # As UVC does: an automatic camera does not let its exposure be set.
+            _require(self.knobs[v4l2.EXPOSURE_AUTO].value == v4l2.EXPOSURE_MANUAL, errno.EACCES)
+            self._pending.append((self.lag, argument.value))
+        knob.value = argument.value
+
+    def _run(self) -> None:
+        """Finish every frame whose end has come; one that finds no free buffer is lost."""
+        while self._streaming and not self.stopped:
+            exposure_ns = self._exposure * v4l2.EXPOSURE_UNIT_NS
+            start_ns = self._next_ns
+            end_ns = start_ns + exposure_ns + self.readout_ns
+            if end_ns + self.held_ns > self._now_ns():
+                return
+            self._finish(start_ns, end_ns, exposure_ns)
+            period_ns = self.shortest_ns if self.belies_exposure else max(self.shortest_ns, exposure_ns)
+            self._next_ns += period_ns
+            self._pending = [(left - 1, value) for left, value in self._pending]
+            while self._pending and self._pending[0][0] < 0:
+                self._exposure = self._pending.pop(0)[1]
+
+    def _finish(self, start_ns: int, end_ns: int, exposure_ns: int) -> None:
+        number = self._sequence
+        self.exposures[number] = start_ns, exposure_ns
+        if not self.frozen:
+            self._sequence = (self._sequence + 1) % (1 << 32)
+        if not self._free:
+            return
+        index = self._free.popleft()
+        stamp_ns = start_ns if self.stamp_source == v4l2.STAMP_START_OF_EXPOSURE else end_ns
+        if self.stamps_packets:
+            stamp_ns = start_ns + exposure_ns
+        stamp_ns += self.stamp_offset_ns
+        flags = self.clock_flag | self.stamp_source | (v4l2.FLAG_ERROR if number in self.spoil else 0)
+        used = self._image_bytes // 2 if number in self.shorten else self._image_bytes
+        if self.draws:
+            self._draw(index, next(self.level))
+        buffer = v4l2.Buffer(
+            index=index, type=v4l2.VIDEO_CAPTURE, bytesused=used, flags=flags, sequence=number
+        )
+        buffer.timestamp.seconds, rest_ns = divmod(stamp_ns, 10**9)
+        buffer.timestamp.microseconds = rest_ns // 1000
+        self._filled.append(buffer)
+
+    def _draw(self, index: int, level: int) -> None:
+        """Write an image whose pixel (x, y) is level + x + 100 y, in the low bits, padding 255."""
+        columns, rows = self.sizes[self._kind]
+        kind = np.dtype("u1") if self._kind == "GREY" else np.dtype("<u2")
+        bits = {"GREY": 8, "Y10": 10, "Y12": 12, "Y16": 16}[self._kind]
+        y, x = np.mgrid[:rows, :columns]
+        image = ((level + x + 100 * y) % (1 << bits)).astype(kind)
+        lines = b"".join(row.tobytes() + b"\xff" * self.padding for row in image)
+        os.pwrite(self._memory, lines, index * self._slot_bytes)
+
+
+def _require(fulfilled: bool, code: int) -> None:
+    if not fulfilled:
+        raise OSError(code, os.strerror(code))

@@ -1,0 +1,111 @@
+"""The kernel's structures have the kernel's sizes, and its requests the kernel's codes."""
+
+from __future__ import annotations
+
+import ctypes
+import platform
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from hal.buses import videodev2
+from hal.buses.v4l2 import fourcc, fourcc_name
+
+# Of linux/videodev2.h on x86-64.
+CODES = {
+    "QUERYCAP": 0x80685600,
+    "ENUM_FMT": 0xC0405602,
+    "S_FMT": 0xC0D05605,
+    "REQBUFS": 0xC0145608,
+    "QUERYBUF": 0xC0585609,
+    "QBUF": 0xC058560F,
+    "DQBUF": 0xC0585611,
+    "STREAMON": 0x40045612,
+    "STREAMOFF": 0x40045613,
+    "G_PARM": 0xC0CC5615,
+    "S_PARM": 0xC0CC5616,
+    "G_CTRL": 0xC008561B,
+    "S_CTRL": 0xC008561C,
+    "QUERYCTRL": 0xC0445624,
+}
+STRUCTURES = {
+    "v4l2_capability": videodev2.Capability,
+    "v4l2_fmtdesc": videodev2.FormatDescription,
+    "v4l2_format": videodev2.Format,
+    "v4l2_requestbuffers": videodev2.RequestBuffers,
+    "v4l2_buffer": videodev2.Buffer,
+    "v4l2_streamparm": videodev2.StreamParameters,
+    "v4l2_control": videodev2.Control,
+    "v4l2_queryctrl": videodev2.QueryControl,
+}
+MEMBERS = [
+    (
+        "v4l2_buffer",
+        videodev2.Buffer,
+        ("bytesused", "flags", "timestamp", "sequence", "memory", "m", "length"),
+    ),
+    ("v4l2_pix_format", videodev2.PixelFormat, ("pixelformat", "field", "bytesperline", "sizeimage")),
+    ("v4l2_capability", videodev2.Capability, ("card", "capabilities", "device_caps")),
+    ("v4l2_format", videodev2.Format, ("fmt",)),
+    ("v4l2_queryctrl", videodev2.QueryControl, ("minimum", "maximum", "step", "flags")),
+]
+CONSTANTS = {
+    "V4L2_BUF_FLAG_ERROR": videodev2.FLAG_ERROR,
+    "V4L2_BUF_FLAG_TIMESTAMP_MASK": videodev2.STAMP_MASK,
+    "V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC": videodev2.STAMP_MONOTONIC,
+    "V4L2_BUF_FLAG_TSTAMP_SRC_MASK": videodev2.STAMP_SOURCE_MASK,
+    "V4L2_BUF_FLAG_TSTAMP_SRC_SOE": videodev2.STAMP_START_OF_EXPOSURE,
+    "V4L2_CAP_VIDEO_CAPTURE": videodev2.CAP_VIDEO_CAPTURE,
+    "V4L2_CAP_STREAMING": videodev2.CAP_STREAMING,
+    "V4L2_CAP_DEVICE_CAPS": videodev2.CAP_DEVICE_CAPS,
+    "V4L2_CAP_TIMEPERFRAME": videodev2.CAP_TIME_PER_FRAME,
+    "V4L2_BUF_TYPE_VIDEO_CAPTURE": videodev2.VIDEO_CAPTURE,
+    "V4L2_MEMORY_MMAP": videodev2.MMAP,
+    "V4L2_FIELD_NONE": videodev2.FIELD_NONE,
+    "V4L2_CTRL_FLAG_DISABLED": videodev2.CONTROL_DISABLED,
+    "V4L2_CID_AUTOGAIN": videodev2.AUTO_GAIN,
+    "V4L2_CID_GAIN": videodev2.GAIN,
+    "V4L2_CID_ANALOGUE_GAIN": videodev2.ANALOGUE_GAIN,
+    "V4L2_CID_EXPOSURE_AUTO": videodev2.EXPOSURE_AUTO,
+    "V4L2_EXPOSURE_MANUAL": videodev2.EXPOSURE_MANUAL,
+    "V4L2_CID_EXPOSURE_ABSOLUTE": videodev2.EXPOSURE_ABSOLUTE,
+    "V4L2_PIX_FMT_GREY": fourcc("GREY"),
+    "V4L2_PIX_FMT_Y10": fourcc("Y10"),
+    "V4L2_PIX_FMT_Y12": fourcc("Y12"),
+    "V4L2_PIX_FMT_Y16": fourcc("Y16"),
+}
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="the published codes are those of x86-64")
+def test_requests_are_the_published_ones() -> None:
+    assert {name: getattr(videodev2, name) for name in CODES} == CODES
+    assert [ctypes.sizeof(kind) for kind in (videodev2.Buffer, videodev2.Format)] == [88, 208]
+    assert videodev2.Format.fmt.offset == 8
+    assert fourcc("GREY") == 0x59455247
+    assert fourcc("Y10") == 0x20303159
+
+
+def test_names_of_pixel_formats_survive_their_code() -> None:
+    assert [fourcc_name(fourcc(name)) for name in ("GREY", "Y10", "Y16")] == ["GREY", "Y10", "Y16"]
+
+
+def test_all_agree_with_this_machines_own_header(tmp_path: Path) -> None:
+    compiler = shutil.which("cc")
+    if compiler is None or not Path("/usr/include/linux/videodev2.h").exists():
+        pytest.skip("no C compiler or no kernel headers here")
+    lines = [f'printf("%zu ", sizeof(struct {name}));' for name in STRUCTURES]
+    lines += [f'printf("%zu ", offsetof(struct {name}, {m}));' for name, _, all_ in MEMBERS for m in all_]
+    lines += [f'printf("%lu ", (unsigned long)VIDIOC_{name});' for name in CODES]
+    lines += [f'printf("%lu ", (unsigned long){name});' for name in CONSTANTS]
+    headers = "#include <linux/videodev2.h>\n#include <stddef.h>\n#include <stdio.h>\n"
+    source, program = tmp_path / "sizes.c", tmp_path / "sizes"
+    source.write_text(headers + "int main(void) {\n" + "\n".join(lines) + "\nreturn 0; }\n", encoding="ascii")
+    subprocess.run([compiler, str(source), "-o", str(program)], check=True, timeout=60)
+    told = subprocess.run([str(program)], check=True, timeout=10, capture_output=True, text=True).stdout
+    ours = [ctypes.sizeof(kind) for kind in STRUCTURES.values()]
+    ours += [getattr(kind, member).offset for _, kind, members in MEMBERS for member in members]
+    ours += [getattr(videodev2, name) for name in CODES]
+    ours += list(CONSTANTS.values())
+    assert [int(word) for word in told.split()] == ours
