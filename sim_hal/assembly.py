@@ -24,7 +24,7 @@ from sim_hal.emulators.pca9685 import EmulatedPca9685
 from sim_hal.emulators.star_camera import EmulatedStarCamera, Expose
 from sim_hal.emulators.vn100 import Vn100Emulator, Vn100EmulatorSettings
 from sim_hal.emulators.vn100_sensors import NoiseProfile
-from sim_hal.faults import FaultTimeline
+from sim_hal.faults.timeline import FaultTimeline
 from sim_hal.settings import Simulation, Sky
 from sim_hal.star_camera import StarCameraModel, render
 from sim_hal.truth import TruthRecorder
@@ -33,6 +33,7 @@ from sim_hal.world.simulation import TimedSimulation
 from sim_hal.world.testbed import Testbed, TestbedModel
 
 _LINE_STREAM = 0x11E
+_FAULT_STREAM = 0xFA017
 
 BUS_VOLTAGE = 5.0
 """V in the coils' supply, before the losses of the bridge [ch. 5: a 5 V power bus]."""
@@ -146,6 +147,11 @@ def assemble(
 def line_generator(seed: int) -> np.random.Generator:
     """Return the draws of the serial line's faults, apart from all others of the same seed."""
     return np.random.default_rng([seed, _LINE_STREAM])
+
+
+def fault_generator(seed: int) -> np.random.Generator:
+    """Return the draws of the faults of devices, likewise."""
+    return np.random.default_rng([seed, _FAULT_STREAM])
 
 
 def camera_model(camera: Camera, sky: Sky) -> StarCameraModel:

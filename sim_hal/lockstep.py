@@ -11,9 +11,11 @@ from pathlib import Path
 from flight.settings import Config
 from flight.telemetry.log import FlightLog
 from hal.interfaces.wires import Wires
-from sim_hal.assembly import Hardware, assemble, line_generator
+from sim_hal.assembly import Hardware, assemble, fault_generator, line_generator
 from sim_hal.clock import SimClock
 from sim_hal.emulators.serial_line import SerialLine
+from sim_hal.faults.bench import Bench
+from sim_hal.faults.schedule import put, scheduled
 from sim_hal.settings import Simulation
 from sim_hal.truth import TruthRecorder
 
@@ -40,7 +42,14 @@ def build(config: Config, section: Simulation, truth: TruthRecorder | None, cloc
     hardware = assemble(config, section, clock.now_ns, line.device, truth)
     clock.attach(hardware.simulation)
     wires = Wires(line.host, hardware.bus, hardware.camera)
-    return LockStep(clock, wires, hardware.release, hardware, line)
+    faults = scheduled(section.faults, realtime=False)
+    bench = Bench(hardware, line, clock.now_ns, fault_generator(section.seed), line.host)
+
+    def release(epoch_ns: int) -> None:
+        hardware.release(epoch_ns)
+        put(faults, bench, epoch_ns)
+
+    return LockStep(clock, wires, release, hardware, line)
 
 
 @contextmanager

@@ -5,22 +5,17 @@
 
 from __future__ import annotations
 
-import errno
-import itertools
 import json
 import os
 import select
-import socket
 import subprocess
 import sys
-import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from hal.buses.clock import SystemClock
@@ -28,107 +23,20 @@ from hal.buses.serial_port import PySerialPort
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.readings import Frame
 from hal.interfaces.wires import Wires
-from sim_hal.server import LENGTH
+from sim_hal.device_link import Link, RemoteI2cBus
 
 PATIENCE_S = 5.0
 """How long the devices outlive a flight process that died."""
 
-_ANSWER_S = 0.1
 _START_S = 20.0
-
-
-class _Link:
-    """One connection to the server."""
-
-    def __init__(self, path: Path) -> None:
-        self._line = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        self._line.settimeout(_ANSWER_S)
-        self._line.connect(str(path))
-        self._received = bytearray()
-        self._numbers = itertools.count(1)
-
-    def fileno(self) -> int:
-        return self._line.fileno()
-
-    def send(self, name: str, *arguments: Any) -> int:
-        """Send a request; return its number."""
-        number = next(self._numbers)
-        body = msgspec.msgpack.encode([number, name, *arguments])
-        self._line.sendall(LENGTH.pack(len(body)) + body)
-        return number
-
-    def receive(self) -> list[Any]:
-        """Wait for one message. Raises TimeoutError, or ConnectionError when the server is gone."""
-        while (message := self._message()) is None:
-            chunk = self._line.recv(65536)
-            if not chunk:
-                raise ConnectionResetError(errno.ECONNRESET, "the emulated devices are gone")
-            self._received += chunk
-        return message
-
-    def close(self) -> None:
-        self._line.close()
-
-    def _message(self) -> list[Any] | None:
-        if len(self._received) < LENGTH.size:
-            return None
-        (length,) = LENGTH.unpack_from(self._received)
-        end = LENGTH.size + length
-        if len(self._received) < end:
-            return None
-        message: list[Any] = msgspec.msgpack.decode(bytes(self._received[LENGTH.size : end]))
-        del self._received[:end]
-        return message
-
-
-class RemoteI2cBus:
-    """An I2cBus whose parts are in the server's process. Safe for several threads."""
-
-    def __init__(self, path: Path) -> None:
-        self._link = _Link(path)
-        self._lock = threading.Lock()
-
-    def call(self, name: str, *arguments: Any) -> Any:
-        """Ask and wait for the answer. Raises OSError as a bus does."""
-        with self._lock:
-            try:
-                number = self._link.send(name, *arguments)
-                # An answer that came too late for its own question is passed over.
-                while (answer := self._link.receive())[0] != number:
-                    pass
-            except TimeoutError as error:
-                raise TimeoutError(errno.ETIMEDOUT, "the emulated bus does not answer") from error
-        _, kind, result, text = answer
-        if kind == "error":
-            raise OSError(result, text)
-        return result
-
-    def read_byte_data(self, address: int, register: int) -> int:
-        """Read one byte."""
-        return int(self.call("read_byte_data", address, register))
-
-    def write_byte_data(self, address: int, register: int, value: int) -> None:
-        """Write one byte."""
-        self.call("write_byte_data", address, register, value)
-
-    def read_i2c_block_data(self, address: int, register: int, length: int) -> list[int]:
-        """Read a block."""
-        return list(self.call("read_i2c_block_data", address, register, length))
-
-    def write_i2c_block_data(self, address: int, register: int, values: Sequence[int]) -> None:
-        """Write a block."""
-        self.call("write_i2c_block_data", address, register, list(values))
-
-    def close(self) -> None:
-        """Close the connection."""
-        self._link.close()
+OPENER = "sim_hal.device_link:open_bus"
 
 
 class RemoteFrameSource:
     """A FrameSource whose camera is in the server's process; frames are announced, and read from a file."""
 
     def __init__(self, path: Path, clock: SystemClock) -> None:
-        self._link = _Link(path)
+        self._link = Link(path)
         self._folder = path.parent
         self._clock = clock
 
@@ -143,7 +51,7 @@ class RemoteFrameSource:
         """Return the newest frame announced since the last call. Raises NotResponding when refused."""
         newest: Frame | None = None
         try:
-            while select.select([self._link], [], [], 0.0)[0]:
+            while self._link.pending() or select.select([self._link], [], [], 0.0)[0]:
                 _, kind, result, text = self._link.receive()
                 if kind == "frame":
                     newest = self._read(result, text)
@@ -169,8 +77,10 @@ class Served:
 
     clock: SystemClock
     wires: Wires
-    release: Callable[[int], None]
-    process_id: int
+    release: Callable[..., None]
+    """Takes mission time zero, and the faults of the flight as they are written."""
+    bus: tuple[str, str]
+    """How another process opens the bus: `module:function` and that function's argument."""
 
 
 @contextmanager
@@ -196,20 +106,8 @@ def served(config_path: Path, seed: int, folder: Path) -> Iterator[Served]:
         env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
     )
     try:
-        facts = _first_words(process)
-        clock = SystemClock()
-        serial = PySerialPort(facts["serial"], facts["baud_rate"], clock)
-        path = Path(facts["socket"])
-        bus = RemoteI2cBus(path)
-        camera = RemoteFrameSource(path, clock) if facts["camera"] else None
-        try:
-            wires = Wires(serial, bus, camera)
-            yield Served(clock, wires, lambda epoch_ns: bus.call("release", epoch_ns), process.pid)
-        finally:
-            serial.close()
-            bus.close()
-            if camera is not None:
-                camera.close()
+        with _plugged_into(_first_words(process)) as plugged:
+            yield plugged
     finally:
         process.terminate()
         try:
@@ -219,6 +117,45 @@ def served(config_path: Path, seed: int, folder: Path) -> Iterator[Served]:
             process.wait()
         if process.stdout is not None:
             process.stdout.close()
+
+
+@contextmanager
+def running(facts_path: Path) -> Iterator[Served]:
+    """Connect to a server that runs already, and leave it running. Raises NotResponding.
+
+    `facts_path` is what it was told to write: `python -m sim_hal serve CONFIG --facts FILE`.
+    """
+    try:
+        facts = json.loads(facts_path.read_text(encoding="utf-8"))
+        facts = {name: facts[name] for name in ("serial", "baud_rate", "socket", "camera")}
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        raise NotResponding("emulated devices", f"{facts_path} tells of no server: {error!r}") from error
+    with _plugged_into(facts) as devices:
+        yield devices
+
+
+@contextmanager
+def _plugged_into(facts: dict[str, Any]) -> Iterator[Served]:
+    """Connect to the server that said these words of itself."""
+    clock = SystemClock()
+    path = Path(facts["socket"])
+    with ExitStack() as stack:
+        serial = PySerialPort(facts["serial"], facts["baud_rate"], clock)
+        stack.callback(serial.close)
+        try:
+            bus = RemoteI2cBus(path)
+            stack.callback(bus.close)
+            camera = RemoteFrameSource(path, clock) if facts["camera"] else None
+        except OSError as error:
+            raise NotResponding("emulated devices", f"nobody answers on {path} ({error})") from error
+        if camera is not None:
+            stack.callback(camera.close)
+        wires = Wires(serial, bus, camera)
+
+        def release(epoch_ns: int, faults: Sequence[str] = ()) -> None:
+            bus.call("release", epoch_ns, list(faults), os.getpid())
+
+        yield Served(clock, wires, release, (OPENER, str(path)))
 
 
 def _first_words(process: subprocess.Popen[bytes]) -> dict[str, Any]:

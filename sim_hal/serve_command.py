@@ -31,6 +31,9 @@ def add_to(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> Non
     parser.add_argument(
         "--patience", type=float, metavar="S", help="end S seconds after the last client has left"
     )
+    parser.add_argument(
+        "--facts", type=Path, metavar="FILE", help="write the object to FILE too, for `flight run --devices`"
+    )
     parser.set_defaults(command=serve)
 
 
@@ -57,6 +60,10 @@ def serve(options: argparse.Namespace) -> int:
             "socket": str(server.socket_path),
             "camera": config.camera is not None,
         }
+        if options.facts is not None:
+            beside = options.facts.with_suffix(".part")
+            beside.write_text(json.dumps(facts) + "\n", encoding="utf-8")
+            beside.replace(options.facts)
         sys.stdout.write(json.dumps(facts) + "\n")
         sys.stdout.flush()
         server.serve(None if options.patience is None else round(options.patience * 1e9))

@@ -12,16 +12,13 @@ import os
 import selectors
 import signal
 import socket
-import struct
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 from types import FrameType
 from typing import Any
-
-import msgspec
 
 from flight.arrays import FloatArray, Image
 from flight.settings import Camera, Config
@@ -29,13 +26,16 @@ from flight.telemetry.log import FlightLog
 from hal.buses.clock import SystemClock
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.readings import Frame
-from sim_hal.assembly import Hardware, StarRenderer, assemble, line_generator
+from sim_hal.assembly import Hardware, StarRenderer, assemble, fault_generator, line_generator
+from sim_hal.device_link import Inbox, pack
 from sim_hal.emulators.pty_line import PtyLine
+from sim_hal.faults.bench import Bench
+from sim_hal.faults.grammar import parse
+from sim_hal.faults.schedule import put
 from sim_hal.settings import Simulation, Sky
 from sim_hal.truth import TruthRecorder
 
 SOCKET_NAME = "devices.sock"
-LENGTH = struct.Struct("<I")
 _LONGEST_WAIT_NS = 20_000_000
 _FRAME_SLOTS = 4
 _PR_SET_PDEATHSIG = 1
@@ -60,7 +60,7 @@ class _Connection:
     def __init__(self, line: socket.socket) -> None:
         self.line = line
         self.wants_frames = False
-        self._received = bytearray()
+        self._inbox = Inbox()
 
     def requests(self) -> list[Any] | None:
         """Return the complete requests that have come; None when the client has gone."""
@@ -70,22 +70,12 @@ class _Connection:
             return None
         if not chunk:
             return None
-        self._received += chunk
-        complete = []
-        while len(self._received) >= LENGTH.size:
-            (length,) = LENGTH.unpack_from(self._received)
-            end = LENGTH.size + length
-            if len(self._received) < end:
-                break
-            complete.append(msgspec.msgpack.decode(bytes(self._received[LENGTH.size : end])))
-            del self._received[:end]
-        return complete
+        return self._inbox.take(chunk)
 
     def answer(self, message: Any) -> None:
         """Send a message; a client that is gone, or does not read, is not waited for."""
-        body = msgspec.msgpack.encode(message)
         try:
-            self.line.sendall(LENGTH.pack(len(body)) + body)
+            self.line.sendall(pack(message))
         except OSError:
             self.wants_frames = False
 
@@ -103,6 +93,7 @@ class DeviceServer:
         self.hardware: Hardware = assemble(
             config, section, self._clock.now_ns, self._pty, TruthRecorder(self._log), self._expose
         )
+        self._faults_drawn = fault_generator(section.seed)
         self._frames_sent = 0
         self._served_anybody = False
         self._selector = selectors.DefaultSelector()
@@ -196,10 +187,17 @@ class DeviceServer:
             "write_byte_data": lambda _, *a: bus.write_byte_data(*a),
             "read_i2c_block_data": lambda _, *a: bus.read_i2c_block_data(*a),
             "write_i2c_block_data": lambda _, *a: bus.write_i2c_block_data(*a),
-            "release": lambda _, epoch_ns: self.hardware.release(epoch_ns),
+            "release": lambda _, *a: self._release(*a),
             "currents": lambda _: self.hardware.circuit.currents().tolist(),
             "trigger": trigger,
         }
+
+    def _release(self, epoch_ns: int, faults: Sequence[str] = (), flight_process: int | None = None) -> None:
+        """Let the body go, and have the faults of a flight process come at their times after that."""
+        self.hardware.release(epoch_ns)
+        generator = self._faults_drawn
+        bench = Bench(self.hardware, self._pty, self._clock.now_ns, generator, None, flight_process)
+        put([parse(text) for text in faults], bench, epoch_ns)
 
     def _deliver_frame(self) -> None:
         camera = self.hardware.camera

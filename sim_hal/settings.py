@@ -71,6 +71,17 @@ class Sky(Section, frozen=True, kw_only=True):
     line_time: NotNegative = 0.0
 
 
+class FaultEntry(Section, frozen=True, kw_only=True):
+    """A fault on the time line: what, from which second of mission time on, for how many seconds.
+
+    Without `at` it begins at 0, without `for` it lasts to the end. `sim_hal.faults.grammar` reads `fault`.
+    """
+
+    fault: str
+    at: NotNegative | None = None
+    span: Positive | None = msgspec.field(default=None, name="for")
+
+
 class Simulation(Section, frozen=True, kw_only=True):
     """The whole section."""
 
@@ -83,3 +94,4 @@ class Simulation(Section, frozen=True, kw_only=True):
     sky: Sky = Sky()
     truth: Truth = Truth()
     latency: Latency = Latency()
+    faults: tuple[FaultEntry, ...] = ()

@@ -37,6 +37,7 @@ class _Fault:
     after: int = 0
     index: int = 0
     mask: int = 0
+    chance: Callable[[], bool] | None = None
 
 
 class EmulatedI2cBus:
@@ -67,6 +68,17 @@ class EmulatedI2cBus:
         """Take a part off the bus; its address is acknowledged no more."""
         with self._lock:
             self._parts.remove(part)
+
+    def put_before(self, part: I2cPart, cover: I2cPart) -> Callable[[], None]:
+        """Let `cover` take the place of a part that is on the bus; return what puts the part back."""
+        with self._lock:
+            self._parts[self._parts.index(part)] = cover
+
+        def uncover() -> None:
+            with self._lock:
+                self._parts[self._parts.index(cover)] = part
+
+        return uncover
 
     def read_byte_data(self, address: int, register: int) -> int:
         """Read one byte."""
@@ -102,33 +114,54 @@ class EmulatedI2cBus:
                 data = _flipped(data, 1 + fault.index, fault.mask)
             self._deliver(parts, address, data)
 
-    def nack(self, address: int, times: int | None = 1, after: int = 0) -> None:
-        """Let a part refuse `times` transactions (None: until cleared), a write after `after` bytes taken.
+    def nack(
+        self,
+        address: int | None,
+        times: int | None = 1,
+        after: int = 0,
+        chance: Callable[[], bool] | None = None,
+    ) -> Callable[[], None]:
+        """Let a part (None: all) refuse `times` transactions (None: until lifted or cleared).
 
-        The register byte counts as the first of them.
+        A write is refused after `after` bytes taken, the register byte the first of them; with `chance` only
+        where it says so. Returns what lifts the fault, as all of these do.
         """
-        self._add(_Fault(errno.EREMOTEIO, "no acknowledge", address, times, after=after))
+        return self._add(
+            _Fault(errno.EREMOTEIO, "no acknowledge", address, times, after=after, chance=chance)
+        )
 
-    def hang(self, times: int | None = None) -> None:
+    def hang(self, times: int | None = None) -> Callable[[], None]:
         """Hold the clock line low: each transaction takes the time-out and fails."""
-        self._add(_Fault(errno.ETIMEDOUT, "time-out, the clock line is held low", None, times))
+        return self._add(_Fault(errno.ETIMEDOUT, "time-out, the clock line is held low", None, times))
 
-    def lose_arbitration(self, times: int | None = 1) -> None:
+    def time_out(self, address: int, chance: Callable[[], bool]) -> Callable[[], None]:
+        """Let a part stretch the clock beyond the time-out where `chance` says so."""
+        return self._add(
+            _Fault(errno.ETIMEDOUT, "time-out, the clock is stretched", address, None, chance=chance)
+        )
+
+    def lose_arbitration(self, times: int | None = 1) -> Callable[[], None]:
         """Let another master win."""
-        self._add(_Fault(errno.EAGAIN, "arbitration lost", None, times))
+        return self._add(_Fault(errno.EAGAIN, "arbitration lost", None, times))
 
-    def flip_bits(self, address: int, index: int, mask: int, times: int | None = 1) -> None:
+    def flip_bits(self, address: int, index: int, mask: int, times: int | None = 1) -> Callable[[], None]:
         """Invert the bits of `mask` in byte `index` of the data written or read, silently."""
-        self._add(_Fault(0, "bits flipped", address, times, index=index, mask=mask))
+        return self._add(_Fault(0, "bits flipped", address, times, index=index, mask=mask))
 
     def clear_faults(self) -> None:
         """Let the bus be in order again."""
         with self._lock:
             self._faults.clear()
 
-    def _add(self, fault: _Fault) -> None:
+    def _add(self, fault: _Fault) -> Callable[[], None]:
         with self._lock:
             self._faults.append(fault)
+        return lambda: self._lift(fault)
+
+    def _lift(self, fault: _Fault) -> None:
+        with self._lock:
+            # By identity: two faults alike are two faults.
+            self._faults = [other for other in self._faults if other is not fault]
 
     def _read(self, address: int, register: int, count: int) -> bytes:
         with self._lock:
@@ -152,7 +185,7 @@ class EmulatedI2cBus:
 
     def _due_fault(self, address: int) -> _Fault | None:
         for fault in self._faults:
-            if fault.address is None or fault.address == address:
+            if fault.address in {None, address} and (fault.chance is None or fault.chance()):
                 if fault.left is not None:
                     fault.left -= 1
                     if fault.left <= 0:

@@ -30,7 +30,12 @@ def conversion_ns(code: int) -> int:
 
 
 class EmulatedIna219:
-    """One monitor; `measure(start_ns, end_ns)` gives mean bus voltage (V) and current (A) of a window."""
+    """One monitor; `measure(start_ns, end_ns)` gives mean bus voltage (V) and current (A) of a window.
+
+    Attributes:
+        gain: of its current measurement; 1 is sound.
+        frozen: words that it gives whatever it measures, none when sound.
+    """
 
     def __init__(
         self,
@@ -43,6 +48,8 @@ class EmulatedIna219:
         self._now_ns = now_ns
         self._measure = measure
         self._ohm = shunt_ohm
+        self.gain = 1.0
+        self.frozen: dict[int, int] = {}
         self._power_on()
 
     def brown_out(self) -> None:
@@ -51,6 +58,8 @@ class EmulatedIna219:
 
     def register(self, register: int) -> int:
         """Return a register's word without any effect of reading it."""
+        if register in self.frozen:
+            return self.frozen[register]
         self._convert()
         current, power, overflow = self._products()
         bus = self._bus << 3 | (_READY if self._ready else 0) | (_OVERFLOW if overflow else 0)
@@ -122,7 +131,9 @@ class EmulatedIna219:
             _, amps = self._measure(start, middle)
             gain = 1 << (self._config >> 11 & 0b11)
             code = self._config >> 3 & 0xF
-            self._shunt = _digitised(amps * self._ohm / _SHUNT_STEP_V, code, -4000 * gain, 4000 * gain)
+            self._shunt = _digitised(
+                amps * self.gain * self._ohm / _SHUNT_STEP_V, code, -4000 * gain, 4000 * gain
+            )
         if self._bus_ns:
             volts, _ = self._measure(middle, middle + self._bus_ns)
             top = 8000 if self._config & _BUS_32V else 4000

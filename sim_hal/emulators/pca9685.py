@@ -88,6 +88,11 @@ class EmulatedPca9685:
         self._power_on()
         self._stop(_ALL_CHANNELS)
 
+    def upset(self, register: int, value: int) -> None:
+        """Let radiation write a register, awake or asleep."""
+        self._registers[register] = value
+        self._stop(_ALL_CHANNELS)
+
     def register(self, register: int) -> int:
         """Return a register's content, as a read of it gives."""
         restart = RESTART if register == MODE1 and self._restart else 0

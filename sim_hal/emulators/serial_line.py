@@ -29,6 +29,7 @@ class LineFaults:
         cut_probability: of a message to lose a random run of its bytes.
         flip_probability: of each bit to arrive inverted.
         delay_ns: added to the time of each byte.
+        thinned: of so many messages one crosses.
     """
 
     silent: bool = False
@@ -36,6 +37,7 @@ class LineFaults:
     cut_probability: float = 0.0
     flip_probability: float = 0.0
     delay_ns: int = 0
+    thinned: int = 1
 
 
 SOUND = LineFaults()
@@ -79,6 +81,7 @@ class Wire:
         self._waiting = 0
         self._free_ns = -NEVER
         self._last_ns = -NEVER
+        self._messages_sent = 0
 
     def push(self, data: bytes, now_ns: int, sender_baud: int, receiver_baud: int) -> None:
         """Send bytes, from `now_ns` on or when the wire is free; unlike speeds make noise of them."""
@@ -90,7 +93,7 @@ class Wire:
             start_ns += faults.delay_ns
         # A delay that is taken away again lets no byte overtake another.
         start_ns = max(start_ns, self._last_ns)
-        if sender_baud != receiver_baud:
+        if data and sender_baud != receiver_baud:
             # A slower receiver sees fewer characters; none of them is what was sent.
             data = self._rng.bytes(max(1, len(data) * min(receiver_baud, sender_baud) // sender_baud))
         room = self._capacity - self._waiting
@@ -130,7 +133,8 @@ class Wire:
 
     def _disturb(self, data: bytes, faults: LineFaults) -> bytes:
         rng = self._rng
-        if faults.silent:
+        self._messages_sent += 1
+        if faults.silent or self._messages_sent % faults.thinned:
             return b""
         if faults.garbage:
             data = rng.bytes(len(data))

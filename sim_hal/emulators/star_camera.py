@@ -41,7 +41,12 @@ class _Exposure:
 
 
 class EmulatedStarCamera:
-    """A FrameSource and an emulated device. Faults: "off", "black", "frozen", "saturated"."""
+    """A FrameSource and an emulated device.
+
+    Attributes:
+        fault: "off", "black", "frozen", "saturated", "torn", "garbage", "wrong" (upside down), or none.
+        late_ns: how much later than its read-out a frame comes.
+    """
 
     def __init__(
         self,
@@ -63,6 +68,7 @@ class EmulatedStarCamera:
         self._exposure: _Exposure | None = None
         self._last: Frame | None = None
         self.fault = ""
+        self.late_ns = 0
 
     def trigger(self, exposure_ns: int) -> None:
         """Start an exposure; one that is under way is abandoned, as a camera's reset does."""
@@ -76,7 +82,11 @@ class EmulatedStarCamera:
         """Return the frame once its read-out is over."""
         exposure = self._exposure
         now_ns = self._now_ns()
-        if exposure is None or exposure.image is None or now_ns < exposure.end_ns + self._readout_ns:
+        if (
+            exposure is None
+            or exposure.image is None
+            or now_ns < exposure.end_ns + self._readout_ns + self.late_ns
+        ):
             return None
         if not exposure.image.done():
             return None
@@ -86,9 +96,9 @@ class EmulatedStarCamera:
         frame = Frame(
             exposure.sequence, exposure.start_ns, exposure.length_ns, now_ns, exposure.image.result()
         )
-        frame = self._spoil(frame)
-        self._last = frame
-        return frame
+        shown = self._spoil(frame)
+        self._last = shown if self.fault == "frozen" else frame
+        return shown
 
     def next_event_ns(self) -> int:
         """Return the time of the next attitude sample."""
@@ -126,6 +136,18 @@ class EmulatedStarCamera:
             )
         if self.fault in {"black", "saturated"}:
             level = 0 if self.fault == "black" else np.iinfo(frame.pixels.dtype).max
-            pixels = np.full_like(frame.pixels, level)
-            return Frame(frame.sequence, frame.exposure_start_ns, frame.exposure_ns, frame.arrival_ns, pixels)
+            return _with_pixels(frame, np.full_like(frame.pixels, level))
+        if self.fault == "torn" and self._last is not None:
+            middle = len(frame.pixels) // 2
+            return _with_pixels(frame, np.concatenate([self._last.pixels[:middle], frame.pixels[middle:]]))
+        if self.fault == "garbage":
+            top = np.iinfo(frame.pixels.dtype).max
+            noise = np.random.default_rng(frame.sequence).integers(0, top, frame.pixels.shape)
+            return _with_pixels(frame, noise.astype(frame.pixels.dtype))
+        if self.fault == "wrong":
+            return _with_pixels(frame, np.ascontiguousarray(frame.pixels[::-1]))
         return frame
+
+
+def _with_pixels(frame: Frame, pixels: Image) -> Frame:
+    return Frame(frame.sequence, frame.exposure_start_ns, frame.exposure_ns, frame.arrival_ns, pixels)

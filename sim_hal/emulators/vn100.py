@@ -91,7 +91,11 @@ class _Stream:
 
 
 class Vn100Emulator:
-    """The unit; a `sim_hal.emulators.device.EmulatedDevice`."""
+    """The unit; a `sim_hal.emulators.device.EmulatedDevice`.
+
+    Attributes:
+        spoil: what becomes of a measurement before it is told: for faults.
+    """
 
     def __init__(
         self,
@@ -103,6 +107,7 @@ class Vn100Emulator:
     ) -> None:
         """Find the unit on since `settings.uptime_ns` at `now_ns`; `sense` gives the motion at a time."""
         self.registers = RegisterFile()
+        self.spoil: Callable[[Measured], Measured] | None = None
         self._sense = sense
         self._line = line
         self._settings = settings
@@ -144,6 +149,22 @@ class Vn100Emulator:
         self.registers.save()
         self._line.baud_rate = baud_rate
 
+    def switch_off(self) -> None:
+        """Take the power away."""
+        self._then = NEVER, lambda _: None
+        self._due_ns = NEVER
+
+    def switch_on(self, now_ns: int) -> None:
+        """Give power, or reset: the unit starts anew from its flash."""
+        self._then = now_ns + self._settings.boot_ns, lambda end_ns: self._start(end_ns, 0)
+        self._schedule(now_ns)
+
+    def change_baud_rate(self, baud_rate: int, now_ns: int) -> None:
+        """Speak at another speed from now on, as if somebody had written register 5."""
+        self.registers.write(5, (str(baud_rate),))
+        self._line.baud_rate = baud_rate
+        self._build_streams(now_ns)
+
     # Time: ticks of 1/800 s of the unit's own clock.
 
     def _device_ns(self, now_ns: int) -> int:
@@ -180,7 +201,8 @@ class Vn100Emulator:
 
     def _measure(self, now_ns: int) -> Measured:
         windows = tuple(self.registers.integer(85, index) for index in range(3))
-        return self._sensors.measure(self._sense(now_ns), windows)
+        measured = self._sensors.measure(self._sense(now_ns), windows)
+        return measured if self.spoil is None else self.spoil(measured)
 
     def _instant(self, device_ns: int, measured: Measured, since_ns: int) -> Instant:
         interval = (device_ns - since_ns) * 1e-9

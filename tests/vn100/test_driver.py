@@ -20,6 +20,7 @@ from flight.quaternion import (
 from hal.drivers.vn100.ascii import build
 from hal.drivers.vn100.codec import layout_of
 from hal.drivers.vn100.driver import OUTPUT_SET, Vn100, Vn100Settings
+from hal.drivers.vn100.set_up import Question
 from hal.interfaces.errors import CorruptData, NotResponding, OutOfRange, Refused
 from sim_hal.emulators.serial_line import SOUND, LineFaults
 from sim_hal.emulators.vn100 import Vn100EmulatorSettings
@@ -196,9 +197,9 @@ def test_another_model_is_refused() -> None:
 def test_an_error_answer_is_refused_with_its_meaning() -> None:
     bench = bench_line(baud_rate=115200)
     with pytest.raises(Refused, match=r"error 0C, insufficient baud rate"):
-        bench.driver._write(75, 1, 1, "01", "0531")
+        bench.driver._ask(Question("WRG", (75, 1, 1, "01", "0531")))
     with pytest.raises(Refused, match=r"error 08, invalid register"):
-        bench.driver._write(200, 1)
+        bench.driver._ask(Question("WRG", (200, 1)))
 
 
 def test_an_echo_of_other_values_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -280,18 +281,18 @@ def test_noise_between_packets_costs_no_packet() -> None:
     assert bench.driver.link().discarded_bytes == 40 * 30
 
 
-def test_a_reset_unit_is_noticed_and_can_be_set_up_again() -> None:
+def test_a_unit_that_must_not_be_set_up_is_left_alone_after_its_reset() -> None:
     bench = bench_line()
     bench.driver.configure()
     bench.run(1.0)
+    silent = Vn100(bench.line.host, bench.clock, replace(MISSION, configure=False))
+    bench = replace(bench, driver=silent)
     bench.line.host.send(build("RST"))
     assert len(bench.run(3.0)) <= 1  # it boots, then speaks VNYMR, which is no reading
-    assert bench.driver.link().last_byte_ns > bench.clock.now_ns() - 50_000_000
-    bench.driver.configure()
-    readings = bench.run(1.0)
-    assert len(readings) == pytest.approx(40, abs=1)
-    assert readings[0].device_time_ns < 4_000_000_000
-    assert bench.driver.resets == 1
+    assert silent.link().last_byte_ns > bench.clock.now_ns() - 50_000_000
+    silent_to_unit = bench.unit.registers.read(6)
+    assert silent_to_unit == ("14",)
+    assert silent.recoveries == 0
 
 
 @pytest.mark.parametrize(

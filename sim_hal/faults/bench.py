@@ -1,0 +1,104 @@
+"""What faults are done to: the emulated hardware, the line, and how to do things again and again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import reduce
+from typing import Protocol
+
+import numpy as np
+
+from sim_hal.assembly import Hardware
+from sim_hal.emulators.serial_line import SOUND, HostEnd, LineFaults, Wire
+
+Lift = Callable[[], None]
+"""Takes a fault away again."""
+
+
+class Line(Protocol):
+    """A serial line, in memory or on a pseudo-terminal."""
+
+    to_host: Wire
+    to_device: Wire
+
+
+def no_lift() -> None:
+    """Take nothing away: what was broken stays so until somebody mends it."""
+
+
+@dataclass(slots=True)
+class Bench:
+    """Everything that can be broken from outside the flight process.
+
+    Attributes:
+        now_ns: the simulation's time.
+        generator: the draws of faults that draw.
+        host: the line's host end, where it is in memory.
+        flight_process: its number, where it is another one than this.
+    """
+
+    hardware: Hardware
+    line: Line
+    now_ns: Callable[[], int]
+    generator: np.random.Generator
+    host: HostEnd | None = None
+    flight_process: int | None = None
+    _on_wires: dict[int, list[LineFaults]] = field(default_factory=dict)
+
+    def spoil(self, wire: Wire, faults: LineFaults) -> Lift:
+        """Put one more fault on a wire; those that are there already stay."""
+        present = self._on_wires.setdefault(id(wire), [])
+        present.append(faults)
+        wire.faults = _together(present)
+
+        def lift() -> None:
+            present.remove(faults)
+            wire.faults = _together(present)
+
+        return lift
+
+    def after(self, seconds: float, action: Callable[[], None]) -> None:
+        """Do `action` in so many seconds of the simulation."""
+        self.hardware.faults.at(self.now_ns() + round(seconds * 1e9), action)
+
+    def toggle(self, begin: Callable[[], Lift], period: float, share: float) -> Lift:
+        """Have a fault come and go: there for `share` of each `period` s."""
+        state: dict[str, Lift | None] = {"lift": None}
+        stopped = False
+
+        def mend() -> None:
+            lift, state["lift"] = state["lift"], None
+            if lift is not None:
+                lift()
+
+        def turn() -> None:
+            if stopped:
+                return
+            state["lift"] = begin()
+            self.after(share * period, mend)
+            self.after(period, turn)
+
+        def lift() -> None:
+            nonlocal stopped
+            stopped = True
+            mend()
+
+        turn()
+        return lift
+
+
+def _together(faults: Sequence[LineFaults]) -> LineFaults:
+    return reduce(_both, faults, SOUND)
+
+
+def _both(a: LineFaults, b: LineFaults) -> LineFaults:
+    return replace(
+        a,
+        silent=a.silent or b.silent,
+        garbage=a.garbage or b.garbage,
+        cut_probability=max(a.cut_probability, b.cut_probability),
+        flip_probability=max(a.flip_probability, b.flip_probability),
+        delay_ns=max(a.delay_ns, b.delay_ns),
+        thinned=max(a.thinned, b.thinned),
+    )

@@ -1,0 +1,44 @@
+"""Faults of the coils and of the bridges that drive them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from sim_hal.faults.bench import Bench, Lift
+from sim_hal.faults.kinds import FaultKind, Parameters
+from sim_hal.world.coil_circuit import Condition
+
+_COIL = (
+    (Condition.OPEN, "open", "its wire is broken: no current"),
+    (Condition.SHORTED, "shorted", "the bridge drives this many ohm, the coil carries nothing"),
+    (Condition.REVERSED, "reversed", "its ends are exchanged"),
+)
+_BRIDGE = (
+    (Condition.A_HIGH, "a-high", "the output of input A stays high"),
+    (Condition.A_LOW, "a-low", "the output of input A stays low"),
+    (Condition.B_HIGH, "b-high", "the output of input B stays high"),
+    (Condition.B_LOW, "b-low", "the output of input B stays low"),
+)
+
+
+def _broken(axis: int, condition: Condition) -> Callable[[Bench, Parameters], Lift]:
+    def begin(bench: Bench, given: Parameters) -> Lift:
+        circuit = bench.hardware.circuit
+        circuit.become(axis, condition, given.get("ohm", 0.0))
+        return lambda: circuit.become(axis, Condition.SOUND)
+
+    return begin
+
+
+def _kinds() -> tuple[FaultKind, ...]:
+    found = []
+    for axis, letter in enumerate("xyz"):
+        for condition, kind, meaning in _COIL:
+            given = {"ohm": 5.0} if condition is Condition.SHORTED else {}
+            found.append(FaultKind(f"coil-{letter}", kind, meaning, _broken(axis, condition), given))
+        for condition, kind, meaning in _BRIDGE:
+            found.append(FaultKind(f"bridge-{letter}", kind, meaning, _broken(axis, condition)))
+    return tuple(found)
+
+
+COILS = _kinds()

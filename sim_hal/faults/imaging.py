@@ -1,0 +1,52 @@
+"""Faults of the star camera."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from sim_hal.faults.bench import Bench, Lift, no_lift
+from sim_hal.faults.kinds import FaultKind, Parameters
+
+
+def _showing(fault: str) -> Callable[[Bench, Parameters], Lift]:
+    def begin(bench: Bench, _: Parameters) -> Lift:
+        camera = bench.hardware.camera
+        if camera is None:
+            return no_lift
+        camera.fault = fault
+
+        def lift() -> None:
+            if camera.fault == fault:
+                camera.fault = ""
+
+        return lift
+
+    return begin
+
+
+def _slow(bench: Bench, given: Parameters) -> Lift:
+    camera = bench.hardware.camera
+    if camera is None:
+        return no_lift
+    camera.late_ns = round(given["delay"] * 1e9)
+    return lambda: setattr(camera, "late_ns", 0)
+
+
+def _by_turns(bench: Bench, given: Parameters) -> Lift:
+    begin = _showing("off")
+    return bench.toggle(lambda: begin(bench, given), given["period"], given["share"])
+
+
+CAMERA = (
+    FaultKind("camera", "off", "it answers no trigger and gives no frame", _showing("off")),
+    FaultKind("camera", "black", "frames without light", _showing("black")),
+    FaultKind("camera", "saturated", "frames of light only", _showing("saturated")),
+    FaultKind("camera", "frozen", "the same frame again and again", _showing("frozen")),
+    FaultKind(
+        "camera", "torn", "the upper part of the frame before, the lower of this one", _showing("torn")
+    ),
+    FaultKind("camera", "garbage", "random pixels", _showing("garbage")),
+    FaultKind("camera", "wrong", "rows in the opposite order", _showing("wrong")),
+    FaultKind("camera", "slow", "frames come so many seconds later", _slow, {"delay": 3.0}),
+    FaultKind("camera", "intermittent", "off and on, by turns", _by_turns, {"period": 6.0, "share": 0.5}),
+)

@@ -1,0 +1,55 @@
+"""Faults of the computer: the flight process from outside; workers, wall clock and disk from inside."""
+
+from __future__ import annotations
+
+import os
+import signal
+
+from sim_hal.faults.bench import Bench, Lift, no_lift
+from sim_hal.faults.kinds import FaultKind, Parameters, Where
+
+
+def _killed(bench: Bench, _: Parameters) -> Lift:
+    if bench.flight_process is not None:
+        os.kill(bench.flight_process, signal.SIGKILL)
+    return no_lift
+
+
+def _stopped(bench: Bench, _: Parameters) -> Lift:
+    process = bench.flight_process
+    if process is None:
+        return no_lift
+    os.kill(process, signal.SIGSTOP)
+    return lambda: os.kill(process, signal.SIGCONT)
+
+
+def _worker(device: str) -> tuple[FaultKind, ...]:
+    return (
+        FaultKind(device, "nan", "every number of its result is NaN", None),
+        FaultKind(device, "exception", "it raises one", None),
+        FaultKind(device, "endless", "it never returns", None),
+        FaultKind(device, "killed", "its process is killed at its work", None),
+        FaultKind(device, "slow", "results come so many seconds later", None, {"delay": 1.5}),
+    )
+
+
+MACHINE = (
+    *_worker("planner"),
+    *_worker("vision"),
+    FaultKind(
+        "process", "killed", "kill -9 of the flight process", _killed, momentary=True, where=Where.REALTIME
+    ),
+    FaultKind("process", "stopped", "SIGSTOP of the flight process", _stopped, where=Where.REALTIME),
+    FaultKind("clock", "stepped", "the wall clock is set forward, s", None, {"by": 3600.0}),
+    FaultKind("disk", "full", "no byte more of the log can be written", None),
+    FaultKind("disk", "failing", "every write of the log fails", None),
+    FaultKind(
+        "config",
+        "corrupted",
+        "so many bytes of the file are changed before it is read",
+        None,
+        {"bytes": 3.0},
+        momentary=True,
+        where=Where.COMMAND_LINE,
+    ),
+)

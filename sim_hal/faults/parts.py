@@ -1,0 +1,242 @@
+"""Faults of the I2C bus and of the two parts on it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from hal.drivers.pca9685 import PRE_SCALE
+from sim_hal.emulators.i2c_bus import I2cPart
+from sim_hal.faults.bench import Bench, Lift, no_lift
+from sim_hal.faults.kinds import FaultKind, Parameters
+
+_MOST_BYTES = 32
+
+
+class SpoiledPart:
+    """A part with something wrong between it and the bus; it acknowledges as before."""
+
+    def __init__(
+        self,
+        part: I2cPart,
+        written: Callable[[int, bytes], None] | None = None,
+        read: Callable[[bytes], bytes] | None = None,
+    ) -> None:
+        """Let `written` take what is written in the part's place, and `read` change what is read."""
+        self._part = part
+        self._written = written or part.write
+        self._read = read or (lambda data: data)
+
+    def answers(self, address: int) -> bool:
+        """Tell what the part tells."""
+        return self._part.answers(address)
+
+    def write(self, address: int, data: bytes) -> None:
+        """Take a write; a register pointer alone is never spoiled."""
+        if len(data) == 1:
+            self._part.write(address, data)
+        else:
+            self._written(address, data)
+
+    def read(self, count: int) -> bytes:
+        """Give bytes."""
+        return self._read(self._part.read(count))
+
+
+def part_of(bench: Bench, device: str) -> I2cPart | None:
+    """Return the part of a device; None where it is not fitted."""
+    return bench.hardware.pwm if device == "pwm" else bench.hardware.monitor
+
+
+def _spoiled(
+    bench: Bench,
+    device: str,
+    written: Callable[[int, bytes], None] | None = None,
+    read: Callable[[bytes], bytes] | None = None,
+) -> Lift:
+    part = part_of(bench, device)
+    return no_lift if part is None else bench.hardware.bus.put_before(part, SpoiledPart(part, written, read))
+
+
+def _off(device: str) -> Callable[[Bench, Parameters], Lift]:
+    def begin(bench: Bench, _: Parameters) -> Lift:
+        part = part_of(bench, device)
+        if part is None:
+            return no_lift
+        part.brown_out()  # type: ignore[attr-defined]  # both parts can
+        bench.hardware.bus.detach(part)
+        return lambda: bench.hardware.bus.attach(part)
+
+    return begin
+
+
+def _brown_out(device: str) -> Callable[[Bench, Parameters], Lift]:
+    def begin(bench: Bench, _: Parameters) -> Lift:
+        part = part_of(bench, device)
+        if part is not None:
+            part.brown_out()  # type: ignore[attr-defined]  # both parts can
+        return no_lift
+
+    return begin
+
+
+def _stuck_pwm(bench: Bench, _: Parameters) -> Lift:
+    return _spoiled(bench, "pwm", written=lambda address, data: None)
+
+
+def _stuck_monitor(bench: Bench, _: Parameters) -> Lift:
+    monitor = bench.hardware.monitor
+    if monitor is None:
+        return no_lift
+    monitor.frozen = {number: monitor.register(number) for number in range(6)}
+    monitor.frozen[2] |= 0b10  # a converter that believes itself at work
+    return monitor.frozen.clear
+
+
+def _garbage(device: str) -> Callable[[Bench, Parameters], Lift]:
+    def begin(bench: Bench, _: Parameters) -> Lift:
+        return _spoiled(bench, device, read=lambda data: bench.generator.bytes(len(data)))
+
+    return begin
+
+
+def _bits(device: str) -> Callable[[Bench, Parameters], Lift]:
+    def begin(bench: Bench, given: Parameters) -> Lift:
+        part = part_of(bench, device)
+
+        def flipped(data: bytes) -> bytes:
+            flips = np.packbits(bench.generator.random(8 * len(data)) < given["chance"])
+            return (np.frombuffer(data, dtype=np.uint8) ^ flips).tobytes()
+
+        def write(address: int, data: bytes) -> None:
+            assert part is not None
+            part.write(address, data[:1] + flipped(data[1:]))
+
+        return _spoiled(bench, device, write, flipped)
+
+    return begin
+
+
+def _wrong_pwm(bench: Bench, _: Parameters) -> Lift:
+    bench.hardware.pwm.upset(PRE_SCALE, 0x1E)
+    return no_lift
+
+
+def _wrong_monitor(bench: Bench, given: Parameters) -> Lift:
+    monitor = bench.hardware.monitor
+    if monitor is None:
+        return no_lift
+    monitor.gain = given["gain"]
+    return lambda: setattr(monitor, "gain", 1.0)
+
+
+def _delayed(device: str) -> Callable[[Bench, Parameters], Lift]:
+    def begin(bench: Bench, given: Parameters) -> Lift:
+        part = part_of(bench, device)
+
+        def later(address: int, data: bytes) -> None:
+            assert part is not None
+            bench.after(given["delay"], lambda: part.write(address, data))
+
+        return _spoiled(bench, device, later)
+
+    return begin
+
+
+def _address(bench: Bench, device: str) -> int:
+    part = part_of(bench, device)
+    return getattr(part, "address", 0)
+
+
+def _nack(device: str) -> Callable[[Bench, Parameters], Lift]:
+    return lambda bench, _: bench.hardware.bus.nack(_address(bench, device), times=None)
+
+
+def _slow(device: str) -> Callable[[Bench, Parameters], Lift]:
+    def begin(bench: Bench, given: Parameters) -> Lift:
+        chance = given["chance"]
+        return bench.hardware.bus.time_out(_address(bench, device), lambda: bench.generator.random() < chance)
+
+    return begin
+
+
+def _by_turns(
+    begin: Callable[[Bench, Parameters], Lift],
+) -> Callable[[Bench, Parameters], Lift]:
+    return lambda bench, given: bench.toggle(lambda: begin(bench, given), given["period"], given["share"])
+
+
+_TURNS = {"period": 0.5, "share": 0.5}
+
+
+def _part(device: str) -> tuple[FaultKind, ...]:
+    """Return the faults that both parts have."""
+    return (
+        FaultKind(device, "off", "no power: nothing acknowledges, the registers are lost", _off(device)),
+        FaultKind(device, "nack", "it acknowledges nothing", _nack(device)),
+        FaultKind(device, "garbage", "random bytes for what it is asked", _garbage(device)),
+        FaultKind(
+            device, "bits", "each bit read or written flips with this chance", _bits(device), {"chance": 5e-3}
+        ),
+        FaultKind(
+            device,
+            "slow",
+            "it stretches the clock beyond the bus's time-out, with this chance",
+            _slow(device),
+            {"chance": 0.5},
+        ),
+        FaultKind(device, "delayed", "what is written counts later, s", _delayed(device), {"delay": 0.2}),
+        FaultKind(
+            device, "intermittent", "it acknowledges or not, by turns", _by_turns(_nack(device)), _TURNS
+        ),
+        FaultKind(
+            device,
+            "brown-out",
+            "its registers are back at their power-on values",
+            _brown_out(device),
+            momentary=True,
+        ),
+    )
+
+
+PWM = (
+    *_part("pwm"),
+    FaultKind("pwm", "stuck", "it acknowledges and changes nothing", _stuck_pwm),
+    FaultKind("pwm", "wrong", "an upset register: the frequency is false", _wrong_pwm, momentary=True),
+)
+MONITOR = (
+    *_part("monitor"),
+    FaultKind("monitor", "stuck", "always the same conversion", _stuck_monitor),
+    FaultKind("monitor", "wrong", "it measures so many times too much", _wrong_monitor, {"gain": 2.0}),
+)
+BUS = (
+    FaultKind(
+        "bus", "off", "no part acknowledges", lambda bench, _: bench.hardware.bus.nack(None, times=None)
+    ),
+    FaultKind(
+        "bus",
+        "nack",
+        "no acknowledge, with this chance",
+        lambda bench, given: bench.hardware.bus.nack(
+            None, times=None, chance=lambda: bench.generator.random() < given["chance"]
+        ),
+        {"chance": 0.5},
+    ),
+    FaultKind(
+        "bus",
+        "arbitration",
+        "another master wins, always",
+        lambda bench, _: bench.hardware.bus.lose_arbitration(times=None),
+    ),
+    FaultKind(
+        "bus", "hang", "the clock line is held low", lambda bench, _: bench.hardware.bus.hang(times=None)
+    ),
+    FaultKind(
+        "bus",
+        "intermittent",
+        "the clock line is held low, by turns",
+        _by_turns(lambda bench, _: bench.hardware.bus.hang(times=None)),
+        _TURNS,
+    ),
+)

@@ -1,0 +1,124 @@
+"""Faults of the inertial unit and its line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from flight.quaternion import from_rotation_vector, multiply
+from sim_hal.emulators.serial_line import LineFaults
+from sim_hal.emulators.vn100_sensors import Measured
+from sim_hal.faults.bench import Bench, Lift, no_lift
+from sim_hal.faults.kinds import FaultKind, Parameters
+
+
+def _line(faults: Callable[[Parameters], LineFaults]) -> Callable[[Bench, Parameters], Lift]:
+    return lambda bench, given: bench.spoil(bench.line.to_host, faults(given))
+
+
+def _off(bench: Bench, _: Parameters) -> Lift:
+    bench.hardware.unit.switch_off()
+    return lambda: bench.hardware.unit.switch_on(bench.now_ns())
+
+
+def _reset(bench: Bench, _: Parameters) -> Lift:
+    bench.hardware.unit.switch_on(bench.now_ns())
+    return no_lift
+
+
+def _unplugged(bench: Bench, _: Parameters) -> Lift:
+    host = bench.host
+    if host is None:  # a pseudo-terminal cannot be pulled: nothing crosses, either way
+        ours = bench.spoil(bench.line.to_host, LineFaults(silent=True))
+        theirs = bench.spoil(bench.line.to_device, LineFaults(silent=True))
+
+        def plug_in() -> None:
+            ours()
+            theirs()
+
+        return plug_in
+    host.unplugged = True
+    return lambda: setattr(host, "unplugged", False)
+
+
+def _baud(bench: Bench, given: Parameters) -> Lift:
+    bench.hardware.unit.change_baud_rate(round(given["rate"]), bench.now_ns())
+    return no_lift
+
+
+def _measuring(bench: Bench, spoil: Callable[[Measured], Measured]) -> Lift:
+    unit = bench.hardware.unit
+    unit.spoil = spoil
+
+    def lift() -> None:
+        if unit.spoil is spoil:
+            unit.spoil = None
+
+    return lift
+
+
+def _stuck(bench: Bench, _: Parameters) -> Lift:
+    kept: list[Measured] = []
+
+    def same(measured: Measured) -> Measured:
+        kept.append(measured)
+        return kept[0]
+
+    return _measuring(bench, same)
+
+
+def _wrong(bench: Bench, given: Parameters) -> Lift:
+    turn = from_rotation_vector(np.array([0.0, given["angle"], 0.0]))
+    bias = np.array([0.0, given["rate"], 0.0])
+    return _measuring(
+        bench,
+        lambda seen: replace(seen, quaternion=multiply(turn, seen.quaternion), rate=seen.rate + bias),
+    )
+
+
+def _intermittent(bench: Bench, given: Parameters) -> Lift:
+    def begin() -> Lift:
+        return bench.spoil(bench.line.to_host, LineFaults(silent=True))
+
+    return bench.toggle(begin, given["period"], given["share"])
+
+
+IMU = (
+    FaultKind("imu", "off", "no power; it starts anew, on its saved settings, when it is back", _off),
+    FaultKind("imu", "silent", "not one byte crosses", _line(lambda _: LineFaults(silent=True))),
+    FaultKind("imu", "unplugged", "the serial port is gone", _unplugged),
+    FaultKind("imu", "stuck", "good packets, always the same values", _stuck),
+    FaultKind("imu", "garbage", "random bytes for its own", _line(lambda _: LineFaults(garbage=True))),
+    FaultKind("imu", "wrong", "good packets, false values", _wrong, {"angle": 0.2, "rate": 0.05}),
+    FaultKind(
+        "imu", "slow", "one packet of n comes", _line(lambda p: LineFaults(thinned=round(p["n"]))), {"n": 8.0}
+    ),
+    FaultKind(
+        "imu",
+        "delayed",
+        "every byte comes later, s",
+        _line(lambda p: LineFaults(delay_ns=round(p["delay"] * 1e9))),
+        {"delay": 0.2},
+    ),
+    FaultKind(
+        "imu", "intermittent", "silent and not, by turns", _intermittent, {"period": 0.5, "share": 0.5}
+    ),
+    FaultKind(
+        "imu",
+        "bits",
+        "each bit flips with this chance",
+        _line(lambda p: LineFaults(flip_probability=p["chance"])),
+        {"chance": 1e-3},
+    ),
+    FaultKind(
+        "imu",
+        "cut",
+        "packets lose bytes with this chance",
+        _line(lambda p: LineFaults(cut_probability=p["chance"])),
+        {"chance": 0.3},
+    ),
+    FaultKind("imu", "reset", "it starts anew, on its saved settings", _reset, momentary=True),
+    FaultKind("imu", "baud", "it speaks at another speed", _baud, {"rate": 230400.0}, momentary=True),
+)

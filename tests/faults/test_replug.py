@@ -1,0 +1,82 @@
+"""A serial adapter that is pulled out and plugged in again is opened again, under its lasting name."""
+
+from __future__ import annotations
+
+import os
+import time
+import tty
+from pathlib import Path
+
+import pytest
+
+from hal.buses.clock import SystemClock
+from hal.buses.serial_port import PySerialPort
+from hal.interfaces.errors import NotResponding
+
+
+def plug_in(link: Path) -> tuple[int, int]:
+    """Make a terminal under a lasting name, as udev does."""
+    near, far = os.openpty()
+    tty.setraw(far)
+    link.unlink(missing_ok=True)
+    link.symlink_to(os.ttyname(far))
+    return near, far
+
+
+def pull_out(ends: tuple[int, int]) -> None:
+    for end in ends:
+        os.close(end)
+
+
+def receive(port: PySerialPort, patience: float = 3.0) -> bytes:
+    """Return the next bytes, whatever the port says until then."""
+    deadline = time.monotonic() + patience
+    while time.monotonic() < deadline:
+        try:
+            chunks = port.receive()
+        except NotResponding:
+            chunks = []
+        if chunks:
+            return b"".join(data for _, data in chunks)
+        time.sleep(0.01)
+    return b""
+
+
+def test_the_port_is_open_again_within_two_seconds(tmp_path: Path) -> None:
+    link = tmp_path / "imu"
+    ends = plug_in(link)
+    port = PySerialPort(str(link), 115200, SystemClock())
+    try:
+        os.write(ends[0], b"before")
+        assert receive(port) == b"before"
+        pull_out(ends)
+        time.sleep(0.3)
+        with pytest.raises(NotResponding, match="still there"):
+            port.receive()
+        with pytest.raises(NotResponding):
+            port.send(b"lost")
+        ends = plug_in(link)
+        begun = time.monotonic()
+        found = b""
+        while not found and time.monotonic() - begun < 3.0:
+            os.write(ends[0], b"after")  # what came before it was open is thrown away
+            found = receive(port, 0.05)
+        assert found.startswith(b"after")
+        assert time.monotonic() - begun < 2.0
+        port.send(b"heard")
+        assert os.read(ends[0], 16) == b"heard"
+        pull_out(ends)
+    finally:
+        port.close()
+
+
+def test_a_port_that_is_gone_for_good_can_be_closed(tmp_path: Path) -> None:
+    link = tmp_path / "imu"
+    ends = plug_in(link)
+    port = PySerialPort(str(link), 115200, SystemClock())
+    pull_out(ends)
+    link.unlink()
+    time.sleep(0.3)
+    begun = time.monotonic()
+    port.close()
+    assert time.monotonic() - begun < 1.0
