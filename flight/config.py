@@ -9,6 +9,7 @@ from __future__ import annotations
 import difflib
 import math
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -22,6 +23,7 @@ T = TypeVar("T")
 S = TypeVar("S", bound=msgspec.Struct)
 Lines = dict[str, int]
 
+_LONGEST = 1 << 20
 _FLOAT = re.compile(
     r"^[-+]?(\.[0-9]+|[0-9]+\.[0-9]*|[0-9]+(?=[eE]))([eE][-+]?[0-9]+)?$"
     r"|^[-+]?\.(inf|Inf|INF)$|^\.(nan|NaN|NAN)$"
@@ -35,6 +37,13 @@ class _Loader(yaml.SafeLoader):
         first: [entry for entry in entries if entry[0] != "tag:yaml.org,2002:float"]
         for first, entries in yaml.SafeLoader.yaml_implicit_resolvers.items()
     }
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        """Return the next value; refuse an alias: a few lines of them can say more than memory holds."""
+        if self.check_event(yaml.AliasEvent):
+            mark = self.get_event().start_mark  # type: ignore[no-untyped-call]  # its stubs lack types
+            raise yaml.composer.ComposerError(None, None, "an alias (*): write the value out", mark)
+        return super().compose_node(parent, index)
 
 
 _Loader.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+0123456789."))
@@ -71,6 +80,12 @@ def load_camera(path: Path) -> Camera:
     return camera
 
 
+def load_whole(path: Path, shape: type[T]) -> T:
+    """Read a file that is one `shape` and nothing else. Raises ConfigError."""
+    tree, lines = _read_yaml(_read(path), str(path))
+    return convert(tree, shape, str(path), lines)
+
+
 def simulation_section(text: str, name: str, shape: type[T]) -> T | None:
     """Return the `simulation` section of configuration text as `shape`, None when there is none.
 
@@ -97,16 +112,28 @@ def convert(tree: Any, shape: type[T], name: str, lines: Lines, prefix: str = ""
         unknown = re.match(r"Object contains unknown field `(.+)`", message)
         if unknown:
             dotted = _join(dotted, unknown.group(1))
-            message = "is an unknown key" + _nearest(unknown.group(1), shape, path.rstrip("`"))
+            message = "is an unknown key" + _nearest(unknown.group(1), shape, tree, path.rstrip("`"))
         else:
             value = _lookup(tree, path.rstrip("`"))
-            message = f"is {value!r}: {message[0].lower()}{message[1:]}" if value is not _ABSENT else message
+            message = (
+                f"is {_shown(value)}: {message[0].lower()}{message[1:]}" if value is not _ABSENT else message
+            )
         raise ConfigError(_place(name, dotted, lines), f"`{dotted or 'configuration'}` {message}") from error
+
+
+def _shown(value: Any) -> str:
+    """Return a value as a complaint shows it: one that fills the screen is cut."""
+    text = repr(value)
+    return text if len(text) <= 200 else text[:200] + "..."
 
 
 def _read(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8")
+        with path.open(encoding="utf-8") as file:
+            text = file.read(_LONGEST + 1)  # a device may have no end
+        if len(text) > _LONGEST:
+            raise ConfigError(str(path), f"has more than {_LONGEST} characters: no configuration has")
+        return text
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(str(path), f"cannot be read: {error}") from error
 
@@ -119,7 +146,8 @@ def _read_yaml(text: str, name: str) -> tuple[dict[str, Any], Lines]:
         node = loader.get_single_node()
         _walk(node, "", lines, name)
         tree = loader.construct_document(node) if node is not None else None
-    except (yaml.YAMLError, ValueError) as error:
+    # pyyaml's own constructors raise these for a tag that a value does not fit, such as `!!timestamp name`.
+    except (yaml.YAMLError, ValueError, AttributeError, TypeError, OverflowError) as error:
         mark = getattr(error, "problem_mark", None)
         where = f"{name}:{mark.line + 1}" if mark else name
         problem = getattr(error, "problem", None) or str(error).splitlines()[0]
@@ -159,6 +187,18 @@ def _refuse_not_finite(value: Any, dotted: str, name: str, lines: Lines) -> None
         raise ConfigError(_place(name, dotted, lines), f"`{dotted}` is {value!r}: must be a finite number")
 
 
+PIXEL_BITS = {
+    "GREY": range(8, 9),
+    "Mono8": range(8, 9),
+    "Y10": range(10, 11),
+    "Mono10": range(10, 11),
+    "Y12": range(12, 13),
+    "Mono12": range(12, 13),
+    "Y16": range(9, 17),
+    "Mono16": range(9, 17),
+}
+"""Of a camera's pixel formats; those of 16 may be filled by a converter of fewer."""
+
 _ABSENT = object()
 
 
@@ -172,11 +212,12 @@ def _lookup(tree: Any, path: str) -> Any:
     return tree if not isinstance(tree, dict) else _ABSENT
 
 
-def _nearest(key: str, shape: Any, path: str) -> str:
+def _nearest(key: str, shape: Any, tree: Any, path: str) -> str:
     """Suggest the right name for an unknown key of the struct found along `path`."""
     for step in re.findall(r"\.([^.\[]+)", path):
         fields = {f.encode_name: f.type for f in msgspec.structs.fields(shape)}
-        shape = _struct_of(fields.get(step))
+        tree = tree.get(step) if isinstance(tree, dict) else None
+        shape = _struct_of(fields.get(step), tree)
         if shape is None:
             return ""
     names = [f.encode_name for f in msgspec.structs.fields(shape)]
@@ -184,14 +225,23 @@ def _nearest(key: str, shape: Any, path: str) -> str:
     return f", did you mean `{close[0]}`?" if close else f"; known keys: {', '.join(names)}"
 
 
-def _struct_of(annotation: Any) -> Any:
-    """Return the struct inside an annotation such as `Camera | None` or `tuple[Step, ...]`."""
+def _struct_of(annotation: Any, tree: Any) -> Any:
+    """Return the struct inside an annotation such as `Camera | None` or `tuple[Step, ...]`.
+
+    Of several that a tag tells apart it is the one whose tag stands in `tree`.
+    """
     if isinstance(annotation, type) and issubclass(annotation, msgspec.Struct):
-        return annotation
+        config = annotation.__struct_config__
+        told = tree.get(config.tag_field) if isinstance(tree, dict) and config.tag_field else config.tag
+        return annotation if told == config.tag else None
     for inner in getattr(annotation, "__args__", ()):
-        if (found := _struct_of(inner)) is not None:
+        if (found := _struct_of(inner, tree)) is not None:
             return found
     return None
+
+
+def _span(numbers: range) -> str:
+    return f"{numbers[0]}" if len(numbers) == 1 else f"{numbers[0]} to {numbers[-1]}"
 
 
 def _join(prefix: str, key: str) -> str:
@@ -219,6 +269,10 @@ def _check_sense(config: Config, name: str, lines: Lines) -> None:
             refuse(f"steps[{index}].at", f"is {times[index]!r}: targets must stand in order of time")
     if config.duration <= times[-1]:
         refuse("duration", f"is {config.duration!r}: the last target is given at {times[-1]!r} s")
+    for index, step in enumerate(config.commands.timeline):
+        given = [name for name in ("mode", "slew", "clear") if getattr(step, name) is not None]
+        if len(given) != 1:
+            refuse(f"commands.timeline[{index}]", f"gives {given}: must give one of mode, slew, clear")
     used = [c for pair in config.coils.channels for c in pair] + list(config.coils.enable_channels or ())
     if len(set(used)) != len(used):
         refuse("coils.channels", f"{used} use a channel of the PWM chip twice")
@@ -230,8 +284,8 @@ def _check_sense(config: Config, name: str, lines: Lines) -> None:
         )
     if config.guidance.replan_period >= config.guidance.horizon:
         refuse("guidance.replan_period", "must be shorter than `guidance.horizon`")
-    if config.camera is not None and config.camera.exposure >= config.camera.period:
-        refuse("camera.exposure", "must be shorter than `camera.period`")
+    if config.camera is not None:
+        _check_camera(config.camera, refuse)
     for dotted, quaternion in (
         ("inertial_unit.mounting", config.inertial_unit.mounting),
         ("camera.mounting", config.camera.mounting if config.camera else (0.0, 0.0, 0.0, 1.0)),
@@ -239,3 +293,12 @@ def _check_sense(config: Config, name: str, lines: Lines) -> None:
         norm = math.sqrt(sum(c * c for c in quaternion))
         if abs(norm - 1.0) > 1e-6:
             refuse(dotted, f"has length {norm:.6g}: a quaternion must have length 1")
+
+
+def _check_camera(camera: Camera, refuse: Callable[[str, str], None]) -> None:
+    if camera.exposure >= camera.period:
+        refuse("camera.exposure", "must be shorter than `camera.period`")
+    if camera.device is not None:
+        pixel_format, possible = camera.device.pixel_format, PIXEL_BITS[camera.device.pixel_format]
+        if camera.bits not in possible:
+            refuse("camera.bits", f"is {camera.bits}: pixels of {pixel_format} have {_span(possible)}")

@@ -21,6 +21,18 @@ class Severity(IntEnum):
     FAULT = 2
 
 
+class Reaction(IntEnum):
+    """What an event makes the satellite do, beyond being told."""
+
+    NOTE = 0
+    COILS_OFF = 1
+    ISOLATE = 2
+    HOLD = 3
+    DETUMBLE = 4
+    SAFE = 5
+    RESTART = 6
+
+
 @dataclass(frozen=True, slots=True)
 class EventKind:
     """One row of the table. The code is for ever; names are for people."""
@@ -29,57 +41,108 @@ class EventKind:
     name: str
     severity: Severity
     meaning: str
+    reaction: Reaction = Reaction.NOTE
 
 
-STARTED = EventKind(1, "started", Severity.INFORMATION, "the loop begins")
-STOPPED = EventKind(2, "stopped", Severity.INFORMATION, "the loop ends, with the reason")
-CYCLE_SLIP = EventKind(3, "cycle-slip", Severity.WARNING, "slots of a rate group were skipped")
-TASK_FAILED = EventKind(4, "task-failed", Severity.FAULT, "a task of the loop raised an exception")
-IMU_SILENT = EventKind(10, "imu-silent", Severity.FAULT, "no bytes come from the inertial unit")
-IMU_CORRUPT = EventKind(
-    11, "imu-corrupt", Severity.WARNING, "bytes come from the inertial unit that are no packets"
+_TOLD, _WARNED, _FAULT = Severity.INFORMATION, Severity.WARNING, Severity.FAULT
+
+STARTED = EventKind(1, "started", _TOLD, "the loop begins")
+STOPPED = EventKind(2, "stopped", _TOLD, "the loop ends, with the reason")
+CYCLE_SLIP = EventKind(3, "cycle-slip", _WARNED, "slots of the control group were skipped")
+TASK_FAILED = EventKind(
+    4, "task-failed", _FAULT, "a task raised an exception; where it was the control task, coils to zero"
 )
-IMU_IMPLAUSIBLE = EventKind(12, "imu-implausible", Severity.WARNING, "values out of range or not finite")
-IMU_LINE_LOST = EventKind(13, "imu-line-lost", Severity.FAULT, "the serial port is gone")
-IMU_RECOVERED = EventKind(14, "imu-recovered", Severity.INFORMATION, "good packets come again")
-IMU_UNUSABLE = EventKind(
-    16, "imu-unusable", Severity.FAULT, "bytes come from the inertial unit, but no reading in them"
+MODE = EventKind(5, "mode", _TOLD, "another mode than at the start, with what led to it")
+CRASHED_OFTEN = EventKind(
+    6, "crashed-often", _WARNED, "too many unclean shutdowns of late: the start leads to safe"
 )
+BOOT_WAITS = EventKind(7, "boot-waits", _WARNED, "the devices give no good data: still booting")
+TASK_FAILING = EventKind(8, "task-failing", _FAULT, "the control task fails cycle after cycle", Reaction.SAFE)
+NO_PROGRESS = EventKind(
+    9, "no-progress", _FAULT, "a rate group or worker stands still: the watchdog is fed no more"
+)
+IMU_SILENT = EventKind(10, "imu-silent", _FAULT, "no bytes come from the inertial unit")
+IMU_CORRUPT = EventKind(11, "imu-corrupt", _WARNED, "bytes come from the inertial unit that are no packets")
+IMU_IMPLAUSIBLE = EventKind(12, "imu-implausible", _WARNED, "values out of range or not finite")
+IMU_LINE_LOST = EventKind(13, "imu-line-lost", _FAULT, "the serial port is gone")
+IMU_RECOVERED = EventKind(14, "imu-recovered", _TOLD, "good packets come again")
 IMU_REFUSED = EventKind(
-    15, "imu-refused", Severity.WARNING, "measurements disagree with the estimate and are left out"
+    15, "imu-refused", _WARNED, "measurements disagree with the estimate and are left out"
 )
-CONTROL_LOST = EventKind(20, "control-lost", Severity.FAULT, "no trustworthy estimate: coils to zero")
-CONTROL_REGAINED = EventKind(
-    21, "control-regained", Severity.INFORMATION, "the estimate is trustworthy again"
+IMU_UNUSABLE = EventKind(
+    16, "imu-unusable", _FAULT, "bytes come from the inertial unit, but no reading in them"
 )
-COIL_FAULT = EventKind(30, "coil-fault", Severity.FAULT, "the PWM chip does not take commands")
-COIL_RECOVERED = EventKind(31, "coil-recovered", Severity.INFORMATION, "the PWM chip takes commands again")
-POWER_FAULT = EventKind(32, "power-fault", Severity.WARNING, "the current monitor does not answer")
-POWER_RECOVERED = EventKind(33, "power-recovered", Severity.INFORMATION, "the current monitor answers again")
-TARGET = EventKind(40, "target", Severity.INFORMATION, "a new attitude is commanded")
-PLAN_STRETCHED = EventKind(
-    41, "plan-stretched", Severity.INFORMATION, "no path within the horizon: stretched"
+CONTROL_LOST = EventKind(
+    20, "control-lost", _FAULT, "no trustworthy estimate: coils to zero", Reaction.COILS_OFF
 )
-PLAN_REFUSED = EventKind(42, "plan-refused", Severity.WARNING, "a plan was not flown, with the reason")
-PLANNER_BUSY = EventKind(43, "planner-busy", Severity.WARNING, "the planner has not finished the last job")
-PLANNER_FAILED = EventKind(
-    44, "planner-failed", Severity.WARNING, "the planner gave no plan, with the reason"
+CONTROL_REGAINED = EventKind(21, "control-regained", _TOLD, "the estimate is trustworthy again")
+BLIND = EventKind(22, "blind", _FAULT, "no trustworthy estimate for too long", Reaction.SAFE)
+TUMBLING = EventKind(
+    23, "tumbling", _WARNED, "the body turns faster than a hold or a slew may", Reaction.DETUMBLE
 )
-HOLDING = EventKind(
-    45, "holding", Severity.WARNING, "the last good path has ended: holding its final attitude"
+HOLD_IMPOSSIBLE = EventKind(
+    24, "hold-impossible", _FAULT, "the attitude cannot be held: far off and not coming back", Reaction.SAFE
 )
-CAMERA_LOST = EventKind(50, "camera-lost", Severity.WARNING, "no frame has come for too long")
-CAMERA_RECOVERED = EventKind(51, "camera-recovered", Severity.INFORMATION, "frames come again")
-CAMERA_FROZEN = EventKind(52, "camera-frozen", Severity.WARNING, "the camera gives the same frame again")
-CAMERA_BLACK = EventKind(53, "camera-black", Severity.WARNING, "the frame holds no light, or only light")
-VISION_FAILED = EventKind(54, "vision-failed", Severity.WARNING, "vision gave no result, with the reason")
-STREAK_REFUSED = EventKind(
-    55, "streak-refused", Severity.WARNING, "a rate from streaks disagrees with the estimate"
+STREAM_POOR = EventKind(25, "stream-poor", _WARNED, "a stream of readings is late, slow or out of its range")
+STREAM_GOOD = EventKind(26, "stream-good", _TOLD, "a stream of readings is as it should be again")
+COIL_FAULT = EventKind(30, "coil-fault", _FAULT, "the PWM chip does not take commands", Reaction.COILS_OFF)
+COIL_RECOVERED = EventKind(31, "coil-recovered", _TOLD, "the PWM chip takes commands again")
+COIL_BROKEN = EventKind(
+    34, "coil-broken", _FAULT, "a coil does not carry what is commanded: left out", Reaction.ISOLATE
 )
-STARS_REFUSED = EventKind(
-    56, "stars-refused", Severity.WARNING, "the stars' attitude disagrees with the estimate"
+COIL_TRUSTED = EventKind(35, "coil-trusted", _TOLD, "by command a coil is used again")
+COIL_SUSPECT = EventKind(
+    36, "coil-suspect", _WARNED, "the supply current is not what the coils are told; which one is not known"
 )
-LOG_FAULT = EventKind(60, "log-fault", Severity.FAULT, "the flight log cannot be written")
+POWER_DOUBTED = EventKind(
+    37, "power-doubted", _WARNED, "the current monitor says what the body does not feel"
+)
+POWER_FAULT = EventKind(32, "power-fault", _WARNED, "the current monitor does not answer")
+POWER_RECOVERED = EventKind(33, "power-recovered", _TOLD, "the current monitor answers again")
+TARGET = EventKind(40, "target", _TOLD, "a new attitude is commanded")
+PLAN_STRETCHED = EventKind(41, "plan-stretched", _TOLD, "no path within the horizon: stretched")
+PLAN_REFUSED = EventKind(42, "plan-refused", _WARNED, "a plan was not flown, with the reason")
+PLANNER_BUSY = EventKind(43, "planner-busy", _WARNED, "the planner has not finished the last job")
+PLANNER_FAILED = EventKind(44, "planner-failed", _WARNED, "the planner gave no plan, with the reason")
+HOLDING = EventKind(45, "holding", _WARNED, "the last good path has ended: holding its final attitude")
+SLEW_LATE = EventKind(46, "slew-late", _WARNED, "a slew does not arrive", Reaction.HOLD)
+CAMERA_LOST = EventKind(50, "camera-lost", _WARNED, "no frame has come for too long")
+CAMERA_RECOVERED = EventKind(51, "camera-recovered", _TOLD, "frames come again")
+CAMERA_FROZEN = EventKind(52, "camera-frozen", _WARNED, "the camera gives the same frame again")
+CAMERA_BLACK = EventKind(53, "camera-black", _WARNED, "the frame holds no light, or only light")
+VISION_FAILED = EventKind(54, "vision-failed", _WARNED, "vision gave no result, with the reason")
+STREAK_REFUSED = EventKind(55, "streak-refused", _WARNED, "a rate from streaks disagrees with the estimate")
+STARS_REFUSED = EventKind(56, "stars-refused", _WARNED, "the stars' attitude disagrees with the estimate")
+LOG_FAULT = EventKind(60, "log-fault", _FAULT, "the flight log cannot be written")
+LOG_RECOVERED = EventKind(65, "log-recovered", _TOLD, "packets reach the disk again")
+STATE_RECOVERED = EventKind(
+    61, "state-recovered", _WARNED, "a copy of the kept state is bad: the other is used"
+)
+STATE_LOST = EventKind(62, "state-lost", _WARNED, "both copies of the kept state are bad: defaults")
+STATE_UNWRITTEN = EventKind(63, "state-unwritten", _WARNED, "the state cannot be kept on disk")
+UNCLEAN_SHUTDOWN = EventKind(64, "unclean-shutdown", _WARNED, "the last boot did not end by itself")
+CLOCK_STEP = EventKind(70, "clock-step", _WARNED, "the wall clock was set; nothing steers by it")
+CPU_HIGH = EventKind(71, "cpu-high", _WARNED, "the control process takes more of a core than it should")
+MEMORY_GROWS = EventKind(72, "memory-grows", _WARNED, "the memory of the flight processes grows")
+MEMORY_HIGH = EventKind(
+    73, "memory-high", _FAULT, "the flight processes take too much memory", Reaction.RESTART
+)
+DISK_LOW = EventKind(74, "disk-low", _WARNED, "little room is left for the flight log")
+HOT = EventKind(75, "hot", _WARNED, "the board is warm")
+TOO_HOT = EventKind(76, "too-hot", _FAULT, "the board is too hot to drive coils", Reaction.SAFE)
+RESOURCE_NORMAL = EventKind(77, "resource-normal", _TOLD, "a resource is within its bounds again")
+COMMANDED = EventKind(80, "commanded", _TOLD, "a command was obeyed")
+COMMAND_REFUSED = EventKind(81, "command-refused", _WARNED, "a command was not obeyed, with the reason")
+GUARDIAN_LOST = EventKind(90, "guardian-lost", _FAULT, "the guardian has died or hangs: another is started")
+GUARDIAN_READY = EventKind(91, "guardian-ready", _TOLD, "a guardian is on watch again")
+GUARDIAN_ACTED = EventKind(
+    92, "guardian-acted", _WARNED, "heartbeats stopped: the guardian held the coils at 0"
+)
+GUARDIAN_BLIND = EventKind(
+    93, "guardian-blind", _FAULT, "the guardian cannot reach the PWM chip; it goes on trying"
+)
+REAL_TIME = EventKind(94, "real-time", _TOLD, "what was obtained of real-time scheduling and locked memory")
+REAL_TIME_REFUSED = EventKind(95, "real-time-refused", _WARNED, "scheduling or locked memory was refused")
 
 EVENTS: tuple[EventKind, ...] = tuple(
     value for value in dict(vars()).values() if isinstance(value, EventKind)
@@ -88,19 +151,32 @@ EVENTS: tuple[EventKind, ...] = tuple(
 Sink = Callable[[EventKind, int, int, str], None]
 """Takes an event that is told: kind, time in ns, how many of its kind were held back before it, text."""
 
+Reactor = Callable[[EventKind, int, str], None]
+"""Does what an event's row asks for: kind, time in ns, text."""
+
 
 class EventLog:
     """Tells events to a sink, throttled by kind."""
 
     def __init__(self, sink: Sink, throttle_ns: int = THROTTLE_NS) -> None:
         self._sink = sink
+        self._react: Reactor | None = None
         self._throttle_ns = throttle_ns
         self._last_told: dict[int, int] = {}
         self._held_back: dict[int, int] = {}
         self.count = 0
 
+    def react_by(self, react: Reactor) -> None:
+        """Have `react` called for every event whose row asks for more than a note, throttled or not."""
+        self._react = react
+
     def tell(self, kind: EventKind, time_ns: int, text: str) -> None:
-        """Tell an event, or count it if one of its kind was told a moment ago."""
+        """Tell an event, or count it if one of its kind was told a moment ago; then react."""
+        self._tell(kind, time_ns, text)
+        if self._react is not None and kind.reaction is not Reaction.NOTE:
+            self._react(kind, time_ns, text)
+
+    def _tell(self, kind: EventKind, time_ns: int, text: str) -> None:
         self.count += 1
         last_ns = self._last_told.get(kind.code)
         if last_ns is not None and time_ns - last_ns < self._throttle_ns:
@@ -115,21 +191,3 @@ class EventLog:
         for code, held_back in list(self._held_back.items()):
             self._sink(by_code[code], time_ns, held_back - 1, "the last one held back by the throttle")
         self._held_back.clear()
-
-
-class Condition:
-    """A state that is told when it begins and, by another kind, when it ends."""
-
-    def __init__(self, log: EventLog, begins: EventKind, ends: EventKind | None) -> None:
-        self._log = log
-        self._begins = begins
-        self._ends = ends
-        self.holds = False
-
-    def update(self, holds: bool, time_ns: int, text: str) -> None:
-        """Tell the change, if there is one."""
-        if holds and not self.holds:
-            self._log.tell(self._begins, time_ns, text)
-        elif self.holds and not holds and self._ends is not None:
-            self._log.tell(self._ends, time_ns, text)
-        self.holds = holds

@@ -85,8 +85,11 @@ def grey_stretch(image: Image, low: float = 1.0, high: float = 99.7) -> npt.NDAr
     return np.repeat(np.rint(grey).astype(np.uint8)[..., None], 3, axis=-1)
 
 
-def write_picture(path: Path, picture: npt.NDArray[np.uint8]) -> None:
-    """Write `picture` (rows, columns, 3) as a PNG. Raises UsageError when it cannot be written."""
+def write_picture(path: Path, picture: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> None:
+    """Write a PNG: colours (rows, columns, 3), or grey counts (rows, columns) of 8 or 16 bits as they are.
+
+    Raises UsageError when it cannot be written.
+    """
     try:
         from PIL import Image as pillow  # noqa: PLC0415 - an extra, and only for files
     except ImportError as error:

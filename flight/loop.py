@@ -7,48 +7,52 @@ from __future__ import annotations
 
 import time
 import zlib
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from pathlib import Path
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from flight import __version__, events
-from flight.camera import camera_model
+from flight import __version__, composition, events
+from flight.commands.channel import Channel
 from flight.control.choice import controller_of
-from flight.estimation.attitude_filter import AttitudeFilter, FilterSettings
-from flight.estimation.rigid_body import Parameters, RigidBody
 from flight.events import EventLog
 from flight.executive.executive import Executive
 from flight.executive.jobs import JobRunner, Worker
 from flight.executive.rate_group import Cycle, RateGroup
 from flight.guidance import job as plan_job
 from flight.guidance.guidance import AcceptanceRules, Guidance
-from flight.guidance.vmc import NODES
+from flight.health.facts import Facts
+from flight.health.progress import GroupsAndWorkers, WorkerWatch
+from flight.health.resources import ClockWatch, ResourceMonitor, ResourceReader
+from flight.health.streams import Streams, streams_of
+from flight.modes.machine import ModeMachine
 from flight.plant import SingleAxisPlant
-from flight.settings import Camera, Config
+from flight.settings import Config
 from flight.startracker import frame_job
-from flight.startracker.detection import DetectionSettings
-from flight.startracker.frame_job import TrackerSettings
-from flight.startracker.solve import SolveSettings
+from flight.state.keeper import StateKeeper
+from flight.state.learning import learned_of
 from flight.tasks import imaging as imaging_task
 from flight.tasks import planning as planning_task
+from flight.tasks.coil_drive import CoilDrive
+from flight.tasks.commanding import Commanding
 from flight.tasks.control_cycle import ControlCycle, Rooms
+from flight.tasks.health_watch import HealthRooms, HealthWatch
 from flight.tasks.housekeeping import Housekeeping, Watched
-from flight.tasks.imaging import Imaging, ImagingSettings
-from flight.tasks.navigation import Navigation, NavigationSettings
+from flight.tasks.imaging import Imaging
+from flight.tasks.mode_control import ModeControl
+from flight.tasks.navigation import Navigation
 from flight.tasks.performance import CONTROL, PerformanceObserver
-from flight.tasks.planning import Planning, PlanningSettings, Strategy
+from flight.tasks.planning import Planning, Strategy
 from flight.tasks.steering import Steering
 from flight.tasks.targets import TargetSequence
 from flight.telemetry.definitions import RUN
 from flight.telemetry.recorder import Recorder
-from flight.vision.likelihood.settings import LikelihoodSettings
-from flight.vision.settings import StreakSettings
 from hal.interfaces.devices import FrameSource, InertialUnit, PowerMonitor, TorqueCoils
 from hal.interfaces.wires import Clock
 
-SECOND_NS = 1_000_000_000
+SECOND_NS = composition.SECOND_NS
+HEALTH_PERIOD_NS = SECOND_NS // 4
+COMMAND_PERIOD_NS = SECOND_NS // 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,6 +115,10 @@ def workers(config: Config, planner_latency_ns: int = 0, vision_latency_ns: int 
     return made
 
 
+def _nothing() -> None:
+    """Feed no watchdog, beat for no guardian."""
+
+
 class FlightLoop:
     """One flight: from the release at mission time zero to the end of the configured duration."""
 
@@ -122,62 +130,98 @@ class FlightLoop:
         jobs: JobRunner,
         recorder: Recorder,
         log_error: Callable[[], str],
+        *,
+        feed: Callable[[], None] = _nothing,
+        beat: Callable[[], None] = _nothing,
+        keeper: StateKeeper | None = None,
+        board: ResourceReader | None = None,
+        channels: Sequence[Channel] = (),
     ) -> None:
+        """Take open devices and logs.
+
+        `feed` is called about four times a second while every rate group and worker makes progress: the
+        watchdog's food. `beat` is called at the end of each control cycle that ran well: the guardian's
+        heartbeat. `keeper` remembers earlier boots; `board` looks at processor, memory, disk and warmth;
+        `channels` are where commands come from.
+        """
         self._config = config
+        self._beat = beat
+        self._board = board
+        self._keeper = keeper
         self._clock = clock
         self._devices = devices
         self._recorder = recorder
         self._duration_ns = round(config.duration * SECOND_NS)
         self._events = EventLog(recorder.event)
+        self._facts = Facts(self._events)
+        self._streams = Streams(streams_of(config))
         self._progress: Callable[[Progress], None] | None = None
+        self._stop_reason = ""
         plant = plant_of(config)
-        self._navigation = _navigation(config, plant, devices.unit, recorder, self._events)
-        planning_settings = _planning_settings(config)
+        self._navigation = Navigation(
+            devices.unit,
+            composition.attitude_filter(config, plant),
+            composition.navigation_settings(config, plant),
+            recorder,
+            self._events,
+            self._facts,
+            self._streams,
+        )
+        planning = composition.planning_settings(config)
         guidance = Guidance(
             plant,
             AcceptanceRules(late_after=config.guidance.late_after),
-            arrives=planning_settings.strategy is not Strategy.RECEDING,
+            arrives=planning.strategy is not Strategy.RECEDING,
         )
-        period = 1.0 / config.executive.control_rate_hz
-        controller = controller_of(config.control, plant, period, config.identification)
-        self._steering = Steering(guidance, controller, devices.coils, self._events)
-        self._planning = Planning(plant, planning_settings, guidance, jobs, recorder, self._events)
-        self._imaging = (
-            Imaging(
-                devices.camera,
-                _imaging_settings(config.camera, self._unrest(plant)),
-                self._navigation,
-                jobs,
-                recorder,
-                self._events,
-            )
-            if config.camera is not None and devices.camera is not None
-            else None
+        self._drive = CoilDrive(
+            devices.coils,
+            composition.coil_watch(config, plant),
+            composition.dipole_per_ampere(config),
+            np.full(3, config.coils.current_limit),
+            self._facts,
+            self._events,
+            devices.power,
         )
-        observer = PerformanceObserver(clock, devices.coils, recorder, self._events)
-        self._observer = observer
-        rooms = Rooms(self._navigation, self._steering, self._planning, self._imaging, devices.coils, jobs)
-        targets = TargetSequence([(step.at, step.q2, step.rate) for step in config.steps])
-        self._control = ControlCycle(rooms, targets, recorder, self._events, observer)
-        self._housekeeping = Housekeeping(
-            Watched(
-                self._navigation,
-                self._steering,
-                self._planning,
-                self._imaging,
-                devices.coils,
-                devices.power,
-                log_error,
-            ),
+        self._steering = self._steering_of(plant, guidance)
+        self._planning = Planning(plant, planning, guidance, jobs, recorder, self._events)
+        self._imaging = self._imaging_of(plant, jobs)
+        self._modes = ModeControl(
+            config.modes,
+            ModeMachine(),
+            guidance,
+            self._steering,
+            self._drive,
+            self._facts,
+            recorder,
+            self._events,
+            (config.detumble.low_rate, config.detumble.low_for),
+            self.stop,
+        )
+        self._events.react_by(self._modes.react)
+        self._observer = PerformanceObserver(clock, devices.coils, recorder, self._events)
+        self._control = self._control_of(jobs)
+        self._housekeeping = self._housekeeping_of(log_error)
+        self._commanding = Commanding(
+            self._modes,
+            self._facts,
+            self._drive,
+            config.commands.timeline,
+            channels,
             recorder,
             self._events,
         )
+        self._commanded = bool(channels or config.commands.timeline)
         self._groups = self._rate_groups()
+        self._health = self._health_of(feed)
         # Jobs done on the spot, in lock-step, are no part of a cycle's execution time.
         self._executive = Executive(
-            clock, self._groups, observer, lambda: time.perf_counter_ns() - jobs.borrowed_ns
+            clock, self._groups, self._observer, lambda: time.perf_counter_ns() - jobs.borrowed_ns
         )
-        self._stop_reason = ""
+
+    @property
+    def restart(self) -> str:
+        """Why the process should be started again after this flight; empty when it should not."""
+        return self._modes.restart
 
     def stop(self, reason: str) -> None:
         """End the flight after the running cycle. Safe from a signal handler."""
@@ -194,12 +238,16 @@ class FlightLoop:
         self._navigation.begin(epoch_ns)
         if self._imaging is not None:
             self._imaging.begin(epoch_ns)
+        self._streams.begin(epoch_ns)
         self._record_run(epoch_ns, label)
+        self._modes.begin(epoch_ns, self._keeper.record.unclean_recent if self._keeper else 0)
         self._events.tell(events.STARTED, epoch_ns, f"{self._config.name}, {self._config.duration:g} s")
+        self._begin_health(epoch_ns)
         try:
             self._executive.run(epoch_ns, epoch_ns + self._duration_ns)
         finally:
             self._devices.coils.off()
+            self._health.close()
             now_ns = self._clock.now_ns()
             reason = self._stop_reason or "the configured duration is over"
             self._events.flush(now_ns)
@@ -213,21 +261,116 @@ class FlightLoop:
         control_ns = round(SECOND_NS / config.executive.control_rate_hz)
         replan_ns = round(config.guidance.replan_period * SECOND_NS)
         groups = [
-            RateGroup(CONTROL, control_ns, self._control.run),
+            RateGroup(CONTROL, control_ns, self._run_control),
             RateGroup("planning", replan_ns, self._planning.replan),
         ]
         if self._imaging is not None and config.camera is not None:
             groups.append(RateGroup("camera", round(config.camera.period * SECOND_NS), self._imaging.trigger))
+        if self._commanded:
+            groups.append(RateGroup("commands", COMMAND_PERIOD_NS, self._commanding.run))
+        groups.append(RateGroup("health", HEALTH_PERIOD_NS, self._watch_health))
         groups.append(RateGroup("housekeeping", SECOND_NS, self._keep_house))
         return groups
+
+    def _steering_of(self, plant: SingleAxisPlant, guidance: Guidance) -> Steering:
+        config = self._config
+        period = 1.0 / config.executive.control_rate_hz
+        return Steering(
+            guidance,
+            controller_of(config.control, plant, period, config.identification),
+            composition.detumbler(config, plant),
+            self._navigation,
+            self._devices.coils,
+            self._drive,
+            self._facts,
+        )
+
+    def _imaging_of(self, plant: SingleAxisPlant, jobs: JobRunner) -> Imaging | None:
+        camera, source = self._config.camera, self._devices.camera
+        if camera is None or source is None:
+            return None
+        settings = composition.imaging_settings(camera, self._unrest(plant))
+        return Imaging(
+            source,
+            settings,
+            self._navigation,
+            jobs,
+            self._recorder,
+            self._events,
+            self._facts,
+            self._streams,
+        )
+
+    def _control_of(self, jobs: JobRunner) -> ControlCycle:
+        rooms = Rooms(
+            self._navigation,
+            self._modes,
+            self._steering,
+            self._planning,
+            self._imaging,
+            self._devices.coils,
+            self._drive,
+            jobs,
+        )
+        targets = TargetSequence([(step.at, step.q2, step.rate) for step in self._config.steps])
+        return ControlCycle(rooms, targets, self._recorder, self._events, self._observer, self._streams)
+
+    def _housekeeping_of(self, log_error: Callable[[], str]) -> Housekeeping:
+        watched = Watched(
+            self._navigation,
+            self._steering,
+            self._planning,
+            self._imaging,
+            self._devices.coils,
+            self._devices.power,
+            log_error,
+        )
+        return Housekeeping(watched, self._recorder, self._events, self._facts)
+
+    def _health_of(self, feed: Callable[[], None]) -> HealthWatch:
+        config = self._config
+        rooms = HealthRooms(
+            self._modes,
+            self._streams,
+            self._facts,
+            self._drive,
+            self._devices.power,
+            self._groups[0],
+            GroupsAndWorkers(self._groups, self._worker_watches()),
+        )
+        clock_watch = ClockWatch(self._clock, config.health.clock_step)
+        monitor = ResourceMonitor(config.health)
+        return HealthWatch(rooms, monitor, clock_watch, self._recorder, self._events, feed)
+
+    def _worker_watches(self) -> list[WorkerWatch]:
+        """Return the workers with twice the time after which the runner kills them."""
+        executive = self._config.executive
+        busy = [("planner", self._planning.busy_since_ns, executive.planner_timeout)]
+        if self._imaging is not None:
+            busy.append(("vision", self._imaging.busy_since_ns, executive.vision_timeout))
+        return [WorkerWatch(name, since, round(2.0 * limit * SECOND_NS)) for name, since, limit in busy]
+
+    def _begin_health(self, epoch_ns: int) -> None:
+        self._health.begin(epoch_ns)
+        if self._board is not None:
+            period_ns = round(self._config.health.look_period * SECOND_NS)
+            self._health.read_resources(self._clock, self._board, period_ns)
 
     def _unrest(self, plant: SingleAxisPlant) -> float:
         """Return the density of the angular acceleration that the coils' uncertain current makes."""
         noise = plant.torque_constant / plant.inertia * self._config.estimation.current_noise
         return noise**2 / self._config.executive.control_rate_hz
 
+    def _run_control(self, cycle: Cycle) -> None:
+        self._control.run(cycle)
+        self._beat()
+
+    def _watch_health(self, cycle: Cycle) -> None:
+        self._health.run(cycle)
+
     def _keep_house(self, cycle: Cycle) -> None:
         self._housekeeping.run(cycle)
+        self._keep_state(cycle.start_ns)
         self._tell_performance(cycle.start_ns)
         if self._progress is not None:
             estimate, target = self._control.estimate, self._control.target
@@ -244,6 +387,15 @@ class FlightLoop:
                     self._events.count,
                 )
             )
+
+    def _keep_state(self, now_ns: int) -> None:
+        """Note what is to outlive the process, and tell what became of it; touches no disk."""
+        if self._keeper is None:
+            return
+        for kind, text in self._keeper.notices():
+            self._events.tell(kind, now_ns, text)
+        estimate = self._navigation.attitude(now_ns)
+        self._keeper.note(self._modes.mode.label, learned_of(estimate) if estimate else None)
 
     def _tell_performance(self, now_ns: int) -> None:
         for group in self._groups:
@@ -267,96 +419,3 @@ class FlightLoop:
             supply_voltage=coils.supply_voltage,
             current_limit=coils.current_limit,
         )
-
-
-def _navigation(
-    config: Config, plant: SingleAxisPlant, unit: InertialUnit, recorder: Recorder, event_log: EventLog
-) -> Navigation:
-    section, believed = config.estimation, config.plant
-    body = RigidBody(
-        np.eye(3) * plant.inertia,
-        believed.coil_turns * believed.coil_area,
-        np.array([0.0, 0.0, -believed.field]),
-        suspended=True,
-        stiffness=plant.stiffness,
-        damping=plant.damping,
-    )
-    filter_ = AttitudeFilter(
-        body,
-        FilterSettings(
-            current_noise=section.current_noise,
-            control_period=1.0 / config.executive.control_rate_hz,
-            disturbance_walk=section.disturbance_walk,
-            bias_start=section.bias_start,
-            torsion_start=section.torsion_start,
-            damping_start=section.damping_start,
-            gain_start=section.gain_start,
-            latency_start=section.latency_start,
-            latency_walk=section.latency_walk,
-            gate_sigma=section.gate_sigma,
-            history_ns=round(section.history * SECOND_NS),
-        ),
-    )
-    settings = NavigationSettings(
-        config.inertial_unit.angle_noise,
-        config.inertial_unit.rate_noise,
-        round(config.inertial_unit.max_age * SECOND_NS),
-        round(section.coast * SECOND_NS),
-        Parameters(plant.stiffness / plant.inertia, plant.damping / plant.inertia),
-    )
-    return Navigation(unit, filter_, settings, recorder, event_log)
-
-
-def _planning_settings(config: Config) -> PlanningSettings:
-    section = config.guidance
-    return PlanningSettings(
-        horizon=section.horizon,
-        max_horizon=section.max_horizon,
-        late_after_ns=round(section.late_after * SECOND_NS),
-        nodes=section.nodes or NODES,
-        strategy=Strategy(section.strategy),
-        time_price=section.time_price,
-        current_share=section.current_share,
-    )
-
-
-def _imaging_settings(camera: Camera, unrest: float) -> ImagingSettings:
-    return ImagingSettings(
-        camera=camera_model(camera),
-        exposure_ns=round(camera.exposure * SECOND_NS),
-        max_age_ns=round(camera.max_age * SECOND_NS),
-        mounting=np.array(camera.mounting),
-        estimator=_estimator(camera),
-        tracker=_tracker(camera),
-        unrest=unrest,
-    )
-
-
-def _tracker(camera: Camera) -> TrackerSettings | None:
-    """Return what the star tracker must know of the configured camera, None where it is not wanted."""
-    section = camera.star_tracker
-    if section is None:
-        return None
-    detection = DetectionSettings(
-        psf_sigma=camera.psf_sigma, gain=camera.gain, saturation=_saturation(camera)
-    )
-    spread = 1.0 + section.scale_error
-    scale = (1.0 / spread, spread)
-    index = Path(section.index) if section.index is not None else None
-    velocity = None if section.velocity is None else np.array(section.velocity)
-    return TrackerSettings(SolveSettings(detection=detection, velocity=velocity), scale, index)
-
-
-def _saturation(camera: Camera) -> float:
-    return camera.saturation or float(2**camera.bits - 1)
-
-
-def _estimator(camera: Camera) -> StreakSettings | LikelihoodSettings:
-    """Return the settings of the estimator that the configuration chose, for its camera."""
-    saturation = _saturation(camera)
-    if camera.estimator == "likelihood":
-        return LikelihoodSettings(
-            gain=camera.gain, saturation=saturation, psf_sigma=camera.psf_sigma, line_time=camera.line_time
-        )
-    settings = StreakSettings.of(camera.estimator, saturation=saturation, gain=camera.gain)
-    return settings if camera.endpoint_bias is None else replace(settings, endpoint_bias=camera.endpoint_bias)

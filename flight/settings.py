@@ -20,6 +20,7 @@ Sign = Literal[-1, 1]
 Channel = Annotated[int, Meta(ge=0, le=15)]
 Estimator = Literal["likelihood", "harris", "minimum-eigenvalue", "trajkovic-4", "trajkovic-8"]
 Quaternion = tuple[float, float, float, float]
+PlainMode = Literal["testbed-demo", "hold", "detumble", "safe"]
 
 
 class Section(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
@@ -29,10 +30,10 @@ class Section(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
 class Plant(Section, frozen=True, kw_only=True):
     """What the flight application believes about the body and its actuator (Sease Table 5.1, 5.3, 5.4)."""
 
-    inertia: Positive
-    coil_turns: Annotated[int, Meta(gt=0)]
-    coil_area: Positive
-    field: Positive
+    inertia: Annotated[float, Meta(gt=0.0, le=1e3)]
+    coil_turns: Annotated[int, Meta(gt=0, le=100_000)]
+    coil_area: Annotated[float, Meta(gt=0.0, le=100.0)]
+    field: Annotated[float, Meta(gt=0.0, le=1.0)]
     thread_stiffness: NotNegative = 0.0
     thread_damping: NotNegative = 0.0
 
@@ -97,8 +98,28 @@ class StarTracker(Section, frozen=True, kw_only=True):
     velocity: tuple[float, float, float] | None = None
 
 
+class V4l2Device(Section, frozen=True, kw_only=True, tag_field="kind", tag="v4l2"):
+    """A camera of Video for Linux (`hal.drivers.v4l2_camera`); gain in its own steps, `stamp_delay` in s."""
+
+    path: Annotated[str, Meta(min_length=1)] = "/dev/knightcube-camera"
+    pixel_format: Literal["GREY", "Y10", "Y12", "Y16"] = "GREY"
+    gain: int | None = None
+    stamp: Literal["told", "start", "end"] = "told"
+    stamp_delay: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
+
+
+class AravisDevice(Section, frozen=True, kw_only=True, tag_field="kind", tag="aravis"):
+    """A GenICam camera by the name that `arv-tool-0.8` lists (`hal.drivers.aravis_camera`)."""
+
+    name: Annotated[str, Meta(min_length=1)]
+    pixel_format: Literal["Mono8", "Mono10", "Mono12", "Mono16"] = "Mono12"
+    gain: float | None = None
+
+
 class Camera(Section, frozen=True, kw_only=True):
-    """The star camera: what flight must know to read its frames."""
+    """The star camera: what flight must know to read its frames; `device` is the real one."""
+
+    device: V4l2Device | AravisDevice | None = None
 
     columns: Annotated[int, Meta(ge=64, le=8192)] = 1024
     rows: Annotated[int, Meta(ge=64, le=8192)] = 1024
@@ -201,11 +222,100 @@ class Step(Section, frozen=True, kw_only=True):
     rate: Annotated[float, Meta(ge=-0.1, le=0.1)] = 0.0
 
 
+class Modes(Section, frozen=True, kw_only=True):
+    """Where the start leads, and what leads on from mode to mode (`flight.modes`).
+
+    After `crash_limit` unclean shutdowns within `crash_window` s of operation the start leads to safe instead
+    of `initial`. A slew has arrived within `arrived_angle` rad and `arrived_rate` rad/s for `arrived_for` s;
+    it is late after `slew_limit` s. A hold is impossible that is `hold_error` rad off for `hold_patience` s.
+    A body turns too fast to hold or slew beyond `tumble_rate` rad/s. Without an estimate for `blind_limit` s
+    the mode is safe.
+    """
+
+    initial: PlainMode = "testbed-demo"
+    crash_limit: Annotated[int, Meta(ge=1, le=16)] = 3
+    crash_window: Positive = 600.0
+    boot_patience: Positive = 10.0
+    arrived_angle: Positive = 0.01
+    arrived_rate: Positive = 0.01
+    arrived_for: Positive = 1.0
+    slew_limit: Positive = 120.0
+    hold_error: Positive = 0.5
+    hold_patience: Positive = 15.0
+    tumble_rate: Positive = 0.5
+    blind_limit: Positive = 60.0
+
+
+class Detumble(Section, frozen=True, kw_only=True):
+    """B-dot on the magnetometer (`flight.control.detumble`): windows with the coils off, and the law.
+
+    Times in s: `settle` after the coils went off until the field is trusted, `measure` while it is averaged,
+    `act` with the coils on. `share` of the rate is to go in each window, as far as the coils can. It is over
+    when the rate has been below `low_rate` rad/s for `low_for` s. Where the field's direction turns by
+    `field_turn` rad/s, as in an orbit, the share follows from that; zero for the testbed, where it stands.
+    """
+
+    settle: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.05
+    measure: Annotated[float, Meta(ge=0.02, le=1.0)] = 0.05
+    act: Annotated[float, Meta(ge=0.02, le=5.0)] = 0.15
+    share: Annotated[float, Meta(gt=0.0, le=0.5)] = 0.3
+    field_turn: NotNegative = 0.0
+    low_rate: Positive = 0.02
+    low_for: Positive = 2.0
+
+
+class Health(Section, frozen=True, kw_only=True):
+    """Bounds of what the flight may take of its board (`flight.health.resources`); looked at in real time.
+
+    `cpu_share` of one core, `memory` and `disk_free` in bytes, `memory_slope` in bytes an hour over at least
+    `slope_window` s after `warm_up` s; temperatures in degree C; `clock_step` in s.
+    """
+
+    look_period: Annotated[float, Meta(ge=0.5, le=600.0)] = 5.0
+    warm_up: NotNegative = 120.0
+    slope_window: Positive = 1200.0
+    cpu_share: Positive = 0.7
+    memory: Positive = 1.0e9
+    memory_slope: Positive = 1.0e7
+    disk_free: Positive = 2.0e8
+    temperature: float = 80.0
+    hottest: float = 95.0
+    clock_step: Positive = 0.5
+
+
+class CommandStep(Section, frozen=True, kw_only=True):
+    """One command of a time line: at `at` s of mission time a mode, a slew to q2, or an event to clear."""
+
+    at: NotNegative
+    mode: PlainMode | None = None
+    slew: Annotated[float, Meta(ge=-0.68, le=0.68)] | None = None
+    clear: Annotated[str, Meta(min_length=1, max_length=32)] | None = None
+
+
+class Commands(Section, frozen=True, kw_only=True):
+    """Where commands come from: a UNIX datagram socket, a UDP address (HOST:PORT), and a time line."""
+
+    socket: Annotated[str, Meta(min_length=1, max_length=100)] | None = None
+    udp: Annotated[str, Meta(pattern=r"^[^:\s]+:[0-9]{1,5}$")] | None = None
+    timeline: tuple[CommandStep, ...] = ()
+
+
 class Telemetry(Section, frozen=True, kw_only=True):
-    """Sizes of the flight log."""
+    """Sizes of the flight log and of the performance log, of each; and of all the runs of an archive."""
 
     segment_bytes: Annotated[int, Meta(ge=4096)] = 16 * 1024 * 1024
     budget_bytes: Annotated[int, Meta(ge=16384)] = 1024 * 1024 * 1024
+    archive_bytes: Annotated[int, Meta(ge=32768)] = 8 * 1024 * 1024 * 1024
+
+
+class State(Section, frozen=True, kw_only=True):
+    """What outlives the process (`flight.state`): its folder, and the period of its writing, s.
+
+    Without a folder it is kept in systemd's STATE_DIRECTORY where real devices are flown, else nowhere.
+    """
+
+    folder: Annotated[str, Meta(min_length=1)] | None = None
+    period: Annotated[float, Meta(ge=1.0, le=3600.0)] = 10.0
 
 
 class Config(Section, frozen=True, kw_only=True):
@@ -222,7 +332,12 @@ class Config(Section, frozen=True, kw_only=True):
     guidance: Guidance = Guidance()
     control: Control = Control()
     identification: Identification = Identification()
+    modes: Modes = Modes()
+    detumble: Detumble = Detumble()
+    health: Health = Health()
+    commands: Commands = Commands()
     steps: Annotated[tuple[Step, ...], Meta(min_length=1)]
     duration: Positive
     telemetry: Telemetry = Telemetry()
+    state: State = State()
     simulation: dict[str, Any] | None = None

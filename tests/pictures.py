@@ -18,6 +18,9 @@ from flight import config as configuration
 from flight.app import Order, fly
 from flight.camera import camera_model
 from flight.guidance.vmc import plan
+from flight.horizon.nadir import find_nadir
+from flight.horizon.picture import draw_horizon
+from flight.horizon.solution import HorizonStatus
 from flight.images import grey_stretch, write_picture
 from flight.loop import plant_of
 from flight.quaternion import about_axis_y, from_rotation_vector, multiply
@@ -32,8 +35,11 @@ from flight.vision.likelihood.estimate import estimate_motion
 from flight.vision.likelihood.settings import LikelihoodSettings
 from flight.vision.streak_rate import StreakStatus
 from sim_hal.assembly import StarRenderer
+from sim_hal.earth_camera import render as render_earth
 from sim_hal.settings import Sky
 from sim_hal.star_camera import StarCameraModel, render
+from tests.campaigns import nadir
+from tests.earth_camera.scenes import random_scene
 
 ROOT = Path(__file__).resolve().parents[1]
 CONFIG = ROOT / "config" / "step_demo.yaml"
@@ -41,6 +47,7 @@ RATE = 0.03
 """rad/s: the peak of a 0.1 step."""
 ORION_DEG = 84.0, -2.0, 15.0
 """Right ascension, declination and roll of the solved picture."""
+HORIZON_SEEDS = 2, 4, 6
 
 
 def main() -> int:
@@ -60,7 +67,8 @@ def main() -> int:
     draw_path(plan(plant, 0.4, 0.015, -0.3, 0.0, 10.0), plant, folder / "path.png")
     _draw_frame(folder / "frame.png")
     _draw_solved(folder / "solved.png")
-    for name in ("overview.png", "paths.png", "path.png", "frame.png", "solved.png"):
+    _draw_horizons(folder / "horizons.png")
+    for name in ("overview.png", "paths.png", "path.png", "frame.png", "solved.png", "horizons.png"):
         sys.stdout.write(f"{folder / name}\n")
     return 0
 
@@ -111,6 +119,21 @@ def _draw_solved(path: Path) -> None:
     found = solve_frame(pixels, camera.pinhole, (0.95, 1.05), 0.5, sky, SolveSettings())
     assert found.status is SolveStatus.SOLVED
     write_picture(path, draw_solution(grey_stretch(pixels), found, sky))
+
+
+def _draw_horizons(path: Path) -> None:
+    """Draw the Earth with its terminator in view, three times: edges that were found, the limb they fit."""
+    model = nadir.camera_model()
+    pictures = []
+    for seed in HORIZON_SEEDS:
+        generator = np.random.default_rng(seed)
+        scene = random_scene(generator, model, "terminator")
+        pixels = render_earth(model, scene, generator)
+        knowledge = nadir.coarse_knowledge(scene, generator)
+        found = find_nadir(pixels, model.lens, knowledge, nadir.finder_settings(model))
+        assert found.status is HorizonStatus.FOUND
+        pictures.append(draw_horizon(grey_stretch(pixels), found, model.lens))
+    write_picture(path, np.hstack(pictures))
 
 
 if __name__ == "__main__":

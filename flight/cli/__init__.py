@@ -16,12 +16,15 @@ from hal.interfaces.errors import DeviceError
 
 COMMANDS = {
     "run": "fly a configuration",
+    "command": "tell a flight what to do",
     "report": "tell what a run achieved",
     "export": "write a run's packets as CSV",
     "plan": "plan a single path",
     "identify": "the body's constants from a short flight",
     "rate": "body rate from a picture of streaked stars",
     "solve": "where a picture of the sky looks, and which stars it shows",
+    "camera": "take frames from the configured camera and look at them",
+    "horizon": "the way down, from a picture of the Earth's limb",
     "calibrate": "a camera's lens from pictures of the sky",
 }
 
@@ -32,6 +35,7 @@ examples:
   python -m flight plan --from 0.4 --to -0.3 --picture path.png
   python -m flight rate frame.png --fov 20 --exposure 0.2 --overlay found.png
   python -m flight solve night.jpg --fov 11.4 --overlay solved.png
+  python -m flight horizon limb.png --fov 67 --altitude 515 --overlay found.png
 """
 
 
@@ -47,6 +51,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _complain(str(error), 1)
     except BrokenPipeError:
         return 1  # whoever read our output has read enough
+    except OSError as error:  # a name that no file can have, a folder that may not be entered
+        if error.filename is None:
+            return _complain(error.strerror or str(error), 1)
+        return _complain(f"{error.filename}: {error.strerror}", 2)
     return status
 
 

@@ -9,6 +9,8 @@ from pathlib import Path
 
 from flight import report as reporting
 from flight.errors import UsageError
+from flight.report.archive import format_archive, summarise_archive
+from flight.telemetry.archive import find_runs
 from flight.telemetry.reader import read_run
 
 
@@ -18,7 +20,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "Print a run's performance against Table 5.3 of the thesis, and draw its figures. "
         "Judged on the simulation's truth where there is one, on the estimate otherwise."
     )
-    parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run")
+    parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run, or of an archive of runs")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead, and draw nothing")
     parser.add_argument(
         "--figures", type=Path, metavar="DIR", help="folder of the pictures (default RUN/figures)"
@@ -29,6 +31,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def report(options: argparse.Namespace) -> int:
     """Print the report, then draw."""
+    if find_runs(options.run):
+        archive = summarise_archive(options.run)
+        text = json.dumps(archive, allow_nan=False) + "\n" if options.json else format_archive(archive)
+        sys.stdout.write(text)
+        return 0
     run = read_run(options.run)
     summary = reporting.summarise(run)
     if options.json:

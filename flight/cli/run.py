@@ -22,14 +22,45 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "the devices in a process of their own. Ctrl-C ends a flight, coils at zero, log whole."
     )
     parser.add_argument("config", type=Path, metavar="CONFIG", help="YAML file, see config/step_demo.yaml")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the run (default runs/NAME-TIME)")
+    place = parser.add_mutually_exclusive_group()
+    place.add_argument("--out", type=Path, metavar="DIR", help="folder of the run (default runs/NAME-TIME)")
+    place.add_argument("--archive", type=Path, metavar="DIR", help="folder of a board's runs: fly the next")
     parser.add_argument("--duration", type=float, metavar="S", help="fly so many seconds instead")
     parser.add_argument("--seed", type=seed_number, metavar="N", help="seed of the simulation instead")
     parser.add_argument(
         "--realtime", action="store_true", help="fly simulated devices on the machine's clock"
     )
+    parser.add_argument(
+        "--devices",
+        type=Path,
+        metavar="FILE",
+        help="fly the simulated devices that `python -m sim_hal serve --facts FILE` serves; with --realtime",
+    )
+    parser.add_argument(
+        "--fault",
+        action="append",
+        default=[],
+        metavar="FAULT",
+        help="break something in the simulation, as 'imu: silent @ 120 for 5'; may be given again (below)",
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object when done")
     parser.set_defaults(command=run)
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    plain = parser.format_help
+    parser.format_help = lambda: plain() + _faults_help()  # type: ignore[method-assign]  # the list is slow to load
+
+
+def _faults_help() -> str:
+    """Return how faults are written, and all of them."""
+    from flight.app import fault_catalogue  # noqa: PLC0415 - for those who ask for help only
+
+    grammar, listing = fault_catalogue()
+    return (
+        f"\nfaults: {grammar}\n"
+        "  Seconds are of mission time; without @ a fault begins at 0, without `for` it lasts to the end.\n"
+        "  In a configuration: simulation: {faults: [{fault: 'imu: silent', at: 120, for: 5}]}\n"
+        f"\n{listing}\n"
+    )
 
 
 def run(options: argparse.Namespace) -> int:
@@ -37,15 +68,25 @@ def run(options: argparse.Namespace) -> int:
     from flight.app import Order, default_folder, fly  # noqa: PLC0415 - no other command needs devices
 
     out = options.out or default_folder(options.config)
-    order = Order(options.config, out, options.realtime, options.duration, options.seed)
+    order = Order(
+        options.config,
+        out,
+        options.realtime,
+        options.duration,
+        options.seed,
+        options.devices,
+        options.archive,
+        tuple(options.fault),
+    )
     begun = time.perf_counter()
     with_line = sys.stderr.isatty()
     outcome = fly(order, progress_line(sys.stderr) if with_line else None)
     if with_line:
         sys.stderr.write("\r\x1b[K")
     elapsed = time.perf_counter() - begun
-    flown = read_run(outcome.folder)
-    seconds = float(flown["control"]["time_ns"][-1]) * 1e-9 if len(flown["control"]) else 0.0
+    # A service that is told to stop does not read days of packets first.
+    flown = None if options.archive else read_run(outcome.folder)["control"]
+    seconds = elapsed if flown is None else float(flown["time_ns"][-1]) * 1e-9 if len(flown) else 0.0
     if options.json:
         facts = {
             "folder": str(outcome.folder),
@@ -53,7 +94,7 @@ def run(options: argparse.Namespace) -> int:
             "interrupted": outcome.interrupted,
             "mission_time_s": seconds,
             "elapsed_s": elapsed,
-            "packets": sum(log.counts.get("control", 0) for log in flown.logs.values()),
+            "packets": None if flown is None else len(flown),
             "log_error": outcome.log_error or None,
         }
         sys.stdout.write(json.dumps(facts) + "\n")
@@ -63,10 +104,10 @@ def run(options: argparse.Namespace) -> int:
             f"log:   {outcome.folder}\n"
             f"next:  python -m flight report {outcome.folder}\n"
         )
-    if outcome.log_error:
-        sys.stderr.write(f"flight: {outcome.log_error}\n")
-        return 1
-    return 0
+    for problem in filter(None, (outcome.log_error, outcome.restart)):
+        sys.stderr.write(f"flight: {problem}\n")
+    # A service manager starts again what ends with a failure.
+    return 1 if outcome.log_error or outcome.restart else 0
 
 
 def progress_line(stream: TextIO) -> Callable[[Progress], None]:

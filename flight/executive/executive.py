@@ -69,10 +69,12 @@ class Executive:
         if cycle is None:
             return
         begun = self._stopwatch()
+        completed = False
         try:
             group.task(cycle)
+            completed = True
         except Exception as error:  # noqa: BLE001 - containment boundary: the task runner
             self._observer.failed(group, error)
         execution_ns = self._stopwatch() - begun
-        group.account(execution_ns)
+        group.account(execution_ns, completed)
         self._observer.ran(group, cycle, execution_ns)

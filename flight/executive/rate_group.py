@@ -35,6 +35,7 @@ class RateGroup:
         self.period_ns = period_ns
         self.task = task
         self.cycles = 0
+        self.completed = 0
         self.slips = 0
         self.overruns = 0
         self.total_execution_ns = 0
@@ -74,9 +75,10 @@ class RateGroup:
         self.slips += skipped
         return cycle, skipped
 
-    def account(self, execution_ns: int) -> bool:
-        """Note the time a cycle took; tell whether it overran its period."""
+    def account(self, execution_ns: int, completed: bool = True) -> bool:
+        """Note the time a cycle took and whether its task came to its end; tell whether it overran."""
         self.cycles += 1
+        self.completed += completed
         self.total_execution_ns += execution_ns
         self.max_execution_ns = max(self.max_execution_ns, execution_ns)
         overran = execution_ns > self.period_ns

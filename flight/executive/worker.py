@@ -5,6 +5,7 @@ Run as `python -m flight.executive.worker MODULE:FUNCTION SOCKET_FD MEMORY_FD`, 
 
 from __future__ import annotations
 
+import ctypes
 import importlib
 import mmap
 import os
@@ -25,6 +26,18 @@ def serve(function: Any, line: socket.socket, slab: mmap.mmap) -> None:
             argument = unpack_message(bytes(received[:length]), slab)
             del received[:length]
             line.sendall(pack_message(_run(function, argument), slab))
+            del argument
+            give_back()
+
+
+def give_back() -> None:
+    """Return to the machine what the job's arrays took: glibc would keep them, tens of MB for a frame.
+
+    After the result is on its way, so that nobody waits for it (about 2 ms). Does nothing with another libc.
+    """
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
 
 
 def _run(function: Any, argument: Any) -> tuple[str, Any, str, int]:

@@ -115,6 +115,11 @@ class Guidance:
         self._path = PolynomialPath.holding(angle, now_ns)
         self._planned_ns = now_ns - 1
 
+    def release(self) -> None:
+        """Forget the path: there is none until the next plan or hold."""
+        self._path = None
+        self._planned_ns = None
+
     def offer(
         self,
         plan: Plan,

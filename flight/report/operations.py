@@ -8,6 +8,9 @@ from typing import Any
 import numpy as np
 
 from flight.arrays import FloatArray
+from flight.health.facts import FACTS
+from flight.health.streams import StreamState
+from flight.modes.mode import Mode
 from flight.report.signals import seconds
 from flight.telemetry.packets import PacketArray, to_text
 from flight.telemetry.reader import Run
@@ -95,6 +98,52 @@ def events(packets: PacketArray) -> list[Object]:
         )
         event["count"] += 1 + int(row["suppressed"])
     return [{"name": name, **event} for name, event in found.items()]
+
+
+def modes(packets: PacketArray) -> list[Object]:
+    """Return the modes in order, each with when it was entered and what led to it."""
+    return [
+        {
+            "mode": Mode(int(row["mode"])).label,
+            "at_s": float(time),
+            "trigger": to_text(row["trigger"]),
+            "reason": to_text(row["reason"]),
+        }
+        for row, time in zip(packets, seconds(packets), strict=True)
+    ]
+
+
+def health(packets: PacketArray) -> Object | None:
+    """Return the share of looks at which each stream was good, what else was seen; None without a look."""
+    if not len(packets):
+        return None
+    streams = {
+        name: float(np.mean(packets[name] == StreamState.GOOD))
+        for name in ("imu", "field", "coils", "power", "camera")
+        if (packets[name] != StreamState.NOT_FITTED).any()
+    }
+    held = int(np.bitwise_or.reduce(packets["facts"].astype(np.uint64)))
+    return {
+        "streams_good": streams,
+        "facts": [fact.name for bit, fact in enumerate(FACTS) if held >> bit & 1],
+        "watchdog_fed": int(packets["fed"][-1]),
+        "clock_steps": int(packets["clock_steps"][-1]),
+        "cpu_share": _largest(packets["cpu_share"]),
+        "proportional_bytes": _largest(packets["proportional"]),
+        "memory_slope_bytes_per_hour": _last(packets["memory_slope"], 3600.0),
+        "disk_free_bytes": _last(packets["disk_free"]),
+        "temperature_c": _largest(packets["temperature"]),
+    }
+
+
+def _largest(values: FloatArray) -> float | None:
+    known = values[np.isfinite(values)]
+    return float(known.max()) if len(known) else None
+
+
+def _last(values: FloatArray, scale: float = 1.0) -> float | None:
+    known = values[np.isfinite(values)]
+    return float(known[-1]) * scale if len(known) else None
 
 
 def logs(run: Run) -> list[Object]:

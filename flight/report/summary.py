@@ -12,7 +12,7 @@ import numpy as np
 
 from flight.arrays import FloatArray
 from flight.report import performance as limits
-from flight.report.operations import cycles, events, jobs, logs, planner, rate_groups
+from flight.report.operations import cycles, events, health, jobs, logs, modes, planner, rate_groups
 from flight.report.performance import Command, Response, commands, response
 from flight.report.sensing import estimate_errors, star_attitudes, streaks
 from flight.report.signals import Attitude, coil_power, estimated_attitude, seconds, true_attitude
@@ -22,6 +22,7 @@ from flight.telemetry.reader import Run
 Object = dict[str, Any]
 
 
+@np.errstate(all="ignore")  # a packet may hold any number: what cannot be reckoned with comes out as None
 def summarise(run: Run) -> Object:
     """Return everything the report tells of a run; only None, bool, int, float, str, list and dict."""
     attitude = true_attitude(run) or estimated_attitude(run)
@@ -42,6 +43,8 @@ def summarise(run: Run) -> Object:
         "estimate": estimate_errors(run),
         "streaks": streaks(run),
         "stars": star_attitudes(run),
+        "modes": modes(run["mode"]),
+        "health": health(run["health"]),
         "events": events(run["event"]),
         "logs": logs(run),
         "notes": notes,

@@ -22,6 +22,8 @@ def format_report(summary: Object) -> str:
         _loop(summary),
         _planner(summary),
         _sensing(summary),
+        _modes(summary["modes"]),
+        _health(summary["health"]),
         _events(summary["events"]),
         _logs(summary["logs"]),
         [f"note: {note}" for note in summary["notes"]],
@@ -45,6 +47,10 @@ def number(value: float | None, digits: int = 2, scale: float = 1.0) -> str:
     return "-" if value is None else f"{value * scale:.{digits}f}"
 
 
+def _signed(q2: float | None) -> str:
+    return "-" if q2 is None else f"{q2:+.3f}"
+
+
 def _headline(summary: Object) -> list[str]:
     run = summary["run"]
     lines = [f"Run {run['folder']}: {number(run['duration_s'], 1)} s"]
@@ -64,7 +70,7 @@ def _steps(summary: Object) -> list[str]:
         rise = number(step["rise_s"]) + ("" if step["rise_judged"] or step["rise_s"] is None else " *")
         rows.append(
             [
-                f"{step['index']}  {step['from_q2']:+.3f} -> {step['target_q2']:+.3f}",
+                f"{step['index']}  {_signed(step['from_q2'])} -> {_signed(step['target_q2'])}",
                 number(step["start_s"], 1),
                 number(step["steady_state_deg"]),
                 number(step["overshoot_percent"], 1),
@@ -117,7 +123,7 @@ def _loop(summary: Object) -> list[str]:
         rows = [
             [
                 group["name"],
-                f"{group['period_s']:g}",
+                number(group["period_s"], 3),
                 str(group["cycles"]),
                 str(group["slips"]),
                 str(group["overruns"]),
@@ -198,6 +204,33 @@ def _stars(stars: Object) -> list[str]:
         lines.append(
             f"  rms error about x, y, z {errors} arcsec of {stars['compared']} attitudes; "
             f"mean e' P^-1 e / 3 = {number(stars['normalised'])}"
+        )
+    return lines
+
+
+def _modes(modes: list[Object]) -> list[str]:
+    if not modes:
+        return []
+    rows = [[mode["mode"], number(mode["at_s"], 3), mode["trigger"], mode["reason"] or "-"] for mode in modes]
+    return ["Modes", *table(["", "at s", "by", "because"], rows)]
+
+
+def _health(health: Object | None) -> list[str]:
+    if health is None:
+        return []
+    good = ", ".join(f"{name} {number(share, 1, 1e2)} %" for name, share in health["streams_good"].items())
+    lines = [
+        f"Health: streams good {good}",
+        f"  facts that counted: {', '.join(health['facts']) or 'none'}; "
+        f"watchdog fed {health['watchdog_fed']} times, wall clock set {health['clock_steps']} times",
+    ]
+    if health["proportional_bytes"] is not None:
+        lines.append(
+            f"  at most {number(health['cpu_share'])} of a core, "
+            f"{number(health['proportional_bytes'], 0, 2.0**-20)} MiB, "
+            f"{number(health['temperature_c'], 1)} deg C; memory slope "
+            f"{number(health['memory_slope_bytes_per_hour'], 2, 2.0**-20)} MiB/h; "
+            f"{number(health['disk_free_bytes'], 0, 2.0**-20)} MiB of disk free"
         )
     return lines
 

@@ -1,4 +1,4 @@
-"""One cycle at 40 Hz: bytes to estimate, estimate and path to currents, all of it into the log."""
+"""One cycle at 40 Hz: bytes to estimate, mode and path to currents, all of it into the log."""
 
 from __future__ import annotations
 
@@ -10,14 +10,18 @@ from flight.estimation.estimate import ThreadEstimate
 from flight.events import EventLog
 from flight.executive.jobs import JobRunner
 from flight.executive.rate_group import Cycle
+from flight.health.streams import Streams
+from flight.modes.mode import STEERING, Mode
 from flight.tasks import imaging as imaging_task
 from flight.tasks import planning as planning_task
+from flight.tasks.coil_drive import CoilDrive
 from flight.tasks.imaging import Imaging
+from flight.tasks.mode_control import ModeControl
 from flight.tasks.navigation import Navigation
 from flight.tasks.performance import PerformanceObserver
 from flight.tasks.planning import Planning
 from flight.tasks.steering import Steering
-from flight.tasks.targets import Target, TargetSequence
+from flight.tasks.targets import KEPT, Target, TargetSequence
 from flight.telemetry.definitions import CONTROL, TARGET
 from flight.telemetry.recorder import Recorder
 from hal.interfaces.devices import TorqueCoils
@@ -28,10 +32,12 @@ class Rooms:
     """What a cycle goes through."""
 
     navigation: Navigation
+    modes: ModeControl
     steering: Steering
     planning: Planning
     imaging: Imaging | None
     coils: TorqueCoils
+    drive: CoilDrive
     jobs: JobRunner
 
 
@@ -45,12 +51,14 @@ class ControlCycle:
         recorder: Recorder,
         event_log: EventLog,
         observer: PerformanceObserver,
+        streams: Streams,
     ) -> None:
         self._rooms = rooms
         self._targets = targets
         self._recorder = recorder
         self._events = event_log
         self._observer = observer
+        self._streams = streams
         self._ever_started = False
         self._blind = True
         self.target: Target | None = None
@@ -59,33 +67,58 @@ class ControlCycle:
     def run(self, cycle: Cycle) -> None:
         """Run one cycle."""
         rooms, now_ns = self._rooms, cycle.start_ns
-        target = self._command_target(now_ns)
         # What the last command came to be on the wire, and when: the coils' thread may have needed a moment.
         in_force = rooms.coils.state()
         rooms.navigation.commanded(in_force.written_ns, in_force.current)
         rooms.navigation.update(now_ns)
+        if not in_force.error:
+            self._streams.note("coils", now_ns)
+        rooms.drive.look(in_force, rooms.navigation.readings, now_ns)
         if rooms.imaging is not None:
             rooms.imaging.serve(now_ns)
         self.estimate = rooms.navigation.estimate(now_ns)
+        mode = rooms.modes.step(self.estimate, self._measured_rate(), not in_force.error, now_ns)
+        self._aim(now_ns)
         if self.estimate is not None and self._blind:
             rooms.planning.request(now_ns)  # from where the body is by now, not from an old path
         self._blind = self.estimate is None
         self._ever_started = self._ever_started or self.estimate is not None
         self._collect(now_ns)
-        rooms.steering.run(self.estimate, now_ns, self._ever_started)
+        self._act(mode, now_ns)
         written = rooms.coils.state()
-        rooms.planning.serve(self.estimate, target, now_ns)
-        self._record(cycle, target, written.current.tolist(), written.saturated)
+        if mode in STEERING and self.target is not None:
+            rooms.planning.serve(self.estimate, self.target, now_ns)
+        self._record(cycle, written.current.tolist(), written.saturated)
 
-    def _command_target(self, now_ns: int) -> Target:
-        """Return the target in force; tell a new one and want a path to it at once."""
-        target = self._targets.at(now_ns - self._recorder.epoch_ns)
-        if target is not self.target:
-            self.target = target
+    def _measured_rate(self) -> float | None:
+        """Return the length of the newest body rate of this cycle, rad/s."""
+        readings = self._rooms.navigation.readings
+        return math.hypot(*readings[-1].rate.tolist()) if readings else None
+
+    def _act(self, mode: Mode, now_ns: int) -> None:
+        """Use the coils as the mode wants."""
+        steering = self._rooms.steering
+        if mode in STEERING:
+            steering.run(self.estimate, now_ns, self._ever_started)
+        elif mode is Mode.DETUMBLE:
+            steering.brake(now_ns)
+        else:
+            steering.rest(now_ns)
+
+    def _aim(self, now_ns: int) -> None:
+        """See which target is in force; want a path to a new one at once, and tell it."""
+        modes = self._rooms.modes
+        steps = modes.flies_steps
+        target = self._targets.at(now_ns - self._recorder.epoch_ns) if steps else modes.wanted
+        if target is self.target:
+            return
+        self.target = target
+        if target is None:
+            return
+        if target.index != KEPT:
             self._recorder.record(TARGET, now_ns, index=target.index, q2=target.q2, rate=target.rate)
             self._events.tell(events.TARGET, now_ns, f"step {target.index}: q2 = {target.q2:+.2f}")
-            self._rooms.planning.aim(target, now_ns)
-        return target
+        self._rooms.planning.aim(target, now_ns)
 
     def _collect(self, now_ns: int) -> None:
         """Take in what the workers have finished."""
@@ -97,7 +130,7 @@ class ControlCycle:
                 self._rooms.imaging.finish(result, now_ns)
                 self.estimate = self._rooms.navigation.estimate(now_ns)
 
-    def _record(self, cycle: Cycle, target: Target, written: list[float], saturated: bool) -> None:
+    def _record(self, cycle: Cycle, written: list[float], saturated: bool) -> None:
         estimate, sample = self.estimate, self._rooms.steering.sample
         nan = math.nan
         self._recorder.record(
@@ -111,7 +144,7 @@ class ControlCycle:
             rate=estimate.rate if estimate else nan,
             angle_sigma=math.sqrt(estimate.covariance[0, 0]) if estimate else nan,
             rate_sigma=math.sqrt(estimate.covariance[1, 1]) if estimate else nan,
-            target_q2=target.q2,
+            target_q2=self.target.q2 if self.target else nan,
             path_q2=math.sin(0.5 * sample.angle) if sample else nan,
             path_rate=sample.rate if sample else nan,
             path_acceleration=sample.acceleration if sample else nan,

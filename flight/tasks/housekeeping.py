@@ -6,9 +6,10 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from flight import events
-from flight.events import Condition, EventLog
+from flight.events import EventLog
 from flight.executive.rate_group import Cycle
+from flight.health import facts
+from flight.health.facts import Facts
 from flight.tasks.imaging import Imaging
 from flight.tasks.navigation import Navigation
 from flight.tasks.planning import Planning
@@ -34,20 +35,20 @@ class Watched:
 class Housekeeping:
     """The 1 Hz task."""
 
-    def __init__(self, watched: Watched, recorder: Recorder, event_log: EventLog) -> None:
+    def __init__(self, watched: Watched, recorder: Recorder, event_log: EventLog, facts_: Facts) -> None:
         self._watched = watched
         self._recorder = recorder
         self._events = event_log
-        self._power = Condition(event_log, events.POWER_FAULT, events.POWER_RECOVERED)
-        self._log = Condition(event_log, events.LOG_FAULT, None)
+        self._facts = facts_
 
     def run(self, cycle: Cycle) -> None:
         """Write the housekeeping packet."""
         watched, now_ns = self._watched, cycle.start_ns
         error = watched.power.error() if watched.power else ""
-        self._power.update(bool(error), now_ns, error or "readings come again")
+        self._facts.state(facts.POWER_FAULT, bool(error), now_ns, error or "readings come again")
         log_error = watched.log_error()
-        self._log.update(bool(log_error), now_ns, log_error)
+        text = log_error or "packets reach the disk again"
+        self._facts.state(facts.LOG_FAULT, bool(log_error), now_ns, text)
         reading = watched.power.latest() if watched.power and not error else None
         link = watched.navigation.link()
         imaging = watched.imaging

@@ -6,6 +6,7 @@ that make no packets are corruption, packets with impossible values are implausi
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,18 +17,23 @@ from flight.estimation.attitude_filter import AttitudeFilter
 from flight.estimation.estimate import Estimate, ThreadEstimate
 from flight.estimation.measurements import (
     AttitudeMeasurement,
-    MeanRateMeasurement,
     Measurement,
     RateMeasurement,
 )
 from flight.estimation.rigid_body import Parameters
-from flight.events import Condition, EventLog
-from flight.quaternion import angle_about_axis_y
+from flight.events import EventLog
+from flight.health import facts
+from flight.health.facts import Facts
+from flight.health.streams import Streams
+from flight.quaternion import about_axis_y, angle_about_axis_y, attitude_matrix
 from flight.telemetry.definitions import IMU
 from flight.telemetry.recorder import Recorder
 from hal.interfaces.devices import InertialUnit
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.readings import ImuLink, ImuReading
+
+_AT_A_TIME = 16
+"""Measurements applied again in a cycle: some ms, so that a second of them takes a few cycles."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +47,7 @@ class NavigationSettings:
         angle_noise: rad, standard deviation of the unit's attitude about each axis.
         rate_noise: rad/s, of its rate.
         believed: torsion and damping of the thread in the plant: the disturbance told is the rest.
+        field: (3,) T, of the surroundings, reference axes.
     """
 
     angle_noise: float
@@ -48,10 +55,15 @@ class NavigationSettings:
     max_age_ns: int
     coast_ns: int
     believed: Parameters
+    field: FloatArray
 
 
 class Navigation:
-    """Owns the filter and the watch over the inertial unit's line."""
+    """Owns the filter and the watch over the inertial unit's line.
+
+    Attributes:
+        readings: of this cycle, oldest first.
+    """
 
     def __init__(
         self,
@@ -60,6 +72,8 @@ class Navigation:
         settings: NavigationSettings,
         recorder: Recorder,
         event_log: EventLog,
+        facts_: Facts,
+        streams: Streams,
     ) -> None:
         self._unit = unit
         self._filter = filter_
@@ -72,9 +86,9 @@ class Navigation:
         self._last_good_ns = 0
         self._link = unit.link()
         self._heard_since_ns = 0
-        self._silent = Condition(event_log, events.IMU_SILENT, events.IMU_RECOVERED)
-        self._unusable = Condition(event_log, events.IMU_UNUSABLE, events.IMU_RECOVERED)
-        self._lost = Condition(event_log, events.IMU_LINE_LOST, events.IMU_RECOVERED)
+        self._facts = facts_
+        self._streams = streams
+        self.readings: tuple[ImuReading, ...] = ()
 
     def begin(self, time_ns: int) -> None:
         """Use samples from `time_ns` on only: the body is released then."""
@@ -92,18 +106,26 @@ class Navigation:
         self._filter.command(time_ns, currents)
 
     def update(self, now_ns: int) -> None:
-        """Take in what the unit has sent."""
+        """Take in what the unit has sent, and go on with what came late."""
+        self._filter.catch_up(_AT_A_TIME)
         try:
             readings = self._unit.poll()
         except DeviceError as error:
-            self._lost.update(True, now_ns, str(error))
+            self.readings = ()
+            self._facts.state(facts.IMU_LINE_LOST, True, now_ns, str(error))
             return
-        self._lost.update(False, now_ns, "the serial port is back")
-        for reading in readings:
-            if reading.time_ns >= self._since_ns:
-                self._take(reading)
-                self._last_good_ns = now_ns
+        self._facts.state(facts.IMU_LINE_LOST, False, now_ns, "the serial port is back")
+        self.readings = tuple(reading for reading in readings if reading.time_ns >= self._since_ns)
+        for reading in self.readings:
+            self._take(reading)
+            self._streams.note("imu", reading.time_ns)
+            self._streams.note("field", reading.time_ns, float(np.linalg.norm(reading.field)))
+            self._last_good_ns = now_ns
         self._watch_line(now_ns)
+
+    def is_heard(self, now_ns: int) -> bool:
+        """Tell whether a reading has come within the age limit: for who steers by readings alone."""
+        return now_ns - self._last_good_ns <= self._settings.max_age_ns
 
     def attitude(self, now_ns: int) -> Estimate | None:
         """Return the whole estimate for now, None when there is none to be trusted."""
@@ -117,26 +139,23 @@ class Navigation:
         estimate = self.attitude(now_ns)
         return None if estimate is None else estimate.about_thread(self._settings.believed)
 
+    def field(self, angle: float) -> FloatArray:
+        """Return the field (3,) T in body axes at `angle` rad about the thread."""
+        return np.asarray(attitude_matrix(about_axis_y(angle)) @ self._settings.field)
+
     def past(self, time_ns: int) -> Estimate | None:
         """Return the whole estimate as it stood at a past time, None when that is not remembered."""
         return self._filter.past(time_ns) if self._filter.started else None
 
-    def take_mean_rate(self, since_ns: int, until_ns: int, rate: FloatArray, covariance: FloatArray) -> bool:
-        """Put the mean body rate (3,) over an exposure, covariance (3, 3), where it belongs in time.
+    def take_late(self, late: Sequence[Measurement], told: Callable[[list[bool]], None]) -> None:
+        """Put measurements of a frame where they belong in time, over the next cycles.
 
-        Tells whether it passed the gate.
+        `told` is called, later or at once, with which of them passed the gate.
         """
-        return self._take_late(MeanRateMeasurement(since_ns, until_ns, rate, covariance))
-
-    def take_attitude(self, time_ns: int, quaternion: FloatArray, covariance: FloatArray) -> bool:
-        """Put an attitude (4,), covariance (3, 3) of turns about the body's axes, where it belongs in time.
-
-        Tells whether it passed the gate.
-        """
-        return self._take_late(AttitudeMeasurement(time_ns, quaternion, covariance))
-
-    def _take_late(self, measurement: Measurement) -> bool:
-        return self._filter.started and self._filter.measure(measurement)
+        if self._filter.started:
+            self._filter.measure_in_turn(late, told)
+        else:
+            told([False] * len(late))
 
     def _take(self, reading: ImuReading) -> None:
         self._recorder.record(
@@ -174,13 +193,14 @@ class Navigation:
         quiet_ns = now_ns - max(link.last_byte_ns, self._since_ns)
         silent = quiet_ns > limit_ns
         text = f"no byte for {quiet_ns * 1e-9:.2f} s" if silent else "bytes come again"
-        self._silent.update(silent, now_ns, text)
+        self._facts.state(facts.IMU_SILENT, silent, now_ns, text)
         if silent:
             self._heard_since_ns = now_ns
         without_ns = now_ns - max(self._last_good_ns, self._heard_since_ns)
         unusable = without_ns > limit_ns
         text = f"no reading in {without_ns * 1e-9:.2f} s of bytes: has the unit started anew?"
-        self._unusable.update(unusable, now_ns, text if unusable else "readings come again")
+        text = text if unusable else "readings come again"
+        self._facts.state(facts.IMU_UNUSABLE, unusable, now_ns, text)
         bad = link.bad_checksum - before.bad_checksum
         stray = link.discarded_bytes - before.discarded_bytes
         if bad or stray:

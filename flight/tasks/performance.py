@@ -40,7 +40,9 @@ class PerformanceObserver:
             )
 
     def slipped(self, group: RateGroup, slots: int) -> None:
-        """Tell of skipped slots."""
+        """Tell of skipped slots of the control group: no other can slip without it."""
+        if group.name != CONTROL:
+            return
         text = f"{group.name}: {slots} slots skipped, {group.slips} since start"
         self._events.tell(events.CYCLE_SLIP, self._clock.now_ns(), text)
 

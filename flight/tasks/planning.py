@@ -94,6 +94,10 @@ class Planning:
         self.accepted = 0
         self.refused = 0
 
+    def busy_since_ns(self) -> int | None:
+        """Return since when a plan is being made, None when none is."""
+        return None if self._job is None else self._asked_ns
+
     def aim(self, target: Target, now_ns: int) -> None:
         """Want another attitude, and a plan for it at once; the present path is flown until that comes."""
         self._guidance.aim(target.q2, target.rate, now_ns)

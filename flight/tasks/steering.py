@@ -6,16 +6,17 @@ from enum import IntEnum
 
 import numpy as np
 
-from flight import events
 from flight.arrays import FloatArray
 from flight.control.controller import Controller
+from flight.control.detumble import Detumbler
 from flight.estimation.estimate import ThreadEstimate
-from flight.events import Condition, EventLog
 from flight.guidance.guidance import Guidance, GuidanceState
 from flight.guidance.path import Sample
+from flight.health import facts
+from flight.health.facts import Facts
+from flight.tasks.coil_drive import CoilDrive
+from flight.tasks.navigation import Navigation
 from hal.interfaces.devices import TorqueCoils
-
-_NO_CURRENT: FloatArray = np.zeros(3)
 
 
 class SteeringState(IntEnum):
@@ -24,40 +25,51 @@ class SteeringState(IntEnum):
     OFF = 0
     FOLLOWING = 1
     HOLDING = 2
+    BRAKING = 3
 
 
 class Steering:
-    """Commands the coil on body x, the one that turns the body about the thread (Sease 5.4)."""
+    """Turns the body about the thread by the coil on body x (Sease 5.4), brakes it, or rests.
+
+    Control is lost when there is no trustworthy estimate, or, while braking, no reading within its age limit.
+    An estimate that the model carries over a short silence has an honest covariance: steering by it is
+    control, until it is older than the configured coast.
+    """
 
     def __init__(
-        self, guidance: Guidance, controller: Controller, coils: TorqueCoils, event_log: EventLog
+        self,
+        guidance: Guidance,
+        controller: Controller,
+        detumbler: Detumbler,
+        navigation: Navigation,
+        coils: TorqueCoils,
+        drive: CoilDrive,
+        facts_: Facts,
     ) -> None:
         self._guidance = guidance
         self._controller = controller
+        self._detumbler = detumbler
+        self._navigation = navigation
         self._coils = coils
+        self._drive = drive
+        self._facts = facts_
         self.state = SteeringState.OFF
         self.sample: Sample | None = None
-        self.command: FloatArray = _NO_CURRENT
         self.saturated = False
-        self._lost = Condition(event_log, events.CONTROL_LOST, events.CONTROL_REGAINED)
-        self._holding = Condition(event_log, events.HOLDING, None)
-        self._coil_fault = Condition(event_log, events.COIL_FAULT, events.COIL_RECOVERED)
+
+    @property
+    def command(self) -> FloatArray:
+        """The currents (3,) A asked of the coils in this cycle."""
+        return self._drive.command
 
     def run(self, estimate: ThreadEstimate | None, now_ns: int, ever_started: bool) -> None:
-        """Command the coils for this cycle. `ever_started`: there was an estimate once, so none is a loss."""
+        """Follow or hold in this cycle. `ever_started`: there was an estimate once, so none is a loss."""
         self.sample = self._guidance.sample(now_ns)
-        self._lost.update(
-            estimate is None and ever_started,
-            now_ns,
-            "no measurement fresh enough to steer by: coils to zero"
-            if estimate is None
-            else "steering again",
-        )
+        text = "steering again" if estimate else "no measurement fresh enough to steer by: coils to zero"
+        self._facts.state(facts.CONTROL_LOST, estimate is None and ever_started, now_ns, text)
         if estimate is None or self.sample is None:
-            self.state = SteeringState.OFF
-            self.command = _NO_CURRENT
-            self.saturated = False
-            self._controller.reset()
+            self._let_go(now_ns)
+            adrift = False
         else:
             following = self._guidance.state(now_ns) is GuidanceState.FOLLOWING
             self.state = SteeringState.FOLLOWING if following else SteeringState.HOLDING
@@ -65,9 +77,47 @@ class Steering:
                 self.sample, estimate.angle, estimate.rate, estimate.disturbance
             )
             self.saturated = wanted.saturated
-            self.command = np.array([wanted.current, 0.0, 0.0])
-        adrift = self.state is SteeringState.HOLDING and self._guidance.is_adrift(now_ns)
-        self._holding.update(adrift, now_ns, "no newer path: holding the attitude at the end of the last")
-        self._coils.command(self.command)
+            current = np.array([wanted.current, 0.0, 0.0])
+            self._drive.send(current, lambda: self._navigation.field(estimate.angle))
+            adrift = not following and self._guidance.is_adrift(now_ns)
+        self._facts.state(
+            facts.HOLDING, adrift, now_ns, "no newer path: holding the attitude at the end of the last"
+        )
+        self._look_at_coils(now_ns)
+
+    def begin_braking(self, now_ns: int) -> None:
+        """Begin the windows of detumbling anew."""
+        self._detumbler.begin(now_ns)
+
+    def brake(self, now_ns: int) -> None:
+        """Detumble in this cycle, by the magnetometer alone."""
+        for reading in self._navigation.readings:
+            self._detumbler.sample(reading.time_ns, reading.field)
+        heard = self._navigation.is_heard(now_ns)
+        text = "braking again" if heard else "no reading fresh enough to brake by: coils to zero"
+        self._facts.state(facts.CONTROL_LOST, not heard, now_ns, text)
+        self._controller.reset()
+        self.sample, self.saturated = None, False
+        self.state = SteeringState.BRAKING if heard else SteeringState.OFF
+        if heard:
+            self._drive.send(self._detumbler.current(now_ns), lambda: self._detumbler.field(now_ns))
+        else:
+            self._drive.zero()
+        self._look_at_coils(now_ns)
+
+    def rest(self, now_ns: int) -> None:
+        """Keep the coils at zero in this cycle."""
+        self.sample = None
+        self._let_go(now_ns)
+        self._look_at_coils(now_ns)
+
+    def _let_go(self, now_ns: int) -> None:
+        self.state = SteeringState.OFF
+        self.saturated = False
+        self._drive.zero()
+        self._controller.reset()
+
+    def _look_at_coils(self, now_ns: int) -> None:
         error = self._coils.state().error
-        self._coil_fault.update(bool(error), now_ns, error or "the PWM chip takes commands again")
+        text = error or "the PWM chip takes commands again"
+        self._facts.state(facts.COIL_FAULT, bool(error), now_ns, text)

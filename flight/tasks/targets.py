@@ -6,6 +6,11 @@ import bisect
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+COMMANDED = 1000
+"""Slews that are commanded are numbered from here on."""
+KEPT = 65535
+"""The number of an attitude that is only held."""
+
 
 @dataclass(frozen=True, slots=True)
 class Target:

@@ -33,6 +33,7 @@ class Packet:
     meaning: str
     fields: tuple[Field, ...]
     version: int = field(default=1)
+    telecommand: bool = False
 
 
 MAX_NODES = 40
@@ -80,7 +81,7 @@ CONTROL = Packet(
     "One control cycle: estimate, path, command",
     (
         Field("cycle", "u4", "-", "slot of the control grid since start, skipped ones counted"),
-        Field("state", "u1", "-", "0 coils off, 1 following a path, 2 holding"),
+        Field("state", "u1", "-", "0 coils off, 1 following a path, 2 holding, 3 braking"),
         Field("estimate_age", "f8", "s", "age of the newest measurement in the estimate"),
         Field("angle", "f8", "rad", "estimated turn about the thread"),
         Field("q2", "f8", "-", "estimated second quaternion component"),
@@ -107,6 +108,20 @@ TARGET = Packet(
         Field("index", "u2", "-", "number of the step, from 0"),
         Field("q2", "f8", "-", "commanded final q2"),
         Field("rate", "f8", "rad/s", "commanded final rate"),
+    ),
+)
+
+MODE = Packet(
+    "mode",
+    0x113,
+    "at each change",
+    "A new mode, and what led to it",
+    (
+        Field("before", "u1", "-", "mode until now, numbered as in mode"),
+        Field("mode", "u1", "-", "0 boot, 1 safe, 2 detumble, 3 hold, 4 slew, 5 testbed-demo"),
+        Field("trigger", "S32", "-", "what led to it (flight.modes.mode)"),
+        Field("reason", "S96", "-", "of the trigger: the event, the values"),
+        Field("target_q2", "f8", "-", "q2 wanted by a hold or a slew, NaN when not yet known"),
     ),
 )
 
@@ -210,6 +225,48 @@ HOUSEKEEPING = Packet(
     ),
 )
 
+HEALTH = Packet(
+    "health",
+    0x132,
+    "1 Hz",
+    "Mode, streams, facts and resources",
+    (
+        Field("mode", "u1", "-", "as in mode"),
+        Field("mode_age", "f8", "s", "time in this mode"),
+        Field("imu", "u1", "-", "0 not fitted, 1 never came, 2 stale, 3 invalid, 4 slow, 5 good"),
+        Field("field", "u1", "-", "the magnetometer, as imu"),
+        Field("coils", "u1", "-", "acknowledged commands, as imu"),
+        Field("power", "u1", "-", "the current monitor, as imu"),
+        Field("camera", "u1", "-", "frames, as imu"),
+        Field("facts", "u8", "-", "bit n: fact n of the table (flight.health.facts) counts"),
+        Field("coils_in_use", "u1", "-", "bits 0, 1, 2: the coils on body x, y, z"),
+        Field("fed", "u4", "-", "how often the watchdog was fed"),
+        Field("slips", "u4", "-", "slots of the control group skipped since start"),
+        Field("clock_steps", "u4", "-", "how often the wall clock was set"),
+        Field("cpu_share", "f8", "-", "processor time of the control process over time; NaN when unknown"),
+        Field("resident", "f8", "B", "resident set of the control process; NaN when unknown"),
+        Field("proportional", "f8", "B", "proportional set of all flight processes; NaN when unknown"),
+        Field("memory_slope", "f8", "B/s", "of the proportional set, by least squares; NaN when unknown"),
+        Field("disk_free", "f8", "B", "room for the flight log; NaN when unknown"),
+        Field("temperature", "f8", "deg C", "of the warmest zone of the board; NaN when unknown"),
+    ),
+)
+
+COMMAND = Packet(
+    "command",
+    0x133,
+    "each command",
+    "What became of a command; also the answer to whoever sent it",
+    (
+        Field("obeyed", "u1", "-", "1 when obeyed, 0 when refused"),
+        Field("name", "S16", "-", "name of the command; empty for bytes that are none"),
+        Field("source", "S16", "-", "socket, udp or timeline"),
+        Field("count", "u4", "-", "commands since start"),
+        Field("mode", "u1", "-", "mode after it, as in mode"),
+        Field("text", "S128", "-", "its values, or why it was refused"),
+    ),
+)
+
 TRUTH = Packet(
     "truth",
     0x140,
@@ -269,11 +326,14 @@ PACKETS: tuple[Packet, ...] = (
     IMU,
     CONTROL,
     TARGET,
+    MODE,
     PLAN,
     STREAK,
     STARS,
     EVENT,
     HOUSEKEEPING,
+    HEALTH,
+    COMMAND,
     TRUTH,
     CYCLE_TIMING,
     RATE_GROUP,

@@ -1,7 +1,8 @@
 """The flight log: packets queued by the control thread, put on disk beside it.
 
 `write` appends to a bounded queue and never waits; a ticker of the clock drains the queue into the segments.
-What cannot be kept is counted and told: packets lost, segments dropped.
+While the disk takes nothing (full, gone, hung) packets wait in the queue, and are written once it does again;
+what does not fit there is counted and told.
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ from flight.telemetry.segments import SegmentFile, SegmentStore, find_segments, 
 from hal.interfaces.wires import Clock
 
 _HUNG_DISK_S = 5.0
+_RETRY_NS = 1_000_000_000
+_RECENT_NS = 2_000_000_000
 
 
 class FlightLog:
@@ -55,7 +58,11 @@ class FlightLog:
         self._queue: deque[bytes] = deque()
         self._refused = 0  # packets lost by the writer
         self._unwritten = 0  # packets lost by the drainer
-        self._failure = ""
+        self._refused_ns = 0  # when last
+        self._failure = ""  # why nothing can be written now
+        self._past_failure = ""
+        self._retry_ns = 0
+        self._busy_since_ns: int | None = None
         self._closed = False
         self._draining = threading.Lock()  # held by whoever drains, never asked for by write()
         try:
@@ -68,8 +75,9 @@ class FlightLog:
 
     def write(self, packet: bytes) -> None:
         """Take one packet. Never waits: what does not fit in the queue is lost and counted."""
-        if self._closed or self._failure or len(self._queue) >= self._queue_packets:
+        if self._closed or len(self._queue) >= self._queue_packets:
             self._refused += 1
+            self._refused_ns = self._clock.now_ns()
         else:
             self._queue.append(packet)
 
@@ -84,9 +92,24 @@ class FlightLog:
         return self._store.dropped
 
     def error(self) -> str:
-        """Return what is wrong and how many packets it has cost so far, empty while nothing is."""
-        problem = self._failure or ("the queue was full or the log closed" if self._refused else "")
-        return f"log {self._stem}: {problem}; {self.lost} packets lost" if problem else ""
+        """Return what is wrong and how many packets the log has lost so far, empty while nothing is wrong.
+
+        Of a closed log it tells of any loss in its life.
+        """
+        problem = self._problem()
+        waiting = len(self._queue)
+        waits = f", {waiting} waiting" if problem and waiting else ""
+        return f"log {self._stem}: {problem}; {self.lost} packets lost{waits}" if problem else ""
+
+    def _problem(self) -> str:
+        now_ns, busy_since_ns = self._clock.now_ns(), self._busy_since_ns
+        if self._failure:
+            return self._failure
+        if busy_since_ns is not None and now_ns - busy_since_ns > _HUNG_DISK_S * 1e9:
+            return "the disk does not answer"
+        if self._refused and (self._closed or now_ns - self._refused_ns <= _RECENT_NS):
+            return self._past_failure or "the queue was full or the log closed"
+        return ""
 
     def close(self) -> None:
         """Put the queue on disk, sync and close. Safe to call twice; never waits long for a hung disk."""
@@ -96,46 +119,55 @@ class FlightLog:
         if not self._draining.acquire(timeout=_HUNG_DISK_S):
             self._closed = True
             self._failure = "the disk does not answer"
-            self._unwritten += len(self._queue)
+            self._give_up()
             return
         try:
             self._closed = True
             self._write_queue()
+            self._give_up()
             self._store.close()
         except OSError as error:
-            self._failure = self._failure or _reason(error)
+            self._fail(error)
         finally:
             self._draining.release()
 
     def _drain(self) -> None:
         """Put the queue on disk and sync when it is time: the ticker's job."""
         with self._draining:
-            if self._closed:
+            now_ns = self._clock.now_ns()
+            if self._closed or (self._failure and now_ns < self._retry_ns):
                 return
+            self._busy_since_ns = now_ns
             self._write_queue()
-            now = self._clock.now_ns()
-            due = self._sync_period_ns is not None and now - self._synced_ns >= self._sync_period_ns
+            now_ns = self._clock.now_ns()
+            due = self._sync_period_ns is not None and now_ns - self._synced_ns >= self._sync_period_ns
             if due and not self._failure:
-                self._synced_ns = now
+                self._synced_ns = now_ns
                 try:
                     self._store.sync()
                 except OSError as error:
-                    self._failure = _reason(error)
+                    self._fail(error)
+            self._busy_since_ns = None
 
     def _write_queue(self) -> None:
-        """Write the packets queued now; after a failure they are only counted."""
+        """Write the packets queued now; those that the disk does not take wait on."""
         packets = [self._queue.popleft() for _ in range(len(self._queue))]
         before = self._store.packets
-        if not self._failure:
-            try:
-                self._store.append(packets)
-            except OSError as error:
-                self._failure = _reason(error)
-        self._unwritten += len(packets) - (self._store.packets - before)
+        try:
+            self._store.append(packets)
+            self._failure = ""
+        except OSError as error:
+            self._fail(error)
+            self._queue.extendleft(reversed(packets[self._store.packets - before :]))
 
+    def _fail(self, error: OSError) -> None:
+        self._failure = self._past_failure = f"writing stopped: {error.strerror or error}"
+        self._retry_ns = self._clock.now_ns() + _RETRY_NS
 
-def _reason(error: OSError) -> str:
-    return f"writing stopped: {error.strerror or error}"
+    def _give_up(self) -> None:
+        """Count what still waits as lost."""
+        self._unwritten += len(self._queue)
+        self._queue.clear()
 
 
 def _clear(folder: Path, stem: str, overwrite: bool) -> None:

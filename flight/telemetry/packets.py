@@ -79,7 +79,8 @@ class Layout:
     @cached_property
     def identifier(self) -> int:
         """The first 16 bits of the primary header."""
-        return int(PacketId(PacketType.TM, sec_header_flag=True, apid=self.packet.apid).raw())
+        kind = PacketType.TC if self.packet.telecommand else PacketType.TM
+        return int(PacketId(kind, sec_header_flag=True, apid=self.packet.apid).raw())
 
     @cached_property
     def body(self) -> struct.Struct:
@@ -147,8 +148,10 @@ LAYOUTS: dict[str, Layout] = compile_layouts(PACKETS)
 class Packer:
     """Makes packets, and counts them for each APID. For one thread."""
 
-    def __init__(self) -> None:
-        self._counts = dict.fromkeys(LAYOUTS, 0)
+    def __init__(self, layouts: Mapping[str, Layout] | None = None) -> None:
+        """Pack the packets of a compiled table, by default telemetry's."""
+        self._layouts = LAYOUTS if layouts is None else layouts
+        self._counts = dict.fromkeys(self._layouts, 0)
 
     def pack(
         self, packet: Packet, time_ns: int, values: Mapping[str, object] | None = None, /, **fields: object
@@ -161,7 +164,7 @@ class Packer:
         """
         if values is not None:
             fields = {**values, **fields}
-        layout = LAYOUTS[packet.name]
+        layout = self._layouts[packet.name]
         count = self._counts[packet.name]
         data_length = layout.length - HEADER_BYTES - 1
         flat: list[Any] = [layout.identifier, UNSEGMENTED | count, data_length, packet.version, time_ns]

@@ -1,7 +1,8 @@
 """Finds the packets in a stretch of bytes, whatever has happened to it, and makes arrays of them.
 
-A packet is believed when its version bits, APID, length and CRC are right. After anything else the search
-goes on at the next byte that could begin a packet, so that damage costs no more than the packets it touched.
+A packet is believed when its version bits, APID, sequence flags, length and CRC are right. After anything
+else the search goes on at the next byte that could begin a packet, so that damage costs no more than the
+packets it touched.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from flight.telemetry.packets import (
     LAYOUTS,
     LONGEST_PACKET,
     SEQUENCE_MODULUS,
+    UNSEGMENTED,
     Layout,
     PacketArray,
     TelemetryError,
@@ -27,6 +29,8 @@ _BY_IDENTIFIER = {layout.identifier.to_bytes(2, "big"): layout for layout in LAY
 _START = re.compile(
     b"|".join(re.escape(i) + b"|" + re.escape(i[:1]) + rb"\Z" for i in _BY_IDENTIFIER), re.DOTALL
 )
+
+_SEQUENCE_FLAGS = UNSEGMENTED >> 8  # as the first byte of the sequence control carries them
 
 
 @dataclass(frozen=True)
@@ -112,6 +116,8 @@ def _valid_length(data: bytes, position: int, layout: Layout) -> int:
     length = _stated_length(data, position)
     stop = position + length
     if length < HEADER_BYTES + 1 or stop > len(data):
+        return 0
+    if data[position + 2] & _SEQUENCE_FLAGS != _SEQUENCE_FLAGS:
         return 0
     own_version = data[position + HEADER_BYTES] == layout.packet.version
     plausible = length == layout.length if own_version else length <= LONGEST_PACKET

@@ -6,7 +6,6 @@ incomplete, the last.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
 from collections import deque
@@ -34,13 +33,23 @@ class SegmentFile(Protocol):
 
 
 def open_segment(path: Path) -> SegmentFile:
-    """Create a segment, never over an existing file, and make its name durable."""
-    file = path.open("xb", buffering=0)
-    folder = os.open(path.parent, os.O_RDONLY)
+    """Create a segment, never over an existing file, and make its name durable.
+
+    It is opened for appending: after a write that failed half-way and was cut off, the next one follows on
+    the last whole packet.
+    """
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC
+    file = os.fdopen(os.open(path, flags, 0o644), "wb", buffering=0)
     try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+    except OSError:  # nothing is left in the way of another try
+        file.close()
+        path.unlink(missing_ok=True)
+        raise
     return file
 
 
@@ -84,7 +93,8 @@ class SegmentStore:
     def append(self, packets: Sequence[bytes]) -> None:
         """Write packets, turning to a new segment wherever one is full. Raises OSError.
 
-        After a failure `packets` tells how many were kept; the segment ends with the last of them.
+        After a failure `packets` tells how many were kept; the segment ends with the last of them, and may
+        be appended to again.
         """
         chunk: list[bytes] = []
         size = self._size
@@ -154,6 +164,8 @@ class SegmentStore:
                 break
             whole += len(packet)
             self.packets += 1
-        self._size += whole
-        with contextlib.suppress(OSError):  # a reader copes with the stump as well
-            self._file.truncate(self._size)
+        try:
+            self._file.truncate(self._size + whole)
+            self._size += whole
+        except OSError:  # a reader copes with the stump as well
+            self._size += written

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.linalg import solve_continuous_are
 
 from flight.control.lq_tracker import LqTracker, lq_gains
 from flight.errors import UsageError
@@ -24,12 +25,12 @@ REST = Sample(0.0, 0.0, 0.0)
 
 @settings(deadline=None)
 @given(st.floats(0.01, 1e4), st.floats(0.01, 1e3))
-def test_gains_are_those_of_the_closed_form(state_weight: float, input_weight: float) -> None:
-    """For a double integrator K_e = sqrt(Q/R), K_e' = sqrt(Q/R + 2 K_e)."""
-    ratio = state_weight / input_weight
-    rate_gain, error_gain = lq_gains(state_weight, input_weight)
-    assert error_gain == pytest.approx(math.sqrt(ratio), rel=1e-6)
-    assert rate_gain == pytest.approx(math.sqrt(ratio + 2.0 * math.sqrt(ratio)), rel=1e-6)
+def test_gains_are_those_of_a_general_solver(state_weight: float, input_weight: float) -> None:
+    """(5.28-5.32) with the state (e', e): the Riccati equation as scipy solves it."""
+    integrators, entry = np.array([[0.0, 0.0], [1.0, 0.0]]), np.array([[1.0], [0.0]])
+    riccati = solve_continuous_are(integrators, entry, state_weight * np.eye(2), [[input_weight]])
+    expected = (entry.T @ riccati)[0] / input_weight
+    assert lq_gains(state_weight, input_weight) == pytest.approx(tuple(expected), rel=1e-6)
 
 
 def test_the_thesis_gains() -> None:

@@ -6,6 +6,7 @@ import json
 import resource
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,8 @@ from tests.campaigns.controllers import clairvoyant_power
 from tests.scenario.flights import CONFIG, demo_config, demo_world, fly
 
 ROOT = CONFIG.parents[1]
+ORDINARY_PACE_S = 0.45
+"""Ten million additions on the machines that the minute is meant for."""
 
 
 def command(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
@@ -130,14 +133,22 @@ def test_the_streak_rates_are_right_and_enter_the_estimate(demonstration: tuple[
 def test_flight_and_report_take_less_than_a_minute_of_one_core(
     demonstration: tuple[Run, float], tmp_path: Path
 ) -> None:
-    """Processor time, which other tests beside this one do not lengthen as they do the clock's."""
+    """Processor time, which others lengthen less than the clock's; slower machines have longer minutes."""
     run, flown_s = demonstration
     begun = children_cpu_s()
     done = command("report", run.folder, "--figures", tmp_path / "figures")
     assert done.returncode == 0, done.stderr
     assert "steady-state error" in done.stdout
     assert len(list((tmp_path / "figures").glob("*.png"))) == 7
-    assert flown_s + children_cpu_s() - begun < 60.0
+    assert flown_s + children_cpu_s() - begun < 60.0 * max(1.0, _pace_s() / ORDINARY_PACE_S)
+
+
+def _pace_s() -> float:
+    """Return the processor time of ten million additions, s."""
+    begun, total = time.process_time(), 0
+    for number in range(10_000_000):
+        total += number
+    return time.process_time() - begun
 
 
 def test_the_same_seed_gives_the_same_log_bit_for_bit_and_another_seed_does_not(tmp_path: Path) -> None:

@@ -34,6 +34,7 @@ class SmallDisk:
     def __init__(self, room: int) -> None:
         self.room = room
         self.syncs = 0
+        self.refusals = 0
 
     def open(self, path: Path) -> SegmentFile:
         """Open a segment on this disk."""
@@ -50,6 +51,7 @@ class SmallDiskFile:
     def write(self, data: bytes, /) -> int | None:
         """Take what fits."""
         if self._disk.room == 0 and data:
+            self._disk.refusals += 1
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         fits = data[: self._disk.room]
         self._disk.room -= len(fits)
@@ -160,6 +162,92 @@ def test_a_full_disk_stops_the_log_politely(tmp_path: Path, room: int) -> None:
     )
 
 
+@pytest.mark.parametrize("room", [0, 500, 777])
+def test_a_disk_that_was_full_and_has_room_again_gets_what_waited(tmp_path: Path, room: int) -> None:
+    """Within the queue's reach nothing is lost, and what was cut off half-way is written again whole."""
+    clock, disk = ManualClock(0), SmallDisk(room)
+    packets = timing_packets(60)
+    log = FlightLog(tmp_path, clock=clock, segment_bytes=25 * len(packets[0]), opener=disk.open)
+    for packet in packets[:40]:
+        log.write(packet)
+    clock.advance(SECOND)
+    whole = room // len(packets[0])
+    waiting = f"; 0 packets lost, {40 - whole} waiting"
+    assert log.error() == f"log flight: writing stopped: {os.strerror(errno.ENOSPC)}{waiting}"
+    disk.room = 1 << 20
+    clock.advance(2 * SECOND)
+    assert log.error() == ""
+    for packet in packets[40:]:
+        log.write(packet)
+    log.close()
+    assert content(tmp_path) == b"".join(packets)
+    assert (log.error(), log.lost) == ("", 0)
+
+
+def test_what_did_not_fit_while_the_disk_was_full_is_counted_to_the_end(tmp_path: Path) -> None:
+    clock, disk = ManualClock(0), SmallDisk(0)
+    packets = timing_packets(30)
+    log = FlightLog(tmp_path, clock=clock, queue_packets=10, opener=disk.open)
+    for packet in packets[:20]:
+        log.write(packet)
+        clock.advance(SECOND // 2)
+    assert "10 packets lost, 10 waiting" in log.error()
+    disk.room = 1 << 20
+    clock.advance(5 * SECOND)
+    assert log.error() == "", "nothing is wrong any more"
+    for packet in packets[20:]:
+        log.write(packet)
+    log.close()
+    assert log.error() == f"log flight: writing stopped: {os.strerror(errno.ENOSPC)}; 10 packets lost"
+    result = scan(content(tmp_path))
+    assert result.packets["cycle_timing"]["cycle"].tolist() == [*range(10), *range(20, 30)]
+    assert result.missing["cycle_timing"] == 10, "the sequence counts tell the gap"
+
+
+def test_a_full_disk_is_asked_once_a_second_not_at_every_drain(tmp_path: Path) -> None:
+    clock, disk = ManualClock(0), SmallDisk(0)
+    log = FlightLog(tmp_path, clock=clock, opener=disk.open)
+    for packet in timing_packets(400):
+        log.write(packet)
+        clock.advance(SECOND // 40)
+    assert 8 <= disk.refusals <= 11
+    log.close()
+
+
+def test_a_segment_whose_name_cannot_be_synced_is_not_left_in_the_way(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(_: int) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    path = tmp_path / "flight-0001.ccsds"
+    with monkeypatch.context() as broken:
+        broken.setattr("flight.telemetry.segments.os.fsync", fail)
+        with pytest.raises(OSError, match=os.strerror(errno.EIO)):
+            open_segment(path)
+    assert not path.exists()
+    open_segment(path).close()
+
+
+def test_a_stump_that_cannot_be_cut_off_costs_no_later_packet(tmp_path: Path) -> None:
+    class Uncut(SmallDiskFile):
+        def truncate(self, size: int, /) -> int:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    clock, disk = ManualClock(0), SmallDisk(100)
+    packets = timing_packets(20)
+    log = FlightLog(tmp_path, clock=clock, opener=lambda path: Uncut(disk, open_segment(path)))
+    for packet in packets:
+        log.write(packet)
+    clock.advance(SECOND)
+    disk.room = 1 << 20
+    clock.advance(2 * SECOND)
+    log.close()
+    result = scan(content(tmp_path))
+    assert result.packets["cycle_timing"]["cycle"].tolist() == list(range(20))
+    assert result.skipped_bytes == 100 % len(packets[0])
+
+
 def test_a_disk_that_takes_little_at_a_time_loses_nothing(tmp_path: Path) -> None:
     class Sip:
         def __init__(self, path: Path) -> None:
@@ -258,7 +346,8 @@ def test_a_hung_disk_blocks_neither_write_nor_close(tmp_path: Path, monkeypatch:
             release.wait()
             return self._file.write(data)
 
-    log = FlightLog(tmp_path, clock=ManualClock(), opener=Hung)
+    clock = ManualClock()
+    log = FlightLog(tmp_path, clock=clock, drain_period_ns=100 * SECOND, opener=Hung)
     first, second = timing_packets(2)
     log.write(first)
     drain = threading.Thread(target=log._drain)
@@ -268,6 +357,8 @@ def test_a_hung_disk_blocks_neither_write_nor_close(tmp_path: Path, monkeypatch:
     start = time.monotonic()
     log.write(second)
     assert time.monotonic() - start < 0.05
+    clock.advance(10 * SECOND)
+    assert log.error() == "log flight: the disk does not answer; 0 packets lost, 1 waiting"
     log.close()
     assert time.monotonic() - start < 1.0
     assert log.error() == "log flight: the disk does not answer; 1 packets lost"

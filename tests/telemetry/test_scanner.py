@@ -65,17 +65,6 @@ def test_every_byte_of_any_stretch_is_accounted_for(pieces: list[bytes]) -> None
     assert result.truncated_bytes >= 0
 
 
-def test_a_cut_at_any_byte_of_the_last_4_kib_leaves_every_whole_packet() -> None:
-    packets = timing_packets(120)
-    data, length = b"".join(packets), len(packets[0])
-    assert len(data) > 4096
-    for end in range(len(data) - 4096, len(data)):
-        result = scan(data[:end])
-        assert result.counts.get("cycle_timing", 0) == end // length
-        assert result.skipped_bytes == 0
-        assert result.truncated_bytes == end % length
-
-
 def test_one_damaged_byte_costs_one_packet_and_shows_in_the_sequence() -> None:
     packets = timing_packets(5)
     length = len(packets[0])

@@ -1,0 +1,1 @@
+"""Packets become commands: from whom they come, what they may say, what is done."""

@@ -1,0 +1,1 @@
+"""Is all well? Facts become events, events reactions, reactions a mode."""

@@ -1,0 +1,1 @@
+"""What the satellite is doing, and what makes it do something else."""

@@ -1,0 +1,1 @@
+"""What must outlive the process: boots, unclean shutdowns, what was learned, the last mode."""

@@ -1,0 +1,95 @@
+"""Replaces a small file so that a crash at any moment leaves the old content or the new one, whole.
+
+The order is that of Pillai et al., "All File Systems Are Not Created Equal" (OSDI 2014), section 2: write a
+temporary file, sync it, rename it over the old one, sync the folder. Each call goes through `Files`, so that
+a test can stop the machine before any of them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from pathlib import Path
+from typing import Protocol
+
+
+class Files(Protocol):
+    """The calls that keeping a file takes; each raises OSError."""
+
+    def read(self, path: Path) -> bytes | None:
+        """Return a file's content, None when there is no such file."""
+
+    def create(self, path: Path) -> int:
+        """Open an empty file for writing, over an old one if need be; returns its descriptor."""
+
+    def write(self, file: int, data: bytes) -> int:
+        """Write at most all of `data`; returns how many bytes were taken."""
+
+    def sync(self, file: int) -> None:
+        """Make the file's content durable."""
+
+    def close(self, file: int) -> None:
+        """Close a descriptor."""
+
+    def rename(self, old: Path, new: Path) -> None:
+        """Give a file a new name, atomically, over what has that name."""
+
+    def sync_folder(self, folder: Path) -> None:
+        """Make the names in a folder durable."""
+
+
+class LinuxFiles:
+    """The real ones."""
+
+    def read(self, path: Path) -> bytes | None:
+        """Return a file's content, None when there is no such file."""
+        try:
+            return path.read_bytes()
+        except FileNotFoundError:
+            return None
+
+    def create(self, path: Path) -> int:
+        """Open an empty file for writing, over an old one if need be."""
+        return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o640)
+
+    def write(self, file: int, data: bytes) -> int:
+        """Write at most all of `data`."""
+        return os.write(file, data)
+
+    def sync(self, file: int) -> None:
+        """Make the file's content durable."""
+        os.fsync(file)
+
+    def close(self, file: int) -> None:
+        """Close a descriptor."""
+        os.close(file)
+
+    def rename(self, old: Path, new: Path) -> None:
+        """Give a file a new name, atomically."""
+        os.rename(old, new)
+
+    def sync_folder(self, folder: Path) -> None:
+        """Make the names in a folder durable."""
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+def replace_file(files: Files, path: Path, data: bytes) -> None:
+    """Put `data` in place of the file's content; durable when this returns. Raises OSError, the old kept."""
+    temporary = path.with_suffix(".tmp")
+    file = files.create(temporary)
+    try:
+        written = 0
+        while written < len(data):
+            written += files.write(file, data[written:])
+        files.sync(file)
+    except OSError:
+        with contextlib.suppress(OSError):
+            files.close(file)
+        raise
+    files.close(file)
+    files.rename(temporary, path)
+    files.sync_folder(path.parent)

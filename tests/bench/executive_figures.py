@@ -1,0 +1,217 @@
+"""What `tests.bench.executive` makes of a flight: figures of its logs and of looks at its processes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flight.telemetry.packets import to_text
+from flight.telemetry.reader import Run
+from tests.bench.lateness import Grid, lost_beyond, on_grid, slope_per_hour
+from tests.bench.process_watch import MIB, Look
+from tests.guardian.live_flight import CoilTruth
+
+PERIOD_NS = 25_000_000
+"""Of the control group at 40 Hz; mission time zero is a multiple of it (`flight.app.mission_zero`)."""
+
+Figures = dict[str, Any]
+
+ASKED: dict[str, float] = {
+    "lost_beyond_machine": 0.0,
+    "processor_control": 0.35,
+    "memory_alone_max_mib": 220.0,
+    "memory_slope_mib_per_hour": 1.0,
+    "ready_s": 1.5,
+    "first_command_s": 2.0,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Began:
+    """When the flight was started and when it said READY, monotonic ns; its processor time until then, s.
+
+    `utc_offset_ns` is UTC less monotonic time.
+    """
+
+    exec_ns: int
+    ready_ns: int
+    processor_until_ready: float
+    utc_offset_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Watched:
+    """Looks at the flight's processes; memory in bytes that others share with them; time stolen, s."""
+
+    looks: list[Look]
+    shared_with_others: float
+    stolen: float
+
+
+@dataclass(frozen=True, slots=True)
+class Flown:
+    """One flight's figures, and how late it and the bare loop beside it were."""
+
+    figures: Figures
+    flight: Grid
+    machine: Grid
+
+
+def evaluate(
+    folder: Path, devices: Path, wakes: Path, began: Began, watched: Watched, warm_up: float
+) -> Flown:
+    """Return what a flight in `folder` showed, its devices' truth in `devices`."""
+    truth = CoilTruth(folder, devices)
+    run = truth.run
+    start = run["run"][0]
+    zero_ns = int(start["utc_ns"]) - began.utc_offset_ns
+    first = round(zero_ns / PERIOD_NS)
+    cycles = run["cycle_timing"]
+    slots = cycles["cycle"].astype(np.int64)
+    starts_ns = (first + slots) * PERIOD_NS + np.rint(1e9 * cycles["lateness"]).astype(np.int64)
+    flight = on_grid(starts_ns, PERIOD_NS, first, int(slots[-1]) + 1)
+    machine = on_grid(np.fromfile(wakes, dtype=np.int64), PERIOD_NS, first, len(flight.lateness))
+    groups = run["rate_group"]
+    control = groups[groups["name"] == b"control"][-1]
+    figures: Figures = {
+        "scheduling": _scheduling(run),
+        "slots": len(flight.lateness),
+        "slips": int(control["slips"]),
+        "lost": int(np.count_nonzero(flight.lost)),
+        "lost_at_s": [round(float(slot) * PERIOD_NS * 1e-9, 3) for slot in np.flatnonzero(flight.lost)],
+        "lost_by_bare_loop": int(np.count_nonzero(machine.lost)),
+        "lost_beyond_machine": lost_beyond(flight, machine),
+        "overruns": int(control["overruns"]),
+        "lateness_s": flight.figures(),
+        "lateness_of_bare_loop_s": machine.figures(),
+        "execution_s": {
+            name: float(np.quantile(cycles["execution"], part))
+            for name, part in (("p50", 0.5), ("p99", 0.99), ("max", 1.0))
+        },
+        "stolen_s": watched.stolen,
+        "ready_s": (began.ready_ns - began.exec_ns) * 1e-9,
+        "processor_until_ready_s": began.processor_until_ready,
+        "first_command_s": truth.driven_after(began.exec_ns),
+        "jobs": _jobs(run, len(flight.lateness) * PERIOD_NS * 1e-9),
+    }
+    figures |= _of_processes(watched, zero_ns * 1e-9 + warm_up)
+    return Flown(figures, flight, machine)
+
+
+def _scheduling(run: Run) -> str:
+    """Return what the flight says it obtained."""
+    events = run["event"]
+    texts = [to_text(event["text"]) for event in events if event["name"].startswith(b"real-time")]
+    return texts[0] if texts else "nothing asked"
+
+
+def _jobs(run: Run, seconds: float) -> dict[str, Any]:
+    """Return by worker how many jobs were done, how many were not, and the part of the time at work."""
+    timing = run["job_timing"]
+    found = {}
+    for name in sorted(set(timing["name"])):
+        own = timing[timing["name"] == name]
+        done = int(np.count_nonzero(own["outcome"] == b"done"))
+        busy = float(own["execution"].sum()) / seconds
+        found[to_text(name)] = {"done": done, "not_done": len(own) - done, "busy": busy}
+    return found
+
+
+def _of_processes(watched: Watched, warm_s: float) -> Figures:
+    """Return processor and memory from `warm_s` of monotonic time on."""
+    looks = [look for look in watched.looks if look.time >= warm_s]
+    if len(looks) < 2:
+        raise RuntimeError(f"only {len(looks)} looks at the processes after the warm-up: fly for longer")
+    names = sorted({name for look in looks for name in look.memory})
+    processor = {name: _share([look for look in looks if name in look.processor], name) for name in names}
+    total = np.array([sum(look.memory.values()) for look in looks]) / MIB
+    times = [look.time for look in looks]
+    alone = watched.shared_with_others / MIB
+    slope = slope_per_hour(times, [sum(look.own.values()) / MIB for look in looks])
+    of_control = slope_per_hour(times, [look.own["control"] / MIB for look in looks])
+    return {
+        "processor": processor,
+        "processor_control": processor["control"],
+        "looks": len(looks),
+        "memory_mib": {
+            name: float(np.median([look.memory.get(name, 0.0) for look in looks])) / MIB for name in names
+        },
+        "memory_largest_mib": {
+            name: max(look.memory.get(name, 0.0) for look in looks) / MIB for name in names
+        },
+        "memory_median_mib": float(np.median(total)),
+        "memory_max_mib": float(total.max()),
+        "memory_alone_max_mib": float(total.max()) + alone,
+        "memory_slope_mib_per_hour": slope[0],
+        "memory_slope_interval": slope[1:],
+        "control_slope_mib_per_hour": of_control[0],
+        "control_slope_interval": of_control[1:],
+    }
+
+
+def _share(looks: list[Look], name: str) -> float:
+    """Return the part of a core that a process took; of one that was replaced meanwhile, of all together."""
+    spent = np.diff([look.processor[name] for look in looks])
+    return float(spent[spent > 0.0].sum()) / (looks[-1].time - looks[0].time)
+
+
+def misses(figures: Figures) -> list[str]:
+    """Return the names of the figures that exceed what is asked.
+
+    Of the slope its interval decides: it misses when all of that lies above. A slope that is not known in so
+    short a flight is not judged.
+    """
+    found = [name for name, limit in ASKED.items() if not _slope(name) and not figures[name] <= limit]
+    steep = figures["memory_slope_interval"][0] > ASKED["memory_slope_mib_per_hour"]
+    return [*found, "memory_slope_mib_per_hour"] if steep else found
+
+
+def _slope(name: str) -> bool:
+    return name == "memory_slope_mib_per_hour"
+
+
+def table(figures: Figures, name: str) -> str:
+    """Return the table: what was asked, what was measured."""
+    late, bare, spent = figures["lateness_s"], figures["lateness_of_bare_loop_s"], figures["execution_s"]
+    wrong = misses(figures)
+    rows = [
+        ("cycles lost beyond the machine's stalls", "lost_beyond_machine", "0", "{:d}"),
+        ("processor, control process, % of a core", "processor_control", "35", "{:.1%}"),
+        ("memory (PSS), largest, MiB", "memory_alone_max_mib", "220", "{:.1f}"),
+        ("memory slope, MiB/h", "memory_slope_mib_per_hour", "1", "{:+.2f}"),
+        ("exec to READY, s", "ready_s", "1.5", "{:.2f}"),
+        ("exec to first coil command, s", "first_command_s", "2", "{:.2f}"),
+    ]
+    low, high = figures["memory_slope_interval"]
+    lines = [f"{name}: {figures['scheduling']}", f"{'':42}{'asked <=':>10}{'measured':>12}"]
+    for text, key, asked, form in rows:
+        measured = form.format(figures[key]).rstrip("%")
+        lines.append(f"{text:42}{asked:>10}{measured:>12}{'  MISSED' if key in wrong else ''}")
+    lines += [
+        f"slots {figures['slots']}: lost {figures['lost']} (slips counted {figures['slips']}), by the bare "
+        f"loop {figures['lost_by_bare_loop']}; overruns {figures['overruns']}; "
+        f"stolen {figures['stolen_s']:.1f} s",
+        f"processor time until READY {figures['processor_until_ready_s']:.2f} s",
+        f"{'lateness, ms':24}" + "".join(f"{part:>10}" for part in late),
+        f"{'  flight':24}" + "".join(f"{1e3 * value:10.3f}" for value in late.values()),
+        f"{'  bare loop':24}" + "".join(f"{1e3 * value:10.3f}" for value in bare.values()),
+        "execution of a cycle, ms: "
+        + ", ".join(f"{part} {1e3 * value:.2f}" for part, value in spent.items()),
+        f"slope's 95 % interval {low:+.2f} to {high:+.2f} MiB/h ({figures['looks']} looks); control process "
+        "{:+.2f} ({:+.2f} to {:+.2f})".format(
+            figures["control_slope_mib_per_hour"], *figures["control_slope_interval"]
+        ),
+        f"memory of all: median {figures['memory_median_mib']:.1f}, largest {figures['memory_max_mib']:.1f} "
+        "MiB; the row above adds what other processes share with the flight",
+        f"{'process':16}{'CPU %':>8}{'PSS MiB':>10}{'largest':>9}{'jobs':>8}{'failed':>8}{'at work %':>11}",
+    ]
+    for process, memory in figures["memory_mib"].items():
+        jobs, largest = figures["jobs"].get(process), figures["memory_largest_mib"][process]
+        work = f"{jobs['done']:8}{jobs['not_done']:8}{100.0 * jobs['busy']:11.0f}" if jobs else ""
+        lines.append(
+            f"  {process:14}{100.0 * figures['processor'][process]:8.1f}{memory:10.1f}{largest:9.1f}{work}"
+        )
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,234 @@
+"""A machine of its own for the service: this one's files in an overlay, systemd booted in them by nspawn.
+
+`python -m tests.deploy.container FOLDER` is run by `boot` in a mount namespace of its own, so that nothing it
+mounts is seen outside or stays. It installs the service by `deploy/install.sh` and boots; inside, the unit
+`scenario` runs `tests.deploy.scenario`, which leaves what it saw in FOLDER, and the machine is switched off.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from tests.guardian.live_flight import ROOT, write_config
+
+LIMIT_S = 100.0
+_CGROUP = "knightcube-test"
+_SHARE = "/share"
+_UNITS = "etc/systemd/system"
+_FACTS = "/run/knightcube-devices/facts.json"
+_OPENED = f"""[Service]
+ProtectHome=no
+ReadWritePaths={_SHARE}/told.txt
+Environment=PATH={_SHARE}/bin:/usr/bin PYTHONPATH={ROOT}"""
+"""What the sandbox must let through here: an interpreter in a home, and the stand-in for i2cset."""
+
+_TOOLS = ("systemd-nspawn", "unshare", "systemctl", "mount", "useradd")
+
+
+def why_not() -> str:
+    """Return why this machine cannot boot such a container, "" where it can."""
+    if os.environ.get("CI"):
+        return "takes a minute: not in continuous integration"
+    if os.geteuid() != 0:
+        return "needs root, to mount and to boot systemd in a container"
+    missing = [tool for tool in _TOOLS if shutil.which(tool) is None]
+    if missing:
+        return f"{', '.join(missing)} missing: install systemd-container"
+    if "overlay" not in Path("/proc/filesystems").read_text(encoding="ascii"):
+        return "the kernel has no overlay file system"
+    trial = "mount -t cgroup2 cgroup2 /sys/fs/cgroup && test -w /sys/fs/cgroup/cgroup.procs"
+    tried = subprocess.run(
+        ["unshare", "--mount", "--propagation", "private", "sh", "-c", trial],
+        capture_output=True,
+        check=False,
+    )
+    if tried.returncode != 0:
+        return f"no writable cgroup2 hierarchy: {tried.stderr.decode().strip()}"
+    return ""
+
+
+def boot(folder: Path) -> dict[str, Any]:
+    """Boot, have the scenario played, return what it saw. Raises AssertionError with the log."""
+    words = ["unshare", "--mount", "--propagation", "private", sys.executable, "-m", "tests.deploy.container"]
+    done = subprocess.run(
+        [*words, str(folder)], cwd=ROOT, capture_output=True, text=True, timeout=LIMIT_S + 20.0, check=False
+    )
+    result = folder / "seen.json"
+    if not result.exists():
+        journal = folder / "journal.txt"
+        told = journal.read_text(encoding="utf-8") if journal.exists() else ""
+        raise AssertionError(f"the scenario did not come to its end:\n{done.stdout}{done.stderr}{told}")
+    seen: dict[str, Any] = json.loads(result.read_text(encoding="utf-8"))
+    return seen
+
+
+def main(folder: Path) -> None:
+    """Build the machine, boot it, leave nothing."""
+    root = _overlay()
+    _furnish(root, folder)
+    home = _enter_cgroup()
+    try:
+        subprocess.run(
+            [
+                "systemd-nspawn",
+                f"--directory={root}",
+                f"--bind={folder}:{_SHARE}",
+                "--register=no",
+                "--keep-unit",
+                "--private-network",
+                # Without these the units' device policy and address filter would not be in force inside.
+                "--system-call-filter=bpf",
+                "--capability=CAP_BPF,CAP_PERFMON",
+                "--console=pipe",
+                "--boot",
+                "systemd.unit=scenario.service",
+                "systemd.show_status=no",
+            ],
+            stdin=subprocess.DEVNULL,
+            timeout=LIMIT_S,
+            check=False,
+        )
+    finally:
+        _leave_cgroup(home)
+    (root / _UNITS / "knightcube-devices.service").unlink()  # the test's own
+    _do("chroot", str(root), str(ROOT / "deploy/install.sh"), "--uninstall", "--purge")
+    kept = subprocess.run(
+        [
+            "find",
+            *(str(root / name) for name in ("etc", "opt", "var/lib", "var/cache")),
+            "-name",
+            "*knightcube*",
+        ],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    (folder / "after_uninstall.txt").write_text(kept.stdout, encoding="utf-8")
+
+
+def _overlay() -> Path:
+    """Mount this machine's files with a layer of memory above, which takes what is written."""
+    _do("mount", "-t", "tmpfs", "tmpfs", "/mnt")
+    for name in ("upper", "work", "root"):
+        Path("/mnt", name).mkdir()
+    layers = "lowerdir=/,upperdir=/mnt/upper,workdir=/mnt/work"
+    _do("mount", "-t", "overlay", "overlay", "-o", layers, "/mnt/root")
+    # nspawn keeps its own things here; they go with the mount.
+    _do("mount", "-t", "tmpfs", "tmpfs", "/run/systemd")
+    return Path("/mnt/root")
+
+
+def _furnish(root: Path, folder: Path) -> None:
+    """Install the service as anybody would, and put the emulated devices and the scenario beside it."""
+    (root / "etc/machine-id").write_text("0123456789abcdef0123456789abcdef\n", encoding="ascii")
+    config = write_config(folder)
+    installer = ["chroot", str(root), str(ROOT / "deploy/install.sh")]
+    options = ["--venv", sys.prefix, "--config", str(config)]
+    _do(*installer, *options)
+    again = subprocess.run([*installer, "--dry-run", *options], capture_output=True, text=True, check=True)
+    (folder / "second_install.txt").write_text(again.stdout, encoding="utf-8")
+    # The interpreter may stand in somebody's home, which the service's user must be let into here.
+    for place in (Path(sys.base_prefix), *Path(sys.base_prefix).parents, ROOT, *ROOT.parents):
+        inside = root / place.relative_to("/")
+        inside.chmod(inside.stat().st_mode | 0o055)
+    units = root / _UNITS
+    python = "/opt/knightcube/venv/bin/python"
+    (units / "knightcube-devices.service").write_text(
+        f"""[Service]
+Type=exec
+User=knightcube
+RuntimeDirectory=knightcube-devices
+Environment=TMPDIR=/run/knightcube-devices
+WorkingDirectory={ROOT}
+ExecStart={sys.prefix}/bin/python -m sim_hal serve /etc/knightcube/flight.yaml \
+    --folder /run/knightcube-devices --facts {_FACTS}
+""",
+        encoding="utf-8",
+    )
+    (units / "knightcube.service.d/test.conf").write_text(
+        f"""{_OPENED}
+ExecStart=
+ExecStart={python} -m flight run /etc/knightcube/flight.yaml --archive /var/lib/knightcube/runs \
+    --realtime --devices {_FACTS}
+""",
+        encoding="utf-8",
+    )
+    (units / "knightcube-safe.service.d/test.conf").write_text(f"{_OPENED}\n", encoding="utf-8")
+    (units / "scenario.service").write_text(
+        f"""[Unit]
+DefaultDependencies=no
+Requires=sysinit.target
+After=sysinit.target
+[Service]
+Type=oneshot
+WorkingDirectory={ROOT}
+ExecStart={sys.prefix}/bin/python -m tests.deploy.scenario /share {_FACTS}
+ExecStopPost=/bin/sh -c 'journalctl --no-pager > /share/journal.txt; systemctl --no-block --force poweroff'
+""",
+        encoding="utf-8",
+    )
+    _write_i2cset(folder)
+
+
+def _write_i2cset(folder: Path) -> None:
+    """Put an i2cset first in the services' path that reaches the emulated chip, and notes why it was run."""
+    (folder / "bin").mkdir()
+    told = folder / "told.txt"
+    told.touch()
+    told.chmod(0o666)
+    tool = folder / "bin/i2cset"
+    tool.write_text(
+        f"""#!{sys.base_prefix}/bin/python3 -ISE
+import json, os, sys
+sys.path.insert(0, {str(ROOT)!r})
+from sim_hal.device_link import open_bus
+_, yes, bus, address, register, value, mode = sys.argv
+assert (yes, bus, mode) == ("-y", "1", "b"), sys.argv
+chip = open_bus(json.load(open({_FACTS!r}))["socket"])
+chip.write_byte_data(int(address, 0), int(register, 0), int(value, 0))
+with open("/share/told.txt", "a") as told:
+    told.write(os.environ.get("SERVICE_RESULT", "before") + "\\n")
+""",
+        encoding="utf-8",
+    )
+    tool.chmod(0o755)
+    folder.chmod(0o755)
+
+
+def _enter_cgroup() -> Path:
+    """Move into a cgroup of our own, in a pure cgroup2 hierarchy as systemd wants it; return the old one."""
+    _do("umount", "--recursive", "/sys/fs/cgroup")
+    _do("mount", "-t", "cgroup2", "cgroup2", "/sys/fs/cgroup")
+    before = Path("/proc/self/cgroup").read_text(encoding="ascii").splitlines()
+    home = next(line.removeprefix("0::") for line in before if line.startswith("0::"))
+    own = Path("/sys/fs/cgroup") / _CGROUP
+    own.mkdir(exist_ok=True)
+    (own / "cgroup.procs").write_text(str(os.getpid()), encoding="ascii")
+    return Path("/sys/fs/cgroup") / home.lstrip("/")
+
+
+def _leave_cgroup(home: Path) -> None:
+    own = Path("/sys/fs/cgroup") / _CGROUP
+    (home / "cgroup.procs").write_text(str(os.getpid()), encoding="ascii")
+    (own / "cgroup.kill").write_text("1", encoding="ascii")
+    for inside, _, _ in os.walk(own, topdown=False):
+        for _ in range(50):
+            try:
+                Path(inside).rmdir()
+                break
+            except OSError:  # who was killed is still leaving
+                subprocess.run(["sleep", "0.05"], check=True)
+
+
+def _do(*words: str) -> None:
+    subprocess.run(words, check=True, stdout=subprocess.DEVNULL)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

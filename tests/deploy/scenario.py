@@ -1,0 +1,143 @@
+"""What is done to the service in the container, and what is seen; `tests.deploy.container` runs it."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from sim_hal.device_link import RemoteI2cBus, open_bus
+
+SERVICE = "knightcube.service"
+_PROBE = """[Service]
+Type=oneshot
+DevicePolicy={}
+ExecStart=/bin/sh -c ": </dev/net/tun"
+"""
+
+
+class Service:
+    """The service as systemctl shows it, and the coils of the emulated devices."""
+
+    def __init__(self, bus: RemoteI2cBus) -> None:
+        self._bus = bus
+
+    def show(self, name: str, unit: str = SERVICE) -> str:
+        return systemctl("show", "--value", "-p", name, unit).strip()
+
+    def pid(self) -> int:
+        return int(self.show("MainPID"))
+
+    def driven(self) -> bool:
+        """Tell whether a coil carries current; the devices of a busy machine may take a moment to say."""
+        for _ in range(50):
+            with contextlib.suppress(TimeoutError):
+                return any(self._bus.call("currents"))
+        raise TimeoutError("the emulated devices do not answer")
+
+    def hurt(self, act: Callable[[int], None]) -> dict[str, Any]:
+        """Do something to the running service; return when the coils went to zero and when it flew again."""
+        wait(self.driven, 20.0)
+        old = self.pid()
+        begun = time.monotonic()
+        act(old)
+        zero = again = None
+        while (since := time.monotonic() - begun) < 15.0 and again is None:
+            if self.driven():
+                # The next process drives the coils again by right, from its first cycle on.
+                if self.pid() in (old, 0):
+                    zero = None
+                elif self.show("ActiveState") == "active":
+                    again = since
+            elif zero is None:
+                zero = since
+            time.sleep(0.004)
+        return {"zero_after": zero, "flies_again": again, "result": _last_words()}
+
+
+def systemctl(*words: str) -> str:
+    done = subprocess.run(["systemctl", *words], capture_output=True, text=True, check=False)
+    return done.stdout
+
+
+def wait(condition: Callable[[], bool], patience: float) -> float:
+    """Wait for a condition; return how long. Raises TimeoutError."""
+    begun = time.monotonic()
+    while not condition():
+        if time.monotonic() - begun > patience:
+            raise TimeoutError(f"not within {patience:g} s")
+        time.sleep(0.01)
+    return time.monotonic() - begun
+
+
+def _last_words() -> str:
+    """Return why systemd ran the last ExecStopPost, as the stand-in for i2cset has noted."""
+    told = [word for word in Path("/share/told.txt").read_text(encoding="ascii").split() if word != "before"]
+    return told[-1] if told else ""
+
+
+def play(facts: Path) -> dict[str, Any]:
+    """Play the whole scenario; return what was seen."""
+    systemctl("start", "knightcube-devices.service")
+    wait(facts.exists, 20.0)
+    service = Service(open_bus(json.loads(facts.read_text(encoding="utf-8"))["socket"]))
+    seen: dict[str, Any] = {}
+    begun = time.monotonic()
+    systemctl("start", SERVICE)
+    seen["ready_s"] = time.monotonic() - begun
+    seen["active"] = service.show("ActiveState")
+    seen["status"] = service.show("StatusText")
+    seen["devices_closed"] = _devices_closed()
+    seen["killed with its guardian"] = service.hurt(
+        lambda _: void(systemctl("kill", "--kill-whom=all", "--signal=KILL", SERVICE))
+    )
+    seen["killed"] = service.hurt(lambda pid: os.kill(pid, signal.SIGKILL))
+    seen["stopped"] = service.hurt(lambda pid: os.kill(pid, signal.SIGSTOP))
+    seen["restarts"] = int(service.show("NRestarts"))
+    wait(service.driven, 20.0)
+    systemctl("stop", SERVICE)
+    seen["end"] = {"driven": service.driven(), "result": service.show("Result"), "told": _last_words()}
+    seen["broken"] = _broken(service)
+    return seen
+
+
+def _devices_closed() -> bool:
+    """Tell whether a unit with the service's device policy is kept from a device that any other may open."""
+
+    def opens(policy: str) -> bool:
+        Path("/run/systemd/system/probe.service").write_text(_PROBE.format(policy), encoding="ascii")
+        systemctl("daemon-reload")
+        return subprocess.run(["systemctl", "start", "probe.service"], check=False).returncode == 0
+
+    ours = systemctl("show", "--value", "-p", "DevicePolicy", SERVICE).strip()
+    return opens("auto") and not opens(ours)
+
+
+def _broken(service: Service) -> dict[str, Any]:
+    """Take the interpreter away under a running service; see it given up with the coils at zero."""
+    systemctl("reset-failed", SERVICE)
+    systemctl("start", SERVICE)
+    wait(service.driven, 20.0)
+    Path("/opt/knightcube/venv").unlink()
+    systemctl("kill", "--kill-whom=all", "--signal=KILL", SERVICE)
+    wait(lambda: service.show("ActiveState") == "failed", 20.0)
+    safe = "knightcube-safe.service"
+    wait(lambda: service.show("ExecMainExitTimestamp", safe) != "", 10.0)
+    return {"driven": service.driven(), "safe_status": service.show("ExecMainStatus", safe)}
+
+
+def void(_: object) -> None:
+    """Return nothing."""
+
+
+if __name__ == "__main__":
+    place = Path(sys.argv[1])
+    facts_seen = play(Path(sys.argv[2]))
+    (place / "seen.json").write_text(json.dumps(facts_seen, indent=1), encoding="utf-8")

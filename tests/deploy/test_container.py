@@ -1,0 +1,80 @@
+"""The service installed, booted under systemd and hurt in every way: the coils are at zero each time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.deploy import container
+
+REASON = container.why_not()
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(REASON), reason=REASON), pytest.mark.timeout(240)]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("machine")
+
+
+@pytest.fixture(scope="module")
+def seen(folder: Path) -> dict[str, Any]:
+    return container.boot(folder)
+
+
+def test_it_starts_and_says_when_it_is_ready(seen: dict[str, Any]) -> None:
+    assert seen["active"] == "active"
+    # Real time is the machine's to grant: without CAP_SYS_RESOURCE systemd cannot raise limits.
+    granted, *refused = seen["status"].removeprefix("flying; ").split("; ")
+    assert granted == "SCHED_FIFO 50, memory locked" or refused
+
+
+@pytest.mark.parametrize(
+    ("act", "result", "limit"),
+    [("killed", "signal", 0.5), ("killed with its guardian", "signal", 1.5), ("stopped", "watchdog", 0.5)],
+)
+def test_the_coils_are_at_zero_and_it_comes_back(
+    seen: dict[str, Any], act: str, result: str, limit: float
+) -> None:
+    """Guardian and flight killed at a stroke leave ExecStopPost; a stopped flight is the watchdog's.
+
+    What systemd must start first takes a busy machine longer: that limit is not the guardian's.
+    """
+    facts = seen[act]
+    assert facts["zero_after"] is not None
+    assert facts["zero_after"] <= limit
+    assert facts["flies_again"] is not None
+    assert facts["result"] == result
+
+
+def test_each_death_was_one_restart(seen: dict[str, Any]) -> None:
+    assert seen["restarts"] == 3
+
+
+def test_devices_that_were_not_named_are_closed_to_it(seen: dict[str, Any]) -> None:
+    assert seen["devices_closed"]
+
+
+def test_a_polite_stop_is_a_success(seen: dict[str, Any]) -> None:
+    assert seen["end"] == {"driven": False, "result": "success", "told": "success"}
+
+
+def test_without_its_python_it_is_given_up_in_the_safe_state(seen: dict[str, Any]) -> None:
+    assert seen["broken"] == {"driven": False, "safe_status": "0"}
+
+
+def test_a_second_installation_changes_nothing(seen: dict[str, Any], folder: Path) -> None:
+    assert seen
+    assert (folder / "second_install.txt").read_text(encoding="utf-8") == ""
+
+
+def test_uninstalling_with_purge_leaves_nothing(seen: dict[str, Any], folder: Path) -> None:
+    assert seen
+    assert (folder / "after_uninstall.txt").read_text(encoding="utf-8") == ""
+
+
+def test_no_cgroup_and_no_mount_is_left(seen: dict[str, Any]) -> None:
+    assert seen
+    assert not list(Path("/sys/fs/cgroup").glob("**/knightcube-test"))
+    assert "/mnt/root" not in Path("/proc/self/mounts").read_text(encoding="utf-8")

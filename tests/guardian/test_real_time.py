@@ -1,0 +1,50 @@
+"""Real-time privileges: asked for, and reported as they were obtained."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from hal.buses import real_time
+
+
+def test_a_refusal_is_told_with_its_cure(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    monkeypatch.setattr(real_time, "lock_memory", lambda: "locked memory refused (x): allow it with y")
+    obtained = real_time.obtain([0], 50)
+    assert (obtained.priority, obtained.locked) == (0, False)
+    assert str(obtained) == (
+        "ordinary scheduling, memory not locked; SCHED_FIFO 50 refused (Operation not permitted): "
+        "allow it with LimitRTPRIO; locked memory refused (x): allow it with y"
+    )
+
+
+def test_what_is_granted_is_asked_for_each_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[int, int, int]] = []
+    monkeypatch.setattr(
+        os,
+        "sched_setscheduler",
+        lambda thread, policy, value: asked.append((thread, policy, value.sched_priority)),
+    )
+    monkeypatch.setattr(real_time, "lock_memory", lambda: "")
+    assert str(real_time.obtain([0, 77], 50)) == "SCHED_FIFO 50, memory locked"
+    assert asked == [(thread, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, 50) for thread in (0, 77)]
+
+
+def test_locked_memory_is_seen_by_the_kernel_or_refused_in_words() -> None:
+    """Locking on fault leaves untouched address space out: a gigabyte that is only reserved costs nothing."""
+    script = (
+        "import mmap; from hal.buses import real_time\n"
+        "said = real_time.lock_memory(); reserved = mmap.mmap(-1, 1 << 30)\n"
+        "status = open('/proc/self/status').read()\n"
+        "field = lambda name: int(status.split(name)[1].split()[0])\n"
+        "print(said or (field('VmLck:') > 1 << 20 and field('VmRSS:') < 100_000))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "True" or done.stdout.startswith("locked memory refused")

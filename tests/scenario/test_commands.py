@@ -1,0 +1,121 @@
+"""Commands in flight: obeyed or refused with an event and an answer, whatever is sent."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flight.commands.codec import ChangeMode, Clear, Command, CommandPacker, Ping, Slew
+from flight.modes.mode import Mode
+from flight.telemetry.packets import to_text
+from flight.telemetry.reader import Run
+from flight.telemetry.scanner import decode
+from tests.scenario.flights import Rigged, demo_config, event_names, fly
+from tests.scenario.test_modes import commanded, modes_of
+
+
+class Script:
+    """A channel that says prepared datagrams at prepared times and keeps the answers."""
+
+    name = "socket"
+
+    def __init__(self) -> None:
+        self.due: list[bytes] = []
+        self.answers: list[bytes] = []
+
+    def say(self, data: bytes) -> None:
+        self.due.append(data)
+
+    def poll(self) -> list[tuple[bytes, Any]]:
+        said, self.due = self.due, []
+        return [(data, "somebody") for data in said]
+
+    def answer(self, data: bytes, sender: Any) -> None:
+        assert sender == "somebody"
+        self.answers.append(data)
+
+    def close(self) -> None:
+        pass
+
+
+def said(folder: Path, *script: tuple[float, bytes]) -> tuple[Run, Script]:
+    """Fly while datagrams come at mission times in s."""
+    channel = Script()
+
+    def prepare(rigged: Rigged) -> None:
+        rigged.loop._commanding._channels = (channel,)
+        for at, data in script:
+            rigged.at(at, partial(channel.say, data))
+
+    far = {"at": 1e6, "mode": "safe"}  # a time line, so that the commands' group runs
+    return fly(commanded(4.0, far), folder, prepare), channel
+
+
+def packed(*commands: Command) -> list[bytes]:
+    packer = CommandPacker()
+    return [packer.pack(command, k) for k, command in enumerate(commands)]
+
+
+def test_each_command_is_obeyed_recorded_and_answered(tmp_path: Path) -> None:
+    ping, hold, slew, safe = packed(
+        Ping(7), ChangeMode(Mode.HOLD), Slew(0.1), ChangeMode(Mode.SAFE, "enough")
+    )
+    run, channel = said(tmp_path, (1.0, ping), (1.5, hold), (2.0, slew), (3.0, safe))
+    assert modes_of(run)[2:] == [Mode.HOLD, Mode.SLEW, Mode.SAFE]
+    rows = run["command"]
+    assert rows["obeyed"].tolist() == [1, 1, 1, 1]
+    assert [to_text(text) for text in rows["text"]] == [
+        "ping 7",
+        "mode hold",
+        "slew to q2 +0.1000",
+        "mode safe: enough",
+    ]
+    answers = np.concatenate([decode(answer)["command"] for answer in channel.answers])
+    assert answers["count"].tolist() == [1, 2, 3, 4]
+    assert answers["mode"].tolist() == [Mode.TESTBED_DEMO, Mode.HOLD, Mode.SLEW, Mode.SAFE]
+    assert event_names(run).count("commanded") == 2, "told at once, the others at the end: throttled"
+
+
+def test_rubbish_and_repetitions_are_refused_with_the_reason_and_change_nothing(tmp_path: Path) -> None:
+    (hold,) = packed(ChangeMode(Mode.HOLD))
+    broken = bytes([*hold[:-1], hold[-1] ^ 1])
+    run, _ = said(tmp_path, (1.0, b"abort!"), (1.2, broken), (1.4, b""), (1.6, hold), (2.0, hold))
+    rows = run["command"]
+    assert rows["obeyed"].tolist() == [0, 0, 0, 1, 0]
+    reasons = [to_text(text) for text in rows["text"]]
+    assert "no command begins with" in reasons[0]
+    assert "CRC" in reasons[1]
+    assert "0 bytes are no packet" in reasons[2]
+    assert "has come before" in reasons[4]
+    assert modes_of(run)[2:] == [Mode.HOLD]
+    assert "command-refused" in event_names(run)
+    assert "task-failed" not in event_names(run)
+
+
+def test_nothing_latched_is_nothing_to_clear(tmp_path: Path) -> None:
+    (clear,) = packed(Clear("too-hot"))
+    run, _ = said(tmp_path, (1.0, clear))
+    (row,) = run["command"]
+    assert to_text(row["text"]) == "clear too-hot: nothing is latched under 'too-hot'; latched: nothing"
+
+
+def test_a_defect_of_a_command_is_contained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fall(*_: object) -> str:
+        raise ZeroDivisionError("a defect")
+
+    monkeypatch.setattr("flight.tasks.mode_control.ModeControl.command", fall)
+    (hold,) = packed(ChangeMode(Mode.HOLD))
+    run, _ = said(tmp_path, (1.0, hold))
+    (row,) = run["command"]
+    assert to_text(row["text"]) == "mode hold: ZeroDivisionError: a defect"
+    assert "task-failed" not in event_names(run)
+
+
+def test_without_commands_configured_there_is_no_group_for_them(tmp_path: Path) -> None:
+    run = fly(demo_config(1.5, camera=False), tmp_path)
+    groups = {to_text(name) for name in run["rate_group"]["name"]}
+    assert groups == {"control", "planning", "health", "housekeeping"}

@@ -1,0 +1,256 @@
+"""Every mode and every way between modes, in lock-step: what moves the coils, and what never does."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flight import config as configuration
+from flight.arrays import FloatArray
+from flight.modes.mode import Mode
+from flight.settings import Commands, CommandStep, Config
+from flight.state.keeper import Notices, StateKeeper
+from flight.state.store import StateStore
+from flight.telemetry.packets import to_text
+from flight.telemetry.reader import Run
+from sim_hal.clock import SimClock
+from sim_hal.emulators.serial_line import SOUND, LineFaults
+from sim_hal.settings import Release
+from tests.scenario.flights import Rigged, demo_config, demo_world, event_names, fly
+
+BRIEF = {"arrived_for": 0.3, "boot_patience": 1.0, "hold_patience": 2.0, "blind_limit": 3.0}
+"""Modes' settings with little patience, s."""
+
+
+def commanded(duration: float, *steps: dict[str, Any], initial: str = "testbed-demo", **modes: Any) -> Config:
+    """Return the demonstration without a camera, with a time line of commands, and little patience."""
+    config = demo_config(duration, camera=False)
+    timeline = tuple(CommandStep(**step) for step in steps)
+    section = configuration.replace(config.modes, initial=initial, **{**BRIEF, **modes})
+    return configuration.replace(config, modes=section, commands=Commands(timeline=timeline))
+
+
+def path_of_modes(run: Run) -> list[tuple[Mode, str]]:
+    """Return the modes entered, each with its trigger."""
+    return [(Mode(int(row["mode"])), to_text(row["trigger"])) for row in run["mode"]]
+
+
+def modes_of(run: Run) -> list[Mode]:
+    return [mode for mode, _ in path_of_modes(run)]
+
+
+def entered(run: Run, mode: Mode) -> float:
+    """Return the mission time, s, at which a mode was entered last."""
+    return float(run["mode"]["time_ns"][run["mode"]["mode"] == mode][-1]) * 1e-9
+
+
+def currents(run: Run, since: float, until: float) -> FloatArray:
+    """Return |I| of the coil that carried most at each sample of the truth in an interval."""
+    time = run["truth"]["time_ns"] * 1e-9
+    largest: FloatArray = np.abs(run["truth"]["current"]).max(axis=1)
+    return largest[(time >= since) & (time < until)]
+
+
+def true_angle(run: Run) -> FloatArray:
+    return np.asarray(2.0 * np.arcsin(run["truth"]["quaternion"][:, 1]))
+
+
+def released(q2: float, rate: float) -> Any:
+    return configuration.replace(demo_world(), release=Release(q2=q2, rate=rate))
+
+
+def test_the_demonstration_is_what_flies_by_default_after_one_cycle_of_boot(tmp_path: Path) -> None:
+    run = fly(demo_config(3.0, camera=False), tmp_path)
+    assert path_of_modes(run) == [(Mode.BOOT, "begin"), (Mode.TESTBED_DEMO, "start in testbed-demo")]
+    assert entered(run, Mode.TESTBED_DEMO) == pytest.approx(0.025)
+    assert event_names(run) == ["started", "target", "stopped"]
+
+
+def test_boot_keeps_the_coils_at_zero_until_the_unit_speaks(tmp_path: Path) -> None:
+    def prepare(rigged: Rigged) -> None:
+        wire = rigged.lock.line.to_host
+        rigged.at(-0.2, lambda: setattr(wire, "faults", LineFaults(silent=True)))
+        rigged.at(2.0, lambda: setattr(wire, "faults", SOUND))
+
+    run = fly(commanded(5.0, {"at": 1.0, "mode": "hold"}), tmp_path, prepare)
+    assert modes_of(run) == [Mode.BOOT, Mode.TESTBED_DEMO]
+    assert entered(run, Mode.TESTBED_DEMO) == pytest.approx(2.0, abs=0.2)
+    assert currents(run, -1.0, 2.0).max() == 0.0
+    assert currents(run, 2.5, 5.0).max() > 0.0
+    names = event_names(run)
+    assert "boot-waits" in names
+    (answer,) = run["command"]
+    assert (answer["obeyed"], to_text(answer["text"])) == (0, "mode hold: not while in boot")
+
+
+def test_safe_never_moves_a_coil_and_is_left_by_command_only(tmp_path: Path) -> None:
+    run = fly(commanded(6.0, {"at": 4.0, "slew": 0.0}, initial="safe"), tmp_path)
+    assert modes_of(run) == [Mode.BOOT, Mode.SAFE, Mode.SLEW]
+    assert currents(run, -1.0, 4.0).max() == 0.0
+    assert currents(run, 4.2, 6.0).max() > 0.0
+    assert run["control"]["state"][:160].max() == 0
+
+
+def test_a_command_to_be_safe_zeroes_the_coils_within_two_cycles(tmp_path: Path) -> None:
+    run = fly(commanded(4.0, {"at": 2.0, "mode": "safe"}), tmp_path)
+    assert modes_of(run) == [Mode.BOOT, Mode.TESTBED_DEMO, Mode.SAFE]
+    assert currents(run, 1.5, 2.0).max() > 0.0
+    assert currents(run, 2.05, 4.0).max() == 0.0
+    names = event_names(run)
+    assert names[-3:] == ["mode", "commanded", "stopped"]
+
+
+def test_hold_keeps_the_attitude_of_the_moment_it_is_commanded(tmp_path: Path) -> None:
+    run = fly(commanded(30.0, {"at": 3.0, "mode": "hold"}), tmp_path)
+    assert modes_of(run) == [Mode.BOOT, Mode.TESTBED_DEMO, Mode.HOLD]
+    time = run["truth"]["time_ns"] * 1e-9
+    moment = float(np.interp(3.0, time, true_angle(run)))
+    assert np.abs(true_angle(run)[time > 25.0] - moment).max() < 0.01
+    wanted = run["control"]["target_q2"][-1]
+    assert 2.0 * np.arcsin(wanted) == pytest.approx(moment, abs=0.01)
+
+
+def test_a_slew_arrives_and_is_held(tmp_path: Path) -> None:
+    run = fly(commanded(25.0, {"at": 1.0, "slew": -0.1}, initial="hold"), tmp_path)
+    assert path_of_modes(run)[1:] == [
+        (Mode.HOLD, "start in hold"),
+        (Mode.SLEW, "commanded slew"),
+        (Mode.HOLD, "arrived"),
+    ]
+    assert entered(run, Mode.HOLD) < 15.0
+    final = true_angle(run)[run["truth"]["time_ns"] * 1e-9 > 20.0]
+    assert np.abs(final - 2.0 * np.arcsin(-0.1)).max() < 0.005
+    assert run["mode"]["target_q2"][-1] == -0.1
+    assert run["target"]["index"].tolist() == [1001]
+
+
+def test_a_slew_commanded_again_goes_to_the_new_target(tmp_path: Path) -> None:
+    steps = ({"at": 1.0, "slew": -0.1}, {"at": 4.0, "slew": 0.2})
+    run = fly(commanded(25.0, *steps, initial="hold"), tmp_path)
+    assert modes_of(run)[2:] == [Mode.SLEW, Mode.SLEW, Mode.HOLD]
+    assert true_angle(run)[-1] == pytest.approx(2.0 * np.arcsin(0.2), abs=0.005)
+
+
+def test_a_slew_that_does_not_arrive_becomes_a_hold(tmp_path: Path) -> None:
+    run = fly(commanded(8.0, {"at": 1.0, "slew": -0.3}, initial="hold", slew_limit=2.0), tmp_path)
+    assert path_of_modes(run)[-1] == (Mode.HOLD, "reaction hold")
+    assert "slew-late" in event_names(run)
+
+
+def test_detumbling_takes_the_rate_out_monotonically(tmp_path: Path) -> None:
+    """From 0.5 rad/s, by coils on x and z; the field is measured while they are off."""
+    run = fly(commanded(11.0, initial="detumble"), tmp_path, section=released(-0.68, 0.5))
+    assert modes_of(run) == [Mode.BOOT, Mode.DETUMBLE]
+    truth = run["truth"]
+    time = truth["time_ns"] * 1e-9
+    rate = truth["rate"][:, 1]
+    # 0.096 A m^2 in 0.45 mT, on 0.6 of the time, take 0.025 rad/s each second, two coils 1.4 times that.
+    assert rate[time > 10.9].max() < 0.2
+    windows = np.interp(np.arange(0.5, 11.0, 0.25), time, rate)
+    assert np.diff(windows).max() < 2e-3
+    braking = time > 0.5
+    off = np.abs(truth["current"][braking]).max(axis=1) == 0.0
+    assert 0.3 < off.mean() < 0.5, "two fifths of the time the magnetometer is heard alone"
+    assert np.abs(truth["current"][braking][:, 2]).max() > 0.05
+    assert (run["control"]["state"][20:] == 3).all()
+
+
+def test_a_body_that_has_been_detumbled_is_held(tmp_path: Path) -> None:
+    run = fly(commanded(40.0, initial="detumble"), tmp_path, section=released(-0.6, 0.25))
+    assert path_of_modes(run)[1:] == [(Mode.DETUMBLE, "start in detumble"), (Mode.HOLD, "rate is low")]
+    time = run["truth"]["time_ns"] * 1e-9
+    after = time > entered(run, Mode.HOLD)
+    assert np.abs(run["truth"]["rate"][after, 1]).max() < 0.03
+    assert np.ptp(true_angle(run)[time > 35.0]) < 0.005
+
+
+def test_a_body_that_is_pushed_out_of_its_hold_is_detumbled_and_held_again(tmp_path: Path) -> None:
+    def prepare(rigged: Rigged) -> None:
+        world = rigged.lock.hardware.world
+        rigged.at(4.0, lambda: setattr(world, "rate", world.rate + 0.7))
+
+    run = fly(commanded(60.0, initial="hold"), tmp_path, prepare)
+    assert path_of_modes(run)[1:] == [
+        (Mode.HOLD, "start in hold"),
+        (Mode.DETUMBLE, "reaction detumble"),
+        (Mode.HOLD, "rate is low"),
+    ]
+    assert "tumbling" in event_names(run)
+
+
+def test_a_hold_that_is_impossible_ends_in_safe_with_the_coils_at_zero(tmp_path: Path) -> None:
+    def prepare(rigged: Rigged) -> None:
+        world = rigged.lock.hardware.world
+
+        def hand() -> None:
+            world.angle, world.rate = 1.2, 0.0
+
+        for k in range(400):
+            rigged.at(4.0 + 0.02 * k, hand)
+
+    run = fly(commanded(12.0, initial="hold"), tmp_path, prepare)
+    assert path_of_modes(run)[-1] == (Mode.SAFE, "reaction safe")
+    assert "hold-impossible" in event_names(run)
+    assert currents(run, 4.0, entered(run, Mode.SAFE)).max() > 0.0
+    assert currents(run, entered(run, Mode.SAFE) + 0.1, 12.0).max() == 0.0
+
+
+@pytest.mark.parametrize("initial", ["testbed-demo", "hold", "detumble"])
+def test_a_unit_that_stays_silent_leads_to_safe_from_every_mode_that_drives(
+    tmp_path: Path, initial: str
+) -> None:
+    def prepare(rigged: Rigged) -> None:
+        rigged.at(2.0, lambda: setattr(rigged.lock.line.to_host, "faults", LineFaults(silent=True)))
+
+    run = fly(commanded(8.0, initial=initial), tmp_path, prepare, section=released(0.2, 0.4))
+    assert path_of_modes(run)[-1] == (Mode.SAFE, "reaction safe")
+    names = event_names(run)
+    assert names.index("imu-silent") < names.index("control-lost") < names.index("blind")
+
+
+@pytest.mark.parametrize(("crashes", "mode"), [(2, Mode.TESTBED_DEMO), (3, Mode.SAFE)])
+def test_too_many_crashes_of_late_lead_to_safe_and_one_fewer_does_not(
+    tmp_path: Path, crashes: int, mode: Mode
+) -> None:
+    """Killed so many times: the kept state of each boot is left as one that runs."""
+    config = commanded(1.0)
+    state = tmp_path / "state"
+    for _ in range(crashes):
+        keeper_of(state).close(clean=False)
+    config = configuration.replace(config, state=configuration.replace(config.state, folder=str(state)))
+    run = fly(config, tmp_path / "run")
+    assert modes_of(run) == [Mode.BOOT, mode]
+    assert ("crashed-often" in event_names(run)) is (mode is Mode.SAFE)
+    again = fly(config, tmp_path / "again")
+    assert modes_of(again) == [Mode.BOOT, mode], "a clean end is not counted, and mends nothing by itself"
+
+
+def keeper_of(folder: Path) -> StateKeeper:
+    """Return the state of a boot in `folder`, begun."""
+    folder.mkdir(exist_ok=True)
+    notices = Notices()
+    return StateKeeper(StateStore(folder, notices.tell), notices, SimClock(), window=600.0)
+
+
+def test_every_mode_is_reached_by_command_and_the_demonstration_goes_on_where_it_is_due(
+    tmp_path: Path,
+) -> None:
+    steps: list[dict[str, Any]] = [
+        {"at": 2.0, "mode": "safe"},
+        {"at": 3.0, "mode": "detumble"},
+        {"at": 6.0, "mode": "hold"},
+        {"at": 7.0, "slew": 0.1},
+        {"at": 8.0, "mode": "testbed-demo"},
+    ]
+    run = fly(commanded(25.0, *steps), tmp_path)
+    ways = modes_of(run)
+    assert ways[:3] == [Mode.BOOT, Mode.TESTBED_DEMO, Mode.SAFE]
+    assert ways[-3:] == [Mode.HOLD, Mode.SLEW, Mode.TESTBED_DEMO]
+    assert run["command"]["obeyed"].all()
+    assert run["target"]["index"].tolist() == [0, 1001, 0]
+    assert true_angle(run)[-1] == pytest.approx(2.0 * np.arcsin(-0.3), abs=0.005)
+    for log in run.logs.values():
+        assert log.intact

@@ -1,0 +1,137 @@
+"""A disk in memory that can lose its power: what was not synced may be there, in part, or not at all."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+
+Names = dict[Path, int]
+
+
+class PowerLostError(BaseException):
+    """The machine is off. No OSError: software never sees it."""
+
+
+@dataclass
+class _Inode:
+    durable: bytes | None
+    """What a sync made safe, None for a file that never was synced."""
+    cached: bytes
+
+
+class Disk:
+    """A file system: content is safe after sync, names after sync_folder, everything else is open.
+
+    `calls` counts the calls that change something. Before call number `stop_before` the power fails, or, when
+    `failure` is an errno, that call and all after it fail with it. `forget` names a call that does nothing.
+    """
+
+    def __init__(
+        self, stop_before: int | None = None, failure: int = 0, bite: int = 1 << 30, forget: str = ""
+    ) -> None:
+        self.calls = 0
+        self._stop_before = stop_before
+        self._failure = failure
+        self._bite = bite
+        self._forget = forget
+        self._inodes: list[_Inode] = []
+        self._open: dict[int, int] = {}
+        self._names: Names = {}
+        self._steps: list[Names] = [{}]
+        """The names that power loss may find: the durable ones, and those after each change since."""
+
+    def start(self, stop_before: int | None, failure: int = 0) -> None:
+        """Count anew, and fail at another call."""
+        self.calls, self._stop_before, self._failure = 0, stop_before, failure
+
+    def read(self, path: Path) -> bytes | None:
+        """Return what software sees while the power is on."""
+        return self._inodes[self._names[path]].cached if path in self._names else None
+
+    def create(self, path: Path) -> int:
+        """Open an empty file."""
+        self._count()
+        if path in self._names:
+            inode = self._names[path]
+            self._inodes[inode].cached = b""
+        else:
+            inode = len(self._inodes)
+            self._inodes.append(_Inode(None, b""))
+            self._names = {**self._names, path: inode}
+            self._steps.append(self._names)
+        descriptor = 100 + self.calls
+        self._open[descriptor] = inode
+        return descriptor
+
+    def write(self, file: int, data: bytes) -> int:
+        """Take at most a bite."""
+        self._count()
+        taken = data[: self._bite]
+        self._inodes[self._open[file]].cached += taken
+        return len(taken)
+
+    def sync(self, file: int) -> None:
+        """Make the content safe."""
+        self._count()
+        if self._forget != "sync":
+            inode = self._inodes[self._open[file]]
+            inode.durable = inode.cached
+
+    def close(self, file: int) -> None:
+        """Forget a descriptor."""
+        del self._open[file]
+
+    def rename(self, old: Path, new: Path) -> None:
+        """Move a name."""
+        self._count()
+        names = dict(self._names)
+        names[new] = names.pop(old)
+        self._names = names
+        self._steps.append(names)
+
+    def sync_folder(self, folder: Path) -> None:
+        """Make the names safe."""
+        self._count()
+        assert folder.name == "state"
+        if self._forget != "sync_folder":
+            self._steps = [self._names]
+
+    def after_power_loss(self) -> Iterator[Disk]:
+        """Yield every disk that may be found when the power is back."""
+        for names in self._steps:
+            present = sorted(set(names.values()))
+            for contents in product(*(_possible(self._inodes[i]) for i in present)):
+                disk = Disk()
+                disk._inodes = [_Inode(content, content) for content in contents]
+                disk._names = {path: present.index(inode) for path, inode in names.items()}
+                disk._steps = [disk._names]
+                yield disk
+
+    def _count(self) -> None:
+        if self._stop_before is not None and self.calls >= self._stop_before:
+            if self._failure:
+                raise OSError(self._failure, os.strerror(self._failure))
+            raise PowerLostError
+        self.calls += 1
+
+
+NO_SPACE = errno.ENOSPC
+
+
+def _possible(inode: _Inode) -> list[bytes]:
+    """Return what a file may hold after power loss: blocks not synced are old, new, torn, or zeros."""
+    if inode.durable == inode.cached:
+        return [inode.cached]
+    half = len(inode.cached) // 2
+    torn = [
+        inode.cached,
+        b"",
+        inode.cached[:half],
+        bytes(len(inode.cached)),
+        inode.cached[:half] + bytes(half),
+    ]
+    return torn if inode.durable is None else [*torn, inode.durable]
