@@ -40,8 +40,8 @@ def test_errors_and_innovations_are_as_large_as_the_filter_says(scene: str, runs
 
 def test_variances_that_are_claimed_too_small_are_found_out() -> None:
     """The unit's noise said to be half of what it is."""
-    facts = consistency.scene_facts(fly("testbed", 4, claimed=0.25))
-    assert facts["nees_final"] > consistency.band(4 * facts["degrees"], 0.999)[1]
+    facts = consistency.scene_facts(fly("testbed", 8, claimed=0.25))
+    assert facts["nees_final"] > consistency.band(8 * facts["degrees"], 0.999)[1]
     assert facts["nis"]["gyro"]["mean"] > 2.0
 
 
