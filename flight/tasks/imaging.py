@@ -126,7 +126,8 @@ class Imaging:
         late = age_ns > self._settings.max_age_ns
         text = f"frame {frame.sequence} comes {age_ns * 1e-9:.1f} s after its exposure"
         self._facts.state(facts.CAMERA_LOST, late, now_ns, text)
-        self._streams.note("camera", self._last_frame_ns)
+        if not late:
+            self._streams.note("camera", now_ns)
         self.frames += 1
         self._last_sequence = frame.sequence
         if self._jobs.submit(WORKER, self._job(frame)):
