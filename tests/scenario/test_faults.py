@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from flight.arrays import FloatArray
+from flight.config import replace
 from flight.telemetry.reader import Run
 from sim_hal.emulators.serial_line import SOUND, LineFaults
 from tests.scenario.flights import Rigged, demo_config, event_names, fly
@@ -227,6 +228,19 @@ def test_a_camera_that_is_off_is_told_and_the_flight_goes_on(tmp_path: Path) -> 
     assert "camera-lost" in event_names(run)
     assert len(run["streak"]) == 1
     assert run["control"]["state"][-1] != 0
+
+
+@pytest.mark.parametrize(("max_age", "lost"), [(14.0, False), (7.0, True)])
+def test_a_frame_that_comes_late_is_no_fresh_one(tmp_path: Path, max_age: float, lost: bool) -> None:
+    def prepare(rigged: Rigged) -> None:
+        setattr(rigged.lock.hardware.camera, "late_ns", 9_000_000_000)  # noqa: B010 - it may be None
+
+    config = demo_config(12.0)
+    assert config.camera is not None
+    run = fly(replace(config, camera=replace(config.camera, period=20.0, max_age=max_age)), tmp_path, prepare)
+    assert len(run["streak"]) == 1
+    assert ("camera-lost" in event_names(run)) is lost
+    assert "camera-recovered" not in event_names(run)
 
 
 def test_a_stall_of_the_loop_is_counted_once_and_flown_through(tmp_path: Path) -> None:
