@@ -1,59 +1,120 @@
-"""Print the drop-in for knightcube.service that a configuration needs: its devices, its network, its bus.
+"""Print the drop-in of the units that a configuration needs: its devices, its network, its bus.
 
-Run by install.sh with the installed Python: board_dropin.py CONFIG. Exit status 2, and one line, for a
-configuration that is wrong.
+Run by install.sh with the installed Python: board_dropin.py [--safe] CONFIG; with --safe that of
+knightcube-safe.service, else that of knightcube.service. Exit status 2, and one line, for a configuration
+that is wrong.
 """
 
 from __future__ import annotations
 
+import os
+import stat
+import string
 import sys
 from pathlib import Path
 
+from flight.commands.peers import peer_networks
 from flight.config import load
 from flight.errors import UsageError
 from flight.settings import Config, V4l2Device
+from hal.buses.i2c_bus import device_file
+
+SERIAL, VIDEO, I2C = ("ttyUSB", "ttyACM"), ("video4linux",), ()
+"""Drivers' classes of the devices that may be plugged in after the start, by kind."""
 
 
 def dropin(config: Config) -> str:
-    """Return the drop-in's text."""
-    lines = [
-        "# Made by install.sh from the configuration: run it again when devices or network change there."
-    ]
+    """Return the text for the flight's unit."""
+    lines = []
     if config.simulation is None:
-        lines += _devices(config)
+        awaited = [device_unit(path) for path, _ in _nodes(config)]
+        lines += ["[Unit]", *(f"{word}={unit}" for unit in awaited for word in ("Wants", "After"))]
+    lines += ["[Service]", *_devices(config)]
+    if peers := peer_networks(config.commands):
+        # IPAddressDeny=any of the unit stays: what is not allowed here goes neither in nor out.
+        lines += ["PrivateNetwork=no", "RestrictAddressFamilies=AF_INET"]
+        lines += [f"IPAddressAllow={peer}" for peer in peers]
+    return _text(lines)
+
+
+def safe_dropin(config: Config) -> str:
+    """Return the text for the unit that is left when the flight is given up: it reaches the coils alone."""
+    return _text(["[Service]", *(_bus(config) if config.simulation is None else [])])
+
+
+def device_unit(path: str) -> str:
+    """Return the name of systemd's unit for a device's file (systemd.unit(5), "string escaping")."""
+    kept = {ord(letter) for letter in string.ascii_letters + string.digits + ":_."}
+    name = path.strip("/").encode()
+    escaped = ["-" if byte == ord("/") else chr(byte) if byte in kept else f"\\x{byte:02x}" for byte in name]
+    return "".join(escaped) + ".device"
+
+
+def allowed(path: str, plugged: tuple[str, ...], root: Path = Path("/")) -> list[str]:
+    """Return the DeviceAllow lines of a device's file, a udev name or the node itself.
+
+    systemd turns a file into one device number when the unit starts. What hangs on USB may come back under
+    another number, ttyUSB1 for ttyUSB0, so it is let through by its driver's class; and so is, by the classes
+    `plugged`, what is not there yet. `root` holds proc and sys.
+    """
+    try:
+        mode, number = (found := os.stat(path)).st_mode, found.st_rdev
+    except OSError:
+        classes = plugged
     else:
-        lines.append("[Service]")
-    if config.commands.udp is not None:
-        lines += ["PrivateNetwork=no", "IPAddressDeny=", "RestrictAddressFamilies=AF_INET"]
-    return "\n".join(lines) + "\n"
+        of_device = root / f"sys/dev/char/{os.major(number)}:{os.minor(number)}"
+        on_usb = stat.S_ISCHR(mode) and any(part.startswith("usb") for part in of_device.resolve().parts)
+        classes = _driver_classes(os.major(number), root) if on_usb else ()
+    return [f"DeviceAllow={what} rw" for what in (path, *(f"char-{name}" for name in classes))]
+
+
+def _driver_classes(major: int, root: Path) -> tuple[str, ...]:
+    """Return the name of a character device's driver, as /proc/devices has it."""
+    listed = (root / "proc/devices").read_text(encoding="ascii").partition("Block devices:")[0]
+    pairs = (words for line in listed.splitlines() if len(words := line.split()) == 2)
+    return tuple(name for number, name in pairs if number == str(major))
+
+
+def _text(lines: list[str]) -> str:
+    first = "# Made by install.sh from the configuration: run it again when devices or network change there."
+    return "\n".join([first, *lines]) + "\n"
+
+
+def _nodes(config: Config) -> list[tuple[str, tuple[str, ...]]]:
+    """Return the files of the configured devices, each with the classes it may be plugged in as."""
+    nodes = [(device_file(config.coils.bus), I2C), (config.inertial_unit.device, SERIAL)]
+    camera = config.camera.device if config.camera is not None else None
+    return [*nodes, (camera.path, VIDEO)] if isinstance(camera, V4l2Device) else nodes
 
 
 def _devices(config: Config) -> list[str]:
-    """Return what real devices need: to be waited for, and to be let through."""
-    i2c, unit = f"/dev/i2c-{config.coils.bus}", config.inertial_unit.device
-    # systemd's own escape of a path: what waits for udev's name to appear is a unit of that name.
-    awaited = unit.strip("/").replace("-", r"\x2d").replace("/", "-") + ".device"
-    lines = [
-        "[Unit]",
-        f"Wants={awaited}",
-        f"After={awaited}",
-        "[Service]",
-        f"Environment=KNIGHTCUBE_I2C={i2c} KNIGHTCUBE_PWM=0x{config.coils.address:02x}",
-        f"DeviceAllow={i2c} rw",
-        f"DeviceAllow={unit} rw",
-    ]
+    """Return what lets the real devices through."""
+    if config.simulation is not None:
+        return []
+    lines = _bus(config)
+    for path, plugged in _nodes(config)[1:]:
+        lines += allowed(path, plugged)
     camera = config.camera.device if config.camera is not None else None
-    if isinstance(camera, V4l2Device):
-        lines.append(f"DeviceAllow={camera.path} rw")
-    elif camera is not None:  # Aravis talks to USB3 Vision cameras by libusb, which asks udev for them
+    if camera is not None and not isinstance(camera, V4l2Device):
+        # Aravis talks to USB3 Vision cameras by libusb, which asks udev for them.
         lines += ["DeviceAllow=char-usb_device rw", "RestrictAddressFamilies=AF_NETLINK"]
     return lines
 
 
-def main() -> int:
+def _bus(config: Config) -> list[str]:
+    """Return what `coils-off` must know and have."""
+    i2c = device_file(config.coils.bus)
+    return [
+        f"Environment=KNIGHTCUBE_I2C={i2c} KNIGHTCUBE_PWM=0x{config.coils.address:02x}",
+        *allowed(i2c, I2C),
+    ]
+
+
+def main(words: list[str]) -> int:
     """Print the drop-in of the configuration that the command line names."""
+    make = safe_dropin if words[:1] == ["--safe"] else dropin
     try:
-        sys.stdout.write(dropin(load(Path(sys.argv[1]))))
+        sys.stdout.write(make(load(Path(words[-1]))))
     except UsageError as error:
         sys.stderr.write(f"install: {error}\n")
         return 2
@@ -61,4 +122,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(main(sys.argv[1:]))

@@ -5,14 +5,16 @@ set -eu
 usage() {
     cat <<'TEXT'
 usage: install.sh [--config FILE] [--wheels DIR | --venv DIR] [--python PYTHON] [--dry-run]
+       install.sh --accept [--dry-run]
        install.sh --uninstall [--purge] [--dry-run]
 
-  --config FILE   configuration to fly; kept as /etc/knightcube/flight.yaml, which is
-                  not overwritten when it is there (default: config/testbed.yaml)
+  --config FILE   configuration to fly; kept as /etc/knightcube/flight.yaml with its
+                  checksum, and not overwritten (default: config/testbed.yaml)
   --wheels DIR    install without a network, from the wheels in DIR
   --venv DIR      use this virtual environment instead of making one
   --python PYTHON make the virtual environment with this Python (default python3)
   --dry-run       say what would be done, do nothing
+  --accept        take /etc/knightcube/flight.yaml as it is now, after it was edited
   --uninstall     stop and remove the service, the software and the udev rules
   --purge         with --uninstall: configuration, flight logs, state and user too
 
@@ -20,6 +22,8 @@ What goes where:
   /opt/knightcube/venv   the software           /etc/knightcube          configuration
   /opt/knightcube/bin    coils-off              /var/lib/knightcube      flight logs, state
   /etc/systemd/system    the units              /etc/udev/rules.d        device names
+  /etc/modules-load.d    i2c-dev
+DESTDIR=FOLDER in the environment: into an image that is mounted there, whose user you make.
 TEXT
 }
 
@@ -28,12 +32,15 @@ fail() {
     exit 2
 }
 
-prefix=/opt/knightcube
-settings=/etc/knightcube
-units=/etc/systemd/system
-rules=/etc/udev/rules.d/99-knightcube.rules
+root=${DESTDIR:-}
+prefix=$root/opt/knightcube
+settings=$root/etc/knightcube
+units=$root/etc/systemd/system
+rules=$root/etc/udev/rules.d/99-knightcube.rules
+shipped=$prefix/share/99-knightcube.rules
+modules=$root/etc/modules-load.d/knightcube.conf
 logs=/var/lib/knightcube
-cache=/var/cache/knightcube
+cache=$root/var/cache/knightcube
 user=knightcube
 deploy=$(cd "$(dirname "$0")" && pwd)
 source=$(dirname "$deploy")
@@ -48,7 +55,9 @@ purge=
 while [ $# -gt 0 ]; do
     case $1 in
         --config | --wheels | --venv | --python)
-            [ $# -ge 2 ] || fail "$1 wants a value, see --help"
+            case ${2:-} in
+                '' | -*) fail "$1 wants a value, see --help" ;;
+            esac
             case $1 in
                 --config) config=$2 ;;
                 --wheels) wheels=$2 ;;
@@ -58,6 +67,7 @@ while [ $# -gt 0 ]; do
             shift
             ;;
         --dry-run) dry=yes ;;
+        --accept) action=accept ;;
         --uninstall) action=uninstall ;;
         --purge) purge=yes ;;
         -h | --help)
@@ -85,18 +95,54 @@ place() {
     fi
 }
 
+# Say what the checksum file of a configuration holds, as sha256sum writes and checks it.
+sum_of() { sha256sum <"$1" | sed 's/-$/flight.yaml/'; }
+
+# Refuse what is wrong before the first step is done.
+check_inputs() {
+    [ "$action" != uninstall ] || return 0
+    [ -z "$purge" ] || fail "--purge goes with --uninstall"
+    [ "$action" = install ] || [ -z "$config$wheels$venv" ] || fail "--accept goes alone, see --help"
+    [ -z "$wheels" ] || [ -z "$venv" ] || fail "--wheels and --venv: one of them, see --help"
+    [ -z "$wheels" ] || [ -d "$wheels" ] || fail "--wheels $wheels: no such folder"
+    [ -z "$venv" ] || [ -x "$venv/bin/python" ] ||
+        fail "--venv $venv: no virtual environment, bin/python is missing"
+    if [ "$action" = accept ]; then
+        [ -e "$settings/flight.yaml" ] || fail "--accept: there is no $settings/flight.yaml"
+        [ -x "$prefix/venv/bin/python" ] || fail "--accept: nothing is installed"
+        return
+    fi
+    [ -n "$venv" ] || "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' ||
+        fail "--python $python: Python 3.11 or newer is wanted"
+    flown=${config:-$source/config/testbed.yaml}
+    { [ -f "$flown" ] && [ -r "$flown" ]; } || fail "--config $flown: cannot be read"
+    [ -e "$settings/flight.yaml" ] || return 0
+    [ -z "$config" ] || cmp -s "$config" "$settings/flight.yaml" ||
+        fail "--config $config: another one is flown; put yours there first: rm $settings/flight.yaml"
+    flown=$settings/flight.yaml
+    [ ! -e "$flown.sha256" ] || [ "$(sum_of "$flown")" = "$(cat "$flown.sha256")" ] ||
+        fail "$flown is not what was accepted: was it edited? Then: install.sh --accept"
+}
+
 # systemd and udev are told where they run; an image that is being built has neither.
-systemd_runs() { [ -d /run/systemd/system ]; }
+systemd_runs() { [ -z "$root" ] && [ -d /run/systemd/system ]; }
+
+in_root() { systemctl ${root:+--root="$root"} "$@"; }
 
 reload() {
     if systemd_runs; then
         run systemctl daemon-reload
         run udevadm control --reload
-        run udevadm trigger --subsystem-match=tty --subsystem-match=i2c-dev --subsystem-match=video4linux
+        run udevadm trigger --subsystem-match=tty --subsystem-match=i2c-dev --subsystem-match=video4linux \
+            --subsystem-match=usb
     fi
 }
 
 make_user() {
+    if [ -n "$root" ]; then
+        echo "install: make a system user $user in the image, in the groups dialout, i2c and video" >&2
+        return
+    fi
     for group in dialout i2c video; do
         getent group "$group" >/dev/null || run groupadd --system "$group"
     done
@@ -107,13 +153,10 @@ make_user() {
 install_software() {
     [ -d "$prefix/bin" ] || run mkdir -p "$prefix/bin"
     if [ -n "$venv" ]; then
-        [ -x "$venv/bin/python" ] || fail "--venv $venv: no virtual environment, bin/python is missing"
         target=$(cd "$venv" && pwd)
         [ "$(readlink "$prefix/venv")" = "$target" ] || run ln -sfn "$target" "$prefix/venv"
     else
         [ ! -L "$prefix/venv" ] || run rm "$prefix/venv"
-        "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' ||
-            fail "--python $python: Python 3.11 or newer is wanted"
         [ -x "$prefix/venv/bin/python" ] || run "$python" -m venv "$prefix/venv"
         if [ -n "$wheels" ]; then
             set -- --no-index --find-links "$wheels"
@@ -127,34 +170,46 @@ install_software() {
 }
 
 install_settings() {
-    if [ -e "$settings/flight.yaml" ]; then
-        if [ -n "$config" ] && ! cmp -s "$config" "$settings/flight.yaml"; then
-            echo "install: $settings/flight.yaml is kept; yours would be put there after: rm $settings/flight.yaml" >&2
-        fi
-        flown=$settings/flight.yaml
-    else
-        flown=${config:-$source/config/testbed.yaml}
-        [ -r "$flown" ] || fail "--config $flown: cannot be read"
-        place 644 "$flown" "$settings/flight.yaml"
-    fi
-    if [ -n "$dry" ] && [ ! -x "$prefix/venv/bin/python" ]; then
+    python=$prefix/venv/bin/python
+    if [ -n "$dry" ] && [ ! -x "$python" ]; then
+        echo "would write: $settings/flight.yaml and its checksum, from $flown"
         echo "would write: $units/knightcube.service.d/board.conf, from $flown"
         return
     fi
-    made=$(mktemp)
-    if ! "$prefix/venv/bin/python" "$deploy/board_dropin.py" "$flown" >"$made"; then
-        rm -f "$made"
-        exit 2
+    made=$(mktemp -d)
+    trap 'rm -rf "$made"' EXIT
+    # First of all these, which refuse a configuration that is wrong.
+    "$python" "$deploy/board_dropin.py" "$flown" >"$made/flight" || exit 2
+    "$python" "$deploy/board_dropin.py" --safe "$flown" >"$made/safe" || exit 2
+    place 644 "$flown" "$settings/flight.yaml"
+    sum_of "$flown" >"$made/sum"
+    place 644 "$made/sum" "$settings/flight.yaml.sha256"
+    place 644 "$made/flight" "$units/knightcube.service.d/board.conf"
+    place 644 "$made/safe" "$units/knightcube-safe.service.d/board.conf"
+    wanted=$(XDG_CACHE_HOME="$cache" "$python" "$deploy/sky_index.py" --wanted "$flown")
+    if [ -n "$wanted" ]; then
+        run install -d "$cache" # systemd gives it to its user
+        run env XDG_CACHE_HOME="$cache" "$python" "$deploy/sky_index.py" "$flown"
     fi
-    place 644 "$made" "$units/knightcube.service.d/board.conf"
-    grep -e '^#' -e '^\[Service\]' -e '^Environment=' -e '^DeviceAllow=/dev/i2c' "$made" >"$made.safe"
-    place 644 "$made.safe" "$units/knightcube-safe.service.d/board.conf"
-    rm -f "$made" "$made.safe"
-    # The star tracker's sky index takes seconds to make: now, not at the start of a flight.
-    if grep -q '^ *star_tracker:' "$flown"; then
-        run install -d -o "$user" -g "$user" "$cache"
-        run env XDG_CACHE_HOME="$cache" "$prefix/venv/bin/python" -c \
-            'from flight.startracker.build import ensure_default_index; ensure_default_index()'
+}
+
+# Device names are for editing: what was edited since it was put there is kept.
+install_rules() {
+    if [ -e "$rules" ] && [ -e "$shipped" ] && ! cmp -s "$rules" "$shipped"; then
+        cmp -s "$deploy/99-knightcube.rules" "$shipped" ||
+            echo "install: $rules was edited and is kept; compare $deploy/99-knightcube.rules" >&2
+    else
+        place 644 "$deploy/99-knightcube.rules" "$rules"
+    fi
+    place 644 "$deploy/99-knightcube.rules" "$shipped"
+}
+
+# The module behind /dev/i2c-*, which nothing else asks for: at each boot, and now.
+install_modules() {
+    place 644 "$deploy/modules.conf" "$modules"
+    if systemd_runs && [ ! -d /sys/class/i2c-dev ]; then
+        run modprobe i2c-dev ||
+            echo "install: i2c-dev cannot be loaded: without it there is no /dev/i2c-* to reach the coils" >&2
     fi
 }
 
@@ -162,9 +217,8 @@ install_units() {
     for unit in knightcube.service knightcube-safe.service; do
         place 644 "$deploy/$unit" "$units/$unit"
     done
-    place 644 "$deploy/99-knightcube.rules" "$rules"
-    systemctl is-enabled --quiet knightcube.service 2>/dev/null ||
-        run systemctl enable --quiet knightcube.service
+    in_root is-enabled --quiet knightcube.service 2>/dev/null ||
+        run in_root enable --quiet knightcube.service
 }
 
 install_all() {
@@ -172,24 +226,43 @@ install_all() {
     install_software
     install_settings
     install_units
+    install_rules
+    install_modules
     reload
     command -v i2cset >/dev/null 2>&1 ||
         echo "install: i2cset is missing (package i2c-tools): the coils are then zeroed by Python alone" >&2
-    [ -n "$dry" ] || echo "installed. Fly: systemctl start knightcube    Watch: journalctl -fu knightcube"
+    say_next installed
+}
+
+accept_settings() {
+    flown=$settings/flight.yaml
+    install_settings
+    reload
+    say_next accepted
+}
+
+say_next() {
+    if [ -z "$dry" ]; then
+        verb=start
+        if systemd_runs && systemctl is-active --quiet knightcube.service; then
+            verb=restart # what flies now is what was there before
+        fi
+        echo "$1. Fly: systemctl $verb knightcube    Watch: journalctl -fu knightcube"
+    fi
 }
 
 uninstall_all() {
     if systemd_runs; then
         run systemctl stop knightcube.service knightcube-safe.service || true
     fi
-    if systemctl is-enabled --quiet knightcube.service 2>/dev/null; then
-        run systemctl disable --quiet knightcube.service
+    if in_root is-enabled --quiet knightcube.service 2>/dev/null; then
+        run in_root disable --quiet knightcube.service
     fi
     run rm -rf "$units/knightcube.service" "$units/knightcube-safe.service" \
-        "$units/knightcube.service.d" "$units/knightcube-safe.service.d" "$rules" "$prefix" "$cache"
+        "$units/knightcube.service.d" "$units/knightcube-safe.service.d" "$rules" "$modules" "$prefix" "$cache"
     if [ -n "$purge" ]; then
-        run rm -rf "$settings" "$logs"
-        if getent passwd "$user" >/dev/null; then
+        run rm -rf "$settings" "$root$logs"
+        if [ -z "$root" ] && getent passwd "$user" >/dev/null; then
             run userdel "$user"
         fi
     fi
@@ -197,10 +270,11 @@ uninstall_all() {
     [ -n "$dry" ] || echo "uninstalled${purge:+, with configuration, logs and user}"
 }
 
-[ -n "$dry" ] || [ "$(id -u)" -eq 0 ] || fail "run it as root (or look with --dry-run)"
+[ -n "$dry$root" ] || [ "$(id -u)" -eq 0 ] || fail "run it as root (or look with --dry-run)"
 command -v systemctl >/dev/null || fail "no systemd on this machine: fly by hand with python -m flight run"
-if [ "$action" = install ]; then
-    install_all
-else
-    uninstall_all
-fi
+check_inputs
+case $action in
+    install) install_all ;;
+    accept) accept_settings ;;
+    uninstall) uninstall_all ;;
+esac

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import numpy as np
 from flight.arrays import FloatArray
 from flight.camera import camera_model
 from flight.control.detumble import Braking, Detumbler, WindowSchedule, share_in_turning_field
-from flight.estimation.attitude_filter import AttitudeFilter, FilterSettings
+from flight.estimation.attitude_filter import AttitudeFilter, FilterSettings, slow_prior
 from flight.estimation.rigid_body import Parameters, RigidBody
 from flight.guidance.vmc import NODES
 from flight.health.coil_response import ResponseSettings
@@ -20,6 +21,8 @@ from flight.settings import Camera, Config
 from flight.startracker.detection import DetectionSettings
 from flight.startracker.frame_job import TrackerSettings
 from flight.startracker.solve import SolveSettings
+from flight.state.content import Learned
+from flight.state.learning import start_from
 from flight.tasks.imaging import ImagingSettings
 from flight.tasks.navigation import NavigationSettings
 from flight.tasks.planning import PlanningSettings, Strategy
@@ -39,8 +42,10 @@ def dipole_per_ampere(config: Config) -> float:
     return config.plant.coil_turns * config.plant.coil_area
 
 
-def attitude_filter(config: Config, plant: SingleAxisPlant) -> AttitudeFilter:
-    """Return the filter of a body on the thread."""
+def attitude_filter(
+    config: Config, plant: SingleAxisPlant, learned: Mapping[str, Learned] | None = None
+) -> tuple[AttitudeFilter, list[str]]:
+    """Return the filter of a body on the thread, and why some of what was `learned` was not taken."""
     section, believed = config.estimation, config.plant
     body = RigidBody(
         np.eye(3) * plant.inertia,
@@ -50,22 +55,22 @@ def attitude_filter(config: Config, plant: SingleAxisPlant) -> AttitudeFilter:
         stiffness=plant.stiffness,
         damping=plant.damping,
     )
-    return AttitudeFilter(
-        body,
-        FilterSettings(
-            current_noise=section.current_noise,
-            control_period=1.0 / config.executive.control_rate_hz,
-            disturbance_walk=section.disturbance_walk,
-            bias_start=section.bias_start,
-            torsion_start=section.torsion_start,
-            damping_start=section.damping_start,
-            gain_start=section.gain_start,
-            latency_start=section.latency_start,
-            latency_walk=section.latency_walk,
-            gate_sigma=section.gate_sigma,
-            history_ns=round(section.history * SECOND_NS),
-        ),
+    settings = FilterSettings(
+        current_noise=section.current_noise,
+        control_period=1.0 / config.executive.control_rate_hz,
+        disturbance_walk=section.disturbance_walk,
+        bias_start=section.bias_start,
+        torsion_start=section.torsion_start,
+        damping_start=section.damping_start,
+        gain_start=section.gain_start,
+        latency_start=section.latency_start,
+        latency_walk=section.latency_walk,
+        unknown_current=plant.current_limit,
+        gate_sigma=section.gate_sigma,
+        history_ns=round(section.history * SECOND_NS),
     )
+    prior, problems = start_from(learned or {}, slow_prior(body, settings), section.changed)
+    return AttitudeFilter(body, settings, prior), problems
 
 
 def navigation_settings(config: Config, plant: SingleAxisPlant) -> NavigationSettings:
@@ -76,6 +81,7 @@ def navigation_settings(config: Config, plant: SingleAxisPlant) -> NavigationSet
         config.inertial_unit.rate_noise,
         round(config.inertial_unit.max_age * SECOND_NS),
         round(section.coast * SECOND_NS),
+        round(SECOND_NS / config.executive.control_rate_hz),
         Parameters(plant.stiffness / plant.inertia, plant.damping / plant.inertia),
         surrounding_field(config),
     )
@@ -125,6 +131,8 @@ def imaging_settings(camera: Camera, unrest: float) -> ImagingSettings:
         camera=camera_model(camera),
         exposure_ns=round(camera.exposure * SECOND_NS),
         max_age_ns=round(camera.max_age * SECOND_NS),
+        late_ns=round(camera.late_after * SECOND_NS),
+        slow_ns=round(camera.vision_slow_after * SECOND_NS),
         mounting=np.array(camera.mounting),
         estimator=_estimator(camera),
         tracker=_tracker(camera),

@@ -16,8 +16,9 @@ from typing import Any, TypeVar
 import msgspec
 import yaml
 
+from flight.commands.peers import peer_networks
 from flight.errors import ConfigError
-from flight.settings import Camera, Config
+from flight.settings import Camera, Commands, Config
 
 T = TypeVar("T")
 S = TypeVar("S", bound=msgspec.Struct)
@@ -269,10 +270,7 @@ def _check_sense(config: Config, name: str, lines: Lines) -> None:
             refuse(f"steps[{index}].at", f"is {times[index]!r}: targets must stand in order of time")
     if config.duration <= times[-1]:
         refuse("duration", f"is {config.duration!r}: the last target is given at {times[-1]!r} s")
-    for index, step in enumerate(config.commands.timeline):
-        given = [name for name in ("mode", "slew", "clear") if getattr(step, name) is not None]
-        if len(given) != 1:
-            refuse(f"commands.timeline[{index}]", f"gives {given}: must give one of mode, slew, clear")
+    _check_commands(config.commands, refuse)
     used = [c for pair in config.coils.channels for c in pair] + list(config.coils.enable_channels or ())
     if len(set(used)) != len(used):
         refuse("coils.channels", f"{used} use a channel of the PWM chip twice")
@@ -282,6 +280,12 @@ def _check_sense(config: Config, name: str, lines: Lines) -> None:
             f"is 0x{config.power_monitor.address:02x}, the PWM chip's: both leave the factory at 0x40, "
             "set the monitor's address pins (0x45) and say so here",
         )
+    # A reading waits for its cycle, and the current that it leads to flows until the next.
+    unit = config.inertial_unit
+    least = 1.0 / unit.rate_hz + 2.0 / config.executive.control_rate_hz
+    if unit.max_age < least:
+        problem = f"is {unit.max_age!r}: at the rates of unit and control it must be {least:g} s at least"
+        refuse("inertial_unit.max_age", problem)
     if config.guidance.replan_period >= config.guidance.horizon:
         refuse("guidance.replan_period", "must be shorter than `guidance.horizon`")
     if config.camera is not None:
@@ -293,6 +297,17 @@ def _check_sense(config: Config, name: str, lines: Lines) -> None:
         norm = math.sqrt(sum(c * c for c in quaternion))
         if abs(norm - 1.0) > 1e-6:
             refuse(dotted, f"has length {norm:.6g}: a quaternion must have length 1")
+
+
+def _check_commands(commands: Commands, refuse: Callable[[str, str], None]) -> None:
+    for index, step in enumerate(commands.timeline):
+        given = [name for name in ("mode", "slew", "clear") if getattr(step, name) is not None]
+        if len(given) != 1:
+            refuse(f"commands.timeline[{index}]", f"gives {given}: must give one of mode, slew, clear")
+    try:
+        peer_networks(commands)
+    except ValueError as error:
+        refuse("commands.peers" if commands.peers else "commands.udp", str(error))
 
 
 def _check_camera(camera: Camera, refuse: Callable[[str, str], None]) -> None:

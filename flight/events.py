@@ -61,6 +61,10 @@ TASK_FAILING = EventKind(8, "task-failing", _FAULT, "the control task fails cycl
 NO_PROGRESS = EventKind(
     9, "no-progress", _FAULT, "a rate group or worker stands still: the watchdog is fed no more"
 )
+SERVICE_FAILING = EventKind(
+    96, "service-failing", _FAULT, "a job beside the loop, as the coils' or the log's, fails or stands still"
+)
+SERVICE_RECOVERED = EventKind(97, "service-recovered", _TOLD, "the jobs beside the loop run again")
 IMU_SILENT = EventKind(10, "imu-silent", _FAULT, "no bytes come from the inertial unit")
 IMU_CORRUPT = EventKind(11, "imu-corrupt", _WARNED, "bytes come from the inertial unit that are no packets")
 IMU_IMPLAUSIBLE = EventKind(12, "imu-implausible", _WARNED, "values out of range or not finite")
@@ -113,6 +117,14 @@ CAMERA_BLACK = EventKind(53, "camera-black", _WARNED, "the frame holds no light,
 VISION_FAILED = EventKind(54, "vision-failed", _WARNED, "vision gave no result, with the reason")
 STREAK_REFUSED = EventKind(55, "streak-refused", _WARNED, "a rate from streaks disagrees with the estimate")
 STARS_REFUSED = EventKind(56, "stars-refused", _WARNED, "the stars' attitude disagrees with the estimate")
+CAMERA_TORN = EventKind(57, "camera-torn", _WARNED, "parts of a frame are of an earlier one")
+CAMERA_STRANGE = EventKind(
+    58, "camera-strange", _WARNED, "many stars in a frame, and no sky that has them: are its pixels in order?"
+)
+VISION_SLOW = EventKind(59, "vision-slow", _WARNED, "vision takes long over a frame")
+CAMERA_LATE = EventKind(
+    66, "camera-late", _WARNED, "a frame comes long after its exposure, or has not come yet"
+)
 LOG_FAULT = EventKind(60, "log-fault", _FAULT, "the flight log cannot be written")
 LOG_RECOVERED = EventKind(65, "log-recovered", _TOLD, "packets reach the disk again")
 STATE_RECOVERED = EventKind(
@@ -120,6 +132,12 @@ STATE_RECOVERED = EventKind(
 )
 STATE_LOST = EventKind(62, "state-lost", _WARNED, "both copies of the kept state are bad: defaults")
 STATE_UNWRITTEN = EventKind(63, "state-unwritten", _WARNED, "the state cannot be kept on disk")
+CONFIG_DAMAGED = EventKind(
+    67, "config-damaged", _WARNED, "the configuration is not the accepted one: the last that flew is flown"
+)
+LEARNED_REFUSED = EventKind(
+    68, "learned-refused", _WARNED, "what an earlier boot learned is not believed: begun without it"
+)
 UNCLEAN_SHUTDOWN = EventKind(64, "unclean-shutdown", _WARNED, "the last boot did not end by itself")
 CLOCK_STEP = EventKind(70, "clock-step", _WARNED, "the wall clock was set; nothing steers by it")
 CPU_HIGH = EventKind(71, "cpu-high", _WARNED, "the control process takes more of a core than it should")

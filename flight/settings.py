@@ -16,6 +16,8 @@ Positive = Annotated[float, Meta(gt=0.0)]
 NotNegative = Annotated[float, Meta(ge=0.0)]
 Q2 = Annotated[float, Meta(ge=-0.7, le=0.7)]
 Address = Annotated[int, Meta(ge=0x08, le=0x77)]
+Bus = Annotated[int, Meta(ge=0, le=0xFFFFF)] | Annotated[str, Meta(pattern=r"^/[A-Za-z0-9_./:+-]+$")]
+Peer = Annotated[str, Meta(pattern=r"^[0-9]{1,3}(\.[0-9]{1,3}){3}(/[0-9]{1,2})?$")]
 Sign = Literal[-1, 1]
 Channel = Annotated[int, Meta(ge=0, le=15)]
 Estimator = Literal["likelihood", "harris", "minimum-eigenvalue", "trajkovic-4", "trajkovic-8"]
@@ -39,7 +41,10 @@ class Plant(Section, frozen=True, kw_only=True):
 
 
 class InertialUnit(Section, frozen=True, kw_only=True):
-    """The VN-100 and its line."""
+    """The VN-100 and its line.
+
+    No coil is driven by a reading that would be older than `max_age` s before the next one is used.
+    """
 
     device: str = "/dev/knightcube-imu"
     baud_rate: Literal[9600, 19200, 38400, 57600, 115200, 230400, 460800, 921600] = 115200
@@ -53,9 +58,9 @@ class InertialUnit(Section, frozen=True, kw_only=True):
 
 
 class Coils(Section, frozen=True, kw_only=True):
-    """The PWM chip, the H-bridges and the coils behind them."""
+    """The PWM chip, the H-bridges and the coils behind them; `bus` is its number or its device file."""
 
-    bus: Annotated[int, Meta(ge=0)] = 1
+    bus: Bus = 1
     address: Address = 0x40
     channels: tuple[tuple[Channel, Channel], tuple[Channel, Channel], tuple[Channel, Channel]] = (
         (0, 1),
@@ -117,7 +122,11 @@ class AravisDevice(Section, frozen=True, kw_only=True, tag_field="kind", tag="ar
 
 
 class Camera(Section, frozen=True, kw_only=True):
-    """The star camera: what flight must know to read its frames; `device` is the real one."""
+    """The star camera: what flight must know to read its frames; `device` is the real one.
+
+    A frame is late `late_after` s after the exposure that it may have waited for; vision is slow after
+    `vision_slow_after` s.
+    """
 
     device: V4l2Device | AravisDevice | None = None
 
@@ -138,6 +147,8 @@ class Camera(Section, frozen=True, kw_only=True):
     endpoint_bias: float | None = None
     mounting: Quaternion = (0.0, 0.0, 0.0, 1.0)
     max_age: Positive = 12.0
+    late_after: Positive = 1.0
+    vision_slow_after: Positive = 1.0
 
 
 class Executive(Section, frozen=True, kw_only=True):
@@ -154,6 +165,9 @@ class Estimation(Section, frozen=True, kw_only=True):
     `*_start` are standard deviations at the start of what is estimated besides: the gyro's bias, rad/s; the
     thread's torsion, 1/s^2, and damping, 1/s, beyond the plant's; the coils' gain; and the age, s, that the
     inertial unit's samples have at their stamp, which may walk by `latency_walk`, s per sqrt(s). Zero: known.
+    `coast` is for how long, s, the model carries the estimate on without a measurement; no coil is driven by
+    what it carries (`inertial_unit.max_age`). Since an earlier boot learned a value it may have `changed` by
+    this part of its standard deviation at the start.
     """
 
     current_noise: NotNegative = 2.0e-3
@@ -167,6 +181,7 @@ class Estimation(Section, frozen=True, kw_only=True):
     gate_sigma: Annotated[float, Meta(ge=3.0)] = 15.0
     history: Positive = 6.0
     coast: Positive = 1.2
+    changed: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.3
 
 
 class Guidance(Section, frozen=True, kw_only=True):
@@ -227,9 +242,9 @@ class Modes(Section, frozen=True, kw_only=True):
 
     After `crash_limit` unclean shutdowns within `crash_window` s of operation the start leads to safe instead
     of `initial`. A slew has arrived within `arrived_angle` rad and `arrived_rate` rad/s for `arrived_for` s;
-    it is late after `slew_limit` s. A hold is impossible that is `hold_error` rad off for `hold_patience` s.
-    A body turns too fast to hold or slew beyond `tumble_rate` rad/s. Without an estimate for `blind_limit` s
-    the mode is safe.
+    it is late after `slew_limit` s. A hold is impossible that is `hold_error` rad off for `hold_patience` s;
+    a target of the demonstration is to be held from the end of the first path to it on. A body turns too fast
+    to hold or slew beyond `tumble_rate` rad/s. Without an estimate for `blind_limit` s the mode is safe.
     """
 
     initial: PlainMode = "testbed-demo"
@@ -293,10 +308,15 @@ class CommandStep(Section, frozen=True, kw_only=True):
 
 
 class Commands(Section, frozen=True, kw_only=True):
-    """Where commands come from: a UNIX datagram socket, a UDP address (HOST:PORT), and a time line."""
+    """Where commands come from: a UNIX datagram socket, a UDP address (HOST:PORT), and a time line.
+
+    `peers` are the IPv4 addresses and subnets that UDP is open to, both ways; without them those of `udp`
+    itself: the machine where that is a loopback address, the 256 addresses around it where it is another.
+    """
 
     socket: Annotated[str, Meta(min_length=1, max_length=100)] | None = None
     udp: Annotated[str, Meta(pattern=r"^[^:\s]+:[0-9]{1,5}$")] | None = None
+    peers: Annotated[tuple[Peer, ...], Meta(min_length=1)] | None = None
     timeline: tuple[CommandStep, ...] = ()
 
 

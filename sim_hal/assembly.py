@@ -10,6 +10,7 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -26,11 +27,13 @@ from sim_hal.emulators.vn100 import Vn100Emulator, Vn100EmulatorSettings
 from sim_hal.emulators.vn100_sensors import NoiseProfile
 from sim_hal.faults.timeline import FaultTimeline
 from sim_hal.settings import Simulation, Sky
-from sim_hal.star_camera import StarCameraModel, render
 from sim_hal.truth import TruthRecorder
 from sim_hal.world.coil_circuit import CoilCircuit
 from sim_hal.world.simulation import TimedSimulation
 from sim_hal.world.testbed import Testbed, TestbedModel
+
+if TYPE_CHECKING:
+    from sim_hal.star_camera import StarCameraModel
 
 _LINE_STREAM = 0x11E
 _FAULT_STREAM = 0xFA017
@@ -156,6 +159,9 @@ def fault_generator(seed: int) -> np.random.Generator:
 
 def camera_model(camera: Camera, sky: Sky) -> StarCameraModel:
     """Return the optics and detector of an emulated camera."""
+    # Of no use to a server, whose frames another process renders: half of its start.
+    from sim_hal.star_camera import StarCameraModel  # noqa: PLC0415
+
     return StarCameraModel(
         columns=camera.columns,
         rows=camera.rows,
@@ -184,6 +190,8 @@ class StarRenderer:
 
     def render(self, sequence: int, times: FloatArray, attitudes: FloatArray) -> Image:
         """Return frame `sequence`, exposed along `attitudes` (k, 4) at `times` (k,) s."""
+        from sim_hal.star_camera import render  # noqa: PLC0415 - see `camera_model`
+
         generator = np.random.default_rng([self._seed, sequence])
         return render(self._model, self._directions, self._magnitudes, times, attitudes, generator)
 

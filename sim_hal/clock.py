@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Protocol
 
+from hal.buses.contained_job import ContainedJob
 from hal.interfaces.wires import Ticker
 
 
@@ -86,15 +87,14 @@ class SimClock:
             self._running_jobs = False
 
 
-class SimTicker:
+class SimTicker(ContainedJob):
     """A job on simulated time; a kick runs it on the spot."""
 
     def __init__(self, clock: SimClock, name: str, period_ns: int, job: Callable[[], None]) -> None:
-        self.name = name
+        super().__init__(name, job, clock.now_ns)
         self.period_ns = period_ns
         self.due_ns = clock.now_ns() + period_ns
         self._clock = clock
-        self._job = job
         self._busy = False
 
     def kick(self) -> None:
@@ -108,7 +108,7 @@ class SimTicker:
             return
         self._busy = True
         try:
-            self._job()
+            super().run()
         finally:
             self._busy = False
 

@@ -89,6 +89,7 @@ class DeviceServer:
         self._stopped = False
         self._log = FlightLog(folder, "truth", clock=self._clock)
         self._pool = _renderer_pool(config, section)
+        self._rendering: Future[Image] | None = None
         self._pty = PtyLine(config.inertial_unit.baud_rate, line_generator(section.seed))
         self.hardware: Hardware = assemble(
             config, section, self._clock.now_ns, self._pty, TruthRecorder(self._log), self._expose
@@ -148,7 +149,11 @@ class DeviceServer:
 
     def _expose(self, sequence: int, times: FloatArray, attitudes: FloatArray) -> Future[Image]:
         assert self._pool is not None
-        return self._pool.submit(_render, sequence, times, attitudes)
+        # The exposure before has its frame by now, or is abandoned: to make that first would delay this one.
+        if self._rendering is not None:
+            self._rendering.cancel()
+        self._rendering = self._pool.submit(_render, sequence, times, attitudes)
+        return self._rendering
 
     def _accept(self) -> None:
         line, _ = self._listener.accept()
@@ -223,7 +228,7 @@ def _describe(frame: Frame) -> list[Any]:
 
 
 def _renderer_pool(config: Config, section: Simulation) -> ProcessPoolExecutor | None:
-    """Start the rendering process, and have it load the sky before the first frame is wanted."""
+    """Start the rendering process, which loads the sky at once. Nobody waits: no frame is exposed yet."""
     if config.camera is None:
         return None
     pool = ProcessPoolExecutor(
@@ -232,5 +237,5 @@ def _renderer_pool(config: Config, section: Simulation) -> ProcessPoolExecutor |
         initializer=_prepare_renderer,
         initargs=(config.camera, section.sky, section.seed),
     )
-    pool.submit(os.getpid).result()
+    pool.submit(os.getpid)
     return pool

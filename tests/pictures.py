@@ -15,14 +15,15 @@ from matplotlib.figure import Figure
 
 from flight import catalogue
 from flight import config as configuration
-from flight.app import Order, fly
+from flight.app.flight import fly
+from flight.app.order import Order
+from flight.believed_plant import plant_of
 from flight.camera import camera_model
 from flight.guidance.vmc import plan
 from flight.horizon.nadir import find_nadir
 from flight.horizon.picture import draw_horizon
 from flight.horizon.solution import HorizonStatus
 from flight.images import grey_stretch, write_picture
-from flight.loop import plant_of
 from flight.quaternion import about_axis_y, from_rotation_vector, multiply
 from flight.report import draw, draw_path
 from flight.startracker.build import default_index

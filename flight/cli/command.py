@@ -8,9 +8,9 @@ import os
 import socket
 import sys
 import tempfile
-from datetime import UTC, datetime
 from pathlib import Path
 
+from flight.app.utc_label import utc_ns
 from flight.commands.codec import ChangeMode, Clear, Command, CommandPacker, Ping, Slew
 from flight.errors import FlightError, UsageError
 from flight.modes.mode import COMMANDS, Mode
@@ -49,13 +49,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def command(options: argparse.Namespace) -> int:
     """Send, wait, print."""
-    data = CommandPacker().pack(_command_of(options), _label())
+    data = CommandPacker().pack(_command_of(options), utc_ns())  # tells it from all others
     raw = exchange(options.to, data, options.timeout)
     try:
         (row,) = decode(raw)[COMMAND.name]
+        mode = Mode(int(row["mode"]))
     except (TelemetryError, ValueError) as error:
         raise FlightError(f"{options.to}: its answer of {len(raw)} bytes is none") from error
-    obeyed, mode, text = bool(row["obeyed"]), Mode(int(row["mode"])), to_text(row["text"])
+    obeyed, text = bool(row["obeyed"]), to_text(row["text"])
     if options.json:
         facts = {"obeyed": obeyed, "mode": mode.label, "text": text, "count": int(row["count"])}
         sys.stdout.write(json.dumps(facts) + "\n")
@@ -73,7 +74,7 @@ def exchange(to: str, data: bytes, timeout: float) -> bytes:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
             return _ask(line, (host, int(port)), data, timeout, to)
     with (
-        tempfile.TemporaryDirectory(prefix="knightcube-") as folder,
+        tempfile.TemporaryDirectory(prefix="knightcube-", dir=_answering_place(Path(to))) as folder,
         socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as line,
     ):
         own = os.path.join(folder, "answer")
@@ -81,6 +82,15 @@ def exchange(to: str, data: bytes, timeout: float) -> bytes:
         line.bind(own)
         os.chmod(own, 0o777)
         return _ask(line, to, data, timeout, to)
+
+
+def _answering_place(to: Path) -> Path | None:
+    """Return the folder where a flight reaches our socket: its own in /run, None for that of temporary files.
+
+    A service (`deploy/knightcube.service`) has temporary files to itself.
+    """
+    beside = to.absolute().parent
+    return beside if beside.is_relative_to("/run") and os.access(beside, os.W_OK | os.X_OK) else None
 
 
 def _ask(line: socket.socket, address: str | tuple[str, int], data: bytes, timeout: float, to: str) -> bytes:
@@ -95,11 +105,6 @@ def _ask(line: socket.socket, address: str | tuple[str, int], data: bytes, timeo
         return line.recv(LONGEST_PACKET)
     except OSError as error:
         raise FlightError(f"{to}: no answer within {timeout:g} s") from error
-
-
-def _label() -> int:
-    """Return what tells this packet from all others: UTC in ns."""
-    return round(datetime.now(UTC).timestamp() * 1e9)
 
 
 def _command_of(options: argparse.Namespace) -> Command:

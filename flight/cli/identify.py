@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from flight import config as configuration
+from flight.app.order import Order
 from flight.cli.pictures import positive
 from flight.cli.run import progress_line, seed_number
 from flight.errors import UsageError
@@ -116,7 +117,8 @@ def _flown(options: argparse.Namespace) -> Path:
 
 def _fly(options: argparse.Namespace) -> Path:
     """Fly the excitation; return the folder of the run."""
-    from flight.app import Order, default_folder, fly  # noqa: PLC0415 - only who flies needs devices
+    from flight.app.flight import fly  # noqa: PLC0415 - only who flies needs devices
+    from flight.app.run_folder import default_folder  # noqa: PLC0415
 
     config = excitation_config(configuration.load(options.source), options.duration or DURATION)
     out = options.run or default_folder(Path(f"{options.source.stem}-identify"))

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from flight import config as configuration
+from flight.believed_plant import plant_of
 from flight.guidance.vmc import NODES, Plan, plan
-from flight.loop import plant_of
 from flight.plant import SingleAxisPlant
 
 _DEFAULT_CONFIG = Path("config/step_demo.yaml")

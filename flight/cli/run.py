@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TextIO
 
-from flight.loop import Progress
+from flight.app.order import Order
+from flight.loop.progress import Progress
 from flight.telemetry.reader import read_run
 
 
@@ -52,7 +54,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def _faults_help() -> str:
     """Return how faults are written, and all of them."""
-    from flight.app import fault_catalogue  # noqa: PLC0415 - for those who ask for help only
+    from flight.app.simulated import fault_catalogue  # noqa: PLC0415 - for those who ask for help only
 
     grammar, listing = fault_catalogue()
     return (
@@ -65,11 +67,16 @@ def _faults_help() -> str:
 
 def run(options: argparse.Namespace) -> int:
     """Fly, showing progress on standard error when it is a terminal."""
-    from flight.app import Order, default_folder, fly  # noqa: PLC0415 - no other command needs devices
+    from flight.app.flight import fly  # noqa: PLC0415 - no other command needs devices
+    from flight.app.run_folder import default_folder  # noqa: PLC0415
+    from flight.kept_config import choose  # noqa: PLC0415
 
+    config, problem = choose(options.config, os.environ)
+    if problem:
+        sys.stderr.write(f"flight: {problem}\n")
     out = options.out or default_folder(options.config)
     order = Order(
-        options.config,
+        config,
         out,
         options.realtime,
         options.duration,
@@ -77,6 +84,7 @@ def run(options: argparse.Namespace) -> int:
         options.devices,
         options.archive,
         tuple(options.fault),
+        problem,
     )
     begun = time.perf_counter()
     with_line = sys.stderr.isatty()
@@ -96,11 +104,14 @@ def run(options: argparse.Namespace) -> int:
             "elapsed_s": elapsed,
             "packets": None if flown is None else len(flown),
             "log_error": outcome.log_error or None,
+            "faults": outcome.faults,
         }
         sys.stdout.write(json.dumps(facts) + "\n")
     else:
+        broken = f"faults: {'; '.join(outcome.faults)}\n" if outcome.faults else ""
         sys.stdout.write(
             f"flown: {seconds:.0f} s in {elapsed:.1f} s, {outcome.reason}\n"
+            f"{broken}"
             f"log:   {outcome.folder}\n"
             f"next:  python -m flight report {outcome.folder}\n"
         )

@@ -6,6 +6,8 @@ import contextlib
 import os
 import socket
 import stat
+from collections.abc import Sequence
+from ipaddress import IPv4Address, IPv4Network
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -34,11 +36,18 @@ class Channel(Protocol):
 class DatagramChannel:
     """A bound datagram socket."""
 
-    def __init__(self, name: str, bound: socket.socket, path: Path | None = None) -> None:
-        """Take a bound socket; `path` is removed at the end."""
+    def __init__(
+        self,
+        name: str,
+        bound: socket.socket,
+        path: Path | None = None,
+        peers: Sequence[IPv4Network] | None = None,
+    ) -> None:
+        """Take a bound socket; `path` is removed at the end, only `peers` are listened to where given."""
         self.name = name
         self._socket = bound
         self._path = path
+        self._peers = peers
         bound.setblocking(False)
 
     def poll(self) -> list[tuple[bytes, Any]]:
@@ -46,9 +55,11 @@ class DatagramChannel:
         found = []
         for _ in range(AT_MOST):
             try:
-                found.append(self._socket.recvfrom(LONGEST + 1))
+                data, sender = self._socket.recvfrom(LONGEST + 1)
             except OSError:  # nothing there, or a sender that is gone
                 break
+            if self._peers is None or any(IPv4Address(sender[0]) in peers for peers in self._peers):
+                found.append((data, sender))
         return found
 
     def answer(self, data: bytes, sender: Any) -> None:
@@ -89,8 +100,8 @@ def open_unix(path: Path) -> DatagramChannel:
     return DatagramChannel("socket", bound, path)
 
 
-def open_udp(address: str) -> DatagramChannel:
-    """Bind a UDP socket to HOST:PORT. Raises UsageError."""
+def open_udp(address: str, peers: Sequence[IPv4Network] | None = None) -> DatagramChannel:
+    """Bind a UDP socket to HOST:PORT; only `peers` are listened to where given. Raises UsageError."""
     host, _, port = address.rpartition(":")
     bound = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
@@ -98,7 +109,7 @@ def open_udp(address: str) -> DatagramChannel:
     except (OSError, OverflowError) as error:
         bound.close()
         raise UsageError(f"commands.udp: {address} cannot be listened to: {error}") from error
-    return DatagramChannel("udp", bound)
+    return DatagramChannel("udp", bound, peers=peers)
 
 
 def _is_served(path: Path) -> bool:

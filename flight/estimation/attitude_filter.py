@@ -18,11 +18,20 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtri
 
 from flight.arrays import FloatArray
+from flight.estimation import chi_square
 from flight.estimation.commands import CommandHistory
-from flight.estimation.estimate import BIAS, DISTURBANCE, FIELD_BIAS, LATENCY, RATE, TURN, Estimate
+from flight.estimation.estimate import (
+    BIAS,
+    DISTURBANCE,
+    FIELD_BIAS,
+    LATENCY,
+    PARAMETERS,
+    RATE,
+    TURN,
+    Estimate,
+)
 from flight.estimation.latency import LONGEST_LATENCY
 from flight.estimation.measurements import (
     AttitudeMeasurement,
@@ -33,6 +42,7 @@ from flight.estimation.measurements import (
 from flight.estimation.propagation import LONGEST_STEP, ProcessNoise
 from flight.estimation.replay import Checkpoint, Model, Replay
 from flight.estimation.rigid_body import RigidBody
+from flight.estimation.slow_prior import SlowPrior
 from flight.estimation.state import SIZE, State
 from flight.estimation.turn import exponential, twist
 
@@ -56,6 +66,7 @@ class FilterSettings:
         field_bias_start: T, standard deviation of the magnetometer's bias at the start, zero without one.
         field_bias_walk: T per sqrt(s), the random walk of that bias, and of the field model's error with it.
         rate_walk: rad/s per sqrt(s), white acceleration beside that of the coils.
+        unknown_current: A, of each coil while it is not known what they carry.
         gate_sigma: a measurement is refused that is less likely than this many sigma of one component.
         history_ns: how late a measurement may come and still be used.
         longest_step: s, between measurements; a body that turns slowly may take longer ones.
@@ -75,10 +86,14 @@ class FilterSettings:
     field_bias_start: float = 0.0
     field_bias_walk: float = 0.0
     rate_walk: float = 0.0
+    unknown_current: float = 0.0
     gate_sigma: float = 5.0
     history_ns: int = 6_000_000_000
     longest_step: float = LONGEST_STEP
 
+
+_UNKNOWN_FOR = 1.0
+"""s: a current that is not known is taken for white noise that wanders as far in this time as it would."""
 
 Told = Callable[[list[bool]], None]
 """Is told of measurements that came late which of them passed the gate."""
@@ -109,11 +124,13 @@ class AttitudeFilter:
     REJECTIONS_AT_THE_START = 3
     """So many are enough when it has taken in no more than it refuses: it began with what is no more true."""
 
-    def __init__(self, body: RigidBody, settings: FilterSettings) -> None:
+    def __init__(self, body: RigidBody, settings: FilterSettings, prior: SlowPrior | None = None) -> None:
+        """Take the body; `prior` is what is known of it by now, by default what the settings say."""
         self._body = body
         self._settings = settings
         free = np.array([0.0, 1.0, 0.0]) if body.suspended else np.ones(3)
         self._free = free
+        self._prior = prior or slow_prior(body, settings)
         noise = ProcessNoise(
             settings.current_noise**2 * settings.control_period,
             np.diag(settings.rate_walk**2 * free),
@@ -125,6 +142,7 @@ class AttitudeFilter:
             ),
             settings.latency_walk**2,
             settings.field_bias_walk**2,
+            settings.unknown_current**2 * _UNKNOWN_FOR,
         )
         self._commands = CommandHistory(body, settings.history_ns)
         gate = {degrees: _gate(settings.gate_sigma, degrees) for degrees in (1, 2, 3)}
@@ -138,23 +156,41 @@ class AttitudeFilter:
         self.restarts = 0
         self.nis = math.nan
 
-    def command(self, time_ns: int, currents: FloatArray, field: FloatArray | None = None) -> None:
+    def command(
+        self, time_ns: int, currents: FloatArray, field: FloatArray | None = None, known: bool = True
+    ) -> None:
         """Note the coil currents (3,) A in force from `time_ns` on, and the field (3,) T, reference axes.
 
         Commands come in order of time, each before the measurements taken under it. Without `field` the
-        body's own is meant.
+        body's own is meant. Currents that are not `known` are no more than a guess.
         """
-        self._commands.note(time_ns, currents, field)
+        self._commands.note(time_ns, currents, field, known)
+
+    def doubt(self, since_ns: int) -> None:
+        """Learn that the currents noted since then may not have flown.
+
+        What was measured since is applied once more, a part of the work at each `catch_up`: what looked like
+        a disturbance, or like a plant of other parameters, may have been a current.
+        """
+        self.catch_up()
+        self._commands.doubt(since_ns)
+        self._refused_in_a_row = {}
+        index = max(self._index_before(since_ns), 1)
+        again = [checkpoint.measurement for checkpoint in self._history[index:]]
+        if again:
+            base = self._history[index - 1]
+            self._catching_up = _CatchingUp(base, Replay(self._model, base, again), (), lambda _: None)
 
     def start(self, attitude: AttitudeMeasurement, rate: RateMeasurement) -> None:
         """Begin from one attitude and one rate; of a suspended body, from what they say about the thread."""
         settings, free = self._settings, self._free
         a, b, c, d = attitude.quaternion.tolist()
         quaternion = exponential(0.0, twist((a, b, c, d)), 0.0) if self._body.suspended else (a, b, c, d)
-        x, y, z = (free * rate.rate).tolist()
+        prior = self._prior
+        x, y, z = (free * (rate.rate - prior.bias)).tolist()
         turn_variance = attitude.covariance * np.outer(free, free)
         rate_variance = rate.covariance * np.outer(free, free)
-        bias_variance = np.diag(settings.bias_start**2 * free)
+        bias_variance = prior.bias_covariance
         covariance = np.zeros((SIZE, SIZE))
         covariance[TURN, TURN] = turn_variance
         # The gyro gives the sum of rate and bias: what one has too much the other has too little.
@@ -162,17 +198,17 @@ class AttitudeFilter:
         covariance[RATE, BIAS] = covariance[BIAS, RATE] = -bias_variance
         covariance[BIAS, BIAS] = bias_variance
         covariance[DISTURBANCE, DISTURBANCE] = np.diag(settings.disturbance_start**2 * free)
-        if self._body.suspended:
-            covariance[12, 12], covariance[13, 13] = settings.torsion_start**2, settings.damping_start**2
-        covariance[14, 14] = settings.gain_start**2
+        covariance[PARAMETERS, PARAMETERS] = prior.parameters_covariance
         covariance[FIELD_BIAS, FIELD_BIAS] = settings.field_bias_start**2 * np.eye(3)
-        state = State(quaternion, (x, y, z), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), self._body.parameters)
+        bx, by, bz = prior.bias.tolist()
+        none = (0.0, 0.0, 0.0)
+        state = State(quaternion, (x, y, z), (bx, by, bz), none, prior.parameters, latency=prior.latency)
         newest: Measurement = attitude if attitude.time_ns >= rate.time_ns else rate
         # The older both are, the further the body has gone on: the errors of all three go together.
         age = np.zeros(SIZE)
         age[TURN], age[RATE] = (x, y, z), self._model.motion(state, covariance, newest.time_ns).acceleration
         age[LATENCY] = 1.0
-        covariance += settings.latency_start**2 * np.outer(age, age)
+        covariance += prior.latency_variance * np.outer(age, age)
         self._history = [Checkpoint(newest, True, state, covariance)]
         self._give_up_branch()
         self._refused_in_a_row = {}
@@ -248,7 +284,7 @@ class AttitudeFilter:
     @property
     def latency(self) -> float:
         """By how much the inertial unit's samples are older than they say, s, within reason."""
-        found = self._history[-1].state.latency if self._history else 0.0
+        found = self._history[-1].state.latency if self._history else self._prior.latency
         return min(max(found, 0.0), LONGEST_LATENCY)
 
     def at(self, time_ns: int) -> Estimate:
@@ -334,10 +370,22 @@ class AttitudeFilter:
             del self._history[: min(keep, len(self._history) - 1)]
 
 
+def slow_prior(body: RigidBody, settings: FilterSettings) -> SlowPrior:
+    """Return what the settings say of the slow parts of a body that nothing was learned of."""
+    free = np.array([0.0, 1.0, 0.0]) if body.suspended else np.ones(3)
+    thread = (settings.torsion_start**2, settings.damping_start**2) if body.suspended else (0.0, 0.0)
+    return SlowPrior(
+        bias_covariance=np.diag(settings.bias_start**2 * free),
+        parameters=body.parameters,
+        parameters_covariance=np.diag([*thread, settings.gain_start**2]),
+        latency_variance=settings.latency_start**2,
+    )
+
+
 def _time_of(checkpoint: Checkpoint) -> int:
     return checkpoint.measurement.time_ns
 
 
 def _gate(sigma: float, degrees: int) -> float:
     """Return the chi-square bound of `degrees` that is passed as seldom as `sigma` of one component."""
-    return float(chdtri(degrees, math.erfc(sigma / math.sqrt(2.0))))
+    return chi_square.bound(math.erfc(sigma / math.sqrt(2.0)), degrees)

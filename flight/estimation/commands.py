@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bisect
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -24,9 +25,9 @@ class CommandHistory:
     def __len__(self) -> int:
         return len(self._times)
 
-    def note(self, time_ns: int, currents: FloatArray, field: FloatArray | None) -> None:
+    def note(self, time_ns: int, currents: FloatArray, field: FloatArray | None, known: bool = True) -> None:
         """Note the coil currents (3,) A in force from `time_ns` on, in the field (3,) T, reference axes."""
-        torquing = self._body.torquing(currents, field)
+        torquing = self._body.torquing(currents, field, known)
         if self._torquings and self._torquings[-1] == torquing:
             return
         self._times.append(time_ns)
@@ -34,6 +35,14 @@ class CommandHistory:
         oldest = bisect.bisect_right(self._times, time_ns - self._history_ns) - 1
         if oldest > 64:  # now and then, not each cycle
             del self._times[:oldest], self._torquings[:oldest]
+
+    def doubt(self, since_ns: int) -> None:
+        """Take nothing that was noted for the time from `since_ns` on for known."""
+        first = bisect.bisect_left(self._times, since_ns)
+        if self._torquings and (first == len(self._times) or self._times[first] > since_ns):
+            self._torquings.insert(first, self.at(since_ns))
+            self._times.insert(first, since_ns)
+        self._torquings[first:] = [replace(torquing, known=False) for torquing in self._torquings[first:]]
 
     def at(self, time_ns: int) -> Torquing:
         """Return what the coils do at a time."""

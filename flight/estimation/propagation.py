@@ -24,7 +24,8 @@ class ProcessNoise(NamedTuple):
     """What drives the state beside the model: spectral densities.
 
     `current` of one driven coil, A^2 s; `rate` (3, 3) rad^2/s^3; `walks` (6,) of bias (rad^2/s^3)
-    and disturbance (rad^2/s^5); `latency` of that, s; `field_bias` of that, T^2/s.
+    and disturbance (rad^2/s^5); `latency` of that, s; `field_bias` of that, T^2/s; `unknown_current` of each
+    coil while it is not known what they do, A^2 s.
     """
 
     current: float
@@ -32,6 +33,7 @@ class ProcessNoise(NamedTuple):
     walks: FloatArray
     latency: float = 0.0
     field_bias: float = 0.0
+    unknown_current: float = 0.0
 
 
 def carry(
@@ -104,6 +106,8 @@ def _add_noise(
     density = noise.rate
     if noise.current and any(torquing.driven):
         density = density + noise.current * ((by_current * torquing.driven) @ by_current.T)
+    if not torquing.known:
+        density = density + noise.unknown_current * (by_current @ by_current.T)
     cross = (0.5 * dt * dt) * density
     covariance[TURN, TURN] += (dt**3 / 3.0) * density
     covariance[TURN, RATE] += cross

@@ -39,11 +39,15 @@ NOMINAL = Parameters()
 
 @dataclass(frozen=True, slots=True)
 class Torquing:
-    """What the coils do: dipole moment (body, A m^2) in a field (reference, T); which of them are driven."""
+    """What the coils do: dipole moment (body, A m^2) in a field (reference, T); which of them are driven.
+
+    What they do is not `known` where the PWM chip does not answer to its commands: any of them may be driven.
+    """
 
     dipole: Vector
     field: Vector
     driven: tuple[bool, bool, bool]
+    known: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,12 +111,14 @@ class RigidBody:
         object.__setattr__(self, "_response", _rows(response))
         object.__setattr__(self, "_inertia", _rows(inertia))
 
-    def torquing(self, currents: FloatArray, reference_field: FloatArray | None = None) -> Torquing:
+    def torquing(
+        self, currents: FloatArray, reference_field: FloatArray | None = None, known: bool = True
+    ) -> Torquing:
         """Return what `currents` (3,) A do in `reference_field` (3,) T, by default the body's own."""
         x, y, z = (float(i) for i in currents)
         bx, by, bz = (float(b) for b in (self.field if reference_field is None else reference_field))
         n = self.dipole_per_ampere
-        return Torquing((n * x, n * y, n * z), (bx, by, bz), (x != 0.0, y != 0.0, z != 0.0))
+        return Torquing((n * x, n * y, n * z), (bx, by, bz), (x != 0.0, y != 0.0, z != 0.0), known)
 
     @property
     def parameters(self) -> Parameters:

@@ -24,6 +24,7 @@ SLAB_BYTES = 64 * 1024 * 1024
 """Room for a job's arrays: address space, not memory, until it is used."""
 
 _HEADER = struct.Struct("<QQ")
+_CHUNK_BYTES = 1 << 16
 
 
 def pack_message(value: Any, slab: mmap.mmap) -> bytes:
@@ -71,6 +72,7 @@ class _WorkerProcess:
         self.worker = worker
         self.submitted_ns = -1
         self._received = bytearray()
+        self._chunk = memoryview(bytearray(_CHUNK_BYTES))
         memory = os.memfd_create(f"knightcube-{worker.name}")
         os.ftruncate(memory, SLAB_BYTES)
         self._slab = mmap.mmap(memory, SLAB_BYTES)
@@ -106,8 +108,9 @@ class _WorkerProcess:
     def receive(self) -> tuple[bool, Any]:
         """Return (True, message) when one has arrived, else (False, None). Raises EOFError at a death."""
         try:
-            while chunk := self._socket.recv(1 << 20):
-                self._received += chunk
+            # Into room that is there: this is asked in every cycle, mostly in vain.
+            while taken := self._socket.recv_into(self._chunk):
+                self._received += self._chunk[:taken]
             raise EOFError(self.worker.name)
         except BlockingIOError:
             pass

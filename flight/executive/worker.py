@@ -1,11 +1,12 @@
 """The other end of `flight.executive.processes`: serves one function until its socket closes.
 
-Run as `python -m flight.executive.worker MODULE:FUNCTION SOCKET_FD MEMORY_FD`, by the runner only.
+What the control process need not hold the function's module imports in its `prepare`, if it has one: that is
+called before the first job. Run as `python -m flight.executive.worker MODULE:FUNCTION SOCKET_FD MEMORY_FD`,
+by the runner only.
 """
 
 from __future__ import annotations
 
-import ctypes
 import importlib
 import mmap
 import os
@@ -14,6 +15,7 @@ import sys
 import time
 from typing import Any
 
+from flight.executive.memory import give_back
 from flight.executive.processes import SLAB_BYTES, message_length, pack_message, unpack_message
 
 
@@ -27,17 +29,8 @@ def serve(function: Any, line: socket.socket, slab: mmap.mmap) -> None:
             del received[:length]
             line.sendall(pack_message(_run(function, argument), slab))
             del argument
+            # The result is on its way: nobody waits for this.
             give_back()
-
-
-def give_back() -> None:
-    """Return to the machine what the job's arrays took: glibc would keep them, tens of MB for a frame.
-
-    After the result is on its way, so that nobody waits for it (about 2 ms). Does nothing with another libc.
-    """
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim is not None:
-        trim(0)
 
 
 def _run(function: Any, argument: Any) -> tuple[str, Any, str, int]:
@@ -49,12 +42,18 @@ def _run(function: Any, argument: Any) -> tuple[str, Any, str, int]:
     return "done", value, "", time.perf_counter_ns() - begun
 
 
+def _nothing() -> None:
+    """Be prepared without more."""
+
+
 def main(arguments: list[str]) -> None:
     """Import the function, then serve."""
     function_name, socket_fd, memory_fd = arguments
     module, _, name = function_name.partition(":")
     os.nice(5)  # the control loop comes first
-    function = getattr(importlib.import_module(module), name)
+    home = importlib.import_module(module)
+    getattr(home, "prepare", _nothing)()
+    function = getattr(home, name)
     line = socket.socket(fileno=int(socket_fd))
     slab = mmap.mmap(int(memory_fd), SLAB_BYTES)
     serve(function, line, slab)

@@ -24,6 +24,7 @@ class CoilFault(Enum):
     B_LOW = "input B's leg stuck low: no current in the negative direction"
     A_HIGH = "input A's leg stuck high: current at zero command"
     B_HIGH = "input B's leg stuck high: current at zero command"
+    HIGH = "a leg stuck high: current at zero command, gone while its bridge is braked"
     REVERSED = "reversed: it turns the body the wrong way"
     UNCERTAIN = "broken in one of several ways"
 
@@ -53,14 +54,31 @@ class Bounds:
         uncertainty: A, of each driven coil.
         gain: relative, common to all readings.
         noise: A, of the monitor.
-        range_share: part of the range in its window by which a mean of five conversions may miss the mean.
     """
 
     full_current: tuple[float, float, float]
     uncertainty: float
     gain: float
     noise: float
-    range_share: float = 0.25
+
+
+@dataclass(frozen=True, slots=True)
+class Sampling:
+    """How a reading samples the chopped and changing current of its window.
+
+    Attributes:
+        scatter: relative, by which it may miss what is chopped.
+        range_share: part of the range in its window by which it may miss the mean.
+    """
+
+    scatter: float
+    range_share: float
+
+
+NEWEST = Sampling(0.2, 1.0)
+"""A single conversion, somewhere in its window; 18 % (`hal.drivers.ina219`)."""
+MEAN = Sampling(0.02, 0.25)
+"""The mean of five, over the window; the 7 % are the gain's, which is common to readings in a row."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,17 +88,18 @@ class Foretold:
     current: float
     mean: FloatArray
     slack: FloatArray
+    scatter: float
 
 
-def foretell(current: float, commands: FloatArray, bounds: Bounds) -> Foretold:
+def foretell(current: float, commands: FloatArray, bounds: Bounds, sampling: Sampling) -> Foretold:
     """Work out what each variant would have drawn under the commands (k, 3) A of a reading's window."""
     drawn = np.empty((3, len(_VARIANTS), len(commands)))
     for axis in range(3):
         for place, fault in enumerate(_VARIANTS):
             drawn[axis, place] = supply_current(commands[:, axis], fault, bounds.full_current[axis])
     driven = np.count_nonzero(drawn, axis=2) / len(commands)
-    slack = bounds.uncertainty * driven + bounds.range_share * np.ptp(drawn, axis=2)
-    return Foretold(current, drawn.mean(axis=2), slack)
+    slack = bounds.uncertainty * driven + sampling.range_share * np.ptp(drawn, axis=2)
+    return Foretold(current, drawn.mean(axis=2), slack, sampling.scatter)
 
 
 def supply_current(command: FloatArray, fault: CoilFault | None, full: float) -> FloatArray:
@@ -133,7 +152,8 @@ def fits(
     factors = _SHORTED_FACTORS if own.any() else np.ones(1)
     scales = np.linspace(1.0 - bounds.gain, 1.0 + bounds.gain, 9)
     explained = scales[:, None, None] * mean + factors[None, :, None] * own
-    spare = slack + 0.02 * explained + _SHORTED_SLACK * factors[None, :, None] * own
+    scatter = np.array([one.scatter for one in evidence])
+    spare = slack + scatter * explained + _SHORTED_SLACK * factors[None, :, None] * own
     inside = (current >= explained - spare) & (current <= explained + spare + free)
     misses = len(evidence) - int(inside.sum(axis=2).max())
     return misses <= _OUTLIERS * len(evidence)

@@ -3,12 +3,14 @@
 For the loop (all calls are cheap, none waits):
 
     watch = CoilWatch(CoilWatchSettings(full_current=..., ...))
-    watch.commanded(time_ns, currents)   # each cycle: what is on the wire (CoilState.current)
+    watch.commanded(time_ns, currents, braked)   # each cycle: what is on the wire (CoilState)
     watch.interrupted()                  # in cycles in which the driver does not know what is on the wire
     watch.felt(time_ns, rate, field)     # each sample of the inertial unit: rad/s, T, body axes
     watch.measured(power_reading)        # each look at the monitor; the same reading twice is no matter
     watch.verdicts                       # tuple of CoilVerdict, one an axis at most; they stay until `forget`
-    watch.available, watch.neutral       # (3,) bool and (3,) A, for `flight.control.allocation`
+    watch.available                      # (3,) bool, for `flight.control.allocation`
+    watch.braked                         # which bridges are to be braked now (TorqueCoils.brake)
+    watch.at_rest                        # whether nothing is to be commanded now, for half a second
     watch.suspicion                      # text while the readings fit no healthy circuit, else empty
     watch.probe                          # (3,) A to be added to the commands: zero, or a wave without a mean
     watch.monitor_doubted                # why the monitor, not a coil, is to be doubted; empty when nothing
@@ -20,22 +22,37 @@ it should be (`flight.health.coil_hypotheses`); one is held while it explains th
 began. A verdict is given when healthy is not held and one axis alone is left; where several are left that are
 not driven, a small wave is asked for on each in turn, which tells them apart. A reversed coil is found from
 the angular acceleration (`flight.health.coil_response`), which also tells a monitor that lies from a coil
-that is broken. The bounds are the thesis's 3.5 mA on each coil's current (Sease 2013 ch. 5), the resistance's
-error, and the 7 % that the monitor's windows may miss of the chopped current (`hal.drivers.ina219`).
+that is broken. Current that nobody asked for is told sooner: `flight.health.stuck_leg` brakes what is at
+rest, in every mode; while it is at work no other verdict is given. The bounds are the thesis's 3.5 mA on each
+coil's current (Sease 2013 ch. 5), the resistance's error, and the 18 % by which a single conversion may miss
+the chopped current (`hal.drivers.ina219`).
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
 from flight.arrays import FloatArray
-from flight.health.coil_hypotheses import ELECTRICAL, Bounds, CoilFault, Foretold, fits, foretell
-from flight.health.coil_response import CoilResponse, ResponseSettings
+from flight.health.coil_commands import CoilCommands
+from flight.health.coil_hypotheses import (
+    ELECTRICAL,
+    MEAN,
+    NEWEST,
+    Bounds,
+    CoilFault,
+    Foretold,
+    Sampling,
+    fits,
+    foretell,
+)
+from flight.health.coil_response import CoilResponse
+from flight.health.coil_verdict import CoilVerdict, CoilWatchSettings
+from flight.health.stuck_leg import NONE, Axes, StuckLeg, Supplied
 from hal.interfaces.readings import PowerReading
 
 __all__ = ["CoilFault", "CoilVerdict", "CoilWatch", "CoilWatchSettings"]
@@ -45,54 +62,20 @@ AXES = "xyz"
 BoolArray = npt.NDArray[np.bool_]
 
 
-@dataclass(frozen=True, slots=True)
-class CoilVerdict:
-    """One broken axis: 0, 1, 2 for x, y, z. `neutral` A is the command that makes the axis carry least."""
-
-    axis: int
-    fault: CoilFault
-    time_ns: int
-    neutral: float
-    text: str
-
-
-@dataclass(frozen=True, slots=True)
-class CoilWatchSettings:
-    """What is known of the circuit and of the monitor.
-
-    Attributes:
-        full_current: A, of a coil that is fully on: supply voltage over resistance.
-        current_uncertainty: A, bound on each driven coil's current beside its command.
-        gain_error: relative bound: resistance, supply, and the monitor's windows in the chopped current.
-        monitor_noise: A, bound, at any current.
-        window_ns: how far back a reading reaches. Readings further apart than this begin anew.
-        persistence: readings in a row without a healthy explanation until there is a suspicion.
-        settle: readings after that until one tells of the time after the fault only.
-        evidence: readings that a verdict takes.
-        probe_current: A, of the wave by which axes that are not driven are told apart.
-        probe_half_ns: half of its period.
-        response: how the body answers to the coils; None where it cannot tell.
-    """
-
-    full_current: tuple[float, float, float]
-    current_uncertainty: float = 3.5e-3
-    gain_error: float = 0.2
-    monitor_noise: float = 1.5e-3
-    window_ns: int = 1_100_000_000
-    persistence: int = 3
-    settle: int = 5
-    evidence: int = 3
-    probe_current: float = 0.04
-    probe_half_ns: int = 1_300_000_000
-    response: ResponseSettings | None = None
-
-
 # A leg stuck high drives its coil all the time, one way or the other.
 _STUCK = {CoilFault.A_HIGH: 1.0, CoilFault.B_HIGH: -1.0}
+_BRAKED = {CoilFault.A_HIGH, CoilFault.B_HIGH, CoilFault.HIGH}
+_STUCK_EXCESS = 0.3  # of a coil that is fully on: what a leg stuck high draws beyond all doubt
 _LITTLE_FELT = 0.4
+_LEAST_SHORT = 0.02
+"""A; of less that is too much the body would not feel whether the coil carries it."""
 _READING_NS = 200_000_000
 _MOST_EVIDENCE = 40
-_SAMPLES = 45  # of the commands in a window
+_PROOFS = 2  # conversions that must agree on whether a brake is right
+_DOUBTED_FOR_NS = 60_000_000_000
+"""A monitor that lied is not believed for so long where the body cannot bear it out."""
+_IN_DOUBT = 5
+"""Readings until a verdict may be given that leaves open what is wrong with the axis."""
 
 
 class CoilWatch:
@@ -101,20 +84,30 @@ class CoilWatch:
     def __init__(self, settings: CoilWatchSettings) -> None:
         self._settings = settings
         self._bounds = Bounds(
-            settings.full_current, settings.current_uncertainty, settings.gain_error, settings.monitor_noise
+            settings.full_current,
+            settings.current_uncertainty,
+            settings.gain_error,
+            settings.monitor_noise,
         )
-        self._commands: deque[tuple[int, tuple[float, ...]]] = deque()
+        self._commands = CoilCommands(2 * settings.window_ns)
         self._reading_ns = -(1 << 62)
         self._fresh = 0
         self._strange = 0
         self._suspected_ns: int | None = None
         self._judge_ns = 0  # when a verdict may be given in doubt of the kind of fault
+        self._sound_ns = 0  # when a coil that was driven last drew what it should
+        self._unmixed_ns = 0  # from when on a reading's mean tells of one state of the circuit
         self._evidence: deque[Foretold] = deque(maxlen=_MOST_EVIDENCE)
         self._probing: tuple[int, int] | None = None  # axis, and since when
         self._probed: set[int] = set()
         self._response = None if settings.response is None else CoilResponse(settings.response)
         self._verdicts: dict[int, CoilVerdict] = {}
-        self.suspicion = ""
+        self._looked_ns = 0
+        self._leg = StuckLeg(_STUCK_EXCESS * min(settings.full_current))
+        self._unproven: set[int] = set()  # braked on a verdict that no brake has confirmed
+        self._proofs: deque[bool] = deque(maxlen=_PROOFS)
+        self._strangeness = ""
+        self._doubted_ns = -_DOUBTED_FOR_NS
         self.monitor_doubted = ""
 
     @property
@@ -128,23 +121,37 @@ class CoilWatch:
         return np.array([axis not in self._verdicts for axis in range(3)])
 
     @property
-    def neutral(self) -> FloatArray:
-        """Return (3,) A to be commanded beside what is wanted: of a leg stuck high it brakes the coil."""
-        found = self._verdicts
-        return np.array([found[axis].neutral if axis in found else 0.0 for axis in range(3)])
+    def suspicion(self) -> str:
+        """Return why a coil is suspected, empty while none is."""
+        return self._leg.suspicion or self._strangeness
+
+    @property
+    def braked(self) -> Axes:
+        """Return which bridges are to be braked: those with a leg stuck high, or to find out which has."""
+        x, y, z = (
+            asked or (axis in self._verdicts and self._verdicts[axis].fault in _BRAKED)
+            for axis, asked in enumerate(self._leg.brake)
+        )
+        return x, y, z
+
+    @property
+    def at_rest(self) -> bool:
+        """Tell whether nothing is to be commanded now, so that a leg stuck high shows."""
+        return self._leg.rest
 
     def forget(self, axis: int) -> None:
         """Trust an axis again, by command; a fault that lasts will be found again."""
         self._verdicts.pop(axis, None)
+        self._unproven.discard(axis)
         self.interrupted()
 
-    def commanded(self, time_ns: int, currents: FloatArray) -> None:
-        """Tell which currents (3,) A are on the wire from `time_ns` on."""
+    def commanded(self, time_ns: int, currents: FloatArray, braked: Axes = NONE) -> None:
+        """Tell which currents (3,) A are on the wire from `time_ns` on, and which bridges are braked."""
         values = tuple(currents.tolist())
-        self._commands.append((time_ns, values))
-        horizon = time_ns - 2 * self._settings.window_ns
-        while len(self._commands) > 1 and self._commands[1][0] <= horizon:
-            self._commands.popleft()
+        self._commands.note(time_ns, values, braked)
+        # Without readings nobody would end a rest or a brake.
+        if self._leg.is_at_work and time_ns - self._looked_ns > self._settings.window_ns:
+            self._leg.begin_anew()
         if self._response is not None:
             self._response.commanded(time_ns, values)
 
@@ -153,12 +160,14 @@ class CoilWatch:
         if self._response is None or not self._response.felt(time_ns, rate, field):
             return
         for axis in self._response.reversed_axes():
-            if axis not in self._verdicts:
+            # A current that nobody asked for turns the body too.
+            if axis not in self._verdicts and not self.suspicion:
                 self._give(axis, CoilFault.REVERSED, time_ns, self._response.text(axis))
 
     def interrupted(self) -> None:
         """Know nothing of the time until now: the driver cannot say what is on the wire."""
         self._fresh = 0
+        self._leg.begin_anew()
         self._begin_anew()
         if self._response is not None:
             self._response.begin_anew()
@@ -169,16 +178,22 @@ class CoilWatch:
         if gap_ns <= 0 or not self._commands:
             return
         self._reading_ns = reading.time_ns
+        self._look_at_legs(reading)
+        if self._leg.is_at_work:
+            self._unmixed_ns = reading.time_ns
+            if self._suspected_ns is None:
+                self._suspect(self._leg.suspicion)
+            return
         self._fresh = self._fresh + 1 if gap_ns < self._settings.window_ns else 1
-        # The driver's mean fills up again after a gap: until it has, it covers less than the window.
         if self._fresh <= self._settings.settle:
             self._begin_anew()
+            self._unmixed_ns = reading.time_ns
             return
-        taken = foretell(reading.current, self._window(reading.time_ns), self._bounds)
+        taken = self._taken(reading)
         if self._suspected_ns is None:
-            self._look_healthy(taken)
+            self._look_healthy(taken, reading)
         elif reading.time_ns - self._suspected_ns > self._settle_ns:
-            self._evidence.append(taken)
+            self._evidence.extend(taken)
             self._judge(reading.time_ns)
 
     @property
@@ -187,7 +202,7 @@ class CoilWatch:
         wave = np.zeros(3)
         if self._probing is not None and self._commands:
             axis, since_ns = self._probing
-            half = (self._commands[-1][0] - since_ns) // self._settings.probe_half_ns
+            half = (self._commands.newest_ns - since_ns) // self._settings.probe_half_ns
             if half < 2:
                 wave[axis] = self._settings.probe_current * (1.0 if half == 0 else -1.0)
             else:
@@ -200,20 +215,71 @@ class CoilWatch:
 
     @property
     def _known(self) -> dict[int, CoilFault]:
-        return {axis: verdict.fault for axis, verdict in self._verdicts.items()}
+        """Return what the circuit does of each broken axis: one that is braked takes nothing."""
+        return {
+            axis: CoilFault.OPEN if verdict.fault in _BRAKED else verdict.fault
+            for axis, verdict in self._verdicts.items()
+        }
 
-    def _look_healthy(self, taken: Foretold) -> None:
-        if fits([taken], self._bounds, self._known):
+    def _look_at_legs(self, reading: PowerReading) -> None:
+        """Look whether a leg is stuck high, where this conversion was made under the present brakes."""
+        commands = self._commands
+        if commands.braked != self.braked or not commands.is_known_since(reading.newest_since_ns):
+            return
+        self._looked_ns = reading.time_ns
+        seen = commands.supplied(reading, self._bounds, self._known)
+        if self._unproven:
+            self._prove(seen)
+            return
+        found = self._leg.look(seen)
+        if found is not None:
+            text = f"{1e3 * reading.newest:.0f} mA without a command"
+            self._give(found, CoilFault.HIGH, reading.time_ns, text)
+            self.interrupted()
+
+    def _prove(self, seen: Supplied) -> None:
+        """See whether a brake on a mere verdict is right: where a leg is stuck low it drives the coil."""
+        self._proofs.append(self._leg.exceeds(seen))
+        if len(self._proofs) < _PROOFS:
+            return
+        if all(self._proofs):  # back to both inputs low
+            for axis in self._unproven:
+                self._verdicts[axis] = replace(self._verdicts[axis], fault=CoilFault.UNCERTAIN)
+        if len(set(self._proofs)) == 1:
+            self._unproven.clear()
+            self._proofs.clear()
+
+    def _taken(self, reading: PowerReading) -> list[Foretold]:
+        """Return what a reading says: its newest conversion, and its mean where nothing is mixed in it."""
+        windows: list[tuple[float, int, Sampling]] = [(reading.newest, reading.newest_since_ns, NEWEST)]
+        begin_ns = reading.time_ns - self._settings.window_ns
+        if begin_ns >= self._unmixed_ns:
+            windows.append((reading.current, begin_ns, MEAN))
+        return [
+            foretell(current, self._commands.window(since_ns, reading.time_ns), self._bounds, sampling)
+            for current, since_ns, sampling in windows
+        ]
+
+    def _look_healthy(self, taken: list[Foretold], reading: PowerReading) -> None:
+        asked = float(taken[0].mean[:, 0].sum())
+        if all(fits([one], self._bounds, self._known) for one in taken):
             self._strange = 0
             self.monitor_doubted = ""
+            if asked > self._bounds.uncertainty:
+                self._sound_ns = reading.newest_since_ns
             return
         self._strange += 1
         if self._strange >= self._settings.persistence:
-            self._suspected_ns = self._reading_ns
-            self._judge_ns = self._suspected_ns + self._settle_ns + 8 * _READING_NS
-            self._evidence.clear()
-            asked = float(taken.mean[:, 0].sum())
-            self.suspicion = f"supply current {1e3 * taken.current:.0f} mA where {1e3 * asked:.0f} are due"
+            why = f"supply current {1e3 * reading.newest:.0f} mA where {1e3 * asked:.0f} are due"
+            self._suspect(why)
+            if reading.newest > asked > 0.0:
+                self._leg.ask_for_rest(why)
+
+    def _suspect(self, why: str) -> None:
+        self._suspected_ns = self._unmixed_ns = self._reading_ns
+        self._judge_ns = self._reading_ns + self._settle_ns + _IN_DOUBT * _READING_NS
+        self._evidence.clear()
+        self._strangeness = why
 
     def _judge(self, now_ns: int) -> None:
         """Give a verdict if the evidence leaves one axis; give the suspicion up if all is healthy again."""
@@ -239,19 +305,29 @@ class CoilWatch:
             self._look_further(axes, now_ns)
 
     def _conclude(self, axis: int, fault: CoilFault, now_ns: int) -> None:
+        excess = max(one.current - float(one.mean[:, 0].sum()) for one in self._evidence)
+        if fault is CoilFault.SHORTED and excess < _LEAST_SHORT:
+            self._begin_anew()  # too little for the body to bear it out: it may be the monitor
+            return
         if self._body_disagrees(axis, fault):
-            self.monitor_doubted = f"{self.suspicion}; yet the body feels no change of coil {AXES[axis]}"
+            self._doubted_ns = now_ns
+            self.monitor_doubted = f"{self._strangeness}; yet the body feels no change of coil {AXES[axis]}"
         else:
-            self._give(axis, fault, now_ns, self.suspicion)
+            self._give(axis, fault, now_ns, self._strangeness)
+            if fault in _BRAKED:
+                self._unproven.add(axis)
+                self._fresh = 0
         self._begin_anew()
 
     def _body_disagrees(self, axis: int, fault: CoilFault) -> bool:
         """Tell whether the body feels a coil's torque as before, so that the monitor is wrong."""
         if self._response is None or self._suspected_ns is None:
             return False
-        begun_ns = self._suspected_ns - self._settings.window_ns
+        begun_ns = min(self._sound_ns, self._suspected_ns - self._settings.window_ns)
         carried = _STUCK.get(fault, 0.0) * self._settings.full_current[axis]
         felt = self._response.felt_of(axis, carried, begun_ns, self._suspected_ns)
+        if (felt is None or math.isnan(felt)) and self._reading_ns - self._doubted_ns < _DOUBTED_FOR_NS:
+            return True
         if felt is None:
             return fault not in _STUCK and self._response.is_healthy(axis)
         # Without memory of the time before: a coil that is driven at zero command would be felt by now.
@@ -266,17 +342,15 @@ class CoilWatch:
         if not candidates:
             self._evidence.clear()
             self._probed.clear()
-            self._judge_ns = now_ns + 8 * _READING_NS
+            self._judge_ns = now_ns + _IN_DOUBT * _READING_NS
             return
         self._probed.add(candidates[0])
         self._probing = (candidates[0], now_ns)
         self._judge_ns = now_ns + 2 * self._settings.probe_half_ns + _READING_NS
 
     def _give(self, axis: int, fault: CoilFault, now_ns: int, why: str) -> None:
-        full = self._settings.full_current[axis]
-        neutral = {CoilFault.A_HIGH: -full, CoilFault.B_HIGH: full}.get(fault, 0.0)
         text = f"coil {AXES[axis]} {fault.value} ({why})"
-        self._verdicts[axis] = CoilVerdict(axis, fault, now_ns, neutral, text)
+        self._verdicts[axis] = CoilVerdict(axis, fault, now_ns, text)
 
     def _begin_anew(self) -> None:
         self._strange = 0
@@ -284,12 +358,4 @@ class CoilWatch:
         self._evidence.clear()
         self._probing = None
         self._probed.clear()
-        self.suspicion = ""
-
-    def _window(self, end_ns: int) -> FloatArray:
-        """Return the commands (k, 3) that were in force in the window before `end_ns`, at even distances."""
-        times = np.array([time_ns for time_ns, _ in self._commands])
-        values = np.array([currents for _, currents in self._commands])
-        back = np.linspace(self._settings.window_ns, 0, _SAMPLES, endpoint=False).astype(np.int64)
-        newest: FloatArray = values[np.maximum(np.searchsorted(times, end_ns - back, side="right") - 1, 0)]
-        return newest
+        self._strangeness = ""

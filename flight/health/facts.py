@@ -49,8 +49,10 @@ IMU_UNUSABLE = Fact("imu-unusable", events.IMU_UNUSABLE, events.IMU_RECOVERED)
 IMU_LINE_LOST = Fact("imu-line-lost", events.IMU_LINE_LOST, events.IMU_RECOVERED)
 CONTROL_LOST = Fact("control-lost", events.CONTROL_LOST, events.CONTROL_REGAINED)
 BLIND = Fact("blind", events.BLIND, modes=_DRIVEN)
-TUMBLING = Fact("tumbling", events.TUMBLING, after=8, modes=frozenset({Mode.HOLD, Mode.SLEW}))
-HOLD_IMPOSSIBLE = Fact("hold-impossible", events.HOLD_IMPOSSIBLE, modes=frozenset({Mode.HOLD}))
+TUMBLING = Fact("tumbling", events.TUMBLING, after=8, modes=STEERING)
+HOLD_IMPOSSIBLE = Fact(
+    "hold-impossible", events.HOLD_IMPOSSIBLE, modes=frozenset({Mode.HOLD, Mode.TESTBED_DEMO})
+)
 SLEW_LATE = Fact("slew-late", events.SLEW_LATE, modes=frozenset({Mode.SLEW}))
 HOLDING = Fact("holding", events.HOLDING, modes=frozenset({Mode.SLEW, Mode.TESTBED_DEMO}))
 COIL_FAULT = Fact("coil-fault", events.COIL_FAULT, events.COIL_RECOVERED)
@@ -72,6 +74,9 @@ IMU_POOR, FIELD_POOR, COILS_POOR, POWER_POOR, CAMERA_POOR = (
     Fact(f"{stream}-poor", events.STREAM_POOR, events.STREAM_GOOD, after=4, mended_after=8)
     for stream in ("imu", "field", "coils", "power", "camera")
 )
+SERVICE_FAILING = Fact("service-failing", events.SERVICE_FAILING, events.SERVICE_RECOVERED)
+CAMERA_LATE = Fact("camera-late", events.CAMERA_LATE, events.CAMERA_RECOVERED)
+VISION_SLOW = Fact("vision-slow", events.VISION_SLOW)
 
 FACTS: tuple[Fact, ...] = tuple(value for value in dict(vars()).values() if isinstance(value, Fact))
 

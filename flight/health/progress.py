@@ -1,15 +1,17 @@
 """Does everything get on? The watchdog is fed only while every rate group and every worker does.
 
 A group gets on when a cycle of it has run to its end within its patience; a worker, when no job has been
-under way for longer than it may take.
+under way for longer than it may take. The jobs beside the loop, on tickers, are looked at too; a slow disk or
+a hung bus may hold them up, which another process would not mend, so they are told and no more.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from flight.executive.rate_group import RateGroup
+from hal.interfaces.wires import Ticker
 
 _PERIODS = 3
 _LEAST_PATIENCE_NS = 2_000_000_000
@@ -57,3 +59,15 @@ class GroupsAndWorkers:
             if since_ns is not None and now_ns - since_ns > worker.patience_ns:
                 names.append(worker.name)
         return names
+
+
+def failing(tickers: Sequence[Ticker], now_ns: int) -> list[str]:
+    """Return what is to be told of the jobs beside the loop: those that raise and those that stand still."""
+    told = []
+    for ticker in tickers:
+        stood_ns = now_ns - ticker.served_ns
+        if ticker.error:
+            told.append(f"{ticker.name}: {ticker.error}")
+        elif stood_ns > max(_PERIODS * ticker.period_ns, _LEAST_PATIENCE_NS):
+            told.append(f"{ticker.name}: stands still for {stood_ns * 1e-9:.1f} s")
+    return told

@@ -18,21 +18,14 @@ import numpy as np
 from flight.arrays import Image
 from flight.horizon.consensus import best_cone, left_free
 from flight.horizon.edges import Nearby, find_edges
-from flight.horizon.hypothesis import (
-    SPHERE_ALTITUDE_SIGMA,
-    Hypothesis,
-    Place,
-    Supposition,
-    examine,
-    near_limb,
-    place_of,
-    suppose,
-)
+from flight.horizon.hypothesis import Hypothesis, examine
 from flight.horizon.knowledge import HorizonKnowledge
 from flight.horizon.limb_equation import ALTITUDE
+from flight.horizon.limb_points import near_limb
 from flight.horizon.observation import Observation, observe
 from flight.horizon.settings import HorizonSettings
 from flight.horizon.solution import HorizonSolution, HorizonStatus, NadirMeasurement
+from flight.horizon.supposition import SPHERE_ALTITUDE_SIGMA, Place, Supposition, place_of, suppose
 from flight.lens import CameraModel
 from flight.pixel_access import ArrayPixels, PixelAccess
 

@@ -80,6 +80,14 @@ def fit(record: Record, noise: Noise, progress: Callable[[int, float], None] | N
     """
     if not np.any(record.current):
         raise IdentificationError("the coil on x was never driven: nothing in this flight shows its torque")
+    try:
+        return _fitted(record, noise, progress)
+    except (ValueError, OverflowError) as error:
+        # What a prediction without bounds ends in: the cosine of infinity, a covariance that is none.
+        raise IdentificationError("no constants explain this flight: their prediction runs away") from error
+
+
+def _fitted(record: Record, noise: Noise, progress: Callable[[int, float], None] | None) -> Fit:
     constants, believed, share, before = first_guess(record), noise, 1.0, np.zeros(len(NAMES))
     restarts: frozenset[int] = frozenset()
     gates = list(_GATES)

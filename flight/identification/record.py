@@ -21,6 +21,12 @@ LEAST_SAMPLES = 200
 _AT_LIMIT = 0.97
 _RESOLUTION = 1.0e-4  # A; a count of the PWM chip is some 4e-5 A
 _SETTLED_FIELD = 0.5  # s after the coils went off until the field is taken
+_LONGEST_GAP = 60.0  # s between two samples
+_LARGEST = {
+    "imu": {"quaternion": 1.001, "rate": 50.0, "field": 0.1},
+    "control": {"current_command": 10.0, "current_written": 10.0},
+}
+"""Beyond which, in SI units, a value was not written by a flight."""
 
 
 class IdentificationError(FlightError):
@@ -65,19 +71,27 @@ def read_record(run: Run, stale_after: float = 0.25) -> Record:
     """Return the record of a run.
 
     Without commands for `stale_after` s the driver lets the coils fall to zero. Raises UsageError for a run
-    in which another coil was driven too, IdentificationError for one that is too short.
+    in which another coil was driven too, IdentificationError for one that is too short, or whose log holds
+    what no flight writes.
     """
     control, imu, told = run["control"], run["imu"], run["run"]
     if len(control) < 2 or len(imu) < LEAST_SAMPLES or not len(told):
         raise IdentificationError(
             f"{run.folder}: {len(imu)} samples and {len(control)} control cycles: too short a flight"
         )
+    _refuse_impossible(run, told)
     written = control["current_written"].astype(float)
     if np.any(written[:, 1:]):
         raise UsageError(f"{run.folder}: coils y or z were driven: identification knows the one on x only")
     time = _sample_times(imu)
     once = np.append(True, np.diff(np.maximum.accumulate(time)) > 0.0)
     time, imu = time[once], imu[once]
+    gap = float(np.max(np.diff(time), initial=0.0))
+    if len(time) < LEAST_SAMPLES or gap > _LONGEST_GAP:
+        raise IdentificationError(
+            f"{run.folder}: {len(time)} samples in order of time, the longest gap {gap:.3g} s: "
+            f"{LEAST_SAMPLES} are needed, and none longer than {_LONGEST_GAP:g} s"
+        )
     quaternion = imu["quaternion"].astype(float)
     turn = 2.0 * np.arctan2(quaternion[:, 1], quaternion[:, 3])
     limit = min(
@@ -94,6 +108,23 @@ def read_record(run: Run, stale_after: float = 0.25) -> Record:
         period=float(told["control_period_ns"][0]) * 1e-9,
         field=_field(time, imu["field"].astype(float), switch_time, current),
     )
+
+
+def _refuse_impossible(run: Run, told: PacketArray) -> None:
+    """Raise IdentificationError for values that no flight writes, NaN among them: they are damage."""
+    for packet, fields in _LARGEST.items():
+        for name, largest in fields.items():
+            values = run[packet][name].reshape(len(run[packet]), -1)
+            bad = np.argwhere(~(np.abs(values) <= largest))
+            if len(bad):
+                value = float(values[tuple(bad[0])])
+                raise IdentificationError(f"{run.folder}: {packet}, {name} = {value:g}: the log is damaged")
+    for name in ("control_period_ns", "current_limit", "supply_voltage", "coil_resistance"):
+        value = float(told[name].reshape(len(told), -1)[0, 0])
+        if not 0.0 < value < np.inf:
+            raise IdentificationError(f"{run.folder}: run, {name} = {value:g}: the log is damaged")
+    if np.any(np.diff(run["control"]["time_ns"]) <= 0):
+        raise IdentificationError(f"{run.folder}: control cycles out of order: the log is damaged")
 
 
 def _sample_times(imu: PacketArray) -> FloatArray:

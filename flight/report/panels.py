@@ -38,6 +38,7 @@ BLUE, ORANGE, GREEN, VERMILLION, PURPLE, SKY = (
 )
 PATH_COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, VERMILLION)
 COILS = ("x", "y", "z")
+_ABSURD = 1e9  # mrad/s: no rate, but what a damaged log may hold
 
 
 @dataclass(frozen=True)
@@ -275,6 +276,7 @@ def rate_error(ax: Axes, scene: Scene) -> None:
             label=r"streaks less true, $\pm\sigma$",
         )
     everything = np.concatenate([np.abs(error), bound, np.abs(1e3 * difference[known])])
+    everything = everything[everything < _ABSURD]
     if len(everything):  # a start-up transient must not flatten the rest
         span = 1.5 * float(np.percentile(everything, 99.0)) or 1.0
         ax.set_ylim(-span, span)

@@ -37,6 +37,8 @@ _MOST_STEPS = 50
 _MOST_SELECTIONS = 10
 # Of the chi-square: a step that promises less is none.
 _CONVERGED = 1e-6
+# Of the lengths in a frame: what their sums and products in double precision leave open.
+_ROUNDING = 8.0 * float(np.finfo(np.float64).eps)
 _CUT = 5.0
 # Cauchy's constant, for 95 % efficiency where no match is wrong.
 _CAUCHY = 2.385
@@ -144,12 +146,22 @@ def _descend(
 ) -> Step:
     """Return the last step of the fit to the matches `used`."""
     weights = [chosen.astype(float) for chosen in used]
+    least = max(_CONVERGED, _rounding(frames, used, fit.parameters[0]))
     for _ in range(_MOST_STEPS):
         last = step(frames, fit, weights, information, expected)
-        if last.decrease < _CONVERGED:
+        if last.decrease < least:
             return last
         fit = last.fit
     raise CalibrationError(f"the fit does not converge in {_MOST_STEPS} steps")
+
+
+def _rounding(frames: Sequence[MatchedFrame], used: Sequence[BoolArray], focal_length: float) -> float:
+    """Return the chi-square of residuals that are rounding alone: with tiny sigmas a fit gets no nearer."""
+    total = 0.0
+    for frame, chosen in zip(frames, used, strict=True):
+        length = focal_length + np.linalg.norm(frame.points[chosen], axis=1)
+        total += 2.0 * float(np.sum((_ROUNDING * length / frame.sigma[chosen]) ** 2))
+    return total
 
 
 def _attitude(frame: MatchedFrame, lens: Lens, number: int) -> FloatArray:

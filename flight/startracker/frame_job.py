@@ -1,8 +1,13 @@
-"""The vision worker's job: one frame in; its rate, and the attitude that its stars give, out."""
+"""The vision worker's job: one frame in; its rate, and the attitude that its stars give, out.
+
+The control process makes the job and takes in what was found. The estimators, and scipy with them, are tens
+of MB and of no use there: they are imported where the work is done.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,11 +27,10 @@ from flight.startracker.solve import (
     solve_points,
 )
 from flight.startracker.two_ends import solve_ends
-from flight.vision.likelihood.estimate import estimate_motion
 from flight.vision.likelihood.result import MotionResult
 from flight.vision.likelihood.settings import LikelihoodSettings
 from flight.vision.settings import StreakSettings
-from flight.vision.streak_rate import StreakResult, StreakStatus, estimate_rate
+from flight.vision.streak_result import StreakResult, StreakStatus
 
 Found = StreakResult | MotionResult
 
@@ -76,13 +80,14 @@ class FrameFound:
 
 def run(job: FrameJob) -> FrameFound:
     """Return what the frame tells; at the top level of a module, so that a worker process can import it."""
+    estimate_motion, estimate_rate = prepare()
     lens, prior = job.camera.ideal, job.rate_prior
     rate, sigma = (prior.rate, prior.sigma) if prior is not None else (None, math.inf)
     if isinstance(job.estimator, LikelihoodSettings):
         motion = estimate_motion(
             job.pixels, lens, job.exposure, job.estimator, rate, sigma, job.previous_checksum
         )
-        return FrameFound(motion, _attitude(job, motion))
+        return _known_better(job, FrameFound(motion, _attitude(job, motion)))
     streaks = estimate_rate(job.pixels, lens, job.exposure, job.estimator, rate, sigma, job.previous_checksum)
     if job.tracker is None or streaks.status not in _MOVED:
         return FrameFound(streaks, _attitude(job, streaks))
@@ -90,6 +95,27 @@ def run(job: FrameJob) -> FrameFound:
     sky = _sky(tracker)
     solution, found = solve_ends(streaks, job.camera, tracker.scale, sky, tracker.solve, job.attitude_prior)
     return FrameFound(found, solution)
+
+
+def prepare() -> tuple[Callable[..., MotionResult], Callable[..., StreakResult]]:
+    """Import what `run` needs, and return the two estimators; a worker does so before its first job."""
+    from flight.vision.likelihood.estimate import estimate_motion  # noqa: PLC0415
+    from flight.vision.streak_rate import estimate_rate  # noqa: PLC0415
+
+    return estimate_motion, estimate_rate
+
+
+def _known_better(job: FrameJob, found: FrameFound) -> FrameFound:
+    """Return what a second fit finds, the stars of a solved frame of streaks being known by then."""
+    solution, tracker = found.solution, job.tracker
+    if solution is None or solution.motion is None or tracker is None:
+        return found
+    if not isinstance(job.estimator, LikelihoodSettings):
+        return found
+    from flight.startracker.known_sky import with_known_sky  # noqa: PLC0415 - see the module
+
+    better = with_known_sky(job.pixels, solution, _sky(tracker), tracker.solve, job.estimator)
+    return FrameFound(better.motion or found.motion, better)
 
 
 def _attitude(job: FrameJob, motion: Found) -> FrameSolution | None:

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
 from flight.arrays import FloatArray
 from flight.catalogue import StarCatalogue
@@ -50,6 +49,8 @@ def choose_guide_stars(
     Stars nearer to one another than `resolution` rad, directly or by way of others, are one.
     Raises ValueError when `epoch` is not finite.
     """
+    from scipy.spatial import cKDTree  # noqa: PLC0415 - to make a table, not to read one
+
     direction = catalogue.directions_at(epoch)
     pairs = cKDTree(direction).query_pairs(2.0 * np.sin(0.5 * resolution), output_type="ndarray")
     group = _connected(len(catalogue), pairs)

@@ -2,16 +2,18 @@
 
 A star drawn out to a streak is known well across its path and badly along it. Each residual b - A r is taken
 in the two directions across the star, whitened by the place's covariance, and the sum of squares made least
-by Gauss-Newton: the maximum likelihood for Gaussian errors.
+by Gauss-Newton: the maximum likelihood for Gaussian errors. A star in whose streak another's light hides is
+not where its pixels say: stars that disagree by more than chance allows, measured by how the most scatter,
+are found under Huber's weights, which bound any one star's pull, and have no say.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from flight.arrays import FloatArray
+from flight.arrays import BoolArray, FloatArray
 from flight.attitude.wahba import AttitudeError, AttitudeFix
 from flight.lens import CameraModel
 from flight.quaternion import attitude_matrix, from_matrix
@@ -22,6 +24,13 @@ _MOST_STEPS = 8
 _SETTLED = 1e-11
 # px, over which the slope of the lens is taken.
 _STEP_PX = 0.5
+# Of a chi-square of 2: exceeded by chance once in 1000, and its median.
+_FARTHEST = 13.8
+_MEDIAN = 2.0 * float(np.log(2.0))
+# Deviations beyond which a star's pull grows no more while it is asked who disagrees.
+_PULL = 1.5
+_HUBER_ROUNDS = 10
+_LEAST_AGREEING = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,16 +38,18 @@ class ImageFit:
     """The attitude, and what the stars say of the fit.
 
     Attributes:
-        fix: the attitude; its covariance is widened where the stars scatter beyond theirs.
+        fix: the attitude by the stars that agree; its covariance is widened where they scatter beyond theirs.
         scale: factor of the tangents x/z, y/z; 1 when it was held.
         scale_sigma: relative standard deviation of the scale; 0 when it was held.
         squares: (n,) squared error of each star over its covariance, of two degrees of freedom.
+        agree: (n,) whether the star has a say.
     """
 
     fix: AttitudeFix
     scale: float
     scale_sigma: float
     squares: FloatArray
+    agree: BoolArray
 
 
 def fit_in_image(
@@ -62,30 +73,74 @@ def fit_in_image(
     Raises AttitudeError when the stars do not fix what is asked.
     """
     observed = camera.unit_vectors(points)
-    whitener = _whitener(points, observed, covariance, camera)
-    matrix, scale = attitude_matrix(start), 1.0
-    parameters = 4 if free_scale else 3
-    for _ in range(_MOST_STEPS):
-        seen, predicted = stretched(observed, scale), reference @ matrix.T
-        residual = np.einsum("nij,nj->ni", whitener, seen - predicted).ravel()
-        flat = _slope(whitener, seen, predicted, free_scale)
-        try:
-            inverse = np.linalg.inv(flat.T @ flat)
-        except np.linalg.LinAlgError as error:
-            raise AttitudeError(f"{len(points)} stars in one place fix no attitude") from error
-        step = -inverse @ (flat.T @ residual)
-        if not np.all(np.abs(step) < 1.0):
-            raise AttitudeError(f"{len(points)} stars do not agree on an attitude")
-        matrix = turned(matrix, step[:3])
-        scale *= float(np.exp(step[3])) if free_scale else 1.0
-        if np.abs(step).max() < _SETTLED:
-            break
-    left = np.einsum("nij,nj->ni", whitener, stretched(observed, scale) - reference @ matrix.T)
-    squares = np.sum(left**2, axis=1)
-    inverse = inverse * inflation(squares, parameters)
+    seen = _Seen(observed, _whitener(points, observed, covariance, camera), reference, free_scale)
+    pose = seen.fitted(_Pose(attitude_matrix(start), 1.0), np.ones(len(points)))
+    squares, agree = seen.squares(pose), np.ones(len(points), dtype=np.bool_)
+    # One star far off draws all others off: their spread tells nothing before its pull is bounded.
+    if squares.max() > _FARTHEST:
+        held = pose
+        for _ in range(_HUBER_ROUNDS):
+            held = seen.fitted(held, _PULL / np.maximum(np.sqrt(squares), _PULL))
+            squares = seen.squares(held)
+        agree = _agreeing(squares)
+        pose = seen.fitted(held, agree.astype(np.float64))
+        squares = seen.squares(pose)
+    inverse = pose.covariance * inflation(squares[agree], len(pose.covariance))
     turn = np.ascontiguousarray(inverse[:3, :3], dtype=np.float64)
-    fix = AttitudeFix(from_matrix(matrix), turn, 0.5 * float(squares.sum()))
-    return ImageFit(fix, scale, float(np.sqrt(inverse[3, 3])) if free_scale else 0.0, squares)
+    fix = AttitudeFix(from_matrix(pose.matrix), turn, 0.5 * float(squares[agree].sum()))
+    return ImageFit(fix, pose.scale, float(np.sqrt(inverse[3, 3])) if free_scale else 0.0, squares, agree)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pose:
+    """Attitude (3, 3) and scale, and the covariance of the turn and ln scale that weights of stars give."""
+
+    matrix: FloatArray
+    scale: float
+    covariance: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Seen:
+    """Stars seen at `observed` (n, 3) with `whitener` (n, 2, 3), at `reference` (n, 3) in the sky."""
+
+    observed: FloatArray
+    whitener: FloatArray
+    reference: FloatArray
+    free_scale: bool
+
+    def fitted(self, start: _Pose, weight: FloatArray) -> _Pose:
+        """Return the least of the squares times `weight` (n,)."""
+        whitener = self.whitener * np.sqrt(weight)[:, None, None]
+        matrix, scale = start.matrix, start.scale
+        for _ in range(_MOST_STEPS):
+            seen, predicted = stretched(self.observed, scale), self.reference @ matrix.T
+            residual = np.einsum("nij,nj->ni", whitener, seen - predicted).ravel()
+            flat = _slope(whitener, seen, predicted, self.free_scale)
+            try:
+                inverse = np.linalg.inv(flat.T @ flat)
+            except np.linalg.LinAlgError as error:
+                raise AttitudeError(f"{len(weight)} stars in one place fix no attitude") from error
+            step = -inverse @ (flat.T @ residual)
+            if not np.all(np.abs(step) < 1.0):
+                raise AttitudeError(f"{len(weight)} stars do not agree on an attitude")
+            matrix = turned(matrix, step[:3])
+            scale *= float(np.exp(step[3])) if self.free_scale else 1.0
+            if np.abs(step).max() < _SETTLED:
+                break
+        return _Pose(matrix, scale, np.asarray(inverse, dtype=np.float64))
+
+    def squares(self, pose: _Pose) -> FloatArray:
+        """Return each star's squared error over its covariance (n,)."""
+        missed = stretched(self.observed, pose.scale) - self.reference @ pose.matrix.T
+        return np.asarray(np.sum(np.einsum("nij,nj->ni", self.whitener, missed) ** 2, axis=1))
+
+
+def _agreeing(squares: FloatArray) -> BoolArray:
+    """Tell which stars (n,) scatter as the most do; all where too few would be left to say who is right."""
+    agree = squares <= _FARTHEST * max(1.0, float(np.median(squares)) / _MEDIAN)
+    enough = np.count_nonzero(agree) >= max(_LEAST_AGREEING, len(squares) // 2)
+    return agree if enough else np.ones(len(squares), dtype=np.bool_)
 
 
 def _slope(whitener: FloatArray, seen: FloatArray, predicted: FloatArray, free_scale: bool) -> FloatArray:

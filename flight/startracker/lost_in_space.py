@@ -91,7 +91,9 @@ def _candidates(
         if sum(pair in tried for pair in pairs) >= 2:
             continue
         tried.update(pairs)
-        yield _attitude_of(observed, sky, finds, find), float(finds.scale[find])
+        # One triangle tells the scale badly: where the lens is known better, that is where it is looked from.
+        scale = min(max(float(finds.scale[find]), observed.scale[0]), observed.scale[1])
+        yield _attitude_of(observed, sky, finds, find), scale
         yielded += 1
         if yielded == most:
             return

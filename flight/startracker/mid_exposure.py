@@ -15,7 +15,7 @@ import numpy as np
 
 from flight.arrays import FloatArray
 from flight.vision.likelihood.result import MotionResult
-from flight.vision.streak_rate import StreakResult, StreakStatus
+from flight.vision.streak_result import StreakResult, StreakStatus
 
 NODES = (0.0, 0.25, 0.75, 1.0)
 """Parts of the exposure at which the turn away from its middle is asked."""

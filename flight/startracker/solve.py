@@ -34,7 +34,6 @@ from flight.startracker.sky_index import SkyIndex
 from flight.startracker.solution import FrameSolution, SolveStatus
 from flight.startracker.tracking import track
 from flight.startracker.verification import expected_stars
-from flight.vision.likelihood.estimate import estimate_motion
 from flight.vision.likelihood.result import MotionResult
 from flight.vision.likelihood.settings import LikelihoodSettings
 
@@ -229,6 +228,9 @@ def _at_rest(prior: RatePrior | None, camera: CameraModel, exposure: float) -> b
 def _motion(
     pixels: Image, camera: CameraModel, exposure: float, settings: SolveSettings, prior: RatePrior | None
 ) -> MotionResult:
+    # Not where settings and results are only named.
+    from flight.vision.likelihood.estimate import estimate_motion  # noqa: PLC0415
+
     rate, sigma = (prior.rate, prior.sigma) if prior is not None else (None, 0.0)
     return estimate_motion(pixels, camera.ideal, exposure, settings.likelihood, rate, sigma)
 

@@ -2,7 +2,7 @@
 
 A star belongs to the triangles at whose size it is among the brightest: with r its distance from the
 `rank`-th nearest of the stars brighter than itself, it is among the `rank` brightest of every circle about
-it that is smaller than r. A triangle is kept if its longest side is below r of each of its stars. No field
+it that is smaller than r. A triangle is kept if its longest side is at most r of each of its stars. No field
 of view enters: every size of field finds as many triangles, of stars that a frame of that size shows among
 its brightest. In any part of the sky there are as many stars, and a dense field adds no triangles.
 
@@ -18,7 +18,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
 from flight.arrays import FloatArray, IntArray
 
@@ -29,6 +28,8 @@ FINE = 256
 SIZE_BITS = 18
 SIZE_UNIT = 2.0**-SIZE_BITS
 """Of the longest side's chord, which is below 1."""
+TIE = 1e-9
+"""A side longer than a limit by less than this part of it is as long: the limits are sides themselves."""
 LEAST_RATIO = 0.1
 """Of the shortest to the longest side: flatter triangles say little more than a pair."""
 
@@ -56,6 +57,8 @@ def reach(direction: FloatArray, rank: int, farthest: float) -> FloatArray:
 
     At most `farthest`, as for those that have fewer than `rank` brighter ones.
     """
+    from scipy.spatial import cKDTree  # noqa: PLC0415 - to make a table, not to read one
+
     count = len(direction)
     result = np.full(count, farthest)
     begin = 0
@@ -87,11 +90,13 @@ def build(direction: FloatArray, sizes: FloatArray, ranks: IntArray) -> Triangle
 
 def _band(direction: FloatArray, smallest: float, largest: float, rank: int) -> IntArray:
     """Return the triangles (m, 3) of one band of sizes."""
+    from scipy.spatial import cKDTree  # noqa: PLC0415 - to make a table, not to read one
+
     limit = reach(direction, rank, largest)
     able = np.flatnonzero(limit >= smallest)
     # In order of reach, so that each triangle is found once: from its last star, the one of least reach.
     able = able[np.argsort(-limit[able], kind="stable")]
-    limit, place = limit[able], direction[able]
+    limit, place = limit[able] * (1.0 + TIE), direction[able]
     first, last = np.sort(cKDTree(place).query_pairs(largest, output_type="ndarray"), axis=1).T
     close = np.linalg.norm(place[first] - place[last], axis=-1) <= limit[last]
     first, last = first[close], last[close]

@@ -19,7 +19,7 @@ from flight.startracker.sky_index import SkyIndex
 from flight.startracker.solution import FrameSolution, SolveStatus
 from flight.startracker.solve import AttitudePrior, SolveSettings, solve_places
 from flight.vision import two_attitudes
-from flight.vision.streak_rate import StreakResult
+from flight.vision.streak_result import StreakResult
 from flight.vision.two_attitudes import TwoAttitudes
 
 # px, of an endpoint: a residual below is luck of few streaks, not precision.

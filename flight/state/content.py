@@ -60,6 +60,7 @@ class StoredState(Kept, frozen=True, kw_only=True):
         mode: the mode when last heard of.
         utc: when it was last heard of: a label.
         learned: parameters by name.
+        devices: of which devices they were learned: a digest of what the configuration says of them.
     """
 
     boot_count: Count = 0
@@ -69,6 +70,7 @@ class StoredState(Kept, frozen=True, kw_only=True):
     mode: Label = ""
     utc: Label = ""
     learned: Annotated[dict[Label, Learned], Meta(max_length=32)] = {}
+    devices: Label = ""
 
 
 def check(state: StoredState) -> None:

@@ -32,13 +32,22 @@ class BootRecord:
     mode: str
 
 
-def begin(state: StoredState, utc: str) -> StoredState:
-    """Return the state of the next boot: running, and with the last one's crash remembered."""
+def begin(state: StoredState, utc: str, devices: str = "") -> StoredState:
+    """Return the state of the next boot: running, and with the last one's crash remembered.
+
+    What was learned of other `devices` than these is forgotten.
+    """
     unclean = state.unclean
     if state.running:
         unclean = (*unclean, UncleanShutdown(state.boot_count, state.operated, state.utc))[-REMEMBERED:]
     return msgspec.structs.replace(
-        state, boot_count=state.boot_count + 1, running=True, unclean=unclean, utc=utc
+        state,
+        boot_count=state.boot_count + 1,
+        running=True,
+        unclean=unclean,
+        utc=utc,
+        learned=state.learned if state.devices == devices else {},
+        devices=devices,
     )
 
 

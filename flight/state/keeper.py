@@ -49,17 +49,29 @@ class StateKeeper:
     """
 
     def __init__(
-        self, store: StateStore, notices: Notices, clock: Clock, *, window: float, period_ns: int = PERIOD_NS
+        self,
+        store: StateStore,
+        notices: Notices,
+        clock: Clock,
+        *,
+        window: float,
+        devices: str = "",
+        period_ns: int = PERIOD_NS,
     ) -> None:
         """Load the state, count this boot and write that it runs.
 
-        `window` is the operating time, s, in which unclean shutdowns count as recent.
+        `window` is the operating time, s, in which unclean shutdowns count as recent; `devices` stands for
+        those that are flown: what was learned of others is not taken.
         """
         self._store = store
         self._notices = notices
         self._clock = clock
         self._begun_ns = clock.now_ns()
-        self._begun = history.begin(store.load(), self._label())
+        loaded = store.load()
+        self._begun = history.begin(loaded, self._label(), devices)
+        if loaded.learned and not self._begun.learned:
+            text = f"learned of the devices {loaded.devices or 'of an older version'}, these are {devices}"
+            notices.tell(events.LEARNED_REFUSED, text)
         self.record: BootRecord = history.boot_record(self._begun, window)
         self.learned: Mapping[str, Learned] = self._begun.learned
         self._noted: tuple[str, Mapping[str, Learned]] = (self._begun.mode, {})

@@ -8,7 +8,9 @@ from pathlib import Path
 
 from flight.settings import Config
 from flight.state.keeper import Notices, StateKeeper
+from flight.state.learning import digest_of
 from flight.state.store import StateStore
+from hal.interfaces.errors import DeviceError
 from hal.interfaces.wires import Clock
 
 
@@ -18,6 +20,11 @@ def state_folder(config: Config, environment: Mapping[str, str]) -> Path | None:
         return Path(config.state.folder)
     if config.simulation is not None:
         return None
+    return service_folder(environment)
+
+
+def service_folder(environment: Mapping[str, str]) -> Path | None:
+    """Return the state folder that systemd gives a service, None where there is none."""
     # systemd puts colons between several folders; the first is the application's own.
     first = environment.get("STATE_DIRECTORY", "").partition(":")[0]
     return Path(first) if first else None
@@ -26,7 +33,11 @@ def state_folder(config: Config, environment: Mapping[str, str]) -> Path | None:
 def open_state(
     config: Config, environment: Mapping[str, str], clock: Clock, stack: ExitStack
 ) -> StateKeeper | None:
-    """Count this boot; None where no state is kept. `stack` ends it: cleanly, unless an exception passes."""
+    """Count this boot; None where no state is kept.
+
+    `stack` ends it: cleanly, unless an exception passes. A device that does not answer is no crash: it is
+    told, and safe mode would not mend it.
+    """
     folder = state_folder(config, environment)
     if folder is None:
         return None
@@ -38,11 +49,12 @@ def open_state(
         notices,
         clock,
         window=config.modes.crash_window,
+        devices=digest_of(config),
         period_ns=round(config.state.period * 1e9),
     )
 
     def close(kind: type[BaseException] | None, *_: object) -> bool:
-        keeper.close(clean=kind is None)
+        keeper.close(clean=kind is None or issubclass(kind, DeviceError))
         return False
 
     stack.push(close)

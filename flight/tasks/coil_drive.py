@@ -17,6 +17,7 @@ from flight.events import EventLog
 from flight.health import facts
 from flight.health.coil_watch import CoilVerdict, CoilWatch
 from flight.health.facts import Facts
+from flight.health.stuck_leg import NONE, Axes
 from hal.interfaces.devices import PowerMonitor, TorqueCoils
 from hal.interfaces.readings import CoilState, ImuReading
 
@@ -50,7 +51,7 @@ class CoilDrive:
         self._events = event_log
         self._power = power
         self._verdicts = 0
-        self._neutral: FloatArray = np.zeros(3)
+        self._braked = NONE
         self.available = np.ones(3, dtype=bool)
         self.command: FloatArray = np.zeros(3)
 
@@ -58,7 +59,7 @@ class CoilDrive:
         """Compare what is on the wire with what the monitor and the body answer, once a cycle."""
         watch = self._watch
         if in_force.written_ns >= 0:
-            watch.commanded(now_ns, in_force.current)
+            watch.commanded(now_ns, in_force.current, in_force.braked)
         if in_force.error:
             watch.interrupted()  # what the chip does is not known
         for reading in readings:
@@ -70,13 +71,13 @@ class CoilDrive:
         for verdict in found[self._verdicts :]:
             self._state(verdict, now_ns)
         self._verdicts = len(found)
+        self._brake(watch.braked)
         self._facts.state(facts.COIL_SUSPECT, bool(watch.suspicion), now_ns, watch.suspicion)
         self._facts.state(facts.POWER_DOUBTED, bool(watch.monitor_doubted), now_ns, watch.monitor_doubted)
 
     def isolate(self) -> None:
         """Leave out the axes that have a verdict: the reaction to `coil-broken`."""
         self.available = self._watch.available
-        self._neutral = self._watch.neutral
 
     def trust(self, now_ns: int) -> None:
         """Use all axes again, by command; what is still broken will be found again."""
@@ -90,13 +91,19 @@ class CoilDrive:
         """Command currents (3,) A; `field` tells the field (3,) T in body axes where they are reallocated."""
         if not self.available.all() and currents.any():
             currents = self._reallocated(currents, field())
-        self.command = currents + self._watch.probe
+        self.command = np.zeros(3) if self._watch.at_rest else currents + self._watch.probe
         self._coils.command(self.command)
 
     def zero(self) -> None:
-        """Command nothing at all; a leg that is stuck high is braked."""
-        self.command = self._neutral
+        """Command nothing at all."""
+        self.command = np.zeros(3)
         self._coils.command(self.command)
+
+    def _brake(self, axes: Axes) -> None:
+        """Have bridges braked: one with a leg stuck high drives its coil at zero command."""
+        if axes != self._braked:
+            self._coils.brake(axes)
+            self._braked = axes
 
     def _reallocated(self, currents: FloatArray, field: FloatArray | None) -> FloatArray:
         """Return the currents of the axes in use that make the torque that `currents` would have made."""
@@ -107,7 +114,7 @@ class CoilDrive:
         shared = allocate(
             torque, field, self._dipole, self._limits, self.available.astype(float), about_thread
         )
-        return shared.currents + self._neutral
+        return shared.currents
 
     def _state(self, verdict: CoilVerdict, now_ns: int) -> None:
         self._facts.state(_BROKEN[verdict.axis], True, now_ns, verdict.text)

@@ -61,6 +61,7 @@ class ControlCycle:
         self._streams = streams
         self._ever_started = False
         self._blind = True
+        self._measured = False
         self.target: Target | None = None
         self.estimate: ThreadEstimate | None = None
 
@@ -69,7 +70,7 @@ class ControlCycle:
         rooms, now_ns = self._rooms, cycle.start_ns
         # What the last command came to be on the wire, and when: the coils' thread may have needed a moment.
         in_force = rooms.coils.state()
-        rooms.navigation.commanded(in_force.written_ns, in_force.current)
+        rooms.navigation.commanded(in_force, now_ns)
         rooms.navigation.update(now_ns)
         if not in_force.error:
             self._streams.note("coils", now_ns)
@@ -77,17 +78,17 @@ class ControlCycle:
         if rooms.imaging is not None:
             rooms.imaging.serve(now_ns)
         self.estimate = rooms.navigation.estimate(now_ns)
-        mode = rooms.modes.step(self.estimate, self._measured_rate(), not in_force.error, now_ns)
+        due = None if self.target is None else rooms.planning.due_angle(self.target, now_ns)
+        mode = rooms.modes.step(self.estimate, self._measured_rate(), due, not in_force.error, now_ns)
         self._aim(now_ns)
-        if self.estimate is not None and self._blind:
-            rooms.planning.request(now_ns)  # from where the body is by now, not from an old path
-        self._blind = self.estimate is None
+        measured = self._look_out(now_ns)
         self._ever_started = self._ever_started or self.estimate is not None
         self._collect(now_ns)
-        self._act(mode, now_ns)
+        steered_by = self.estimate if measured else None
+        self._act(mode, steered_by, now_ns)
         written = rooms.coils.state()
         if mode in STEERING and self.target is not None:
-            rooms.planning.serve(self.estimate, self.target, now_ns)
+            rooms.planning.serve(steered_by, self.target, now_ns)
         self._record(cycle, written.current.tolist(), written.saturated)
 
     def _measured_rate(self) -> float | None:
@@ -95,11 +96,22 @@ class ControlCycle:
         readings = self._rooms.navigation.readings
         return math.hypot(*readings[-1].rate.tolist()) if readings else None
 
-    def _act(self, mode: Mode, now_ns: int) -> None:
-        """Use the coils as the mode wants."""
+    def _look_out(self, now_ns: int) -> bool:
+        """Tell whether the estimate is measured; see to a path from where the body is, after it was not."""
+        planning, measured = self._rooms.planning, self._rooms.navigation.is_measured(now_ns)
+        if self.estimate is not None and self._blind:
+            planning.request(now_ns)
+        elif measured and not self._measured:
+            planning.resume(now_ns)
+        self._blind = self.estimate is None
+        self._measured = measured
+        return measured
+
+    def _act(self, mode: Mode, estimate: ThreadEstimate | None, now_ns: int) -> None:
+        """Use the coils as the mode wants, by an estimate that is measured."""
         steering = self._rooms.steering
         if mode in STEERING:
-            steering.run(self.estimate, now_ns, self._ever_started)
+            steering.run(estimate, now_ns, self._ever_started)
         elif mode is Mode.DETUMBLE:
             steering.brake(now_ns)
         else:

@@ -11,7 +11,7 @@ from flight.events import EventLog
 from flight.executive.rate_group import Cycle, RateGroup
 from flight.health import facts
 from flight.health.facts import FACTS, Facts
-from flight.health.progress import GroupsAndWorkers
+from flight.health.progress import GroupsAndWorkers, failing
 from flight.health.resources import ClockWatch, ResourceMonitor, ResourceReader, ResourceSample
 from flight.health.streams import Streams
 from flight.tasks.coil_drive import CoilDrive
@@ -36,6 +36,7 @@ class HealthRooms:
     power: PowerMonitor | None
     control: RateGroup
     progress: GroupsAndWorkers
+    clock: Clock
 
 
 class HealthWatch:
@@ -85,6 +86,7 @@ class HealthWatch:
         now_ns = cycle.start_ns
         self._look_at_streams(now_ns)
         self._look_at_progress(now_ns)
+        self._look_at_services(now_ns)
         step = self._clock_watch.look()
         if step is not None:
             self._events.tell(events.CLOCK_STEP, now_ns, f"by {step:+.3f} s")
@@ -117,6 +119,12 @@ class HealthWatch:
         if not still:
             self._feed()
             self._fed += 1
+
+    def _look_at_services(self, now_ns: int) -> None:
+        """Tell of the jobs beside the loop that fail or stand still."""
+        poor = failing(self._rooms.clock.tickers, now_ns)
+        text = "; ".join(poor) if poor else "all jobs run"
+        self._rooms.facts.state(facts.SERVICE_FAILING, bool(poor), now_ns, text)
 
     def _record(self, now_ns: int) -> None:
         rooms, state = self._rooms, self._monitor.state

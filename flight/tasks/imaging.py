@@ -1,6 +1,7 @@
 """Imaging: triggers the star camera, hands frames to the vision worker, its findings to navigation.
 
-A frame is known to be of a living camera by its sequence number, its pixels and its age.
+A frame is known to be of a living camera by its sequence number, its pixels and its age, and to be the sky's
+by its stars.
 """
 
 from __future__ import annotations
@@ -19,19 +20,20 @@ from flight.executive.jobs import JobResult, JobRunner
 from flight.executive.rate_group import Cycle
 from flight.health import facts
 from flight.health.facts import Facts
+from flight.health.repeated_rows import RepeatedRows
 from flight.health.streams import Streams
 from flight.lens import CameraModel
 from flight.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
 from flight.startracker.frame_job import Found, FrameFound, FrameJob, TrackerSettings
 from flight.startracker.mid_exposure import NODES, doubt, reading_of
-from flight.startracker.solution import FrameSolution
+from flight.startracker.solution import FrameSolution, SolveStatus
 from flight.startracker.solve import AttitudePrior, RatePrior
 from flight.tasks.navigation import Navigation
 from flight.telemetry.definitions import STARS, STREAK
 from flight.telemetry.recorder import Recorder
 from flight.vision.likelihood.settings import LikelihoodSettings
 from flight.vision.settings import StreakSettings
-from flight.vision.streak_rate import StreakStatus
+from flight.vision.streak_result import StreakStatus
 from hal.interfaces.devices import FrameSource
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.readings import Frame
@@ -39,6 +41,8 @@ from hal.interfaces.readings import Frame
 WORKER = "vision"
 # rad, of the mounting between the camera and the inertial unit that the estimate is of.
 _LEAST_PRIOR_SIGMA = 5e-4
+# Of so many that are taken for stars some are: a frame that they do not solve is not of the sky as it is.
+_MANY_STARS = 12
 _NAN = np.full(3, np.nan), np.full((3, 3), np.nan)
 
 
@@ -47,6 +51,8 @@ class ImagingSettings:
     """The camera as vision must know it.
 
     Attributes:
+        late_ns: after the exposure, from which a frame is late.
+        slow_ns: from which vision is slow over a frame.
         mounting: (4,) takes the body's axes to the camera's.
         unrest: rad^2/s^3, density of the white angular acceleration that shakes the body.
     """
@@ -54,6 +60,8 @@ class ImagingSettings:
     camera: CameraModel
     exposure_ns: int
     max_age_ns: int
+    late_ns: int
+    slow_ns: int
     mounting: FloatArray
     estimator: StreakSettings | LikelihoodSettings
     tracker: TrackerSettings | None
@@ -85,6 +93,8 @@ class Imaging:
         self._last_sequence = -1
         self._last_checksum: int | None = None
         self._last_frame_ns = 0
+        self._due_ns: int | None = None  # by when the oldest trigger without a frame should have one
+        self._rows = RepeatedRows()
         self._facts = facts_
         self._streams = streams
         self._busy_since_ns = 0
@@ -105,12 +115,20 @@ class Imaging:
             self._camera.trigger(self._settings.exposure_ns)
         except DeviceError as error:
             self._facts.state(facts.CAMERA_LOST, True, cycle.start_ns, str(error))
+            return
+        if self._due_ns is None:
+            # A camera that runs free is in an exposure already, and begins another one after it.
+            patience_ns = 2 * self._settings.exposure_ns + self._settings.late_ns
+            self._due_ns = cycle.start_ns + patience_ns
 
     def serve(self, now_ns: int) -> None:
         """Take in a finished frame, if there is one, and hand it to the worker."""
+        self._look_at_worker(now_ns)
         frame = self._poll(now_ns)
         age_ns = now_ns - self._last_frame_ns
         if frame is None:
+            if self._due_ns is not None and now_ns > self._due_ns:
+                self._facts.state(facts.CAMERA_LATE, True, now_ns, "no frame yet after its trigger")
             if age_ns > self._settings.max_age_ns:
                 self._facts.state(facts.CAMERA_LOST, True, now_ns, f"no frame for {age_ns * 1e-9:.1f} s")
             return
@@ -120,17 +138,25 @@ class Imaging:
             self._events.tell(events.CAMERA_FROZEN, now_ns, text)
             self._record_rate(frame, StreakStatus.FROZEN.value, None, now_ns, False)
             return
+        self._due_ns = None
         # Old is what shows old light, however fresh it arrived.
         self._last_frame_ns = frame.exposure_start_ns + frame.exposure_ns
         age_ns = now_ns - self._last_frame_ns
         late = age_ns > self._settings.max_age_ns
         text = f"frame {frame.sequence} comes {age_ns * 1e-9:.1f} s after its exposure"
         self._facts.state(facts.CAMERA_LOST, late, now_ns, text)
+        self._facts.state(facts.CAMERA_LATE, age_ns > self._settings.late_ns, now_ns, text)
         if not late:
             self._streams.note("camera", now_ns)
+        old = self._rows.look(frame.pixels)
+        if old:
+            text = f"frame {frame.sequence}: {old} of the rows looked at are an earlier frame's"
+            self._events.tell(events.CAMERA_TORN, now_ns, text)
         self.frames += 1
         self._last_sequence = frame.sequence
-        if self._jobs.submit(WORKER, self._job(frame)):
+        if old:
+            self._record_rate(frame, StreakStatus.FAILED.value, None, now_ns, False)
+        elif self._jobs.submit(WORKER, self._job(frame)):
             self._frame = frame
             self._busy_since_ns = now_ns
         else:
@@ -141,6 +167,7 @@ class Imaging:
         frame, self._frame = self._frame, None
         if frame is None:
             return
+        self._judge_speed(now_ns)
         if result.outcome != "done":
             self._events.tell(events.VISION_FAILED, now_ns, f"{result.outcome}: {result.error}")
             self._record_rate(frame, StreakStatus.FAILED.value, None, now_ns, False)
@@ -155,6 +182,8 @@ class Imaging:
         elif motion.status in {StreakStatus.BLACK, StreakStatus.SATURATED}:
             self._events.tell(events.CAMERA_BLACK, now_ns, f"frame {frame.sequence} is {motion.status.value}")
         rate, attitude = self._mean_rate(frame, motion), self._attitude(frame, found)
+        if _is_strange(found.solution):
+            rate = None  # of pixels that are not in order
         known = self._navigation.past(_middle_ns(frame)) is not None
         late = [m for m in (rate, attitude if known else None) if m is not None]
 
@@ -169,6 +198,16 @@ class Imaging:
             self._navigation.take_late(late, told)
         else:
             told([])
+
+    def _look_at_worker(self, now_ns: int) -> None:
+        """Tell of a worker that is slow while it still is at it."""
+        if self._frame is not None and now_ns - self._busy_since_ns > self._settings.slow_ns:
+            self._judge_speed(now_ns)
+
+    def _judge_speed(self, now_ns: int) -> None:
+        taken_ns = now_ns - self._busy_since_ns
+        text = f"{taken_ns * 1e-9:.2f} s over a frame, {self._settings.slow_ns * 1e-9:g} s expected"
+        self._facts.state(facts.VISION_SLOW, taken_ns > self._settings.slow_ns, now_ns, text)
 
     def _poll(self, now_ns: int) -> Frame | None:
         try:
@@ -242,6 +281,9 @@ class Imaging:
         accepted: bool | None,
     ) -> None:
         """Record what the stars said; `accepted` None when nobody was asked to take it."""
+        if _is_strange(solution):
+            text = f"frame {frame.sequence}: {len(solution.points)} stars that are nowhere in the sky"
+            self._events.tell(events.CAMERA_STRANGE, now_ns, text)
         if accepted is False:
             text = f"frame {frame.sequence}: {len(solution.matched)} stars"
             self._events.tell(events.STARS_REFUSED, now_ns, text)
@@ -300,6 +342,13 @@ class Imaging:
             residual=found.residual if found else math.nan,
             accepted=int(accepted),
         )
+
+
+def _is_strange(solution: FrameSolution | None) -> bool:
+    """Tell whether a frame shows many stars that are nowhere in the sky."""
+    if solution is None or solution.status is not SolveStatus.NO_MATCH:
+        return False
+    return len(solution.points) >= _MANY_STARS
 
 
 def _middle_ns(frame: Frame) -> int:

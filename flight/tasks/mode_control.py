@@ -111,11 +111,17 @@ class ModeControl:
         self._record(Mode.BOOT, "begin", "", now_ns)
 
     def step(
-        self, estimate: ThreadEstimate | None, rate: float | None, coils_answer: bool, now_ns: int
+        self,
+        estimate: ThreadEstimate | None,
+        rate: float | None,
+        due: float | None,
+        coils_answer: bool,
+        now_ns: int,
     ) -> Mode:
         """Look at what has been achieved in this cycle; return the mode to act in.
 
-        `rate` rad/s is the length of the newest body rate measured in this cycle, None when there was none.
+        `rate` rad/s is the length of the newest body rate measured in this cycle, None when there was none;
+        `due` rad is where the demonstration should have brought the body, None while it is on its way.
         """
         if estimate is not None:
             self._seen_ns = now_ns
@@ -131,6 +137,8 @@ class ModeControl:
                 self._fire(Trigger.DETUMBLED, f"below {self._low_rate:g} rad/s", now_ns)
         if estimate is not None and self.mode in {Mode.HOLD, Mode.SLEW}:
             self._keep(estimate, now_ns)
+        elif estimate is not None and self.mode is Mode.TESTBED_DEMO:
+            self._watch(estimate, due, now_ns)
         return self.mode
 
     def command(self, mode: Mode, now_ns: int, q2: float | None = None) -> str:
@@ -143,6 +151,8 @@ class ModeControl:
             return f"not while in {self.mode.label}"
         if answer is Answer.STAY:
             return ""
+        if self.mode is Mode.SAFE and (barred := self._barred()):
+            return barred
         if mode is Mode.SLEW:
             if q2 is None or not abs(q2) <= Q2_LIMIT:
                 return f"q2 {q2} is not within +-{Q2_LIMIT}"
@@ -187,19 +197,36 @@ class ModeControl:
             q2 = min(max(estimate.q2, -Q2_LIMIT), Q2_LIMIT)
             self.wanted = Target(KEPT, now_ns, q2)
             self._guidance.hold(angle_of(q2), now_ns)
-        error = abs(math.remainder(angle_of(self.wanted.q2) - estimate.angle, 2.0 * math.pi))
-        speed = abs(estimate.rate)
-        text = f"{speed:.3f} rad/s, {settings.tumble_rate:g} allowed"
-        self._facts.state(facts.TUMBLING, speed > settings.tumble_rate, now_ns, text)
-        impossible = self._off.update(error > settings.hold_error, now_ns)
-        text = f"{error:.2f} rad off for {settings.hold_patience:g} s"
-        self._facts.state(facts.HOLD_IMPOSSIBLE, impossible, now_ns, text)
+        error = self._watch(estimate, angle_of(self.wanted.q2), now_ns)
         slewing = (now_ns - self._machine.since_ns) * 1e-9
-        near = error < settings.arrived_angle and speed < settings.arrived_rate
+        near = error < settings.arrived_angle and abs(estimate.rate) < settings.arrived_rate
         if self.mode is Mode.SLEW and self._arrived.update(near, now_ns):
             self._fire(Trigger.ARRIVED, f"{error:.4f} rad off", now_ns)
         text = f"{error:.3f} rad off after {slewing:.0f} s"
         self._facts.state(facts.SLEW_LATE, slewing > settings.slew_limit, now_ns, text)
+
+    def _watch(self, estimate: ThreadEstimate, wanted: float | None, now_ns: int) -> float:
+        """State whether the body turns too fast and stays too far off; return how far, rad.
+
+        `wanted` rad, None while nothing is: then it is not off.
+        """
+        settings, speed = self._settings, abs(estimate.rate)
+        text = f"{speed:.3f} rad/s, {settings.tumble_rate:g} allowed"
+        self._facts.state(facts.TUMBLING, speed > settings.tumble_rate, now_ns, text)
+        error = 0.0 if wanted is None else abs(math.remainder(wanted - estimate.angle, 2.0 * math.pi))
+        impossible = self._off.update(error > settings.hold_error, now_ns)
+        text = f"{error:.2f} rad off for {settings.hold_patience:g} s"
+        self._facts.state(facts.HOLD_IMPOSSIBLE, impossible, now_ns, text)
+        return error
+
+    def _barred(self) -> str:
+        """Return why safe may not be left: what led there and was not cleared; empty when it may."""
+        held = [
+            fact.begins.name
+            for fact in self._facts.held()
+            if fact.latching and fact.begins.reaction is Reaction.SAFE
+        ]
+        return f"not before it is cleared: {', '.join(held)}" if held else ""
 
     def _fire(self, trigger: Trigger, reason: str, now_ns: int) -> None:
         change = self._machine.fire(trigger, now_ns)

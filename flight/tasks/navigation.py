@@ -30,22 +30,26 @@ from flight.telemetry.definitions import IMU
 from flight.telemetry.recorder import Recorder
 from hal.interfaces.devices import InertialUnit
 from hal.interfaces.errors import DeviceError
-from hal.interfaces.readings import ImuLink, ImuReading
+from hal.interfaces.readings import CoilState, ImuLink, ImuReading
 
 _AT_A_TIME = 16
 """Measurements applied again in a cycle: some ms, so that a second of them takes a few cycles."""
+
+
+_UNSEEN_NS = 600_000_000
+"""The coils' driver reads its outputs back twice a second: what it finds wrong may be so since then."""
 
 
 @dataclass(frozen=True, slots=True)
 class NavigationSettings:
     """Noise of the unit, two ages, and what planner and controller know of the thread.
 
-    Without a reading for `max_age_ns` the unit is told to be silent; the estimate is carried on by the model
-    and trusted until it is `coast_ns` old.
-
     Attributes:
         angle_noise: rad, standard deviation of the unit's attitude about each axis.
         rate_noise: rad/s, of its rate.
+        max_age_ns: of a reading that the coils are driven by.
+        coast_ns: for how long the model carries the estimate on without a measurement; nothing steers by it.
+        period_ns: of the control cycle: a current that is commanded flows until the next one at least.
         believed: torsion and damping of the thread in the plant: the disturbance told is the rest.
         field: (3,) T, of the surroundings, reference axes.
     """
@@ -54,6 +58,7 @@ class NavigationSettings:
     rate_noise: float
     max_age_ns: int
     coast_ns: int
+    period_ns: int
     believed: Parameters
     field: FloatArray
 
@@ -83,17 +88,20 @@ class Navigation:
         self._recorder = recorder
         self._events = event_log
         self._since_ns = 0
-        self._last_good_ns = 0
+        self._heard_ns = 0  # the newest reading, and the newest that agreed with the estimate
+        self._agreed_ns = 0
         self._link = unit.link()
         self._heard_since_ns = 0
         self._facts = facts_
         self._streams = streams
+        self._coils_known = True
+        self._known_ns = -1
         self.readings: tuple[ImuReading, ...] = ()
 
     def begin(self, time_ns: int) -> None:
         """Use samples from `time_ns` on only: the body is released then."""
         self._since_ns = time_ns
-        self._last_good_ns = time_ns
+        self._heard_ns = self._agreed_ns = time_ns
         self._heard_since_ns = time_ns
         self._link = self._unit.link()
 
@@ -101,9 +109,15 @@ class Navigation:
         """Return the unit's counters."""
         return self._link
 
-    def commanded(self, time_ns: int, currents: FloatArray) -> None:
-        """Tell the filter which currents (3,) A are in force in the coils from `time_ns` on."""
-        self._filter.command(time_ns, currents)
+    def commanded(self, in_force: CoilState, now_ns: int) -> None:
+        """Tell the filter what the coils carry, or that nobody knows while the chip does not obey."""
+        known = not in_force.error
+        if not known and self._coils_known:
+            self._filter.doubt(now_ns - _UNSEEN_NS)
+        elif known and not self._coils_known:
+            self._known_ns = now_ns
+        self._coils_known = known
+        self._filter.command(max(in_force.written_ns, self._known_ns), in_force.current, known=known)
 
     def update(self, now_ns: int) -> None:
         """Take in what the unit has sent, and go on with what came late."""
@@ -120,22 +134,33 @@ class Navigation:
             self._take(reading)
             self._streams.note("imu", reading.time_ns)
             self._streams.note("field", reading.time_ns, float(np.linalg.norm(reading.field)))
-            self._last_good_ns = now_ns
+            self._heard_ns = reading.time_ns
         self._watch_line(now_ns)
 
     def is_heard(self, now_ns: int) -> bool:
-        """Tell whether a reading has come within the age limit: for who steers by readings alone."""
-        return now_ns - self._last_good_ns <= self._settings.max_age_ns
+        """Tell whether the coils may be driven by readings alone until the next cycle."""
+        return self._is_fresh(self._heard_ns, now_ns)
+
+    def is_measured(self, now_ns: int) -> bool:
+        """Tell whether the coils may be driven by the estimate until the next cycle.
+
+        The newest reading that agreed with it must be within the age limit until then: an estimate that the
+        model alone carries is told, but steers nothing.
+        """
+        return self._filter.started and self._is_fresh(self._agreed_ns, now_ns)
+
+    def _is_fresh(self, time_ns: int, now_ns: int) -> bool:
+        return now_ns + self._settings.period_ns - time_ns < self._settings.max_age_ns
 
     def attitude(self, now_ns: int) -> Estimate | None:
-        """Return the whole estimate for now, None when there is none to be trusted."""
+        """Return the whole estimate for now, measured or carried on by the model; None when there is none."""
         # Carried on over a long silence it would cost more with every cycle, and be of no use.
         if not self._filter.started or now_ns - self._filter.measured_ns > self._settings.coast_ns:
             return None
         return self._filter.at(now_ns)
 
     def estimate(self, now_ns: int) -> ThreadEstimate | None:
-        """Return what it says of the turn about the thread, None when it is not to be trusted."""
+        """Return what it says of the turn about the thread, None when there is none."""
         estimate = self.attitude(now_ns)
         return None if estimate is None else estimate.about_thread(self._settings.believed)
 
@@ -174,11 +199,14 @@ class Navigation:
         rate = RateMeasurement(time_ns, reading.rate, self._rate_covariance, latency)
         if not self._filter.started:
             self._filter.start(attitude, rate)
+            self._agreed_ns = reading.time_ns
             return
         # Each for itself: a gyro that is right keeps the rate while the attitude is in doubt.
-        agreed = self._filter.measure(attitude)
-        agreed = self._filter.started and self._filter.measure(rate) and agreed
-        if not agreed:
+        turned = self._filter.measure(attitude)
+        moved = self._filter.started and self._filter.measure(rate)
+        if turned or moved:
+            self._agreed_ns = reading.time_ns
+        if not (turned and moved):
             self._events.tell(
                 events.IMU_REFUSED,
                 reading.arrival_ns,
@@ -196,7 +224,7 @@ class Navigation:
         self._facts.state(facts.IMU_SILENT, silent, now_ns, text)
         if silent:
             self._heard_since_ns = now_ns
-        without_ns = now_ns - max(self._last_good_ns, self._heard_since_ns)
+        without_ns = now_ns - max(self._heard_ns, self._heard_since_ns)
         unusable = without_ns > limit_ns
         text = f"no reading in {without_ns * 1e-9:.2f} s of bytes: has the unit started anew?"
         text = text if unusable else "readings come again"

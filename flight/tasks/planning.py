@@ -105,12 +105,28 @@ class Planning:
         self._wanted = True
         if self._settings.strategy is Strategy.STEP:
             self._guidance.hold(angle_of(target.q2), now_ns)
+            self._due_ns = now_ns + round(self._settings.horizon * 1e9)
+
+    def due_angle(self, target: Target, now_ns: int) -> float | None:
+        """Return where the body should be by now, rad; None while it is on its way to the target.
+
+        It is due at the end of the first path to the target, whatever is planned after that; where paths are
+        not planned, a horizon after the command.
+        """
+        if self._due_ns is None or now_ns < self._due_ns:
+            return None
+        return _moved(target, (now_ns - self._due_ns) * 1e-9)
 
     def request(self, now_ns: int) -> None:
         """Want a plan as soon as there is an estimate to start from and the worker is free."""
         self._wanted = True
         if self._is_near_goal(now_ns):
             self._goal_ns = None
+
+    def resume(self, now_ns: int) -> None:
+        """Want the rest of a path anew after nobody steered along it; an end that is held is held on."""
+        if now_ns - self._asked_ns > _AGAIN_NS and not self._is_near_goal(now_ns):
+            self._wanted = True
 
     def replan(self, cycle: Cycle) -> None:
         """Want a plan because its time has come: the task of the replanning rate group."""
@@ -167,8 +183,7 @@ class Planning:
         if target.rate == 0.0 or self._due_ns is None:
             return target.q2
         late = horizon - (self._due_ns - now_ns) * 1e-9
-        angle = angle_of(target.q2) + target.rate * max(late, 0.0)
-        return q2_of(min(max(angle, -FARTHEST), FARTHEST))
+        return q2_of(_moved(target, max(late, 0.0)))
 
     def _is_near_goal(self, now_ns: int) -> bool:
         """Tell whether too little is left until the goal to plan for it."""
@@ -213,9 +228,10 @@ class Planning:
         else:
             self.accepted += 1
             self.flown = job.number
+            end_ns = job.origin_ns + round(plan.horizon * 1e9)
+            self._due_ns = self._due_ns or end_ns
             if self._settings.strategy is Strategy.GOAL:
-                self._goal_ns = job.origin_ns + round(plan.horizon * 1e9)
-                self._due_ns = self._due_ns or self._goal_ns
+                self._goal_ns = end_ns
             if plan.status is PlanStatus.STRETCHED:
                 text = (
                     f"plan {job.number}: {plan.horizon_asked:g} s is too short, flying {plan.horizon:.2f} s"
@@ -244,3 +260,8 @@ class Planning:
             nodes=count,
             node_q2=nodes + [math.nan] * (MAX_NODES - count),
         )
+
+
+def _moved(target: Target, since: float) -> float:
+    """Return where a target is `since` s after it was due, rad: it moves as far as the coil has authority."""
+    return min(max(angle_of(target.q2) + target.rate * since, -FARTHEST), FARTHEST)

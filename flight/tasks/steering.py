@@ -31,9 +31,11 @@ class SteeringState(IntEnum):
 class Steering:
     """Turns the body about the thread by the coil on body x (Sease 5.4), brakes it, or rests.
 
-    Control is lost when there is no trustworthy estimate, or, while braking, no reading within its age limit.
-    An estimate that the model carries over a short silence has an honest covariance: steering by it is
-    control, until it is older than the configured coast.
+    Control is lost when no reading within its age limit agrees with the estimate, or, while braking, when
+    there is none. The model carries the estimate on over a silence, so that control comes back smoothly, but
+    a current that flows meanwhile is nobody's: within a tenth of a second of the last reading it is zero.
+    A planner that is gone is no loss while there is a path: the body is steered along it by the readings, and
+    at its end held there, which is told (`holding`). Without a path no current flows.
     """
 
     def __init__(
@@ -63,7 +65,10 @@ class Steering:
         return self._drive.command
 
     def run(self, estimate: ThreadEstimate | None, now_ns: int, ever_started: bool) -> None:
-        """Follow or hold in this cycle. `ever_started`: there was an estimate once, so none is a loss."""
+        """Follow or hold in this cycle, by an `estimate` that is measured.
+
+        `ever_started`: there was an estimate once, so none is a loss.
+        """
         self.sample = self._guidance.sample(now_ns)
         text = "steering again" if estimate else "no measurement fresh enough to steer by: coils to zero"
         self._facts.state(facts.CONTROL_LOST, estimate is None and ever_started, now_ns, text)

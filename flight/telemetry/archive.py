@@ -1,11 +1,17 @@
 """The runs of a board: a folder for each boot under one roof, the oldest dropped to keep a budget.
 
+A full disk does not keep a satellite from flying: the oldest runs go until there is room, but never the last
+one, which tells how things came to be; and where nothing can be written the flight goes on without.
+
 A service restarts into the same place, and a run's folder is never written twice: `begin_run` makes the next,
 `run-000042`. Runs are in the order of their numbers: a board's wall clock may be wrong.
 """
 
 from __future__ import annotations
 
+import errno
+import math
+import os
 import re
 import shutil
 from dataclasses import dataclass
@@ -16,12 +22,18 @@ from flight.errors import UsageError
 MOST_RUNS = 1000
 """A board that crashes at every start makes many runs of a few kilobytes: they are bounded by number too."""
 
+LEAST_FREE_BYTES = 64 << 20
+"""On the disk, for a run to begin with: hours of packets."""
+
+DISK_TROUBLE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS})
+"""What a disk says that is full or failing, where others tell of a mistake in the path."""
+
 _NAME = re.compile(r"run-(\d{6,})")
 
 
 @dataclass(frozen=True, slots=True)
 class NewRun:
-    """A run's new folder, and how many old ones went to make room for it."""
+    """A run's new folder, not yet there on a disk that takes nothing, and how many old ones went for it."""
 
     folder: Path
     dropped: int
@@ -36,20 +48,48 @@ def begin_run(archive: Path, budget_bytes: int, coming_bytes: int) -> NewRun:
     """Make the folder of the next run, and room for `coming_bytes`, all that it may come to hold.
 
     Nothing but the folders of runs is ever removed. Raises UsageError when the budget holds not even the
-    coming run, or when the archive cannot be written.
+    coming run, or when the archive cannot be there; who writes into a disk that takes nothing will be told.
     """
     if coming_bytes > budget_bytes:
         raise UsageError(
             f"archive budget of {budget_bytes} bytes: it must hold the logs of one run, {coming_bytes} bytes"
         )
+    runs, taken = find_runs(archive), _numbered(archive)
+    folder = archive / f"run-{taken[-1][0] + 1 if taken else 1:06d}"
+    dropped = _make_room(runs, budget_bytes - coming_bytes)
+    while dropped < len(runs) - 1 and _free(archive) < LEAST_FREE_BYTES:
+        _drop(runs[dropped])
+        dropped += 1
     try:
-        archive.mkdir(parents=True, exist_ok=True)
-        runs, taken = find_runs(archive), _numbered(archive)
-        folder = archive / f"run-{taken[-1][0] + 1 if taken else 1:06d}"
-        folder.mkdir()
+        folder.mkdir(parents=True)
+        _make_lasting(archive)
     except OSError as error:
-        raise UsageError(f"{archive}: no run can be begun there: {error.strerror or error}") from error
-    return NewRun(folder, _make_room(runs, budget_bytes - coming_bytes))
+        if error.errno not in DISK_TROUBLE:
+            raise UsageError(f"{archive}: no run can be begun there: {error.strerror or error}") from error
+    return NewRun(folder, dropped)
+
+
+def _free(archive: Path) -> float:
+    """Return the bytes that may yet be written to the archive's disk, infinity when it does not say."""
+    try:
+        disk = os.statvfs(archive)
+    except OSError:
+        return math.inf
+    return float(disk.f_bavail * disk.f_frsize)
+
+
+def _make_lasting(folder: Path) -> None:
+    """Have the names in a folder outlive a loss of power."""
+    names = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(names)
+    finally:
+        os.close(names)
+
+
+def _drop(run: Path) -> None:
+    """Remove a run; what cannot go now is tried again at the next boot."""
+    shutil.rmtree(run, ignore_errors=True)
 
 
 def _numbered(archive: Path) -> list[tuple[int, Path]]:
@@ -63,7 +103,7 @@ def _make_room(runs: list[Path], room_bytes: int) -> int:
     sizes = [_size(run) for run in runs]
     total, dropped = sum(sizes), 0
     while dropped < len(runs) and (total > room_bytes or len(runs) - dropped >= MOST_RUNS):
-        shutil.rmtree(runs[dropped], ignore_errors=True)  # what cannot go now is tried again at the next boot
+        _drop(runs[dropped])
         total -= sizes[dropped]
         dropped += 1
     return dropped

@@ -39,13 +39,15 @@ class FlightLog:
         drain_period_ns: int = 250_000_000,
         sync_period_ns: int | None = 1_000_000_000,
         overwrite: bool = False,
+        patient: bool = False,
         opener: Callable[[Path], SegmentFile] = open_segment,
     ) -> None:
         """Begin a new log.
 
         `sync_period_ns` None leaves fsync to the end of each segment: right for lock-step simulation, where
         seconds are short. Raises UsageError when the folder holds such a log already and `overwrite` is not
-        set, when it cannot be written, or when the sizes make no sense.
+        set, when the sizes make no sense, or when the folder cannot be written; but a `patient` log waits for
+        a disk that takes nothing, as it does later on.
         """
         if not 0 < segment_bytes <= budget_bytes // 2:
             raise UsageError(
@@ -65,11 +67,22 @@ class FlightLog:
         self._busy_since_ns: int | None = None
         self._closed = False
         self._draining = threading.Lock()  # held by whoever drains, never asked for by write()
-        try:
+        self._store: SegmentStore | None = None
+
+        def begin() -> SegmentStore:
+            nonlocal overwrite
             _clear(folder, stem, overwrite)
-            self._store = SegmentStore(folder, stem, segment_bytes, budget_bytes, opener)
+            overwrite = True  # what a failed beginning leaves is its own
+            return SegmentStore(folder, stem, segment_bytes, budget_bytes, opener)
+
+        self._begin = begin
+        try:
+            self._store = begin()
         except OSError as error:
-            raise UsageError(f"{folder}: no log can be written there: {error.strerror or error}") from error
+            if not patient:
+                problem = f"{folder}: no log can be written there: {error.strerror or error}"
+                raise UsageError(problem) from error
+            self._fail(error)
         self._synced_ns = clock.now_ns()
         self._ticker = clock.ticker(f"log-{stem}", drain_period_ns, self._drain)
 
@@ -89,7 +102,7 @@ class FlightLog:
     @property
     def dropped_segments(self) -> int:
         """Oldest segments deleted to keep the budget."""
-        return self._store.dropped
+        return self._store.dropped if self._store is not None else 0
 
     def error(self) -> str:
         """Return what is wrong and how many packets the log has lost so far, empty while nothing is wrong.
@@ -125,7 +138,8 @@ class FlightLog:
             self._closed = True
             self._write_queue()
             self._give_up()
-            self._store.close()
+            if self._store is not None:
+                self._store.close()
         except OSError as error:
             self._fail(error)
         finally:
@@ -141,7 +155,7 @@ class FlightLog:
             self._write_queue()
             now_ns = self._clock.now_ns()
             due = self._sync_period_ns is not None and now_ns - self._synced_ns >= self._sync_period_ns
-            if due and not self._failure:
+            if due and not self._failure and self._store is not None:
                 self._synced_ns = now_ns
                 try:
                     self._store.sync()
@@ -151,6 +165,12 @@ class FlightLog:
 
     def _write_queue(self) -> None:
         """Write the packets queued now; those that the disk does not take wait on."""
+        if self._store is None:
+            try:
+                self._store = self._begin()
+            except OSError as error:
+                self._fail(error)
+                return
         packets = [self._queue.popleft() for _ in range(len(self._queue))]
         before = self._store.packets
         try:

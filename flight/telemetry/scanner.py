@@ -143,5 +143,7 @@ def _cut_short(data: bytes, position: int) -> bool:
 
 def _missing(layout: Layout, packets: bytes) -> int:
     """Return how many packets the sequence counts of those found say are missing between them."""
+    if len(packets) <= layout.length:  # most kinds of packets are in no datagram
+        return 0
     steps = np.diff(layout.sequence_counts(packets))
     return int(np.sum((steps - 1) % SEQUENCE_MODULUS))

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
-from scipy import ndimage
 
 from flight.arrays import BoolArray, FloatArray, Image
 
@@ -82,6 +81,8 @@ def estimate_background(pixels: Image, block: int = 64, stride: int = 4) -> Back
     0.06 and the noise to 0.05 of the noise. A block that a bright object fills takes its neighbours' noise
     (3 x 3 median).
     """
+    from scipy import ndimage  # noqa: PLC0415 - a process that only names the estimators need not hold it
+
     rows, columns = pixels.shape
     down, across = max(1, rows // block), max(1, columns // block)
     height, width = rows // down, columns // across

@@ -7,12 +7,21 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from hal.buses.contained_job import ContainedJob
+
 if TYPE_CHECKING:  # at run time the Protocols would bring numpy in, which the guardian does without
     from hal.interfaces.wires import Ticker
 
 
 class SystemClock:
-    """CLOCK_MONOTONIC of the machine."""
+    """CLOCK_MONOTONIC of the machine.
+
+    Attributes:
+        tickers: those that run, in the order in which they were made.
+    """
+
+    def __init__(self) -> None:
+        self.tickers: list[Ticker] = []
 
     def now_ns(self) -> int:
         """Return the monotonic time."""
@@ -29,19 +38,22 @@ class SystemClock:
 
     def ticker(self, name: str, period_ns: int, job: Callable[[], None]) -> Ticker:
         """Run `job` on a daemon thread every `period_ns`."""
-        return ThreadTicker(name, period_ns, job)
+        made = ThreadTicker(self, name, period_ns, job)
+        self.tickers.append(made)
+        return made
 
     def utc_ns(self) -> int:
         """Return UTC as nanoseconds since 1970."""
         return time.time_ns()
 
 
-class ThreadTicker:
-    """A job on a daemon thread, run every period and whenever kicked."""
+class ThreadTicker(ContainedJob):
+    """A job on a daemon thread, run every period and whenever kicked; a failure does not end the thread."""
 
-    def __init__(self, name: str, period_ns: int, job: Callable[[], None]) -> None:
-        self._period = period_ns * 1e-9
-        self._job = job
+    def __init__(self, clock: SystemClock, name: str, period_ns: int, job: Callable[[], None]) -> None:
+        super().__init__(name, job, clock.now_ns)
+        self.period_ns = period_ns
+        self._clock = clock
         self._wake = threading.Event()
         self._stopped = False
         self._thread = threading.Thread(target=self._serve, name=name, daemon=True)
@@ -55,12 +67,14 @@ class ThreadTicker:
         """Let the job finish and end the thread."""
         self._stopped = True
         self._wake.set()
+        if self in self._clock.tickers:
+            self._clock.tickers.remove(self)
         if threading.current_thread() is not self._thread:
             self._thread.join(timeout=2.0)
 
     def _serve(self) -> None:
         while not self._stopped:
-            self._wake.wait(self._period)
+            self._wake.wait(self.period_ns * 1e-9)
             self._wake.clear()
             if not self._stopped:
-                self._job()
+                self.run()

@@ -41,15 +41,16 @@ _LINE_IN_ORDER = frozenset({errno.EREMOTEIO, errno.ENXIO, errno.EAGAIN, errno.EB
 class LinuxI2cBus:
     """One /dev/i2c-N, safe to share between drivers and threads; reopened after the line has failed."""
 
-    def __init__(self, device: int | str, timeout_ns: int = 20_000_000) -> None:
+    def __init__(self, device: int | str, timeout_ns: int = 20_000_000, patient: bool = False) -> None:
         """Open bus number N, or the device file of a udev name.
 
         The kernel counts the time-out in steps of 10 ms; it is rounded up. Raises NotResponding when there is
-        no such bus, Refused when it may not be opened or cannot do block transfers.
+        no such bus, Refused when it may not be opened or cannot do block transfers; a `patient` bus that is
+        not there yet is opened by the first transaction that finds it.
         """
         if timeout_ns <= 0:
             raise OutOfRange("i2c bus", "time-out", timeout_ns * 1e-9, 0.01, 1.0, "s")
-        self.name = f"/dev/i2c-{device}" if isinstance(device, int) else device
+        self.name = device_file(device)
         self._timeout_units = -(-timeout_ns // _TIMEOUT_UNIT_NS)
         # A transaction is at most two messages, each of which may run into the time-out.
         self._patience = 2.0 * self._timeout_units * _TIMEOUT_UNIT_NS * 1e-9
@@ -59,6 +60,8 @@ class LinuxI2cBus:
         try:
             self._bus = self._open()
         except FileNotFoundError as error:
+            if patient:
+                return
             raise NotResponding(self.name, _how_to_find_a_bus()) from error
         except PermissionError as error:
             raise Refused(self.name, "no permission: add the user to the group that owns it (i2c)") from error
@@ -132,6 +135,11 @@ class LinuxI2cBus:
             raise OSError(code, f"{meaning}, address 0x{address:02x} on {self.name}") from error
         finally:
             self._lock.release()
+
+
+def device_file(bus: int | str) -> str:
+    """Return the device file of a bus that is given by its number or by a file, as a udev name is one."""
+    return f"/dev/i2c-{bus}" if isinstance(bus, int) else bus
 
 
 def adapters(folder: Path = Path("/sys/bus/i2c/devices")) -> list[tuple[int, str]]:

@@ -34,8 +34,11 @@ class PySerialPort:
         lost_bytes: bytes dropped, oldest first, because nobody called `receive` for too long.
     """
 
-    def __init__(self, device: str, baud_rate: int, clock: Clock) -> None:
-        """Open the port. Raises NotResponding, with the cure, when it cannot be."""
+    def __init__(self, device: str, baud_rate: int, clock: Clock, patient: bool = False) -> None:
+        """Open the port.
+
+        Raises NotResponding, with the cure, when it cannot be; a `patient` one is gone until it is there.
+        """
         self.baud_rate = baud_rate
         self.lost_bytes = 0
         self._device = device
@@ -48,11 +51,13 @@ class PySerialPort:
         try:
             self._serial = self._open()
         except _PORT_ERRORS as error:
-            raise NotResponding(
-                device,
+            self._failure = (
                 f"cannot be opened at {baud_rate} baud ({error}): is the device plugged in, the name right, "
-                "the port free, and may this user open it (group dialout)?",
-            ) from error
+                "the port free, and may this user open it (group dialout)?"
+            )
+            if not patient:
+                raise NotResponding(device, self._failure) from error
+            self._serial = serial.Serial()  # not open
         self._thread = threading.Thread(target=self._read, name=f"serial {device}", daemon=True)
         self._thread.start()
 
@@ -109,6 +114,8 @@ class PySerialPort:
         )
 
     def _read(self) -> None:
+        if self._failure:
+            self._open_again()
         while not self._closing.is_set():
             try:
                 # The first byte wakes the thread; what lies ready behind it comes along.

@@ -119,7 +119,7 @@ class VideoDevice:
         answer = Capability()
         self._ask(QUERYCAP, answer)
         own = answer.device_caps if answer.capabilities & CAP_DEVICE_CAPS else answer.capabilities
-        return answer.driver.decode(), answer.card.decode(), own
+        return _text(answer.driver), _text(answer.card), own
 
     def formats(self) -> Iterator[str]:
         """Yield the names of the pixel formats that the device offers."""
@@ -168,7 +168,7 @@ class VideoDevice:
             raise
         if answer.flags & CONTROL_DISABLED:
             return None
-        return ControlRange(answer.name.decode(), answer.minimum, answer.maximum, max(answer.step, 1))
+        return ControlRange(_text(answer.name), answer.minimum, answer.maximum, max(answer.step, 1))
 
     def set_control(self, control: int, value: int) -> int:
         """Set a control; return the value that it then has."""
@@ -230,6 +230,11 @@ class VideoDevice:
     def _ask(self, request: int, argument: ctypes.Structure | ctypes.c_int) -> None:
         # The kernel returns EINTR only where a call may wait; these do not.
         ioctl(self._descriptor, request, argument)
+
+
+def _text(name: bytes) -> str:
+    """Return a name of the device's: one too long for its field is cut, perhaps inside a character."""
+    return name.decode("utf-8", "replace")
 
 
 def _numbered(index: int) -> Buffer:

@@ -75,8 +75,12 @@ class ServedCamera:
         counts: what became of its frames.
     """
 
-    def __init__(self, device: CameraDevice, clock: Clock, patience_ns: int = PATIENCE_NS) -> None:
-        """Open the camera and serve it. Raises DeviceError when it cannot be opened.
+    def __init__(
+        self, device: CameraDevice, clock: Clock, patience_ns: int = PATIENCE_NS, patient: bool = False
+    ) -> None:
+        """Open the camera and serve it.
+
+        Raises DeviceError when it cannot be opened; a `patient` one is gone until it can be.
 
         A camera that has not delivered `patience_ns` and six exposures after a trigger is opened anew: one
         that runs free may be in an exposure, and may take more of them before a new setting holds.
@@ -94,7 +98,12 @@ class ServedCamera:
         self._open = False
         self._retry_ns = clock.now_ns()
         self._closed = False
-        self._open_device()
+        try:
+            self._open_device()
+        except DeviceError as error:
+            if not patient:
+                raise
+            self._drop(error)
         self._ticker = clock.ticker(f"camera {device.name}", PERIOD_NS, self._serve)
 
     def trigger(self, exposure_ns: int) -> None:

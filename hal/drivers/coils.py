@@ -4,6 +4,9 @@
 asks for zero, touches the bus. The job writes the newest command, lets a stale one fall to zero, says zero
 again at every period while zero is wanted, reads set-up and outputs back twice a second, sets the chip up
 again after a brown-out, and never ends on a failure without having tried zero last.
+
+Zero is both inputs of a bridge low, the one message that needs no set-up of the chip. Where a leg is known to
+be stuck high that would drive its coil: such a bridge is braked, both inputs high, right after it.
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ import numpy as np
 
 from hal.drivers.coil_settings import DEVICE, CoilSettings
 from hal.drivers.h_bridge import (
+    brake,
     counts_for,
     current_step,
     enable_for,
@@ -32,8 +36,10 @@ _CHECK_PERIOD_NS = 500_000_000
 _OFF_PATIENCE = 0.3  # s that `off` waits for a transaction of the job, before it writes regardless
 _AXES = "xyz"
 _ZERO = (0, 0, 0)
+_NONE = (False, False, False)
 
 _Counts = tuple[int, int, int]
+_Axes = tuple[bool, bool, bool]
 
 
 class PwmTorqueCoils:
@@ -51,7 +57,8 @@ class PwmTorqueCoils:
         # Both locks are re-entrant: a signal handler may ask for zero in the middle of its own thread's call.
         self._mailbox = threading.RLock()
         self._wanted: _Counts | None = None  # None: zero
-        self._number = 0  # of the newest command or withdrawal
+        self._braked = _NONE  # wanted
+        self._number = 0  # of the newest command, withdrawal or brake
         self._command: tuple[float, float, float] = (0.0, 0.0, 0.0)
         self._command_ns = -1
         self._saturated = False
@@ -61,6 +68,7 @@ class PwmTorqueCoils:
         self._wire = threading.RLock()
         self._serving = False
         self._written = _ZERO
+        self._written_braked = _NONE
         self._written_ns = -1
         self._served = -1  # the number whose counts are on the wire
         self._lost = False
@@ -68,26 +76,39 @@ class PwmTorqueCoils:
         self._faults = 0
         self._error = ""
 
-    def start(self) -> None:
-        """Set the PWM chip up with every output off. Raises DeviceError when it is silent or refuses."""
+    def start(self, patient: bool = False) -> None:
+        """Set the PWM chip up with every output off.
+
+        Raises DeviceError when it is silent or refuses; a `patient` start tells so in `state` and goes on
+        trying.
+        """
         with self._wire:
-            for left in reversed(range(self._settings.tries)):
-                try:
-                    self._configure()
-                    break
-                except DeviceError as error:
-                    self._count(error)
-                    if left == 0:
-                        self._try_zero()
-                        raise
-                    self._wait()
-            self._lost = False
-            self._error = ""
+            try:
+                self._set_up()
+            except DeviceError as error:
+                self._try_zero()
+                if not patient:
+                    raise
+                self._lost, self._error = True, str(error)
         with self._mailbox:
             self._withdraw()
+            self._braked = _NONE
             self._running = True
             if self._ticker is None:
                 self._ticker = self._clock.ticker(DEVICE, SERVE_PERIOD_NS, self._serve)
+
+    def _set_up(self) -> None:
+        for left in reversed(range(self._settings.tries)):
+            try:
+                self._configure()
+            except DeviceError as error:
+                self._count(error)
+                if left == 0:
+                    raise
+                self._wait()
+            else:
+                self._lost, self._error = False, ""
+                return
 
     def command(self, currents: FloatArray) -> None:
         """Ask for currents (3,) in A; limited explicitly. Never waits for the bus.
@@ -116,6 +137,19 @@ class PwmTorqueCoils:
             self._wanted = (counts_x, counts_y, counts_z)
             self._saturated = limited_x or limited_y or limited_z
             self._stale = False
+            self._number += 1
+        ticker.kick()
+
+    def brake(self, axes: tuple[bool, bool, bool]) -> None:
+        """Hold both inputs of these bridges high from now on, whatever is commanded. Never waits for the bus.
+
+        Refused before `start` and after `close`.
+        """
+        with self._mailbox:
+            ticker = self._ticker
+            if ticker is None or not self._running:
+                raise Refused(DEVICE, "a brake before start() or after close()")
+            self._braked = axes
             self._number += 1
         ticker.kick()
 
@@ -152,6 +186,7 @@ class PwmTorqueCoils:
                 stale=self._stale,
                 faults=self._faults,
                 error=self._error,
+                braked=self._written_braked,
             )
 
     def close(self) -> None:
@@ -197,7 +232,9 @@ class PwmTorqueCoils:
                 self._saturated = False
                 self._stale = True
                 self._number += 1
-            return self._wanted or _ZERO, self._number
+            x, y, z = self._wanted or _ZERO
+            brake_x, brake_y, brake_z = self._braked
+            return (0 if brake_x else x, 0 if brake_y else y, 0 if brake_z else z), self._number
 
     def _serve(self) -> None:
         """Bring the wire up to date; the job of the clock."""
@@ -243,7 +280,8 @@ class PwmTorqueCoils:
             try:
                 held = self._pca.is_configured()
                 # Zero is said in more than one way, and again at each period: it is not asked for here.
-                kept = held and (not any(self._written) or self._keeps_written())
+                driven = any(self._written) or any(self._written_braked)
+                kept = held and (not driven or self._keeps_written())
             except NotResponding as error:
                 self._count(error)
                 if left == 0:
@@ -261,59 +299,65 @@ class PwmTorqueCoils:
 
     def _configure(self) -> None:
         self._pca.configure()
-        self._note(_ZERO)
+        self._note(_ZERO, _NONE)
         self._check_ns = self._clock.now_ns() + _CHECK_PERIOD_NS
 
     def _write_newest(self) -> None:
         for left in reversed(range(self._settings.tries)):
             # Asked for at each try: what came in meanwhile counts, above all a withdrawal.
             counts, number = self._newest()
+            braked = self._braked
             try:
-                self._write(counts)
+                self._write(counts, braked)
             except DeviceError as error:
                 self._count(error)
                 if left == 0:
                     raise
                 self._wait()
             else:
-                self._note(counts)
+                self._note(counts, braked)
                 self._served = number
                 if number == self._number:
                     return
 
     def _keeps_written(self) -> bool:
         """Tell whether the outputs are what was last written to them. Raises NotResponding."""
-        blocks = self._channel_blocks(self._written)
+        blocks = self._channel_blocks(self._written, self._written_braked)
         return all(self._pca.holds(first, block) for first, block in blocks)
 
-    def _write(self, counts: _Counts) -> None:
-        for first, block in self._channel_blocks(counts):
+    def _write(self, counts: _Counts, braked: _Axes) -> None:
+        for first, block in self._channel_blocks(counts, braked):
             self._pca.write_channels(first, block)
 
-    def _channel_blocks(self, counts: _Counts) -> list[tuple[int, list[PwmCounts]]]:
+    def _channel_blocks(self, counts: _Counts, braked: _Axes) -> list[tuple[int, list[PwmCounts]]]:
         """Return (first channel, counts of it and its neighbours) for signed counts of the coils."""
         pins: list[PwmCounts] = []
-        for coil, value in zip(self._settings.coils, counts, strict=True):
-            pins += inputs_for(value)
+        for coil, value, held in zip(self._settings.coils, counts, braked, strict=True):
+            pins += brake() if held else inputs_for(value)
             if coil.enable_channel is not None:
                 pins.append(enable_for(value))
         return [(first, [pins[member] for member in members]) for first, members in self._blocks]
 
     def _try_zero(self) -> bool:
-        """Say zero once; tell whether it was acknowledged."""
+        """Say zero once, and brake what is to be braked; tell whether it was acknowledged."""
         try:
             self._pca.all_off()
+            self._note(_ZERO, _NONE)
+            # A chip that may have lost its set-up would take a block for something else.
+            if any(self._braked) and not self._lost:
+                self._write(_ZERO, self._braked)
+                self._note(_ZERO, self._braked)
         except NotResponding as error:
             self._count(error)
             return False
-        self._note(_ZERO)
         return True
 
-    def _note(self, counts: _Counts) -> None:
+    def _note(self, counts: _Counts, braked: _Axes) -> None:
         """Keep what the chip has acknowledged; a repetition does not change since when."""
         with self._mailbox:
-            if counts != self._written:
-                self._written, self._written_ns = counts, self._clock.now_ns()
+            if self._written_ns < 0 or (counts, braked) != (self._written, self._written_braked):
+                self._written, self._written_braked = counts, braked
+                self._written_ns = self._clock.now_ns()
 
     def _count(self, error: DeviceError) -> None:
         self._faults += 1

@@ -50,6 +50,14 @@ def inputs_for(counts: int) -> tuple[PwmCounts, PwmCounts]:
     return FULL_OFF, FULL_OFF
 
 
+def brake() -> tuple[PwmCounts, PwmCounts]:
+    """Return what both inputs are driven with to hold a coil at zero whose bridge has a leg stuck high.
+
+    Both ends of the coil are at the upper rail then, whichever leg it is; those of a sound bridge are too.
+    """
+    return FULL_ON, FULL_ON
+
+
 def enable_for(counts: int) -> PwmCounts:
     """Return what a wired enable input is driven with: low at zero, so that the coil coasts, not brakes."""
     return FULL_ON if counts else FULL_OFF

@@ -26,6 +26,10 @@ OVERFLOW = 0b01
 
 _SHUNT_RANGES_V = (0.04, 0.08, 0.16, 0.32)  # in the order of the PG bits
 _SILENCE_NS = 1_000_000_000
+_SURE_STUCK = 3
+"""Conversions in a row after which the flag has stayed: one may just have become ready anew."""
+_REACH_NS = 300_000_000
+"""A conversion of shunt and bus takes 136 ms, 10 % more at most, and may be as old when it is read."""
 
 
 def range_for(maximum_current: float, shunt_ohm: float) -> int:
@@ -79,6 +83,7 @@ class Ina219:
         self._latest: PowerReading | None = None
         self._error = ""
         self._set_up_before = False
+        self._flag_stays = 0
         self._heard_ns = clock.now_ns()
         self._ticker = clock.ticker("ina219", period_ns, self._serve)
 
@@ -111,8 +116,10 @@ class Ina219:
         count = len(self._conversions)
         voltage = math.fsum(volts for volts, _ in self._conversions) / count
         current = math.fsum(amps for _, amps in self._conversions) / count
+        now_ns = self._clock.now_ns()
+        newest, since_ns = conversion[1], now_ns - _REACH_NS
         with self._lock:
-            self._latest = PowerReading(self._clock.now_ns(), voltage, current, voltage * current)
+            self._latest = PowerReading(now_ns, voltage, current, voltage * current, newest, since_ns)
             # A failure is told until the mean is whole again: who looks once a second must not miss it.
             if count == self._conversions.maxlen:
                 self._error = ""
@@ -131,6 +138,9 @@ class Ina219:
             return None
         shunt = self._read(SHUNT)
         self._read(POWER)  # clears "ready", so that no conversion is counted twice
+        self._flag_stays = self._flag_stays + 1 if self._read(BUS) & CONVERSION_READY else 0
+        if self._flag_stays >= _SURE_STUCK:
+            raise NotResponding(self.name, "its registers are stuck: a conversion that was read stays new")
         self._heard_ns = self._clock.now_ns()
         signed = shunt - 0x10000 if shunt & 0x8000 else shunt
         full_scale = _SHUNT_RANGES_V[self._range_bits]

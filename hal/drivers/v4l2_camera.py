@@ -45,6 +45,8 @@ _STAMP_AHEAD_NS = 10_000_000
 _INTERVAL_SLACK = 0.05
 _CONTRADICTIONS = 3
 _EXPOSURE_LIMIT = (1 << 31) - 1
+# An EIO of VIDIOC_DQBUF may be of a signal that was lost for a moment, as the kernel's documentation has it.
+_PASSING_NS = 500_000_000
 
 
 class Stamp(Enum):
@@ -104,6 +106,7 @@ class V4l2Camera:
         self._changed_ns = 0
         self._to_settle = 0
         self._contradictions = 0
+        self._failing_ns: int | None = None  # since when fetching fails
 
     def open(self) -> None:
         """Open the device and let it run. Raises NotResponding, Refused or OutOfRange, with the cure."""
@@ -146,7 +149,7 @@ class V4l2Camera:
         """Return the frame that was waited for; give all others back to the kernel. Raises DeviceError."""
         device = self._opened()
         try:
-            while (filled := device.take()) is not None:
+            while (filled := self._take(device)) is not None:
                 frame = self._judge(device, filled)
                 device.queue(filled.index)
                 if frame is not None:
@@ -161,6 +164,20 @@ class V4l2Camera:
         device, self._device = self._device, None
         if device is not None:
             device.close()
+
+    def _take(self, device: VideoDevice) -> Filled | None:
+        """Return the oldest filled buffer; none, for a while, where the kernel fails to hand one over."""
+        try:
+            filled = device.take()
+        except OSError as error:
+            now_ns = self._clock.now_ns()
+            if self._failing_ns is None:
+                self._failing_ns = now_ns
+            if error.errno != errno.EIO or now_ns - self._failing_ns >= _PASSING_NS:
+                raise
+            return None
+        self._failing_ns = None
+        return filled
 
     def _opened(self) -> VideoDevice:
         if self._device is None:
@@ -198,7 +215,7 @@ class V4l2Camera:
         self._asked_steps = 0
         self._set_exposure(device, settings.exposure_ns)
         self._numbers.begin_again()
-        self._before = self._trigger_ns = None
+        self._before = self._trigger_ns = self._failing_ns = None
         self._contradictions = 0
 
     def _check_layout(self, device: VideoDevice, card: str) -> None:

@@ -7,6 +7,7 @@ Nothing here waits once the flight has begun: a beat is one byte that is written
 from __future__ import annotations
 
 import contextlib
+import os
 import select
 import socket
 import subprocess
@@ -38,11 +39,19 @@ class CoilReach:
     address: int
 
     def note(self, folder: Path) -> None:
-        """Leave word of bus and address in a folder, for `deploy/coils-off`. Never raises."""
+        """Leave word of bus and address, durably, in a folder, for `deploy/coils-off`. Never raises."""
         beside = folder / f"{NOTE}.part"
         with contextlib.suppress(OSError):
-            beside.write_text(f"{self.where} 0x{self.address:02x}\n", encoding="ascii")
+            with beside.open("wb") as note:
+                note.write(f"{self.where} 0x{self.address:02x}\n".encode())
+                note.flush()
+                os.fsync(note.fileno())
             beside.replace(folder / NOTE)
+            names = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+            try:
+                os.fsync(names)
+            finally:
+                os.close(names)
 
 
 _NEWS = {line.READY: GuardianNews.READY, line.ACTED: GuardianNews.ACTED, line.FAILED: GuardianNews.FAILED}
@@ -64,13 +73,17 @@ class GuardianLine:
         """The process identifier of the guardian."""
         return self._process.pid
 
-    def wait_ready(self, patience: float = 2.0) -> None:
-        """Wait until the guardian has told the coils zero. Raises NotResponding after `patience` s."""
+    def wait_ready(self, patience: float = 2.0, *, patient: bool = False) -> None:
+        """Wait until the guardian has told the coils zero.
+
+        Raises NotResponding when it has not within `patience` s; not where the flight is `patient` and waits
+        for its coils as well: the guardian goes on trying, and tells when it succeeds.
+        """
         heard = b""
         if select.select([self._line], [], [], patience)[0]:
             with contextlib.suppress(OSError):
                 heard = self._line.recv(1)
-        if heard != line.READY:
+        if heard != line.READY and not patient:
             raise NotResponding(DEVICE, "it does not reach the coils' PWM chip, see above: nothing is flown")
 
     def beat(self) -> None:
@@ -89,8 +102,10 @@ class GuardianLine:
             self._retry_ns = now_ns + _RETRY_NS
             news.append(GuardianNews.LOST)
             self._drop()
-            self._process, self._line = self._start()
-            self._lost = False
+            # One that cannot be started now is tried again; the task that asks must not fail for that.
+            with contextlib.suppress(NotResponding):
+                self._process, self._line = self._start()
+                self._lost = False
         self._ended = [process for process in self._ended if process.poll() is None]
         return news
 
@@ -122,7 +137,10 @@ class GuardianLine:
         self._line.close()
 
     def _start(self) -> tuple[subprocess.Popen[bytes], socket.socket]:
-        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
+        except OSError as error:
+            raise NotResponding(DEVICE, f"no line to it: {error.strerror}") from error
         ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _QUEUE_BYTES)
         reach = self._reach
         words = [str(theirs.fileno()), reach.opener, reach.where, str(reach.address)]

@@ -39,8 +39,17 @@ class TorqueCoils(Protocol):
         Raises OutOfRange, and brings the coils to zero, if a value is not finite.
         """
 
+    def brake(self, axes: tuple[bool, bool, bool]) -> None:
+        """Hold both inputs of these bridges high from now on, whatever is commanded: never waits for the bus.
+
+        A leg stuck high then drives nothing; nor does a sound bridge. Until `start` or another call.
+        """
+
     def off(self) -> None:
-        """Bring all coils to zero now, with retries; returns when written or given up."""
+        """Bring all coils to zero now, with retries; returns when written or given up.
+
+        What is braked stays so: low inputs would let a leg that is stuck high drive its coil.
+        """
 
     def state(self) -> CoilState:
         """Return what is on the wire."""

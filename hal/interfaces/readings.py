@@ -73,12 +73,18 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class PowerReading:
-    """What the current monitor measured: bus voltage (V), current of all coils together (A), power (W)."""
+    """What the current monitor measured: bus voltage (V), current of all coils together (A), power (W).
+
+    They are means over about a second; `newest` A is the last conversion's current alone, of a window that
+    lies between `newest_since_ns` and `time_ns`.
+    """
 
     time_ns: int
     voltage: float
     current: float
     power: float
+    newest: float
+    newest_since_ns: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,6 +100,7 @@ class CoilState:
         stale: the command was too old and the driver has let the coils decay to zero.
         faults: failed transactions since start.
         error: the text of the last failure while it lasts, empty when the last transaction succeeded.
+        braked: (3,) which bridges have both inputs high, so that a leg stuck high drives nothing.
     """
 
     command: FloatArray
@@ -104,3 +111,4 @@ class CoilState:
     stale: bool
     faults: int
     error: str
+    braked: tuple[bool, bool, bool] = (False, False, False)

@@ -16,6 +16,22 @@ from hal.interfaces.devices import FrameSource
 class Ticker(Protocol):
     """A small job that a clock runs again and again beside the control loop."""
 
+    @property
+    def name(self) -> str:
+        """The job's name, for people."""
+
+    @property
+    def period_ns(self) -> int:
+        """How often it runs, unless it is kicked."""
+
+    @property
+    def error(self) -> str:
+        """What escaped from the job's last run, empty when it came to its end."""
+
+    @property
+    def served_ns(self) -> int:
+        """When a run last came to its end, or when the ticker was made."""
+
     def kick(self) -> None:
         """Run the job as soon as possible, without waiting for its next period."""
 
@@ -35,8 +51,13 @@ class Clock(Protocol):
     def ticker(self, name: str, period_ns: int, job: Callable[[], None]) -> Ticker:
         """Run `job` every `period_ns`, beside the caller: on a thread in real time, in turn in simulation.
 
-        A job must not raise and must not block for long; it must be safe beside the control loop.
+        A job must not block for long and must be safe beside the control loop. One that raises is told by its
+        ticker, and run again in its next period.
         """
+
+    @property
+    def tickers(self) -> Sequence[Ticker]:
+        """The tickers that run, in the order in which they were made."""
 
     def utc_ns(self) -> int:
         """Return UTC as nanoseconds since 1970: a label for telemetry, never an input of control."""

@@ -6,6 +6,7 @@ worked out when the bus asks for its result. Not modelled: noise, gain error, th
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 
 CONFIG = 0x00
@@ -18,6 +19,9 @@ _BUS_32V = 0x2000
 _SHUNT_STEP_V = 10e-6
 _BUS_STEP_V = 4e-3
 _READY, _OVERFLOW = 0b10, 0b01
+_RESERVED = 0x4000  # of Config; reads zero
+_CALIBRATION_BITS = 0xFFFE
+_REMEMBERED_NS = 60_000_000_000
 
 # Nanoseconds by ADC code: 9 to 12 bits, then 12 bits averaged 2 to 128 times.
 _SINGLE_NS = (84_000, 148_000, 276_000, 532_000)
@@ -35,6 +39,7 @@ class EmulatedIna219:
     Attributes:
         gain: of its current measurement; 1 is sound.
         frozen: words that it gives whatever it measures, none when sound.
+        lag_ns: how old the conversions are that it gives, up to a minute; 0 is sound.
     """
 
     def __init__(
@@ -50,11 +55,22 @@ class EmulatedIna219:
         self._ohm = shunt_ohm
         self.gain = 1.0
         self.frozen: dict[int, int] = {}
+        self.lag_ns = 0
+        self._calibration = 0
+        self._past: deque[tuple[int, int, int]] = deque()  # (time, shunt, bus) of conversions, oldest first
         self._power_on()
 
     def brown_out(self) -> None:
         """Let the supply fail for an instant: every register is back at its power-on value."""
         self._power_on()
+
+    def upset(self, register: int, bit: int) -> None:
+        """Let radiation flip a bit of Config or Calibration; one that does not exist stays zero."""
+        if register == CONFIG:
+            self._convert()
+            self._configure((self._config ^ 1 << bit) & 0xFFFF)
+        elif register == CALIBRATION:
+            self._calibration = (self._calibration ^ 1 << bit) & _CALIBRATION_BITS
 
     def register(self, register: int) -> int:
         """Return a register's word without any effect of reading it."""
@@ -62,8 +78,9 @@ class EmulatedIna219:
             return self.frozen[register]
         self._convert()
         current, power, overflow = self._products()
-        bus = self._bus << 3 | (_READY if self._ready else 0) | (_OVERFLOW if overflow else 0)
-        words = (self._config, self._shunt, bus, power, current, self._calibration)
+        shunt, volts = self._shown()
+        bus = volts << 3 | (_READY if self._ready else 0) | (_OVERFLOW if overflow else 0)
+        words = (self._config, shunt, bus, power, current, self._calibration)
         return words[register] & 0xFFFF if register < len(words) else 0
 
     def answers(self, address: int) -> bool:
@@ -80,7 +97,7 @@ class EmulatedIna219:
             self._convert()
             self._configure(word)
         elif self._pointer == CALIBRATION:
-            self._calibration = word & 0xFFFE
+            self._calibration = word & _CALIBRATION_BITS
 
     def read(self, count: int) -> bytes:
         """Give the pointed-at word, big-endian; beyond it the line floats high."""
@@ -95,13 +112,14 @@ class EmulatedIna219:
         self._shunt = 0
         self._bus = 0
         self._ready = False
+        self._past.clear()
         self._configure(POWER_ON_CONFIG)
 
     def _configure(self, word: int) -> None:
         if word & _RESET:
             self._power_on()
             return
-        self._config = word & ~0x4000
+        self._config = word & ~_RESERVED
         mode = word & 0b111
         shunt_wanted, bus_wanted = mode & 0b001, mode & 0b010
         self._continuous = bool(mode & 0b100)
@@ -138,13 +156,26 @@ class EmulatedIna219:
             volts, _ = self._measure(middle, middle + self._bus_ns)
             top = 8000 if self._config & _BUS_32V else 4000
             self._bus = _digitised(volts / _BUS_STEP_V, self._config >> 7 & 0xF, 0, top)
+        now_ns = self._now_ns()
+        self._past.append((now_ns, self._shunt, self._bus))
+        while self._past[0][0] < now_ns - _REMEMBERED_NS:
+            self._past.popleft()
+
+    def _shown(self) -> tuple[int, int]:
+        """Return the shunt's and the bus's conversion that the registers give: the newest, or an old one."""
+        if not self.lag_ns or not self._past:
+            return self._shunt, self._bus
+        until_ns = self._now_ns() - self.lag_ns
+        old = next((one for one in reversed(self._past) if one[0] <= until_ns), self._past[0])
+        return old[1:]
 
     def _products(self) -> tuple[int, int, bool]:
         """Return Current, Power and whether either is beyond its register."""
-        current = abs(self._shunt) * self._calibration // 4096
-        power = current * self._bus // 5000
+        shunt, volts = self._shown()
+        current = abs(shunt) * self._calibration // 4096
+        power = current * volts // 5000
         overflow = current > 0x7FFF or power > 0xFFFF
-        return (-current if self._shunt < 0 else current), power, overflow
+        return (-current if shunt < 0 else current), power, overflow
 
 
 def _digitised(steps: float, code: int, low: int, high: int) -> int:

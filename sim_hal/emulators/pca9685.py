@@ -91,7 +91,12 @@ class EmulatedPca9685:
     def upset(self, register: int, value: int) -> None:
         """Let radiation write a register, awake or asleep."""
         self._registers[register] = value
+        self._find_addresses()
         self._stop(_ALL_CHANNELS)
+
+    def flip(self, register: int, bit: int) -> None:
+        """Let radiation flip a bit of a register; one that does not exist stays zero."""
+        self.upset(register, self._registers[register] ^ 1 << bit & _WRITABLE[register])
 
     def register(self, register: int) -> int:
         """Return a register's content, as a read of it gives."""

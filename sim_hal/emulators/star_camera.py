@@ -46,6 +46,7 @@ class EmulatedStarCamera:
     Attributes:
         fault: "off", "black", "frozen", "saturated", "torn", "garbage", "wrong" (upside down), or none.
         late_ns: how much later than its read-out a frame comes.
+        one_of: it answers every so many triggers with one exposure; those between are lost.
     """
 
     def __init__(
@@ -69,11 +70,17 @@ class EmulatedStarCamera:
         self._last: Frame | None = None
         self.fault = ""
         self.late_ns = 0
+        self.one_of = 1
+        self._unanswered = 0
 
     def trigger(self, exposure_ns: int) -> None:
         """Start an exposure; one that is under way is abandoned, as a camera's reset does."""
         if self.fault == "off":
             raise NotResponding("camera", "does not answer the trigger")
+        self._unanswered += 1
+        if self._unanswered < self.one_of:
+            return
+        self._unanswered = 0
         self._sequence += 1
         self._exposure = _Exposure(self._sequence, self._now_ns(), exposure_ns, self._scan_ns, [], [])
         self.advance(self._now_ns())

@@ -117,6 +117,7 @@ class Vn100Emulator:
         self._received = bytearray()
         self._then: tuple[int, Callable[[int], None]] | None = None
         self._streams: dict[int, _Stream] = {}
+        self._mute: set[int] = set()
         self._paused = False
         self._status = 0
         self._origin_ns = now_ns
@@ -164,6 +165,20 @@ class Vn100Emulator:
         self.registers.write(5, (str(baud_rate),))
         self._line.baud_rate = baud_rate
         self._build_streams(now_ns)
+
+    def upset(self, register: int, bit: int, now_ns: int) -> None:
+        """Let radiation flip a bit of a register that its outputs are made of.
+
+        Assumed: an output whose register makes no sense, or asks for more than the line carries, is silent
+        until that register is written.
+        """
+        try:
+            self.registers.flip(register, bit)
+            self._build_streams(now_ns)
+        except UnitError:
+            self._mute.add(register)
+            self._build_streams(now_ns)
+        self._schedule(now_ns)
 
     # Time: ticks of 1/800 s of the unit's own clock.
 
@@ -217,11 +232,11 @@ class Vn100Emulator:
         device_ns = self._device_ns(now_ns)
         streams: dict[int, _Stream] = {}
         report = REPORT_BY_TYPE.get(self.registers.integer(6))
-        if report is not None:
+        if report is not None and not self._mute & {6, 7}:
             divisor = IMU_RATE_HZ // self.registers.integer(7)
             length = report_length(report) + len(self._suffix()) + 2 * (self._checksum() == "crc16")
             streams[6] = _Stream(divisor, length, lambda now: self._sentence(report, now), device_ns)
-        for number in BINARY_OUTPUTS:
+        for number in sorted(set(BINARY_OUTPUTS) - self._mute):
             output = binary_output(self.registers.read(number))
             if output is not None and output.ports & _OUR_PORT:
                 streams[number] = _Stream(output.divisor, output.layout.length, _packer(output), device_ns)
@@ -330,6 +345,7 @@ class Vn100Emulator:
             raise UnitError(UNAUTHORIZED)
         before = self.registers.read(number)
         echo = self.registers.write(number, fields[1:])
+        self._mute.discard(number)
         try:
             self._build_streams(now_ns)
         except UnitError:
@@ -354,6 +370,7 @@ class Vn100Emulator:
         self._sensors.restart()
         self._received.clear()
         self._streams = {}
+        self._mute.clear()
         self._paused = False
         self._status = 0
         self._origin_ns = now_ns

@@ -147,6 +147,10 @@ REGISTERS: Mapping[int, Register] = {
 
 _OFF = ("0", "0", "00")
 
+FIELD_BITS = 16
+"""Of each field of a register that bits are flipped in."""
+_BASE_10 = 2  # fields of a binary output; the others are hexadecimal
+
 
 @dataclass(frozen=True, slots=True)
 class BinaryOutput:
@@ -216,6 +220,25 @@ class RegisterFile:
         if kept[len(register.rules) :] != ("2",):
             self._values[number] = kept[: len(register.rules)]
         return kept
+
+    def flip(self, number: int, bit: int) -> None:
+        """Flip a bit, counted from the lowest of the first field on; one beyond the last is none.
+
+        The register keeps what it holds then, and this raises UnitError where no write would have put it
+        there.
+        """
+        place, shift = divmod(bit, FIELD_BITS)
+        fields = list(self._values[number])
+        if place >= len(fields):
+            return
+        hexadecimal = number in BINARY_OUTPUTS and place >= _BASE_10
+        value = int(fields[place], 16 if hexadecimal else 10) ^ 1 << shift
+        fields[place] = f"{value:0{len(fields[place])}X}" if hexadecimal else str(value)
+        self._values[number] = tuple(fields)
+        if number in BINARY_OUTPUTS:
+            binary_output(self._values[number])
+        else:
+            REGISTERS[number].checked(self._values[number])
 
     def set_back(self, number: int, fields: tuple[str, ...]) -> None:
         """Put a register back to fields that it had."""

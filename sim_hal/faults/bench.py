@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import reduce
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from sim_hal.assembly import Hardware
 from sim_hal.emulators.serial_line import SOUND, HostEnd, LineFaults, Wire
+
+if TYPE_CHECKING:  # a flight process that only reads what faults there are need not hold the whole world
+    from sim_hal.assembly import Hardware
 
 Lift = Callable[[], None]
 """Takes a fault away again."""

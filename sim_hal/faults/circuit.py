@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from sim_hal.faults.bench import Bench, Lift
-from sim_hal.faults.kinds import FaultKind, Parameters
+from sim_hal.faults.kinds import FaultKind, Parameter, Parameters
 from sim_hal.world.coil_circuit import Condition
 
+_OHM = Parameter(5.0, 0.1, 1000.0, "ohm")
 _COIL = (
     (Condition.OPEN, "open", "its wire is broken: no current"),
     (Condition.SHORTED, "shorted", "the bridge drives this many ohm, the coil carries nothing"),
@@ -34,7 +35,7 @@ def _kinds() -> tuple[FaultKind, ...]:
     found = []
     for axis, letter in enumerate("xyz"):
         for condition, kind, meaning in _COIL:
-            given = {"ohm": 5.0} if condition is Condition.SHORTED else {}
+            given = {"ohm": _OHM} if condition is Condition.SHORTED else {}
             found.append(FaultKind(f"coil-{letter}", kind, meaning, _broken(axis, condition), given))
         for condition, kind, meaning in _BRIDGE:
             found.append(FaultKind(f"bridge-{letter}", kind, meaning, _broken(axis, condition)))

@@ -10,7 +10,7 @@ import difflib
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from flight.errors import UsageError
 from sim_hal.faults.catalogue import CATALOGUE
@@ -18,6 +18,9 @@ from sim_hal.faults.kinds import FaultKind, Where
 from sim_hal.settings import FaultEntry
 
 GRAMMAR = "DEVICE: KIND [(NAME=VALUE, ...)] [@ SECONDS] [for SECONDS]"
+
+LONGEST = 1e9
+"""s, thirty years: what is beyond is a slip of the pen, and soon does not fit into 64 bits of ns."""
 
 _FAULT = re.compile(
     r"\s*(?P<name>[\w-]+\s*:\s*[\w-]+)\s*(\((?P<given>[^()]*)\))?"
@@ -33,6 +36,13 @@ class ScheduledFault:
     at: float
     span: float | None
     parameters: Mapping[str, float]
+
+    @property
+    def end(self) -> float:
+        """When it is over, s: at once where there is nothing to lift, infinity where it lasts."""
+        if self.kind.momentary:
+            return self.at
+        return math.inf if self.span is None else self.at + self.span
 
     def __str__(self) -> str:
         """Return it as it is written."""
@@ -50,6 +60,8 @@ def parse(text: str) -> ScheduledFault:
     known = _known(f"{device.strip()}: {kind.strip()}", text)
     at = _seconds(found["at"], "@", text) if found["at"] is not None else 0.0
     span = _seconds(found["span"], "for", text) if found["span"] is not None else None
+    if span == 0.0:
+        raise UsageError(f"fault {text!r}: for 0 is no time at all: give more, or leave `for` out")
     return ScheduledFault(known, at, span, _parameters(known, found["given"] or "", text))
 
 
@@ -67,7 +79,10 @@ def schedule(entries: Sequence[FaultEntry]) -> tuple[ScheduledFault, ...]:
         if entry.span is not None and fault.span is not None:
             raise UsageError(f"{place}: `for` stands twice; which?")
         at = fault.at if entry.at is None else entry.at
-        made.append(ScheduledFault(fault.kind, at, entry.span or fault.span, fault.parameters))
+        span = fault.span if entry.span is None else entry.span
+        if max(at, span or 0.0) > LONGEST:
+            raise UsageError(f"{place}: seconds go up to {LONGEST:g}")
+        made.append(replace(fault, at=at, span=span))
     return tuple(made)
 
 
@@ -94,13 +109,15 @@ def _known(name: str, text: str) -> FaultKind:
 
 
 def _parameters(kind: FaultKind, given: str, text: str) -> dict[str, float]:
-    values = dict(kind.parameters)
+    values = {name: value.default for name, value in kind.parameters.items() if value.default is not None}
     for word in filter(None, (word.strip() for word in given.split(","))):
         name, equals, value = (part.strip() for part in word.partition("="))
-        if name not in values or not equals:
+        if name not in kind.parameters or not equals:
             has = ", ".join(kind.parameters) or "no parameters"
             raise UsageError(f"fault {text!r}: {word!r}: {kind.name} has {has}")
         values[name] = _number(value, name, text)
+        if not kind.parameters[name].accepts(values[name]):
+            raise UsageError(f"fault {text!r}: {name}={value}: it is {kind.parameters[name].bounds()}")
     return values
 
 
@@ -108,6 +125,8 @@ def _seconds(word: str, after: str, text: str) -> float:
     value = _number(word, after, text)
     if value < 0.0:
         raise UsageError(f"fault {text!r}: {after} {word}: seconds cannot be below zero")
+    if value > LONGEST:
+        raise UsageError(f"fault {text!r}: {after} {word}: seconds go up to {LONGEST:g}")
     return value
 
 

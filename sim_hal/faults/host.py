@@ -42,7 +42,7 @@ class HostFaults:
             return None
         now = (self._clock.now_ns() - self._epoch_ns) * 1e-9
         for fault in self._faults:
-            if fault.kind.device == device and fault.at <= now < fault.at + (fault.span or np.inf):
+            if fault.kind.device == device and fault.at <= now < fault.end:
                 return fault
         return None
 
@@ -93,11 +93,11 @@ def corrupted_by(faults: Sequence[str], text: str, seed: int | None) -> str:
 
 
 def corrupted(text: str, count: int, seed: int) -> str:
-    """Return a file's text with `count` of its bytes changed."""
+    """Return a file's text with one bit flipped in each of `count` of its bytes."""
     data = bytearray(text.encode())
     rng = np.random.default_rng([seed, count, len(data)])
     for place in rng.choice(len(data), min(count, len(data)), replace=False):
-        data[place] ^= int(rng.integers(1, 256))
+        data[place] ^= 1 << int(rng.integers(8))
     return data.decode("utf-8", errors="replace")
 
 
@@ -116,6 +116,10 @@ class _SteppedClock:
 
     def ticker(self, name: str, period_ns: int, job: Callable[[], None]) -> Ticker:
         return self._clock.ticker(name, period_ns, job)
+
+    @property
+    def tickers(self) -> Sequence[Ticker]:
+        return self._clock.tickers
 
     def utc_ns(self) -> int:
         fault = self._faults.active("clock")

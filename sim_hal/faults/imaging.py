@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 from sim_hal.faults.bench import Bench, Lift, no_lift
-from sim_hal.faults.kinds import FaultKind, Parameters
+from sim_hal.faults.kinds import PERIOD, SHARE, FaultKind, Parameter, Parameters, delay
 
 
 def _showing(fault: str) -> Callable[[Bench, Parameters], Lift]:
@@ -28,6 +29,14 @@ def _slow(bench: Bench, given: Parameters) -> Lift:
     camera = bench.hardware.camera
     if camera is None:
         return no_lift
+    camera.one_of = round(given["n"])
+    return lambda: setattr(camera, "one_of", 1)
+
+
+def _delayed(bench: Bench, given: Parameters) -> Lift:
+    camera = bench.hardware.camera
+    if camera is None:
+        return no_lift
     camera.late_ns = round(given["delay"] * 1e9)
     return lambda: setattr(camera, "late_ns", 0)
 
@@ -47,6 +56,19 @@ CAMERA = (
     ),
     FaultKind("camera", "garbage", "random pixels", _showing("garbage")),
     FaultKind("camera", "wrong", "rows in the opposite order", _showing("wrong")),
-    FaultKind("camera", "slow", "frames come so many seconds later", _slow, {"delay": 3.0}),
-    FaultKind("camera", "intermittent", "off and on, by turns", _by_turns, {"period": 6.0, "share": 0.5}),
+    FaultKind(
+        "camera",
+        "slow",
+        "one trigger of n gives a frame",
+        _slow,
+        {"n": Parameter(3.0, 2.0, 1000.0, whole=True)},
+    ),
+    FaultKind("camera", "delayed", "frames come so many seconds later", _delayed, {"delay": delay(3.0)}),
+    FaultKind(
+        "camera",
+        "intermittent",
+        "off and on, by turns",
+        _by_turns,
+        {"period": replace(PERIOD, default=6.0), "share": SHARE},
+    ),
 )

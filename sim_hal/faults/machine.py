@@ -6,7 +6,10 @@ import os
 import signal
 
 from sim_hal.faults.bench import Bench, Lift, no_lift
-from sim_hal.faults.kinds import FaultKind, Parameters, Where
+from sim_hal.faults.kinds import FaultKind, Parameter, Parameters, Where, delay
+
+_STEP = Parameter(3600.0, -3.2e8, 3.2e8, "s")
+"""Ten years either way."""
 
 
 def _killed(bench: Bench, _: Parameters) -> Lift:
@@ -29,7 +32,7 @@ def _worker(device: str) -> tuple[FaultKind, ...]:
         FaultKind(device, "exception", "it raises one", None),
         FaultKind(device, "endless", "it never returns", None),
         FaultKind(device, "killed", "its process is killed at its work", None),
-        FaultKind(device, "slow", "results come so many seconds later", None, {"delay": 1.5}),
+        FaultKind(device, "slow", "results come so many seconds later", None, {"delay": delay(1.5)}),
     )
 
 
@@ -40,15 +43,15 @@ MACHINE = (
         "process", "killed", "kill -9 of the flight process", _killed, momentary=True, where=Where.REALTIME
     ),
     FaultKind("process", "stopped", "SIGSTOP of the flight process", _stopped, where=Where.REALTIME),
-    FaultKind("clock", "stepped", "the wall clock is set forward, s", None, {"by": 3600.0}),
+    FaultKind("clock", "stepped", "the wall clock is set forward by so many s", None, {"by": _STEP}),
     FaultKind("disk", "full", "no byte more of the log can be written", None),
     FaultKind("disk", "failing", "every write of the log fails", None),
     FaultKind(
         "config",
         "corrupted",
-        "so many bytes of the file are changed before it is read",
+        "a bit flips in so many bytes of the file before it is read",
         None,
-        {"bytes": 3.0},
+        {"bytes": Parameter(3.0, 1.0, 10000.0, whole=True)},
         momentary=True,
         where=Where.COMMAND_LINE,
     ),

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from hal.drivers.pca9685 import PRE_SCALE
 from sim_hal.emulators.i2c_bus import I2cPart
 from sim_hal.faults.bench import Bench, Lift, no_lift
-from sim_hal.faults.kinds import FaultKind, Parameters
+from sim_hal.faults.kinds import CHANCE, PERIOD, SHARE, FaultKind, Parameter, Parameters, delay
 
 _MOST_BYTES = 32
 
@@ -131,17 +132,21 @@ def _wrong_monitor(bench: Bench, given: Parameters) -> Lift:
     return lambda: setattr(monitor, "gain", 1.0)
 
 
-def _delayed(device: str) -> Callable[[Bench, Parameters], Lift]:
-    def begin(bench: Bench, given: Parameters) -> Lift:
-        part = part_of(bench, device)
+def _delayed_pwm(bench: Bench, given: Parameters) -> Lift:
+    part = bench.hardware.pwm
 
-        def later(address: int, data: bytes) -> None:
-            assert part is not None
-            bench.after(given["delay"], lambda: part.write(address, data))
+    def later(address: int, data: bytes) -> None:
+        bench.after(given["delay"], lambda: part.write(address, data))
 
-        return _spoiled(bench, device, later)
+    return _spoiled(bench, "pwm", later)
 
-    return begin
+
+def _delayed_monitor(bench: Bench, given: Parameters) -> Lift:
+    monitor = bench.hardware.monitor
+    if monitor is None:
+        return no_lift
+    monitor.lag_ns = round(given["delay"] * 1e9)
+    return lambda: setattr(monitor, "lag_ns", 0)
 
 
 def _address(bench: Bench, device: str) -> int:
@@ -167,28 +172,37 @@ def _by_turns(
     return lambda bench, given: bench.toggle(lambda: begin(bench, given), given["period"], given["share"])
 
 
-_TURNS = {"period": 0.5, "share": 0.5}
+_TURNS = {"period": PERIOD, "share": SHARE}
 
 
 def _part(device: str) -> tuple[FaultKind, ...]:
     """Return the faults that both parts have."""
     return (
         FaultKind(device, "off", "no power: nothing acknowledges, the registers are lost", _off(device)),
-        FaultKind(device, "nack", "it acknowledges nothing", _nack(device)),
+        FaultKind(device, "nack", "it acknowledges nothing", _nack(device), adds=True),
         FaultKind(device, "garbage", "random bytes for what it is asked", _garbage(device)),
         FaultKind(
-            device, "bits", "each bit read or written flips with this chance", _bits(device), {"chance": 5e-3}
+            device,
+            "bits",
+            "each bit read or written flips with this chance",
+            _bits(device),
+            {"chance": replace(CHANCE, default=5e-3)},
         ),
         FaultKind(
             device,
             "slow",
             "it stretches the clock beyond the bus's time-out, with this chance",
             _slow(device),
-            {"chance": 0.5},
+            {"chance": CHANCE},
+            adds=True,
         ),
-        FaultKind(device, "delayed", "what is written counts later, s", _delayed(device), {"delay": 0.2}),
         FaultKind(
-            device, "intermittent", "it acknowledges or not, by turns", _by_turns(_nack(device)), _TURNS
+            device,
+            "intermittent",
+            "it acknowledges or not, by turns",
+            _by_turns(_nack(device)),
+            _TURNS,
+            adds=True,
         ),
         FaultKind(
             device,
@@ -196,6 +210,7 @@ def _part(device: str) -> tuple[FaultKind, ...]:
             "its registers are back at their power-on values",
             _brown_out(device),
             momentary=True,
+            adds=True,
         ),
     )
 
@@ -203,16 +218,32 @@ def _part(device: str) -> tuple[FaultKind, ...]:
 PWM = (
     *_part("pwm"),
     FaultKind("pwm", "stuck", "it acknowledges and changes nothing", _stuck_pwm),
-    FaultKind("pwm", "wrong", "an upset register: the frequency is false", _wrong_pwm, momentary=True),
+    FaultKind("pwm", "delayed", "what is written counts later, s", _delayed_pwm, {"delay": delay(0.2)}),
+    FaultKind(
+        "pwm", "wrong", "an upset register: the frequency is false", _wrong_pwm, momentary=True, adds=True
+    ),
 )
 MONITOR = (
     *_part("monitor"),
     FaultKind("monitor", "stuck", "always the same conversion", _stuck_monitor),
-    FaultKind("monitor", "wrong", "it measures so many times too much", _wrong_monitor, {"gain": 2.0}),
+    FaultKind(
+        "monitor", "delayed", "it tells what it measured s ago", _delayed_monitor, {"delay": delay(2.0)}
+    ),
+    FaultKind(
+        "monitor",
+        "wrong",
+        "it measures so many times too much",
+        _wrong_monitor,
+        {"gain": Parameter(2.0, 0.0, 10.0)},
+    ),
 )
 BUS = (
     FaultKind(
-        "bus", "off", "no part acknowledges", lambda bench, _: bench.hardware.bus.nack(None, times=None)
+        "bus",
+        "off",
+        "no part acknowledges",
+        lambda bench, _: bench.hardware.bus.nack(None, times=None),
+        adds=True,
     ),
     FaultKind(
         "bus",
@@ -221,16 +252,22 @@ BUS = (
         lambda bench, given: bench.hardware.bus.nack(
             None, times=None, chance=lambda: bench.generator.random() < given["chance"]
         ),
-        {"chance": 0.5},
+        {"chance": CHANCE},
+        adds=True,
     ),
     FaultKind(
         "bus",
         "arbitration",
         "another master wins, always",
         lambda bench, _: bench.hardware.bus.lose_arbitration(times=None),
+        adds=True,
     ),
     FaultKind(
-        "bus", "hang", "the clock line is held low", lambda bench, _: bench.hardware.bus.hang(times=None)
+        "bus",
+        "hang",
+        "the clock line is held low",
+        lambda bench, _: bench.hardware.bus.hang(times=None),
+        adds=True,
     ),
     FaultKind(
         "bus",
@@ -238,5 +275,6 @@ BUS = (
         "the clock line is held low, by turns",
         _by_turns(lambda bench, _: bench.hardware.bus.hang(times=None)),
         _TURNS,
+        adds=True,
     ),
 )

@@ -5,10 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from flight.errors import UsageError
+from flight.settings import Config
 from sim_hal.faults.bench import Bench, Lift
 from sim_hal.faults.grammar import ScheduledFault, schedule
 from sim_hal.faults.kinds import Where
 from sim_hal.settings import FaultEntry
+
+_SECTIONS = {"camera": "camera", "vision": "camera", "monitor": "power_monitor"}
+"""Which section of a configuration a device flies by, where it can be left out."""
 
 
 def scheduled(entries: Sequence[FaultEntry], realtime: bool) -> tuple[ScheduledFault, ...]:
@@ -19,7 +23,45 @@ def scheduled(entries: Sequence[FaultEntry], realtime: bool) -> tuple[ScheduledF
             raise UsageError(f"fault {str(fault)!r}: makes sense in real time only: add --realtime")
         if fault.kind.where is Where.COMMAND_LINE:
             raise UsageError(f"fault {str(fault)!r}: give it with --fault; a file cannot corrupt itself")
+    _check_apart(faults)
     return faults
+
+
+def check(entries: Sequence[FaultEntry], config: Config, realtime: bool) -> tuple[ScheduledFault, ...]:
+    """Read the faults of a flight of `config`. Raises UsageError for one that could not do anything in it."""
+    faults = scheduled(entries, realtime)
+    for fault in faults:
+        if fault.at >= config.duration:
+            raise UsageError(
+                f"fault {str(fault)!r}: the flight is over after {config.duration:g} s: "
+                "begin it earlier, or fly longer (--duration)"
+            )
+        section = _SECTIONS.get(fault.kind.device)
+        if section is not None and getattr(config, section) is None:
+            raise UsageError(
+                f"fault {str(fault)!r}: no {fault.kind.device} flies here: the configuration needs a "
+                f"`{section}` section"
+            )
+        if fault.kind.name == "imu: baud" and fault.parameters["rate"] == config.inertial_unit.baud_rate:
+            raise UsageError(f"fault {str(fault)!r}: it speaks at this speed already: give another rate")
+    return faults
+
+
+def _check_apart(faults: Sequence[ScheduledFault]) -> None:
+    """Raise UsageError for two that would take each other's place."""
+    alone = [fault for fault in faults if not fault.kind.adds]
+    for number, fault in enumerate(alone):
+        for other in alone[:number]:
+            if fault.kind.thing == other.kind.thing and _meet(fault, other):
+                raise UsageError(
+                    f"fault {str(fault)!r} would take the place of {str(other)!r}: "
+                    "let one end (`for`) before the other begins"
+                )
+
+
+def _meet(fault: ScheduledFault, other: ScheduledFault) -> bool:
+    first, second = sorted((fault, other), key=lambda one: one.at)
+    return second.at < first.end or second.at == first.at
 
 
 def put(faults: Sequence[ScheduledFault], bench: Bench, epoch_ns: int) -> None:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 
 from flight.quaternion import from_rotation_vector, multiply
 from sim_hal.emulators.serial_line import LineFaults
+from sim_hal.emulators.vn100_registers import BAUD_RATES, UnitError
 from sim_hal.emulators.vn100_sensors import Measured
 from sim_hal.faults.bench import Bench, Lift, no_lift
-from sim_hal.faults.kinds import FaultKind, Parameters
+from sim_hal.faults.kinds import CHANCE, PERIOD, SHARE, FaultKind, Parameter, Parameters, delay
 
 
 def _line(faults: Callable[[Parameters], LineFaults]) -> Callable[[Bench, Parameters], Lift]:
@@ -44,7 +47,9 @@ def _unplugged(bench: Bench, _: Parameters) -> Lift:
 
 
 def _baud(bench: Bench, given: Parameters) -> Lift:
-    bench.hardware.unit.change_baud_rate(round(given["rate"]), bench.now_ns())
+    # A speed that its stream does not fit into is one all the same: nobody asked the unit.
+    with suppress(UnitError):
+        bench.hardware.unit.change_baud_rate(round(given["rate"]), bench.now_ns())
     return no_lift
 
 
@@ -85,40 +90,59 @@ def _intermittent(bench: Bench, given: Parameters) -> Lift:
     return bench.toggle(begin, given["period"], given["share"])
 
 
+_WRONG = {"angle": Parameter(0.2, -math.pi, math.pi, "rad"), "rate": Parameter(0.05, -10.0, 10.0, "rad/s")}
+_ONE_OF = Parameter(8.0, 2.0, 1000.0, whole=True)
+_RATE = Parameter(230400.0, min(BAUD_RATES), max(BAUD_RATES), "baud", choices=BAUD_RATES)
+
 IMU = (
     FaultKind("imu", "off", "no power; it starts anew, on its saved settings, when it is back", _off),
-    FaultKind("imu", "silent", "not one byte crosses", _line(lambda _: LineFaults(silent=True))),
+    FaultKind("imu", "silent", "not one byte crosses", _line(lambda _: LineFaults(silent=True)), adds=True),
     FaultKind("imu", "unplugged", "the serial port is gone", _unplugged),
     FaultKind("imu", "stuck", "good packets, always the same values", _stuck),
-    FaultKind("imu", "garbage", "random bytes for its own", _line(lambda _: LineFaults(garbage=True))),
-    FaultKind("imu", "wrong", "good packets, false values", _wrong, {"angle": 0.2, "rate": 0.05}),
     FaultKind(
-        "imu", "slow", "one packet of n comes", _line(lambda p: LineFaults(thinned=round(p["n"]))), {"n": 8.0}
+        "imu", "garbage", "random bytes for its own", _line(lambda _: LineFaults(garbage=True)), adds=True
+    ),
+    FaultKind("imu", "wrong", "good packets, false values", _wrong, _WRONG),
+    FaultKind(
+        "imu",
+        "slow",
+        "one packet of n comes",
+        _line(lambda p: LineFaults(thinned=round(p["n"]))),
+        {"n": _ONE_OF},
+        adds=True,
     ),
     FaultKind(
         "imu",
         "delayed",
         "every byte comes later, s",
         _line(lambda p: LineFaults(delay_ns=round(p["delay"] * 1e9))),
-        {"delay": 0.2},
+        {"delay": delay(0.2)},
+        adds=True,
     ),
     FaultKind(
-        "imu", "intermittent", "silent and not, by turns", _intermittent, {"period": 0.5, "share": 0.5}
+        "imu",
+        "intermittent",
+        "silent and not, by turns",
+        _intermittent,
+        {"period": PERIOD, "share": SHARE},
+        adds=True,
     ),
     FaultKind(
         "imu",
         "bits",
         "each bit flips with this chance",
         _line(lambda p: LineFaults(flip_probability=p["chance"])),
-        {"chance": 1e-3},
+        {"chance": replace(CHANCE, default=1e-3)},
+        adds=True,
     ),
     FaultKind(
         "imu",
         "cut",
         "packets lose bytes with this chance",
         _line(lambda p: LineFaults(cut_probability=p["chance"])),
-        {"chance": 0.3},
+        {"chance": replace(CHANCE, default=0.3)},
+        adds=True,
     ),
     FaultKind("imu", "reset", "it starts anew, on its saved settings", _reset, momentary=True),
-    FaultKind("imu", "baud", "it speaks at another speed", _baud, {"rate": 230400.0}, momentary=True),
+    FaultKind("imu", "baud", "it speaks at another speed", _baud, {"rate": _RATE}, momentary=True),
 )

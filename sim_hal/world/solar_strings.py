@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flight.arrays import FloatArray
+from flight.directions import tangent_basis
 from flight.earth import EARTH_RADIUS
 from flight.shadow import sunlit_share
 from flight.sun import ASTRONOMICAL_UNIT
@@ -94,9 +95,7 @@ def _ground_in_view(position: FloatArray) -> tuple[FloatArray, FloatArray, float
     cosine = 1.0 - (np.arange(_RINGS) + 0.5) / _RINGS * (1.0 - widest)
     sine = np.sqrt(1.0 - cosine**2)
     angle = np.arange(_SPOKES) * (2.0 * np.pi / _SPOKES)
-    first = np.cross(down, np.eye(3)[int(np.argmin(np.abs(down)))])
-    first /= np.linalg.norm(first)
-    spokes = np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * np.cross(down, first)
+    spokes = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ tangent_basis(down)
     rays = cosine[:, None, None] * down + sine[:, None, None] * spokes
     length = distance * cosine - np.sqrt(EARTH_RADIUS**2 - (distance * sine) ** 2)
     ground = (position + length[:, None, None] * rays) / EARTH_RADIUS

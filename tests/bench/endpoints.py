@@ -88,28 +88,36 @@ def _print_faint(options: argparse.Namespace) -> dict[str, Any]:
 
 def _print_attitudes(options: argparse.Namespace) -> dict[str, Any]:
     rows = [
-        attitude_row(percent, options.attitude_frames, options.seed, options.faintest)
+        attitude_row(percent, options.attitude_frames, options.seed, options.faintest, options.exposure)
         for percent in options.percent
     ]
     if not options.json:
         _say(
-            f"\nattitude at mid-exposure, across the boresight, {mid_exposure.EXPOSURE:g} s,"
+            f"\nattitude at mid-exposure, across the boresight, {options.exposure:g} s,"
             f" stars to V {options.faintest:g}"
         )
         _say("turn %  solution     rates  rms px  median  largest  bound px  rms x bound  median x bound")
         for row in rows:
             for name, one in row["solutions"].items():
-                _say(
-                    f"{row['percent']:6.0f}  {name:10} {row['attitudes']:3d}/{row['frames']:<3d}"
-                    f" {one['rms_px']:7.4f} {one['median_px']:7.4f} {one['largest_px']:8.4f}"
-                    f" {row['bound_px']:9.4f} {one['over_bound']:12.2f} {one['over_bound_median']:15.2f}"
-                )
-            if row["solutions"]:
+                _print_solution(row, name, one)
+            if row["attitudes"]:
+                claimed = ", ".join(f"{name} {ratio:.2f}" for name, ratio in row["over_claimed"].items())
+                rates = ", ".join(f"{name} fit {ratio:.2f}" for name, ratio in row["rate_over_bound"].items())
                 _say(
                     f"        {100 * row['dropped']:.0f} % of the stars do not agree;"
-                    f" refined: rms over its own sigma {row['refined_over_claimed']:.2f}"
+                    f" rms over its own sigma: {claimed}; rate, vector, x bound: {rates}"
                 )
-    return {"attitude": rows}
+    return {"exposure": options.exposure, "attitude": rows}
+
+
+def _print_solution(row: dict[str, Any], name: str, one: dict[str, Any]) -> None:
+    if not one["attitudes"]:
+        return
+    _say(
+        f"{row['percent']:6.0f}  {name:10} {one['attitudes']:3d}/{row['frames']:<3d}"
+        f" {one['rms_px']:7.4f} {one['median_px']:7.4f} {one['largest_px']:8.4f}"
+        f" {row['bound_px']:9.4f} {one['over_bound']:12.2f} {one['over_bound_median']:15.2f}"
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -133,11 +141,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
         default=8.5,
         help="star in the sky of the attitudes, V (default %(default)s; the bound knows of no hidden light)",
     )
+    parser.add_argument(
+        "--exposure",
+        type=float,
+        default=mid_exposure.EXPOSURE,
+        help="s, of the attitudes (default %(default)s)",
+    )
     parser.add_argument("--seed", type=int, default=_SEED, help="default %(default)s")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of the tables")
     options = parser.parse_args(arguments)
     if options.frames < 2 or min(options.faint_frames, options.attitude_frames) < 1:
         parser.error("--frames must be at least 2, the other numbers of frames at least 1")
+    if not options.exposure > 0.0:
+        parser.error("--exposure must be positive")
     facts: dict[str, Any] = {"seed": options.seed}
     if not options.json:
         _say(f"seed {options.seed}")

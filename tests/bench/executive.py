@@ -49,6 +49,14 @@ PRIORITY = 50
 
 _PR_CAPBSET_READ, _PR_CAPBSET_DROP, _CAP_SYS_NICE = 23, 24, 23  # linux/prctl.h, linux/capability.h
 _NO_BYTECODE, _BYTECODE = "PYTHONDONTWRITEBYTECODE", "PYTHONPYCACHEPREFIX"
+_IMPORTED = (
+    "flight.app.flight",
+    "flight.cli.run",
+    "flight.executive.worker",
+    "flight.vision.likelihood.estimate",
+    "sim_hal.faults.host",
+    "sim_hal.remote",
+)
 _ROLES = {
     "flight.guidance.job": "planner",
     "flight.startracker.frame_job": "vision",
@@ -166,7 +174,7 @@ def _compiled() -> Iterator[None]:
         before = {name: os.environ.pop(name, None) for name in (_NO_BYTECODE, _BYTECODE)}
         os.environ[_BYTECODE] = folder
         try:
-            modules = ", ".join(("flight.app", "flight.cli.run", "flight.executive.worker", *_ROLES))
+            modules = ", ".join((*_IMPORTED, *_ROLES))
             subprocess.run([sys.executable, "-c", f"import {modules}"], cwd=ROOT, check=True)
             yield
         finally:

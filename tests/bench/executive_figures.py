@@ -15,7 +15,10 @@ from tests.bench.process_watch import MIB, Look
 from tests.guardian.live_flight import CoilTruth
 
 PERIOD_NS = 25_000_000
-"""Of the control group at 40 Hz; mission time zero is a multiple of it (`flight.app.mission_zero`)."""
+"""Of the control group at 40 Hz; mission time zero is a multiple of it (`flight.app.mission_time`)."""
+
+SLOPE_SPAN = 240.0
+"""s after the warm-up from which on a slope is told."""
 
 Figures = dict[str, Any]
 
@@ -130,8 +133,8 @@ def _of_processes(watched: Watched, warm_s: float) -> Figures:
     total = np.array([sum(look.memory.values()) for look in looks]) / MIB
     times = [look.time for look in looks]
     alone = watched.shared_with_others / MIB
-    slope = slope_per_hour(times, [sum(look.own.values()) / MIB for look in looks])
-    of_control = slope_per_hour(times, [look.own["control"] / MIB for look in looks])
+    slope = judged_slope(times, [sum(look.own.values()) / MIB for look in looks])
+    of_control = judged_slope(times, [look.own["control"] / MIB for look in looks])
     return {
         "processor": processor,
         "processor_control": processor["control"],
@@ -150,6 +153,16 @@ def _of_processes(watched: Watched, warm_s: float) -> Figures:
         "control_slope_mib_per_hour": of_control[0],
         "control_slope_interval": of_control[1:],
     }
+
+
+def judged_slope(seconds: list[float], levels: list[float]) -> tuple[float, float, float]:
+    """Return the slope per hour and its interval; NaN where the span is too short to tell one that is asked.
+
+    Pages come and go by tenths of a MiB: over a minute that alone is tens of MiB/h.
+    """
+    if seconds[-1] - seconds[0] < SLOPE_SPAN:
+        return np.nan, np.nan, np.nan
+    return slope_per_hour(seconds, levels)
 
 
 def _share(looks: list[Look], name: str) -> float:

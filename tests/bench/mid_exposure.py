@@ -6,6 +6,10 @@ covariance. `refined` weighs the stars' pixels by their whole covariances, since
 known several times worse than across, and does without stars that disagree with the rest by more than chance
 allows, the worst first: light of fainter stars hides in some streaks. `agreed` is ESOQ2 of those that remain.
 
+`flight` is the star tracker's own answer to the same fit, told roughly where the camera looks, and
+`known sky` its answer after the second fit, with the light of unseen stars taken out
+(`flight.startracker.known_sky`); the rates of both fits are held against their bound too.
+
 The bound: all pixels of the brightest stars, whose directions are known and whose light and background are
 not, the turn, the width of the point spread and the attitude common to all (Fisher information as in
 `flight.vision.bound`).
@@ -23,13 +27,19 @@ from flight.attitude import esoq2
 from flight.errors import FlightError
 from flight.pinhole import Pinhole
 from flight.quaternion import attitude_matrix, from_rotation_vector, multiply
+from flight.startracker.build import default_index
+from flight.startracker.known_sky import with_known_sky
+from flight.startracker.solution import FrameSolution
+from flight.startracker.solve import AttitudePrior, SolveSettings, solve_motion
 from flight.vision.bound import star_information
 from flight.vision.likelihood.motion import Motion
 from flight.vision.likelihood.result import MotionResult
+from flight.vision.likelihood.settings import LikelihoodSettings
 from flight.vision.olae import cross_matrices
 from flight.vision.two_attitudes import attitude_error, error_in_pixels
 from sim_hal.star_camera import StarCameraModel
 from tests.bench.streaks import estimated, scenes
+from tests.campaigns import streaks as campaign
 from tests.campaigns.scenes import FIELD, Scene, noise_floor
 
 _MATCH_PX = 6.0
@@ -41,7 +51,10 @@ _ROUNDS = 2
 _FARTHEST = 13.8
 _LEAST_STARS = 4
 EXPOSURE = 0.2
-SOLUTIONS = ("all stars", "agreed", "refined")
+SOLUTIONS = ("all stars", "agreed", "refined", "flight", "known sky")
+FITS = ("first", "known sky")
+# rad: by how much the tracker's prior is wrong about each axis, and believed to be.
+_PRIOR_ERROR, _PRIOR_SIGMA = np.array([2e-4, -1e-4, 1e-4]), 3e-4
 # Median of the distance of a point whose two coordinates have the rms distance 1.
 _RAYLEIGH_MEDIAN = float(np.sqrt(np.log(2.0)))
 
@@ -176,47 +189,85 @@ def across_bound(scene: Scene, camera: StarCameraModel) -> float:
     return float(np.sqrt(covariance[4, 4] + covariance[5, 5]))
 
 
-def attitude_row(percent: float, frames: int, seed: int, faintest: float) -> dict[str, Any]:
+def tracked(
+    found: MotionResult, scene: Scene, camera: StarCameraModel, truth: FloatArray
+) -> tuple[FrameSolution, FrameSolution]:
+    """Return what the star tracker makes of the fit, and of a second one with all stars known."""
+    settings = SolveSettings(
+        likelihood=LikelihoodSettings(saturation=float(camera.highest_count), gain=camera.gain)
+    )
+    prior = AttitudePrior(multiply(from_rotation_vector(_PRIOR_ERROR), truth), _PRIOR_SIGMA)
+    first = solve_motion(found, camera.pinhole, (1.0, 1.0), default_index(), settings, prior)
+    return first, with_known_sky(scene.pixels, first, default_index(), settings, settings.likelihood)
+
+
+def attitude_row(percent: float, frames: int, seed: int, faintest: float, exposure: float) -> dict[str, Any]:
     """Return errors of the attitude at mid-exposure across the boresight, px, and over the bound."""
     camera = StarCameraModel(field_of_view=FIELD)
-    errors, bounds, claimed, dropped = [], [], [], []
-    for scene in scenes(camera, frames, percent, (0.0, 90.0), EXPOSURE, (seed, 3), faintest):
-        found = estimated(scene.pixels, scene.rate, EXPOSURE, camera)
+    errors, bounds, claimed, dropped, rates = [], [], [], [], []
+    for scene in scenes(camera, frames, percent, (0.0, 90.0), exposure, (seed, 3), faintest):
+        found = estimated(scene.pixels, scene.rate, exposure, camera)
+        least = campaign._bound(scene, camera)
         fix = mid_attitude(found, scene, camera.pinhole) if found.rate is not None else None
-        if fix is None:
+        if fix is None or least is None:
             continue
         half = from_rotation_vector(0.5 * scene.rate * scene.exposure)
         truth = multiply(half, scene.attitudes[0])
-        errors.append([attitude_error(q, truth)[1] for q in (fix.quaternion, fix.agreed, fix.refined)])
+        solved = tracked(found, scene, camera, truth)
+        motions, fixes = [one.motion for one in solved], [one.fix for one in solved]
+        attitudes = [fix.quaternion, fix.agreed, fix.refined]
+        attitudes += [np.full(4, np.nan) if one is None else one.quaternion for one in fixes]
+        errors.append([attitude_error(quaternion, truth)[1] for quaternion in attitudes])
         bounds.append(across_bound(scene, camera))
-        claimed.append(fix.sigma_across)
+        claimed.append(
+            [fix.sigma_across]
+            + [np.nan if f is None else np.sqrt(np.trace(f.covariance[:2, :2])) for f in fixes]
+        )
         dropped.append(fix.dropped)
-    angles, least = np.array(errors).reshape(-1, 3), np.array(bounds)
-    pixels = error_in_pixels(1.0, camera.columns, camera.field_of_view) * angles
-    table = (
-        {
-            name: {
-                "rms_px": float(np.sqrt(np.mean(pixels[:, k] ** 2))),
-                "median_px": float(np.median(pixels[:, k])),
-                "largest_px": float(pixels[:, k].max()),
-                "over_bound": float(np.sqrt(np.mean((angles[:, k] / least) ** 2))),
-                "over_bound_median": float(np.median(angles[:, k] / least) / _RAYLEIGH_MEDIAN),
-            }
-            for k, name in enumerate(SOLUTIONS)
-        }
-        if len(angles)
-        else {}
-    )
+        size = float(np.linalg.norm(scene.rate))
+        rates.append(
+            [
+                float(np.linalg.norm(one.rate - scene.rate)) / size / least[1]
+                for one in motions
+                if one is not None and one.rate is not None
+            ]
+        )
+    angles = np.array(errors).reshape(-1, len(SOLUTIONS))
+    least_angles = np.array(bounds)
+    pixel = error_in_pixels(1.0, camera.columns, camera.field_of_view)
+    over_claimed = angles[:, 2:] / np.array(claimed).reshape(-1, 3)
     return {
         "percent": percent,
         "attitudes": len(angles),
         "frames": frames,
-        "bound_px": _root_mean_square(error_in_pixels(1.0, camera.columns, camera.field_of_view) * least),
-        "solutions": table,
+        "bound_px": _root_mean_square(pixel * least_angles),
+        "solutions": {name: _figures(angles[:, k], least_angles, pixel) for k, name in enumerate(SOLUTIONS)},
         "dropped": float(np.mean(dropped)) if dropped else None,
-        "refined_over_claimed": _root_mean_square(angles[:, 2] / np.array(claimed)),
+        "over_claimed": {name: _root_mean_square(over_claimed[:, k]) for k, name in enumerate(SOLUTIONS[2:])},
+        "rate_over_bound": {
+            name: _root_mean_square(np.array(rates)[:, k]) if rates else None for k, name in enumerate(FITS)
+        },
+    }
+
+
+def _figures(angles: FloatArray, least: FloatArray, pixel: float) -> dict[str, Any]:
+    """Return how many attitudes (n,) rad there are, NaN for none, and their errors, px and over the bound."""
+    there = np.isfinite(angles)
+    if not there.any():
+        return {"attitudes": 0}
+    ratio = angles[there] / least[there]
+    pixels = pixel * angles[there]
+    return {
+        "attitudes": int(np.count_nonzero(there)),
+        "rms_px": float(np.sqrt(np.mean(pixels**2))),
+        "median_px": float(np.median(pixels)),
+        "largest_px": float(pixels.max()),
+        "over_bound": float(np.sqrt(np.mean(ratio**2))),
+        "over_bound_median": float(np.median(ratio) / _RAYLEIGH_MEDIAN),
     }
 
 
 def _root_mean_square(values: FloatArray) -> float | None:
-    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else None
+    """Return that of the values that there are, None without any."""
+    there = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(np.square(there)))) if len(there) else None

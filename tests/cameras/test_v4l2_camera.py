@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from pathlib import Path
 
@@ -265,13 +266,48 @@ def test_a_broken_exchange_is_not_a_crash(
 
     with monkeypatch.context() as broken:
         broken.setattr("hal.buses.v4l2.ioctl", fail)
-        video.rig.wait(20_000_000)
+        video.rig.wait(400_000_000)
+        assert video.camera.poll() is None, "it may pass"
+        video.rig.wait(120_000_000)
         with pytest.raises(NotResponding, match="fetching a frame: Input/output error"):
             video.camera.poll()
     kernel._streamoff(None)  # type: ignore[arg-type]  # the driver's own request was among those that failed
     video.rig.wait(1_100_000_000)
     assert video.rig.next_frame() is not None
     video.camera.close()
+
+
+def test_an_input_output_error_that_passes_costs_no_reopening(
+    kernel: IoctlCamera, clock: ManualClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the kernel's documentation of VIDIOC_DQBUF an EIO may be of a signal lost for a moment."""
+    video = settled(kernel, clock)
+    fetched = kernel._dqbuf
+
+    def lose_signal(_: v4l2.Buffer) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    for _ in range(3):
+        monkeypatch.setattr(kernel, "_dqbuf", lose_signal)
+        video.rig.wait(300_000_000)
+        monkeypatch.setattr(kernel, "_dqbuf", fetched)
+        assert video.rig.next_frame() is not None
+    assert video.camera.counts.openings == 1
+    video.camera.close()
+
+
+def test_a_name_cut_inside_a_character_is_no_crash(kernel: IoctlCamera, clock: ManualClock) -> None:
+    """The fields are of 32 bytes: a name that is longer ends wherever they end."""
+    kernel.card = "Caméra de précision à l'été, é".encode()[:31]
+    kernel.knobs[v4l2.GAIN].name = b"Verst\xc3"
+    with pytest.raises(UnicodeDecodeError):
+        kernel.card.decode()
+    video = video_rig(kernel, clock, gain=5)
+    assert video.rig.next_frame() is not None
+    video.camera.close()
+    kernel.capabilities = v4l2.CAP_STREAMING
+    with pytest.raises(Refused, match="Caméra de précision"):
+        video_rig(kernel, clock)
 
 
 def test_exposures_that_the_camera_cannot_make_are_refused_with_its_limits(

@@ -12,7 +12,7 @@ import tests.bench
 from sim_hal.star_camera import StarCameraModel
 from tests.bench import __main__ as bench
 from tests.bench import streaks
-from tests.bench.mid_exposure import Seen
+from tests.bench.mid_exposure import FITS, SOLUTIONS, Seen, attitude_row
 from tests.bench.stage_clock import REST, WHOLE, clocked
 from tests.campaigns.scenes import FIELD, slew
 
@@ -72,6 +72,19 @@ def test_the_attitude_of_perfect_places_is_exact_and_a_displaced_star_is_singled
     assert int(stars.disagreement(stars.attitude()).argmax()) == 2
     refined, _ = stars.without(2).refined(stars.attitude())
     assert abs(float(refined @ attitude)) == pytest.approx(1.0, abs=1e-14)
+
+
+def test_the_bench_of_the_attitudes_asks_the_tracker_before_and_after_the_sky_is_known() -> None:
+    """One frame of long streaks: an attitude of each way, within some sigmas of the truth."""
+    row = attitude_row(30.0, 1, 5, 8.5, 0.2)
+    assert row["attitudes"] == 1
+    assert list(row["solutions"]) == list(SOLUTIONS)
+    for one in row["solutions"].values():
+        assert 0.0 < one["over_bound"] < 6.0
+    assert all(0.0 < row["over_claimed"][name] < 4.0 for name in ("flight", "known sky"))
+    assert all(0.0 < row["rate_over_bound"][name] < 4.0 for name in FITS)
+    both = [row["solutions"][name]["rms_px"] for name in ("flight", "known sky")]
+    assert both[0] != both[1]
 
 
 def test_pieces_of_one_streak_are_merged_and_crossing_ones_are_not() -> None:

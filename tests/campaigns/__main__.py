@@ -24,9 +24,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("name", choices=sorted(CAMPAIGNS), metavar="NAME", help="which campaign")
     parser.add_argument("--runs", type=_positive, metavar="N", help="runs of each cell, or of the whole")
-    parser.add_argument(
-        "--hours", type=_positive, dest="runs", metavar="H", help="of soak: hours of flight, a run each"
-    )
+    parser.add_argument("--hours", type=_positive, dest="runs", metavar="H", help="of soak: hours of flight")
     parser.add_argument("--seed", type=int, default=1, metavar="S", help="seed of all draws (default 1)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder (default runs/campaigns/NAME)")
     parser.add_argument("--workers", type=_positive, metavar="N", help="processes (default: the cores)")

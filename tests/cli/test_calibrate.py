@@ -10,7 +10,7 @@ import pytest
 
 pillow = pytest.importorskip("PIL.Image", reason="needs the extra `images`")
 
-from tests.cli.test_commands import command  # noqa: E402
+from tests.cli.in_process import command  # noqa: E402
 from tests.startracker.frames import NARROW, sky_frame  # noqa: E402
 
 

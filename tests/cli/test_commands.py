@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import signal
@@ -12,7 +13,9 @@ from pathlib import Path
 
 import pytest
 
+from flight.cli import main
 from flight.telemetry.reader import read_run
+from tests.report.synthetic import Recipe, make_run
 
 ROOT = Path(__file__).resolve().parents[2]
 DEMO = ROOT / "config" / "step_demo.yaml"
@@ -50,6 +53,7 @@ def test_json_is_one_object_and_nothing_else(tmp_path: Path) -> None:
     ("words", "complaint"),
     [
         (["run", "nothing.yaml"], "nothing.yaml: cannot be read"),
+        (["run", "."], ".: cannot be read"),
         (["run", DEMO, "--duration", "-1", "--out", "/tmp/never"], "--duration -1.0: must be a positive"),
         (["run", DEMO, "--duration", "nan", "--out", "/tmp/never"], "--duration nan: must be a positive"),
         (
@@ -139,10 +143,20 @@ def test_export_writes_a_table_for_each_kind_of_packet(tmp_path: Path) -> None:
     assert {"control.csv", "imu.csv", "truth.csv", "event.csv"} <= set(files)
 
 
+def test_a_file_whose_name_is_no_text_is_named_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    raw = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(raw, encoding="utf-8", write_through=True))
+    out = tmp_path / os.fsdecode(b"csv-\xff")
+    assert main(["export", str(make_run(tmp_path / "run", Recipe(duration=1.0))), "--out", str(out)]) == 0
+    assert b"csv-\\udcff/control.csv\n" in raw.getvalue()
+
+
 def test_on_board_nothing_is_imported_that_a_board_does_not_need() -> None:
     """Plots, the simulator and the general optimisers stay away from the flight application."""
     script = (
-        "import sys, flight.app, flight.cli; "
+        "import sys, flight.app.flight, flight.cli; "
         "away = ('matplotlib', 'PIL', 'sim_hal', 'pytest', 'hypothesis'); "
         "print([n for n in sys.modules if n.split('.')[0] in away or n.startswith('scipy.optimize')])"
     )

@@ -12,7 +12,7 @@ pillow = pytest.importorskip("PIL.Image", reason="needs the extra `images`")
 
 from sim_hal.earth_camera import nadir, render  # noqa: E402
 from tests.campaigns.nadir import camera_model  # noqa: E402
-from tests.cli.test_commands import command  # noqa: E402
+from tests.cli.in_process import command  # noqa: E402
 from tests.earth_camera.scenes import limb_scene  # noqa: E402
 
 MODEL = camera_model()

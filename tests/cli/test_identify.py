@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from flight.config import parse
-from tests.cli.test_commands import DEMO, command
+from tests.cli.in_process import command
+from tests.cli.test_commands import DEMO
 
 
 @pytest.fixture(scope="module")

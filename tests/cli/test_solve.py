@@ -13,7 +13,7 @@ pillow = pytest.importorskip("PIL.Image", reason="needs the extra `images`")
 
 from flight.quaternion import angle_between  # noqa: E402
 from flight.startracker.pointing import Pointing  # noqa: E402
-from tests.cli.test_commands import command  # noqa: E402
+from tests.cli.in_process import command  # noqa: E402
 from tests.startracker.frames import SkyFrame, sky_frame  # noqa: E402
 
 

@@ -114,6 +114,16 @@ def test_an_adapter_without_block_transfers_is_refused(kernel: IoctlWire) -> Non
         LinuxI2cBus("/dev/null")
 
 
+def test_a_patient_bus_is_opened_when_it_comes(kernel: IoctlWire, tmp_path: Path) -> None:
+    name = tmp_path / "knightcube-i2c"
+    bus = LinuxI2cBus(str(name), patient=True)
+    with pytest.raises(FileNotFoundError):
+        bus.read_byte_data(PCA, 0x00)
+    name.symlink_to("/dev/null")
+    assert bus.read_byte_data(PCA, 0x00) == 0x11
+    bus.close()
+
+
 def test_a_missing_bus_says_which_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hal.buses.i2c_bus.adapters", lambda: [(1, "Synopsys DesignWare I2C adapter")])
     with pytest.raises(NotResponding, match=r"/dev/i2c-97: .*i2c-1 \(Synopsys.*udev rule"):

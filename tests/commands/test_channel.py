@@ -6,6 +6,7 @@ import json
 import os
 import socket
 import stat
+import tempfile
 import threading
 import time
 from collections.abc import Callable
@@ -14,9 +15,10 @@ from pathlib import Path
 import pytest
 
 from flight.cli import main
+from flight.cli.command import exchange
 from flight.commands.channel import AT_MOST, Channel, DatagramChannel, open_udp, open_unix
 from flight.commands.codec import LONGEST, ChangeMode, Command, Slew, unpack
-from flight.errors import UsageError
+from flight.errors import FlightError, UsageError
 from flight.modes.mode import Mode
 from flight.telemetry.definitions import COMMAND
 from flight.telemetry.packets import Packer
@@ -27,7 +29,9 @@ def place(tmp_path: Path) -> Path:
     return tmp_path / "commands"
 
 
-def answer_once(channel: Channel, taken: list[Command], obeyed: bool = True) -> threading.Thread:
+def answer_once(
+    channel: Channel, taken: list[Command], obeyed: bool = True, mode: int = Mode.HOLD
+) -> threading.Thread:
     """Answer the next command, as the flight would, in a thread."""
 
     def serve() -> None:
@@ -36,7 +40,7 @@ def answer_once(channel: Channel, taken: list[Command], obeyed: bool = True) -> 
             for data, sender in channel.poll():
                 taken.append(unpack(data))
                 fields = {"obeyed": int(obeyed), "name": "x", "source": channel.name, "count": 1}
-                fields |= {"mode": int(Mode.HOLD), "text": "as told"}
+                fields |= {"mode": int(mode), "text": "as told"}
                 channel.answer(Packer().pack(COMMAND, 0, fields), sender)
                 return
             time.sleep(0.01)
@@ -104,6 +108,18 @@ def test_a_flight_that_does_not_answer_is_told(place: Path, capsys: pytest.Captu
     assert "no answer within 0.05 s" in capsys.readouterr().err
 
 
+def test_an_answer_of_a_mode_that_there_is_not_is_none(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    channel = open_unix(place)
+    thread = answer_once(channel, [], mode=200)
+    status = main(["command", "--to", str(place), "ping"])
+    thread.join()
+    channel.close()
+    assert status == 1
+    assert capsys.readouterr().err.endswith("bytes is none\n")
+
+
 def flood(to: Path, count: int, data: bytes) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as line:
         line.setblocking(False)
@@ -142,6 +158,26 @@ def test_the_socket_is_for_owner_and_group_only(place: Path) -> None:
     channel = open_unix(place)
     assert stat.S_IMODE(os.stat(place).st_mode) == 0o660
     channel.close()
+
+
+@pytest.mark.skipif(not os.access("/run", os.W_OK), reason="/run may not be written to: be root")
+def test_a_service_is_answered_where_it_can_see_the_socket() -> None:
+    """Its /tmp is its own: what stands in ours is not there for it."""
+    with tempfile.TemporaryDirectory(dir="/run", prefix="knightcube-test-") as folder:
+        channel = open_unix(Path(folder) / "commands")
+        senders: list[str] = []
+
+        def serve() -> None:
+            while not senders:
+                senders.extend(sender for _, sender in channel.poll())
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        with pytest.raises(FlightError, match="no answer"):
+            exchange(f"{folder}/commands", b"ping", 0.2)
+        thread.join()
+        channel.close()
+        assert senders[0].startswith(folder)
 
 
 def test_the_socket_of_a_flight_that_is_gone_is_replaced_but_nothing_else_is(place: Path) -> None:

@@ -52,6 +52,7 @@ def test_the_thesis_loop_stays_as_it_was_in_the_same_world() -> None:
         ),
         ("camera:", "kamera:", "did you mean `camera`"),
         ("horizon: 10.0", "horizon: ten", "`guidance.horizon` is 'ten'"),
+        ("max_age: 0.1 ", "max_age: 0.06 ", r"`inertial_unit.max_age` is 0.06: .* must be 0.075 s at least"),
         ("q2: 0.1}", "q2: .nan}", r"`steps\[4\].q2` is nan: must be a finite number"),
         ("q2: 0.1}", "q2: 0.9}", r"`steps\[4\].q2` is 0.9"),
         ("{at: 0.0,", "{att: 0.0,", "did you mean `at`"),

@@ -17,11 +17,14 @@ from typing import Any
 
 from tests.guardian.live_flight import ROOT, write_config
 
-LIMIT_S = 100.0
+LIMIT_S = 180.0
 _CGROUP = "knightcube-test"
 _SHARE = "/share"
 _UNITS = "etc/systemd/system"
 _FACTS = "/run/knightcube-devices/facts.json"
+COMMANDS = "/run/knightcube/commands"
+"""Where the service listens."""
+
 _OPENED = f"""[Service]
 ProtectHome=no
 ReadWritePaths={_SHARE}/told.txt
@@ -128,6 +131,8 @@ def _furnish(root: Path, folder: Path) -> None:
     """Install the service as anybody would, and put the emulated devices and the scenario beside it."""
     (root / "etc/machine-id").write_text("0123456789abcdef0123456789abcdef\n", encoding="ascii")
     config = write_config(folder)
+    with config.open("a", encoding="utf-8") as file:
+        file.write(f"\ncommands: {{socket: {COMMANDS}}}\n")
     installer = ["chroot", str(root), str(ROOT / "deploy/install.sh")]
     options = ["--venv", sys.prefix, "--config", str(config)]
     _do(*installer, *options)

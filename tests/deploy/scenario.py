@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from sim_hal.device_link import RemoteI2cBus, open_bus
+from sim_hal.faults.host import corrupted
+from tests.deploy.container import COMMANDS
 
 SERVICE = "knightcube.service"
 _PROBE = """[Service]
@@ -49,7 +51,7 @@ class Service:
         begun = time.monotonic()
         act(old)
         zero = again = None
-        while (since := time.monotonic() - begun) < 15.0 and again is None:
+        while (since := time.monotonic() - begun) < 30.0 and again is None:
             if self.driven():
                 # The next process drives the coils again by right, from its first cycle on.
                 if self.pid() in (old, 0):
@@ -94,6 +96,7 @@ def play(facts: Path) -> dict[str, Any]:
     seen["ready_s"] = time.monotonic() - begun
     seen["active"] = service.show("ActiveState")
     seen["status"] = service.show("StatusText")
+    seen["commanded"] = _flight("command", "--to", COMMANDS, "--timeout", "10", "ping")
     seen["devices_closed"] = _devices_closed()
     seen["killed with its guardian"] = service.hurt(
         lambda _: void(systemctl("kill", "--kill-whom=all", "--signal=KILL", SERVICE))
@@ -104,7 +107,36 @@ def play(facts: Path) -> dict[str, Any]:
     wait(service.driven, 20.0)
     systemctl("stop", SERVICE)
     seen["end"] = {"driven": service.driven(), "result": service.show("Result"), "told": _last_words()}
+    seen["damaged"] = _damaged(service)
     seen["broken"] = _broken(service)
+    return seen
+
+
+def _flight(*words: str) -> str:
+    """Return what a command of the flight software printed."""
+    done = subprocess.run(
+        [sys.executable, "-m", "flight", *words], capture_output=True, text=True, check=False
+    )
+    return done.stdout + done.stderr
+
+
+def _damaged(service: Service) -> dict[str, Any]:
+    """Flip one bit of the configuration, with no copy of one that flew; see it refused, not started again."""
+    systemctl("reset-failed", SERVICE)
+    for kept in Path("/var/lib/knightcube").glob("flown.yaml*"):
+        kept.unlink()
+    config = Path("/etc/knightcube/flight.yaml")
+    whole = config.read_text(encoding="utf-8")
+    config.write_text(corrupted(whole, 1, 1), encoding="utf-8")
+    restarts = service.show("NRestarts")
+    systemctl("start", SERVICE)
+    wait(lambda: service.show("ActiveState") == "failed", 20.0)
+    seen = {
+        "driven": service.driven(),
+        "status": service.show("ExecMainStatus"),
+        "restarted": service.show("NRestarts") != restarts,
+    }
+    config.write_text(whole, encoding="utf-8")
     return seen
 
 

@@ -1,8 +1,7 @@
-"""The units, the installer and `coils-off`, as far as they can be tried without booting."""
+"""The units, their drop-ins and the device names, as far as they can be tried without booting."""
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
 import subprocess
@@ -11,36 +10,47 @@ from pathlib import Path
 
 import pytest
 
-from hal.drivers.pca9685 import ALL_LED_OFF_H, FULL
-from hal.guardian.client import CoilReach
+from flight.app.flight import fly
+from flight.app.order import Order
+from flight.errors import ConfigError
+from hal.interfaces.errors import NotResponding
+from tests.deploy.scripts import (
+    DEPLOY,
+    ROOT,
+    TESTBED,
+    board_dropin,
+    changed_testbed,
+    dropin,
+    safe_dropin,
+)
 from tests.scenario.flights import CONFIG
 
-ROOT = CONFIG.parents[1]
-DEPLOY = ROOT / "deploy"
 UNITS = ("knightcube.service", "knightcube-safe.service")
-TESTBED = ROOT / "config" / "testbed.yaml"
+CAMERA = "{device: {kind: v4l2, path: /dev/knightcube-camera, pixel_format: Y16}}"
 
 needs_systemd = pytest.mark.skipif(
     shutil.which("systemd-analyze") is None, reason="systemd-analyze is missing: install systemd"
 )
 
 
-def dropin(config: Path) -> str:
-    words = [sys.executable, str(DEPLOY / "board_dropin.py"), str(config)]
-    return subprocess.run(words, capture_output=True, text=True, check=True, cwd=ROOT).stdout
-
-
-@pytest.fixture(scope="module")
-def units(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with the units, the commands in them where they are now, the drop-in at their end."""
-    folder = tmp_path_factory.mktemp("units")
-    added = dropin(TESTBED)
-    for name in UNITS:
+def put_units(folder: Path, config: Path) -> Path:
+    """Put the units in a folder, the commands in them where they are now, the drop-ins at their end."""
+    for name, added in zip(UNITS, (dropin(config), safe_dropin(config)), strict=True):
         text = (DEPLOY / name).read_text(encoding="utf-8")
         text = text.replace("/opt/knightcube/venv/bin/python", sys.executable)
         text = text.replace("/opt/knightcube/bin/coils-off", str(DEPLOY / "coils-off"))
         (folder / name).write_text(text + "\n" + added, encoding="utf-8")
     return folder
+
+
+@pytest.fixture(scope="module")
+def units(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the units of a board that uses all there is: lasting names, a camera, a ground link."""
+    folder = tmp_path_factory.mktemp("units")
+    config = changed_testbed(
+        folder, camera=CAMERA, coils_bus="/dev/knightcube-i2c", commands="{udp: '192.168.7.2:5000'}"
+    )
+    return put_units(folder, config)
 
 
 @needs_systemd
@@ -50,14 +60,27 @@ def test_systemd_finds_nothing_to_complain_of(units: Path) -> None:
     assert (done.returncode, done.stderr) == (0, "")
 
 
-@needs_systemd
-@pytest.mark.parametrize("name", UNITS)
-def test_the_sandbox_leaves_an_exposure_of_at_most_1_5(units: Path, name: str) -> None:
-    words = ["systemd-analyze", "security", "--offline=true", "--no-pager", str(units / name)]
+def exposure(unit: Path) -> float:
+    """Return what systemd makes of a unit's sandbox: 0 the tightest, 10 none."""
+    words = ["systemd-analyze", "security", "--offline=true", "--no-pager", str(unit)]
     told = subprocess.run(words, capture_output=True, text=True, check=True).stdout
     found = re.search(r"Overall exposure level for \S+: ([0-9.]+)", told)
     assert found is not None
-    assert float(found[1]) <= 1.5
+    return float(found[1])
+
+
+@needs_systemd
+@pytest.mark.parametrize("name", UNITS)
+def test_the_sandbox_leaves_an_exposure_of_at_most_1_5(units: Path, name: str) -> None:
+    """Also with a ground link, and wherever in the network its peer is."""
+    assert exposure(units / name) <= 1.5
+
+
+@needs_systemd
+def test_a_usb3_vision_camera_beside_a_ground_link_leaves_no_more(tmp_path: Path) -> None:
+    camera = "{device: {kind: aravis, name: Some-1, pixel_format: Mono16}}"
+    config = changed_testbed(tmp_path, camera=camera, commands="{udp: '10.1.2.3:5000', peers: [10.0.0.0/8]}")
+    assert exposure(put_units(tmp_path, config) / UNITS[0]) <= 1.5
 
 
 def test_the_watchdog_leaves_room_for_four_meals() -> None:
@@ -80,21 +103,108 @@ def test_the_flight_waits_for_the_device_that_udev_names() -> None:
     unit = subprocess.run(words, capture_output=True, text=True, check=True).stdout.strip()
     text = dropin(TESTBED)
     assert f"Wants={unit}\nAfter={unit}\n" in text
+
+
+@needs_systemd
+@pytest.mark.parametrize("path", ["/dev/i2c-1", "/dev/knightcube-camera", "/dev/v4l/by-id/a b+c.d:0"])
+def test_a_devices_unit_is_named_as_systemd_does_it(path: str) -> None:
+    words = ["systemd-escape", "--path", "--suffix=device", path]
+    assert (
+        board_dropin.device_unit(path)
+        == subprocess.run(words, capture_output=True, text=True, check=True).stdout.strip()
+    )
+
+
+def test_the_flight_waits_for_bus_and_camera_too_which_udev_makes_units(tmp_path: Path) -> None:
+    text = dropin(changed_testbed(tmp_path, camera=CAMERA, coils_bus="/dev/knightcube-i2c"))
+    for name in ("i2c", "imu", "camera"):
+        unit = rf"dev-knightcube\x2d{name}.device"
+        assert f"Wants={unit}\nAfter={unit}\n" in text
     rules = (DEPLOY / "99-knightcube.rules").read_text(encoding="utf-8").splitlines()
-    assert all('TAG+="systemd"' in line for line in rules if "knightcube-imu" in line)
+    for subsystem in ("tty", "i2c-dev", "video4linux"):
+        tagged = [line for line in rules if line.startswith(f'SUBSYSTEM=="{subsystem}"') and "GROUP=" in line]
+        assert tagged
+        assert all('TAG+="systemd"' in line for line in tagged)
 
 
 def test_simulated_devices_ask_for_none_of_the_boards() -> None:
     assert "Device" not in dropin(CONFIG)
 
 
-def test_the_dropin_opens_the_network_only_for_a_command_link(tmp_path: Path) -> None:
-    config = tmp_path / "flight.yaml"
-    linked = TESTBED.read_text(encoding="utf-8") + "\ncommands: {udp: '127.0.0.1:5000'}\n"
-    config.write_text(linked, encoding="utf-8")
-    text = dropin(config)
+@pytest.mark.parametrize(
+    ("commands", "allowed"),
+    [
+        ("{udp: '127.0.0.1:5000'}", ["127.0.0.0/8"]),
+        ("{udp: 'localhost:5000'}", ["127.0.0.0/8"]),
+        ("{udp: '192.168.7.2:5000'}", ["192.168.7.0/24"]),
+        ("{udp: '0.0.0.0:5000', peers: [192.168.7.9, 10.1.0.0/16]}", ["192.168.7.9/32", "10.1.0.0/16"]),
+    ],
+)
+def test_the_dropin_opens_the_network_only_for_a_command_link_and_its_peers(
+    tmp_path: Path, commands: str, allowed: list[str]
+) -> None:
+    text = dropin(changed_testbed(tmp_path, commands=commands))
     assert "RestrictAddressFamilies=AF_INET\n" in text
     assert "PrivateNetwork=no\n" in text
+    assert "IPAddressDeny" not in text, "any, as the unit says, stays"
+    assert re.findall("IPAddressAllow=(.*)", text) == allowed
+    assert "IPAddressDeny=any\n" in (DEPLOY / "knightcube.service").read_text(encoding="utf-8")
+
+
+def test_the_coils_bus_may_have_a_lasting_name_everywhere(tmp_path: Path) -> None:
+    config = changed_testbed(tmp_path, coils_bus="/dev/knightcube-i2c")
+    for text in (dropin(config), safe_dropin(config)):
+        assert "Environment=KNIGHTCUBE_I2C=/dev/knightcube-i2c KNIGHTCUBE_PWM=0x40\n" in text
+        assert "DeviceAllow=/dev/knightcube-i2c rw\n" in text
+    assert "knightcube-imu" not in safe_dropin(config)
+    rules = (DEPLOY / "99-knightcube.rules").read_text(encoding="utf-8")
+    assert re.search(
+        r'^SUBSYSTEM=="i2c-dev", ATTR\{name\}==.*SYMLINK\+="knightcube-i2c"$', rules, re.MULTILINE
+    )
+
+
+@pytest.mark.parametrize("bus", ["-1", "knightcube-i2c", "/dev/a b", "/dev/100%", "true", "1.5", "'1'"])
+def test_a_bus_that_is_neither_number_nor_path_is_refused(tmp_path: Path, bus: str) -> None:
+    """A path goes into units and into a note of ASCII words: one with blanks or % would be read otherwise."""
+    with pytest.raises(ConfigError, match=r"`coils\.bus`"):
+        dropin(changed_testbed(tmp_path, coils_bus=bus))
+
+
+def test_the_flight_opens_the_bus_by_its_lasting_name(tmp_path: Path) -> None:
+    config = changed_testbed(tmp_path, coils_bus="/dev/knightcube-nowhere")
+    with pytest.raises(NotResponding, match="/dev/knightcube-nowhere: no such bus"):
+        fly(Order(config, tmp_path / "run"))
+
+
+def board(folder: Path, below: str) -> Path:
+    """Return a proc and a sys in which the device /dev/null, 1:3, is a serial line somewhere `below`."""
+    (folder / "proc").mkdir(exist_ok=True)
+    (folder / "proc/devices").write_text(
+        "Character devices:\n  1 ttyUSB\n  4 tty\n\nBlock devices:\n  1 ramdisk\n", encoding="ascii"
+    )
+    place = folder / "sys/devices" / below
+    place.mkdir(parents=True)
+    (folder / "sys/dev/char").mkdir(parents=True, exist_ok=True)
+    number = folder / "sys/dev/char/1:3"
+    number.unlink(missing_ok=True)
+    number.symlink_to(place)
+    return folder
+
+
+def test_what_hangs_on_usb_is_let_through_whatever_number_it_comes_back_with(tmp_path: Path) -> None:
+    """DeviceAllow of a file is one number, found when the unit starts; a class is all of its driver's."""
+    node = "DeviceAllow=/dev/null rw"
+    usb = board(tmp_path, "pci0000:00/0000:00:14.0/usb1/1-3/1-3:1.0/ttyUSB0/tty/ttyUSB0")
+    assert board_dropin.allowed("/dev/null", (), usb) == [node, "DeviceAllow=char-ttyUSB rw"]
+    fixed = board(tmp_path, "pci0000:00/0000:00:1e.0/tty/ttyS4")
+    assert board_dropin.allowed("/dev/null", board_dropin.SERIAL, fixed) == [node]
+
+
+def test_what_is_not_there_yet_is_let_through_as_what_it_may_be(tmp_path: Path) -> None:
+    text = dropin(changed_testbed(tmp_path, camera=CAMERA))
+    for name in ("ttyUSB", "ttyACM", "video4linux"):
+        assert f"DeviceAllow=char-{name} rw\n" in text
+    assert "char-i2c" not in text, "the memory's and the monitor's buses are none of its business"
 
 
 @pytest.mark.parametrize(
@@ -105,10 +215,7 @@ def test_the_dropin_opens_the_network_only_for_a_command_link(tmp_path: Path) ->
     ],
 )
 def test_the_dropin_lets_the_configured_camera_through(tmp_path: Path, device: str, allowed: str) -> None:
-    config = tmp_path / "flight.yaml"
-    text = TESTBED.read_text(encoding="utf-8")
-    given = re.sub(r"^camera: none.*$", f"camera: {{device: {device}}}", text, flags=re.MULTILINE)
-    config.write_text(given, encoding="utf-8")
+    config = changed_testbed(tmp_path, camera=f"{{device: {device}}}")
     assert f"DeviceAllow={allowed} rw\n" in dropin(config)
 
 
@@ -122,117 +229,6 @@ def test_a_wrong_configuration_is_one_line_and_status_2(tmp_path: Path) -> None:
     assert "Traceback" not in done.stderr
 
 
-class Tools:
-    """Stand-ins for i2cset and python3, which note how they were called, and whether they succeed."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        (folder / "bin").mkdir()
-        shutil.copy(DEPLOY / "coils-off", folder)
-
-    def put(self, name: str, status: int) -> None:
-        tool = self.folder / "bin" / name
-        tool.write_text(
-            f'#!/bin/sh\necho "{name} $*" >>"{self.folder}/calls"\nexit {status}\n', encoding="utf-8"
-        )
-        tool.chmod(0o755)
-
-    def run(self, **environment: str) -> tuple[int, list[str], str]:
-        done = subprocess.run(
-            [str(self.folder / "coils-off")],
-            env={
-                "PATH": f"{self.folder}/bin:{os.environ['PATH']}",
-                "STATE_DIRECTORY": str(self.folder),
-                **environment,
-            },
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        calls = (self.folder / "calls").read_text(encoding="utf-8").splitlines()
-        return done.returncode, calls, done.stderr
-
-
-@pytest.fixture
-def tools(tmp_path: Path) -> Tools:
-    return Tools(tmp_path)
-
-
-def test_the_coils_are_zeroed_by_i2cset_first(tools: Tools) -> None:
-    tools.put("i2cset", 0)
-    tools.put("python3", 0)
-    assert tools.run() == (0, [f"i2cset -y 1 0x40 0x{ALL_LED_OFF_H:02x} 0x{FULL:02x} b"], "")
-
-
-def test_where_i2cset_fails_any_python_does_it(tools: Tools) -> None:
-    tools.put("i2cset", 1)
-    tools.put("python3", 0)
-    status, calls, _ = tools.run()
-    assert status == 0
-    assert calls[1] == f"python3 -I -S {tools.folder}/smbus_byte.py /dev/i2c-1 0x40 0xfd 0x10"
-
-
-def test_it_tries_again_and_says_so_when_all_is_in_vain(tools: Tools) -> None:
-    tools.put("i2cset", 1)
-    tools.put("python3", 1)
-    status, calls, told = tools.run()
-    assert status == 1
-    assert len(calls) == 10, "five times each"
-    assert "the coils may be driven" in told
-
-
-def test_the_bus_and_address_last_flown_count_more_than_the_units(tools: Tools) -> None:
-    tools.put("i2cset", 0)
-    assert tools.run(KNIGHTCUBE_I2C="/dev/i2c-3", KNIGHTCUBE_PWM="0x41")[1][-1].startswith(
-        "i2cset -y 3 0x41 "
-    )
-    CoilReach("hal.buses.smbus_byte:open_bus", "/dev/i2c-7", 0x42).note(tools.folder)
-    assert tools.run(KNIGHTCUBE_I2C="/dev/i2c-3")[1][-1].startswith("i2cset -y 7 0x42 ")
-
-
-def test_a_stable_name_of_the_bus_is_followed_to_its_number(tools: Tools, tmp_path: Path) -> None:
-    tools.put("i2cset", 0)
-    (tmp_path / "knightcube-i2c").symlink_to("/dev/i2c-5")
-    status, calls, _ = tools.run(KNIGHTCUBE_I2C=str(tmp_path / "knightcube-i2c"))
-    assert status == 0
-    assert calls[-1].startswith("i2cset -y 5 0x40 ")
-
-
-@needs_systemd
-def test_a_dry_run_tells_every_step_and_touches_nothing() -> None:
-    before = sorted(Path("/etc/systemd/system").iterdir())
-    words = ["sh", str(DEPLOY / "install.sh"), "--dry-run", "--config", str(TESTBED)]
-    told = subprocess.run(words, capture_output=True, text=True, check=True).stdout
-    for step in (
-        "useradd",
-        "venv",
-        "pip install",
-        "coils-off",
-        "flight.yaml",
-        "knightcube.service",
-        "99-knight",
-    ):
-        assert step in told
-    assert sorted(Path("/etc/systemd/system").iterdir()) == before
-    assert not Path("/opt/knightcube").exists()
-
-
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        (["--frobnicate"], "unknown option"),
-        (["--config"], "wants a value"),
-        (["--dry-run", "--config", "/no"], "/no"),
-    ],
-)
-def test_wrong_use_of_the_installer_is_one_line_and_status_2(words: list[str], told: str) -> None:
-    done = subprocess.run(
-        ["sh", str(DEPLOY / "install.sh"), *words], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 2
-    assert told in done.stderr
-
-
 @pytest.mark.skipif(shutil.which("shellcheck") is None, reason="shellcheck is missing")
 def test_shellcheck_is_silent() -> None:
     words = ["shellcheck", str(DEPLOY / "install.sh"), str(DEPLOY / "coils-off")]
@@ -243,6 +239,7 @@ def test_every_udev_rule_is_of_matches_and_assignments() -> None:
     rules = (DEPLOY / "99-knightcube.rules").read_text(encoding="utf-8").splitlines()
     term = re.compile(r'[A-Z_]+(\{[^}]+\})?(==|!=|=|\+=)"[^"]*"')
     lines = [line for line in rules if line and not line.startswith("# ")]
+    assert any("ef0500" in line and 'GROUP="video"' in line for line in lines), "USB3 Vision"
     assert {name for line in lines for name in re.findall(r"knightcube-\w+", line)} == {
         "knightcube-imu", "knightcube-i2c", "knightcube-camera"
     }  # fmt: skip

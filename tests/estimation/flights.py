@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,10 +45,16 @@ class Flight:
     parameters: Parameters
 
 
-def fly(seed: int, cycles: int, suspended: bool, amplitude: float = 0.05) -> Flight:
+def fly(
+    seed: int,
+    cycles: int,
+    suspended: bool,
+    amplitude: float = 0.05,
+    driven: Callable[[int, FloatArray], FloatArray] = lambda _, command: command,
+) -> Flight:
     """Return a flight with noise of the unit and of the coils, a gyro bias and a thread or a drag.
 
-    `amplitude` A is that of the currents.
+    `amplitude` A is that of the currents; `driven` tells by cycle and command what the coils carry.
     """
     rng = np.random.default_rng(seed)
     world = SuspendedWorld(rng) if suspended else FreeWorld(rng)
@@ -67,7 +74,7 @@ def fly(seed: int, cycles: int, suspended: bool, amplitude: float = 0.05) -> Fli
         swing = amplitude * math.sin(0.015 * cycle)
         command = np.array([swing, 0.0, 0.0]) if suspended else np.array([swing, -swing, 0.5 * swing])
         flight.commands.append(command)
-        world.command(command)
+        world.command(driven(cycle, command))
         world.advance(CYCLE_NS)
     return flight
 

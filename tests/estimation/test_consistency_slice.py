@@ -21,10 +21,19 @@ def fly(scene: str, runs: int, **parameters: float) -> list[Result]:
     return [consistency.run(Case(str(run), (SEED, run), parameters_)) for run in range(runs)]
 
 
-@pytest.mark.parametrize(("scene", "runs"), [("testbed", 8), ("free", 3)])
-def test_errors_and_innovations_are_as_large_as_the_filter_says(scene: str, runs: int) -> None:
+@pytest.fixture(scope="module")
+def flown() -> dict[str, list[Result]]:
+    """Return honest runs of both scenes."""
+    return {"testbed": fly("testbed", 8), "free": fly("free", 3)}
+
+
+@pytest.mark.parametrize("scene", ["testbed", "free"])
+def test_errors_and_innovations_are_as_large_as_the_filter_says(
+    scene: str, flown: dict[str, list[Result]]
+) -> None:
     """Final NEES in its 99.9 % band; NIS of 40 Hz measurements within 4 %, of the camera's within a half."""
-    results = fly(scene, runs)
+    results = flown[scene]
+    runs = len(results)
     facts = consistency.scene_facts(results)
     low, high = consistency.band(runs * facts["degrees"], 0.999)
     assert low < facts["nees_final"] < high
@@ -52,8 +61,8 @@ def test_variances_that_are_claimed_too_large_are_found_out() -> None:
     assert facts["nis"]["gyro"]["mean"] < 0.5
 
 
-def test_the_summary_tells_both_scenes(tmp_path: Path) -> None:
-    summary = consistency.summarise([*fly("testbed", 1), *fly("free", 1)], tmp_path)
+def test_the_summary_tells_both_scenes(flown: dict[str, list[Result]], tmp_path: Path) -> None:
+    summary = consistency.summarise([*flown["testbed"], *flown["free"]], tmp_path)
     assert set(summary.facts) == {"testbed", "free"}
     assert "NIS gyro" in summary.text
     assert np.isfinite(summary.facts["free"]["nees_final"])

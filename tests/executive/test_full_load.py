@@ -23,7 +23,7 @@ from flight.executive.processes import ProcessRunner
 from hal.buses.clock import SystemClock
 from tests.bench import bare_loop, process_watch
 from tests.bench.executive import Load, fly
-from tests.bench.executive_figures import ASKED, PERIOD_NS, misses, table
+from tests.bench.executive_figures import ASKED, PERIOD_NS, SLOPE_SPAN, judged_slope, misses, table
 from tests.bench.lateness import Grid, lost_beyond, on_grid, slope_per_hour
 from tests.bench.process_watch import MIB
 
@@ -115,6 +115,13 @@ def test_memory_that_a_process_touches_is_seen_and_its_processor_time_too() -> N
     assert process_watch.unshared(me) - alone == pytest.approx(32 << 20, abs=6 << 20)
     assert 0.05 < after.processor["me"] - before.processor["me"] < 1.0
     assert alone >= before.memory["me"] - (1 << 20)
+
+
+def test_a_slope_is_told_from_minutes_on_and_not_before() -> None:
+    seconds = np.arange(0.0, SLOPE_SPAN + 1.0, 0.5)
+    levels = 100.0 + 12.0 * seconds / 3600.0
+    assert judged_slope(seconds.tolist(), levels.tolist()) == pytest.approx((12.0, 12.0, 12.0))
+    assert np.isnan(judged_slope(seconds[:-4].tolist(), levels[:-4].tolist())).all()
 
 
 def fill_and_free(_: Any) -> tuple[int, float]:

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight import app
 from flight import config as configuration
+from flight.app.devices import coil_settings, unit_settings
+from flight.app.mission_time import next_whole_second
 from flight.arrays import FloatArray
 from flight.health.coil_response import ResponseSettings
 from flight.health.coil_watch import CoilWatch, CoilWatchSettings
@@ -60,13 +61,15 @@ def watch_settings(config: Config, monitor_only: bool = False) -> CoilWatchSetti
 
 @dataclass
 class Watched:
-    """What a watch saw: verdicts and doubts with the time at which they came, s."""
+    """What a watch saw: verdicts with the time at which they came, s; what the coils carried (k, 3) A."""
 
     watch: CoilWatch
     found: list[tuple[float, str, str]]
     readings: int
     suspicious: int
     angle: float
+    times: FloatArray
+    carried: FloatArray
 
 
 def observe(
@@ -88,22 +91,24 @@ def observe(
     clock = SimClock()
     lock = lockstep.build(config, section, None, clock)
     pca = Pca9685(lock.wires.i2c, config.coils.address, clock)
-    coils = PwmTorqueCoils(pca, clock, app.coil_settings(config))
+    coils = PwmTorqueCoils(pca, clock, coil_settings(config))
     coils.start()
     monitor = Ina219(lock.wires.i2c, 0x45, clock)
-    unit = Vn100(lock.wires.serial, clock, app.unit_settings(config))
+    unit = Vn100(lock.wires.serial, clock, unit_settings(config))
     unit.configure()
     watch = CoilWatch(watch_settings(config, monitor_only))
-    epoch_ns = app.next_whole_second(clock)
+    epoch_ns = next_whole_second(clock)
     lock.release(epoch_ns)
-    seen = Watched(watch, [], 0, 0, 0.0)
+    seen = Watched(watch, [], 0, 0, 0.0, np.empty(0), np.empty((0, 3)))
+    carried: list[tuple[float, FloatArray]] = []
     newest: ImuReading | None = None
     for cycle in range(round(duration * 1e9) // CYCLE_NS):
         clock.sleep_until_ns(epoch_ns + cycle * CYCLE_NS)
         now_ns = clock.now_ns()
         time = (now_ns - epoch_ns) * 1e-9
         state = coils.state()
-        watch.commanded(now_ns, state.current)
+        carried.append((time, lock.hardware.circuit.currents().copy()))
+        watch.commanded(now_ns, state.current, state.braked)
         for reading in unit.poll():
             newest = reading
             watch.felt(reading.time_ns, reading.rate, reading.field)
@@ -117,7 +122,10 @@ def observe(
             seen.found.append((time, "xyz"[verdict.axis], verdict.fault.name))
         if newest is not None:
             wanted = command(time, newest)
-            coils.command(np.where(watch.available, wanted, 0.0) + watch.neutral + watch.probe)
+            usable = watch.available & (not watch.at_rest)
+            coils.command(np.where(usable, wanted, 0.0) + watch.probe)
+        coils.brake(watch.braked)
+    seen.times, seen.carried = (np.array(column) for column in zip(*carried, strict=True))
     seen.angle = lock.hardware.world.angle
     coils.close()
     monitor.close()

@@ -52,6 +52,8 @@ def is_sound(lock: LockStep) -> bool:
         and set(hardware.circuit._conditions) == {Condition.SOUND}
         and hardware.camera.fault == ""
         and hardware.camera.late_ns == 0
+        and hardware.camera.one_of == 1
+        and hardware.monitor.lag_ns == 0
     )
 
 

@@ -110,8 +110,9 @@ def _excerpt(draw: Draw, tree: dict[str, Any]) -> dict[str, Any]:
 
 def _set_up(config: Config) -> None:
     """Make of a configuration what a flight makes of it first."""
-    from flight.app import coil_settings, unit_settings  # noqa: PLC0415 - the whole flight hangs on it
-    from flight.loop import plant_of, workers  # noqa: PLC0415
+    from flight.app.devices import coil_settings, unit_settings  # noqa: PLC0415 - the whole flight hangs on it
+    from flight.believed_plant import plant_of  # noqa: PLC0415
+    from flight.tasks.workers import workers  # noqa: PLC0415
 
     plant = plant_of(config)
     coils, unit = coil_settings(config), unit_settings(config)

@@ -16,15 +16,19 @@ import tempfile
 import weakref
 from collections import Counter
 from pathlib import Path
+from unittest import mock
 
+from flight import report as reporting
 from flight.errors import UsageError
-from flight.report import format_report, summarise
 from flight.telemetry.packets import LAYOUTS
 from flight.telemetry.reader import Run, read_run
 from flight.telemetry.scanner import ScanResult, scan
 from tests.fuzz.harness import Finding
 from tests.fuzz.mutation import Draw, chance, damage, integer
+from tests.fuzz.vn100 import checksum
 from tests.report.synthetic import Recipe, make_run
+
+_DRAWN, _SAVED = 0.004, 0.05
 
 STEMS = ("flight", "truth", "performance")
 _RECIPES = (
@@ -35,13 +39,8 @@ _RECIPES = (
 
 
 def ccitt(data: bytes) -> int:
-    """Return the CRC-16 of CCSDS 232.0-B bit by bit."""
-    value = 0xFFFF
-    for byte in data:
-        value ^= byte << 8
-        for _ in range(8):
-            value = (value << 1 ^ 0x1021 if value & 0x8000 else value << 1) & 0xFFFF
-    return value
+    """Return the CRC-16 of CCSDS 232.0-B: the VN-100's, but for its preset."""
+    return checksum(data, 0xFFFF)
 
 
 def split(data: bytes) -> list[bytes]:
@@ -84,12 +83,23 @@ class Logs:
         if chance(draw, 0.05):
             tally += self._read(draw)
         run = Run(self._folder / "none", results["flight"], results["truth"], results["performance"])
-        summary = summarise(run)
+        summary = reporting.summarise(run)
         json.dumps(summary, allow_nan=False)
-        text = format_report(summary)
+        text = reporting.format_report(summary)
         if not text.endswith("\n") or "Log integrity" not in text:
             raise Finding("a report without its end")
+        if chance(draw, _DRAWN):
+            tally += self._draw(draw, run)
         return tally + Counter(reports=1)
+
+    def _draw(self, draw: Draw, run: Run) -> Counter[str]:
+        """Have the pictures drawn; most are not saved, which is matplotlib's work and takes long."""
+        saved = chance(draw, _SAVED)
+        unsaved = mock.patch("matplotlib.figure.Figure.savefig")
+        with contextlib.nullcontext() if saved else unsaved:
+            pictures = reporting.draw(run, self._folder / "figures")
+        shutil.rmtree(self._folder / "figures")
+        return Counter(drawn=len(pictures), saved=len(pictures) * saved)
 
     def _read(self, draw: Draw) -> Counter[str]:
         """Have the reader read the run from segments cut anywhere; it finds what the scanner found."""

@@ -44,9 +44,8 @@ def _crc_table() -> list[int]:
 _TABLE = _crc_table()
 
 
-def checksum(data: bytes) -> int:
-    """Return CRC-16/XMODEM by a way of its own."""
-    value = 0
+def checksum(data: bytes, value: int = 0) -> int:
+    """Return CRC-16/XMODEM, or of another preset `value`, by a way of its own."""
     for byte in data:
         value = (value << 8 & 0xFF00) ^ _TABLE[value >> 8 ^ byte]
     return value

@@ -69,7 +69,7 @@ def hurt_in_every_way(folder: Path) -> Campaign:
         times.append(("kill -9", flight.do(signal.SIGKILL), None))
         flight.process.wait()
         time.sleep(_CALM_S)
-        left_over = [child for child in guardians if _lives(child)]
+        left_over = [child for child in guardians if lives(child)]
         _end_devices(children)
     truth = CoilTruth(flight.folder)
     hurts = [_measured(truth, *act) for act in times]
@@ -93,7 +93,7 @@ def _end_devices(children: list[int]) -> None:
                 time.sleep(0.02)
 
 
-def _lives(process: int) -> bool:
+def lives(process: int) -> bool:
     """Tell whether a process runs; one that has ended and was not reaped has no command line."""
     try:
         return Path(f"/proc/{process}/cmdline").read_bytes() != b""

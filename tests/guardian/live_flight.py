@@ -163,8 +163,12 @@ class CoilTruth:
         self.epoch_ns = epoch_ns
 
     def before(self, act_ns: int) -> float:
-        """Return the current in A when an act came."""
-        return float(self.current[np.searchsorted(self.time_ns, act_ns) - 1])
+        """Return the largest current in A shortly before an act came.
+
+        A flight takes it off for a cycle or two when a reading is late, as on a machine that is busy.
+        """
+        shortly = (self.time_ns > act_ns - 250_000_000) & (self.time_ns <= act_ns)
+        return float(np.abs(self.current[shortly]).max(initial=0.0))
 
     def zero_after(self, act_ns: int, until_ns: int) -> float:
         """Return how long after an act, in s, the coil was at zero and stayed there until `until_ns`."""

@@ -16,7 +16,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flight.app import Order, fly
+from flight.app.flight import fly
+from flight.app.order import Order
 from flight.errors import UsageError
 from hal.interfaces.errors import NotResponding
 from sim_hal.device_link import Inbox, RemoteI2cBus, open_bus, pack

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
+import socket
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -107,6 +109,21 @@ def test_a_killed_guardian_is_replaced_and_told(guardian: GuardianLine) -> None:
     assert news_until(guardian, GuardianNews.READY) == [GuardianNews.LOST, GuardianNews.READY]
     assert guardian.process_id != first
     wait_until(lambda: not guardian.tend(0) and not Path(f"/proc/{first}").exists())
+
+
+def test_a_guardian_that_cannot_be_replaced_now_is_replaced_later(
+    guardian: GuardianLine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No descriptor is left for its line: whoever tends it goes on."""
+
+    def no_line(*_: object) -> None:
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    os.kill(guardian.process_id, signal.SIGKILL)
+    with monkeypatch.context() as patch:
+        patch.setattr(socket, "socketpair", no_line)
+        assert news_until(guardian, GuardianNews.LOST) == [GuardianNews.LOST]
+    assert news_until(guardian, GuardianNews.READY) == [GuardianNews.LOST, GuardianNews.READY]
 
 
 def test_a_guardian_that_hangs_is_replaced_and_told(guardian: GuardianLine) -> None:

@@ -5,10 +5,13 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import threading
 
 import pytest
 
+from flight.app import watchers
 from hal.buses import real_time
+from hal.drivers.coil_settings import DEVICE as COILS
 
 
 def test_a_refusal_is_told_with_its_cure(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -48,3 +51,26 @@ def test_locked_memory_is_seen_by_the_kernel_or_refused_in_words() -> None:
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "True" or done.stdout.startswith("locked memory refused")
+
+
+def test_the_threads_beside_the_control_thread_are_served_next(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: dict[int, int] = {}
+
+    def note(thread_id: int, priority: int) -> str:
+        asked[thread_id] = priority
+        return ""
+
+    monkeypatch.setattr(real_time, "prioritise", note)
+    done = threading.Event()
+    beside, coils = (threading.Thread(target=done.wait, name=name) for name in ("log", COILS))
+    for thread in (beside, coils):
+        thread.start()
+    try:
+        watchers.serve_the_rest_next()
+    finally:
+        done.set()
+        beside.join()
+        coils.join()
+    assert asked[beside.native_id or 0] == watchers.NEXT_PRIORITY < watchers.CONTROL_PRIORITY
+    assert threading.main_thread().native_id not in asked, "it is served first"
+    assert coils.native_id not in asked, "they are served first"

@@ -42,6 +42,18 @@ class Events(Recorder):
         self.told.append((kind.name, text))
 
 
+class CoilJob:
+    """The coils' job, which may begin to fail."""
+
+    def __init__(self, clock: ManualClock) -> None:
+        self.broken = False
+        self.ticker = clock.ticker("coils", 50_000_000, self._serve)
+
+    def _serve(self) -> None:
+        if self.broken:
+            raise MemoryError
+
+
 @pytest.fixture
 def watchers() -> Watchers:
     return Watchers()
@@ -53,8 +65,18 @@ def events() -> Events:
 
 
 @pytest.fixture
-def supervision(watchers: Watchers, events: Events) -> Supervision:
-    return Supervision(watchers, watchers, ManualClock(), events, "flying")
+def clock() -> ManualClock:
+    return ManualClock()
+
+
+@pytest.fixture
+def coils(clock: ManualClock) -> CoilJob:
+    return CoilJob(clock)
+
+
+@pytest.fixture
+def supervision(watchers: Watchers, events: Events, clock: ManualClock, coils: CoilJob) -> Supervision:
+    return Supervision(watchers, watchers, clock, events, "flying", coils.ticker)
 
 
 def test_ready_is_said_once_after_the_first_good_cycle(supervision: Supervision, watchers: Watchers) -> None:
@@ -77,3 +99,42 @@ def test_what_becomes_of_the_guardian_is_told_as_events(
         ("guardian-acted", GuardianNews.ACTED.value),
         ("guardian-blind", GuardianNews.FAILED.value),
     ]
+
+
+def test_a_guardian_that_acts_again_and_again_is_told_once_in_a_while(
+    supervision: Supervision, watchers: Watchers, events: Events, clock: ManualClock
+) -> None:
+    for _ in range(40):
+        watchers.news = [GuardianNews.ACTED]
+        supervision.feed()
+        clock.advance(250_000_000)
+    assert events.told == [("guardian-acted", GuardianNews.ACTED.value)] * 10, "ten seconds, one in each"
+
+
+def test_a_loop_whose_commands_do_not_reach_the_coils_sends_no_heartbeat(
+    supervision: Supervision, watchers: Watchers, clock: ManualClock, coils: CoilJob
+) -> None:
+    for _ in range(4):
+        clock.advance(25_000_000)
+        supervision.beat()
+    assert watchers.told.count("beat") == 4
+    coils.broken = True
+    clock.advance(200_000_000)
+    supervision.beat()
+    assert watchers.told.count("beat") == 4
+    coils.broken = False
+    clock.advance(50_000_000)
+    supervision.beat()
+    assert watchers.told.count("beat") == 5
+
+
+def test_the_process_settles_once_before_it_is_called_ready(
+    watchers: Watchers, events: Events, clock: ManualClock, coils: CoilJob
+) -> None:
+    told = watchers.told
+    settling = Supervision(
+        watchers, watchers, clock, events, "flying", coils.ticker, lambda: told.append("settled")
+    )
+    settling.beat()
+    settling.beat()
+    assert told == ["beat", "settled", "ready: flying", "beat"]

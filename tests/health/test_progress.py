@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from flight.executive.rate_group import RateGroup
-from flight.health.progress import GroupsAndWorkers, WorkerWatch
+from flight.health.progress import GroupsAndWorkers, WorkerWatch, failing
+from tests.manual_clock import ManualClock
 
 SECOND = 1_000_000_000
 
@@ -45,3 +46,28 @@ def test_a_worker_gets_on_while_idle_and_until_its_patience_is_over() -> None:
     assert watch.standing_still(104 * SECOND + 1) == ["planner"]
     busy[0] = None
     assert watch.standing_still(200 * SECOND) == []
+
+
+def test_a_job_beside_the_loop_that_raises_is_told_and_runs_again() -> None:
+    clock, runs = ManualClock(), 0
+
+    def job() -> None:
+        nonlocal runs
+        runs += 1
+        if runs <= 2:
+            raise OSError("no such device")
+
+    clock.ticker("camera", SECOND, job)
+    clock.advance(2 * SECOND)
+    assert failing(clock.tickers, clock.now_ns()) == ["camera: OSError: no such device"]
+    clock.advance(SECOND)
+    assert (runs, failing(clock.tickers, clock.now_ns())) == (3, [])
+
+
+def test_a_job_that_does_not_come_to_its_end_is_told_after_three_periods() -> None:
+    clock = ManualClock()
+    ticker = clock.ticker("log", 4 * SECOND, lambda: None)
+    clock.advance(4 * SECOND)
+    end_ns = ticker.served_ns
+    assert failing(clock.tickers, end_ns + 12 * SECOND) == []
+    assert failing(clock.tickers, end_ns + 13 * SECOND) == ["log: stands still for 13.0 s"]

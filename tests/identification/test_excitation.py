@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from flight.believed_plant import plant_of
 from flight.errors import UsageError
 from flight.guidance.path import Sample
 from flight.identification.excitation import ExcitationController, ExcitationSettings, manoeuvres
-from flight.loop import plant_of
 from tests.identification.conftest import Identified
 from tests.identification.worlds import PERIOD, World, believed, drawn, fly_bare
 

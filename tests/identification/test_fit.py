@@ -120,6 +120,16 @@ def test_a_flight_without_current_or_with_next_to_none_is_refused() -> None:
         fit(still, NOISE)
 
 
+@pytest.mark.filterwarnings("ignore:overflow:RuntimeWarning", "ignore:invalid value:RuntimeWarning")
+@pytest.mark.parametrize(("value", "times"), [(1e300, 1), (1e160, 100), (40.0, 100)])
+def test_rates_that_nothing_explains_are_refused_however_wild(value: float, times: int) -> None:
+    record = fly_bare(USUAL, 20.0)
+    rate = record.rate.copy()
+    rate[100 : 100 + times] = value * np.random.default_rng(2).standard_normal(times)
+    with pytest.raises(IdentificationError):
+        fit(replace(record, rate=rate), NOISE)
+
+
 def test_progress_is_told_until_the_steps_are_small() -> None:
     steps: list[float] = []
     fit(fly_bare(USUAL, 40.0), NOISE, lambda _, step: steps.append(step))

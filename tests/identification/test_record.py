@@ -113,3 +113,27 @@ def test_another_coil_and_a_flight_too_short_are_refused(short: Run) -> None:
         read_record(altered(short, "control", current_written=driven))
     with pytest.raises(IdentificationError, match="too short"):
         read_record(altered(short, "imu", keep=slice(0, 50)))
+
+
+@pytest.mark.parametrize(
+    ("packet", "field", "value"),
+    [
+        ("imu", "rate", np.nan),
+        ("imu", "quaternion", 1e200),
+        ("imu", "sample_time_ns", 2**60),
+        ("control", "current_command", -np.inf),
+        ("control", "time_ns", 2**60),
+        ("run", "control_period_ns", 0),
+        ("run", "coil_resistance", np.nan),
+    ],
+)
+def test_values_that_no_flight_writes_are_told_as_damage(
+    short: Run, packet: str, field: str, value: float
+) -> None:
+    values = short[packet][field].copy()
+    values[len(values) // 2] = value
+    damaged = altered(short, packet, **{field: values})
+    if field == "sample_time_ns":  # of no consequence while the unit's clock runs on
+        damaged = altered(damaged, "imu", device_time_ns=values)
+    with pytest.raises(IdentificationError, match=r"the log is damaged|in order of time"):
+        read_record(damaged)

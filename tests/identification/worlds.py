@@ -10,13 +10,13 @@ import numpy as np
 
 from flight import config as configuration
 from flight.arrays import FloatArray
+from flight.believed_plant import plant_of
 from flight.guidance.path import Sample
 from flight.identification.constants import Constants
 from flight.identification.excitation import ExcitationController, ExcitationSettings
 from flight.identification.preparation import excitation_config
 from flight.identification.record import FieldMeasurement, Record, read_record
 from flight.identification.scale import AbsolutePlant
-from flight.loop import plant_of
 from flight.settings import Config
 from sim_hal.settings import ImuNoise, Simulation, Thread, Truth
 from sim_hal.world.testbed import Testbed, TestbedModel

@@ -65,6 +65,17 @@ def test_the_panels_show_the_values_of_the_log(tmp_path: Path) -> None:
     assert drawn.max() == CURRENT
 
 
+def test_values_that_only_a_damaged_log_has_do_not_keep_a_panel_from_being_drawn(tmp_path: Path) -> None:
+    run = read_run(make_run(tmp_path, Recipe(duration=20.0, rate_hz=10.0)))
+    damaged = run.truth.packets["truth"].copy()
+    damaged["rate"][: len(damaged) // 2] = np.inf
+    run.truth.packets["truth"] = damaged
+    axes = Figure().subplots()
+    with np.errstate(invalid="ignore"):
+        panels.rate_error(axes, panels.Scene(run))
+    assert np.isfinite(axes.get_ylim()).all()
+
+
 def test_a_planned_path_passes_through_its_nodes_and_is_the_polynomial_between(tmp_path: Path) -> None:
     run = read_run(make_run(tmp_path, Recipe(duration=5.0, rate_hz=10.0)))
     plan = run["plan"][0]

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from flight import config as configuration
+from flight.believed_plant import plant_of
 from flight.errors import UsageError
 from flight.guidance.vmc import plan
-from flight.loop import plant_of
 from flight.report import draw_path
 
 pytest.importorskip("matplotlib", reason="pictures need the extra 'plots'")

@@ -7,9 +7,14 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from flight import app
 from flight import config as configuration
-from flight.loop import SECOND_NS, FlightLoop, RunLabel
+from flight.app import preparation
+from flight.app.mission_time import next_whole_second
+from flight.app.rig import Rig
+from flight.app.simulated import with_host_faults
+from flight.composition import SECOND_NS
+from flight.loop.loop import FlightLoop
+from flight.loop.run_label import RunLabel
 from flight.settings import Config
 from flight.telemetry.packets import to_text
 from flight.telemetry.reader import Run, read_run
@@ -53,7 +58,7 @@ def thesis_config(duration: float) -> Config:
     config = demo_config(duration, camera=False)
     guidance = configuration.replace(config.guidance, strategy="receding", current_share=1.0)
     control = configuration.replace(config.control, tracker="thesis", state_weight=20.0)
-    estimation = configuration.replace(config.estimation, gate_sigma=5.0, coast=0.1)
+    estimation = configuration.replace(config.estimation, gate_sigma=5.0)
     return configuration.replace(config, guidance=guidance, control=control, estimation=estimation)
 
 
@@ -64,10 +69,12 @@ def fly(
     seed: int = 1,
     planner_latency: float | None = None,
     section: Simulation | None = None,
+    absent: Callable[[LockStep], None] | None = None,
 ) -> Run:
     """Fly a configuration in lock-step and return what it left; `prepare` may schedule faults.
 
-    `section` is the world to fly in, with its own seed; by default the demonstration's.
+    `section` is the world to fly in, with its own seed; by default the demonstration's. `absent` takes
+    devices away before they are opened; the flight is a patient one then.
     However the flight ended, the coils are at zero when the devices have been closed.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -78,10 +85,12 @@ def fly(
             stack.callback(lambda: _assert_off(lock))
         planner_s = section.latency.planner if planner_latency is None else planner_latency
         latency = round(planner_s * SECOND_NS), round(section.latency.vision * SECOND_NS)
-        rig = app.Rig(lock.clock, lock.wires, lock.release, False, section.seed, latency)
-        rig = app.with_host_faults(rig, section)
-        loop, _ = app.prepare(config, rig, folder, stack)
-        epoch_ns = app.next_whole_second(lock.clock)
+        rig = Rig(lock.clock, lock.wires, lock.release, False, section.seed, latency)
+        rig = with_host_faults(rig, section)
+        if absent is not None:
+            absent(lock)
+        loop, _ = preparation.prepare(config, rig, folder, stack, patient=absent is not None)
+        epoch_ns = next_whole_second(lock.clock)
         rig.release(epoch_ns)
         prepare(Rigged(lock, loop, epoch_ns))
         loop.run(epoch_ns, RunLabel(TEXT, section.seed, True, False))

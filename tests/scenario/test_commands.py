@@ -47,7 +47,7 @@ def said(folder: Path, *script: tuple[float, bytes]) -> tuple[Run, Script]:
     channel = Script()
 
     def prepare(rigged: Rigged) -> None:
-        rigged.loop._commanding._channels = (channel,)
+        rigged.loop._rooms.commanding._channels = (channel,)
         for at, data in script:
             rigged.at(at, partial(channel.say, data))
 

@@ -10,8 +10,9 @@ import pytest
 
 from flight import config as configuration
 from flight.arrays import FloatArray
+from flight.estimation.attitude_filter import AttitudeFilter
 from flight.modes.mode import Mode
-from flight.settings import Commands, CommandStep, Config
+from flight.settings import Commands, CommandStep, Config, Step
 from flight.state.keeper import Notices, StateKeeper
 from flight.state.store import StateStore
 from flight.telemetry.packets import to_text
@@ -21,6 +22,7 @@ from sim_hal.emulators.serial_line import SOUND, LineFaults
 from sim_hal.settings import Release
 from tests.scenario.flights import Rigged, demo_config, demo_world, event_names, fly
 
+CYCLE = 0.025
 BRIEF = {"arrived_for": 0.3, "boot_patience": 1.0, "hold_patience": 2.0, "blind_limit": 3.0}
 """Modes' settings with little patience, s."""
 
@@ -181,21 +183,77 @@ def test_a_body_that_is_pushed_out_of_its_hold_is_detumbled_and_held_again(tmp_p
     assert "tumbling" in event_names(run)
 
 
-def test_a_hold_that_is_impossible_ends_in_safe_with_the_coils_at_zero(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("initial", "strategy"),
+    [("hold", "goal"), ("testbed-demo", "goal"), ("testbed-demo", "receding"), ("testbed-demo", "step")],
+)
+def test_a_hold_that_is_impossible_ends_in_safe_with_the_coils_at_zero(
+    tmp_path: Path, initial: str, strategy: str
+) -> None:
     def prepare(rigged: Rigged) -> None:
         world = rigged.lock.hardware.world
 
         def hand() -> None:
             world.angle, world.rate = 1.2, 0.0
 
-        for k in range(400):
+        for k in range(550):
             rigged.at(4.0 + 0.02 * k, hand)
 
-    run = fly(commanded(12.0, initial="hold"), tmp_path, prepare)
+    config = commanded(15.0, initial=initial)
+    config = configuration.replace(config, guidance=configuration.replace(config.guidance, strategy=strategy))
+    run = fly(config, tmp_path, prepare, section=released(-0.2, 0.0))
     assert path_of_modes(run)[-1] == (Mode.SAFE, "reaction safe")
+    # The demonstration has until its path's end, or as long without one. In a hold nothing is waited for but
+    # that the filter gives its estimate up.
+    since = 10.0 if initial == "testbed-demo" else 4.0 + AttitudeFilter.REJECTIONS_TO_RESTART * CYCLE
+    assert entered(run, Mode.SAFE) == pytest.approx(since + BRIEF["hold_patience"], abs=0.1)
     assert "hold-impossible" in event_names(run)
     assert currents(run, 4.0, entered(run, Mode.SAFE)).max() > 0.0
-    assert currents(run, entered(run, Mode.SAFE) + 0.1, 12.0).max() == 0.0
+    assert currents(run, entered(run, Mode.SAFE) + 0.1, 15.0).max() == 0.0
+
+
+def test_what_the_demonstration_is_on_its_way_to_and_a_target_that_moves_are_not_impossible_to_hold(
+    tmp_path: Path,
+) -> None:
+    """It is 0.8 rad off at first, for longer than a hold's patience; at the end the target is 0.68 rad on."""
+    config = configuration.replace(commanded(27.0), steps=(Step(at=0.0, q2=-0.2, rate=0.04),))
+    run = fly(config, tmp_path)
+    assert modes_of(run) == [Mode.BOOT, Mode.TESTBED_DEMO]
+    assert event_names(run) == ["started", "target", "stopped"]
+    assert true_angle(run)[-1] == pytest.approx(2.0 * np.arcsin(-0.2) + 0.04 * 17.0, abs=0.01)
+
+
+def test_a_body_spun_up_in_the_demonstration_is_detumbled(tmp_path: Path) -> None:
+    def prepare(rigged: Rigged) -> None:
+        rigged.at(4.0, lambda: setattr(rigged.lock.hardware.world, "rate", 0.9))
+
+    run = fly(commanded(8.0, hold_patience=15.0), tmp_path, prepare)
+    assert modes_of(run)[:3] == [Mode.BOOT, Mode.TESTBED_DEMO, Mode.DETUMBLE]
+    assert "tumbling" in event_names(run)
+
+
+def test_what_led_to_safe_and_is_latched_bars_the_way_out_until_it_is_cleared(tmp_path: Path) -> None:
+    def prepare(rigged: Rigged) -> None:
+        def fail(*_: object) -> None:
+            raise ZeroDivisionError
+
+        rigged.at(1.0, lambda: setattr(rigged.loop._rooms.steering, "run", fail))
+        rigged.at(4.0, lambda: delattr(rigged.loop._rooms.steering, "run"))
+
+    run = fly(
+        commanded(
+            8.0,
+            {"at": 5.0, "mode": "hold"},
+            {"at": 6.0, "clear": "task-failing"},
+            {"at": 7.0, "mode": "hold"},
+            hold_patience=15.0,
+        ),
+        tmp_path,
+        prepare,
+    )
+    assert modes_of(run) == [Mode.BOOT, Mode.TESTBED_DEMO, Mode.SAFE, Mode.HOLD]
+    assert run["command"]["obeyed"].tolist() == [0, 1, 1]
+    assert to_text(run["command"][0]["text"]).endswith("not before it is cleared: task-failing")
 
 
 @pytest.mark.parametrize("initial", ["testbed-demo", "hold", "detumble"])
@@ -205,10 +263,11 @@ def test_a_unit_that_stays_silent_leads_to_safe_from_every_mode_that_drives(
     def prepare(rigged: Rigged) -> None:
         rigged.at(2.0, lambda: setattr(rigged.lock.line.to_host, "faults", LineFaults(silent=True)))
 
-    run = fly(commanded(8.0, initial=initial), tmp_path, prepare, section=released(0.2, 0.4))
+    config = commanded(8.0, initial=initial, hold_patience=60.0)
+    run = fly(config, tmp_path, prepare, section=released(0.2, 0.4))
     assert path_of_modes(run)[-1] == (Mode.SAFE, "reaction safe")
     names = event_names(run)
-    assert names.index("imu-silent") < names.index("control-lost") < names.index("blind")
+    assert names.index("control-lost") < names.index("imu-silent") < names.index("blind")
 
 
 @pytest.mark.parametrize(("crashes", "mode"), [(2, Mode.TESTBED_DEMO), (3, Mode.SAFE)])

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import pytest
+
+from hal.buses.clock import SystemClock
 from sim_hal.clock import SimClock
 
 MS = 1_000_000
@@ -78,3 +81,27 @@ def test_utc_is_the_label_of_the_start_plus_the_time_since() -> None:
     clock = SimClock(utc_start_ns=5)
     clock.sleep_until_ns(7)
     assert clock.utc_ns() == 12
+
+
+@pytest.mark.parametrize("clock", [SimClock(), SystemClock()])
+def test_a_job_that_raises_is_kept_as_an_error_and_runs_again(clock: SimClock | SystemClock) -> None:
+    """A thread that ends on an exception would leave its device, the coils above all, as it last was."""
+    runs = list[int]()
+
+    def job() -> None:
+        runs.append(clock.now_ns())
+        if len(runs) == 1:
+            raise MemoryError("none left")
+
+    ticker = clock.ticker("job", 5 * MS, job)
+    made_ns = ticker.served_ns
+    clock.sleep_until_ns(clock.now_ns() + 5 * MS)
+    patience_ns = clock.now_ns() + 1_000 * MS
+    while not ticker.error and clock.now_ns() < patience_ns and len(runs) < 2:
+        clock.sleep_until_ns(clock.now_ns() + MS)
+    while ticker.served_ns == made_ns and clock.now_ns() < patience_ns:
+        clock.sleep_until_ns(clock.now_ns() + MS)
+    assert len(runs) >= 2
+    assert (ticker.error, list(clock.tickers)) == ("", [ticker])
+    ticker.stop()
+    assert list(clock.tickers) == []

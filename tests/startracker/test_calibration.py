@@ -92,13 +92,14 @@ def test_without_a_prior_the_stars_alone_give_the_same_lens() -> None:
     assert np.max(angle_between(found.attitudes, attitudes)) < 5.0 / truth.focal_length
 
 
-def test_without_noise_the_lens_is_exact() -> None:
+@pytest.mark.parametrize("noise", [1e-7, 1e-9, 1e-11], ids=["small", "smaller", "below rounding"])
+def test_without_noise_the_lens_is_exact(noise: float) -> None:
     rng = np.random.default_rng(83)
     truth = _lens(rng, _begun())
-    frames, _ = _frames(rng, truth, 3, 20, noise=1e-9)
+    frames, _ = _frames(rng, truth, 3, 20, noise=noise)
     found = calibrate(frames, _begun(), _OPEN)
     assert parameters_of(found.lens) == pytest.approx(parameters_of(truth), rel=1e-6, abs=1e-6)
-    assert found.rms_after < 1e-7
+    assert found.rms_after < 5e-7
 
 
 def test_which_matches_were_wrong_is_told() -> None:

@@ -14,13 +14,14 @@ from flight.arrays import FloatArray
 from flight.errors import ConfigError
 from flight.quaternion import angle_between, from_rotation_vector, multiply
 from flight.startracker.frame_job import FrameFound, FrameJob, TrackerSettings, run
+from flight.startracker.known_sky import with_known_sky
 from flight.startracker.solution import FrameSolution, SolveStatus
-from flight.startracker.solve import AttitudePrior, RatePrior, SolveSettings
+from flight.startracker.solve import AttitudePrior, RatePrior, SolveSettings, solve_motion
 from flight.vision.likelihood.result import MotionResult
 from flight.vision.likelihood.settings import LikelihoodSettings
 from flight.vision.settings import StreakSettings
 from flight.vision.streak_rate import StreakResult, StreakStatus
-from tests.startracker.frames import NARROW, SkyFrame, sky_frame
+from tests.startracker.frames import NARROW, SkyFrame, sky, sky_frame
 
 _TRACKER = TrackerSettings(SolveSettings(), (1.0, 1.0))
 _ESTIMATORS = [LikelihoodSettings(saturation=65_535), StreakSettings()]
@@ -121,6 +122,27 @@ def test_without_a_tracker_there_is_the_same_motion_and_no_attitude(
     kind = MotionResult if isinstance(estimator, LikelihoodSettings) else StreakResult
     assert isinstance(found.motion, kind)
     assert found.motion.rate == pytest.approx(frame.rate, abs=0.05 * float(np.linalg.norm(frame.rate)))
+
+
+def test_the_stars_of_a_solved_frame_of_streaks_serve_a_second_fit() -> None:
+    job = _job(_frame(40.0), LikelihoodSettings(saturation=65_535))
+    first, found = run(replace(job, tracker=None)).motion, run(job)
+    assert isinstance(first, MotionResult)
+    assert isinstance(job.estimator, LikelihoodSettings)
+    solved = solve_motion(first, job.camera, _TRACKER.scale, sky(), _TRACKER.solve)
+    better = with_known_sky(job.pixels, solved, sky(), _TRACKER.solve, job.estimator)
+    assert better.motion is not None
+    assert found.solution is not None
+    assert found.motion is found.solution.motion
+    assert found.motion.status is first.status
+    assert found.motion.rate is not None
+    assert better.motion.rate is not None
+    assert first.rate is not None
+    assert np.array_equal(found.motion.rate, better.motion.rate)
+    assert not np.array_equal(found.motion.rate, first.rate)
+    assert found.solution.fix is not None
+    assert better.fix is not None
+    assert np.array_equal(found.solution.fix.quaternion, better.fix.quaternion)
 
 
 def test_a_job_and_what_it_found_pass_between_processes() -> None:

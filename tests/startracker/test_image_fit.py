@@ -92,6 +92,37 @@ def test_stars_that_scatter_beyond_their_errors_widen_the_covariance() -> None:
     assert ratio > 0.3
 
 
+def test_stars_that_disagree_have_no_say_and_leave_the_errors_as_the_covariance_says() -> None:
+    """Two of 14 stars lie 6 px, sixty deviations across their streaks, from where they should."""
+    rng = np.random.default_rng(4)
+    mismatch = 0.0
+    for _ in range(_TRIALS):
+        points, covariance = _streaks(rng, 14)
+        reference = _reference(points)
+        noise = np.einsum("nij,nj->ni", np.linalg.cholesky(covariance), rng.standard_normal((14, 2)))
+        _, axes = np.linalg.eigh(covariance[:2])
+        noise[:2] += 6.0 * axes[:, :, 0]
+        found = _fit(points + noise, covariance, reference)
+        assert not found.agree[:2].any()
+        error = _error(found)
+        mismatch += float(error @ np.linalg.solve(found.fix.covariance, error))
+    assert _LOW < mismatch / (3.0 * _TRIALS) < _HIGH
+
+
+def test_where_too_few_would_be_left_all_keep_their_say_and_the_covariance_tells() -> None:
+    """One of four stars is wrong, but nobody could say which."""
+    rng = np.random.default_rng(5)
+    points, covariance = rng.uniform(50.0, 970.0, (4, 2)), np.tile(0.01 * np.eye(2), (4, 1, 1))
+    reference = _reference(points)
+    sound = _fit(points, covariance, reference)
+    points[0] += 6.0
+    found = _fit(points, covariance, reference)
+    assert found.agree.all()
+    error = _error(found)
+    assert np.trace(found.fix.covariance) > 100.0 * np.trace(sound.fix.covariance)
+    assert float(error @ np.linalg.solve(found.fix.covariance, error)) < 3.0 * 3.0
+
+
 def test_stars_in_one_direction_fix_no_attitude() -> None:
     points = np.full((3, 2), 400.0)
     with pytest.raises(AttitudeError):

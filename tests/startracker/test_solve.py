@@ -49,6 +49,14 @@ def test_a_frame_is_solved_lost_in_space_within_its_own_covariance(streak_px: fl
     assert found.camera.focal_length == pytest.approx(NARROW.pinhole.focal_length, rel=1e-4)
 
 
+def test_a_calibrated_lens_is_kept_lost_in_space() -> None:
+    """The triangle that names the stars tells a scale of its own, up to a part in a thousand off."""
+    for seed in range(3):
+        found = _solve(sky_frame(np.random.default_rng([31, seed]), 40.0, 0.1))
+        assert found.status is SolveStatus.SOLVED
+        assert found.camera.focal_length == NARROW.pinhole.focal_length
+
+
 def test_a_streaked_frame_tells_the_rate_and_a_frame_at_rest_does_not() -> None:
     streaked = sky_frame(np.random.default_rng(12), 40.0, 0.1)
     motion = _solve(streaked).motion

@@ -8,13 +8,15 @@ from pathlib import Path
 import pytest
 
 from flight import config as configuration
-from flight.app import Order, fly
+from flight.app.flight import fly
+from flight.app.order import Order
 from flight.settings import Config
 from flight.state.content import StoredState
 from flight.state.opening import open_state, state_folder
 from flight.state.store import StateStore
 from flight.telemetry.packets import to_text
 from flight.telemetry.reader import read_run
+from hal.interfaces.errors import NotResponding
 from tests.manual_clock import ManualClock
 
 CONFIG = Path(__file__).resolve().parents[2] / "config" / "step_demo.yaml"
@@ -49,6 +51,17 @@ def test_the_configured_folder_comes_first_then_systemds_and_in_simulation_none(
 def test_without_a_folder_nothing_is_kept() -> None:
     with ExitStack() as stack:
         assert open_state(simulated(None), {}, ManualClock(), stack) is None
+
+
+def test_a_device_that_does_not_answer_is_no_crash(tmp_path: Path) -> None:
+    def end() -> None:
+        with ExitStack() as stack:
+            open_state(simulated(tmp_path), {}, ManualClock(), stack)
+            raise NotResponding("vn100", "not one byte")
+
+    with pytest.raises(NotResponding):
+        end()
+    assert not stored(tmp_path).running
 
 
 def test_an_exception_that_passes_is_no_clean_end(tmp_path: Path) -> None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from flight.errors import UsageError
-from flight.telemetry.archive import MOST_RUNS, begin_run, find_runs
+from flight.telemetry.archive import LEAST_FREE_BYTES, MOST_RUNS, begin_run, find_runs
 
 
 def fill(folder: Path, size: int) -> None:
@@ -83,3 +86,37 @@ def test_a_budget_below_the_coming_run_and_a_place_that_cannot_be_written_are_cl
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(UsageError, match="no run can be begun there: Not a directory"):
         begin_run(tmp_path / "file" / "runs", 10, 1)
+
+
+def test_a_full_disk_takes_the_oldest_runs_but_not_the_last(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The disk has room for one run more when the two oldest are gone; then, when only all would do."""
+    for _ in range(4):
+        fill(begin_run(tmp_path, 10_000, 100).folder, 300)
+
+    def statvfs(needed: int) -> None:
+        def free(path: Path) -> SimpleNamespace:
+            gone = 4 - len(find_runs(Path(path)))
+            return SimpleNamespace(f_bavail=LEAST_FREE_BYTES if gone >= needed else 0, f_frsize=1)
+
+        monkeypatch.setattr(os, "statvfs", free)
+
+    statvfs(2)
+    assert begin_run(tmp_path, 10_000, 100).dropped == 2
+    assert names(tmp_path) == ["run-000003", "run-000004", "run-000005"]
+    (tmp_path / "run-000005").rmdir()
+    statvfs(9)
+    assert begin_run(tmp_path, 10_000, 100).dropped == 1
+    assert names(tmp_path) == ["run-000004", "run-000005"]
+
+
+def test_a_disk_that_takes_nothing_is_no_reason_not_to_fly(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def mkdir(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Path, "mkdir", mkdir)
+    run = begin_run(tmp_path / "runs", 10, 1)
+    assert (run.folder, run.folder.exists()) == (tmp_path / "runs" / "run-000001", False)

@@ -364,6 +364,7 @@ def test_a_hung_disk_blocks_neither_write_nor_close(tmp_path: Path, monkeypatch:
     assert log.error() == "log flight: the disk does not answer; 1 packets lost"
     release.set()
     drain.join()
+    assert log._store is not None
     log._store.close()  # what the process's end does
 
 
@@ -428,3 +429,26 @@ def test_a_kill_at_every_byte_of_a_write_leaves_every_whole_packet(tmp_path: Pat
     for end in range(path.stat().st_size, 0, -13):
         os.truncate(path, end)
         assert scan(content(tmp_path)).counts.get("cycle_timing", 0) == end // len(packets[0])
+
+
+def test_a_patient_log_begins_without_its_disk_and_writes_all_when_it_comes(tmp_path: Path) -> None:
+    clock, disk = ManualClock(0), SmallDisk(0)
+    packets = timing_packets(20)
+
+    def opener(path: Path) -> SegmentFile:
+        if not disk.room:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return disk.open(path)
+
+    with pytest.raises(UsageError, match=f"no log can be written there: {os.strerror(errno.ENOSPC)}"):
+        FlightLog(tmp_path, clock=clock, opener=opener)
+    log = FlightLog(tmp_path, clock=clock, patient=True, opener=opener)
+    for packet in packets:
+        log.write(packet)
+    clock.advance(2 * SECOND)
+    assert log.error().endswith("0 packets lost, 20 waiting")
+    disk.room = 1 << 20
+    clock.advance(2 * SECOND)
+    assert (log.error(), log.lost) == ("", 0)
+    log.close()
+    assert content(tmp_path) == b"".join(packets)

@@ -9,6 +9,7 @@ from scipy import ndimage
 from flight.vision.segmentation import (
     box_sum,
     find_regions,
+    less_boxes,
     repair_hot_pixels,
     threshold_local,
     threshold_mean,
@@ -71,3 +72,15 @@ def test_hot_pixels_are_repaired_and_stars_are_left() -> None:
         signal[row, column] = 3000.0
     assert repair_hot_pixels(signal, noise) == len(np.unique(places, axis=0))
     assert signal[places[:, 0], places[:, 1]].max() < 300.0
+
+
+def test_light_taken_from_some_pixels_leaves_the_sums_of_what_is_left() -> None:
+    """At the frame's corners and edges too."""
+    generator = np.random.default_rng(9)
+    image = generator.integers(0, 1000, (40, 50)).astype(np.float32)
+    pixels = np.unique(np.append(generator.integers(0, image.size, 300), [0, 49, 50, image.size - 1]))
+    taken = generator.integers(0, 500, len(pixels)).astype(np.float32)
+    left = image.copy().reshape(-1)
+    left[pixels] -= taken
+    found = less_boxes(box_sum(image).reshape(-1), (40, 50), pixels, taken)
+    np.testing.assert_array_equal(found.reshape(40, 50), box_sum(left.reshape(40, 50)))

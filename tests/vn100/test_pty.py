@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -95,6 +96,27 @@ def test_the_port_is_exclusive(served: tuple[str, subprocess.Popen[str]]) -> Non
 def test_a_port_that_is_not_there_is_named() -> None:
     with pytest.raises(NotResponding, match=r"/dev/no-such-port: cannot be opened at 115200 baud"):
         PySerialPort("/dev/no-such-port", 115200, SystemClock())
+
+
+def test_a_patient_port_is_gone_until_it_is_there(tmp_path: Path) -> None:
+    clock, name = SystemClock(), tmp_path / "imu"
+    port = PySerialPort(str(name), 115200, clock, patient=True)
+    with pytest.raises(NotResponding, match=f"{name}: cannot be opened at 115200 baud"):
+        port.receive()
+    with pytest.raises(NotResponding):
+        port.send(b"?")
+    near, far = os.openpty()
+    name.symlink_to(os.ttyname(far))
+    deadline_ns, sent, words = clock.now_ns() + 3_000_000_000, False, b""
+    while words != b"first words" and clock.now_ns() < deadline_ns:
+        clock.sleep_until_ns(clock.now_ns() + 5_000_000)
+        with suppress(NotResponding):
+            words += b"".join(data for _, data in port.receive())
+            sent = sent or os.write(near, b"first words") > 0
+    assert words == b"first words"
+    port.close()
+    os.close(near)
+    os.close(far)
 
 
 def test_a_unit_that_is_unplugged_is_not_responding() -> None:

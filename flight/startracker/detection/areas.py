@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse import csgraph
 
 from flight.arrays import BoolArray, FloatArray, Image, IntArray
 from flight.startracker.detection.sky import BrightPixels, Sky
@@ -121,6 +119,9 @@ def cluttered(areas: Areas, place: IntArray, share: float) -> BoolArray:
 
 def connected(first: IntArray, second: IntArray, count: int) -> tuple[int, IntArray]:
     """Return how many groups the pairs (p,) make of `count` pixels, and each one's group (count,)."""
+    from scipy import sparse  # noqa: PLC0415 - a process that only names the detection need not hold it
+    from scipy.sparse import csgraph  # noqa: PLC0415
+
     if not count:
         return 0, np.zeros(0, dtype=np.int64)
     graph = sparse.coo_matrix((np.ones(len(first), dtype=np.int8), (first, second)), (count, count))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.special import ndtr
 
 from flight.arrays import FloatArray
 
@@ -18,6 +17,8 @@ def profile(offset: FloatArray, sigma: FloatArray, half: int) -> tuple[FloatArra
     `offset` (n,) px is the star's place from the middle pixel's centre, `sigma` (n,) px. The derivatives
     (n, k) are by place and by sigma.
     """
+    from scipy.special import ndtr  # noqa: PLC0415 - see `areas.connected`
+
     edges = (np.arange(-half, half + 2) - 0.5 - offset[:, None]) / sigma[:, None]
     whole = ndtr(edges)
     bell = _BELL * np.exp(-0.5 * edges * edges)

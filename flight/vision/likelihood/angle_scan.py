@@ -17,7 +17,6 @@ import numpy as np
 from flight.arrays import BoolArray, FloatArray, IntArray
 from flight.pinhole import Pinhole
 from flight.vision.likelihood.exposed_frame import ExposedFrame
-from flight.vision.segmentation import box_sum
 
 SCANNED_STARS = 14
 """So many of the brightest regions tell the angle."""
@@ -145,8 +144,7 @@ def _boxes(frame: ExposedFrame, pinhole: Pinhole, circles: Circles) -> _Boxes:
     column, row = np.rint(x * depth + pinhole.centre[0]), np.rint(y * depth + pinhole.centre[1])
     exist = (column > 0) & (column < pinhole.columns - 1) & (row > 0) & (row < pinhole.rows - 1) & (z > 0.0)
     index = np.where(exist, row * pinhole.columns + column, 0.0).astype(np.int64)
-    sums = box_sum(frame.signal.reshape(frame.shape)).reshape(-1)
-    light = np.where(exist, sums[index], np.float32(0.0)).astype(np.float64)
+    light = np.where(exist, frame.sums[index], np.float32(0.0)).astype(np.float64)
     middle = np.clip(np.rint((circles.azimuth + wide) / step).astype(np.int64), 0, count - 1)
     about = np.clip(middle[:, None] + np.arange(-4, 5), 0, count - 1)
     own = np.median(np.take_along_axis(light, about, axis=1), axis=1)

@@ -9,7 +9,7 @@ from scipy import ndimage
 
 from flight.arrays import BoolArray, FloatArray, IntArray
 from flight.vision.likelihood.exposed_frame import ExposedFrame, Float32Array
-from flight.vision.segmentation import box_sum, positions
+from flight.vision.segmentation import positions
 
 _EIGHT_NEIGHBOURS = np.ones((3, 3), dtype=np.int64)
 # One noise peak fills nine pixels of the 3 x 3 sum.
@@ -48,7 +48,7 @@ class Blobs:
 def find_blobs(frame: ExposedFrame, sigmas: float, most: int) -> Blobs:
     """Return the `most` brightest regions whose 3 x 3 sum exceeds `sigmas` of its noise."""
     signal, floor = frame.signal.reshape(frame.shape), frame.floor.reshape(frame.shape)
-    mask = _above(box_sum(signal), floor, 3.0 * sigmas)
+    mask = _above(frame.sums.reshape(frame.shape), floor, 3.0 * sigmas)
     labels, count = ndimage.label(mask, structure=_EIGHT_NEIGHBOURS)
     row, column = positions(mask)
     number = labels[row, column]

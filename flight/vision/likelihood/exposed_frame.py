@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from flight.arrays import BoolArray, Image, IntArray
 from flight.vision.background import at_least, estimate_background
-from flight.vision.segmentation import positions
+from flight.vision.segmentation import box_sum, positions
 
 Float32Array = npt.NDArray[np.float32]
 
@@ -23,7 +23,7 @@ class ExposedFrame:
 
     Attributes:
         shape: rows, columns.
-        signal: counts above the background.
+        signal: counts above the background; sums: of it, over 3 x 3 pixels.
         floor: counts^2, variance of a pixel without a star.
         counts: as the camera gave them; top: at which a pixel saturates.
         bad: pixels that tell nothing: saturated or hot.
@@ -33,6 +33,7 @@ class ExposedFrame:
 
     shape: tuple[int, int]
     signal: Float32Array
+    sums: Float32Array
     floor: Float32Array
     counts: Image
     top: float
@@ -60,6 +61,7 @@ def expose_frame(pixels: Image, saturation: float | None, gain: float) -> Expose
     return ExposedFrame(
         (pixels.shape[0], pixels.shape[1]),
         signal.reshape(-1),
+        box_sum(signal).reshape(-1),
         floor.reshape(-1),
         pixels.reshape(-1),
         top,

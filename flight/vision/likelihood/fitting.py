@@ -9,6 +9,7 @@ import numpy as np
 from flight.arrays import BoolArray, IntArray
 from flight.vision.likelihood.agreement import Opinions, agreeing, opinions
 from flight.vision.likelihood.chains import close_by
+from flight.vision.likelihood.exposed_frame import Float32Array
 from flight.vision.likelihood.matched_filter import FaintStars, find_faint
 from flight.vision.likelihood.motion import Motion
 from flight.vision.likelihood.normal_equations import light_of
@@ -21,7 +22,7 @@ from flight.vision.likelihood.rounds import (
     iterate,
 )
 from flight.vision.likelihood.scene import Scene, path_lengths
-from flight.vision.likelihood.streak_model import Float32Array
+from flight.vision.likelihood.windows import window_areas
 
 # A rate that changes by more than this part of itself is beyond the model.
 _MOST_GROWTH = 0.5
@@ -36,6 +37,11 @@ _FAR = 6.0
 _MOST_REPEATS = 2
 # How wrong the light of a faint star found along the motion may be on a pixel, as part of it.
 _DOUBT = 0.35
+# Pixels of all windows that a fit looks at, those that stars share once for each: what a crowd of long
+# streaks needs of memory and time is bounded so, and the brightest stars hold most of the information.
+_MOST_PIXELS = 200_000
+# So many stars' light is taken out at a time.
+_AT_ONCE = 16
 
 
 def last_fit(camera: ExposedCamera, first: Fit) -> tuple[Fit | None, FaintStars]:
@@ -90,22 +96,29 @@ def _fit_from(camera: ExposedCamera, first: Fit) -> tuple[Fit | None, FaintStars
     fitted = others.select(near[: settings.most_neighbours])
     scene = scene.with_stars(fitted.stars, fitted.light)
     accounted = _accounted(camera, others.select(near[settings.most_neighbours :]))
-    done = _joint(accounted, scene)
+    done = joint_fit(accounted, scene)
     rest = np.delete(rest, near[: settings.most_neighbours])
     rest = rest[rest >= len(before.light)] - len(before.light)
     return done, FaintStars(faint.stars[rest], faint.light[rest], faint.significance[rest])
 
 
-def _joint(camera: ExposedCamera, scene: Scene) -> Fit | None:
-    """Return the fit of `scene` by the stars that agree, under the rate's model that the pixels ask for."""
+def joint_fit(camera: ExposedCamera, scene: Scene) -> Fit | None:
+    """Return the fit of `scene` by the stars that agree, under the rate's model that the pixels ask for.
+
+    Of the stars without a say the brightest are fitted, as far as there is room; the others' light is taken
+    out as it is known. None where the fit fails.
+    """
+    fitted = _affordable(camera, scene)
+    camera, scene = _accounted(camera, scene.select(~fitted)), scene.select(fitted)
     done = iterate(camera, scene, camera.free, ROUGH)
     if done is not None and camera.undecided and done.grows():
         camera = replace(camera, growing=True)
         done = iterate(camera, done.scene, camera.free, LAST, done.windows)
     if done is None or _beyond(done.scene.motion):
         return None
-    scene = replace(done.scene, trusted=_trusted(camera, done))
-    done = iterate(camera, scene, camera.free, LAST, done.windows)
+    scene, windows = replace(done.scene, trusted=_trusted(camera, done)), done.windows
+    del done  # equations of tens of MB
+    done = iterate(camera, scene, camera.free, LAST, windows)
     if done is not None and camera.undecided and done.grows():
         done = iterate(replace(camera, growing=True), done.scene, GROWING, LAST, done.windows)
     return None if done is None or _beyond(done.scene.motion) else done
@@ -135,14 +148,25 @@ def _trusted(camera: ExposedCamera, rough: Fit) -> BoolArray:
     return after
 
 
+def _affordable(camera: ExposedCamera, scene: Scene) -> BoolArray:
+    """Return which stars (n,) the fit has room for: those with a say, of the others the brightest."""
+    room = window_areas(camera.pinhole, scene, camera.settings.reach)
+    order = np.lexsort((-scene.light, ~scene.trusted))
+    needed = np.empty(len(room))
+    needed[order] = np.cumsum(room[order])
+    return np.asarray(scene.trusted | (needed <= _MOST_PIXELS))
+
+
 def _accounted(camera: ExposedCamera, others: Scene) -> ExposedCamera:
     """Return the camera with a frame less the light of `others`, which is not known to the last electron."""
     if not len(others.light):
         return camera
-    pixels, light = _modelled(camera, others)
     signal, floor = camera.frame.signal.copy(), camera.frame.floor.copy()
-    signal[pixels] -= light
-    floor[pixels] += np.square(np.float32(_DOUBT) * light)
+    count = len(others.light)
+    for some in np.split(np.arange(count), range(_AT_ONCE, count, _AT_ONCE)):
+        pixels, light = _modelled(camera, others.select(some))
+        signal[pixels] -= light
+        floor[pixels] += np.square(np.float32(_DOUBT) * light)
     return replace(camera, frame=replace(camera.frame, signal=signal, floor=floor))
 
 

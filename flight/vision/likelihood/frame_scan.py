@@ -11,12 +11,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from flight.arrays import FloatArray
+from flight.arrays import FloatArray, IntArray
 from flight.pinhole import Pinhole
 from flight.vision.likelihood.exposed_frame import ExposedFrame, Float32Array
 from flight.vision.likelihood.motion import Motion
-from flight.vision.likelihood.polar_grid import polar_grid, totals
-from flight.vision.segmentation import box_sum
+from flight.vision.likelihood.polar_grid import polar_grid
+from flight.vision.likelihood.running_sums import totals
 
 # Lengths tried differ by this factor, from so many samples on.
 _FACTOR = 1.1
@@ -35,44 +35,56 @@ def frame_angles(frame: ExposedFrame, pinhole: Pinhole, turn: FloatArray, most: 
     # A turn by one radian has the longest steps and the widest circles.
     grid = polar_grid(pinhole, Motion.steady(turn / np.linalg.norm(turn)), _SPARSE)
     step = grid.angle / grid.length
-    held = totals(box_sum(frame.signal.reshape(frame.shape).copy()), pinhole, grid)
+    held = totals(frame.sums, pinhole, grid)
     held *= np.float32(1.0 / (_SAMPLE_NOISE * np.sqrt(np.median(frame.floor[::97]))))
     longest = min(len(grid.azimuth) // 2, int(np.pi / step))
     if longest < 2 * _SHORTEST:
         return []
     count = int(np.log(longest / _SHORTEST) / np.log(_FACTOR)) + 1
     widths = np.unique(np.rint(_SHORTEST * _FACTOR ** np.arange(count)).astype(np.int64))
-    score = np.array([_standing_out(held, int(width)) for width in widths])
+    room = int(_sharper(int(widths[-1]))[-1]) // 2
+    # Azimuth by azimuth, so that what is compared lies side by side.
+    padded = np.pad(np.ascontiguousarray(held.T), ((room, room), (0, 0)), mode="edge")
+    score = np.array([_standing_out(padded, room, int(width)) for width in widths])
     before, after = np.append(0.0, score[:-1]), np.append(score[1:], 0.0)
     peak = np.flatnonzero((score > before) & (score >= after))
     peak = peak[np.argsort(-score[peak], kind="stable")][:most]
-    return [_sharpened(held, int(widths[index])) * step for index in peak]
+    return [_sharpened(padded, room, int(widths[index])) * step for index in peak]
 
 
-def _standing_out(held: Float32Array, width: int) -> float:
-    """Return the squared significance of the boxes of `width` samples that stand out most."""
-    half = width // 2
-    padded = np.pad(held, ((0, 0), (half, half)), mode="edge")
-    size = held.shape[1] - width
-    first, last = padded[:, half : half + size], padded[:, half + width : half + width + size]
-    light = (last - first) * np.float32(2.0)
-    light -= padded[:, 2 * half + width : 2 * half + width + size]
-    light += padded[:, :size]
+def _standing_out(padded: Float32Array, room: int, width: int) -> float:
+    """Return the squared significance of the boxes of `width` samples that stand out most.
+
+    `padded` (c, r) are the totals by azimuth, with `room` more on either side.
+    """
+    stretches = (len(padded) - 2 * room - width) // width
+    outer, inner, behind, beyond = (
+        padded[room + offset : room + offset + stretches * width]
+        for offset in (-(width // 2), 0, width, width + width // 2)
+    )
+    light = behind - inner
+    light *= np.float32(2.0)
+    light -= beyond
+    light += outer
     # The highest box of each stretch of a circle, if none beside it is higher.
-    stretches = size // width
-    best = light[:, : stretches * width].reshape(len(light), stretches, width).max(axis=2)
+    best = light.reshape(stretches, width, -1).max(axis=1)
     best *= np.float32(1.0 / np.sqrt(2.0 * width))
     around = np.pad(best, 1)
     highest = best >= _LEAST_SIGMAS
-    for down in (-1, 0, 1):
-        for beside in (-1, 0, 1):
-            rows, columns = slice(1 + down, 1 + down + len(best)), slice(1 + beside, 1 + beside + stretches)
-            highest &= best >= around[rows, columns]
+    for down in (0, 1, 2):
+        for beside in (0, 1, 2):
+            highest &= best >= around[down : down + stretches, beside : beside + best.shape[1]]
     return float(np.sum(np.minimum(best[highest], _ENOUGH) ** 2))
 
 
-def _sharpened(held: Float32Array, width: int) -> int:
-    """Return the best width within half a step of those tried."""
+def _sharper(width: int) -> IntArray:
+    """Return the widths within half a step of those tried."""
     room = max(1, round(0.6 * (_FACTOR - 1.0) * width))
-    widths = range(max(width - room, 2), width + room + 1)
-    return widths[int(np.argmax([_standing_out(held, each) for each in widths]))]
+    return np.arange(max(width - room, 2), width + room + 1)
+
+
+def _sharpened(padded: Float32Array, room: int, width: int) -> int:
+    """Return the best width within half a step of those tried."""
+    widths = _sharper(width)
+    score = [_standing_out(padded, room, int(each)) for each in widths]
+    return int(widths[int(np.argmax(score))])

@@ -16,7 +16,7 @@ from flight.arrays import FloatArray, IntArray
 from flight.pinhole import Pinhole
 from flight.vision.likelihood.exposed_frame import ExposedFrame, Float32Array
 from flight.vision.likelihood.motion import Motion, paths
-from flight.vision.likelihood.polar_grid import ACROSS, PolarGrid, RunningSums, polar_grid, running_sums
+from flight.vision.likelihood.polar_grid import ACROSS, PolarGrid, polar_grid
 from flight.vision.likelihood.responses import (
     FARTHEST,
     LEAST_SEEN,
@@ -25,7 +25,8 @@ from flight.vision.likelihood.responses import (
     sharp_peaks,
     standing_peaks,
 )
-from flight.vision.segmentation import box_sum
+from flight.vision.likelihood.running_sums import RunningSums, running_sums
+from flight.vision.segmentation import less_boxes
 
 # Samples are rounded to this part of their noise.
 _ROUNDING = 30.0
@@ -36,6 +37,8 @@ _TINY = 1e-6
 # Heights are solved for to this part of them, by so many conjugate gradients at most.
 _SOLVED = 1e-4
 _MOST_GRADIENTS = 200
+# Places that stars reach, worked on at a time.
+_SOME_PLACES = 1 << 16
 # Shorter streaks, px, are no lines that a filter could follow.
 _LEAST_LENGTH = 6.0
 # The part of a streak's light that falls in the three pixels across.
@@ -68,8 +71,7 @@ def find_faint(
         return FaintStars(np.empty((0, 2)), np.empty(0), np.empty(0))
     grid = polar_grid(pinhole, motion)
     usual = _SAMPLE_NOISE * float(np.sqrt(np.median(frame.floor[::97])))
-    sums = box_sum(_left_over(frame, modelled))
-    held = running_sums(sums, pinhole, grid, usual / _ROUNDING)
+    held = running_sums(_left_over(frame, modelled), pinhole, grid, usual / _ROUNDING)
     # The noise for every number of samples; too few tell nothing.
     noise = usual * np.sqrt(np.arange(max(round(grid.length), 1) + 1.0))
     noise[: math.ceil(LEAST_SEEN * grid.length)] = np.inf
@@ -85,15 +87,22 @@ def find_faint(
 
 
 def _left_over(frame: ExposedFrame, modelled: tuple[IntArray, Float32Array]) -> Float32Array:
-    """Return the frame (rows, columns) less `modelled` light; pixels that tell nothing are zero."""
-    left = frame.signal.copy()
+    """Return the 3 x 3 sums (rows * columns,) of the frame less `modelled` light and what tells nothing."""
     pixels, light = modelled
-    floor = frame.floor[pixels]
+    signal, floor = frame.signal[pixels], frame.floor[pixels]
     # Where a bright star was taken out, what is left is mostly its own noise.
     share = floor / (floor + np.maximum(light, np.float32(0.0)) * np.float32(1.0 / frame.gain))
-    left[pixels] = (left[pixels] - light) * share
-    left[np.flatnonzero(frame.bad)] = 0.0
-    return left.reshape(frame.shape)
+    left = (signal - light) * share
+    left[frame.bad[pixels]] = 0.0
+    lost = frame.bad.copy()
+    lost[pixels] = False
+    untold = np.flatnonzero(lost)
+    return less_boxes(
+        frame.sums,
+        frame.shape,
+        np.concatenate([pixels, untold]),
+        np.concatenate([signal - left, frame.signal[untold]]),
+    )
 
 
 def _cleaned(
@@ -171,15 +180,24 @@ def _given(
     count = np.searchsorted(place, (circle * columns + high[:, None]).reshape(-1), side="right") - first
     told = np.flatnonzero((count > 0) & (weight.reshape(-1) > 0.0))
     first, count = first[told], count[told]
-    which = np.arange(count.sum()) + np.repeat(first - np.cumsum(count) + count, count)
-    circle = circle.reshape(-1)[told]
-    star = told // weight.shape[1]
-    at = (place[which] - np.repeat(circle * columns, count)).astype(np.float64)
-    common = shared(
-        at, np.repeat(column[star], count), np.repeat(held.span[circle], count, axis=0), grid.length
-    )
-    common *= np.repeat(weight.reshape(-1)[told], count)
-    return np.asarray(np.bincount(which, common, len(place)), dtype=float)
+    circle, weight = circle.reshape(-1)[told], weight.reshape(-1)[told]
+    star = told // (2 * FARTHEST)
+    out = np.zeros(len(place))
+    # A crowd of stars gives a multiple of the frame: some stretches at a time.
+    cuts = np.searchsorted(np.cumsum(count), np.arange(_SOME_PLACES, int(count.sum()), _SOME_PLACES))
+    for some in np.split(np.arange(len(told)), np.unique(cuts)):
+        many = count[some]
+        which = np.arange(many.sum()) + np.repeat(first[some] - np.cumsum(many) + many, many)
+        at = (place[which] - np.repeat(circle[some] * columns, many)).astype(np.float64)
+        common = shared(
+            at,
+            np.repeat(column[star[some]], many),
+            np.repeat(held.span[circle[some]], many, axis=0),
+            grid.length,
+        )
+        common *= np.repeat(weight[some], many)
+        np.add.at(out, which, common)
+    return out
 
 
 def _heights(held: RunningSums, row: FloatArray, column: FloatArray, grid: PolarGrid) -> FloatArray:

@@ -56,7 +56,7 @@ class Paths:
 
 def paths(pinhole: Pinhole, motion: Motion, stars: FloatArray, time: FloatArray) -> Paths:
     """Return where the stars that are at pixels `stars` (m, 2) at mid-exposure are at `time` (m,)."""
-    v = _rotated(motion, _directions(pinhole, stars), time)
+    v = _rotated(_turning(motion, time), _directions(pinhole, stars))
     w = _rate(motion, time)
     velocity = _cross(v, w)  # -omega x v
     acceleration = _cross(velocity, w)
@@ -72,7 +72,7 @@ def paths(pinhole: Pinhole, motion: Motion, stars: FloatArray, time: FloatArray)
 
 def positions(pinhole: Pinhole, motion: Motion, stars: FloatArray, time: FloatArray) -> FloatArray:
     """Return the positions (m, 2) of `paths`, and nothing else."""
-    v = _rotated(motion, _directions(pinhole, stars), time)
+    v = _rotated(_turning(motion, time), _directions(pinhole, stars))
     return _pixels(pinhole, v[:2] / v[2])
 
 
@@ -89,7 +89,8 @@ def sensitivities(
     Exact in the turn and the star; in the growth to second order of the angle turned, and left zero unless
     `growing`.
     """
-    v = _rotated(motion, _directions(pinhole, stars), time)
+    turning = _turning(motion, time)
+    v = _rotated(turning, _directions(pinhole, stars))
     there = v[:2] / v[2]
     out = np.zeros((2, 8, len(time)))
     # A change of turn or growth is a small rotation psi against the camera, the integral of the rotation from
@@ -106,9 +107,9 @@ def sensitivities(
     out[:, :3] = sine * flow - versine * about
     out[:, :3] += (((time - sine) * np.sum(flow * axis, axis=1))[:, None]) * axis
     if growing:
-        out[:, 3:6] = (0.5 * time**2) * flow - (time**3 / 6.0 * angle) * about
+        out[:, 3:6] = (0.5 * time**2) * flow - (time * time * time / 6.0 * angle) * about
     for column, unit in ((6, np.array([[1.0], [0.0], [0.0]])), (7, np.array([[0.0], [1.0], [0.0]]))):
-        beside = _rotated(motion, unit, time)
+        beside = _rotated(turning, unit)
         out[:, column] = (beside[:2] - there * beside[2]) / v[2]
     return out.transpose(2, 0, 1)
 
@@ -160,24 +161,30 @@ def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.asarray(a[..., after, :] * b[before] - a[..., before, :] * b[after])
 
 
-def _rotated(motion: Motion, v: FloatArray, time: FloatArray) -> FloatArray:
-    """Return fixed directions (3, m) in the camera's axes at `time`.
-
-    They are v cos - (a x v) sin + a (a.v)(1 - cos), about the unit vector a of the rotation until then.
-    """
+def _turning(motion: Motion, time: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the axis (3, 1) or (3, m) of the rotation until `time` (m,), sine and cosine of its angle."""
     if motion.constant:
         angle = float(np.linalg.norm(motion.turn))
         a = (motion.turn / max(angle, _TINY))[:, None]
         phi = angle * time
-        along = (a * a.T) @ v
     else:
         twist = np.cross(motion.turn, motion.growth) / 12.0
         parts = np.stack([motion.turn, 0.5 * motion.growth, twist], axis=1)
-        vector = parts @ np.stack([time, time**2, time**3])
+        square = time * time
+        vector = parts @ np.stack([time, square, square * time])
         phi = np.sqrt(np.sum(vector**2, axis=0))
         a = vector / np.maximum(phi, _TINY)
-        along = a * np.sum(a * v, axis=0)
-    out = (v - along) * np.cos(phi)
-    out += _cross(v, a) * np.sin(phi)
+    return a, np.sin(phi), np.cos(phi)
+
+
+def _rotated(turning: tuple[FloatArray, FloatArray, FloatArray], v: FloatArray) -> FloatArray:
+    """Return fixed directions (3, m) in the axes of a camera that has turned by `turning`.
+
+    They are v cos - (a x v) sin + a (a.v)(1 - cos), about the unit vector a of the rotation until then.
+    """
+    a, sine, cosine = turning
+    along = (a * a.T) @ v if a.shape[1] == 1 else a * np.sum(a * v, axis=0)
+    out = (v - along) * cosine
+    out += _cross(v, a) * sine
     out += along
     return np.asarray(out)

@@ -13,9 +13,9 @@ import numpy as np
 from flight.arrays import BoolArray, FloatArray, IntArray
 from flight.pinhole import Pinhole
 from flight.vision.likelihood import spot_model, streak_model
+from flight.vision.likelihood.exposed_frame import Float32Array
 from flight.vision.likelihood.scene import Scene
 from flight.vision.likelihood.shutter import Shutter
-from flight.vision.likelihood.streak_model import Float32Array
 from flight.vision.likelihood.windows import Sight, Windows
 
 SHARED = 7
@@ -23,10 +23,14 @@ SHARED = 7
 ALONE = 4
 """x, y, light, sky of a star."""
 
+# So many blocks are multiplied at a time: what is weighted stays in the processor's cache.
+_AT_ONCE = 128
 # A star's place along a streak whose ends are both outside is not known: this keeps its step finite, px.
 _LOOSE = 30.0
 # The sky about a star is near the frame's background, counts.
 _SKY = 3.0
+PRIOR = np.array([_LOOSE**-2, _LOOSE**-2, 0.0, _SKY**-2])
+"""The information (ALONE,) that keeps what the pixels do not tell of a star finite."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,12 +103,14 @@ def evaluate(
     if len(strips.star):
         matrix = _block_parameters(pinhole, shutter, scene, windows, growing)
         matrix[:, :, :SHARED] *= scene.trusted[of_block, None, None]
-        _add(out, of_block, windows.on_strips, weights[0], residuals[0], images, matrix)
+        images[:, streak_model.IMAGES] = residuals[0]
+        _add(out, of_block, windows.on_strips, weights[0], images, matrix)
     if len(windows.spot):
         spot_images = _spot_images(scene, windows, spots, change)
         matrix = np.tile(np.eye(size), (len(windows.spot), 1, 1))
         matrix[:, :, :SHARED] *= scene.trusted[windows.spot, None, None]
-        _add(out, windows.spot, windows.on_patches, weights[1], residuals[1], spot_images, matrix)
+        spot_images[:, size] = residuals[1]
+        _add(out, windows.spot, windows.on_patches, weights[1], spot_images, matrix)
     return out
 
 
@@ -112,15 +118,18 @@ def light_of(pinhole: Pinhole, shutter: Shutter, scene: Scene, windows: Windows)
     """Return the light of all stars of `scene` on the pixels in use of its windows, sky left out."""
     images, spots, _ = _shapes(pinhole, shutter, scene, windows)
     streaks = images[:, 0] * scene.light[windows.long[windows.strips.star], None, None].astype(np.float32)
-    return windows.total(streaks, spots * scene.light[windows.spot, None, None])
+    return windows.total(streaks, spots * scene.light[windows.spot, None, None])[:-1]
 
 
 def _shapes(
     pinhole: Pinhole, shutter: Shutter, scene: Scene, windows: Windows
 ) -> tuple[Float32Array, FloatArray, FloatArray]:
-    """Return the images of the strips, the spots' light and its derivatives, all of stars of light 1."""
+    """Return the images of the strips, the spots' light and its derivatives, all of stars of light 1.
+
+    The images have room for the residual behind them.
+    """
     long, spot = scene.stars[windows.long], scene.stars[windows.spot]
-    images = streak_model.images(pinhole, scene.motion, shutter, long, scene.width, windows.strips)
+    images = streak_model.images(pinhole, scene.motion, shutter, long, scene.width, windows.strips, 1)
     spots, change = spot_model.derivatives(pinhole, scene.motion, shutter, spot, scene.sigma, windows.patches)
     return images, spots, change
 
@@ -148,23 +157,27 @@ def _add(
     star: IntArray,
     sight: Sight,
     weight: Float32Array,
-    residual: Float32Array,
     images: Float32Array,
     matrix: FloatArray,
 ) -> None:
-    """Add blocks of pixels, in order of their stars, to the normal equations."""
-    blocks = len(images)
-    flat = images.reshape(blocks, images.shape[1], -1)
-    weight, residual = weight.reshape(blocks, -1), residual.reshape(blocks, -1)
-    weighted = flat * weight[:, None]
-    gram = (weighted @ flat.swapaxes(1, 2)).astype(np.float64)
-    slope = (weighted @ residual[..., None]).astype(np.float64)
+    """Add blocks of pixels, in order of their stars, to the normal equations.
+
+    The last of the `images` is the residual: its products with the others are the score, with itself the
+    chi-square.
+    """
+    blocks, count = images.shape[:2]
+    flat = images.reshape(blocks, count, -1)
+    weight = weight.reshape(blocks, -1)
+    gram = np.empty((blocks, count, count))
+    for begin in range(0, blocks, _AT_ONCE):
+        part = slice(begin, begin + _AT_ONCE)
+        gram[part] = (flat[part] * weight[part, None]) @ flat[part].swapaxes(1, 2)
     turned = matrix.swapaxes(1, 2)
     first = np.flatnonzero(np.diff(star, prepend=-1))
     owner = star[first]
-    out.information[owner] += np.add.reduceat(turned @ gram @ matrix, first)
-    out.gradient[owner] += np.add.reduceat((turned @ slope)[..., 0], first)
-    out.chi2[owner] += np.add.reduceat(np.einsum("bp,bp,bp->b", weight, residual, residual), first)
+    out.information[owner] += np.add.reduceat(turned @ gram[:, :-1, :-1] @ matrix, first)
+    out.gradient[owner] += np.add.reduceat((turned @ gram[:, :-1, -1:])[..., 0], first)
+    out.chi2[owner] += np.add.reduceat(gram[:, -1, -1], first)
     out.pixels[owner] += np.add.reduceat((weight > 0.0).sum(axis=1), first)
     if len(sight.crowded):
         out.crowds.append(_crowd(star, sight, weight, flat, matrix))
@@ -176,6 +189,12 @@ def _crowd(
     block, place = np.divmod(sight.crowded, images.shape[2])
     first = np.flatnonzero(np.diff(block, prepend=-1))
     held = block[first]
+    _, count, size = images.shape
+    place += block * (count * size)
+    drawn = np.empty((count - 1, len(place)), dtype=np.float32)
+    for image in drawn:
+        image[:] = images.reshape(-1).take(place)
+        place += size
     return Crowd(
         star[held],
         matrix[held],
@@ -183,14 +202,14 @@ def _crowd(
         first,
         sight.common,
         weight.reshape(-1)[sight.crowded],
-        np.ascontiguousarray(images[block, :, place].T),
+        drawn,
     )
 
 
 def _spot_images(scene: Scene, windows: Windows, spots: FloatArray, change: FloatArray) -> Float32Array:
-    """Return the derivatives (n, SHARED + ALONE, p, p) of the spots' light."""
+    """Return the derivatives (n, SHARED + ALONE + 1, p, p) of the spots' light, the last left empty."""
     light = scene.light[windows.spot, None, None, None]
-    images = np.empty((len(spots), SHARED + ALONE, *spots.shape[1:]), dtype=np.float32)
+    images = np.empty((len(spots), SHARED + ALONE + 1, *spots.shape[1:]), dtype=np.float32)
     images[:, :6] = change[:, :6] * light
     # The width is that of Gaussian and pixel together: d sigma / d width = width / sigma.
     images[:, 6] = change[:, 8] * light[:, 0] * (scene.width / scene.sigma)
@@ -220,9 +239,4 @@ def apply_information(
         felt = crowd.weight * (change[crowd.slot] - light).astype(np.float32)
         slope = np.add.reduceat(crowd.images * felt, crowd.first, axis=1).T.astype(np.float64)
         np.add.at(out, crowd.star, (slope[:, None] @ crowd.matrix)[:, 0])
-    return out[:, :SHARED].sum(axis=0), out[:, SHARED:] + prior_information(evaluation) * alone
-
-
-def prior_information(evaluation: Evaluation) -> FloatArray:
-    """Return the information (n, ALONE) that keeps what the pixels do not tell finite."""
-    return np.broadcast_to(np.array([_LOOSE**-2, _LOOSE**-2, 0.0, _SKY**-2]), (len(evaluation.chi2), ALONE))
+    return out[:, :SHARED].sum(axis=0), out[:, SHARED:] + PRIOR * alone

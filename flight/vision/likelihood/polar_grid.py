@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.arrays import BoolArray, FloatArray, IntArray
+from flight.arrays import BoolArray, FloatArray
 from flight.pinhole import Pinhole
 from flight.vision.likelihood.exposed_frame import Float32Array
 from flight.vision.likelihood.motion import Motion
@@ -20,8 +20,8 @@ _ALONG = 4.0
 # Circles worked on at a time, so that they stay in the processor's cache.
 _CHUNK = 64
 _NEAREST = 0.003
-# Pixels to a side of what is summed for a sample.
-_BOX = 3.0
+# The detector's border is looked at every so many pixels.
+_BORDER_STEP = 8.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,83 +83,14 @@ def polar_grid(pinhole: Pinhole, motion: Motion, every: int = 1) -> PolarGrid:
     return PolarGrid(frame, polar, azimuth, angle / step, angle, np.sin(polar) * pinhole.focal_length)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RunningSums:
-    """Samples summed over a streak's length.
+def sampled(
+    sums: Float32Array, pinhole: Pinhole, grid: PolarGrid, room: int, unit: float
+) -> Iterator[tuple[slice, slice, Float32Array, BoolArray]]:
+    """Yield some circles after others: which, and where they cross the detector; their samples there.
 
-    Attributes:
-        light: (r, c) counts; count: (r, c) how many samples exist.
-        span: (r, 2) between which columns a circle's samples exist; without bounds where not in one piece.
-        excess: (r,) by what factor noise exceeds that of samples which share no pixels.
-    """
-
-    light: Float32Array
-    count: IntArray
-    span: FloatArray
-    excess: FloatArray
-
-
-def running_sums(sums: Float32Array, pinhole: Pinhole, grid: PolarGrid, unit: float) -> RunningSums:
-    """Return the running sums of samples of `sums` within half a streak.
-
-    `sums` is zero along the border, where all that is outside is sampled; it is rounded to `unit` counts.
-    """
-    width = max(round(grid.length), 1)
-    before, after = width // 2, width - width // 2
-    shape = len(grid.polar), len(grid.azimuth)
-    response, count = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.int64)
-    span = np.tile([-np.inf, np.inf], (shape[0], 1))
-    # Samples, and whether they exist, with room for half a streak to either side.
-    padded = np.zeros((2, _CHUNK, shape[1] + width + 1), dtype=np.int64)
-    middle = slice(before + 1, before + 1 + shape[1])
-    total = np.empty_like(padded)
-    for part, samples, inside in _sampled(sums, pinhole, grid, unit):
-        rows = len(samples)
-        padded[0, :rows, middle] = samples
-        padded[1, :rows, middle] = inside
-        if grid.full:
-            padded[:, :, : before + 1] = padded[:, :, shape[1] : shape[1] + before + 1]
-            padded[:, :, middle.stop :] = padded[:, :, before + 1 : before + 1 + after]
-        np.cumsum(padded, axis=2, out=total)
-        held = total[:, :rows, width : width + shape[1]] - total[:, :rows, : shape[1]]
-        np.multiply(held[0], unit, out=response[part], casting="same_kind")
-        count[part] = held[1]
-        first, last = inside.argmax(axis=1), shape[1] - 1 - inside[:, ::-1].argmax(axis=1)
-        whole = inside.sum(axis=1) == last - first + 1
-        # An even number of samples is not about its middle one, but half a sample before it.
-        edges = np.stack([first - 0.5, last + 0.5], axis=1) + grid.off_centre
-        span[part] = np.where(whole[:, None], edges, span[part])
-    return RunningSums(response, count, span, _excess(grid, width))
-
-
-def _excess(grid: PolarGrid, width: int) -> FloatArray:
-    """Return the noise (r,) of sums of `width` samples of 3 x 3 pixels over that of samples far apart.
-
-    On the slow circles near the axis samples are so close that they are of the same pixels.
-    """
-    spacing = grid.speed * (grid.azimuth[1] - grid.azimuth[0])
-    slow = np.flatnonzero(spacing < _BOX)
-    steps = np.arange(1, width)
-    common = np.maximum(1.0 - spacing[slow, None] * steps / _BOX, 0.0)
-    out = np.ones(len(spacing))
-    out[slow] = np.sqrt(1.0 + 2.0 * common @ (1.0 - steps / width))
-    return out
-
-
-def totals(sums: Float32Array, pinhole: Pinhole, grid: PolarGrid) -> Float32Array:
-    """Return the totals (r, c + 1) of the samples of `sums` before each sample of a circle."""
-    out = np.zeros((len(grid.polar), len(grid.azimuth) + 1), dtype=np.float32)
-    for part, samples, _ in _sampled(sums, pinhole, grid, 1.0):
-        out[part, 1:] = np.cumsum(samples, axis=1, dtype=np.float64)
-    return out
-
-
-def _sampled(
-    sums: Float32Array, pinhole: Pinhole, grid: PolarGrid, unit: float
-) -> Iterator[tuple[slice, Float32Array, BoolArray]]:
-    """Yield some circles after others: their samples in whole `unit`s, and which exist.
-
-    Whole numbers add up several times faster than others, and exactly.
+    The samples of `sums`, zero along the border, are in whole `unit`s: whole numbers add up several times
+    faster than others, and exactly. Beside them stands which exist. Where circles close, `room` samples
+    beside those that cross the detector are on the grid too.
     """
     # Directions over the sine of the polar angle: one part for the azimuth, one for the circle.
     turning = grid.frame[:2].T @ np.stack([np.cos(grid.azimuth), np.sin(grid.azimuth)])
@@ -167,23 +98,47 @@ def _sampled(
     around, aloft = turning.astype(np.float32), rising.astype(np.float32)
     last = np.float32(pinhole.columns - 1), np.float32(pinhole.rows - 1)
     flat = sums.reshape(-1)
-    for start in range(0, len(grid.polar), _CHUNK):
-        part = slice(start, start + _CHUNK)
-        depth = around[2] + aloft[2, part, None]
+    for part, crossing in _crossings(pinhole, grid, room):
+        depth = around[2, crossing] + aloft[2, part, None]
         np.maximum(depth, np.float32(1e-3), out=depth)
         np.divide(np.float32(pinhole.focal_length), depth, out=depth)
         places = []
         for axis, limit in ((0, last[0]), (1, last[1])):
-            place = around[axis] + aloft[axis, part, None]
+            place = around[axis, crossing] + aloft[axis, part, None]
             place *= depth
             place += np.float32(pinhole.centre[axis])
             np.rint(place, out=place)
             places.append(np.clip(place, np.float32(0.0), limit, out=place))
         column, row = places
         inside = (column > 0.0) & (column < last[0]) & (row > 0.0) & (row < last[1])
-        index = row.astype(np.int64)
+        index = row.astype(np.int32)
         index *= pinhole.columns
-        index += column.astype(np.int64)
+        index += column.astype(np.int32)
         samples = flat.take(index)
         samples *= np.float32(1.0 / unit)
-        yield part, np.rint(samples, out=samples), inside
+        yield part, crossing, np.rint(samples, out=samples), inside
+
+
+def _crossings(pinhole: Pinhole, grid: PolarGrid, room: int) -> Iterator[tuple[slice, slice]]:
+    """Yield circles, some after others, and between which azimuths they cross the detector."""
+    x, y = pinhole.columns - 1.0, pinhole.rows - 1.0
+    sides = np.arange(0.0, x, _BORDER_STEP), np.arange(0.0, y, _BORDER_STEP)
+    along = np.concatenate([sides[0], np.full_like(sides[1], x), x - sides[0], np.zeros_like(sides[1])])
+    down = np.concatenate([np.zeros_like(sides[0]), sides[1], np.full_like(sides[0], y), y - sides[1]])
+    local = pinhole.unit_vectors(np.stack([along, down], axis=-1)) @ grid.frame.T
+    polar, azimuth = np.arccos(np.clip(local[:, 2], -1.0, 1.0)), np.arctan2(local[:, 1], local[:, 0])
+    column = (azimuth - grid.azimuth[0]) / (grid.azimuth[1] - grid.azimuth[0])
+    count, margin = len(grid.azimuth), _BORDER_STEP / pinhole.focal_length
+    for start in range(0, len(grid.polar), _CHUNK):
+        part = slice(start, min(start + _CHUNK, len(grid.polar)))
+        near = (polar > grid.polar[start] - margin) & (polar < grid.polar[part.stop - 1] + margin)
+        # The azimuths are about the direction to the field's middle: away from it the field ends first.
+        behind = grid.pixels(pinhole, np.array([start]), np.zeros(1))
+        if grid.full and pinhole.contains(behind, margin=2.0)[0]:
+            yield part, slice(0, count)
+        elif near.any():
+            beside = margin / max(np.sin(grid.polar[start]), margin) / (grid.azimuth[1] - grid.azimuth[0])
+            low, high = column[near].min() - beside, column[near].max() + beside + 1.0
+            if grid.full and (low < room or high > count - room):
+                low, high = 0.0, count
+            yield part, slice(max(int(low), 0), min(int(np.ceil(high)), count))

@@ -13,7 +13,8 @@ from scipy.special import ndtr
 
 from flight.arrays import BoolArray, FloatArray, IntArray
 from flight.vision.likelihood.exposed_frame import Float32Array
-from flight.vision.likelihood.polar_grid import ACROSS, PolarGrid, RunningSums
+from flight.vision.likelihood.polar_grid import ACROSS, PolarGrid
+from flight.vision.likelihood.running_sums import RunningSums
 
 LEAST_SEEN = 0.35
 """A streak needs this part of itself on the detector."""

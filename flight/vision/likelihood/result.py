@@ -9,7 +9,7 @@ import numpy as np
 from flight.arrays import BoolArray, FloatArray
 from flight.quaternion import from_rotation_vector
 from flight.vision.likelihood.settings import RateModel
-from flight.vision.streak_rate import StreakStatus
+from flight.vision.streak_result import StreakStatus
 
 
 def _none(*shape: int) -> FloatArray:

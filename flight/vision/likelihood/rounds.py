@@ -21,7 +21,7 @@ from flight.vision.likelihood.windows import Windows, cut_windows
 
 _LONGEST_STEP = 3.0
 # An end so far, px, from where its window was cut has left the window's middle.
-_DRIFT = 1.0
+_DRIFT = 1.5
 # Ends of stars without a say may be farther from it; after the first round by any distance: all windows are
 # not cut again for those whose light hardly fixes their place.
 _FAINT_DRIFT = 2.5
@@ -40,6 +40,8 @@ _FAR_BELOW = 0.5
 _GROWTHS = 3
 GROWING = np.ones(SHARED, dtype=np.bool_)
 _WIDEST = 6.0
+# A joint fit whose point spread grows beyond so many of the first fit's has no streaks to hold on to.
+_WIDER = 1.6
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +64,7 @@ class Rounds:
     patience: int
 
 
-FIRST = Rounds(8, clipped=False, tolerance=0.1, settled=SETTLED, conjugate=4, patience=2)
+FIRST = Rounds(6, clipped=False, tolerance=0.1, settled=SETTLED, conjugate=4, patience=2)
 ROUGH = Rounds(3, clipped=True, tolerance=0.003, settled=1.5, conjugate=12, patience=3)
 LAST = Rounds(10, clipped=True, tolerance=0.003, settled=SETTLED, conjugate=12, patience=4)
 
@@ -140,14 +142,16 @@ def iterate(
     whole, cut_at = windows or camera.windows(scene), scene
     windows = whole
     restless, asked, before = np.inf, np.inf, np.zeros(SHARED)
+    widest = _WIDER * scene.width if how.clipped else _WIDEST
     solution, evaluation = None, None
     for turn in range(how.rounds):
+        evaluation = None  # tens of MB, as is the next
         evaluation = camera.evaluate(scene, windows, camera.settings.clip if how.clipped else 0.0)
         solution = solve(evaluation, scene, free, how.conjugate)
         if solution is None:
             return None
         scene, wanted = moved(scene, solution, camera.pinhole, _LONGEST_STEP)
-        if not _possible(scene):
+        if not _possible(scene) or scene.width > widest:
             return None
         deviation = np.sqrt(np.maximum(np.diag(solution.covariance)[free], 1e-30))
         restless = float(np.max(np.abs(solution.shared[free]) / deviation))
@@ -162,6 +166,7 @@ def iterate(
             break
         asked, before = wanted, solution.shared
         if _drifted(camera, cut_at, scene, _FAINT_DRIFT if turn == 0 else np.inf):
+            del windows, whole  # tens of MB, as are the new ones
             windows = whole = camera.windows(scene)
             cut_at = scene
         elif how.clipped and turn >= _LOOKS:

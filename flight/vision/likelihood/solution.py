@@ -16,10 +16,10 @@ from flight.pinhole import Pinhole
 from flight.vision.likelihood.motion import Motion, sensitivities
 from flight.vision.likelihood.normal_equations import (
     ALONE,
+    PRIOR,
     SHARED,
     Evaluation,
     apply_information,
-    prior_information,
 )
 from flight.vision.likelihood.scene import Scene
 
@@ -73,7 +73,7 @@ def eliminate(evaluation: Evaluation, free: BoolArray) -> Eliminated | None:
     """
     alone = evaluation.information[:, SHARED:, SHARED:].copy()
     diagonal = np.einsum("nii->ni", alone)
-    diagonal += prior_information(evaluation)
+    diagonal += PRIOR
     # Light of a star outside has no information: a unit keeps the block regular, its gradient is zero.
     diagonal += np.where(diagonal > 0.0, 0.0, 1.0)
     own = _scaled_inverse(alone)
@@ -98,7 +98,7 @@ def solve(evaluation: Evaluation, scene: Scene, free: BoolArray, rounds: int) ->
     eliminated = eliminate(evaluation, free)
     if eliminated is None:
         return None
-    alone = evaluation.gradient[:, SHARED:] - prior_information(evaluation) * _from_prior(scene)
+    alone = evaluation.gradient[:, SHARED:] - PRIOR * _from_prior(scene)
     shared = np.where(free, evaluation.gradient[:, :SHARED].sum(axis=0), 0.0)
     step = _conjugate(evaluation, eliminated, free, (shared, alone), rounds)
     return Solution(*step, *_covariances(eliminated, len(alone)))

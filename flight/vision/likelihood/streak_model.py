@@ -21,20 +21,20 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import ndtr
 
 from flight.arrays import FloatArray
 from flight.pinhole import Pinhole
+from flight.vision.likelihood.exposed_frame import Float32Array
 from flight.vision.likelihood.motion import Motion, paths, sensitivities
 from flight.vision.likelihood.shutter import Shutter
-from flight.vision.likelihood.strips import LINES, Strips
-
-Float32Array = npt.NDArray[np.float32]
+from flight.vision.likelihood.strips import LINES, Strips, beside
 
 IMAGES = 7
 """m, (n/w^2) m, its first moment along the path, e0, e1, dm/dw, 1."""
 
+# Blocks are worked on so many at a time, that their pixels stay in the processor's cache.
+_AT_ONCE = 256
 _ENDS = 5.5
 """Widths from an end beyond which its profile is 0 or 1."""
 _OBLIQUE = 7.0
@@ -46,87 +46,133 @@ _KURTOSIS = -1.0 / 120.0
 
 
 def images(
-    pinhole: Pinhole, motion: Motion, shutter: Shutter, stars: FloatArray, width: float, strips: Strips
+    pinhole: Pinhole,
+    motion: Motion,
+    shutter: Shutter,
+    stars: FloatArray,
+    width: float,
+    strips: Strips,
+    more: int = 0,
 ) -> Float32Array:
-    """Return the images (b, IMAGES, LINES, k) of stars (n, 2), each of light 1, on their strips.
+    """Return the images (b, IMAGES + more, LINES, k) of stars (n, 2), each of light 1, on their strips.
 
-    `width` is w in px.
+    `width` is w in px; so many `more` images are left for others to fill in.
     """
     shape = strips.time.shape
     path = paths(pinhole, motion, np.repeat(stars[strips.star], LINES, axis=0), strips.time.reshape(-1))
     velocity = path.velocity.reshape(*shape, 2)
     speed = np.maximum(np.hypot(velocity[..., 0], velocity[..., 1]), _SLOWEST)
-    tx, ty = velocity[..., 0] / speed, velocity[..., 1] / speed
-    acceleration = path.acceleration.reshape(*shape, 2)
+    position, acceleration = path.position.reshape(*shape, 2), path.acceleration.reshape(*shape, 2)
+    lines = position, velocity / speed[..., None], speed, acceleration
+    out = np.empty((len(strips.star), IMAGES + more, *strips.index.shape[1:]), dtype=np.float32)
+    for first in range(0, len(out), _AT_ONCE):
+        part = slice(first, first + _AT_ONCE)
+        _draw(out[part], strips, part, tuple(line[part] for line in lines), shutter, width)
+    return out
+
+
+def _draw(
+    out: Float32Array,
+    strips: Strips,
+    part: slice,
+    path: tuple[FloatArray, ...],
+    shutter: Shutter,
+    width: float,
+) -> None:
+    """Fill in the images of some blocks; `path`: position, tangent, speed and acceleration on their lines."""
+    position, tangent, speed, acceleration = path
+    tx, ty = tangent[..., 0], tangent[..., 1]
     gained = acceleration[..., 0] * tx + acceleration[..., 1] * ty
     bend = (acceleration[..., 1] * tx - acceleration[..., 0] * ty) / speed**2
-    place = path.position.reshape(*shape, 2)
-
-    def wide(line: FloatArray) -> Float32Array:
-        return line[..., None].astype(np.float32)
-
-    dx = strips.column - wide(place[..., 0])
-    dy = strips.row - wide(place[..., 1])
-    curvature = wide(bend)
-    ahead = dx * wide(tx) + dy * wide(ty)
-    aside = dy * wide(tx) - dx * wide(ty)
-    squeeze = curvature * aside
-    np.clip(squeeze, -0.5, 0.5, out=squeeze)
-    s = ahead / (1.0 - squeeze)
-    n = aside - 0.5 * curvature * ahead * s
-    time = s * wide(1.0 / speed)
-    out = np.empty((len(strips.star), IMAGES, *strips.index.shape[1:]), dtype=np.float32)
-    light = np.empty(strips.index.shape, dtype=np.float32)
-    u = n * n
+    aside, ahead = beside(strips.corner[part], strips.step[part], position, tangent, out.shape[3])
+    squeeze = bend.astype(np.float32) * aside
+    np.clip(squeeze, np.float32(-0.5), np.float32(0.5), out=squeeze)
+    s = ahead / (np.float32(1.0) - squeeze)
+    ahead *= (0.5 * bend).astype(np.float32)
+    ahead *= s
+    aside -= ahead
+    u = aside * aside
     u *= np.float32(1.0 / width**2)
-    np.exp(np.float32(-0.5) * u, out=light)
+    light = np.multiply(u, np.float32(-0.5), out=ahead)
+    np.exp(light, out=light)
     # Slower stretches are brighter; inside a bend light is denser.
-    light *= (1.0 + 0.5 * squeeze + 0.375 * squeeze * squeeze) * (1.0 - time * wide(gained / speed))
-    light *= wide(_BELL / (width * speed))
-    square = _KURTOSIS * (tx**4 + ty**4) / (24.0 * width**4)
-    light *= 1.0 + wide(square) * ((u - 6.0) * u + 3.0)
-    time += wide(strips.time)
-    out[:, 0] = light
-    _ends(out, time, speed, shutter, strips, width)
+    light *= np.float32(1.0) + squeeze * (np.float32(0.5) + np.float32(0.375) * squeeze)
+    light *= np.float32(1.0) - s * (gained / speed**2).astype(np.float32)
+    scale = _BELL / (width * speed)
+    # The fourth powers of the tangent's components, whose squares add up to one.
+    square = scale * (_KURTOSIS / (24.0 * width**4)) * (1.0 - 2.0 * np.square(tx * ty))
+    u = (u - np.float32(6.0)) * u
+    u *= square.astype(np.float32)
+    u += (scale + 3.0 * square).astype(np.float32)
+    light *= u
+    time = strips.time[part]
+    centre = time[:, LINES // 2 - 1 : LINES // 2 + 1].mean(axis=1, keepdims=True)
+    s += ((time - centre) * speed).astype(np.float32)
+    out[:, 0] = light.transpose(1, 2, 0)
+    across, along = (np.ascontiguousarray(each.transpose(1, 2, 0)) for each in (aside, s))
+    _ends(out, along, (time, centre, speed), shutter, strips, part, width)
     light = out[:, 0]
-    across = n * np.float32(1.0 / width**2)
+    u = across * across
+    u *= np.float32(1.0 / width**3)
+    u -= np.float32(1.0 / width)
+    u *= light
+    out[:, 5] += u
+    across *= np.float32(1.0 / width**2)
     np.multiply(across, light, out=out[:, 1])
-    centre = strips.time[:, LINES // 2 - 1 : LINES // 2 + 1].mean(axis=1)
-    from_centre = (time - centre[:, None, None].astype(np.float32)) * wide(speed)
-    from_centre *= light
-    from_centre += np.float32(width**2) * (out[:, 3] - out[:, 4])
-    np.multiply(from_centre, across, out=out[:, 2])
-    out[:, 5] += (u - 1.0) * np.float32(1.0 / width) * light
+    # The first moment of the light along the path, and what its ends cut off.
+    along *= out[:, 1]
+    across *= np.float32(width**2)
+    across *= out[:, 3] - out[:, 4]
+    np.add(along, across, out=out[:, 2])
     out[:, 6] = 1.0
-    return out
 
 
 def _ends(
     out: Float32Array,
-    time: Float32Array,
-    speed: FloatArray,
+    along: Float32Array,
+    lines: tuple[FloatArray, FloatArray, FloatArray],
     shutter: Shutter,
     strips: Strips,
+    part: slice,
     width: float,
 ) -> None:
-    """Cut the light in `out[:, 0]` at both ends of the exposure, and fill in what changes with them."""
+    """Cut the light in `out[:, 0]` at both ends of the exposure, and fill in what changes with them.
+
+    `along` (b, LINES, k) px from where the path is at the blocks' middle; `lines`: when it crosses each line
+    (b, LINES), when at the middle (b, 1), and its speed on each.
+    """
     out[:, 3:6] = 0.0
-    rows = strips.row
-    outer = shutter.delay(rows[..., [0, -1]])
+    crossing, centre, speed = lines
+    rolling = shutter.delay_per_row != 0.0
+    delay = shutter.delay(strips.rows(part)[..., [0, -1]]) if rolling else np.zeros(2)
     for end, image in ((-0.5, 3), (0.5, 4)):
         sign = -1.0 if end > 0.0 else 1.0
-        closest = sign * (strips.time - end) + np.min(-sign * outer, axis=-1)
-        near = np.flatnonzero(np.min(closest * speed, axis=1) < (_ENDS + _OBLIQUE) * width)
+        closest = sign * (crossing - end) - np.max(sign * delay, axis=-1)
+        near = np.flatnonzero((closest * speed < (_ENDS + _OBLIQUE) * width).any(axis=1))
         if not near.size:
             continue
-        # A row-dependent end is a slanted cut of the path: the pixel's window is exact, row by row.
-        edge = np.float32(end) + shutter.delay(rows[near])
-        u = (time[near] - edge) * (sign * speed[near] / width)[..., None]
-        bell = _BELL * np.exp(-0.5 * u * u)
+        u = along[near]
+        u += _wide((centre[near] - end) * speed[near])
+        if rolling:
+            # A row-dependent end is a slanted cut of the path: the pixel's window is exact, row by row.
+            u -= shutter.delay(strips.rows(near + part.start)) * _wide(speed[near])
+        u *= np.float32(sign / width)
+        bell = u * u
+        bell *= np.float32(-0.5)
+        np.exp(bell, out=bell)
+        bell *= np.float32(_BELL / width)
         before = out[near, 0]
-        out[near, image] = before * bell / width
-        out[near, 0] = before * ndtr(u)
-        out[near, 5] -= before * u * bell / width
+        bell *= before
+        out[near, image] = bell
+        before *= ndtr(u)
+        out[near, 0] = before
+        bell *= u
+        out[near, 5] -= bell
+
+
+def _wide(line: FloatArray) -> Float32Array:
+    """Return a number of each line (b, l) for all its pixels."""
+    return line[..., None].astype(np.float32)
 
 
 def coefficients(
@@ -147,7 +193,7 @@ def coefficients(
     delay = np.zeros(len(stars))
     ending, spread = stars, strips.star
     if shutter.delay_per_row != 0.0:
-        rows = strips.row[:, LINES // 2].mean(axis=1).astype(np.float64)
+        rows = strips.rows(slice(None))[:, LINES // 2].mean(axis=1).astype(np.float64)
         delay, ending, spread = np.asarray(shutter.delay(rows)), of_block, np.arange(len(centre))
     times = (centre - _STEP, centre + _STEP, delay - 0.5, delay + 0.5)
     shift, side, speed = _moved(

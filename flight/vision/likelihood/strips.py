@@ -12,17 +12,18 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from flight.arrays import BoolArray, FloatArray, IntArray
 from flight.pinhole import Pinhole
+from flight.vision.likelihood.exposed_frame import Float32Array
 from flight.vision.likelihood.motion import Motion, Paths, paths, positions
 
 LINES = 10
 """Lines in a block."""
 
-# A part of a path turns by no more than this, rad, so that it stays monotonic along its major axis.
-_LONGEST_TURN = 0.6
+LONGEST_TURN = 0.6
+"""A part of a path turns by no more than this, rad, so that it stays monotonic along its major axis."""
+
 _SAMPLES = 17
 _SLOWEST = 1e-3
 # How exactly, px, two parts agree on which of them a pixel is nearest to.
@@ -37,7 +38,7 @@ class Strips:
         count: stars.
         star: (b,) which star a block is of, ascending.
         time: (b, LINES) at which the path crosses the line, exposures.
-        column, row: (b, LINES, 1) or (b, LINES, k) of the pixels, float32.
+        corner: (b, LINES, 2) column and row of each line's first pixel; step: (b, 2) from pixel to pixel.
         index: (b, LINES, k) into the flat frame; clipped where not `inside`.
         inside: (b, LINES, k) whether the pixel exists and is nearest to this part of the path.
     """
@@ -45,10 +46,15 @@ class Strips:
     count: int
     star: IntArray
     time: FloatArray
-    column: npt.NDArray[np.float32]
-    row: npt.NDArray[np.float32]
+    corner: IntArray
+    step: IntArray
     index: IntArray
     inside: BoolArray
+
+    def rows(self, of: IntArray | slice) -> Float32Array:
+        """Return the rows (.., LINES, k) of the pixels of some blocks."""
+        along = np.arange(self.index.shape[2]) * self.step[of, 1, None, None]
+        return (self.corner[of, :, 1, None] + along).astype(np.float32)
 
 
 def cut_strips(
@@ -98,7 +104,7 @@ class _Lines:
 def _parts(motion: Motion, times: FloatArray) -> tuple[IntArray, FloatArray, FloatArray, BoolArray]:
     """Return the parts' stars, start and end times, and which of those two are ends of the path (.., 2)."""
     turned = float(np.linalg.norm(motion.turn)) + float(np.linalg.norm(motion.growth))
-    pieces = max(1, math.ceil(turned * float(np.max(times[:, 1] - times[:, 0], initial=0.0)) / _LONGEST_TURN))
+    pieces = max(1, math.ceil(turned * float(np.max(times[:, 1] - times[:, 0], initial=0.0)) / LONGEST_TURN))
     edges = times[:, :1] + (times[:, 1:] - times[:, :1]) * np.linspace(0.0, 1.0, pieces + 1)
     part = np.repeat(np.arange(len(times)), pieces)
     outer = np.zeros((len(times), pieces, 2), dtype=np.bool_)
@@ -131,42 +137,59 @@ def _pixels(
     position, velocity = path.position.reshape(*shape, 2), path.velocity.reshape(*shape, 2)
     speed = np.maximum(np.hypot(velocity[..., 0], velocity[..., 1]), _SLOWEST)
     tangent = velocity / speed[..., None]
+    bent = path.acceleration.reshape(*shape, 2)
+    bend = (bent[..., 1] * tangent[..., 0] - bent[..., 0] * tangent[..., 1]) / speed**2
     crossing = np.where(along, position[..., 1], position[..., 0])
     steep = np.maximum(np.abs(np.where(along, tangent[..., 0], tangent[..., 1])), 0.2)
     half = math.ceil(float(np.max(np.where(lines.real, width / steep, 0.0), initial=0.0)))
-    minor = np.rint(crossing).astype(np.int64)[..., None] + np.arange(-half, half + 1)
-    wide = along[..., None]
-    line = lines.line[..., None]
-    limit = np.where(wide, pinhole.rows, pinhole.columns)
-    column, row = np.where(wide, line, minor), np.where(wide, minor, line)
+    minor = np.rint(crossing).astype(np.int64) - half
+    corner = np.stack([np.where(along, lines.line, minor), np.where(along, minor, lines.line)], axis=-1)
+    step = np.where(along, [[0, 1]], [[1, 0]])
+    aside, ahead = beside(corner, step, position, tangent, 2 * half + 1)
     # Distances are wanted to a hundredth of a px.
-    here, way, pace = (np.asarray(part, dtype=np.float32) for part in (position, tangent, speed))
-    dx, dy = column.astype(np.float32) - here[..., :1], row.astype(np.float32) - here[..., 1:]
-    aside = dy * way[..., :1] - dx * way[..., 1:]
-    bent = path.acceleration.reshape(*shape, 2).astype(np.float32)
-    bend = (bent[..., 1] * way[..., 0] - bent[..., 0] * way[..., 1]) / pace**2
-    ahead = (dx * way[..., :1] + dy * way[..., 1:]) / np.maximum(1.0 - bend[..., None] * aside, 0.5)
-    foot = lines.time[..., None].astype(np.float32) + ahead / pace[..., None]
-    across = np.abs(aside - 0.5 * bend[..., None] * ahead**2)
-    room = width / pace[..., None]
-    start, stop = low[lines.part][:, None, None], high[lines.part][:, None, None]
-    open_start, open_stop = outer[lines.part, 0][:, None, None], outer[lines.part, 1][:, None, None]
-    inside = lines.real[..., None] & (minor >= 0) & (minor < limit) & (across <= width)
+    pace, curved = speed.astype(np.float32), bend.astype(np.float32)
+    ahead /= np.maximum(np.float32(1.0) - curved * aside, np.float32(0.5))
+    aside -= np.float32(0.5) * curved * ahead * ahead
+    foot = np.divide(ahead, pace, out=ahead)
+    foot += lines.time.astype(np.float32)
     # Between two parts a pixel may be lost, but none is counted twice.
-    seam = _SEAM / pace[..., None]
-    inside &= foot >= start + np.where(open_start, -room, seam)
-    inside &= foot < stop - np.where(open_stop, -room, seam)
-    used = inside.any(axis=(1, 2))
-    index = np.where(inside, row * pinhole.columns + column, 0)
+    seam, room = _SEAM / speed, width / speed
+    start = low[lines.part, None] + np.where(outer[lines.part, :1], -room, seam)
+    stop = high[lines.part, None] - np.where(outer[lines.part, 1:], -room, seam)
+    offset = np.arange(2 * half + 1)
+    limit = np.where(along, pinhole.rows, pinhole.columns)
+    within = np.abs(aside, out=aside) <= np.float32(width)
+    within &= foot >= start.astype(np.float32)
+    within &= foot < stop.astype(np.float32)
+    within &= offset[:, None, None] >= np.where(lines.real, -minor, 2 * half + 1)
+    within &= offset[:, None, None] < limit - minor
+    inside = np.ascontiguousarray(within.transpose(1, 2, 0))
+    first = corner[..., 1] * pinhole.columns + corner[..., 0]
+    index = first[..., None] + offset * (step[:, 1] * pinhole.columns + step[:, 0])[:, None, None]
+    index *= inside
+    used = np.flatnonzero(inside.any(axis=(1, 2)))
     return Strips(
-        count,
-        lines.star[used],
-        lines.time[used],
-        column[used].astype(np.float32),
-        row[used].astype(np.float32),
-        index[used],
-        inside[used],
+        count, lines.star[used], lines.time[used], corner[used], step[used], index[used], inside[used]
     )
+
+
+def beside(
+    corner: IntArray, step: IntArray, position: FloatArray, tangent: FloatArray, count: int
+) -> tuple[Float32Array, Float32Array]:
+    """Return how far the pixels of each line (b, l) lie beside their path and ahead on it, (count, b, l) px.
+
+    `corner` and `step` as of `Strips`; `position`, `tangent` (b, l, 2) of the path on the line. Pixels come
+    first: what is of lines goes with all of them at the speed of long arrays.
+    """
+    offset = np.arange(count, dtype=np.float32)[:, None, None]
+    dx, dy = corner[..., 0] - position[..., 0], corner[..., 1] - position[..., 1]
+    tx, ty = tangent[..., 0], tangent[..., 1]
+    by_x, by_y = step[:, :1], step[:, 1:]
+    aside = (by_y * tx - by_x * ty).astype(np.float32) * offset
+    aside += (dy * tx - dx * ty).astype(np.float32)
+    ahead = (by_x * tx + by_y * ty).astype(np.float32) * offset
+    ahead += (dx * tx + dy * ty).astype(np.float32)
+    return aside, ahead
 
 
 def _speed(path: Paths) -> FloatArray:

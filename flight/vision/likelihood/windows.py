@@ -9,15 +9,18 @@ import numpy as np
 from flight.arrays import BoolArray, FloatArray, IntArray
 from flight.pinhole import Pinhole
 from flight.vision.likelihood.exposed_frame import ExposedFrame, Float32Array
+from flight.vision.likelihood.motion import positions
 from flight.vision.likelihood.scene import Scene, path_lengths, window_times
 from flight.vision.likelihood.shutter import Shutter
 from flight.vision.likelihood.spot_model import Patches, cut_patches
-from flight.vision.likelihood.strips import Strips, cut_strips
+from flight.vision.likelihood.strips import LONGEST_TURN, Strips, cut_strips
 
 # Paths shorter than this many widths are summed instant by instant.
 _SPOT_WIDTHS = 8.0
 # Predicted light within so many sigmas of saturation is left out: chosen by the model, not by the noise.
 _MARGIN = 3.0
+# Instants at which it is asked what of a path the frame sees.
+_INSTANTS = 9
 _UNRESOLVED = 0.1
 
 
@@ -26,7 +29,8 @@ class Sight:
     """What the frame shows on some blocks of pixels, all arrays (b, ...) alike.
 
     Attributes:
-        slot: number of the pixel among those in use, the same for every star that shares it.
+        slot: number of the pixel among those in use, the same for every star that shares it; one past the
+            last where the pixel does not exist.
         inside: whether the pixel exists, tells something, and is meant.
         signal, floor, ceiling: of the frame.
         gain: electrons a count.
@@ -72,7 +76,7 @@ class Windows:
     Attributes:
         long, spot: stars (a,), (b,) of each kind, indices into the scene.
         strips, patches: their pixels; star i of the strips is `long[i]`.
-        pixels: (m,) flat indices of the pixels in use, by slot.
+        pixels: (m,) flat indices of the pixels in use, by slot; slot: of all blocks' pixels, one after other.
         on_strips, on_patches: what the frame shows there.
         shared: how many pixels are of several stars.
     """
@@ -82,20 +86,18 @@ class Windows:
     strips: Strips
     patches: Patches
     pixels: IntArray
+    slot: IntArray
     on_strips: Sight
     on_patches: Sight
     shared: int
 
     def total(self, on_strips: Float32Array, on_patches: FloatArray) -> Float32Array:
-        """Return the light (m,) of all stars on the pixels in use, from that on each star's own."""
-        slots = np.concatenate([self.on_strips.slot.reshape(-1), self.on_patches.slot.reshape(-1)])
-        light = np.concatenate(
-            [
-                (on_strips * self.strips.inside).reshape(-1),
-                (on_patches * self.patches.inside).reshape(-1).astype(np.float32),
-            ]
-        )
-        return np.bincount(slots, light, len(self.pixels)).astype(np.float32)
+        """Return the light (m + 1,) of all stars on the pixels in use, from that on each star's own.
+
+        What comes last is of pixels that do not exist.
+        """
+        light = np.concatenate([on_strips.reshape(-1), on_patches.reshape(-1).astype(np.float32)])
+        return np.bincount(self.slot, light, len(self.pixels) + 1).astype(np.float32)
 
     def only(self, on_strips: BoolArray, on_patches: BoolArray) -> Windows:
         """Return the windows with only these pixels meant."""
@@ -104,6 +106,26 @@ class Windows:
             on_strips=replace(self.on_strips, inside=on_strips),
             on_patches=replace(self.on_patches, inside=on_patches),
         )
+
+
+def window_areas(pinhole: Pinhole, scene: Scene, reach: float) -> FloatArray:
+    """Return about how many pixels (n,) each star's window takes, `reach` widths to either side of its path.
+
+    All lines of all strips are as long as that which its path crosses most obliquely.
+    """
+    n, room = len(scene.stars), reach * scene.width
+    if n == 0:
+        return np.empty(0)
+    time = np.tile(np.linspace(-0.5, 0.5, _INSTANTS), n)
+    there = positions(pinhole, scene.motion, np.repeat(scene.stars, _INSTANTS, axis=0), time)
+    seen = pinhole.contains(there).reshape(n, _INSTANTS).mean(axis=1)
+    step = np.abs(np.diff(there.reshape(n, _INSTANTS, 2), axis=1))
+    lines = step.max(axis=2)
+    steep = float(np.min(lines / np.maximum(np.hypot(step[..., 0], step[..., 1]), 1e-9)))
+    # A part of a path keeps one kind of line, as the camera's roll bends it.
+    bent = min(abs(float(scene.motion.turn[2])), LONGEST_TURN)
+    across = 2.0 * np.ceil(room / np.cos(np.arccos(min(steep, 1.0)) + 0.5 * bent)) + 1.0
+    return np.asarray(across * (lines.sum(axis=1) * seen + 2.0 * room))
 
 
 def cut_windows(
@@ -120,15 +142,19 @@ def cut_windows(
     patches = cut_patches(pinhole, scene.stars[spot], int(np.ceil(room + 0.5 * longest)))
     index = np.concatenate([strips.index.reshape(-1), patches.index.reshape(-1)])
     inside = np.concatenate([strips.inside.reshape(-1), patches.inside.reshape(-1)])
+    named = index[inside]
     # Each pixel is told by the last place that names it; only memory of pixels in use is touched.
+    turn = np.arange(len(named), dtype=np.int32)
     number = np.empty(frame.signal.size, dtype=np.int32)
-    number[index] = np.arange(len(index), dtype=np.int32)
-    last = number[index]
-    own = last == np.arange(len(index), dtype=np.int32)
-    pixels = index[own]
-    slot = (np.cumsum(own) - 1)[last]
-    shared = np.bincount(slot[inside], minlength=len(pixels)) > 1
-    crowded = shared[slot] & inside
+    number[named] = turn
+    last = number.take(named)
+    own = last == turn
+    pixels = named[own]
+    place = (np.cumsum(own) - 1).take(last)
+    shared = np.bincount(place, minlength=len(pixels)) > 1
+    slot = np.full(len(index), len(pixels))
+    slot[inside] = place
+    crowded = np.flatnonzero(np.append(shared, False).take(slot))
     common = np.cumsum(shared) - 1
     cut = strips.index.size
     return Windows(
@@ -137,8 +163,9 @@ def cut_windows(
         strips,
         patches,
         pixels,
-        _sight(frame, strips.index, strips.inside, slot[:cut], crowded[:cut], common),
-        _sight(frame, patches.index, patches.inside, slot[cut:], crowded[cut:], common),
+        slot,
+        _sight(frame, strips.index, strips.inside, slot[:cut], crowded[crowded < cut], common),
+        _sight(frame, patches.index, patches.inside, slot[cut:], crowded[crowded >= cut] - cut, common),
         int(np.count_nonzero(shared)),
     )
 
@@ -148,19 +175,18 @@ def _sight(
     index: IntArray,
     inside: BoolArray,
     slot: IntArray,
-    crowded: BoolArray,
+    crowded: IntArray,
     common: IntArray,
 ) -> Sight:
-    signal = frame.signal[index]
-    places = np.flatnonzero(crowded)
+    signal = frame.signal.take(index)
     return Sight(
         slot.reshape(index.shape),
-        inside & ~frame.bad[index],
+        inside & ~frame.bad.take(index),
         signal,
-        frame.floor[index],
+        frame.floor.take(index),
         # The background's level is what a pixel's counts exceed its signal by.
-        np.float32(frame.top) - frame.counts[index] + signal,
+        np.float32(frame.top) - frame.counts.take(index) + signal,
         frame.gain,
-        places,
-        common[slot[places]],
+        crowded,
+        common.take(slot.take(crowded)),
     )

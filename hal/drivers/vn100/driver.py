@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import contextlib
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from hal.drivers.vn100.ascii import AsciiLine, error_meaning, measurement
 from hal.drivers.vn100.codec import BinaryPacket, Layout
 from hal.drivers.vn100.recovery import Recovery
 from hal.drivers.vn100.set_up import PASSING_ERRORS, Question, set_up
-from hal.drivers.vn100.settings import DEVICE, OUTPUT_SET, Vn100Settings, check
+from hal.drivers.vn100.settings import DEVICE, IMU_RATE_HZ, OUTPUT_SET, Vn100Settings, check
 from hal.drivers.vn100.stream import StreamParser
 from hal.interfaces.errors import CorruptData, DeviceError, NotResponding, Refused
 from hal.interfaces.readings import ImuLink, ImuReading
@@ -27,6 +28,7 @@ TESLA_PER_GAUSS = 1e-4
 _LONGEST_PACKET = 128  # more than any output set that 40 Hz asks for; bounds the wait on a false start
 _POLL_STEP_NS = 1_000_000
 _UNIT_NORM_TOLERANCE = 1e-2
+_SURELY_OTHER = 4  # steps of time, or polls with lines, in a row that the settings do not ask for
 
 # Where a packet may carry each quantity, in order of preference.
 _SOURCES = (
@@ -59,6 +61,8 @@ class Vn100:
         self._places: dict[bytes, _Places | None] = {}
         self._recovery = Recovery(port, settings)
         self._device_ns = 0
+        self._period_ns = 1_000_000_000 // settings.rate_hz
+        self._odd_steps = self._odd_polls = 0
         self._sample: tuple[tuple[float, ...], ...] = ()
         self._alike = 0
         self._out_of_range = 0
@@ -92,6 +96,7 @@ class Vn100:
         found = (self._reading(item) for item in items)
         readings = [reading for reading in found if reading is not None]
         if self._settings.configure:
+            self._look_for_lines(items)
             sentences = [item.sentence for item in items if not isinstance(item, BinaryPacket)]
             parser = self._parser
             self._recovery.advance(
@@ -235,9 +240,29 @@ class Vn100:
             if device_ns < self._device_ns:
                 self.resets += 1
                 self._recovery.reset()
+            self._look_at_step(device_ns - self._device_ns)
             self._device_ns = device_ns
         q, rate, mag, accel = places.sensors
         return device_ns, values[q], values[rate], values[mag], values[accel]
+
+    def _look_at_step(self, step_ns: int) -> None:
+        """Find out a unit that gives samples at another rate: its register is not what was written to it.
+
+        Lost packets leave whole periods; a divisor with one bit flipped leaves parts of one, a tick at least.
+        """
+        part_ns = step_ns % self._period_ns
+        off = min(part_ns, self._period_ns - part_ns) > 500_000_000 // IMU_RATE_HZ
+        self._odd_steps = self._odd_steps + 1 if off else 0
+        if self._odd_steps == _SURELY_OTHER:
+            self._recovery.reset()
+
+    def _look_for_lines(self, items: Sequence[BinaryPacket | AsciiLine]) -> None:
+        """Find out a unit that was set up for packets and gives measurements as lines, too."""
+        lines = (item.sentence for item in items if isinstance(item, AsciiLine))
+        found = self._settings.output == "binary" and any(measurement(line) is not None for line in lines)
+        self._odd_polls = self._odd_polls + 1 if found else 0
+        if self._odd_polls == _SURELY_OTHER:
+            self._recovery.reset()
 
     def _ascii_sample(self, line: AsciiLine) -> _Sample | None:
         error = error_meaning(line.sentence)

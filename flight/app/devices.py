@@ -1,0 +1,70 @@
+"""The devices on a rig's wires: drivers set up as the configuration wants them."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack, nullcontext, suppress
+
+import numpy as np
+
+from flight.app.rig import Rig
+from flight.frames import NED_TO_TESTBED, attitude_map
+from flight.loop.surroundings import Devices
+from flight.quaternion import attitude_matrix
+from flight.settings import Config
+from hal.drivers.coil_settings import CoilSettings, CoilWiring
+from hal.drivers.coils import PwmTorqueCoils
+from hal.drivers.ina219 import Ina219
+from hal.drivers.pca9685 import Pca9685
+from hal.drivers.vn100.driver import Vn100, Vn100Settings
+from hal.interfaces.errors import DeviceError
+
+
+def open_devices(config: Config, rig: Rig, stack: ExitStack, patient: bool) -> Devices:
+    """Set the devices up, the coils first: they are at zero before anything else happens.
+
+    Raises DeviceError for one that does not answer; a `patient` flight has its driver go on trying.
+    """
+    coils = PwmTorqueCoils(
+        Pca9685(rig.wires.i2c, config.coils.address, rig.clock), rig.clock, coil_settings(config)
+    )
+    stack.callback(coils.close)
+    coils.start(patient=patient)
+    power = None
+    if config.power_monitor is not None:
+        monitor = config.power_monitor
+        power = Ina219(rig.wires.i2c, monitor.address, rig.clock, monitor.shunt)
+        stack.callback(power.close)
+    unit = Vn100(rig.wires.serial, rig.clock, unit_settings(config))
+    stack.callback(unit.close)
+    with suppress(DeviceError) if patient else nullcontext():
+        unit.configure()
+    camera = rig.wires.frames
+    if camera is not None:
+        stack.callback(camera.close)
+    return Devices(unit, coils, power, camera)
+
+
+def coil_settings(config: Config) -> CoilSettings:
+    """Return the coils as the configuration believes them."""
+    coils = config.coils
+    enables = coils.enable_channels or (None, None, None)
+    x, y, z = (
+        CoilWiring(pair[0], pair[1], resistance, sign, enable)
+        for pair, resistance, sign, enable in zip(
+            coils.channels, coils.resistance, coils.signs, enables, strict=True
+        )
+    )
+    return CoilSettings((x, y, z), coils.supply_voltage, coils.current_limit, coils.stale_after)
+
+
+def unit_settings(config: Config) -> Vn100Settings:
+    """Return what is asked of the inertial unit; its readings come out in the testbed frame."""
+    unit = config.inertial_unit
+    mounting = np.array(unit.mounting)
+    return Vn100Settings(
+        attitude_map=attitude_map(mounting, NED_TO_TESTBED),
+        mounting=attitude_matrix(mounting),
+        rate_hz=unit.rate_hz,
+        output=unit.output,
+        field_range=unit.field_range,
+    )

@@ -1,0 +1,81 @@
+"""A flight from its order to its outcome. Whatever happens, the coils are at zero when `fly` returns."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from types import FrameType
+
+from flight import events
+from flight.app.linux import linux_rig
+from flight.app.mission_time import mission_zero, next_whole_second
+from flight.app.order import Order, Outcome
+from flight.app.ordered_config import ordered_config
+from flight.app.preparation import prepare
+from flight.app.rig import Rig
+from flight.app.run_folder import begin_folder
+from flight.app.simulated import flown_faults, simulated_rig
+from flight.errors import UsageError
+from flight.kept_config import FlownConfig
+from flight.loop.loop import FlightLoop
+from flight.loop.progress import Progress
+from flight.loop.run_label import RunLabel
+from flight.settings import Config
+from flight.state.opening import service_folder
+
+
+def fly(order: Order, progress: Callable[[Progress], None] | None = None) -> Outcome:
+    """Fly a configuration to its end. Raises UsageError for the user to mend, DeviceError for a device."""
+    text, config = ordered_config(order)
+    order = begin_folder(order, text, config)
+    with ExitStack() as stack:
+        rig = _open_rig(order, text, config, stack)
+        loop, flight_log = prepare(config, rig, order.out, stack, patient=_is_patient(order))
+        if progress is not None:
+            loop.watch(progress)
+        if order.config_problem:
+            loop.note(events.CONFIG_DAMAGED, order.config_problem)
+        elif rig.realtime and (folder := service_folder(os.environ)) is not None:
+            stack.callback(FlownConfig(text, folder).serve(rig.clock).stop)
+        label = RunLabel(text, rig.seed, config.simulation is not None, rig.realtime)
+        with _signals_stop(loop) as received:
+            epoch_ns = mission_zero(rig.clock) if rig.realtime else next_whole_second(rig.clock)
+            rig.release(epoch_ns)
+            reason = loop.run(epoch_ns, label)
+    faults = () if config.simulation is None else flown_faults(order, text)
+    return Outcome(order.out, reason, bool(received), flight_log.error(), loop.restart, faults)
+
+
+def _open_rig(order: Order, text: str, config: Config, stack: ExitStack) -> Rig:
+    """Return the hardware that the configuration asks for."""
+    if config.simulation is not None:
+        return simulated_rig(order, text, config, stack)
+    if order.seed is not None:
+        raise UsageError("--seed: this configuration flies real devices, which draw their own noise")
+    if order.devices is not None:
+        raise UsageError("--devices: this configuration flies real devices, not simulated ones")
+    return linux_rig(config, stack, _is_patient(order))
+
+
+def _is_patient(order: Order) -> bool:
+    """Tell whether the flight begins without what is missing: on a board, where nobody can see to it."""
+    return order.archive is not None
+
+
+@contextmanager
+def _signals_stop(loop: FlightLoop) -> Iterator[list[int]]:
+    """End the flight politely on Ctrl-C and on systemd's SIGTERM; the list holds the signals received."""
+    received: list[int] = []
+
+    def stop(number: int, _: FrameType | None) -> None:
+        received.append(number)
+        loop.stop(f"stopped by {signal.Signals(number).name}")
+
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield received
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,80 @@
+"""Linux's hardware: the serial port, the I2C bus and the camera that the configuration names."""
+
+from __future__ import annotations
+
+import os
+from contextlib import ExitStack, nullcontext, suppress
+
+from flight.app.rig import Rig
+from flight.composition import SECOND_NS
+from flight.errors import ConfigError
+from flight.settings import AravisDevice, Camera, Config, V4l2Device
+from flight.state.opening import state_folder
+from hal.buses.clock import SystemClock
+from hal.buses.i2c_bus import LinuxI2cBus
+from hal.buses.serial_port import PySerialPort
+from hal.drivers.aravis_camera import AravisCamera, AravisSettings
+from hal.drivers.camera import CameraDevice, ServedCamera
+from hal.drivers.pca9685 import switch_off
+from hal.drivers.v4l2_camera import Stamp, V4l2Camera, V4l2Settings
+from hal.guardian.client import CoilReach
+from hal.interfaces.devices import FrameSource
+from hal.interfaces.errors import DeviceError
+from hal.interfaces.wires import Clock, Wires
+
+
+def linux_rig(config: Config, stack: ExitStack, patient: bool) -> Rig:
+    """Open the wires, the coils off before anything else can fail.
+
+    Raises ConfigError; DeviceError for what is not there, but `patient` wires are opened when they come.
+    """
+    clock = SystemClock()
+    i2c = LinuxI2cBus(config.coils.bus, patient=patient)
+    stack.callback(i2c.close)
+    with suppress(DeviceError) if patient else nullcontext():
+        switch_off(i2c, config.coils.address)  # before anything else can fail
+    unit = config.inertial_unit
+    serial = PySerialPort(unit.device, unit.baud_rate, clock, patient)
+    stack.callback(serial.close)
+    reach = CoilReach("hal.buses.smbus_byte:open_bus", i2c.name, config.coils.address)
+    if (folder := state_folder(config, os.environ)) is not None:
+        reach.note(folder)
+    frames = linux_camera(config.camera, clock, stack, patient) if config.camera is not None else None
+    return Rig(clock, Wires(serial, i2c, frames), lambda _: None, True, 0, reach=reach)
+
+
+def linux_camera(camera: Camera, clock: Clock, stack: ExitStack, patient: bool = False) -> FrameSource:
+    """Open the camera that the configuration names.
+
+    Raises ConfigError when it names none; DeviceError, but a `patient` one is opened when it comes.
+    """
+    device, shape = camera.device, (camera.columns, camera.rows)
+    exposure_ns = round(camera.exposure * SECOND_NS)
+    opened: CameraDevice
+    if isinstance(device, V4l2Device):
+        delay_ns = round(device.stamp_delay * SECOND_NS)
+        opened = V4l2Camera(
+            V4l2Settings(
+                device.path,
+                *shape,
+                device.pixel_format,
+                exposure_ns,
+                device.gain,
+                Stamp(device.stamp),
+                delay_ns,
+            ),
+            clock,
+        )
+    elif isinstance(device, AravisDevice):
+        opened = AravisCamera(
+            AravisSettings(device.name, *shape, device.pixel_format, exposure_ns, device.gain), clock
+        )
+    else:
+        raise ConfigError(
+            "camera.device",
+            "real devices are flown: say which camera, `{kind: v4l2, path: ...}` or `{kind: aravis, name: "
+            "...}`, or say `camera: none`",
+        )
+    source = ServedCamera(opened, clock, patient=patient)
+    stack.callback(source.close)
+    return source

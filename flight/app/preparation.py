@@ -1,0 +1,84 @@
+"""From a rig to a loop ready to run: logs, guardian, devices, workers and channels, opened in order."""
+
+from __future__ import annotations
+
+import os
+from contextlib import ExitStack
+from pathlib import Path
+
+from flight.app.devices import open_devices
+from flight.app.rig import Rig
+from flight.app.run_folder import open_log
+from flight.app.watchers import start_guardian, supervise
+from flight.commands.channel import Channel, open_udp, open_unix
+from flight.commands.peers import peer_networks
+from flight.executive.jobs import JobResult, JobRunner
+from flight.executive.lockstep import LockStepRunner
+from flight.executive.processes import ProcessRunner
+from flight.health.board import Board
+from flight.loop.loop import FlightLoop, nothing
+from flight.settings import Config
+from flight.startracker.build import ensure_default_index
+from flight.state.opening import open_state
+from flight.tasks.workers import workers
+from flight.telemetry.log import FlightLog
+from flight.telemetry.recorder import Recorder
+
+
+def prepare(
+    config: Config, rig: Rig, folder: Path, stack: ExitStack, *, patient: bool = False
+) -> tuple[FlightLoop, FlightLog]:
+    """Open logs, devices and workers; `stack` closes them in the opposite order, the coils at zero.
+
+    Raises DeviceError for a device that does not answer; a `patient` flight begins without and waits for it
+    in BOOT, as it waits for a disk that takes nothing.
+    """
+    flight_log = open_log(folder, "flight", rig, config, stack, patient)
+    performance_log = open_log(folder, "performance", rig, config, stack, patient)
+    keeper = open_state(config, os.environ, rig.clock, stack)
+    guardian = start_guardian(rig, stack)
+    devices = open_devices(config, rig, stack, patient)
+    tracker = config.camera.star_tracker if config.camera is not None else None
+    if tracker is not None and tracker.index is None:
+        ensure_default_index()
+    jobs = _open_jobs(config, rig, stack)
+    recorder = Recorder(flight_log, performance_log)
+    feed, beat = nothing, nothing
+    if guardian is not None:
+        guardian.wait_ready(patient=patient)
+        supervision = supervise(guardian, rig.clock, recorder, stack)
+        feed, beat = supervision.feed, supervision.beat
+    loop = FlightLoop(
+        config,
+        rig.clock,
+        devices,
+        jobs,
+        recorder,
+        flight_log.error,
+        feed=feed,
+        beat=beat,
+        keeper=keeper,
+        board=Board(folder) if rig.realtime else None,
+        channels=_open_channels(config, stack),
+    )
+    return loop, flight_log
+
+
+def _open_jobs(config: Config, rig: Rig, stack: ExitStack) -> JobRunner:
+    specs = workers(config, *rig.latency)
+    made = specs if rig.host is None else rig.host.workers(specs)
+    runner: JobRunner = ProcessRunner(rig.clock, made) if rig.realtime else LockStepRunner(rig.clock, made)
+    stack.callback(runner.close)
+    return runner if rig.host is None else rig.host.jobs(runner, specs, JobResult)
+
+
+def _open_channels(config: Config, stack: ExitStack) -> list[Channel]:
+    """Listen where the configuration says."""
+    channels: list[Channel] = []
+    if config.commands.socket is not None:
+        channels.append(open_unix(Path(config.commands.socket)))
+    if config.commands.udp is not None:
+        channels.append(open_udp(config.commands.udp, peer_networks(config.commands)))
+    for channel in channels:
+        stack.callback(channel.close)
+    return channels

@@ -1,0 +1,61 @@
+"""The folder of a run: where it is, made with its configuration in it, and the logs opened there."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+
+from flight.app.order import Order
+from flight.app.rig import Rig
+from flight.app.utc_label import utc_text
+from flight.composition import SECOND_NS
+from flight.errors import UsageError
+from flight.settings import Config
+from flight.telemetry.archive import DISK_TROUBLE, begin_run
+from flight.telemetry.log import FlightLog
+from flight.telemetry.segments import open_segment
+
+
+def default_folder(config_path: Path) -> Path:
+    """Return the folder of a run that was given none: its configuration's name and the time, as labels."""
+    return Path("runs") / f"{config_path.stem}-{utc_text()}"
+
+
+def begin_folder(order: Order, text: str, config: Config) -> Order:
+    """Make the run's folder, the archive's next where there is one; return the order that names it.
+
+    A folder that holds a run is not touched. Raises UsageError for that, and where nothing can be written;
+    but a board that keeps an archive flies on, and its logs wait for the disk.
+    """
+    if order.archive is not None:
+        logs_bytes = (2 if config.simulation is None else 3) * config.telemetry.budget_bytes
+        run = begin_run(order.archive, config.telemetry.archive_bytes, logs_bytes)
+        order = replace(order, out=run.folder)
+    out = order.out
+    if any(out.glob("*.ccsds")):
+        raise UsageError(f"{out} holds a run already: give another folder with --out, or remove it")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "config.yaml").write_text(text, encoding="utf-8")
+    except OSError as error:
+        if order.archive is not None and error.errno in DISK_TROUBLE:
+            return order
+        raise UsageError(f"{out}: cannot be written: {error.strerror or error}") from error
+    return order
+
+
+def open_log(folder: Path, stem: str, rig: Rig, config: Config, stack: ExitStack, patient: bool) -> FlightLog:
+    """Open one log of the run; on real time it is synchronised to disk once a second."""
+    log = FlightLog(
+        folder,
+        stem,
+        clock=rig.clock,
+        segment_bytes=config.telemetry.segment_bytes,
+        budget_bytes=config.telemetry.budget_bytes,
+        sync_period_ns=SECOND_NS if rig.realtime else None,
+        patient=patient,
+        opener=open_segment if rig.host is None else rig.host.opener(open_segment),
+    )
+    stack.callback(log.close)
+    return log

@@ -1,0 +1,65 @@
+"""Who watches a flight from outside, the guardian and the service manager, and the scheduler told of it."""
+
+from __future__ import annotations
+
+import os
+import threading
+from contextlib import ExitStack
+
+from flight import events
+from flight.app.rig import Rig
+from flight.executive import memory
+from flight.supervision import Supervision
+from flight.telemetry.recorder import Recorder
+from hal.buses import real_time
+from hal.buses.service_manager import ServiceManager
+from hal.drivers.coil_settings import DEVICE as COILS
+from hal.guardian.client import GuardianLine
+from hal.interfaces.wires import Clock
+
+CONTROL_PRIORITY = 50
+"""Of SCHED_FIFO, for the control thread and the coils' own."""
+NEXT_PRIORITY = CONTROL_PRIORITY - 10
+"""Of the other threads of the control process."""
+
+
+def start_guardian(rig: Rig, stack: ExitStack) -> GuardianLine | None:
+    """Start the guardian before any coil can be energised; it is the last to go, the coils being off."""
+    if rig.reach is None:
+        return None
+    guardian = GuardianLine(rig.reach)
+    stack.callback(guardian.close)
+    return guardian
+
+
+def supervise(guardian: GuardianLine, clock: Clock, recorder: Recorder, stack: ExitStack) -> Supervision:
+    """Have the flight watched, and the control loop with its coils served first."""
+    overseer = ServiceManager(os.environ, os.getpid())
+    stack.callback(overseer.close)
+    first = [thread for thread in threading.enumerate() if thread.name == COILS]
+    obtained = real_time.obtain([0, *(thread.native_id or 0 for thread in first)], CONTROL_PRIORITY)
+    stack.callback(real_time.relinquish)
+    stack.callback(overseer.stopping)
+    coils = next(ticker for ticker in clock.tickers if ticker.name == COILS)
+
+    def settle() -> None:
+        memory.settle()
+        if obtained.priority:
+            serve_the_rest_next()
+
+    status = f"flying; {obtained}"
+    supervision = Supervision(guardian, overseer, clock, recorder, status, coils, settle)
+    stack.callback(supervision.close)
+    supervision.note(events.REAL_TIME_REFUSED if obtained.refusals else events.REAL_TIME, str(obtained))
+    return supervision
+
+
+def serve_the_rest_next() -> None:
+    """Have the other threads of this process, those of log, serial line and disk, served next.
+
+    Whichever of them holds the interpreter's lock while another process has its core holds up the control
+    thread as well: by a time slice and more where much else runs.
+    """
+    for thread in threading.enumerate():
+        if thread is not threading.main_thread() and thread.name != COILS:
+            real_time.prioritise(thread.native_id or 0, NEXT_PRIORITY)

@@ -1,0 +1,1 @@
+"""The flight application once its devices are open: builds the rooms, lays the rate groups, runs, ends."""

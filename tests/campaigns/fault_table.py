@@ -1,0 +1,61 @@
+"""What flight has to say and to do about each fault: the authority that campaign `faults` judges by.
+
+A fault is told only by an event of its own: that the body tumbles because a coil is stuck is true, and does
+not say what broke. Where the table of events asks for more than a note, what it asks for has to follow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from sim_hal.faults.kinds import FaultKind
+
+_STARS = {"stars-refused", "streak-refused", "vision-failed"}
+
+OWN: Mapping[str, frozenset[str]] = {
+    "imu": frozenset(
+        {"imu-silent", "imu-corrupt", "imu-implausible", "imu-line-lost", "imu-refused", "imu-unusable"}
+    ),
+    "pwm": frozenset({"coil-fault"}),
+    "bus": frozenset({"coil-fault", "power-fault"}),
+    "monitor": frozenset({"power-fault", "power-doubted", "coil-suspect"}),
+    "coil": frozenset({"coil-broken", "coil-suspect"}),
+    "bridge": frozenset({"coil-broken", "coil-suspect"}),
+    "camera": frozenset(
+        {"camera-lost", "camera-frozen", "camera-black", "camera-torn", "camera-strange", "camera-late"}
+        | _STARS
+    ),
+    "planner": frozenset({"planner-busy", "planner-failed", "plan-refused", "holding"}),
+    "vision": frozenset({"vision-slow"} | _STARS),
+    "clock": frozenset({"clock-step"}),
+    "disk": frozenset({"log-fault"}),
+}
+"""Events by which a fault of a device is told."""
+
+OWN_OF_KIND: dict[str, frozenset[str]] = {
+    # Good packets, too few or too old to steer by: what is told of the stream is all that there is to tell.
+    "imu: slow": OWN["imu"] | {"stream-poor"},
+    "imu: delayed": OWN["imu"] | {"stream-poor"},
+    "imu: intermittent": OWN["imu"] | {"stream-poor"},
+    "imu: cut": OWN["imu"] | {"stream-poor"},
+}
+"""Exceptions from it, by kind."""
+
+REACTION: Mapping[str, str] = {
+    "imu": "control-lost",
+    "pwm": "coil-fault",
+    "bus": "coil-fault",
+    "coil": "coil-broken",
+    "bridge": "coil-broken",
+}
+"""The event whose row of the table of events has the reaction that must follow: coils off, or isolation."""
+
+
+def part_of(kind: FaultKind) -> str:
+    """Return what the table calls a device: one row for the coils of all axes."""
+    return kind.device.partition("-")[0]
+
+
+def own_events(kind: FaultKind) -> frozenset[str]:
+    """Return the names of the events by which a fault is told."""
+    return OWN_OF_KIND.get(kind.name, OWN[part_of(kind)])

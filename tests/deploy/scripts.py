@@ -1,0 +1,51 @@
+"""The scripts of deploy/ as they are called by hand, and configurations to call them with."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from pathlib import Path
+from typing import Any
+
+from flight.config import load
+from tests.scenario.flights import CONFIG
+
+ROOT = CONFIG.parents[1]
+DEPLOY = ROOT / "deploy"
+TESTBED = ROOT / "config" / "testbed.yaml"
+
+
+def script(name: str) -> Any:
+    """Return a Python script of deploy/, which is no package, as a module."""
+    spec = importlib.util.spec_from_file_location(name, DEPLOY / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+board_dropin = script("board_dropin")
+
+
+def dropin(config: Path) -> str:
+    """Return the drop-in that a configuration needs."""
+    return str(board_dropin.dropin(load(config)))
+
+
+def safe_dropin(config: Path) -> str:
+    """Return that of the unit which is left when the flight is given up."""
+    return str(board_dropin.safe_dropin(load(config)))
+
+
+def changed_testbed(folder: Path, **sections: str) -> Path:
+    """Return a copy of the testbed's configuration with other sections, or other values `coils_bus`."""
+    text = TESTBED.read_text(encoding="utf-8")
+    for name, section in sections.items():
+        if name == "coils_bus":
+            text = re.sub(r"^  bus: \S+", f"  bus: {section}", text, flags=re.MULTILINE)
+        else:
+            text = re.sub(rf"^{name}: .*$", "", text, flags=re.MULTILINE) + f"\n{name}: {section}\n"
+    path = folder / "flight.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path

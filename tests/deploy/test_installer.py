@@ -1,0 +1,197 @@
+"""The installer: into an image, where root and systemd are not needed, and as a dry run on this machine."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from sim_hal.faults.host import corrupted
+from tests.deploy.scripts import DEPLOY, TESTBED, changed_testbed
+from tests.scenario.flights import CONFIG
+
+pytestmark = pytest.mark.skipif(
+    shutil.which("systemctl") is None, reason="systemctl is missing: install systemd"
+)
+
+
+def call(*words: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        ["sh", str(DEPLOY / "install.sh"), *words],
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+class Image:
+    """The files of a board that is not running."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.config = self.root / "etc/knightcube/flight.yaml"
+        self.sum = self.root / "etc/knightcube/flight.yaml.sha256"
+        self.rules = self.root / "etc/udev/rules.d/99-knightcube.rules"
+
+    def call(self, *words: str) -> tuple[int, str]:
+        done = call(*words, DESTDIR=str(self.root))
+        return done.returncode, done.stdout + done.stderr
+
+    def install(self, *words: str) -> tuple[int, str]:
+        return self.call("--venv", sys.prefix, *words)
+
+    def text(self, name: str) -> str:
+        return (self.root / name).read_text(encoding="utf-8")
+
+    def files(self) -> dict[Path, float]:
+        return {path: path.lstat().st_mtime for path in self.root.rglob("*") if not path.is_dir()}
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Image:
+    image = Image(tmp_path_factory.mktemp("installed"))
+    status, told = image.install("--config", str(TESTBED))
+    assert status == 0, told
+    return image
+
+
+@pytest.fixture
+def image(installed: Image, tmp_path: Path) -> Image:
+    """Return a copy of an image with the testbed's configuration installed."""
+    shutil.copytree(installed.root, tmp_path / "image", symlinks=True)
+    return Image(tmp_path / "image")
+
+
+def test_everything_is_put_in_its_place_once(image: Image) -> None:
+    assert image.text("etc/modules-load.d/knightcube.conf").splitlines()[-1] == "i2c-dev"
+    assert image.config.read_bytes() == TESTBED.read_bytes()
+    assert "DeviceAllow=/dev/i2c-1 rw\n" in image.text(
+        "etc/systemd/system/knightcube-safe.service.d/board.conf"
+    )
+    assert (image.root / "etc/systemd/system/multi-user.target.wants/knightcube.service").is_symlink()
+    before = image.files()
+    assert image.install("--config", str(TESTBED))[0] == 0
+    assert image.files() == before
+    assert image.call("--uninstall")[0] == 0
+    assert sorted(path.name for path in image.files()) == ["flight.yaml", "flight.yaml.sha256"]
+    assert image.call("--uninstall", "--purge")[0] == 0
+    assert not image.files()
+
+
+def test_the_checksum_is_one_that_sha256sum_checks(image: Image) -> None:
+    assert image.sum.read_text(encoding="ascii") == (
+        f"{hashlib.sha256(TESTBED.read_bytes()).hexdigest()}  flight.yaml\n"
+    )
+    words = ["sha256sum", "--check", "--strict", image.sum.name]
+    assert subprocess.run(words, cwd=image.sum.parent, capture_output=True, check=False).returncode == 0
+
+
+def test_an_update_accepts_no_changed_configuration_but_accept_does(image: Image, tmp_path: Path) -> None:
+    image.config.write_text(corrupted(TESTBED.read_text(encoding="utf-8"), 1, 7), encoding="utf-8")
+    status, told = image.install()
+    assert status == 2
+    assert "is not what was accepted: was it edited? Then: install.sh --accept" in told
+    shutil.copy(changed_testbed(tmp_path, coils_bus="/dev/knightcube-i2c"), image.config)
+    status, told = image.call("--accept")
+    assert (status, told.startswith("accepted")) == (0, True), told
+    assert hashlib.sha256(image.config.read_bytes()).hexdigest() in image.sum.read_text(encoding="ascii")
+    assert "/dev/knightcube-i2c" in image.text("etc/systemd/system/knightcube.service.d/board.conf")
+    assert image.install()[0] == 0
+
+
+def test_what_cannot_be_flown_is_not_accepted(image: Image) -> None:
+    accepted = image.sum.read_bytes()
+    image.config.write_text("name: [", encoding="utf-8")
+    status, told = image.call("--accept")
+    assert status == 2
+    assert "Traceback" not in told
+    assert image.sum.read_bytes() == accepted
+
+
+def test_another_configuration_than_the_installed_one_is_refused(image: Image) -> None:
+    status, told = image.install("--config", str(CONFIG))
+    assert status == 2
+    assert f"another one is flown; put yours there first: rm {image.config}" in told
+    assert image.config.read_bytes() == TESTBED.read_bytes()
+
+
+def test_device_names_that_were_edited_survive_an_update(image: Image) -> None:
+    shipped = image.rules.read_text(encoding="utf-8")
+    mine = shipped.replace("Synopsys DesignWare I2C adapter", "CP2112 SMBus Bridge")
+    image.rules.write_text(mine, encoding="utf-8")
+    assert image.install()[0] == 0
+    assert image.rules.read_text(encoding="utf-8") == mine
+    # An update with other rules: those as they were shipped are replaced, the edited are kept and told of.
+    copy = image.root / "opt/knightcube/share/99-knightcube.rules"
+    copy.write_text(shipped + "# of yesterday\n", encoding="utf-8")
+    status, told = image.install()
+    assert (status, "was edited and is kept" in told) == (0, True)
+    assert image.rules.read_text(encoding="utf-8") == mine
+    for path in (image.rules, copy):
+        path.write_text(shipped + "# of yesterday\n", encoding="utf-8")
+    assert image.install()[0] == 0
+    assert image.rules.read_text(encoding="utf-8") == shipped
+
+
+@pytest.mark.parametrize(
+    ("camera", "wanted"),
+    [
+        ("{device: {kind: v4l2, pixel_format: Y16}}", False),
+        ("{device: {kind: v4l2, pixel_format: Y16}, star_tracker: {}}", True),
+    ],
+)
+def test_the_sky_index_is_made_where_the_configuration_wants_one_however_it_is_written(
+    image: Image, tmp_path: Path, camera: str, wanted: bool
+) -> None:
+    shutil.copy(changed_testbed(tmp_path, camera=camera), image.config)
+    _, told = image.call("--accept", "--dry-run")
+    assert ("sky_index.py" in told) == wanted
+
+
+def test_a_dry_run_tells_every_step_and_touches_nothing() -> None:
+    before = sorted(Path("/etc/systemd/system").iterdir())
+    told = call("--dry-run", "--config", str(TESTBED)).stdout
+    for step in (
+        "useradd",
+        "venv",
+        "pip install",
+        "coils-off",
+        "flight.yaml and its checksum",
+        "knightcube.service",
+        "99-knight",
+        "modules-load.d",
+    ):
+        assert step in told
+    assert sorted(Path("/etc/systemd/system").iterdir()) == before
+    assert not Path("/opt/knightcube").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--frobnicate"], "unknown option"),
+        (["--config"], "wants a value"),
+        (["--config", "--wheels"], "--config wants a value"),
+        (["--dry-run", "--config", "/no"], "--config /no: cannot be read"),
+        (["--dry-run", "--wheels", "/no"], "--wheels /no: no such folder"),
+        (["--dry-run", "--venv", "/no"], "--venv /no: no virtual environment"),
+        (["--dry-run", "--venv", "/no", "--wheels", "/tmp"], "one of them"),
+        (["--dry-run", "--python", "/no"], "--python /no: Python 3.11 or newer is wanted"),
+        (["--dry-run", "--purge"], "--purge goes with --uninstall"),
+        (["--dry-run", "--accept", "--config", str(TESTBED)], "--accept goes alone"),
+        (["--dry-run", "--accept"], "there is no"),
+    ],
+)
+def test_wrong_use_of_the_installer_is_told_before_the_first_step_with_status_2(
+    words: list[str], told: str
+) -> None:
+    done = call(*words)
+    assert done.returncode == 2
+    assert told in done.stderr
+    assert not done.stdout, "nothing was done, or would have been"

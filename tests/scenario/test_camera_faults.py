@@ -1,0 +1,68 @@
+"""A camera whose frames are not the sky's or not in time, a worker that is slow: told, and not believed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flight.config import replace
+from flight.telemetry.reader import Run
+from sim_hal.settings import FaultEntry
+from tests.campaigns.faults import config_for
+from tests.scenario.flights import demo_world, event_names, fly
+
+AT, SPAN = 3.0, 4.0
+ABOUT_VISION = {"camera-late", "camera-lost", "camera-strange", "camera-torn", "vision-slow", "vision-failed"}
+
+
+def flown(folder: Path, mode: str, fault: str = "") -> Run:
+    faults = (FaultEntry(fault=fault, at=AT, span=SPAN),) if fault else ()
+    config = replace(config_for(mode, camera=True), duration=8.0)
+    return fly(config, folder, section=replace(demo_world(), faults=faults))
+
+
+def first_told(run: Run, name: str) -> float:
+    return float(run["event"]["time_ns"][event_names(run).index(name)]) * 1e-9
+
+
+def test_a_sound_camera_raises_no_alarm(tmp_path: Path) -> None:
+    run = flown(tmp_path, "hold")
+    assert not ABOUT_VISION & set(event_names(run))
+    assert len(run["stars"]) == 4
+
+
+@pytest.mark.parametrize(
+    ("fault", "event", "within"),
+    [
+        ("camera: slow", "camera-late", 2.6),
+        ("camera: delayed", "camera-late", 2.6),
+        ("vision: slow", "vision-slow", 2.5),
+    ],
+)
+def test_what_is_late_is_told_with_the_next_frame(
+    fault: str, event: str, within: float, tmp_path: Path
+) -> None:
+    """A frame is exposed each 2 s."""
+    run = flown(tmp_path, "hold", fault)
+    assert AT < first_told(run, event) < AT + within
+    assert "task-failed" not in event_names(run)
+
+
+@pytest.mark.parametrize(
+    ("fault", "event"), [("camera: torn", "camera-torn"), ("camera: wrong", "camera-strange")]
+)
+def test_a_frame_that_is_not_in_order_is_told_and_not_believed(
+    fault: str, event: str, tmp_path: Path
+) -> None:
+    run = flown(tmp_path, "safe", fault)
+    assert AT < first_told(run, event) < AT + 2.0
+    streak = run["streak"]
+    time = streak["time_ns"] * 1e-9
+    spoiled = (time > AT) & (time < AT + 2.0)
+    assert spoiled.sum() == 1
+    assert not streak["accepted"][spoiled].any()
+    assert streak["accepted"][time < AT].all()
+    error = np.abs(run["control"]["rate"] - run["truth"]["rate"][: len(run["control"]), 1])
+    assert np.nanmax(error[40:]) < 5e-3
