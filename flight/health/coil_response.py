@@ -55,6 +55,8 @@ class ResponseSettings:
 
 
 _STALE_NS = 200_000_000
+_REACH_NS = 3_000_000_000
+"""For how long commands are remembered: samples of a loop that stood still come late, and in a burst."""
 _MODEL_ERROR = 8.0e-4
 """rad/s^2: what the delay between command and current and its uncertainty leave unexplained in a bin."""
 _LEAST_CHANGE = 4.0e-3
@@ -73,7 +75,8 @@ class CoilResponse:
         self._settings = settings
         self._inverse = np.linalg.inv(settings.inertia)
         self._free = np.array(settings.free)
-        self._command: tuple[float, ...] = (0.0, 0.0, 0.0)
+        self._commands: deque[tuple[int, tuple[float, ...]]] = deque([(0, (0.0, 0.0, 0.0))])
+        self._known_ns = 0
         self._last_ns = 0
         self._wrong_for = [0, 0, 0]
         self._sound_for = [0, 0, 0]
@@ -102,12 +105,22 @@ class CoilResponse:
         self.sigma = np.full(3, np.inf)
 
     def commanded(self, time_ns: int, currents: tuple[float, ...]) -> None:
-        """Tell which currents (3,) A are in force from now on."""
-        del time_ns
-        self._command = currents
+        """Tell which currents (3,) A are in force from `time_ns` on."""
+        if currents == self._commands[-1][1]:
+            return
+        self._commands.append((time_ns, currents))
+        while len(self._commands) > 1 and self._commands[1][0] < time_ns - _REACH_NS:
+            self._commands.popleft()
+
+    def interrupted(self, until_ns: int) -> None:
+        """Make nothing of samples of the time until `until_ns`: what the coils carried is not known."""
+        self._known_ns = until_ns
+        self.begin_anew()
 
     def felt(self, time_ns: int, rate: FloatArray, field: FloatArray) -> bool:
         """Take a sample of rate (3,) and field (3,); tell whether there is a new fit."""
+        if time_ns < self._known_ns:
+            return False
         since_ns = time_ns - self._last_ns
         self._last_ns = time_ns
         if not 0 < since_ns < _STALE_NS:
@@ -116,7 +129,7 @@ class CoilResponse:
         # Row a: what one ampere in coil a alone asks of the rate.
         moments = np.eye(3) * self._settings.dipole_per_ampere
         self._per_ampere = np.cross(moments, field) @ self._inverse.T
-        currents = np.array(self._command)[:, None]
+        currents = np.array(self._command_at(time_ns))[:, None]
         self._asked = self._asked + currents * self._per_ampere * (since_ns * 1e-9)
         self._asked_sum = self._asked_sum + self._asked
         self._rate_sum = self._rate_sum + rate
@@ -125,6 +138,12 @@ class CoilResponse:
         if self._count < self._settings.bin_samples:
             return False
         return self._close_bin()
+
+    def _command_at(self, time_ns: int) -> tuple[float, ...]:
+        for since_ns, currents in reversed(self._commands):
+            if since_ns <= time_ns:
+                return currents
+        return self._commands[0][1]
 
     def reversed_axes(self) -> list[int]:
         """Return the axes that have turned the body the wrong way, fit after fit."""

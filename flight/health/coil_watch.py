@@ -3,8 +3,8 @@
 For the loop (all calls are cheap, none waits):
 
     watch = CoilWatch(CoilWatchSettings(full_current=..., ...))
-    watch.commanded(time_ns, currents, braked)   # each cycle: what is on the wire (CoilState)
-    watch.interrupted()                  # in cycles in which the driver does not know what is on the wire
+    watch.commanded(time_ns, currents, braked, written_ns)  # each cycle: what is on the wire (CoilState)
+    watch.interrupted(time_ns)           # in cycles before which nobody knows what the coils carried
     watch.felt(time_ns, rate, field)     # each sample of the inertial unit: rad/s, T, body axes
     watch.measured(power_reading)        # each look at the monitor; the same reading twice is no matter
     watch.verdicts                       # tuple of CoilVerdict, one an axis at most; they stay until `forget`
@@ -143,17 +143,22 @@ class CoilWatch:
         """Trust an axis again, by command; a fault that lasts will be found again."""
         self._verdicts.pop(axis, None)
         self._unproven.discard(axis)
-        self.interrupted()
+        self.interrupted(self._commands.newest_ns if self._commands else 0)
 
-    def commanded(self, time_ns: int, currents: FloatArray, braked: Axes = NONE) -> None:
-        """Tell which currents (3,) A are on the wire from `time_ns` on, and which bridges are braked."""
+    def commanded(
+        self, time_ns: int, currents: FloatArray, braked: Axes = NONE, written_ns: int | None = None
+    ) -> None:
+        """Tell which currents (3,) A are on the wire at `time_ns`, and which bridges are braked.
+
+        They have been since `written_ns`, by default since now.
+        """
         values = tuple(currents.tolist())
         self._commands.note(time_ns, values, braked)
         # Without readings nobody would end a rest or a brake.
         if self._leg.is_at_work and time_ns - self._looked_ns > self._settings.window_ns:
             self._leg.begin_anew()
         if self._response is not None:
-            self._response.commanded(time_ns, values)
+            self._response.commanded(time_ns if written_ns is None else written_ns, values)
 
     def felt(self, time_ns: int, rate: FloatArray, field: FloatArray) -> None:
         """Take a sample of the body rate (3,) rad/s and the magnetic field (3,) T, body axes."""
@@ -164,13 +169,13 @@ class CoilWatch:
             if axis not in self._verdicts and not self.suspicion:
                 self._give(axis, CoilFault.REVERSED, time_ns, self._response.text(axis))
 
-    def interrupted(self) -> None:
-        """Know nothing of the time until now: the driver cannot say what is on the wire."""
+    def interrupted(self, now_ns: int) -> None:
+        """Know nothing of the time until now: the driver, or nobody, can say what was on the wire."""
         self._fresh = 0
         self._leg.begin_anew()
         self._begin_anew()
         if self._response is not None:
-            self._response.begin_anew()
+            self._response.interrupted(now_ns)
 
     def measured(self, reading: PowerReading) -> None:
         """Take a reading of the monitor."""
@@ -235,7 +240,7 @@ class CoilWatch:
         if found is not None:
             text = f"{1e3 * reading.newest:.0f} mA without a command"
             self._give(found, CoilFault.HIGH, reading.time_ns, text)
-            self.interrupted()
+            self.interrupted(reading.time_ns)
 
     def _prove(self, seen: Supplied) -> None:
         """See whether a brake on a mere verdict is right: where a leg is stuck low it drives the coil."""

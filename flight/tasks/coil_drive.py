@@ -55,13 +55,18 @@ class CoilDrive:
         self.available = np.ones(3, dtype=bool)
         self.command: FloatArray = np.zeros(3)
 
-    def look(self, in_force: CoilState, readings: Sequence[ImuReading], now_ns: int) -> None:
-        """Compare what is on the wire with what the monitor and the body answer, once a cycle."""
+    def look(
+        self, in_force: CoilState, readings: Sequence[ImuReading], now_ns: int, *, known: bool = True
+    ) -> None:
+        """Compare what is on the wire with what the monitor and the body answer, once a cycle.
+
+        Nothing is made of the time until now where it is not `known` what the coils carried.
+        """
         watch = self._watch
         if in_force.written_ns >= 0:
-            watch.commanded(now_ns, in_force.current, in_force.braked)
-        if in_force.error:
-            watch.interrupted()  # what the chip does is not known
+            watch.commanded(now_ns, in_force.current, in_force.braked, in_force.written_ns)
+        if not known:
+            watch.interrupted(now_ns)
         for reading in readings:
             watch.felt(reading.time_ns, reading.rate, reading.field)
         answer = self._power.latest() if self._power is not None and not self._power.error() else None

@@ -15,6 +15,7 @@ from flight.modes.mode import STEERING, Mode
 from flight.tasks import imaging as imaging_task
 from flight.tasks import planning as planning_task
 from flight.tasks.coil_drive import CoilDrive
+from flight.tasks.coil_knowledge import CoilKnowledge
 from flight.tasks.imaging import Imaging
 from flight.tasks.mode_control import ModeControl
 from flight.tasks.navigation import Navigation
@@ -59,6 +60,7 @@ class ControlCycle:
         self._events = event_log
         self._observer = observer
         self._streams = streams
+        self._knowledge = CoilKnowledge()
         self._ever_started = False
         self._blind = True
         self._measured = False
@@ -70,11 +72,12 @@ class ControlCycle:
         rooms, now_ns = self._rooms, cycle.start_ns
         # What the last command came to be on the wire, and when: the coils' thread may have needed a moment.
         in_force = rooms.coils.state()
-        rooms.navigation.commanded(in_force, now_ns)
+        known = self._knowledge.look(in_force, now_ns)
+        rooms.navigation.commanded(in_force, known)
         rooms.navigation.update(now_ns)
         if not in_force.error:
             self._streams.note("coils", now_ns)
-        rooms.drive.look(in_force, rooms.navigation.readings, now_ns)
+        rooms.drive.look(in_force, rooms.navigation.readings, now_ns, known=known.until_now)
         if rooms.imaging is not None:
             rooms.imaging.serve(now_ns)
         self.estimate = rooms.navigation.estimate(now_ns)

@@ -26,6 +26,7 @@ from flight.health import facts
 from flight.health.facts import Facts
 from flight.health.streams import Streams
 from flight.quaternion import about_axis_y, angle_about_axis_y, attitude_matrix
+from flight.tasks.coil_knowledge import Known
 from flight.telemetry.definitions import IMU
 from flight.telemetry.recorder import Recorder
 from hal.interfaces.devices import InertialUnit
@@ -34,10 +35,6 @@ from hal.interfaces.readings import CoilState, ImuLink, ImuReading
 
 _AT_A_TIME = 16
 """Measurements applied again in a cycle: some ms, so that a second of them takes a few cycles."""
-
-
-_UNSEEN_NS = 600_000_000
-"""The coils' driver reads its outputs back twice a second: what it finds wrong may be so since then."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,8 +91,6 @@ class Navigation:
         self._heard_since_ns = 0
         self._facts = facts_
         self._streams = streams
-        self._coils_known = True
-        self._known_ns = -1
         self.readings: tuple[ImuReading, ...] = ()
 
     def begin(self, time_ns: int) -> None:
@@ -109,15 +104,11 @@ class Navigation:
         """Return the unit's counters."""
         return self._link
 
-    def commanded(self, in_force: CoilState, now_ns: int) -> None:
-        """Tell the filter what the coils carry, or that nobody knows while the chip does not obey."""
-        known = not in_force.error
-        if not known and self._coils_known:
-            self._filter.doubt(now_ns - _UNSEEN_NS)
-        elif known and not self._coils_known:
-            self._known_ns = now_ns
-        self._coils_known = known
-        self._filter.command(max(in_force.written_ns, self._known_ns), in_force.current, known=known)
+    def commanded(self, in_force: CoilState, known: Known) -> None:
+        """Tell the filter what the coils carry, as far as that is known."""
+        if known.doubt_ns is not None:
+            self._filter.doubt(known.doubt_ns)
+        self._filter.command(max(in_force.written_ns, known.since_ns), in_force.current, known=known.now)
 
     def update(self, now_ns: int) -> None:
         """Take in what the unit has sent, and go on with what came late."""

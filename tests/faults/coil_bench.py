@@ -108,7 +108,7 @@ def observe(
         time = (now_ns - epoch_ns) * 1e-9
         state = coils.state()
         carried.append((time, lock.hardware.circuit.currents().copy()))
-        watch.commanded(now_ns, state.current, state.braked)
+        watch.commanded(now_ns, state.current, state.braked, state.written_ns)
         for reading in unit.poll():
             newest = reading
             watch.felt(reading.time_ns, reading.rate, reading.field)

@@ -206,7 +206,7 @@ def test_a_gap_in_the_readings_begins_the_watch_anew() -> None:
     assert not is_suspicious()
     feed(3.0, 4.0, 0.0)
     assert is_suspicious()
-    watch.interrupted()
+    watch.interrupted(0)
     assert not is_suspicious()
     feed(4.0, 4.5, 0.0)
     assert not is_suspicious(), "these may tell of the time before"

@@ -1,0 +1,55 @@
+"""Is it known what the coils carry? Not while their chip does not obey, nor while the loop stands."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from hal.interfaces.readings import CoilState
+
+_UNSEEN_NS = 600_000_000
+"""The coils' driver reads its outputs back twice a second: what it finds wrong may be so since then."""
+_STOOD_NS = 200_000_000
+"""A loop that stood still for longer may have been taken for dead, the coils zeroed by the guardian."""
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """What a look at the coils' driver says of the currents.
+
+    Attributes:
+        now: whether the currents in force are known.
+        since_ns: from when on they are.
+        doubt_ns: from when on what was believed until now is newly in doubt; None when nothing is.
+    """
+
+    now: bool
+    since_ns: int
+    doubt_ns: int | None
+
+    @property
+    def until_now(self) -> bool:
+        """Whether the currents since the look before are known."""
+        return self.now and self.doubt_ns is None
+
+
+class CoilKnowledge:
+    """Looks at the coils' driver once a cycle."""
+
+    def __init__(self) -> None:
+        self._known = True
+        self._since_ns = -1
+        self._looked_ns: int | None = None
+
+    def look(self, in_force: CoilState, now_ns: int) -> Known:
+        """Tell what is known, by what the driver says and by how long nobody looked."""
+        obeyed, self._known = self._known, not in_force.error
+        looked_ns, self._looked_ns = self._looked_ns, now_ns
+        doubt_ns = None
+        if obeyed and not self._known:
+            doubt_ns = now_ns - _UNSEEN_NS
+        elif self._known and not obeyed:
+            self._since_ns = now_ns
+        if looked_ns is not None and now_ns - looked_ns > _STOOD_NS:
+            self._since_ns = now_ns
+            doubt_ns = looked_ns if doubt_ns is None else min(doubt_ns, looked_ns)
+        return Known(self._known, self._since_ns, doubt_ns)

@@ -1,0 +1,41 @@
+"""From when on it is known what the coils carry."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from flight.tasks.coil_knowledge import CoilKnowledge, Known
+from hal.interfaces.readings import CoilState
+
+MS = 1_000_000
+OBEYS = CoilState(np.zeros(3), np.zeros(3), 0, False, 0, False, 0, "", (False, False, False))
+REFUSES = replace(OBEYS, error="pca9685 at 0x40: does not keep what is written to its outputs")
+
+
+def test_what_a_chip_carries_that_obeys_is_known() -> None:
+    knowledge = CoilKnowledge()
+    looks = [knowledge.look(OBEYS, 1000 * MS + 25 * MS * cycle) for cycle in range(4)]
+    assert looks == [Known(True, -1, None)] * 4
+    assert looks[0].until_now
+
+
+def test_what_a_chip_does_not_keep_is_in_doubt_since_it_was_last_read_back() -> None:
+    knowledge = CoilKnowledge()
+    knowledge.look(OBEYS, 1000 * MS)
+    first, second = (knowledge.look(REFUSES, now * MS) for now in (1025, 1050))
+    assert first == Known(False, -1, 425 * MS)
+    assert second == Known(False, -1, None)
+    again = knowledge.look(OBEYS, 1075 * MS)
+    assert again == Known(True, 1075 * MS, None)
+
+
+def test_what_the_coils_carried_while_the_loop_stood_still_is_in_doubt() -> None:
+    knowledge = CoilKnowledge()
+    knowledge.look(OBEYS, 1000 * MS)
+    assert knowledge.look(OBEYS, 1150 * MS).until_now, "no guardian has acted yet"
+    stood = knowledge.look(OBEYS, 1450 * MS)
+    assert stood == Known(True, 1450 * MS, 1150 * MS)
+    assert not stood.until_now
+    assert knowledge.look(OBEYS, 1475 * MS) == Known(True, 1450 * MS, None)
