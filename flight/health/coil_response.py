@@ -73,7 +73,7 @@ class CoilResponse:
 
     def __init__(self, settings: ResponseSettings) -> None:
         self._settings = settings
-        self._inverse = np.linalg.inv(settings.inertia)
+        self._moved = settings.dipole_per_ampere * np.linalg.inv(settings.inertia).T
         self._free = np.array(settings.free)
         self._commands: deque[tuple[int, tuple[float, ...]]] = deque([(0, (0.0, 0.0, 0.0))])
         self._known_ns = 0
@@ -127,8 +127,8 @@ class CoilResponse:
             self.begin_anew()
             return False
         # Row a: what one ampere in coil a alone asks of the rate.
-        moments = np.eye(3) * self._settings.dipole_per_ampere
-        self._per_ampere = np.cross(moments, field) @ self._inverse.T
+        x, y, z = field.tolist()
+        self._per_ampere = np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))) @ self._moved
         currents = np.array(self._command_at(time_ns))[:, None]
         self._asked = self._asked + currents * self._per_ampere * (since_ns * 1e-9)
         self._asked_sum = self._asked_sum + self._asked
