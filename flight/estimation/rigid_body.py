@@ -50,8 +50,7 @@ class Torquing:
     known: bool = True
 
 
-@dataclass(frozen=True, slots=True)
-class Linearised:
+class Linearised(NamedTuple):
     """Angular acceleration w' (rad/s^2) and how it changes.
 
     `by_turn` and `by_rate` (3, 3) are its derivatives by a small turn about the body's axes and by the rate;

@@ -99,6 +99,8 @@ class HealthWatch:
 
     def _look_at_streams(self, now_ns: int) -> None:
         rooms = self._rooms
+        error = rooms.power.error() if rooms.power is not None else ""
+        rooms.facts.state(facts.POWER_FAULT, bool(error), now_ns, error or "readings come again")
         reading = rooms.power.latest() if rooms.power is not None else None
         if reading is not None and reading.time_ns != self._power_ns:
             self._power_ns = reading.time_ns

@@ -45,7 +45,6 @@ class Housekeeping:
         """Write the housekeeping packet."""
         watched, now_ns = self._watched, cycle.start_ns
         error = watched.power.error() if watched.power else ""
-        self._facts.state(facts.POWER_FAULT, bool(error), now_ns, error or "readings come again")
         log_error = watched.log_error()
         text = log_error or "packets reach the disk again"
         self._facts.state(facts.LOG_FAULT, bool(log_error), now_ns, text)
