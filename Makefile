@@ -31,7 +31,7 @@ arrows: $(READY)  ## the architecture's import arrows
 	$(VENV)/bin/lint-imports --no-cache
 
 unit: $(READY)  ## the tests, on all cores
-	$(RUN) -m pytest -n auto
+	$(RUN) -m pytest -n auto --dist loadfile
 
 pictures: $(READY)  ## the README's pictures
 	$(RUN) -m tests.pictures

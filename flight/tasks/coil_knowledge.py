@@ -8,7 +8,7 @@ from hal.interfaces.readings import CoilState
 
 _UNSEEN_NS = 600_000_000
 """The coils' driver reads its outputs back twice a second: what it finds wrong may be so since then."""
-_STOOD_NS = 200_000_000
+STOOD_NS = 200_000_000
 """A loop that stood still for longer may have been taken for dead, the coils zeroed by the guardian."""
 
 
@@ -49,7 +49,7 @@ class CoilKnowledge:
             doubt_ns = now_ns - _UNSEEN_NS
         elif self._known and not obeyed:
             self._since_ns = now_ns
-        if looked_ns is not None and now_ns - looked_ns > _STOOD_NS:
+        if looked_ns is not None and now_ns - looked_ns > STOOD_NS:
             self._since_ns = now_ns
             doubt_ns = looked_ns if doubt_ns is None else min(doubt_ns, looked_ns)
         return Known(self._known, self._since_ns, doubt_ns)

@@ -176,6 +176,11 @@ def _recovered(
             if kind.momentary and len(lost):
                 later = _first(time[finite], float(lost[-1]))
                 found = None if later is None else float(lost[-1]) + later - end
+            # Told four times a second, where housekeeping comes once.
+            known = [t for t, name in told if name == "power-recovered" and t < DURATION - CYCLE]
+            back = _first(np.array(known), end)
+            if back is not None:
+                found = back if found is None or kind.momentary else min(found, back)
         case "camera":
             grown = np.flatnonzero(np.diff(house["frames"].astype(int)) > 0) + 1
             found = _first(house["time_ns"][grown] * 1e-9, end)

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from flight.tasks.coil_knowledge import CoilKnowledge, Known
+from flight.tasks.coil_knowledge import STOOD_NS, CoilKnowledge, Known
+from hal.guardian.watch import SILENCE_NS
 from hal.interfaces.readings import CoilState
 
 MS = 1_000_000
@@ -39,3 +40,8 @@ def test_what_the_coils_carried_while_the_loop_stood_still_is_in_doubt() -> None
     assert stood == Known(True, 1450 * MS, 1150 * MS)
     assert not stood.until_now
     assert knowledge.look(OBEYS, 1475 * MS) == Known(True, 1450 * MS, None)
+
+
+def test_no_guardian_acts_in_a_gap_that_is_not_seen() -> None:
+    """From heartbeat to heartbeat it may be longer than from look to look by nearly two cycles."""
+    assert STOOD_NS + 2 * 25 * MS < SILENCE_NS
