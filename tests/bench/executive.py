@@ -3,7 +3,8 @@
 The step demonstration flies in real time on emulated devices in processes of their own, as a board flies on
 its devices: planner and vision have work without pause, the guardian watches. Beside it a bare absolute-sleep
 loop at the same rate (`tests.bench.bare_loop`) tells what the machine stalls by itself. Where SCHED_FIFO is
-allowed the flight is flown twice, with it and without. Run it alone on two cores.
+allowed the flight is flown twice, with it and without. Run it alone on two cores. The slope of memory is told
+by flights of 16 minutes and more.
 """
 
 from __future__ import annotations
@@ -110,7 +111,7 @@ def _load(arguments: Sequence[str]) -> tuple[Load, argparse.Namespace]:
         "--replan-period", type=float, default=Load.replan_period, metavar="S", help="default %(default)s"
     )
     parser.add_argument(
-        "--warm-up", type=float, metavar="S", help="not in CPU and slope (default 60, or a fifth of a flight)"
+        "--warm-up", type=float, metavar="S", help="not in the figures (default 60, or a fifth of a flight)"
     )
     parser.add_argument(
         "--scheduling", choices=["fifo", "ordinary", "both"], default="both", help="default %(default)s"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,8 +18,11 @@ from tests.guardian.live_flight import CoilTruth
 PERIOD_NS = 25_000_000
 """Of the control group at 40 Hz; mission time zero is a multiple of it (`flight.app.mission_time`)."""
 
-SLOPE_SPAN = 240.0
-"""s after the warm-up from which on a slope is told."""
+SLOPE_FROM, SLOPE_SPAN = 720.0, 240.0
+"""s of flight from which on, and over which at least, the slope of memory is told.
+
+Until then windows of minutes fill, and pages of libraries and of the sky's index are touched the first time.
+"""
 
 Figures = dict[str, Any]
 
@@ -100,7 +104,8 @@ def evaluate(
         "first_command_s": truth.driven_after(began.exec_ns),
         "jobs": _jobs(run, len(flight.lateness) * PERIOD_NS * 1e-9),
     }
-    figures |= _of_processes(watched, zero_ns * 1e-9 + warm_up)
+    zero_s = zero_ns * 1e-9
+    figures |= _of_processes(watched, zero_s + warm_up, zero_s + max(warm_up, SLOPE_FROM))
     return Flown(figures, flight, machine)
 
 
@@ -123,18 +128,19 @@ def _jobs(run: Run, seconds: float) -> dict[str, Any]:
     return found
 
 
-def _of_processes(watched: Watched, warm_s: float) -> Figures:
-    """Return processor and memory from `warm_s` of monotonic time on."""
+def _of_processes(watched: Watched, warm_s: float, settled_s: float) -> Figures:
+    """Return processor and memory from `warm_s` of monotonic time on, their slope from `settled_s`."""
     looks = [look for look in watched.looks if look.time >= warm_s]
     if len(looks) < 2:
         raise RuntimeError(f"only {len(looks)} looks at the processes after the warm-up: fly for longer")
     names = sorted({name for look in looks for name in look.memory})
     processor = {name: _share([look for look in looks if name in look.processor], name) for name in names}
     total = np.array([sum(look.memory.values()) for look in looks]) / MIB
-    times = [look.time for look in looks]
     alone = watched.shared_with_others / MIB
-    slope = judged_slope(times, [sum(look.own.values()) / MIB for look in looks])
-    of_control = judged_slope(times, [look.own["control"] / MIB for look in looks])
+    settled = [look for look in looks if look.time >= settled_s]
+    times = [look.time for look in settled]
+    slope = judged_slope(times, [sum(look.own.values()) / MIB for look in settled])
+    of_control = judged_slope(times, [look.own["control"] / MIB for look in settled])
     return {
         "processor": processor,
         "processor_control": processor["control"],
@@ -160,7 +166,7 @@ def judged_slope(seconds: list[float], levels: list[float]) -> tuple[float, floa
 
     Pages come and go by tenths of a MiB: over a minute that alone is tens of MiB/h.
     """
-    if seconds[-1] - seconds[0] < SLOPE_SPAN:
+    if not seconds or seconds[-1] - seconds[0] < SLOPE_SPAN:
         return np.nan, np.nan, np.nan
     return slope_per_hour(seconds, levels)
 
@@ -198,10 +204,10 @@ def table(figures: Figures, name: str) -> str:
         ("exec to READY, s", "ready_s", "1.5", "{:.2f}"),
         ("exec to first coil command, s", "first_command_s", "2", "{:.2f}"),
     ]
-    low, high = figures["memory_slope_interval"]
     lines = [f"{name}: {figures['scheduling']}", f"{'':42}{'asked <=':>10}{'measured':>12}"]
     for text, key, asked, form in rows:
-        measured = form.format(figures[key]).rstrip("%")
+        known = not math.isnan(figures[key])
+        measured = form.format(figures[key]).rstrip("%") if known else "not told"
         lines.append(f"{text:42}{asked:>10}{measured:>12}{'  MISSED' if key in wrong else ''}")
     lines += [
         f"slots {figures['slots']}: lost {figures['lost']} (slips counted {figures['slips']}), by the bare "
@@ -213,10 +219,7 @@ def table(figures: Figures, name: str) -> str:
         f"{'  bare loop':24}" + "".join(f"{1e3 * value:10.3f}" for value in bare.values()),
         "execution of a cycle, ms: "
         + ", ".join(f"{part} {1e3 * value:.2f}" for part, value in spent.items()),
-        f"slope's 95 % interval {low:+.2f} to {high:+.2f} MiB/h ({figures['looks']} looks); control process "
-        "{:+.2f} ({:+.2f} to {:+.2f})".format(
-            figures["control_slope_mib_per_hour"], *figures["control_slope_interval"]
-        ),
+        *_of_slope(figures),
         f"memory of all: median {figures['memory_median_mib']:.1f}, largest {figures['memory_max_mib']:.1f} "
         "MiB; the row above adds what other processes share with the flight",
         f"{'process':16}{'CPU %':>8}{'PSS MiB':>10}{'largest':>9}{'jobs':>8}{'failed':>8}{'at work %':>11}",
@@ -228,3 +231,16 @@ def table(figures: Figures, name: str) -> str:
             f"  {process:14}{100.0 * figures['processor'][process]:8.1f}{memory:10.1f}{largest:9.1f}{work}"
         )
     return "\n".join(lines) + "\n"
+
+
+def _of_slope(figures: Figures) -> list[str]:
+    """Return what is told of the slope of memory: in a flight that is long enough its interval."""
+    low, high = figures["memory_slope_interval"]
+    if math.isnan(low):
+        return [
+            f"slope of memory: told by flights of {(SLOPE_FROM + SLOPE_SPAN) / 60.0:.0f} minutes and more"
+        ]
+    own = "{:+.2f} ({:+.2f} to {:+.2f})".format(
+        figures["control_slope_mib_per_hour"], *figures["control_slope_interval"]
+    )
+    return [f"slope's 95 % interval {low:+.2f} to {high:+.2f} MiB/h; control process {own}"]
