@@ -8,7 +8,7 @@ import pytest
 from flight.arrays import BoolArray, FloatArray
 from flight.pinhole import Pinhole
 from flight.vision.likelihood import spot_model, streak_model
-from flight.vision.likelihood.motion import Motion, paths, sensitivities
+from flight.vision.likelihood.motion import Motion, moving, paths, sensitivities
 from flight.vision.likelihood.shutter import Shutter
 from flight.vision.likelihood.strips import cut_strips
 from tests.star_camera.scenes import integrated_by_brute_force
@@ -94,6 +94,15 @@ def test_sensitivities_are_finite_differences_of_the_path() -> None:
         truth = (position(step) - position(-step)) / 2e-6
         scale = np.abs(truth).max()
         assert np.abs(found[:, :, k] - truth).max() < (0.02 if k < 6 else 1e-5) * scale
+
+
+@pytest.mark.parametrize("growth", [[0.0, 0.0, 0.0], [0.02, 0.03, -0.05]])
+def test_velocities_beside_sensitivities_are_those_of_the_paths(growth: list[float]) -> None:
+    """At constant rate and at one that changes: each has its own formula, from the flow and from the turn."""
+    motion = Motion(np.array([0.1, -0.2, 0.3]), np.array(growth))
+    stars, time = np.array([[100.0, 250.0], [280.0, 40.0]]), np.array([-0.4, 0.3])
+    _, velocity = moving(_PINHOLE, motion, stars, time)
+    assert np.allclose(velocity, paths(_PINHOLE, motion, stars, time).velocity, rtol=1e-9)
 
 
 def test_the_turn_of_a_rate_that_changes_is_that_of_many_small_turns() -> None:

@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from flight.arrays import BoolArray, FloatArray, IntArray
 from flight.vision.likelihood.exposed_frame import ExposedFrame, Float32Array
-from flight.vision.segmentation import positions
 
-_EIGHT_NEIGHBOURS = np.ones((3, 3), dtype=np.int64)
 # One noise peak fills nine pixels of the 3 x 3 sum.
 _LEAST_AREA = 12
 # Threshold and point spread widen a region by about this at each end, px.
@@ -47,30 +46,45 @@ class Blobs:
 
 def find_blobs(frame: ExposedFrame, sigmas: float, most: int) -> Blobs:
     """Return the `most` brightest regions whose 3 x 3 sum exceeds `sigmas` of its noise."""
-    signal, floor = frame.signal.reshape(frame.shape), frame.floor.reshape(frame.shape)
-    mask = _above(frame.sums.reshape(frame.shape), floor, 3.0 * sigmas)
-    labels, count = ndimage.label(mask, structure=_EIGHT_NEIGHBOURS)
-    row, column = positions(mask)
-    number = labels[row, column]
-    light = np.maximum(signal[row, column], 0.0).astype(np.float64)
-    area = np.bincount(number, minlength=count + 1)
-    flux = np.bincount(number, light, count + 1)
+    pixel = _above(frame.sums, frame.floor, 3.0 * sigmas)
+    number, count = _connected(pixel, frame.shape[1])
+    light = np.maximum(frame.signal[pixel], 0.0).astype(np.float64)
+    area = np.bincount(number, minlength=count)
+    flux = np.bincount(number, light, count)
     flux[area < _LEAST_AREA] = 0.0
     chosen = np.argsort(-flux, kind="stable")[:most]
     chosen = chosen[flux[chosen] > 0.0]
-    rank = np.full(count + 1, -1)
+    rank = np.full(count, -1)
     rank[chosen] = np.arange(len(chosen))
     owner = rank[number]
-    kept = owner >= 0
-    return _measured(frame, owner[kept], column[kept], row[kept], light[kept], len(chosen))
+    kept = np.flatnonzero(owner >= 0)
+    row, column = np.divmod(pixel[kept], frame.shape[1])
+    return _measured(frame, owner[kept], column, row, light[kept], len(chosen))
 
 
-def _above(sums: Float32Array, floor: Float32Array, sigmas: float) -> BoolArray:
-    """Tell where `sums` exceed `sigmas` times the root of `floor`, all (rows, columns)."""
-    mask = sums > np.float32(sigmas * np.sqrt(floor.min()))
-    row, column = positions(mask)
-    mask[row, column] = sums[row, column] > np.float32(sigmas) * np.sqrt(floor[row, column])
-    return mask
+def _above(sums: Float32Array, floor: Float32Array, sigmas: float) -> IntArray:
+    """Return where (m,) flat `sums` exceed `sigmas` times the root of `floor`, ascending."""
+    pixel = np.flatnonzero(sums > np.float32(sigmas * np.sqrt(floor.min())))
+    return pixel[sums[pixel] > np.float32(sigmas) * np.sqrt(floor[pixel])]
+
+
+def _connected(pixel: IntArray, columns: int) -> tuple[IntArray, int]:
+    """Return which region each flat `pixel` (m,), ascending, belongs to, and how many regions there are.
+
+    Runs of pixels along rows are joined, which are many times fewer. None goes on in the next row: the
+    frame's outermost sums are zero.
+    """
+    first = np.flatnonzero(np.diff(pixel, prepend=-2) > 1)
+    length = np.diff(first, append=len(pixel))
+    start, stop = pixel[first], pixel[first] + length
+    # A run touches those of the next row from one column before it to one after.
+    low = np.searchsorted(stop, start + columns)
+    count = np.searchsorted(start, stop + columns, side="right") - low
+    one = np.repeat(np.arange(len(first)), count)
+    other = np.arange(len(one)) + np.repeat(low - np.cumsum(count) + count, count)
+    touching = coo_array((np.ones(len(one), dtype=np.bool_), (one, other)), shape=(len(first), len(first)))
+    regions, number = connected_components(touching, directed=False)
+    return np.repeat(number, length), int(regions)
 
 
 def _measured(

@@ -42,28 +42,31 @@ def true_ends(
     light: FloatArray,
     times: FloatArray,
 ) -> FloatArray:
-    """Return 1 for each end on the detector that is where it should be, else 0, in one row (k,).
+    """Return (n, 2) 1 for the ends that are where they should be, 0 for those that are not.
 
-    `times` (n, 2) are when stars (n, 2) of `light` (n,) counts begin and end to be exposed. Streaks too short
-    to tell have no ends here.
+    `times` (n, 2) are when stars (n, 2) of `light` (n,) counts begin and end to be exposed. Ends that are not
+    on the detector, and those of streaks too short to tell, are NaN.
     """
+    out = np.full((len(stars), 2), np.nan)
     length = path_lengths(pinhole, motion, stars)
     long = length > 2.0 * (_FROM_END + _LEAST_STRETCH)
     if not long.any():
-        return np.empty(0)
+        return out
     stars, light, times, length = stars[long], light[long], times[long], length[long]
     stretch = np.maximum(_STRETCH * length, _LEAST_STRETCH)
     expected = _MIDDLE * light / length
-    verdicts = []
-    for end, outward in ((0, -1.0), (1, 1.0)):
-        away = _FROM_END + np.linspace(0.0, 1.0, _SAMPLES) * stretch[:, None]
-        velocity = paths(pinhole, motion, stars, times[:, end]).velocity
-        delay = outward * away / np.maximum(np.hypot(velocity[:, 0], velocity[:, 1]), 1e-3)[:, None]
-        within, _ = _brightness(frame, pinhole, motion, stars, times[:, end, None] - delay)
-        beyond, _ = _brightness(frame, pinhole, motion, stars, times[:, end, None] + delay)
-        told = np.isfinite(within) & np.isfinite(beyond)
-        verdicts.append(((within > _HALF * expected) & (beyond < _HALF * expected))[told])
-    return np.concatenate(verdicts).astype(float)
+    away = _FROM_END + np.linspace(0.0, 1.0, _SAMPLES) * stretch[:, None]
+    end = times.T.reshape(-1)
+    velocity = paths(pinhole, motion, np.tile(stars, (2, 1)), end).velocity
+    outward = np.repeat([-1.0, 1.0], len(stars)) / np.maximum(np.hypot(velocity[:, 0], velocity[:, 1]), 1e-3)
+    delay = outward[:, None] * np.tile(away, (2, 1))
+    time = np.concatenate([end[:, None] - delay, end[:, None] + delay])
+    mean, _ = _brightness(frame, pinhole, motion, np.tile(stars, (4, 1)), time)
+    within, beyond = mean.reshape(2, 2, -1)
+    told = np.isfinite(within) & np.isfinite(beyond)
+    true = (within > _HALF * expected) & (beyond < _HALF * expected)
+    out[long] = np.where(told, true, np.nan).T
+    return out
 
 
 def unbroken(

@@ -89,7 +89,9 @@ def rescanned_fits(camera: ExposedCamera, turn: FloatArray, angles: list[float])
         circles = Circles(frame, z, np.arctan2(y, x))
         for turned in islice(scan_angles(camera.frame, pinhole, circles, 1, angle), 1):
             stars, light = turned.stars[:_FIRST_STARS], turned.light[:_FIRST_STARS]
-            tried = _tried(camera, Guess(frame[2] * turned.angle, stars, light, 0.0)) if len(light) else None
+            if len(light) < settings.least_stars:
+                continue
+            tried = _tried(camera, Guess(frame[2] * turned.angle, stars, light, 0.0))
             if tried is not None:
                 yield tried[2]
 
@@ -147,7 +149,9 @@ def _ending(camera: ExposedCamera, scene: Scene) -> float:
     """
     times = window_times(camera.pinhole, scene.motion, camera.shutter, scene.stars)
     seen = camera.frame, camera.pinhole, scene.motion, scene.stars, scene.light, times
-    return min(float(np.mean(told)) if len(told) else 1.0 for told in (true_ends(*seen), unbroken(*seen)))
+    ends = true_ends(*seen)
+    told = ends[np.isfinite(ends)], unbroken(*seen)
+    return min(float(np.mean(share)) if len(share) else 1.0 for share in told)
 
 
 def _borne_out(done: Fit) -> tuple[float, float]:

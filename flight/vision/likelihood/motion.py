@@ -84,7 +84,14 @@ def image_flow(pinhole: Pinhole, points: FloatArray) -> FloatArray:
 def sensitivities(
     pinhole: Pinhole, motion: Motion, stars: FloatArray, time: FloatArray, growing: bool = True
 ) -> FloatArray:
-    """Return d(pixel at `time`)/d(turn, growth, star's pixel at mid-exposure): (m, 2, 8).
+    """Return d(pixel at `time`)/d(turn, growth, star's pixel at mid-exposure): (m, 2, 8)."""
+    return moving(pinhole, motion, stars, time, growing)[0]
+
+
+def moving(
+    pinhole: Pinhole, motion: Motion, stars: FloatArray, time: FloatArray, growing: bool = True
+) -> tuple[FloatArray, FloatArray]:
+    """Return the sensitivities (m, 2, 8), and the velocities (m, 2) of `paths`.
 
     Exact in the turn and the star; in the growth to second order of the angle turned, and left zero unless
     `growing`.
@@ -111,7 +118,8 @@ def sensitivities(
     for column, unit in ((6, np.array([[1.0], [0.0], [0.0]])), (7, np.array([[0.0], [1.0], [0.0]]))):
         beside = _rotated(turning, unit)
         out[:, column] = (beside[:2] - there * beside[2]) / v[2]
-    return out.transpose(2, 0, 1)
+    velocity = np.sum(flow * _rate(motion, time), axis=1)
+    return out.transpose(2, 0, 1), velocity.T
 
 
 # Below, vectors are (..., 3, m), components before points: they then lie together in memory. What is returned

@@ -96,7 +96,7 @@ def sampled(
     turning = grid.frame[:2].T @ np.stack([np.cos(grid.azimuth), np.sin(grid.azimuth)])
     rising = grid.frame[2][:, None] / np.tan(grid.polar)
     around, aloft = turning.astype(np.float32), rising.astype(np.float32)
-    last = np.float32(pinhole.columns - 1), np.float32(pinhole.rows - 1)
+    last = np.int32(pinhole.columns - 1), np.int32(pinhole.rows - 1)
     flat = sums.reshape(-1)
     for part, crossing in _crossings(pinhole, grid, room):
         depth = around[2, crossing] + aloft[2, part, None]
@@ -106,14 +106,15 @@ def sampled(
         for axis, limit in ((0, last[0]), (1, last[1])):
             place = around[axis, crossing] + aloft[axis, part, None]
             place *= depth
-            place += np.float32(pinhole.centre[axis])
-            np.rint(place, out=place)
-            places.append(np.clip(place, np.float32(0.0), limit, out=place))
+            # Half a pixel more, and the fraction cut off: rounded.
+            place += np.float32(pinhole.centre[axis] + 0.5)
+            np.maximum(place, np.float32(0.0), out=place)
+            np.minimum(place, np.float32(limit), out=place)
+            places.append(place.astype(np.int32))
         column, row = places
-        inside = (column > 0.0) & (column < last[0]) & (row > 0.0) & (row < last[1])
-        index = row.astype(np.int32)
-        index *= pinhole.columns
-        index += column.astype(np.int32)
+        inside = (column > 0) & (column < last[0]) & (row > 0) & (row < last[1])
+        index = row * np.int32(pinhole.columns)
+        index += column
         samples = flat.take(index)
         samples *= np.float32(1.0 / unit)
         yield part, crossing, np.rint(samples, out=samples), inside

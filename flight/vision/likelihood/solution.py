@@ -33,14 +33,32 @@ class Solution:
 
     Attributes:
         shared: (SHARED,) step of what is shared; alone: (n, ALONE) of each star's own.
-        covariance: (SHARED, SHARED) of what is shared.
-        joint: (n, SHARED + ALONE, SHARED + ALONE) of what is shared and each star's own.
+        eliminated: the equations that gave it, stars not sharing pixels.
     """
 
     shared: FloatArray
     alone: FloatArray
-    covariance: FloatArray
-    joint: FloatArray
+    eliminated: Eliminated
+
+    @property
+    def covariance(self) -> FloatArray:
+        """The covariance (SHARED, SHARED) of what is shared."""
+        kept = self.eliminated.kept
+        out = np.zeros((SHARED, SHARED))
+        out[kept[:, None], kept] = self.eliminated.inner
+        return out
+
+    @property
+    def joint(self) -> FloatArray:
+        """The covariance (n, SHARED + ALONE, SHARED + ALONE) of what is shared and each star's own."""
+        kept, gain, inner = self.eliminated.kept, self.eliminated.gain, self.eliminated.inner
+        joint = np.zeros((len(gain), SHARED + ALONE, SHARED + ALONE))
+        joint[:, :SHARED, :SHARED] = self.covariance
+        crossed = -inner @ gain
+        joint[:, kept, SHARED:] = crossed
+        joint[:, SHARED:, kept] = crossed.swapaxes(1, 2)
+        joint[:, SHARED:, SHARED:] = self.eliminated.own + gain.swapaxes(1, 2) @ inner @ gain
+        return joint
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,7 +103,8 @@ def eliminate(evaluation: Evaluation, free: BoolArray) -> Eliminated | None:
     if not np.all(np.isfinite(normal)) or not np.all(scale > 0.0):
         return None
     scaled = normal / np.outer(scale, scale)
-    if np.linalg.cond(scaled) > 1e10:
+    least, most = np.linalg.eigvalsh(scaled)[[0, -1]]
+    if most > 1e10 * least:
         return None
     return Eliminated(kept, own, gain, np.linalg.inv(scaled) / np.outer(scale, scale))
 
@@ -101,25 +120,12 @@ def solve(evaluation: Evaluation, scene: Scene, free: BoolArray, rounds: int) ->
     alone = evaluation.gradient[:, SHARED:] - PRIOR * _from_prior(scene)
     shared = np.where(free, evaluation.gradient[:, :SHARED].sum(axis=0), 0.0)
     step = _conjugate(evaluation, eliminated, free, (shared, alone), rounds)
-    return Solution(*step, *_covariances(eliminated, len(alone)))
+    return Solution(*step, eliminated)
 
 
 def _from_prior(scene: Scene) -> FloatArray:
     """Return how far each star's numbers are from where the prior puts them: only the sky has a place."""
     return np.stack([np.zeros_like(scene.sky)] * 3 + [scene.sky], axis=-1)
-
-
-def _covariances(eliminated: Eliminated, n: int) -> tuple[FloatArray, FloatArray]:
-    kept, gain, inner = eliminated.kept, eliminated.gain, eliminated.inner
-    covariance = np.zeros((SHARED, SHARED))
-    covariance[np.ix_(kept, kept)] = inner
-    joint = np.zeros((n, SHARED + ALONE, SHARED + ALONE))
-    joint[:, :SHARED, :SHARED] = covariance
-    crossed = -inner @ gain
-    joint[:, kept, SHARED:] = crossed
-    joint[:, SHARED:, kept] = crossed.swapaxes(1, 2)
-    joint[:, SHARED:, SHARED:] = eliminated.own + gain.swapaxes(1, 2) @ inner @ gain
-    return covariance, joint
 
 
 def shared_covariance(evaluation: Evaluation, free: BoolArray, rounds: int) -> FloatArray | None:

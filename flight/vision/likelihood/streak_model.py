@@ -26,7 +26,7 @@ from scipy.special import ndtr
 from flight.arrays import FloatArray
 from flight.pinhole import Pinhole
 from flight.vision.likelihood.exposed_frame import Float32Array
-from flight.vision.likelihood.motion import Motion, paths, sensitivities
+from flight.vision.likelihood.motion import Motion, moving, paths
 from flight.vision.likelihood.shutter import Shutter
 from flight.vision.likelihood.strips import LINES, Strips, beside
 
@@ -220,8 +220,7 @@ def _moved(
     pinhole: Pinhole, motion: Motion, stars: FloatArray, time: FloatArray, growing: bool
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return how each parameter moves points along the path, in exposures, and across, px; and the speed."""
-    change = sensitivities(pinhole, motion, stars, time, growing)
-    velocity = paths(pinhole, motion, stars, time).velocity
+    change, velocity = moving(pinhole, motion, stars, time, growing)
     speed = np.maximum(np.hypot(velocity[:, 0], velocity[:, 1]), _SLOWEST)
     tx, ty = (velocity / speed[:, None]).T[:, :, None]
     along = change[:, 0] * tx + change[:, 1] * ty

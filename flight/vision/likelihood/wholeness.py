@@ -36,7 +36,8 @@ def wholeness(camera: ExposedCamera, scene: Scene, faint: FaintStars) -> Wholene
 
     In a crowded frame what passes for a star may be several: a few that are dark here or there do not speak
     against the motion, but ask for another witness. So does a motion that most of the streaks disown which
-    show both ends, the only ones that tell by what angle the stars turned.
+    show both ends, the only ones that tell by what angle the stars turned, and one that no such streak
+    vouches for; where the ends of those that decide are not where they should be, it is not the motion.
     """
     stars = np.concatenate([scene.stars, faint.stars])
     light = np.concatenate([scene.light, faint.light])
@@ -47,14 +48,19 @@ def wholeness(camera: ExposedCamera, scene: Scene, faint: FaintStars) -> Wholene
     times = window_times(camera.pinhole, deciding.motion, camera.shutter, deciding.stars)
     seen = camera.frame, camera.pinhole, scene.motion, deciding.stars, deciding.light, times
     ends, lit = true_ends(*seen), unbroken(*seen)
-    right = float(np.mean(ends)) if len(ends) else 1.0
+    told = np.isfinite(ends)
+    both = told.all(axis=1)
+    right = float(np.mean(ends[told])) if told.any() else 1.0
+    if both.any() and float(np.mean(ends[both])) < _TRUE_ENDS[1]:
+        return Wholeness.BROKEN
     dark = np.count_nonzero(lit == 0.0)
     for worst, (least_ends, most_broken) in zip(
         (Wholeness.BROKEN, Wholeness.DOUBTED), zip(_TRUE_ENDS[::-1], _BROKEN[::-1], strict=True), strict=True
     ):
         if right < least_ends or dark > max(1.0, most_broken * len(lit)):
             return worst
-    return Wholeness.DOUBTED if _disowned(camera, scene) else Wholeness.WHOLE
+    unvouched = bool(told.any()) and not both.any()
+    return Wholeness.DOUBTED if unvouched or _disowned(camera, scene) else Wholeness.WHOLE
 
 
 def _disowned(camera: ExposedCamera, scene: Scene) -> bool:
