@@ -113,7 +113,9 @@ def _is_worker_met(flown: Run, kind: FaultKind, at: float, end: float) -> bool:
     mine = np.array([to_text(name) == kind.device for name in jobs["name"]], dtype=bool)
     if kind.kind == "endless":  # a job that was under way ran into its time limit
         return bool((mine & (when >= at) & (jobs["outcome"] == b"timed-out")).any())
-    return bool((mine & (when >= at) & (when < end + 0.1)).any())  # results are told when they come
+    # A result is told in a cycle after that in which the job was begun.
+    begun = CYCLE * np.floor((when - jobs["execution"]) / CYCLE + 1e-6)
+    return bool((mine & (begun >= at) & (when < end + 0.1)).any())
 
 
 def _is_behind(flown: Run, kind: FaultKind, inside: BoolArray) -> bool:
