@@ -16,7 +16,7 @@ from flight.arrays import Image
 from flight.camera import camera_model
 from flight.cli.pictures import add_picture, positive, read_picture
 from flight.errors import UsageError
-from flight.horizon.knowledge import HorizonKnowledge
+from flight.horizon.knowledge import LEAST_ALTITUDE, HorizonKnowledge
 from flight.horizon.nadir import find_nadir
 from flight.horizon.picture import draw_horizon
 from flight.horizon.response import LogarithmicResponse
@@ -62,6 +62,9 @@ def run(options: argparse.Namespace) -> int:
     pixels = read_picture(options)
     camera = _camera(options, pixels)
     altitude = None if options.altitude is None else 1e3 * options.altitude
+    if altitude is not None and altitude < LEAST_ALTITUDE:
+        least = f"{1e-3 * LEAST_ALTITUDE:g} km"
+        raise UsageError(f"--altitude {options.altitude:g}: the limb is seen as one from {least} up")
     response = None if options.log_response is None else LogarithmicResponse(*options.log_response)
     settings = HorizonSettings(edges=EdgeSettings(response=response))
     solution = find_nadir(pixels, camera, HorizonKnowledge(altitude=altitude), settings)

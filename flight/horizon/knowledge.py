@@ -10,8 +10,8 @@ from flight.arrays import FloatArray
 from flight.earth import SEMI_MAJOR_AXIS
 
 ICRS_POLE: FloatArray = np.array([0.0, 0.0, 1.0])
-_LEAST_DISTANCE = SEMI_MAJOR_AXIS + 50e3
-"""m: below it no limb is seen as one."""
+LEAST_ALTITUDE = 50e3
+"""m: from lower down no limb is seen as one; within the air there is none."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,7 +65,9 @@ class HorizonKnowledge:
             value = getattr(self, name)
             if value is not None and (np.shape(value) != (3,) or not np.all(np.isfinite(value))):
                 raise ValueError(f"{name} = {value}: give (3,) finite numbers")
-        if self.position is not None and np.linalg.norm(self.position) < _LEAST_DISTANCE:
+        if self.position is not None and np.linalg.norm(self.position) < SEMI_MAJOR_AXIS + LEAST_ALTITUDE:
             raise ValueError(f"position = {self.position}: inside the Earth, give metres from its centre")
-        if self.altitude is not None and not 0.0 < self.altitude < np.inf:
-            raise ValueError(f"altitude = {self.altitude}: give metres above the Earth")
+        if self.altitude is not None and not LEAST_ALTITUDE <= self.altitude < np.inf:
+            raise ValueError(
+                f"altitude = {self.altitude}: give metres above the Earth, {LEAST_ALTITUDE:g} at least"
+            )

@@ -187,7 +187,8 @@ def test_the_terminator_is_told_from_the_limb() -> None:
     [
         ({"position": np.array([np.nan, 0.0, 7e6])}, "finite"),
         ({"position": np.array([0.0, 0.0, 7000.0])}, "inside the Earth"),
-        ({"altitude": -5.0}, "metres above"),
+        ({"altitude": -5.0}, "give metres"),
+        ({"altitude": 5e3}, "50000 at least"),
         ({"sun": np.zeros(2)}, "finite"),
     ],
 )
