@@ -73,7 +73,7 @@ class CoilResponse:
 
     def __init__(self, settings: ResponseSettings) -> None:
         self._settings = settings
-        self._moved = settings.dipole_per_ampere * np.linalg.inv(settings.inertia).T
+        self._per_field = settings.dipole_per_ampere * np.linalg.inv(settings.inertia).T
         self._free = np.array(settings.free)
         self._commands: deque[tuple[int, tuple[float, ...]]] = deque([(0, (0.0, 0.0, 0.0))])
         self._known_ns = 0
@@ -126,9 +126,9 @@ class CoilResponse:
         if not 0 < since_ns < _STALE_NS:
             self.begin_anew()
             return False
-        # Row a: what one ampere in coil a alone asks of the rate.
+        # Row a: what one ampere in coil a alone asks of the rate, J^-1 (n e_a x B).
         x, y, z = field.tolist()
-        self._per_ampere = np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))) @ self._moved
+        self._per_ampere = np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))) @ self._per_field
         currents = np.array(self._command_at(time_ns))[:, None]
         self._asked = self._asked + currents * self._per_ampere * (since_ns * 1e-9)
         self._asked_sum = self._asked_sum + self._asked

@@ -18,18 +18,15 @@ class Known:
 
     Attributes:
         now: whether the currents in force are known.
+        until_now: whether those since the look before are, too.
         since_ns: from when on they are.
         doubt_ns: from when on what was believed until now is newly in doubt; None when nothing is.
     """
 
     now: bool
+    until_now: bool
     since_ns: int
     doubt_ns: int | None
-
-    @property
-    def until_now(self) -> bool:
-        """Whether the currents since the look before are known."""
-        return self.now and self.doubt_ns is None
 
 
 class CoilKnowledge:
@@ -44,12 +41,11 @@ class CoilKnowledge:
         """Tell what is known, by what the driver says and by how long nobody looked."""
         obeyed, self._known = self._known, not in_force.error
         looked_ns, self._looked_ns = self._looked_ns, now_ns
-        doubt_ns = None
-        if obeyed and not self._known:
-            doubt_ns = now_ns - _UNSEEN_NS
-        elif self._known and not obeyed:
+        stood = looked_ns is not None and now_ns - looked_ns > STOOD_NS
+        until_now = obeyed and self._known and not stood
+        if self._known and not until_now:
             self._since_ns = now_ns
-        if looked_ns is not None and now_ns - looked_ns > STOOD_NS:
-            self._since_ns = now_ns
-            doubt_ns = looked_ns if doubt_ns is None else min(doubt_ns, looked_ns)
-        return Known(self._known, self._since_ns, doubt_ns)
+        doubts = [now_ns - _UNSEEN_NS] if obeyed and not self._known else []
+        if looked_ns is not None and stood:
+            doubts.append(looked_ns)
+        return Known(self._known, until_now, self._since_ns, min(doubts, default=None))
