@@ -1,9 +1,10 @@
 """A bare absolute-sleep loop in a process of its own, in the flight's place: what the machine itself stalls.
 
 It does what the least C program would: clock_nanosleep with TIMER_ABSTIME to the next slot, and notes when it
-woke. Its slots lie on the multiples of the period in CLOCK_MONOTONIC, as those of a flight in real time do.
+woke, and how much processor time the machine's host had given to others by then. Its slots lie on the
+multiples of the period in CLOCK_MONOTONIC, as those of a flight in real time do.
 Run as `python -m tests.bench.bare_loop PERIOD_NS PRIORITY FILE`, under SCHED_FIFO with a priority above zero.
-At SIGTERM it writes when it woke to the file, int64 monotonic ns.
+At SIGTERM it writes what it noted to the file: rows of two int64, monotonic ns and ns stolen since boot.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from array import array
 from pathlib import Path
 
 from hal.buses import real_time
+from tests.bench.process_watch import stolen_ns
 
 _CLOCK_MONOTONIC = 1
 _TIMER_ABSTIME = 1
@@ -27,8 +29,11 @@ class _Timespec(ctypes.Structure):
     _fields_ = (("seconds", ctypes.c_long), ("nanoseconds", ctypes.c_long))
 
 
-def loop(period_ns: int, wakes: array[int], stopped: list[int]) -> None:
-    """Wake at every slot until something is in `stopped`, and note when; what has passed is skipped."""
+def loop(period_ns: int, noted: array[int], stopped: list[int]) -> None:
+    """Wake at every slot until something is in `stopped`, and note when and what was stolen by then.
+
+    What has passed is skipped.
+    """
     nanosleep = ctypes.CDLL(None).clock_nanosleep
     deadline = _Timespec()
     slot = time.monotonic_ns() // period_ns + 1
@@ -36,14 +41,14 @@ def loop(period_ns: int, wakes: array[int], stopped: list[int]) -> None:
         deadline.seconds, deadline.nanoseconds = divmod(slot * period_ns, _SECOND_NS)
         if nanosleep(_CLOCK_MONOTONIC, _TIMER_ABSTIME, ctypes.byref(deadline), None) == 0:
             now_ns = time.monotonic_ns()
-            wakes.append(now_ns)
+            noted.extend((now_ns, stolen_ns()))
             slot = now_ns // period_ns + 1
 
 
 def _serve(words: list[str]) -> None:
     """Loop until SIGTERM, then write what was noted."""
     period_ns, priority, path = int(words[0]), int(words[1]), Path(words[2])
-    wakes: array[int] = array("q")
+    noted: array[int] = array("q")
     stopped: list[int] = []
     signal.signal(signal.SIGTERM, lambda number, _: stopped.append(number))
     if priority and (refusal := real_time.prioritise(0, priority)):
@@ -51,8 +56,8 @@ def _serve(words: list[str]) -> None:
     gc.disable()
     sys.stdout.write("looping\n")
     sys.stdout.flush()
-    loop(period_ns, wakes, stopped)
-    path.write_bytes(wakes.tobytes())
+    loop(period_ns, noted, stopped)
+    path.write_bytes(noted.tobytes())
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ import numpy as np
 
 from flight.telemetry.packets import to_text
 from flight.telemetry.reader import Run
-from tests.bench.lateness import Grid, lost_beyond, on_grid, slope_per_hour
+from tests.bench.lateness import Grid, on_grid, robbed, slope_per_hour, stalled
 from tests.bench.process_watch import MIB, Look
 from tests.guardian.live_flight import CoilTruth
 
@@ -51,11 +51,10 @@ class Began:
 
 @dataclass(frozen=True, slots=True)
 class Watched:
-    """Looks at the flight's processes; memory in bytes that others share with them; time stolen, s."""
+    """Looks at the flight's processes; memory in bytes that others share with them."""
 
     looks: list[Look]
     shared_with_others: float
-    stolen: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +79,9 @@ def evaluate(
     slots = cycles["cycle"].astype(np.int64)
     starts_ns = (first + slots) * PERIOD_NS + np.rint(1e9 * cycles["lateness"]).astype(np.int64)
     flight = on_grid(starts_ns, PERIOD_NS, first, int(slots[-1]) + 1)
-    machine = on_grid(np.fromfile(wakes, dtype=np.int64), PERIOD_NS, first, len(flight.lateness))
+    woke_ns, stolen_ns = np.fromfile(wakes, dtype=np.int64).reshape(-1, 2).T
+    machine = on_grid(woke_ns, PERIOD_NS, first, len(flight.lateness))
+    with_machine, by_host = stalled(machine), robbed(flight, woke_ns, stolen_ns)
     groups = run["rate_group"]
     control = groups[groups["name"] == b"control"][-1]
     figures: Figures = {
@@ -90,7 +91,11 @@ def evaluate(
         "lost": int(np.count_nonzero(flight.lost)),
         "lost_at_s": [round(float(slot) * PERIOD_NS * 1e-9, 3) for slot in np.flatnonzero(flight.lost)],
         "lost_by_bare_loop": int(np.count_nonzero(machine.lost)),
-        "lost_beyond_machine": lost_beyond(flight, machine),
+        "lost_with_bare_loop": int(np.count_nonzero(flight.lost & with_machine)),
+        "lost_while_stolen": int(np.count_nonzero(flight.lost & by_host)),
+        "lost_beyond_machine": int(np.count_nonzero(flight.lost & ~with_machine & ~by_host)),
+        "stolen_s": float(stolen_ns[-1] - stolen_ns[0]) * 1e-9,
+        "slots_stolen_from": int(np.count_nonzero(by_host)),
         "overruns": int(control["overruns"]),
         "lateness_s": flight.figures(),
         "lateness_of_bare_loop_s": machine.figures(),
@@ -98,7 +103,6 @@ def evaluate(
             name: float(np.quantile(cycles["execution"], part))
             for name, part in (("p50", 0.5), ("p99", 0.99), ("max", 1.0))
         },
-        "stolen_s": watched.stolen,
         "ready_s": (began.ready_ns - began.exec_ns) * 1e-9,
         "processor_until_ready_s": began.processor_until_ready,
         "first_command_s": truth.driven_after(began.exec_ns),
@@ -210,9 +214,11 @@ def table(figures: Figures, name: str) -> str:
         measured = form.format(figures[key]).rstrip("%") if known else "not told"
         lines.append(f"{text:42}{asked:>10}{measured:>12}{'  MISSED' if key in wrong else ''}")
     lines += [
-        f"slots {figures['slots']}: lost {figures['lost']} (slips counted {figures['slips']}), by the bare "
-        f"loop {figures['lost_by_bare_loop']}; overruns {figures['overruns']}; "
-        f"stolen {figures['stolen_s']:.1f} s",
+        f"slots {figures['slots']}: lost {figures['lost']} (slips counted {figures['slips']}), of these "
+        f"{figures['lost_with_bare_loop']} with the bare loop, which lost {figures['lost_by_bare_loop']}, "
+        f"{figures['lost_while_stolen']} while the host took what makes a slot lost",
+        f"overruns {figures['overruns']}; taken by the host {figures['stolen_s']:.1f} s, as much as makes a "
+        f"slot lost in {figures['slots_stolen_from']} slots",
         f"processor time until READY {figures['processor_until_ready_s']:.2f} s",
         f"{'lateness, ms':24}" + "".join(f"{part:>10}" for part in late),
         f"{'  flight':24}" + "".join(f"{1e3 * value:10.3f}" for value in late.values()),

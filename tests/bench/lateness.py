@@ -43,14 +43,28 @@ def on_grid(starts_ns: Times, period_ns: int, first: int, count: int) -> Grid:
     return Grid(first, period_ns, lateness)
 
 
-def lost_beyond(flight: Grid, machine: Grid) -> int:
-    """Return how many slots the flight lost while the bare loop lost neither that one nor its neighbours.
+def stalled(machine: Grid) -> npt.NDArray[np.bool_]:
+    """Tell which slots the bare loop lost, itself or one of their neighbours.
 
     Neighbours count because a stall need not begin and end for both loops within the same slot: one of them
-    may still be at work, the other asleep. The grids must be the same.
+    may still be at work, the other asleep.
     """
-    near = np.convolve(machine.lost, np.ones(3), mode="same") > 0.5
-    return int(np.count_nonzero(flight.lost & ~near))
+    return np.asarray(np.convolve(machine.lost, np.ones(3), mode="same") > 0.5)
+
+
+def robbed(loop: Grid, noted_ns: Times, stolen_ns: Times) -> npt.NDArray[np.bool_]:
+    """Tell during which slots the host gave others what makes a slot lost, and half of how late it was.
+
+    A slot lasts from its predecessor's time to the look after it was served: `stolen_ns`, of all cores since
+    boot, was looked at when `noted_ns`.
+    """
+    due_ns = (loop.first + np.arange(len(loop.lateness))) * loop.period_ns
+    late_ns = 1e9 * np.minimum(loop.lateness, 60.0)
+    before = np.searchsorted(noted_ns, due_ns - loop.period_ns, side="right") - 1
+    after = np.searchsorted(noted_ns, due_ns + late_ns)
+    last = len(noted_ns) - 1
+    taken = stolen_ns[np.minimum(after, last)] - stolen_ns[np.maximum(before, 0)]
+    return np.asarray(2.0 * taken >= np.maximum(loop.period_ns, late_ns))
 
 
 def slope_per_hour(

@@ -127,9 +127,10 @@ def unshared(processes: Mapping[str, int]) -> float:
     return private + sum(of_files.values())
 
 
-def stolen() -> float:
-    """Return the processor time in s, of all cores since boot, that the machine's host gave to others."""
-    return int(Path("/proc/stat").read_text().split(maxsplit=9)[8]) / _TICKS
+def stolen_ns() -> int:
+    """Return the processor time, of all cores since boot, that the machine's host gave to others."""
+    with open("/proc/stat", "rb", buffering=0) as file:
+        return int(file.read(256).split(maxsplit=9)[8]) * (1_000_000_000 // _TICKS)
 
 
 def _processor(process: int) -> float:

@@ -25,7 +25,7 @@ from hal.buses.clock import SystemClock
 from tests.bench import bare_loop, process_watch
 from tests.bench.executive import Load, fly
 from tests.bench.executive_figures import ASKED, PERIOD_NS, SLOPE_SPAN, judged_slope, misses, table
-from tests.bench.lateness import Grid, lost_beyond, on_grid, slope_per_hour
+from tests.bench.lateness import Grid, on_grid, robbed, slope_per_hour, stalled
 from tests.bench.process_watch import MIB
 
 FIRST = 1000
@@ -63,7 +63,30 @@ def test_a_lost_slot_is_the_machines_only_when_the_bare_loop_lost_it_or_its_neig
     flight[6] = 15_000_000
     if machine_at is not None:
         machine[machine_at] = 14_000_000
-    assert lost_beyond(_grid(flight), _grid(machine)) == beyond
+    lost_beyond = np.count_nonzero(_grid(flight).lost & ~stalled(_grid(machine)))
+    assert lost_beyond == beyond
+
+
+@pytest.mark.parametrize(
+    ("late_ms", "taken_ms", "found"),
+    [
+        (15, 20, True),
+        (15, 10, False),
+        # Whoever is late for long of himself is not excused by the little that is always taken meanwhile.
+        (90, 40, False),
+        (90, 50, True),
+    ],
+)
+def test_a_slot_is_the_hosts_when_it_took_what_makes_it_lost(
+    late_ms: int, taken_ms: int, found: bool
+) -> None:
+    late = _IN_TIME.copy()
+    late[6] = late_ms * 1_000_000
+    noted_ns = (FIRST + np.arange(-2, 16)) * PERIOD_NS + 100_000
+    stolen_ns = 7_000_000_000 + np.where(np.arange(-2, 16) >= 7, taken_ms * 1_000_000, 0)
+    grid = _grid(late)
+    assert bool(robbed(grid, noted_ns, stolen_ns)[6]) is found
+    assert not robbed(grid, noted_ns, stolen_ns)[[0, 1, 2, 3, 4, 11]].any()
 
 
 def test_a_leak_is_seen_through_the_memory_of_jobs_that_come_and_go() -> None:
@@ -85,22 +108,25 @@ def test_a_flight_too_short_for_a_slope_has_none() -> None:
 
 
 def test_the_bare_loop_wakes_at_its_slots_and_never_before() -> None:
-    wakes: array[int] = array("q")
+    noted: list[tuple[int, int]] = []
     stopped: list[int] = []
 
     class Ending(array):  # type: ignore[type-arg]
-        def append(self, wake: int) -> None:
-            wakes.append(wake)
-            if len(wakes) == 20:
+        def extend(self, row: tuple[int, int]) -> None:  # type: ignore[override]
+            noted.append(row)
+            if len(noted) == 20:
                 stopped.append(1)
 
     begun = time.monotonic_ns()
     bare_loop.loop(5_000_000, Ending("q"), stopped)
-    assert len(wakes) == 20
-    slots = np.array(wakes) // 5_000_000
+    assert len(noted) == 20
+    wakes, stolen_ns = np.array(noted).T
+    slots = wakes // 5_000_000
     assert np.diff(slots).min() >= 1
     assert slots[0] > begun // 5_000_000
-    assert np.median(np.array(wakes) % 5_000_000) < 2_500_000
+    assert np.median(wakes % 5_000_000) < 2_500_000
+    # No more than all cores are there to be taken from.
+    assert 0 <= stolen_ns[-1] - stolen_ns[0] <= (os.cpu_count() or 1) * (wakes[-1] - wakes[0]) + 20_000_000
 
 
 def test_memory_that_a_process_touches_is_seen_and_its_processor_time_too() -> None:
