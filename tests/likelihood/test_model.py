@@ -72,6 +72,24 @@ def test_the_derivatives_are_those_of_brute_force(turn: list[float], star: list[
         assert np.linalg.norm(found - truth) < 0.02 * np.linalg.norm(truth)
 
 
+@pytest.mark.parametrize("turn", [0.9, 2.5])
+def test_the_pixels_of_a_bent_streak_are_named_once_by_lines_no_longer_than_they_need_be(turn: float) -> None:
+    """Through several diagonals: against the distance of every pixel from a path of thousands of instants."""
+    motion, star, width = Motion.steady(np.array([0.0, 0.02, turn])), np.array([231.3, 214.6]), 3.7
+    strips = cut_strips(_PINHOLE, motion, star[None], np.array([[-0.5, 0.5]]), width)
+    times = np.bincount(strips.index[strips.inside], minlength=320 * 320).reshape(320, 320)
+    time = np.linspace(-0.5, 0.5, 2000)
+    path = paths(_PINHOLE, motion, np.tile(star, (2000, 1)), time).position
+    row, column = np.indices((320, 320))
+    apart = np.full((320, 320), np.inf)
+    for x, y in path:
+        np.minimum(apart, np.hypot(column - x, row - y), out=apart)
+    assert times.max() == 1
+    assert np.count_nonzero(times[apart <= width - 0.1]) > 0.995 * np.count_nonzero(apart <= width - 0.1)
+    # At 45 deg a line is as long as the square root of two; near its ends a part is crossed more obliquely.
+    assert strips.index.shape[2] <= 2.0 * np.sqrt(2.0) * width + 4.0
+
+
 def test_a_short_bent_streak_is_summed_exactly() -> None:
     """Five px from the axis at a radian: no line at all."""
     motion, star = Motion.steady(np.array([0.0, 0.0, 1.0])), np.array([163.0, 155.0])

@@ -116,9 +116,9 @@ def joint_fit(camera: ExposedCamera, scene: Scene) -> Fit | None:
         done = iterate(camera, done.scene, camera.free, LAST, done.windows)
     if done is None or _beyond(done.scene.motion):
         return None
-    scene, windows = replace(done.scene, trusted=_trusted(camera, done)), done.windows
-    del done  # equations of tens of MB
-    done = iterate(camera, scene, camera.free, LAST, windows)
+    scene, windows = replace(done.scene, trusted=_trusted(camera, done)), [done.windows]
+    del done  # equations of tens of MB; the windows too are let go where new ones are cut
+    done = iterate(camera, scene, camera.free, LAST, windows.pop())
     if done is not None and camera.undecided and done.grows():
         done = iterate(replace(camera, growing=True), done.scene, GROWING, LAST, done.windows)
     return None if done is None or _beyond(done.scene.motion) else done

@@ -122,10 +122,13 @@ def _standing(
     count = np.searchsorted(row[by_row], row + FARTHEST) - first
     stronger = np.repeat(np.arange(len(row)), count)
     weaker = by_row[np.arange(len(stronger)) + np.repeat(first - np.cumsum(count) + count, count)]
+    # In a crowd there are hundreds of thousands of pairs: most are too far apart to share anything.
+    near = np.flatnonzero((stronger < weaker) & (np.abs(column[stronger] - column[weaker]) < grid.length))
+    stronger, weaker = stronger[near], weaker[near]
     there = column.astype(np.float64)
     share = shared(there[stronger], there[weaker], span[stronger], grid.length)
     share /= np.maximum(shared(there, there, span, grid.length), LEAST_SEEN)[stronger]
-    shading = np.flatnonzero((stronger < weaker) & (share > 0.0))
+    shading = np.flatnonzero(share > 0.0)
     stronger, weaker = stronger[shading], weaker[shading]
     share = share[shading] * profile((row[stronger] - row[weaker]) * ACROSS)
     begin = np.searchsorted(stronger, np.arange(len(row) + 1))

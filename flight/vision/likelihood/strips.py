@@ -2,8 +2,9 @@
 
 A path that runs more along the rows of the frame than across them is cut column by column, any other row by
 row; each line holds the pixels about its crossing. Ten lines make a block, over which the motion's
-sensitivity is linear. Long turns are divided in time, each part keeping the pixels nearest to it. The pixels
-stay as the fit moves; only their distances from the path are computed again.
+sensitivity is linear. Long turns are divided in time, and where the path comes to run rather along the other
+axis, each part keeping the pixels nearest to it. The pixels stay as the fit moves; only their distances from
+the path are computed again.
 """
 
 from __future__ import annotations
@@ -21,13 +22,22 @@ from flight.vision.likelihood.motion import Motion, Paths, paths, positions
 LINES = 10
 """Lines in a block."""
 
-LONGEST_TURN = 0.6
-"""A part of a path turns by no more than this, rad, so that it stays monotonic along its major axis."""
+STEEPEST = 0.68
+"""No path crosses its lines more obliquely: cosine to their normal, a little below that of both diagonals."""
 
+# A part of a path turns by no more than this, rad, so that it stays monotonic along its major axis.
+_LONGEST_TURN = 1.1
 _SAMPLES = 17
+_DIAGONAL = 1.03
+# Instants of a part at which it is asked how its path runs.
+_INSTANTS = 7
 _SLOWEST = 1e-3
-# How exactly, px, two parts agree on which of them a pixel is nearest to.
-_SEAM = 0.03
+# A line within reach of a part, beyond its end, may be crossed as obliquely as this.
+_MOST_BENT = 0.5
+# How exactly, px, two parts of a straight path agree on which of them a pixel is nearest to; of a bent one
+# less exactly, by this part of the third power of the width over the square of the radius.
+_SEAM = 0.003
+_ARC = 0.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,7 +71,7 @@ def cut_strips(
     pinhole: Pinhole, motion: Motion, stars: FloatArray, times: FloatArray, width: float
 ) -> Strips:
     """Return the pixels within `width` px of the paths of stars (n, 2) between `times` (n, 2), exposures."""
-    part, low, high, outer = _parts(motion, times)
+    part, low, high, outer = _parts(pinhole, motion, stars, times)
     reach = 1.45 * width + 1.0
     begin = low - reach / _speed(paths(pinhole, motion, stars[part], low))
     end = high + reach / _speed(paths(pinhole, motion, stars[part], high))
@@ -101,15 +111,45 @@ class _Lines:
     along_rows: BoolArray
 
 
-def _parts(motion: Motion, times: FloatArray) -> tuple[IntArray, FloatArray, FloatArray, BoolArray]:
+def _parts(
+    pinhole: Pinhole, motion: Motion, stars: FloatArray, times: FloatArray
+) -> tuple[IntArray, FloatArray, FloatArray, BoolArray]:
     """Return the parts' stars, start and end times, and which of those two are ends of the path (.., 2)."""
     turned = float(np.linalg.norm(motion.turn)) + float(np.linalg.norm(motion.growth))
-    pieces = max(1, math.ceil(turned * float(np.max(times[:, 1] - times[:, 0], initial=0.0)) / LONGEST_TURN))
+    pieces = max(1, math.ceil(turned * float(np.max(times[:, 1] - times[:, 0], initial=0.0)) / _LONGEST_TURN))
     edges = times[:, :1] + (times[:, 1:] - times[:, :1]) * np.linspace(0.0, 1.0, pieces + 1)
     part = np.repeat(np.arange(len(times)), pieces)
-    outer = np.zeros((len(times), pieces, 2), dtype=np.bool_)
-    outer[:, 0, 0] = outer[:, -1, 1] = True
-    return part, edges[:, :-1].reshape(-1), edges[:, 1:].reshape(-1), outer.reshape(-1, 2)
+    low, high = edges[:, :-1].reshape(-1), edges[:, 1:].reshape(-1)
+    owner, diagonal = _diagonals(pinhole, motion, stars[part], low, high)
+    star, edge = np.append(np.repeat(np.arange(len(times)), pieces + 1), part[owner]), edges.reshape(-1)
+    edge = np.append(edge, diagonal)
+    order = np.lexsort((edge, star))
+    star, edge = star[order], edge[order]
+    begin = np.flatnonzero(star[1:] == star[:-1])
+    part, low, high = star[begin], edge[begin], edge[begin + 1]
+    return part, low, high, np.stack([low == times[part, 0], high == times[part, 1]], axis=-1)
+
+
+def _diagonals(
+    pinhole: Pinhole, motion: Motion, stars: FloatArray, low: FloatArray, high: FloatArray
+) -> tuple[IntArray, FloatArray]:
+    """Return which parts (n,) to divide, and when: where they run as much along the rows as across them.
+
+    Those that keep to one axis need it not; `stars` (n, 2) and `low` to `high` (n,) are the parts'.
+    """
+    instants = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, _INSTANTS)
+    path = paths(pinhole, motion, np.repeat(stars, _INSTANTS, axis=0), instants.reshape(-1))
+    way = np.abs(path.velocity.reshape(-1, _INSTANTS, 2))
+    major = way.sum(axis=1).argmax(axis=1)[:, None]
+    steep = np.where(major, way[..., 1], way[..., 0]) < STEEPEST * np.hypot(way[..., 0], way[..., 1])
+    divided = np.flatnonzero(steep.any(axis=1))
+    # Not just at 45 deg: the seam would be along a diagonal of pixels, of which all might be lost.
+    excess = way[divided, :, 0] - _DIAGONAL * way[divided, :, 1]
+    which, before = np.nonzero((excess[:, 1:] < 0.0) != (excess[:, :-1] < 0.0))
+    first, last = excess[which, before], excess[which, before + 1]
+    which = divided[which]
+    begin, end = instants[which, before], instants[which, before + 1]
+    return which, begin + (end - begin) * first / (first - last)
 
 
 def _crossings(major: FloatArray, sampled: FloatArray, line: IntArray, owner: IntArray) -> FloatArray:
@@ -140,7 +180,7 @@ def _pixels(
     bent = path.acceleration.reshape(*shape, 2)
     bend = (bent[..., 1] * tangent[..., 0] - bent[..., 0] * tangent[..., 1]) / speed**2
     crossing = np.where(along, position[..., 1], position[..., 0])
-    steep = np.maximum(np.abs(np.where(along, tangent[..., 0], tangent[..., 1])), 0.2)
+    steep = np.maximum(np.abs(np.where(along, tangent[..., 0], tangent[..., 1])), _MOST_BENT)
     half = math.ceil(float(np.max(np.where(lines.real, width / steep, 0.0), initial=0.0)))
     minor = np.rint(crossing).astype(np.int64) - half
     corner = np.stack([np.where(along, lines.line, minor), np.where(along, minor, lines.line)], axis=-1)
@@ -153,7 +193,7 @@ def _pixels(
     foot = np.divide(ahead, pace, out=ahead)
     foot += lines.time.astype(np.float32)
     # Between two parts a pixel may be lost, but none is counted twice.
-    seam, room = _SEAM / speed, width / speed
+    seam, room = (_SEAM + _ARC * width**3 * np.square(bend)) / speed, width / speed
     start = low[lines.part, None] + np.where(outer[lines.part, :1], -room, seam)
     stop = high[lines.part, None] - np.where(outer[lines.part, 1:], -room, seam)
     offset = np.arange(2 * half + 1)
@@ -163,14 +203,17 @@ def _pixels(
     within &= foot < stop.astype(np.float32)
     within &= offset[:, None, None] >= np.where(lines.real, -minor, 2 * half + 1)
     within &= offset[:, None, None] < limit - minor
-    inside = np.ascontiguousarray(within.transpose(1, 2, 0))
+    # No longer lines than there is something on, and no blocks without.
+    told = np.flatnonzero(within.any(axis=(1, 2)))
+    used = np.flatnonzero(within.any(axis=(0, 2)))
+    begin, end = (int(told[0]), int(told[-1]) + 1) if len(told) else (0, 0)
+    inside = np.ascontiguousarray(within[begin:end, used].transpose(1, 2, 0))
+    corner, step = corner[used] + begin * step[used, None], step[used]
     first = corner[..., 1] * pinhole.columns + corner[..., 0]
-    index = first[..., None] + offset * (step[:, 1] * pinhole.columns + step[:, 0])[:, None, None]
+    next_pixel = (step[:, 1] * pinhole.columns + step[:, 0])[:, None, None]
+    index = first[..., None] + np.arange(end - begin) * next_pixel
     index *= inside
-    used = np.flatnonzero(inside.any(axis=(1, 2)))
-    return Strips(
-        count, lines.star[used], lines.time[used], corner[used], step[used], index[used], inside[used]
-    )
+    return Strips(count, lines.star[used], lines.time[used], corner, step, index, inside)
 
 
 def beside(

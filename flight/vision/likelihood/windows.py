@@ -13,7 +13,7 @@ from flight.vision.likelihood.motion import positions
 from flight.vision.likelihood.scene import Scene, path_lengths, window_times
 from flight.vision.likelihood.shutter import Shutter
 from flight.vision.likelihood.spot_model import Patches, cut_patches
-from flight.vision.likelihood.strips import LONGEST_TURN, Strips, cut_strips
+from flight.vision.likelihood.strips import STEEPEST, Strips, cut_strips
 
 # Paths shorter than this many widths are summed instant by instant.
 _SPOT_WIDTHS = 8.0
@@ -122,9 +122,7 @@ def window_areas(pinhole: Pinhole, scene: Scene, reach: float) -> FloatArray:
     step = np.abs(np.diff(there.reshape(n, _INSTANTS, 2), axis=1))
     lines = step.max(axis=2)
     steep = float(np.min(lines / np.maximum(np.hypot(step[..., 0], step[..., 1]), 1e-9)))
-    # A part of a path keeps one kind of line, as the camera's roll bends it.
-    bent = min(abs(float(scene.motion.turn[2])), LONGEST_TURN)
-    across = 2.0 * np.ceil(room / np.cos(np.arccos(min(steep, 1.0)) + 0.5 * bent)) + 1.0
+    across = 2.0 * np.floor(room / min(max(steep, STEEPEST), 1.0) + 0.5) + 1.0
     return np.asarray(across * (lines.sum(axis=1) * seen + 2.0 * room))
 
 
