@@ -76,4 +76,5 @@ class CoilCommands:
             most=most + sum(bounds.full_current[axis] for axis in free),
             at_rest=[axis for axis in range(3) if not sizes[:, axis].any() and axis not in known],
             driven=bool(sizes.any()),
+            spread=float(np.ptp(sizes.sum(axis=1))),
         )

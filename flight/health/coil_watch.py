@@ -186,7 +186,7 @@ class CoilWatch:
         self._look_at_legs(reading)
         if self._leg.is_at_work:
             self._unmixed_ns = reading.time_ns
-            if self._suspected_ns is None:
+            if self._suspected_ns is None and self._leg.suspicion:
                 self._suspect(self._leg.suspicion)
             return
         self._fresh = self._fresh + 1 if gap_ns < self._settings.window_ns else 1

@@ -5,7 +5,9 @@ across the coil, whichever leg it is; nor is there across that of a sound bridge
 too much or too little, all that is driven is put to rest: a current that stays is nobody's command. Then all
 bridges are braked at once, and if that ends it, they are let go one after the other: the one with which it
 comes back is broken. No coil but the broken one carries anything meanwhile; and where rest or brakes show
-nothing, as with a shorted coil or a monitor that lies, they are taken back.
+nothing, as with a shorted coil or a monitor that lies, they are taken back. Where commands come and go all
+the time, as in B-dot's windows, a conversion may be of the one or of the other and tells nothing: then there
+is a rest every few seconds without a suspicion, only to look.
 """
 
 from __future__ import annotations
@@ -22,6 +24,8 @@ _PATIENCE = 12
 """Conversions without agreement after which a step is given up."""
 _PAUSE = 50
 """Conversions after a rest that showed nothing before there may be another: control goes first."""
+_UNCLEAR = 20
+"""Conversions in a row that could have been of one command or of quite another, until one looks at rest."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +35,7 @@ class Supplied:
     Attributes:
         current: A, measured.
         least, most: A, that all sound coils would have drawn together.
+        spread: A, between the least and the most of what was commanded in its window.
         at_rest: the axes that were not driven and are not known to be broken.
         driven: whether any axis was driven.
     """
@@ -40,6 +45,7 @@ class Supplied:
     most: float
     at_rest: Sequence[int]
     driven: bool
+    spread: float = 0.0
 
 
 class _Step(Enum):
@@ -62,7 +68,7 @@ class StuckLeg:
     def __init__(self, excess: float) -> None:
         """Take how much more than is due, in A, only a fault can draw."""
         self._excess = excess
-        self._pause = 0
+        self._pause = self._unclear = 0
         self._high = self._short = self._normal = self._looks = 0
         self.begin_anew()
 
@@ -104,6 +110,10 @@ class StuckLeg:
         if self.is_at_work and self._looks > _PATIENCE:
             self._give_up()  # what comes and goes is no leg that is stuck
             return None
+        self._unclear = self._unclear + 1 if seen.spread > self._excess else 0
+        if self._unclear >= _UNCLEAR and self._step is _Step.WATCHING:
+            self._rest("")
+            return None
         if self._high >= _SURE:
             return self._judge_too_much(seen)
         if self._short >= _SURE and self._step is _Step.WATCHING:
@@ -128,6 +138,8 @@ class StuckLeg:
 
     def _judge_normal(self) -> None:
         match self._step:
+            case _Step.RESTING if not self.suspicion:
+                self.begin_anew()
             case _Step.RESTING:
                 self._pause = _PAUSE
                 self._give_up()

@@ -17,6 +17,7 @@ from sim_hal.faults.kinds import FaultKind
 from sim_hal.settings import FaultEntry
 from tests.campaigns.campaign import Result
 from tests.campaigns.fault_table import REACTION, own_events, part_of
+from tests.scenario.flights import demo_world
 
 DURATION = 26.0
 """s, of each flight."""
@@ -88,8 +89,11 @@ def _is_exercised(flown: Run, kind: FaultKind, at: float, end: float) -> bool:
     device, _, axis = kind.device.partition("-")
     if device in {"coil", "bridge"}:
         return _is_missed(control["current_written"][inside][:, "xyz".index(axis)], kind.kind)
-    if kind.name in {"pwm: stuck", "pwm: delayed", "pwm: bits", "monitor: wrong"}:
+    if kind.name in {"pwm: stuck", "pwm: delayed", "pwm: bits"}:
         return bool((written > DRIVEN).any(axis=1).sum() * CYCLE > 1.0)
+    if kind.name == "monitor: wrong":
+        asked = written.sum(axis=1)
+        return bool(_differs(asked, (kind.parameters["gain"].default or 0.0) * asked).sum() * CYCLE > 1.0)
     if kind.name == "monitor: delayed":
         return _is_behind(flown, kind, inside)
     if kind.kind == "upset" or device == "camera":
@@ -113,9 +117,9 @@ def _is_worker_met(flown: Run, kind: FaultKind, at: float, end: float) -> bool:
     mine = np.array([to_text(name) == kind.device for name in jobs["name"]], dtype=bool)
     if kind.kind == "endless":  # a job that was under way ran into its time limit
         return bool((mine & (when >= at) & (jobs["outcome"] == b"timed-out")).any())
-    # A result is told in a cycle after that in which the job was begun.
-    begun = CYCLE * np.floor((when - jobs["execution"]) / CYCLE + 1e-6)
-    return bool((mine & (begun >= at) & (when < end + 0.1)).any())
+    # A result is told when the latency that the world models for it has passed.
+    begun = when - getattr(demo_world().latency, kind.device)
+    return bool((mine & (begun >= at - 1e-6) & (begun < end)).any())
 
 
 def _is_behind(flown: Run, kind: FaultKind, inside: BoolArray) -> bool:
@@ -123,8 +127,12 @@ def _is_behind(flown: Run, kind: FaultKind, inside: BoolArray) -> bool:
     asked = np.abs(flown["control"]["current_written"]).sum(axis=1)
     behind = round((kind.parameters["delay"].default or 0.0) / CYCLE)
     before = np.concatenate([np.full(behind, asked[0]), asked[:-behind]])
-    strange = np.abs(asked - before) > OFF_SURELY + GAIN_ERROR * np.maximum(asked, before)
-    return bool((strange & inside).sum() * CYCLE > 1.0)
+    return bool((_differs(asked, before) & inside).sum() * CYCLE > 1.0)
+
+
+def _differs(one: FloatArray, other: FloatArray) -> BoolArray:
+    """Tell which supply currents (n,) A are further apart than the same one may be read twice."""
+    return np.asarray(np.abs(one - other) > OFF_SURELY + GAIN_ERROR * np.maximum(one, other))
 
 
 def _is_upset(flown: Run, device: str, at: float) -> bool:

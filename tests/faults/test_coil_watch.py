@@ -12,7 +12,7 @@ from flight.arrays import FloatArray
 from flight.health.coil_hypotheses import MEAN, NEWEST, Bounds, CoilFault, fits, foretell, supply_current
 from flight.health.coil_watch import CoilWatch, CoilWatchSettings
 from flight.health.stuck_leg import NONE, StuckLeg, Supplied
-from hal.interfaces.readings import PowerReading
+from hal.interfaces.readings import ImuReading, PowerReading
 from tests.faults.coil_bench import hold, observe
 
 TARGET = -0.6
@@ -127,6 +127,26 @@ def test_a_stuck_leg_of_an_axis_that_is_driven_is_told_from_one_that_carries_not
         leg.look(driven)
     asked.append(leg.rest)
     assert asked == [True, False, False], "nothing flows: another fault; and no second rest so soon"
+
+
+def windows(time: float, _: ImuReading) -> FloatArray:
+    """Return B-dot's currents of a body that turns fast: off and fully on, four times a second."""
+    return np.array([0.0 if time % 0.25 < 0.1 else FULL, 0.0, 0.0])
+
+
+def test_a_leg_stuck_high_that_drives_in_the_pauses_of_the_command_is_found() -> None:
+    """As much flows in the pauses as should flow between them: no conversion tells one from the other."""
+    seen = observe(windows, FAULT_AT + 7.0, [f"bridge-x: b-high @ {FAULT_AT}"])
+    assert [(axis, name) for _, axis, name in seen.found] == [("x", "HIGH")]
+    assert seen.watch.braked == (True, False, False)
+
+
+def test_to_look_at_rest_only_is_no_suspicion() -> None:
+    seen = observe(windows, 20.0)
+    assert seen.found == []
+    assert seen.suspicious == 0
+    on = np.abs(seen.carried[:, 0]) > 0.9 * FULL
+    assert 0.45 < np.mean(on) < 0.58, "of 0.6 a rest of half a second in five takes some"
 
 
 def test_a_rest_ends_when_the_monitor_falls_silent() -> None:
