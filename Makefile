@@ -19,7 +19,8 @@ demo: $(READY)  ## fly the 700 s step demonstration on simulated hardware and pr
 	$(RUN) -m flight run config/step_demo.yaml --out runs/demo
 	$(RUN) -m flight report runs/demo
 
-test: lint types arrows unit  ## every check
+test: $(READY)  ## every check, two at a time
+	@$(MAKE) --no-print-directory --jobs 2 lint types arrows unit
 
 lint: $(READY)  ## style
 	$(VENV)/bin/ruff check . && $(VENV)/bin/ruff format --check --quiet .

@@ -54,14 +54,14 @@ def true_ends(
         return out
     stars, light, times, length = stars[long], light[long], times[long], length[long]
     stretch = np.maximum(_STRETCH * length, _LEAST_STRETCH)
-    expected = _MIDDLE * light / length
+    expected = expected_brightness(light, length)
     away = _FROM_END + np.linspace(0.0, 1.0, _SAMPLES) * stretch[:, None]
     end = times.T.reshape(-1)
     velocity = paths(pinhole, motion, np.tile(stars, (2, 1)), end).velocity
     outward = np.repeat([-1.0, 1.0], len(stars)) / np.maximum(np.hypot(velocity[:, 0], velocity[:, 1]), 1e-3)
     delay = outward[:, None] * np.tile(away, (2, 1))
     time = np.concatenate([end[:, None] - delay, end[:, None] + delay])
-    mean, _ = _brightness(frame, pinhole, motion, np.tile(stars, (4, 1)), time)
+    mean, _ = brightness(frame, pinhole, motion, np.tile(stars, (4, 1)), time)
     within, beyond = mean.reshape(2, 2, -1)
     told = np.isfinite(within) & np.isfinite(beyond)
     true = (within > _HALF * expected) & (beyond < _HALF * expected)
@@ -89,8 +89,8 @@ def unbroken(
     share = (np.arange(_WITHIN * _WITHIN_SAMPLES) + 0.5) / (_WITHIN * _WITHIN_SAMPLES)
     time = times[:, :1] + (times[:, 1:] - times[:, :1]) * share
     each = np.repeat(stars, _WITHIN, axis=0)
-    mean, deviation = _brightness(frame, pinhole, motion, each, time.reshape(len(each), _WITHIN_SAMPLES))
-    expected = np.repeat(_MIDDLE * light / length, _WITHIN)
+    mean, deviation = brightness(frame, pinhole, motion, each, time.reshape(len(each), _WITHIN_SAMPLES))
+    expected = np.repeat(expected_brightness(light, length), _WITHIN)
     told = np.isfinite(mean) & (expected > _TELLING * deviation)
     dark = (told & (mean < _HALF * expected)).reshape(-1, _WITHIN).sum(axis=1)
     told_of = told.reshape(-1, _WITHIN).sum(axis=1)
@@ -98,7 +98,12 @@ def unbroken(
     return np.asarray(dark[judged] <= _DARK * told_of[judged], dtype=float)
 
 
-def _brightness(
+def expected_brightness(light: FloatArray, length: FloatArray) -> FloatArray:
+    """Return the mean counts (n,) that `brightness` finds on streaks of `light` (n,) and `length` (n,) px."""
+    return np.asarray(_MIDDLE * light / length)
+
+
+def brightness(
     frame: ExposedFrame, pinhole: Pinhole, motion: Motion, stars: FloatArray, time: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return the mean counts (n,) of pixels about a stretch of the path, at `time` (n, s), and its deviation.

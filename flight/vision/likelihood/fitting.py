@@ -9,6 +9,7 @@ import numpy as np
 from flight.arrays import BoolArray, IntArray
 from flight.vision.likelihood.agreement import Opinions, agreeing, opinions
 from flight.vision.likelihood.chains import close_by
+from flight.vision.likelihood.edges import stretched
 from flight.vision.likelihood.exposed_frame import Float32Array
 from flight.vision.likelihood.matched_filter import FaintStars, find_faint
 from flight.vision.likelihood.motion import Motion
@@ -48,15 +49,23 @@ def last_fit(camera: ExposedCamera, first: Fit) -> tuple[Fit | None, FaintStars]
     """Return the joint fit of the brightest stars, and the faint ones that it left to the matched filter.
 
     Where it comes far from `first`, the stars found along that motion are not where they seemed: once more.
+    So where the streaks do not end where it says: from where they do. One that they contradict again is none.
     """
+    other = None
     for _ in range(_MOST_REPEATS):
         done, faint = _fit_from(camera, first)
-        if done is None or not _far(camera, first.scene, done.scene):
+        if done is None:
             break
         leading = np.flatnonzero(done.scene.trusted)
-        leading = leading[np.argsort(-done.scene.light[leading], kind="stable")[: len(first.scene.light)]]
         scene = done.scene.select(leading)
+        other = stretched(camera, scene)
+        if other is None and not _far(camera, first.scene, scene):
+            break
+        scene = scene if other is None else other
+        scene = scene.select(np.argsort(-scene.light, kind="stable")[: len(first.scene.light)])
         first = replace(done, scene=scene, windows=camera.windows(scene))
+    else:
+        done = done if other is None else None
     return done, faint
 
 
