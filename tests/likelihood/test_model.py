@@ -72,6 +72,20 @@ def test_the_derivatives_are_those_of_brute_force(turn: list[float], star: list[
         assert np.linalg.norm(found - truth) < 0.02 * np.linalg.norm(truth)
 
 
+def test_a_path_reaches_beyond_both_its_ends_whatever_its_times() -> None:
+    """A rolling shutter's times are any numbers: the pixels about the last instant are as many as before."""
+    motion, star = Motion.steady(np.array([0.0, 0.04, 0.0])), np.array([160.0, 150.0])
+    rng = np.random.default_rng(11)
+    for begin, end in np.sort(rng.uniform(-0.55, 0.55, (200, 2)), axis=1):
+        if end - begin < 0.2:
+            continue
+        strips = cut_strips(_PINHOLE, motion, star[None], np.array([[begin, end]]), 3.7)
+        row, column = np.divmod(strips.index[strips.inside], 320)
+        ends = paths(_PINHOLE, motion, np.tile(star, (2, 1)), np.array([begin, end])).position[:, 0]
+        about = np.abs(row - 150.0) < 1.0
+        assert 2.0 * 3.7 - 2.0 <= np.ptp(column[about]) - np.ptp(ends) <= 2.0 * 3.7
+
+
 @pytest.mark.parametrize("turn", [0.9, 2.5])
 def test_the_pixels_of_a_bent_streak_are_named_once_by_lines_no_longer_than_they_need_be(turn: float) -> None:
     """Through several diagonals: against the distance of every pixel from a path of thousands of instants."""

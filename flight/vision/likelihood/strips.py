@@ -28,6 +28,7 @@ STEEPEST = 0.68
 # A part of a path turns by no more than this, rad, so that it stays monotonic along its major axis.
 _LONGEST_TURN = 1.1
 _SAMPLES = 17
+# Where a path is divided it runs by so much more along the rows than across them.
 _DIAGONAL = 1.03
 # Instants of a part at which it is asked how its path runs.
 _INSTANTS = 7
@@ -118,6 +119,7 @@ def _parts(
     turned = float(np.linalg.norm(motion.turn)) + float(np.linalg.norm(motion.growth))
     pieces = max(1, math.ceil(turned * float(np.max(times[:, 1] - times[:, 0], initial=0.0)) / _LONGEST_TURN))
     edges = times[:, :1] + (times[:, 1:] - times[:, :1]) * np.linspace(0.0, 1.0, pieces + 1)
+    edges[:, -1] = times[:, 1]  # to the last bit: it is told by that
     part = np.repeat(np.arange(len(times)), pieces)
     low, high = edges[:, :-1].reshape(-1), edges[:, 1:].reshape(-1)
     owner, diagonal = _diagonals(pinhole, motion, stars[part], low, high)
