@@ -51,7 +51,10 @@ def test_planner_and_vision_worked_beside_the_loop(flown: Run) -> None:
     jobs = flown["job_timing"]
     outcomes = {(to_text(job["name"]), to_text(job["outcome"])) for job in jobs}
     assert outcomes == {("planner", "done"), ("vision", "done")}
-    assert flown["plan"]["accepted"].all()
+    plans = flown["plan"]
+    assert plans["accepted"][-1]
+    # A busy machine may be late with one, which is told and not flown.
+    assert all(status.startswith(b"late") for status in plans["status"][plans["accepted"] == 0])
     assert to_text(flown["streak"]["status"][0]) == "rate"
 
 
