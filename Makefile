@@ -35,7 +35,7 @@ unit: $(READY)  ## the tests, on all cores
 	$(RUN) -m pytest -n auto --dist loadfile
 
 pictures: $(READY)  ## the README's pictures
-	$(RUN) -m tests.pictures
+	$(RUN) -m tests.studies.pictures
 
 lock: $(READY)  ## write down the versions in use
 	$(VENV)/bin/pip freeze --exclude-editable > requirements.lock

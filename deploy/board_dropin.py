@@ -13,10 +13,10 @@ import string
 import sys
 from pathlib import Path
 
-from flight.commands.peers import peer_networks
-from flight.config import load
-from flight.errors import UsageError
-from flight.settings import Config, V4l2Device
+from flight.gnc.errors import UsageError
+from flight.schema.peers import peer_networks
+from flight.schema.reader import load
+from flight.schema.sections import Config, V4l2Device
 from hal.buses.i2c_bus import device_file
 
 SERIAL, VIDEO, I2C = ("ttyUSB", "ttyACM"), ("video4linux",), ()

@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from flight.config import load
+from flight.schema.reader import load
 
 
 def main(words: list[str]) -> None:
@@ -18,7 +18,7 @@ def main(words: list[str]) -> None:
     tracker = camera.star_tracker if camera is not None else None
     if tracker is None or tracker.index is not None:
         return
-    from flight.startracker.build import PATH, ensure_default_index  # noqa: PLC0415 - slow, and seldom needed
+    from flight.gnc.vision.startracker.index.build import PATH, ensure_default_index  # noqa: PLC0415
 
     if PATH.exists():
         return

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flight.arrays import FloatArray, Image
-from flight.catalogue import load
-from flight.settings import Camera, Config
+from flight.gnc.catalogue import load
+from flight.gnc.math.arrays import FloatArray, Image
+from flight.schema.sections import Camera, Config
 from hal.drivers.coil_settings import CoilSettings, CoilWiring
 from sim_hal.emulators.device import EmulatedDevice, SerialEnd
 from sim_hal.emulators.i2c_bus import EmulatedI2cBus
@@ -28,9 +28,9 @@ from sim_hal.emulators.vn100_sensors import NoiseProfile
 from sim_hal.faults.timeline import FaultTimeline
 from sim_hal.settings import Simulation, Sky
 from sim_hal.truth import TruthRecorder
-from sim_hal.world.coil_circuit import CoilCircuit
-from sim_hal.world.simulation import TimedSimulation
-from sim_hal.world.testbed import Testbed, TestbedModel
+from sim_hal.worlds.coil_circuit import CoilCircuit
+from sim_hal.worlds.simulation import TimedSimulation
+from sim_hal.worlds.testbed import Testbed, TestbedModel
 
 if TYPE_CHECKING:
     from sim_hal.star_camera import StarCameraModel

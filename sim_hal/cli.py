@@ -15,12 +15,12 @@ import numpy as np
 
 from hal.buses.clock import SystemClock
 from hal.interfaces.wires import Clock
-from sim_hal import serve_command
 from sim_hal.emulators.pty_line import PtyLine
 from sim_hal.emulators.vn100 import Vn100Emulator, Vn100EmulatorSettings
 from sim_hal.emulators.vn100_registers import BAUD_RATES
 from sim_hal.emulators.vn100_sensors import PROFILES
-from sim_hal.world.motion import Motion, about_thread
+from sim_hal.serving import command
+from sim_hal.worlds.motion import Motion, about_thread
 
 _LONGEST_WAIT_NS = 50_000_000
 
@@ -48,7 +48,7 @@ def _parser() -> argparse.ArgumentParser:
     emulate = commands.add_parser("emulate", help="serve one emulated device", description="Serve a device.")
     devices = emulate.add_subparsers(required=True, metavar="DEVICE")
     _add_vn100(devices)
-    serve_command.add_to(commands)
+    command.add_to(commands)
     return parser
 
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-from flight.settings import Config
-from flight.telemetry.log import FlightLog
+from flight.link.telemetry.log import FlightLog
+from flight.schema.sections import Config
 from hal.interfaces.wires import Wires
 from sim_hal.assembly import Hardware, assemble, fault_generator, line_generator
 from sim_hal.clock import SimClock

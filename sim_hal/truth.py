@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from flight.telemetry.definitions import TRUTH
-from flight.telemetry.packets import Packer
+from flight.link.telemetry.definitions import TRUTH
+from flight.link.telemetry.packets import Packer
 from sim_hal.emulators.device import NEVER
-from sim_hal.world.testbed import Testbed
+from sim_hal.worlds.testbed import Testbed
 
 PERIOD_NS = 25_000_000
 

@@ -7,10 +7,10 @@ from contextlib import ExitStack, nullcontext, suppress
 import numpy as np
 
 from flight.app.rig import Rig
-from flight.frames import NED_TO_TESTBED, attitude_map
-from flight.loop.surroundings import Devices
-from flight.quaternion import attitude_matrix
-from flight.settings import Config
+from flight.gnc.math.frames import NED_TO_TESTBED, attitude_map
+from flight.gnc.math.quaternion import attitude_matrix
+from flight.loop.services import Devices
+from flight.schema.sections import Config
 from hal.drivers.coil_settings import CoilSettings, CoilWiring
 from hal.drivers.coils import PwmTorqueCoils
 from hal.drivers.ina219 import Ina219

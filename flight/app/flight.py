@@ -8,22 +8,22 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from types import FrameType
 
-from flight import events
+from flight.app.accepted_config import FlownConfig
 from flight.app.linux import linux_rig
 from flight.app.mission_time import mission_zero, next_whole_second
-from flight.app.order import Order, Outcome
-from flight.app.ordered_config import ordered_config
 from flight.app.preparation import prepare
+from flight.app.request import Order, Outcome
+from flight.app.requested_config import ordered_config
 from flight.app.rig import Rig
 from flight.app.run_folder import begin_folder
 from flight.app.simulated import flown_faults, simulated_rig
-from flight.errors import UsageError
-from flight.kept_config import FlownConfig
+from flight.gnc.errors import UsageError
+from flight.loop.fdir import events
 from flight.loop.loop import FlightLoop
 from flight.loop.progress import Progress
 from flight.loop.run_label import RunLabel
-from flight.settings import Config
-from flight.state.opening import service_folder
+from flight.loop.state.opening import service_folder
+from flight.schema.sections import Config
 
 
 def fly(order: Order, progress: Callable[[Progress], None] | None = None) -> Outcome:

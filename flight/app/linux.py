@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 from contextlib import ExitStack, nullcontext, suppress
 
+from flight.app.build.settings import SECOND_NS
 from flight.app.rig import Rig
-from flight.composition import SECOND_NS
-from flight.errors import ConfigError
-from flight.settings import AravisDevice, Camera, Config, V4l2Device
-from flight.state.opening import state_folder
+from flight.gnc.errors import ConfigError
+from flight.loop.state.opening import state_folder
+from flight.schema.sections import AravisDevice, Camera, Config, V4l2Device
 from hal.buses.clock import SystemClock
 from hal.buses.i2c_bus import LinuxI2cBus
 from hal.buses.serial_port import PySerialPort

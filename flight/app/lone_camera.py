@@ -7,11 +7,11 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from flight.app.linux import linux_camera
-from flight.app.order import Order
-from flight.app.ordered_config import ordered_config
+from flight.app.request import Order
+from flight.app.requested_config import ordered_config
 from flight.app.simulated import simulated_camera
-from flight.errors import ConfigError
-from flight.settings import Camera
+from flight.gnc.errors import ConfigError
+from flight.schema.sections import Camera
 from hal.buses.clock import SystemClock
 from hal.interfaces.devices import FrameSource
 from hal.interfaces.wires import Clock

@@ -6,23 +6,23 @@ import os
 from contextlib import ExitStack
 from pathlib import Path
 
+from flight.app.build.workers import workers
 from flight.app.devices import open_devices
 from flight.app.rig import Rig
 from flight.app.run_folder import open_log
 from flight.app.watchers import start_guardian, supervise
-from flight.commands.channel import Channel, open_udp, open_unix
-from flight.commands.peers import peer_networks
-from flight.executive.jobs import JobResult, JobRunner
-from flight.executive.lockstep import LockStepRunner
-from flight.executive.processes import ProcessRunner
-from flight.health.board import Board
+from flight.gnc.vision.startracker.index.build import ensure_default_index
+from flight.link.commands.channel import Channel, open_udp, open_unix
+from flight.link.telemetry.log import FlightLog
+from flight.link.telemetry.recorder import Recorder
+from flight.loop.executive.jobs import JobResult, JobRunner
+from flight.loop.executive.lockstep import LockStepRunner
+from flight.loop.executive.processes import ProcessRunner
+from flight.loop.fdir.board import Board
 from flight.loop.loop import FlightLoop, nothing
-from flight.settings import Config
-from flight.startracker.build import ensure_default_index
-from flight.state.opening import open_state
-from flight.tasks.workers import workers
-from flight.telemetry.log import FlightLog
-from flight.telemetry.recorder import Recorder
+from flight.loop.state.opening import open_state
+from flight.schema.peers import peer_networks
+from flight.schema.sections import Config
 
 
 def prepare(

@@ -6,15 +6,15 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
-from flight.app.order import Order
+from flight.app.build.settings import SECOND_NS
+from flight.app.request import Order
 from flight.app.rig import Rig
 from flight.app.utc_label import utc_text
-from flight.composition import SECOND_NS
-from flight.errors import UsageError
-from flight.settings import Config
-from flight.telemetry.archive import DISK_TROUBLE, begin_run
-from flight.telemetry.log import FlightLog
-from flight.telemetry.segments import open_segment
+from flight.gnc.errors import UsageError
+from flight.link.telemetry.archive import DISK_TROUBLE, begin_run
+from flight.link.telemetry.log import FlightLog
+from flight.link.telemetry.segments import open_segment
+from flight.schema.sections import Config
 
 
 def default_folder(config_path: Path) -> Path:

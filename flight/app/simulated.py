@@ -12,12 +12,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from flight import config as configuration
-from flight.app.order import Order
+from flight.app.build.settings import SECOND_NS
+from flight.app.request import Order
 from flight.app.rig import Rig
-from flight.composition import SECOND_NS
-from flight.errors import UsageError
-from flight.settings import Config
+from flight.gnc.errors import UsageError
+from flight.schema import reader as configuration
+from flight.schema.sections import Config
 from hal.guardian.client import CoilReach
 from hal.interfaces.devices import FrameSource
 from hal.interfaces.wires import Clock
@@ -89,7 +89,7 @@ def _simulation_section(text: str, config_path: Path) -> Any:
 def _served_rig(order: Order, config: Config, section: Any, stack: ExitStack) -> Rig:
     """Return devices in a process of their own, in real time."""
     schedule = importlib.import_module("sim_hal.faults.schedule").scheduled
-    remote = importlib.import_module("sim_hal.remote")
+    remote = importlib.import_module("sim_hal.serving.remote")
     if order.devices is not None:
         served = stack.enter_context(remote.running(order.devices))
     else:

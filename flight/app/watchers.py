@@ -6,11 +6,11 @@ import os
 import threading
 from contextlib import ExitStack
 
-from flight import events
 from flight.app.rig import Rig
-from flight.executive import memory
-from flight.supervision import Supervision
-from flight.telemetry.recorder import Recorder
+from flight.link.telemetry.recorder import Recorder
+from flight.loop.executive import memory
+from flight.loop.fdir import events
+from flight.loop.fdir.supervision import Supervision
 from hal.buses import real_time
 from hal.buses.service_manager import ServiceManager
 from hal.drivers.coil_settings import DEVICE as COILS

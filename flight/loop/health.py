@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from flight.executive.rate_group import RateGroup
-from flight.health.progress import GroupsAndWorkers
-from flight.health.resources import ClockWatch, ResourceMonitor
-from flight.loop.rooms import LoopRooms
-from flight.loop.surroundings import Surroundings
-from flight.settings import Config
-from flight.tasks.health_watch import HealthRooms, HealthWatch
-from flight.tasks.workers import worker_watches
+from flight.app.build.tasks import LoopRooms
+from flight.app.build.workers import worker_watches
+from flight.loop.executive.rate_group import RateGroup
+from flight.loop.fdir.health_watch import HealthRooms, HealthWatch
+from flight.loop.fdir.progress import GroupsAndWorkers
+from flight.loop.fdir.resources import ClockWatch, ResourceMonitor
+from flight.loop.services import Surroundings
+from flight.schema.sections import Config
 
 
 def health_watch(

@@ -8,27 +8,27 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 
-from flight import events
-from flight.believed_plant import plant_of
-from flight.commands.channel import Channel
-from flight.composition import SECOND_NS, attitude_filter
-from flight.events import EventKind, EventLog
-from flight.executive.executive import Executive
-from flight.executive.jobs import JobRunner
-from flight.executive.rate_group import Cycle
-from flight.health.facts import Facts
-from flight.health.resources import ResourceReader
-from flight.health.streams import Streams, streams_of
+from flight.app.build.settings import SECOND_NS, attitude_filter
+from flight.app.build.tasks import build_rooms
+from flight.bodies.testbed.plant_model import plant_of
+from flight.link.commands.channel import Channel
+from flight.link.telemetry.recorder import Recorder
+from flight.loop.executive.executive import Executive
+from flight.loop.executive.jobs import JobRunner
+from flight.loop.executive.rate_group import Cycle
+from flight.loop.fdir import events
+from flight.loop.fdir.events import EventKind, EventLog
+from flight.loop.fdir.facts import Facts
+from flight.loop.fdir.resources import ResourceReader
+from flight.loop.fdir.streams import Streams, streams_of
 from flight.loop.health import health_watch
 from flight.loop.progress import Progress, progress_of
 from flight.loop.rate_groups import LoopTasks, rate_groups
-from flight.loop.rooms import build_rooms
 from flight.loop.run_label import RunLabel, record_run
-from flight.loop.surroundings import Devices, Surroundings
-from flight.settings import Config
-from flight.state.keeper import StateKeeper
-from flight.state.learning import learned_of
-from flight.telemetry.recorder import Recorder
+from flight.loop.services import Devices, Surroundings
+from flight.loop.state.keeper import StateKeeper
+from flight.loop.state.learning import learned_of
+from flight.schema.sections import Config
 from hal.interfaces.wires import Clock
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from flight.executive.rate_group import RateGroup
-from flight.loop.rooms import LoopRooms
+from flight.app.build.tasks import LoopRooms
+from flight.loop.executive.rate_group import RateGroup
 
 
 @dataclass(frozen=True, slots=True)

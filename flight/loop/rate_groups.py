@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from flight.composition import SECOND_NS
-from flight.executive.rate_group import RateGroup, Task
-from flight.loop.rooms import LoopRooms
-from flight.settings import Config
-from flight.tasks.performance import CONTROL
+from flight.app.build.settings import SECOND_NS
+from flight.app.build.tasks import LoopRooms
+from flight.loop.executive.rate_group import RateGroup, Task
+from flight.loop.performance import CONTROL
+from flight.schema.sections import Config
 
 HEALTH_PERIOD_NS = SECOND_NS // 4
 COMMAND_PERIOD_NS = SECOND_NS // 10

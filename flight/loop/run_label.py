@@ -6,9 +6,9 @@ import zlib
 from dataclasses import dataclass
 
 from flight import __version__
-from flight.settings import Config
-from flight.telemetry.definitions import RUN
-from flight.telemetry.recorder import Recorder
+from flight.link.telemetry.definitions import RUN
+from flight.link.telemetry.recorder import Recorder
+from flight.schema.sections import Config
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import erfcx
 
-from flight.earth import SEMI_MAJOR_AXIS
+from flight.gnc.earth.figure import SEMI_MAJOR_AXIS
 from hal.interfaces.errors import OutOfRange
 
 Float32Array = npt.NDArray[np.float32]

@@ -9,9 +9,9 @@ from typing import Any, Literal, Self
 
 import numpy as np
 
-from flight.arrays import FloatArray
-from flight.lens import CameraModel, Lens
-from flight.pinhole import Pinhole
+from flight.gnc.camera.lens import CameraModel, Lens
+from flight.gnc.camera.pinhole import Pinhole
+from flight.gnc.math.arrays import FloatArray
 from hal.interfaces.errors import OutOfRange
 
 DEVICE = "Earth camera model"
@@ -122,7 +122,8 @@ class EarthCameraModel:
         """Return the camera of Meller et al.: 512 x 512, 8 bits, logarithmic over six decades, 67 deg.
 
         `field_of_view` rad is the undistorted one, edge to edge; `k1`, `k2` and the axis's pixel `centre` are
-        those of `flight.lens.Lens`; `numbers` are other attributes, `response="linear"` among them.
+        those of `flight.gnc.camera.lens.Lens`; `numbers` are other attributes, `response="linear"` among
+        them.
         """
         rows, columns = int(numbers.get("rows", 512)), int(numbers.get("columns", 512))
         ideal = Pinhole.from_field_of_view(columns, rows, field_of_view)

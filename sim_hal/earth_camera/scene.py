@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from flight import quaternion
-from flight.arrays import FloatArray
-from flight.earth import semi_axes
+from flight.gnc.earth.figure import semi_axes
+from flight.gnc.math import quaternion
+from flight.gnc.math.arrays import FloatArray
 from hal.interfaces.errors import OutOfRange
 from sim_hal.earth_camera.atmosphere import Atmosphere
 

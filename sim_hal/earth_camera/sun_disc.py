@@ -8,10 +8,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import gaussian_filter
 
-from flight.arrays import FloatArray
-from flight.directions import tangent_basis
-from flight.lens import CameraModel
-from flight.sun import SUN_RADIUS
+from flight.gnc.camera.lens import CameraModel
+from flight.gnc.earth.sun import SUN_RADIUS
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.directions import tangent_basis
 from sim_hal.earth_camera.model import EarthCameraModel, pixel_rays
 from sim_hal.earth_camera.radiance import look
 from sim_hal.earth_camera.scene import EarthScene

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.arrays import FloatArray, Image
-from flight.quaternion import multiply
+from flight.gnc.math.arrays import FloatArray, Image
+from flight.gnc.math.quaternion import multiply
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.readings import Frame
 from sim_hal.emulators.device import NEVER
-from sim_hal.world.motion import Motion
+from sim_hal.worlds.motion import Motion
 
 SAMPLE_NS = 10_000_000
 

@@ -14,9 +14,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from flight.arrays import FloatArray
-from flight.frames import NED_TO_TESTBED
-from flight.quaternion import IDENTITY
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.frames import NED_TO_TESTBED
+from flight.gnc.math.quaternion import IDENTITY
 from hal.drivers.vn100.ascii import Checksum, Sentence, build, parse
 from sim_hal.emulators.device import NEVER, SerialEnd
 from sim_hal.emulators.vn100_outputs import (
@@ -44,7 +44,7 @@ from sim_hal.emulators.vn100_registers import (
     expect_count,
 )
 from sim_hal.emulators.vn100_sensors import IMU_RATE_HZ, PROFILES, Measured, NoiseProfile, Sensors
-from sim_hal.world.motion import Motion
+from sim_hal.worlds.motion import Motion
 
 TICK_NS = 1_000_000_000 // IMU_RATE_HZ
 _BILLION = 1_000_000_000

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.arrays import FloatArray
+from flight.gnc.math.arrays import FloatArray
 from sim_hal.emulators.vn100_sensors import Measured
-from sim_hal.world.motion import STANDARD_GRAVITY
+from sim_hal.worlds.motion import STANDARD_GRAVITY
 
 GRAVITY_NED: FloatArray = np.array([0.0, 0.0, STANDARD_GRAVITY])
 

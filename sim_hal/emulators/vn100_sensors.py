@@ -15,9 +15,9 @@ from typing import Literal
 
 import numpy as np
 
-from flight.arrays import FloatArray
-from flight.quaternion import attitude_matrix, conjugate, from_rotation_vector, multiply
-from sim_hal.world.motion import STANDARD_GRAVITY, Motion
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import attitude_matrix, conjugate, from_rotation_vector, multiply
+from sim_hal.worlds.motion import STANDARD_GRAVITY, Motion
 
 IMU_RATE_HZ = 800
 GAUSS_PER_TESLA = 1e4

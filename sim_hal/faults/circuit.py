@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from sim_hal.faults.bench import Bench, Lift
 from sim_hal.faults.kinds import FaultKind, Parameter, Parameters
-from sim_hal.world.coil_circuit import Condition
+from sim_hal.worlds.coil_circuit import Condition
 
 _OHM = Parameter(5.0, 0.1, 1000.0, "ohm")
 _COIL = (

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight import quaternion
-from flight.arrays import FloatArray
+from flight.gnc.math import quaternion
+from flight.gnc.math.arrays import FloatArray
 from hal.interfaces.errors import OutOfRange
 
 DEVICE = "star camera model"

@@ -9,8 +9,8 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from flight.arrays import FloatArray
-from flight.pinhole import Pinhole
+from flight.gnc.camera.pinhole import Pinhole
+from flight.gnc.math.arrays import FloatArray
 from hal.interfaces.errors import OutOfRange
 
 DEVICE = "star camera model"

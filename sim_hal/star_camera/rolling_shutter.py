@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.arrays import FloatArray, IntArray
-from flight.pinhole import Pinhole
+from flight.gnc.camera.pinhole import Pinhole
+from flight.gnc.math.arrays import FloatArray, IntArray
 from hal.interfaces.errors import OutOfRange
 from sim_hal.star_camera.exposure import Span, add_patches, path_lengths, spans, touches
 from sim_hal.star_camera.model import DEVICE

@@ -15,7 +15,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from tests.guardian.live_flight import ROOT, write_config
+from tests.hal.guardian.live_flight import ROOT, write_config
 
 LIMIT_S = 180.0
 _CGROUP = "knightcube-test"
@@ -192,7 +192,7 @@ def _write_i2cset(folder: Path) -> None:
         f"""#!{sys.base_prefix}/bin/python3 -ISE
 import json, os, sys
 sys.path.insert(0, {str(ROOT)!r})
-from sim_hal.device_link import open_bus
+from sim_hal.serving.device_link import open_bus
 _, yes, bus, address, register, value, mode = sys.argv
 assert (yes, bus, mode) == ("-y", "1", "b"), sys.argv
 chip = open_bus(json.load(open({_FACTS!r}))["socket"])

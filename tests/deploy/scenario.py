@@ -13,8 +13,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from sim_hal.device_link import RemoteI2cBus, open_bus
 from sim_hal.faults.host import corrupted
+from sim_hal.serving.device_link import RemoteI2cBus, open_bus
 from tests.deploy.container import COMMANDS
 
 SERVICE = "knightcube.service"

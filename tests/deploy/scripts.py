@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from flight.config import load
+from flight.schema.reader import load
 from tests.scenario.flights import CONFIG
 
 ROOT = CONFIG.parents[1]

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from flight.app.flight import fly
-from flight.app.order import Order
-from flight.errors import ConfigError
+from flight.app.request import Order
+from flight.gnc.errors import ConfigError
 from hal.interfaces.errors import NotResponding
 from tests.deploy.scripts import (
     DEPLOY,

@@ -7,17 +7,17 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from flight import config as configuration
 from flight.app import preparation
+from flight.app.build.settings import SECOND_NS
 from flight.app.mission_time import next_whole_second
 from flight.app.rig import Rig
 from flight.app.simulated import with_host_faults
-from flight.composition import SECOND_NS
+from flight.link.telemetry.packets import to_text
+from flight.link.telemetry.reader import Run, read_run
 from flight.loop.loop import FlightLoop
 from flight.loop.run_label import RunLabel
-from flight.settings import Config
-from flight.telemetry.packets import to_text
-from flight.telemetry.reader import Run, read_run
+from flight.schema import reader as configuration
+from flight.schema.sections import Config
 from sim_hal import lockstep
 from sim_hal.lockstep import LockStep
 from sim_hal.settings import Simulation

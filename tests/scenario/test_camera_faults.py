@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.config import replace
-from flight.telemetry.reader import Run
+from flight.link.telemetry.reader import Run
+from flight.schema.reader import replace
 from sim_hal.settings import FaultEntry
-from tests.campaigns.faults import config_for
 from tests.scenario.flights import demo_world, event_names, fly
+from tests.studies.campaigns.faults import config_for
 
 AT, SPAN = 3.0, 4.0
 ABOUT_VISION = {"camera-late", "camera-lost", "camera-strange", "camera-torn", "vision-slow", "vision-failed"}

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.arrays import FloatArray
-from flight.config import replace
-from flight.health.resources import ResourceSample
-from flight.modes.mode import Mode
-from flight.quaternion import attitude_matrix
-from flight.settings import Modes
-from flight.telemetry.packets import to_text
-from flight.telemetry.reader import Run
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import attitude_matrix
+from flight.link.telemetry.packets import to_text
+from flight.link.telemetry.reader import Run
+from flight.loop.fdir.resources import ResourceSample
+from flight.loop.modes.mode import Mode
+from flight.schema.reader import replace
+from flight.schema.sections import Modes
 from sim_hal.settings import FaultEntry
 from tests.scenario.flights import Rigged, demo_config, demo_world, event_names, fly
 from tests.scenario.test_modes import modes_of

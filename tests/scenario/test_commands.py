@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flight.commands.codec import ChangeMode, Clear, Command, CommandPacker, Ping, Slew
-from flight.modes.mode import Mode
-from flight.telemetry.packets import to_text
-from flight.telemetry.reader import Run
-from flight.telemetry.scanner import decode
+from flight.link.commands.codec import ChangeMode, Clear, Command, CommandPacker, Ping, Slew
+from flight.link.telemetry.packets import to_text
+from flight.link.telemetry.reader import Run
+from flight.link.telemetry.scanner import decode
+from flight.loop.modes.mode import Mode
 from tests.scenario.flights import Rigged, demo_config, event_names, fly
 from tests.scenario.test_modes import commanded, modes_of
 
@@ -107,7 +107,7 @@ def test_a_defect_of_a_command_is_contained(tmp_path: Path, monkeypatch: pytest.
     def fall(*_: object) -> str:
         raise ZeroDivisionError("a defect")
 
-    monkeypatch.setattr("flight.tasks.mode_control.ModeControl.command", fall)
+    monkeypatch.setattr("flight.loop.modes.control.ModeControl.command", fall)
     (hold,) = packed(ChangeMode(Mode.HOLD))
     run, _ = said(tmp_path, (1.0, hold))
     (row,) = run["command"]

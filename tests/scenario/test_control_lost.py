@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight import config as configuration
-from flight import report
-from flight.quaternion import from_rotation_vector, multiply
-from flight.settings import Config, Step
-from flight.telemetry.reader import Run
+from flight.gnc.math.quaternion import from_rotation_vector, multiply
+from flight.link.telemetry.reader import Run
+from flight.schema import reader as configuration
+from flight.schema.sections import Config, Step
+from ground import report
 from sim_hal.emulators.serial_line import SOUND, LineFaults
 from sim_hal.emulators.vn100_sensors import Measured
 from tests.scenario.flights import Rigged, demo_config, event_names, fly, thesis_config

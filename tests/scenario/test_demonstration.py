@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from flight import report
-from flight.telemetry.reader import Run, read_run
-from tests.campaigns.controllers import clairvoyant_power
+from flight.link.telemetry.reader import Run, read_run
+from ground import report
 from tests.scenario.flights import CONFIG, demo_config, demo_world, fly
+from tests.studies.campaigns.controllers import clairvoyant_power
 
 ROOT = CONFIG.parents[1]
 ORDINARY_PACE_S = 0.045

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.arrays import FloatArray
-from flight.config import replace
-from flight.telemetry.reader import Run
+from flight.gnc.math.arrays import FloatArray
+from flight.link.telemetry.reader import Run
+from flight.schema.reader import replace
 from sim_hal.emulators.serial_line import SOUND, LineFaults
 from sim_hal.settings import FaultEntry
 from tests.scenario.flights import Rigged, demo_config, demo_world, event_names, fly

@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flight import config as configuration
-from flight.arrays import FloatArray
-from flight.estimation.attitude_filter import AttitudeFilter
-from flight.modes.mode import Mode
-from flight.settings import Commands, CommandStep, Config, Step
-from flight.state.keeper import Notices, StateKeeper
-from flight.state.store import StateStore
-from flight.telemetry.packets import to_text
-from flight.telemetry.reader import Run
+from flight.gnc.estimation.attitude_filter import AttitudeFilter
+from flight.gnc.math.arrays import FloatArray
+from flight.link.telemetry.packets import to_text
+from flight.link.telemetry.reader import Run
+from flight.loop.modes.mode import Mode
+from flight.loop.state.keeper import Notices, StateKeeper
+from flight.loop.state.store import StateStore
+from flight.schema import reader as configuration
+from flight.schema.sections import Commands, CommandStep, Config, Step
 from sim_hal.clock import SimClock
 from sim_hal.emulators.serial_line import SOUND, LineFaults
 from sim_hal.settings import Release

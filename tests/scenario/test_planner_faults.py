@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight import config as configuration
-from flight.errors import PlanningError
-from flight.guidance import job as plan_job
-from flight.guidance.job import PlanJob
-from flight.guidance.path import PolynomialPath
-from flight.guidance.vmc import Plan
-from flight.guidance.vmc import plan as make_plan
-from flight.settings import Config, Step
-from flight.telemetry.packets import to_text
+from flight.gnc.errors import PlanningError
+from flight.gnc.guidance.one_axis import job as plan_job
+from flight.gnc.guidance.one_axis.job import PlanJob
+from flight.gnc.guidance.one_axis.path import PolynomialPath
+from flight.gnc.guidance.one_axis.vmc import Plan
+from flight.gnc.guidance.one_axis.vmc import plan as make_plan
+from flight.link.telemetry.packets import to_text
+from flight.schema import reader as configuration
+from flight.schema.sections import Config, Step
 from tests.scenario.flights import demo_config, event_names, fly, thesis_config
 
 DURATION = 24.0

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.telemetry.packets import to_text
-from flight.telemetry.reader import Run, read_run
+from flight.link.telemetry.packets import to_text
+from flight.link.telemetry.reader import Run, read_run
 from tests.scenario.flights import CONFIG, event_names
 
 ROOT = CONFIG.parents[1]

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flight import config as configuration
-from flight.arrays import FloatArray
-from flight.plant import angle_of
-from flight.settings import Config, Step
-from flight.telemetry.reader import Run
+from flight.gnc.guidance.one_axis.plant import angle_of
+from flight.gnc.math.arrays import FloatArray
+from flight.link.telemetry.reader import Run
+from flight.schema import reader as configuration
+from flight.schema.sections import Config, Step
 from tests.scenario.flights import Rigged, demo_config, event_names, fly, thesis_config
 
 

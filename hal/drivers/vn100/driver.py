@@ -2,7 +2,8 @@
 
 Attitude: the unit sends (q0, q1, q2, q3), scalar last, a Hamilton quaternion that rotates body into NED;
 by our convention the same four numbers rotate NED into the sensor. Two constant linear maps, given by whoever
-composes, take it to the mission's reference frame and the body's axes (`flight.frames.attitude_map`).
+composes, take it to the mission's reference frame and the body's axes
+(`flight.gnc.math.frames.attitude_map`).
 """
 
 from __future__ import annotations

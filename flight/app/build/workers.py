@@ -1,0 +1,32 @@
+"""The workers that a configuration needs, and for how long they may be busy."""
+
+from __future__ import annotations
+
+from flight.app.build.settings import SECOND_NS
+from flight.loop.executive.jobs import Worker
+from flight.gnc.guidance.one_axis import job as plan_job
+from flight.loop.fdir.progress import WorkerWatch
+from flight.schema.sections import (Config, Executive)
+from flight.gnc.vision.startracker import frame_job
+from flight.loop import imaging as imaging_task
+from flight.bodies.testbed import planning as planning_task
+from flight.loop.imaging import Imaging
+from flight.bodies.testbed.planning import Planning
+
+
+def workers(config: Config, planner_latency_ns: int = 0, vision_latency_ns: int = 0) -> list[Worker]:
+    """Return the workers that a configuration needs; latencies hold in lock-step simulation only."""
+    planner_timeout_ns = round(config.executive.planner_timeout * SECOND_NS)
+    vision_timeout_ns = round(config.executive.vision_timeout * SECOND_NS)
+    made = [Worker(planning_task.WORKER, plan_job.run, planner_latency_ns, planner_timeout_ns)]
+    if config.camera is not None:
+        made.append(Worker(imaging_task.WORKER, frame_job.run, vision_latency_ns, vision_timeout_ns))
+    return made
+
+
+def worker_watches(limits: Executive, planning: Planning, imaging: Imaging | None) -> list[WorkerWatch]:
+    """Return the workers with twice the time after which the runner kills them."""
+    busy = [(planning_task.WORKER, planning.busy_since_ns, limits.planner_timeout)]
+    if imaging is not None:
+        busy.append((imaging_task.WORKER, imaging.busy_since_ns, limits.vision_timeout))
+    return [WorkerWatch(name, since, round(2.0 * limit * SECOND_NS)) for name, since, limit in busy]

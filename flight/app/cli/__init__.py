@@ -1,0 +1,87 @@
+"""The command line: one module a command; a mistake of the user's is one line and exit status 2.
+
+Only the module of the command that was typed is imported: a board that flies has no use for the others.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import io
+import sys
+from collections.abc import Sequence
+from importlib import metadata
+
+from flight import __version__
+from flight.gnc.errors import FlightError, UsageError
+from hal.interfaces.errors import DeviceError
+
+COMMANDS = {"run": "fly a configuration"}
+"""What a board has; the packages of `GROUP` add theirs."""
+
+GROUP = "knightcube.commands"
+"""Entry points: each a table like `COMMANDS` in the package whose modules bear the commands' names."""
+
+_EXAMPLES = """\
+examples:
+  python -m flight run config/step_demo.yaml --out runs/demo
+  python -m flight report runs/demo
+  python -m flight plan --from 0.4 --to -0.3 --picture path.png
+  python -m flight rate frame.png --fov 20 --exposure 0.2 --overlay found.png
+  python -m flight solve night.jpg --fov 11.4 --overlay solved.png
+  python -m flight horizon limb.png --fov 67 --altitude 515 --overlay found.png
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; return the exit status: 0 done, 1 ran and failed, 2 wrong use."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # a file's name need not be a text
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    options = _parser(words).parse_args(words)
+    try:
+        status: int = options.command(options)
+    except UsageError as error:
+        return _complain(str(error), 2)
+    except (FlightError, DeviceError) as error:
+        return _complain(str(error), 1)
+    except BrokenPipeError:
+        return 1  # whoever read our output has read enough
+    except OSError as error:  # a name that no file can have, a folder that may not be entered
+        if error.filename is None:
+            return _complain(error.strerror or str(error), 1)
+        return _complain(f"{error.filename}: {error.strerror}", 2)
+    return status
+
+
+def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m flight",
+        description="The on-board application of the KnightCube.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"knightcube-flight {__version__}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    for name, (purpose, module) in _available(words).items():
+        command = commands.add_parser(name, help=purpose)
+        if words[:1] == [name]:
+            importlib.import_module(module).configure(command)
+    return parser
+
+
+def _available(words: Sequence[str]) -> dict[str, tuple[str, str]]:
+    """Return purpose and module of each command; a flight that starts looks for no others."""
+    own = {name: (purpose, f"{__name__}.{name}") for name, purpose in COMMANDS.items()}
+    if words and words[0] in own:
+        return own
+    others: dict[str, tuple[str, str]] = {}
+    for found in metadata.entry_points(group=GROUP):
+        table: dict[str, str] = found.load()
+        others |= {name: (purpose, f"{found.module}.{name}") for name, purpose in table.items()}
+    return own | others
+
+
+def _complain(message: str, status: int) -> int:
+    sys.stderr.write(f"flight: {message}\n")
+    return status

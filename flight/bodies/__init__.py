@@ -1,0 +1,1 @@
+"""The bodies that the loop can fly, each behind the same Protocols."""

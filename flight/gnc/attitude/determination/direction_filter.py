@@ -1,0 +1,267 @@
+"""The attitude determination of Fig. 3: gyros carry the attitude, every direction corrects it and their bias.
+
+The filter is the flight application's MEKF (`flight.gnc.estimation`), of a body free in orbit. It begins from
+the first two directions that fix an attitude well enough and agree; from then on each of Sun, nadir and field
+is
+taken when it comes, alone or not. The magnetometer's bias is estimated beside the gyros' (with the error that
+the field model has there, which changes no faster): sunlight finds it, eclipse lives from it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from scipy.special import chdtri
+
+from flight.gnc.attitude.determination.single_frame import Sight, field_sight, optimum
+from flight.gnc.attitude.wahba import AttitudeError, AttitudeFix
+from flight.gnc.estimation.attitude_filter import AttitudeFilter, FilterSettings
+from flight.gnc.estimation.estimate import FIELD_BIAS, TURN, Estimate
+from flight.gnc.estimation.measurements import (
+    AttitudeMeasurement,
+    DirectionMeasurement,
+    FieldMeasurement,
+    RateMeasurement,
+)
+from flight.gnc.estimation.rigid_body import RigidBody
+from flight.gnc.math.arrays import FloatArray
+
+FIELD = "field"
+_UNIT_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DeterminationSettings:
+    """What is known of the sensors and of the body.
+
+    Attributes:
+        inertia: (3, 3) kg m^2, body axes.
+        rate_sigma: rad/s of a gyro sample.
+        bias_start, bias_walk: rad/s and rad/s per sqrt(s), of the gyros.
+        field_sigma: T of a magnetometer sample.
+        field_bias_start, field_bias_walk: T and T per sqrt(s), of the magnetometer, hard iron and model.
+        disturbance_start, disturbance_walk: rad/s^2 and per sqrt(s), of all torques over the inertia.
+        start_sigma: rad, the attitude must be known so well on its worst axis to begin.
+        start_age: s, directions that old may still begin it together.
+        lost_sigma: rad, an estimate worse than this is given up: the filter is linear no more.
+        fresh: s, a sensor not taken in for so long is out of use.
+        gate_sigma: a measurement less likely than so many sigma is refused.
+        longest_step: s, of the filter.
+    """
+
+    inertia: FloatArray
+    rate_sigma: float
+    bias_start: float
+    bias_walk: float
+    field_sigma: float
+    field_bias_start: float
+    field_bias_walk: float
+    disturbance_start: float
+    disturbance_walk: float
+    start_sigma: float = math.radians(5.0)
+    start_age: float = 2.0
+    lost_sigma: float = math.radians(6.0)
+    fresh: float = 5.0
+    gate_sigma: float = 5.0
+    longest_step: float = 0.5
+
+
+class Status(Enum):
+    """What the attitude rests on."""
+
+    ACQUIRING = "acquiring"
+    """There is none: no two directions yet that fix one."""
+    OBSERVED = "observed"
+    """Two directions at least, the field among them or not, are coming in."""
+    AIDED = "aided"
+    """One direction is: the turn about it drifts with the gyros until the direction moves."""
+    COASTING = "coasting"
+    """None is: the gyros alone carry it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Report:
+    """The attitude at `time_ns` and what it is worth.
+
+    Attributes:
+        estimate: None while acquiring.
+        sigma: (3,) rad about the body's axes, infinite while acquiring.
+        in_use: the sensors taken in of late, gyros apart.
+    """
+
+    time_ns: int
+    status: Status
+    estimate: Estimate | None
+    sigma: FloatArray
+    in_use: frozenset[str]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Waiting:
+    """A direction that came before there was an attitude."""
+
+    time_ns: int
+    sight: Sight
+
+
+class AttitudeDetermination:
+    """Holds the filter, or the directions with which it will begin.
+
+    Attributes:
+        refused: how many measurements of each sensor did not pass their gate.
+        starts: how often it began.
+        nis: normalised innovation squared of the measurement last given, NaN when there was none.
+    """
+
+    def __init__(self, settings: DeterminationSettings) -> None:
+        self._settings = settings
+        self._body = RigidBody(settings.inertia, 0.0, np.zeros(3))
+        self._filter = self._new_filter()
+        self._waiting: dict[str, _Waiting] = {}
+        self._taken_ns: dict[str, int] = {}
+        self._rate: RateMeasurement | None = None
+        self.refused: dict[str, int] = {}
+        self.starts = 0
+        self.nis = math.nan
+
+    def rate(self, time_ns: int, rate: FloatArray) -> None:
+        """Take in the gyros' rate (3,) rad/s, body axes."""
+        self.nis = math.nan
+        if not np.all(np.isfinite(rate)):
+            return
+        self._rate = RateMeasurement(time_ns, rate, self._settings.rate_sigma**2 * np.eye(3))
+        if self._filter.started:
+            self._take("gyro", self._rate)
+
+    def direction(
+        self, sensor: str, time_ns: int, observed: FloatArray, reference: FloatArray, covariance: FloatArray
+    ) -> None:
+        """Take in a direction: unit vectors (3,) in body and inertial axes, covariance (3, 3) rad^2, body.
+
+        `sensor` is any name but that of the field.
+        """
+        self.nis = math.nan
+        if not (_is_unit(observed) and _is_unit(reference) and np.all(np.isfinite(covariance))):
+            self._refuse(sensor)
+        elif self._filter.started:
+            self._take(sensor, DirectionMeasurement(time_ns, observed, reference, covariance))
+        else:
+            self._wait(sensor, time_ns, Sight(observed, reference, covariance))
+
+    def field(self, time_ns: int, field: FloatArray, reference: FloatArray) -> None:
+        """Take in the magnetometer's field (3,) T, body axes, where the model has `reference` (3,) T."""
+        self.nis = math.nan
+        settings = self._settings
+        if not (np.all(np.isfinite(field)) and np.all(np.isfinite(reference))):
+            self._refuse(FIELD)
+        elif self._filter.started:
+            covariance = settings.field_sigma**2 * np.eye(3)
+            self._take(FIELD, FieldMeasurement(time_ns, field, reference, covariance))
+        else:
+            # Its bias goes into the attitude it begins, and comes again with the next sample as if it were
+            # another's: twice the bias's sigma leaves that attitude with its own weight.
+            spread = settings.field_sigma**2 + (2.0 * settings.field_bias_start) ** 2
+            try:
+                self._wait(FIELD, time_ns, field_sight(field, reference, spread * np.eye(3)))
+            except AttitudeError:
+                self._refuse(FIELD)
+
+    def report(self, time_ns: int) -> Report:
+        """Return the attitude at `time_ns` and its accuracy there; one that is worth nothing is given up."""
+        fresh_ns = round(self._settings.fresh * 1e9)
+        in_use = frozenset(name for name, then in self._taken_ns.items() if time_ns - then <= fresh_ns)
+        estimate = self._filter.at(time_ns) if self._filter.started else None
+        if estimate is not None:
+            sigma = np.sqrt(np.diag(estimate.covariance)[TURN])
+            if float(np.max(sigma)) < self._settings.lost_sigma:
+                return Report(time_ns, _status(in_use), estimate, sigma, in_use)
+            self._filter = self._new_filter()
+        return Report(time_ns, Status.ACQUIRING, None, np.full(3, np.inf), in_use)
+
+    def _take(
+        self, sensor: str, measurement: RateMeasurement | DirectionMeasurement | FieldMeasurement
+    ) -> None:
+        if self._filter.measure(measurement):
+            if sensor != "gyro":
+                self._taken_ns[sensor] = max(measurement.time_ns, self._taken_ns.get(sensor, 0))
+        else:
+            self._refuse(sensor)
+        self.nis = self._filter.nis
+
+    def _refuse(self, sensor: str) -> None:
+        self.refused[sensor] = self.refused.get(sensor, 0) + 1
+
+    def _wait(self, sensor: str, time_ns: int, sight: Sight) -> None:
+        """Keep a direction, and begin if those at hand fix an attitude."""
+        self._waiting[sensor] = _Waiting(time_ns, sight)
+        oldest_ns = time_ns - round(self._settings.start_age * 1e9)
+        self._waiting = {name: w for name, w in self._waiting.items() if w.time_ns >= oldest_ns}
+        if self._rate is None or self._rate.time_ns < oldest_ns or len(self._waiting) < 2:
+            return
+        fix = begin([self._moved(waiting, time_ns) for waiting in self._waiting.values()])
+        if fix is None or float(np.max(np.diag(fix.covariance))) > self._settings.start_sigma**2:
+            return
+        attitude = AttitudeMeasurement(time_ns, fix.quaternion, fix.covariance)
+        self._filter = self._new_filter()
+        self._filter.start(attitude, self._rate)
+        self._taken_ns = {name: w.time_ns for name, w in self._waiting.items()}
+        self._waiting = {}
+        self.starts += 1
+
+    def _moved(self, waiting: _Waiting, time_ns: int) -> Sight:
+        """Return a direction as it may be at `time_ns`: the body has turned since, and nobody knows how."""
+        assert self._rate is not None
+        rate = float(np.linalg.norm(self._rate.rate)) + 3.0 * self._settings.bias_start
+        turned = rate * (time_ns - waiting.time_ns) * 1e-9
+        sight = waiting.sight
+        return Sight(sight.observed, sight.reference, sight.covariance + turned**2 * np.eye(3))
+
+    def _new_filter(self) -> AttitudeFilter:
+        settings = self._settings
+        return AttitudeFilter(
+            self._body,
+            FilterSettings(
+                current_noise=0.0,
+                control_period=1.0,
+                disturbance_walk=settings.disturbance_walk,
+                disturbance_start=settings.disturbance_start,
+                bias_walk=settings.bias_walk,
+                bias_start=settings.bias_start,
+                field_bias_start=settings.field_bias_start,
+                field_bias_walk=settings.field_bias_walk,
+                gate_sigma=settings.gate_sigma,
+                longest_step=settings.longest_step,
+            ),
+        )
+
+
+def begin(sights: Sequence[Sight], improbable: float = 1e-4) -> AttitudeFix | None:
+    """Return the attitude that directions fix, None when they fix none or contradict each other.
+
+    Their angles to each other must be those of their references: a chi-square of 2 n - 3 degrees of freedom.
+    """
+    try:
+        fix = optimum(sights)
+    except (AttitudeError, np.linalg.LinAlgError):
+        return None
+    return fix if 2.0 * fix.loss <= float(chdtri(2 * len(sights) - 3, improbable)) else None
+
+
+def field_bias(estimate: Estimate) -> tuple[FloatArray, FloatArray]:
+    """Return what the magnetometer reads too much, (3,) T body axes, and its sigmas (3,)."""
+    return estimate.field_bias, np.sqrt(np.diag(estimate.covariance)[FIELD_BIAS])
+
+
+def _status(in_use: frozenset[str]) -> Status:
+    if len(in_use) >= 2:
+        return Status.OBSERVED
+    return Status.AIDED if in_use else Status.COASTING
+
+
+def _is_unit(vector: FloatArray) -> bool:
+    # A NaN fails the comparison too.
+    return vector.shape == (3,) and abs(float(np.linalg.norm(vector)) - 1.0) <= _UNIT_TOLERANCE

@@ -1,0 +1,62 @@
+"""What Sun sensor, horizon cameras and magnetometer should see from where the satellite is, in ICRS.
+
+The Sun's place is ERFA's epv00 (Bretagnon's VSOP2000, 0.009" by 2030), from the satellite itself (9" of
+parallax) and aberrated by its motion (20.5" and 5"): the low-precision series of `flight.gnc.earth.sun`, 42"
+off, would show beside a sensor of 0.02 deg that is averaged over minutes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import erfa
+import numpy as np
+
+from flight.gnc.earth import geomagnetism
+from flight.gnc.earth.orbit_knowledge import OrbitState
+from flight.gnc.earth.orientation import terrestrial_time
+from flight.gnc.earth.sun import ASTRONOMICAL_UNIT, DAY, SUN_RADIUS
+from flight.gnc.math.arrays import FloatArray
+
+SPEED_OF_LIGHT = 299_792_458.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class References:
+    """Unit vectors (3,) of Sun and nadir, and the field (3,) T.
+
+    `nadir_sigma` rad an axis is of where one believes to be, `sun_radius` rad is half the Sun's disc.
+    """
+
+    sun: FloatArray
+    nadir: FloatArray
+    field: FloatArray
+    nadir_sigma: float
+    sun_radius: float
+
+
+def references(state: OrbitState) -> References:
+    """Return what there is to be seen from `state`. Raises GeomagneticError outside the model's years."""
+    sun, distance = sun_from(state.julian_date, state.position, state.velocity)
+    radius = float(np.linalg.norm(state.position))
+    return References(
+        sun,
+        state.nadir,
+        geomagnetism.field(state.julian_date, state.position),
+        state.sigma / radius,
+        float(np.arcsin(SUN_RADIUS / distance)),
+    )
+
+
+def sun_from(julian_date: float, position: FloatArray, velocity: FloatArray) -> tuple[FloatArray, float]:
+    """Return the Sun's apparent direction (3,), ICRS, and its distance in m.
+
+    Seen from `position` (3,) m that moves with `velocity` (3,) m/s about the Earth, at a Julian date UTC.
+    """
+    whole = np.floor(julian_date)
+    heliocentric, barycentric = erfa.epv00(whole, float(terrestrial_time(julian_date)) - whole)
+    towards = -ASTRONOMICAL_UNIT * np.asarray(heliocentric["p"]) - position
+    distance = float(np.linalg.norm(towards))
+    moving = ASTRONOMICAL_UNIT / DAY * np.asarray(barycentric["v"]) + velocity
+    seen = towards / distance + moving / SPEED_OF_LIGHT
+    return np.asarray(seen / np.linalg.norm(seen)), distance

@@ -1,0 +1,50 @@
+"""ESOQ2, Mortari's Second Estimator of the Optimal Quaternion (Sease chapter 3, text at 3.23).
+
+Davenport's K has the optimal quaternion as eigenvector of its largest eigenvalue. ESOQ2 takes that eigenvalue
+from the characteristic polynomial and the rotation axis from a 3 x 3 singular matrix by cross products, so no
+matrix is decomposed. The axis is lost as the rotation tends to none: the frame after that half turn is taken
+which leaves B the least trace, and so the directions the most to turn (sequential rotation).
+
+References: Mortari, ESOQ-2 single-point algorithm, Advances in the Astronautical Sciences 95 (1997); Markley
+and Mortari, Quaternion attitude estimation using vector observations, J. Astronautical Sciences 48 (2000).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flight.gnc.attitude.adjugate import adjugate
+from flight.gnc.attitude.profile import by_eigenvalue, in_turned_frame, skew_part, traces
+from flight.gnc.attitude.wahba import AttitudeFix, fix, sightings
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import normalise
+
+
+def solve(observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> AttitudeFix:
+    """Return the attitude that best turns `reference` into `observed` (n, 3), errors `sigma` (n,) rad.
+
+    Raises AttitudeError when fewer than two distinct directions are left to fix it.
+    """
+    seen = sightings(observed, reference, sigma)
+    return fix(seen, optimal_quaternion(seen.profile))
+
+
+def optimal_quaternion(profile: FloatArray) -> FloatArray:
+    """Return the optimal quaternion (4,) of an attitude profile matrix (3, 3) whose weights sum to one."""
+    widest = int(traces(profile).argmin())
+    return in_turned_frame(profile, lambda turned: by_eigenvalue(turned, _from_axis), widest)
+
+
+def _from_axis(profile: FloatArray, eigenvalue: float) -> FloatArray:
+    """Return the quaternion (4,) whose axis is the null vector of (t - l)(B + B^T - t - l) - z z^T.
+
+    That is symmetric of rank 2: the cross products of its rows, its adjugate's, all lie along the axis; the
+    longest is best.
+    """
+    trace = float(profile.trace())
+    z = skew_part(profile)
+    s = profile + profile.T - (trace + eigenvalue) * np.eye(3)
+    products = np.array(adjugate(((trace - eigenvalue) * s - np.outer(z, z)).tolist()))
+    axis = products[np.argmax(np.abs(products.diagonal()))]
+    axis = axis / np.linalg.norm(axis)
+    return normalise(np.append((eigenvalue - trace) * axis, z @ axis))

@@ -1,0 +1,45 @@
+"""FOAM, Markley's Fast Optimal Attitude Matrix (Michalski 3.4.6).
+
+The attitude matrix itself from B, its adjugate and the characteristic polynomial's largest root; no angle is
+singular.
+
+Reference: Markley, Attitude determination using vector observations: a fast optimal matrix algorithm,
+J. Astronautical Sciences 41 (1993).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flight.gnc.attitude.adjugate import adjugate, determinant
+from flight.gnc.attitude.profile import by_eigenvalue
+from flight.gnc.attitude.wahba import AttitudeFix, fix, sightings
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import from_matrix
+
+
+def solve(observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> AttitudeFix:
+    """Return the attitude that best turns `reference` into `observed` (n, 3), errors `sigma` (n,) rad.
+
+    Raises AttitudeError when the directions fix no attitude.
+    """
+    seen = sightings(observed, reference, sigma)
+    return fix(seen, optimal_quaternion(seen.profile))
+
+
+def optimal_quaternion(profile: FloatArray) -> FloatArray:
+    """Return the optimal quaternion (4,) of an attitude profile matrix (3, 3) whose weights sum to one."""
+    return by_eigenvalue(profile, _from_attitude_matrix)
+
+
+def _from_attitude_matrix(profile: FloatArray, eigenvalue: float) -> FloatArray:
+    """Return the quaternion (4,) of [(k + |B|^2) B + l adj(B)^T - B B^T B] / (k l - det B).
+
+    k = (l^2 - |B|^2)/2.
+    """
+    rows = profile.tolist()
+    cofactors = adjugate(rows)
+    square = float(np.vdot(profile, profile))
+    kappa = 0.5 * (eigenvalue**2 - square)
+    matrix = (kappa + square) * profile + eigenvalue * np.array(cofactors).T - profile @ profile.T @ profile
+    return from_matrix(matrix / (kappa * eigenvalue - determinant(rows, cofactors)))

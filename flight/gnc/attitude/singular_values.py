@@ -1,0 +1,31 @@
+"""The attitude (direction cosine) matrix by singular values of B (Michalski 80-84 corrected).
+
+A = U diag(1, 1, det U det V) V^T: the determinants stand in the middle once, so that A is a rotation.
+
+Reference: Markley, Attitude determination using vector observations and the singular value decomposition,
+J. Astronautical Sciences 36 (1988).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flight.gnc.attitude.wahba import AttitudeFix, fix, sightings
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import from_matrix
+
+
+def solve(observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> AttitudeFix:
+    """Return the attitude that best turns `reference` into `observed` (n, 3), errors `sigma` (n,) rad.
+
+    Raises AttitudeError when the directions fix no attitude.
+    """
+    seen = sightings(observed, reference, sigma)
+    return fix(seen, optimal_quaternion(seen.profile))
+
+
+def optimal_quaternion(profile: FloatArray) -> FloatArray:
+    """Return the optimal quaternion (4,) of an attitude profile matrix (3, 3)."""
+    u, _, vt = np.linalg.svd(profile)
+    u[:, 2] *= np.linalg.det(u) * np.linalg.det(vt)
+    return from_matrix(u @ vt)

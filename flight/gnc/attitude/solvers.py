@@ -1,0 +1,39 @@
+"""The attitude solvers by name, all of one signature, and the default (Michalski 3.4)."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from flight.gnc.attitude import davenport, esoq2, foam, olae, predictive, quest, singular_values, triad
+from flight.gnc.attitude.wahba import AttitudeFix
+from flight.gnc.math.arrays import FloatArray
+
+
+class Solver(Protocol):
+    """A way from directions to an attitude."""
+
+    def __call__(self, observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> AttitudeFix:
+        """Return the attitude that turns `reference` into `observed` (n, 3), errors `sigma` (n,) rad.
+
+        Raises AttitudeError when the directions fix no attitude.
+        """
+        ...
+
+
+SOLVERS: dict[str, Solver] = {
+    "davenport": davenport.solve,
+    "esoq2": esoq2.solve,
+    "foam": foam.solve,
+    "olae": olae.solve,
+    "predictive": predictive.solve,
+    "quest": quest.solve,
+    "svd": singular_values.solve,
+    "triad": triad.solve,
+}
+OPTIMAL = frozenset(SOLVERS) - {"olae", "triad"}
+DEFAULT = "davenport"
+
+
+def solve(observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> AttitudeFix:
+    """Return the default solver's attitude; arguments and exceptions as of every `Solver`."""
+    return SOLVERS[DEFAULT](observed, reference, sigma)

@@ -1,0 +1,1 @@
+"""Cameras as geometry, and image files as arrays."""

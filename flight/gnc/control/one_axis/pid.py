@@ -1,0 +1,71 @@
+"""A PID controller of the angle about the thread, for comparison (Sease 2013, ch. 5: 0.15 W on the testbed).
+
+Its gains are those of three poles at -w for a double integrator: 3 w, 3 w^2 and w^3 on rate, angle and its
+integral. The reference enters the proportional part by a weight b (two degrees of freedom, Astrom and
+Hagglund 1995, 3.4): with b = 0 a step of the target does not kick the coil and does not overshoot. The
+integral stops where the limit is in force and would be pushed further (conditional integration). It knows
+the ratio of inertia to torque constant, which scales the gains, and nothing else of the plant.
+"""
+
+from __future__ import annotations
+
+import math
+
+from flight.gnc.control.one_axis.controller import CoilCommand, attitude_error
+from flight.gnc.errors import UsageError
+from flight.gnc.guidance.one_axis.path import Sample
+from flight.gnc.guidance.one_axis.plant import SingleAxisPlant
+
+
+class PidController:
+    """Holds the integral of the error, rad s."""
+
+    def __init__(
+        self, plant: SingleAxisPlant, period: float, bandwidth: float, target_weight: float = 0.0
+    ) -> None:
+        """Place three poles at -`bandwidth` rad/s; `period` in s between commands.
+
+        Raises UsageError when a value is outside its range.
+        """
+        for name, value in (("period", period), ("bandwidth", bandwidth)):
+            if not (math.isfinite(value) and value > 0.0):
+                raise UsageError(f"PID {name} is {value}: it must be finite and positive")
+        if not 0.0 <= target_weight <= 1.0:
+            raise UsageError(f"PID target_weight is {target_weight}: it must lie between 0 and 1")
+        self._scale = plant.inertia / plant.torque_constant
+        self._limit = plant.current_limit
+        self._period = period
+        self._weight = target_weight
+        self._derivative, self._proportional, self._integral = (
+            3.0 * bandwidth,
+            3.0 * bandwidth**2,
+            bandwidth**3,
+        )
+        self._sum: float | None = None
+
+    def command(self, wanted: Sample, angle: float, rate: float, disturbance: float = 0.0) -> CoilCommand:
+        """Return the command at `angle` rad and `rate` rad/s; an estimated disturbance is not used.
+
+        Raises UsageError when an input is not finite.
+        """
+        error = attitude_error(wanted, angle, rate, disturbance)
+        # The whole target is in the integral; what of it is not in the proportional part is made up for
+        # there at the start, so that taking over at rest asks for no current.
+        unweighted = (1.0 - self._weight) * wanted.angle
+        if self._sum is None:
+            self._sum = self._proportional / self._integral * ((1.0 - self._weight) * angle)
+        total = self._sum + self._period * error
+        acceleration = (
+            self._proportional * (error - unweighted)
+            + self._integral * total
+            + self._derivative * (wanted.rate - rate)
+            + wanted.acceleration
+        )
+        made = CoilCommand.within(self._limit, self._scale * acceleration, error)
+        if not (made.saturated and made.demanded * error > 0.0):
+            self._sum = total
+        return made
+
+    def reset(self) -> None:
+        """Forget the integral."""
+        self._sum = None

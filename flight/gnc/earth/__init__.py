@@ -1,0 +1,1 @@
+"""The Earth around a satellite: figure, orientation, Sun, shadow, geomagnetic field, orbit."""

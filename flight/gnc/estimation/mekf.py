@@ -1,0 +1,98 @@
+"""The correction of a multiplicative extended Kalman filter, and the attitudes of the past that it keeps.
+
+The error of the attitude is a small turn about the body's axes (Lefferts, Markley and Shuster 1982), put into
+the quaternion at each correction and taken out of the covariance with the frame it was written in (Markley
+and Crassidis 2014, 6.2.4: the reset). The rate is a state of its own, driven by Euler's equation and not by
+the gyro: what the plant model knows makes the rate better than the gyro's. Attitudes of the past that are
+still needed stand behind the state (stochastic cloning, Roumeliotis and Burdick 2002).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flight.gnc.estimation.estimate import FIELD_BIAS, LATENCY
+from flight.gnc.estimation.innovation import Innovation
+from flight.gnc.estimation.measurements import MeanRateMeasurement
+from flight.gnc.estimation.rigid_body import Parameters
+from flight.gnc.estimation.state import SIZE, State, place_of
+from flight.gnc.estimation.turn import Vector, compose, exponential
+from flight.gnc.math.arrays import FloatArray
+
+
+def normalised_square(found: Innovation, covariance: FloatArray) -> tuple[float, FloatArray]:
+    """Return y^T S^-1 y, chi-square of as many degrees as y has components, and the gain P H^T S^-1."""
+    cross = covariance @ found.rows.T
+    weight = _inverted(found.rows @ cross + found.noise)
+    y = np.array(found.value)
+    return float(y @ weight @ y), cross @ weight
+
+
+def correct(
+    state: State, covariance: FloatArray, found: Innovation, gain: FloatArray
+) -> tuple[State, FloatArray]:
+    """Put the correction into the state; covariance in Joseph's form, symmetric and positive."""
+    keep = -(gain @ found.rows)
+    keep.reshape(-1)[:: len(keep) + 1] += 1.0
+    error = (gain @ np.array(found.value)).tolist()
+    # The reset: the turn that is left is written in axes turned by half the correction.
+    for first in (0, *range(SIZE, len(covariance), 3)):
+        x, y, z = error[first : first + 3]
+        reset = np.array(((1.0, 0.5 * z, -0.5 * y), (-0.5 * z, 1.0, 0.5 * x), (0.5 * y, -0.5 * x, 1.0)))
+        keep[first : first + 3] = reset @ keep[first : first + 3]
+        gain[first : first + 3] = reset @ gain[first : first + 3]
+    covariance = keep @ covariance @ keep.T + gain @ found.noise @ gain.T
+    covariance = 0.5 * (covariance + covariance.T)
+    corrected = State(
+        compose(exponential(*error[0:3]), state.quaternion),
+        _sum(state.rate, error[3:6]),
+        _sum(state.bias, error[6:9]),
+        _sum(state.disturbance, error[9:12]),
+        Parameters(*_sum(state.parameters, error[12:15])),
+        tuple(
+            (measurement, compose(exponential(*error[first : first + 3]), quaternion))
+            for first, (measurement, quaternion) in zip(range(SIZE, len(error), 3), state.kept, strict=True)
+        ),
+        state.latency + error[LATENCY],
+        _sum(state.field_bias, error[FIELD_BIAS]),
+    )
+    return corrected, covariance
+
+
+def keep_attitude(
+    state: State, covariance: FloatArray, measurement: MeanRateMeasurement
+) -> tuple[State, FloatArray]:
+    """Keep the attitude of now for the end of the exposure that begins here."""
+    pick = [*range(len(covariance)), 0, 1, 2]
+    kept = (*state.kept, (measurement, state.quaternion))
+    return state._replace(kept=kept), covariance[np.ix_(pick, pick)]
+
+
+def release_attitude(
+    state: State, covariance: FloatArray, measurement: MeanRateMeasurement
+) -> tuple[State, FloatArray]:
+    """Forget the attitude that was kept for this exposure."""
+    place = place_of(state, measurement)
+    first = SIZE + 3 * place
+    pick = [*range(first), *range(first + 3, len(covariance))]
+    kept = state.kept[:place] + state.kept[place + 1 :]
+    return state._replace(kept=kept), covariance[np.ix_(pick, pick)]
+
+
+def _sum(a: Vector, b: list[float]) -> Vector:
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+def _inverted(s: FloatArray) -> FloatArray:
+    """Return the inverse of a symmetric (1, 1), (2, 2) or (3, 3) matrix, by cofactors."""
+    if len(s) == 1:
+        return np.asarray(1.0 / s)
+    if len(s) == 2:
+        (a, b), (_, d) = s.tolist()
+        scale = 1.0 / (a * d - b * b)
+        return np.array(((scale * d, -scale * b), (-scale * b, scale * a)))
+    (a, b, c), (_, d, e), (_, _, f) = s.tolist()
+    ca, cb, cc = d * f - e * e, c * e - b * f, b * e - c * d
+    cd, ce, cf = a * f - c * c, b * c - a * e, a * d - b * b
+    scale = 1.0 / (a * ca + b * cb + c * cc)
+    return np.asarray(np.array(((ca, cb, cc), (cb, cd, ce), (cc, ce, cf))) * scale)

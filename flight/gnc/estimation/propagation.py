@@ -1,0 +1,126 @@
+"""How state and covariance are carried over time: Euler's equation, and the walks of what is not modelled.
+
+The error of the attitude is a small turn about the body's axes; attitudes kept stay what they were.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from flight.gnc.estimation.estimate import DISTURBANCE, FIELD_BIAS, LATENCY, PARAMETERS, RATE, TURN
+from flight.gnc.estimation.rigid_body import Linearised, RigidBody, Torquing
+from flight.gnc.estimation.state import SIZE, State
+from flight.gnc.estimation.turn import Vector, compose, exponential
+from flight.gnc.math.arrays import FloatArray
+
+LONGEST_STEP = 0.025
+"""s: also without measurements no step is longer than in the testbed's loop, unless the filter is told so."""
+
+
+class ProcessNoise(NamedTuple):
+    """What drives the state beside the model: spectral densities.
+
+    `current` of one driven coil, A^2 s; `rate` (3, 3) rad^2/s^3; `walks` (6,) of bias (rad^2/s^3)
+    and disturbance (rad^2/s^5); `latency` of that, s; `field_bias` of that, T^2/s; `unknown_current` of each
+    coil while it is not known what they do, A^2 s.
+    """
+
+    current: float
+    rate: FloatArray
+    walks: FloatArray
+    latency: float = 0.0
+    field_bias: float = 0.0
+    unknown_current: float = 0.0
+
+
+def carry(
+    body: RigidBody,
+    noise: ProcessNoise,
+    state: State,
+    covariance: FloatArray,
+    torquing: Torquing,
+    duration: float,
+    longest_step: float = LONGEST_STEP,
+) -> tuple[State, FloatArray]:
+    """Carry state and covariance over `duration` s under one torquing, no step above `longest_step` s."""
+    steps = max(1, math.ceil(duration / longest_step - 1e-9))
+    for _ in range(steps):
+        state, covariance = _step(body, noise, state, covariance, torquing, duration / steps)
+    return state, covariance
+
+
+def _step(
+    body: RigidBody,
+    noise: ProcessNoise,
+    state: State,
+    covariance: FloatArray,
+    torquing: Torquing,
+    dt: float,
+) -> tuple[State, FloatArray]:
+    """Carry by one step of the midpoint rule; kept attitudes stay what they were."""
+    half = 0.5 * dt
+    wx, wy, wz = state.rate
+    middle = compose(exponential(half * wx, half * wy, half * wz), state.quaternion)
+    model = body.linearise(middle, state.rate, state.parameters, torquing, half)
+    ax, ay, az = (a + d for a, d in zip(model.acceleration, state.disturbance, strict=True))
+    moved = exponential(dt * (wx + half * ax), dt * (wy + half * ay), dt * (wz + half * az))
+    carried = State(
+        compose(moved, state.quaternion),
+        (wx + dt * ax, wy + dt * ay, wz + dt * az),
+        state.bias,
+        state.disturbance,
+        state.parameters,
+        state.kept,
+        state.latency,
+        state.field_bias,
+    )
+    transition = _transition(state.rate, model, dt)
+    if state.kept:
+        covariance = covariance.copy()
+        covariance[:SIZE] = transition @ covariance[:SIZE]
+        covariance[:, :SIZE] = covariance[:, :SIZE] @ transition.T
+    else:
+        covariance = transition @ covariance @ transition.T
+    _add_noise(covariance, noise, model.by_current, torquing, dt)
+    return carried, covariance
+
+
+def _transition(rate: Vector, model: Linearised, dt: float) -> FloatArray:
+    """Return I + F dt + (F dt)^2 / 2 of the error's dynamics: turn' = -w x turn + rate error, and so on."""
+    flow = _FLOW * dt
+    x, y, z = rate[0] * dt, rate[1] * dt, rate[2] * dt
+    flow[TURN, TURN] = ((0.0, z, -y), (-z, 0.0, x), (y, -x, 0.0))
+    flow[RATE, TURN] = model.by_turn * dt
+    flow[RATE, RATE] = model.by_rate * dt
+    flow[RATE, PARAMETERS] = np.array(model.by_parameters) * dt
+    return np.asarray(_IDENTITY + flow + 0.5 * (flow @ flow))
+
+
+def _add_noise(
+    covariance: FloatArray, noise: ProcessNoise, by_current: FloatArray, torquing: Torquing, dt: float
+) -> None:
+    """Add what white angular acceleration and the two walks make in dt, in place."""
+    density = noise.rate
+    if noise.current and any(torquing.driven):
+        density = density + noise.current * ((by_current * torquing.driven) @ by_current.T)
+    if not torquing.known:
+        density = density + noise.unknown_current * (by_current @ by_current.T)
+    cross = (0.5 * dt * dt) * density
+    covariance[TURN, TURN] += (dt**3 / 3.0) * density
+    covariance[TURN, RATE] += cross
+    covariance[RATE, TURN] += cross
+    covariance[RATE, RATE] += dt * density
+    stride = len(covariance) + 1
+    covariance.reshape(-1)[6 * stride : 12 * stride : stride] += dt * noise.walks
+    covariance[LATENCY, LATENCY] += dt * noise.latency
+    if noise.field_bias:
+        covariance[FIELD_BIAS, FIELD_BIAS] += dt * noise.field_bias * _IDENTITY[FIELD_BIAS, FIELD_BIAS]
+
+
+_IDENTITY: FloatArray = np.eye(SIZE)
+_FLOW: FloatArray = np.zeros((SIZE, SIZE))
+_FLOW[TURN, RATE] = np.eye(3)
+_FLOW[RATE, DISTURBANCE] = np.eye(3)

@@ -1,0 +1,128 @@
+"""Measurements applied one after another from a checkpoint on: at once, or a few at a time.
+
+A measurement that comes late makes all those after it be applied once more. A second of them costs more than
+a control cycle has, so the work can be spread over cycles while the filter goes on as it was.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from flight.gnc.estimation.commands import CommandHistory
+from flight.gnc.estimation.estimate import LATENCY
+from flight.gnc.estimation.innovation import innovation
+from flight.gnc.estimation.latency import Motion, considered, motion
+from flight.gnc.estimation.measurements import MeanRateMeasurement, Measurement, RateMeasurement
+from flight.gnc.estimation.mekf import correct, keep_attitude, normalised_square, release_attitude
+from flight.gnc.estimation.propagation import ProcessNoise, carry
+from flight.gnc.estimation.rigid_body import RigidBody
+from flight.gnc.estimation.state import SIZE, State
+from flight.gnc.math.arrays import FloatArray
+
+
+@dataclass(slots=True, eq=False)
+class Checkpoint:
+    """A measurement, whether it passed the gate, and the state just after it."""
+
+    measurement: Measurement
+    used: bool
+    state: State
+    covariance: FloatArray
+    nis: float = math.nan
+
+    @property
+    def time_ns(self) -> int:
+        """When the measurement was taken."""
+        return self.measurement.time_ns
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """What carries a state on: the body, its noise and its commands; `gate` by a measurement's numbers."""
+
+    body: RigidBody
+    noise: ProcessNoise
+    commands: CommandHistory
+    longest_step: float
+    gate: Mapping[int, float]
+
+    def propagate(
+        self, state: State, covariance: FloatArray, from_ns: int, to_ns: int
+    ) -> tuple[State, FloatArray]:
+        """Carry state and covariance over the commands in force between two times, forward only."""
+        for torquing, span_ns in self.commands.spans(from_ns, to_ns):
+            state, covariance = carry(
+                self.body, self.noise, state, covariance, torquing, span_ns * 1e-9, self.longest_step
+            )
+        return state, covariance
+
+    def motion(self, state: State, covariance: FloatArray, time_ns: int) -> Motion:
+        """Return how the rate changes about the time of a sample whose age is not known for sure."""
+        half_ns = round(0.5e9 * math.sqrt(covariance[LATENCY, LATENCY]))
+        before, after = (
+            self.body.linearise(
+                state.quaternion, state.rate, state.parameters, self.commands.at(time_ns + shift), 0.0
+            )
+            for shift in (-half_ns, half_ns)
+        )
+        return motion(before, after, state.disturbance, covariance)
+
+
+class Replay:
+    """Applies measurements in order of time; `taken` are the checkpoints that they make."""
+
+    def __init__(self, model: Model, start: Checkpoint, measurements: Sequence[Measurement]) -> None:
+        self._model = model
+        self._state, self._covariance, self._time_ns = start.state, start.covariance, start.time_ns
+        self._pending = deque(measurements)
+        # Exposures that have yet to begin, the first one last.
+        self._exposures = [m for m in measurements if isinstance(m, MeanRateMeasurement)]
+        self._exposures.sort(key=lambda m: m.since_ns, reverse=True)
+        self.taken: list[Checkpoint] = []
+
+    @property
+    def done(self) -> bool:
+        """Whether none is left."""
+        return not self._pending
+
+    def add(self, measurement: Measurement) -> None:
+        """Put one more at the end: it is no older than the others, and no mean over an exposure."""
+        self._pending.append(measurement)
+
+    def go_on(self, most: int | None = None) -> None:
+        """Apply the next `most` measurements, or all that are left."""
+        for _ in range(len(self._pending) if most is None else min(most, len(self._pending))):
+            self._take(self._pending.popleft())
+
+    def _take(self, measurement: Measurement) -> None:
+        model = self._model
+        while self._exposures and self._exposures[-1].since_ns <= measurement.time_ns:
+            exposure = self._exposures.pop()
+            self._carry_to(exposure.since_ns)
+            self._state, self._covariance = keep_attitude(self._state, self._covariance, exposure)
+        self._carry_to(measurement.time_ns)
+        state, covariance = self._state, self._covariance
+        aging = None
+        if isinstance(measurement, RateMeasurement) and measurement.latency is not None:
+            aging = model.motion(state, covariance, measurement.time_ns)
+        found = innovation(state, measurement, model.body.suspended, aging)
+        nis, gain = normalised_square(found, covariance)
+        used = 0.0 <= nis <= model.gate[len(found.value)]  # a NaN does not pass
+        if aging is not None:
+            gain = considered(gain)
+        if used:
+            state, covariance = correct(state, covariance, found, gain)
+        if isinstance(measurement, MeanRateMeasurement):
+            state, covariance = release_attitude(state, covariance, measurement)
+        self._state, self._covariance = state, covariance
+        alone = state._replace(kept=()) if state.kept else state
+        self.taken.append(Checkpoint(measurement, used, alone, covariance[:SIZE, :SIZE], nis))
+
+    def _carry_to(self, time_ns: int) -> None:
+        self._state, self._covariance = self._model.propagate(
+            self._state, self._covariance, self._time_ns, time_ns
+        )
+        self._time_ns = time_ns

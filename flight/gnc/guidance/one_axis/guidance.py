@@ -1,0 +1,222 @@
+"""Which path is flown: new plans are accepted by rule, the last good one is flown on, then its end is held.
+
+A plan that is late, not finite, beyond the limits, out of order, for another target or not starting where
+the body then was is refused with its reason; refusing changes nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+import numpy as np
+
+from flight.gnc.errors import UsageError
+from flight.gnc.guidance.one_axis.path import PolynomialPath, Sample
+from flight.gnc.guidance.one_axis.plant import Q2_LIMIT, SingleAxisPlant, q2_of
+from flight.gnc.guidance.one_axis.vmc import Plan
+
+_CHECKED_POINTS = 600
+_SAME = 1e-6
+"""Of q2 and rad/s: how near an end must be to the target."""
+
+
+class GuidanceState(StrEnum):
+    """What `Guidance.sample` gives: a path under way, an attitude held, or nothing yet."""
+
+    NONE = "none"
+    FOLLOWING = "following"
+    HOLDING = "holding"
+
+
+@dataclass(frozen=True, slots=True)
+class AcceptanceRules:
+    """What a plan must keep to be flown.
+
+    Attributes:
+        late_after: s from its origin to its arrival.
+        angle_tolerance: rad, rate_tolerance: rad/s, between its start and the estimate at its origin.
+        q2_limit: bound of |q2|; a planner that overshoots by 1e-3 of it is forgiven.
+        current_excess: relative, over the plant's limit, everywhere.
+    """
+
+    late_after: float = 1.0
+    angle_tolerance: float = 0.05
+    rate_tolerance: float = 0.02
+    q2_limit: float = Q2_LIMIT
+    current_excess: float = 1e-3
+
+    def __post_init__(self) -> None:
+        """Refuse bounds that are not positive and finite; raises UsageError."""
+        for name in ("late_after", "angle_tolerance", "rate_tolerance", "q2_limit", "current_excess"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise UsageError(f"guidance {name} is {value}: it must be finite and positive")
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Whether a plan is flown, and why not: `reason` is empty when it is."""
+
+    accepted: bool
+    reason: str = ""
+
+
+class Guidance:
+    """Owns the path being flown and the target wanted."""
+
+    def __init__(
+        self, plant: SingleAxisPlant, rules: AcceptanceRules | None = None, arrives: bool = True
+    ) -> None:
+        """Take the plant whose limit holds; `arrives`: a path is meant to end, and its end to be held.
+
+        Where it is not, as on a receding horizon, a path that ends tells of plans that did not come.
+        """
+        self._plant = plant
+        self._rules = rules or AcceptanceRules()
+        self._arrives = arrives
+        self._path: PolynomialPath | None = None
+        self._planned_ns: int | None = None
+        self._target_q2: float | None = None
+        self._target_rate = 0.0
+        self._aimed_ns = 0
+
+    @property
+    def target_q2(self) -> float | None:
+        """The attitude wanted, as q2; None before the first."""
+        return self._target_q2
+
+    @property
+    def path(self) -> PolynomialPath | None:
+        """The path being flown or held."""
+        return self._path
+
+    def aim(self, target_q2: float, target_rate: float = 0.0, now_ns: int = 0) -> None:
+        """Want another attitude, at `target_rate` rad/s; the present path is flown until a plan for it comes.
+
+        Raises UsageError when one is not finite or q2 is beyond its limit.
+        """
+        if not abs(target_q2) <= self._rules.q2_limit:  # NaN compares false
+            raise UsageError(f"target q2 is {target_q2}: it must lie within +-{self._rules.q2_limit}")
+        if not math.isfinite(target_rate):
+            raise UsageError(f"target rate is {target_rate}: it must be finite")
+        self._target_q2 = target_q2
+        self._target_rate = target_rate
+        self._aimed_ns = now_ns
+
+    def hold(self, angle: float, now_ns: int) -> None:
+        """Hold `angle` rad from now on; plans made earlier than now are then out of order.
+
+        Raises UsageError when it is not finite.
+        """
+        if not math.isfinite(angle):
+            raise UsageError(f"the angle to hold is {angle}: it must be finite")
+        self._path = PolynomialPath.holding(angle, now_ns)
+        self._planned_ns = now_ns - 1
+
+    def release(self) -> None:
+        """Forget the path: there is none until the next plan or hold."""
+        self._path = None
+        self._planned_ns = None
+
+    def offer(
+        self,
+        plan: Plan,
+        origin_ns: int,
+        now_ns: int,
+        estimate_angle: float,
+        estimate_rate: float,
+        disturbance: float = 0.0,
+    ) -> Verdict:
+        """Fly `plan` from `origin_ns` if it keeps the rules.
+
+        Estimates in rad and rad/s at its origin; `disturbance` in rad/s^2 is what it had to allow for.
+        """
+        reason = (
+            self._untimely(origin_ns, now_ns)
+            or self._unwanted(plan)
+            or self._unflyable(plan.path, replace(self._plant, disturbance=disturbance))
+            or self._displaced(plan.path, estimate_angle, estimate_rate)
+        )
+        if reason:
+            return Verdict(False, reason)
+        self._path = plan.path.starting_at(origin_ns)
+        self._planned_ns = origin_ns
+        return Verdict(True)
+
+    def sample(self, now_ns: int) -> Sample | None:
+        """Return the motion wanted now; None when there is no path yet."""
+        return None if self._path is None else self._path.sample(now_ns)
+
+    def state(self, now_ns: int) -> GuidanceState:
+        """Return what is being done now."""
+        if self._path is None:
+            return GuidanceState.NONE
+        return GuidanceState.HOLDING if self._path.has_ended(now_ns) else GuidanceState.FOLLOWING
+
+    def is_adrift(self, now_ns: int) -> bool:
+        """Tell whether an attitude is held that nobody wanted held: no plan came in time."""
+        if self._path is None or not self._path.has_ended(now_ns):
+            return False
+        if not self._arrives:
+            return True
+        waited = (now_ns - self._aimed_ns) * 1e-9
+        return not self._reaches_target(self._path) and waited > self._rules.late_after
+
+    def remains(self, now_ns: int) -> PolynomialPath | None:
+        """Return the path under way to the present target, its origin counted from `now_ns`; None without."""
+        path = self._path
+        if path is None or path.has_ended(now_ns) or not self._reaches_target(path):
+            return None
+        return path.starting_at(path.origin_ns - now_ns)
+
+    def _reaches_target(self, path: PolynomialPath) -> bool:
+        if self._target_q2 is None:
+            return False
+        near = abs(q2_of(path.end_angle) - self._target_q2) <= _SAME
+        return near and abs(path.end_rate - self._target_rate) <= _SAME
+
+    def _untimely(self, origin_ns: int, now_ns: int) -> str:
+        age = (now_ns - origin_ns) * 1e-9
+        if age < 0.0:
+            return f"its origin lies {-age:.3f} s in the future"
+        if age > self._rules.late_after:
+            return f"late: {age:.3f} s after its origin, {self._rules.late_after} s allowed"
+        if self._planned_ns is not None and origin_ns <= self._planned_ns:
+            return "out of order: the path being flown is not older"
+        return ""
+
+    def _unwanted(self, plan: Plan) -> str:
+        if self._target_q2 is None:
+            return "no target is wanted"
+        if not (abs(plan.target_q2 - self._target_q2) <= _SAME and self._reaches_target(plan.path)):
+            ends = f"q2 {q2_of(plan.path.end_angle):.4f} at {plan.path.end_rate:.4f} rad/s"
+            return f"it ends at {ends}, wanted is {self._target_q2:.4f} at {self._target_rate:.4f} rad/s"
+        return ""
+
+    def _unflyable(self, path: PolynomialPath, plant: SingleAxisPlant) -> str:
+        if not (math.isfinite(path.horizon) and path.horizon > 0.0):
+            return f"not finite: its horizon is {path.horizon} s"
+        # Just inside the end: at the end itself the hold has begun.
+        times = path.horizon * np.linspace(0.0, 1.0 - 1e-12, _CHECKED_POINTS)
+        angle, rate, acceleration = path.motion(times)
+        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+            current = plant.currents(angle, rate, acceleration)
+            peak_q2 = float(np.abs(np.sin(0.5 * angle)).max())
+        peak = float(np.abs(current).max())
+        if not (math.isfinite(peak) and math.isfinite(peak_q2)):
+            return "not finite somewhere along the path"
+        if peak > plant.current_limit * (1.0 + self._rules.current_excess):
+            return f"needs {peak:.4f} A, the limit is {plant.current_limit} A"
+        if peak_q2 > self._rules.q2_limit * (1.0 + 1e-3):
+            return f"reaches |q2| {peak_q2:.4f}, the limit is {self._rules.q2_limit}"
+        return ""
+
+    def _displaced(self, path: PolynomialPath, angle: float, rate: float) -> str:
+        start = path.sample(path.origin_ns)
+        if not abs(start.angle - angle) <= self._rules.angle_tolerance:
+            return f"starts at {start.angle:.4f} rad, the body was at {angle:.4f} rad"
+        if not abs(start.rate - rate) <= self._rules.rate_tolerance:
+            return f"starts at {start.rate:.4f} rad/s, the body moved at {rate:.4f} rad/s"
+        return ""

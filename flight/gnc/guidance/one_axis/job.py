@@ -1,0 +1,47 @@
+"""The planner worker's job: one state and one target in, one plan out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from flight.gnc.guidance.one_axis.path import PolynomialPath
+from flight.gnc.guidance.one_axis.plant import SingleAxisPlant
+from flight.gnc.guidance.one_axis.vmc import NODES, Plan, plan
+
+
+@dataclass(frozen=True, slots=True)
+class PlanJob:
+    """From (q2, rad/s) at `origin_ns` to (q2, rad/s) within `horizon` s; `number` counts the jobs.
+
+    With `time_price` in W the horizon is the planner's to choose, `horizon` a first guess. `last` is the path
+    flown until now, its origin counted from `origin_ns`.
+    """
+
+    number: int
+    origin_ns: int
+    plant: SingleAxisPlant
+    start_q2: float
+    start_rate: float
+    end_q2: float
+    end_rate: float
+    horizon: float
+    max_horizon: float
+    nodes: int = NODES
+    time_price: float | None = None
+    last: PolynomialPath | None = None
+
+
+def run(job: PlanJob) -> Plan:
+    """Plan; at the top level of a module, so that a worker process can import it. Raises PlanningError."""
+    return plan(
+        job.plant,
+        job.start_q2,
+        job.start_rate,
+        job.end_q2,
+        job.end_rate,
+        job.horizon,
+        nodes=job.nodes,
+        max_stretch=max(job.max_horizon / job.horizon, 1.0),
+        time_price=job.time_price,
+        last=job.last,
+    )

@@ -1,0 +1,140 @@
+"""Which horizon a path gets: the one asked for, the shortest feasible one, or that of a price of time.
+
+All three are one program, energy plus a price for each second, between a least and a greatest horizon. With a
+price far above the coil's power and the asked horizon as the least, it ends at the asked horizon where a path
+there keeps the limits, and else at the shortest that has one: no infeasible program is ever tried.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from flight.gnc.guidance.one_axis.vmc_program import LIMIT_TOLERANCE, FreeHorizon, Program, Trial
+from flight.gnc.math.arrays import FloatArray
+
+ProgramAt = Callable[[float], Program]
+"""Makes the program whose family is whitened around the prey over a horizon in s."""
+
+PRICE_OF_HASTE = 7.0
+"""Of a second, in R Imax^2, where the shortest horizon is wanted. An infinite price would give the family's
+very shortest path, all bang, whose cost is up to 1 % above the true optimum's at that horizon; this one stops
+about 0.3 % later, where the cost is within 0.25 %."""
+
+_START_BELOW = 1.7
+_GROW_TO = 1.4
+_RETRY = 1.4
+_ALONG_LIMIT = 0.99
+_ATTEMPTS = 10
+_AT_BOUND = 1e-9
+_PRICED_STEPS = 12
+_PRICED_CHANGE = 0.03
+
+
+@dataclass(slots=True)
+class Search:
+    """One search for a path; counts what it costs.
+
+    Attributes:
+        program_at: makes programs.
+        warm: (N,) how far an earlier path lay from its prey on the nodes; None to start from the prey.
+        evaluations: of the cost so far.
+    """
+
+    program_at: ProgramAt
+    warm: FloatArray | None = None
+    evaluations: int = field(default=0)
+
+    def within(self, asked: float, longest: float) -> tuple[Program, Trial | None]:
+        """Return the least-energy path over `asked` s, or over the shortest feasible time up to `longest` s.
+
+        Current scales with 1/T^2 for a slew at rest: unlimited solutions lead to a horizon near the shortest
+        feasible one, from where the program with a free horizon starts. Should it fail, it starts later.
+        """
+        if self.warm is not None:
+            program = self.program_at(asked)
+            trial = self._resumed(program, self.warm, asked, longest)
+            self.evaluations += program.evaluations
+            if trial is not None:
+                return program, trial
+        time = asked
+        for _ in range(_ATTEMPTS):
+            program = self.program_at(time)
+            relaxed = program.unlimited(program.prey(time))
+            trial, growth = None, _RETRY
+            if relaxed is not None:
+                current, q2 = np.abs(program.ratios(relaxed)).max(axis=1).tolist()
+                if time == asked and max(current, q2) <= 1.0 + LIMIT_TOLERANCE:
+                    trial = relaxed
+                elif current < _START_BELOW or time == longest:
+                    trial = self._hasty(program, relaxed, asked, longest)
+                else:
+                    growth = math.sqrt(current / _GROW_TO)
+            self.evaluations += program.evaluations
+            if trial is not None or time == longest:
+                break
+            time = min(longest, time * growth)
+        return program, trial
+
+    def priced(
+        self, guess: float, least: float, longest: float, price: float
+    ) -> tuple[Program, Trial | None]:
+        """Return the path of least energy plus `price` W times its horizon, begun from `guess` s.
+
+        The slope of the least energy over the horizon is the partial derivative at that optimum. Where a
+        longer horizon saves more than its price it is a lower bound, else an upper one; in between leads that
+        the energy of an unlimited slew falls as 1/T^3. The limits come in with the last program only.
+        """
+        low, high, time = least, longest, min(max(guess, least), longest)
+        price = min(price, PRICE_OF_HASTE * self.program_at(time).bang_power)
+        for _ in range(_PRICED_STEPS):
+            program = self.program_at(time)
+            relaxed = program.unlimited(program.prey(time))
+            self.evaluations += program.evaluations
+            if relaxed is None:
+                break
+            current = float(np.abs(program.ratios(relaxed)[0]).max())
+            _, _, slope = program.energy(relaxed)
+            if current > _START_BELOW:
+                low, following = time, time * math.sqrt(current / _GROW_TO)
+            else:
+                low, high = (time, high) if slope < -price else (low, time)
+                following = time * min(max(max(-slope / price, 0.0) ** 0.25, 0.5), 2.0)
+            if not low < following < high:
+                following = math.sqrt(low * high)
+            if abs(following - time) <= _PRICED_CHANGE * time or high <= low * (1.0 + _PRICED_CHANGE):
+                spent = program.evaluations
+                trial = program.limited(relaxed, FreeHorizon(least, longest, price))
+                self.evaluations += program.evaluations - spent
+                if trial is not None:
+                    return program, trial
+                break
+            time = following
+        return self.within(time, longest)
+
+    def _resumed(self, program: Program, warm: FloatArray, asked: float, longest: float) -> Trial | None:
+        """Return the path that an earlier one leads to; None when it leads nowhere.
+
+        Where the earlier path ran along a limit the limits are imposed at once: no detour beyond them.
+        """
+        start = program.beside_prey(warm, asked)
+        worst = float(np.abs(program.ratios(start)).max())
+        if not worst < _START_BELOW:
+            return None
+        if worst > _ALONG_LIMIT:
+            return self._hasty(program, start, asked, longest)
+        trial = program.unlimited(start)
+        if trial is None or float(np.abs(program.ratios(trial)).max()) > 1.0 + LIMIT_TOLERANCE:
+            return None
+        return trial
+
+    def _hasty(self, program: Program, start: Trial, asked: float, longest: float) -> Trial | None:
+        """Return the shortest path from `asked` s on, at its least energy when that is the asked horizon."""
+        price = PRICE_OF_HASTE * program.bang_power
+        trial = program.limited(start, FreeHorizon(asked, longest, price))
+        if trial is None or trial.horizon > asked * (1.0 + _AT_BOUND):
+            return trial
+        return program.limited(Trial(trial.parameters, asked)) or trial

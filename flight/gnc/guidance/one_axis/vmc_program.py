@@ -1,0 +1,270 @@
+"""The programs of virtual motion camouflage, on NLopt's SLSQP with exact gradients (Sease 5.8, 5.14).
+
+Two programs share cost and limits: the least energy at a fixed horizon, and the least of energy and time at
+a price of time. The limits hold at every time, not on the nodes only: they are imposed at those points of a
+dense grid where a solution without them broke them, until none does (the exchange method of semi-infinite
+programming).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import nlopt
+import numpy as np
+
+from flight.gnc.guidance.one_axis.plant import (
+    SQUARE_Q2_WITHOUT_AUTHORITY,
+    SingleAxisPlant,
+    current_and_slopes,
+)
+from flight.gnc.guidance.one_axis.vmc_family import Family, Observed, time_scale
+from flight.gnc.math.arrays import BoolArray, FloatArray, IntArray
+
+LIMIT_TOLERANCE = 3e-4
+"""Relative: what a limit may be exceeded by on the dense grid; leaves room under 1e-3 between its points."""
+
+IMPOSED_MARGIN = 2e-4
+"""Relative: how far within a limit it is imposed, so that the peaks between the imposed points keep it too;
+without it each exchange creeps up on the limit."""
+
+# NLopt 2.11 has a runtime_error of its own, older bindings raise Python's.
+_SOLVER_STOPS = (nlopt.RoundoffLimited, RuntimeError, getattr(nlopt, "runtime_error", RuntimeError))
+_CONVERGED = (nlopt.SUCCESS, nlopt.FTOL_REACHED, nlopt.XTOL_REACHED)
+_EXCHANGES = 10
+_EVALUATIONS = 60
+_FREE_TOLERANCE = 1e-5
+_IMPOSE_ABOVE = 0.5
+_IMPOSE_EVERY = 16
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """One point of a program: the path's parameters (N - 4,) and its horizon in s."""
+
+    parameters: FloatArray
+    horizon: float
+
+
+@dataclass(frozen=True, slots=True)
+class FreeHorizon:
+    """A horizon to be found between `least` and `greatest` s, each second at `price` W."""
+
+    least: float
+    greatest: float
+    price: float
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Where limits are imposed: (m,) dense points, the sign there, and which limit, q2's or the current's."""
+
+    index: IntArray
+    sign: FloatArray
+    is_q2: BoolArray
+
+    @classmethod
+    def at(cls, chosen: BoolArray, ratios: FloatArray) -> Limits:
+        """Return limits at `chosen` (2, dense), signed as `ratios` (2, dense), current then q2."""
+        row, index = np.nonzero(chosen)
+        return cls(index, np.sign(ratios[row, index]), row == 1)
+
+
+class Program:
+    """One plant, one family of paths between two states, and their cost and limits.
+
+    Attributes:
+        family: whitened around the prey at the horizon given.
+        evaluations: of the cost, over all solutions.
+    """
+
+    def __init__(self, plant: SingleAxisPlant, family: Family, q2_limit: float, horizon: float) -> None:
+        self._plant = plant
+        self._q2_limit = q2_limit
+        # Beyond its limit q2 is held for the current's sake: an iterate may wander past the singularity.
+        self._q2_cap = 0.5 * (q2_limit + math.sqrt(SQUARE_Q2_WITHOUT_AUTHORITY))
+        self._weights = 0.5 * plant.resistance * family.grid.cost_weights
+        self._bang = plant.resistance * plant.current_limit**2
+        self.family = self._whitened(family, horizon)
+        self._cost_points = self.family.observed(family.grid.cost)
+        self.evaluations = 0
+
+    @property
+    def current_limit(self) -> float:
+        """The plant's, A."""
+        return self._plant.current_limit
+
+    @property
+    def bang_power(self) -> float:
+        """R Imax^2, W: what the coil takes at its limit."""
+        return self._bang
+
+    def prey(self, horizon: float) -> Trial:
+        """Return the prey path itself over `horizon` s: every path control parameter one."""
+        return Trial(np.zeros(self.family.size), horizon)
+
+    def _whitened(self, family: Family, horizon: float) -> Family:
+        """Return the family with the unit matrix for the energy's Gauss-Newton Hessian at the prey.
+
+        SLSQP starts from that matrix, so its first step is the Gauss-Newton step.
+        """
+        observed = family.observed(family.grid.cost)
+        prey = observed.trajectory(np.zeros(family.size), horizon)
+        _, slopes = self._current(prey, horizon)
+        root_weights = np.sqrt(2.0 * horizon * self._weights)
+        jacobian = root_weights[:, None] * _contract(slopes, observed.basis)
+        return family.remixed(np.linalg.inv(np.linalg.qr(jacobian, mode="r")))
+
+    def _current(self, trajectory: FloatArray, horizon: float) -> tuple[FloatArray, FloatArray]:
+        """Return the current (m,) and its slopes (3, m) by q2 and its s-derivatives."""
+        q2 = trajectory[0]
+        held = np.minimum(np.maximum(q2, -self._q2_cap), self._q2_cap)
+        current, *slopes = current_and_slopes(self._plant, held, trajectory[1], trajectory[2])
+        stacked = np.array(slopes)
+        stacked[0] *= held == q2
+        stacked *= time_scale(horizon)
+        return current, stacked
+
+    def energy(self, trial: Trial) -> tuple[float, FloatArray, float]:
+        """Return the integral of R I^2 in J (5.8 without the 1/2 of 5.1), its gradient (N - 4,), and d/dT."""
+        points, horizon = self._cost_points, trial.horizon
+        trajectory = points.trajectory(trial.parameters, horizon)
+        current, slopes = self._current(trajectory, horizon)
+        weighted = self._weights * current
+        energy = horizon * float(weighted @ current)
+        pull = (2.0 * horizon) * weighted * slopes
+        gradient = pull.ravel() @ points.basis.reshape(-1, points.basis.shape[2])
+        by_horizon = energy / horizon + float(np.sum(pull * points.aging(trajectory, horizon)))
+        return energy, gradient, by_horizon
+
+    def excess(
+        self, limits: Limits, points: Observed, trial: Trial
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return limit ratios minus one (m,), gradients (m, N - 4) and d/dT (m,), seen at `points` (m)."""
+        trajectory = points.trajectory(trial.parameters, trial.horizon)
+        current, slopes = self._current(trajectory, trial.horizon)
+        value = np.where(limits.is_q2, trajectory[0] / self._q2_limit, current / self._plant.current_limit)
+        slopes /= self._plant.current_limit
+        slopes[:, limits.is_q2] = np.array([[1.0 / self._q2_limit], [0.0], [0.0]])
+        slopes *= limits.sign
+        aged = np.sum(slopes * points.aging(trajectory, trial.horizon), axis=0)
+        return limits.sign * value - 1.0, _contract(slopes, points.basis), aged
+
+    def ratios(self, trial: Trial) -> FloatArray:
+        """Return current and q2 over their limits on the dense grid, signed (2, dense)."""
+        nodes = self.family.nodes(trial.parameters, trial.horizon)
+        trajectory = time_scale(trial.horizon) * (self.family.grid.dense.matrices @ nodes)
+        current, _ = self._current(trajectory, trial.horizon)
+        return np.stack([current / self._plant.current_limit, trajectory[0] / self._q2_limit])
+
+    def beside_prey(self, apart: FloatArray, horizon: float) -> Trial:
+        """Return the path that lies `apart` (N,) from the prey on the nodes, ends and end slopes aside."""
+        return Trial(np.asarray(np.linalg.solve(self.family.basis[2:-2], apart[2:-2]), dtype=float), horizon)
+
+    def unlimited(self, start: Trial) -> Trial | None:
+        """Return the least-energy path over the horizon of `start`, limits aside; None when none is found."""
+        trial, converged = self._minimise(start, None, None)
+        if converged:
+            return trial
+        # NLopt ends a problem that is solved from the start as limited by rounding. The whitened gradient
+        # tells that from a failure: half its square is the energy still to be saved.
+        _, gradient, _ = self.energy(trial)
+        return trial if 0.5 * float(gradient @ gradient) <= self._energy_tolerance(trial.horizon) else None
+
+    def limited(self, start: Trial, free: FreeHorizon | None = None) -> Trial | None:
+        """Return the least-energy path within the limits, from `start`; None when none was found.
+
+        With `free` the horizon is free and its price is added to the energy.
+        """
+        ratios = self.ratios(start)
+        every = np.arange(ratios.shape[1]) % _IMPOSE_EVERY == _IMPOSE_EVERY // 2
+        chosen = (np.abs(ratios) > _IMPOSE_ABOVE) & every | _peaks(ratios)
+        trial = start
+        for _ in range(_EXCHANGES):
+            limits = Limits.at(chosen, ratios)
+            trial, converged = self._minimise(trial, limits, free)
+            latest = self.ratios(trial)
+            worst = float(np.abs(latest).max())
+            if worst <= 1.0 + LIMIT_TOLERANCE:
+                return trial if converged else None
+            if not math.isfinite(worst) or np.any(np.abs(latest[chosen]) > 1.0 + LIMIT_TOLERANCE):
+                return None  # imposed, and broken all the same
+            added = _peaks(latest) & ~chosen
+            ratios = np.where(added, latest, ratios)
+            chosen = chosen | added
+        return None
+
+    def _energy_tolerance(self, horizon: float) -> float:
+        """Return what energy is solved to, J: 1e-8 of what the coil can spend in the time."""
+        return 1e-8 * self._bang * horizon
+
+    def _minimise(self, start: Trial, limits: Limits | None, free: FreeHorizon | None) -> tuple[Trial, bool]:
+        """Run SLSQP once from `start`, over (parameters[, log-horizon]); tell if it converged.
+
+        The second variable is log(T/T0) over a scale that gives the price of time, like the whitened energy,
+        a curvature of about one.
+        """
+        size, origin = self.family.size, start.horizon
+        root = 1.0 / math.sqrt(free.price * origin) if free else 0.0
+        price = free.price if free else 0.0
+        last = np.append(start.parameters, 0.0) if free else start.parameters
+
+        def trial_of(x: FloatArray) -> Trial:
+            return Trial(x[:size].copy(), origin * math.exp(root * x[size]) if free else origin)
+
+        def objective(x: FloatArray, gradient: FloatArray) -> float:
+            nonlocal last
+            last = x.copy()
+            self.evaluations += 1
+            trial = trial_of(x)
+            energy, by_parameters, by_horizon = self.energy(trial)
+            if gradient.size:
+                gradient[:size] = by_parameters
+                if free:
+                    gradient[size] = root * trial.horizon * (by_horizon + price)
+            return energy + price * trial.horizon
+
+        solver = nlopt.opt(nlopt.LD_SLSQP, last.size)
+        solver.set_min_objective(objective)
+        # A part of 1e-5 of a free horizon's objective is a horizon to 0.01 % or better.
+        solver.set_ftol_abs(_FREE_TOLERANCE * price * origin if free else self._energy_tolerance(origin))
+        solver.set_maxeval(_EVALUATIONS)
+        if free is not None:
+            low, high = (math.log(bound / origin) / root for bound in (free.least, free.greatest))
+            solver.set_lower_bounds(np.append(np.full(size, -np.inf), low))
+            solver.set_upper_bounds(np.append(np.full(size, np.inf), high))
+            last[size] = min(max(0.0, low), high)
+        if limits is not None and limits.index.size:
+            points = self.family.observed(self.family.grid.dense.take(limits.index))
+
+            def constraints(result: FloatArray, x: FloatArray, gradient: FloatArray) -> None:
+                trial = trial_of(x)
+                value, by_parameters, by_horizon = self.excess(limits, points, trial)
+                result[:] = value + IMPOSED_MARGIN
+                if gradient.size:
+                    gradient[:, :size] = by_parameters
+                    if free:
+                        gradient[:, size] = root * trial.horizon * by_horizon
+
+            solver.add_inequality_mconstraint(constraints, np.full(limits.index.size, 1e-6))
+        try:
+            found = np.asarray(solver.optimize(last))
+        except _SOLVER_STOPS:
+            # Trivial and infeasible problems end so: the line search has shrunk onto the last point.
+            return trial_of(last), False
+        return trial_of(found), solver.last_optimize_result() in _CONVERGED
+
+
+def _contract(slopes: FloatArray, basis: FloatArray) -> FloatArray:
+    """Return d/dy (m, n) from slopes (3, m) by q2 and its s-derivatives and their d/dy (3, m, n)."""
+    return np.asarray((slopes[:, :, None] * basis).sum(axis=0))
+
+
+def _peaks(ratios: FloatArray) -> BoolArray:
+    """Tell where |ratios| (2, m) has a local maximum along its rows above one."""
+    size = np.abs(ratios)
+    peak = size > 1.0
+    peak[:, 1:] &= size[:, 1:] >= size[:, :-1]
+    peak[:, :-1] &= size[:, :-1] >= size[:, 1:]
+    return np.asarray(peak)

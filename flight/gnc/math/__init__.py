@@ -1,0 +1,1 @@
+"""Quaternions, directions, frames and array types."""

@@ -1,0 +1,25 @@
+"""Directions: unit vectors, and the plane across one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import numpy as np
+
+from flight.gnc.math.arrays import FloatArray
+
+
+def tangent_basis(direction: Iterable[float]) -> FloatArray:
+    """Return two unit vectors (2, 3) at right angles to a unit vector (3,) and to each other.
+
+    With the direction itself last they are a right-handed frame.
+    """
+    # Plain floats: for one vector numpy costs ten times as much.
+    x, y, z = map(float, direction)
+    # Off the axis that is farthest from it.
+    least = min((abs(x), 0), (abs(y), 1), (abs(z), 2))[1]
+    first = ((0.0, z, -y), (-z, 0.0, x), (y, -x, 0.0))[least]
+    length = math.hypot(*first)
+    a, b, c = first[0] / length, first[1] / length, first[2] / length
+    return np.array(((a, b, c), (y * c - z * b, z * a - x * c, x * b - y * a)))

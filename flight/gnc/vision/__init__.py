@@ -1,0 +1,1 @@
+"""What the cameras show: streaks, objects, stars, the horizon and the Sun."""

@@ -1,0 +1,97 @@
+"""The turn about nadir, from what else is known: a rough attitude, the coarse Sun, the magnetic field.
+
+A horizon says nothing of it, but the Earth's flattening lies along the pole and the light along the Sun. And
+each such direction must stand at its known angle from nadir: a nadir for which it does not is wrong.
+"""
+
+from __future__ import annotations
+
+import cmath
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.directions import tangent_basis
+from flight.gnc.math.quaternion import attitude_matrix
+from flight.gnc.vision.horizon.knowledge import HorizonKnowledge
+from flight.gnc.vision.horizon.limb_equation import turn
+from flight.gnc.vision.horizon.vector_method import shortest_turn
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Orientation:
+    """A camera's orientation about a supposed nadir.
+
+    Attributes:
+        rotation: (3, 3), inertial into camera axes; nadir exactly as supposed.
+        sigma: rad, of the turn about nadir; infinite when nothing is known of it.
+        surprise: the worst disagreement of a known direction with this nadir, in its own standard deviations.
+    """
+
+    rotation: FloatArray
+    sigma: float
+    surprise: float
+
+
+def orientation(nadir: FloatArray, inertial_nadir: FloatArray, knowledge: HorizonKnowledge) -> Orientation:
+    """Return the orientation about `nadir` (3,), camera axes, that stands at `inertial_nadir` (3,)."""
+    base = shortest_turn(inertial_nadir, nadir)
+    down = _unit(nadir)
+    vote, weight, surprise = 0.0 + 0.0j, 0.0, 0.0
+    for camera, inertial, sigma in _known(knowledge, inertial_nadir):
+        seen, expected = _unit(camera), _unit(base @ inertial)
+        below, supposed = _dot(down, seen), _dot(down, expected)
+        across = _length(_cross(down, expected))
+        apart = math.atan2(_length(_cross(down, seen)), below) - math.atan2(across, supposed)
+        surprise = max(surprise, abs(apart) / sigma)
+        if across > 0.05:
+            angle = math.atan2(_dot(down, _cross(expected, seen)), _dot(seen, expected) - below * supposed)
+            precision = (across / sigma) ** 2
+            vote += precision * cmath.exp(1j * angle)
+            weight += precision
+    if weight == 0.0:
+        return Orientation(base, math.inf, surprise)
+    return Orientation(turn(cmath.phase(vote) * nadir) @ base, weight**-0.5, surprise)
+
+
+def turned(rotation: FloatArray, nadir: FloatArray, angle: float) -> FloatArray:
+    """Return a camera's rotation (3, 3) after a turn by `angle` rad about `nadir` (3,), camera axes."""
+    return np.asarray(turn(angle * nadir) @ rotation)
+
+
+def _known(
+    knowledge: HorizonKnowledge, inertial_nadir: FloatArray
+) -> list[tuple[FloatArray, FloatArray, float]]:
+    """Return pairs of directions, camera and inertial, with their spreads: an attitude is two of them."""
+    pairs = [(each.camera, each.inertial, each.sigma) for each in knowledge.sensed]
+    if knowledge.attitude is not None:
+        matrix, sigma = attitude_matrix(knowledge.attitude.quaternion), knowledge.attitude.sigma
+        # Nadir itself judges the tilt, a direction normal to it gives the turn.
+        for axis in (inertial_nadir, tangent_basis(inertial_nadir)[0]):
+            pairs.append((matrix @ axis, axis, sigma))
+    return pairs
+
+
+# Plain floats: for one vector numpy costs ten times as much.
+Vector = tuple[float, float, float]
+
+
+def _unit(vector: FloatArray) -> Vector:
+    x, y, z = vector.tolist()
+    length = math.sqrt(x * x + y * y + z * z)
+    return x / length, y / length, z / length
+
+
+def _dot(one: Vector, other: Vector) -> float:
+    return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
+
+
+def _cross(one: Vector, other: Vector) -> Vector:
+    (a, b, c), (x, y, z) = one, other
+    return b * z - c * y, c * x - a * z, a * y - b * x
+
+
+def _length(vector: Vector) -> float:
+    return math.sqrt(_dot(vector, vector))

@@ -1,0 +1,154 @@
+"""One supposed horizon: fitted in full, and held against everything that is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flight.gnc.camera.lens import CameraModel
+from flight.gnc.math.arrays import BoolArray, FloatArray
+from flight.gnc.vision.horizon.illumination import (
+    DAYLIGHT,
+    GLARE,
+    Agreement,
+    agreement,
+    limb_rays,
+    sun_elevation,
+)
+from flight.gnc.vision.horizon.knowledge import HorizonKnowledge
+from flight.gnc.vision.horizon.limb_equation import View
+from flight.gnc.vision.horizon.limb_fit import FittedLimb, Prior, fit_limb, stepped
+from flight.gnc.vision.horizon.limb_points import LimbPoints, limb_points, near_limb, placed_by_profile
+from flight.gnc.vision.horizon.observation import Observation
+from flight.gnc.vision.horizon.settings import HorizonSettings
+from flight.gnc.vision.horizon.supposition import Supposition, sun_from
+
+_UNKNOWN_TURN = 1.0
+"""rad: the prior on a turn about nadir of which nothing is known; on a sphere it changes nothing."""
+_NIGHT = np.radians(-8.0)
+"""Elevation of the Sun: an edge there is no limb's."""
+_LIMB_RAYS = 120
+_BORDER = 8.0
+"""px."""
+_NEAR = 0.0375
+"""Of the picture's size, little more than the space of two scan lines: an edge so near covers the limb."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hypothesis:
+    """A fitted horizon and what speaks for and against it.
+
+    Attributes:
+        fit: the limb.
+        members: (n,) the picture's edges that lie on it.
+        residual: px rms normal to the limb, of the members.
+        supposition: what it was fitted from.
+        lighting: how the picture agrees with it.
+        coverage: the share of the lit limb that runs through the picture near a member; 1 where there is
+            none.
+        night: the share of members where the Sun is well below the horizon.
+        allowance: rad an axis, to be added to the covariance for what the model leaves out.
+    """
+
+    fit: FittedLimb
+    members: BoolArray
+    residual: float
+    supposition: Supposition
+    lighting: Agreement
+    coverage: float
+    night: float
+    allowance: float
+
+    @property
+    def covariance(self) -> FloatArray:
+        """The nadir's covariance (3, 3) rad^2, allowances included."""
+        nadir = self.fit.view.nadir
+        across = np.eye(3) - np.outer(nadir, nadir)
+        return np.asarray(self.fit.nadir_covariance + self.allowance**2 * across)
+
+
+def examine(
+    supposition: Supposition,
+    seen: Observation,
+    knowledge: HorizonKnowledge,
+    settings: HorizonSettings,
+    camera: CameraModel,
+) -> Hypothesis | None:
+    """Return the supposed horizon fitted and judged, or None when no limb can be fitted to it."""
+    place, stand = supposition.place, supposition.orientation
+    sun = sun_from(place, knowledge)
+    prior = Prior(min(stand.sigma, _UNKNOWN_TURN), settings.limb_height_sigma, place.altitude_sigma)
+    fitted = _fitted(supposition.view, seen, supposition.members, sun, settings, prior)
+    if fitted is None:
+        return None
+    fit, limb = fitted
+    members = near_limb(fit.view, seen, settings.tolerance)
+    used = np.zeros(len(seen.edges), dtype=bool)
+    used[limb.index[fit.used]] = True
+    night = 0.0
+    if sun is not None and np.any(members):
+        night = float(np.mean(sun_elevation(fit.view, seen.rays.rays[members], sun) < _NIGHT))
+    return Hypothesis(
+        fit,
+        used,
+        float(np.sqrt(np.mean((fit.residuals / limb.pixel)[fit.used] ** 2))),
+        supposition,
+        agreement(fit.view, sun, seen.samples),
+        _coverage(fit.view, seen, used, sun, camera),
+        night,
+        settings.sphere_sigma if np.isinf(stand.sigma) else 0.0,
+    )
+
+
+def _fitted(
+    view: View,
+    seen: Observation,
+    members: BoolArray,
+    sun: FloatArray | None,
+    settings: HorizonSettings,
+    prior: Prior,
+) -> tuple[FittedLimb, LimbPoints] | None:
+    """Return the limb through the members, and the places it was fitted to; None where there is none.
+
+    One step towards the steepest places of the edges, and from there the fit to their profiles.
+    """
+    limb = limb_points(view, seen, members, sun)
+    if len(limb.index) < settings.least_edges:
+        return None
+    start = stepped(view, limb.residuals, limb.gradients, limb.sigma, prior)
+    if start is None:
+        return None
+    limb = limb_points(start, seen, near_limb(start, seen, settings.tolerance), sun)
+    limb = placed_by_profile(start, seen, limb, settings)
+    if len(limb.index) < settings.least_edges:
+        return None
+    fit = fit_limb(start, limb.rays, limb.sigma, prior)
+    if fit is None or np.count_nonzero(fit.used) < settings.least_edges:
+        return None
+    return fit, limb
+
+
+def _coverage(
+    view: View,
+    seen: Observation,
+    used: BoolArray,
+    sun: FloatArray | None,
+    camera: CameraModel,
+) -> float:
+    """Return the share of the limb in view, of the lit one where the Sun is known, near a used edge."""
+    rays = limb_rays(view, _LIMB_RAYS)
+    if sun is not None:
+        plain = (sun_elevation(view, rays, sun) > DAYLIGHT) & (rays @ (view.rotation @ sun) < np.cos(GLARE))
+        rays = rays[plain]
+    points = camera.project(rays)
+    points = points[camera.contains(points, -_BORDER)]
+    if not len(points):
+        return 1.0
+    space = _NEAR * max(camera.columns, camera.rows)
+    edges = seen.edges.points[used]
+    apart = np.maximum(
+        np.abs(points[:, :1] - edges[:, 0]),
+        np.abs(points[:, 1:] - edges[:, 1]),
+    )
+    return float(np.mean(apart.min(axis=1, initial=np.inf) < space))

@@ -1,0 +1,73 @@
+"""What is known beforehand of where the camera is and how it looks: all optional, each with its spread."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from flight.gnc.earth.figure import SEMI_MAJOR_AXIS
+from flight.gnc.math.arrays import FloatArray
+
+ICRS_POLE: FloatArray = np.array([0.0, 0.0, 1.0])
+LEAST_ALTITUDE = 50e3
+"""m: from lower down no limb is seen as one; within the air there is none."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensedDirection:
+    """A direction that is known in both frames: the coarse Sun of the solar strings, or the magnetic field.
+
+    Attributes:
+        camera: (3,) as sensed, camera axes; of any length.
+        inertial: (3,) as it should be, from ephemeris or field model; of any length.
+        sigma: rad, of an axis.
+    """
+
+    camera: FloatArray
+    inertial: FloatArray
+    sigma: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RoughAttitude:
+    """An attitude of the camera, inertial into camera axes, (4,) scalar last, and its spread, rad an axis."""
+
+    quaternion: FloatArray
+    sigma: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class HorizonKnowledge:
+    """What GPS, ephemerides and the coarse sensors say; without any of it the horizon is still fitted.
+
+    Attributes:
+        position: (3,) m from the Earth's centre, inertial axes: sets the altitude and, with `pole`, the
+            ellipsoid's cone.
+        altitude: m above a sphere of the mean radius, where there is no position.
+        sun: (3,) towards the Sun, inertial axes; of any length.
+        pole: (3,) the Earth's axis, inertial axes.
+        attitude: a rough one, as the filter has it.
+        sensed: directions from coarse sensors.
+
+    Raises ValueError for what is not finite, of another shape, or inside the Earth.
+    """
+
+    position: FloatArray | None = None
+    altitude: float | None = None
+    sun: FloatArray | None = None
+    pole: FloatArray = field(default_factory=ICRS_POLE.copy)
+    attitude: RoughAttitude | None = None
+    sensed: tuple[SensedDirection, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("position", "sun", "pole"):
+            value = getattr(self, name)
+            if value is not None and (np.shape(value) != (3,) or not np.all(np.isfinite(value))):
+                raise ValueError(f"{name} = {value}: give (3,) finite numbers")
+        if self.position is not None and np.linalg.norm(self.position) < SEMI_MAJOR_AXIS + LEAST_ALTITUDE:
+            raise ValueError(f"position = {self.position}: inside the Earth, give metres from its centre")
+        if self.altitude is not None and not LEAST_ALTITUDE <= self.altitude < np.inf:
+            raise ValueError(
+                f"altitude = {self.altitude}: give metres above the Earth, {LEAST_ALTITUDE:g} at least"
+            )

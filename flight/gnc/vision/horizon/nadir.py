@@ -1,0 +1,224 @@
+"""From a picture to the way down: the default method, and its judgement.
+
+    solution = find_nadir(frame, camera, HorizonKnowledge(position=..., sun=..., attitude=...))
+    if solution.nadir is not None:
+        filter.update(solution.nadir.direction, solution.nadir.covariance, -position)
+
+Edges on scan lines, cones on which many of them agree, the ellipsoid's limb fitted to each, and each fit held
+against the light in the whole picture, the coarse sensors and the rough attitude. One that stands alone is
+found; several that stand are ambiguous, and said to be so; none is refused with the reason.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flight.gnc.camera.lens import CameraModel
+from flight.gnc.camera.pixel_access import ArrayPixels, PixelAccess
+from flight.gnc.math.arrays import Image
+from flight.gnc.vision.horizon.consensus import best_cone, left_free
+from flight.gnc.vision.horizon.edges import Nearby, find_edges
+from flight.gnc.vision.horizon.hypothesis import Hypothesis, examine
+from flight.gnc.vision.horizon.knowledge import HorizonKnowledge
+from flight.gnc.vision.horizon.limb_equation import ALTITUDE
+from flight.gnc.vision.horizon.limb_points import near_limb
+from flight.gnc.vision.horizon.observation import Observation, observe
+from flight.gnc.vision.horizon.settings import HorizonSettings
+from flight.gnc.vision.horizon.solution import HorizonSolution, HorizonStatus, NadirMeasurement
+from flight.gnc.vision.horizon.supposition import SPHERE_ALTITUDE_SIGMA, Place, Supposition, place_of, suppose
+
+_ALTITUDES = 100e3, 40_000e3
+"""m: where an unknown altitude is looked for."""
+_SURPRISE = 4.0
+"""Standard deviations by which a coarse sensor may disagree."""
+_STRAY, _COVERED, _NIGHT = 0.05, 0.6, 0.1
+_RIVAL = 0.3
+"""Of the best's edges: a second horizon of so many is a rival."""
+_SAME = np.radians(1.0)
+_GAIN = 1.5
+"""Thrice the lines must show so many times the edges on a horizon, or it is none."""
+
+
+def find_nadir(
+    frame: Image | PixelAccess,
+    camera: CameraModel,
+    knowledge: HorizonKnowledge | None = None,
+    settings: HorizonSettings | None = None,
+) -> HorizonSolution:
+    """Return the nadir that the horizon in a frame gives, or why there is none.
+
+    Where a horizon of few edges runs, more lines are read; edges without a horizon are looked at a second
+    time on more lines everywhere. Raises ValueError for a frame of another size than the camera's, or with
+    pixels that are not finite.
+    """
+    knowledge, settings = knowledge or HorizonKnowledge(), settings or HorizonSettings()
+    access = ArrayPixels(frame) if isinstance(frame, np.ndarray) else frame
+    if (access.columns, access.rows) != (camera.columns, camera.rows):
+        raise ValueError(
+            f"a frame of {access.columns} x {access.rows} pixels, but the camera has"
+            f" {camera.columns} x {camera.rows}"
+        )
+    look = _look(access, camera, knowledge, settings)
+    found = look.solution()
+    if found.nadir is not None and found.nadir.used >= settings.enough_edges:
+        return found
+    if len(found.points) < settings.some_edges:
+        return found
+    again = replace(settings, edges=replace(settings.edges, lines=settings.edges.more_lines))
+    read = found.pixels_read
+    if found.nadir is not None:
+        closer = _closer(look, access, camera, knowledge, again)
+        read += closer.read
+        second = closer.solution()
+        if second.nadir is not None and second.nadir.used >= _GAIN * found.nadir.used:
+            # Its rivals have been judged in the first look.
+            return replace(second, candidates=found.candidates, pixels_read=read)
+    second = _look(access, camera, knowledge, again).solution()
+    return replace(second, pixels_read=read + second.pixels_read)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Look:
+    """What was read at once: `levels` as in `ScanLines`, hypotheses, the best first; how many pixels."""
+
+    seen: Observation
+    levels: tuple[float, float, float]
+    hypotheses: list[Hypothesis]
+    read: int
+
+    def solution(self) -> HorizonSolution:
+        """Return what becomes of it."""
+        points, hypotheses = self.seen.edges.points, self.hypotheses
+        if not hypotheses:
+            return HorizonSolution(
+                HorizonStatus.NO_HORIZON,
+                f"{len(points)} edges lie on no common horizon",
+                points=points,
+                on_horizon=np.zeros(len(points), dtype=bool),
+                pixels_read=self.read,
+            )
+        status, reason = _judged(hypotheses)
+        best, found = hypotheses[0], status is HorizonStatus.FOUND
+        return HorizonSolution(
+            status,
+            reason,
+            _measurement(best) if found else None,
+            tuple(_measurement(each) for each in (hypotheses[1:] if found else hypotheses)),
+            points,
+            best.members,
+            best.fit.view,
+            self.read,
+        )
+
+
+def _look(
+    access: PixelAccess, camera: CameraModel, knowledge: HorizonKnowledge, settings: HorizonSettings
+) -> _Look:
+    edges, lines = find_edges(access, settings.edges)
+    seen = observe(edges, lines, camera)
+    hypotheses = _hypotheses(seen, place_of(knowledge, settings), knowledge, settings, camera)
+    return _Look(seen, lines.levels, hypotheses, lines.pixels)
+
+
+def _closer(
+    look: _Look,
+    access: PixelAccess,
+    camera: CameraModel,
+    knowledge: HorizonKnowledge,
+    settings: HorizonSettings,
+) -> _Look:
+    """Return the best horizon of a look once more, with the lines that cross it."""
+    best = look.hypotheses[0]
+    points = look.seen.edges.points[best.members]
+    box = np.stack([points.min(axis=0) - look.seen.space, points.max(axis=0) + look.seen.space])
+    edges, lines = find_edges(access, settings.edges, Nearby(box, look.levels))
+    # The whole picture's light has been judged on the first look's samples.
+    seen = observe(edges, lines, camera, look.seen.samples)
+    members = near_limb(best.fit.view, seen, 2.0 * settings.tolerance)
+    again = replace(best.supposition, view=best.fit.view, members=members)
+    found = examine(again, seen, knowledge, settings, camera)
+    return _Look(seen, look.levels, [] if found is None else [found], lines.pixels)
+
+
+def _hypotheses(
+    seen: Observation,
+    place: Place | None,
+    knowledge: HorizonKnowledge,
+    settings: HorizonSettings,
+    camera: CameraModel,
+) -> list[Hypothesis]:
+    """Return what horizons there could be, those without a flaw first, then by their edges."""
+    if place is None:
+        low, high = (float(np.sqrt(1.0 - (6.37e6 / (6.37e6 + h)) ** 2)) for h in _ALTITUDES)
+    else:
+        low = high = place.cosine
+    free = np.ones(len(seen.edges), dtype=bool)
+    sound: list[Hypothesis] = []
+    doubtful: list[Supposition] = []
+    # What could not be a rival of one that stands need not be looked at.
+    enough = float(settings.least_edges)
+    for _ in range(settings.candidates):
+        if np.count_nonzero(free) < enough:
+            break
+        cone = best_cone(seen.rays, free, (low, high), settings.tolerance, settings.tries)
+        if cone is None or np.count_nonzero(cone.members & free) < enough:
+            break
+        free = left_free(seen.rays, free, cone, settings.tolerance)
+        supposition = suppose(cone, seen, place, knowledge, settings)
+        if supposition.orientation.surprise > _SURPRISE:
+            doubtful.append(supposition)
+            continue
+        found = examine(supposition, seen, knowledge, settings, camera)
+        if found is not None:
+            sound.append(found)
+            if not _flaw(found):
+                enough = max(enough, _RIVAL * np.count_nonzero(found.members))
+    if all(_flaw(each) for each in sound):
+        # What is wrong for certain is fitted only to be told of.
+        fitted = (examine(each, seen, knowledge, settings, camera) for each in doubtful)
+        sound += [each for each in fitted if each is not None]
+    return sorted(sound, key=lambda each: (_flaw(each) != "", -np.count_nonzero(each.members)))
+
+
+def _judged(hypotheses: list[Hypothesis]) -> tuple[HorizonStatus, str]:
+    """Return what becomes of hypotheses, the best first: those without a flaw come before the others."""
+    best = hypotheses[0]
+    flaw = _flaw(best)
+    if flaw:
+        return HorizonStatus.REFUSED, flaw
+    count = np.count_nonzero(best.members)
+    for other in hypotheses[1:]:
+        apart = float(np.arccos(np.clip(other.fit.view.nadir @ best.fit.view.nadir, -1.0, 1.0)))
+        own = np.count_nonzero(other.members & ~best.members)
+        if not _flaw(other) and apart > _SAME and own > _RIVAL * count:
+            return HorizonStatus.AMBIGUOUS, f"two horizons {np.degrees(apart):.1f} deg apart"
+    return HorizonStatus.FOUND, ""
+
+
+def _flaw(one: Hypothesis) -> str:
+    """Return what speaks against a hypothesis, or nothing."""
+    light = one.lighting
+    if one.supposition.orientation.surprise > _SURPRISE:
+        return f"a coarse direction is {one.supposition.orientation.surprise:.1f} sigma off"
+    if light.stray > _STRAY:
+        return f"{100.0 * light.stray:.0f} % of sky and night are bright"
+    if one.coverage < _COVERED:
+        return f"only {100.0 * one.coverage:.0f} % of the lit limb in view show an edge"
+    if one.night > _NIGHT:
+        return f"{100.0 * one.night:.0f} % of the horizon's points lie in the night"
+    return ""
+
+
+def _measurement(one: Hypothesis) -> NadirMeasurement:
+    view = one.fit.view
+    allowance = 0.0 if one.supposition.place.located else SPHERE_ALTITUDE_SIGMA
+    return NadirMeasurement(
+        view.nadir,
+        one.covariance,
+        view.surface.height_of(view.position),
+        float(np.hypot(np.sqrt(one.fit.covariance[ALTITUDE, ALTITUDE]), allowance)),
+        one.residual,
+        int(np.count_nonzero(one.members)),
+    )

@@ -1,0 +1,73 @@
+"""The numbers of the search for the horizon."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from flight.gnc.errors import UsageError
+from flight.gnc.vision.horizon.response import LogarithmicResponse
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EdgeSettings:
+    """How edges are looked for along scan lines.
+
+    Attributes:
+        lines: columns, and as many rows, that are read.
+        more_lines: the same, where those show too little.
+        run: px, odd: shorter fluctuations are filtered out (Meller 3.1).
+        threshold: what counts as bright, as a share of the way from the low to the high average.
+        contrast: an edge that is weaker, as a share of the same way, is none.
+        most: edges that are kept for each of `lines`, those with the darkest dark side.
+        psf_sigma: px, the blur of the optics.
+        response: the detector's, if it is not linear.
+    """
+
+    lines: int = 32
+    more_lines: int = 96
+    run: int = 5
+    threshold: float = 0.3
+    contrast: float = 0.15
+    most: int = 5
+    psf_sigma: float = 0.6
+    response: LogarithmicResponse | None = None
+
+    def __post_init__(self) -> None:
+        if self.lines < 2:
+            raise UsageError(f"lines {self.lines}: at least 2 columns and rows are read")
+        if self.run < 1 or self.run % 2 == 0:
+            raise UsageError(f"run {self.run}: must be an odd number of pixels")
+        for name in ("threshold", "contrast"):
+            if not 0.0 < getattr(self, name) < 1.0:
+                raise UsageError(f"{name} {getattr(self, name)}: must lie between 0 and 1")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HorizonSettings:
+    """How the horizon is told among edges, and what is believed of it.
+
+    Attributes:
+        edges: see `EdgeSettings`.
+        limb_height_sigma: m, by which the apparent limb may be off the height that physics gives: the default
+            for air of unknown scale height (6.5 to 9.5 km) and haze (a third more or less), 1,000 for known.
+        altitude_sigma: m, of a position that is given.
+        tolerance: px, within which edges agree with a circular cone; the Earth's flattening fits into it.
+        least_edges: a horizon of fewer is none.
+        enough_edges: a horizon of fewer is looked at again on more lines.
+        some_edges: in a picture of fewer nothing is looked at again.
+        candidates: how many horizons are looked for in one picture.
+        tries: pairs or triples of edges looked at for each.
+        sphere_sigma: rad an axis, what is added where the flattening's direction is not known.
+    """
+
+    edges: EdgeSettings = field(default_factory=EdgeSettings)
+    limb_height_sigma: float = 3000.0
+    altitude_sigma: float = 50.0
+    tolerance: float = 2.0
+    least_edges: int = 8
+    enough_edges: int = 20
+    some_edges: int = 4
+    candidates: int = 4
+    tries: int = 400
+    sphere_sigma: float = math.radians(0.1)

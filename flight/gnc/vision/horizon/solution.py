@@ -1,0 +1,83 @@
+"""What a picture tells of the way down: nadir in camera axes with its covariance, or why it tells none."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+
+import numpy as np
+
+from flight.gnc.math.arrays import BoolArray, FloatArray
+from flight.gnc.math.directions import tangent_basis
+from flight.gnc.vision.horizon.limb_equation import View
+
+
+class HorizonStatus(Enum):
+    """How the search for the horizon ended."""
+
+    FOUND = "found"
+    AMBIGUOUS = "ambiguous"
+    """Several fits stand, or one that nothing told from the terminator: see the candidates."""
+    NO_HORIZON = "no-horizon"
+    """Too few edges, or none that lie on one horizon."""
+    REFUSED = "refused"
+    """A horizon was fitted, but it contradicts what is known: see the reason."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NadirMeasurement:
+    """The direction to the Earth's centre, as one horizon gives it.
+
+    Attributes:
+        direction: (3,) unit vector in camera axes, towards the Earth's centre (geocentric nadir).
+        covariance: (3, 3) rad^2, of the direction's error; of rank 2, nothing along the direction itself.
+        altitude: m above the ellipsoid (or the sphere of the mean radius): given, or fitted where unknown.
+        altitude_sigma: m.
+        residual: px rms, normal to the fitted horizon, of the points that were used.
+        used: how many points lie on the horizon.
+    """
+
+    direction: FloatArray
+    covariance: FloatArray
+    altitude: float
+    altitude_sigma: float
+    residual: float
+    used: int
+
+    @property
+    def basis(self) -> FloatArray:
+        """Two unit vectors (2, 3) normal to the direction and to one another."""
+        return tangent_basis(self.direction)
+
+    @property
+    def tangent_covariance(self) -> FloatArray:
+        """The covariance (2, 2) rad^2 along `basis`."""
+        return np.asarray(self.basis @ self.covariance @ self.basis.T)
+
+    @property
+    def sigma(self) -> float:
+        """The root of the mean variance over the two axes, rad."""
+        return float(np.sqrt(0.5 * np.trace(self.covariance)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HorizonSolution:
+    """The outcome of one picture.
+
+    Attributes:
+        nadir: the measurement, when the status is FOUND.
+        candidates: what could be the horizon and was not chosen, or all of it when ambiguous.
+        points: (n, 2) px, every edge from dark to bright that was found.
+        on_horizon: (n,) those that the fit used.
+        view: the camera's place and attitude by the best fit, accepted or not; see `limb_in_picture`.
+        pixels_read: how many of the picture's pixels were looked at.
+    """
+
+    status: HorizonStatus
+    reason: str = ""
+    nadir: NadirMeasurement | None = None
+    candidates: tuple[NadirMeasurement, ...] = ()
+    points: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    on_horizon: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    view: View | None = None
+    pixels_read: int = 0

@@ -1,0 +1,1 @@
+"""Resident space objects among the streaks of one frame (Sease chapter 4)."""

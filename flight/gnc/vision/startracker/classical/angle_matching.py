@@ -1,0 +1,33 @@
+"""Angle matching (Michalski 3.2.1; Gottlieb in Wertz 1978, 7.7): pairs by angle, triangles of pairs.
+
+The triangles of the brightest observed stars are taken in order of brightness. Pairs of guide stars with
+the angle of two sides are joined at the star they share, and the third angle decides; what is left is a
+candidate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import combinations
+
+import numpy as np
+
+from flight.gnc.vision.startracker.classical.known_sky import KnownSky
+from flight.gnc.vision.startracker.classical.polygon import matching_triangles
+from flight.gnc.vision.startracker.classical.search import Candidates, search
+from flight.gnc.vision.startracker.classical.settings import DEFAULT, ClassicalSettings
+from flight.gnc.vision.startracker.classical.view import View
+from flight.gnc.vision.startracker.identification.field import StarField
+from flight.gnc.vision.startracker.identification.identification import Identification
+
+
+def identify(field: StarField, sky: KnownSky, settings: ClassicalSettings = DEFAULT) -> Identification:
+    """Return which stars the field shows. Raises FieldUnknown when its scale is known too badly."""
+    return search(field, sky, settings, _propose)
+
+
+def _propose(view: View, sky: KnownSky, settings: ClassicalSettings) -> Iterator[Candidates]:
+    triangles = sorted(combinations(range(view.stars), 3), key=lambda corners: corners[::-1])
+    for corners in triangles[: settings.joins]:
+        found = matching_triangles(view, sky, corners, settings.tolerance)
+        yield Candidates(np.tile(corners, (len(found), 1)), found)

@@ -1,0 +1,32 @@
+"""Stars in a frame: points with honest errors, from a camera of any kind.
+
+    found = detect(pixels, DetectionSettings()).stars()
+    found.points, found.covariance, found.flux        # brightest first
+
+`sky` measures the background and finds what stands above it, `areas` puts that together: that is the
+`survey`, which tells points from streaks (`frame_kind`); streaks are `flight.gnc.vision.streaks`'s. `peaks`
+chooses what is worth a measurement, `first_look` tells the frame's own point spread and noise
+(`noise_model`), and
+`measurement` fits each star with them (`psf_fit`, `blending`) or takes the centre of mass
+(`window_centroid`); `detect` composes. `nearby` measures about predicted places only.
+"""
+
+from flight.gnc.vision.startracker.detection.detect import detect, measure_areas
+from flight.gnc.vision.startracker.detection.detections import Detections, FrameKind, FrameShape, Quality
+from flight.gnc.vision.startracker.detection.nearby import measure_near
+from flight.gnc.vision.startracker.detection.settings import DetectionSettings
+from flight.gnc.vision.startracker.detection.survey import Survey, kind_of_frame, survey
+
+__all__ = [
+    "DetectionSettings",
+    "Detections",
+    "FrameKind",
+    "FrameShape",
+    "Quality",
+    "Survey",
+    "detect",
+    "kind_of_frame",
+    "measure_areas",
+    "measure_near",
+    "survey",
+]

@@ -1,0 +1,200 @@
+"""The sky of a frame, its noise, and where the smoothed frame stands above it.
+
+Smoothing is by [1 2 1] each way, nearly the matched filter of a star of sigma 0.7 to 1.5 px. The noise of the
+smoothed frame is measured in it, not derived: demosaicing and JPEG correlate pixels, and a threshold from
+single pixels would then pass thousands of peaks. The frame is gone through in bands of rows that stay in the
+processor's cache; no image of its size is ever made.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from flight.gnc.math.arrays import FloatArray, Image, IntArray
+from flight.gnc.vision.streaks.background import estimate_background
+
+Float32Array = npt.NDArray[np.float32]
+
+KERNEL_NORM = 6.0
+"""Root of the sum of squares of the smoothing kernel: the noise of white noise of 1."""
+LEAST_SIDE = 16
+# A frame without whole counts is brought to so many counts of noise.
+_FLOATING_NOISE = 16.0
+_BAND = 32
+_BLOCK, _STRIDE, _SINGLE_STRIDE = 64, 4, 8
+_TAIL_PART = 0.97725
+_ROUNDING = 12.0**-0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surface:
+    """Values (down, across) of equal blocks of a frame of `shape`, bilinear between their centres."""
+
+    values: FloatArray
+    shape: tuple[int, int]
+
+    def at(self, column: npt.ArrayLike, row: npt.ArrayLike) -> FloatArray:
+        """Return the values (n,) at pixels `column` (n,), `row` (n,)."""
+        top, down = _place(np.asarray(row, dtype=float), self.shape[0], self.values.shape[0])
+        left, across = _place(np.asarray(column, dtype=float), self.shape[1], self.values.shape[1])
+        bottom = np.minimum(top + 1, self.values.shape[0] - 1)
+        right = np.minimum(left + 1, self.values.shape[1] - 1)
+        high = self.values[top, left] * (1.0 - across) + self.values[top, right] * across
+        low = self.values[bottom, left] * (1.0 - across) + self.values[bottom, right] * across
+        return np.asarray(high * (1.0 - down) + low * down)
+
+    def factors(self) -> tuple[Float32Array, Float32Array]:
+        """Return (rows, down) and (down, columns), whose product is the whole frame."""
+        weights = []
+        for pixels, blocks in zip(self.shape, self.values.shape, strict=True):
+            first, share = _place(np.arange(pixels, dtype=float), pixels, blocks)
+            weight = np.zeros((pixels, blocks))
+            weight[np.arange(pixels), first] += 1.0 - share
+            weight[np.arange(pixels), np.minimum(first + 1, blocks - 1)] += share
+            weights.append(weight)
+        return weights[0].astype(np.float32), (self.values @ weights[1].T).astype(np.float32)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sky:
+    """What a frame is like between its stars.
+
+    Attributes:
+        level, noise: counts of single pixels.
+        smooth_level, smooth_noise: of the smoothed frame (kernel of sum 16).
+    """
+
+    level: Surface
+    noise: Surface
+    smooth_level: Surface
+    smooth_noise: Surface
+
+    @property
+    def correlation(self) -> float:
+        """How much more noisy a sum of pixels is than independent pixels would make it; 1 or more."""
+        white = KERNEL_NORM * np.median(self.noise.values)
+        return max(1.0, float(np.median(self.smooth_noise.values) / white))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BrightPixels:
+    """The pixels (m,) of the smoothed frame above the noise, row by row.
+
+    Attributes:
+        index: of the pixel in the flat frame, increasing.
+        smooth: counts of the smoothed frame, its level taken off.
+        shape: rows, columns.
+    """
+
+    index: IntArray
+    smooth: FloatArray
+    shape: tuple[int, int]
+
+
+def in_counts(pixels: Image) -> tuple[Image, float]:
+    """Return `pixels` (rows, columns) in whole counts or as if they were, and the unit of one.
+
+    Raises ValueError unless it is a finite frame of real numbers, 16 x 16 or larger.
+    """
+    if pixels.ndim != 2 or min(pixels.shape) < LEAST_SIDE:
+        raise ValueError(f"a frame of shape {pixels.shape}: give (rows, columns), {LEAST_SIDE} or more each")
+    if pixels.dtype.kind not in "uif":
+        raise ValueError(f"a frame of {pixels.dtype}: give integers or floating numbers")
+    if pixels.dtype.kind != "f":
+        return pixels, 1.0
+    if not np.all(np.isfinite(pixels)):
+        raise ValueError("a frame with pixels that are not finite")
+    sample = pixels[::4, ::4].astype(float)
+    spread = 1.4826 * float(np.median(np.abs(sample - np.median(sample))))
+    spread = spread or float(sample.std()) or 1.0
+    unit = spread / _FLOATING_NOISE
+    return (pixels / unit).astype(np.float32), unit
+
+
+def measure_sky(pixels: Image) -> Sky:
+    """Return level and noise of `pixels` (rows, columns), of single ones and of the smoothed frame."""
+    shape = (pixels.shape[0], pixels.shape[1])
+    single = estimate_background(pixels, _BLOCK, _SINGLE_STRIDE)
+    level = Surface(single.level, shape)
+    row, column = np.arange(2, shape[0] - 1, _STRIDE), np.arange(2, shape[1] - 1, _STRIDE)
+    sample = _smoothed_at(pixels, row, column)
+    smooth = estimate_background(sample, _BLOCK // _STRIDE, 1)
+    # Rounding to whole counts is noise, even of a sky that is zero everywhere.
+    smooth_noise = np.maximum(smooth.noise, KERNEL_NORM * _ROUNDING)
+    lone = pixels[2::_SINGLE_STRIDE, 2::_SINGLE_STRIDE].astype(np.float32)
+    return Sky(
+        level,
+        Surface(single.noise * _tail(lone, single.level, single.noise), shape),
+        Surface(smooth.level, shape),
+        Surface(smooth_noise * _tail(sample, smooth.level, smooth_noise), shape),
+    )
+
+
+def find_bright(pixels: Image, sky: Sky, sigmas: float) -> BrightPixels:
+    """Return where the smoothed frame exceeds its level by more than `sigmas` of its noise."""
+    rows, columns = pixels.shape
+    limit = Surface(sky.smooth_level.values + sigmas * sky.smooth_noise.values, (rows, columns))
+    down, across = limit.factors()
+    across = np.ascontiguousarray(across[:, 1:-1])
+    count = min(_BAND, rows - 2)
+    band = np.empty((count + 2, columns), dtype=np.float32)
+    once, twice = (np.empty((count + 2 - k, columns), dtype=np.float32) for k in (1, 2))
+    wide, smooth = (
+        np.empty((count, columns - 1), dtype=np.float32),
+        np.empty((count, columns - 2), np.float32),
+    )
+    bound = np.empty_like(smooth)
+    places: list[IntArray] = []
+    values: list[Float32Array] = []
+    for first in [*range(1, rows - 1 - count, count), rows - 1 - count]:
+        band[:] = pixels[first - 1 : first + count + 1]
+        np.add(band[:-1], band[1:], out=once)
+        np.add(once[:-1], once[1:], out=twice)
+        np.add(twice[:, :-1], twice[:, 1:], out=wide)
+        np.add(wide[:, :-1], wide[:, 1:], out=smooth)
+        np.matmul(down[first : first + count], across, out=bound)
+        above = np.flatnonzero(smooth > bound)
+        row, column = np.divmod(above, columns - 2)
+        # The last band may begin before its predecessor's end.
+        place = (row + first) * columns + column + 1
+        new = slice(0, None) if not places or not len(places[-1]) else place > places[-1][-1]
+        places.append(place[new])
+        values.append(smooth.reshape(-1)[above][new])
+    index = np.concatenate(places)
+    row, column = np.divmod(index, columns)
+    return BrightPixels(index, np.concatenate(values) - sky.smooth_level.at(column, row), (rows, columns))
+
+
+def _smoothed_at(pixels: Image, row: IntArray, column: IntArray) -> Float32Array:
+    """Return the smoothed frame at every crossing of `row` (r,) and `column` (c,), evenly spaced."""
+    total = np.zeros((len(row), len(column)), dtype=np.float32)
+    for dy in (-1, 0, 1):
+        rows = slice(row[0] + dy, row[-1] + dy + 1, _STRIDE)
+        for dx in (-1, 0, 1):
+            part = pixels[rows, column[0] + dx : column[-1] + dx + 1 : _STRIDE]
+            total += np.float32((2 - abs(dy)) * (2 - abs(dx))) * part
+    return total
+
+
+def _tail(sample: Float32Array, level: FloatArray, noise: FloatArray) -> float:
+    """Return how much farther the noise reaches upwards than a normal one; 1 or more.
+
+    2.3 % of a frame should stand above twice its noise. A sky cut off at zero counts has noise on one side
+    only, whose clipped moments say too little of it.
+    """
+    (rows, columns), (down, across) = sample.shape, level.shape
+    block = np.ix_(np.arange(rows) * down // rows, np.arange(columns) * across // columns)
+    relative = (sample - level[block]) / noise[block]
+    place = min(relative.size - 1, int(_TAIL_PART * relative.size))
+    return max(1.0, 0.5 * float(np.partition(relative, place, axis=None)[place]))
+
+
+def _place(pixel: FloatArray, pixels: int, blocks: int) -> tuple[IntArray, FloatArray]:
+    """Return the block (n,) whose centre is before `pixel` (n,), and how far it is to the next one."""
+    width = pixels // blocks
+    place = np.clip((pixel - 0.5 * (width - 1)) / width, 0.0, blocks - 1.0)
+    first = place.astype(np.int64)
+    return first, place - first

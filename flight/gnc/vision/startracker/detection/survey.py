@@ -1,0 +1,50 @@
+"""The first pass over a frame, of points or of streaks: its sky, and what stands above the noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from flight.gnc.math.arrays import Image
+from flight.gnc.vision.startracker.detection.areas import Areas, find_areas
+from flight.gnc.vision.startracker.detection.detections import FrameShape
+from flight.gnc.vision.startracker.detection.frame_kind import frame_shape
+from flight.gnc.vision.startracker.detection.settings import DetectionSettings
+from flight.gnc.vision.startracker.detection.sky import Sky, find_bright, in_counts, measure_sky
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Survey:
+    """What one pass over a frame sees: its sky, and the areas that stand above the noise.
+
+    Attributes:
+        pixels: (rows, columns) in counts, `unit` of the frame's own numbers each.
+        settings: in these counts.
+    """
+
+    pixels: Image
+    unit: float
+    settings: DetectionSettings
+    sky: Sky
+    areas: Areas
+
+    @property
+    def shape(self) -> FrameShape:
+        """Whether they are points or streaks."""
+        return frame_shape(self.areas)
+
+
+def survey(pixels: Image, settings: DetectionSettings | None = None) -> Survey:
+    """Return what stands above the noise of a frame (rows, columns). Raises ValueError as `detect`."""
+    pixels, unit = in_counts(pixels)
+    settings = (settings or DetectionSettings()).in_units_of(unit)
+    sky = measure_sky(pixels)
+    bright = find_bright(pixels, sky, settings.threshold_sigmas)
+    return Survey(pixels, unit, settings, sky, find_areas(pixels, sky, bright, settings.saturation))
+
+
+def kind_of_frame(pixels: Image, settings: DetectionSettings | None = None) -> FrameShape:
+    """Return whether a frame (rows, columns) shows points, streaks or neither, and how long they are.
+
+    Raises ValueError as `detect`.
+    """
+    return survey(pixels, settings).shape

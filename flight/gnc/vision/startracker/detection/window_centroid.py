@@ -1,0 +1,81 @@
+"""The windowed centre of mass with border subtraction: Michalski eq. 12-21, corrected.
+
+The window is a x a pixels about the brightest one. 14 and 15 as printed end it one pixel too far for the
+divisor 4 (a - 1) of 16e, which counts the border of a x a pixels: here it ends at x_start + a - 1. (20) is
+y_CM with j (errata). The outermost pixels are the border, the centre of mass is taken of those within.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.vision.startracker.detection.noise_model import NoiseModel
+from flight.gnc.vision.startracker.detection.point_spread import light
+from flight.gnc.vision.startracker.detection.windows import Windows
+
+_PHASES = np.linspace(-0.45, 0.45, 10)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WindowCentroids:
+    """Centres of mass.
+
+    Attributes:
+        offset: (n, 2) px from the middle pixel; clipped to the window where the light is noise.
+        flux, sky: (n,) counts within the border, and a pixel on the border.
+        variance: (n,) px^2 along one axis, of the noise and of what the window cuts off.
+        flux_variance: (n,) counts^2.
+    """
+
+    offset: FloatArray
+    flux: FloatArray
+    sky: FloatArray
+    variance: FloatArray
+    flux_variance: FloatArray
+
+
+def centre_of_mass(windows: Windows, noise: NoiseModel, psf_sigma: float) -> WindowCentroids:
+    """Return the centres of mass of `windows` (eq. 12-20); those cut by the edge are of what is there."""
+    half = windows.half
+    offset, flux, sky = _moments(windows.light)
+    step = np.arange(1 - half, half)
+    inner = windows.light[:, 1:-1, 1:-1]
+    clean = inner - sky[:, None, None]
+    variance = noise.variance(clean, windows.noise)
+    dx, dy = step - offset[:, :1], step - offset[:, 1:]
+    whole = np.maximum(flux, 1e-30) ** 2
+    both = 0.5 * np.sum(variance * (dx[:, None, :] ** 2 + dy[:, :, None] ** 2), axis=(1, 2)) / whole
+    # The border's mean is off by its noise, and pulls the centre of mass towards the window's middle.
+    border = windows.noise**2 / (8.0 * half)
+    area = float(inner[0].size) if len(inner) else 1.0
+    both += 0.5 * np.sum(offset**2, axis=1) * area**2 * border / whole
+    return WindowCentroids(
+        offset,
+        flux,
+        sky,
+        both + _cut_off(half, psf_sigma) ** 2,
+        np.sum(variance, axis=(1, 2)) + area**2 * border,
+    )
+
+
+def _moments(window: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    half = window.shape[1] // 2
+    rim = window[:, 0].sum(axis=1) + window[:, -1].sum(axis=1)
+    rim = rim + window[:, 1:-1, 0].sum(axis=1) + window[:, 1:-1, -1].sum(axis=1)
+    sky = rim / (4.0 * (window.shape[1] - 1))
+    clean = window[:, 1:-1, 1:-1] - sky[:, None, None]
+    flux = clean.sum(axis=(1, 2))
+    step = np.arange(1 - half, half)
+    whole = np.where(flux > 0.0, flux, np.inf)
+    x, y = clean.sum(axis=1) @ step / whole, clean.sum(axis=2) @ step / whole
+    return np.clip(np.stack([x, y], axis=-1), 1 - half, half - 1), flux, sky
+
+
+def _cut_off(half: int, psf_sigma: float) -> float:
+    """Return the rms error in px that the window's edge and border make, over places within a pixel."""
+    place = np.stack([_PHASES, np.zeros_like(_PHASES)], axis=-1)
+    stars = light(place, np.full(len(_PHASES), psf_sigma), half)
+    return float(np.sqrt(np.mean((_moments(stars)[0][:, 0] - _PHASES) ** 2)))

@@ -1,0 +1,1 @@
+"""Which stars a frame shows: lost in space and tracking."""

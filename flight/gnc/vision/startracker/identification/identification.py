@@ -1,0 +1,40 @@
+"""What an identification method answers, whichever it is (Michalski 3.2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from flight.gnc.attitude.wahba import AttitudeFix
+from flight.gnc.math.arrays import IntArray
+
+
+class Status(Enum):
+    """How an identification ended."""
+
+    IDENTIFIED = "identified"
+    TOO_FEW_STARS = "too-few-stars"
+    NO_MATCH = "no-match"
+    AMBIGUOUS = "ambiguous"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Identification:
+    """Which guide star each observed star is.
+
+    Attributes:
+        status: the rest is meaningful for IDENTIFIED only.
+        star: (n,) numbers of guide stars, -1 for an observed star that is none of them.
+        fix: attitude from all matched stars, ICRS to camera, with its covariance; None unless identified.
+        scale: by which the tangents of the observed directions had to be multiplied.
+        scale_sigma: its standard deviation; 0 when the scale was given.
+        log10_false_alarm: of the probability that stars strewn at random would match as well anywhere in the
+            sky; -inf never, 0 when nothing is known.
+    """
+
+    status: Status
+    star: IntArray
+    fix: AttitudeFix | None = None
+    scale: float = 1.0
+    scale_sigma: float = 0.0
+    log10_false_alarm: float = 0.0

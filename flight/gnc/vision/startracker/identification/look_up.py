@@ -1,0 +1,217 @@
+"""Observed triangles among those of the guide stars: all of them, at all steps of scale, at once."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from flight.gnc.math.arrays import BoolArray, FloatArray, IntArray
+from flight.gnc.vision.startracker.identification.field import StarField
+from flight.gnc.vision.startracker.index.sky_index import SkyIndex
+from flight.gnc.vision.startracker.index.triangle_index import (
+    CELL,
+    CELLS,
+    FINE,
+    LEAST_RATIO,
+    SIZE_BITS,
+    SIZE_UNIT,
+)
+
+_LARGEST_SIZE = (1 << SIZE_BITS) - 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScaleSteps:
+    """Ranges of scale that together cover what the lens may have, each narrow enough for one set of shapes.
+
+    Attributes:
+        middle: (s,) scale that the shapes are taken at.
+        lowest, highest: (s,) ends of each range.
+    """
+
+    middle: FloatArray
+    lowest: FloatArray
+    highest: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.middle)
+
+    @classmethod
+    def of(cls, field: StarField, tolerance: float) -> ScaleSteps:
+        """Return the steps for the scales of a field, ratios of sides being right to `tolerance` in each.
+
+        At the tangent t from the boresight a gnomonic image is stretched by 1 + t^2 along the radius and by
+        1 + t^2 / 2 across it, so the ratio of two sides at half the way to the corner varies by t^2 / 2.
+        """
+        lowest, highest = field.scale
+        half_way = 0.25 * (field.half_width[0] ** 2 + field.half_width[1] ** 2)
+        count = max(1, math.ceil((highest**2 - lowest**2) * half_way / (4.0 * tolerance)))
+        edges = np.sqrt(np.linspace(lowest**2, highest**2, count + 1))
+        return cls(np.sqrt(edges[:-1] * edges[1:]), edges[:-1], edges[1:])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Finds:
+    """Observed triangles that look like triangles of guide stars, corner by corner.
+
+    Attributes:
+        observed: (k, 3) numbers of observed stars.
+        star: (k, 3) numbers of guide stars.
+        scale: (k,) factor of the tangents that makes the longest sides equal.
+    """
+
+    observed: IntArray
+    star: IntArray
+    scale: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.scale)
+
+    @classmethod
+    def of(cls, parts: Sequence[Finds]) -> Finds:
+        """Return several finds as one."""
+        if len(parts) == 1:
+            return parts[0]
+        return cls(
+            np.concatenate([part.observed for part in parts]),
+            np.concatenate([part.star for part in parts]),
+            np.concatenate([part.scale for part in parts]),
+        )
+
+    def votes(self) -> IntArray:
+        """Return for each pair of each find (k, 3) how many finds of about the same scale have it.
+
+        Scales are counted in two sets of bins, half a bin apart, and the better count holds: no scale is
+        at the edge of both.
+        """
+        bins = np.log(self.scale) * _BINS_PER_LN_SCALE
+        if bins.max() - bins.min() < 1.0:
+            return self._votes_in(np.zeros_like(bins))
+        return np.asarray(np.maximum(self._votes_in(np.floor(bins)), self._votes_in(np.floor(bins + 0.5))))
+
+    def _votes_in(self, scale_bin: FloatArray) -> IntArray:
+        slots = 1 << max(13, (3 * self.star.size).bit_length())
+        # Spread by a multiplicative hash: that two pairs share a slot is as rare as it is harmless.
+        code = (self.star * 1021 + self.observed) * 257 + scale_bin.astype(np.int64)[:, None]
+        slot = ((code * 2654435761) >> 11) & (slots - 1)
+        return np.asarray(np.bincount(slot.ravel(), minlength=slots)[slot])
+
+
+_BINS_PER_LN_SCALE = 25.0
+
+
+def look_up(
+    field: StarField,
+    sky: SkyIndex,
+    steps: ScaleSteps,
+    triangles: IntArray,
+    tolerance: float,
+    distortion: float,
+    most: int,
+) -> tuple[Finds, int]:
+    """Return the finds of observed `triangles` (t, 3), and how many entries of the index were read.
+
+    Args:
+        field: the observed stars.
+        sky: the guide stars' triangles.
+        steps: of scale.
+        triangles: numbers of observed stars.
+        tolerance: of a ratio of sides, in its sigmas.
+        distortion: by which it may be wrong besides.
+        most: entries that may be read; the triangles that come first have them.
+    """
+    corners, sides, left = _forms(field, triangles, steps)
+    size = np.maximum(sides[:, 2], SIZE_UNIT)
+    sigma = np.sqrt(np.mean(field.sigma[corners] ** 2, axis=1))
+    step = np.tile(np.arange(len(steps)), len(triangles))
+    # The error of a difference of two directions, and of the side that it is divided by.
+    slack = (1.6 * tolerance) * sigma * steps.middle[step] / size + distortion
+    ratio = sides[:, :2] / size[:, None]
+    usable = np.flatnonzero((slack <= CELL) & (ratio[:, 0] + slack >= LEAST_RATIO))
+    corners, size, left = corners[usable], size[usable], left[usable]
+    slack, ratio, step = slack[usable], ratio[usable], step[usable]
+    lowest = size * (steps.lowest / steps.middle)[step] * (1.0 - slack)
+    highest = size * (steps.highest / steps.middle)[step] * (1.0 + slack)
+    query, short, middle, begin, end = _runs(sky, ratio, slack, left, lowest, highest)
+    entry, run = _entries(begin, end, most)
+    total = len(entry)
+    # In units of the finest division of a ratio, from its middle.
+    wanted = ratio * (CELLS * FINE) - 0.5
+    off_short = (short * FINE - wanted[query, 0])[run] + sky.triangles.shape[entry, 0]
+    off_middle = (middle * FINE - wanted[query, 1])[run] + sky.triangles.shape[entry, 1]
+    reach = (slack[query] * (CELLS * FINE) + 0.5)[run]
+    near = np.flatnonzero((np.abs(off_short) <= reach) & (np.abs(off_middle) <= reach))
+    entry, query = entry[near], query[run[near]]
+    longest = (sky.triangles.key[entry] & np.uint32(_LARGEST_SIZE)) * SIZE_UNIT
+    scale = longest / size[query] * steps.middle[step[query]]
+    star = sky.triangles.corners[entry].astype(np.int64)
+    return Finds(corners[query], star, scale), total
+
+
+def _entries(begin: IntArray, end: IntArray, most: int) -> tuple[IntArray, IntArray]:
+    """Return the entries (k,) of the first runs that have no more than `most`, and the run of each."""
+    count = end - begin
+    read = np.cumsum(count)
+    if len(read) and read[-1] > most:
+        kept = int(np.searchsorted(read, most))
+        count, read, begin = count[:kept], read[:kept], begin[:kept]
+    run = np.repeat(np.arange(len(count)), count)
+    return np.arange(len(run)) + (begin - read + count)[run], run
+
+
+def _forms(
+    field: StarField, triangles: IntArray, steps: ScaleSteps
+) -> tuple[IntArray, FloatArray, BoolArray]:
+    """Return corners (t s, 3) in order of the sides opposite, sides (t s, 3), whether they turn left."""
+    x, y, z = field.direction.T
+    direction = np.empty((len(steps), len(field), 3))
+    direction[:, :, 0] = steps.middle[:, None] * x
+    direction[:, :, 1] = steps.middle[:, None] * y
+    direction[:, :, 2] = z
+    direction /= np.sqrt(np.einsum("sij,sij->si", direction, direction))[:, :, None]
+    first, second, third = triangles.T
+    one = np.stack([second, third, first], axis=-1)
+    two = np.stack([third, first, second], axis=-1)
+    cosine = (direction @ direction.transpose(0, 2, 1))[:, one, two]
+    sides = np.sqrt(np.maximum(2.0 - 2.0 * cosine, 0.0)).transpose(1, 0, 2).reshape(-1, 3)
+    order = np.argsort(sides, axis=1)
+    rows = np.arange(len(sides))[:, None]
+    corners = np.repeat(triangles, len(steps), axis=0)[rows, order]
+    a, b, c = corners.T
+    u, v = x / z, y / z
+    left = (u[b] - u[a]) * (v[c] - v[a]) > (u[c] - u[a]) * (v[b] - v[a])
+    return corners, sides[rows, order], left
+
+
+def _runs(
+    sky: SkyIndex,
+    ratio: FloatArray,
+    slack: FloatArray,
+    left: BoolArray,
+    lowest: FloatArray,
+    highest: FloatArray,
+) -> tuple[IntArray, IntArray, IntArray, IntArray, IntArray]:
+    """Return the runs of keys that hold triangles like the queries.
+
+    Of each: the number of its query, the cells of the short and the middle ratio, where it begins and ends. A
+    query's ratios may lie in up to three cells each.
+    """
+    low = np.maximum(((ratio - slack[:, None]) * CELLS).astype(np.int64), 0)
+    high = np.minimum(((ratio + slack[:, None]) * CELLS).astype(np.int64), CELLS - 1)
+    spans = high - low
+    widest = int(spans.max(initial=0)) + 1
+    here = np.arange(widest) <= spans[:, :, None]
+    # In order of the queries: the triangles that come first have the first of the entries that may be read.
+    query, along_short, along_middle = np.nonzero(here[:, 0, :, None] & here[:, 1, None, :])
+    short = low[query, 0] + along_short
+    middle = low[query, 1] + along_middle
+    form = ((left[query] * CELLS + short) * CELLS + middle) << SIZE_BITS
+    first = np.minimum(lowest / SIZE_UNIT, _LARGEST_SIZE).astype(np.int64)[query]
+    last = np.minimum(highest / SIZE_UNIT, _LARGEST_SIZE).astype(np.int64)[query]
+    # The keys' own type: searchsorted would convert all keys to another.
+    begin = np.searchsorted(sky.triangles.key, (form | first).astype(np.uint32))
+    end = np.searchsorted(sky.triangles.key, (form | last).astype(np.uint32), side="right")
+    return query, short, middle, begin, end

@@ -1,0 +1,123 @@
+"""Lost in space: which stars of the whole sky a frame shows, from nothing but the frame.
+
+Every triangle of the brightest observed stars is looked up by shape, turning and size among those of the
+guide stars, all at once. Each find votes for its three pairs of an observed and a guide star: pairs of the
+truth occur in many triangles, chance pairs in one. The finds with the most votes are verified against the
+whole field, one after the other, until one holds. If none does, more stars are taken, until the work
+allowed is done; and last the triangles of neighbours, for a list that is not in order of brightness.
+
+The shape on the sphere depends on the scale of the image, though little: a wide range of scales is tried in
+steps, each narrow enough for the ratios of the sides to stay within the tolerance.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.vision.startracker.identification.field import StarField
+from flight.gnc.vision.startracker.identification.identification import Identification, Status
+from flight.gnc.vision.startracker.identification.look_up import Finds, ScaleSteps, look_up
+from flight.gnc.vision.startracker.identification.observed_triangles import batches_of
+from flight.gnc.vision.startracker.identification.refinement import stretched
+from flight.gnc.vision.startracker.identification.verification import (
+    VerificationSettings,
+    nothing,
+    verify_matrix,
+)
+from flight.gnc.vision.startracker.index.sky_index import SkyIndex
+
+
+@dataclass(frozen=True, slots=True)
+class IdentificationSettings:
+    """How hard to try.
+
+    Attributes:
+        tolerance: of the ratios of sides, in their sigmas.
+        distortion: by which a ratio of sides may be wrong besides, for a lens that is no pinhole.
+        batches: numbers of triangles that are looked up, one batch after the other; at each step of scale.
+        work: entries of the index that may be read in all.
+        verified: candidates of each batch that are verified at most.
+        verification: when a candidate is believed.
+    """
+
+    tolerance: float = 3.0
+    distortion: float = 0.0015
+    batches: tuple[int, ...] = (60, 250, 800)
+    work: int = 50_000
+    verified: int = 12
+    verification: VerificationSettings = field(default_factory=VerificationSettings)
+
+
+DEFAULT = IdentificationSettings()
+
+
+def identify(
+    observed: StarField, sky: SkyIndex, settings: IdentificationSettings = DEFAULT
+) -> Identification:
+    """Return which stars the frame shows, and the attitude that they fix; or that it cannot be told."""
+    if len(observed) < settings.verification.least_matches:
+        return nothing(observed, Status.TOO_FEW_STARS)
+    steps = ScaleSteps.of(observed, settings.distortion)
+    found: list[Finds] = []
+    tried: set[tuple[int, int]] = set()
+    work = 0
+    for triangles in batches_of(observed, settings.batches, len(steps)):
+        finds, read = look_up(
+            observed, sky, steps, triangles, settings.tolerance, settings.distortion, settings.work - work
+        )
+        found.append(finds)
+        for matrix, scale in _candidates(observed, sky, Finds.of(found), tried, settings.verified):
+            answer = verify_matrix(observed, sky, matrix, scale, 1.0, settings.verification)
+            if answer.status is Status.IDENTIFIED:
+                return answer
+        work += read
+        if work >= settings.work:
+            break
+    return nothing(observed)
+
+
+def _candidates(
+    observed: StarField, sky: SkyIndex, finds: Finds, tried: set[tuple[int, int]], most: int
+) -> Iterator[tuple[FloatArray, float]]:
+    """Yield attitudes (3, 3) and scales of the finds with the most votes, those that agree but once."""
+    if not len(finds):
+        return
+    votes = finds.votes().sum(axis=1)
+    order = np.argsort(-votes, kind="stable")
+    yielded = 0
+    for find in order[: 8 * most].tolist():
+        pairs = list(zip(finds.observed[find].tolist(), finds.star[find].tolist(), strict=True))
+        if sum(pair in tried for pair in pairs) >= 2:
+            continue
+        tried.update(pairs)
+        # One triangle tells the scale badly: where the lens is known better, that is where it is looked from.
+        scale = min(max(float(finds.scale[find]), observed.scale[0]), observed.scale[1])
+        yield _attitude_of(observed, sky, finds, find), scale
+        yielded += 1
+        if yielded == most:
+            return
+
+
+def _attitude_of(observed: StarField, sky: SkyIndex, finds: Finds, find: int) -> FloatArray:
+    """Return the attitude (3, 3) that lays a find's guide stars on the observed ones."""
+    seen = stretched(observed.direction[finds.observed[find]], float(finds.scale[find]))
+    return np.asarray(_frame(seen).T @ _frame(sky.stars.direction[finds.star[find]]))
+
+
+def _frame(corners: FloatArray) -> FloatArray:
+    """Return the rows of a frame (3, 3) fixed in a triangle (3, 3): its middle, along its longest side."""
+    (ax, ay, az), (bx, by, bz), (cx, cy, cz) = corners.tolist()
+    mx, my, mz = ax + bx + cx, ay + by + cy, az + bz + cz
+    norm = math.sqrt(mx * mx + my * my + mz * mz)
+    mx, my, mz = mx / norm, my / norm, mz / norm
+    dx, dy, dz = ax - bx, ay - by, az - bz
+    along = mx * dx + my * dy + mz * dz
+    dx, dy, dz = dx - along * mx, dy - along * my, dz - along * mz
+    norm = math.sqrt(dx * dx + dy * dy + dz * dz)
+    dx, dy, dz = dx / norm, dy / norm, dz / norm
+    return np.array([[mx, my, mz], [dx, dy, dz], [my * dz - mz * dy, mz * dx - mx * dz, mx * dy - my * dx]])

@@ -1,0 +1,102 @@
+"""Tracking: which stars the frame shows, told roughly where it looks.
+
+Laid over the frame by a prior attitude that is off by a small turn, the expected stars are all shifted by
+nearly the same vector. Of all pairs of an observed and an expected star close enough to be the same, the
+largest set with one shift refines the attitude, and the whole field verifies it, as it does lost in space:
+only that chance has the prior's uncertainty to choose from, and not the whole sky.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from flight.gnc.math.arrays import FloatArray, IntArray
+from flight.gnc.math.quaternion import attitude_matrix
+from flight.gnc.vision.startracker.identification.field import StarField
+from flight.gnc.vision.startracker.identification.identification import Identification, Status
+from flight.gnc.vision.startracker.identification.refinement import refine, stretched
+from flight.gnc.vision.startracker.identification.verification import (
+    VerificationSettings,
+    expected_stars,
+    nothing,
+    verify_matrix,
+)
+from flight.gnc.vision.startracker.index.sky_index import SkyIndex
+
+_BRIGHTEST = 16
+_PRIOR_SIGMAS = 4.0
+# More of them tell nothing apart, and compare in longer than the whole sky takes.
+_MOST_PAIRS = 400
+_DEFAULT = VerificationSettings()
+
+
+def track(
+    field: StarField,
+    sky: SkyIndex,
+    attitude: FloatArray,
+    sigma: float,
+    settings: VerificationSettings = _DEFAULT,
+) -> Identification:
+    """Return which stars the frame shows if it looks where the prior says, NO_MATCH if it does not.
+
+    `attitude` (4,) ICRS to camera is believed to be right to `sigma` rad about each axis; beyond some degrees
+    `identify` is faster and surer.
+    """
+    if len(field) < settings.least_matches:
+        return nothing(field, Status.TOO_FEW_STARS)
+    scale = math.sqrt(field.scale[0] * field.scale[1])
+    matrix = attitude_matrix(attitude)
+    observed, star = _same_shift(field, sky, matrix, scale, sigma)
+    if len(observed) >= 2:
+        free_scale = field.scale[1] > field.scale[0] and len(observed) > 2
+        found = refine(
+            field.direction[observed],
+            sky.stars.direction[star],
+            field.sigma[observed],
+            matrix,
+            scale,
+            free_scale,
+        )
+        if found is not None:
+            matrix, scale = found.matrix, found.scale
+    # A ball of turns, of all turns, 8 pi^2 in the same measure.
+    searched = min((_PRIOR_SIGMAS * sigma) ** 3 / (6.0 * math.pi), 1.0)
+    return verify_matrix(field, sky, matrix, scale, searched, settings)
+
+
+def _same_shift(
+    field: StarField, sky: SkyIndex, matrix: FloatArray, scale: float, sigma: float
+) -> tuple[IntArray, npt.NDArray[np.intp]]:
+    """Return observed and guide stars (k,), (k,) of the largest set of pairs with one shift."""
+    reach = _PRIOR_SIGMAS * sigma
+    across, down = (scale * width for width in field.half_width)
+    wider = across + reach * (1.0 + across**2), down + reach * (1.0 + down**2)
+    area = (wider[0] * wider[1]) / (across * down)
+    expected = expected_stars(sky, matrix, wider, int((1.3 * min(len(field), _BRIGHTEST) + 8) * area))
+    seen = stretched(field.direction[:_BRIGHTEST], scale)
+    shift = seen[:, None, :] - sky.stars.direction[expected] @ matrix.T
+    # By roll, and by the scale where it is not known, the shifts of stars at the edge differ.
+    radius = math.hypot(across, down)
+    star_sigma = float(field.sigma[:_BRIGHTEST].max()) * scale
+    stretch = 0.5 * math.log(field.scale[1] / field.scale[0])
+    close = (
+        np.einsum("ijk,ijk->ij", shift, shift)
+        <= (math.sqrt(2.0) * reach + stretch * radius + 4.0 * star_sigma) ** 2
+    )
+    one, two = np.nonzero(close)
+    if not len(one) or len(one) > _MOST_PAIRS:
+        return np.empty(0, dtype=np.int64), expected[:0]
+    shifts = shift[one, two]
+    apart = shifts[:, None, :] - shifts
+    tolerance = 4.0 * star_sigma + (_PRIOR_SIGMAS * sigma + stretch) * radius
+    agree = np.einsum("ijk,ijk->ij", apart, apart) <= tolerance**2
+    # Pairs of one observed star do not support one another, nor do those of one guide star.
+    agree &= (one[:, None] != one) & (two[:, None] != two)
+    best = int(agree.sum(axis=1).argmax())
+    members = np.append(np.flatnonzero(agree[best]), best)
+    nearest = members[np.argsort(np.einsum("ij,ij->i", apart[best, members], apart[best, members]))]
+    observed, first = np.unique(one[nearest], return_index=True)
+    return observed, expected[two[nearest[first]]]

@@ -1,0 +1,225 @@
+"""Verification: how many stars of the whole field a candidate attitude matches, and whether by chance.
+
+The guide stars that should be in the field are laid over the observed ones; those that fall together refine
+attitude and scale, and again, until the same stars match. What the match is worth does not depend on how the
+candidate was found: it is the number of equal or better ones to be expected in the whole sky, were the stars
+strewn at random (`chance`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from flight.gnc.math.arrays import FloatArray, IntArray
+from flight.gnc.math.quaternion import attitude_matrix
+from flight.gnc.vision.startracker.identification.chance import Chance
+from flight.gnc.vision.startracker.identification.field import StarField
+from flight.gnc.vision.startracker.identification.identification import Identification, Status
+from flight.gnc.vision.startracker.identification.refinement import Refinement, refine, stretched
+from flight.gnc.vision.startracker.index.sky_index import SkyIndex
+
+
+@dataclass(frozen=True, slots=True)
+class VerificationSettings:
+    """When a candidate is believed.
+
+    Attributes:
+        log10_false_alarm: the most that the expected number of chance matches in the whole sky may be.
+        gates: half widths within which a star matches, in its sigmas: of these the one that makes chance the
+            least likely. The wide ones serve a lens with distortion, or sigmas that are too small.
+        least_matches: fewer stars are not believed.
+        rounds: of matching and refining.
+        most: observed stars, the brightest, that decide; all are matched in the end.
+    """
+
+    log10_false_alarm: float = -4.5
+    gates: tuple[float, ...] = (3.5, 8.0, 20.0)
+    least_matches: int = 4
+    rounds: int = 5
+    most: int = 64
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Matching:
+    """Observed stars (k,) and the guide stars (k,) that they match, and what that is worth."""
+
+    observed: IntArray
+    star: IntArray
+    log10_chance: float
+
+
+# A candidate that begins with less than this, in powers of ten, above what is believed will not get there.
+_HOPELESS = 7.0
+
+
+def verify(
+    field: StarField,
+    sky: SkyIndex,
+    attitude: FloatArray,
+    scale: float,
+    searched: float = 1.0,
+    settings: VerificationSettings = VerificationSettings(),
+) -> Identification:
+    """Return the whole field's identification if the candidate holds, NO_MATCH if it may be chance.
+
+    Args:
+        field: the observed stars.
+        sky: the guide stars.
+        attitude: (4,) of the candidate, ICRS to camera, within some sigmas of the answer.
+        scale: of the candidate.
+        searched: part of all attitudes that candidates were taken from: 1 is lost in space.
+        settings: when a candidate is believed.
+    """
+    return verify_matrix(field, sky, attitude_matrix(attitude), scale, searched, settings)
+
+
+def verify_matrix(
+    field: StarField,
+    sky: SkyIndex,
+    matrix: FloatArray,
+    scale: float,
+    searched: float = 1.0,
+    settings: VerificationSettings = VerificationSettings(),
+) -> Identification:
+    """Do as `verify` with the attitude matrix (3, 3)."""
+    expected = expected_stars(sky, matrix, _half_width(field, scale), int(1.3 * len(field)) + 8)
+    deciding = field if len(field) <= settings.most else field.subset(np.arange(settings.most))
+    start = Refinement(matrix, scale, np.empty((0, 0)), np.empty(0))
+    decided = _settle(deciding, sky, expected, start, searched, settings)
+    if decided is None:
+        return nothing(field)
+    matching, refined = decided
+    if matching.log10_chance > settings.log10_false_alarm:
+        return nothing(field)
+    if deciding is not field:
+        expected = expected_stars(
+            sky, refined.matrix, _half_width(field, refined.scale), int(1.3 * len(field)) + 8
+        )
+        decided = _settle(field, sky, expected, refined, searched, settings)
+        if decided is None:
+            return nothing(field)
+        matching, refined = decided
+    return _identified(field, matching, refined.widened())
+
+
+def nothing(field: StarField, status: Status = Status.NO_MATCH) -> Identification:
+    """Return the answer that no star was identified."""
+    return Identification(status, np.full(len(field), -1))
+
+
+def expected_stars(
+    sky: SkyIndex, matrix: FloatArray, half_width: tuple[float, float], count: int
+) -> npt.NDArray[np.intp]:
+    """Return the numbers of the `count` brightest guide stars in the field, the brightest first."""
+    across, down = half_width
+    cosine = 1.0 / math.sqrt(1.0 + across * across + down * down)
+    # Of twice as many as the whole sky should hold for `count` here: the Milky Way is denser, the poles less.
+    brightest = int(math.pi / (across * down) * 2.0 * (count + 5.0))
+    near = np.flatnonzero(matrix[2].astype(np.float32) @ sky.coarse[:, :brightest] > cosine)
+    x, y, z = matrix @ sky.stars.direction[near].T
+    inside = (np.abs(x) <= across * z) & (np.abs(y) <= down * z)
+    return np.asarray(near[inside][:count])
+
+
+def _half_width(field: StarField, scale: float) -> tuple[float, float]:
+    return field.half_width[0] * scale, field.half_width[1] * scale
+
+
+def _settle(
+    field: StarField,
+    sky: SkyIndex,
+    expected: npt.NDArray[np.intp],
+    start: Refinement,
+    searched: float,
+    settings: VerificationSettings,
+) -> tuple[_Matching, Refinement] | None:
+    """Return matched stars and what they refine `start` to, when the two agree; None if it leads nowhere."""
+    refined, previous = start, None
+    for _ in range(settings.rounds):
+        matching = _match(field, sky, expected, refined, searched, settings)
+        if matching is None or (
+            previous is None and matching.log10_chance > settings.log10_false_alarm + _HOPELESS
+        ):
+            return None
+        if previous is not None and np.array_equal(previous.observed, matching.observed):
+            return matching, refined
+        previous = matching
+        found = refine(
+            field.direction[matching.observed],
+            sky.stars.direction[matching.star],
+            field.sigma[matching.observed],
+            refined.matrix,
+            refined.scale,
+            field.scale[1] > field.scale[0],
+        )
+        if found is None or not _plausible(found, field):
+            return None
+        refined = found
+    return (previous, refined) if previous is not None else None
+
+
+def _match(
+    field: StarField,
+    sky: SkyIndex,
+    expected: npt.NDArray[np.intp],
+    at: Refinement,
+    searched: float,
+    settings: VerificationSettings,
+) -> _Matching | None:
+    """Return which observed stars have an expected one within a gate, by the most telling gate."""
+    if len(expected) < settings.least_matches:
+        return None
+    cosines = stretched(field.direction, at.scale) @ (at.matrix @ sky.stars.direction[expected].T)
+    nearest = cosines.argmax(axis=1)
+    rows = np.arange(len(nearest))
+    variance = (field.sigma * at.scale) ** 2
+    squared = 2.0 * (1.0 - cosines[rows, nearest]) / variance
+    squared[cosines.argmax(axis=0)[nearest] != rows] = np.inf
+    area = 4.0 * field.half_width[0] * field.half_width[1] * at.scale**2
+    chance = Chance(
+        len(field),
+        float(variance.mean()) / area,
+        4.0 * math.pi / area * searched,
+        math.log(field.scale[1] / field.scale[0]),
+        len(settings.gates),
+        settings.least_matches,
+        settings.log10_false_alarm,
+    )
+    best: _Matching | None = None
+    matched = settings.least_matches - 1
+    for gate in settings.gates:
+        within = np.flatnonzero(squared <= gate * gate)
+        # A wider gate about the same stars tells less.
+        if len(within) <= matched:
+            continue
+        matched = len(within)
+        value = chance.log10(gate, within.tolist(), nearest[within].tolist())
+        if best is None or value < best.log10_chance:
+            best = _Matching(within, expected[nearest[within]], value)
+    return best
+
+
+def _plausible(refined: Refinement, field: StarField) -> bool:
+    """Tell whether the scale found is one that the lens may have, within five of its sigmas."""
+    lowest, highest = field.scale
+    if lowest == highest:
+        return True
+    slack = math.exp(5.0 * refined.scale_sigma)
+    return lowest / slack <= refined.scale <= highest * slack
+
+
+def _identified(field: StarField, matching: _Matching, refined: Refinement) -> Identification:
+    star = np.full(len(field), -1)
+    star[matching.observed] = matching.star
+    return Identification(
+        Status.IDENTIFIED,
+        star,
+        refined.fix(),
+        refined.scale,
+        refined.scale_sigma * refined.scale,
+        matching.log10_chance,
+    )

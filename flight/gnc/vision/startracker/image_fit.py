@@ -1,0 +1,169 @@
+"""The attitude from matched stars whose places in the image have covariances of their own.
+
+A star drawn out to a streak is known well across its path and badly along it. Each residual b - A r is taken
+in the two directions across the star, whitened by the place's covariance, and the sum of squares made least
+by Gauss-Newton: the maximum likelihood for Gaussian errors. A star in whose streak another's light hides is
+not where its pixels say: stars that disagree by more than chance allows, measured by how the most scatter,
+are found under Huber's weights, which bound any one star's pull, and have no say.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from flight.gnc.attitude.wahba import AttitudeError, AttitudeFix
+from flight.gnc.camera.lens import CameraModel
+from flight.gnc.math.arrays import BoolArray, FloatArray
+from flight.gnc.math.quaternion import attitude_matrix, from_matrix
+from flight.gnc.vision.objects.olae import cross_matrices
+from flight.gnc.vision.startracker.identification.refinement import inflation, scale_slope, stretched, turned
+
+_MOST_STEPS = 8
+_SETTLED = 1e-11
+# px, over which the slope of the lens is taken.
+_STEP_PX = 0.5
+# Of a chi-square of 2: exceeded by chance once in 1000, and its median.
+_FARTHEST = 13.8
+_MEDIAN = 2.0 * float(np.log(2.0))
+# Deviations beyond which a star's pull grows no more while it is asked who disagrees.
+_PULL = 1.5
+_HUBER_ROUNDS = 10
+_LEAST_AGREEING = 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageFit:
+    """The attitude, and what the stars say of the fit.
+
+    Attributes:
+        fix: the attitude by the stars that agree; its covariance is widened where they scatter beyond theirs.
+        scale: factor of the tangents x/z, y/z; 1 when it was held.
+        scale_sigma: relative standard deviation of the scale; 0 when it was held.
+        squares: (n,) squared error of each star over its covariance, of two degrees of freedom.
+        agree: (n,) whether the star has a say.
+    """
+
+    fix: AttitudeFix
+    scale: float
+    scale_sigma: float
+    squares: FloatArray
+    agree: BoolArray
+
+
+def fit_in_image(
+    points: FloatArray,
+    covariance: FloatArray,
+    reference: FloatArray,
+    camera: CameraModel,
+    start: FloatArray,
+    free_scale: bool = False,
+) -> ImageFit:
+    """Return the attitude that puts stars at `reference` (n, 3) to `points` (n, 2) px.
+
+    Args:
+        points: (n, 2) px.
+        covariance: (n, 2, 2) px^2 of each.
+        reference: (n, 3) unit vectors.
+        camera: with its lens.
+        start: (4,) an attitude near the answer, reference into camera.
+        free_scale: whether the focal length may be wrong.
+
+    Raises AttitudeError when the stars do not fix what is asked.
+    """
+    observed = camera.unit_vectors(points)
+    seen = _Seen(observed, _whitener(points, observed, covariance, camera), reference, free_scale)
+    pose = seen.fitted(_Pose(attitude_matrix(start), 1.0), np.ones(len(points)))
+    squares, agree = seen.squares(pose), np.ones(len(points), dtype=np.bool_)
+    # One star far off draws all others off: their spread tells nothing before its pull is bounded.
+    if squares.max() > _FARTHEST:
+        held = pose
+        for _ in range(_HUBER_ROUNDS):
+            held = seen.fitted(held, _PULL / np.maximum(np.sqrt(squares), _PULL))
+            squares = seen.squares(held)
+        agree = _agreeing(squares)
+        pose = seen.fitted(held, agree.astype(np.float64))
+        squares = seen.squares(pose)
+    inverse = pose.covariance * inflation(squares[agree], len(pose.covariance))
+    turn = np.ascontiguousarray(inverse[:3, :3], dtype=np.float64)
+    fix = AttitudeFix(from_matrix(pose.matrix), turn, 0.5 * float(squares[agree].sum()))
+    return ImageFit(fix, pose.scale, float(np.sqrt(inverse[3, 3])) if free_scale else 0.0, squares, agree)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pose:
+    """Attitude (3, 3) and scale, and the covariance of the turn and ln scale that weights of stars give."""
+
+    matrix: FloatArray
+    scale: float
+    covariance: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Seen:
+    """Stars seen at `observed` (n, 3) with `whitener` (n, 2, 3), at `reference` (n, 3) in the sky."""
+
+    observed: FloatArray
+    whitener: FloatArray
+    reference: FloatArray
+    free_scale: bool
+
+    def fitted(self, start: _Pose, weight: FloatArray) -> _Pose:
+        """Return the least of the squares times `weight` (n,)."""
+        whitener = self.whitener * np.sqrt(weight)[:, None, None]
+        matrix, scale = start.matrix, start.scale
+        for _ in range(_MOST_STEPS):
+            seen, predicted = stretched(self.observed, scale), self.reference @ matrix.T
+            residual = np.einsum("nij,nj->ni", whitener, seen - predicted).ravel()
+            flat = _slope(whitener, seen, predicted, self.free_scale)
+            try:
+                inverse = np.linalg.inv(flat.T @ flat)
+            except np.linalg.LinAlgError as error:
+                raise AttitudeError(f"{len(weight)} stars in one place fix no attitude") from error
+            step = -inverse @ (flat.T @ residual)
+            if not np.all(np.abs(step) < 1.0):
+                raise AttitudeError(f"{len(weight)} stars do not agree on an attitude")
+            matrix = turned(matrix, step[:3])
+            scale *= float(np.exp(step[3])) if self.free_scale else 1.0
+            if np.abs(step).max() < _SETTLED:
+                break
+        return _Pose(matrix, scale, np.asarray(inverse, dtype=np.float64))
+
+    def squares(self, pose: _Pose) -> FloatArray:
+        """Return each star's squared error over its covariance (n,)."""
+        missed = stretched(self.observed, pose.scale) - self.reference @ pose.matrix.T
+        return np.asarray(np.sum(np.einsum("nij,nj->ni", self.whitener, missed) ** 2, axis=1))
+
+
+def _agreeing(squares: FloatArray) -> BoolArray:
+    """Tell which stars (n,) scatter as the most do; all where too few would be left to say who is right."""
+    agree = squares <= _FARTHEST * max(1.0, float(np.median(squares)) / _MEDIAN)
+    enough = np.count_nonzero(agree) >= max(_LEAST_AGREEING, len(squares) // 2)
+    return agree if enough else np.ones(len(squares), dtype=np.bool_)
+
+
+def _slope(whitener: FloatArray, seen: FloatArray, predicted: FloatArray, free_scale: bool) -> FloatArray:
+    """Return d(whitened residuals)/d(turn, ln scale), (2n, 3 or 4)."""
+    turn = -whitener @ cross_matrices(predicted)
+    if not free_scale:
+        return np.asarray(turn.reshape(-1, 3))
+    scale = np.einsum("nij,nj->ni", whitener, scale_slope(seen))
+    return np.concatenate([turn, scale[:, :, None]], axis=2).reshape(-1, 4)
+
+
+def _whitener(
+    points: FloatArray, observed: FloatArray, covariance: FloatArray, camera: CameraModel
+) -> FloatArray:
+    """Return matrices (n, 2, 3) that turn an error of a direction into two of variance one."""
+    slopes = np.stack(
+        [
+            camera.unit_vectors(points + offset) - camera.unit_vectors(points - offset)
+            for offset in _STEP_PX * np.eye(2)
+        ],
+        axis=-1,
+    ) / (2.0 * _STEP_PX)
+    root = np.linalg.cholesky(covariance)
+    spread = slopes @ root
+    # The pseudo-inverse: the third direction, along the line of sight, carries no error.
+    return np.asarray(np.linalg.inv(np.swapaxes(spread, -1, -2) @ spread) @ np.swapaxes(spread, -1, -2))

@@ -1,0 +1,1 @@
+"""The sky index: guide stars, their pairs and triangles, in memory-mapped files."""

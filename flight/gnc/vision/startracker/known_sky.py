@@ -1,0 +1,252 @@
+"""The streaks fitted once more when it is known which stars there are, the unseen ones too.
+
+Where streaks are long most stars are below the noise of a pixel, yet their light lies under that of the
+bright ones and draws it off; close pairs are taken for one star. Once a frame is identified the catalogue
+tells where all stars lie and, by the light of those that were found, how bright they are. The light of those
+that are too faint, or too near to a brighter one, to be fitted is taken out of the frame, as uncertain as the
+catalogue's magnitudes are for the camera's colours; the others are fitted from their true places. What was
+found and is in no catalogue stays in the fit, without a say.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flight.gnc.camera.pinhole import Pinhole
+from flight.gnc.math.arrays import BoolArray, FloatArray, Image, IntArray
+from flight.gnc.math.quaternion import attitude_matrix
+from flight.gnc.vision.startracker.aberration import apparent
+from flight.gnc.vision.startracker.index.sky_index import SkyIndex
+from flight.gnc.vision.startracker.solution import FrameSolution, SolveStatus
+from flight.gnc.vision.startracker.solve import AttitudePrior, SolveSettings, solve_motion
+from flight.gnc.vision.streaks.maximum_likelihood.chains import close_by
+from flight.gnc.vision.streaks.maximum_likelihood.description import with_rate, with_stars
+from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import ExposedFrame, expose_frame
+from flight.gnc.vision.streaks.maximum_likelihood.fitting import joint_fit
+from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion, positions
+from flight.gnc.vision.streaks.maximum_likelihood.normal_equations import light_of
+from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
+from flight.gnc.vision.streaks.maximum_likelihood.rounds import ExposedCamera
+from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene, path_lengths
+from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from flight.gnc.vision.streaks.maximum_likelihood.shutter import Shutter
+from flight.gnc.vision.streaks.maximum_likelihood.wholeness import Wholeness
+from flight.gnc.vision.streaks.streak_result import StreakStatus
+
+# Streaks so many reaches beside a bright one's lie on its pixels.
+_NEAR = 1.4
+# Stars so close, px, are not fitted apart.
+_TWIN = 2.0
+# A star found is one of the catalogue's that is within so many px and has at least this part of its light.
+_SAME, _ALIKE = 5.0, 0.3
+# Of a star's light, as the catalogue predicts it.
+_DOUBT = 0.15
+# Stars whose pixels are held at a time while their light is taken out.
+_AT_ONCE = 25
+# Instants at which it is asked whether a star is in the frame.
+_INSTANTS = 9
+# Chi-square of 3, exceeded by chance once in 100,000: two rates farther apart are not of one motion.
+_ONE_MOTION = 25.9
+# px: the attitude before is believed to so much besides its covariance.
+_PRIOR_PX = 1.0
+
+
+def with_known_sky(
+    pixels: Image,
+    solution: FrameSolution,
+    sky: SkyIndex,
+    settings: SolveSettings,
+    likelihood: LikelihoodSettings,
+) -> FrameSolution:
+    """Return `solution` with motion and attitude fitted anew; as it is where that leads nowhere.
+
+    Args:
+        pixels: (rows, columns), of which `solution` is.
+        solution: of a frame of streaks; only a calibrated lens, whose scale was held, is served.
+        sky: the guide stars.
+        settings: with which it was solved.
+        likelihood: settings of the fit.
+    """
+    motion, fix = solution.motion, solution.fix
+    if motion is None or fix is None or solution.status is not SolveStatus.SOLVED or solution.scale_sigma:
+        return solution
+    again = refitted(pixels, motion, solution, sky, settings, likelihood)
+    if again is None:
+        return solution
+    sigma = np.sqrt(np.linalg.eigvalsh(fix.covariance)[-1]) + _PRIOR_PX / solution.camera.focal_length
+    prior = AttitudePrior(fix.quaternion, float(sigma))
+    better = solve_motion(again, solution.camera, (1.0, 1.0), sky, settings, prior)
+    if better.status is not SolveStatus.SOLVED or not better.tracked:
+        return solution
+    return replace(better, tracked=solution.tracked, log10_false_alarm=solution.log10_false_alarm)
+
+
+def refitted(
+    pixels: Image,
+    motion: MotionResult,
+    solution: FrameSolution,
+    sky: SkyIndex,
+    settings: SolveSettings,
+    likelihood: LikelihoodSettings,
+) -> MotionResult | None:
+    """Return `motion` fitted anew with all stars known; None where it fails or comes to another rate."""
+    if motion.rate is None or motion.covariance is None:
+        return None
+    pinhole, exposure = solution.camera.ideal, motion.exposure
+    growth = np.zeros(3) if motion.acceleration is None else motion.acceleration * exposure**2
+    course = Motion(motion.rate * exposure, growth)
+    most = likelihood.most_stars + likelihood.most_neighbours + likelihood.most_faint
+    known = _known_stars(motion, solution, sky, settings, course, most)
+    if known is None:
+        return None
+    camera = ExposedCamera(
+        expose_frame(pixels, likelihood.saturation, likelihood.gain),
+        pinhole,
+        Shutter(likelihood.line_time / exposure, pinhole.centre[1]),
+        likelihood,
+        motion.rate_model == "accelerating",
+    )
+    scene, hidden = _scenes(camera, course, known, motion)
+    camera = replace(camera, frame=_without(camera, hidden))
+    done = joint_fit(camera, scene)
+    if done is None:
+        return None
+    told = with_rate(with_stars(motion, camera, done), camera, done, Wholeness.WHOLE)
+    if told.status is not StreakStatus.AMBIGUOUS or told.rate is None or told.covariance is None:
+        return None
+    apart = told.rate - motion.rate
+    if not apart @ np.linalg.solve(motion.covariance + told.covariance, apart) < _ONE_MOTION:
+        return None
+    left = _elsewhere(motion.faint_endpoints, told.endpoints)
+    return replace(
+        told,
+        status=motion.status,
+        faint_endpoints=motion.faint_endpoints[left],
+        faint_flux=motion.faint_flux[left],
+        faint_significance=motion.faint_significance[left],
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Known:
+    """Stars of the catalogue: `places` (n, 2) px at mid-exposure, `light` (n,) counts over the exposure.
+
+    `inside` (n,) is the part of the path that lies in the frame.
+    """
+
+    places: FloatArray
+    light: FloatArray
+    inside: FloatArray
+
+    @classmethod
+    def seen(
+        cls, pinhole: Pinhole, course: Motion, places: FloatArray, light: FloatArray, most: int
+    ) -> _Known:
+        """Return the `most` of stars (n, 2), (n,) that give the frame light, the most light in it first."""
+        n = len(places)
+        time = np.tile(np.linspace(-0.5, 0.5, _INSTANTS), n)
+        there = positions(pinhole, course, np.repeat(places, _INSTANTS, axis=0), time)
+        inside = pinhole.contains(there).reshape(n, _INSTANTS).mean(axis=1)
+        order = np.argsort(-light * inside, kind="stable")
+        order = order[inside[order] > 0.0][:most]
+        return cls(places[order], light[order], inside[order])
+
+    def twins(self) -> BoolArray:
+        """Tell which have a brighter one too near to be fitted apart."""
+        order = np.argsort(self.places[:, 0], kind="stable")
+        fainter = np.zeros(len(order), dtype=np.bool_)
+        for places_on in range(1, len(order)):
+            one, two = order[:-places_on], order[places_on:]
+            gap = self.places[two] - self.places[one]
+            if not (gap[:, 0] < _TWIN).any():
+                break
+            close = np.hypot(gap[:, 0], gap[:, 1]) < _TWIN
+            fainter[np.maximum(one, two)[close]] = True
+        return fainter
+
+
+def _known_stars(
+    motion: MotionResult,
+    solution: FrameSolution,
+    sky: SkyIndex,
+    settings: SolveSettings,
+    course: Motion,
+    most: int,
+) -> _Known | None:
+    """Return the stars that the frame sees; None where no fitted star was identified to tell their light."""
+    matched = solution.matched
+    apart = np.linalg.norm(solution.points[matched, None] - motion.stars, axis=-1)
+    fitted = apart.argmin(axis=1)
+    sure = motion.used[fitted]
+    if solution.fix is None or not sure.any():
+        return None
+    magnitude = sky.stars.magnitude
+    zero = np.median(np.log10(motion.flux[fitted[sure]]) + 0.4 * magnitude[solution.star[matched[sure]]])
+    pinhole, matrix = solution.camera.ideal, attitude_matrix(solution.fix.quaternion)
+    reach = min(pinhole.half_diagonal + 0.5 * float(np.linalg.norm(course.turn)), 0.5 * np.pi)
+    near = np.flatnonzero(matrix[2].astype(np.float32) @ sky.coarse > np.cos(reach))
+    direction = sky.stars.direction[near]
+    if settings.velocity is not None:
+        direction = apparent(direction, settings.velocity)
+    places = solution.camera.project(direction @ matrix.T)
+    return _Known.seen(pinhole, course, places, 10.0 ** (float(zero) - 0.4 * magnitude[near]), most)
+
+
+def _scenes(
+    camera: ExposedCamera, course: Motion, known: _Known, motion: MotionResult
+) -> tuple[Scene, Scene]:
+    """Return what is to be fitted, the brightest with a say, and the stars whose light is only taken out."""
+    settings = camera.settings
+    width = float(np.sqrt(motion.psf_sigma**2 + 1.0 / 12.0))
+    leading = np.arange(len(known.light)) < settings.most_stars
+    room = _NEAR * settings.reach * width
+    near = leading | close_by(camera.pinhole, course, known.places, known.places[leading], room)
+    twin = known.twins()
+    path = path_lengths(camera.pinhole, course, known.places) + 2.0 * np.sqrt(np.pi) * width
+    light = known.light * known.inside
+    floor = float(np.median(camera.frame.floor)) * 2.0 * np.sqrt(np.pi) * width * path * known.inside
+    seen = light > settings.faint_sigmas * np.sqrt(floor + light / settings.gain)
+    fitted = np.flatnonzero(near & (leading | seen) & ~twin)[: settings.most_stars + settings.most_neighbours]
+    hidden = near.copy()
+    hidden[fitted] = False
+    foreign = _foreign(motion, known)
+    scene = _scene(course, width, known.places[fitted], known.light[fitted], leading[fitted])
+    return scene.with_stars(motion.stars[foreign], motion.flux[foreign]), _scene(
+        course, width, known.places[hidden], known.light[hidden], leading[hidden]
+    )
+
+
+def _scene(course: Motion, width: float, places: FloatArray, light: FloatArray, trusted: BoolArray) -> Scene:
+    return Scene(course, width, places, light, np.zeros(len(light)), trusted)
+
+
+def _foreign(motion: MotionResult, known: _Known) -> IntArray:
+    """Return which stars found are none of the catalogue's: no light like theirs is where they are."""
+    near = np.linalg.norm(motion.stars[:, None] - known.places, axis=2) < _SAME
+    alike = known.light > _ALIKE * motion.flux[:, None]
+    return np.flatnonzero(~(near & alike).any(axis=1))
+
+
+def _elsewhere(faint: FloatArray, ends: FloatArray) -> BoolArray:
+    """Tell which streaks (n, 2, 2) px are none of those with `ends` (m, 2, 2)."""
+    worst = np.linalg.norm(faint[:, None] - ends, axis=-1).max(axis=-1)
+    return np.asarray((worst > _SAME).all(axis=1))
+
+
+def _without(camera: ExposedCamera, hidden: Scene) -> ExposedFrame:
+    """Return the frame less the light of `hidden` stars, and as much noisier as that is uncertain."""
+    frame = camera.frame
+    if not len(hidden.light):
+        return frame
+    light = np.zeros_like(frame.signal)
+    for begin in range(0, len(hidden.light), _AT_ONCE):
+        some = hidden.select(np.arange(begin, min(begin + _AT_ONCE, len(hidden.light))))
+        windows = camera.windows(some)
+        light[windows.pixels] += light_of(camera.pinhole, camera.shutter, some, windows)
+    signal = frame.signal - light
+    light *= np.float32(_DOUBT)
+    light *= light
+    light += frame.floor
+    return replace(frame, signal=signal, floor=light)

@@ -1,0 +1,64 @@
+"""What the star tracker says of one frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+
+import numpy as np
+
+from flight.gnc.attitude.wahba import AttitudeFix
+from flight.gnc.camera.lens import CameraModel
+from flight.gnc.math.arrays import FloatArray, IntArray
+from flight.gnc.vision.startracker.detection import FrameKind
+from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
+
+
+class SolveStatus(Enum):
+    """How a frame ended."""
+
+    SOLVED = "solved"
+    NO_STARS = "no-stars"
+    TOO_FEW_STARS = "too-few-stars"
+    NO_MATCH = "no-match"
+    AMBIGUOUS = "ambiguous"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameSolution:
+    """Attitude at mid-exposure, and the rate where the stars are streaks.
+
+    Attributes:
+        status: all below `camera` is meaningful for SOLVED only.
+        reason: why it is not solved, in a sentence; empty when it is.
+        kind: what the frame shows.
+        points: (n, 2) px at mid-exposure of what was taken for stars, the brightest first.
+        covariance: (n, 2, 2) px^2.
+        camera: with the focal length that the stars gave, where it was not known.
+        star: (n,) numbers of guide stars, -1 for none.
+        expected: (n, 2) px, where the attitude puts the guide star; NaN for none.
+        fix: attitude, ICRS to camera, and its covariance; the smaller scalar part is not negative.
+        scale_sigma: relative standard deviation of the focal length; 0 where it was given.
+        log10_false_alarm: of the probability that a frame of strewn points would have been solved.
+        tracked: whether the prior told where to look.
+        motion: from the streaks, camera frame; None for points.
+    """
+
+    status: SolveStatus
+    reason: str
+    kind: FrameKind
+    camera: CameraModel
+    points: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+    covariance: FloatArray = field(default_factory=lambda: np.empty((0, 2, 2)))
+    star: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    expected: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+    fix: AttitudeFix | None = None
+    scale_sigma: float = 0.0
+    log10_false_alarm: float = 0.0
+    tracked: bool = False
+    motion: MotionResult | None = None
+
+    @property
+    def matched(self) -> IntArray:
+        """Which of the points (m,) are guide stars."""
+        return np.flatnonzero(self.star >= 0)

@@ -1,0 +1,118 @@
+"""Which stars agree about what all share.
+
+A close pair taken for one star is wider or longer than the rest; another's light in a streak shifts its ends.
+Each star's own estimate of the shared parameters, with its deviation, shows it: most stars agree, to what
+their information allows, and those that do not lose their say.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flight.gnc.math.arrays import BoolArray, FloatArray, IntArray
+from flight.gnc.vision.streaks.maximum_likelihood.normal_equations import SHARED, Evaluation
+from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene
+from flight.gnc.vision.streaks.maximum_likelihood.solution import eliminate
+
+# The error of a median over that of a mean.
+_MEDIAN = 1.25
+
+
+# A star that knows less than this part of what the best one does says nothing.
+_NOTHING = 1e-9
+# Stars of unequal say count as fewer equal ones, of which no fewer than this have a spread.
+_LEAST_EFFECTIVE = 2.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Opinions:
+    """What each star alone says of what all share: change (n, k) along k directions, and its deviation."""
+
+    change: FloatArray
+    deviation: FloatArray
+
+
+def opinions(evaluation: Evaluation, scene: Scene, free: BoolArray) -> Opinions | None:
+    """Return each star's own estimate of the turn, along it and across it twice, and of the width.
+
+    All are steps from the scene's; the units are rad, and px for the width.
+    """
+    said = _alone(evaluation, free)
+    if said is None:
+        return None
+    kept, schur, score = said
+    axis = scene.motion.turn / max(float(np.linalg.norm(scene.motion.turn)), 1e-12)
+    across = np.linalg.svd(axis[None])[2][1:]
+    directions = np.zeros((4, SHARED))
+    directions[0, :3], directions[1:3, :3], directions[3, 6] = axis, across, 1.0
+    directions = directions[:, kept]
+    information = np.einsum("ai,nij,aj->na", directions, schur, directions)
+    told = information > _NOTHING * information.max(axis=0)
+    information = np.where(told, information, _NOTHING * information.max(axis=0) + 1e-300)
+    return Opinions(np.where(told, score @ directions.T / information, 0.0), 1.0 / np.sqrt(information))
+
+
+def agreed_step(evaluation: Evaluation, step: FloatArray) -> tuple[float, int]:
+    """Return by how much, in sigmas squared, the stars together ask for `step` (SHARED,), and how many ask.
+
+    Each star asks for its own part of the step. The spread of what they ask is the measure, where it is more
+    than the noise: one star in whose light another's is hidden moves no agreement.
+    """
+    said = _alone(evaluation, step != 0.0)
+    if said is None:
+        return 0.0, 0
+    kept, schur, score = said
+    asked, due = score @ step[kept], np.einsum("i,nij,j->n", step[kept], schur, step[kept])
+    count = int(np.count_nonzero(due > 0.0))
+    spread = float(np.sum((asked - due) ** 2)) * count / max(count - 1, 1)
+    total = float(due.sum())
+    return total**2 / max(total, spread, 1e-300), count
+
+
+def _alone(evaluation: Evaluation, free: BoolArray) -> tuple[IntArray, FloatArray, FloatArray] | None:
+    """Return the free shared parameters (k,), each star's information (n, k, k) and score (n, k) of them.
+
+    Its own numbers are eliminated; None when what is shared is not determined.
+    """
+    eliminated = eliminate(evaluation, free)
+    if eliminated is None:
+        return None
+    kept, gain = eliminated.kept, eliminated.gain
+    cross = evaluation.information[:, SHARED:][:, :, kept]
+    schur = evaluation.information[:, kept[:, None], kept] - gain @ cross
+    score = evaluation.gradient[:, kept] - np.einsum("nij,nj->ni", gain, evaluation.gradient[:, SHARED:])
+    return kept, schur, score
+
+
+def agreeing(said: Opinions, floors: FloatArray, sigmas: float) -> BoolArray:
+    """Tell which stars (n,) say the same as most: within `sigmas` of the weighted median in all directions.
+
+    A star in whose light another's is hidden is wider or longer than the rest; `floors` (k,) are added to the
+    deviations for what the model does not describe.
+    """
+    agree = np.ones(len(said.change), dtype=np.bool_)
+    for change, deviation, floor in zip(said.change.T, said.deviation.T, floors, strict=True):
+        spread = np.hypot(deviation, floor)
+        order = np.argsort(change)
+        weight = np.cumsum(1.0 / spread[order])
+        middle = change[order][np.searchsorted(weight, 0.5 * weight[-1])]
+        # The median of few is itself uncertain: a star that knows more than all others is not to yield to it.
+        error = _MEDIAN * np.sqrt(len(spread)) / np.sum(1.0 / spread)
+        agree &= np.abs(change - middle) <= sigmas * np.hypot(spread, error)
+    return agree
+
+
+def disagreement(said: Opinions, which: BoolArray) -> float:
+    """Return the chi-square per degree of freedom between stars `which` (n,): 1 when all obey the model."""
+    change, weight = said.change[which], said.deviation[which] ** -2
+    if len(change) < 3:
+        return 1.0
+    total = weight.sum(axis=0)
+    mean = np.sum(weight * change, axis=0) / total
+    # Each counts by its say in the whole: the spread of a few bright ones is not lost among many faint.
+    effective = np.maximum(total**2 / np.sum(weight**2, axis=0), _LEAST_EFFECTIVE)
+    found = np.sum(weight**2 * (change - mean) ** 2, axis=0) / total * effective / (effective - 1.0)
+    # The largest of several is larger than one, by about a standard deviation.
+    return float(np.max(found / (1.0 + np.sqrt(2.0 / (effective - 1.0)))))

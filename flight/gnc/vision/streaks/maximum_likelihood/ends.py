@@ -1,0 +1,127 @@
+"""Whether streaks are as long as the motion says: light from end to end, and none beyond.
+
+The fit sees only a few pixels beyond the ends. A turn too small by a fifth can fit what it is given, one end
+of every streak and the middle; the frame beyond the other end tells. A turn too large has stretches without
+light, which a fit makes little of that lays several streaks end to end, or the far end outside the frame.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flight.gnc.camera.pinhole import Pinhole
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import ExposedFrame
+from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion, paths
+from flight.gnc.vision.streaks.maximum_likelihood.scene import path_lengths
+
+# Looked at is a stretch of this part of the path, at least so long, from so far before or beyond the end, px.
+_STRETCH = 0.1
+_LEAST_STRETCH = 8.0
+_FROM_END = 4.0
+_SAMPLES = 24
+# Within the path as many stretches are looked at.
+_WITHIN = 10
+_WITHIN_SAMPLES = 10
+_ASIDE = np.array([-1.0, 0.0, 1.0])
+# The part of a streak's light per px of length that each of the middle three pixels across has.
+_MIDDLE = 0.287
+_HALF = 0.5
+_LEAST_VALID = 0.7
+# A stretch tells of light when what is expected exceeds so many deviations of its mean.
+_TELLING = 4.0
+# So much of a streak may be dark for reasons of its own.
+_DARK = 0.15
+
+
+def true_ends(
+    frame: ExposedFrame,
+    pinhole: Pinhole,
+    motion: Motion,
+    stars: FloatArray,
+    light: FloatArray,
+    times: FloatArray,
+) -> FloatArray:
+    """Return (n, 2) 1 for the ends that are where they should be, 0 for those that are not.
+
+    `times` (n, 2) are when stars (n, 2) of `light` (n,) counts begin and end to be exposed. Ends that are not
+    on the detector, and those of streaks too short to tell, are NaN.
+    """
+    out = np.full((len(stars), 2), np.nan)
+    length = path_lengths(pinhole, motion, stars)
+    long = length > 2.0 * (_FROM_END + _LEAST_STRETCH)
+    if not long.any():
+        return out
+    stars, light, times, length = stars[long], light[long], times[long], length[long]
+    stretch = np.maximum(_STRETCH * length, _LEAST_STRETCH)
+    expected = expected_brightness(light, length)
+    away = _FROM_END + np.linspace(0.0, 1.0, _SAMPLES) * stretch[:, None]
+    end = times.T.reshape(-1)
+    velocity = paths(pinhole, motion, np.tile(stars, (2, 1)), end).velocity
+    outward = np.repeat([-1.0, 1.0], len(stars)) / np.maximum(np.hypot(velocity[:, 0], velocity[:, 1]), 1e-3)
+    delay = outward[:, None] * np.tile(away, (2, 1))
+    time = np.concatenate([end[:, None] - delay, end[:, None] + delay])
+    mean, _ = brightness(frame, pinhole, motion, np.tile(stars, (4, 1)), time)
+    within, beyond = mean.reshape(2, 2, -1)
+    told = np.isfinite(within) & np.isfinite(beyond)
+    true = (within > _HALF * expected) & (beyond < _HALF * expected)
+    out[long] = np.where(told, true, np.nan).T
+    return out
+
+
+def unbroken(
+    frame: ExposedFrame,
+    pinhole: Pinhole,
+    motion: Motion,
+    stars: FloatArray,
+    light: FloatArray,
+    times: FloatArray,
+) -> FloatArray:
+    """Return 1 for each star that is bright all along its path on the detector, else 0, in one row (k,).
+
+    Arguments as of `true_ends`; stars too short or too faint to tell are left out.
+    """
+    length = path_lengths(pinhole, motion, stars)
+    long = length > _WITHIN * _LEAST_STRETCH
+    if not long.any():
+        return np.empty(0)
+    stars, light, times, length = stars[long], light[long], times[long], length[long]
+    share = (np.arange(_WITHIN * _WITHIN_SAMPLES) + 0.5) / (_WITHIN * _WITHIN_SAMPLES)
+    time = times[:, :1] + (times[:, 1:] - times[:, :1]) * share
+    each = np.repeat(stars, _WITHIN, axis=0)
+    mean, deviation = brightness(frame, pinhole, motion, each, time.reshape(len(each), _WITHIN_SAMPLES))
+    expected = np.repeat(expected_brightness(light, length), _WITHIN)
+    told = np.isfinite(mean) & (expected > _TELLING * deviation)
+    dark = (told & (mean < _HALF * expected)).reshape(-1, _WITHIN).sum(axis=1)
+    told_of = told.reshape(-1, _WITHIN).sum(axis=1)
+    judged = told_of > 0
+    return np.asarray(dark[judged] <= _DARK * told_of[judged], dtype=float)
+
+
+def expected_brightness(light: FloatArray, length: FloatArray) -> FloatArray:
+    """Return the mean counts (n,) that `brightness` finds on streaks of `light` (n,) and `length` (n,) px."""
+    return np.asarray(_MIDDLE * light / length)
+
+
+def brightness(
+    frame: ExposedFrame, pinhole: Pinhole, motion: Motion, stars: FloatArray, time: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the mean counts (n,) of pixels about a stretch of the path, at `time` (n, s), and its deviation.
+
+    NaN where too few are seen.
+    """
+    samples = time.shape[1]
+    there = paths(pinhole, motion, np.repeat(stars, samples, axis=0), time.reshape(-1))
+    way = there.velocity / np.maximum(np.linalg.norm(there.velocity, axis=1, keepdims=True), 1e-3)
+    normal = np.stack([-way[:, 1], way[:, 0]], axis=-1)
+    points = there.position[:, None] + _ASIDE[:, None] * normal[:, None]
+    pixel = np.rint(points).astype(np.int64)
+    seen = pinhole.contains(pixel.astype(float))
+    index = np.where(seen, pixel[..., 1] * pinhole.columns + pixel[..., 0], 0)
+    seen &= ~frame.bad[index]
+    count = seen.reshape(len(stars), -1).sum(axis=1)
+    enough = count >= _LEAST_VALID * samples * len(_ASIDE)
+    total = np.where(seen, frame.signal[index], 0.0).reshape(len(stars), -1).sum(axis=1)
+    variance = np.where(seen, frame.floor[index], 0.0).reshape(len(stars), -1).sum(axis=1)
+    count = np.maximum(count, 1)
+    return np.where(enough, total / count, np.nan), np.sqrt(variance) / count

@@ -1,0 +1,191 @@
+"""The motion over one exposure from all pixels of all its streaks, from the frame to a covariance.
+
+Regions give a first guess, the brightest stars a first fit, the motion a matched filter for the faint; the
+joint fit of the bright with the faint accounted for gives the answer. Pure and deterministic, made for a
+worker process. One frame cannot tell omega from -omega; a prior (gyro, or the last estimate) decides.
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass, replace
+from itertools import chain, islice
+
+import numpy as np
+
+from flight.gnc.camera.pinhole import Pinhole
+from flight.gnc.math.arrays import FloatArray, Image
+from flight.gnc.vision.streaks.background import FrameState, frame_state
+from flight.gnc.vision.streaks.corners.streak_rate import StreakStatus, direction_of_time, refuse_nonsense
+from flight.gnc.vision.streaks.maximum_likelihood.blobs import Blobs, find_blobs
+from flight.gnc.vision.streaks.maximum_likelihood.description import with_faint, with_rate, with_stars
+from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import expose_frame, saturation_count
+from flight.gnc.vision.streaks.maximum_likelihood.fitting import last_fit
+from flight.gnc.vision.streaks.maximum_likelihood.frame_scan import frame_angles
+from flight.gnc.vision.streaks.maximum_likelihood.hypotheses import (
+    alike,
+    first_fits,
+    rescanned_fits,
+    still_fit,
+)
+from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
+from flight.gnc.vision.streaks.maximum_likelihood.rounds import ExposedCamera, Fit
+from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from flight.gnc.vision.streaks.maximum_likelihood.shutter import Shutter
+from flight.gnc.vision.streaks.maximum_likelihood.wholeness import Wholeness, wholeness
+
+_MOST_BLOBS = 48
+# So many motions are fitted in full before the frame is given up.
+_MOST_MOTIONS = 2
+# So many angles of the whole frame's light are tried, and told apart to this part.
+_MOST_ANGLES = 2
+_SAME_ANGLE = 0.05
+# Median length, px, of regions below which a frame without an agreed motion is one of stars at rest.
+_AT_REST = 4.0
+# The same of the brightest regions, below which no streak of the least length can be among them.
+_SPOT = 2.2
+_BRIGHTEST = 12
+
+
+def estimate_motion(
+    pixels: Image,
+    pinhole: Pinhole,
+    exposure: float,
+    settings: LikelihoodSettings,
+    prior_rate: FloatArray | None = None,
+    prior_sigma: float = 0.0,
+    previous_checksum: int | None = None,
+) -> MotionResult:
+    """Return the rate over one exposure, with its covariance, and the stars of the frame `pixels`.
+
+    Args:
+        pixels: (rows, columns) of an unsigned integer type, as the camera gave them.
+        pinhole: the camera, of the same shape.
+        exposure: s.
+        settings: of the camera and the fit.
+        prior_rate: (3,) rad/s, camera frame: tells the direction of rotation; None when unknown.
+        prior_sigma: rad/s, standard deviation of each component of `prior_rate`.
+        previous_checksum: of the frame before: the same pixels again are a frozen camera.
+
+    Raises FlightError for a frame, exposure or prior that cannot be meant. What the scene does is told as a
+    status.
+    """
+    refuse_nonsense(pixels, pinhole, exposure, prior_rate, prior_sigma)
+    checksum = zlib.crc32(pixels.tobytes())
+    saturation = settings.saturation if settings.saturation is not None else saturation_count(pixels)
+    state = frame_state(pixels, saturation, settings.saturated_fraction)
+    if state is not FrameState.USABLE:
+        return MotionResult(StreakStatus(state.value), checksum, exposure)
+    if checksum == previous_checksum:
+        return MotionResult(StreakStatus.FROZEN, checksum, exposure)
+    frame = expose_frame(pixels, saturation, settings.gain)
+    growing = settings.rate_model == "accelerating"
+    camera = ExposedCamera(frame, pinhole, _shutter(pinhole, exposure, settings), settings, growing)
+    blobs = find_blobs(frame, settings.threshold_sigmas, _MOST_BLOBS)
+    near = None if prior_rate is None else float(np.linalg.norm(prior_rate)) * exposure
+    seen = MotionResult(StreakStatus.FAILED, checksum, exposure, hot_pixels=frame.hot_pixels)
+    if len(blobs) < settings.least_stars:
+        return replace(seen, status=StreakStatus.TOO_FEW)
+    told = None if _resting(blobs) else _told(camera, seen, blobs, near)
+    if told is None:
+        return _without_rate(seen, camera, blobs)
+    return _in_time(told, prior_rate, prior_sigma, settings.sign_sigmas)
+
+
+def _told(camera: ExposedCamera, seen: MotionResult, blobs: Blobs, near: float | None) -> MotionResult | None:
+    """Return what the first motion that stands every test says, else the likeliest; None without one."""
+    rivals = islice(first_fits(camera, blobs, near), _MOST_MOTIONS)
+    first = next(rivals, None)
+    if first is None:
+        return None
+    leading = _fitted(camera, seen, first)
+    if leading.whole is Wholeness.WHOLE:
+        return leading.result
+    # A doubted motion to which the light of the whole frame leads again has two witnesses. To ask it costs
+    # less than to fit a rival, and the axis is often right, known well from pieces of streaks, where the
+    # angle is not.
+    angles = frame_angles(camera.frame, camera.pinhole, leading.turn, _MOST_ANGLES)
+    if leading.stands and _witnessed(leading.turn, angles):
+        return leading.result
+    candidates = [leading]
+    for fit in chain(rescanned_fits(camera, leading.turn, angles), rivals):
+        said = _fitted(camera, seen, fit)
+        again = any(other.stands and alike(said.turn, other.turn) for other in candidates)
+        if said.whole is Wholeness.WHOLE or (said.stands and (again or _witnessed(said.turn, angles))):
+            return said.result
+        candidates.append(said)
+    return replace(leading.result, status=StreakStatus.FAILED, rate=None, covariance=None)
+
+
+def _witnessed(turn: FloatArray, angles: list[float]) -> bool:
+    """Tell whether `turn` (3,) is by the likeliest of the frame's `angles`."""
+    size = float(np.linalg.norm(turn))
+    return bool(angles) and abs(size - angles[0]) < _SAME_ANGLE * size
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Told:
+    """What a motion says: the result, its turn (3,), and whether its streaks are whole."""
+
+    result: MotionResult
+    turn: FloatArray
+    whole: Wholeness
+
+    @property
+    def stands(self) -> bool:
+        return self.whole is not Wholeness.BROKEN
+
+
+def _fitted(camera: ExposedCamera, seen: MotionResult, first: Fit) -> _Told:
+    """Return what the joint fit from `first` says; a fit that failed is broken."""
+    last, faint = last_fit(camera, first)
+    if last is None:
+        return _Told(seen, first.scene.motion.turn, Wholeness.BROKEN)
+    whole = wholeness(camera, last.scene, faint)
+    told = with_faint(with_stars(seen, camera, last), camera, last.scene, faint)
+    told = with_rate(told, camera, last, whole)
+    failed = told.status is StreakStatus.FAILED
+    return _Told(told, last.scene.motion.turn, Wholeness.BROKEN if failed else whole)
+
+
+def _shutter(pinhole: Pinhole, exposure: float, settings: LikelihoodSettings) -> Shutter:
+    return Shutter(settings.line_time / exposure, pinhole.centre[1])
+
+
+def _resting(blobs: Blobs) -> bool:
+    """Tell whether the brightest regions, most of them at least, are spots: no motion is looked for then."""
+    return float(np.median(blobs.length[:_BRIGHTEST])) < _SPOT
+
+
+def _without_rate(seen: MotionResult, camera: ExposedCamera, blobs: Blobs) -> MotionResult:
+    """Return `seen` for a frame without an agreed motion: stars at rest, or a failure."""
+    length = float(np.median(blobs.length))
+    if length >= _AT_REST:
+        return replace(seen, status=StreakStatus.FAILED, length=length)
+    resting = still_fit(camera, blobs)
+    if resting is None:
+        return replace(seen, status=StreakStatus.TOO_SHORT, length=length)
+    return replace(with_stars(seen, camera, resting), status=StreakStatus.TOO_SHORT)
+
+
+def _in_time(
+    result: MotionResult, prior_rate: FloatArray | None, prior_sigma: float, sigmas: float
+) -> MotionResult:
+    """Return an ambiguous `result` in the direction of time that the prior tells, if it can."""
+    if result.rate is None or prior_rate is None:
+        return result
+    sign = direction_of_time(result.rate, np.asarray(prior_rate, dtype=float), prior_sigma, sigmas)
+    if sign == 0:
+        return result
+    if sign > 0:
+        return replace(result, status=StreakStatus.RATE)
+    return replace(
+        result,
+        status=StreakStatus.RATE,
+        rate=-result.rate,
+        endpoints=result.endpoints[:, ::-1],
+        endpoint_covariance=result.endpoint_covariance[:, ::-1],
+        directions=result.directions[:, ::-1],
+        faint_endpoints=result.faint_endpoints[:, ::-1],
+        # Backwards in time the rate changes sign, its change does not.
+    )

@@ -1,0 +1,185 @@
+"""The joint fit: the brightest stars, and all that share their pixels."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from flight.gnc.math.arrays import BoolArray, IntArray
+from flight.gnc.vision.streaks.maximum_likelihood.agreement import Opinions, agreeing, opinions
+from flight.gnc.vision.streaks.maximum_likelihood.chains import close_by
+from flight.gnc.vision.streaks.maximum_likelihood.edges import stretched
+from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import Float32Array
+from flight.gnc.vision.streaks.maximum_likelihood.matched_filter import FaintStars, find_faint
+from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion
+from flight.gnc.vision.streaks.maximum_likelihood.normal_equations import light_of
+from flight.gnc.vision.streaks.maximum_likelihood.rounds import (
+    GROWING,
+    LAST,
+    ROUGH,
+    ExposedCamera,
+    Fit,
+    iterate,
+)
+from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene, path_lengths
+from flight.gnc.vision.streaks.maximum_likelihood.windows import window_areas
+
+# A rate that changes by more than this part of itself is beyond the model.
+_MOST_GROWTH = 0.5
+# A star is trusted within so many deviations; ends (px) and width (px) are never modelled better than this.
+_TRUST_SIGMAS = 3.5
+_END_FLOOR = 0.01
+_WIDTH_FLOOR = 0.002
+# Streaks so many reaches beside a bright one's are fitted with it: farther ones touch only its window's edge.
+_NEAR = 1.4
+# Ends that move by more px than this from the first fit to the last make the stars to be found again.
+_FAR = 6.0
+_MOST_REPEATS = 2
+# How wrong the light of a faint star found along the motion may be on a pixel, as part of it.
+_DOUBT = 0.35
+# Pixels of all windows that a fit looks at, those that stars share once for each: what a crowd of long
+# streaks needs of memory and time is bounded so, and the brightest stars hold most of the information.
+_MOST_PIXELS = 200_000
+# So many stars' light is taken out at a time.
+_AT_ONCE = 16
+
+
+def last_fit(camera: ExposedCamera, first: Fit) -> tuple[Fit | None, FaintStars]:
+    """Return the joint fit of the brightest stars, and the faint ones that it left to the matched filter.
+
+    Where it comes far from `first`, the stars found along that motion are not where they seemed: once more.
+    So where the streaks do not end where it says: from where they do. One that they contradict again is none.
+    """
+    other = None
+    for _ in range(_MOST_REPEATS):
+        done, faint = _fit_from(camera, first)
+        if done is None:
+            break
+        leading = np.flatnonzero(done.scene.trusted)
+        scene = done.scene.select(leading)
+        other = stretched(camera, scene)
+        if other is None and not _far(camera, first.scene, scene):
+            break
+        scene = scene if other is None else other
+        scene = scene.select(np.argsort(-scene.light, kind="stable")[: len(first.scene.light)])
+        first = replace(done, scene=scene, windows=camera.windows(scene))
+    else:
+        done = done if other is None else None
+    return done, faint
+
+
+def _far(camera: ExposedCamera, before: Scene, after: Scene) -> bool:
+    """Tell whether the ends of the streaks have moved by more than the fit sees."""
+    changed = float(np.linalg.norm(after.motion.turn - before.motion.turn))
+    turn = float(np.linalg.norm(after.motion.turn))
+    length = float(np.median(path_lengths(camera.pinhole, after.motion, before.stars)))
+    return length * changed / max(turn, 1e-12) > _FAR
+
+
+def _fit_from(camera: ExposedCamera, first: Fit) -> tuple[Fit | None, FaintStars]:
+    """Return the joint fit of the stars that are found along the motion of `first`, and the faint ones left.
+
+    Of the models of the rate the fit takes the constant one unless told otherwise, or shown by the pixels.
+    """
+    settings, before = camera.settings, first.scene
+    light = light_of(camera.pinhole, camera.shutter, before, first.windows)
+    faint = find_faint(
+        camera.frame,
+        (first.windows.pixels, light),
+        camera.pinhole,
+        before.motion,
+        settings.faint_sigmas,
+        settings.most_faint,
+    )
+    whole = before.with_stars(faint.stars, faint.light)
+    order = np.argsort(-whole.light, kind="stable")
+    bright, rest = order[: settings.most_stars], order[settings.most_stars :]
+    scene, others = whole.select(bright), whole.select(rest)
+    scene = replace(scene, trusted=np.ones(len(bright), dtype=np.bool_))
+    near = np.flatnonzero(
+        close_by(
+            camera.pinhole, scene.motion, others.stars, scene.stars, _NEAR * settings.reach * scene.width
+        )
+    )
+    fitted = others.select(near[: settings.most_neighbours])
+    scene = scene.with_stars(fitted.stars, fitted.light)
+    accounted = _accounted(camera, others.select(near[settings.most_neighbours :]))
+    done = joint_fit(accounted, scene)
+    rest = np.delete(rest, near[: settings.most_neighbours])
+    rest = rest[rest >= len(before.light)] - len(before.light)
+    return done, FaintStars(faint.stars[rest], faint.light[rest], faint.significance[rest])
+
+
+def joint_fit(camera: ExposedCamera, scene: Scene) -> Fit | None:
+    """Return the fit of `scene` by the stars that agree, under the rate's model that the pixels ask for.
+
+    Of the stars without a say the brightest are fitted, as far as there is room; the others' light is taken
+    out as it is known. None where the fit fails.
+    """
+    fitted = _affordable(camera, scene)
+    camera, scene = _accounted(camera, scene.select(~fitted)), scene.select(fitted)
+    done = iterate(camera, scene, camera.free, ROUGH)
+    if done is not None and camera.undecided and done.grows():
+        camera = replace(camera, growing=True)
+        done = iterate(camera, done.scene, camera.free, LAST, done.windows)
+    if done is None or _beyond(done.scene.motion):
+        return None
+    scene, windows = replace(done.scene, trusted=_trusted(camera, done)), [done.windows]
+    del done  # equations of tens of MB; the windows too are let go where new ones are cut
+    done = iterate(camera, scene, camera.free, LAST, windows.pop())
+    if done is not None and camera.undecided and done.grows():
+        done = iterate(replace(camera, growing=True), done.scene, GROWING, LAST, done.windows)
+    return None if done is None or _beyond(done.scene.motion) else done
+
+
+def _beyond(motion: Motion) -> bool:
+    """Tell whether the rate changes by more than the model describes."""
+    return float(np.linalg.norm(motion.growth)) > _MOST_GROWTH * float(np.linalg.norm(motion.turn))
+
+
+def _trusted(camera: ExposedCamera, rough: Fit) -> BoolArray:
+    """Return which stars keep a say in what is shared: those that agree with most; all when too few do."""
+    said = opinions(rough.evaluation, rough.scene, camera.free)
+    before = rough.scene.trusted
+    if said is None:
+        return before
+    had = np.flatnonzero(before)
+    moved = path_lengths(camera.pinhole, rough.scene.motion, rough.scene.stars[had])
+    turn = float(np.linalg.norm(rough.scene.motion.turn))
+    angle = _END_FLOOR * turn / max(float(np.median(moved)), 1.0)
+    floors = np.array([angle, angle, angle, _WIDTH_FLOOR])
+    agree = agreeing(Opinions(said.change[had], said.deviation[had]), floors, _TRUST_SIGMAS)
+    if np.count_nonzero(agree) < max(camera.settings.least_stars, len(had) // 3):
+        return before
+    after = before.copy()
+    after[had] = agree
+    return after
+
+
+def _affordable(camera: ExposedCamera, scene: Scene) -> BoolArray:
+    """Return which stars (n,) the fit has room for: those with a say, of the others the brightest."""
+    room = window_areas(camera.pinhole, scene, camera.settings.reach)
+    order = np.lexsort((-scene.light, ~scene.trusted))
+    needed = np.empty(len(room))
+    needed[order] = np.cumsum(room[order])
+    return np.asarray(scene.trusted | (needed <= _MOST_PIXELS))
+
+
+def _accounted(camera: ExposedCamera, others: Scene) -> ExposedCamera:
+    """Return the camera with a frame less the light of `others`, which is not known to the last electron."""
+    if not len(others.light):
+        return camera
+    signal, floor = camera.frame.signal.copy(), camera.frame.floor.copy()
+    count = len(others.light)
+    for some in np.split(np.arange(count), range(_AT_ONCE, count, _AT_ONCE)):
+        pixels, light = _modelled(camera, others.select(some))
+        signal[pixels] -= light
+        floor[pixels] += np.square(np.float32(_DOUBT) * light)
+    return replace(camera, frame=replace(camera.frame, signal=signal, floor=floor))
+
+
+def _modelled(camera: ExposedCamera, scene: Scene) -> tuple[IntArray, Float32Array]:
+    """Return the pixels (m,) about the stars of `scene`, and its light there."""
+    windows = camera.windows(scene)
+    return windows.pixels, light_of(camera.pinhole, camera.shutter, scene, windows)

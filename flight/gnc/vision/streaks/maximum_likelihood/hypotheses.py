@@ -1,0 +1,172 @@
+"""Rival motions for the brightest stars: guessed, fitted, and judged by what light and ends they explain."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import islice
+
+import numpy as np
+
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.vision.streaks.maximum_likelihood.angle_scan import SCANNED_STARS, Circles, scan_angles
+from flight.gnc.vision.streaks.maximum_likelihood.blobs import Blobs
+from flight.gnc.vision.streaks.maximum_likelihood.ends import true_ends, unbroken
+from flight.gnc.vision.streaks.maximum_likelihood.first_guess import (
+    Guess,
+    find_turning,
+    scanned_motions,
+    voted_motions,
+)
+from flight.gnc.vision.streaks.maximum_likelihood.matched_filter import find_faint
+from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion
+from flight.gnc.vision.streaks.maximum_likelihood.polar_grid import polar_grid
+from flight.gnc.vision.streaks.maximum_likelihood.rounds import (
+    FIRST,
+    LAST,
+    SETTLED,
+    ExposedCamera,
+    Fit,
+    iterate,
+    misfit,
+)
+from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene, window_times
+
+_FIRST_STARS = 12
+# So many guesses are tried at most.
+_MOST_GUESSES = 5
+_STILL_ROUNDS = 12
+# A guess is made of so many whole streaks, or of a scan; regions longer than it speak against it.
+_WHOLE = 8
+_CONTRADICTED = 0.3
+# A hypothesis with so many stars, this part of which it explains, needs no rival.
+_MANY = 3
+_MOST = 0.6
+_WORST_FIRST = 12.0
+# A star is explained when no more than this part of its light is left; none counts more than so many sigmas.
+_LEFT_OVER = 0.01
+_ENOUGH = 200.0
+# Regions longer than a hypothesis allows speak against it, but may be two streaks in one.
+_CONTRADICTION = 0.6
+_CALM = 2.0
+# Motions that differ by less than this part are one.
+_SAME_MOTION = 0.005
+# Ends in place of a hypothesis of the wrong turn: it may have one of the two of each streak.
+_BY_CHANCE = 0.4
+
+
+def first_fits(camera: ExposedCamera, blobs: Blobs, near: float | None) -> Iterator[Fit]:
+    """Yield fits of the brightest stars, the likeliest motion first: one that they bear out, then its rivals.
+
+    `near` rad is a turn that something else tells, None when nothing does.
+    """
+    rivals: list[tuple[float, Fit]] = []
+    yielded: list[FloatArray] = []
+    for guess in islice(_guesses(camera, blobs, near), _MOST_GUESSES):
+        tried = _tried(camera, guess)
+        if tried is None:
+            continue
+        explained, convincing, done = tried
+        if any(alike(done.scene.motion.turn, other) for other in yielded):
+            continue
+        if convincing and all(explained > rival for rival, _ in rivals):
+            yielded.append(done.scene.motion.turn)
+            yield done
+        elif misfit(done.evaluation) <= _WORST_FIRST:
+            rivals.append((explained, done))
+    rivals.sort(key=lambda rival: -rival[0])
+    for _, done in rivals:
+        if not any(alike(done.scene.motion.turn, other) for other in yielded):
+            yielded.append(done.scene.motion.turn)
+            yield done
+
+
+def rescanned_fits(camera: ExposedCamera, turn: FloatArray, angles: list[float]) -> Iterator[Fit]:
+    """Yield fits of the brightest stars about the axis of `turn` (3,), near each of `angles` (rad)."""
+    settings, pinhole = camera.settings, camera.pinhole
+    nothing = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.float32)
+    frame = polar_grid(pinhole, Motion.steady(turn)).frame
+    for angle in angles:
+        motion = Motion.steady(frame[2] * angle)
+        found = find_faint(camera.frame, nothing, pinhole, motion, settings.faint_sigmas, settings.most_faint)
+        bright = np.argsort(-found.light, kind="stable")[:SCANNED_STARS]
+        x, y, z = frame @ pinhole.unit_vectors(found.stars[bright]).T
+        circles = Circles(frame, z, np.arctan2(y, x))
+        for turned in islice(scan_angles(camera.frame, pinhole, circles, 1, angle), 1):
+            stars, light = turned.stars[:_FIRST_STARS], turned.light[:_FIRST_STARS]
+            if len(light) < settings.least_stars:
+                continue
+            tried = _tried(camera, Guess(frame[2] * turned.angle, stars, light, 0.0))
+            if tried is not None:
+                yield tried[2]
+
+
+def alike(one: FloatArray, other: FloatArray) -> bool:
+    """Tell whether two turns (3,) are one motion, forwards or backwards in time."""
+    apart = min(np.linalg.norm(one - other), np.linalg.norm(one + other))
+    return float(apart) < _SAME_MOTION * float(np.linalg.norm(one))
+
+
+def _guesses(camera: ExposedCamera, blobs: Blobs, near: float | None) -> Iterator[Guess]:
+    """Yield where to start, the likeliest first: by whole streaks if there are many, else by a scan."""
+    turning = find_turning(blobs, camera.pinhole)
+    if turning is None:
+        return
+    voted = voted_motions(turning, blobs, camera.pinhole, _FIRST_STARS)
+    if voted and len(voted[0].light) >= _WHOLE and voted[0].contradicted < _CONTRADICTED:
+        yield voted.pop(0)
+    yield from scanned_motions(turning, camera.frame, camera.pinhole, _FIRST_STARS, near)
+    yield from voted
+
+
+def _tried(camera: ExposedCamera, guess: Guess) -> tuple[float, bool, Fit] | None:
+    """Return how much light a guess explains once fitted, whether that convinces, and the fit."""
+    count = len(guess.light)
+    everyone = np.ones(count, dtype=np.bool_)
+    width = float(np.hypot(camera.settings.psf_sigma, 0.29))
+    scene = Scene(Motion.steady(guess.turn), width, guess.stars, guess.light, np.zeros(count), everyone)
+    free = np.array([True] * 3 + [False] * 3 + [True])
+    done = iterate(camera, scene, free, FIRST)
+    if done is None:
+        return None
+    evidence, share = _borne_out(done)
+    ends = _ending(camera, done.scene)
+    explained = evidence * (1.0 - _CONTRADICTION * guess.contradicted) * max(ends - _BY_CHANCE, 0.02)
+    convincing = done.restless <= SETTLED and min(share, ends) > _MOST and count >= _MANY
+    return explained, convincing, done
+
+
+def still_fit(camera: ExposedCamera, blobs: Blobs) -> Fit | None:
+    """Return the stars of a camera at rest: their centroids, and the width of the point spread."""
+    count = min(len(blobs), camera.settings.most_stars)
+    width = float(np.hypot(camera.settings.psf_sigma, 0.29))
+    everyone = np.ones(count, dtype=np.bool_)
+    still = Motion.steady(np.zeros(3))
+    scene = Scene(still, width, blobs.centre[:count], blobs.flux[:count], np.zeros(count), everyone)
+    free = np.array([False] * 6 + [True])
+    return iterate(camera, scene, free, replace(LAST, rounds=_STILL_ROUNDS))
+
+
+def _ending(camera: ExposedCamera, scene: Scene) -> float:
+    """Return what part of the ends is where it should be, or of the streaks unbroken, whichever is less.
+
+    1 when none can be told.
+    """
+    times = window_times(camera.pinhole, scene.motion, camera.shutter, scene.stars)
+    seen = camera.frame, camera.pinhole, scene.motion, scene.stars, scene.light, times
+    ends = true_ends(*seen)
+    told = ends[np.isfinite(ends)], unbroken(*seen)
+    return min(float(np.mean(share)) if len(share) else 1.0 for share in told)
+
+
+def _borne_out(done: Fit) -> tuple[float, float]:
+    """Return how much light a fit explains, in sigmas squared, and what part of the stars.
+
+    A turn of the wrong size leaves an end of each streak over, or makes one of nothing: a good part of its
+    light. No single star outweighs the rest.
+    """
+    light = done.scene.light**2 / np.maximum(done.solution.joint[:, 9, 9], 1e-30)
+    left = done.evaluation.chi2 - done.evaluation.pixels
+    good = left < _LEFT_OVER * light + done.evaluation.pixels
+    calm = 1.0 if done.restless < _CALM else 0.3
+    return calm * float(np.sum(np.minimum(light, _ENOUGH**2)[good])), float(np.mean(good))

@@ -1,0 +1,198 @@
+"""How a star moves over the detector while the camera turns, and how that depends on the rate.
+
+Time is in exposures, zero at mid-exposure. With turn u = omega T and growth g = (d omega/dt) T^2, both in the
+camera's axes, the rate is u + g t and the stars move as v' = -(u + g t) x v. The rotation since mid-exposure
+is the vector u t + g t^2/2 + (u x g) t^3/12, exact without growth and to the fourth order with it (Magnus).
+A star is named by its pixel at mid-exposure.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flight.gnc.camera.pinhole import Pinhole
+from flight.gnc.math.arrays import FloatArray
+
+_TINY = 1e-12
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """The camera's rotation over one exposure.
+
+    Attributes:
+        turn: (3,) rad, rate at mid-exposure times the exposure.
+        growth: (3,) rad, change of the rate over the exposure times the exposure.
+    """
+
+    turn: FloatArray
+    growth: FloatArray
+
+    @classmethod
+    def steady(cls, turn: FloatArray) -> Motion:
+        """Return the motion at constant rate."""
+        return cls(np.asarray(turn, dtype=float), np.zeros(3))
+
+    @property
+    def constant(self) -> bool:
+        """Whether the rate does not change."""
+        return not self.growth.any()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Paths:
+    """Points on paths, (m,) of them: where, how fast, how bent, in px and exposures.
+
+    Attributes:
+        position, velocity, acceleration: (m, 2).
+    """
+
+    position: FloatArray
+    velocity: FloatArray
+    acceleration: FloatArray
+
+
+def paths(pinhole: Pinhole, motion: Motion, stars: FloatArray, time: FloatArray) -> Paths:
+    """Return where the stars that are at pixels `stars` (m, 2) at mid-exposure are at `time` (m,)."""
+    v = _rotated(_turning(motion, time), _directions(pinhole, stars))
+    w = _rate(motion, time)
+    velocity = _cross(v, w)  # -omega x v
+    acceleration = _cross(velocity, w)
+    if not motion.constant:
+        acceleration += _cross(v, motion.growth[:, None])
+    focal = pinhole.focal_length
+    inverse = 1.0 / v[2]
+    there = v[:2] * inverse
+    pace = (velocity[:2] - there * velocity[2]) * inverse
+    bent = (acceleration[:2] - there * acceleration[2] - 2.0 * pace * velocity[2]) * inverse
+    return Paths(_pixels(pinhole, there), (focal * pace).T, (focal * bent).T)
+
+
+def positions(pinhole: Pinhole, motion: Motion, stars: FloatArray, time: FloatArray) -> FloatArray:
+    """Return the positions (m, 2) of `paths`, and nothing else."""
+    v = _rotated(_turning(motion, time), _directions(pinhole, stars))
+    return _pixels(pinhole, v[:2] / v[2])
+
+
+def image_flow(pinhole: Pinhole, points: FloatArray) -> FloatArray:
+    """Return B (n, 2, 3), px per rad: the velocity of stars at `points` (n, 2) is B times the turn."""
+    return _flow(pinhole, _directions(pinhole, points)[:2]).transpose(2, 0, 1)
+
+
+def sensitivities(
+    pinhole: Pinhole, motion: Motion, stars: FloatArray, time: FloatArray, growing: bool = True
+) -> FloatArray:
+    """Return d(pixel at `time`)/d(turn, growth, star's pixel at mid-exposure): (m, 2, 8)."""
+    return moving(pinhole, motion, stars, time, growing)[0]
+
+
+def moving(
+    pinhole: Pinhole, motion: Motion, stars: FloatArray, time: FloatArray, growing: bool = True
+) -> tuple[FloatArray, FloatArray]:
+    """Return the sensitivities (m, 2, 8), and the velocities (m, 2) of `paths`.
+
+    Exact in the turn and the star; in the growth to second order of the angle turned, and left zero unless
+    `growing`.
+    """
+    turning = _turning(motion, time)
+    v = _rotated(turning, _directions(pinhole, stars))
+    there = v[:2] / v[2]
+    out = np.zeros((2, 8, len(time)))
+    # A change of turn or growth is a small rotation psi against the camera, the integral of the rotation from
+    # t' to t over t'. It moves the star by v x psi: the flow of its place, times psi.
+    flow = _flow(pinhole, there)
+    # The mean rate since mid-exposure: what changes beyond it is of higher order.
+    mean = motion.turn[:, None] + 0.5 * time * motion.growth[:, None]
+    angle = np.sqrt(np.sum(mean * mean, axis=0))
+    axis = mean / np.maximum(angle, _TINY)
+    phi = angle * time
+    sine = time * np.sinc(phi / np.pi)
+    versine = 0.5 * time * phi * np.sinc(0.5 * phi / np.pi) ** 2
+    about = _cross(flow, axis)
+    out[:, :3] = sine * flow - versine * about
+    out[:, :3] += (((time - sine) * np.sum(flow * axis, axis=1))[:, None]) * axis
+    if growing:
+        out[:, 3:6] = (0.5 * time**2) * flow - (time * time * time / 6.0 * angle) * about
+    for column, unit in ((6, np.array([[1.0], [0.0], [0.0]])), (7, np.array([[0.0], [1.0], [0.0]]))):
+        beside = _rotated(turning, unit)
+        out[:, column] = (beside[:2] - there * beside[2]) / v[2]
+    velocity = np.sum(flow * _rate(motion, time), axis=1)
+    return out.transpose(2, 0, 1), velocity.T
+
+
+# Below, vectors are (..., 3, m), components before points: they then lie together in memory. What is returned
+# above is a transposed view of such arrays.
+
+
+def _flow(pinhole: Pinhole, there: FloatArray) -> FloatArray:
+    """Return (2, 3, m) px per rad, by which small rotations move what is at `there` (2, m), x/z and y/z."""
+    x, y = there
+    xy = x * y
+    out = np.empty((2, 3, len(x)))
+    out[0, 0], out[0, 1], out[0, 2] = xy, -1.0 - x * x, y
+    out[1, 0], out[1, 1], out[1, 2] = 1.0 + y * y, -xy, -x
+    out *= pinhole.focal_length
+    return out
+
+
+def _directions(pinhole: Pinhole, stars: FloatArray) -> FloatArray:
+    """Return directions (3, m), not normalised (z is 1), of pixels (m, 2)."""
+    out = np.ones((3, len(stars)))
+    out[:2] = stars.T
+    out[:2] -= np.array(pinhole.centre)[:, None]
+    out[:2] /= pinhole.focal_length
+    return out
+
+
+def _pixels(pinhole: Pinhole, there: FloatArray) -> FloatArray:
+    """Return the pixels (m, 2) of x/z and y/z (2, m)."""
+    pixel = pinhole.focal_length * there
+    pixel += np.array(pinhole.centre)[:, None]
+    return pixel.T
+
+
+def _rate(motion: Motion, time: FloatArray) -> FloatArray:
+    """Return the turn's rate (3, 1), or (3, m) where it changes with `time`."""
+    if motion.constant:
+        return motion.turn[:, None]
+    return motion.turn[:, None] + motion.growth[:, None] * time
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return a x b of vectors (..., 3, m) and (3, m), or of one vector (3, 1)."""
+    if b.shape[1] == 1:
+        x, y, z = b[:, 0]
+        return np.asarray(np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]) @ a)
+    after, before = [1, 2, 0], [2, 0, 1]
+    return np.asarray(a[..., after, :] * b[before] - a[..., before, :] * b[after])
+
+
+def _turning(motion: Motion, time: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the axis (3, 1) or (3, m) of the rotation until `time` (m,), sine and cosine of its angle."""
+    if motion.constant:
+        angle = float(np.linalg.norm(motion.turn))
+        a = (motion.turn / max(angle, _TINY))[:, None]
+        phi = angle * time
+    else:
+        twist = np.cross(motion.turn, motion.growth) / 12.0
+        parts = np.stack([motion.turn, 0.5 * motion.growth, twist], axis=1)
+        square = time * time
+        vector = parts @ np.stack([time, square, square * time])
+        phi = np.sqrt(np.sum(vector**2, axis=0))
+        a = vector / np.maximum(phi, _TINY)
+    return a, np.sin(phi), np.cos(phi)
+
+
+def _rotated(turning: tuple[FloatArray, FloatArray, FloatArray], v: FloatArray) -> FloatArray:
+    """Return fixed directions (3, m) in the axes of a camera that has turned by `turning`.
+
+    They are v cos - (a x v) sin + a (a.v)(1 - cos), about the unit vector a of the rotation until then.
+    """
+    a, sine, cosine = turning
+    along = (a * a.T) @ v if a.shape[1] == 1 else a * np.sum(a * v, axis=0)
+    out = (v - along) * cosine
+    out += _cross(v, a) * sine
+    out += along
+    return np.asarray(out)

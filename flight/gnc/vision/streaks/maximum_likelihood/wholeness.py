@@ -1,0 +1,75 @@
+"""Whether a motion makes whole streaks of the light: not pieces of longer ones, nor several end to end."""
+
+from __future__ import annotations
+
+from enum import Enum
+
+import numpy as np
+
+from flight.gnc.vision.streaks.maximum_likelihood.chains import in_chains
+from flight.gnc.vision.streaks.maximum_likelihood.ends import true_ends, unbroken
+from flight.gnc.vision.streaks.maximum_likelihood.matched_filter import FaintStars
+from flight.gnc.vision.streaks.maximum_likelihood.motion import positions
+from flight.gnc.vision.streaks.maximum_likelihood.rounds import ExposedCamera
+from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene, window_times
+
+# Share of the stars that may seem pieces of longer streaks by chance.
+_MOST_CHAINED = 0.45
+# Share of the ends on the detector that are where the motion puts them: without doubt, and at least.
+_TRUE_ENDS = (0.75, 0.6)
+# Share of the stars that are dark along a good part of their path, which one may be for reasons of its own.
+_BROKEN = (0.12, 0.35)
+# Share of the light of streaks that lie in the frame from end to end which the motion must have on its side.
+_WHOLE_LIGHT = 0.5
+
+
+class Wholeness(Enum):
+    """What the streaks' ends and the light between them say of a motion."""
+
+    WHOLE = "whole"
+    DOUBTED = "doubted"
+    BROKEN = "broken"
+
+
+def wholeness(camera: ExposedCamera, scene: Scene, faint: FaintStars) -> Wholeness:
+    """Return whether the stars that decide are as long as their light; doubted when some of them are not.
+
+    In a crowded frame what passes for a star may be several: a few that are dark here or there do not speak
+    against the motion, but ask for another witness. So does a motion that most of the streaks disown which
+    show both ends, the only ones that tell by what angle the stars turned, and one that no such streak
+    vouches for; where the ends of those that decide are not where they should be, it is not the motion.
+    """
+    stars = np.concatenate([scene.stars, faint.stars])
+    light = np.concatenate([scene.light, faint.light])
+    chained = in_chains(camera.pinhole, scene.motion, stars, light, len(scene.stars))
+    if float(np.mean(chained[scene.trusted])) > _MOST_CHAINED:
+        return Wholeness.BROKEN
+    deciding = scene.select(scene.trusted)
+    times = window_times(camera.pinhole, deciding.motion, camera.shutter, deciding.stars)
+    seen = camera.frame, camera.pinhole, scene.motion, deciding.stars, deciding.light, times
+    ends, lit = true_ends(*seen), unbroken(*seen)
+    told = np.isfinite(ends)
+    both = told.all(axis=1)
+    right = float(np.mean(ends[told])) if told.any() else 1.0
+    if both.any() and float(np.mean(ends[both])) < _TRUE_ENDS[1]:
+        return Wholeness.BROKEN
+    dark = np.count_nonzero(lit == 0.0)
+    for worst, (least_ends, most_broken) in zip(
+        (Wholeness.BROKEN, Wholeness.DOUBTED), zip(_TRUE_ENDS[::-1], _BROKEN[::-1], strict=True), strict=True
+    ):
+        if right < least_ends or dark > max(1.0, most_broken * len(lit)):
+            return worst
+    unvouched = bool(told.any()) and not both.any()
+    return Wholeness.DOUBTED if unvouched or _disowned(camera, scene) else Wholeness.WHOLE
+
+
+def _disowned(camera: ExposedCamera, scene: Scene) -> bool:
+    """Tell whether most light of the bright streaks that show both ends is not of stars that agree."""
+    times = window_times(camera.pinhole, scene.motion, camera.shutter, scene.stars)
+    inside = np.ones(len(scene.stars), dtype=np.bool_)
+    for time in times.T:
+        inside &= camera.pinhole.contains(positions(camera.pinhole, scene.motion, scene.stars, time))
+    # Fainter stars were never asked.
+    bright = inside & (scene.light >= scene.light[scene.trusted].min())
+    light = scene.light[bright]
+    return float(light[scene.trusted[bright]].sum()) < _WHOLE_LIGHT * float(light.sum())

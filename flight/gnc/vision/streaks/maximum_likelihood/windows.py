@@ -1,0 +1,190 @@
+"""The pixels that are fitted: strips about long streaks, patches about spots."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flight.gnc.camera.pinhole import Pinhole
+from flight.gnc.math.arrays import BoolArray, FloatArray, IntArray
+from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import ExposedFrame, Float32Array
+from flight.gnc.vision.streaks.maximum_likelihood.motion import positions
+from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene, path_lengths, window_times
+from flight.gnc.vision.streaks.maximum_likelihood.shutter import Shutter
+from flight.gnc.vision.streaks.maximum_likelihood.spot_model import Patches, cut_patches
+from flight.gnc.vision.streaks.maximum_likelihood.strips import STEEPEST, Strips, cut_strips
+
+# Paths shorter than this many widths are summed instant by instant.
+_SPOT_WIDTHS = 8.0
+# Predicted light within so many sigmas of saturation is left out: chosen by the model, not by the noise.
+_MARGIN = 3.0
+# Instants at which it is asked what of a path the frame sees.
+_INSTANTS = 9
+_UNRESOLVED = 0.1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sight:
+    """What the frame shows on some blocks of pixels, all arrays (b, ...) alike.
+
+    Attributes:
+        slot: number of the pixel among those in use, the same for every star that shares it; one past the
+            last where the pixel does not exist.
+        inside: whether the pixel exists, tells something, and is meant.
+        signal, floor, ceiling: of the frame.
+        gain: electrons a count.
+        crowded: (e,) flat positions of the pixels that other stars share; common: (e,) their numbers among
+            all that are shared.
+    """
+
+    slot: IntArray
+    inside: BoolArray
+    signal: Float32Array
+    floor: Float32Array
+    ceiling: Float32Array
+    gain: float
+    crowded: IntArray
+    common: IntArray
+
+    def residual(self, total: Float32Array, clip: float) -> tuple[Float32Array, Float32Array]:
+        """Return weights (1/variance, 0 where left out) and residuals under the light `total` by slot.
+
+        Residuals of more than `clip` sigma and a tenth of the model are no noise: left out; 0 leaves none out
+        for that.
+        """
+        model = total.take(self.slot)
+        variance = np.maximum(model, np.float32(0.0))
+        variance *= np.float32(1.0 / self.gain)
+        variance += self.floor
+        residual = self.signal - model
+        deviation = np.sqrt(variance)
+        good = self.inside & (model + np.float32(_MARGIN) * deviation < self.ceiling)
+        if clip > 0.0:
+            deviation *= np.float32(clip)
+            deviation += np.float32(_UNRESOLVED) * model
+            good &= np.abs(residual) <= deviation
+        weight = np.where(good, np.float32(1.0) / variance, np.float32(0.0))
+        residual[~good] = 0.0
+        return weight, residual
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Windows:
+    """The pixels that are fitted: strips about long streaks, patches about spots.
+
+    Attributes:
+        long, spot: stars (a,), (b,) of each kind, indices into the scene.
+        strips, patches: their pixels; star i of the strips is `long[i]`.
+        pixels: (m,) flat indices of the pixels in use, by slot; slot: of all blocks' pixels, one after other.
+        on_strips, on_patches: what the frame shows there.
+        shared: how many pixels are of several stars.
+    """
+
+    long: IntArray
+    spot: IntArray
+    strips: Strips
+    patches: Patches
+    pixels: IntArray
+    slot: IntArray
+    on_strips: Sight
+    on_patches: Sight
+    shared: int
+
+    def total(self, on_strips: Float32Array, on_patches: FloatArray) -> Float32Array:
+        """Return the light (m + 1,) of all stars on the pixels in use, from that on each star's own.
+
+        What comes last is of pixels that do not exist.
+        """
+        light = np.concatenate([on_strips.reshape(-1), on_patches.reshape(-1).astype(np.float32)])
+        return np.bincount(self.slot, light, len(self.pixels) + 1).astype(np.float32)
+
+    def only(self, on_strips: BoolArray, on_patches: BoolArray) -> Windows:
+        """Return the windows with only these pixels meant."""
+        return replace(
+            self,
+            on_strips=replace(self.on_strips, inside=on_strips),
+            on_patches=replace(self.on_patches, inside=on_patches),
+        )
+
+
+def window_areas(pinhole: Pinhole, scene: Scene, reach: float) -> FloatArray:
+    """Return about how many pixels (n,) each star's window takes, `reach` widths to either side of its path.
+
+    All lines of all strips are as long as that which its path crosses most obliquely.
+    """
+    n, room = len(scene.stars), reach * scene.width
+    if n == 0:
+        return np.empty(0)
+    time = np.tile(np.linspace(-0.5, 0.5, _INSTANTS), n)
+    there = positions(pinhole, scene.motion, np.repeat(scene.stars, _INSTANTS, axis=0), time)
+    seen = pinhole.contains(there).reshape(n, _INSTANTS).mean(axis=1)
+    step = np.abs(np.diff(there.reshape(n, _INSTANTS, 2), axis=1))
+    lines = step.max(axis=2)
+    steep = float(np.min(lines / np.maximum(np.hypot(step[..., 0], step[..., 1]), 1e-9)))
+    across = 2.0 * np.floor(room / min(max(steep, STEEPEST), 1.0) + 0.5) + 1.0
+    return np.asarray(across * (lines.sum(axis=1) * seen + 2.0 * room))
+
+
+def cut_windows(
+    frame: ExposedFrame, pinhole: Pinhole, shutter: Shutter, scene: Scene, reach: float
+) -> Windows:
+    """Return the pixels of `frame` within `reach` widths of the stars' paths."""
+    length = path_lengths(pinhole, scene.motion, scene.stars)
+    limit = _SPOT_WIDTHS * scene.width
+    long, spot = np.flatnonzero(length >= limit), np.flatnonzero(length < limit)
+    room = reach * scene.width
+    times = window_times(pinhole, scene.motion, shutter, scene.stars[long])
+    strips = cut_strips(pinhole, scene.motion, scene.stars[long], times, room)
+    longest = float(length[spot].max(initial=0.0))
+    patches = cut_patches(pinhole, scene.stars[spot], int(np.ceil(room + 0.5 * longest)))
+    index = np.concatenate([strips.index.reshape(-1), patches.index.reshape(-1)])
+    inside = np.concatenate([strips.inside.reshape(-1), patches.inside.reshape(-1)])
+    named = index[inside]
+    # Each pixel is told by the last place that names it; only memory of pixels in use is touched.
+    turn = np.arange(len(named), dtype=np.int32)
+    number = np.empty(frame.signal.size, dtype=np.int32)
+    number[named] = turn
+    last = number.take(named)
+    own = last == turn
+    pixels = named[own]
+    place = (np.cumsum(own) - 1).take(last)
+    shared = np.bincount(place, minlength=len(pixels)) > 1
+    slot = np.full(len(index), len(pixels))
+    slot[inside] = place
+    crowded = np.flatnonzero(np.append(shared, False).take(slot))
+    common = np.cumsum(shared) - 1
+    cut = strips.index.size
+    return Windows(
+        long,
+        spot,
+        strips,
+        patches,
+        pixels,
+        slot,
+        _sight(frame, strips.index, strips.inside, slot[:cut], crowded[crowded < cut], common),
+        _sight(frame, patches.index, patches.inside, slot[cut:], crowded[crowded >= cut] - cut, common),
+        int(np.count_nonzero(shared)),
+    )
+
+
+def _sight(
+    frame: ExposedFrame,
+    index: IntArray,
+    inside: BoolArray,
+    slot: IntArray,
+    crowded: IntArray,
+    common: IntArray,
+) -> Sight:
+    signal = frame.signal.take(index)
+    return Sight(
+        slot.reshape(index.shape),
+        inside & ~frame.bad.take(index),
+        signal,
+        frame.floor.take(index),
+        # The background's level is what a pixel's counts exceed its signal by.
+        np.float32(frame.top) - frame.counts.take(index) + signal,
+        frame.gain,
+        crowded,
+        common.take(slot.take(crowded)),
+    )

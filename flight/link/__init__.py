@@ -1,0 +1,1 @@
+"""What space and ground say to each other: packets, commands, logs."""

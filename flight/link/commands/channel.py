@@ -1,0 +1,122 @@
+"""Where commands come from: datagrams on a UNIX socket or on UDP, never waited for."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import stat
+from collections.abc import Sequence
+from ipaddress import IPv4Address, IPv4Network
+from pathlib import Path
+from typing import Any, Protocol
+
+from flight.gnc.errors import UsageError
+from flight.link.commands.codec import LONGEST
+
+AT_MOST = 16
+"""Datagrams taken at once: a flood costs its senders, not the loop."""
+
+
+class Channel(Protocol):
+    """A source of datagrams, each with whom to answer."""
+
+    name: str
+
+    def poll(self) -> list[tuple[bytes, Any]]:
+        """Return what has come, oldest first. Never waits, never raises."""
+
+    def answer(self, data: bytes, sender: Any) -> None:
+        """Answer if there is somebody; whoever does not listen has no answer. Never waits, never raises."""
+
+    def close(self) -> None:
+        """Close. Safe to call twice."""
+
+
+class DatagramChannel:
+    """A bound datagram socket."""
+
+    def __init__(
+        self,
+        name: str,
+        bound: socket.socket,
+        path: Path | None = None,
+        peers: Sequence[IPv4Network] | None = None,
+    ) -> None:
+        """Take a bound socket; `path` is removed at the end, only `peers` are listened to where given."""
+        self.name = name
+        self._socket = bound
+        self._path = path
+        self._peers = peers
+        bound.setblocking(False)
+
+    def poll(self) -> list[tuple[bytes, Any]]:
+        """Return what has come, oldest first; of a datagram too long for a command, enough to refuse it."""
+        found = []
+        for _ in range(AT_MOST):
+            try:
+                data, sender = self._socket.recvfrom(LONGEST + 1)
+            except OSError:  # nothing there, or a sender that is gone
+                break
+            if self._peers is None or any(IPv4Address(sender[0]) in peers for peers in self._peers):
+                found.append((data, sender))
+        return found
+
+    def answer(self, data: bytes, sender: Any) -> None:
+        """Answer a sender that has an address."""
+        if sender:
+            with contextlib.suppress(OSError):
+                self._socket.sendto(data, sender)
+
+    def close(self) -> None:
+        """Close, and remove the socket's file."""
+        self._socket.close()
+        if self._path is not None:
+            self._path.unlink(missing_ok=True)
+
+
+def open_unix(path: Path) -> DatagramChannel:
+    """Bind a UNIX datagram socket that owner and group may write to. Raises UsageError.
+
+    The file of a flight that is gone is replaced; anything else that stands there is not touched.
+    """
+    bound = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    try:
+        with contextlib.suppress(FileNotFoundError):
+            if not stat.S_ISSOCK(path.lstat().st_mode):
+                raise OSError("something else stands there")
+            if _is_served(path):
+                raise OSError("another flight listens there")
+            path.unlink()
+        before = os.umask(0o117)
+        try:
+            bound.bind(str(path))
+        finally:
+            os.umask(before)
+    except OSError as error:
+        bound.close()
+        reason = error.strerror or error
+        raise UsageError(f"commands.socket: {path} cannot be listened to: {reason}") from error
+    return DatagramChannel("socket", bound, path)
+
+
+def open_udp(address: str, peers: Sequence[IPv4Network] | None = None) -> DatagramChannel:
+    """Bind a UDP socket to HOST:PORT; only `peers` are listened to where given. Raises UsageError."""
+    host, _, port = address.rpartition(":")
+    bound = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        bound.bind((host, int(port)))
+    except (OSError, OverflowError) as error:
+        bound.close()
+        raise UsageError(f"commands.udp: {address} cannot be listened to: {error}") from error
+    return DatagramChannel("udp", bound, peers=peers)
+
+
+def _is_served(path: Path) -> bool:
+    """Tell whether somebody listens at a socket's file."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(str(path))
+        except OSError:
+            return False
+        return True

@@ -1,0 +1,32 @@
+"""The one table of telecommands: CCSDS space packets of type 1, made and read as telemetry is.
+
+`time_ns` of the secondary header is a number that the sender uses once, its UTC say: the very same packet is
+obeyed once, so that a datagram which a network brings twice does no harm.
+"""
+
+from __future__ import annotations
+
+from flight.link.telemetry.definitions import Field, Packet
+from flight.link.telemetry.packets import Layout, compile_layouts
+
+
+def _command(name: str, apid: int, meaning: str, *fields: Field) -> Packet:
+    return Packet(name, apid, "at will", meaning, fields, telecommand=True)
+
+
+PING = _command(
+    "ping", 0x201, "Answer, and do nothing else", Field("number", "u4", "-", "comes back in the answer")
+)
+SAFE = _command("safe", 0x202, "Abort: coils to zero, mode safe", Field("reason", "S64", "-", "for the log"))
+MODE = _command("mode", 0x203, "Change the mode", Field("mode", "u1", "-", "as in the telemetry packet mode"))
+SLEW = _command(
+    "slew", 0x204, "Go to an attitude, then hold it", Field("q2", "f8", "-", "commanded final q2, +-0.68")
+)
+CLEAR = _command(
+    "clear", 0x205, "Let a latched event begin anew", Field("event", "S32", "-", "name of the event")
+)
+
+COMMANDS: tuple[Packet, ...] = (PING, SAFE, MODE, SLEW, CLEAR)
+
+LAYOUTS: dict[str, Layout] = compile_layouts(COMMANDS)
+"""Their bytes, by name."""

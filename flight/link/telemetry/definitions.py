@@ -1,0 +1,341 @@
+"""The one table of telemetry: every packet, every field, its type, unit and meaning.
+
+The packer, the parser, the ground database, the CSV export and the documentation are made from it. A packet
+is never changed in place once it has flown: a field is appended and the packet's version raised.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """One field: `kind` is a numpy type code (f8, f4, u1, u2, u4, u8, i8) or S<n> for n bytes of UTF-8.
+
+    `count` > 1 makes an array. All numbers are big-endian on the wire.
+    """
+
+    name: str
+    kind: str
+    unit: str
+    meaning: str
+    count: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Packet:
+    """One packet: its application process identifier (APID), rate and fields."""
+
+    name: str
+    apid: int
+    rate: str
+    meaning: str
+    fields: tuple[Field, ...]
+    version: int = field(default=1)
+    telecommand: bool = False
+
+
+MAX_NODES = 40
+
+RUN = Packet(
+    "run",
+    0x101,
+    "once, at start",
+    "What is being flown",
+    (
+        Field("config_name", "S64", "-", "name of the configuration"),
+        Field("config_crc", "u4", "-", "CRC-32 of the configuration as it stands in the run's folder"),
+        Field("software", "S32", "-", "version of the flight application"),
+        Field("seed", "u8", "-", "seed of the simulation, 0 on hardware"),
+        Field("utc_ns", "i8", "ns", "UTC at mission time zero, nanoseconds since 1970: a label only"),
+        Field("simulated", "u1", "-", "1 when the devices are emulated"),
+        Field("realtime", "u1", "-", "1 when flown on the machine's clock, 0 in lock-step"),
+        Field("control_period_ns", "u8", "ns", "period of the control rate group"),
+        Field("duration", "f8", "s", "planned length of the run, NaN when open"),
+        Field("coil_resistance", "f8", "ohm", "resistance of each coil, NaN where none is fitted", 3),
+        Field("supply_voltage", "f8", "V", "coil supply after losses, as configured"),
+        Field("current_limit", "f8", "A", "largest current that a coil may carry"),
+    ),
+)
+
+IMU = Packet(
+    "imu",
+    0x110,
+    "40 Hz",
+    "One sample of the inertial unit as the driver gave it",
+    (
+        Field("sample_time_ns", "i8", "ns", "mission time of the sample"),
+        Field("device_time_ns", "u8", "ns", "the unit's own clock"),
+        Field("quaternion", "f8", "-", "reference frame into body, scalar last", 4),
+        Field("rate", "f8", "rad/s", "body rate, body axes", 3),
+        Field("field", "f8", "T", "magnetic field, body axes", 3),
+        Field("acceleration", "f8", "m/s^2", "specific force, body axes", 3),
+    ),
+)
+
+CONTROL = Packet(
+    "control",
+    0x111,
+    "40 Hz",
+    "One control cycle: estimate, path, command",
+    (
+        Field("cycle", "u4", "-", "slot of the control grid since start, skipped ones counted"),
+        Field("state", "u1", "-", "0 coils off, 1 following a path, 2 holding, 3 braking"),
+        Field("estimate_age", "f8", "s", "age of the newest measurement in the estimate"),
+        Field("angle", "f8", "rad", "estimated turn about the thread"),
+        Field("q2", "f8", "-", "estimated second quaternion component"),
+        Field("rate", "f8", "rad/s", "estimated rate about the thread"),
+        Field("angle_sigma", "f8", "rad", "standard deviation of the angle"),
+        Field("rate_sigma", "f8", "rad/s", "standard deviation of the rate"),
+        Field("target_q2", "f8", "-", "commanded final q2"),
+        Field("path_q2", "f8", "-", "planned q2 now"),
+        Field("path_rate", "f8", "rad/s", "planned rate now"),
+        Field("path_acceleration", "f8", "rad/s^2", "planned angular acceleration now"),
+        Field("plan", "u4", "-", "number of the plan being flown, 0 when none"),
+        Field("current_command", "f8", "A", "currents asked of the coils", 3),
+        Field("current_written", "f8", "A", "currents on the wire, limited and quantised", 3),
+        Field("saturated", "u1", "-", "1 when any coil was limited"),
+    ),
+)
+
+TARGET = Packet(
+    "target",
+    0x112,
+    "at each command",
+    "A new commanded attitude",
+    (
+        Field("index", "u2", "-", "number of the step, from 0"),
+        Field("q2", "f8", "-", "commanded final q2"),
+        Field("rate", "f8", "rad/s", "commanded final rate"),
+    ),
+)
+
+MODE = Packet(
+    "mode",
+    0x113,
+    "at each change",
+    "A new mode, and what led to it",
+    (
+        Field("before", "u1", "-", "mode until now, numbered as in mode"),
+        Field("mode", "u1", "-", "0 boot, 1 safe, 2 detumble, 3 hold, 4 slew, 5 testbed-demo"),
+        Field("trigger", "S32", "-", "what led to it (flight.loop.modes.mode)"),
+        Field("reason", "S96", "-", "of the trigger: the event, the values"),
+        Field("target_q2", "f8", "-", "q2 wanted by a hold or a slew, NaN when not yet known"),
+    ),
+)
+
+PLAN = Packet(
+    "plan",
+    0x120,
+    "every 5 s",
+    "One result of the path planner, flown or not",
+    (
+        Field("number", "u4", "-", "number of the plan, from 1"),
+        Field("accepted", "u1", "-", "1 when flown"),
+        Field("status", "S32", "-", "optimal, stretched, or the reason of refusal"),
+        Field("origin_ns", "i8", "ns", "mission time of the path's start"),
+        Field("horizon_asked", "f8", "s", "horizon asked for"),
+        Field("horizon", "f8", "s", "horizon planned"),
+        Field("start_q2", "f8", "-", "q2 at the start"),
+        Field("start_rate", "f8", "rad/s", "rate at the start"),
+        Field("target_q2", "f8", "-", "q2 at the end"),
+        Field("cost", "f8", "J", "planned integral of R I^2"),
+        Field("peak_current", "f8", "A", "largest current between and on the nodes"),
+        Field("evaluations", "u4", "-", "evaluations of the cost"),
+        Field("nodes", "u1", "-", "number of nodes in use"),
+        Field("node_q2", "f8", "-", "q2 on the Legendre-Gauss-Lobatto nodes, NaN past the last", MAX_NODES),
+    ),
+)
+
+STREAK = Packet(
+    "streak",
+    0x121,
+    "each frame",
+    "What vision found in one frame",
+    (
+        Field("sequence", "u4", "-", "the camera's count"),
+        Field("exposure_start_ns", "i8", "ns", "mission time of the exposure's start"),
+        Field("exposure", "f8", "s", "exposure time"),
+        Field("status", "S32", "-", "rate, ambiguous, too-short, too-few, failed, black, saturated, frozen"),
+        Field("streaks", "u2", "-", "streaks found"),
+        Field("used", "u2", "-", "streaks used in the rate"),
+        Field("length", "f8", "px", "median length of the streaks"),
+        Field("rate", "f8", "rad/s", "mean body rate over the exposure, body axes; NaN when none", 3),
+        Field("covariance", "f8", "rad^2/s^2", "xx yy zz xy xz yz of the rate, body axes; NaN when none", 6),
+        Field("residual", "f8", "rad", "rms residual of the endpoints; NaN when none"),
+        Field("accepted", "u1", "-", "1 when it entered the estimate"),
+    ),
+)
+
+STARS = Packet(
+    "stars",
+    0x122,
+    "each frame",
+    "Which stars one frame shows, and the attitude that they give",
+    (
+        Field("sequence", "u4", "-", "the camera's count"),
+        Field("middle_ns", "i8", "ns", "mission time of the exposure's middle"),
+        Field("status", "S32", "-", "solved, no-stars, too-few-stars, no-match, ambiguous"),
+        Field("tracked", "u1", "-", "1 when the estimate told where to look, 0 lost in space"),
+        Field("found", "u2", "-", "what was taken for a star"),
+        Field("matched", "u2", "-", "of them guide stars"),
+        Field("quaternion", "f8", "-", "reference into body, scalar last; NaN when none", 4),
+        Field("covariance", "f8", "rad^2", "xx yy zz xy xz yz of small turns, body axes; NaN when none", 6),
+        Field("log10_false_alarm", "f8", "-", "log10 of the chance matches expected in the whole sky"),
+        Field("accepted", "u1", "-", "1 when it entered the estimate"),
+    ),
+)
+
+EVENT = Packet(
+    "event",
+    0x130,
+    "when it happens",
+    "Something a reader of the log at night wants to know",
+    (
+        Field("code", "u2", "-", "number of the event (flight.loop.fdir.events)"),
+        Field("severity", "u1", "-", "0 information, 1 warning, 2 fault"),
+        Field("suppressed", "u4", "-", "how many of its kind the throttle held back since the last one told"),
+        Field("name", "S32", "-", "name of the event"),
+        Field("text", "S160", "-", "what happened, with its values"),
+    ),
+)
+
+HOUSEKEEPING = Packet(
+    "housekeeping",
+    0x131,
+    "1 Hz",
+    "Health of the devices and of the loop",
+    (
+        Field("state", "u1", "-", "as in control"),
+        Field("imu_packets", "u4", "-", "packets accepted since start"),
+        Field("imu_bad_checksum", "u4", "-", "packets with a wrong checksum"),
+        Field("imu_discarded_bytes", "u4", "-", "bytes that belonged to no packet"),
+        Field("imu_out_of_range", "u4", "-", "packets with implausible values"),
+        Field("imu_not_finite", "u4", "-", "packets with NaN or infinity"),
+        Field("coil_faults", "u4", "-", "failed transactions with the PWM chip"),
+        Field("coil_voltage", "f8", "V", "supply of the coils, measured; NaN when unknown"),
+        Field("coil_current", "f8", "A", "total current of the coils, measured; NaN when unknown"),
+        Field("coil_power", "f8", "W", "power of the coils, measured; NaN when unknown"),
+        Field("plans_accepted", "u4", "-", "plans flown since start"),
+        Field("plans_refused", "u4", "-", "plans refused since start"),
+        Field("frames", "u4", "-", "frames received since start"),
+        Field("streak_rates", "u4", "-", "rates from streaks that entered the estimate"),
+        Field("events", "u4", "-", "events since start, suppressed ones counted"),
+    ),
+)
+
+HEALTH = Packet(
+    "health",
+    0x132,
+    "1 Hz",
+    "Mode, streams, facts and resources",
+    (
+        Field("mode", "u1", "-", "as in mode"),
+        Field("mode_age", "f8", "s", "time in this mode"),
+        Field("imu", "u1", "-", "0 not fitted, 1 never came, 2 stale, 3 invalid, 4 slow, 5 good"),
+        Field("field", "u1", "-", "the magnetometer, as imu"),
+        Field("coils", "u1", "-", "acknowledged commands, as imu"),
+        Field("power", "u1", "-", "the current monitor, as imu"),
+        Field("camera", "u1", "-", "frames, as imu"),
+        Field("facts", "u8", "-", "bit n: fact n of the table (flight.loop.fdir.facts) counts"),
+        Field("coils_in_use", "u1", "-", "bits 0, 1, 2: the coils on body x, y, z"),
+        Field("fed", "u4", "-", "how often the watchdog was fed"),
+        Field("slips", "u4", "-", "slots of the control group skipped since start"),
+        Field("clock_steps", "u4", "-", "how often the wall clock was set"),
+        Field("cpu_share", "f8", "-", "processor time of the control process over time; NaN when unknown"),
+        Field("resident", "f8", "B", "resident set of the control process; NaN when unknown"),
+        Field("proportional", "f8", "B", "proportional set of all flight processes; NaN when unknown"),
+        Field("memory_slope", "f8", "B/s", "of the proportional set, by least squares; NaN when unknown"),
+        Field("disk_free", "f8", "B", "room for the flight log; NaN when unknown"),
+        Field("temperature", "f8", "deg C", "of the warmest zone of the board; NaN when unknown"),
+    ),
+)
+
+COMMAND = Packet(
+    "command",
+    0x133,
+    "each command",
+    "What became of a command; also the answer to whoever sent it",
+    (
+        Field("obeyed", "u1", "-", "1 when obeyed, 0 when refused"),
+        Field("name", "S16", "-", "name of the command; empty for bytes that are none"),
+        Field("source", "S16", "-", "socket, udp or timeline"),
+        Field("count", "u4", "-", "commands since start"),
+        Field("mode", "u1", "-", "mode after it, as in mode"),
+        Field("text", "S128", "-", "its values, or why it was refused"),
+    ),
+)
+
+TRUTH = Packet(
+    "truth",
+    0x140,
+    "40 Hz, simulation only",
+    "What the simulated world really did; written by sim_hal into a log of its own",
+    (
+        Field("quaternion", "f8", "-", "reference frame into body, scalar last", 4),
+        Field("rate", "f8", "rad/s", "body rate, body axes", 3),
+        Field("current", "f8", "A", "mean coil currents as the world felt them", 3),
+        Field("energy", "f8", "J", "integral of R I^2 over all coils since mission time zero"),
+        Field("supply_energy", "f8", "J", "integral of V |I| over all coils since mission time zero"),
+    ),
+)
+
+CYCLE_TIMING = Packet(
+    "cycle_timing",
+    0x150,
+    "40 Hz, performance record",
+    "When a control cycle ran and how long it took, on the machine's clock",
+    (
+        Field("cycle", "u4", "-", "slot of the control grid"),
+        Field("lateness", "f8", "s", "start of the cycle after its slot"),
+        Field("execution", "f8", "s", "time spent in the cycle"),
+    ),
+)
+
+RATE_GROUP = Packet(
+    "rate_group",
+    0x151,
+    "1 Hz each, performance record",
+    "One rate group of the executive since start",
+    (
+        Field("name", "S16", "-", "name of the group"),
+        Field("period", "f8", "s", "its period"),
+        Field("cycles", "u4", "-", "slots that ran"),
+        Field("slips", "u4", "-", "slots that were skipped"),
+        Field("overruns", "u4", "-", "cycles longer than the period"),
+        Field("mean", "f8", "s", "mean execution time"),
+        Field("max", "f8", "s", "longest execution time"),
+    ),
+)
+
+JOB_TIMING = Packet(
+    "job_timing",
+    0x152,
+    "each job, performance record",
+    "One job of a worker",
+    (
+        Field("name", "S16", "-", "name of the worker"),
+        Field("execution", "f8", "s", "time spent in the job"),
+        Field("outcome", "S16", "-", "done, failed, timed-out, died"),
+    ),
+)
+
+PACKETS: tuple[Packet, ...] = (
+    RUN,
+    IMU,
+    CONTROL,
+    TARGET,
+    MODE,
+    PLAN,
+    STREAK,
+    STARS,
+    EVENT,
+    HOUSEKEEPING,
+    HEALTH,
+    COMMAND,
+    TRUTH,
+    CYCLE_TIMING,
+    RATE_GROUP,
+    JOB_TIMING,
+)

@@ -1,0 +1,200 @@
+"""The flight log: packets queued by the control thread, put on disk beside it.
+
+`write` appends to a bounded queue and never waits; a ticker of the clock drains the queue into the segments.
+While the disk takes nothing (full, gone, hung) packets wait in the queue, and are written once it does again;
+what does not fit there is counted and told.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+
+from flight.gnc.errors import UsageError
+from flight.link.telemetry.segments import SegmentFile, SegmentStore, find_segments, open_segment
+from hal.interfaces.wires import Clock
+
+_HUNG_DISK_S = 5.0
+_RETRY_NS = 1_000_000_000
+_RECENT_NS = 2_000_000_000
+
+
+class FlightLog:
+    """One log of one folder. One thread writes; the clock's ticker drains.
+
+    The bytes on disk depend on the packets alone, not on when they were drained.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        stem: str = "flight",
+        *,
+        clock: Clock,
+        segment_bytes: int = 16 << 20,
+        budget_bytes: int = 1 << 30,
+        queue_packets: int = 20_000,
+        drain_period_ns: int = 250_000_000,
+        sync_period_ns: int | None = 1_000_000_000,
+        overwrite: bool = False,
+        patient: bool = False,
+        opener: Callable[[Path], SegmentFile] = open_segment,
+    ) -> None:
+        """Begin a new log.
+
+        `sync_period_ns` None leaves fsync to the end of each segment: right for lock-step simulation, where
+        seconds are short. Raises UsageError when the folder holds such a log already and `overwrite` is not
+        set, when the sizes make no sense, or when the folder cannot be written; but a `patient` log waits for
+        a disk that takes nothing, as it does later on.
+        """
+        if not 0 < segment_bytes <= budget_bytes // 2:
+            raise UsageError(
+                f"log budget of {budget_bytes} bytes: it must hold two segments of {segment_bytes} bytes"
+            )
+        self._stem = stem
+        self._clock = clock
+        self._queue_packets = queue_packets
+        self._sync_period_ns = sync_period_ns
+        self._queue: deque[bytes] = deque()
+        self._refused = 0  # packets lost by the writer
+        self._unwritten = 0  # packets lost by the drainer
+        self._refused_ns = 0  # when last
+        self._failure = ""  # why nothing can be written now
+        self._past_failure = ""
+        self._retry_ns = 0
+        self._busy_since_ns: int | None = None
+        self._closed = False
+        self._draining = threading.Lock()  # held by whoever drains, never asked for by write()
+        self._store: SegmentStore | None = None
+
+        def begin() -> SegmentStore:
+            nonlocal overwrite
+            _clear(folder, stem, overwrite)
+            overwrite = True  # what a failed beginning leaves is its own
+            return SegmentStore(folder, stem, segment_bytes, budget_bytes, opener)
+
+        self._begin = begin
+        try:
+            self._store = begin()
+        except OSError as error:
+            if not patient:
+                problem = f"{folder}: no log can be written there: {error.strerror or error}"
+                raise UsageError(problem) from error
+            self._fail(error)
+        self._synced_ns = clock.now_ns()
+        self._ticker = clock.ticker(f"log-{stem}", drain_period_ns, self._drain)
+
+    def write(self, packet: bytes) -> None:
+        """Take one packet. Never waits: what does not fit in the queue is lost and counted."""
+        if self._closed or len(self._queue) >= self._queue_packets:
+            self._refused += 1
+            self._refused_ns = self._clock.now_ns()
+        else:
+            self._queue.append(packet)
+
+    @property
+    def lost(self) -> int:
+        """Packets given to `write` that are not on disk and will not be."""
+        return self._refused + self._unwritten
+
+    @property
+    def dropped_segments(self) -> int:
+        """Oldest segments deleted to keep the budget."""
+        return self._store.dropped if self._store is not None else 0
+
+    def error(self) -> str:
+        """Return what is wrong and how many packets the log has lost so far, empty while nothing is wrong.
+
+        Of a closed log it tells of any loss in its life.
+        """
+        problem = self._problem()
+        waiting = len(self._queue)
+        waits = f", {waiting} waiting" if problem and waiting else ""
+        return f"log {self._stem}: {problem}; {self.lost} packets lost{waits}" if problem else ""
+
+    def _problem(self) -> str:
+        now_ns, busy_since_ns = self._clock.now_ns(), self._busy_since_ns
+        if self._failure:
+            return self._failure
+        if busy_since_ns is not None and now_ns - busy_since_ns > _HUNG_DISK_S * 1e9:
+            return "the disk does not answer"
+        if self._refused and (self._closed or now_ns - self._refused_ns <= _RECENT_NS):
+            return self._past_failure or "the queue was full or the log closed"
+        return ""
+
+    def close(self) -> None:
+        """Put the queue on disk, sync and close. Safe to call twice; never waits long for a hung disk."""
+        if self._closed:
+            return
+        self._ticker.stop()
+        if not self._draining.acquire(timeout=_HUNG_DISK_S):
+            self._closed = True
+            self._failure = "the disk does not answer"
+            self._give_up()
+            return
+        try:
+            self._closed = True
+            self._write_queue()
+            self._give_up()
+            if self._store is not None:
+                self._store.close()
+        except OSError as error:
+            self._fail(error)
+        finally:
+            self._draining.release()
+
+    def _drain(self) -> None:
+        """Put the queue on disk and sync when it is time: the ticker's job."""
+        with self._draining:
+            now_ns = self._clock.now_ns()
+            if self._closed or (self._failure and now_ns < self._retry_ns):
+                return
+            self._busy_since_ns = now_ns
+            self._write_queue()
+            now_ns = self._clock.now_ns()
+            due = self._sync_period_ns is not None and now_ns - self._synced_ns >= self._sync_period_ns
+            if due and not self._failure and self._store is not None:
+                self._synced_ns = now_ns
+                try:
+                    self._store.sync()
+                except OSError as error:
+                    self._fail(error)
+            self._busy_since_ns = None
+
+    def _write_queue(self) -> None:
+        """Write the packets queued now; those that the disk does not take wait on."""
+        if self._store is None:
+            try:
+                self._store = self._begin()
+            except OSError as error:
+                self._fail(error)
+                return
+        packets = [self._queue.popleft() for _ in range(len(self._queue))]
+        before = self._store.packets
+        try:
+            self._store.append(packets)
+            self._failure = ""
+        except OSError as error:
+            self._fail(error)
+            self._queue.extendleft(reversed(packets[self._store.packets - before :]))
+
+    def _fail(self, error: OSError) -> None:
+        self._failure = self._past_failure = f"writing stopped: {error.strerror or error}"
+        self._retry_ns = self._clock.now_ns() + _RETRY_NS
+
+    def _give_up(self) -> None:
+        """Count what still waits as lost."""
+        self._unwritten += len(self._queue)
+        self._queue.clear()
+
+
+def _clear(folder: Path, stem: str, overwrite: bool) -> None:
+    """Make the folder and see to a log that is there already. Raises UsageError, OSError."""
+    folder.mkdir(parents=True, exist_ok=True)
+    old = find_segments(folder, stem)
+    if old and not overwrite:
+        raise UsageError(f"{old[0]} exists: give another folder, or ask for it to be overwritten")
+    for path in old:
+        path.unlink()

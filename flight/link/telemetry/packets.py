@@ -1,0 +1,221 @@
+"""CCSDS space packets made from, and read by, the table in `flight.link.telemetry.definitions`.
+
+A packet is the primary header of CCSDS 133.0-B-2 (6 bytes: version 0, telemetry, secondary header present,
+APID; unsegmented, 14-bit sequence count of that APID; data length less one), a secondary header (version of
+the definition, u1; mission time in ns, i8), the fields of the table, and a packet error control of 16 bits:
+the CRC of CCSDS 232.0-B (x^16 + x^12 + x^5 + 1, preset to ones) over all that precedes it. All is big-endian.
+"""
+
+from __future__ import annotations
+
+import binascii
+import struct
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from spacepackets.ccsds.spacepacket import (  # type: ignore[import-untyped]  # it ships no py.typed
+    PacketId,
+    PacketSeqCtrl,
+    PacketType,
+    SequenceFlags,
+)
+
+from flight.gnc.errors import FlightError
+from flight.link.telemetry.definitions import PACKETS, Field, Packet
+
+PacketArray = npt.NDArray[np.void]
+
+HEADER_BYTES = 6
+SECONDARY_BYTES = 9
+CRC_BYTES = 2
+LONGEST_PACKET = 4096  # bounds the search for packets of another version in a damaged log
+SEQUENCE_MODULUS = 1 << 14
+UNSEGMENTED = int(PacketSeqCtrl(SequenceFlags.UNSEGMENTED, 0).raw())
+
+_STRUCT_CODES = {"f8": "d", "f4": "f", "u1": "B", "u2": "H", "u4": "I", "u8": "Q", "i8": "q"}
+
+
+class TelemetryError(FlightError):
+    """Values that do not fit their packet's definition, or bytes that are no packets."""
+
+
+def crc16(data: bytes) -> int:
+    """Return the CRC-16 of CCSDS 232.0-B ("CCITT-FALSE"); 0 over a packet that ends in its own CRC."""
+    return binascii.crc_hqx(data, 0xFFFF)
+
+
+def to_text(value: bytes) -> str:
+    """Return the text of a string field, padding removed."""
+    return bytes(value).rstrip(b"\0").decode("utf-8", "replace")
+
+
+def _to_bytes(value: object, size: int) -> bytes:
+    """Return at most `size` bytes of UTF-8, cut between characters; what UTF-8 cannot say becomes '?'."""
+    if not isinstance(value, str):
+        raise TypeError("a text is needed")
+    raw = value.encode("utf-8", "replace")
+    return raw if len(raw) <= size else raw[:size].decode("utf-8", "ignore").encode("utf-8")
+
+
+def _text_size(field: Field) -> int:
+    """Return the bytes of a string field, 0 for a number."""
+    return int(field.kind[1:]) if field.kind.startswith("S") else 0
+
+
+def _struct_code(field: Field) -> str:
+    return f"{_text_size(field)}s" if _text_size(field) else f"{field.count}{_STRUCT_CODES[field.kind]}"
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The bytes of one packet, compiled from its definition."""
+
+    packet: Packet
+
+    @cached_property
+    def identifier(self) -> int:
+        """The first 16 bits of the primary header."""
+        kind = PacketType.TC if self.packet.telecommand else PacketType.TM
+        return int(PacketId(kind, sec_header_flag=True, apid=self.packet.apid).raw())
+
+    @cached_property
+    def body(self) -> struct.Struct:
+        """Both headers and the fields, without the CRC."""
+        return struct.Struct(">HHHBq" + "".join(_struct_code(field) for field in self.packet.fields))
+
+    @cached_property
+    def length(self) -> int:
+        """Bytes of the whole packet."""
+        return self.body.size + CRC_BYTES
+
+    @cached_property
+    def fields(self) -> tuple[tuple[str, int, int], ...]:
+        """Of each field its name, its bytes when it is a text (else 0), its count."""
+        return tuple((field.name, _text_size(field), field.count) for field in self.packet.fields)
+
+    @cached_property
+    def offsets(self) -> dict[str, int]:
+        """The first byte of `time_ns` and of every field, by name."""
+        offsets = {"time_ns": HEADER_BYTES + 1}
+        offset = HEADER_BYTES + SECONDARY_BYTES
+        for field in self.packet.fields:
+            offsets[field.name] = offset
+            offset += np.dtype(field.kind).itemsize * field.count
+        return offsets
+
+    @cached_property
+    def dtype(self) -> np.dtype[np.void]:
+        """The numpy type of one whole packet: `time_ns`, then the fields of the table."""
+        formats = [">i8"]
+        for field in self.packet.fields:
+            number = np.dtype(field.kind).newbyteorder(">")
+            formats.append(f"{field.count if field.count > 1 else ''}{number.str}")
+        names, offsets = list(self.offsets), list(self.offsets.values())
+        return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": self.length})
+
+    def array(self, packets: bytes) -> PacketArray:
+        """Return a structured array, read-only and without a copy, of whole packets back to back."""
+        return np.frombuffer(packets, dtype=self.dtype)
+
+    def sequence_counts(self, packets: bytes) -> npt.NDArray[np.int64]:
+        """Return the 14-bit sequence counts of whole packets back to back."""
+        view = np.dtype({"names": ["word"], "formats": [">u2"], "offsets": [2], "itemsize": self.length})
+        return np.asarray(np.frombuffer(packets, dtype=view)["word"].astype(np.int64) % SEQUENCE_MODULUS)
+
+
+def compile_layouts(packets: Iterable[Packet]) -> dict[str, Layout]:
+    """Return the layouts of a table by packet name. Raises TelemetryError for a table that cannot work."""
+    layouts = {packet.name: Layout(packet) for packet in packets}
+    apids = [layout.packet.apid for layout in layouts.values()]
+    if len(set(apids)) != len(apids):
+        raise TelemetryError("two packets of the definition table share an APID")
+    for name, layout in layouts.items():
+        names = [field.name for field in layout.packet.fields]
+        if len({*names, "time_ns"}) != len(names) + 1:
+            raise TelemetryError(f"packet {name}: a field's name is used twice, or is 'time_ns'")
+        if layout.length > LONGEST_PACKET:
+            raise TelemetryError(f"packet {name}: {layout.length} bytes, more than {LONGEST_PACKET}")
+    return layouts
+
+
+LAYOUTS: dict[str, Layout] = compile_layouts(PACKETS)
+
+
+class Packer:
+    """Makes packets, and counts them for each APID. For one thread."""
+
+    def __init__(self, layouts: Mapping[str, Layout] | None = None) -> None:
+        """Pack the packets of a compiled table, by default telemetry's."""
+        self._layouts = LAYOUTS if layouts is None else layouts
+        self._counts = dict.fromkeys(self._layouts, 0)
+
+    def pack(
+        self, packet: Packet, time_ns: int, values: Mapping[str, object] | None = None, /, **fields: object
+    ) -> bytes:
+        """Return the bytes of one packet at mission time `time_ns`, all fields given by name.
+
+        Texts too long for their field are cut between two characters. NaN passes: the table says where it
+        means "none". Raises TelemetryError, and counts no packet, for a field missing, unknown, of the
+        wrong length or out of its type's range.
+        """
+        if values is not None:
+            fields = {**values, **fields}
+        layout = self._layouts[packet.name]
+        count = self._counts[packet.name]
+        data_length = layout.length - HEADER_BYTES - 1
+        flat: list[Any] = [layout.identifier, UNSEGMENTED | count, data_length, packet.version, time_ns]
+        try:
+            for name, text_size, items in layout.fields:
+                value = fields[name]
+                if text_size:
+                    flat.append(_to_bytes(value, text_size))
+                elif items == 1:
+                    flat.append(value)
+                else:
+                    flat.extend(_to_items(value, items))
+            body = layout.body.pack(*flat)
+        except (KeyError, TypeError, ValueError, OverflowError, struct.error) as error:
+            raise _explain(layout, time_ns, fields) from error
+        if len(fields) != len(layout.fields):
+            raise _unknown_fields(layout, fields)
+        self._counts[packet.name] = (count + 1) % SEQUENCE_MODULUS
+        return body + crc16(body).to_bytes(CRC_BYTES, "big")
+
+
+def _to_items(value: Any, count: int) -> list[Any]:
+    """Return the numbers of an array field. Raises ValueError unless there are `count` of them."""
+    items = value.tolist() if isinstance(value, np.ndarray) else list(value)
+    if len(items) != count:
+        raise ValueError(f"{len(items)} values where {count} are needed")
+    return items
+
+
+def _unknown_fields(layout: Layout, given: Mapping[str, object]) -> TelemetryError:
+    unknown = sorted(set(given) - {field.name for field in layout.packet.fields})
+    return TelemetryError(f"packet {layout.packet.name}: no such field: {', '.join(unknown)}")
+
+
+def _explain(layout: Layout, time_ns: int, given: Mapping[str, object]) -> TelemetryError:
+    """Return the error that names what is at fault in the values of a packet that would not pack."""
+    name = layout.packet.name
+    missing = [field.name for field in layout.packet.fields if field.name not in given]
+    if missing:
+        return TelemetryError(f"packet {name}: missing: {', '.join(missing)}")
+    if len(given) != len(layout.fields):
+        return _unknown_fields(layout, given)
+    for field in layout.packet.fields:
+        value: Any = given[field.name]
+        try:
+            if _text_size(field):
+                _to_bytes(value, _text_size(field))
+            else:
+                items = _to_items(value, field.count) if field.count > 1 else [value]
+                struct.pack(">" + _struct_code(field), *items)
+        except (TypeError, ValueError, OverflowError, struct.error) as error:
+            kind = f"{field.kind} x {field.count}" if field.count > 1 else field.kind
+            return TelemetryError(f"packet {name}: {field.name} = {value!r} is no {kind}: {error}")
+    return TelemetryError(f"packet {name}: mission time {time_ns!r} is no i8")

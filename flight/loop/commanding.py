@@ -1,0 +1,144 @@
+"""Commanding: takes commands from channels and from the time line, has them obeyed, answers.
+
+The dispatcher is one of the named containment boundaries: whatever is sent, the loop goes on.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+from flight.link.commands.channel import Channel
+from flight.link.commands.codec import (
+    ChangeMode,
+    Clear,
+    Command,
+    CommandError,
+    Ping,
+    Slew,
+    describe,
+    name_of,
+    unpack,
+)
+from flight.link.telemetry.definitions import COMMAND
+from flight.link.telemetry.packets import Packer
+from flight.link.telemetry.recorder import Recorder
+from flight.loop.coil_drive import CoilDrive
+from flight.loop.executive.rate_group import Cycle
+from flight.loop.fdir import events
+from flight.loop.fdir.events import EventLog
+from flight.loop.fdir.facts import Facts
+from flight.loop.modes.control import ModeControl
+from flight.loop.modes.mode import Mode
+from flight.schema.sections import CommandStep
+
+_REMEMBERED = 64
+
+
+class Commanding:
+    """The task of the commands' rate group."""
+
+    def __init__(
+        self,
+        modes: ModeControl,
+        facts_: Facts,
+        drive: CoilDrive,
+        timeline: Sequence[CommandStep],
+        channels: Sequence[Channel],
+        recorder: Recorder,
+        event_log: EventLog,
+    ) -> None:
+        self._modes = modes
+        self._facts = facts_
+        self._drive = drive
+        self._timeline = deque(sorted(timeline, key=lambda step: step.at))
+        self._channels = channels
+        self._recorder = recorder
+        self._events = event_log
+        self._answers = Packer()
+        self._seen: deque[bytes] = deque(maxlen=_REMEMBERED)
+        self._count = 0
+
+    def run(self, cycle: Cycle) -> None:
+        """Obey what is due and what has come."""
+        now_ns = cycle.start_ns
+        while self._timeline and self._timeline[0].at <= (now_ns - self._recorder.epoch_ns) * 1e-9:
+            self._conclude("timeline", command_of(self._timeline.popleft()), "", now_ns)
+        for channel in self._channels:
+            for data, sender in channel.poll():
+                fields = self._take(channel.name, data, now_ns)
+                mission_ns = now_ns - self._recorder.epoch_ns
+                channel.answer(self._answers.pack(COMMAND, mission_ns, fields), sender)
+
+    def _take(self, source: str, data: bytes, now_ns: int) -> dict[str, Any]:
+        """Obey a datagram; return what is answered."""
+        command: Command | None = None
+        problem = ""
+        if data in self._seen:
+            problem = "the very same packet has come before"
+        else:
+            try:
+                command = unpack(data)
+                self._seen.append(data)
+            except CommandError as error:
+                problem = str(error)
+        return self._conclude(source, command, problem, now_ns)
+
+    def _conclude(self, source: str, command: Command | None, problem: str, now_ns: int) -> dict[str, Any]:
+        """Obey a command that has no problem yet; tell and record what became of it."""
+        self._count += 1
+        if command is not None and not problem:
+            try:
+                problem = self._obey(command, now_ns)
+            except Exception as error:  # noqa: BLE001 - containment boundary: the command dispatcher
+                problem = f"{type(error).__name__}: {error}"
+        text = describe(command) if command is not None else ""
+        told = ": ".join(part for part in (text, problem) if part)
+        self._events.tell(
+            events.COMMAND_REFUSED if problem else events.COMMANDED, now_ns, f"{source}: {told}"
+        )
+        fields = {
+            "obeyed": int(not problem),
+            "name": name_of(command) if command is not None else "",
+            "source": source,
+            "count": self._count,
+            "mode": int(self._modes.mode),
+            "text": told,
+        }
+        self._recorder.record(COMMAND, now_ns, **fields)
+        return fields
+
+    def _obey(self, command: Command, now_ns: int) -> str:
+        """Do what a command says; return why not, empty when done."""
+        match command:
+            case Ping():
+                return ""
+            case ChangeMode(mode):
+                return self._modes.command(mode, now_ns)
+            case Slew(q2):
+                return self._modes.command(Mode.SLEW, now_ns, q2)
+            case Clear(event):
+                return self._clear(event, now_ns)
+
+    def _clear(self, event: str, now_ns: int) -> str:
+        if not self._facts.clear(event):
+            latched = [fact.begins.name for fact in self._facts.held() if fact.latching]
+            return f"nothing is latched under {event!r}; latched: {', '.join(latched) or 'nothing'}"
+        if event == events.COIL_BROKEN.name:
+            self._drive.trust(now_ns)
+        return ""
+
+
+def command_of(step: CommandStep) -> Command:
+    """Return the command of a step of a time line. Raises CommandError unless it is exactly one."""
+    found: list[Command] = []
+    if step.mode is not None:
+        found.append(ChangeMode(Mode.named(step.mode)))
+    if step.slew is not None:
+        found.append(Slew(step.slew))
+    if step.clear is not None:
+        found.append(Clear(step.clear))
+    if len(found) != 1:
+        raise CommandError(f"at {step.at:g} s: give one of mode, slew, clear; {len(found)} are given")
+    return found[0]

@@ -1,0 +1,82 @@
+"""Looks at a Linux board through /proc and /sys: the `ResourceReader` of real time."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from flight.loop.fdir.resources import ResourceSample
+
+_TICKS = os.sysconf("SC_CLK_TCK")
+_PAGE = os.sysconf("SC_PAGE_SIZE")
+
+
+class Board:
+    """Reads what the kernel tells; what it does not tell is NaN."""
+
+    def __init__(self, log_folder: Path, proc: Path = Path("/proc"), thermal: Path | None = None) -> None:
+        """Take the folder that the flight log goes to; the others are where the kernel tells."""
+        self._folder = log_folder
+        self._proc = proc
+        self._thermal = thermal or Path("/sys/class/thermal")
+
+    def __call__(self, now_ns: int) -> ResourceSample:
+        """Return what the board is like now."""
+        process = os.getpid()
+        members = [process, *self._below(process)]
+        return ResourceSample(
+            now_ns,
+            self._cpu(process),
+            self._resident(process),
+            math.fsum(self._proportional(member) for member in members),
+            self._disk_free(),
+            self._temperature(),
+        )
+
+    def _below(self, parent: int) -> Iterator[int]:
+        """Yield the processes below `parent`, its workers."""
+        for task in sorted((self._proc / str(parent) / "task").glob("*/children")):
+            for word in _read(task).split():
+                yield int(word)
+                yield from self._below(int(word))
+
+    def _cpu(self, process: int) -> float:
+        # The name, in brackets, may hold anything; user and system time are words 14 and 15 of all (proc(5)).
+        words = _read(self._proc / str(process) / "stat").rpartition(")")[2].split()
+        return (int(words[11]) + int(words[12])) / _TICKS if len(words) > 12 else math.nan
+
+    def _resident(self, process: int) -> float:
+        words = _read(self._proc / str(process) / "statm").split()
+        return float(words[1]) * _PAGE if len(words) > 1 else math.nan
+
+    def _proportional(self, process: int) -> float:
+        """Return the proportional set in bytes; 0 of a process that has just ended."""
+        for line in _read(self._proc / str(process) / "smaps_rollup").splitlines():
+            if line.startswith("Pss:"):
+                return float(line.split()[1]) * 1024.0
+        return math.nan if (self._proc / str(process)).exists() else 0.0
+
+    def _disk_free(self) -> float:
+        try:
+            room = os.statvfs(self._folder)
+        except OSError:
+            return math.nan
+        return float(room.f_bavail) * room.f_frsize
+
+    def _temperature(self) -> float:
+        found = []
+        for zone in sorted(self._thermal.glob("thermal_zone*/temp")):
+            word = _read(zone).strip()
+            if word.lstrip("-").isdigit():
+                found.append(int(word) * 1e-3)
+        return max(found, default=math.nan)
+
+
+def _read(path: Path) -> str:
+    """Return what stands in a file of the kernel's, nothing where it is not to be read."""
+    try:
+        return path.read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return ""

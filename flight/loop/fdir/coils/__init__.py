@@ -1,0 +1,1 @@
+"""Fault detection of the coils and their bridges."""

@@ -1,0 +1,80 @@
+"""What has been on the wire of late, and what a sound circuit would have taken from the supply for it."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+
+import numpy as np
+
+from flight.gnc.math.arrays import FloatArray
+from flight.loop.fdir.coils.hypotheses import NEWEST, Bounds, CoilFault
+from flight.loop.fdir.coils.stuck_leg import NONE, Axes, Supplied
+from hal.interfaces.readings import PowerReading
+
+_SAMPLES_NS = 25_000_000
+_TOLD_LATE_NS = 25_000_000
+"""A command is told a cycle after it was written."""
+
+
+class CoilCommands:
+    """Currents and brakes with their times.
+
+    Attributes:
+        braked: which bridges are braked on the wire.
+    """
+
+    def __init__(self, reach_ns: int) -> None:
+        """Remember so far back."""
+        self._reach_ns = reach_ns
+        self._commands: deque[tuple[int, tuple[float, ...]]] = deque()
+        self._braked_ns = 0
+        self.braked = NONE
+
+    def __bool__(self) -> bool:
+        """Tell whether anything has been told yet."""
+        return bool(self._commands)
+
+    @property
+    def newest_ns(self) -> int:
+        """When the newest was told."""
+        return self._commands[-1][0]
+
+    def note(self, time_ns: int, currents: tuple[float, ...], braked: Axes) -> None:
+        """Take what is on the wire from `time_ns` on: currents (3,) A."""
+        if braked != self.braked:
+            self._braked_ns, self.braked = time_ns, braked
+        self._commands.append((time_ns, currents))
+        horizon = time_ns - self._reach_ns
+        while len(self._commands) > 1 and self._commands[1][0] <= horizon:
+            self._commands.popleft()
+
+    def is_known_since(self, time_ns: int) -> bool:
+        """Tell whether all since `time_ns` is known, and under the present brakes."""
+        return time_ns >= max(self._braked_ns, self._commands[0][0])
+
+    def window(self, begin_ns: int, end_ns: int) -> FloatArray:
+        """Return the commands (k, 3) A that may have been in force between two times, at even distances."""
+        times = np.array([time_ns for time_ns, _ in self._commands])
+        values = np.array([currents for _, currents in self._commands])
+        at = np.arange(begin_ns, end_ns + _TOLD_LATE_NS + 1, _SAMPLES_NS)
+        newest: FloatArray = values[np.maximum(np.searchsorted(times, at, side="right") - 1, 0)]
+        return newest
+
+    def supplied(self, reading: PowerReading, bounds: Bounds, known: Mapping[int, CoilFault]) -> Supplied:
+        """Return the newest conversion with what coils that are sound, but for `known`, would have drawn."""
+        sizes = np.abs(self.window(reading.newest_since_ns, reading.time_ns))
+        free = [axis for axis, fault in known.items() if fault in {CoilFault.SHORTED, CoilFault.UNCERTAIN}]
+        sure = sizes.copy()
+        sure[:, [axis for axis, fault in known.items() if fault is not CoilFault.SHORTED]] = 0.0
+        slack = np.count_nonzero(sizes.any(axis=0)) * bounds.uncertainty + bounds.noise
+        error = bounds.gain + NEWEST.scatter
+        most = float(sizes.sum(axis=1).max()) * (1.0 + error) + slack
+        return Supplied(
+            reading.newest,
+            least=float(sure.sum(axis=1).min()) * (1.0 - error) - slack,
+            most=most + sum(bounds.full_current[axis] for axis in free),
+            at_rest=[axis for axis in range(3) if not sizes[:, axis].any() and axis not in known],
+            driven=bool(sizes.any()),
+            spread=float(np.ptp(sizes.sum(axis=1))),
+        )

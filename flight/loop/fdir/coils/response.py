@@ -1,0 +1,238 @@
+"""How much of each coil's torque the body really feels: a fit of its angular acceleration over some seconds.
+
+Rate and commanded rate change (the integral of J^-1 (m x B)) are averaged over short bins alike; differences
+of neighbouring bins are accelerations, and least squares over the last bins gives each coil's gain beside a
+constant disturbance, a torsion and a damping of each free axis. One is sound, zero feels nothing, minus one
+is reversed. Where the commands of the last seconds do not move enough to tell, the gain's standard deviation
+says so, and nothing is claimed.
+
+What is left of an acceleration when all coils are taken to be sound is kept longer: whether it changed when
+the supply current did tells a broken coil from a monitor that lies (`felt_of`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from flight.gnc.math.arrays import FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class ResponseSettings:
+    """The body as the coils see it.
+
+    Attributes:
+        inertia: (3, 3) kg m^2.
+        dipole_per_ampere: n A of each coil, m^2.
+        rate_noise: rad/s, standard deviation of a sample of the rate about each axis.
+        free: (3,) whether the body can turn about each axis; on a thread only about y.
+        bin_samples: samples of the rate in a bin.
+        bins: differences of bins in the fit.
+        torsion, damping: 1/s^2 and 1/s, standard deviations of a thread's (or of drag) about each free axis.
+        sure: standard deviation of a gain below which it is believed.
+        persistence: fits in a row that must agree.
+        lowest_sound, highest_reversed: bounds of the gains that are believed to be so.
+        memory_ns: how long the remainders of the acceleration are kept.
+    """
+
+    inertia: FloatArray
+    dipole_per_ampere: float
+    rate_noise: float
+    free: tuple[bool, bool, bool] = (True, True, True)
+    bin_samples: int = 8
+    bins: int = 15
+    torsion: float = 0.03
+    damping: float = 5.0e-3
+    sure: float = 0.25
+    persistence: int = 4
+    lowest_sound: float = 0.6
+    highest_reversed: float = -0.5
+    memory_ns: int = 20_000_000_000
+
+
+_STALE_NS = 200_000_000
+_REACH_NS = 3_000_000_000
+"""For how long commands are remembered: samples of a loop that stood still come late, and in a burst."""
+_MODEL_ERROR = 8.0e-4
+"""rad/s^2: what the delay between command and current and its uncertainty leave unexplained in a bin."""
+_LEAST_CHANGE = 4.0e-3
+"""rad/s^2: torques below are too small to be missed."""
+_GAIN_PRIOR = 10.0
+
+
+class CoilResponse:
+    """Sliding fit of the three gains.
+
+    Attributes:
+        gain, sigma: (3,) newest fit; sigma is infinite where the commands do not tell.
+    """
+
+    def __init__(self, settings: ResponseSettings) -> None:
+        self._settings = settings
+        self._per_field = settings.dipole_per_ampere * np.linalg.inv(settings.inertia).T
+        self._free = np.array(settings.free)
+        self._commands: deque[tuple[int, tuple[float, ...]]] = deque([(0, (0.0, 0.0, 0.0))])
+        self._known_ns = 0
+        self._last_ns = 0
+        self._wrong_for = [0, 0, 0]
+        self._sound_for = [0, 0, 0]
+        self.gain: FloatArray = np.ones(3)
+        self.sigma: FloatArray = np.full(3, np.inf)
+        self.begin_anew()
+
+    def begin_anew(self) -> None:
+        """Forget all samples."""
+        self._asked: FloatArray = np.zeros((3, 3))
+        self._asked_sum: FloatArray = np.zeros((3, 3))
+        self._rate_sum: FloatArray = np.zeros(3)
+        self._time_sum = 0
+        self._count = 0
+        self._previous: tuple[float, FloatArray, FloatArray] | None = None
+        self._turned: FloatArray = np.zeros(3)
+        # Accelerations asked by each coil (3, 3), felt (3,), and the mean rate and angle (3,) of that time.
+        self._rows: deque[tuple[FloatArray, FloatArray, FloatArray, FloatArray]] = deque(
+            maxlen=self._settings.bins
+        )
+        # Time; accelerations asked by each coil and those of one ampere in it (3, 3); what is left (3,).
+        self._remainders: deque[tuple[int, FloatArray, FloatArray, FloatArray]] = deque()
+        self._per_ampere: FloatArray = np.zeros((3, 3))
+        self._wrong_for = [0, 0, 0]
+        self._sound_for = [0, 0, 0]
+        self.sigma = np.full(3, np.inf)
+
+    def commanded(self, time_ns: int, currents: tuple[float, ...]) -> None:
+        """Tell which currents (3,) A are in force from `time_ns` on."""
+        if currents == self._commands[-1][1]:
+            return
+        self._commands.append((time_ns, currents))
+        while len(self._commands) > 1 and self._commands[1][0] < time_ns - _REACH_NS:
+            self._commands.popleft()
+
+    def interrupted(self, until_ns: int) -> None:
+        """Make nothing of samples of the time until `until_ns`: what the coils carried is not known."""
+        self._known_ns = until_ns
+        self.begin_anew()
+
+    def felt(self, time_ns: int, rate: FloatArray, field: FloatArray) -> bool:
+        """Take a sample of rate (3,) and field (3,); tell whether there is a new fit."""
+        if time_ns < self._known_ns:
+            return False
+        since_ns = time_ns - self._last_ns
+        self._last_ns = time_ns
+        if not 0 < since_ns < _STALE_NS:
+            self.begin_anew()
+            return False
+        # Row a: what one ampere in coil a alone asks of the rate, J^-1 (n e_a x B).
+        x, y, z = field.tolist()
+        self._per_ampere = np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))) @ self._per_field
+        currents = np.array(self._command_at(time_ns))[:, None]
+        self._asked = self._asked + currents * self._per_ampere * (since_ns * 1e-9)
+        self._asked_sum = self._asked_sum + self._asked
+        self._rate_sum = self._rate_sum + rate
+        self._time_sum += time_ns
+        self._count += 1
+        if self._count < self._settings.bin_samples:
+            return False
+        return self._close_bin()
+
+    def _command_at(self, time_ns: int) -> tuple[float, ...]:
+        for since_ns, currents in reversed(self._commands):
+            if since_ns <= time_ns:
+                return currents
+        return self._commands[0][1]
+
+    def reversed_axes(self) -> list[int]:
+        """Return the axes that have turned the body the wrong way, fit after fit."""
+        return [axis for axis in range(3) if self._wrong_for[axis] >= self._settings.persistence]
+
+    def is_healthy(self, axis: int) -> bool:
+        """Tell whether an axis has turned the body as it should, fit after fit, until now."""
+        return self._sound_for[axis] >= self._settings.persistence
+
+    def felt_of(self, axis: int, constant: float, since_ns: int, settled_ns: int) -> float | None:
+        """Return which part of a change of a coil's current the body felt.
+
+        None where it would not feel any, NaN where that is not remembered.
+
+        The change: the coil carries `constant` A in place of what it is told. Compared are the seconds
+        before `since_ns` with those after `settled_ns`.
+        """
+        before = [row[3] for row in self._remainders if row[0] < since_ns]
+        after = [row for row in self._remainders if row[0] >= settled_ns]
+        if len(before) < 3 or len(after) < 3:
+            return math.nan
+        expected = np.mean([constant * row[2][:, axis] - row[1][:, axis] for row in after], axis=0)
+        size = float(expected @ expected)
+        if size < _LEAST_CHANGE**2:
+            return None
+        change = np.mean([row[3] for row in after], axis=0) - np.mean(before[-10:], axis=0)
+        return float(change @ expected) / size
+
+    def text(self, axis: int) -> str:
+        """Return the gain in words."""
+        return f"the body feels {self.gain[axis]:+.2f} +- {self.sigma[axis]:.2f} of its torque"
+
+    def _close_bin(self) -> bool:
+        count = self._count
+        middle = self._time_sum / count * 1e-9
+        rate, asked = self._rate_sum / count, self._asked_sum / count
+        before, self._previous = self._previous, (middle, rate, asked)
+        self._rate_sum, self._asked_sum = np.zeros(3), np.zeros((3, 3))
+        self._time_sum = self._count = 0
+        if before is None:
+            return False
+        span = middle - before[0]
+        inputs, output = (asked - before[2]).T / span, (rate - before[1]) / span
+        mean_rate = 0.5 * (rate + before[1])
+        self._turned = self._turned + mean_rate * span
+        self._rows.append((inputs, output, mean_rate, self._turned))
+        free = self._free
+        remainder = np.where(free, output - inputs.sum(axis=1), 0.0)
+        kept = free[:, None]
+        self._remainders.append(
+            (self._last_ns, np.where(kept, inputs, 0.0), np.where(kept, self._per_ampere.T, 0.0), remainder)
+        )
+        while self._remainders[0][0] < self._last_ns - self._settings.memory_ns:
+            self._remainders.popleft()
+        if len(self._rows) < self._settings.bins // 2:
+            return False
+        self._fit(span)
+        return True
+
+    def _fit(self, span: float) -> None:
+        free = np.flatnonzero(self._free)
+        count = len(free)
+        asked = np.array([row[0][free] for row in self._rows])  # (k, f, 3)
+        outputs = np.array([row[1][free] for row in self._rows])  # (k, f)
+        # Each free axis has its own torsion and damping: columns 3 .. 3 + f, 3 + f .. 3 + 2 f.
+        inputs = np.zeros((len(asked), count, 3 + 2 * count))
+        inputs[:, :, :3] = asked
+        for place, axis in enumerate(free):
+            inputs[:, place, 3 + place] = [-row[3][int(axis)] for row in self._rows]
+            inputs[:, place, 3 + count + place] = [-row[2][int(axis)] for row in self._rows]
+        # A constant disturbance about each free axis drops out with the means.
+        inputs = (inputs - inputs.mean(axis=0)).reshape(-1, 3 + 2 * count)
+        outputs = (outputs - outputs.mean(axis=0)).reshape(-1)
+        settings = self._settings
+        floor = settings.rate_noise * np.sqrt(2.0 / settings.bin_samples) / span + _MODEL_ERROR
+        weight = 1.0 / floor**2
+        spreads = [_GAIN_PRIOR] * 3 + [settings.torsion] * count + [settings.damping] * count
+        known = 1.0 / np.array(spreads) ** 2
+        expected = np.array([1.0] * 3 + [0.0] * (2 * count))
+        covariance = np.linalg.inv(inputs.T @ inputs * weight + np.diag(known))
+        found = covariance @ (inputs.T @ outputs * weight + known * expected)
+        residual = outputs - inputs @ found
+        freedom = max(len(outputs) - count - 3, 1)
+        spread = max(1.0, float(residual @ residual) * weight / freedom)
+        self.gain = found[:3]
+        self.sigma = np.sqrt(spread * np.diag(covariance)[:3])
+        for number in range(3):
+            gain, three_sigma = self.gain[number], 3.0 * self.sigma[number]
+            wrong = gain + three_sigma < 0.0 and gain < self._settings.highest_reversed
+            sound = self.sigma[number] < self._settings.sure and gain > self._settings.lowest_sound
+            self._wrong_for[number] = self._wrong_for[number] + 1 if wrong else 0
+            self._sound_for[number] = self._sound_for[number] + 1 if sound else 0

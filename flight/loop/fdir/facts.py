@@ -1,0 +1,155 @@
+"""The table of facts: what monitors state, how often in a row before it counts, and which event it becomes.
+
+After NASA's Limit Checker: act after N violations in a row; what cannot be known now (None) neither counts
+nor mends. A latching fact stays until it is cleared by command. In a mode in which a fact is not watched its
+count begins anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+from flight.gnc.errors import FlightError
+from flight.loop.fdir import events
+from flight.loop.fdir.events import EventKind, EventLog, Reaction
+from flight.loop.modes.mode import STEERING, Mode
+
+EVERYWHERE = frozenset(Mode)
+_DRIVEN = STEERING | {Mode.DETUMBLE}
+
+
+@dataclass(frozen=True, slots=True)
+class Fact:
+    """One row: the events that tell when the fact begins and ends, and when it counts.
+
+    Facts of the 40 Hz cycle count cycles, the others looks of health.
+
+    Attributes:
+        after: statements in a row that it holds until it counts.
+        mended_after: statements in a row that it does not until it is over.
+        latching: it is over only when cleared by command.
+        modes: in which it is watched.
+    """
+
+    name: str
+    begins: EventKind
+    ends: EventKind | None = None
+    after: int = 1
+    mended_after: int = 1
+    latching: bool = False
+    modes: frozenset[Mode] = EVERYWHERE
+
+
+BOOT_WAITS = Fact("boot-waits", events.BOOT_WAITS, modes=frozenset({Mode.BOOT}))
+TASK_FAILING = Fact("task-failing", events.TASK_FAILING, latching=True)
+NO_PROGRESS = Fact("no-progress", events.NO_PROGRESS)
+IMU_SILENT = Fact("imu-silent", events.IMU_SILENT, events.IMU_RECOVERED)
+IMU_UNUSABLE = Fact("imu-unusable", events.IMU_UNUSABLE, events.IMU_RECOVERED)
+IMU_LINE_LOST = Fact("imu-line-lost", events.IMU_LINE_LOST, events.IMU_RECOVERED)
+CONTROL_LOST = Fact("control-lost", events.CONTROL_LOST, events.CONTROL_REGAINED)
+BLIND = Fact("blind", events.BLIND, modes=_DRIVEN)
+TUMBLING = Fact("tumbling", events.TUMBLING, after=8, modes=STEERING)
+HOLD_IMPOSSIBLE = Fact(
+    "hold-impossible", events.HOLD_IMPOSSIBLE, modes=frozenset({Mode.HOLD, Mode.TESTBED_DEMO})
+)
+SLEW_LATE = Fact("slew-late", events.SLEW_LATE, modes=frozenset({Mode.SLEW}))
+HOLDING = Fact("holding", events.HOLDING, modes=frozenset({Mode.SLEW, Mode.TESTBED_DEMO}))
+COIL_FAULT = Fact("coil-fault", events.COIL_FAULT, events.COIL_RECOVERED)
+COIL_X_BROKEN, COIL_Y_BROKEN, COIL_Z_BROKEN = (
+    Fact(f"coil-{axis}-broken", events.COIL_BROKEN, latching=True) for axis in "xyz"
+)
+COIL_SUSPECT = Fact("coil-suspect", events.COIL_SUSPECT)
+POWER_DOUBTED = Fact("power-doubted", events.POWER_DOUBTED)
+POWER_FAULT = Fact("power-fault", events.POWER_FAULT, events.POWER_RECOVERED)
+CAMERA_LOST = Fact("camera-lost", events.CAMERA_LOST, events.CAMERA_RECOVERED)
+LOG_FAULT = Fact("log-fault", events.LOG_FAULT, events.LOG_RECOVERED)
+CPU_HIGH = Fact("cpu-high", events.CPU_HIGH, events.RESOURCE_NORMAL, after=3, mended_after=3)
+MEMORY_GROWS = Fact("memory-grows", events.MEMORY_GROWS, events.RESOURCE_NORMAL, after=3, mended_after=3)
+MEMORY_HIGH = Fact("memory-high", events.MEMORY_HIGH, after=3)
+DISK_LOW = Fact("disk-low", events.DISK_LOW, events.RESOURCE_NORMAL, after=2, mended_after=2)
+HOT = Fact("hot", events.HOT, events.RESOURCE_NORMAL, after=2, mended_after=2)
+TOO_HOT = Fact("too-hot", events.TOO_HOT, after=2, latching=True)
+IMU_POOR, FIELD_POOR, COILS_POOR, POWER_POOR, CAMERA_POOR = (
+    Fact(f"{stream}-poor", events.STREAM_POOR, events.STREAM_GOOD, after=4, mended_after=8)
+    for stream in ("imu", "field", "coils", "power", "camera")
+)
+SERVICE_FAILING = Fact("service-failing", events.SERVICE_FAILING, events.SERVICE_RECOVERED)
+CAMERA_LATE = Fact("camera-late", events.CAMERA_LATE, events.CAMERA_RECOVERED)
+VISION_SLOW = Fact("vision-slow", events.VISION_SLOW)
+
+FACTS: tuple[Fact, ...] = tuple(value for value in dict(vars()).values() if isinstance(value, Fact))
+
+
+def check(facts: Iterable[Fact], modes_of: Callable[[Reaction], frozenset[Mode]]) -> None:
+    """Refuse a table that cannot work; raises FlightError naming the row.
+
+    `modes_of` tells in which modes a reaction does something: a fact watched in none is no safeguard.
+    """
+    seen: set[str] = set()
+    for fact in facts:
+        if fact.name in seen:
+            raise FlightError(f"fact {fact.name} stands twice in the table")
+        seen.add(fact.name)
+        if fact.after < 1 or fact.mended_after < 1:
+            raise FlightError(f"fact {fact.name}: a count of statements must be at least 1")
+        if not fact.modes & modes_of(fact.begins.reaction):
+            raise FlightError(
+                f"fact {fact.name}: in no mode in which it is watched does its reaction "
+                f"{fact.begins.reaction.name.lower()} do anything"
+            )
+
+
+@dataclass(slots=True)
+class _State:
+    holds: bool = False
+    count: int = 0
+
+
+class Facts:
+    """What is stated, and what of it counts. Tells its events when that changes."""
+
+    def __init__(self, event_log: EventLog) -> None:
+        self._events = event_log
+        self._states = {fact.name: _State() for fact in FACTS}
+        self._mode = Mode.BOOT
+
+    def state(self, fact: Fact, holds: bool | None, now_ns: int, text: str) -> None:
+        """State whether a fact holds now; None when that cannot be known. `text` goes with the event."""
+        state = self._states[fact.name]
+        if holds is None or self._mode not in fact.modes:
+            return
+        if holds == state.holds:
+            state.count = 0
+            return
+        state.count += 1
+        if state.holds and (fact.latching or state.count < fact.mended_after):
+            return
+        if not state.holds and state.count < fact.after:
+            return
+        state.holds, state.count = holds, 0
+        kind = fact.begins if holds else fact.ends
+        if kind is not None:
+            self._events.tell(kind, now_ns, text)
+
+    def holds(self, fact: Fact) -> bool:
+        """Tell whether a fact counts now."""
+        return self._states[fact.name].holds
+
+    def held(self) -> tuple[Fact, ...]:
+        """Return the facts that count now, in the order of the table."""
+        return tuple(fact for fact in FACTS if self._states[fact.name].holds)
+
+    def clear(self, event_name: str) -> bool:
+        """Let what was latched under an event's name begin anew; tell whether there was any."""
+        found = [fact for fact in self.held() if fact.latching and fact.begins.name == event_name]
+        for fact in found:
+            self._states[fact.name] = _State()
+        return bool(found)
+
+    def enter(self, mode: Mode) -> None:
+        """Watch what is watched in `mode`; the rest begins anew when it is watched again."""
+        self._mode = mode
+        for fact in FACTS:
+            if mode not in fact.modes:
+                self._states[fact.name] = _State()

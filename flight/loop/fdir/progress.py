@@ -1,0 +1,73 @@
+"""Does everything get on? The watchdog is fed only while every rate group and every worker does.
+
+A group gets on when a cycle of it has run to its end within its patience; a worker, when no job has been
+under way for longer than it may take. The jobs beside the loop, on tickers, are looked at too; a slow disk or
+a hung bus may hold them up, which another process would not mend, so they are told and no more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from flight.loop.executive.rate_group import RateGroup
+from hal.interfaces.wires import Ticker
+
+_PERIODS = 3
+_LEAST_PATIENCE_NS = 2_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class WorkerWatch:
+    """A worker by name; `busy_since_ns` tells since when a job is under way, None when none is."""
+
+    name: str
+    busy_since_ns: Callable[[], int | None]
+    patience_ns: int
+
+
+class _GroupWatch:
+    def __init__(self, group: RateGroup) -> None:
+        self.group = group
+        self.patience_ns = max(_PERIODS * group.period_ns, _LEAST_PATIENCE_NS)
+        self._completed = group.completed
+        self.since_ns = 0
+
+    def stands_still(self, now_ns: int) -> bool:
+        if self.group.completed != self._completed:
+            self._completed, self.since_ns = self.group.completed, now_ns
+        return now_ns - self.since_ns > self.patience_ns
+
+
+class GroupsAndWorkers:
+    """Watches rate groups and workers."""
+
+    def __init__(self, groups: list[RateGroup], workers: list[WorkerWatch]) -> None:
+        self._groups = [_GroupWatch(group) for group in groups]
+        self._workers = workers
+
+    def begin(self, time_ns: int) -> None:
+        """Count from here."""
+        for watch in self._groups:
+            watch.since_ns = time_ns
+
+    def standing_still(self, now_ns: int) -> list[str]:
+        """Return the names of the groups and workers that do not get on."""
+        names = [watch.group.name for watch in self._groups if watch.stands_still(now_ns)]
+        for worker in self._workers:
+            since_ns = worker.busy_since_ns()
+            if since_ns is not None and now_ns - since_ns > worker.patience_ns:
+                names.append(worker.name)
+        return names
+
+
+def failing(tickers: Sequence[Ticker], now_ns: int) -> list[str]:
+    """Return what is to be told of the jobs beside the loop: those that raise and those that stand still."""
+    told = []
+    for ticker in tickers:
+        stood_ns = now_ns - ticker.served_ns
+        if ticker.error:
+            told.append(f"{ticker.name}: {ticker.error}")
+        elif stood_ns > max(_PERIODS * ticker.period_ns, _LEAST_PATIENCE_NS):
+            told.append(f"{ticker.name}: stands still for {stood_ns * 1e-9:.1f} s")
+    return told

@@ -1,0 +1,133 @@
+"""What the flight takes of its board: processor, memory, disk, warmth; and whether the wall clock was set.
+
+A `ResourceReader` looks (`flight.loop.fdir.board` on Linux, a script in tests); this judges. Looks are made
+on a ticker of the clock, beside the control loop, because the kernel may take milliseconds to answer.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from flight.loop.fdir import facts
+from flight.loop.fdir.facts import Facts
+from flight.schema.sections import Health
+from hal.interfaces.wires import Clock
+
+_HOUR = 3600.0
+_LEAST_SLOPE_SAMPLES = 8
+
+
+@dataclass(frozen=True, slots=True)
+class ResourceSample:
+    """One look at the board; NaN stands for what it does not have.
+
+    Attributes:
+        time_ns: monotonic.
+        cpu: s of processor time that the control process has taken since it began.
+        resident: bytes, resident set of the control process.
+        proportional: bytes, proportional set of all flight processes together.
+        disk_free: bytes that are left where the flight log goes.
+        temperature: degree C of the warmest zone.
+    """
+
+    time_ns: int
+    cpu: float
+    resident: float
+    proportional: float
+    disk_free: float
+    temperature: float
+
+
+class ResourceReader(Protocol):
+    """Looks at the board."""
+
+    def __call__(self, now_ns: int) -> ResourceSample:
+        """Return what it is like now. Must not raise."""
+
+
+@dataclass(frozen=True, slots=True)
+class ResourceState:
+    """What the samples say; NaN where they do not yet.
+
+    Attributes:
+        cpu_share: of one core, between the last two samples.
+        memory_slope: bytes/s, by least squares over the window.
+    """
+
+    sample: ResourceSample | None = None
+    cpu_share: float = math.nan
+    memory_slope: float = math.nan
+
+
+class ResourceMonitor:
+    """Keeps the newest samples and states facts of them."""
+
+    def __init__(self, settings: Health) -> None:
+        self._settings = settings
+        self._warm: deque[ResourceSample] = deque(maxlen=max(round(_HOUR / settings.look_period), 2))
+        self._begun_ns: int | None = None
+        self.state = ResourceState()
+
+    def take(self, sample: ResourceSample) -> None:
+        """Take in a sample."""
+        share = math.nan
+        if self.state.sample is not None:
+            span = (sample.time_ns - self.state.sample.time_ns) * 1e-9
+            share = (sample.cpu - self.state.sample.cpu) / span if span > 0.0 else math.nan
+        if self._begun_ns is None:
+            self._begun_ns = sample.time_ns
+        if (sample.time_ns - self._begun_ns) * 1e-9 >= self._settings.warm_up:
+            self._warm.append(sample)
+        self.state = ResourceState(sample, share, self._slope())
+
+    def report(self, facts_: Facts, now_ns: int) -> None:
+        """State what the newest sample says."""
+        sample, limits = self.state.sample, self._settings
+        if sample is None:
+            return
+        slope = self.state.memory_slope * _HOUR
+        for fact, value, limit, text in (
+            (facts.CPU_HIGH, self.state.cpu_share, limits.cpu_share, "{:.2f} of a core, {:g} allowed"),
+            (facts.MEMORY_GROWS, slope, limits.memory_slope, "{:.3g} bytes an hour, {:g} allowed"),
+            (facts.MEMORY_HIGH, sample.proportional, limits.memory, "{:.4g} bytes, {:g} allowed"),
+            (facts.DISK_LOW, -sample.disk_free, -limits.disk_free, "{:.3g} bytes free, {:g} wanted"),
+            (facts.HOT, sample.temperature, limits.temperature, "{:.1f} deg C, {:g} is warm"),
+            (facts.TOO_HOT, sample.temperature, limits.hottest, "{:.1f} deg C, {:g} allowed"),
+        ):
+            known = not math.isnan(value)
+            facts_.state(fact, value > limit if known else None, now_ns, text.format(abs(value), abs(limit)))
+
+    def _slope(self) -> float:
+        if len(self._warm) < _LEAST_SLOPE_SAMPLES:
+            return math.nan
+        time = np.array([sample.time_ns for sample in self._warm]) * 1e-9
+        memory = np.array([sample.proportional for sample in self._warm])
+        time -= time.mean()
+        if (time[-1] - time[0]) < self._settings.slope_window or not np.isfinite(memory).all():
+            return math.nan
+        return float(time @ (memory - memory.mean()) / (time @ time))
+
+
+class ClockWatch:
+    """Sees the wall clock being set: UTC should run beside monotonic time."""
+
+    def __init__(self, clock: Clock, threshold: float) -> None:
+        """Take a clock and the step in s that counts."""
+        self._clock = clock
+        self._threshold_ns = round(threshold * 1e9)
+        self._offset_ns: int | None = None
+        self.steps = 0
+
+    def look(self) -> float | None:
+        """Return the step in s since the last look, None without one; slow drift is followed."""
+        offset_ns = self._clock.utc_ns() - self._clock.now_ns()
+        before_ns, self._offset_ns = self._offset_ns, offset_ns
+        if before_ns is None or abs(offset_ns - before_ns) <= self._threshold_ns:
+            return None
+        self.steps += 1
+        return (offset_ns - before_ns) * 1e-9

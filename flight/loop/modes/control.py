@@ -1,0 +1,263 @@
+"""Mode control: reactions, commands and achievements become triggers; modes are entered with what they need.
+
+Entering never waits for an estimate: what needs one is done in the first cycle that has it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from flight.bodies.testbed.steering import Steering
+from flight.bodies.testbed.targets import COMMANDED, KEPT, Target
+from flight.gnc.estimation.estimate import ThreadEstimate
+from flight.gnc.guidance.one_axis.guidance import Guidance
+from flight.gnc.guidance.one_axis.plant import Q2_LIMIT, angle_of
+from flight.link.telemetry.definitions import MODE
+from flight.link.telemetry.recorder import Recorder
+from flight.loop.coil_drive import CoilDrive
+from flight.loop.fdir import events, facts
+from flight.loop.fdir.events import EventKind, EventLog, Reaction
+from flight.loop.fdir.facts import Facts
+from flight.loop.fdir.hold_timer import Dwell
+from flight.loop.modes.machine import Change, ModeMachine
+from flight.loop.modes.mode import COMMANDS, STARTS, STEERING, Mode, Trigger
+from flight.loop.modes.table import TRANSITIONS, Answer
+from flight.schema.sections import Modes
+
+SAFING_REACTIONS = {
+    Reaction.SAFE: Trigger.REACT_SAFE,
+    Reaction.DETUMBLE: Trigger.REACT_DETUMBLE,
+    Reaction.HOLD: Trigger.REACT_HOLD,
+}
+"""The trigger of each reaction that may change the mode."""
+
+
+def modes_moved_by(reaction: Reaction) -> frozenset[Mode]:
+    """Return the modes in which a reaction does something: all, for one that leaves the mode alone."""
+    trigger = SAFING_REACTIONS.get(reaction)
+    if trigger is None:
+        return frozenset(Mode)
+    return frozenset(mode for mode, row in TRANSITIONS.items() if isinstance(row[trigger], Mode))
+
+
+class ModeControl:
+    """Owns the machine, and the attitude that a hold or a slew wants.
+
+    Attributes:
+        restart: why the process should end and be started again; empty when it should not.
+    """
+
+    def __init__(
+        self,
+        settings: Modes,
+        machine: ModeMachine,
+        guidance: Guidance,
+        steering: Steering,
+        drive: CoilDrive,
+        facts_: Facts,
+        recorder: Recorder,
+        event_log: EventLog,
+        low_rate: tuple[float, float],
+        stop: Callable[[str], None],
+    ) -> None:
+        """Take the rooms that modes need.
+
+        `low_rate` rad/s, for s, ends detumbling; `stop` ends the flight politely, for a restart. Raises
+        FlightError where a fact's reaction would do nothing.
+        """
+        facts.check(facts.FACTS, modes_moved_by)
+        self._settings = settings
+        self._machine = machine
+        self._guidance = guidance
+        self._steering = steering
+        self._drive = drive
+        self._facts = facts_
+        self._recorder = recorder
+        self._events = event_log
+        self._low_rate = low_rate[0]
+        self._stop = stop
+        self._initial = Mode.named(settings.initial)
+        self._crashed = 0
+        self._commands = 0
+        self._seen_ns = 0
+        self._slow = Dwell(low_rate[1])
+        self._arrived = Dwell(settings.arrived_for)
+        self._off = Dwell(settings.hold_patience)
+        self.restart = ""
+        self.wanted: Target | None = None
+
+    @property
+    def mode(self) -> Mode:
+        """The mode."""
+        return self._machine.mode
+
+    @property
+    def since_ns(self) -> int:
+        """When it was entered."""
+        return self._machine.since_ns
+
+    @property
+    def flies_steps(self) -> bool:
+        """Whether the configured steps are flown, or will be as soon as the devices give good data."""
+        booting = self.mode is Mode.BOOT and self._initial is Mode.TESTBED_DEMO
+        return self.mode is Mode.TESTBED_DEMO or (booting and not self._too_many_crashes)
+
+    def begin(self, now_ns: int, unclean_recent: int) -> None:
+        """Begin to boot, after so many unclean shutdowns of late."""
+        self._machine.since_ns = self._seen_ns = now_ns
+        self._crashed = unclean_recent
+        self._record(Mode.BOOT, "begin", "", now_ns)
+
+    def step(
+        self,
+        estimate: ThreadEstimate | None,
+        rate: float | None,
+        due: float | None,
+        coils_answer: bool,
+        now_ns: int,
+    ) -> Mode:
+        """Look at what has been achieved in this cycle; return the mode to act in.
+
+        `rate` rad/s is the length of the newest body rate measured in this cycle, None when there was none;
+        `due` rad is where the demonstration should have brought the body, None while it is on its way.
+        """
+        if estimate is not None:
+            self._seen_ns = now_ns
+        if self.mode is Mode.BOOT:
+            self._boot(estimate is not None and coils_answer, now_ns)
+        blind = (now_ns - self._seen_ns) * 1e-9
+        text = f"no estimate for {blind:.0f} s"
+        self._facts.state(facts.BLIND, blind > self._settings.blind_limit, now_ns, text)
+        if self.mode is Mode.DETUMBLE and rate is not None:
+            # Where no current turns the body no hold is possible: wait there until the thread has turned it.
+            within = estimate is not None and abs(estimate.q2) < Q2_LIMIT
+            if self._slow.update(rate < self._low_rate and within, now_ns):
+                self._fire(Trigger.DETUMBLED, f"below {self._low_rate:g} rad/s", now_ns)
+        if estimate is not None and self.mode in {Mode.HOLD, Mode.SLEW}:
+            self._keep(estimate, now_ns)
+        elif estimate is not None and self.mode is Mode.TESTBED_DEMO:
+            self._watch(estimate, due, now_ns)
+        return self.mode
+
+    def command(self, mode: Mode, now_ns: int, q2: float | None = None) -> str:
+        """Obey a command; return why not, empty when obeyed. A slew needs its `q2`."""
+        trigger = COMMANDS.get(mode)
+        if trigger is None:
+            return f"{mode.label} cannot be commanded"
+        answer = self._machine.answer(trigger)
+        if answer is Answer.REFUSE:
+            return f"not while in {self.mode.label}"
+        if answer is Answer.STAY:
+            return ""
+        if self.mode is Mode.SAFE and (barred := self._barred()):
+            return barred
+        if mode is Mode.SLEW:
+            if q2 is None or not abs(q2) <= Q2_LIMIT:
+                return f"q2 {q2} is not within +-{Q2_LIMIT}"
+            self._commands += 1
+            self.wanted = Target(COMMANDED + self._commands, now_ns, q2)
+        self._fire(trigger, "" if q2 is None else f"to q2 {q2:+.3f}", now_ns)
+        return ""
+
+    def react(self, kind: EventKind, time_ns: int, text: str) -> None:
+        """Do what an event's row asks for: the reactor of the event log."""
+        reaction = kind.reaction
+        if reaction is Reaction.COILS_OFF:
+            self._drive.zero()
+        elif reaction is Reaction.ISOLATE:
+            self._drive.isolate()
+        elif reaction is Reaction.RESTART:
+            self.restart = f"{kind.name}: {text}"
+            self._stop(f"restart wanted: {self.restart}")
+        elif reaction in SAFING_REACTIONS:
+            self._fire(SAFING_REACTIONS[reaction], kind.name, time_ns)
+
+    @property
+    def _too_many_crashes(self) -> bool:
+        return self._crashed >= self._settings.crash_limit
+
+    def _boot(self, good: bool, now_ns: int) -> None:
+        waited = (now_ns - self._machine.since_ns) * 1e-9
+        if self._too_many_crashes:
+            text = f"{self._crashed} unclean shutdowns within {self._settings.crash_window:g} s of operation"
+            self._events.tell(events.CRASHED_OFTEN, now_ns, text)
+            self._fire(Trigger.START_SAFE, text, now_ns)
+        elif good:
+            self._fire(STARTS[self._initial], "", now_ns)
+        else:
+            late = waited > self._settings.boot_patience
+            self._facts.state(facts.BOOT_WAITS, late, now_ns, f"for {waited:.1f} s: coils at zero")
+
+    def _keep(self, estimate: ThreadEstimate, now_ns: int) -> None:
+        """State how a hold or a slew gets on."""
+        settings = self._settings
+        if self.wanted is None:
+            q2 = min(max(estimate.q2, -Q2_LIMIT), Q2_LIMIT)
+            self.wanted = Target(KEPT, now_ns, q2)
+            self._guidance.hold(angle_of(q2), now_ns)
+        error = self._watch(estimate, angle_of(self.wanted.q2), now_ns)
+        slewing = (now_ns - self._machine.since_ns) * 1e-9
+        near = error < settings.arrived_angle and abs(estimate.rate) < settings.arrived_rate
+        if self.mode is Mode.SLEW and self._arrived.update(near, now_ns):
+            self._fire(Trigger.ARRIVED, f"{error:.4f} rad off", now_ns)
+        text = f"{error:.3f} rad off after {slewing:.0f} s"
+        self._facts.state(facts.SLEW_LATE, slewing > settings.slew_limit, now_ns, text)
+
+    def _watch(self, estimate: ThreadEstimate, wanted: float | None, now_ns: int) -> float:
+        """State whether the body turns too fast and stays too far off; return how far, rad.
+
+        `wanted` rad, None while nothing is: then it is not off.
+        """
+        settings, speed = self._settings, abs(estimate.rate)
+        text = f"{speed:.3f} rad/s, {settings.tumble_rate:g} allowed"
+        self._facts.state(facts.TUMBLING, speed > settings.tumble_rate, now_ns, text)
+        error = 0.0 if wanted is None else abs(math.remainder(wanted - estimate.angle, 2.0 * math.pi))
+        impossible = self._off.update(error > settings.hold_error, now_ns)
+        text = f"{error:.2f} rad off for {settings.hold_patience:g} s"
+        self._facts.state(facts.HOLD_IMPOSSIBLE, impossible, now_ns, text)
+        return error
+
+    def _barred(self) -> str:
+        """Return why safe may not be left: what led there and was not cleared; empty when it may."""
+        held = [
+            fact.begins.name
+            for fact in self._facts.held()
+            if fact.latching and fact.begins.reaction is Reaction.SAFE
+        ]
+        return f"not before it is cleared: {', '.join(held)}" if held else ""
+
+    def _fire(self, trigger: Trigger, reason: str, now_ns: int) -> None:
+        change = self._machine.fire(trigger, now_ns)
+        if change is not None:
+            self._enter(change, reason, now_ns)
+
+    def _enter(self, change: Change, reason: str, now_ns: int) -> None:
+        """Prepare what the new mode needs."""
+        self._facts.enter(change.after)
+        for dwell in (self._slow, self._arrived, self._off):
+            dwell.reset()
+        if change.before not in STEERING | {Mode.BOOT}:
+            self._guidance.release()  # an old path says nothing of where the body is now
+        if change.after is Mode.DETUMBLE:
+            self._steering.begin_braking(now_ns)
+        if change.after is not Mode.SLEW and change.trigger is not Trigger.ARRIVED:
+            self.wanted = None
+        if change.after not in STEERING:
+            self._drive.zero()
+        self._record(change.before, change.trigger.value, reason, now_ns)
+        if change.before is not Mode.BOOT:
+            because = f": {reason}" if reason else ""
+            text = f"{change.before.label} -> {change.after.label}, {change.trigger.value}{because}"
+            self._events.tell(events.MODE, now_ns, text)
+
+    def _record(self, before: Mode, trigger: str, reason: str, now_ns: int) -> None:
+        self._recorder.record(
+            MODE,
+            now_ns,
+            before=int(before),
+            mode=int(self.mode),
+            trigger=trigger,
+            reason=reason,
+            target_q2=self.wanted.q2 if self.wanted is not None else math.nan,
+        )

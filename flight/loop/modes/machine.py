@@ -1,0 +1,45 @@
+"""The state machine: a mode, a table, and triggers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from flight.loop.modes.mode import Mode, Trigger
+from flight.loop.modes.table import TRANSITIONS, Answer, Table, check
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """What a trigger did: from one mode into another, or into the same anew."""
+
+    before: Mode
+    after: Mode
+    trigger: Trigger
+
+
+class ModeMachine:
+    """Holds the mode. Pure: what a mode does is for others to do.
+
+    Attributes:
+        since_ns: when the mode was entered, or entered anew.
+    """
+
+    def __init__(self, time_ns: int = 0, table: Table = TRANSITIONS) -> None:
+        """Begin in BOOT. Raises FlightError for a table that leaves something to chance."""
+        check(table)
+        self._table = table
+        self.mode = Mode.BOOT
+        self.since_ns = time_ns
+
+    def answer(self, trigger: Trigger) -> Mode | Answer:
+        """Return what `trigger` would do now."""
+        return self._table[self.mode][trigger]
+
+    def fire(self, trigger: Trigger, now_ns: int) -> Change | None:
+        """Follow the table; return the change, None when the mode stays or the trigger is refused."""
+        after = self.answer(trigger)
+        if isinstance(after, Answer):
+            return None
+        change = Change(self.mode, after, trigger)
+        self.mode, self.since_ns = after, now_ns
+        return change

@@ -1,0 +1,119 @@
+"""The transitions, as data: every mode with every trigger, so that nothing is left to chance.
+
+`Answer.STAY` is for a trigger that means nothing in that mode, `Answer.REFUSE` for a command not obeyed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import Enum
+
+from flight.gnc.errors import FlightError
+from flight.loop.modes.mode import COMMANDS, SAFING, STARTS, Mode, Trigger
+
+
+class Answer(Enum):
+    """What a trigger does that leads nowhere."""
+
+    STAY = "stays"
+    REFUSE = "is refused"
+
+
+Row = Mapping[Trigger, Mode | Answer]
+Table = Mapping[Mode, Row]
+
+_COMMANDED: Row = {trigger: mode for mode, trigger in COMMANDS.items()}
+_STARTED: Row = dict.fromkeys(STARTS.values(), Answer.STAY)
+
+TRANSITIONS: Table = {
+    Mode.BOOT: {
+        **{trigger: mode for mode, trigger in STARTS.items()},
+        **dict.fromkeys(COMMANDS.values(), Answer.REFUSE),
+        Trigger.COMMAND_SAFE: Mode.SAFE,
+        Trigger.REACT_SAFE: Mode.SAFE,
+        Trigger.REACT_DETUMBLE: Answer.STAY,
+        Trigger.REACT_HOLD: Answer.STAY,
+        Trigger.DETUMBLED: Answer.STAY,
+        Trigger.ARRIVED: Answer.STAY,
+    },
+    Mode.SAFE: {  # left by command only
+        **_STARTED,
+        **_COMMANDED,
+        Trigger.COMMAND_SAFE: Answer.STAY,
+        Trigger.REACT_SAFE: Answer.STAY,
+        Trigger.REACT_DETUMBLE: Answer.STAY,
+        Trigger.REACT_HOLD: Answer.STAY,
+        Trigger.DETUMBLED: Answer.STAY,
+        Trigger.ARRIVED: Answer.STAY,
+    },
+    Mode.DETUMBLE: {
+        **_STARTED,
+        **_COMMANDED,
+        Trigger.COMMAND_DETUMBLE: Answer.STAY,
+        Trigger.REACT_SAFE: Mode.SAFE,
+        Trigger.REACT_DETUMBLE: Answer.STAY,
+        Trigger.REACT_HOLD: Answer.STAY,
+        Trigger.DETUMBLED: Mode.HOLD,
+        Trigger.ARRIVED: Answer.STAY,
+    },
+    Mode.HOLD: {  # commanded again it keeps the attitude of that moment
+        **_STARTED,
+        **_COMMANDED,
+        Trigger.REACT_SAFE: Mode.SAFE,
+        Trigger.REACT_DETUMBLE: Mode.DETUMBLE,
+        Trigger.REACT_HOLD: Answer.STAY,
+        Trigger.DETUMBLED: Answer.STAY,
+        Trigger.ARRIVED: Answer.STAY,
+    },
+    Mode.SLEW: {  # commanded again it goes to the new target
+        **_STARTED,
+        **_COMMANDED,
+        Trigger.REACT_SAFE: Mode.SAFE,
+        Trigger.REACT_DETUMBLE: Mode.DETUMBLE,
+        Trigger.REACT_HOLD: Mode.HOLD,
+        Trigger.DETUMBLED: Answer.STAY,
+        Trigger.ARRIVED: Mode.HOLD,
+    },
+    Mode.TESTBED_DEMO: {  # holds by itself while there is no plan, and goes on when there is one
+        **_STARTED,
+        **_COMMANDED,
+        Trigger.COMMAND_DEMO: Answer.STAY,
+        Trigger.REACT_SAFE: Mode.SAFE,
+        Trigger.REACT_DETUMBLE: Mode.DETUMBLE,
+        Trigger.REACT_HOLD: Answer.STAY,
+        Trigger.DETUMBLED: Answer.STAY,
+        Trigger.ARRIVED: Answer.STAY,
+    },
+}
+
+
+def check(table: Table) -> None:
+    """Refuse a table that leaves something to chance; raises FlightError naming the first fault."""
+    for mode in Mode:
+        row = table.get(mode)
+        if row is None:
+            raise FlightError(f"mode table: {mode.label} has no row")
+        for trigger in Trigger:
+            if trigger not in row:
+                raise FlightError(f"mode table: {mode.label} has no answer to {trigger.value!r}")
+        for trigger in SAFING:
+            if row[trigger] is not Mode.SAFE and not (mode is Mode.SAFE and row[trigger] is Answer.STAY):
+                raise FlightError(f"mode table: {trigger.value!r} does not lead from {mode.label} to safe")
+        if not any(isinstance(to, Mode) and to is not mode for to in row.values()):
+            raise FlightError(f"mode table: {mode.label} is a dead end")
+        if mode is not Mode.BOOT and Mode.BOOT in row.values():
+            raise FlightError(f"mode table: {mode.label} leads back to boot, which is for the start only")
+    lost = set(Mode) - _reachable(table, Mode.BOOT)
+    if lost:
+        raise FlightError(f"mode table: {min(lost).label} cannot be reached from boot")
+
+
+def _reachable(table: Table, start: Mode) -> set[Mode]:
+    """Return the modes that some sequence of triggers leads to."""
+    found, ahead = {start}, [start]
+    while ahead:
+        for to in table[ahead.pop()].values():
+            if isinstance(to, Mode) and to not in found:
+                found.add(to)
+                ahead.append(to)
+    return found

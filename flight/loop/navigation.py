@@ -1,0 +1,227 @@
+"""Navigation: the inertial unit's samples, streaks' rates and stars' attitudes into one estimate, or none.
+
+It also watches the unit's line and tells silence from corruption: bytes that stand still are silence, bytes
+that make no packets are corruption, packets with impossible values are implausible.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from flight.gnc.estimation.attitude_filter import AttitudeFilter
+from flight.gnc.estimation.estimate import Estimate, ThreadEstimate
+from flight.gnc.estimation.measurements import AttitudeMeasurement, Measurement, RateMeasurement
+from flight.gnc.estimation.rigid_body import Parameters
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import about_axis_y, angle_about_axis_y, attitude_matrix
+from flight.link.telemetry.definitions import IMU
+from flight.link.telemetry.recorder import Recorder
+from flight.loop.fdir import events, facts
+from flight.loop.fdir.coils.knowledge import Known
+from flight.loop.fdir.events import EventLog
+from flight.loop.fdir.facts import Facts
+from flight.loop.fdir.streams import Streams
+from hal.interfaces.devices import InertialUnit
+from hal.interfaces.errors import DeviceError
+from hal.interfaces.readings import CoilState, ImuLink, ImuReading
+
+_AT_A_TIME = 16
+"""Measurements applied again in a cycle: some ms, so that a second of them takes a few cycles."""
+
+
+@dataclass(frozen=True, slots=True)
+class NavigationSettings:
+    """Noise of the unit, two ages, and what planner and controller know of the thread.
+
+    Attributes:
+        angle_noise: rad, standard deviation of the unit's attitude about each axis.
+        rate_noise: rad/s, of its rate.
+        max_age_ns: of a reading that the coils are driven by.
+        coast_ns: for how long the model carries the estimate on without a measurement; nothing steers by it.
+        period_ns: of the control cycle: a current that is commanded flows until the next one at least.
+        believed: torsion and damping of the thread in the plant: the disturbance told is the rest.
+        field: (3,) T, of the surroundings, reference axes.
+    """
+
+    angle_noise: float
+    rate_noise: float
+    max_age_ns: int
+    coast_ns: int
+    period_ns: int
+    believed: Parameters
+    field: FloatArray
+
+
+class Navigation:
+    """Owns the filter and the watch over the inertial unit's line.
+
+    Attributes:
+        readings: of this cycle, oldest first.
+    """
+
+    def __init__(
+        self,
+        unit: InertialUnit,
+        filter_: AttitudeFilter,
+        settings: NavigationSettings,
+        recorder: Recorder,
+        event_log: EventLog,
+        facts_: Facts,
+        streams: Streams,
+    ) -> None:
+        self._unit = unit
+        self._filter = filter_
+        self._settings = settings
+        self._angle_covariance: FloatArray = np.eye(3) * settings.angle_noise**2
+        self._rate_covariance: FloatArray = np.eye(3) * settings.rate_noise**2
+        self._recorder = recorder
+        self._events = event_log
+        self._since_ns = 0
+        self._heard_ns = 0  # the newest reading, and the newest that agreed with the estimate
+        self._agreed_ns = 0
+        self._link = unit.link()
+        self._heard_since_ns = 0
+        self._facts = facts_
+        self._streams = streams
+        self.readings: tuple[ImuReading, ...] = ()
+
+    def begin(self, time_ns: int) -> None:
+        """Use samples from `time_ns` on only: the body is released then."""
+        self._since_ns = time_ns
+        self._heard_ns = self._agreed_ns = time_ns
+        self._heard_since_ns = time_ns
+        self._link = self._unit.link()
+
+    def link(self) -> ImuLink:
+        """Return the unit's counters."""
+        return self._link
+
+    def commanded(self, in_force: CoilState, known: Known) -> None:
+        """Tell the filter what the coils carry, as far as that is known."""
+        if known.doubt_ns is not None:
+            self._filter.doubt(known.doubt_ns)
+        self._filter.command(max(in_force.written_ns, known.since_ns), in_force.current, known=known.now)
+
+    def update(self, now_ns: int) -> None:
+        """Take in what the unit has sent, and go on with what came late."""
+        self._filter.catch_up(_AT_A_TIME)
+        try:
+            readings = self._unit.poll()
+        except DeviceError as error:
+            self.readings = ()
+            self._facts.state(facts.IMU_LINE_LOST, True, now_ns, str(error))
+            return
+        self._facts.state(facts.IMU_LINE_LOST, False, now_ns, "the serial port is back")
+        self.readings = tuple(reading for reading in readings if reading.time_ns >= self._since_ns)
+        for reading in self.readings:
+            self._take(reading)
+            self._streams.note("imu", reading.time_ns)
+            self._streams.note("field", reading.time_ns, float(np.linalg.norm(reading.field)))
+            self._heard_ns = reading.time_ns
+        self._watch_line(now_ns)
+
+    def is_heard(self, now_ns: int) -> bool:
+        """Tell whether the coils may be driven by readings alone until the next cycle."""
+        return self._is_fresh(self._heard_ns, now_ns)
+
+    def is_measured(self, now_ns: int) -> bool:
+        """Tell whether the coils may be driven by the estimate until the next cycle.
+
+        The newest reading that agreed with it must be within the age limit until then: an estimate that the
+        model alone carries is told, but steers nothing.
+        """
+        return self._filter.started and self._is_fresh(self._agreed_ns, now_ns)
+
+    def _is_fresh(self, time_ns: int, now_ns: int) -> bool:
+        return now_ns + self._settings.period_ns - time_ns < self._settings.max_age_ns
+
+    def attitude(self, now_ns: int) -> Estimate | None:
+        """Return the whole estimate for now, measured or carried on by the model; None when there is none."""
+        # Carried on over a long silence it would cost more with every cycle, and be of no use.
+        if not self._filter.started or now_ns - self._filter.measured_ns > self._settings.coast_ns:
+            return None
+        return self._filter.at(now_ns)
+
+    def estimate(self, now_ns: int) -> ThreadEstimate | None:
+        """Return what it says of the turn about the thread, None when there is none."""
+        estimate = self.attitude(now_ns)
+        return None if estimate is None else estimate.about_thread(self._settings.believed)
+
+    def field(self, angle: float) -> FloatArray:
+        """Return the field (3,) T in body axes at `angle` rad about the thread."""
+        return np.asarray(attitude_matrix(about_axis_y(angle)) @ self._settings.field)
+
+    def past(self, time_ns: int) -> Estimate | None:
+        """Return the whole estimate as it stood at a past time, None when that is not remembered."""
+        return self._filter.past(time_ns) if self._filter.started else None
+
+    def take_late(self, late: Sequence[Measurement], told: Callable[[list[bool]], None]) -> None:
+        """Put measurements of a frame where they belong in time, over the next cycles.
+
+        `told` is called, later or at once, with which of them passed the gate.
+        """
+        if self._filter.started:
+            self._filter.measure_in_turn(late, told)
+        else:
+            told([False] * len(late))
+
+    def _take(self, reading: ImuReading) -> None:
+        self._recorder.record(
+            IMU,
+            reading.arrival_ns,
+            sample_time_ns=reading.time_ns - self._recorder.epoch_ns,
+            device_time_ns=reading.device_time_ns,
+            quaternion=reading.quaternion.tolist(),
+            rate=reading.rate.tolist(),
+            field=reading.field.tolist(),
+            acceleration=reading.acceleration.tolist(),
+        )
+        latency = self._filter.latency
+        time_ns = reading.time_ns - round(latency * 1e9)
+        attitude = AttitudeMeasurement(time_ns, reading.quaternion, self._angle_covariance, latency)
+        rate = RateMeasurement(time_ns, reading.rate, self._rate_covariance, latency)
+        if not self._filter.started:
+            self._filter.start(attitude, rate)
+            self._agreed_ns = reading.time_ns
+            return
+        # Each for itself: a gyro that is right keeps the rate while the attitude is in doubt.
+        turned = self._filter.measure(attitude)
+        moved = self._filter.started and self._filter.measure(rate)
+        if turned or moved:
+            self._agreed_ns = reading.time_ns
+        if not (turned and moved):
+            self._events.tell(
+                events.IMU_REFUSED,
+                reading.arrival_ns,
+                f"angle {angle_about_axis_y(reading.quaternion):.4f} rad, rate {reading.rate[1]:.5f} rad/s "
+                "disagree with the estimate",
+            )
+
+    def _watch_line(self, now_ns: int) -> None:
+        link, before = self._unit.link(), self._link
+        self._link = link
+        limit_ns = self._settings.max_age_ns
+        quiet_ns = now_ns - max(link.last_byte_ns, self._since_ns)
+        silent = quiet_ns > limit_ns
+        text = f"no byte for {quiet_ns * 1e-9:.2f} s" if silent else "bytes come again"
+        self._facts.state(facts.IMU_SILENT, silent, now_ns, text)
+        if silent:
+            self._heard_since_ns = now_ns
+        without_ns = now_ns - max(self._heard_ns, self._heard_since_ns)
+        unusable = without_ns > limit_ns
+        text = f"no reading in {without_ns * 1e-9:.2f} s of bytes: has the unit started anew?"
+        text = text if unusable else "readings come again"
+        self._facts.state(facts.IMU_UNUSABLE, unusable, now_ns, text)
+        bad = link.bad_checksum - before.bad_checksum
+        stray = link.discarded_bytes - before.discarded_bytes
+        if bad or stray:
+            text = f"{bad} packets with a wrong checksum, {stray} bytes of no packet"
+            self._events.tell(events.IMU_CORRUPT, now_ns, text)
+        odd = link.out_of_range - before.out_of_range
+        endless = link.not_finite - before.not_finite
+        if odd or endless:
+            text = f"{odd} packets out of range, {endless} not finite"
+            self._events.tell(events.IMU_IMPLAUSIBLE, now_ns, text)

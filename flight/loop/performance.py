@@ -1,0 +1,79 @@
+"""The performance record: when cycles ran and how long they took, apart from the flight log.
+
+Also the executive's observer: slips and failures become events, and a failed control cycle zeroes the coils.
+"""
+
+from __future__ import annotations
+
+import traceback
+
+from flight.link.telemetry.definitions import CYCLE_TIMING, JOB_TIMING, RATE_GROUP
+from flight.link.telemetry.recorder import Recorder
+from flight.loop.executive.jobs import JobResult
+from flight.loop.executive.rate_group import Cycle, RateGroup
+from flight.loop.fdir import events
+from flight.loop.fdir.events import EventLog
+from hal.interfaces.devices import TorqueCoils
+from hal.interfaces.wires import Clock
+
+CONTROL = "control"
+
+
+class PerformanceObserver:
+    """Told by the executive of every cycle, slip and failure."""
+
+    def __init__(self, clock: Clock, coils: TorqueCoils, recorder: Recorder, event_log: EventLog) -> None:
+        self._clock = clock
+        self._coils = coils
+        self._recorder = recorder
+        self._events = event_log
+
+    def ran(self, group: RateGroup, cycle: Cycle, execution_ns: int) -> None:
+        """Note each control cycle's lateness and length."""
+        if group.name == CONTROL:
+            self._recorder.time(
+                CYCLE_TIMING,
+                cycle.start_ns,
+                cycle=cycle.slot,
+                lateness=(cycle.start_ns - cycle.due_ns) * 1e-9,
+                execution=execution_ns * 1e-9,
+            )
+
+    def slipped(self, group: RateGroup, slots: int) -> None:
+        """Tell of skipped slots of the control group: no other can slip without it."""
+        if group.name != CONTROL:
+            return
+        text = f"{group.name}: {slots} slots skipped, {group.slips} since start"
+        self._events.tell(events.CYCLE_SLIP, self._clock.now_ns(), text)
+
+    def failed(self, group: RateGroup, error: Exception) -> None:
+        """Bring the coils to zero when it was the control task that failed, and tell where."""
+        if group.name == CONTROL:
+            self._coils.off()
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        text = f"{group.name}: {type(error).__name__}: {error} ({last.name}, line {last.lineno})"
+        self._events.tell(events.TASK_FAILED, self._clock.now_ns(), text)
+
+    def group(self, group: RateGroup, now_ns: int) -> None:
+        """Note the state of a rate group."""
+        self._recorder.time(
+            RATE_GROUP,
+            now_ns,
+            name=group.name,
+            period=group.period_ns * 1e-9,
+            cycles=group.cycles,
+            slips=group.slips,
+            overruns=group.overruns,
+            mean=group.mean_execution_ns * 1e-9,
+            max=group.max_execution_ns * 1e-9,
+        )
+
+    def job(self, result: JobResult, now_ns: int) -> None:
+        """Note how long a worker took."""
+        self._recorder.time(
+            JOB_TIMING,
+            now_ns,
+            name=result.worker,
+            execution=result.execution_ns * 1e-9,
+            outcome=result.outcome,
+        )

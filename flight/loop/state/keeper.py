@@ -1,0 +1,128 @@
+"""Keeps the state up to date beside the loop: the control thread notes, a ticker's thread writes.
+
+`note` and `notices` touch memory only. The disk is touched at the start, before there is a loop, by the
+clock's ticker while it runs, and at the end, when the coils are at zero; a disk that hangs delays only the
+ticker.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Mapping
+from datetime import UTC, datetime
+
+from flight.loop.fdir import events
+from flight.loop.fdir.events import EventKind
+from flight.loop.state import history
+from flight.loop.state.content import Learned
+from flight.loop.state.history import BootRecord
+from flight.loop.state.store import StateStore
+from hal.interfaces.wires import Clock
+
+PERIOD_NS = 10_000_000_000
+_HUNG_DISK_S = 5.0
+_NOTICES = 64
+
+
+class Notices:
+    """Events that happen where there is no event log: kept, the oldest dropped, until the loop takes them."""
+
+    def __init__(self) -> None:
+        self._kept: deque[tuple[EventKind, str]] = deque(maxlen=_NOTICES)
+
+    def tell(self, kind: EventKind, text: str) -> None:
+        """Keep an event. Safe from any thread."""
+        self._kept.append((kind, text))
+
+    def take(self) -> list[tuple[EventKind, str]]:
+        """Return the events since the last call, oldest first."""
+        return [self._kept.popleft() for _ in range(len(self._kept))]
+
+
+class StateKeeper:
+    """The state of one boot, from its begin to its end.
+
+    Attributes:
+        record: what the past says.
+        learned: what earlier boots learned, by name.
+    """
+
+    def __init__(
+        self,
+        store: StateStore,
+        notices: Notices,
+        clock: Clock,
+        *,
+        window: float,
+        devices: str = "",
+        period_ns: int = PERIOD_NS,
+    ) -> None:
+        """Load the state, count this boot and write that it runs.
+
+        `window` is the operating time, s, in which unclean shutdowns count as recent; `devices` stands for
+        those that are flown: what was learned of others is not taken.
+        """
+        self._store = store
+        self._notices = notices
+        self._clock = clock
+        self._begun_ns = clock.now_ns()
+        loaded = store.load()
+        self._begun = history.begin(loaded, self._label(), devices)
+        if loaded.learned and not self._begun.learned:
+            text = f"learned of the devices {loaded.devices or 'of an older version'}, these are {devices}"
+            notices.tell(events.LEARNED_REFUSED, text)
+        self.record: BootRecord = history.boot_record(self._begun, window)
+        self.learned: Mapping[str, Learned] = self._begun.learned
+        self._noted: tuple[str, Mapping[str, Learned]] = (self._begun.mode, {})
+        self._writing = threading.Lock()  # held by whoever writes, never asked for by note()
+        self._closed = False
+        if self.record.after_unclean:
+            last = self._begun.unclean[-1]
+            text = f"boot {last.boot}, last heard of {last.utc}: {self.record.unclean_recent} of late"
+            notices.tell(events.UNCLEAN_SHUTDOWN, text)
+        store.store(self._begun)
+        self._ticker = clock.ticker("state", period_ns, self._write)
+
+    def note(self, mode: str, learned: Mapping[str, Learned] | None = None) -> None:
+        """Remember the mode and what is learned until the next write. Never waits."""
+        self._noted = (mode, self._noted[1] if learned is None else learned)
+
+    def notices(self) -> list[tuple[EventKind, str]]:
+        """Return what happened to the state since the last call, for the event log."""
+        return self._notices.take()
+
+    def close(self, clean: bool) -> None:
+        """Write the last state, as that of a clean end or not. Safe to call twice; never waits long."""
+        self._ticker.stop()
+        if self._closed or not self._writing.acquire(timeout=_HUNG_DISK_S):
+            self._closed = True
+            return
+        try:
+            self._closed = True
+            self._put(ended=clean)
+        finally:
+            self._writing.release()
+
+    def _write(self) -> None:
+        """Write what was noted: the ticker's job."""
+        with self._writing:
+            if not self._closed:
+                self._put(ended=False)
+
+    def _put(self, ended: bool) -> None:
+        mode, learned = self._noted
+        elapsed = (self._clock.now_ns() - self._begun_ns) * 1e-9
+        state = history.go_on(self._begun, elapsed, mode, learned, self._label())
+        try:
+            self._store.store(history.end(state) if ended else state)
+        except ValueError as error:
+            # What was learned is unfit to be kept; that the application ran, and how it ended, is not.
+            self._notices.tell(events.STATE_UNWRITTEN, str(error))
+            self._noted = (mode, {})
+            state = history.go_on(self._begun, elapsed, mode, {}, self._label())
+            self._store.store(history.end(state) if ended else state)
+
+    def _label(self) -> str:
+        """Return UTC as text, for people."""
+        return f"{datetime.fromtimestamp(self._clock.utc_ns() * 1e-9, UTC):%Y-%m-%dT%H:%M:%SZ}"

@@ -1,0 +1,124 @@
+"""The state on disk: two copies, each with its generation and a CRC, each replaced atomically.
+
+A copy is one line of JSON and a line with the CRC-32 of the first. Both are written each time, one after the
+other, so that a crash leaves one of them whole, and damage to one of them loses nothing.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+from msgspec import Meta
+
+from flight.loop.fdir import events
+from flight.loop.fdir.events import EventKind
+from flight.loop.state.content import StoredState, check
+from flight.loop.state.files import Files, LinuxFiles, replace_file
+
+COPIES = ("state-a.json", "state-b.json")
+LARGEST_FILE = 1 << 20
+
+Tell = Callable[[EventKind, str], None]
+"""Takes an event: its kind and what happened."""
+
+
+class _Copy(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The content of one file."""
+
+    generation: Annotated[int, Meta(ge=1, le=2**62)]
+    state: StoredState
+
+
+@dataclass(frozen=True, slots=True)
+class _Read:
+    """One file as it was found; `problem` is empty when it is whole, or not there."""
+
+    name: str
+    copy: _Copy | None
+    problem: str
+
+
+class StateStore:
+    """Keeps a StoredState in a folder. Not for two processes at once."""
+
+    def __init__(self, folder: Path, tell: Tell, files: Files | None = None) -> None:
+        self._folder = folder
+        self._tell = tell
+        self._files = files or LinuxFiles()
+        self._generation = 0
+
+    def load(self) -> StoredState:
+        """Return the newest whole copy; defaults when there is none. Never raises.
+
+        A lost state comes back as that of an application which did not end cleanly.
+        """
+        read = [self._read(name) for name in COPIES]
+        whole = [r for r in read if r.copy is not None]
+        # One that is not there was perhaps never written: the first writes may have been cut short.
+        bad = "; ".join(f"{r.name}: {r.problem}" for r in read if r.problem)
+        newest = max(whole, key=lambda r: r.copy.generation if r.copy else 0, default=None)
+        if newest is None or newest.copy is None:
+            if not bad:
+                return StoredState()
+            self._tell(events.STATE_LOST, f"{bad}: defaults, taken for an unclean shutdown")
+            return StoredState(running=True)
+        self._generation = newest.copy.generation
+        if bad:
+            self._tell(events.STATE_RECOVERED, f"{bad}: read from {newest.name}")
+        return newest.copy.state
+
+    def store(self, state: StoredState) -> bool:
+        """Write both copies; returns whether one at least is durable. Raises ValueError if unfit."""
+        data = encode(self._generation + 1, state)
+        failures = []
+        for name in COPIES:
+            try:
+                replace_file(self._files, self._folder / name, data)
+            except OSError as error:
+                failures.append(f"{name}: {error.strerror or error}")
+        if failures:
+            self._tell(events.STATE_UNWRITTEN, "; ".join(failures))
+        # A copy that failed late may be on disk all the same: a generation is never used twice.
+        self._generation += 1
+        return len(failures) < len(COPIES)
+
+    def _read(self, name: str) -> _Read:
+        try:
+            data = self._files.read(self._folder / name)
+        except OSError as error:
+            return _Read(name, None, f"cannot be read: {error.strerror or error}")
+        if data is None:
+            return _Read(name, None, "")
+        try:
+            return _Read(name, decode(data), "")
+        except ValueError as error:
+            return _Read(name, None, str(error))
+
+
+def encode(generation: int, state: StoredState) -> bytes:
+    """Return the bytes of one copy. Raises ValueError for a state that `decode` would not take."""
+    check(state)
+    line = msgspec.json.encode(_Copy(generation, state)) + b"\n"
+    data = line + b"%08x\n" % zlib.crc32(line)
+    decode(data)
+    return data
+
+
+def decode(data: bytes) -> _Copy:
+    """Return the content of one copy. Raises ValueError for all that `encode` does not make."""
+    if len(data) > LARGEST_FILE:
+        raise ValueError(f"{len(data)} bytes are too many")
+    line, end, crc = data.partition(b"\n")
+    if crc != b"%08x\n" % zlib.crc32(line + end):
+        raise ValueError(f"torn or corrupt, {len(data)} bytes")
+    try:
+        copy = msgspec.json.decode(line, type=_Copy)
+    except (msgspec.DecodeError, RecursionError) as error:
+        raise ValueError(f"holds another kind of state: {error}") from error
+    check(copy.state)
+    return copy

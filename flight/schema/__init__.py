@@ -1,0 +1,1 @@
+"""The shape of one YAML configuration and its reader; each limit and default is written once."""

@@ -1,0 +1,363 @@
+"""The shape of a flight configuration: every section, every value, its unit and its bounds.
+
+A configuration says what the flight application believes and how its devices are wired. What the simulated
+world really does stands in its `simulation` section, whose shape is sim_hal's own (`sim_hal.settings`).
+SI units unless the name says otherwise.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta
+
+Positive = Annotated[float, Meta(gt=0.0)]
+NotNegative = Annotated[float, Meta(ge=0.0)]
+Q2 = Annotated[float, Meta(ge=-0.7, le=0.7)]
+Address = Annotated[int, Meta(ge=0x08, le=0x77)]
+Bus = Annotated[int, Meta(ge=0, le=0xFFFFF)] | Annotated[str, Meta(pattern=r"^/[A-Za-z0-9_./:+-]+$")]
+Peer = Annotated[str, Meta(pattern=r"^[0-9]{1,3}(\.[0-9]{1,3}){3}(/[0-9]{1,2})?$")]
+Sign = Literal[-1, 1]
+Channel = Annotated[int, Meta(ge=0, le=15)]
+Estimator = Literal["likelihood", "harris", "minimum-eigenvalue", "trajkovic-4", "trajkovic-8"]
+Quaternion = tuple[float, float, float, float]
+PlainMode = Literal["testbed-demo", "hold", "detumble", "safe"]
+
+
+class Section(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
+    """One section of the configuration; unknown keys are refused."""
+
+
+class Plant(Section, frozen=True, kw_only=True):
+    """What the flight application believes about the body and its actuator (Sease Table 5.1, 5.3, 5.4)."""
+
+    inertia: Annotated[float, Meta(gt=0.0, le=1e3)]
+    coil_turns: Annotated[int, Meta(gt=0, le=100_000)]
+    coil_area: Annotated[float, Meta(gt=0.0, le=100.0)]
+    field: Annotated[float, Meta(gt=0.0, le=1.0)]
+    thread_stiffness: NotNegative = 0.0
+    thread_damping: NotNegative = 0.0
+
+
+class InertialUnit(Section, frozen=True, kw_only=True):
+    """The VN-100 and its line.
+
+    No coil is driven by a reading that would be older than `max_age` s before the next one is used.
+    """
+
+    device: str = "/dev/knightcube-imu"
+    baud_rate: Literal[9600, 19200, 38400, 57600, 115200, 230400, 460800, 921600] = 115200
+    output: Literal["binary", "ascii"] = "binary"
+    rate_hz: Literal[1, 2, 4, 5, 10, 20, 25, 40, 50, 100, 200] = 40
+    mounting: Quaternion = (0.0, 0.0, 0.0, 1.0)
+    field_range: Positive = 6.0e-4
+    max_age: Positive = 0.1
+    angle_noise: Positive = 2.02e-3
+    rate_noise: Positive = 1.01e-4
+
+
+class Coils(Section, frozen=True, kw_only=True):
+    """The PWM chip, the H-bridges and the coils behind them; `bus` is its number or its device file."""
+
+    bus: Bus = 1
+    address: Address = 0x40
+    channels: tuple[tuple[Channel, Channel], tuple[Channel, Channel], tuple[Channel, Channel]] = (
+        (0, 1),
+        (2, 3),
+        (4, 5),
+    )
+    enable_channels: tuple[Channel, Channel, Channel] | None = None
+    signs: tuple[Sign, Sign, Sign] = (1, 1, 1)
+    resistance: tuple[Positive, Positive, Positive]
+    supply_voltage: Positive
+    current_limit: Positive
+    stale_after: Annotated[float, Meta(gt=0.0, le=0.4)] = 0.25
+
+
+class PowerMonitor(Section, frozen=True, kw_only=True):
+    """The INA219 in the coils' supply."""
+
+    address: Address = 0x45
+    shunt: Positive = 0.1
+
+
+class CameraLens(Section, frozen=True, kw_only=True):
+    """What `python -m flight calibrate` found: px, the pixel (x, y) on the axis, and radial distortion."""
+
+    focal_length: Positive
+    centre: tuple[float, float]
+    k1: float = 0.0
+    k2: float = 0.0
+
+
+class StarTracker(Section, frozen=True, kw_only=True):
+    """The star tracker: its sky index (default: the one in the cache folder), and its trust in the lens.
+
+    `scale_error` is the part by which the focal length may be wrong; 0 for a calibrated camera. `velocity`,
+    m/s with respect to the Sun in the axes of the attitude, is that of stellar aberration; none on a testbed.
+    """
+
+    index: str | None = None
+    scale_error: Annotated[float, Meta(ge=0.0, lt=0.5)] = 0.0
+    velocity: tuple[float, float, float] | None = None
+
+
+class V4l2Device(Section, frozen=True, kw_only=True, tag_field="kind", tag="v4l2"):
+    """A camera of Video for Linux (`hal.drivers.v4l2_camera`); gain in its own steps, `stamp_delay` in s."""
+
+    path: Annotated[str, Meta(min_length=1)] = "/dev/knightcube-camera"
+    pixel_format: Literal["GREY", "Y10", "Y12", "Y16"] = "GREY"
+    gain: int | None = None
+    stamp: Literal["told", "start", "end"] = "told"
+    stamp_delay: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
+
+
+class AravisDevice(Section, frozen=True, kw_only=True, tag_field="kind", tag="aravis"):
+    """A GenICam camera by the name that `arv-tool-0.8` lists (`hal.drivers.aravis_camera`)."""
+
+    name: Annotated[str, Meta(min_length=1)]
+    pixel_format: Literal["Mono8", "Mono10", "Mono12", "Mono16"] = "Mono12"
+    gain: float | None = None
+
+
+class Camera(Section, frozen=True, kw_only=True):
+    """The star camera: what flight must know to read its frames; `device` is the real one.
+
+    A frame is late `late_after` s after the exposure that it may have waited for; vision is slow after
+    `vision_slow_after` s.
+    """
+
+    device: V4l2Device | AravisDevice | None = None
+
+    columns: Annotated[int, Meta(ge=64, le=8192)] = 1024
+    rows: Annotated[int, Meta(ge=64, le=8192)] = 1024
+    field_of_view_deg: Annotated[float, Meta(gt=1.0, lt=120.0)] = 20.0
+    lens: CameraLens | None = None
+    exposure: Annotated[float, Meta(gt=0.0, le=10.0)] = 1.0
+    period: Positive = 5.0
+    bits: Annotated[int, Meta(ge=8, le=16)] = 16
+    gain: Positive = 1.0
+    read_noise: Positive = 10.0
+    saturation: Positive | None = None
+    psf_sigma: Positive = 1.0
+    line_time: NotNegative = 0.0
+    estimator: Estimator = "likelihood"
+    star_tracker: StarTracker | None = None
+    endpoint_bias: float | None = None
+    mounting: Quaternion = (0.0, 0.0, 0.0, 1.0)
+    max_age: Positive = 12.0
+    late_after: Positive = 1.0
+    vision_slow_after: Positive = 1.0
+
+
+class Executive(Section, frozen=True, kw_only=True):
+    """Rates of the loop and bounds of its workers."""
+
+    control_rate_hz: Annotated[float, Meta(ge=1.0, le=200.0)] = 40.0
+    planner_timeout: Positive = 2.0
+    vision_timeout: Positive = 10.0
+
+
+class Estimation(Section, frozen=True, kw_only=True):
+    """The multiplicative Kalman filter of attitude, rate, gyro bias and disturbance about the thread.
+
+    `*_start` are standard deviations at the start of what is estimated besides: the gyro's bias, rad/s; the
+    thread's torsion, 1/s^2, and damping, 1/s, beyond the plant's; the coils' gain; and the age, s, that the
+    inertial unit's samples have at their stamp, which may walk by `latency_walk`, s per sqrt(s). Zero: known.
+    `coast` is for how long, s, the model carries the estimate on without a measurement; no coil is driven by
+    what it carries (`inertial_unit.max_age`). Since an earlier boot learned a value it may have `changed` by
+    this part of its standard deviation at the start.
+    """
+
+    current_noise: NotNegative = 2.0e-3
+    disturbance_walk: Positive = 5.0e-5
+    bias_start: Positive = 1.0e-3
+    torsion_start: NotNegative = 0.02
+    damping_start: NotNegative = 4.0e-3
+    gain_start: NotNegative = 0.15
+    latency_start: NotNegative = 0.03
+    latency_walk: NotNegative = 3.0e-3
+    gate_sigma: Annotated[float, Meta(ge=3.0)] = 15.0
+    history: Positive = 6.0
+    coast: Positive = 1.2
+    changed: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.3
+
+
+class Guidance(Section, frozen=True, kw_only=True):
+    """Virtual motion camouflage (Sease 5.8-5.15); `bodies.testbed.planning` explains the strategies."""
+
+    strategy: Literal["goal", "receding", "step"] = "goal"
+    horizon: Positive = 10.0
+    time_price: Positive | None = None
+    current_share: Annotated[float, Meta(ge=0.5, le=1.0)] = 0.95
+    replan_period: Positive = 5.0
+    late_after: Positive = 1.0
+    max_horizon: Positive = 60.0
+    nodes: Annotated[int, Meta(ge=8, le=40)] | None = None
+
+
+class Control(Section, frozen=True, kw_only=True):
+    """The controller.
+
+    `lq` and `thesis` take the weights of Sease 5.30-5.32, Q = state_weight I and R = control_weight; `pid`
+    and `adaptive` the bandwidth and what follows it. `excitation` is flown by `python -m flight identify`.
+    """
+
+    tracker: Literal["lq", "thesis", "pid", "adaptive", "excitation"] = "lq"
+    state_weight: Positive = 2.0
+    control_weight: Positive = 1.0
+    bandwidth: Positive = 1.0
+    target_weight: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
+    adaptation: Positive = 1.0
+    reference_bandwidth: Positive | None = None
+
+
+class Identification(Section, frozen=True, kw_only=True):
+    """How `python -m flight identify` moves the body, and how well the plant is known beforehand.
+
+    `*_error` are relative standard deviations of what stands in `plant`: the inertia, the coils' dipole per
+    ampere (turns, area and what the resistance makes of it), the field; and of the magnetometer's scale.
+    """
+
+    current_share: Annotated[float, Meta(gt=0.0, le=0.9)] = 0.6
+    largest_q2: Annotated[float, Meta(ge=0.05, le=0.5)] = 0.4
+    swing: Positive = 45.0
+    inertia_error: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.1
+    dipole_error: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.05
+    field_error: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.1
+    magnetometer_error: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.02
+
+
+class Step(Section, frozen=True, kw_only=True):
+    """One commanded attitude: from `at` seconds of mission time reach q2 at `rate` rad/s; zero holds it."""
+
+    at: NotNegative
+    q2: Q2
+    rate: Annotated[float, Meta(ge=-0.1, le=0.1)] = 0.0
+
+
+class Modes(Section, frozen=True, kw_only=True):
+    """Where the start leads, and what leads on from mode to mode (`flight.loop.modes`).
+
+    After `crash_limit` unclean shutdowns within `crash_window` s of operation the start leads to safe instead
+    of `initial`. A slew has arrived within `arrived_angle` rad and `arrived_rate` rad/s for `arrived_for` s;
+    it is late after `slew_limit` s. A hold is impossible that is `hold_error` rad off for `hold_patience` s;
+    a target of the demonstration is to be held from the end of the first path to it on. A body turns too fast
+    to hold or slew beyond `tumble_rate` rad/s. Without an estimate for `blind_limit` s the mode is safe.
+    """
+
+    initial: PlainMode = "testbed-demo"
+    crash_limit: Annotated[int, Meta(ge=1, le=16)] = 3
+    crash_window: Positive = 600.0
+    boot_patience: Positive = 10.0
+    arrived_angle: Positive = 0.01
+    arrived_rate: Positive = 0.01
+    arrived_for: Positive = 1.0
+    slew_limit: Positive = 120.0
+    hold_error: Positive = 0.5
+    hold_patience: Positive = 15.0
+    tumble_rate: Positive = 0.5
+    blind_limit: Positive = 60.0
+
+
+class Detumble(Section, frozen=True, kw_only=True):
+    """B-dot on the magnetometer (`flight.gnc.control.detumble`): windows with the coils off, and the law.
+
+    Times in s: `settle` after the coils went off until the field is trusted, `measure` while it is averaged,
+    `act` with the coils on. `share` of the rate is to go in each window, as far as the coils can. It is over
+    when the rate has been below `low_rate` rad/s for `low_for` s. Where the field's direction turns by
+    `field_turn` rad/s, as in an orbit, the share follows from that; zero for the testbed, where it stands.
+    """
+
+    settle: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.05
+    measure: Annotated[float, Meta(ge=0.02, le=1.0)] = 0.05
+    act: Annotated[float, Meta(ge=0.02, le=5.0)] = 0.15
+    share: Annotated[float, Meta(gt=0.0, le=0.5)] = 0.3
+    field_turn: NotNegative = 0.0
+    low_rate: Positive = 0.02
+    low_for: Positive = 2.0
+
+
+class Health(Section, frozen=True, kw_only=True):
+    """Bounds of what the flight may take of its board (`flight.loop.fdir.resources`); looked at in real time.
+
+    `cpu_share` of one core, `memory` and `disk_free` in bytes, `memory_slope` in bytes an hour over at least
+    `slope_window` s after `warm_up` s; temperatures in degree C; `clock_step` in s.
+    """
+
+    look_period: Annotated[float, Meta(ge=0.5, le=600.0)] = 5.0
+    warm_up: NotNegative = 120.0
+    slope_window: Positive = 1200.0
+    cpu_share: Positive = 0.7
+    memory: Positive = 1.0e9
+    memory_slope: Positive = 1.0e7
+    disk_free: Positive = 2.0e8
+    temperature: float = 80.0
+    hottest: float = 95.0
+    clock_step: Positive = 0.5
+
+
+class CommandStep(Section, frozen=True, kw_only=True):
+    """One command of a time line: at `at` s of mission time a mode, a slew to q2, or an event to clear."""
+
+    at: NotNegative
+    mode: PlainMode | None = None
+    slew: Annotated[float, Meta(ge=-0.68, le=0.68)] | None = None
+    clear: Annotated[str, Meta(min_length=1, max_length=32)] | None = None
+
+
+class Commands(Section, frozen=True, kw_only=True):
+    """Where commands come from: a UNIX datagram socket, a UDP address (HOST:PORT), and a time line.
+
+    `peers` are the IPv4 addresses and subnets that UDP is open to, both ways; without them those of `udp`
+    itself: the machine where that is a loopback address, the 256 addresses around it where it is another.
+    """
+
+    socket: Annotated[str, Meta(min_length=1, max_length=100)] | None = None
+    udp: Annotated[str, Meta(pattern=r"^[^:\s]+:[0-9]{1,5}$")] | None = None
+    peers: Annotated[tuple[Peer, ...], Meta(min_length=1)] | None = None
+    timeline: tuple[CommandStep, ...] = ()
+
+
+class Telemetry(Section, frozen=True, kw_only=True):
+    """Sizes of the flight log and of the performance log, of each; and of all the runs of an archive."""
+
+    segment_bytes: Annotated[int, Meta(ge=4096)] = 16 * 1024 * 1024
+    budget_bytes: Annotated[int, Meta(ge=16384)] = 1024 * 1024 * 1024
+    archive_bytes: Annotated[int, Meta(ge=32768)] = 8 * 1024 * 1024 * 1024
+
+
+class State(Section, frozen=True, kw_only=True):
+    """What outlives the process (`flight.loop.state`): its folder, and the period of its writing, s.
+
+    Without a folder it is kept in systemd's STATE_DIRECTORY where real devices are flown, else nowhere.
+    """
+
+    folder: Annotated[str, Meta(min_length=1)] | None = None
+    period: Annotated[float, Meta(ge=1.0, le=3600.0)] = 10.0
+
+
+class Config(Section, frozen=True, kw_only=True):
+    """A whole configuration."""
+
+    name: Annotated[str, Meta(min_length=1, max_length=64)]
+    plant: Plant
+    inertial_unit: InertialUnit
+    coils: Coils
+    power_monitor: PowerMonitor | None = None
+    camera: Camera | None
+    executive: Executive = Executive()
+    estimation: Estimation = Estimation()
+    guidance: Guidance = Guidance()
+    control: Control = Control()
+    identification: Identification = Identification()
+    modes: Modes = Modes()
+    detumble: Detumble = Detumble()
+    health: Health = Health()
+    commands: Commands = Commands()
+    steps: Annotated[tuple[Step, ...], Meta(min_length=1)]
+    duration: Positive
+    telemetry: Telemetry = Telemetry()
+    state: State = State()
+    simulation: dict[str, Any] | None = None

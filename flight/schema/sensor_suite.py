@@ -1,0 +1,114 @@
+"""A satellite's attitude sensors and how they are mounted: one YAML file of `config/sensors` a satellite.
+
+Body axes (Meller et al., Fig. 2): z down along nadir, x forward along the orbit, y to the right, when the
+satellite flies as it should. SI units unless the name says otherwise.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from msgspec import Meta
+
+from flight.gnc.errors import ConfigError
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import attitude_matrix
+from flight.schema import reader
+from flight.schema.sections import NotNegative, Positive, Quaternion, Section
+
+_UNIT_TOLERANCE = 1e-6
+
+
+class WideCamera(Section, frozen=True, kw_only=True):
+    """A horizon and Sun camera.
+
+    `mounting` takes the body's axes to the camera's (boresight z, columns x, rows y). `field_of_view_deg` is
+    that of the columns and, the pixels being square, of the rows.
+    """
+
+    name: Annotated[str, Meta(min_length=1, max_length=32)]
+    mounting: Quaternion
+    field_of_view_deg: Annotated[float, Meta(gt=1.0, lt=175.0)] = 67.0
+    columns: Annotated[int, Meta(ge=64, le=8192)] = 512
+    rows: Annotated[int, Meta(ge=64, le=8192)] = 512
+    sun: bool = True
+
+    @property
+    def to_camera(self) -> FloatArray:
+        """The matrix (3, 3) that takes body vectors to the camera's axes."""
+        return attitude_matrix(np.array(self.mounting))
+
+
+class SolarString(Section, frozen=True, kw_only=True):
+    """A string of solar cells on one side: its current goes with the cosine of the Sun off its normal."""
+
+    name: Annotated[str, Meta(min_length=1, max_length=32)]
+    normal: tuple[float, float, float]
+    noise: Positive = 0.02
+
+
+class Gyros(Section, frozen=True, kw_only=True):
+    """Three rate gyros along the body's axes.
+
+    `noise` rad/s per sqrt(Hz), `bias_start` rad/s, `bias_walk` rad/s per sqrt(s), `rate_hz` of the samples,
+    each the mean over its period.
+    """
+
+    noise: Positive
+    bias_start: Positive
+    bias_walk: Positive
+    rate_hz: Annotated[float, Meta(gt=0.0, le=200.0)] = 2.0
+
+    @property
+    def sample_sigma(self) -> float:
+        """Of one sample, rad/s."""
+        return self.noise * math.sqrt(self.rate_hz)
+
+
+class Magnetometer(Section, frozen=True, kw_only=True):
+    """A three-axis magnetometer along the body's axes.
+
+    `noise` T of a sample, `bias_start` T of the hard iron left after calibration on the ground, `bias_walk` T
+    per sqrt(s) of it and of the field model's error in orbit.
+    """
+
+    noise: Positive
+    bias_start: NotNegative
+    bias_walk: NotNegative
+    rate_hz: Annotated[float, Meta(gt=0.0, le=100.0)] = 1.0
+
+
+class SensorSuite(Section, frozen=True, kw_only=True):
+    """All of them, and the inertia (kg m^2, about the body's axes) of what carries them."""
+
+    name: Annotated[str, Meta(min_length=1, max_length=64)]
+    inertia: tuple[Positive, Positive, Positive]
+    cameras: Annotated[tuple[WideCamera, ...], Meta(min_length=1)]
+    camera_rate_hz: Annotated[float, Meta(gt=0.0, le=50.0)] = 2.0
+    solar_strings: tuple[SolarString, ...] = ()
+    magnetometer: Magnetometer | None = None
+    gyros: Gyros | None = None
+
+
+def load(path: Path) -> SensorSuite:
+    """Read and check a sensor suite. Raises ConfigError."""
+    suite = reader.load_whole(path, SensorSuite)
+    for kind, named in (("cameras", suite.cameras), ("solar_strings", suite.solar_strings)):
+        names = [entry.name for entry in named]
+        for index, name in enumerate(names):
+            if name in names[:index]:
+                raise ConfigError(str(path), f"`{kind}[{index}].name` is {name!r}, which stands twice")
+    for index, camera in enumerate(suite.cameras):
+        _refuse_length(path, f"cameras[{index}].mounting", camera.mounting, "a quaternion")
+    for index, string in enumerate(suite.solar_strings):
+        _refuse_length(path, f"solar_strings[{index}].normal", string.normal, "a normal")
+    return suite
+
+
+def _refuse_length(path: Path, dotted: str, vector: tuple[float, ...], kind: str) -> None:
+    length = math.sqrt(sum(part * part for part in vector))
+    if abs(length - 1.0) > _UNIT_TOLERANCE:
+        raise ConfigError(str(path), f"`{dotted}` has length {length:.6g}: {kind} must have length 1")

@@ -1,1 +1,0 @@
-"""What the rate groups do: each task owns one concern of the loop."""

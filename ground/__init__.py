@@ -1,0 +1,1 @@
+"""What a person does: report, export, calibrate, identify, look at pictures. Never on board."""

@@ -1,0 +1,115 @@
+"""`flight camera`: take frames from the configured camera, nothing else being opened, and look at them."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flight.gnc.camera.images import write_picture
+from flight.gnc.errors import UsageError
+from flight.schema.sections import Camera
+from hal.interfaces.devices import FrameSource
+from hal.interfaces.errors import NotResponding
+from hal.interfaces.readings import Frame
+from hal.interfaces.wires import Clock
+
+_LOOK_NS = 5_000_000
+_PATIENCE_NS = 10_000_000_000
+_MOST_EXPOSURES = 8
+"""That may pass until a frame comes: a free-running camera takes the next whole one, once it has settled."""
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Tell the parser what this command takes."""
+    parser.description = (
+        "Take frames from the camera of a configuration, real or simulated, one trigger each, and print of "
+        "each its number, how long after the exposure's end it came, and its counts; --out keeps the "
+        "counts as PNG, to be read by `flight solve` and `flight rate`. Coils and unit stay untouched."
+    )
+    parser.epilog = (
+        "example: python -m flight camera --config /etc/knightcube/flight.yaml --out frame.png --count 5"
+    )
+    parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="configuration file")
+    parser.add_argument("--out", type=Path, metavar="PNG", help="keep the frame; of several, name-NUMBER.png")
+    parser.add_argument("--count", type=int, default=1, metavar="N", help="frames to take (default 1)")
+    parser.add_argument("--exposure", type=float, metavar="S", help="exposure instead of the configuration's")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.set_defaults(command=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Take the frames; exit status 1 when they stand still."""
+    from flight.app.lone_camera import opened_camera  # noqa: PLC0415 - no other command needs devices
+
+    if options.count < 1:
+        raise UsageError(f"--count {options.count}: give a number of frames, 1 or more")
+    if options.exposure is not None and not 0.0 < options.exposure <= 10.0:
+        raise UsageError(f"--exposure {options.exposure}: give seconds, up to 10")
+    if options.out is not None and options.out.suffix.lower() != ".png":
+        raise UsageError(f"--out {options.out}: frames are kept as PNG: give a name that ends in .png")
+    facts = []
+    with opened_camera(options.config) as (clock, source, camera):
+        exposure_ns = round((options.exposure or camera.exposure) * 1e9)
+        for frame in _frames(clock, source, exposure_ns, options.count):
+            facts.append(_facts(frame, camera))
+            if not options.json:
+                sys.stdout.write(_line(facts[-1]))
+            if options.out is not None:
+                _keep(options.out, frame, options.count)
+    numbers = [fact["sequence"] for fact in facts]
+    frozen = numbers != sorted(set(numbers))
+    if options.json:
+        sys.stdout.write(json.dumps({"frames": facts, "frozen": frozen}) + "\n")
+    if frozen:
+        sys.stderr.write("flight: the camera's frame numbers do not grow: it is frozen\n")
+    return 1 if frozen else 0
+
+
+def _frames(clock: Clock, source: FrameSource, exposure_ns: int, count: int) -> Iterator[Frame]:
+    """Yield frames, each after a trigger of its own. Raises DeviceError."""
+    for _ in range(count):
+        source.trigger(exposure_ns)
+        deadline_ns = clock.now_ns() + _MOST_EXPOSURES * exposure_ns + _PATIENCE_NS
+        while (frame := source.poll()) is None:
+            if clock.now_ns() > deadline_ns:
+                raise NotResponding("camera", "no frame came after the trigger")
+            clock.sleep_until_ns(clock.now_ns() + _LOOK_NS)
+        yield frame
+
+
+def _facts(frame: Frame, camera: Camera) -> dict[str, Any]:
+    pixels = frame.pixels
+    saturation = camera.saturation or float(2**camera.bits - 1)
+    end_ns = frame.exposure_start_ns + frame.exposure_ns
+    return {
+        "sequence": frame.sequence,
+        "age_s": (frame.arrival_ns - frame.exposure_start_ns) * 1e-9,
+        "latency_s": (frame.arrival_ns - end_ns) * 1e-9,
+        "exposure_s": frame.exposure_ns * 1e-9,
+        "columns": pixels.shape[1],
+        "rows": pixels.shape[0],
+        "minimum": int(pixels.min()),
+        "median": float(np.median(pixels)),
+        "maximum": int(pixels.max()),
+        "saturated": float(np.mean(pixels >= saturation)),
+    }
+
+
+def _line(fact: dict[str, Any]) -> str:
+    return (
+        f"frame {fact['sequence']}: {fact['columns']} x {fact['rows']}, exposed {fact['exposure_s']:.4f} s, "
+        f"{fact['latency_s'] * 1e3:.1f} ms after its end, age {fact['age_s']:.3f} s, "
+        f"counts {fact['minimum']} / {fact['median']:.0f} / {fact['maximum']} (least, median, most), "
+        f"saturated {fact['saturated']:.2%}\n"
+    )
+
+
+def _keep(out: Path, frame: Frame, count: int) -> None:
+    path = out if count == 1 else out.with_name(f"{out.stem}-{frame.sequence}{out.suffix}")
+    write_picture(path, frame.pixels)

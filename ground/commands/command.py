@@ -1,0 +1,121 @@
+"""`flight command`: send a command to a flight and print its answer."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import socket
+import sys
+import tempfile
+from pathlib import Path
+
+from flight.app.utc_label import utc_ns
+from flight.gnc.errors import FlightError, UsageError
+from flight.link.commands.codec import ChangeMode, Clear, Command, CommandPacker, Ping, Slew
+from flight.link.telemetry.definitions import COMMAND
+from flight.link.telemetry.packets import LONGEST_PACKET, TelemetryError, to_text
+from flight.link.telemetry.scanner import decode
+from flight.loop.modes.mode import COMMANDS, Mode
+
+_MODES = [mode.label for mode in COMMANDS if mode is not Mode.SLEW]
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Tell the parser what this command takes."""
+    parser.description = (
+        "Send a command to a flight that listens (`commands` in its configuration) and print its answer. "
+        "Exit status 0 when it was obeyed, 1 when it was refused or nobody answered."
+    )
+    parser.add_argument(
+        "--to",
+        required=True,
+        metavar="SOCKET",
+        help="path of its UNIX socket, or HOST:PORT of its UDP address",
+    )
+    parser.add_argument("--timeout", type=float, default=2.0, metavar="S", help="for the answer (default 2)")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    words = parser.add_subparsers(required=True, metavar="WHAT", dest="what")
+    words.add_parser("ping", help="answer, and do nothing else")
+    safe = words.add_parser("safe", help="abort: coils to zero, mode safe")
+    safe.add_argument("reason", nargs="?", default="", help="for the log")
+    words.add_parser("mode", help="change the mode").add_argument("mode", choices=_MODES)
+    slew = words.add_parser("slew", help="go to an attitude, then hold it")
+    slew.add_argument("q2", type=float, help="commanded final q2, within +-0.68")
+    clear = words.add_parser("clear", help="let a latched event begin anew")
+    clear.add_argument("event", help="its name, as in the log")
+    parser.set_defaults(command=command)
+
+
+def command(options: argparse.Namespace) -> int:
+    """Send, wait, print."""
+    data = CommandPacker().pack(_command_of(options), utc_ns())  # tells it from all others
+    raw = exchange(options.to, data, options.timeout)
+    try:
+        (row,) = decode(raw)[COMMAND.name]
+        mode = Mode(int(row["mode"]))
+    except (TelemetryError, ValueError) as error:
+        raise FlightError(f"{options.to}: its answer of {len(raw)} bytes is none") from error
+    obeyed, text = bool(row["obeyed"]), to_text(row["text"])
+    if options.json:
+        facts = {"obeyed": obeyed, "mode": mode.label, "text": text, "count": int(row["count"])}
+        sys.stdout.write(json.dumps(facts) + "\n")
+    else:
+        sys.stdout.write(f"{'obeyed' if obeyed else 'refused'}: {text}; mode {mode.label}\n")
+    return 0 if obeyed else 1
+
+
+def exchange(to: str, data: bytes, timeout: float) -> bytes:
+    """Send a datagram and return the answer. Raises UsageError for a place where nobody can listen."""
+    if not 0.0 < timeout < float("inf"):
+        raise UsageError(f"--timeout {timeout}: must be a positive number of seconds")
+    host, _, port = to.rpartition(":")
+    if host and port.isdigit() and not Path(to).exists():
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
+            return _ask(line, (host, int(port)), data, timeout, to)
+    with (
+        tempfile.TemporaryDirectory(prefix="knightcube-", dir=_answering_place(Path(to))) as folder,
+        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as line,
+    ):
+        own = os.path.join(folder, "answer")
+        os.chmod(folder, 0o711)  # the flight, another user, must reach our socket to answer
+        line.bind(own)
+        os.chmod(own, 0o777)
+        return _ask(line, to, data, timeout, to)
+
+
+def _answering_place(to: Path) -> Path | None:
+    """Return the folder where a flight reaches our socket: its own in /run, None for that of temporary files.
+
+    A service (`deploy/knightcube.service`) has temporary files to itself.
+    """
+    beside = to.absolute().parent
+    return beside if beside.is_relative_to("/run") and os.access(beside, os.W_OK | os.X_OK) else None
+
+
+def _ask(line: socket.socket, address: str | tuple[str, int], data: bytes, timeout: float, to: str) -> bytes:
+    line.settimeout(timeout)
+    try:
+        line.sendto(data, address)
+    except OSError as error:
+        raise UsageError(f"{to}: no flight listens there: {error.strerror or error}") from error
+    except OverflowError as error:
+        raise UsageError(f"{to}: {error}") from error
+    try:
+        return line.recv(LONGEST_PACKET)
+    except OSError as error:
+        raise FlightError(f"{to}: no answer within {timeout:g} s") from error
+
+
+def _command_of(options: argparse.Namespace) -> Command:
+    match options.what:
+        case "ping":
+            return Ping(os.getpid() & 0xFFFFFFFF)
+        case "safe":
+            return ChangeMode(Mode.SAFE, options.reason)
+        case "mode":
+            return ChangeMode(Mode.named(options.mode))
+        case "slew":
+            return Slew(options.q2)
+        case _:
+            return Clear(options.event)

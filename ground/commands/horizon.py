@@ -1,0 +1,149 @@
+"""`flight horizon`: the Earth's limb in a picture, and the way down from it."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flight.gnc.camera.images import grey_stretch, write_picture
+from flight.gnc.camera.lens import CameraModel
+from flight.gnc.camera.pinhole import Pinhole
+from flight.gnc.errors import UsageError
+from flight.gnc.math.arrays import Image
+from flight.gnc.vision.horizon.knowledge import LEAST_ALTITUDE, HorizonKnowledge
+from flight.gnc.vision.horizon.nadir import find_nadir
+from flight.gnc.vision.horizon.response import LogarithmicResponse
+from flight.gnc.vision.horizon.settings import EdgeSettings, HorizonSettings
+from flight.gnc.vision.horizon.solution import HorizonSolution, NadirMeasurement
+from flight.schema import reader as configuration
+from flight.schema.camera_model import camera_model
+from ground.commands.options import add_picture, positive, read_picture
+from ground.pictures.horizon import draw_horizon
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Tell the parser what this command takes."""
+    parser.description = (
+        "Find the Earth's limb in a picture and the direction to the Earth's centre, in camera axes: z along "
+        "the boresight, x to the right, y down. PNG, TIFF, JPEG or FITS, colour too. Without --altitude the "
+        "altitude is fitted as well. The Earth is taken for a sphere, and what that leaves out stands in the "
+        "uncertainty."
+    )
+    parser.epilog = (
+        "example: python -m flight horizon limb.png --fov 67 --altitude 515 --overlay limb_found.png"
+    )
+    add_picture(parser)
+    camera = parser.add_mutually_exclusive_group(required=True)
+    camera.add_argument("--fov", type=positive, metavar="DEG", help="field of view across the columns")
+    camera.add_argument(
+        "--camera", type=Path, metavar="YAML", help="configuration or calibration of the camera"
+    )
+    parser.add_argument("--altitude", type=positive, metavar="KM", help="above the mean Earth")
+    parser.add_argument(
+        "--log-response",
+        type=positive,
+        nargs=2,
+        metavar=("PEDESTAL", "COUNTS"),
+        help="of a logarithmic detector: counts of darkness, and counts a decade of light",
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--overlay", type=Path, metavar="PNG", help="draw what was found on the picture")
+    parser.set_defaults(command=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Find the horizon, print, draw; exit status 1 when none is found."""
+    pixels = read_picture(options)
+    camera = _camera(options, pixels)
+    altitude = None if options.altitude is None else 1e3 * options.altitude
+    if altitude is not None and altitude < LEAST_ALTITUDE:
+        least = f"{1e-3 * LEAST_ALTITUDE:g} km"
+        raise UsageError(f"--altitude {options.altitude:g}: the limb is seen as one from {least} up")
+    response = None if options.log_response is None else LogarithmicResponse(*options.log_response)
+    settings = HorizonSettings(edges=EdgeSettings(response=response))
+    solution = find_nadir(pixels, camera, HorizonKnowledge(altitude=altitude), settings)
+    if options.json:
+        sys.stdout.write(json.dumps(facts(solution, altitude is None), allow_nan=False) + "\n")
+    else:
+        sys.stdout.write(_text(solution, altitude is None))
+    if options.overlay is not None:
+        write_picture(options.overlay, draw_horizon(grey_stretch(pixels), solution, camera))
+        if not options.json:
+            sys.stdout.write(f"picture:          {options.overlay}\n")
+    return 0 if solution.nadir is not None else 1
+
+
+def _camera(options: argparse.Namespace, pixels: Image) -> CameraModel:
+    rows, columns = pixels.shape
+    if options.camera is None:
+        if not 1.0 <= options.fov <= 150.0:
+            raise UsageError(f"--fov {options.fov:g}: a pinhole camera sees 1 to 150 degrees")
+        return Pinhole.from_field_of_view(columns, rows, math.radians(options.fov))
+    model = camera_model(configuration.load_camera(options.camera))
+    if (rows, columns) != (model.rows, model.columns):
+        raise UsageError(
+            f"{options.image}: {columns} x {rows} pixels, but the camera of {options.camera} has"
+            f" {model.columns} x {model.rows}"
+        )
+    return model
+
+
+def facts(solution: HorizonSolution, altitude_fitted: bool) -> dict[str, Any]:
+    """Return all that is known of a solution, for `--json`."""
+    told: dict[str, Any] = {
+        "status": solution.status.value,
+        "reason": solution.reason or None,
+        "edges_found": len(solution.points),
+        "pixels_read": solution.pixels_read,
+        "candidates": [_nadir_facts(each, altitude_fitted) for each in solution.candidates],
+    }
+    if solution.nadir is not None:
+        told |= _nadir_facts(solution.nadir, altitude_fitted)
+        told["limb_points_px"] = solution.points[solution.on_horizon].tolist()
+    return told
+
+
+def _nadir_facts(nadir: NadirMeasurement, altitude_fitted: bool) -> dict[str, Any]:
+    x, y, z = nadir.direction
+    known = {
+        "nadir_camera": nadir.direction.tolist(),
+        "from_boresight_deg": math.degrees(math.acos(min(1.0, max(-1.0, z)))),
+        "towards_deg": math.degrees(math.atan2(y, x)),
+        "covariance_rad2": nadir.covariance.tolist(),
+        "sigma_deg": math.degrees(nadir.sigma),
+        "residual_px": nadir.residual,
+        "edges_used": nadir.used,
+    }
+    if altitude_fitted:
+        known |= {"altitude_km": 1e-3 * nadir.altitude, "altitude_sigma_km": 1e-3 * nadir.altitude_sigma}
+    return known
+
+
+def _text(solution: HorizonSolution, altitude_fitted: bool) -> str:
+    lines = [f"status:           {solution.status.value}"]
+    if solution.reason:
+        lines.append(f"reason:           {solution.reason}")
+    lines.append(f"edges:            {len(solution.points)} found")
+    for nadir in solution.candidates if solution.nadir is None else (solution.nadir,):
+        told = _nadir_facts(nadir, altitude_fitted)
+        x, y, z = nadir.direction
+        # Across and along the arc from the boresight to nadir the uncertainty differs.
+        sigmas = np.degrees(np.sqrt(np.linalg.eigvalsh(nadir.tangent_covariance)))
+        lines += [
+            f"nadir x, y, z:    {x:+.5f} {y:+.5f} {z:+.5f}",
+            f"from boresight:   {told['from_boresight_deg']:.3f} deg, towards {told['towards_deg']:.3f} deg"
+            " from right to down",
+            f"1 sigma:          {sigmas[1]:.3f} deg at worst, {sigmas[0]:.3f} deg at best",
+            f"limb:             {nadir.used} edges, residual {nadir.residual:.2f} px rms",
+        ]
+        if altitude_fitted:
+            lines.append(
+                f"altitude:         {1e-3 * nadir.altitude:.0f} +- {1e-3 * nadir.altitude_sigma:.0f} km"
+            )
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,237 @@
+"""`flight identify`: the body's constants from a short flight, as a piece of configuration."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from flight.app.cli.run import progress_line, seed_number
+from flight.app.request import Order
+from flight.gnc.errors import UsageError
+from flight.link.telemetry.reader import read_run
+from flight.schema import reader as configuration
+from flight.schema.sections import Config
+from ground.commands.options import positive
+from ground.identification.constants import NAMES, UNITS, Constants
+from ground.identification.fit import Fit, fit
+from ground.identification.fragment import fragment
+from ground.identification.preparation import (
+    DURATION,
+    beliefs_of,
+    believed_constants,
+    excitation_config,
+    noise_of,
+    to_yaml,
+)
+from ground.identification.record import Record, read_record
+from ground.identification.scale import AbsolutePlant, absolute
+
+_ABSOLUTE_UNITS = {
+    "inertia": "kg m^2",
+    "dipole": "m^2",
+    "field": "T",
+    "torque_constant": "N m/A",
+    "stiffness": "N m/rad",
+    "damping": "N m s/rad",
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Identified:
+    """All that came out, and where it came from."""
+
+    folder: Path
+    config: Config
+    record: Record
+    found: Fit
+    plant: AbsolutePlant
+
+    @property
+    def fragment(self) -> str:
+        return fragment(self.plant, self.config.plant.coil_turns, str(self.folder))
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Tell the parser what this command takes."""
+    parser.description = (
+        "Identify torque constant, thread stiffness and damping from a short flight: pulses of the coil on x "
+        "and free swings, on the testbed or simulated, by the same loop as any flight. Or from the folder of "
+        "a flight that was flown already. Motion shows the ratios to the inertia only; the scale rests on "
+        "the configuration (its `identification` section says how well inertia, dipole and field are known) "
+        "and on the magnetometer, and the answer says by how much. The coils are at zero in the end."
+    )
+    parser.epilog = (
+        "example: python -m flight identify config/testbed.yaml --out plant.yaml --picture fit.png"
+    )
+    parser.add_argument("source", type=Path, metavar="CONFIG", help="YAML file, or the folder of a run")
+    parser.add_argument("--out", type=Path, metavar="YAML", help="write the `plant` section here")
+    parser.add_argument(
+        "--run", type=Path, metavar="DIR", help="folder of the flight (default runs/NAME-TIME)"
+    )
+    parser.add_argument(
+        "--duration", type=positive, metavar="S", help=f"fly so many seconds (default {DURATION:g})"
+    )
+    parser.add_argument("--seed", type=seed_number, metavar="N", help="seed of the simulation instead")
+    parser.add_argument(
+        "--realtime", action="store_true", help="fly simulated devices on the machine's clock"
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--picture", type=Path, metavar="PNG", help="draw measured and predicted motion")
+    parser.set_defaults(command=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Fly unless that is done, fit, print, write."""
+    if options.out is not None and options.out.exists():
+        raise UsageError(f"{options.out}: is there already: name another file")
+    folder = _flown(options) if options.source.is_dir() else _fly(options)
+    made = _identify(folder)
+    if options.out is not None:
+        _write(options.out, made.fragment)
+    if options.json:
+        sys.stdout.write(json.dumps(_facts(made), allow_nan=False) + "\n")
+    else:
+        sys.stdout.write(_text(made))
+        sys.stdout.write(f"\nwritten: {options.out}\n" if options.out is not None else "\n" + made.fragment)
+    if options.picture is not None:
+        from ground.report import draw_fit  # noqa: PLC0415
+
+        draw_fit(made.record, made.found, options.picture)
+        if not options.json:
+            sys.stdout.write(f"picture: {options.picture}\n")
+    return 0
+
+
+def _flown(options: argparse.Namespace) -> Path:
+    """Return the folder of a flight that is done; what asks for another one is refused."""
+    for name in ("run", "duration", "seed", "realtime"):
+        if getattr(options, name):
+            raise UsageError(f"--{name}: {options.source} is a flight that is flown already")
+    return Path(options.source)
+
+
+def _fly(options: argparse.Namespace) -> Path:
+    """Fly the excitation; return the folder of the run."""
+    from flight.app.flight import fly  # noqa: PLC0415 - only who flies needs devices
+    from flight.app.run_folder import default_folder  # noqa: PLC0415
+
+    config = excitation_config(configuration.load(options.source), options.duration or DURATION)
+    out = options.run or default_folder(Path(f"{options.source.stem}-identify"))
+    with_line = sys.stderr.isatty()
+    with tempfile.TemporaryDirectory() as place:
+        path = Path(place) / options.source.name
+        path.write_text(to_yaml(config), encoding="utf-8")
+        order = Order(path, out, options.realtime, seed=options.seed)
+        outcome = fly(order, progress_line(sys.stderr) if with_line else None)
+    if with_line:
+        sys.stderr.write("\r\x1b[K")
+    if outcome.interrupted:
+        sys.stderr.write(f"flight: {outcome.reason}: identified from what was flown\n")
+    if outcome.log_error:
+        sys.stderr.write(f"flight: {outcome.log_error}\n")
+    return outcome.folder
+
+
+def _identify(folder: Path) -> _Identified:
+    config = configuration.load(folder / "config.yaml")
+    record = read_record(read_run(folder), config.coils.stale_after)
+    with_line = sys.stderr.isatty()
+    found = fit(record, noise_of(config), _show_round if with_line else None)
+    if with_line:
+        sys.stderr.write("\r\x1b[K")
+    return _Identified(folder, config, record, found, absolute(found, beliefs_of(config), record.field))
+
+
+def _show_round(count: int, step: float) -> None:
+    sys.stderr.write(f"\r\x1b[Kfitting, round {count + 1}: the last step was {step:.2g} sigma")
+    sys.stderr.flush()
+
+
+def _facts(made: _Identified) -> dict[str, Any]:
+    found, plant, field = made.found, made.plant, made.record.field
+    motion = {
+        name: {"value": getattr(found.constants, name), "sigma": found.sigma(name), "unit": UNITS[name]}
+        for name in NAMES
+    }
+    rests = plant.rests_on()
+    scaled = {
+        name: {**asdict(getattr(plant, name)), "unit": unit, "rests_on": rests[name]}
+        for name, unit in _ABSOLUTE_UNITS.items()
+    }
+    return {
+        "folder": str(made.folder),
+        "duration_s": float(made.record.time[-1] - made.record.time[0]),
+        "samples": len(made.record.time),
+        "motion": motion,
+        "motion_covariance": found.covariance.tolist(),
+        "plant": scaled,
+        "magnetometer_T": None if field is None else {"value": field.magnitude, "sigma": field.sigma},
+        "noise": asdict(found.noise),
+        "gone_over": len(found.innovations.restarts),
+        "innovations": {**asdict(found.whiteness), "white": found.whiteness.passed},
+        "fragment": made.fragment,
+    }
+
+
+def _text(made: _Identified) -> str:
+    found, plant, record = made.found, made.plant, made.record
+    before = believed_constants(made.config)
+    lines = [
+        f"flight: {made.folder}, {len(record.time)} samples in {record.time[-1] - record.time[0]:.0f} s, "
+        f"{len(found.innovations.restarts)} gone over",
+        "",
+        "seen in the motion, per inertia:",
+        *(_motion_line(name, found, before) for name in NAMES),
+        "",
+        "with the scale that motion cannot show:",
+    ]
+    rests = plant.rests_on()
+    for name, unit in _ABSOLUTE_UNITS.items():
+        known = getattr(plant, name)
+        label, size = name.replace("_", " ") + ":", f"{known.value:12.5e} +- {known.sigma:.1e} {unit}"
+        lines.append(f"  {label:18s}{size:34s} {rests[name]}")
+    lines += ["", _field_line(made), _noise_line(found)]
+    return "\n".join(lines) + "\n"
+
+
+def _motion_line(name: str, found: Fit, before: Constants) -> str:
+    value, sigma = getattr(found.constants, name), found.sigma(name)
+    return (
+        f"  {name + ':':18s}{value:+12.5e} +- {sigma:.1e} {UNITS[name]}, believed {getattr(before, name):.4g}"
+    )
+
+
+def _field_line(made: _Identified) -> str:
+    field, known = made.record.field, made.config.identification
+    if field is None:
+        return "field:  not measured, the coils were never off long enough: as believed"
+    return (
+        f"field:  {1e4 * field.magnitude:.4f} gauss by the magnetometer, whose scale is trusted to "
+        f"{100.0 * known.magnetometer_error:g} %"
+    )
+
+
+def _noise_line(found: Fit) -> str:
+    noise, test = found.noise, found.whiteness
+    verdict = (
+        "innovations are white"
+        if test.passed
+        else "innovations are NOT white: errors widened to the scatter of the record's parts"
+    )
+    return (
+        f"noise:  current {1e3 * noise.current:.2f} mA, angle {1e3 * noise.angle:.2f} mrad, "
+        f"rate {1e6 * noise.rate:.0f} urad/s; {verdict}"
+    )
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be written: {error.strerror or error}") from error

@@ -1,0 +1,121 @@
+"""`flight plan`: one path by virtual motion camouflage, with its cost."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from flight.bodies.testbed.plant_model import plant_of
+from flight.gnc.guidance.one_axis.plant import SingleAxisPlant
+from flight.gnc.guidance.one_axis.vmc import NODES, Plan, plan
+from flight.schema import reader as configuration
+
+_DEFAULT_CONFIG = Path("config/step_demo.yaml")
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Tell the parser what this command takes."""
+    parser.description = (
+        "Plan the least-energy slew between two attitudes by virtual motion camouflage; print it "
+        "or draw it. A horizon that is too short is stretched to the shortest feasible one."
+    )
+    parser.epilog = "example: python -m flight plan --from 0.4 --from-rate 0.015 --to -0.3 --picture path.png"
+    parser.add_argument(
+        "--from", dest="start", type=_number, required=True, metavar="Q2", help="q2 at the start"
+    )
+    parser.add_argument("--to", dest="end", type=_number, required=True, metavar="Q2", help="q2 at the end")
+    parser.add_argument("--from-rate", type=_number, default=0.0, metavar="W", help="rad/s at the start")
+    parser.add_argument("--to-rate", type=_number, default=0.0, metavar="W", help="rad/s at the end")
+    parser.add_argument("--horizon", type=_number, metavar="S", help="seconds (default: the configuration's)")
+    parser.add_argument(
+        "--time-price",
+        type=_number,
+        metavar="W",
+        help="what a second is worth: the horizon of least energy plus price times time",
+    )
+    parser.add_argument("--nodes", type=int, metavar="N", help=f"nodes of the path (default {NODES})")
+    parser.add_argument(
+        "--config",
+        type=Path,
+        default=_DEFAULT_CONFIG,
+        metavar="YAML",
+        help=f"where the plant stands (default {_DEFAULT_CONFIG})",
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object, with the nodes")
+    parser.add_argument("--picture", type=Path, metavar="PNG", help="draw the path, its rate and its current")
+    parser.set_defaults(command=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Plan, print, draw."""
+    config = configuration.load(options.config)
+    plant = plant_of(config)
+    horizon = config.guidance.horizon if options.horizon is None else options.horizon
+    begun = time.perf_counter()
+    made = plan(
+        plant,
+        options.start,
+        options.from_rate,
+        options.end,
+        options.to_rate,
+        horizon,
+        nodes=options.nodes or config.guidance.nodes or NODES,
+        time_price=options.time_price,
+    )
+    solved_s = time.perf_counter() - begun
+    if options.json:
+        sys.stdout.write(json.dumps(_facts(made, plant, solved_s), allow_nan=False) + "\n")
+    else:
+        sys.stdout.write(_text(made, plant, solved_s))
+    if options.picture is not None:
+        from ground.report import draw_path  # noqa: PLC0415
+
+        draw_path(made, plant, options.picture)
+        if not options.json:
+            sys.stdout.write(f"picture:       {options.picture}\n")
+    return 0
+
+
+def _facts(made: Plan, plant: SingleAxisPlant, solved_s: float) -> dict[str, object]:
+    angle, rate, acceleration = made.path.motion(np.minimum(made.node_times, made.horizon * (1 - 1e-12)))
+    return {
+        "status": made.status.value,
+        "horizon_asked_s": made.horizon_asked,
+        "horizon_s": made.horizon,
+        "energy_J": made.energy,
+        "mean_power_W": made.energy / made.horizon,
+        "peak_current_A": made.peak_current,
+        "current_limit_A": plant.current_limit,
+        "evaluations": made.evaluations,
+        "solved_s": solved_s,
+        "time_s": made.node_times.tolist(),
+        "q2": made.node_q2.tolist(),
+        "rate_rad_s": rate.tolist(),
+        "current_A": plant.currents(angle, rate, acceleration).tolist(),
+        "path_control_parameter": made.nu.tolist(),
+    }
+
+
+def _text(made: Plan, plant: SingleAxisPlant, solved_s: float) -> str:
+    stretched = f" (asked: {made.horizon_asked:g} s, too short)" if made.horizon > made.horizon_asked else ""
+    return (
+        f"status:        {made.status.value}\n"
+        f"horizon:       {made.horizon:.3f} s{stretched}\n"
+        f"energy:        {made.energy:.5f} J, integral of R I^2\n"
+        f"mean power:    {1e3 * made.energy / made.horizon:.2f} mW\n"
+        f"peak current:  {made.peak_current:.4f} A of {plant.current_limit:.4f} A\n"
+        f"solved in:     {1e3 * solved_s:.1f} ms, {made.evaluations} evaluations\n"
+    )
+
+
+def _number(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"{text} is not a finite number")
+    return value

@@ -1,0 +1,164 @@
+"""`flight rate`: the body rate from a picture of streaked stars, and what moves otherwise than they."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flight.gnc.camera.images import grey_stretch, write_picture
+from flight.gnc.camera.pinhole import Pinhole
+from flight.gnc.errors import UsageError
+from flight.gnc.math.arrays import FloatArray, Image
+from flight.gnc.vision.objects.objects import ObjectSettings, SpaceObject, detect
+from flight.gnc.vision.streaks.corners.settings import DETECTOR_NAMES, StreakSettings
+from flight.gnc.vision.streaks.corners.streak_rate import StreakResult, StreakStatus, estimate_rate
+from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion
+from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
+from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from flight.schema import reader as configuration
+from flight.schema.sections import Camera
+from ground.commands.options import add_picture, positive, read_picture
+from ground.pictures.overlay import draw_marks
+
+LIKELIHOOD = "likelihood"
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Tell the parser what this command takes."""
+    parser.description = (
+        "Estimate the mean body rate over one exposure from the star streaks in a picture: PNG, TIFF, "
+        "JPEG or FITS of 8 or 16 bits. The rate is of the camera, in its frame: boresight +z, x right, y "
+        "down. "
+        "One picture cannot tell the direction of time: --prior says about which way it turned."
+    )
+    parser.epilog = "example: python -m flight rate frame.png --fov 20 --exposure 0.2 --overlay found.png"
+    add_picture(parser)
+    parser.add_argument("--fov", type=positive, metavar="DEG", help="field of view across the columns")
+    parser.add_argument("--exposure", type=positive, metavar="S", help="exposure time")
+    parser.add_argument("--camera", type=Path, metavar="YAML", help="configuration whose camera this is")
+    parser.add_argument("--prior", type=float, nargs=3, metavar=("X", "Y", "Z"), help="rough rate, rad/s")
+    parser.add_argument(
+        "--method",
+        choices=(LIKELIHOOD, *DETECTOR_NAMES),
+        default=LIKELIHOOD,
+        help="estimator (default likelihood); the others are the thesis's corner detectors",
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--overlay", type=Path, metavar="PNG", help="draw what was found on the picture")
+    parser.set_defaults(command=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Estimate, print, draw; exit status 1 when the picture gives no rate."""
+    pixels = read_picture(options)
+    if not np.issubdtype(pixels.dtype, np.unsignedinteger):
+        raise UsageError(f"{options.image}: pixels of {pixels.dtype}: give unsigned integers of 8 or 16 bits")
+    camera = configuration.load_camera(options.camera) if options.camera else None
+    pinhole, exposure = _geometry(options, camera, pixels)
+    prior = None if options.prior is None else np.array(options.prior)
+    found = _estimate(options.method, pixels, pinhole, exposure, camera, prior)
+    objects = _objects(pixels, pinhole, exposure, camera, prior)
+    if options.json:
+        sys.stdout.write(json.dumps(_facts(found, objects, options.method), allow_nan=False) + "\n")
+    else:
+        sys.stdout.write(_text(found, objects))
+    if options.overlay is not None:
+        picture = grey_stretch(pixels)
+        draw_marks(picture, found.endpoints, found.used, [item.endpoints for item in objects])
+        write_picture(options.overlay, picture)
+        if not options.json:
+            sys.stdout.write(f"picture:       {options.overlay}\n")
+    return 0 if found.rate is not None else 1
+
+
+def _geometry(options: argparse.Namespace, camera: Camera | None, pixels: Image) -> tuple[Pinhole, float]:
+    rows, columns = pixels.shape
+    fov_deg = options.fov or (camera.field_of_view_deg if camera else None)
+    exposure = options.exposure or (camera.exposure if camera else None)
+    if fov_deg is None or exposure is None:
+        raise UsageError("give --fov and --exposure, or --camera with a configuration that has them")
+    if not 0.1 <= fov_deg <= 120.0:
+        raise UsageError(f"--fov {fov_deg}: a pinhole camera sees 0.1 to 120 degrees")
+    return Pinhole.from_field_of_view(columns, rows, math.radians(fov_deg)), exposure
+
+
+def _estimate(
+    method: str,
+    pixels: Image,
+    pinhole: Pinhole,
+    exposure: float,
+    camera: Camera | None,
+    prior: FloatArray | None,
+) -> StreakResult | MotionResult:
+    gain = camera.gain if camera else 1.0
+    saturation = camera.saturation if camera else None
+    if method == LIKELIHOOD:
+        likelihood = LikelihoodSettings(gain=gain, saturation=saturation)
+        return estimate_motion(pixels, pinhole, exposure, likelihood, prior, 0.0)
+    settings = StreakSettings.of(method, gain=gain, saturation=saturation)  # type: ignore[arg-type]  # a choice
+    return estimate_rate(pixels, pinhole, exposure, settings, prior, 0.0)
+
+
+def _objects(
+    pixels: Image, pinhole: Pinhole, exposure: float, camera: Camera | None, prior: FloatArray | None
+) -> tuple[SpaceObject, ...]:
+    gain = camera.gain if camera else 1.0
+    settings = StreakSettings(gain=gain, saturation=camera.saturation if camera else None)
+    report = detect(pixels, pinhole, exposure, settings, ObjectSettings(), prior)
+    return report.objects if report is not None else ()
+
+
+def _facts(
+    found: StreakResult | MotionResult, objects: tuple[SpaceObject, ...], method: str
+) -> dict[str, Any]:
+    known = found.rate is not None and found.covariance is not None
+    return {
+        "method": method,
+        "status": found.status.value,
+        "rate_rad_s": found.rate.tolist() if found.rate is not None else None,
+        "covariance_rad2_s2": found.covariance.tolist() if known and found.covariance is not None else None,
+        "direction_of_time_known": found.status is StreakStatus.RATE,
+        "exposure_s": found.exposure,
+        "streak_length_px": found.length if math.isfinite(found.length) else None,
+        "residual_rad": found.residual if math.isfinite(found.residual) else None,
+        "streaks": [
+            {"start_px": ends[0].tolist(), "end_px": ends[1].tolist(), "used": bool(used)}
+            for ends, used in zip(found.endpoints, found.used, strict=True)
+        ],
+        "objects": [
+            {
+                "endpoints_px": item.endpoints.tolist(),
+                "rate_among_stars_rad_s": item.relative_rate,
+                "direction": item.direction.tolist(),
+                "flux_counts": item.flux,
+                "improvement_of_chi_square": item.improvement,
+            }
+            for item in objects
+        ],
+    }
+
+
+def _text(found: StreakResult | MotionResult, objects: tuple[SpaceObject, ...]) -> str:
+    lines = [f"status:        {found.status.value}"]
+    if found.rate is not None and found.covariance is not None:
+        sigma = np.sqrt(np.diag(found.covariance))
+        size = float(np.linalg.norm(found.rate))
+        along = found.rate / size
+        spread = float(np.sqrt(along @ found.covariance @ along))
+        values = "  ".join(f"{1e3 * r:+.4f} +- {1e3 * s:.4f}" for r, s in zip(found.rate, sigma, strict=True))
+        lines.append(f"rate x, y, z:  {values} mrad/s")
+        lines.append(f"magnitude:     {1e3 * size:.4f} mrad/s +- {100.0 * spread / size:.3f} %")
+    if found.status is StreakStatus.AMBIGUOUS:
+        lines.append("direction:     unknown, the rate may be its opposite: give --prior")
+    lines.append(f"streaks:       {found.found} found, {found.used_count} used, {found.length:.1f} px long")
+    for item in objects:
+        x, y = item.endpoints.mean(axis=0)
+        rate = 1e3 * item.relative_rate
+        lines.append(f"object:        at {x:.1f}, {y:.1f} px, {rate:.3f} mrad/s among the stars")
+    return "\n".join(lines) + "\n"

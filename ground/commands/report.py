@@ -1,0 +1,57 @@
+"""`flight report`: what a run achieved, against the thesis."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+from flight.gnc.errors import UsageError
+from flight.link.telemetry.archive import find_runs
+from flight.link.telemetry.reader import read_run
+from ground import report as reporting
+from ground.report.archive import format_archive, summarise_archive
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Tell the parser what this command takes."""
+    parser.description = (
+        "Print a run's performance against Table 5.3 of the thesis, and draw its figures. "
+        "Judged on the simulation's truth where there is one, on the estimate otherwise."
+    )
+    parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run, or of an archive of runs")
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead, and draw nothing")
+    parser.add_argument(
+        "--figures", type=Path, metavar="DIR", help="folder of the pictures (default RUN/figures)"
+    )
+    parser.add_argument("--no-figures", action="store_true", help="draw nothing")
+    parser.set_defaults(command=report)
+
+
+def report(options: argparse.Namespace) -> int:
+    """Print the report, then draw."""
+    if find_runs(options.run):
+        archive = summarise_archive(options.run)
+        text = json.dumps(archive, allow_nan=False) + "\n" if options.json else format_archive(archive)
+        sys.stdout.write(text)
+        return 0
+    run = read_run(options.run)
+    summary = reporting.summarise(run)
+    if options.json:
+        sys.stdout.write(json.dumps(summary, allow_nan=False) + "\n")
+        if options.figures is None:
+            return 0
+    else:
+        sys.stdout.write(reporting.format_report(summary))
+    if options.no_figures:
+        return 0
+    try:
+        paths = reporting.draw(run, options.figures or options.run / "figures")
+    except UsageError as error:
+        # The numbers are told already: pictures that cannot be drawn are no failure of the report.
+        sys.stderr.write(f"flight: {error}\n")
+        return 0 if options.figures is None else 2
+    if not options.json:
+        sys.stdout.write("\npictures:\n" + "".join(f"  {path}\n" for path in paths))
+    return 0

@@ -1,0 +1,285 @@
+"""`flight solve`: where a picture of the sky was taken to, which stars it shows, and how it turned."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import time
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flight.gnc.camera.images import grey_stretch, write_picture
+from flight.gnc.camera.lens import CameraModel
+from flight.gnc.camera.pinhole import Pinhole
+from flight.gnc.catalogue.names import PROPER_NAMES
+from flight.gnc.earth.sun import DAY, J2000, earth_velocity
+from flight.gnc.errors import UsageError
+from flight.gnc.math.arrays import Image
+from flight.gnc.vision.startracker.classical.methods import DEFAULT_METHOD, METHODS, method_of
+from flight.gnc.vision.startracker.detection import DetectionSettings
+from flight.gnc.vision.startracker.index import sky_index
+from flight.gnc.vision.startracker.index.build import default_index
+from flight.gnc.vision.startracker.index.sky_index import SkyIndex
+from flight.gnc.vision.startracker.pointing import Pointing
+from flight.gnc.vision.startracker.solution import FrameSolution
+from flight.gnc.vision.startracker.solve import RatePrior, SolveSettings, solve_frame
+from flight.gnc.vision.streaks.corners.streak_rate import StreakStatus
+from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from flight.schema import reader as configuration
+from flight.schema.camera_model import camera_model
+from flight.schema.sections import Camera
+from ground.commands.options import add_picture, positive, read_picture
+from ground.pictures.sky_picture import draw_solution
+
+ARCSECONDS = math.degrees(1.0) * 3600.0
+UNKNOWN_DEG = 10.0, 30.0
+"""Fields of view that are searched when none is given."""
+_FOV_TOLERANCE = 0.05
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Tell the parser what this command takes."""
+    parser.description = (
+        "Find out where a picture of the sky looks: right ascension, declination and roll (the position "
+        "angle of up, from north through east), ICRS; which stars it shows; and, where they are drawn out to "
+        "streaks, how the camera turned. PNG, TIFF, JPEG or FITS. Without --fov or --camera all fields from "
+        f"{UNKNOWN_DEG[0]:g} to {UNKNOWN_DEG[1]:g} deg are searched."
+    )
+    parser.epilog = "example: python -m flight solve night.jpg --fov 11.4 --overlay solved.png"
+    add_picture(parser)
+    parser.add_argument("--fov", type=positive, metavar="DEG", help="field of view across the columns")
+    parser.add_argument(
+        "--fov-error", type=positive, metavar="DEG", help="by which --fov may be wrong (default: 5 %% of it)"
+    )
+    parser.add_argument(
+        "--camera", type=Path, metavar="YAML", help="configuration or calibration of the camera"
+    )
+    parser.add_argument(
+        "--exposure", type=positive, metavar="S", help="exposure time, for the rate of streaks"
+    )
+    parser.add_argument("--prior", type=float, nargs=3, metavar=("X", "Y", "Z"), help="rough rate, rad/s")
+    parser.add_argument(
+        "--date", type=_date, metavar="UTC", help="when, such as 2026-11-21: proper motion, aberration"
+    )
+    parser.add_argument("--index", type=Path, metavar="FILE", help="another sky index")
+    parser.add_argument(
+        "--method",
+        choices=tuple(METHODS),
+        default=DEFAULT_METHOD,
+        help="of identification; all but the default want the field to 1.8 %%: see --fov-error",
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--overlay", type=Path, metavar="PNG", help="draw what was found on the picture")
+    parser.set_defaults(command=run)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Solve, print, draw; exit status 1 when the picture is not solved."""
+    pixels = read_picture(options)
+    camera, scale, exposure, settings = _belief(options, pixels)
+    sky = sky_index.load(options.index) if options.index else default_index()
+    if options.date is not None:
+        sky = sky.at(options.date.year)
+        settings = replace(settings, velocity=earth_velocity(options.date.julian_date))
+    if options.method != DEFAULT_METHOD:
+        settings = replace(settings, method=method_of(options.method))
+    prior = None if options.prior is None else RatePrior(np.array(options.prior), 0.0)
+    begin = time.perf_counter()
+    solution = solve_frame(pixels, camera, scale, exposure or 1.0, sky, settings, rate_prior=prior)
+    seconds = time.perf_counter() - begin
+    if options.json:
+        sys.stdout.write(json.dumps(facts(solution, sky, exposure, seconds), allow_nan=False) + "\n")
+    else:
+        sys.stdout.write(_text(solution, sky, exposure, seconds))
+    if options.overlay is not None:
+        write_picture(options.overlay, draw_solution(grey_stretch(pixels), solution, sky))
+        if not options.json:
+            sys.stdout.write(f"picture:          {options.overlay}\n")
+    return 0 if solution.fix is not None else 1
+
+
+@dataclass(frozen=True, slots=True)
+class Date:
+    """An instant, as the Julian year of a catalogue's epoch and as a Julian date."""
+
+    year: float
+    julian_date: float
+
+
+def _date(text: str) -> Date:
+    try:
+        instant = datetime.fromisoformat(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text!r}: give a date such as 2026-11-21T20:15:00") from error
+    instant = instant.replace(tzinfo=UTC) if instant.tzinfo is None else instant
+    julian_date = J2000 + (instant - datetime(2000, 1, 1, 12, tzinfo=UTC)).total_seconds() / DAY
+    return Date(2000.0 + (julian_date - J2000) / 365.25, julian_date)
+
+
+def _belief(
+    options: argparse.Namespace, pixels: Image
+) -> tuple[CameraModel, tuple[float, float], float | None, SolveSettings]:
+    """Return the camera, the range of its scale, the exposure, and the settings that fit it."""
+    if options.camera is None:
+        lens, scale = lens_of_field(options.fov, options.fov_error, pixels.shape)
+        return lens, scale, options.exposure, SolveSettings()
+    camera = configuration.load_camera(options.camera)
+    if pixels.shape != (camera.rows, camera.columns):
+        raise UsageError(
+            f"{options.image}: {pixels.shape[1]} x {pixels.shape[0]} pixels, but the camera of"
+            f" {options.camera} has {camera.columns} x {camera.rows}"
+        )
+    return calibrated(camera, options.fov_error, options.exposure)
+
+
+def calibrated(
+    camera: Camera, error_deg: float | None, exposure: float | None
+) -> tuple[CameraModel, tuple[float, float], float | None, SolveSettings]:
+    """Return the lens of a configuration; only one that was calibrated is believed without tolerance."""
+    model = camera_model(camera)
+    fov = math.degrees(field_of_view(model))
+    if camera.lens is not None and error_deg is None:
+        scale = 1.0, 1.0
+    else:
+        _, scale = lens_of_field(fov, error_deg, (camera.rows, camera.columns))
+    saturation = camera.saturation
+    return (
+        model,
+        scale,
+        exposure or camera.exposure,
+        SolveSettings(
+            detection=DetectionSettings(saturation=saturation),
+            likelihood=LikelihoodSettings(
+                gain=camera.gain,
+                saturation=saturation,
+                psf_sigma=camera.psf_sigma,
+                line_time=camera.line_time,
+            ),
+        ),
+    )
+
+
+def lens_of_field(
+    fov: float | None, error: float | None, shape: tuple[int, ...]
+) -> tuple[Pinhole, tuple[float, float]]:
+    """Return a camera of `fov` deg across, within `error` deg, and the range of its scale.
+
+    Without a field of view all of UNKNOWN_DEG are meant. Raises UsageError for a field that is none.
+    """
+    lowest, highest = UNKNOWN_DEG
+    if fov is not None:
+        if not 1.0 <= fov <= 120.0:
+            raise UsageError(f"--fov {fov}: a pinhole camera sees 1 to 120 degrees")
+        error = _FOV_TOLERANCE * fov if error is None else error
+        lowest, highest = max(fov - error, 0.5), min(fov + error, 125.0)
+    tangents = [math.tan(0.5 * math.radians(angle)) for angle in (lowest, highest)]
+    middle = math.sqrt(tangents[0] * tangents[1])
+    camera = Pinhole(shape[1], shape[0], 0.5 * shape[1] / middle)
+    return camera, (tangents[0] / middle, tangents[1] / middle)
+
+
+def facts(solution: FrameSolution, sky: SkyIndex, exposure: float | None, seconds: float) -> dict[str, Any]:
+    """Return all that is known of a solution, for `--json`."""
+    camera = solution.camera
+    told: dict[str, Any] = {
+        "status": solution.status.value,
+        "reason": solution.reason or None,
+        "shows": solution.kind.value,
+        "points_found": len(solution.points),
+        "seconds": seconds,
+    }
+    if solution.fix is None:
+        return told
+    pointing = Pointing.of(solution.fix.quaternion)
+    fov, chance = field_of_view(camera), solution.log10_false_alarm
+    return told | {
+        "right_ascension_deg": math.degrees(pointing.right_ascension),
+        "declination_deg": math.degrees(pointing.declination),
+        "roll_deg": math.degrees(pointing.roll),
+        "quaternion": solution.fix.quaternion.tolist(),
+        "covariance_rad2": solution.fix.covariance.tolist(),
+        "field_of_view_deg": math.degrees(fov),
+        "field_of_view_sigma_deg": math.degrees(math.sin(fov) * solution.scale_sigma),
+        "focal_length_px": camera.focal_length,
+        "log10_false_alarm": chance if math.isfinite(chance) else None,
+        "stars": [
+            {
+                "hip": int(sky.stars.hip[solution.star[point]]),
+                "name": PROPER_NAMES.get(int(sky.stars.hip[solution.star[point]])),
+                "magnitude": round(float(sky.stars.magnitude[solution.star[point]]), 3),
+                "point_px": solution.points[point].tolist(),
+                "residual_px": (solution.points[point] - solution.expected[point]).tolist(),
+            }
+            for point in solution.matched
+        ],
+        "motion": _motion_facts(solution, exposure),
+    }
+
+
+def _motion_facts(solution: FrameSolution, exposure: float | None) -> dict[str, Any] | None:
+    motion = solution.motion
+    if motion is None or motion.rate is None or motion.covariance is None:
+        return None
+    turn = {
+        "turn_rad": (motion.rate * motion.exposure).tolist(),
+        "streak_length_px": motion.length,
+        "direction_of_time_known": motion.status is StreakStatus.RATE,
+    }
+    if exposure is None:
+        return turn
+    return turn | {"rate_rad_s": motion.rate.tolist(), "rate_covariance_rad2_s2": motion.covariance.tolist()}
+
+
+def field_of_view(camera: CameraModel) -> float:
+    """Return the angle across the columns, edge to edge, rad, of a camera without distortion."""
+    return 2.0 * math.atan(0.5 * camera.columns / camera.focal_length)
+
+
+def _text(solution: FrameSolution, sky: SkyIndex, exposure: float | None, seconds: float) -> str:
+    lines = [f"status:           {solution.status.value}"]
+    if solution.fix is None:
+        lines.append(f"reason:           {solution.reason}")
+        return "\n".join(lines) + "\n"
+    told = facts(solution, sky, exposure, seconds)
+    sigma = ARCSECONDS * np.sqrt(np.diag(solution.fix.covariance))
+    matched = solution.matched
+    residual = solution.points[matched] - solution.expected[matched]
+    rms = float(np.sqrt(np.mean(residual**2)))
+    per_pixel = ARCSECONDS / solution.camera.focal_length
+    lines += [
+        f"right ascension:  {told['right_ascension_deg']:.4f} deg",
+        f"declination:      {told['declination_deg']:+.4f} deg",
+        f"roll:             {told['roll_deg']:.3f} deg",
+        f'1 sigma:          {sigma[0]:.2f}" x, {sigma[1]:.2f}" y, {sigma[2]:.1f}" about the boresight',
+        f'field of view:    {told["field_of_view_deg"]:.4f} deg across, {per_pixel:.2f}" a pixel',
+        f"stars:            {len(matched)} of {len(solution.points)} {solution.kind.value} matched,"
+        f" residual {rms:.2f} px rms an axis",
+        f"by chance:        10^{solution.log10_false_alarm:.0f}",
+    ]
+    named = [PROPER_NAMES.get(star["hip"]) or f"HIP {star['hip']}" for star in told["stars"][:8]]
+    lines.append(f"brightest:        {', '.join(named)}")
+    lines += _motion_text(solution, exposure)
+    lines.append(f"time:             {1e3 * seconds:.0f} ms")
+    return "\n".join(lines) + "\n"
+
+
+def _motion_text(solution: FrameSolution, exposure: float | None) -> list[str]:
+    motion = solution.motion
+    if motion is None or motion.rate is None or motion.covariance is None:
+        return []
+    length = f"streaks:          {motion.length:.1f} px long"
+    if exposure is None:
+        return [length + ": give --exposure for the rate"]
+    sigma = 1e3 * np.sqrt(np.diag(motion.covariance))
+    each = zip(1e3 * motion.rate, sigma, strict=True)
+    values = "  ".join(f"{rate:+.4f} +- {spread:.4f}" for rate, spread in each)
+    lines = [length, f"rate x, y, z:     {values} mrad/s"]
+    if motion.status is not StreakStatus.RATE:
+        lines.append("direction:        unknown, the rate may be its opposite: give --prior")
+    return lines

@@ -1,0 +1,114 @@
+"""The definition table as Markdown for people and as JSON for ground stations.
+
+`python -m ground.documentation [--json]`
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from typing import Any
+
+from flight.link.telemetry.definitions import Field
+from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, Layout
+
+_FOREWORD = """\
+# Telemetry
+
+Made from `flight/link/telemetry/definitions.py` by `python -m ground.documentation > docs/telemetry.md`;
+`--json` prints the same as a database for ground stations. A flight log is these packets back to back; a
+downlink is a stream of them.
+
+Every packet is a CCSDS space packet (133.0-B-2), all numbers big-endian:
+
+| byte | type | content |
+|---|---|---|
+| 0 | u2 | version 0 (3 bits), type 0 = telemetry (1), secondary header 1 (1), APID (11) |
+| 2 | u2 | 3 = unsegmented (2 bits), sequence count of this APID (14) |
+| 4 | u2 | bytes that follow this word, less one |
+| 6 | u1 | version of the packet's definition |
+| 7 | i8 | mission time, ns |
+| 15 | | the fields below |
+| last 2 | u2 | CRC-16: x^16 + x^12 + x^5 + 1, preset to ones, over everything before it |
+
+Types are u unsigned, i signed, f IEEE 754, followed by their bytes; S is UTF-8 text in so many bytes, padded
+with zeros.
+"""
+
+
+def database() -> dict[str, Any]:
+    """Return the table with every field's offset from the packet's first byte, ready for JSON."""
+    return {
+        "byte_order": "big-endian",
+        "primary_header_bytes": HEADER_BYTES,
+        "secondary_header": [
+            {"name": "version", "type": "u1", "offset": HEADER_BYTES},
+            {"name": "time_ns", "type": "i8", "offset": HEADER_BYTES + 1},
+        ],
+        "error_control": {"polynomial": 0x1021, "preset": 0xFFFF, "bytes": CRC_BYTES},
+        "packets": [_packet(layout) for layout in LAYOUTS.values()],
+    }
+
+
+def markdown() -> str:
+    """Return the table as Markdown."""
+    return _FOREWORD + "".join(_section(layout) for layout in LAYOUTS.values())
+
+
+def _packet(layout: Layout) -> dict[str, Any]:
+    packet = layout.packet
+    return {
+        "name": packet.name,
+        "apid": packet.apid,
+        "version": packet.version,
+        "rate": packet.rate,
+        "bytes": layout.length,
+        "meaning": packet.meaning,
+        "fields": [
+            {
+                "name": field.name,
+                "type": field.kind,
+                "count": field.count,
+                "offset": offset,
+                "unit": field.unit,
+                "meaning": field.meaning,
+            }
+            for field, offset in _offsets(layout)
+        ],
+    }
+
+
+def _offsets(layout: Layout) -> list[tuple[Field, int]]:
+    where = layout.offsets
+    return [(field, where[field.name]) for field in layout.packet.fields]
+
+
+def _section(layout: Layout) -> str:
+    packet = layout.packet
+    identity = f"APID 0x{packet.apid:03X}, version {packet.version}, {layout.length} bytes"
+    lines = [
+        "",
+        f"## {packet.name}",
+        "",
+        f"{packet.meaning}. {identity}, {packet.rate}.",
+        "",
+        "| byte | field | type | unit | meaning |",
+        "|---|---|---|---|---|",
+    ]
+    for field, offset in _offsets(layout):
+        kind = f"{field.kind} x {field.count}" if field.count > 1 else field.kind
+        lines.append(f"| {offset} | {field.name} | {kind} | {field.unit} | {field.meaning} |")
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    """Print the documentation."""
+    parser = argparse.ArgumentParser(prog="python -m ground.documentation", description=__doc__)
+    parser.add_argument("--json", action="store_true", help="print the ground database instead of Markdown")
+    arguments = parser.parse_args()
+    sys.stdout.write(json.dumps(database(), indent=2) + "\n" if arguments.json else markdown())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,56 @@
+"""What an identification flight and its fit start from: the user's own configuration."""
+
+from __future__ import annotations
+
+import msgspec
+import yaml
+
+from flight.schema import reader as configuration
+from flight.schema.sections import Config, Step
+from ground.identification.constants import Constants, Noise
+from ground.identification.scale import Belief, Beliefs
+
+DURATION = 200.0
+"""s: each manoeuvre once with either sign, and the time in between."""
+
+
+def excitation_config(config: Config, duration: float) -> Config:
+    """Return `config` with `duration` s of the excitation in place of its steps, without camera or paths."""
+    return configuration.replace(
+        config,
+        name=f"identify {config.name}"[:64],
+        camera=None,
+        guidance=configuration.replace(config.guidance, strategy="step"),
+        control=configuration.replace(config.control, tracker="excitation"),
+        steps=(Step(at=0.0, q2=0.0),),
+        duration=duration,
+    )
+
+
+def to_yaml(config: Config) -> str:
+    """Return a configuration as text that `flight.schema.reader` reads back as the same."""
+    return yaml.safe_dump(msgspec.to_builtins(config), sort_keys=False)
+
+
+def beliefs_of(config: Config) -> Beliefs:
+    """Return what a configuration believes of the scale, and how firmly."""
+    plant, known = config.plant, config.identification
+    return Beliefs(
+        inertia=Belief(plant.inertia, known.inertia_error),
+        dipole=Belief(plant.coil_turns * plant.coil_area, known.dipole_error),
+        field=Belief(plant.field, known.field_error),
+        magnetometer_error=known.magnetometer_error,
+    )
+
+
+def believed_constants(config: Config) -> Constants:
+    """Return the constants per inertia that a configuration believes in."""
+    plant = config.plant
+    gain = plant.coil_turns * plant.coil_area * plant.field / plant.inertia
+    return Constants(gain, plant.thread_stiffness / plant.inertia, plant.thread_damping / plant.inertia)
+
+
+def noise_of(config: Config) -> Noise:
+    """Return the noise that a configuration believes in, where a fit begins."""
+    unit = config.inertial_unit
+    return Noise(max(config.estimation.current_noise, 1e-4), unit.angle_noise, unit.rate_noise)

@@ -1,0 +1,1 @@
+"""Drawings upon pictures of the sky and of the horizon."""

@@ -1,0 +1,38 @@
+"""A picture of the horizon that was found: the fitted limb, the edges on it, and those that are not."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from flight.gnc.camera.lens import CameraModel
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.vision.horizon.illumination import limb_rays
+from flight.gnc.vision.horizon.limb_equation import View
+from flight.gnc.vision.horizon.solution import HorizonSolution
+from ground.pictures.overlay import STREAK, UNUSED, draw_ring
+
+_RADIUS = 5.0
+_DOT = 0.0
+
+
+def limb_in_picture(view: View, camera: CameraModel) -> FloatArray:
+    """Return pixels (m, 2) along the limb of a view, at most a pixel apart, where the camera sees it."""
+    # The limb is seldom longer than the way round the picture.
+    count = 8 * (camera.columns + camera.rows)
+    points = camera.project(limb_rays(view, count))
+    return np.asarray(points[camera.contains(points)])
+
+
+def draw_horizon(
+    picture: npt.NDArray[np.uint8], solution: HorizonSolution, camera: CameraModel
+) -> npt.NDArray[np.uint8]:
+    """Return `picture` (rows, columns, 3) with the horizon drawn on it, in place.
+
+    The fitted limb as a line, orange rings for the edges on it, blue ones for the others.
+    """
+    for point in limb_in_picture(solution.view, camera) if solution.view is not None else ():
+        draw_ring(picture, point, _DOT, STREAK)
+    for point, used in zip(solution.points, solution.on_horizon, strict=True):
+        draw_ring(picture, point, _RADIUS, STREAK if used else UNUSED)
+    return picture

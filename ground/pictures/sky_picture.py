@@ -1,0 +1,107 @@
+"""A picture of what was solved: rings about the stars, names of the bright, where the sky's axes run.
+
+Constellation lines are left out: no table of them was found whose licence is clear.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from flight.gnc.camera.images import EXTRA
+from flight.gnc.catalogue.names import PROPER_NAMES
+from flight.gnc.errors import UsageError
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import attitude_matrix
+from flight.gnc.vision.startracker.index.sky_index import SkyIndex
+from flight.gnc.vision.startracker.pointing import Pointing
+from flight.gnc.vision.startracker.solution import FrameSolution
+from ground.pictures.overlay import OBJECT, STREAK, UNUSED, Colour, draw_ring
+
+if TYPE_CHECKING:
+    from PIL import ImageDraw
+
+Picture = npt.NDArray[np.uint8]
+
+_MATCHED: Colour = STREAK
+_UNMATCHED: Colour = UNUSED
+_EXPECTED: Colour = (0, 158, 115)
+_NAME: Colour = (240, 228, 66)
+_COMPASS: Colour = OBJECT
+_MOST_NAMES = 25
+_FAINTEST_LABEL = 8
+_ARROW_PART = 0.06
+
+
+def draw_solution(picture: Picture, solution: FrameSolution, sky: SkyIndex) -> Picture:
+    """Return `picture` (rows, columns, 3) with the solution drawn upon it.
+
+    Orange rings: points that are guide stars; blue: points that are none; green, wider: where guide stars as
+    bright as those should be. Yellow: names, or HIP numbers of the brightest. Vermillion: north (long) and
+    east (short). Raises UsageError without Pillow.
+    """
+    drawn = picture.copy()
+    scale = max(1.0, max(picture.shape) / 1024.0)
+    for point, star in zip(solution.points, solution.star, strict=False):
+        draw_ring(drawn, point, 6.0 * scale, _MATCHED if star >= 0 else _UNMATCHED)
+    if solution.fix is None:
+        for point in solution.points[len(solution.star) :]:
+            draw_ring(drawn, point, 6.0 * scale, _UNMATCHED)
+        return drawn
+    matrix = attitude_matrix(solution.fix.quaternion)
+    faintest = float(sky.stars.magnitude[solution.star[solution.matched]].max())
+    bright = sky.stars.brighter_than(faintest)
+    places = solution.camera.project(bright.direction @ matrix.T)
+    inside = np.flatnonzero(solution.camera.contains(places))
+    for place in places[inside]:
+        draw_ring(drawn, place, 9.0 * scale, _EXPECTED)
+    labels = [
+        (places[star], PROPER_NAMES.get(int(bright.hip[star]), f"HIP {bright.hip[star]}"))
+        for star in inside
+        if int(bright.hip[star]) in PROPER_NAMES
+    ]
+    named = {text for _, text in labels}
+    for star in inside[:_FAINTEST_LABEL]:
+        text = PROPER_NAMES.get(int(bright.hip[star]), f"HIP {bright.hip[star]}")
+        if text not in named:
+            labels.append((places[star], text))
+    return _with_text(drawn, labels[:_MOST_NAMES], solution, scale)
+
+
+def _with_text(
+    picture: Picture, labels: list[tuple[FloatArray, str]], solution: FrameSolution, scale: float
+) -> Picture:
+    try:
+        from PIL import Image as pillow  # noqa: PLC0415 - an extra, and only for pictures
+        from PIL import ImageDraw as pillow_draw  # noqa: PLC0415
+        from PIL import ImageFont  # noqa: PLC0415
+    except ImportError as error:
+        raise UsageError(f"names on a picture need Pillow: {EXTRA}") from error
+    image = pillow.fromarray(picture)
+    draw = pillow_draw.Draw(image)
+    font = ImageFont.load_default(size=15.0 * scale)
+    for (x, y), text in labels:
+        # To the right of its star, or to the left where the picture ends.
+        right = x + 11.0 * scale + draw.textlength(text, font=font) < picture.shape[1]
+        place, anchor = (x + 11.0 * scale, "lm") if right else (x - 11.0 * scale, "rm")
+        draw.text((place, y), text, fill=_NAME, font=font, anchor=anchor)
+    if solution.fix is not None:
+        _draw_compass(draw, picture.shape, Pointing.of(solution.fix.quaternion), font, scale)
+    return np.asarray(image)
+
+
+def _draw_compass(
+    draw: ImageDraw.ImageDraw, shape: tuple[int, ...], pointing: Pointing, font: Any, scale: float
+) -> None:
+    """Draw north and east as seen at the boresight, in the picture's lower left corner."""
+    size = _ARROW_PART * max(shape[:2])
+    origin = np.array([1.6 * size, shape[0] - 1.6 * size])
+    # Up stands `roll` from north towards east, and east is to the left of north.
+    north = np.array([np.sin(pointing.roll), -np.cos(pointing.roll)])
+    east = np.array([north[1], -north[0]])
+    for direction, length, letter in ((north, size, "N"), (east, 0.6 * size, "E")):
+        tip = origin + length * direction
+        draw.line([tuple(origin), tuple(tip)], fill=_COMPASS, width=max(2, round(2.0 * scale)))
+        draw.text(tuple(tip + 12.0 * scale * direction), letter, fill=_COMPASS, font=font, anchor="mm")

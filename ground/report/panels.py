@@ -1,0 +1,311 @@
+"""The panels that the pictures are composed of, each drawn on axes it is given.
+
+Colours are of the Okabe-Ito palette, told apart by all common kinds of colour vision.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from flight.gnc.guidance.lgl import lgl_rule
+from flight.gnc.math.arrays import FloatArray
+from flight.link.telemetry.definitions import MAX_NODES
+from flight.link.telemetry.packets import PacketArray
+from flight.link.telemetry.reader import Run
+from ground.report import performance as limits
+from ground.report.sensing import covariance_matrices, mean_rates, with_rate
+from ground.report.signals import Attitude, CoilPower, coil_power, estimated_attitude, seconds, true_attitude
+
+BLACK, GREY = "#222222", "#8a8a8a"
+BLUE, ORANGE, GREEN, VERMILLION, PURPLE, SKY = (
+    "#0072B2",
+    "#E69F00",
+    "#009E73",
+    "#D55E00",
+    "#CC79A7",
+    "#56B4E9",
+)
+PATH_COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, VERMILLION)
+COILS = ("x", "y", "z")
+_ABSURD = 1e9  # mrad/s: no rate, but what a damaged log may hold
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The signals of one run, worked out once for all panels."""
+
+    run: Run
+
+    @cached_property
+    def truth(self) -> Attitude | None:
+        """What the body did, None when not known."""
+        return true_attitude(self.run)
+
+    @cached_property
+    def estimate(self) -> Attitude:
+        """What the estimator believed."""
+        return estimated_attitude(self.run)
+
+    @cached_property
+    def flown(self) -> Attitude:
+        """The best that is known of what the body did."""
+        return self.truth or self.estimate
+
+    @cached_property
+    def power(self) -> CoilPower | None:
+        """The coils' power."""
+        return coil_power(self.run)
+
+    @cached_property
+    def end(self) -> float:
+        """The last moment of the flight log, s."""
+        ends = [seconds(self.run[name])[-1] for name in ("control", "truth") if len(self.run[name])]
+        return max(ends, default=0.0)
+
+    @cached_property
+    def current_limit(self) -> float:
+        """The limit of a coil's current as configured, the thesis's where that is not known."""
+        run = self.run["run"]
+        return float(run["current_limit"][0]) if len(run) else limits.CURRENT_LIMIT_A
+
+
+def style(ax: Axes, ylabel: str, title: str = "", xlabel: str = "mission time, s") -> None:
+    """Give axes the look of all pictures."""
+    ax.set_ylabel(ylabel)
+    ax.set_xlabel(xlabel)
+    if title:
+        ax.set_title(title, loc="left", fontsize=11, fontweight="bold", color=BLACK)
+    ax.grid(True, color="#e4e4e4", linewidth=0.8)
+    ax.set_axisbelow(True)
+    for side in ("top", "right"):
+        ax.spines[side].set_visible(False)
+    for side in ("left", "bottom"):
+        ax.spines[side].set_color(GREY)
+    ax.tick_params(color=GREY, labelcolor=BLACK)
+    ax.margins(x=0.01)
+
+
+def legend(ax: Axes) -> None:
+    """Put the legend above the axes, to the right of the title, where it hides nothing."""
+    handles, labels = ax.get_legend_handles_labels()
+    if handles:
+        ax.legend(
+            handles,
+            labels,
+            ncols=len(handles),
+            loc="lower right",
+            bbox_to_anchor=(1.0, 0.98),
+            fontsize=9,
+            frameon=False,
+            borderaxespad=0.2,
+            columnspacing=1.4,
+        )
+
+
+def attitude(ax: Axes, scene: Scene) -> None:
+    """Draw q2: target, estimate and truth (Sease Figure 5.9)."""
+    targets = scene.run["target"]
+    if len(targets):
+        times, values = seconds(targets), targets["q2"].astype(float)
+        ax.step(
+            np.append(times, scene.end),
+            np.append(values, values[-1]),
+            where="post",
+            color=VERMILLION,
+            linewidth=1.4,
+            linestyle=(0, (5, 2)),
+            label="target",
+            zorder=3,
+        )
+    if len(scene.estimate.time):
+        ax.plot(scene.estimate.time, scene.estimate.q2, color=SKY, linewidth=2.6, label="estimated")
+    if scene.truth is not None:
+        ax.plot(scene.truth.time, scene.truth.q2, color=BLACK, linewidth=1.0, label="true")
+    style(ax, "$q_2$", "Attitude")
+    legend(ax)
+
+
+def current(ax: Axes, scene: Scene) -> None:
+    """Draw the coil currents on the wire within their limit (Sease Figure 5.10)."""
+    control = scene.run["control"]
+    time, written = seconds(control), control["current_written"]
+    for coil, colour in enumerate((BLUE, ORANGE, GREEN)):
+        if np.any(written[:, coil]):
+            values = written[:, coil].astype(float)
+            ax.step(time, values, where="post", color=colour, linewidth=0.8, label=f"coil {COILS[coil]}")
+    for sign in (-1.0, 1.0):
+        ax.axhline(
+            sign * scene.current_limit,
+            color=VERMILLION,
+            linewidth=1.2,
+            linestyle=(0, (5, 2)),
+            label=f"limit, {scene.current_limit:g} A" if sign > 0 else None,
+        )
+    style(ax, "current, A", "Torque coil current")
+    legend(ax)
+
+
+def power(ax: Axes, scene: Scene) -> None:
+    """Draw R I^2 with its average so far and the thesis's 0.10 W (Sease Figure 5.11)."""
+    found = scene.power
+    if found is None:
+        return
+    time, spans = found.time, found.spans
+    average = np.cumsum(found.power * spans) / np.cumsum(spans)
+    ax.fill_between(time, found.power, step="post", color=BLUE, alpha=0.35, linewidth=0.0)
+    ax.step(time, found.power, where="post", color=BLUE, linewidth=0.7, label="$R I^2$")
+    ax.plot(
+        time + spans,
+        average,
+        color=BLACK,
+        linewidth=1.6,
+        label=f"average so far, {1e3 * average[-1]:.1f} mW at the end",
+    )
+    ax.axhline(
+        limits.AVERAGE_POWER_LIMIT_W,
+        color=VERMILLION,
+        linewidth=1.2,
+        linestyle=(0, (5, 2)),
+        label="the thesis's average, 0.10 W",
+    )
+    ax.set_ylim(bottom=0.0)
+    style(ax, "power, W", "Coil power")
+    legend(ax)
+
+
+def paths(ax: Axes, scene: Scene, start: float, stop: float, target: float, title: str) -> None:
+    """Draw the paths planned from `start` on, on their nodes, against the flown one until `stop`, s."""
+    flown = scene.flown
+    inside = (flown.time >= start) & (flown.time <= stop)
+    ax.plot(
+        flown.time[inside] - start,
+        flown.q2[inside],
+        color=BLACK,
+        linewidth=3.2,
+        alpha=0.3,
+        label=f"flown ({'true' if flown.source == 'truth' else 'estimated'})",
+    )
+    plans = scene.run["plan"]
+    origin = plans["origin_ns"] / 1e9
+    drawable = (plans["accepted"] == 1) & (plans["nodes"] >= 2) & (plans["nodes"] <= MAX_NODES)
+    chosen = plans[drawable & (origin >= start - 0.5) & (origin < stop)]
+    for i, plan in enumerate(chosen):
+        time, values, node_time, node_values = planned_path(plan)
+        colour = PATH_COLOURS[i % len(PATH_COLOURS)]
+        ax.plot(time - start, values, color=colour, linewidth=1.3, label=f"plan {int(plan['number'])}")
+        ax.plot(node_time - start, node_values, "o", color=colour, markersize=3.5)
+    ax.axhline(target, color=VERMILLION, linewidth=1.2, linestyle=(0, (5, 2)), label="target")
+    ax.set_xlim(-0.01 * (stop - start), stop - start)
+    style(ax, "$q_2$", title, "time since the command, s")
+    legend(ax)
+
+
+def planned_path(plan: PacketArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return time (m,) s and q2 (m,) along a plan packet's path, and both on its nodes (n,)."""
+    nodes = int(plan["nodes"])
+    values = plan["node_q2"][:nodes].astype(float)
+    rule = lgl_rule(nodes)
+    points = np.linspace(-1.0, 1.0, 201)
+    origin, horizon = float(plan["origin_ns"]) / 1e9, float(plan["horizon"])
+
+    def at(x: FloatArray) -> FloatArray:
+        return np.asarray(origin + 0.5 * horizon * (x + 1.0))
+
+    return at(points), rule.interpolation(points) @ values, at(rule.nodes), values
+
+
+def rate(ax: Axes, scene: Scene) -> None:
+    """Draw the rate about the thread: estimated, true, and from streaks with their standard deviations."""
+    if len(scene.estimate.time):
+        ax.plot(scene.estimate.time, 1e3 * scene.estimate.rate, color=SKY, linewidth=2.6, label="estimated")
+    if scene.truth is not None:
+        ax.plot(scene.truth.time, 1e3 * scene.truth.rate, color=BLACK, linewidth=1.0, label="true")
+    middle, value, sigma, _ = streak_rates(scene.run)
+    if len(middle):
+        ax.errorbar(
+            middle,
+            1e3 * value,
+            yerr=1e3 * sigma,
+            fmt="o",
+            markersize=3.5,
+            color=ORANGE,
+            ecolor=ORANGE,
+            elinewidth=1.0,
+            label="from streaks",
+            zorder=4,
+        )
+    style(ax, "rate, mrad/s", "Rate about the thread")
+    legend(ax)
+
+
+def rate_error(ax: Axes, scene: Scene) -> None:
+    """Draw the errors of the estimated rate and of the streak rates against the truth."""
+    truth, control = scene.truth, scene.run["control"]
+    if truth is None:
+        return
+    control = control[np.isfinite(control["rate"]) & np.isfinite(control["rate_sigma"])]
+    time, bound = seconds(control), 3e3 * control["rate_sigma"].astype(float)
+    error = 1e3 * (control["rate"] - np.interp(time, truth.time, truth.rate))
+    ax.fill_between(
+        time, -bound, bound, color=SKY, alpha=0.35, linewidth=0.0, label=r"$\pm 3\sigma$ of the estimate"
+    )
+    ax.plot(time, error, color=BLUE, linewidth=0.6, label="estimated less true")
+    middle, _, sigma, difference = streak_rates(scene.run)
+    known = np.isfinite(difference)
+    if known.any():
+        ax.errorbar(
+            middle[known],
+            1e3 * difference[known],
+            yerr=1e3 * sigma[known],
+            fmt="o",
+            markersize=3.5,
+            color=ORANGE,
+            ecolor=ORANGE,
+            elinewidth=0.8,
+            label=r"streaks less true, $\pm\sigma$",
+        )
+    everything = np.concatenate([np.abs(error), bound, np.abs(1e3 * difference[known])])
+    everything = everything[everything < _ABSURD]
+    if len(everything):  # a start-up transient must not flatten the rest
+        span = 1.5 * float(np.percentile(everything, 99.0)) or 1.0
+        ax.set_ylim(-span, span)
+    style(ax, "error, mrad/s", "Error of the rate")
+    legend(ax)
+
+
+def streak_rates(run: Run) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return the rates (n,) about the thread from streaks.
+
+    In order: middle of the exposure, s; rate, its standard deviation, and rate less the true mean, rad/s.
+    The standard deviation is 0 and the difference NaN where not known.
+    """
+    rated = with_rate(run["streak"])
+    start = rated["exposure_start_ns"] / 1e9
+    stop = start + rated["exposure"]
+    variance = np.nan_to_num(covariance_matrices(rated["covariance"])[:, 1, 1])
+    difference = rated["rate"][:, 1] - mean_rates(run["truth"], start, stop)[:, 1]
+    value = rated["rate"][:, 1].astype(float)
+    return 0.5 * (start + stop), value, np.sqrt(np.maximum(variance, 0.0)), difference
+
+
+def exceedance(ax: Axes, values: dict[str, FloatArray], title: str) -> None:
+    """Draw the share of values larger than x, of each named set of times in s."""
+    for (name, times), colour in zip(values.items(), PATH_COLOURS, strict=False):
+        ordered = np.sort(1e3 * times)
+        share = 1.0 - np.arange(len(ordered)) / len(ordered)
+        ax.step(
+            ordered,
+            share,
+            where="pre",
+            color=colour,
+            linewidth=1.6,
+            label=f"{name}: median {np.median(ordered):.3g} ms, max {ordered[-1]:.3g} ms",
+        )
+    ax.set_yscale("log")
+    style(ax, "share above", title, "time, ms")
+    ax.set_xlim(left=0.0)
+    legend(ax)

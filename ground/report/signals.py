@@ -1,0 +1,109 @@
+"""The signals of a run that the report judges and draws: from the truth where it is known, else as flown."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flight.gnc.math.arrays import FloatArray
+from flight.link.telemetry.packets import PacketArray
+from flight.link.telemetry.reader import Run
+
+
+@dataclass(frozen=True)
+class Attitude:
+    """The turn about the thread: time (n,) in s, q2 (n,), rate (n,) in rad/s.
+
+    `source` is "truth" or "estimate".
+    """
+
+    time: FloatArray
+    q2: FloatArray
+    rate: FloatArray
+    source: str
+
+
+@dataclass(frozen=True)
+class CoilPower:
+    """What the coils consumed.
+
+    Attributes:
+        time: (n,) s, the beginning of each interval; the last one ends at `end`.
+        end: s.
+        power: (n,) W, mean of R I^2 over each interval, I the mean of the PWM period.
+        supply: (n,) W, mean of V |I| likewise.
+        source: "truth", or "written" for the currents on the wire.
+    """
+
+    time: FloatArray
+    end: float
+    power: FloatArray
+    supply: FloatArray
+    source: str
+
+    @property
+    def spans(self) -> FloatArray:
+        """Lengths (n,) of the intervals, s."""
+        return np.diff(np.append(self.time, self.end))
+
+    @property
+    def energy(self) -> float:
+        """The integral of R I^2, J."""
+        return float(self.power @ self.spans)
+
+    @property
+    def duration(self) -> float:
+        """The time covered, s."""
+        return float(np.sum(self.spans))
+
+
+def seconds(packets: PacketArray) -> FloatArray:
+    """Return the mission times (n,) of packets, in s."""
+    return np.asarray(packets["time_ns"] / 1e9)
+
+
+def true_attitude(run: Run) -> Attitude | None:
+    """Return what the simulated body did, None where no truth is known."""
+    truth = run["truth"]
+    if not len(truth):
+        return None
+    quaternion = truth["quaternion"].astype(float)
+    # q and -q are one attitude: q2 = sin(theta/2) of the turn in (-pi, pi) has the scalar part positive.
+    q2 = quaternion[:, 1] * np.where(quaternion[:, 3] < 0.0, -1.0, 1.0)
+    return Attitude(seconds(truth), q2, truth["rate"][:, 1].astype(float), "truth")
+
+
+def estimated_attitude(run: Run) -> Attitude:
+    """Return what the estimator believed, cycles without an estimate left out."""
+    control = run["control"]
+    known = np.isfinite(control["q2"]) & np.isfinite(control["rate"])
+    control = control[known]
+    return Attitude(seconds(control), control["q2"].astype(float), control["rate"].astype(float), "estimate")
+
+
+def coil_power(run: Run) -> CoilPower | None:
+    """Return the coils' power, None when neither the truth nor the coils' resistance is known."""
+    return _true_power(run["truth"]) or _written_power(run["control"], run["run"])
+
+
+def _true_power(truth: PacketArray) -> CoilPower | None:
+    time = seconds(truth)
+    if len(time) < 2 or not np.all(np.diff(time) > 0.0):
+        return None
+    spans = np.diff(time)
+    power = np.diff(truth["energy"]) / spans
+    supply = np.diff(truth["supply_energy"]) / spans
+    return CoilPower(time[:-1], float(time[-1]), power, supply, "truth")
+
+
+def _written_power(control: PacketArray, run: PacketArray) -> CoilPower | None:
+    """Take each written current to stand until the next cycle writes its own."""
+    time = seconds(control)
+    if len(time) < 2 or not len(run):
+        return None
+    resistance = np.nan_to_num(run["coil_resistance"][0].astype(float))
+    current = control["current_written"][:-1].astype(float)
+    power = current**2 @ resistance
+    supply = float(run["supply_voltage"][0]) * np.sum(np.abs(current), axis=1)
+    return CoilPower(time[:-1], float(time[-1]), power, supply, "written")

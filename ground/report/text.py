@@ -1,0 +1,260 @@
+"""The report as text, from the object that `ground.report.summary.summarise` makes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+Object = dict[str, Any]
+
+ARCSECONDS = 648_000.0 / math.pi
+_SEVERITIES = ("information", "warning", "fault")
+
+
+def format_report(summary: Object) -> str:
+    """Return the whole report, ending in a newline."""
+    blocks = [
+        _headline(summary),
+        _steps(summary),
+        _thesis(summary),
+        _power(summary["power"]),
+        _loop(summary),
+        _planner(summary),
+        _sensing(summary),
+        _modes(summary["modes"]),
+        _health(summary["health"]),
+        _events(summary["events"]),
+        _logs(summary["logs"]),
+        [f"note: {note}" for note in summary["notes"]],
+    ]
+    return "\n\n".join("\n".join(block) for block in blocks if block) + "\n"
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """Return aligned lines, two spaces in: the first column to the left, the others to the right."""
+    cells = [list(head), *(list(row) for row in rows)]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
+    return [
+        "  "
+        + "  ".join(c.rjust(w) if i else c.ljust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True)))
+        for row in cells
+    ]
+
+
+def number(value: float | None, digits: int = 2, scale: float = 1.0) -> str:
+    """Return a number with so many decimals, "-" for None."""
+    return "-" if value is None else f"{value * scale:.{digits}f}"
+
+
+def _signed(q2: float | None) -> str:
+    return "-" if q2 is None else f"{q2:+.3f}"
+
+
+def _headline(summary: Object) -> list[str]:
+    run = summary["run"]
+    lines = [f"Run {run['folder']}: {number(run['duration_s'], 1)} s"]
+    if "software" in run:
+        devices = "simulated hardware" if run["simulated"] else "hardware"
+        pace = "real time" if run["realtime"] else "lock-step"
+        seed = f", seed {run['seed']}" if run["simulated"] else ""
+        lines.append(f"{run['config_name']} on {devices}, {pace}{seed}, software {run['software']}")
+    return lines
+
+
+def _steps(summary: Object) -> list[str]:
+    if not summary["steps"]:
+        return []
+    rows = []
+    for step in summary["steps"]:
+        rise = number(step["rise_s"]) + ("" if step["rise_judged"] or step["rise_s"] is None else " *")
+        rows.append(
+            [
+                f"{step['index']}  {_signed(step['from_q2'])} -> {_signed(step['target_q2'])}",
+                number(step["start_s"], 1),
+                number(step["steady_state_deg"]),
+                number(step["overshoot_percent"], 1),
+                rise,
+                number(step["settling_s"]),
+            ]
+        )
+    head = ["step, q2", "at s", "steady state deg", "overshoot %", "rise s", "settling s"]
+    lines = [f"Attitude steps, judged on the {summary['attitude_source']}", *table(head, rows)]
+    if any(not step["rise_judged"] for step in summary["steps"]):
+        lines.append("  * the slew from the release: its rise is not judged")
+    return lines
+
+
+def _thesis(summary: Object) -> list[str]:
+    digits = {"W": 4, "A": 4}
+    rows = [
+        [
+            row["quantity"],
+            number(row["worst"], digits.get(row["unit"], 2)),
+            f"{row['limit']:g} {row['unit']}",
+            row["verdict"],
+        ]
+        for row in summary["thesis"]
+    ]
+    return [
+        "Worst against the thesis (Sease 2013, Table 5.3 and ch. 5)",
+        *table(["", "here", "bound", ""], rows),
+    ]
+
+
+def _power(power: Object) -> list[str]:
+    if power["source"] is None:
+        return []
+    felt = power["peak_current_felt_a"]
+    return [
+        f"Coil power, from the currents {'that the world felt' if power['source'] == 'truth' else 'written'}",
+        f"  average R I^2   {number(power['average_w'], 3, 1e3)} mW   (thesis: on the order of 100 mW)",
+        f"  peak R I^2      {number(power['peak_w'], 3)} W   (thesis: about 0.5 W)",
+        f"  supply, V |I|   {number(power['supply_average_w'], 3, 1e3)} mW on average",
+        f"  energy          {number(power['energy_j'], 3)} J",
+        f"  largest current {number(power['peak_current_a'], 4)} A written"
+        + ("" if felt is None else f", {number(felt, 4)} A felt"),
+    ]
+
+
+def _loop(summary: Object) -> list[str]:
+    lines = []
+    if summary["rate_groups"]:
+        rows = [
+            [
+                group["name"],
+                number(group["period_s"], 3),
+                str(group["cycles"]),
+                str(group["slips"]),
+                str(group["overruns"]),
+                number(group["mean_s"], 3, 1e3),
+                number(group["max_s"], 3, 1e3),
+            ]
+            for group in summary["rate_groups"]
+        ]
+        head = ["rate group", "period s", "cycles", "slips", "overruns", "mean ms", "max ms"]
+        lines += ["Rate groups", *table(head, rows)]
+    timed = {
+        "lateness of a control cycle": summary["cycles"]["lateness_s"],
+        "execution of a control cycle": summary["cycles"]["execution_s"],
+        **{
+            f"{job['name']}: {job['count']} jobs ({_tally(job['outcomes'])})": job["execution_s"]
+            for job in summary["jobs"]
+        },
+    }
+    rows = [
+        [name, *(number(times[key], 3, 1e3) for key in ("p50", "p99", "max"))]
+        for name, times in timed.items()
+        if times is not None
+    ]
+    if rows:
+        lines += ["Times", *table(["", "median ms", "99 % ms", "max ms"], rows)]
+    cycles = summary["cycles"]
+    return [*lines, f"Control cycles in the log: {cycles['count']}, slots without one: {cycles['skipped']}"]
+
+
+def _planner(summary: Object) -> list[str]:
+    plans = summary["planner"]
+    if not plans["plans"]:
+        return []
+    refusals = f" ({_tally(plans['refusals'])})" if plans["refusals"] else ""
+    return [
+        "Planner",
+        f"  plans {plans['plans']}, flown {plans['accepted']} of which stretched {plans['stretched']}, "
+        f"refused {plans['refused']}{refusals}",
+        f"  longest horizon {number(plans['longest_horizon_s'], 1)} s, "
+        f"largest planned current {number(plans['peak_current_a'], 4)} A",
+    ]
+
+
+def _sensing(summary: Object) -> list[str]:
+    lines = []
+    estimate = summary["estimate"]
+    if estimate is not None:
+        lines.append(
+            f"Estimate: rms error {number(estimate['angle_rms_rad'], 3, 1e3)} mrad, "
+            f"{number(estimate['rate_rms_rad_s'], 3, 1e3)} mrad/s; "
+            f"over its own sigma {number(estimate['angle_normalised'])}, "
+            f"{number(estimate['rate_normalised'])}"
+        )
+    streaks = summary["streaks"]
+    if streaks["frames"]:
+        lines.append(
+            f"Streaks: {streaks['frames']} frames ({_tally(streaks['status'])}), "
+            f"{streaks['rates']} rates, {streaks['accepted']} into the estimate"
+        )
+    if streaks["rms_error"] is not None:
+        errors = ", ".join(number(error, 3, 1e3) for error in streaks["rms_error"])
+        lines.append(
+            f"  rms error x, y, z {errors} mrad/s of {streaks['compared']} rates; "
+            f"mean e' P^-1 e / 3 = {number(streaks['normalised'])}"
+        )
+    return lines + _stars(summary["stars"])
+
+
+def _stars(stars: Object) -> list[str]:
+    if not stars["frames"]:
+        return []
+    lines = [
+        f"Stars:   {stars['frames']} frames ({_tally(stars['status'])}), {stars['tracked']} tracked, "
+        f"{number(stars['matched'], 0)} stars matched in the median, {stars['accepted']} into the estimate"
+    ]
+    if stars["rms_error"] is not None:
+        errors = ", ".join(number(error, 2, ARCSECONDS) for error in stars["rms_error"])
+        lines.append(
+            f"  rms error about x, y, z {errors} arcsec of {stars['compared']} attitudes; "
+            f"mean e' P^-1 e / 3 = {number(stars['normalised'])}"
+        )
+    return lines
+
+
+def _modes(modes: list[Object]) -> list[str]:
+    if not modes:
+        return []
+    rows = [[mode["mode"], number(mode["at_s"], 3), mode["trigger"], mode["reason"] or "-"] for mode in modes]
+    return ["Modes", *table(["", "at s", "by", "because"], rows)]
+
+
+def _health(health: Object | None) -> list[str]:
+    if health is None:
+        return []
+    good = ", ".join(f"{name} {number(share, 1, 1e2)} %" for name, share in health["streams_good"].items())
+    lines = [
+        f"Health: streams good {good}",
+        f"  facts that counted: {', '.join(health['facts']) or 'none'}; "
+        f"watchdog fed {health['watchdog_fed']} times, wall clock set {health['clock_steps']} times",
+    ]
+    if health["proportional_bytes"] is not None:
+        lines.append(
+            f"  at most {number(health['cpu_share'])} of a core, "
+            f"{number(health['proportional_bytes'], 0, 2.0**-20)} MiB, "
+            f"{number(health['temperature_c'], 1)} deg C; memory slope "
+            f"{number(health['memory_slope_bytes_per_hour'], 2, 2.0**-20)} MiB/h; "
+            f"{number(health['disk_free_bytes'], 0, 2.0**-20)} MiB of disk free"
+        )
+    return lines
+
+
+def _events(events: list[Object]) -> list[str]:
+    if not events:
+        return []
+    rows = [
+        [event["name"], _severity(event["severity"]), str(event["count"]), number(event["first_s"], 3)]
+        for event in events
+    ]
+    return ["Events", *table(["", "severity", "count", "first at s"], rows)]
+
+
+def _severity(code: int) -> str:
+    return _SEVERITIES[code] if code < len(_SEVERITIES) else str(code)
+
+
+def _logs(logs: list[Object]) -> list[str]:
+    keys = ["packets", "bytes", "skipped_bytes", "truncated_bytes", "missing_packets", "other_versions"]
+    keys.append("dropped_segments")
+    head = ["log", "packets", "bytes", "skipped", "cut off", "missing", "other version", "dropped segments"]
+    return ["Log integrity", *table(head, [[log["log"], *(str(log[key]) for key in keys)] for log in logs])]
+
+
+def _tally(counts: dict[str, int]) -> str:
+    return ", ".join(f"{name} {count}" for name, count in sorted(counts.items()))

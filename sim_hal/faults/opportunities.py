@@ -1,0 +1,221 @@
+"""When a camera in orbit can observe a resident space object (Sease ch. 4, Table 4.3 and the text after it).
+
+    scenario = table_4_3(epoch=2_461_041.5)
+    for opportunity in opportunities(scenario, cadence=60.0, exposure=0.5):
+        times, attitudes = exposure_attitudes(scenario, opportunity.start, 0.5)
+
+An object is observable while it is in the field, in sunlight and not behind the Earth, and neither the Sun
+nor the Earth is in the field.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from flight.gnc.camera.pinhole import Pinhole
+from flight.gnc.earth import sun
+from flight.gnc.earth.shadow import Shadow, sunlit_share
+from flight.gnc.math import quaternion
+from flight.gnc.math.arrays import BoolArray, FloatArray
+from hal.interfaces.errors import OutOfRange
+from sim_hal.star_camera.rso import ResidentSpaceObject, directions
+from sim_hal.worlds.exclusion import boresights, earth_in_field, hidden_by_earth, in_field, sun_in_field
+from sim_hal.worlds.orbit import KeplerianElements, Orbit, propagate
+
+DEVICE = "observation opportunities"
+ORBITS = 10
+
+Attitude = Callable[[FloatArray], FloatArray]
+"""Camera attitudes (m, 4), ICRS into camera, at times (m,) s."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Scenario:
+    """A camera, the objects it may see, and what spoils its frames.
+
+    Attributes:
+        epoch: the Julian date TT of time 0.
+        duration: s.
+        camera: its orbit.
+        attitude: its attitude at any times.
+        pinhole: its geometry.
+        objects: what there is to see.
+        half_angle: rad, of the cone about the boresight in which Sun and Earth spoil a frame.
+        buffer: rad more, for stray light past the baffle.
+        shadow: conical or cylindrical.
+    """
+
+    epoch: float
+    duration: float
+    camera: Orbit
+    attitude: Attitude
+    pinhole: Pinhole
+    objects: Sequence[ResidentSpaceObject]
+    half_angle: float
+    buffer: float = 0.0
+    shadow: Shadow = "conical"
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """A stretch of time, `start` to `end` s, in which object number `index` is observable."""
+
+    index: int
+    start: float
+    end: float
+
+
+@dataclass(frozen=True, slots=True)
+class Opportunity:
+    """A frame that shows object number `index`: exposed from `start` s.
+
+    Attributes:
+        index: number of the object in the scenario.
+        start: s, of the exposure.
+        first: pixel (x, y) of the object at the start of the exposure.
+        last: pixel (x, y) at its end.
+        distance: m from the camera, in the middle.
+    """
+
+    index: int
+    start: float
+    first: tuple[float, float] = field(compare=False)
+    last: tuple[float, float] = field(compare=False)
+    distance: float = field(compare=False)
+
+
+def constant_slew(rate: FloatArray, initial: FloatArray = quaternion.IDENTITY) -> Attitude:
+    """Return the attitude of a camera that turns from `initial` (4,) at constant `rate` (3,) rad/s."""
+
+    def attitude(times: FloatArray) -> FloatArray:
+        turn = np.asarray(times, dtype=float)[:, None] * np.asarray(rate, dtype=float)
+        return quaternion.multiply(quaternion.from_rotation_vector(turn), initial)
+
+    return attitude
+
+
+def table_4_3(
+    epoch: float,
+    magnitude: float = 4.0,
+    pinhole: Pinhole | None = None,
+    half_angle: float | None = None,
+) -> Scenario:
+    """Return the thesis's ten orbits: the camera turns at 0.05 rad/s about its y axis from the identity.
+
+    Table 4.3. Neither a date nor how often a frame was taken is given: `epoch` (Julian date TT) places the
+    Sun. `pinhole` is by default that of 1024 x 1024 pixels over 20 degrees, `half_angle` its half diagonal;
+    half the field of view is the thesis's (2.17, 2.19). The ten orbits are the camera's, 15.3 h; the text
+    says "approximately 14".
+    """
+    pinhole = pinhole or Pinhole.from_field_of_view(1024, 1024, math.radians(20.0))
+    camera = KeplerianElements(semi_major_axis=6748e3, inclination=math.radians(28.5))
+    spacecraft = KeplerianElements(
+        semi_major_axis=7078e3,
+        inclination=math.radians(89.0),
+        argument_of_perigee=math.radians(30.0),
+        true_anomaly=math.radians(120.0),
+    )
+    duration = ORBITS * camera.period
+    return Scenario(
+        epoch=epoch,
+        duration=duration,
+        camera=propagate(camera, duration),
+        attitude=constant_slew(np.array([0.0, 0.05, 0.0])),
+        pinhole=pinhole,
+        objects=[ResidentSpaceObject(propagate(spacecraft, duration), magnitude)],
+        half_angle=pinhole.half_diagonal if half_angle is None else half_angle,
+    )
+
+
+def exposure_attitudes(
+    scenario: Scenario, start: float, exposure: float, step: float = 0.01
+) -> tuple[FloatArray, FloatArray]:
+    """Return times (k,) s and attitudes (k, 4) of an exposure, no more than `step` s apart."""
+    times = np.linspace(start, start + exposure, max(2, math.ceil(exposure / step) + 1))
+    return times, scenario.attitude(times)
+
+
+def observable(scenario: Scenario, index: int, times: FloatArray) -> BoolArray:
+    """Tell at which `times` (m,) s object number `index` is observable; half the Sun's disc must light it."""
+    camera = scenario.camera.positions_at(times)
+    position = scenario.objects[index].orbit.positions_at(times)
+    attitudes = scenario.attitude(times)
+    good = in_field(scenario.pinhole, attitudes, directions(camera, position))
+    # Few of the times pass; the rest is asked of those alone.
+    left = np.flatnonzero(good)
+    camera, position, boresight = camera[left], position[left], boresights(attitudes[left])
+    sun_position = sun.position(scenario.epoch + np.asarray(times)[left] / sun.DAY)
+    spoilt = sun_in_field(boresight, camera, sun_position, scenario.half_angle, scenario.buffer)
+    spoilt |= earth_in_field(boresight, camera, scenario.half_angle, scenario.buffer)
+    spoilt |= hidden_by_earth(camera, position)
+    spoilt |= sunlit_share(position, sun_position, scenario.shadow) < 0.5
+    good[left] = ~spoilt
+    return good
+
+
+def windows(scenario: Scenario, step: float = 0.25, precision: float = 1e-3) -> list[Window]:
+    """Return all windows in which an object is observable, in order of time.
+
+    Found on a grid of `step` s, their ends by bisection to `precision` s: a window shorter than `step` may be
+    missed. Raises OutOfRange for a step that is not positive.
+    """
+    _check("step", step)
+    grid = np.append(np.arange(0.0, scenario.duration, step), scenario.duration)
+    found = []
+    for index in range(len(scenario.objects)):
+        good = observable(scenario, index, grid)
+        edges = np.flatnonzero(np.diff(good))
+        moments = _bisect(scenario, index, grid[edges], grid[edges + 1], good[edges], precision)
+        starts = np.concatenate([grid[:1][good[:1]], moments[~good[edges]]])
+        ends = np.concatenate([moments[good[edges]], grid[-1:][good[-1:]]])
+        found += [Window(index, float(a), float(b)) for a, b in zip(starts, ends, strict=True)]
+    return sorted(found, key=lambda window: (window.start, window.index))
+
+
+def opportunities(scenario: Scenario, cadence: float, exposure: float) -> list[Opportunity]:
+    """Return the frames, one every `cadence` s from time 0, that show an object in their whole exposure.
+
+    Tested at nine instants of each exposure of `exposure` s. Raises OutOfRange for a cadence or an exposure
+    that is not positive.
+    """
+    _check("cadence", cadence)
+    _check("exposure", exposure)
+    starts = np.arange(0.0, scenario.duration - exposure, cadence)
+    instants = exposure * np.linspace(0.0, 1.0, 9)
+    found = []
+    for index in range(len(scenario.objects)):
+        left = starts
+        for instant in instants:
+            left = left[observable(scenario, index, left + instant)]
+        found += [_opportunity(scenario, index, float(start), exposure) for start in left]
+    return sorted(found, key=lambda opportunity: (opportunity.start, opportunity.index))
+
+
+def _opportunity(scenario: Scenario, index: int, start: float, exposure: float) -> Opportunity:
+    times = start + exposure * np.array([0.0, 0.5, 1.0])
+    camera, position = scenario.camera.positions_at(times), scenario.objects[index].orbit.positions_at(times)
+    matrices = quaternion.attitude_matrix(scenario.attitude(times))
+    seen = (matrices @ directions(camera, position)[..., None])[..., 0]
+    first, _, last = scenario.pinhole.project(seen).tolist()
+    distance = float(np.linalg.norm(position[1] - camera[1]))
+    return Opportunity(index, start, (first[0], first[1]), (last[0], last[1]), distance)
+
+
+def _bisect(
+    scenario: Scenario, index: int, low: FloatArray, high: FloatArray, before: BoolArray, precision: float
+) -> FloatArray:
+    """Return when being observable, `before` at `low`, changes between `low` and `high` (j,) s."""
+    while low.size and np.max(high - low) > precision:
+        middle = 0.5 * (low + high)
+        same = observable(scenario, index, middle) == before
+        low, high = np.where(same, middle, low), np.where(same, high, middle)
+    return 0.5 * (low + high)
+
+
+def _check(name: str, value: float) -> None:
+    if not 0.0 < value < math.inf:
+        raise OutOfRange(DEVICE, name, value, 0.0, math.inf, "s")

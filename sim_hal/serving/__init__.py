@@ -1,0 +1,1 @@
+"""Emulated devices in a process of their own, in real time."""

@@ -1,0 +1,128 @@
+"""The wire to `sim_hal.serving.server`: a line of JSON for each message, over a Unix socket.
+
+Of the standard library alone, and light: the guardian, which must start at once and know no numpy, plugs
+itself into the emulated bus through `open_bus`.
+"""
+
+from __future__ import annotations
+
+import errno
+import itertools
+import json
+import os
+import socket
+import threading
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+_ANSWER_S = 0.1
+
+
+def pack(message: Any) -> bytes:
+    """Return a message as it stands on the wire."""
+    return json.dumps(message, separators=(",", ":")).encode() + b"\n"
+
+
+class Inbox:
+    """What has come in, cut into messages."""
+
+    def __init__(self) -> None:
+        self._rest = b""
+
+    def take(self, chunk: bytes) -> list[Any]:
+        """Return the messages that `chunk` completes, oldest first."""
+        *lines, self._rest = (self._rest + chunk).split(b"\n")
+        return [json.loads(line) for line in lines]
+
+
+class Link:
+    """One connection to the server."""
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self._line = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self._line.settimeout(_ANSWER_S)
+        try:
+            self._line.connect(os.fspath(path))
+        except OSError:
+            self._line.close()
+            raise
+        self._inbox = Inbox()
+        self._messages: deque[Any] = deque()
+        self._numbers = itertools.count(1)
+
+    def fileno(self) -> int:
+        """Return the socket's descriptor, for select."""
+        return self._line.fileno()
+
+    def send(self, name: str, *arguments: Any) -> int:
+        """Send a request; return its number."""
+        number = next(self._numbers)
+        self._line.sendall(pack([number, name, *arguments]))
+        return number
+
+    def pending(self) -> bool:
+        """Tell whether `receive` returns at once: a message has come already."""
+        return bool(self._messages)
+
+    def receive(self) -> list[Any]:
+        """Wait for one message. Raises TimeoutError, or ConnectionError when the server is gone."""
+        while not self._messages:
+            chunk = self._line.recv(65536)
+            if not chunk:
+                raise ConnectionResetError(errno.ECONNRESET, "the emulated devices are gone")
+            self._messages += self._inbox.take(chunk)
+        message: list[Any] = self._messages.popleft()
+        return message
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._line.close()
+
+
+class RemoteI2cBus:
+    """An I2cBus whose parts are in the server's process. Safe for several threads."""
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self._link = Link(path)
+        self._lock = threading.Lock()
+
+    def call(self, name: str, *arguments: Any) -> Any:
+        """Ask and wait for the answer. Raises OSError as a bus does."""
+        with self._lock:
+            try:
+                number = self._link.send(name, *arguments)
+                # An answer that came too late for its own question is passed over.
+                while (answer := self._link.receive())[0] != number:
+                    pass
+            except TimeoutError as error:
+                raise TimeoutError(errno.ETIMEDOUT, "the emulated bus does not answer") from error
+        _, kind, result, text = answer
+        if kind == "error":
+            raise OSError(result, text)
+        return result
+
+    def read_byte_data(self, address: int, register: int) -> int:
+        """Read one byte."""
+        return int(self.call("read_byte_data", address, register))
+
+    def write_byte_data(self, address: int, register: int, value: int) -> None:
+        """Write one byte."""
+        self.call("write_byte_data", address, register, value)
+
+    def read_i2c_block_data(self, address: int, register: int, length: int) -> list[int]:
+        """Read a block."""
+        return list(self.call("read_i2c_block_data", address, register, length))
+
+    def write_i2c_block_data(self, address: int, register: int, values: Sequence[int]) -> None:
+        """Write a block."""
+        self.call("write_i2c_block_data", address, register, list(values))
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._link.close()
+
+
+def open_bus(where: str) -> RemoteI2cBus:
+    """Return the emulated bus behind the socket `where`: what the guardian is given to open."""
+    return RemoteI2cBus(where)

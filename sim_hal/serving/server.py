@@ -1,0 +1,241 @@
+"""Simulated hardware in real time, in a process of its own: devices that go on when the flight process dies.
+
+The VN-100 is served on a pseudo-terminal. The I2C bus and the camera answer on a Unix socket, one request
+after the other on each connection (`sim_hal.serving.remote` is the other end); a frame's pixels pass through
+a file beside the socket. Frames are rendered by a helper process, so that the devices keep time.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import selectors
+import signal
+import socket
+import tempfile
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from flight.gnc.math.arrays import FloatArray, Image
+from flight.link.telemetry.log import FlightLog
+from flight.schema.sections import Camera, Config
+from hal.buses.clock import SystemClock
+from hal.interfaces.errors import DeviceError
+from hal.interfaces.readings import Frame
+from sim_hal.assembly import Hardware, StarRenderer, assemble, fault_generator, line_generator
+from sim_hal.emulators.pty_line import PtyLine
+from sim_hal.faults.bench import Bench
+from sim_hal.faults.grammar import parse
+from sim_hal.faults.schedule import put
+from sim_hal.serving.device_link import Inbox, pack
+from sim_hal.settings import Simulation, Sky
+from sim_hal.truth import TruthRecorder
+
+SOCKET_NAME = "devices.sock"
+_LONGEST_WAIT_NS = 20_000_000
+_FRAME_SLOTS = 4
+_PR_SET_PDEATHSIG = 1
+
+_renderer: list[StarRenderer] = []
+
+
+def _prepare_renderer(camera: Camera, sky: Sky, seed: int) -> None:
+    """Load the sky once in the rendering process, which ends with the server whatever becomes of that."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _renderer.append(StarRenderer(camera, sky, seed))
+
+
+def _render(sequence: int, times: FloatArray, attitudes: FloatArray) -> Image:
+    return _renderer[0].render(sequence, times, attitudes)
+
+
+class _Connection:
+    """One client: a flight process's bus or camera."""
+
+    def __init__(self, line: socket.socket) -> None:
+        self.line = line
+        self.wants_frames = False
+        self._inbox = Inbox()
+
+    def requests(self) -> list[Any] | None:
+        """Return the complete requests that have come; None when the client has gone."""
+        try:
+            chunk = self.line.recv(65536)
+        except ConnectionError:
+            return None
+        if not chunk:
+            return None
+        return self._inbox.take(chunk)
+
+    def answer(self, message: Any) -> None:
+        """Send a message; a client that is gone, or does not read, is not waited for."""
+        try:
+            self.line.sendall(pack(message))
+        except OSError:
+            self.wants_frames = False
+
+
+class DeviceServer:
+    """The devices of one configuration, until stopped."""
+
+    def __init__(self, config: Config, section: Simulation, folder: Path) -> None:
+        self._clock = SystemClock()
+        self._place = tempfile.TemporaryDirectory(prefix="knightcube-")
+        self._stopped = False
+        self._log = FlightLog(folder, "truth", clock=self._clock)
+        self._pool = _renderer_pool(config, section)
+        self._rendering: Future[Image] | None = None
+        self._pty = PtyLine(config.inertial_unit.baud_rate, line_generator(section.seed))
+        self.hardware: Hardware = assemble(
+            config, section, self._clock.now_ns, self._pty, TruthRecorder(self._log), self._expose
+        )
+        self._faults_drawn = fault_generator(section.seed)
+        self._frames_sent = 0
+        self._served_anybody = False
+        self._selector = selectors.DefaultSelector()
+        self._connections: dict[int, _Connection] = {}
+        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self.socket_path = Path(self._place.name) / SOCKET_NAME
+        self._listener.bind(str(self.socket_path))
+        self._listener.listen(8)
+        self._selector.register(self._listener, selectors.EVENT_READ)
+        self._selector.register(self._pty.fileno(), selectors.EVENT_READ)
+        self.serial_device = self._pty.name
+
+    def stop(self, *_: int | FrameType | None) -> None:
+        """End `serve`; a signal handler."""
+        self._stopped = True
+
+    def serve(self, patience_ns: int | None = None) -> None:
+        """Keep the devices' time and answer, until stopped or `patience_ns` after the last client left."""
+        left_ns: int | None = None
+        while not self._stopped:
+            now_ns = self._clock.now_ns()
+            if self._connections or not self._served_anybody:
+                left_ns = None
+            elif left_ns is None:
+                left_ns = now_ns
+            elif patience_ns is not None and now_ns - left_ns > patience_ns:
+                return
+            self._pty.exchange(now_ns)
+            self.hardware.simulation.advance_to(now_ns)
+            self._deliver_frame()
+            due_ns = min(
+                self.hardware.simulation.next_event_ns(),
+                self._pty.to_host.next_arrival_ns(),
+                now_ns + _LONGEST_WAIT_NS,
+            )
+            for key, _ in self._selector.select(max(0, due_ns - self._clock.now_ns()) * 1e-9):
+                if key.fileobj is self._listener:
+                    self._accept()
+                elif key.fd in self._connections:
+                    self._serve_client(self._connections[key.fd])
+
+    def close(self) -> None:
+        """Release everything."""
+        if self._pool is not None:
+            self._pool.shutdown(wait=False, cancel_futures=True)
+        for connection in self._connections.values():
+            connection.line.close()
+        self._listener.close()
+        self._place.cleanup()
+        self._pty.close()
+        self._log.close()
+
+    def _expose(self, sequence: int, times: FloatArray, attitudes: FloatArray) -> Future[Image]:
+        assert self._pool is not None
+        # The exposure before has its frame by now, or is abandoned: to make that first would delay this one.
+        if self._rendering is not None:
+            self._rendering.cancel()
+        self._rendering = self._pool.submit(_render, sequence, times, attitudes)
+        return self._rendering
+
+    def _accept(self) -> None:
+        line, _ = self._listener.accept()
+        self._served_anybody = True
+        self._connections[line.fileno()] = _Connection(line)
+        self._selector.register(line, selectors.EVENT_READ)
+
+    def _serve_client(self, connection: _Connection) -> None:
+        requests = connection.requests()
+        if requests is None:
+            self._selector.unregister(connection.line)
+            del self._connections[connection.line.fileno()]
+            connection.line.close()
+            return
+        for number, name, *arguments in requests:
+            self.hardware.simulation.advance_to(self._clock.now_ns())
+            try:
+                result = self._operations()[name](connection, *arguments)
+            except OSError as error:
+                connection.answer([number, "error", error.errno or 0, str(error.strerror or error)])
+            except DeviceError as error:
+                connection.answer([number, "refused", 0, error.message])
+            else:
+                connection.answer([number, "done", result, ""])
+
+    def _operations(self) -> dict[str, Callable[..., Any]]:
+        bus, camera = self.hardware.bus, self.hardware.camera
+
+        def trigger(connection: _Connection, exposure_ns: int) -> None:
+            if camera is not None:
+                connection.wants_frames = True
+                camera.trigger(exposure_ns)
+
+        return {
+            "read_byte_data": lambda _, *a: bus.read_byte_data(*a),
+            "write_byte_data": lambda _, *a: bus.write_byte_data(*a),
+            "read_i2c_block_data": lambda _, *a: bus.read_i2c_block_data(*a),
+            "write_i2c_block_data": lambda _, *a: bus.write_i2c_block_data(*a),
+            "release": lambda _, *a: self._release(*a),
+            "currents": lambda _: self.hardware.circuit.currents().tolist(),
+            "trigger": trigger,
+        }
+
+    def _release(self, epoch_ns: int, faults: Sequence[str] = (), flight_process: int | None = None) -> None:
+        """Let the body go, and have the faults of a flight process come at their times after that."""
+        self.hardware.release(epoch_ns)
+        generator = self._faults_drawn
+        bench = Bench(self.hardware, self._pty, self._clock.now_ns, generator, None, flight_process)
+        put([parse(text) for text in faults], bench, epoch_ns)
+
+    def _deliver_frame(self) -> None:
+        camera = self.hardware.camera
+        frame = camera.poll() if camera is not None else None
+        if frame is None:
+            return
+        path = self.socket_path.parent / f"frame-{self._frames_sent % _FRAME_SLOTS}.raw"
+        self._frames_sent += 1
+        path.write_bytes(frame.pixels.tobytes())
+        for connection in self._connections.values():
+            if connection.wants_frames:
+                connection.answer([0, "frame", _describe(frame), path.name])
+
+
+def _describe(frame: Frame) -> list[Any]:
+    return [
+        frame.sequence,
+        frame.exposure_start_ns,
+        frame.exposure_ns,
+        list(frame.pixels.shape),
+        frame.pixels.dtype.str,
+    ]
+
+
+def _renderer_pool(config: Config, section: Simulation) -> ProcessPoolExecutor | None:
+    """Start the rendering process, which loads the sky at once. Nobody waits: no frame is exposed yet."""
+    if config.camera is None:
+        return None
+    pool = ProcessPoolExecutor(
+        1,
+        mp_context=get_context("spawn"),
+        initializer=_prepare_renderer,
+        initargs=(config.camera, section.sky, section.seed),
+    )
+    pool.submit(os.getpid)
+    return pool

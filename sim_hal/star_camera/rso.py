@@ -1,0 +1,96 @@
+"""Resident space objects (RSOs) as the star camera sees them: points that move in the sky (Sease ch. 2).
+
+    camera = propagate(KeplerianElements(semi_major_axis=6748e3, inclination=0.497), 55_000.0)
+    orbit = propagate(KeplerianElements(semi_major_axis=7078e3, inclination=1.553), 55_000.0)
+    debris = ResidentSpaceObject(orbit, magnitude=4.0)
+    tracks = source_tracks(camera, [debris], epoch=2_461_041.5, start=120.0, end=120.5)
+    frame = render(model, directions, magnitudes, times, quaternions, rng, extra=tracks)
+
+An object has the same magnitude from wherever it is seen, but for what of the Sun the Earth hides from it.
+Directions are geometric: the stars of the catalogue too are without the aberration of the camera's motion.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from flight.gnc.earth import sun
+from flight.gnc.earth.shadow import Shadow, sunlit_share
+from flight.gnc.math.arrays import FloatArray
+from hal.interfaces.errors import OutOfRange
+from sim_hal.star_camera import SourceTrack
+from sim_hal.worlds.exclusion import hidden_by_earth
+from sim_hal.worlds.orbit import Orbit
+
+DEVICE = "resident space object"
+TRACK_ERROR = 1e-7
+"""rad, of a track between its samples: 3e-4 px of the standard camera."""
+NEAREST = 1.0
+"""m; nearer, an object would not be a point."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ResidentSpaceObject:
+    """An object on its `orbit`, of Johnson V `magnitude` in full sunlight."""
+
+    orbit: Orbit
+    magnitude: float
+
+
+def source_tracks(
+    camera: Orbit,
+    objects: Sequence[ResidentSpaceObject],
+    epoch: float,
+    start: float,
+    end: float,
+    *,
+    zero: float = 0.0,
+    shadow: Shadow = "conical",
+) -> list[SourceTrack]:
+    """Return the tracks from `start` to `end` s of those objects that light reaches the camera from.
+
+    `epoch` is the Julian date TT of the orbits' time 0. The tracks' own times count from `zero` s, on the
+    clock of the attitude history they go with. An object in the umbra or behind the Earth throughout is left
+    out; one that is partly lit, or for part of the time, is fainter by as much, evenly over the track. Give
+    a rolling shutter's tracks its last row's end. Raises OutOfRange beyond the orbits' ends, or within 1 m.
+    """
+    if not start < end:
+        raise OutOfRange(DEVICE, "end of the exposure", end, start, math.inf, "s")
+    tracks = []
+    for item in objects:
+        times = _track_times(camera, item.orbit, start, end)
+        position = item.orbit.positions_at(times)
+        observer = camera.positions_at(times)
+        seen = np.where(hidden_by_earth(observer, position), 0.0, 1.0)
+        seen *= sunlit_share(position, sun.position(epoch + times / sun.DAY), shadow)
+        share = float(np.trapezoid(seen, times) / (end - start))
+        if share > 0.0:
+            direction = directions(observer, position)
+            tracks.append(SourceTrack(times - zero, direction, item.magnitude - 2.5 * math.log10(share)))
+    return tracks
+
+
+def directions(observer: FloatArray, position: FloatArray) -> FloatArray:
+    """Return unit vectors (m, 3) from `observer` to `position`, (m, 3) m each."""
+    way = position - observer
+    return np.asarray(way / np.linalg.norm(way, axis=-1, keepdims=True))
+
+
+def _track_times(camera: Orbit, orbit: Orbit, start: float, end: float) -> FloatArray:
+    """Return so many times that an even motion between them stays within `TRACK_ERROR` of the track.
+
+    The direction of an object that passes at speed v and distance d accelerates by 0.65 (v/d)^2 at most; the
+    error of a step h is an eighth of that times h^2.
+    """
+    times = np.linspace(start, end, 9)
+    apart = orbit.states_at(times) - camera.states_at(times)
+    distance = float(np.min(np.linalg.norm(apart[:, :3], axis=1)))
+    if distance < NEAREST:
+        raise OutOfRange(DEVICE, "distance from the camera", distance, NEAREST, math.inf, "m")
+    rate = float(np.max(np.linalg.norm(apart[:, 3:], axis=1))) / distance
+    steps = max(8, math.ceil((end - start) * rate / math.sqrt(8.0 * TRACK_ERROR)))
+    return np.linspace(start, end, steps + 1)

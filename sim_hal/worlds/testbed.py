@@ -1,0 +1,120 @@
+"""The testbed: a rigid body on a thread in a Helmholtz coil's field, turned by its torque coils.
+
+Sease 2013 ch. 5: the thread leaves one freedom, the turn theta about it; J theta'' = m x B about the thread
+- k theta - c theta'. The testbed frame T has y down along the thread and the field along -z; at theta = 0 the
+body axes are those of T, so the coil on body x gives n A B I cos(theta) (5.4), the one on body z
+n A B I sin(theta), and the one on body y, which lies along the thread, none.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from flight.gnc.math.arrays import FloatArray
+from sim_hal.worlds.motion import Motion, about_thread
+
+_LONGEST_STEP = 0.025
+
+
+@dataclass(frozen=True, slots=True)
+class TestbedModel:
+    """The true constants of the testbed, SI.
+
+    Attributes:
+        inertia: kg m^2, about the thread.
+        dipole_per_ampere: n A of each coil, m^2.
+        field: T, horizontal.
+        stiffness: N m/rad, of the thread.
+        damping: N m s/rad, of thread and air.
+        resistance: (3,) ohm, of the coils.
+        supply_voltage: V across a coil that is fully on.
+    """
+
+    __test__ = False  # pytest: not a test, in spite of its name
+
+    inertia: float
+    dipole_per_ampere: float
+    field: float
+    stiffness: float
+    damping: float
+    resistance: tuple[float, float, float]
+    supply_voltage: float
+
+
+class Testbed:
+    """The state of the world, advanced in time under the currents that the coils carry."""
+
+    __test__ = False
+
+    def __init__(
+        self,
+        model: TestbedModel,
+        angle: float,
+        release_rate: float,
+        currents: Callable[[], FloatArray],
+        start_ns: int = 0,
+    ) -> None:
+        """Hold the body at `angle` rad until it is released with `release_rate` rad/s."""
+        self._model = model
+        self._currents = currents
+        self._release_rate = release_rate
+        self._release_ns: int | None = None
+        self._held = True
+        self.time_ns = start_ns
+        self.angle = angle
+        self.rate = 0.0
+        self.energy = 0.0
+        self.supply_energy = 0.0
+        self.felt_current: FloatArray = np.zeros(3)
+
+    def release_at(self, time_ns: int) -> None:
+        """Let the body go at `time_ns`, now or later."""
+        self._release_ns = time_ns
+
+    def advance_to(self, time_ns: int) -> None:
+        """Carry the state to `time_ns` with the currents of now, by classical Runge-Kutta."""
+        if self._held:
+            if self._release_ns is None or time_ns < self._release_ns:
+                self.time_ns = max(self.time_ns, time_ns)
+                return
+            self._held = False
+            self.time_ns = max(self.time_ns, self._release_ns)
+            self.rate = self._release_rate
+        span = (time_ns - self.time_ns) * 1e-9
+        if span <= 0.0:
+            return
+        self.felt_current = self._currents()
+        ix, iy, iz = (float(i) for i in self.felt_current)
+        steps = max(1, math.ceil(span / _LONGEST_STEP))
+        for _ in range(steps):
+            self._step(span / steps, ix, iz)
+        rx, ry, rz = self._model.resistance
+        self.energy += span * (rx * ix * ix + ry * iy * iy + rz * iz * iz)
+        self.supply_energy += span * self._model.supply_voltage * (abs(ix) + abs(iy) + abs(iz))
+        self.time_ns = time_ns
+
+    def motion(self, time_ns: int) -> Motion:
+        """Return what an ideal sensor in the body would feel; the world must stand at `time_ns`."""
+        self.advance_to(time_ns)
+        return about_thread(self.time_ns, self.angle, self.rate, self._model.field)
+
+    def _acceleration(self, angle: float, rate: float, ix: float, iz: float) -> float:
+        m = self._model
+        dipole = m.dipole_per_ampere * (ix * math.cos(angle) + iz * math.sin(angle))
+        return (dipole * m.field - m.stiffness * angle - m.damping * rate) / m.inertia
+
+    def _step(self, dt: float, ix: float, iz: float) -> None:
+        angle, rate, half = self.angle, self.rate, 0.5 * dt
+        a1 = self._acceleration(angle, rate, ix, iz)
+        v2 = rate + half * a1
+        a2 = self._acceleration(angle + half * rate, v2, ix, iz)
+        v3 = rate + half * a2
+        a3 = self._acceleration(angle + half * v2, v3, ix, iz)
+        v4 = rate + dt * a3
+        a4 = self._acceleration(angle + dt * v3, v4, ix, iz)
+        self.angle = angle + dt / 6.0 * (rate + 2.0 * v2 + 2.0 * v3 + v4)
+        self.rate = rate + dt / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4)

@@ -1,0 +1,68 @@
+"""A small slice of the campaign `consistency`, with its own seed: honest figures pass, false ones do not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.studies.campaigns import consistency
+from tests.studies.campaigns.campaign import Case, Result
+
+SEED = 20_261_121
+SECONDS = 12
+
+
+def fly(scene: str, runs: int, **parameters: float) -> list[Result]:
+    """Return the results of short runs."""
+    parameters_: dict[str, Any] = {"scene": scene, "seconds": SECONDS, **parameters}
+    return [consistency.run(Case(str(run), (SEED, run), parameters_)) for run in range(runs)]
+
+
+@pytest.fixture(scope="module")
+def flown() -> dict[str, list[Result]]:
+    """Return honest runs of both scenes."""
+    return {"testbed": fly("testbed", 8), "free": fly("free", 3)}
+
+
+@pytest.mark.parametrize("scene", ["testbed", "free"])
+def test_errors_and_innovations_are_as_large_as_the_filter_says(
+    scene: str, flown: dict[str, list[Result]]
+) -> None:
+    """Final NEES in its 99.9 % band; NIS of 40 Hz measurements within 4 %, of the camera's within a half."""
+    results = flown[scene]
+    runs = len(results)
+    facts = consistency.scene_facts(results)
+    low, high = consistency.band(runs * facts["degrees"], 0.999)
+    assert low < facts["nees_final"] < high
+    assert facts["nis"]["gyro"]["mean"] == pytest.approx(1.0, abs=0.04)
+    assert facts["nis"]["unit attitude"]["mean"] == pytest.approx(1.0, abs=0.04)
+    assert facts["nis"]["streaks"]["measurements"] >= runs
+    streaks = facts["nis"]["streaks"]
+    low, high = consistency.band(streaks["measurements"] * results[0]["nis_degrees"], 0.999)
+    assert low < streaks["mean"] < high
+    assert sum(facts["refused"].values()) <= 1
+    assert facts["bias_worst_sigmas"] < 4.0
+
+
+def test_variances_that_are_claimed_too_small_are_found_out() -> None:
+    """The unit's noise said to be half of what it is."""
+    facts = consistency.scene_facts(fly("testbed", 8, claimed=0.25))
+    assert facts["nees_final"] > consistency.band(8 * facts["degrees"], 0.999)[1]
+    assert facts["nis"]["gyro"]["mean"] > 2.0
+
+
+def test_variances_that_are_claimed_too_large_are_found_out() -> None:
+    """The unit's noise said to be twice what it is: by the innovations, before the errors show it."""
+    facts = consistency.scene_facts(fly("testbed", 4, claimed=4.0))
+    assert facts["nees_mean"] < 0.9
+    assert facts["nis"]["gyro"]["mean"] < 0.5
+
+
+def test_the_summary_tells_both_scenes(flown: dict[str, list[Result]], tmp_path: Path) -> None:
+    summary = consistency.summarise([*flown["testbed"], *flown["free"]], tmp_path)
+    assert set(summary.facts) == {"testbed", "free"}
+    assert "NIS gyro" in summary.text
+    assert np.isfinite(summary.facts["free"]["nees_final"])

@@ -1,0 +1,86 @@
+"""While nobody knows what the coils carry the filter goes by its measurements, and learns nothing false."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from flight.gnc.estimation.attitude_filter import AttitudeFilter
+from flight.gnc.estimation.commands import CommandHistory
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import angle_about_axis_y
+from tests.flight.gnc.estimation.flights import SETTINGS, SUSPENDED, Flight, begin, fly, follow
+from tests.studies.campaigns.consistency_worlds import CYCLE_NS
+
+STUCK, FOUND, FREE_AGAIN, END = 400, 420, 600, 800
+"""Cycles: the chip keeps its registers, half a second later that is found, then it obeys again."""
+LIMIT = 0.148
+
+
+@pytest.fixture(scope="module")
+def flown() -> Flight:
+    """Return a flight in which the chip keeps a large current in its registers for five seconds."""
+
+    def keep(cycle: int, wanted: FloatArray) -> FloatArray:
+        return np.array([LIMIT, 0.0, 0.0]) if STUCK <= cycle < FREE_AGAIN else wanted
+
+    return fly(5, END, suspended=True, driven=keep)
+
+
+def told(flown: Flight, doubted: bool) -> tuple[AttitudeFilter, int]:
+    """Return the filter after the flight, told of the chip or not, and how much it refused after that."""
+    filter_ = begin(flown, True, dataclasses.replace(SETTINGS, unknown_current=LIMIT, gate_sigma=15.0))
+    follow(filter_, flown, 1, FOUND)
+    refused = filter_.refused
+    assert refused > 0, "half a second of it was enough to disagree"
+    if doubted:
+        filter_.doubt((STUCK - 4) * CYCLE_NS)
+    for cycle in range(FOUND, END):
+        filter_.catch_up(16)
+        for sample in flown.samples[cycle]:
+            filter_.measure(sample)
+        known = not doubted or cycle >= FREE_AGAIN
+        filter_.command(cycle * CYCLE_NS, flown.commands[cycle], flown.fields[cycle], known=known)
+    return filter_, filter_.refused - refused
+
+
+def errors(filter_: AttitudeFilter, flown: Flight) -> FloatArray:
+    """Return the errors of angle, rate and gain over their sigmas, at the last cycle."""
+    estimate = filter_.at((END - 1) * CYCLE_NS)
+    sigma = np.sqrt(np.diag(estimate.covariance))
+    found = np.array([estimate.angle, estimate.rate[1], estimate.parameters.gain])
+    true = [angle_about_axis_y(flown.attitudes[-1]), flown.rates[-1, 1], flown.parameters.gain]
+    return np.asarray(np.abs(found - true) / sigma[[1, 4, 14]])
+
+
+def test_told_that_the_chip_does_not_obey_it_refuses_nothing_and_stays_consistent(flown: Flight) -> None:
+    filter_, refused = told(flown, doubted=True)
+    assert (refused, filter_.restarts) == (0, 0)
+    assert errors(filter_, flown).max() < 4.0
+
+
+def test_not_told_it_refuses_what_it_measures_and_begins_anew(flown: Flight) -> None:
+    filter_, refused = told(flown, doubted=False)
+    assert refused > 0
+    assert filter_.restarts > 0
+
+
+def test_a_doubt_reaches_back_to_its_time_and_no_further() -> None:
+    history = CommandHistory(SUSPENDED, 6_000_000_000)
+    for second in range(5):
+        history.note(second * 1_000_000_000, np.array([0.01 * second, 0.0, 0.0]), None)
+    history.doubt(2_500_000_000)
+    assert [(history.at(t).dipole[0] > 0.0, history.at(t).known) for t in (1_000_000_000, 2_499_999_999)] == [
+        (True, True),
+        (True, True),
+    ]
+    assert history.at(2_400_000_000).dipole == history.at(2_600_000_000).dipole
+    assert not any(history.at(t).known for t in (2_500_000_000, 3_000_000_000, 9_000_000_000))
+
+
+def test_a_doubt_before_anything_was_noted_or_measured_does_nothing() -> None:
+    filter_ = AttitudeFilter(SUSPENDED, SETTINGS)
+    filter_.doubt(0)
+    assert not filter_.started

@@ -1,0 +1,143 @@
+"""The attitude from places whose errors differ along and across: as good as can be and as it says."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flight.gnc.attitude.wahba import AttitudeError
+from flight.gnc.camera.pinhole import Pinhole
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import (
+    attitude_matrix,
+    conjugate,
+    from_rotation_vector,
+    multiply,
+    to_rotation_vector,
+)
+from flight.gnc.vision.startracker.image_fit import ImageFit, fit_in_image
+
+_CAMERA = Pinhole.from_field_of_view(1024, 1024, float(np.deg2rad(12.0)))
+_ATTITUDE = np.array([0.5, -0.5, 0.5, 0.5])
+_ALONG_PX, _ACROSS_PX = 2.0, 0.1
+_TRIALS = 200
+# Of a chi-square of 600 degrees of freedom: its quantiles at 1e-5, over 600.
+_LOW, _HIGH = 0.77, 1.27
+
+
+def _streaks(rng: np.random.Generator, count: int) -> tuple[FloatArray, FloatArray]:
+    """Return places (n, 2) px and covariances (n, 2, 2), long in a direction of each star's own."""
+    points = rng.uniform(50.0, 970.0, (count, 2))
+    angle = rng.uniform(0.0, np.pi, count)
+    axes = np.stack([np.cos(angle), np.sin(angle), -np.sin(angle), np.cos(angle)], axis=-1).reshape(-1, 2, 2)
+    variance = np.diag([_ALONG_PX**2, _ACROSS_PX**2])
+    return points, np.swapaxes(axes, -1, -2) @ variance @ axes
+
+
+def _reference(points: FloatArray) -> FloatArray:
+    return np.asarray(_CAMERA.unit_vectors(points) @ attitude_matrix(_ATTITUDE))
+
+
+def _fit(
+    seen: FloatArray, covariance: FloatArray, reference: FloatArray, free_scale: bool = False
+) -> ImageFit:
+    start = multiply(from_rotation_vector(np.array([1e-3, -2e-3, 3e-3])), _ATTITUDE)
+    return fit_in_image(seen, covariance, reference, _CAMERA, start, free_scale)
+
+
+def _error(found: ImageFit) -> FloatArray:
+    return to_rotation_vector(multiply(found.fix.quaternion, conjugate(_ATTITUDE)))
+
+
+@pytest.mark.parametrize("free_scale", [False, True])
+def test_places_without_error_give_attitude_and_scale_back(free_scale: bool) -> None:
+    """The believed focal length one part in a hundred wrong, where it is free."""
+    points, covariance = _streaks(np.random.default_rng(1), 10)
+    reference = _reference(points)
+    scale = 1.01 if free_scale else 1.0
+    centre = np.array(_CAMERA.centre)
+    found = _fit(centre + (points - centre) / scale, covariance, reference, free_scale)
+    assert np.linalg.norm(_error(found)) < 1e-9
+    assert found.scale == pytest.approx(scale, rel=1e-9)
+    assert found.squares.max() < 1e-9
+
+
+@pytest.mark.parametrize("free_scale", [False, True])
+def test_the_errors_scatter_as_the_covariance_says_and_less_than_with_round_ones(free_scale: bool) -> None:
+    """Monte Carlo of 200 fields of 12 stars; the round errors have the same mean variance."""
+    rng = np.random.default_rng(2)
+    mismatch, mine, rounds, scales = 0.0, 0.0, 0.0, 0.0
+    for _ in range(_TRIALS):
+        points, covariance = _streaks(rng, 12)
+        reference = _reference(points)
+        noise = np.einsum("nij,nj->ni", np.linalg.cholesky(covariance), rng.standard_normal((12, 2)))
+        found = _fit(points + noise, covariance, reference, free_scale)
+        error = _error(found)
+        mismatch += float(error @ np.linalg.solve(found.fix.covariance, error))
+        if free_scale:
+            scales += (np.log(found.scale) / found.scale_sigma) ** 2
+        even = 0.5 * np.trace(covariance, axis1=1, axis2=2)[:, None, None] * np.eye(2)
+        mine += float(error @ error)
+        away = _error(_fit(points + noise, even, reference, free_scale))
+        rounds += float(away @ away)
+    assert _LOW < mismatch / (3.0 * _TRIALS) < _HIGH
+    assert mine < 0.1 * rounds
+    if free_scale:
+        assert 0.6 < scales / _TRIALS < 1.55
+
+
+def test_stars_that_scatter_beyond_their_errors_widen_the_covariance() -> None:
+    rng = np.random.default_rng(3)
+    points, covariance = _streaks(rng, 12)
+    reference = _reference(points)
+    noise = np.einsum("nij,nj->ni", np.linalg.cholesky(covariance), rng.standard_normal((12, 2)))
+    sound = _fit(points + noise, covariance, reference)
+    wider = _fit(points + noise, covariance / 25.0, reference)
+    ratio = np.trace(wider.fix.covariance) / np.trace(sound.fix.covariance)
+    assert ratio == pytest.approx(float(wider.squares.sum()) / (2 * 12 - 3) / 25.0, rel=1e-3)
+    assert ratio > 0.3
+
+
+def test_stars_that_disagree_have_no_say_and_leave_the_errors_as_the_covariance_says() -> None:
+    """Two of 14 stars lie 6 px, sixty deviations across their streaks, from where they should."""
+    rng = np.random.default_rng(4)
+    mismatch = 0.0
+    for _ in range(_TRIALS):
+        points, covariance = _streaks(rng, 14)
+        reference = _reference(points)
+        noise = np.einsum("nij,nj->ni", np.linalg.cholesky(covariance), rng.standard_normal((14, 2)))
+        _, axes = np.linalg.eigh(covariance[:2])
+        noise[:2] += 6.0 * axes[:, :, 0]
+        found = _fit(points + noise, covariance, reference)
+        assert not found.agree[:2].any()
+        error = _error(found)
+        mismatch += float(error @ np.linalg.solve(found.fix.covariance, error))
+    assert _LOW < mismatch / (3.0 * _TRIALS) < _HIGH
+
+
+def test_where_too_few_would_be_left_all_keep_their_say_and_the_covariance_tells() -> None:
+    """One of four stars is wrong, but nobody could say which."""
+    rng = np.random.default_rng(5)
+    points, covariance = rng.uniform(50.0, 970.0, (4, 2)), np.tile(0.01 * np.eye(2), (4, 1, 1))
+    reference = _reference(points)
+    sound = _fit(points, covariance, reference)
+    points[0] += 6.0
+    found = _fit(points, covariance, reference)
+    assert found.agree.all()
+    error = _error(found)
+    assert np.trace(found.fix.covariance) > 100.0 * np.trace(sound.fix.covariance)
+    assert float(error @ np.linalg.solve(found.fix.covariance, error)) < 3.0 * 3.0
+
+
+def test_stars_in_one_direction_fix_no_attitude() -> None:
+    points = np.full((3, 2), 400.0)
+    with pytest.raises(AttitudeError):
+        _fit(points, np.tile(np.eye(2), (3, 1, 1)), _reference(points))
+
+
+def test_stars_that_belong_elsewhere_are_no_attitude() -> None:
+    """Two stars a right angle apart where the image shows them together: no turn brings them there."""
+    points = np.array([[500.0, 500.0], [520.0, 500.0]])
+    reference = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
+    with pytest.raises(AttitudeError):
+        _fit(points, np.tile(1e-4 * np.eye(2), (2, 1, 1)), reference)

@@ -1,0 +1,136 @@
+"""From a frame to an attitude: points, streaks, a prior, and frames that show nothing to be told by."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flight.gnc.camera.images import read_image
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import conjugate, from_rotation_vector, multiply, to_rotation_vector
+from flight.gnc.vision.startracker.solution import FrameSolution, SolveStatus
+from flight.gnc.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings, solve_frame
+from flight.gnc.vision.streaks.corners.two_attitudes import attitude_error
+from tests.flight.gnc.vision.startracker.frames import NARROW, SkyFrame, sky, sky_frame
+from tests.studies.bench.sky import ARCSECONDS, photograph
+
+_KNOWN_TO_A_PERCENT = 0.99, 1.01
+_PHOTOGRAPHS = Path(__file__).parents[6] / "shared" / "data" / "sky"
+_CHI_SQUARE_3_DOF_1E_5 = 25.9
+
+
+def _solve(
+    frame: SkyFrame, prior: AttitudePrior | None = None, scale: tuple[float, float] = (1.0, 1.0)
+) -> FrameSolution:
+    rate = RatePrior(frame.rate, 1e-6)
+    camera = NARROW.pinhole
+    return solve_frame(frame.pixels, camera, scale, frame.exposure, sky(), SolveSettings(), prior, rate)
+
+
+def _mismatch(found: FrameSolution, truth: FloatArray) -> float:
+    """Return the squared error of the attitude over its covariance."""
+    assert found.fix is not None
+    error = to_rotation_vector(multiply(found.fix.quaternion, conjugate(truth)))
+    return float(error @ np.linalg.solve(found.fix.covariance, error))
+
+
+@pytest.mark.parametrize("streak_px", [0.0, 40.0])
+def test_a_frame_is_solved_lost_in_space_within_its_own_covariance(streak_px: float) -> None:
+    frame = sky_frame(np.random.default_rng(11), streak_px, 0.1)
+    found = _solve(frame, scale=_KNOWN_TO_A_PERCENT)
+    assert found.status is SolveStatus.SOLVED
+    assert not found.tracked
+    assert _mismatch(found, frame.attitude) < _CHI_SQUARE_3_DOF_1E_5
+    _, across = attitude_error(found.fix.quaternion, frame.attitude)  # type: ignore[union-attr]  # solved
+    assert across * ARCSECONDS < (1.0 if streak_px == 0.0 else 8.0)
+    assert found.camera.focal_length == pytest.approx(NARROW.pinhole.focal_length, rel=1e-4)
+
+
+def test_a_calibrated_lens_is_kept_lost_in_space() -> None:
+    """The triangle that names the stars tells a scale of its own, up to a part in a thousand off."""
+    for seed in range(3):
+        found = _solve(sky_frame(np.random.default_rng([31, seed]), 40.0, 0.1))
+        assert found.status is SolveStatus.SOLVED
+        assert found.camera.focal_length == NARROW.pinhole.focal_length
+
+
+def test_a_streaked_frame_tells_the_rate_and_a_frame_at_rest_does_not() -> None:
+    streaked = sky_frame(np.random.default_rng(12), 40.0, 0.1)
+    motion = _solve(streaked).motion
+    assert motion is not None
+    assert motion.rate is not None
+    assert np.linalg.norm(motion.rate) == pytest.approx(np.linalg.norm(streaked.rate), rel=0.02)
+    assert _solve(sky_frame(np.random.default_rng(12), 0.0, 0.1)).motion is None
+
+
+def test_the_attitudes_of_many_frames_scatter_as_their_covariances_say() -> None:
+    """Twelve frames of three degrees of freedom: chi-square between its quantiles at 1e-4."""
+    frames = [sky_frame(np.random.default_rng([13, number]), 0.0, 0.1) for number in range(12)]
+    total = sum(_mismatch(_solve(frame, scale=_KNOWN_TO_A_PERCENT), frame.attitude) for frame in frames)
+    assert 11.9 < total < 76.4
+
+
+@pytest.mark.parametrize("streak_px", [0.0, 30.0])
+def test_a_right_prior_is_tracked_to_the_same_attitude(streak_px: float) -> None:
+    frame = sky_frame(np.random.default_rng(14), streak_px, 0.1)
+    off = multiply(from_rotation_vector(np.array([2e-4, -3e-4, 1e-4])), frame.attitude)
+    found = _solve(frame, AttitudePrior(off, 3e-4))
+    assert found.tracked
+    assert _mismatch(found, frame.attitude) < _CHI_SQUARE_3_DOF_1E_5
+
+
+def test_a_wrong_prior_costs_time_but_no_truth() -> None:
+    frame = sky_frame(np.random.default_rng(15), 0.0, 0.1)
+    elsewhere = multiply(from_rotation_vector(np.array([0.5, 0.0, 0.0])), frame.attitude)
+    found = _solve(frame, AttitudePrior(elsewhere, 3e-4))
+    assert found.status is SolveStatus.SOLVED
+    assert not found.tracked
+    assert _mismatch(found, frame.attitude) < _CHI_SQUARE_3_DOF_1E_5
+
+
+def test_noise_alone_shows_no_star() -> None:
+    pixels = np.random.default_rng(16).normal(100.0, 10.0, (512, 512)).round().astype(np.uint16)
+    found = solve_frame(pixels, NARROW.pinhole, (1.0, 1.0), 0.1, sky(), SolveSettings())
+    assert found.status in {SolveStatus.NO_STARS, SolveStatus.TOO_FEW_STARS}
+    assert found.fix is None
+    assert found.reason
+
+
+def test_points_that_are_no_stars_are_refused_with_the_reason() -> None:
+    """A real frame's points, moved about at random: the same light, another sky."""
+    rng = np.random.default_rng(17)
+    pixels = rng.normal(100.0, 10.0, (1024, 1024))
+    rows, columns = np.mgrid[-4:5, -4:5]
+    spot = np.exp(-0.5 * (rows**2 + columns**2))
+    for row, column in rng.integers(10, 1010, (40, 2)):
+        pixels[row - 4 : row + 5, column - 4 : column + 5] += rng.uniform(100.0, 2000.0) * spot
+    found = solve_frame(
+        pixels.round().astype(np.uint16), NARROW.pinhole, (0.5, 2.0), 0.1, sky(), SolveSettings()
+    )
+    assert found.status is SolveStatus.NO_MATCH
+    assert "beyond chance" in found.reason
+
+
+@pytest.mark.skipif(not _PHOTOGRAPHS.is_dir(), reason="the photographs of ../shared/data/sky are not here")
+@pytest.mark.parametrize(
+    "name",
+    ["esa_alt40_azi45.tiff", "hale_bopp.jpg", "tree.jpg", "virgo.jpg", "polar_05sec.jpg",
+     "may8_50ms_gain40_0.png", "may8_100ms_gain12_3.png"],
+)  # fmt: skip
+def test_a_photograph_is_solved_to_a_minute_of_arc(name: str) -> None:
+    truth = json.loads((_PHOTOGRAPHS / "truth.json").read_text())[name]
+    result = photograph(_PHOTOGRAPHS, name, truth, known=True)
+    assert result.solved
+    assert result.arcsec < 60.0
+
+
+@pytest.mark.skipif(not _PHOTOGRAPHS.is_dir(), reason="the photographs of ../shared/data/sky are not here")
+def test_a_mirrored_photograph_is_refused() -> None:
+    """The sky in a mirror is no sky: an answer to it would be a false one."""
+    pixels = np.ascontiguousarray(read_image(_PHOTOGRAPHS / "esa_alt40_azi45.tiff")[:, ::-1])
+    camera = type(NARROW.pinhole)(pixels.shape[1], pixels.shape[0], 5110.0)
+    found = solve_frame(pixels, camera, (0.9, 1.1), 1.0, sky(), SolveSettings())
+    assert found.status is SolveStatus.NO_MATCH

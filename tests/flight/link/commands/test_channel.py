@@ -1,0 +1,207 @@
+"""Commands reach a flight over real sockets; whoever floods, vanishes or sends rubbish harms nobody."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import stat
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from flight.app.cli import main
+from flight.gnc.errors import FlightError, UsageError
+from flight.link.commands.channel import AT_MOST, Channel, DatagramChannel, open_udp, open_unix
+from flight.link.commands.codec import LONGEST, ChangeMode, Command, Slew, unpack
+from flight.link.telemetry.definitions import COMMAND
+from flight.link.telemetry.packets import Packer
+from flight.loop.modes.mode import Mode
+from ground.commands.command import exchange
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Path:
+    return tmp_path / "commands"
+
+
+def answer_once(
+    channel: Channel, taken: list[Command], obeyed: bool = True, mode: int = Mode.HOLD
+) -> threading.Thread:
+    """Answer the next command, as the flight would, in a thread."""
+
+    def serve() -> None:
+        deadline = time.monotonic() + 5.0
+        while time.monotonic() < deadline:
+            for data, sender in channel.poll():
+                taken.append(unpack(data))
+                fields = {"obeyed": int(obeyed), "name": "x", "source": channel.name, "count": 1}
+                fields |= {"mode": int(mode), "text": "as told"}
+                channel.answer(Packer().pack(COMMAND, 0, fields), sender)
+                return
+            time.sleep(0.01)
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    return thread
+
+
+@pytest.mark.parametrize(
+    ("words", "command"),
+    [
+        (["safe", "smoke"], ChangeMode(Mode.SAFE, "smoke")),
+        (["mode", "hold"], ChangeMode(Mode.HOLD)),
+        (["slew", "-0.25"], Slew(-0.25)),
+    ],
+)
+def test_the_command_line_sends_what_was_typed_and_prints_the_answer(
+    place: Path, words: list[str], command: Command, capsys: pytest.CaptureFixture[str]
+) -> None:
+    channel = open_unix(place)
+    taken: list[Command] = []
+    thread = answer_once(channel, taken)
+    status = main(["command", "--to", str(place), *words])
+    thread.join()
+    channel.close()
+    assert status == 0
+    assert taken == [command]
+    assert capsys.readouterr().out == "obeyed: as told; mode hold\n"
+
+
+def test_over_udp_a_refusal_is_exit_status_1_and_one_json_object(capsys: pytest.CaptureFixture[str]) -> None:
+    channel = open_udp("127.0.0.1:0")
+    port = channel._socket.getsockname()[1]
+    thread = answer_once(channel, [], obeyed=False)
+    status = main(["command", "--to", f"127.0.0.1:{port}", "--json", "ping"])
+    thread.join()
+    channel.close()
+    assert status == 1
+    answer = json.loads(capsys.readouterr().out)
+    assert answer == {"obeyed": False, "mode": "hold", "text": "as told", "count": 1}
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "problem"),
+    [
+        (["slew", "0.9"], 1, "q2 = 0.9 must lie within"),
+        (["slew", "nan"], 1, "must lie within"),
+        (["ping"], 2, "no flight listens there"),
+    ],
+)
+def test_what_cannot_be_sent_is_one_line(
+    place: Path, words: list[str], status: int, problem: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["command", "--to", str(place), *words]) == status
+    line = capsys.readouterr().err
+    assert problem in line
+    assert line.count("\n") == 1
+
+
+def test_a_flight_that_does_not_answer_is_told(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    channel = open_unix(place)
+    assert main(["command", "--to", str(place), "--timeout", "0.05", "ping"]) == 1
+    channel.close()
+    assert "no answer within 0.05 s" in capsys.readouterr().err
+
+
+def test_an_answer_of_a_mode_that_there_is_not_is_none(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    channel = open_unix(place)
+    thread = answer_once(channel, [], mode=200)
+    status = main(["command", "--to", str(place), "ping"])
+    thread.join()
+    channel.close()
+    assert status == 1
+    assert capsys.readouterr().err.endswith("bytes is none\n")
+
+
+def flood(to: Path, count: int, data: bytes) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as line:
+        line.setblocking(False)
+        for _ in range(count):
+            try:
+                line.sendto(data, str(to))
+            except BlockingIOError:
+                return
+
+
+def test_a_flood_is_taken_in_small_portions_and_a_long_datagram_is_cut(place: Path) -> None:
+    channel = open_unix(place)
+    flood(place, 200, b"x" * 5000)
+    taken = channel.poll()
+    assert len(taken) <= AT_MOST
+    assert {len(data) for data, _ in taken} == {LONGEST + 1}
+    channel.close()
+
+
+def test_a_sender_without_an_address_and_one_that_is_gone_get_no_answer_and_do_no_harm(
+    place: Path, tmp_path: Path
+) -> None:
+    channel = open_unix(place)
+    flood(place, 1, b"x")
+    ((_, nobody),) = channel.poll()
+    channel.answer(b"y", nobody)
+    channel.answer(b"y", str(tmp_path / "gone"))
+    assert channel.poll() == []
+    channel.close()
+    channel.close()
+    assert channel.poll() == []
+    assert not place.exists()
+
+
+def test_the_socket_is_for_owner_and_group_only(place: Path) -> None:
+    channel = open_unix(place)
+    assert stat.S_IMODE(os.stat(place).st_mode) == 0o660
+    channel.close()
+
+
+@pytest.mark.skipif(not os.access("/run", os.W_OK), reason="/run may not be written to: be root")
+def test_a_service_is_answered_where_it_can_see_the_socket() -> None:
+    """Its /tmp is its own: what stands in ours is not there for it."""
+    with tempfile.TemporaryDirectory(dir="/run", prefix="knightcube-test-") as folder:
+        channel = open_unix(Path(folder) / "commands")
+        senders: list[str] = []
+
+        def serve() -> None:
+            while not senders:
+                senders.extend(sender for _, sender in channel.poll())
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        with pytest.raises(FlightError, match="no answer"):
+            exchange(f"{folder}/commands", b"ping", 0.2)
+        thread.join()
+        channel.close()
+        assert senders[0].startswith(folder)
+
+
+def test_the_socket_of_a_flight_that_is_gone_is_replaced_but_nothing_else_is(place: Path) -> None:
+    open_unix(place)._socket.close()  # killed: the file is left
+    second = open_unix(place)
+    with pytest.raises(UsageError, match="another flight listens there"):
+        open_unix(place)
+    second.close()
+    place.write_text("precious")
+    with pytest.raises(UsageError, match="something else stands there"):
+        open_unix(place)
+    assert place.read_text() == "precious"
+
+
+@pytest.mark.parametrize(
+    ("listen", "problem"),
+    [
+        (lambda: open_unix(Path("/nowhere/at/all")), "commands.socket"),
+        (lambda: open_udp("127.0.0.1:70000"), "commands.udp"),
+        (lambda: open_udp("203.0.113.7:9"), "commands.udp"),
+    ],
+)
+def test_where_nobody_can_listen_is_a_mistake_of_the_users(
+    listen: Callable[[], DatagramChannel], problem: str
+) -> None:
+    with pytest.raises(UsageError, match=problem):
+        listen()

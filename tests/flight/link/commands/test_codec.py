@@ -1,0 +1,114 @@
+"""A command survives its packet; anything else is refused with a reason, never with another exception."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from flight.link.commands.codec import (
+    ChangeMode,
+    Clear,
+    Command,
+    CommandError,
+    CommandPacker,
+    Ping,
+    Slew,
+    describe,
+    name_of,
+    unpack,
+)
+from flight.link.commands.definitions import COMMANDS, LAYOUTS
+from flight.link.telemetry.packets import LAYOUTS as TELEMETRY
+from flight.link.telemetry.packets import crc16
+from flight.loop.modes.mode import Mode
+
+PLAIN_MODES = [Mode.SAFE, Mode.DETUMBLE, Mode.HOLD, Mode.TESTBED_DEMO]
+
+ANY: st.SearchStrategy[Command] = st.one_of(
+    st.builds(Ping, st.integers(0, 2**32 - 1)),
+    st.builds(ChangeMode, st.sampled_from(PLAIN_MODES)),
+    st.builds(Slew, st.floats(-0.68, 0.68)),
+    st.builds(Clear, st.text(st.characters(codec="ascii", exclude_characters="\0"), min_size=1, max_size=32)),
+)
+
+
+@given(ANY, st.integers(0, 2**62))
+def test_a_command_comes_out_as_it_went_in(command: Command, utc_ns: int) -> None:
+    data = CommandPacker().pack(command, utc_ns)
+    assert unpack(data) == command
+    assert name_of(command) in LAYOUTS
+    assert describe(command)
+
+
+@given(ANY, st.data())
+def test_any_flipped_bit_is_found(command: Command, draw: st.DataObject) -> None:
+    data = bytearray(CommandPacker().pack(command, 1))
+    bit = draw.draw(st.integers(0, 8 * len(data) - 1))
+    data[bit // 8] ^= 1 << bit % 8
+    with pytest.raises(CommandError):
+        unpack(bytes(data))
+
+
+def test_a_command_is_a_ccsds_telecommand_and_no_telemetry() -> None:
+    """CCSDS 133.0-B-2, 4.1.3.3: packet type 1, secondary header flag 1, no APID of telemetry's."""
+    data = CommandPacker().pack(Slew(0.25), 77)
+    word = int.from_bytes(data[:2], "big")
+    assert (word >> 13, word >> 12 & 1, word >> 11 & 1, word & 0x7FF) == (0, 1, 1, 0x204)
+    assert int.from_bytes(data[4:6], "big") + 7 == len(data)
+    assert crc16(data) == 0
+    assert {packet.apid for packet in COMMANDS}.isdisjoint(
+        layout.packet.apid for layout in TELEMETRY.values()
+    )
+
+
+@pytest.mark.parametrize(
+    ("command", "problem"),
+    [
+        (Slew(math.nan), "within"),
+        (Slew(0.69), "within"),
+        (Slew(-math.inf), "within"),
+        (ChangeMode(Mode.BOOT), "boot is not to be commanded"),
+        (ChangeMode(Mode.SLEW), "slew is not to be commanded"),
+        (Clear(""), "name of an event"),
+        (Ping(-1), "number = -1"),
+    ],
+)
+def test_values_that_cannot_be_obeyed_are_refused_before_they_are_sent(
+    command: Command, problem: str
+) -> None:
+    with pytest.raises(CommandError, match=problem):
+        CommandPacker().pack(command, 0)
+
+
+def test_and_refused_again_where_they_arrive() -> None:
+    """A sender with another idea of the limits makes a packet that is whole all the same."""
+    for packet, fields in (("slew", {"q2": math.nan}), ("mode", {"mode": 99}), ("mode", {"mode": 0})):
+        layout = LAYOUTS[packet]
+        head = (layout.identifier, 0xC000, layout.length - 7, 1, 0)
+        body = layout.body.pack(*head, *fields.values())
+        with pytest.raises(CommandError, match=r"within|is no mode|not to be commanded"):
+            unpack(body + crc16(body).to_bytes(2, "big"))
+
+
+@pytest.mark.parametrize("cut", [0, 1, 5, 6, 14, -1])
+def test_a_packet_cut_short_or_grown_is_refused(cut: int) -> None:
+    data = CommandPacker().pack(Ping(3), 0)
+    for wrong in (data[:cut], data + b"\0"):
+        with pytest.raises(CommandError):
+            unpack(wrong)
+
+
+def test_random_bytes_are_never_a_command_and_never_anything_worse() -> None:
+    """A slice of 20,000, half of them behind a header that is right; seed 7."""
+    generator = np.random.default_rng(7)
+    heads = [layout.identifier.to_bytes(2, "big") for layout in LAYOUTS.values()]
+    for k in range(20_000):
+        noise = generator.bytes(int(generator.integers(0, 100)))
+        data = heads[k % len(heads)] + noise if k % 2 else noise
+        with contextlib.suppress(CommandError):
+            pytest.fail(f"taken for {unpack(data)}: {data!r}")

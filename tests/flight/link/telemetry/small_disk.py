@@ -1,0 +1,57 @@
+"""A disk with little room, and what a log has written."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+
+from flight.link.telemetry.segments import SegmentFile, find_segments, open_segment
+
+
+def content(folder: Path, stem: str = "flight") -> bytes:
+    """Return what a log has written, its segments in order."""
+    return b"".join(path.read_bytes() for path in find_segments(folder, stem))
+
+
+class SmallDisk:
+    """Opens segments on a disk of `room` bytes; a write beyond it takes what fits, the next fails."""
+
+    def __init__(self, room: int) -> None:
+        self.room = room
+        self.syncs = 0
+        self.refusals = 0
+
+    def open(self, path: Path) -> SegmentFile:
+        """Open a segment on this disk."""
+        return SmallDiskFile(self, open_segment(path))
+
+
+class SmallDiskFile:
+    """One file on a small disk."""
+
+    def __init__(self, disk: SmallDisk, file: SegmentFile) -> None:
+        self._disk = disk
+        self._file = file
+
+    def write(self, data: bytes, /) -> int | None:
+        """Take what fits."""
+        if self._disk.room == 0 and data:
+            self._disk.refusals += 1
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        fits = data[: self._disk.room]
+        self._disk.room -= len(fits)
+        return self._file.write(fits)
+
+    def truncate(self, size: int, /) -> int:
+        """Cut the file."""
+        return self._file.truncate(size)
+
+    def fileno(self) -> int:
+        """Count a sync."""
+        self._disk.syncs += 1
+        return self._file.fileno()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()

@@ -1,0 +1,56 @@
+"""The documentation says what the table says, and is enough to read a packet by."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import pytest
+
+from flight.link.telemetry.definitions import CONTROL, PACKETS
+from flight.link.telemetry.packets import Packer
+from ground.documentation import database, main, markdown
+from tests.flight.link.telemetry.samples import plain_contents
+
+ROOT = Path(__file__).resolve().parents[4]
+
+
+def test_the_document_in_the_repository_is_in_step_with_the_table() -> None:
+    cure = "run: python -m ground.documentation > docs/telemetry.md"
+    assert (ROOT / "docs" / "telemetry.md").read_text(encoding="utf-8") == markdown(), cure
+
+
+def test_every_field_of_every_packet_is_documented() -> None:
+    text = markdown()
+    for packet in PACKETS:
+        section = text.split(f"\n## {packet.name}\n")[1].split("\n## ")[0]
+        assert f"0x{packet.apid:03X}" in section
+        for field in packet.fields:
+            assert f"| {field.name} |" in section
+            assert field.meaning in section
+
+
+def test_the_ground_database_is_enough_to_read_a_packet() -> None:
+    """Reads a field at the offset that the database gives, with nothing of ours but that."""
+    ground = json.loads(json.dumps(database()))
+    (control,) = (packet for packet in ground["packets"] if packet["name"] == "control")
+    raw = Packer().pack(
+        CONTROL, 77, {**plain_contents(CONTROL), "q2": 0.25, "current_written": (1.0, 2.0, 3.0)}
+    )
+    assert control["bytes"] == len(raw)
+    where = {field["name"]: field["offset"] for field in control["fields"]}
+    assert struct.unpack_from(">d", raw, where["q2"]) == (0.25,)
+    assert struct.unpack_from(">3d", raw, where["current_written"]) == (1.0, 2.0, 3.0)
+    assert struct.unpack_from(">q", raw, ground["secondary_header"][1]["offset"]) == (77,)
+    assert struct.unpack_from(">H", raw)[0] & 0x7FF == control["apid"]
+
+
+@pytest.mark.parametrize("arguments", [[], ["--json"]])
+def test_the_command_prints_either(
+    arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["documentation", *arguments])
+    main()
+    printed = capsys.readouterr().out
+    assert json.loads(printed) == database() if arguments else printed == markdown()

@@ -1,0 +1,150 @@
+"""The scanner finds every undamaged packet and accounts for every byte."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from flight.link.telemetry.definitions import CONTROL, EVENT, IMU, TARGET, TRUTH
+from flight.link.telemetry.packets import LAYOUTS, Packer, TelemetryError, crc16
+from flight.link.telemetry.scanner import ScanResult, decode, scan
+from tests.flight.link.telemetry.samples import plain_contents, timing_packets
+
+
+def cycles(result: ScanResult) -> list[int]:
+    return [int(cycle) for cycle in result.packets["cycle_timing"]["cycle"]]
+
+
+def claimed(result: ScanResult) -> int:
+    return sum(LAYOUTS[name].length * count for name, count in result.counts.items())
+
+
+def test_nothing_gives_nothing() -> None:
+    result = scan(b"")
+    assert result.counts == {}
+    assert result.intact
+    assert result.packets["control"]["q2"].shape == (0,)
+
+
+def test_an_undamaged_log_is_intact() -> None:
+    packets = timing_packets(100)
+    result = scan(b"".join(packets))
+    assert result.counts == {"cycle_timing": 100}
+    assert cycles(result) == list(range(100))
+    assert result.intact
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.binary(max_size=200), st.binary(max_size=200), st.binary(max_size=200))
+def test_garbage_around_packets_costs_none_of_them(before: bytes, between: bytes, after: bytes) -> None:
+    first, second = timing_packets(2)
+    result = scan(before + first + between + second + after)
+    assert cycles(result) == [0, 1]
+    assert result.skipped_bytes + result.truncated_bytes == len(before + between + after)
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    st.lists(
+        st.one_of(
+            st.binary(max_size=40),
+            st.sampled_from(timing_packets(3)),
+            st.sampled_from([layout.identifier.to_bytes(2, "big") for layout in LAYOUTS.values()]),
+        )
+    )
+)
+def test_every_byte_of_any_stretch_is_accounted_for(pieces: list[bytes]) -> None:
+    data = b"".join(pieces)
+    result = scan(data)
+    assert claimed(result) + result.skipped_bytes + result.truncated_bytes == result.total_bytes == len(data)
+    assert result.skipped_bytes >= 0
+    assert result.truncated_bytes >= 0
+
+
+def test_one_damaged_byte_costs_one_packet_and_shows_in_the_sequence() -> None:
+    packets = timing_packets(5)
+    length = len(packets[0])
+    for position in range(length):
+        for flip in (0x01, 0x80, 0xFF):
+            data = bytearray(b"".join(packets))
+            data[2 * length + position] ^= flip
+            result = scan(bytes(data))
+            assert cycles(result) == [0, 1, 3, 4]
+            assert result.skipped_bytes == length
+            assert result.missing["cycle_timing"] == 1
+
+
+def test_bytes_lost_in_the_middle_cost_the_packets_they_touch() -> None:
+    packets = timing_packets(6)
+    length = len(packets[0])
+    data = b"".join(packets)
+    result = scan(data[: length + 10] + data[2 * length + 20 :])
+    assert cycles(result) == [0, 3, 4, 5]
+    assert result.missing["cycle_timing"] == 2
+
+
+def test_sequence_gaps_are_counted_across_the_wrap() -> None:
+    packer = Packer()
+    packets = timing_packets((1 << 14) + 10, packer)
+    kept = packets[: (1 << 14) - 3] + packets[(1 << 14) + 5 :]
+    assert scan(b"".join(kept)).missing["cycle_timing"] == 8
+
+
+def test_a_packet_of_another_version_is_stepped_over_and_counted() -> None:
+    first, second = timing_packets(2)
+    other = bytearray(first[:-2] + b"one field more")
+    other[4:6] = (len(other) + 2 - 7).to_bytes(2, "big")
+    other[6] = 2
+    newer = bytes(other) + crc16(bytes(other)).to_bytes(2, "big")
+    result = scan(first + newer + second)
+    assert cycles(result) == [0, 1]
+    assert (result.other_versions, result.skipped_bytes) == (1, 0)
+    assert not result.intact
+
+
+@pytest.mark.parametrize("byte", [0, 1, 2], ids=["version bits", "apid", "sequence"])
+def test_a_header_that_is_not_ours_is_not_believed_even_with_a_good_crc(byte: int) -> None:
+    packet = bytearray(timing_packets(1)[0][:-2])
+    if byte == 0:
+        packet[0] |= 0x20
+    elif byte == 1:
+        packet[1] = 0xEE
+    else:
+        packet[4:6] = (len(packet) + 3 - 7).to_bytes(2, "big")
+    assert scan(bytes(packet) + crc16(bytes(packet)).to_bytes(2, "big")).counts == {}
+
+
+def test_decode_takes_whole_packets_only() -> None:
+    packets = timing_packets(3)
+    assert decode(b"".join(packets))["cycle_timing"]["cycle"].tolist() == [0, 1, 2]
+    with pytest.raises(TelemetryError, match="1 bytes are no packets"):
+        decode(b"".join(packets) + b"x")
+
+
+def test_kinds_of_packets_are_told_apart_in_order() -> None:
+    packer = Packer()
+    kinds = [IMU, CONTROL, TARGET, IMU, EVENT, IMU]
+    data = b"".join(packer.pack(kind, i, plain_contents(kind)) for i, kind in enumerate(kinds))
+    result = scan(data)
+    assert result.counts == {"imu": 3, "control": 1, "target": 1, "event": 1}
+    assert result.packets["imu"]["time_ns"].tolist() == [0, 3, 5]
+    assert result.intact
+
+
+def test_the_log_of_700_s_is_scanned_in_about_a_second() -> None:
+    packer = Packer()
+    kinds = [(kind, plain_contents(kind)) for kind in (IMU, CONTROL, TRUTH)]
+    second = b"".join(packer.pack(kind, i, values) for i in range(1000) for kind, values in kinds)
+    start = time.perf_counter()
+    result = scan(second * 28)
+    assert time.perf_counter() - start < 1.5
+    assert result.counts == {"imu": 28_000, "control": 28_000, "truth": 28_000}
+
+
+def test_noise_holds_no_packets() -> None:
+    noise = np.random.default_rng(7).bytes(1_000_000)
+    assert scan(noise).counts == {}

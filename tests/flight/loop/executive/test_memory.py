@@ -1,0 +1,71 @@
+"""What a process does about its memory, each seen in a process of its own."""
+
+from __future__ import annotations
+
+import ctypes
+import subprocess
+import sys
+
+import pytest
+
+_LIGHT = """
+import sys
+import flight.app.flight, flight.app.cli.run, flight.link.commands.channel
+import sim_hal.faults.host, sim_hal.serving.remote
+sys.stdout.write(" ".join(sorted(name for name in sys.modules if name.partition(".")[0] == "scipy")))
+"""
+_WORKING = """
+import sys
+from flight.gnc.vision.startracker import frame_job
+before = "flight.gnc.vision.streaks.maximum_likelihood.estimate" in sys.modules
+frame_job.prepare()
+sys.stdout.write(f"{before} {'flight.gnc.vision.streaks.maximum_likelihood.estimate' in sys.modules}")
+"""
+_FRAMES = """
+import gc, sys
+from array import array
+from pathlib import Path
+from flight.loop.executive import memory
+
+def heap():
+    lines = iter(Path("/proc/self/smaps").read_text().splitlines())
+    for line in lines:
+        if line.endswith("[heap]"):
+            return next(int(line.split()[1]) for line in lines if line.startswith("Rss:"))
+
+def frames():  # the threshold has moved up; now each frame is followed by something small that stays
+    kept, grown = [], heap()
+    for number in range(20):
+        frame = array("B", bytes(2 << 20))
+        kept.append(bytes(4096))
+        del frame
+        kept.append(array("B", bytes(3 << 19)))
+    return heap() - grown
+
+for _ in range(3):
+    array("B", bytes(8 << 20))
+assert gc.get_freeze_count() == 0
+if sys.argv[1] == "settled":
+    memory.settle()
+    assert gc.get_freeze_count() > 1000
+sys.stdout.write(str(frames()))
+"""
+
+
+def _said(code: str, *words: str) -> str:
+    done = subprocess.run([sys.executable, "-c", code, *words], check=True, capture_output=True, text=True)
+    return done.stdout
+
+
+def test_the_control_process_names_the_vision_job_without_scipy() -> None:
+    assert _said(_LIGHT) == ""
+
+
+def test_a_worker_holds_the_estimators_before_its_first_job() -> None:
+    assert _said(_WORKING) == "False True"
+
+
+@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallopt"), reason="this libc has no mallopt")
+def test_arrays_of_megabytes_do_not_stretch_the_heap_of_a_settled_process() -> None:
+    assert int(_said(_FRAMES, "as it comes")) > 10_000
+    assert int(_said(_FRAMES, "settled")) < 1_000

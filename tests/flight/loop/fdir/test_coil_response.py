@@ -1,0 +1,69 @@
+"""How much of a coil's torque the body feels, where the loop stands still now and then."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from flight.loop.fdir.coils.response import CoilResponse, ResponseSettings
+
+FIELD = np.array([0.0, 0.0, 60e-6])
+INERTIA, DIPOLE = 0.02, 60.0
+TICK_NS = 25_000_000
+STAND_EVERY = 176
+"""Cycles from one stand of the loop to the next: 4.4 s."""
+STANDS = 36
+STALE = 12
+"""Cycles after which the coils' driver, or the guardian, lets a command go."""
+
+
+def _fly(driver_lets_go: bool, told: bool, cycles: int = 1200) -> tuple[list[float], int]:
+    """Drive coil x; the loop stands still now and then, its samples coming in a burst after.
+
+    The driver lets the coils go meanwhile, and says when; or a guardian does, of which nobody hears, unless
+    the loop is `told` that it knows nothing of that time.
+    Returns the gains of coil x that were believed, and how often an axis was taken to be reversed.
+    """
+    settings = ResponseSettings(np.eye(3) * INERTIA, DIPOLE, 1e-4, free=(False, True, False))
+    response, noise = CoilResponse(settings), np.random.default_rng(3)
+    believed: list[float] = []
+    rate, wrong, carried = 0.0, 0, 0.0
+    waiting: list[tuple[int, float]] = []
+    for cycle in range(cycles):
+        now_ns = (cycle + 1) * TICK_NS
+        rate += -DIPOLE * carried * FIELD[2] / INERTIA * TICK_NS * 1e-9
+        waiting.append((now_ns, rate + 1e-4 * noise.standard_normal()))
+        stood = cycle % STAND_EVERY if cycle > STAND_EVERY else STAND_EVERY
+        if stood < STANDS:
+            carried = carried if stood < STALE else 0.0
+            continue
+        if stood == STANDS and driver_lets_go:
+            response.commanded(now_ns - (STANDS - STALE) * TICK_NS, (0.0, 0.0, 0.0))
+        elif stood == STANDS and told:
+            response.interrupted(now_ns)
+        for time_ns, seen in waiting:
+            if response.felt(time_ns, np.array([0.0, seen, 0.0]), FIELD):
+                wrong += len(response.reversed_axes())
+                if response.sigma[0] < settings.sure:
+                    believed.append(float(response.gain[0]))
+        waiting.clear()
+        carried = 0.05 * math.sin(2.0 * math.pi * cycle / 160) - 0.3 * rate
+        response.commanded(now_ns, (carried, 0.0, 0.0))
+    return believed, wrong
+
+
+def test_a_sound_coil_is_not_taken_for_a_broken_one_where_a_guardian_held_it_at_zero() -> None:
+    gains, wrong = _fly(driver_lets_go=False, told=True)
+    assert wrong == 0
+    assert len(gains) > 20
+    assert np.abs(np.array(gains) - 1.0).max() < 0.2
+    misled, _ = _fly(driver_lets_go=False, told=False)
+    assert np.abs(np.array(misled) - 1.0).max() > 0.3, "samples of a time in which others held it do mislead"
+
+
+def test_samples_that_come_in_a_burst_are_those_of_the_commands_of_their_time() -> None:
+    gains, wrong = _fly(driver_lets_go=True, told=False)
+    assert wrong == 0
+    assert len(gains) > 100
+    assert np.abs(np.array(gains) - 1.0).max() < 0.1

@@ -1,0 +1,155 @@
+"""The keeper writes beside the loop, tells what goes wrong, and never makes the loop wait."""
+
+from __future__ import annotations
+
+import errno
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flight.loop.fdir import events
+from flight.loop.state.content import Learned, StoredState
+from flight.loop.state.keeper import Notices, StateKeeper
+from flight.loop.state.store import COPIES, StateStore
+from hal.buses.clock import SystemClock
+from hal.interfaces.wires import Clock
+from tests.flight.loop.state.disk import NO_SPACE, Disk
+from tests.manual_clock import ManualClock
+
+SECOND = 1_000_000_000
+FOLDER = Path("/state")
+
+
+def keeper_on(disk: Disk | None, clock: Clock, folder: Path = FOLDER) -> StateKeeper:
+    """Return the keeper of a new boot."""
+    notices = Notices()
+    return StateKeeper(StateStore(folder, notices.tell, disk), notices, clock, window=600.0)
+
+
+def on_disk(disk: Disk) -> StoredState:
+    """Return what another process would read."""
+    return StateStore(FOLDER, lambda *_: None, disk).load()
+
+
+def test_running_is_on_disk_before_anything_flies_and_gone_after_a_clean_end() -> None:
+    disk = Disk()
+    keeper = keeper_on(disk, ManualClock())
+    assert on_disk(disk).running
+    assert on_disk(disk).boot_count == 1
+    keeper.close(clean=True)
+    keeper.close(clean=False)
+    assert not on_disk(disk).running
+
+
+@pytest.mark.parametrize("closed", [True, False])
+def test_an_end_that_was_not_clean_is_told_at_the_next_start(closed: bool) -> None:
+    """Whether the process was killed, or closed the keeper on its way out of an exception."""
+    disk, clock = Disk(), ManualClock()
+    first = keeper_on(disk, clock)
+    first.note("hold")
+    clock.advance(20 * SECOND)
+    if closed:
+        first.close(clean=False)
+    second = keeper_on(disk, clock)
+    assert (second.record.unclean_recent, second.record.after_unclean) == (1, True)
+    assert second.record.mode == "hold"
+    ((kind, text),) = second.notices()
+    assert kind is events.UNCLEAN_SHUTDOWN
+    assert text == "boot 1, last heard of 1970-01-01T00:00:21Z: 1 of late"
+    assert not second.notices(), "told once"
+
+
+def test_what_is_noted_is_on_disk_after_a_period_with_the_operating_time() -> None:
+    disk, clock = Disk(), ManualClock()
+    keeper = keeper_on(disk, clock)
+    learned = Learned.of(np.array([1e-4, 0.0, 0.0]), np.eye(3) * 1e-10)
+    calls = disk.calls
+    keeper.note("detumble", {"gyro-bias": learned})
+    keeper.note("hold")
+    assert disk.calls == calls, "noting touches no disk"
+    clock.advance(10 * SECOND)
+    state = on_disk(disk)
+    assert (state.mode, state.operated, state.learned) == ("hold", 10.0, {"gyro-bias": learned})
+    clock.advance(10 * SECOND)
+    assert on_disk(disk).operated == 20.0
+    assert keeper_on(disk, clock).learned == {"gyro-bias": learned}
+
+
+def test_learned_values_that_are_unfit_are_left_out_and_told() -> None:
+    disk, clock = Disk(), ManualClock()
+    keeper = keeper_on(disk, clock)
+    keeper.note("hold" * 20, {"gyro-bias": Learned((float("nan"),), ((1.0,),))})
+    clock.advance(10 * SECOND)
+    ((kind, text),) = keeper.notices()
+    assert kind is events.STATE_UNWRITTEN
+    assert text == "gyro-bias: a value or its covariance is not finite"
+    assert on_disk(disk).operated == 10.0
+    clock.advance(10 * SECOND)
+    assert not keeper.notices()
+
+
+def test_a_full_disk_is_told_and_the_flight_goes_on() -> None:
+    disk, clock = Disk(), ManualClock()
+    keeper_on(disk, clock).close(clean=True)
+    disk.start(0, NO_SPACE)
+    keeper = keeper_on(disk, clock)
+    assert [kind for kind, _ in keeper.notices()] == [events.STATE_UNWRITTEN]
+    disk.start(None)
+    clock.advance(10 * SECOND)
+    assert on_disk(disk).boot_count == 2
+
+
+def test_damaged_files_are_told_through_the_notices(tmp_path: Path) -> None:
+    for name in COPIES:
+        (tmp_path / name).write_bytes(b"no state")
+    keeper = keeper_on(None, ManualClock(), tmp_path)
+    assert [kind for kind, _ in keeper.notices()] == [events.STATE_LOST, events.UNCLEAN_SHUTDOWN]
+    assert keeper.record.unclean_recent == 1
+
+
+def test_notices_that_nobody_takes_do_not_pile_up() -> None:
+    notices = Notices()
+    for number in range(1000):
+        notices.tell(events.STATE_UNWRITTEN, str(number))
+    taken = notices.take()
+    assert len(taken) <= 64
+    assert taken[-1][1] == "999"
+
+
+class HungDisk(Disk):
+    """A disk whose sync does not return until it is let go."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.hangs = threading.Event()
+        self.hung = threading.Event()
+        self.let_go = threading.Event()
+
+    def sync(self, file: int) -> None:
+        """Hang."""
+        if self.hangs.is_set():
+            self.hung.set()
+            self.let_go.wait(20.0)
+            raise OSError(errno.EIO, "the disk is gone")
+        super().sync(file)
+
+
+def test_a_hung_disk_delays_neither_note_nor_close(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("flight.loop.state.keeper._HUNG_DISK_S", 0.1)
+    disk, notices = HungDisk(), Notices()
+    store = StateStore(FOLDER, notices.tell, disk)
+    keeper = StateKeeper(store, notices, SystemClock(), window=600.0, period_ns=1_000_000)
+    disk.hangs.set()
+    assert disk.hung.wait(5.0)
+    start = time.monotonic()
+    for _ in range(1000):
+        keeper.note("hold")
+        keeper.notices()
+    assert time.monotonic() - start < 0.5
+    keeper.close(clean=True)
+    assert time.monotonic() - start < 5.0
+    assert on_disk(disk).running, "an end that was not written is no clean end"
+    disk.let_go.set()

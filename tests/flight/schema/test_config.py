@@ -1,0 +1,110 @@
+"""A configuration is right, or one clear line says which value is wrong and what would be right."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from flight.gnc.errors import ConfigError
+from flight.schema import reader
+from sim_hal.settings import Simulation
+
+FOLDER = Path(__file__).resolve().parents[3] / "config"
+DEMO = (FOLDER / "step_demo.yaml").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("path", sorted(FOLDER.glob("*.yaml")), ids=lambda path: path.name)
+def test_every_configuration_in_the_repository_is_valid(path: Path) -> None:
+    loaded = reader.load(path)
+    section = reader.simulation_section(path.read_text(encoding="utf-8"), path.name, Simulation)
+    assert (section is None) == (loaded.simulation is None)
+
+
+@pytest.mark.parametrize("name", ["step_demo.yaml", "step_thesis.yaml"])
+def test_the_demonstration_is_the_thesis(name: str) -> None:
+    loaded = reader.load(FOLDER / name)
+    assert [step.at for step in loaded.steps] == [100.0 * k for k in range(7)]
+    assert [step.q2 for step in loaded.steps] == pytest.approx([-0.3 + 0.1 * k for k in range(7)])
+    assert (loaded.duration, loaded.guidance.horizon, loaded.guidance.replan_period) == (700.0, 10.0, 5.0)
+    assert loaded.coils.current_limit == 0.148
+
+
+def test_the_thesis_loop_stays_as_it_was_in_the_same_world() -> None:
+    demo, thesis = (reader.load(FOLDER / name) for name in ("step_demo.yaml", "step_thesis.yaml"))
+    assert (thesis.control.tracker, thesis.guidance.strategy) == ("thesis", "receding")
+    assert (thesis.control.state_weight, thesis.control.control_weight) == (20.0, 1.0)
+    assert thesis.simulation == demo.simulation
+    assert (thesis.plant, thesis.inertial_unit, thesis.coils) == (demo.plant, demo.inertial_unit, demo.coils)
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "complaint"),
+    [
+        ("supply_voltage: 3.4", "supply_voltage: -3.4", r":28: `coils.supply_voltage` is -3.4: expected"),
+        (
+            "supply_voltage",
+            "suply_voltage",
+            "`coils.suply_voltage` is an unknown key, did you mean `supply_voltage`",
+        ),
+        ("camera:", "kamera:", "did you mean `camera`"),
+        ("horizon: 10.0", "horizon: ten", "`guidance.horizon` is 'ten'"),
+        ("max_age: 0.1 ", "max_age: 0.06 ", r"`inertial_unit.max_age` is 0.06: .* must be 0.075 s at least"),
+        ("q2: 0.1}", "q2: .nan}", r"`steps\[4\].q2` is nan: must be a finite number"),
+        ("q2: 0.1}", "q2: 0.9}", r"`steps\[4\].q2` is 0.9"),
+        ("{at: 0.0,", "{att: 0.0,", "did you mean `at`"),
+        ("at: 200.0", "at: 50", "must stand in order of time"),
+        ("duration: 700.0", "duration: 600.0", "the last target is given at 600.0 s"),
+        ("[[0, 1],", "[[0, 2],", "a channel of the PWM chip twice"),
+        ("address: 0x45", "address: 0x40", "both leave the factory at 0x40"),
+        ("exposure: 1.0", "exposure: 6.0", "must be shorter than `camera.period`"),
+        ("replan_period: 5.0", "replan_period: 12.0", "must be shorter than `guidance.horizon`"),
+        ("name: step-demo", "name: a\nname: b", "`name` stands twice, first in line"),
+        ("name: step-demo", "name: [", "is not YAML"),
+        ("plant:", "plant: 3\nplant2:", "`plant` is 3"),
+    ],
+)
+def test_a_mistake_gets_one_line_with_its_place_and_its_cure(right: str, wrong: str, complaint: str) -> None:
+    with pytest.raises(ConfigError, match=complaint) as caught:
+        reader.parse(DEMO.replace(right, wrong, 1), "demo.yaml")
+    assert str(caught.value).startswith("demo.yaml")
+    assert "\n" not in str(caught.value)
+
+
+def test_mistakes_in_the_simulation_section_are_told_with_their_place_too() -> None:
+    text = DEMO.replace("current_noise: 3.5e-3", "curent_noise: 3.5e-3")
+    with pytest.raises(ConfigError, match=r"`simulation.curent_noise` .* did you mean `current_noise`"):
+        reader.simulation_section(text, "demo.yaml", Simulation)
+
+
+def test_numbers_without_a_point_are_numbers() -> None:
+    text = DEMO.replace("inertia: 1.05e-3", "inertia: 2e-3")
+    assert reader.parse(text).plant.inertia == 2e-3
+
+
+def test_a_testbed_without_a_camera_says_none() -> None:
+    assert reader.load(FOLDER / "testbed.yaml").camera is None
+
+
+def test_a_missing_file_and_a_list_are_clear_errors(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="cannot be read"):
+        reader.load(tmp_path / "nothing.yaml")
+    with pytest.raises(ConfigError, match="must be a mapping"):
+        reader.parse("- 1\n- 2\n")
+
+
+@given(st.text(max_size=200))
+def test_no_text_whatever_makes_a_traceback(text: str) -> None:
+    with pytest.raises(ConfigError):
+        reader.parse(text)
+
+
+@settings(max_examples=150)
+@given(st.integers(min_value=0, max_value=len(DEMO) - 1), st.characters(), st.integers(0, 20))
+def test_a_damaged_configuration_is_valid_or_refused_clearly(place: int, letter: str, cut: int) -> None:
+    damaged = DEMO[:place] + letter + DEMO[place + cut :]
+    with contextlib.suppress(ConfigError):  # anything else is a failure
+        reader.parse(damaged)

@@ -1,0 +1,31 @@
+"""A command line typed in this process: what `python -m flight` does with it, modules and sky loaded once.
+
+That the same comes of a process of its own is what `test_commands.py` looks at.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from pathlib import Path
+from subprocess import CompletedProcess
+
+from flight.app.cli import main
+from tests.ground.commands.test_commands import ROOT
+
+
+def command(*arguments: str | Path) -> CompletedProcess[str]:
+    """Type a command in the repository's folder; return its status, its output and its complaints."""
+    words = [str(word) for word in arguments]
+    raw, complaint = io.BytesIO(), io.StringIO()
+    output = io.TextIOWrapper(raw, encoding="utf-8", write_through=True)
+    with (
+        contextlib.chdir(ROOT),
+        contextlib.redirect_stdout(output),
+        contextlib.redirect_stderr(complaint),
+    ):
+        try:
+            status = main(words)
+        except SystemExit as end:  # argparse: help, or wrong use
+            status = end.code if isinstance(end.code, int) else 1
+    return CompletedProcess(words, status, raw.getvalue().decode(), complaint.getvalue())

@@ -1,0 +1,63 @@
+"""`flight calibrate`: pictures of the sky in, the lens and a camera file for `flight solve` out."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pillow = pytest.importorskip("PIL.Image", reason="needs the extra `images`")
+
+from tests.flight.gnc.vision.startracker.frames import NARROW, sky_frame  # noqa: E402
+from tests.ground.commands.in_process import command  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    folder = tmp_path_factory.mktemp("night")
+    paths = [folder / f"{number}.png" for number in range(3)]
+    for number, path in enumerate(paths):
+        pillow.fromarray(sky_frame(np.random.default_rng([41, number]), 0.0, 0.5).pixels).save(path)
+    return paths
+
+
+def test_the_lens_found_is_the_one_that_took_the_pictures(pictures: list[Path], tmp_path: Path) -> None:
+    """The simulator's camera has no distortion and its axis in the middle: all within five of its sigmas."""
+    out = tmp_path / "camera.yaml"
+    done = command("calibrate", *pictures, "--fov", "12.3", "--out", out, "--json")
+    assert done.returncode == 0, done.stderr
+    facts = json.loads(done.stdout)
+    truth = {"focal_length": NARROW.pinhole.focal_length, "k1": 0.0, "k2": 0.0}
+    for name, value in truth.items():
+        assert abs(facts[name] - value) < 5.0 * facts["sigma"][name], name
+    assert facts["rms_px_after"] < 0.3
+    solved = command("solve", pictures[0], "--camera", out, "--json")
+    assert json.loads(solved.stdout)["field_of_view_deg"] == pytest.approx(12.0, abs=0.005)
+
+
+def test_what_the_stars_leave_open_is_named(pictures: list[Path], tmp_path: Path) -> None:
+    """The middle of one picture, 7 deg across: a distortion shows at the edge, and there is none."""
+    middle = tmp_path / "middle.png"
+    pillow.open(pictures[0]).crop((212, 212, 812, 812)).save(middle)
+    done = command("calibrate", middle, "--fov", "7.05")
+    assert done.returncode == 0, done.stderr
+    assert "the stars leave it open" in done.stdout
+
+
+def test_pictures_without_stars_are_named_with_the_reason_and_exit_status_1(tmp_path: Path) -> None:
+    path = tmp_path / "cloud.png"
+    pillow.fromarray(np.random.default_rng(1).normal(90.0, 9.0, (256, 256)).astype(np.uint8)).save(path)
+    done = command("calibrate", path)
+    assert done.returncode == 1
+    assert "cloud.png" in done.stderr
+
+
+def test_a_file_that_is_there_is_not_overwritten(pictures: list[Path], tmp_path: Path) -> None:
+    out = tmp_path / "camera.yaml"
+    out.write_text("camera: mine\n")
+    done = command("calibrate", *pictures, "--out", out)
+    assert done.returncode == 2
+    assert "is there already" in done.stderr
+    assert out.read_text() == "camera: mine\n"

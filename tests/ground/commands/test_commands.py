@@ -1,0 +1,166 @@
+"""The command line: the first thing typed works, a mistake is one line, Ctrl-C loses nothing."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from flight.app.cli import main
+from flight.link.telemetry.reader import read_run
+from tests.ground.report.synthetic import Recipe, make_run
+
+ROOT = Path(__file__).resolve().parents[3]
+DEMO = ROOT / "config" / "step_demo.yaml"
+
+
+def command(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    """Run `python -m flight` in the repository."""
+    words = [sys.executable, "-m", "flight", *map(str, arguments)]
+    return subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False, timeout=100)
+
+
+@pytest.mark.parametrize("words", [[], ["run"], ["report"], ["export"], ["plan"]])
+def test_help_is_everywhere(words: list[str]) -> None:
+    done = command(*words, "--help")
+    assert done.returncode == 0
+    assert "usage: python -m flight" in done.stdout
+
+
+def test_a_short_flight_says_what_it_did_and_what_to_do_next(tmp_path: Path) -> None:
+    done = command("run", DEMO, "--duration", "3", "--out", tmp_path / "run", "--seed", "4")
+    assert done.returncode == 0
+    assert "python -m flight report" in done.stdout
+    assert done.stderr == "", "no progress line where there is no terminal"
+    assert (tmp_path / "run" / "config.yaml").read_text() == DEMO.read_text()
+
+
+def test_json_is_one_object_and_nothing_else(tmp_path: Path) -> None:
+    done = command("run", DEMO, "--duration", "2", "--out", tmp_path / "run", "--json")
+    facts = json.loads(done.stdout)
+    assert facts["mission_time_s"] == pytest.approx(1.975)
+    assert facts["interrupted"] is False
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (["run", "nothing.yaml"], "nothing.yaml: cannot be read"),
+        (["run", "."], ".: cannot be read"),
+        (["run", DEMO, "--duration", "-1", "--out", "/tmp/never"], "--duration -1.0: must be a positive"),
+        (["run", DEMO, "--duration", "nan", "--out", "/tmp/never"], "--duration nan: must be a positive"),
+        (
+            ["run", "config/testbed.yaml", "--seed", "3", "--out", "{tmp}"],
+            "--seed: this configuration flies real",
+        ),
+        (["report", "/nowhere"], "/nowhere: no such folder"),
+        (["export", "/nowhere"], "/nowhere: no such folder"),
+    ],
+)
+def test_a_mistake_is_one_line_and_exit_status_2(words: list[str], complaint: str, tmp_path: Path) -> None:
+    done = command(*[str(word).format(tmp=tmp_path) for word in words])
+    assert done.returncode == 2
+    assert complaint in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert "Traceback" not in done.stderr
+
+
+def test_a_run_is_not_written_over(tmp_path: Path) -> None:
+    assert command("run", DEMO, "--duration", "1", "--out", tmp_path).returncode == 0
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    again = command("run", DEMO, "--duration", "1", "--out", tmp_path)
+    assert again.returncode == 2
+    assert "holds a run already" in again.stderr
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_a_device_that_is_not_there_is_one_line_and_exit_status_1(tmp_path: Path) -> None:
+    done = command("run", "config/testbed.yaml", "--out", tmp_path)
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    assert "/dev/i2c" in done.stderr
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_flight_with_its_log_whole(tmp_path: Path, number: signal.Signals) -> None:
+    words = [sys.executable, "-m", "flight", "run", str(DEMO), "--out", str(tmp_path / "run")]
+    flight = subprocess.Popen(words, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    log = tmp_path / "run" / "flight-0001.ccsds"
+    deadline = time.monotonic() + 60.0
+    while time.monotonic() < deadline and not (log.exists() and log.stat().st_size > 100_000):
+        time.sleep(0.05)
+    os.kill(flight.pid, number)
+    out, err = flight.communicate(timeout=60)
+    assert flight.returncode == 0, err
+    assert f"stopped by {number.name}" in out
+    run = read_run(tmp_path / "run")
+    assert run["event"]["name"][-1] == b"stopped"
+    assert all(part.intact for part in run.logs.values())
+
+
+def test_plan_tells_a_stretched_horizon_and_draws_it(tmp_path: Path) -> None:
+    picture = tmp_path / "path.png"
+    words: list[str | Path] = [
+        "plan",
+        "--from",
+        "0.4",
+        "--from-rate",
+        "0.015",
+        "--to",
+        "-0.3",
+        "--picture",
+        picture,
+        "--json",
+    ]
+    done = command(*words)
+    assert done.returncode == 0, done.stderr
+    facts = json.loads(done.stdout)
+    assert facts["status"] == "stretched"
+    assert facts["horizon_asked_s"] == 10.0
+    assert 13.6 < facts["horizon_s"] < 14.1, "bang-bang needs about 13.7 s (errata to chapter 5)"
+    assert max(map(abs, facts["current_A"])) <= 1.001 * facts["current_limit_A"]
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_plan_refuses_what_no_coil_can_reach() -> None:
+    done = command("plan", "--from", "0.9", "--to", "0.0")
+    assert done.returncode == 1
+    assert "0.9" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_export_writes_a_table_for_each_kind_of_packet(tmp_path: Path) -> None:
+    command("run", DEMO, "--duration", "1", "--out", tmp_path)
+    done = command("export", tmp_path, "--json")
+    files = [Path(name).name for name in json.loads(done.stdout)["files"]]
+    assert {"control.csv", "imu.csv", "truth.csv", "event.csv"} <= set(files)
+
+
+def test_a_file_whose_name_is_no_text_is_named_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    raw = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(raw, encoding="utf-8", write_through=True))
+    out = tmp_path / os.fsdecode(b"csv-\xff")
+    assert main(["export", str(make_run(tmp_path / "run", Recipe(duration=1.0))), "--out", str(out)]) == 0
+    assert b"csv-\\udcff/control.csv\n" in raw.getvalue()
+
+
+def test_on_board_nothing_is_imported_that_a_board_does_not_need() -> None:
+    """Plots, the simulator and the general optimisers stay away from the flight application."""
+    script = (
+        "import sys, flight.app.flight, flight.app.cli; "
+        "away = ('matplotlib', 'PIL', 'ground', 'sim_hal', 'pytest', 'hypothesis'); "
+        "print([n for n in sys.modules if n.split('.')[0] in away or n.startswith('scipy.optimize')])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "[]"

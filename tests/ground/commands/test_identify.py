@@ -1,0 +1,88 @@
+"""`flight identify`: flies, fits, writes a piece of configuration; a mistake is one line."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from pathlib import Path
+
+import pytest
+
+from flight.schema.reader import parse
+from tests.ground.commands.in_process import command
+from tests.ground.commands.test_commands import DEMO
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, object]]:
+    """Return the folder of a short identification flight and what the command said of it."""
+    place = tmp_path_factory.mktemp("identify")
+    words: list[str | Path] = [
+        "--run",
+        place / "run",
+        "--out",
+        place / "plant.yaml",
+        "--duration",
+        "60",
+        "--seed",
+        "5",
+    ]
+    done = command("identify", DEMO, *words, "--json")
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    facts: dict[str, object] = json.loads(done.stdout)
+    return place, facts
+
+
+def test_a_flight_finds_the_simulated_body(flown: tuple[Path, dict[str, object]]) -> None:
+    """N A B / J, k / J and c / J of config/step_demo.yaml."""
+    _, facts = flown
+    motion: dict[str, dict[str, float]] = facts["motion"]  # type: ignore[assignment]  # JSON
+    truth = {"gain": 80 * 0.0081 * 4.5e-4 / 1.05e-3, "torsion": 1e-5 / 1.05e-3, "damping": 2e-6 / 1.05e-3}
+    for name, true in truth.items():
+        assert abs(motion[name]["value"] - true) < 4.0 * motion[name]["sigma"]
+    assert motion["gain"]["sigma"] < 1e-3
+
+
+def test_the_fragment_can_be_pasted_over_the_old_plant(flown: tuple[Path, dict[str, object]]) -> None:
+    place, facts = flown
+    text = (place / "plant.yaml").read_text()
+    assert text == facts["fragment"]
+    old = DEMO.read_text()
+    head, rest = old.split("plant:", 1)
+    config = parse(head + text + "inertial_unit:" + rest.split("inertial_unit:", 1)[1])
+    assert config.plant.thread_stiffness == pytest.approx(1e-5, rel=0.3)
+
+
+def test_a_flight_that_is_done_is_identified_again_the_same(flown: tuple[Path, dict[str, object]]) -> None:
+    place, facts = flown
+    drawable = importlib.util.find_spec("matplotlib") is not None
+    words: list[str | Path] = ["--picture", place / "fit.png"] if drawable else []
+    done = command("identify", place / "run", *words)
+    assert done.returncode == 0, done.stderr
+    assert str(facts["fragment"]) in done.stdout
+    assert "by the motion" in done.stdout
+    if words:
+        assert (place / "fit.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_mistake_is_one_line_and_exit_status_2(flown: tuple[Path, dict[str, object]]) -> None:
+    place, _ = flown
+    for words, complaint in (
+        (["identify", place / "run", "--seed", "3"], "--seed"),
+        (["identify", DEMO, "--out", place / "plant.yaml"], "is there already"),
+        (["identify", DEMO, "--run", place / "run"], "holds a run already"),
+        (["identify", "nothing.yaml"], "nothing.yaml: cannot be read"),
+    ):
+        done = command(*words)
+        assert done.returncode == 2
+        assert complaint in done.stderr
+        assert done.stderr.count("\n") == 1
+
+
+def test_a_flight_too_short_to_tell_is_one_line_and_exit_status_1(tmp_path: Path) -> None:
+    done = command("identify", DEMO, "--duration", "3", "--run", tmp_path / "run", "--out", tmp_path / "x")
+    assert done.returncode == 1
+    assert "too short a flight" in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "x").exists()

@@ -1,0 +1,91 @@
+"""`flight rate`: from a picture file to a rate, its covariance, its streaks, and a picture of them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pillow = pytest.importorskip("PIL.Image", reason="needs the extra `images`")
+
+from sim_hal.star_camera import StarCameraModel  # noqa: E402
+from tests.ground.commands.in_process import command  # noqa: E402
+from tests.studies.campaigns.scenes import Scene, slew  # noqa: E402
+
+CAMERA = StarCameraModel(columns=640, rows=640, field_of_view=float(np.deg2rad(12.5)))
+FOV = "12.5"
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return slew(np.random.default_rng(20), float(np.deg2rad(80.0)), 0.12, 0.2, model=CAMERA)
+
+
+@pytest.fixture(scope="module")
+def picture(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("pictures") / "frame.png"
+    pillow.fromarray(scene.pixels).save(path)
+    return path
+
+
+@pytest.mark.parametrize("method", ["likelihood", "harris"])
+def test_a_prior_that_says_about_which_way_gives_the_rate_with_its_sign(
+    scene: Scene, picture: Path, method: str
+) -> None:
+    prior = [f"{1.3 * component:.4f}" for component in scene.rate]
+    done = command(
+        "rate", picture, "--fov", FOV, "--exposure", "0.2", "--method", method, "--json", "--prior", *prior
+    )
+    assert done.returncode == 0, done.stderr
+    facts = json.loads(done.stdout)
+    assert facts["status"] == "rate"
+    error = np.array(facts["rate_rad_s"]) - scene.rate
+    covariance = np.array(facts["covariance_rad2_s2"])
+    assert np.linalg.norm(error) < 0.02 * np.linalg.norm(scene.rate)
+    assert error @ np.linalg.solve(covariance, error) < 25.0
+    assert len(facts["streaks"]) >= 4
+
+
+def test_without_a_prior_the_direction_of_time_is_told_to_be_unknown(scene: Scene, picture: Path) -> None:
+    done = command("rate", picture, "--fov", FOV, "--exposure", "0.2")
+    assert done.returncode == 0, done.stderr
+    assert "ambiguous" in done.stdout
+    assert "give --prior" in done.stdout
+
+
+def test_the_overlay_marks_the_streaks_in_colour(picture: Path, tmp_path: Path) -> None:
+    overlay = tmp_path / "found.png"
+    done = command("rate", picture, "--fov", FOV, "--exposure", "0.2", "--overlay", overlay)
+    assert done.returncode == 0, done.stderr
+    drawn = np.asarray(pillow.open(overlay))
+    assert drawn.shape == (640, 640, 3)
+    assert (drawn.max(axis=2) != drawn.min(axis=2)).sum() > 100
+
+
+def test_a_picture_without_stars_gives_no_rate_and_exit_status_1(tmp_path: Path) -> None:
+    noise = np.random.default_rng(1).normal(120.0, 10.0, (256, 256)).astype(np.uint16)
+    path = tmp_path / "noise.png"
+    pillow.fromarray(noise).save(path)
+    done = command("rate", path, "--fov", "5", "--exposure", "1", "--json")
+    assert done.returncode == 1
+    facts = json.loads(done.stdout)
+    assert facts["rate_rad_s"] is None
+    assert facts["status"] in {"too-few", "failed", "too-short"}
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (["nothing.png", "--fov", "20", "--exposure", "1"], "nothing.png: cannot be read"),
+        (["{picture}", "--fov", "20"], "give --fov and --exposure"),
+        (["{picture}", "--camera", "config/testbed.yaml"], "give a configuration with a camera"),
+        (["{picture}", "--fov", "170", "--exposure", "1"], "--fov 170.0"),
+    ],
+)
+def test_a_mistake_is_one_line(words: list[str], complaint: str, picture: Path) -> None:
+    done = command("rate", *[word.format(picture=picture) for word in words])
+    assert done.returncode == 2
+    assert complaint in done.stderr
+    assert done.stderr.count("\n") == 1

@@ -1,0 +1,129 @@
+"""`flight solve`: from a picture file to a place in the sky, its stars, and a picture of them."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pillow = pytest.importorskip("PIL.Image", reason="needs the extra `images`")
+
+from flight.gnc.math.quaternion import angle_between  # noqa: E402
+from flight.gnc.vision.startracker.pointing import Pointing  # noqa: E402
+from tests.flight.gnc.vision.startracker.frames import SkyFrame, sky_frame  # noqa: E402
+from tests.ground.commands.in_process import command  # noqa: E402
+
+
+def _written(frame: SkyFrame, path: Path) -> Path:
+    pillow.fromarray(frame.pixels).save(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def resting() -> SkyFrame:
+    return sky_frame(np.random.default_rng(31), 0.0, 0.2)
+
+
+@pytest.fixture(scope="module")
+def picture(resting: SkyFrame, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return _written(resting, tmp_path_factory.mktemp("pictures") / "frame.png")
+
+
+def test_a_picture_of_an_unknown_field_is_solved(resting: SkyFrame, picture: Path) -> None:
+    done = command("solve", picture, "--json")
+    assert done.returncode == 0, done.stderr
+    facts = json.loads(done.stdout)
+    place = Pointing(
+        *(math.radians(facts[f"{name}_deg"]) for name in ("right_ascension", "declination", "roll"))
+    )
+    assert angle_between(place.quaternion(), resting.attitude) < np.radians(30.0 / 3600.0)
+    assert angle_between(np.array(facts["quaternion"]), resting.attitude) < np.radians(30.0 / 3600.0)
+    assert facts["field_of_view_deg"] == pytest.approx(12.0, abs=0.002)
+    assert np.all(np.linalg.eigvalsh(np.array(facts["covariance_rad2"])) > 0.0)
+    residuals = np.array([star["residual_px"] for star in facts["stars"]])
+    assert len(residuals) > 10
+    assert np.sqrt(np.mean(residuals**2)) < 0.5
+    assert facts["motion"] is None
+
+
+def test_streaks_give_the_rate_when_the_exposure_is_known(tmp_path: Path) -> None:
+    frame = sky_frame(np.random.default_rng(32), 40.0, 0.2)
+    path = _written(frame, tmp_path / "streaks.png")
+    done = command("solve", path, "--fov", "12", "--exposure", "0.2", "--json")
+    assert done.returncode == 0, done.stderr
+    motion = json.loads(done.stdout)["motion"]
+    assert np.linalg.norm(motion["rate_rad_s"]) == pytest.approx(np.linalg.norm(frame.rate), rel=0.02)
+    assert not motion["direction_of_time_known"]
+    told = command("solve", path, "--fov", "12")
+    assert "give --exposure for the rate" in told.stdout
+
+
+def test_the_date_takes_aberration_off(picture: Path) -> None:
+    """The stars were drawn without it: believing in it moves the answer by the Earth's 20.5", at most."""
+    without = json.loads(command("solve", picture, "--fov", "12", "--json").stdout)
+    with_it = command("solve", picture, "--fov", "12", "--date", "2026-07-02T12:00", "--json")
+    facts = json.loads(with_it.stdout)
+    moved = np.degrees(angle_between(np.array(facts["quaternion"]), np.array(without["quaternion"]))) * 3600.0
+    assert 2.0 < moved < 21.0
+
+
+def test_a_classical_method_finds_the_same_place(picture: Path) -> None:
+    default = json.loads(command("solve", picture, "--fov", "12", "--json").stdout)
+    done = command("solve", picture, "--fov", "12", "--fov-error", "0.1", "--method", "pyramid", "--json")
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)["quaternion"]
+    assert angle_between(np.array(found), np.array(default["quaternion"])) < np.radians(5.0 / 3600.0)
+    unknown = command("solve", picture, "--method", "pyramid")
+    assert unknown.returncode != 0
+    assert "Traceback" not in unknown.stderr
+
+
+def test_bare_pixels_behind_a_header_are_read(resting: SkyFrame, tmp_path: Path) -> None:
+    path = tmp_path / "frame.raw"
+    path.write_bytes(b"a header of some bytes" + resting.pixels.astype("<u2").tobytes())
+    done = command("solve", path, "--raw", "1024x1024x16", "--fov", "12", "--json")
+    assert json.loads(done.stdout)["status"] == "solved"
+
+
+def test_the_overlay_shows_the_stars_and_the_text_tells_them(picture: Path, tmp_path: Path) -> None:
+    overlay = tmp_path / "solved.png"
+    done = command("solve", picture, "--fov", "12", "--overlay", overlay)
+    assert done.returncode == 0, done.stderr
+    assert "right ascension" in done.stdout
+    drawn = np.asarray(pillow.open(overlay))
+    coloured = np.count_nonzero(np.ptp(drawn[..., :3].astype(int), axis=-1) > 50)
+    assert coloured > 1000
+
+
+def test_a_picture_without_stars_is_not_solved_and_says_why(tmp_path: Path) -> None:
+    noise = np.random.default_rng(33).normal(100.0, 10.0, (256, 256)).astype(np.uint16)
+    path = tmp_path / "noise.png"
+    pillow.fromarray(noise).save(path)
+    done = command("solve", path, "--json")
+    assert done.returncode == 1
+    facts = json.loads(done.stdout)
+    assert facts["status"] in {"no-stars", "too-few-stars"}
+    assert facts["reason"]
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (["--fov", "200"], "1 to 120 degrees"),
+        (["--date", "yesterday"], "such as 2026-11-21"),
+        (["--fov", "wide"], "is not a number"),
+        (["--raw", "1024x1024"], "such as 1280x960x16"),
+        (["--raw", "9000x9000x16"], "pixels of 16 bits are 162000000"),
+        (["--index", "{tmp}/none.index"], "no sky index can be read"),
+    ],
+)
+def test_a_mistake_is_one_line_and_exit_status_2(
+    words: list[str], complaint: str, picture: Path, tmp_path: Path
+) -> None:
+    done = command("solve", picture, *(word.replace("{tmp}", str(tmp_path)) for word in words))
+    assert done.returncode == 2
+    assert complaint in done.stderr
+    assert "Traceback" not in done.stderr

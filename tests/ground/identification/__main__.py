@@ -1,0 +1,71 @@
+"""`python -m tests.ground.identification`: identification in drawn worlds, flown through the whole stack."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from scipy.stats import chi2
+
+from ground.identification.fit import fit
+from ground.identification.preparation import beliefs_of, noise_of
+from ground.identification.scale import absolute
+from tests.ground.identification.worlds import believed, drawn, fly_bare, fly_stack, motion_error, scale_error
+
+
+def main() -> int:
+    """Fly, fit, compare with the truth."""
+    parser = argparse.ArgumentParser(prog="python -m tests.ground.identification", description=__doc__)
+    parser.add_argument("--runs", type=int, default=60)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--duration", type=float, default=200.0)
+    parser.add_argument("--bare", action="store_true", help="the bare testbed in place of the whole stack")
+    options = parser.parse_args()
+    rng = np.random.default_rng(options.seed)
+    config = believed()
+    noise = noise_of(config)
+    motion, scaled, relative, coloured, reach = [], [], [], 0, 0.0
+    for number in range(options.runs):
+        world = drawn(rng)
+        with tempfile.TemporaryDirectory() as place:
+            record = (
+                fly_bare(world, options.duration)
+                if options.bare
+                else fly_stack(world, Path(place), options.duration)
+            )
+        found = fit(record, noise)
+        error = motion_error(world, found.constants)
+        motion.append((error, found.covariance[:3, :3]))
+        plant = absolute(found, beliefs_of(config), record.field)
+        # One of the six is a combination of the others: the first three and the last two are left.
+        keep = [0, 1, 2, 4, 5]
+        scaled.append((scale_error(world, plant)[keep], plant.covariance[np.ix_(keep, keep)]))
+        relative.append(np.abs(error) / world.constants.to_array()[:3])
+        coloured += not found.whiteness.passed
+        reach = max(reach, float(np.max(np.abs(record.angle[record.time > 15.0]))))
+        sys.stderr.write(f"\r{number + 1} of {options.runs}")
+    sys.stderr.write("\n")
+    _tell("gain, torsion, damping", motion)
+    _tell("with the scale", scaled)
+    errors = np.array(relative)
+    print(f"relative error, median: {np.median(errors, axis=0)}, worst: {errors.max(axis=0)}")  # noqa: T201
+    print(f"innovations not white: {coloured} of {options.runs}; largest |q2|: {np.sin(reach / 2):.3f}")  # noqa: T201
+    return 0
+
+
+def _tell(name: str, pairs: list[tuple[np.ndarray, np.ndarray]]) -> None:
+    squares = np.array([error @ np.linalg.solve(covariance, error) for error, covariance in pairs])
+    size = len(pairs[0][0])
+    z = np.array([error / np.sqrt(np.diag(covariance)) for error, covariance in pairs])
+    low, high = chi2.ppf([0.025, 0.975], size * len(pairs)) / len(pairs)
+    print(  # noqa: T201
+        f"{name}: mean chi-square {squares.mean():.2f} of {size}, 95 % band [{low:.2f}, {high:.2f}]; "
+        f"z mean {np.round(z.mean(axis=0), 2)}, z rms {np.round(np.sqrt((z**2).mean(axis=0)), 2)}"
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

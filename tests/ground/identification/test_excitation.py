@@ -1,0 +1,108 @@
+"""The excitation moves the body as it says and keeps it within its bound, whatever the body is like."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flight.bodies.testbed.plant_model import plant_of
+from flight.gnc.control.one_axis.excitation import ExcitationController, ExcitationSettings, manoeuvres
+from flight.gnc.errors import UsageError
+from flight.gnc.guidance.one_axis.path import Sample
+from tests.ground.identification.conftest import Identified
+from tests.ground.identification.worlds import PERIOD, World, believed, drawn, fly_bare
+
+REST = Sample(0.0, 0.0, 0.0)
+PLANT = plant_of(believed())
+USUAL = World(inertia=1.05e-3, dipole=0.648, field=4.5e-4, stiffness=1.0e-5, damping=2.0e-6)
+
+
+def controller(**changes: float) -> ExcitationController:
+    return ExcitationController(PLANT, PERIOD, ExcitationSettings(**changes))
+
+
+def test_each_manoeuvre_leaves_a_free_body_at_rest_and_the_swings_start_at_the_reach() -> None:
+    """A double integrator under the pulses, integrated exactly."""
+    strength, reach = 0.02, 0.5
+    for manoeuvre in manoeuvres(strength, reach, 45.0):
+        angle = rate = farthest = 0.0
+        for pulse in manoeuvre:
+            a = strength * pulse.share
+            angle += rate * pulse.duration + 0.5 * a * pulse.duration**2
+            rate += a * pulse.duration
+            farthest = max(farthest, abs(angle))
+        assert rate == pytest.approx(0.0, abs=1e-12)
+        assert farthest <= reach + 1e-12
+        assert abs(angle) == pytest.approx(reach if manoeuvre[-1].share == 0.0 else 0.0, abs=1e-12)
+
+
+def test_within_the_drawn_worlds_the_body_stays_within_half_and_the_current_within_its_share(
+    identified: list[Identified],
+) -> None:
+    limit = ExcitationSettings().current_share * PLANT.current_limit
+    for _, record, _ in identified:
+        assert np.max(np.abs(record.current)) <= limit + 1e-12
+        assert 0.15 < np.sin(0.5 * np.max(np.abs(record.angle))) < 0.5
+
+
+def test_a_body_far_livelier_than_believed_is_caught_before_the_bound() -> None:
+    """Three times the believed acceleration: flown blindly the pulses would carry it to q2 = 0.52."""
+    record = fly_bare(replace(USUAL, inertia=USUAL.inertia / 3.0), 60.0)
+    assert np.sin(0.5 * np.max(np.abs(record.angle))) < ExcitationSettings().largest_q2
+    pulses = manoeuvres(1.0, 3.0 * 0.45 * 2.0 * math.asin(ExcitationSettings().largest_q2), 45.0)[1]
+    assert math.sin(0.5 * pulses[0].duration ** 2) > 0.5
+
+
+def test_a_body_without_a_thread_does_not_drift_away_in_the_swing() -> None:
+    record = fly_bare(replace(USUAL, stiffness=0.0, damping=0.0), 120.0)
+    assert np.sin(0.5 * np.max(np.abs(record.angle))) < 0.5
+
+
+def test_a_coil_connected_the_other_way_ends_in_no_current_for_good() -> None:
+    record = fly_bare(replace(USUAL, dipole=-USUAL.dipole), 80.0)
+    assert np.any(record.current[: round(50.0 / PERIOD)])
+    assert not np.any(record.current[round(61.0 / PERIOD) :])
+
+
+def test_it_gives_up_only_when_the_body_does_not_come_to_rest() -> None:
+    lost = controller()
+    for _ in range(round(61.0 / PERIOD)):
+        lost.command(REST, 0.3, 0.0)
+    assert lost.gave_up
+    assert not lost.command(REST, 0.0, 0.0).authority
+    found = controller()
+    for _ in range(round(61.0 / PERIOD)):
+        found.command(REST, 0.0, 0.0)
+    assert not found.gave_up
+
+
+def test_after_a_loss_of_the_estimate_it_brings_the_body_to_rest_before_it_moves_it_again() -> None:
+    made = controller()
+    while made.command(REST, 0.0, 0.0).current == 0.0:
+        pass
+    made.reset()
+    currents = [made.command(REST, 0.0, 0.0).current for _ in range(round(0.9 / PERIOD))]
+    assert not np.any(currents)
+    assert any(made.command(REST, 0.0, 0.0).current for _ in range(round(0.3 / PERIOD)))
+
+
+@pytest.mark.parametrize(
+    "changes", [{"current_share": 0.0}, {"current_share": 1.1}, {"largest_q2": 0.0}, {"largest_q2": 0.6}]
+)
+def test_settings_outside_their_range_are_refused(changes: dict[str, float]) -> None:
+    with pytest.raises(UsageError, match=next(iter(changes))):
+        controller(**changes)
+
+
+def test_an_input_that_is_not_finite_is_refused() -> None:
+    with pytest.raises(UsageError, match="not finite"):
+        controller().command(REST, math.nan, 0.0)
+
+
+def test_the_drawn_worlds_differ() -> None:
+    rng = np.random.default_rng(20)
+    gains = [drawn(rng).constants.gain for _ in range(6)]
+    assert max(gains) > 1.1 * min(gains)

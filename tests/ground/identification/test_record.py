@@ -1,0 +1,139 @@
+"""The record of a flight through the whole stack: what it takes from the log, and what it leaves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.stats import chi2
+
+from flight.gnc.errors import UsageError
+from flight.link.telemetry.reader import Run
+from flight.link.telemetry.scanner import ScanResult
+from ground.identification.fit import fit
+from ground.identification.preparation import excitation_config, noise_of
+from ground.identification.record import IdentificationError, read_record
+from tests.ground.identification.worlds import World, believed, fly_stack, motion_error
+from tests.scenario import flights
+
+WORLD = World(inertia=1.15e-3, dipole=0.62, field=4.2e-4, stiffness=1.6e-5, damping=3.0e-6, bias=1e-4, seed=9)
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """Return 40 s of the excitation in the demonstration's world."""
+    return flights.fly(excitation_config(believed(), 40.0), tmp_path_factory.mktemp("run"))
+
+
+@pytest.mark.slow
+def test_through_drivers_loop_and_log_the_truth_lies_within_the_uncertainty(tmp_path: Path) -> None:
+    record = fly_stack(WORLD, tmp_path, 65.0)
+    made = fit(record, noise_of(believed()))
+    error = motion_error(WORLD, made.constants)
+    assert error @ np.linalg.solve(made.covariance[:3, :3], error) < chi2.ppf(0.999, 3)
+    assert made.sigma("gain") < 2e-3 * WORLD.constants.gain
+    assert abs(made.constants.bias - WORLD.bias) < 4.0 * made.sigma("bias")
+    assert record.field is not None
+    assert record.field.magnitude == pytest.approx(WORLD.field, rel=1e-3)
+
+
+def altered(
+    run: Run, packet: str, keep: npt.NDArray[np.bool_] | slice = slice(None), **columns: npt.NDArray[Any]
+) -> Run:
+    """Return a run with columns of a packet replaced, and only the rows `keep` of it."""
+    array = run.flight.packets[packet].copy()
+    for name, values in columns.items():
+        array[name] = values
+    packets = {**run.flight.packets, packet: array[keep]}
+    return replace(run, flight=replace(run.flight, packets=packets))
+
+
+def test_the_truth_is_not_looked_at(short: Run) -> None:
+    empty: ScanResult = replace(short.truth, packets={n: a[:0] for n, a in short.truth.packets.items()})
+    with_truth, without = read_record(short), read_record(replace(short, truth=empty))
+    assert len(short["truth"])
+    for name in ("time", "angle", "rate", "switch_time", "current"):
+        assert np.array_equal(getattr(with_truth, name), getattr(without, name))
+
+
+def test_samples_that_the_host_noted_late_stand_at_the_time_of_the_unit(short: Run) -> None:
+    exact = read_record(short).time
+    rng = np.random.default_rng(6)
+    noted = short["imu"]["sample_time_ns"] + (20e6 * rng.uniform(size=len(exact)) ** 3).astype(int)
+    late = read_record(altered(short, "imu", sample_time_ns=noted)).time
+    assert np.max(np.abs(late - exact)) < 1e-3
+    restarted = short["imu"]["device_time_ns"].copy()
+    restarted[500:] -= restarted[500]
+    assert read_record(altered(short, "imu", device_time_ns=restarted)).time == pytest.approx(exact)
+
+
+def test_a_current_that_shows_a_cycle_later_counts_from_the_cycle_that_asked(short: Run) -> None:
+    control = short["control"]
+    written = control["current_written"]
+    late = np.concatenate([np.zeros((1, 3)), written[:-1]])
+    found, exact = read_record(altered(short, "control", current_written=late)).current, written[:, 0]
+    assert np.mean(np.abs(found[:-1] - exact[:-1]) > 1e-3) < 0.02
+    assert np.mean(np.abs(late[:-1, 0] - exact[:-1]) > 1e-3) > 0.05, "as written it would be wrong"
+
+
+def test_without_commands_the_coil_falls_to_zero_as_the_driver_lets_it(short: Run) -> None:
+    time = short["control"]["time_ns"] * 1e-9
+    record = read_record(altered(short, "control", keep=(time < 12.0) | (time > 13.0)), stale_after=0.25)
+    at = int(np.searchsorted(record.switch_time, 12.5)) - 1
+    assert record.current[at] == 0.0
+    assert record.switch_time[at] == pytest.approx(11.975 + 0.25)
+
+
+def test_the_field_is_taken_only_while_the_coils_are_off(short: Run) -> None:
+    """A coil that is on lies beside the magnetometer: 10 % more field then must not be seen."""
+    control, imu = short["control"], short["imu"]
+    quiet = control["current_written"].copy()
+    quiet[800:, 0] = 0.0
+    asked = control["current_command"].copy()
+    asked[800:, 0] = 0.0
+    stilled = altered(short, "control", current_written=quiet, current_command=asked)
+    field = imu["field"].copy()
+    field[:805] *= 1.1
+    record = read_record(altered(stilled, "imu", field=field))
+    assert record.field is not None
+    assert record.field.magnitude == pytest.approx(4.5e-4, rel=1e-3)
+    always_on = control["current_written"].copy()
+    always_on[:, 0] = 0.05
+    assert read_record(altered(short, "control", current_written=always_on)).field is None
+
+
+def test_another_coil_and_a_flight_too_short_are_refused(short: Run) -> None:
+    driven = short["control"]["current_written"].copy()
+    driven[5, 2] = 0.01
+    with pytest.raises(UsageError, match="y or z"):
+        read_record(altered(short, "control", current_written=driven))
+    with pytest.raises(IdentificationError, match="too short"):
+        read_record(altered(short, "imu", keep=slice(0, 50)))
+
+
+@pytest.mark.parametrize(
+    ("packet", "field", "value"),
+    [
+        ("imu", "rate", np.nan),
+        ("imu", "quaternion", 1e200),
+        ("imu", "sample_time_ns", 2**60),
+        ("control", "current_command", -np.inf),
+        ("control", "time_ns", 2**60),
+        ("run", "control_period_ns", 0),
+        ("run", "coil_resistance", np.nan),
+    ],
+)
+def test_values_that_no_flight_writes_are_told_as_damage(
+    short: Run, packet: str, field: str, value: float
+) -> None:
+    values = short[packet][field].copy()
+    values[len(values) // 2] = value
+    damaged = altered(short, packet, **{field: values})
+    if field == "sample_time_ns":  # of no consequence while the unit's clock runs on
+        damaged = altered(damaged, "imu", device_time_ns=values)
+    with pytest.raises(IdentificationError, match=r"the log is damaged|in order of time"):
+        read_record(damaged)

@@ -1,0 +1,156 @@
+"""Testbeds unlike the believed one, drawn as the configuration says they may be, and flights in them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from flight.bodies.testbed.plant_model import plant_of
+from flight.gnc.control.one_axis.excitation import ExcitationController, ExcitationSettings
+from flight.gnc.guidance.one_axis.path import Sample
+from flight.gnc.math.arrays import FloatArray
+from flight.schema import reader as configuration
+from flight.schema.sections import Config
+from ground.identification.constants import Constants
+from ground.identification.preparation import excitation_config
+from ground.identification.record import FieldMeasurement, Record, read_record
+from ground.identification.scale import AbsolutePlant
+from sim_hal.settings import ImuNoise, Simulation, Thread, Truth
+from sim_hal.worlds.testbed import Testbed, TestbedModel
+from tests.scenario import flights
+
+PERIOD = 0.025
+ANGLE_BOUND, RATE_BOUND, CURRENT_BOUND = 2.0 * 1.75e-3, 1.75e-4, 3.5e-3
+"""Of uniform noise: on the angle, which is twice q2, on the rate, and on the current in a coil that is on."""
+
+
+@dataclass(frozen=True)
+class World:
+    """What is true: `dipole` is n A per commanded ampere, `magnetometer` its scale."""
+
+    inertia: float
+    dipole: float
+    field: float
+    stiffness: float
+    damping: float
+    bias: float = 0.0
+    magnetometer: float = 1.0
+    seed: int = 1
+
+    @property
+    def constants(self) -> Constants:
+        """The constants per inertia."""
+        return Constants(
+            gain=self.dipole * self.field / self.inertia,
+            torsion=self.stiffness / self.inertia,
+            damping=self.damping / self.inertia,
+            bias=self.bias,
+        )
+
+
+def believed() -> Config:
+    """Return the configuration that is believed in."""
+    return flights.demo_config(200.0, camera=False)
+
+
+def drawn(rng: np.random.Generator) -> World:
+    """Draw a world: scale as believed with the stated errors, a thread of up to three times the usual."""
+    config = believed()
+    plant, known = config.plant, config.identification
+
+    def about(value: float, error: float) -> float:
+        return value * math.exp(error * float(np.clip(rng.standard_normal(), -3.0, 3.0)))
+
+    return World(
+        inertia=about(plant.inertia, known.inertia_error),
+        dipole=about(plant.coil_turns * plant.coil_area, known.dipole_error),
+        field=about(plant.field, known.field_error),
+        stiffness=rng.uniform(0.0, 3.0e-5),
+        damping=rng.uniform(0.0, 6.0e-6),
+        bias=1e-4 * rng.standard_normal(),
+        magnetometer=about(1.0, known.magnetometer_error),
+        seed=int(rng.integers(1, 2**31)),
+    )
+
+
+def fly_stack(world: World, folder: Path, duration: float = 200.0) -> Record:
+    """Fly the excitation through drivers, loop and log; the dipole's error is the resistance's."""
+    config = excitation_config(believed(), duration)
+    resistance = config.coils.resistance[0] * config.plant.coil_turns * config.plant.coil_area / world.dipole
+    section: Simulation = configuration.replace(
+        flights.demo_world(),
+        seed=world.seed,
+        thread=Thread(stiffness=world.stiffness, damping=world.damping),
+        truth=Truth(inertia=world.inertia, field=world.field, resistance=(resistance, 23.0, 23.0)),
+        imu=ImuNoise(quaternion_noise=1.75e-3, rate_noise=1.75e-4, gyro_bias=(0.0, world.bias, 0.0)),
+    )
+    record = read_record(flights.fly(config, folder, section=section))
+    if record.field is None:
+        return record
+    # The emulated magnetometer has no error of scale.
+    field = replace(record.field, magnitude=record.field.magnitude * world.magnetometer)
+    return replace(record, field=field)
+
+
+def fly_bare(
+    world: World, duration: float = 100.0, settings: ExcitationSettings | None = None, noise: float = 1.0
+) -> Record:
+    """Fly the excitation on the bare testbed: no wires, no filter; `noise` scales all of it."""
+    rng = np.random.default_rng(world.seed)
+    plant = plant_of(believed())
+    controller = ExcitationController(plant, PERIOD, settings or ExcitationSettings())
+    felt: list[FloatArray] = [np.zeros(3)]
+    testbed = Testbed(
+        TestbedModel(
+            world.inertia, world.dipole, world.field, world.stiffness, world.damping, (23.0, 23.0, 23.0), 3.4
+        ),
+        angle=0.3,
+        release_rate=-0.05,
+        currents=lambda: felt[0],
+    )
+    testbed.release_at(0)
+    count = round(duration / PERIOD)
+    time, angle, rate, current = (np.zeros(count) for _ in range(4))
+    uniform = noise * rng.uniform(-1.0, 1.0, (count, 3))
+    rest = Sample(0.0, 0.0, 0.0)
+    testbed.advance_to(1)
+    for k in range(count):
+        testbed.advance_to(round(k * PERIOD * 1e9))
+        time[k], angle[k], rate[k] = k * PERIOD, testbed.angle, testbed.rate
+        current[k] = controller.command(rest, testbed.angle, testbed.rate).current
+        on = current[k] != 0.0
+        felt[0] = np.array([current[k] + on * CURRENT_BOUND * uniform[k, 2], 0.0, 0.0])
+    return Record(
+        time=time,
+        angle=angle + ANGLE_BOUND * uniform[:, 0],
+        rate=rate + world.bias + RATE_BOUND * uniform[:, 1],
+        switch_time=time,
+        current=current,
+        clipped=np.zeros(count, dtype=bool),
+        period=PERIOD,
+        field=FieldMeasurement(world.field * world.magnetometer, 0.0, count),
+    )
+
+
+def motion_error(world: World, constants: Constants) -> FloatArray:
+    """Return found less true gain, torsion and damping (3,)."""
+    return np.asarray(constants.to_array() - world.constants.to_array())[:3]
+
+
+def scale_error(world: World, plant: AbsolutePlant) -> FloatArray:
+    """Return found less true ln J, ln n A, ln B, ln g, torsion, damping (6,): what `covariance` is of."""
+    true = world.constants
+    gain = plant.torque_constant.value / plant.inertia.value
+    return np.array(
+        [
+            math.log(plant.inertia.value / world.inertia),
+            math.log(plant.dipole.value / world.dipole),
+            math.log(plant.field.value / world.field),
+            math.log(gain / true.gain),
+            plant.stiffness.value / plant.inertia.value - true.torsion,
+            plant.damping.value / plant.inertia.value - true.damping,
+        ]
+    )

@@ -1,0 +1,110 @@
+"""The pictures are made of whatever the run has, without matplotlib's global state."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flight.gnc.errors import UsageError
+from flight.link.telemetry.reader import read_run
+from ground.report import draw
+from tests.ground.report.synthetic import CURRENT, Recipe, make_run
+
+pytest.importorskip("matplotlib", reason="pictures need the extra 'plots'")
+from matplotlib.figure import Figure
+from matplotlib.image import imread
+
+from ground.report import panels
+
+EVERY = ["attitude", "current", "power", "paths", "cycle_times", "rate", "overview"]
+ROOT = Path(__file__).resolve().parents[3]
+
+
+def is_drawn(path: Path) -> bool:
+    """Tell whether a picture is more than its white paper."""
+    return bool(imread(path)[..., :3].std() > 0.01)
+
+
+@pytest.mark.parametrize(
+    ("recipe", "expected"),
+    [
+        (Recipe(rate_hz=5.0), EVERY),
+        (Recipe(duration=3.0, rate_hz=10.0), EVERY),
+        (
+            Recipe(duration=20.0, rate_hz=10.0, truth=False, identity=False, commands=False),
+            ["attitude", "current", "cycle_times", "rate", "overview"],
+        ),
+    ],
+    ids=["full", "cut short", "hardware, bare"],
+)
+def test_every_picture_that_the_run_has_something_for_is_drawn(
+    tmp_path: Path, recipe: Recipe, expected: list[str]
+) -> None:
+    files = draw(read_run(make_run(tmp_path / "run", recipe)), tmp_path / "pictures")
+    assert [path.stem for path in files] == expected
+    assert all(is_drawn(path) for path in files)
+    rows, columns = imread(files[-1]).shape[:2]
+    assert (columns, rows) == pytest.approx((1200, 1400), abs=5), "the overview, as the README wants it"
+
+
+def test_the_panels_show_the_values_of_the_log(tmp_path: Path) -> None:
+    run = read_run(make_run(tmp_path, Recipe(duration=120.0, rate_hz=10.0)))
+    scene, figure = panels.Scene(run), Figure()
+    top, bottom = figure.subplots(2)
+    panels.attitude(top, scene)
+    lines = {str(line.get_label()): line for line in top.get_lines()}
+    assert set(lines) == {"target", "estimated", "true"}
+    np.testing.assert_array_equal(lines["estimated"].get_ydata(), run["control"]["q2"])
+    np.testing.assert_allclose(lines["true"].get_ydata(), run["control"]["q2"], atol=1e-12)
+    panels.current(bottom, scene)
+    drawn = np.asarray(bottom.get_lines()[0].get_ydata())
+    assert drawn.max() == CURRENT
+
+
+def test_values_that_only_a_damaged_log_has_do_not_keep_a_panel_from_being_drawn(tmp_path: Path) -> None:
+    run = read_run(make_run(tmp_path, Recipe(duration=20.0, rate_hz=10.0)))
+    damaged = run.truth.packets["truth"].copy()
+    damaged["rate"][: len(damaged) // 2] = np.inf
+    run.truth.packets["truth"] = damaged
+    axes = Figure().subplots()
+    with np.errstate(invalid="ignore"):
+        panels.rate_error(axes, panels.Scene(run))
+    assert np.isfinite(axes.get_ylim()).all()
+
+
+def test_a_planned_path_passes_through_its_nodes_and_is_the_polynomial_between(tmp_path: Path) -> None:
+    run = read_run(make_run(tmp_path, Recipe(duration=5.0, rate_hz=10.0)))
+    plan = run["plan"][0]
+    time, q2, node_time, node_q2 = panels.planned_path(plan)
+    assert (time[0], time[-1]) == (node_time[0], node_time[-1]) == (0.0, 13.0)
+    part = time / 13.0
+    np.testing.assert_allclose(q2, 0.2 - 0.5 * (3.0 * part**2 - 2.0 * part**3), atol=1e-12)
+    np.testing.assert_allclose(node_q2, np.interp(node_time, time, q2), atol=1e-3)
+
+
+def test_the_report_on_board_imports_no_matplotlib() -> None:
+    code = "import sys, ground.report, flight.link.telemetry.reader; print('matplotlib' in sys.modules)"
+    printed = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    assert printed.stdout == "False\n"
+
+
+def test_without_matplotlib_the_cure_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = read_run(make_run(tmp_path, Recipe(duration=1.0, rate_hz=10.0)))
+    for name in [name for name in sys.modules if name.startswith(("matplotlib", "ground.report."))]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(UsageError, match=r"pip install '\.\[plots\]'"):
+        draw(run, tmp_path)
+
+
+def test_a_place_that_cannot_be_written_is_a_clear_error(tmp_path: Path) -> None:
+    run = read_run(make_run(tmp_path, Recipe(duration=1.0, rate_hz=10.0)))
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(UsageError, match="no pictures can be written there"):
+        draw(run, tmp_path / "file")

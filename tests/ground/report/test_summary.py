@@ -1,0 +1,257 @@
+"""The summary tells of a run what is known of it, and says what is not."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flight.link.telemetry.definitions import TRUTH
+from flight.link.telemetry.log import FlightLog
+from flight.link.telemetry.packets import Packer
+from flight.link.telemetry.reader import Run, read_run
+from flight.link.telemetry.scanner import scan
+from ground.report import format_report, summarise
+from ground.report.sensing import covariance_matrices, mean_rates
+from ground.report.signals import coil_power
+from tests.ground.report.synthetic import (
+    CURRENT,
+    DAMPING,
+    RATE_BIAS,
+    RESISTANCE,
+    STAR_ERROR,
+    STREAK_ERROR,
+    TARGETS,
+    VOLTAGE,
+    Recipe,
+    make_run,
+)
+from tests.manual_clock import ManualClock
+
+OVERSHOOT = 100.0 * math.exp(-math.pi * DAMPING / math.sqrt(1.0 - DAMPING**2))
+
+
+@pytest.fixture(scope="module")
+def full(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    return read_run(make_run(tmp_path_factory.mktemp("full"), Recipe(rate_hz=10.0)))
+
+
+def short(tmp_path: Path, **changes: object) -> Run:
+    plain: dict[str, object] = {"duration": 250.0, "rate_hz": 10.0, **changes}
+    return read_run(make_run(tmp_path / "run", Recipe(**plain)))  # type: ignore[arg-type]  # built by name
+
+
+def test_every_step_of_a_full_run_is_judged_on_the_truth(full: Run) -> None:
+    summary = summarise(full)
+    assert summary["attitude_source"] == "truth"
+    assert [step["target_q2"] for step in summary["steps"]] == list(TARGETS)
+    for step in summary["steps"]:
+        assert step["complete"]
+        assert step["overshoot_percent"] == pytest.approx(OVERSHOOT, abs=0.05)
+        assert step["steady_state_deg"] == pytest.approx(0.0, abs=1e-3)
+    assert [step["rise_judged"] for step in summary["steps"]] == [False] + 6 * [True]
+    assert summary["steps"][0]["from_q2"] == pytest.approx(0.2)
+    assert summary["notes"] == []
+    assert not summary["run"]["cut_short"]
+
+
+def test_the_worst_of_each_figure_stands_beside_the_thesis(full: Run) -> None:
+    rows = {row["quantity"]: row for row in summarise(full)["thesis"]}
+    limits = {name: (row["limit"], row["unit"]) for name, row in rows.items()}
+    assert limits == {
+        "steady-state error": (4.5, "deg"),
+        "overshoot": (20.0, "%"),
+        "rise time": (8.0, "s"),
+        "settling time": (30.0, "s"),
+        "average power": (0.10, "W"),
+        "largest current": (0.148, "A"),
+    }
+    assert {row["verdict"] for row in rows.values()} == {"pass"}
+    assert rows["overshoot"]["worst"] == pytest.approx(OVERSHOOT, abs=0.05)
+
+
+def test_power_is_the_mean_of_r_i_squared_from_the_true_energy(full: Run) -> None:
+    """A tenth of the time at 0.1 A."""
+    power = summarise(full)["power"]
+    assert power["source"] == "truth"
+    assert power["average_w"] == pytest.approx(0.1 * RESISTANCE * CURRENT**2, rel=1e-9)
+    assert power["peak_w"] == pytest.approx(RESISTANCE * CURRENT**2, rel=1e-6)
+    assert power["supply_average_w"] == pytest.approx(0.1 * VOLTAGE * CURRENT, rel=1e-9)
+    assert power["peak_current_a"] == CURRENT
+
+
+def test_without_truth_estimate_and_written_currents_are_judged(tmp_path: Path) -> None:
+    run = short(tmp_path, truth=False, duration=300.0, planned=300.0)
+    summary = summarise(run)
+    assert summary["attitude_source"] == "estimate"
+    assert summary["power"]["source"] == "written"
+    assert summary["power"]["average_w"] == pytest.approx(0.1 * RESISTANCE * CURRENT**2, rel=1e-9)
+    assert summary["power"]["supply_average_w"] == pytest.approx(0.1 * VOLTAGE * CURRENT, rel=1e-9)
+    assert summary["power"]["peak_current_felt_a"] is None
+    assert summary["estimate"] is None
+    assert summary["streaks"]["rms_error"] is None
+    assert summary["steps"][1]["overshoot_percent"] == pytest.approx(OVERSHOOT, abs=0.05)
+    assert "no truth log: judged on the estimate" in summary["notes"]
+
+
+def test_a_run_cut_short_is_judged_on_its_complete_steps_and_says_so(tmp_path: Path) -> None:
+    summary = summarise(short(tmp_path))
+    assert [step["complete"] for step in summary["steps"]] == [True, True, False]
+    unfinished = summary["steps"][2]
+    assert [
+        unfinished[key] for key in ("steady_state_deg", "overshoot_percent", "rise_s", "settling_s")
+    ] == 4 * [None]
+    assert summary["run"]["cut_short"]
+    assert "cut short: 250.0 s of 700.0 s" in summary["notes"]
+    assert "step 2: not complete, not judged" in summary["notes"]
+    assert {row["verdict"] for row in summary["thesis"]} == {"pass"}
+
+
+def test_a_shorter_run_that_was_meant_to_be_short_is_complete(tmp_path: Path) -> None:
+    summary = summarise(short(tmp_path, planned=250.0))
+    assert [step["complete"] for step in summary["steps"]] == [True, True, True]
+    assert not summary["run"]["cut_short"]
+
+
+def test_a_run_without_targets_has_no_steps_and_unknown_verdicts(tmp_path: Path) -> None:
+    summary = summarise(short(tmp_path, commands=False))
+    assert summary["steps"] == []
+    verdicts = {row["quantity"]: row["verdict"] for row in summary["thesis"]}
+    assert verdicts["rise time"] == verdicts["overshoot"] == "unknown"
+    assert verdicts["average power"] == "pass"
+    assert "no target packets: no steps to judge" in summary["notes"]
+
+
+def test_a_step_of_no_size_is_told_apart_from_one_never_made(tmp_path: Path) -> None:
+    summary = summarise(short(tmp_path, duration=300.0, planned=300.0, targets=(-0.3, -0.3, -0.2)))
+    assert summary["steps"][1]["complete"]
+    assert summary["steps"][1]["rise_s"] is None
+    assert "step 1: the target stays where it was, only the steady state is judged" in summary["notes"]
+    verdicts = {row["quantity"]: row["verdict"] for row in summary["thesis"]}
+    assert verdicts["rise time"] == "pass"
+
+
+def test_a_step_never_settled_is_a_miss(tmp_path: Path) -> None:
+    """Six seconds are too few for this response to reach 90 % of its step."""
+    summary = summarise(short(tmp_path, duration=6.0, planned=6.0, hold=3.0))
+    assert summary["steps"][1]["settling_s"] is None
+    assert "step 1: never settled" in summary["notes"]
+    verdicts = {row["quantity"]: row["verdict"] for row in summary["thesis"]}
+    assert verdicts["settling time"] == "miss"
+
+
+def test_a_figure_beyond_the_thesis_is_a_miss(tmp_path: Path) -> None:
+    log, packer = FlightLog(tmp_path, "truth", clock=ManualClock()), Packer()
+    for i in range(100):
+        log.write(
+            packer.pack(TRUTH, i * 25_000_000, quaternion=(0, 0, 0, 1), rate=(0, 0, 0), current=(0.2, 0, 0),
+                        energy=0.11 * 0.025 * i, supply_energy=0.0)
+        )  # fmt: skip
+    log.close()
+    make_run(tmp_path, Recipe(duration=2.0, truth=False))
+    rows = {row["quantity"]: row for row in summarise(read_run(tmp_path))["thesis"]}
+    assert rows["average power"]["verdict"] == "miss"
+    assert rows["average power"]["worst"] == pytest.approx(0.11)
+
+
+def test_a_run_without_its_identity_is_still_reported(tmp_path: Path) -> None:
+    run = short(tmp_path, identity=False, truth=False)
+    assert coil_power(run) is None
+    summary = summarise(run)
+    assert "no run packet: the configuration of this run is not known" in summary["notes"]
+    assert "power not known: neither truth nor coil resistance in the log" in summary["notes"]
+    assert [step["complete"] for step in summary["steps"]] == [True, True, False]
+    assert format_report(summary)
+
+
+def test_loop_planner_events_and_logs_are_counted(full: Run) -> None:
+    summary = summarise(full)
+    assert [group["name"] for group in summary["rate_groups"]] == ["control", "housekeeping"]
+    assert summary["rate_groups"][0]["cycles"] == 7001
+    assert summary["rate_groups"][0]["slips"] == 3
+    assert summary["cycles"]["lateness_s"]["max"] == pytest.approx(6e-5)
+    assert summary["cycles"]["execution_s"]["p50"] == pytest.approx(5e-4)
+    assert summary["cycles"]["skipped"] == 0
+    (job,) = summary["jobs"]
+    assert (job["name"], job["count"], job["outcomes"]) == ("planner", 3, {"done": 3})
+    assert job["execution_s"]["p50"] == pytest.approx(0.012)
+    planner = summary["planner"]
+    assert [planner[key] for key in ("plans", "accepted", "refused", "stretched")] == [7, 6, 1, 1]
+    assert planner["refusals"] == {"infeasible": 1}
+    assert planner["longest_horizon_s"] == 13.0
+    (event,) = summary["events"]
+    assert (event["name"], event["count"], event["first_s"]) == ("target", 14, 0.0)
+    assert [log["log"] for log in summary["logs"]] == ["flight", "truth", "performance"]
+    assert all(log["skipped_bytes"] == log["missing_packets"] == 0 for log in summary["logs"])
+
+
+def test_slots_without_a_control_packet_are_counted(full: Run, tmp_path: Path) -> None:
+    raw = (full.folder / "flight-0001.ccsds").read_bytes()
+    length = 155
+    third = [m for m in range(len(raw)) if raw[m : m + 2] == b"\x09\x11"][2]
+    (tmp_path / "flight-0001.ccsds").write_bytes(raw[:third] + raw[third + length :])
+    summary = summarise(read_run(tmp_path))
+    assert summary["cycles"]["skipped"] == 1
+    assert summary["logs"][0]["missing_packets"] == 1
+
+
+def test_estimate_and_streaks_are_held_against_the_truth(full: Run) -> None:
+    """The made-up estimate is off by one sigma, each streak by just its covariance."""
+    summary = summarise(full)
+    assert summary["estimate"]["rate_rms_rad_s"] == pytest.approx(RATE_BIAS, rel=1e-6)
+    assert summary["estimate"]["rate_normalised"] == pytest.approx(1.0, rel=1e-6)
+    assert summary["estimate"]["angle_rms_rad"] == pytest.approx(0.0, abs=1e-12)
+    streaks = summary["streaks"]
+    assert streaks["frames"] == streaks["rates"] == streaks["accepted"] == streaks["compared"] == 140
+    assert streaks["rms_error"] == pytest.approx([0.0, STREAK_ERROR, 0.0], rel=1e-6, abs=1e-9)
+    assert streaks["normalised"] == pytest.approx(1.0, rel=1e-4)
+    stars = summary["stars"]
+    assert stars["frames"] == stars["solved"] == stars["tracked"] == stars["accepted"] == 140
+    assert stars["compared"] >= 139
+    assert stars["rms_error"] == pytest.approx([0.0, STAR_ERROR, 0.0], rel=1e-3, abs=1e-9)
+    assert stars["normalised"] == pytest.approx(1.0, rel=1e-3)
+
+
+def test_the_mean_rate_over_an_exposure_is_the_turn_over_its_time() -> None:
+    """A rate growing linearly: the mean is the rate at the middle, whatever the exposure's ends."""
+    packer = Packer()
+    raw = b"".join(
+        packer.pack(TRUTH, i * 25_000_000, quaternion=(0, 0, 0, 1), rate=(0, 0.01 * 0.025 * i, 0),
+                    current=(0, 0, 0), energy=0, supply_energy=0)
+        for i in range(401)
+    )  # fmt: skip
+    truth = scan(raw).packets["truth"]
+    mean = mean_rates(truth, np.array([1.0, 2.013, 9.5]), np.array([2.0, 3.0, 10.5]))
+    np.testing.assert_allclose(mean[:2, 1], [0.015, 0.01 * 0.5 * (2.013 + 3.0)], atol=1e-6)
+    assert np.isnan(mean[2]).all(), "not covered by the truth"
+
+
+def test_packed_covariances_are_unpacked_in_the_table_s_order() -> None:
+    expected = [[1.0, 4.0, 5.0], [4.0, 2.0, 6.0], [5.0, 6.0, 3.0]]
+    assert covariance_matrices(np.array([[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]]))[0].tolist() == expected
+
+
+@pytest.mark.parametrize("changes", [{}, {"truth": False}, {"identity": False}, {"commands": False}])
+def test_the_summary_is_strict_json(tmp_path: Path, changes: dict[str, object]) -> None:
+    summary = summarise(short(tmp_path, **changes))
+    assert json.loads(json.dumps(summary, allow_nan=False)) == summary
+
+
+def test_the_text_tells_the_table_of_the_thesis(full: Run) -> None:
+    text = format_report(summarise(full))
+    assert "3  -0.100 -> +0.000" in text
+    for row in ("steady-state error", "overshoot", "rise time", "settling time", "average power"):
+        (line,) = [line for line in text.splitlines() if line.strip().startswith(row)]
+        assert line.endswith("pass")
+    assert "planner: 3 jobs (done 3)" in text
+    assert max(len(line) for line in text.splitlines()) <= 120
+
+
+def test_the_text_of_the_barest_run_says_what_is_missing(tmp_path: Path) -> None:
+    changes = {"truth": False, "identity": False, "performance": False, "commands": False, "duration": 0.5}
+    text = format_report(summarise(short(tmp_path, **changes)))
+    assert "note: no target packets" in text
+    assert "unknown" in text

@@ -1,0 +1,152 @@
+"""Frame sources for tests, each on a clock that can be waited on."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flight.gnc.math.arrays import FloatArray, Image
+from hal.buses.clock import SystemClock
+from hal.drivers import aravis_camera
+from hal.drivers.aravis_camera import AravisCamera, AravisSettings
+from hal.drivers.camera import ServedCamera
+from hal.drivers.v4l2_camera import V4l2Camera, V4l2Settings
+from hal.interfaces.devices import FrameSource
+from hal.interfaces.errors import Refused
+from hal.interfaces.readings import Frame
+from hal.interfaces.wires import Clock
+from sim_hal.emulators.star_camera import EmulatedStarCamera
+from sim_hal.worlds.motion import Motion
+from tests.hal.cameras.ioctl_camera import IoctlCamera
+from tests.manual_clock import ManualClock
+
+EXPOSURE_NS = 40_000_000
+STEP_NS = 2_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Rig:
+    """A frame source, its clock, and how it is unplugged, None where it cannot be."""
+
+    source: FrameSource
+    clock: Clock
+    shape: tuple[int, int]
+    unplug: Callable[[], None] | None
+
+    def wait(self, span_ns: int) -> None:
+        """Let time pass."""
+        self.clock.sleep_until_ns(self.clock.now_ns() + span_ns)
+
+    def frame_within(self, span_ns: int) -> Frame | None:
+        """Return the first frame to come, None when none does."""
+        deadline_ns = self.clock.now_ns() + span_ns
+        while self.clock.now_ns() < deadline_ns:
+            frame = self.source.poll()
+            if frame is not None:
+                return frame
+            self.wait(STEP_NS)
+        return None
+
+    def next_frame(self) -> Frame:
+        """Trigger and return the frame."""
+        self.source.trigger(EXPOSURE_NS)
+        frame = self.frame_within(2_000_000_000)
+        assert frame is not None, "no frame came"
+        return frame
+
+
+@dataclass(frozen=True, slots=True)
+class VideoRig:
+    """A V4L2 camera over the double."""
+
+    rig: Rig
+    camera: ServedCamera
+    kernel: IoctlCamera
+    clock: ManualClock
+
+
+class _World:
+    """Lets an emulated camera live along with a clock."""
+
+    def __init__(self, camera: EmulatedStarCamera) -> None:
+        self._camera = camera
+
+    def next_event_ns(self) -> int:
+        return self._camera.next_event_ns()
+
+    def advance_to(self, time_ns: int) -> None:
+        self._camera.advance(time_ns)
+
+
+def emulated_rig() -> Rig:
+    """Return the simulated camera, its pictures flat."""
+    clock = ManualClock()
+
+    def expose(sequence: int, _times: FloatArray, _attitudes: FloatArray) -> Future[Image]:
+        promise: Future[Image] = Future()
+        promise.set_result(np.full((48, 64), sequence, np.uint16))
+        return promise
+
+    still = Motion(0, np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), np.zeros(3), np.zeros(3))
+    camera = EmulatedStarCamera(
+        lambda _: still, expose, clock.now_ns, 5_000_000, np.array([0.0, 0.0, 0.0, 1.0])
+    )
+    clock.attach(_World(camera))
+
+    def unplug() -> None:
+        camera.fault = "off"
+
+    return Rig(camera, clock, (48, 64), unplug)
+
+
+def video_rig(kernel: IoctlCamera, clock: ManualClock, **changes: object) -> VideoRig:
+    """Return the V4L2 driver over the double; `changes` are of its settings."""
+    wanted: dict[str, object] = {
+        "path": str(kernel.path),
+        "columns": 64,
+        "rows": 48,
+        "pixel_format": "GREY",
+        "exposure_ns": EXPOSURE_NS,
+    }
+    settings = V4l2Settings(**(wanted | changes))  # type: ignore[arg-type]  # the values are the tests' own
+    camera = ServedCamera(V4l2Camera(settings, clock), clock)
+    return VideoRig(Rig(camera, clock, (48, 64), kernel.unplug), camera, kernel, clock)
+
+
+def require_aravis() -> None:
+    """Skip where Aravis cannot be reached from this Python."""
+    with warnings.catch_warnings(action="ignore"):  # what PyGObject's importer warns of is its own affair
+        try:
+            aravis_camera.library("Fake_1")
+        except Refused as error:
+            pytest.skip(str(error))
+
+
+def aravis_rig(**changes: object) -> Rig:
+    """Return Aravis' Fake camera in real time."""
+    require_aravis()
+    clock = SystemClock()
+    wanted: dict[str, object] = {
+        "name": "Fake_1",
+        "columns": 512,
+        "rows": 256,
+        "pixel_format": "Mono8",
+        "exposure_ns": EXPOSURE_NS,
+    }
+    settings = AravisSettings(**(wanted | changes))  # type: ignore[arg-type]  # the values are the tests' own
+    return Rig(ServedCamera(AravisCamera(settings, clock), clock), clock, (256, 512), None)
+
+
+def kernel_in(folder: Path, clock: ManualClock, monkeypatch: pytest.MonkeyPatch) -> IoctlCamera:
+    """Replace the kernel's V4L2 by a double."""
+    kernel = IoctlCamera(folder, clock.now_ns)
+    monkeypatch.setattr("hal.buses.v4l2.ioctl", kernel)
+    # Whatever this machine's kernel says of a driver that the double is not.
+    monkeypatch.setattr("hal.drivers.v4l2_camera.UVC_STAMPS", folder / "hwtimestamps")
+    return kernel

@@ -1,0 +1,41 @@
+"""The same rig on both buses: the emulated one in memory, and smbus2 over replaced ioctls."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from hal.buses.i2c_bus import LinuxI2cBus
+from hal.drivers.coil_settings import CoilSettings
+from tests.hal.coils.ioctl_wire import IoctlWire
+from tests.hal.coils.rig import THESIS_COILS, Rig, Wire
+from tests.manual_clock import ManualClock
+
+
+@pytest.fixture
+def kernel(monkeypatch: pytest.MonkeyPatch) -> IoctlWire:
+    """Replace the kernel's I2C by an emulated bus; any file that opens is then an adapter."""
+    wire = Wire(ManualClock(), CoilSettings(coils=THESIS_COILS), uncertainty=0.0)
+    return _replace_ioctl(monkeypatch, wire)
+
+
+@pytest.fixture(params=["emulated", "smbus2"])
+def rig(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
+    """Build a rig, not yet started, on either bus."""
+    if request.param == "emulated":
+        yield Rig()
+        return
+    clock = ManualClock()
+    wire = Wire(clock, CoilSettings(coils=THESIS_COILS), uncertainty=0.0)
+    _replace_ioctl(monkeypatch, wire)
+    bus = LinuxI2cBus("/dev/null")
+    yield Rig(wire=wire, clock=clock, bus=bus)
+    bus.close()
+
+
+def _replace_ioctl(monkeypatch: pytest.MonkeyPatch, wire: Wire) -> IoctlWire:
+    kernel = IoctlWire(wire.bus)
+    monkeypatch.setattr("smbus2.smbus2.ioctl", kernel)
+    monkeypatch.setattr("hal.buses.i2c_bus.ioctl", kernel)
+    return kernel

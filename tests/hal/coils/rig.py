@@ -1,0 +1,76 @@
+"""The coils' whole chain on one emulated bus: driver, PWM chip, bridges, coils, current monitor."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from hal.drivers.coil_settings import CoilSettings, CoilWiring
+from hal.drivers.coils import PwmTorqueCoils
+from hal.drivers.pca9685 import Pca9685
+from hal.interfaces.devices import TorqueCoils
+from hal.interfaces.wires import Clock, I2cBus
+from sim_hal.emulators.i2c_bus import EmulatedI2cBus
+from sim_hal.emulators.ina219 import EmulatedIna219
+from sim_hal.emulators.pca9685 import EmulatedPca9685
+from sim_hal.worlds.coil_circuit import CoilCircuit
+from tests.manual_clock import ManualClock
+
+PCA, INA = 0x40, 0x45
+THESIS_COILS = (CoilWiring(0, 1, 23.0), CoilWiring(2, 3, 23.0), CoilWiring(4, 5, 23.0))
+UNEQUAL = CoilSettings(
+    coils=(CoilWiring(0, 1, 23.0), CoilWiring(3, 2, 17.0, sign=-1), CoilWiring(8, 9, 25.0, enable_channel=10))
+)
+
+
+class Wire:
+    """What hangs on the bus, and the bus itself as the parts' side sees it."""
+
+    def __init__(self, clock: Clock, settings: CoilSettings, uncertainty: float, seed: int = 1) -> None:
+        self.chip = EmulatedPca9685(PCA, clock.now_ns)
+        self.circuit = CoilCircuit(
+            self.chip, settings, np.random.default_rng(seed), clock.now_ns, uncertainty=uncertainty
+        )
+        self.monitor = EmulatedIna219(INA, clock.now_ns, self.circuit.mean_supply)
+        self.bus = EmulatedI2cBus(
+            [self.chip, self.monitor],
+            wait=lambda span_ns: clock.sleep_until_ns(clock.now_ns() + span_ns),
+        )
+
+
+class Rig:
+    """Driver and wire on a manual clock, the coils started; `bus` takes the place of the emulated bus."""
+
+    def __init__(
+        self,
+        settings: CoilSettings | None = None,
+        uncertainty: float = 0.0,
+        wire: Wire | None = None,
+        clock: ManualClock | None = None,
+        bus: I2cBus | None = None,
+    ) -> None:
+        self.settings = CoilSettings(coils=THESIS_COILS) if settings is None else settings
+        self.clock = ManualClock() if clock is None else clock
+        self.wire = Wire(self.clock, self.settings, uncertainty) if wire is None else wire
+        self.bus: I2cBus = self.wire.bus if bus is None else bus
+        self.pca = Pca9685(self.bus, PCA, self.clock)
+        self.coils: TorqueCoils = PwmTorqueCoils(self.pca, self.clock, self.settings)
+
+    @property
+    def duties(self) -> list[float]:
+        """The duty of every channel of the chip."""
+        return [self.wire.chip.duty(channel) for channel in range(16)]
+
+    def currents(self) -> list[float]:
+        """Return what the coils carry, A."""
+        return [float(current) for current in self.wire.circuit.currents()]
+
+    def command(self, *currents: float) -> None:
+        """Command currents, A."""
+        self.coils.command(np.array(currents))
+
+
+def limited_to(current_limit: float, settings: CoilSettings = UNEQUAL) -> CoilSettings:
+    """Return settings with another current limit."""
+    return dataclasses.replace(settings, current_limit=current_limit)

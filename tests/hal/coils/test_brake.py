@@ -1,0 +1,128 @@
+"""A bridge with a leg stuck high: what it does to its coil, and what holds the coil at zero all the same."""
+
+from __future__ import annotations
+
+import pytest
+
+from hal.drivers.coil_settings import CoilSettings, CoilWiring
+from hal.drivers.h_bridge import brake
+from hal.drivers.pca9685 import FULL_ON
+from hal.interfaces.errors import Refused
+from sim_hal.worlds.coil_circuit import Condition
+from tests.hal.coils.rig import PCA, Rig
+
+MS = 1_000_000
+FULL = 3.4 / 23.0
+Y = (False, True, False)
+
+
+def stuck(condition: Condition = Condition.A_HIGH) -> Rig:
+    """Return a rig that has been started, with a leg of coil y's bridge broken."""
+    rig = Rig()
+    rig.coils.start()
+    rig.wire.circuit.become(1, condition)
+    return rig
+
+
+@pytest.mark.parametrize(("condition", "sign"), [(Condition.A_HIGH, 1.0), (Condition.B_HIGH, -1.0)])
+def test_a_leg_stuck_high_drives_its_coil_at_zero_and_a_brake_ends_it(
+    condition: Condition, sign: float
+) -> None:
+    """Which leg it is need not be known: both inputs are high."""
+    rig = stuck(condition)
+    rig.command(0.0, 0.0, 0.0)
+    assert rig.currents() == pytest.approx([0.0, sign * FULL, 0.0])
+    rig.coils.brake(Y)
+    assert brake() == (FULL_ON, FULL_ON)
+    assert rig.currents() == [0.0, 0.0, 0.0]
+    assert rig.coils.state().braked == Y
+
+
+def test_a_sound_bridge_that_is_braked_carries_nothing_whatever_is_commanded(rig: Rig) -> None:
+    rig.coils.start()
+    rig.coils.brake(Y)
+    rig.command(0.1, 0.1, -0.05)
+    assert rig.currents() == pytest.approx([0.1, 0.0, -0.05], abs=1e-4)
+    assert rig.coils.state().current.tolist() == pytest.approx([0.1, 0.0, -0.05], abs=1e-4)
+    rig.coils.brake((False, False, False))
+    rig.command(0.1, 0.1, -0.05)
+    assert rig.currents() == pytest.approx([0.1, 0.1, -0.05], abs=1e-4)
+
+
+def test_a_brake_on_a_leg_stuck_low_would_drive_the_coil() -> None:
+    """Why no bridge is braked on a guess alone: the current is looked at, and the brake taken back."""
+    rig = stuck(Condition.A_LOW)
+    assert rig.currents() == [0.0, 0.0, 0.0]
+    rig.coils.brake(Y)
+    assert rig.currents()[1] == pytest.approx(-FULL)
+
+
+def test_zero_keeps_what_is_braked_at_zero() -> None:
+    rig = stuck()
+    rig.coils.brake(Y)
+    rig.command(0.1, 0.0, 0.0)
+    rig.coils.off()
+    assert rig.currents() == [0.0, 0.0, 0.0]
+    rig.clock.advance(1000 * MS)
+    assert rig.currents() == [0.0, 0.0, 0.0], "the job says it again at every period"
+
+
+def test_a_command_that_becomes_stale_does_not_lift_a_brake() -> None:
+    rig = stuck()
+    rig.coils.brake(Y)
+    rig.command(0.1, 0.0, 0.0)
+    rig.clock.advance(500 * MS)
+    assert rig.coils.state().stale
+    assert rig.currents() == [0.0, 0.0, 0.0]
+
+
+def test_close_leaves_a_stuck_leg_braked() -> None:
+    rig = stuck()
+    rig.coils.brake(Y)
+    rig.coils.close()
+    assert rig.currents() == [0.0, 0.0, 0.0]
+    with pytest.raises(Refused, match=r"after close\(\)"):
+        rig.coils.brake(Y)
+
+
+def test_a_brown_out_lifts_a_brake_for_half_a_second_at_most() -> None:
+    """The chip forgets, so the leg drives its coil until the set-up is looked at again."""
+    rig = stuck()
+    rig.coils.brake(Y)
+    rig.wire.chip.brown_out()
+    assert rig.currents()[1] == pytest.approx(FULL)
+    rig.clock.advance(600 * MS)
+    assert rig.currents() == [0.0, 0.0, 0.0]
+    assert rig.wire.chip.violations == set()
+
+
+def test_a_brake_that_the_chip_did_not_take_is_made_up_for() -> None:
+    rig = stuck()
+    rig.wire.bus.nack(PCA, times=None)
+    rig.coils.brake(Y)
+    assert rig.coils.state().braked == (False, False, False)
+    assert rig.coils.state().error
+    rig.wire.bus.clear_faults()
+    rig.clock.advance(100 * MS)
+    assert rig.currents() == [0.0, 0.0, 0.0]
+    assert rig.coils.state().braked == Y
+
+
+def test_a_start_begins_without_brakes() -> None:
+    rig = stuck()
+    rig.coils.brake(Y)
+    rig.coils.close()
+    rig.coils.start()
+    assert rig.coils.state().braked == (False, False, False)
+    assert rig.duties == [0.0] * 16
+
+
+def test_an_enable_that_is_wired_lets_a_braked_coil_coast() -> None:
+    """Low at zero it cuts both legs off, whatever the inputs are."""
+    wiring = CoilWiring(0, 1, 23.0), CoilWiring(2, 3, 23.0, enable_channel=6), CoilWiring(4, 5, 23.0)
+    rig = Rig(CoilSettings(coils=wiring))
+    rig.coils.start()
+    rig.wire.circuit.become(1, Condition.A_HIGH)
+    assert rig.currents() == [0.0, 0.0, 0.0]
+    rig.coils.brake(Y)
+    assert rig.currents() == [0.0, 0.0, 0.0]

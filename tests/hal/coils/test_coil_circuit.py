@@ -1,0 +1,155 @@
+"""From PWM outputs to coil currents: the bridge's truth table, the thesis's uncertainty, the supply."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hal.drivers.coil_settings import CoilSettings, CoilWiring
+from hal.drivers.pca9685 import FULL_OFF, FULL_ON, PwmCounts
+from sim_hal.worlds.coil_circuit import CoilCircuit, common_counts
+from tests.hal.coils.rig import THESIS_COILS, Rig
+
+FULL = 3.4 / 23.0
+WITH_ENABLE = CoilSettings(
+    coils=(CoilWiring(0, 1, 23.0, enable_channel=2), CoilWiring(3, 4, 23.0), CoilWiring(5, 6, 23.0))
+)
+PULSE = st.tuples(st.integers(0, 4095), st.integers(0, 4096))
+
+
+@pytest.mark.parametrize(
+    ("input_a", "input_b", "current"),
+    [
+        (FULL_ON, FULL_ON, 0.0),  # H H: 0 V
+        (FULL_ON, FULL_OFF, FULL),  # H L: V_supply, CW
+        (FULL_OFF, FULL_ON, -FULL),  # L H: V_supply, CCW
+        (FULL_OFF, FULL_OFF, 0.0),  # L L: 0 V
+        ((0, 1024), FULL_OFF, FULL / 4),
+        ((0, 2048), (1024, 3072), 0.0),  # driven +, braking, driven -
+        ((0, 2048), (0, 1024), FULL / 4),  # braking while both are high
+        ((3000, 1000), FULL_OFF, FULL * 2096 / 4096),  # across the period's end
+    ],
+)
+def test_the_coil_sees_table_5_2(input_a: PwmCounts, input_b: PwmCounts, current: float) -> None:
+    rig = Rig()
+    rig.pca.configure()
+    rig.pca.write_channels(0, [input_a, input_b])
+    assert rig.currents() == pytest.approx([current, 0.0, 0.0], abs=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("enable", "current"),
+    [
+        (FULL_ON, FULL / 2),
+        (FULL_OFF, 0.0),  # X: coast
+        ((0, 1024), FULL / 4),
+        ((1024, 3072), FULL / 4),
+        ((2048, 4095), 0.0),
+    ],
+)
+def test_a_low_enable_lets_the_coil_coast(enable: PwmCounts, current: float) -> None:
+    rig = Rig(WITH_ENABLE)
+    rig.pca.configure()
+    rig.pca.write_channels(0, [(0, 2048), FULL_OFF, enable])
+    assert rig.currents()[0] == pytest.approx(current, abs=1e-15)
+
+
+@given(a=PULSE, b=PULSE)
+def test_common_counts_agrees_with_counting(a: tuple[int, int], b: tuple[int, int]) -> None:
+    high_a, high_b = (np.zeros(4096, dtype=bool) for _ in range(2))
+    high_a[(a[0] + np.arange(a[1])) % 4096] = True
+    high_b[(b[0] + np.arange(b[1])) % 4096] = True
+    assert common_counts(a, b) == np.count_nonzero(high_a & high_b)
+
+
+def test_the_uncertainty_is_uniform_within_its_bound_and_drawn_at_each_command() -> None:
+    """Mean 0, standard deviation 3.5e-3/sqrt(3); 2000 draws leave 2.3 % (5 sigma 8 %) on the deviation."""
+    rig = Rig(uncertainty=3.5e-3)
+    rig.coils.start()
+    errors = []
+    for _ in range(2000):
+        rig.command(0.1, -0.05, 0.0)
+        x, y, z = rig.currents()
+        errors.append((x - rig.coils.state().current[0], y - rig.coils.state().current[1]))
+        assert z == 0.0, "none at zero command"
+    spread = np.array(errors)
+    assert np.all(np.abs(spread) <= 3.5e-3)
+    assert np.max(np.abs(spread)) > 3.4e-3
+    assert np.std(spread, axis=0) == pytest.approx([3.5e-3 / 3**0.5] * 2, rel=0.08)
+    assert np.abs(np.mean(spread, axis=0)).max() < 5 * 3.5e-3 / 3**0.5 / 2000**0.5
+    assert abs(np.corrcoef(spread.T)[0, 1]) < 5 / 2000**0.5
+
+
+def test_the_current_keeps_its_error_until_the_coil_is_written_again() -> None:
+    rig = Rig(uncertainty=3.5e-3)
+    rig.coils.start()
+    rig.command(0.1, 0.0, 0.0)
+    before = rig.currents()
+    assert rig.pca.is_configured()
+    rig.pca.write_channels(2, [FULL_OFF, FULL_OFF])
+    assert rig.currents() == before
+    rig.command(0.1, 0.0, 0.0)
+    assert rig.currents() != before
+
+
+def test_the_true_current_never_passes_the_limit() -> None:
+    rig = Rig(uncertainty=3.5e-3)
+    rig.coils.start()
+    for sign in (1.0, -1.0):
+        for _ in range(50):
+            rig.command(sign, sign, sign)
+            assert max(map(abs, rig.currents())) <= FULL
+    limited = Rig(dataclasses.replace(rig.settings, current_limit=0.1), uncertainty=3.5e-3)
+    limited.coils.start()
+    for _ in range(50):
+        limited.command(1.0, 1.0, 1.0)
+        assert max(limited.currents()) <= 0.1
+
+
+def test_the_same_seed_gives_the_same_currents() -> None:
+    def fly() -> list[list[float]]:
+        rig = Rig(uncertainty=3.5e-3)
+        rig.coils.start()
+        felt = []
+        for step in range(20):
+            rig.command(0.01 * step, 0.0, -0.05)
+            rig.clock.advance(25_000_000)
+            felt.append(rig.currents())
+        return felt
+
+    assert fly() == fly()
+
+
+def test_a_coil_whose_resistance_is_not_what_the_driver_believes() -> None:
+    """The driver's 0.1 A through 20 ohm instead of 23 is 0.115 A."""
+    rig = Rig()
+    truth = CoilSettings(coils=(CoilWiring(0, 1, 20.0), *THESIS_COILS[1:]))
+    circuit = CoilCircuit(rig.wire.chip, truth, np.random.default_rng(1), rig.clock.now_ns, uncertainty=0.0)
+    rig.coils.start()
+    rig.command(0.1, 0.0, 0.0)
+    assert circuit.currents()[0] == pytest.approx(0.115, abs=1e-4)
+
+
+def test_a_sleeping_or_browned_out_chip_carries_no_current() -> None:
+    rig = Rig()
+    rig.coils.start()
+    rig.command(0.1, 0.1, 0.1)
+    rig.bus.write_byte_data(0x40, 0x00, 0x30)
+    assert rig.currents() == [0.0, 0.0, 0.0]
+
+
+def test_the_supply_gives_the_sum_of_magnitudes_and_its_mean_over_a_window() -> None:
+    rig = Rig()
+    rig.coils.start()
+    begin = rig.clock.now_ns()
+    rig.command(0.1, -0.05, 0.0)
+    rig.clock.advance(30_000_000)
+    rig.command(0.0, 0.0, 0.02)
+    rig.clock.advance(10_000_000)
+    volts, amps = rig.wire.circuit.mean_supply(begin, rig.clock.now_ns())
+    assert volts == 3.4
+    assert amps == pytest.approx(0.75 * 0.15 + 0.25 * 0.02, abs=1e-4)

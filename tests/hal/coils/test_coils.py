@@ -1,0 +1,224 @@
+"""The torque coils, from the driver to the current in the wire: right when all is well, zero on any doubt."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hal.drivers.coil_settings import CoilSettings, CoilWiring
+from hal.drivers.h_bridge import current_step
+from hal.interfaces.errors import DeviceError, NotResponding, OutOfRange, Refused
+from tests.hal.coils.rig import PCA, THESIS_COILS, UNEQUAL, Rig, limited_to
+
+MS = 1_000_000
+FINITE = st.floats(allow_nan=False, allow_infinity=False)
+USUAL = st.floats(-0.25, 0.25)
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    command=st.tuples(USUAL | FINITE, USUAL | FINITE, USUAL | FINITE),
+    limit=st.sampled_from([0.148, 0.1, 0.0201, 1.0]),
+)
+def test_the_world_feels_what_was_commanded_within_half_a_count(
+    command: tuple[float, float, float], limit: float
+) -> None:
+    """Coils of unequal resistance, one of them wired backwards, one with an enable input."""
+    rig = Rig(limited_to(limit))
+    rig.coils.start()
+    rig.command(*command)
+    state = rig.coils.state()
+    assert rig.currents() == pytest.approx(state.current.tolist(), abs=1e-15)
+    any_limited = False
+    for coil, asked, felt in zip(UNEQUAL.coils, command, rig.currents(), strict=True):
+        step = current_step(coil.resistance, 3.4)
+        bound = min(limit, 3.4 / coil.resistance)
+        any_limited = any_limited or abs(asked) > bound
+        assert abs(felt) <= bound * (1 + 1e-12)
+        assert felt * asked >= 0.0
+        if abs(asked) <= bound - step:
+            assert abs(felt - asked) <= 0.5 * step * (1 + 1e-9)
+        else:
+            assert abs(felt) > bound - step
+    assert state.saturated or not any_limited
+    assert state.command.tolist() == list(command)
+    assert rig.wire.chip.violations == set()
+
+
+def test_saturation_is_told_and_only_when_it_happens(rig: Rig) -> None:
+    rig.coils.start()
+    rig.command(0.148, 0.0, 0.0)  # V/R is 0.14783 A
+    assert rig.coils.state().saturated
+    assert rig.coils.state().current[0] == pytest.approx(3.4 / 23.0)
+    rig.command(0.147, 0.0, 0.0)
+    assert not rig.coils.state().saturated
+
+
+def test_both_inputs_are_low_at_zero_and_the_idle_one_otherwise(rig: Rig) -> None:
+    rig.coils.start()
+    rig.command(0.05, -0.05, 0.0)
+    a_x, b_x, a_y, b_y, a_z, b_z, *others = rig.duties
+    assert a_x == b_y == pytest.approx(0.05 * 23.0 / 3.4, abs=1 / 4096)
+    assert [b_x, a_y, a_z, b_z, *others] == [0.0] * 14
+    rig.command(0.0, 0.0, 0.0)
+    assert rig.duties == [0.0] * 16
+
+
+def test_a_wired_enable_coasts_at_zero_and_drives_otherwise() -> None:
+    rig = Rig(UNEQUAL)
+    rig.coils.start()
+    rig.command(0.0, 0.0, -0.02)
+    assert rig.wire.chip.duty(10) == 1.0
+    rig.command(0.0, 0.0, 0.0)
+    assert rig.wire.chip.duty(10) == 0.0
+
+
+def test_three_coils_with_enable_take_nine_channels_in_two_blocks() -> None:
+    wiring = tuple(CoilWiring(3 * axis, 3 * axis + 1, 23.0, enable_channel=3 * axis + 2) for axis in range(3))
+    rig = Rig(CoilSettings(coils=(wiring[0], wiring[1], wiring[2])))
+    assert [(first, len(pins)) for first, pins in rig.settings.blocks()] == [(0, 8), (8, 1)]
+    rig.coils.start()
+    rig.command(0.1, -0.1, 0.03)
+    half = 0.5 * current_step(23.0, 3.4)
+    assert rig.currents() == pytest.approx([0.1, -0.1, 0.03], abs=half)
+
+
+def test_start_leaves_a_running_chip_at_zero(rig: Rig) -> None:
+    """A process that died left its coils driven."""
+    rig.pca.configure()
+    rig.pca.write_channels(0, [(0, 3000), (0, 4096)])
+    assert rig.currents()[0] != 0.0
+    rig.coils.start()
+    assert rig.duties == [0.0] * 16
+    assert rig.coils.state().error == ""
+
+
+def test_start_without_a_chip_says_so(rig: Rig) -> None:
+    rig.wire.bus.detach(rig.wire.chip)
+    with pytest.raises(NotResponding, match="pca9685 at 0x40"):
+        rig.coils.start()
+    assert "no acknowledge" in rig.coils.state().error
+
+
+def test_start_survives_one_lost_transaction(rig: Rig) -> None:
+    rig.wire.bus.nack(PCA)
+    rig.coils.start()
+    rig.command(0.1, 0.0, 0.0)
+    assert rig.currents()[0] == pytest.approx(0.1, abs=1e-4)
+    assert rig.coils.state().faults == 1
+
+
+def test_a_command_before_start_or_after_close_is_refused(rig: Rig) -> None:
+    with pytest.raises(Refused, match=r"before start\(\)"):
+        rig.command(0.1, 0.0, 0.0)
+    rig.coils.start()
+    rig.coils.close()
+    with pytest.raises(Refused, match=r"after close\(\)"):
+        rig.command(0.1, 0.0, 0.0)
+    assert rig.duties == [0.0] * 16
+
+
+def test_a_stale_command_is_at_zero_within_half_a_second(rig: Rig) -> None:
+    rig.coils.start()
+    rig.command(0.1, -0.1, 0.05)
+    rig.clock.advance(250 * MS)
+    assert rig.currents()[0] != 0.0, "still fresh at 0.25 s"
+    assert not rig.coils.state().stale
+    rig.clock.advance(250 * MS)
+    assert rig.currents() == [0.0, 0.0, 0.0]
+    state = rig.coils.state()
+    assert state.stale
+    assert state.current.tolist() == [0.0, 0.0, 0.0]
+    assert state.command.tolist() == [0.1, -0.1, 0.05]
+
+
+def test_the_longest_allowed_staleness_still_ends_within_half_a_second() -> None:
+    rig = Rig(CoilSettings(coils=THESIS_COILS, stale_after=0.4))
+    rig.coils.start()
+    rig.command(0.1, 0.0, 0.0)
+    rig.clock.advance(499 * MS)
+    assert rig.currents() == [0.0, 0.0, 0.0]
+    with pytest.raises(OutOfRange, match="stale_after"):
+        CoilSettings(coils=THESIS_COILS, stale_after=0.45)
+
+
+def test_commands_that_keep_coming_keep_the_coils_driven(rig: Rig) -> None:
+    rig.coils.start()
+    for _ in range(80):
+        rig.command(0.1, 0.0, 0.0)
+        rig.clock.advance(25 * MS)
+        assert rig.currents()[0] == pytest.approx(0.1, abs=1e-4)
+    state = rig.coils.state()
+    assert (state.stale, state.faults, state.error) == (False, 0, "")
+
+
+def test_a_new_command_ends_staleness(rig: Rig) -> None:
+    rig.coils.start()
+    rig.command(0.1, 0.0, 0.0)
+    rig.clock.advance(1000 * MS)
+    rig.command(0.02, 0.0, 0.0)
+    assert not rig.coils.state().stale
+    assert rig.currents()[0] == pytest.approx(0.02, abs=1e-4)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_value_that_is_not_finite_brings_all_coils_to_zero(rig: Rig, bad: float, axis: int) -> None:
+    rig.coils.start()
+    rig.command(0.1, 0.1, 0.1)
+    values = [0.05, 0.05, 0.05]
+    values[axis] = bad
+    with pytest.raises(
+        OutOfRange, match=f"current of coil {'xyz'[axis]} = (nan|inf|-inf) A is outside -0.147"
+    ):
+        rig.command(*values)
+    assert rig.currents() == [0.0, 0.0, 0.0]
+    assert np.all(np.isfinite(rig.coils.state().command))
+
+
+def test_a_wrong_number_of_currents_brings_all_coils_to_zero(rig: Rig) -> None:
+    rig.coils.start()
+    rig.command(0.1, 0.1, 0.1)
+    with pytest.raises(OutOfRange, match="number of currents"):
+        rig.command(0.1, 0.1)
+    assert rig.currents() == [0.0, 0.0, 0.0]
+
+
+def test_the_coils_can_be_started_again_after_close(rig: Rig) -> None:
+    rig.coils.start()
+    rig.command(0.1, -0.1, 0.1)
+    rig.coils.close()
+    rig.coils.start()
+    assert rig.duties == [0.0] * 16
+    rig.command(0.1, 0.0, 0.0)
+    assert rig.currents()[0] == pytest.approx(0.1, abs=1e-4)
+
+
+def test_before_the_first_command_the_state_is_all_zero(rig: Rig) -> None:
+    rig.coils.start()
+    state = rig.coils.state()
+    assert (state.command_ns, state.stale, state.saturated, state.faults) == (-1, False, False, 0)
+    assert state.command.tolist() == state.current.tolist() == [0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: CoilWiring(0, 1, 0.0),
+        lambda: CoilWiring(0, 1, math.nan),
+        lambda: CoilWiring(0, 1, 23.0, sign=2),
+        lambda: CoilSettings(coils=(CoilWiring(0, 1, 23.0), CoilWiring(1, 2, 23.0), CoilWiring(4, 5, 23.0))),
+        lambda: CoilSettings(coils=(CoilWiring(0, 16, 23.0), CoilWiring(1, 2, 23.0), CoilWiring(4, 5, 23.0))),
+        lambda: CoilSettings(coils=THESIS_COILS, supply_voltage=math.nan),
+        lambda: CoilSettings(coils=THESIS_COILS, current_limit=0.0),
+        lambda: CoilSettings(coils=THESIS_COILS, tries=0),
+    ],
+)
+def test_settings_that_cannot_be_are_refused(make: Callable[[], object]) -> None:
+    with pytest.raises(DeviceError, match="is outside"):
+        make()

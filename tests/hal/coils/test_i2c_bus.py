@@ -1,0 +1,164 @@
+"""Both buses keep the contract of hal.interfaces.wires.I2cBus; Linux's also opens, bounds and reopens."""
+
+from __future__ import annotations
+
+import errno
+import os
+import threading
+from pathlib import Path
+
+import pytest
+
+from hal.buses.i2c_bus import LinuxI2cBus, adapters
+from hal.interfaces.errors import NotResponding, OutOfRange, Refused
+from tests.hal.coils.ioctl_wire import I2C_RETRIES, I2C_TIMEOUT, IoctlWire
+from tests.hal.coils.rig import INA, PCA, Rig
+
+
+def test_bytes_and_blocks_come_back_as_written(rig: Rig) -> None:
+    rig.bus.write_byte_data(PCA, 0x00, 0x21)
+    rig.bus.write_i2c_block_data(PCA, 0x06, list(range(1, 33)))
+    assert rig.bus.read_byte_data(PCA, 0x06) == 1
+    assert rig.bus.read_i2c_block_data(PCA, 0x06, 4) == [1, 2, 3, 4]
+    assert rig.bus.read_i2c_block_data(INA, 0x00, 2) == [0x39, 0x9F]
+
+
+@pytest.mark.parametrize("length", [0, 33])
+def test_a_block_is_1_to_32_bytes(rig: Rig, length: int) -> None:
+    with pytest.raises(ValueError, match="1 to 32"):
+        rig.bus.write_i2c_block_data(PCA, 0x06, [0] * length)
+    with pytest.raises(ValueError, match="1 to 32"):
+        rig.bus.read_i2c_block_data(PCA, 0x06, length)
+
+
+def test_faults_have_the_kernels_codes(rig: Rig) -> None:
+    with pytest.raises(OSError, match="0x22") as caught:
+        rig.bus.read_byte_data(0x22, 0x00)
+    assert caught.value.errno == errno.EREMOTEIO
+    rig.wire.bus.lose_arbitration()
+    with pytest.raises(BlockingIOError, match="arbitration"):
+        rig.bus.read_byte_data(PCA, 0x00)
+    rig.wire.bus.hang(times=1)
+    begin = rig.clock.now_ns()
+    with pytest.raises(TimeoutError, match="time-out"):
+        rig.bus.write_byte_data(PCA, 0x00, 0x10)
+    assert rig.clock.now_ns() - begin == 20_000_000
+    assert rig.bus.read_byte_data(PCA, 0x00) == 0x11, "in order again"
+
+
+def test_flipped_bits_arrive_without_an_error(rig: Rig) -> None:
+    rig.wire.bus.flip_bits(PCA, index=0, mask=0x80)
+    assert rig.bus.read_byte_data(PCA, 0xFE) == 0x9E
+    assert rig.bus.read_byte_data(PCA, 0xFE) == 0x1E
+
+
+def test_a_write_cut_short_leaves_what_was_acknowledged(rig: Rig) -> None:
+    rig.bus.write_byte_data(PCA, 0x00, 0x20)
+    rig.wire.bus.nack(PCA, after=3)
+    with pytest.raises(OSError, match="no acknowledge"):
+        rig.bus.write_i2c_block_data(PCA, 0x06, [1, 2, 3, 4])
+    assert rig.bus.read_i2c_block_data(PCA, 0x06, 4) == [1, 2, 0, 0x10]
+
+
+def test_a_closed_bus_says_so_and_closes_twice(rig: Rig) -> None:
+    rig.bus.close()
+    rig.bus.close()
+    with pytest.raises(OSError, match="closed"):
+        rig.bus.read_byte_data(PCA, 0x00)
+
+
+def test_the_adapter_is_told_its_time_out_and_to_repeat_nothing(kernel: IoctlWire) -> None:
+    LinuxI2cBus("/dev/null", timeout_ns=25_000_000).close()
+    assert kernel.settings == [(I2C_TIMEOUT, 3), (I2C_RETRIES, 0)]
+
+
+def test_a_time_out_of_nothing_is_refused(kernel: IoctlWire) -> None:
+    with pytest.raises(OutOfRange, match="time-out"):
+        LinuxI2cBus("/dev/null", timeout_ns=0)
+
+
+def test_the_descriptor_is_reopened_after_the_line_failed_but_not_after_a_nack(kernel: IoctlWire) -> None:
+    """Each opening shows as one setting of the time-out."""
+    bus = LinuxI2cBus("/dev/null")
+    with pytest.raises(OSError, match="no acknowledge"):
+        bus.read_byte_data(0x22, 0x00)
+    bus.read_byte_data(PCA, 0x00)
+    assert kernel.settings.count((I2C_TIMEOUT, 2)) == 1
+    kernel.wire.hang(times=1)
+    with pytest.raises(TimeoutError):
+        bus.read_byte_data(PCA, 0x00)
+    assert bus.read_byte_data(PCA, 0x00) == 0x11
+    assert kernel.settings.count((I2C_TIMEOUT, 2)) == 2
+    bus.close()
+
+
+def test_no_descriptor_leaks_when_opening_fails() -> None:
+    before = len(os.listdir("/proc/self/fd"))
+    for _ in range(5):
+        with pytest.raises(NotResponding, match="not a usable I2C bus"):
+            LinuxI2cBus("/dev/null")  # the real kernel: no I2C adapter
+    assert len(os.listdir("/proc/self/fd")) == before
+
+
+def test_an_address_held_by_a_kernel_driver_is_told(kernel: IoctlWire) -> None:
+    bus = LinuxI2cBus("/dev/null")
+    kernel.slave_error = errno.EBUSY
+    with pytest.raises(OSError, match="held by a kernel driver, address 0x40 on /dev/null"):
+        bus.read_byte_data(PCA, 0x00)
+    bus.close()
+
+
+def test_an_adapter_without_block_transfers_is_refused(kernel: IoctlWire) -> None:
+    kernel.functions = 0x00010000
+    with pytest.raises(Refused, match="block transfers"):
+        LinuxI2cBus("/dev/null")
+
+
+def test_a_patient_bus_is_opened_when_it_comes(kernel: IoctlWire, tmp_path: Path) -> None:
+    name = tmp_path / "knightcube-i2c"
+    bus = LinuxI2cBus(str(name), patient=True)
+    with pytest.raises(FileNotFoundError):
+        bus.read_byte_data(PCA, 0x00)
+    name.symlink_to("/dev/null")
+    assert bus.read_byte_data(PCA, 0x00) == 0x11
+    bus.close()
+
+
+def test_a_missing_bus_says_which_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hal.buses.i2c_bus.adapters", lambda: [(1, "Synopsys DesignWare I2C adapter")])
+    with pytest.raises(NotResponding, match=r"/dev/i2c-97: .*i2c-1 \(Synopsys.*udev rule"):
+        LinuxI2cBus(97)
+    monkeypatch.setattr("hal.buses.i2c_bus.adapters", list)
+    with pytest.raises(NotResponding, match="modprobe i2c-dev"):
+        LinuxI2cBus(97)
+
+
+def test_adapters_are_read_from_sysfs(tmp_path: Path) -> None:
+    for entry, name in (("i2c-10", "i915 gmbus"), ("i2c-2", "DesignWare"), ("i2c-PNP0C50:00", "touchpad")):
+        (tmp_path / entry).mkdir()
+        (tmp_path / entry / "name").write_text(name + "\n", encoding="utf-8")
+    assert adapters(tmp_path) == [(2, "DesignWare"), (10, "i915 gmbus")]
+    assert adapters(tmp_path / "nothing") == []
+
+
+def test_a_transaction_that_never_ends_does_not_hold_the_others_for_ever(kernel: IoctlWire) -> None:
+    """An adapter ignores its time-out: the next caller still gets an error, and the bus can be closed."""
+    entered, leave = threading.Event(), threading.Event()
+
+    class Stuck(IoctlWire):
+        def _transfer(self, message: object) -> None:
+            entered.set()
+            leave.wait(10.0)
+
+    bus = LinuxI2cBus("/dev/null", timeout_ns=10_000_000)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("smbus2.smbus2.ioctl", Stuck(kernel.wire))
+        stuck = threading.Thread(target=bus.read_byte_data, args=(PCA, 0x00))
+        stuck.start()
+        assert entered.wait(5.0)
+        with pytest.raises(TimeoutError, match="does not end"):
+            bus.read_byte_data(PCA, 0x00)
+        bus.close()
+        leave.set()
+        stuck.join(5.0)
+        assert not stuck.is_alive()

@@ -1,0 +1,365 @@
+"""The current monitor: the emulated part against SBOS448, the driver against the part, on both buses."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from hal.drivers.ina219 import Ina219, config_for, range_for
+from hal.interfaces.devices import PowerMonitor
+from hal.interfaces.errors import OutOfRange
+from sim_hal.emulators.ina219 import EmulatedIna219, conversion_ns
+from tests.hal.coils.rig import INA, PCA, Rig
+from tests.manual_clock import ManualClock
+
+MS = 1_000_000
+CYCLE = 2 * 68_100_000
+
+
+class Part:
+    """One emulated monitor with constant inputs."""
+
+    def __init__(self, volts: float, amps: float, shunt_ohm: float) -> None:
+        self.clock = ManualClock()
+        self.windows: list[tuple[int, int]] = []
+        self.inputs = (volts, amps)
+        self.chip = EmulatedIna219(INA, self.clock.now_ns, self._measure, shunt_ohm)
+
+    def _measure(self, start_ns: int, end_ns: int) -> tuple[float, float]:
+        self.windows.append((start_ns, end_ns))
+        return self.inputs
+
+    def write(self, register: int, word: int) -> None:
+        """Write one word, big-endian."""
+        self.chip.write(INA, bytes((register, word >> 8, word & 0xFF)))
+
+    def read(self, register: int) -> int:
+        """Read one word, big-endian."""
+        self.chip.write(INA, bytes((register,)))
+        return int.from_bytes(self.chip.read(2), "big")
+
+
+def test_power_on_values() -> None:
+    part = Part(3.4, 0.1, 0.1)
+    assert [part.read(register) for register in range(6)] == [0x399F, 0, 0, 0, 0, 0]
+
+
+def test_the_worked_example_of_the_data_sheet() -> None:
+    """SBOS448 table "Configure/Measure/Calculate": 10 A in 2 mohm at 11.98 V, LSB 1 mA, 20 mW."""
+    part = Part(11.98, 10.0, 0.002)
+    part.write(0x00, 0x019F)
+    part.write(0x05, 0x5000)
+    part.clock.advance(2 * 532_000)
+    assert part.read(0x01) == 0x07D0
+    assert part.read(0x02) == 0x5D98 | 0b10  # the table leaves the ready bit out
+    assert part.read(0x04) == 0x2710
+    assert part.read(0x03) == 0x1766
+    assert part.read(0x02) == 0x5D98  # reading Power has cleared it
+
+
+def test_current_and_power_are_zero_while_calibration_is_void() -> None:
+    part = Part(11.98, 10.0, 0.002)
+    part.clock.advance(2 * 532_000)
+    assert (part.read(0x04), part.read(0x03)) == (0, 0)
+    part.write(0x05, 0x0001)
+    assert part.read(0x05) == 0
+
+
+def test_overflow_of_the_mathematics_is_flagged() -> None:
+    part = Part(11.98, 10.0, 0.002)
+    part.write(0x05, 0xFFFE)
+    part.clock.advance(2 * 532_000)
+    assert not part.read(0x02) & 1, "2000 x 65534 / 4096 = 31999 still fits"
+    part.inputs = (11.98, 10.5)
+    part.clock.advance(2 * 532_000)
+    assert part.read(0x02) & 1
+
+
+@pytest.mark.parametrize(
+    ("config", "millivolts", "word"),
+    [
+        (0x019F, 40.0, 0x0FA0),  # full scale of each range, from the data sheet's shunt tables
+        (0x019F, 50.0, 0x0FA0),
+        (0x099F, 80.0, 0x1F40),
+        (0x119F, 160.0, 0x3E80),
+        (0x199F, 320.0, 0x7D00),
+        (0x199F, -320.0, 0x8300),
+        (0x019F, -40.0, 0xF060),
+        (0x199F, -0.01, 0xFFFF),
+    ],
+)
+def test_shunt_words_of_the_data_sheet(config: int, millivolts: float, word: int) -> None:
+    part = Part(5.0, millivolts * 1e-3 / 0.1, 0.1)
+    part.write(0x00, config)
+    part.clock.advance(2 * 532_000)
+    assert part.read(0x01) == word
+
+
+@pytest.mark.parametrize(
+    ("code", "microseconds"),
+    [(0, 84), (1, 148), (2, 276), (3, 532), (4, 84), (8, 532), (9, 1060), (12, 8510), (15, 68100)],
+)
+def test_conversion_times_of_the_data_sheet(code: int, microseconds: int) -> None:
+    assert conversion_ns(code) == microseconds * 1000
+
+
+def test_fewer_bits_give_coarser_steps() -> None:
+    part = Part(5.0, 0.0123, 0.1)  # 1.23 mV = 123 steps of 12 bits
+    part.write(0x00, 0x0007)  # 9 bits
+    part.clock.advance(2 * 84_000)
+    assert part.read(0x01) == 120
+
+
+def test_a_conversion_is_ready_when_its_whole_window_has_passed() -> None:
+    part = Part(3.4, 0.1, 0.1)
+    part.write(0x00, 0x0FFF)
+    begin = part.clock.now_ns()
+    part.clock.advance(CYCLE - 1)
+    assert not part.read(0x02) & 0b10
+    part.clock.advance(1)
+    assert part.read(0x02) & 0b10
+    assert part.windows == [(begin, begin + 68_100_000), (begin + 68_100_000, begin + CYCLE)]
+
+
+def test_a_triggered_conversion_happens_once_and_power_down_none() -> None:
+    part = Part(3.4, 0.1, 0.1)
+    part.write(0x00, 0x0FFB)
+    part.clock.advance(CYCLE)
+    part.read(0x03)
+    part.clock.advance(10 * CYCLE)
+    assert not part.read(0x02) & 0b10
+    part.write(0x00, 0x0FF8)
+    part.clock.advance(10 * CYCLE)
+    assert not part.read(0x02) & 0b10
+
+
+def test_the_reset_bit_is_a_power_on() -> None:
+    part = Part(3.4, 0.1, 0.1)
+    part.write(0x05, 0x1000)
+    part.write(0x00, 0x8000)
+    assert (part.read(0x00), part.read(0x05)) == (0x399F, 0)
+
+
+@pytest.mark.parametrize(("current", "bits"), [(0.4, 0b00), (0.8, 0b01), (1.6, 0b10), (3.2, 0b11)])
+def test_the_narrowest_range_is_chosen(current: float, bits: int) -> None:
+    assert range_for(current, 0.1) == bits
+
+
+def test_config_asks_for_16_v_80_mv_and_128_samples() -> None:
+    assert config_for(0b01) == 0x0FFF
+
+
+@pytest.mark.parametrize(
+    ("current", "shunt"), [(3.3, 0.1), (0.0, 0.1), (math.nan, 0.1), (0.8, 0.0), (0.8, math.inf)]
+)
+def test_what_cannot_be_measured_is_refused(current: float, shunt: float) -> None:
+    rig = Rig()
+    with pytest.raises(OutOfRange):
+        Ina219(rig.bus, INA, rig.clock, shunt_ohm=shunt, maximum_current=current)
+
+
+def test_readings_follow_the_coils(rig: Rig) -> None:
+    """0.1 A and -0.05 A draw 0.15 A together, 0.1 mA resolution; 3.4 V is 850 steps of 4 mV."""
+    rig.coils.start()
+    monitor: PowerMonitor = Ina219(rig.bus, INA, rig.clock)
+    assert monitor.latest() is None
+    for _ in range(80):
+        rig.command(0.1, -0.05, 0.0)
+        rig.clock.advance(25 * MS)
+    reading = monitor.latest()
+    assert reading is not None
+    assert monitor.error() == ""
+    assert reading.voltage == pytest.approx(3.4, abs=2e-3)
+    assert reading.current == pytest.approx(0.15, abs=2e-4)
+    assert reading.power == pytest.approx(reading.voltage * reading.current)
+    assert 0 <= rig.clock.now_ns() - reading.time_ns <= 200 * MS
+    monitor.close()
+    monitor.close()
+    rig.clock.advance(1000 * MS)
+    assert monitor.latest() == reading
+
+
+@pytest.mark.parametrize(("averaged", "least", "most"), [(1, 0.10, 0.185), (5, 0.0, 0.07)])
+def test_a_chopped_current_is_averaged_over_several_conversions(
+    averaged: int, least: float, most: float
+) -> None:
+    """Pulses for 10 % of 19.988 ms, integrated exactly over each window; the worst of 20 s of readings."""
+    period, duty, amps = 19.988e6, 0.1, 3.4 / 23.0
+
+    def charge(time_ns: int) -> float:
+        whole, part = divmod(time_ns, period)
+        return amps * (whole * duty * period + min(part, duty * period))
+
+    clock = ManualClock()
+    rig = Rig(clock=clock)
+    rig.wire.bus.attach(
+        EmulatedIna219(
+            0x44, clock.now_ns, lambda start, end: (3.4, (charge(end) - charge(start)) / (end - start))
+        )
+    )
+    monitor = Ina219(rig.bus, 0x44, clock, averaged=averaged)
+    clock.advance(2000 * MS)
+    worst = 0.0
+    for _ in range(100):
+        clock.advance(200 * MS)
+        reading = monitor.latest()
+        assert reading is not None
+        worst = max(worst, abs(reading.current / (duty * amps) - 1.0))
+    assert least <= worst <= most
+
+
+def test_a_negative_shunt_voltage_is_a_negative_current() -> None:
+    """A monitor with its shunt the other way round must not read 6.5 kA."""
+    clock = ManualClock()
+    rig = Rig(clock=clock)
+    rig.wire.bus.attach(EmulatedIna219(0x44, clock.now_ns, lambda start, end: (3.4, -0.12)))
+    monitor = Ina219(rig.bus, 0x44, clock)
+    clock.advance(600 * MS)
+    reading = monitor.latest()
+    assert reading is not None
+    assert reading.current == pytest.approx(-0.12)
+
+
+def test_no_conversion_is_counted_twice() -> None:
+    rig = Rig()
+    monitor = Ina219(rig.bus, INA, rig.clock, period_ns=10 * MS)
+    times = set()
+    for _ in range(100):
+        rig.clock.advance(10 * MS)
+        reading = monitor.latest()
+        if reading is not None:
+            times.add(reading.time_ns)
+    assert len(times) == (1000 - 10) * MS // CYCLE
+
+
+def test_a_current_beyond_the_range_is_an_error_while_it_lasts() -> None:
+    """A short: 1 A through a range of 0.8 A."""
+    clock = ManualClock()
+    rig = Rig(clock=clock)
+    amps = [0.2]
+    rig.wire.bus.attach(EmulatedIna219(0x44, clock.now_ns, lambda start, end: (3.4, amps[0])))
+    monitor = Ina219(rig.bus, 0x44, clock)
+    clock.advance(1000 * MS)
+    assert monitor.error() == ""
+    amps[0] = 1.0
+    clock.advance(1000 * MS)
+    assert "overflow" in monitor.error()
+    reading = monitor.latest()
+    assert reading is not None
+    assert reading.current == pytest.approx(0.2), "the last good one stays, with its time"
+    amps[0] = 0.1
+    clock.advance(1200 * MS)  # until the mean is whole again
+    assert monitor.error() == ""
+    reading = monitor.latest()
+    assert reading is not None
+    assert reading.current == pytest.approx(0.1), "no mean across the gap"
+
+
+def test_an_overflow_of_the_chips_mathematics_is_an_error() -> None:
+    """Somebody else has written Calibration: 7000 x 65534 / 4096 does not fit into Current."""
+    clock = ManualClock()
+    rig = Rig(clock=clock)
+    rig.wire.bus.attach(EmulatedIna219(0x44, clock.now_ns, lambda start, end: (3.4, 0.7)))
+    rig.bus.write_i2c_block_data(0x44, 0x05, [0xFF, 0xFE])
+    monitor = Ina219(rig.bus, 0x44, clock)
+    clock.advance(600 * MS)
+    assert "overflow" in monitor.error()
+    assert monitor.latest() is None
+
+
+def test_a_silent_monitor_is_an_error_until_it_answers(rig: Rig) -> None:
+    monitor = Ina219(rig.bus, INA, rig.clock)
+    rig.wire.bus.nack(INA, times=None)
+    rig.clock.advance(400 * MS)
+    assert "no acknowledge" in monitor.error()
+    assert monitor.latest() is None
+    rig.wire.bus.clear_faults()
+    rig.clock.advance(1400 * MS)
+    assert monitor.error() == ""
+    assert monitor.latest() is not None
+
+
+def test_a_brown_out_is_noticed_said_and_mended(rig: Rig) -> None:
+    monitor = Ina219(rig.bus, INA, rig.clock)
+    rig.clock.advance(1000 * MS)
+    rig.wire.monitor.brown_out()
+    rig.clock.advance(200 * MS)
+    assert "brown-out" in monitor.error()
+    assert rig.wire.monitor.register(0x00) == 0x0FFF
+    rig.clock.advance(1200 * MS)
+    assert monitor.error() == ""
+
+
+def test_a_brown_out_is_said_even_if_an_earlier_run_had_set_the_chip_up() -> None:
+    rig = Rig()
+    rig.bus.write_i2c_block_data(INA, 0x00, [0x0F, 0xFF])
+    monitor = Ina219(rig.bus, INA, rig.clock)
+    rig.clock.advance(400 * MS)
+    assert monitor.error() == ""
+    rig.wire.monitor.brown_out()
+    rig.clock.advance(200 * MS)
+    assert "brown-out" in monitor.error()
+
+
+def test_another_part_at_the_address_is_named(rig: Rig) -> None:
+    monitor = Ina219(rig.bus, PCA, rig.clock)
+    rig.clock.advance(200 * MS)
+    assert "another part" in monitor.error()
+
+
+def test_a_monitor_that_stops_converting_is_an_error() -> None:
+    class Frozen(EmulatedIna219):
+        def _convert(self) -> None:
+            pass
+
+    clock = ManualClock()
+    rig = Rig(clock=clock)
+    rig.wire.bus.attach(Frozen(0x44, clock.now_ns, lambda start, end: (3.4, 0.1)))
+    monitor = Ina219(rig.bus, 0x44, clock)
+    clock.advance(1000 * MS)
+    assert monitor.error() == ""
+    clock.advance(1000 * MS)
+    assert "no conversion" in monitor.error()
+
+
+def test_the_newest_conversion_is_told_with_the_time_that_it_may_tell_of(rig: Rig) -> None:
+    """A step of the current: no conversion that was begun before it counts as one of after."""
+    rig.coils.start()
+    monitor = Ina219(rig.bus, INA, rig.clock)
+    rig.clock.advance(2000 * MS)
+    step_ns = rig.clock.now_ns()
+    mixed = told = 0
+    for _ in range(40):
+        rig.command(0.1, 0.0, 0.0)
+        rig.clock.advance(25 * MS)
+        reading = monitor.latest()
+        assert reading is not None
+        if reading.newest_since_ns >= step_ns:
+            assert reading.newest == pytest.approx(0.1, abs=2e-4)
+            mixed += reading.current < 0.099
+            told += 1
+    assert mixed > 0, "the mean still holds the time before"
+    assert told > 20
+
+
+@pytest.mark.parametrize("amps", [0.0, 0.05])
+def test_a_monitor_that_always_gives_the_same_is_told_at_any_current(rig: Rig, amps: float) -> None:
+    """Its ready bit stays although the conversion was read; so even where the current is constant."""
+    rig.coils.start()
+    monitor = Ina219(rig.bus, INA, rig.clock)
+
+    def fly(cycles: int) -> None:
+        for _ in range(cycles):
+            rig.command(amps, 0.0, 0.0)
+            rig.clock.advance(25 * MS)
+
+    fly(80)
+    assert monitor.error() == ""
+    rig.wire.monitor.frozen = {number: rig.wire.monitor.register(number) for number in range(6)}
+    rig.wire.monitor.frozen[2] |= 0b10
+    fly(40)
+    assert "stuck" in monitor.error()
+    rig.wire.monitor.frozen.clear()
+    fly(80)
+    assert monitor.error() == ""

@@ -1,0 +1,174 @@
+"""The PCA9685's driver: what it writes, what it refuses, what it notices."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+from collections.abc import Sequence
+
+import pytest
+
+from hal.drivers.pca9685 import FULL_OFF, FULL_ON, Pca9685, prescale_for, switch_off
+from hal.interfaces.errors import NotResponding, OutOfRange, Refused
+from sim_hal.emulators.i2c_bus import EmulatedI2cBus
+from sim_hal.emulators.pca9685 import EmulatedPca9685
+from tests.hal.coils.rig import INA, PCA, Rig
+from tests.manual_clock import ManualClock
+
+
+class Recorder(EmulatedI2cBus):
+    """An emulated bus that writes down what is written."""
+
+    def __init__(self, chip: EmulatedPca9685, clock: ManualClock) -> None:
+        super().__init__([chip])
+        self._clock = clock
+        self.written: list[tuple[int, list[int], int]] = []
+
+    def write_byte_data(self, address: int, register: int, value: int) -> None:
+        """Write one byte, and note it with its time."""
+        self.written.append((register, [value], self._clock.now_ns()))
+        super().write_byte_data(address, register, value)
+
+    def write_i2c_block_data(self, address: int, register: int, values: Sequence[int]) -> None:
+        """Write a block, and note it with its time."""
+        self.written.append((register, list(values), self._clock.now_ns()))
+        super().write_i2c_block_data(address, register, values)
+
+
+@pytest.fixture
+def recorder() -> tuple[Pca9685, Recorder, EmulatedPca9685]:
+    """Make a driver, its recorded bus and its chip."""
+    clock = ManualClock()
+    chip = EmulatedPca9685(PCA, clock.now_ns)
+    bus = Recorder(chip, clock)
+    return Pca9685(bus, PCA, clock), bus, chip
+
+
+@pytest.mark.parametrize(("frequency", "prescale"), [(50.0, 121), (200.0, 30), (1525.0, 3), (24.0, 253)])
+def test_prescale_values_of_the_data_sheet(frequency: float, prescale: int) -> None:
+    """200 Hz is the power-on 0x1E, the data sheet's own example; 50 Hz is 0x79."""
+    assert prescale_for(frequency) == prescale
+
+
+@pytest.mark.parametrize("frequency", [0.0, 23.0, 1600.0, math.nan, math.inf])
+def test_a_frequency_that_the_chip_cannot_make_is_refused(frequency: float) -> None:
+    with pytest.raises(OutOfRange, match="PWM frequency"):
+        prescale_for(frequency)
+
+
+def test_set_up_follows_the_data_sheet_with_all_off_first(
+    recorder: tuple[Pca9685, Recorder, EmulatedPca9685],
+) -> None:
+    """All off, sleep, PRE_SCALE while asleep, wake with auto-increment, wait 500 us, totem pole."""
+    pca, bus, chip = recorder
+    pca.configure()
+    assert [(register, values) for register, values, _ in bus.written] == [
+        (0xFD, [0x10]),
+        (0x00, [0x11]),  # power-on MODE1 is asleep already and keeps ALLCALL until waking
+        (0xFE, [0x79]),
+        (0x00, [0x20]),
+        (0x01, [0x04]),
+    ]
+    assert bus.written[4][2] - bus.written[3][2] >= 500_000
+    assert chip.frequency == pytest.approx(50.03, abs=0.01)
+    assert chip.violations == set()
+
+
+def test_a_chip_left_running_is_switched_off_before_anything_else(
+    recorder: tuple[Pca9685, Recorder, EmulatedPca9685],
+) -> None:
+    """A dead process leaves MODE1 = 0x20 and channels driven."""
+    pca, bus, chip = recorder
+    pca.configure()
+    pca.write_channels(0, [FULL_ON, (0, 100)])
+    bus.written.clear()
+    seen: list[list[float]] = []
+    chip.on_stop = lambda written: seen.append([chip.duty(0), chip.duty(1)])
+    pca.configure()
+    assert bus.written[0][:2] == (0xFD, [0x10])
+    assert bus.written[1][:2] == (0x00, [0x30])
+    assert seen
+    assert all(duties == [0.0, 0.0] for duties in seen)
+    assert chip.violations == set()
+
+
+def test_three_coils_are_one_block_of_24_bytes(recorder: tuple[Pca9685, Recorder, EmulatedPca9685]) -> None:
+    pca, bus, chip = recorder
+    pca.configure()
+    bus.written.clear()
+    pca.write_channels(0, [(0, 0x123), FULL_OFF, FULL_OFF, (0, 0xFED), FULL_ON, FULL_OFF])
+    off, on = [0, 0, 0, 0x10], [0, 0x10, 0, 0]
+    block = [0, 0, 0x23, 0x01, *off, *off, 0, 0, 0xED, 0x0F, *on, *off]
+    assert [(register, values) for register, values, _ in bus.written] == [(0x06, block)]
+    assert [chip.duty(channel) for channel in range(6)] == [0x123 / 4096, 0.0, 0.0, 0xFED / 4096, 1.0, 0.0]
+
+
+@pytest.mark.parametrize("counts", [(0, 0), (7, 7), (4096, 4096), (0, 4097), (-1, 5)])
+def test_counts_that_the_chip_leaves_undefined_are_refused(counts: tuple[int, int]) -> None:
+    rig = Rig()
+    with pytest.raises(OutOfRange, match="never equal"):
+        rig.pca.write_channels(0, [counts])
+
+
+@pytest.mark.parametrize(("first", "number"), [(0, 0), (0, 9), (-1, 2), (15, 2)])
+def test_channels_that_do_not_exist_or_fit_are_refused(first: int, number: int) -> None:
+    rig = Rig()
+    with pytest.raises(OutOfRange, match="channel"):
+        rig.pca.write_channels(first, [FULL_OFF] * number)
+
+
+def test_a_brown_out_is_noticed_and_mended(rig: Rig) -> None:
+    rig.pca.configure()
+    assert rig.pca.is_configured()
+    rig.wire.chip.brown_out()
+    assert not rig.pca.is_configured()
+    rig.pca.configure()
+    assert rig.pca.is_configured()
+
+
+def test_another_part_at_the_address_is_refused_with_the_cure(rig: Rig) -> None:
+    """Both parts leave the factory at 0x40; an INA219 acknowledges every write and keeps none of these."""
+    with pytest.raises(Refused, match="another part at this address"):
+        Pca9685(rig.bus, INA, rig.clock).configure()
+
+
+def test_an_external_clock_that_only_a_power_cycle_clears_is_refused(rig: Rig) -> None:
+    rig.bus.write_byte_data(PCA, 0x00, 0x11)
+    rig.bus.write_byte_data(PCA, 0x00, 0x51)
+    with pytest.raises(Refused, match="power cycle"):
+        rig.pca.configure()
+
+
+def test_a_silent_chip_is_named_with_what_to_check(rig: Rig) -> None:
+    rig.wire.bus.detach(rig.wire.chip)
+    for action in (rig.pca.configure, rig.pca.is_configured, rig.pca.all_off):
+        with pytest.raises(NotResponding, match=r"pca9685 at 0x40: .*no acknowledge"):
+            action()
+
+
+def test_switch_off_works_in_every_state_of_the_chip(rig: Rig) -> None:
+    switch_off(rig.bus, PCA)  # fresh from power-on, asleep
+    rig.pca.configure()
+    rig.pca.write_channels(0, [FULL_ON] * 8)
+    rig.pca.write_channels(8, [(0, 2000)] * 8)
+    assert min(rig.duties) > 0.0
+    switch_off(rig.bus, PCA)
+    assert rig.duties == [0.0] * 16
+
+
+def test_switch_off_tries_again_and_then_says_so(rig: Rig) -> None:
+    rig.pca.configure()
+    rig.pca.write_channels(0, [FULL_ON])
+    rig.wire.bus.nack(PCA, times=2)
+    switch_off(rig.bus, PCA)
+    assert rig.duties == [0.0] * 16
+    rig.wire.bus.nack(PCA, times=3)
+    with pytest.raises(NotResponding, match="could not be switched off"):
+        switch_off(rig.bus, PCA)
+
+
+def test_the_guardian_imports_no_numpy() -> None:
+    """The process that switches the coils off must start fast and need nothing that can break."""
+    code = "import sys, hal.drivers.pca9685, hal.buses.i2c_bus; sys.exit('numpy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False, timeout=30).returncode == 0

@@ -1,0 +1,30 @@
+"""A bus that writes down what it is told, opened by a guardian as `tests.hal.guardian.byte_log:open_bus`.
+
+Light, for the guardian must stay so. While FILE.broken exists the bus fails as a silent part does.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import time
+
+
+class ByteLog:
+    """Appends (monotonic ns, address, register, value) to a file."""
+
+    def __init__(self, path: str) -> None:
+        self._path = path
+
+    def write_byte_data(self, address: int, register: int, value: int) -> None:
+        if os.path.exists(self._path + ".broken"):
+            raise OSError(errno.EREMOTEIO, "no acknowledge")
+        with open(self._path, "a", encoding="ascii") as log:
+            log.write(f"{time.monotonic_ns()} {address} {register} {value}\n")
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+
+def open_bus(where: str) -> ByteLog:
+    return ByteLog(where)

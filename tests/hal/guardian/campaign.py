@@ -1,0 +1,101 @@
+"""One flight that is hurt in every way in turn: how long the coils carried current after each act."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from tests.hal.guardian.live_flight import HANG_S, SLEEPS, SPINS, CoilTruth, live_flight
+
+STOPPED_S = 1.0
+UNGUARDED = "SIGSTOP, the guardian too"
+_CALM_S = 1.2
+
+
+@dataclass(frozen=True)
+class Hurt:
+    """One act. Times in s, the current in A; `recovered` counts from the act's end, None after a death."""
+
+    act: str
+    current: float
+    zero_after: float
+    recovered: float | None
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """All acts, the flight's truth and events, and the guardians that were on watch in turn."""
+
+    hurts: list[Hurt]
+    truth: CoilTruth
+    guardians: list[int]
+    guardian_lost_ns: list[int]
+    left_over: list[int]
+
+
+def hurt_in_every_way(folder: Path) -> Campaign:
+    """Stop, hang (two ways) and let go; kill and stop the guardian; kill the flight. About ten seconds."""
+    times: list[tuple[str, int, int | None]] = []
+    guardians: list[int] = []
+    lost_ns: list[int] = []
+    with live_flight(folder) as flight:
+        flight.wait_for("READY=1")
+        time.sleep(_CALM_S)
+        begin_ns = flight.do(signal.SIGSTOP)
+        time.sleep(STOPPED_S)
+        times.append(("SIGSTOP", begin_ns, flight.do(signal.SIGCONT)))
+        time.sleep(_CALM_S)
+        for name, number in (("hang, other threads alive", SLEEPS), ("hang, interpreter held", SPINS)):
+            begin_ns = flight.do(number)
+            time.sleep(HANG_S + _CALM_S)
+            times.append((name, begin_ns, begin_ns + round(HANG_S * 1e9)))
+        # What the guardian is for: without it the devices go on driving the coil.
+        os.kill(flight.guardian(), signal.SIGSTOP)
+        begin_ns = flight.do(signal.SIGSTOP)
+        time.sleep(STOPPED_S)
+        os.kill(flight.guardian(), signal.SIGCONT)
+        times.append((UNGUARDED, begin_ns, flight.do(signal.SIGCONT)))
+        time.sleep(_CALM_S)
+        for number in (signal.SIGKILL, signal.SIGSTOP):
+            guardians.append(flight.guardian())
+            os.kill(guardians[-1], number)
+            lost_ns.append(time.monotonic_ns())
+            time.sleep(2.5)
+        guardians.append(flight.guardian())
+        children = flight.children()
+        times.append(("kill -9", flight.do(signal.SIGKILL), None))
+        flight.process.wait()
+        time.sleep(_CALM_S)
+        left_over = [child for child in guardians if lives(child)]
+        _end_devices(children)
+    truth = CoilTruth(flight.folder)
+    hurts = [_measured(truth, *act) for act in times]
+    return Campaign(hurts, truth, guardians, lost_ns, left_over)
+
+
+def _measured(truth: CoilTruth, name: str, begin_ns: int, end_ns: int | None) -> Hurt:
+    until_ns = end_ns if end_ns is not None else begin_ns + 1_000_000_000
+    recovered = None if end_ns is None else truth.driven_after(end_ns)
+    return Hurt(name, truth.before(begin_ns), truth.zero_after(begin_ns, until_ns), recovered)
+
+
+def _end_devices(children: list[int]) -> None:
+    """End the emulated devices, which would wait for another flight, and wait until their log is whole."""
+    for child in children:
+        command = Path(f"/proc/{child}/cmdline")
+        if command.exists() and b"sim_hal" in command.read_bytes():
+            os.kill(child, signal.SIGTERM)
+            deadline = time.monotonic() + 5.0
+            while command.exists() and time.monotonic() < deadline:
+                time.sleep(0.02)
+
+
+def lives(process: int) -> bool:
+    """Tell whether a process runs; one that has ended and was not reaped has no command line."""
+    try:
+        return Path(f"/proc/{process}/cmdline").read_bytes() != b""
+    except (FileNotFoundError, ProcessLookupError):
+        return False

@@ -1,0 +1,185 @@
+"""A flight in real time on emulated devices in a process of their own: to be stopped, hung and killed.
+
+The truth log of the devices tells what the coils carried; the service manager's end of the notification
+socket tells when the flight was ready.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from flight.link.telemetry.reader import Run, read_run
+from flight.link.telemetry.segments import find_segments
+from tests.scenario.flights import CONFIG
+
+ROOT = CONFIG.parents[1]
+HANG_S = 1.0
+
+SLEEPS, SPINS = signal.SIGUSR1, signal.SIGUSR2
+"""Signals that hang the control thread: other threads go on; or none does, the interpreter being held."""
+
+_FLIGHT = f"""
+import ctypes, os, signal, time
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+held = ctypes.PyDLL(None)  # unlike CDLL, keeps the interpreter's lock
+signal.signal({int(SLEEPS)}, lambda *_: time.sleep({HANG_S}))
+signal.signal({int(SPINS)}, lambda *_: held.usleep({round(1e6 * HANG_S)}))
+from flight.app.cli import main
+raise SystemExit(main())
+"""
+
+
+def write_config(folder: Path) -> Path:
+    """Write the step demonstration without its camera: quick to start, the coils in use all the time."""
+    text = CONFIG.read_text(encoding="utf-8")
+    before, _, rest = text.partition("\ncamera:")
+    path = folder / "flight.yaml"
+    path.write_text(
+        f"{before}\ncamera: none\n\nestimation:{rest.partition('estimation:')[2]}", encoding="utf-8"
+    )
+    return path
+
+
+class LiveFlight:
+    """One running flight process and what hangs on it."""
+
+    def __init__(
+        self, folder: Path, config: Path, notifications: socket.socket, duration: float, *more: str
+    ) -> None:
+        self._notifications = notifications
+        self.folder = folder / "run"
+        words = [
+            "run",
+            str(config),
+            "--realtime",
+            "--out",
+            str(self.folder),
+            "--duration",
+            str(duration),
+            *more,
+        ]
+        self.begun_ns = time.monotonic_ns()
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", _FLIGHT, *words],
+            cwd=ROOT,
+            env={**os.environ, "NOTIFY_SOCKET": notifications.getsockname(), "WATCHDOG_USEC": "2000000"},
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    def wait_for(self, word: str, patience: float = 30.0) -> int:
+        """Wait until the service manager is told `word`; return the monotonic time in ns."""
+        deadline = time.monotonic() + patience
+        while (left := deadline - time.monotonic()) > 0.0 and self.process.poll() is None:
+            if select.select([self._notifications], [], [], min(left, 0.2))[0]:
+                words = self._notifications.recv(4096).decode().split("\n")
+                if word in words:
+                    return time.monotonic_ns()
+        raise AssertionError(f"no {word} within {patience:g} s: {self.end()}")
+
+    def do(self, number: signal.Signals) -> int:
+        """Send the flight process a signal; return when, in monotonic ns."""
+        self.process.send_signal(number)
+        return time.monotonic_ns()
+
+    def guardian(self) -> int:
+        """Return the process identifier of the guardian on watch."""
+        for child in self.children():
+            if b"hal.guardian" in Path(f"/proc/{child}/cmdline").read_bytes():
+                return child
+        raise AssertionError("no guardian is on watch")
+
+    def children(self) -> list[int]:
+        """Return the living children of the flight process."""
+        tasks = Path(f"/proc/{self.process.pid}/task").glob("*/children")
+        return [int(child) for task in tasks for child in task.read_text().split()]
+
+    def end(self) -> str:
+        """Have the flight end politely; return what it wrote on standard error."""
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGCONT)
+            self.process.terminate()
+        try:
+            return self.process.communicate(timeout=20.0)[1] or ""
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            return self.process.communicate()[1] or ""
+
+
+@contextmanager
+def devices_running(folder: Path) -> Iterator[Path]:
+    """Serve the emulated devices as a board has its own: there before the flight; their truth in `folder`."""
+    facts = folder / "facts.json"
+    words = [sys.executable, "-m", "sim_hal", "serve", str(write_config(folder))]
+    words += ["--folder", str(folder), "--facts", str(facts)]
+    with subprocess.Popen(words, cwd=ROOT, stdout=subprocess.PIPE) as server:
+        try:
+            assert server.stdout is not None
+            server.stdout.readline()
+            yield facts
+        finally:
+            server.terminate()
+
+
+@contextmanager
+def live_flight(folder: Path, duration: float = 60.0, *more: str) -> Iterator[LiveFlight]:
+    """Start a flight, with `more` words for its command line, and end it at the end."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notifications:
+        notifications.bind(str(folder / "notify"))
+        flight = LiveFlight(folder, write_config(folder), notifications, duration, *more)
+        try:
+            yield flight
+        finally:
+            flight.end()
+
+
+class CoilTruth:
+    """What coil x really carried, on the machine's monotonic clock."""
+
+    def __init__(self, folder: Path, devices: Path | None = None) -> None:
+        """Read the run in `folder`; the truth of devices with a folder of their own is moved there."""
+        for path in find_segments(devices, "truth") if devices is not None else ():
+            path.rename(folder / path.name)
+        self.run: Run = read_run(folder)
+        start = self.run["run"][0]
+        # Both clocks now: the run's label tells mission time zero in UTC only.
+        epoch_ns = int(start["utc_ns"]) - (time.time_ns() - time.monotonic_ns())
+        truth = self.run["truth"]
+        self.time_ns: npt.NDArray[np.int64] = truth["time_ns"].astype(np.int64) + epoch_ns
+        self.current: npt.NDArray[np.float64] = truth["current"][:, 0].astype(np.float64)
+        self.epoch_ns = epoch_ns
+
+    def before(self, act_ns: int) -> float:
+        """Return the largest current in A shortly before an act came.
+
+        A flight takes it off for a cycle or two when a reading is late, as on a machine that is busy.
+        """
+        shortly = (self.time_ns > act_ns - 250_000_000) & (self.time_ns <= act_ns)
+        return float(np.abs(self.current[shortly]).max(initial=0.0))
+
+    def zero_after(self, act_ns: int, until_ns: int) -> float:
+        """Return how long after an act, in s, the coil was at zero and stayed there until `until_ns`."""
+        inside = (self.time_ns >= act_ns) & (self.time_ns <= until_ns)
+        driven = np.flatnonzero(inside & (self.current != 0.0))
+        first = int(driven[-1]) + 1 if len(driven) else int(np.flatnonzero(inside)[0])
+        if first >= len(self.time_ns) or self.time_ns[first] > until_ns:
+            return float("inf")
+        return float(self.time_ns[first] - act_ns) * 1e-9
+
+    def driven_after(self, act_ns: int) -> float:
+        """Return how long after an act, in s, the coil was first driven."""
+        driven = np.flatnonzero((self.time_ns >= act_ns) & (self.current != 0.0))
+        return float(self.time_ns[driven[0]] - act_ns) * 1e-9 if len(driven) else float("inf")

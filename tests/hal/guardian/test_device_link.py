@@ -1,0 +1,119 @@
+"""The wire between a flight and devices in another process, and how a flight is plugged into running ones."""
+
+from __future__ import annotations
+
+import errno
+import json
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from flight.app.flight import fly
+from flight.app.request import Order
+from flight.gnc.errors import UsageError
+from hal.interfaces.errors import NotResponding
+from sim_hal.serving.device_link import Inbox, RemoteI2cBus, open_bus, pack
+from tests.scenario.flights import CONFIG
+
+ROOT = CONFIG.parents[1]
+_VALUES = st.recursive(st.integers() | st.text() | st.booleans(), lambda value: st.lists(value, max_size=4))
+
+
+@given(st.lists(_VALUES, max_size=6), st.integers(1, 9))
+def test_messages_come_out_whole_however_the_wire_cuts_them(messages: list[Any], piece: int) -> None:
+    wire = b"".join(map(pack, messages))
+    inbox = Inbox()
+    cut = [wire[at : at + piece] for at in range(0, len(wire), piece)]
+    assert [message for chunk in cut for message in inbox.take(chunk)] == messages
+
+
+Serve = Callable[[Callable[[list[Any]], list[Any]]], RemoteI2cBus]
+
+
+@pytest.fixture
+def serve(tmp_path: Path) -> Iterator[Serve]:
+    """Return what answers each request by a function's messages, and a bus plugged into it."""
+    listener = socket.socket(socket.AF_UNIX)
+    listener.bind(str(tmp_path / "devices.sock"))
+    listener.listen()
+    open_buses: list[RemoteI2cBus] = []
+
+    def start(answer: Callable[[list[Any]], list[Any]]) -> RemoteI2cBus:
+        def work() -> None:
+            line, _ = listener.accept()
+            inbox = Inbox()
+            with line:
+                while chunk := line.recv(4096):
+                    for request in inbox.take(chunk):
+                        line.sendall(b"".join(map(pack, answer(request))))
+
+        threading.Thread(target=work, daemon=True).start()
+        open_buses.append(open_bus(str(tmp_path / "devices.sock")))
+        return open_buses[-1]
+
+    yield start
+    for bus in open_buses:
+        bus.close()
+    listener.close()
+
+
+def test_an_error_on_the_emulated_bus_is_the_errno_of_the_kernel(serve: Serve) -> None:
+    bus = serve(lambda request: [[request[0], "error", errno.EREMOTEIO, "no acknowledge"]])
+    with pytest.raises(OSError, match="no acknowledge") as caught:
+        bus.write_byte_data(0x40, 0xFD, 0x10)
+    assert caught.value.errno == errno.EREMOTEIO
+
+
+def test_an_answer_that_came_too_late_is_not_taken_for_the_next_ones(serve: Serve) -> None:
+    def answer(request: list[Any]) -> list[Any]:
+        if request[0] == 1:
+            return []
+        return [[1, "done", 11, ""], [2, "done", 22, ""]]
+
+    bus = serve(answer)
+    with pytest.raises(TimeoutError):
+        bus.read_byte_data(0x40, 0)
+    assert bus.read_byte_data(0x40, 0) == 22
+
+
+def test_the_guardians_end_is_light() -> None:
+    script = "import sys, sim_hal.serving.device_link; print({'numpy', 'msgspec', 'yaml'} & set(sys.modules))"
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=ROOT
+    )
+    assert done.stdout == "set()\n"
+
+
+def test_devices_that_run_are_flown_in_real_time_only(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="--realtime"):
+        fly(Order(CONFIG, tmp_path / "run", devices=tmp_path / "facts.json"))
+
+
+def test_real_devices_are_not_looked_for_in_a_file(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="--devices"):
+        fly(Order(ROOT / "config/testbed.yaml", tmp_path / "run", devices=tmp_path / "facts.json"))
+
+
+@pytest.mark.parametrize("facts", [None, "{", "[]", "{}"])
+def test_a_file_that_tells_of_no_server_is_said_so(tmp_path: Path, facts: str | None) -> None:
+    path = tmp_path / "facts.json"
+    if facts is not None:
+        path.write_text(facts, encoding="utf-8")
+    with pytest.raises(NotResponding, match=r"facts\.json tells of no server"):
+        fly(Order(CONFIG, tmp_path / "run", realtime=True, devices=path))
+
+
+def test_a_server_that_has_gone_is_said_so(tmp_path: Path) -> None:
+    path = tmp_path / "facts.json"
+    gone = {"serial": "/dev/ptmx", "baud_rate": 115200, "socket": str(tmp_path / "gone"), "camera": False}
+    path.write_text(json.dumps(gone), encoding="utf-8")
+    with pytest.raises(NotResponding):
+        fly(Order(CONFIG, tmp_path / "run", realtime=True, devices=path))

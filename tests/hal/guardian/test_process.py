@@ -1,0 +1,168 @@
+"""The guardian as a process: what it does to its bus, what it tells, what it weighs."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import socket
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from hal.drivers.pca9685 import ALL_LED_OFF_H, FULL
+from hal.guardian.client import CoilReach, GuardianLine
+from hal.interfaces.errors import NotResponding
+from hal.interfaces.guardian import GuardianNews
+
+ADDRESS = 0x41
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    return tmp_path / "bytes"
+
+
+@pytest.fixture
+def guardian(log: Path) -> Iterator[GuardianLine]:
+    line = GuardianLine(CoilReach("tests.hal.guardian.byte_log:open_bus", str(log), ADDRESS))
+    line.wait_ready(10.0)
+    yield line
+    line.close()
+
+
+def zeros(log: Path) -> list[int]:
+    """Return when zero was said, in monotonic ns."""
+    lines = [line.split() for line in log.read_text(encoding="ascii").splitlines()]
+    assert all(line[1:] == [str(ADDRESS), str(ALL_LED_OFF_H), str(FULL)] for line in lines)
+    return [int(line[0]) for line in lines]
+
+
+def beat_for(guardian: GuardianLine, seconds: float) -> int:
+    """Beat at 40 Hz; return when the last beat was."""
+    end_ns = time.monotonic_ns() + round(seconds * 1e9)
+    while time.monotonic_ns() < end_ns:
+        guardian.beat()
+        last_ns = time.monotonic_ns()
+        time.sleep(0.025)
+    return last_ns
+
+
+def news_until(guardian: GuardianLine, wanted: GuardianNews, patience: float = 10.0) -> list[GuardianNews]:
+    """Return the news up to the wanted one."""
+    news: list[GuardianNews] = []
+    deadline = time.monotonic() + patience
+    while wanted not in news:
+        assert time.monotonic() < deadline, f"no {wanted.name} in {news}"
+        news += guardian.tend(time.monotonic_ns())
+        time.sleep(0.01)
+    return news
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 10.0
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def test_heartbeats_keep_it_quiet_and_silence_makes_it_act(guardian: GuardianLine, log: Path) -> None:
+    begun_ns = time.monotonic_ns()
+    last_ns = beat_for(guardian, 0.6)
+    assert not [at for at in zeros(log) if begun_ns + 50_000_000 < at <= last_ns]
+    assert news_until(guardian, GuardianNews.ACTED).count(GuardianNews.ACTED) == 1
+    wait_until(lambda: len([at for at in zeros(log) if at > last_ns]) >= 3)
+    after = [(at - last_ns) * 1e-9 for at in zeros(log) if at > last_ns]
+    assert 0.29 < after[0] < 0.5
+    assert after[1] - after[0] > 0.09, "and again every 0.1 s"
+
+
+def test_a_heart_that_beats_again_is_let_go(guardian: GuardianLine, log: Path) -> None:
+    beat_for(guardian, 0.05)
+    news_until(guardian, GuardianNews.ACTED)
+    begun_ns = time.monotonic_ns()
+    last_ns = beat_for(guardian, 0.5)
+    assert not [at for at in zeros(log) if begun_ns + 50_000_000 < at <= last_ns]
+
+
+def test_a_polite_end_zeroes_once_more_and_leaves_no_process(guardian: GuardianLine, log: Path) -> None:
+    beat_for(guardian, 0.05)
+    before = len(zeros(log))
+    guardian.close()
+    assert len(zeros(log)) == before + 1
+    assert not Path(f"/proc/{guardian.process_id}").exists()
+
+
+def test_signals_that_end_a_flight_do_not_end_its_guardian(guardian: GuardianLine, log: Path) -> None:
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        os.kill(guardian.process_id, number)
+    beat_for(guardian, 0.1)
+    assert guardian.tend(time.monotonic_ns()) == []
+    assert os.getsid(guardian.process_id) == guardian.process_id, "nor what is sent to the flight's group"
+
+
+def test_a_killed_guardian_is_replaced_and_told(guardian: GuardianLine) -> None:
+    first = guardian.process_id
+    os.kill(first, signal.SIGKILL)
+    assert news_until(guardian, GuardianNews.READY) == [GuardianNews.LOST, GuardianNews.READY]
+    assert guardian.process_id != first
+    wait_until(lambda: not guardian.tend(0) and not Path(f"/proc/{first}").exists())
+
+
+def test_a_guardian_that_cannot_be_replaced_now_is_replaced_later(
+    guardian: GuardianLine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No descriptor is left for its line: whoever tends it goes on."""
+
+    def no_line(*_: object) -> None:
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    os.kill(guardian.process_id, signal.SIGKILL)
+    with monkeypatch.context() as patch:
+        patch.setattr(socket, "socketpair", no_line)
+        assert news_until(guardian, GuardianNews.LOST) == [GuardianNews.LOST]
+    assert news_until(guardian, GuardianNews.READY) == [GuardianNews.LOST, GuardianNews.READY]
+
+
+def test_a_guardian_that_hangs_is_replaced_and_told(guardian: GuardianLine) -> None:
+    first = guardian.process_id
+    os.kill(first, signal.SIGSTOP)
+    for _ in range(400):  # ten seconds of heartbeats, more than its line takes
+        guardian.beat()
+    news_until(guardian, GuardianNews.READY)
+    assert guardian.process_id != first
+
+
+def test_a_silent_chip_is_told_once_and_tried_again(guardian: GuardianLine, log: Path) -> None:
+    beat_for(guardian, 0.05)
+    broken = Path(f"{log}.broken")
+    broken.touch()
+    assert news_until(guardian, GuardianNews.FAILED) == [GuardianNews.FAILED]
+    begun_ns = time.monotonic_ns()
+    broken.unlink()
+    assert news_until(guardian, GuardianNews.ACTED) == [GuardianNews.ACTED]
+    assert (zeros(log)[-1] - begun_ns) * 1e-9 < 0.5
+
+
+def test_a_chip_that_is_silent_at_the_start_is_refused(log: Path) -> None:
+    Path(f"{log}.broken").touch()
+    line = GuardianLine(CoilReach("tests.hal.guardian.byte_log:open_bus", str(log), ADDRESS))
+    try:
+        with pytest.raises(NotResponding, match="PWM chip"):
+            line.wait_ready(0.5)
+    finally:
+        line.close()
+
+
+def test_it_is_small_and_knows_no_numpy(guardian: GuardianLine) -> None:
+    process = Path(f"/proc/{guardian.process_id}")
+    maps = (process / "maps").read_text(encoding="utf-8")
+    assert "numpy" not in maps
+    assert "msgspec" not in maps
+    status = (process / "status").read_text(encoding="ascii")
+    (resident,) = (int(line.split()[1]) for line in status.splitlines() if line.startswith("VmRSS"))
+    assert resident < 32 * 1024, "kB"
+    ticks = (process / "stat").read_text(encoding="ascii").rpartition(")")[2].split()[11:13]
+    assert sum(map(int, ticks)) / os.sysconf("SC_CLK_TCK") < 0.2, "s of CPU to start"

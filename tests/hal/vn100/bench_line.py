@@ -1,0 +1,77 @@
+"""A driver and an emulated unit on one line in simulated time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flight.gnc.math.frames import NED_TO_TESTBED, attitude_map
+from flight.gnc.math.quaternion import IDENTITY
+from hal.drivers.vn100.driver import Vn100, Vn100Settings
+from hal.interfaces.readings import ImuReading
+from sim_hal.clock import SimClock
+from sim_hal.emulators.serial_line import SerialLine
+from sim_hal.emulators.vn100 import Vn100Emulator, Vn100EmulatorSettings
+from sim_hal.worlds.motion import Motion, about_thread
+
+MISSION = Vn100Settings(attitude_map=attitude_map(IDENTITY, NED_TO_TESTBED))
+
+
+def at_rest(time_ns: int) -> Motion:
+    return about_thread(time_ns, 0.4, 0.0, 4.5e-4)
+
+
+def turning(time_ns: int) -> Motion:
+    """Turn through q2 = 0 at 0.1 rad/s."""
+    return about_thread(time_ns, 0.1 * (time_ns * 1e-9 - 2.0), 0.1, 4.5e-4)
+
+
+@dataclass(frozen=True, slots=True)
+class Alone:
+    """A world of one unit."""
+
+    unit: Vn100Emulator
+
+    def next_event_ns(self) -> int:
+        """Return the unit's next event."""
+        return self.unit.next_event_ns()
+
+    def advance_to(self, time_ns: int) -> None:
+        """Let the unit act."""
+        self.unit.advance(time_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class BenchLine:
+    """Everything on the bench."""
+
+    clock: SimClock
+    line: SerialLine
+    unit: Vn100Emulator
+    driver: Vn100
+
+    def run(self, seconds: float) -> list[ImuReading]:
+        """Poll at 40 Hz for a while; return all readings."""
+        readings: list[ImuReading] = []
+        end_ns = self.clock.now_ns() + round(seconds * 1e9)
+        while self.clock.now_ns() < end_ns:
+            self.clock.sleep_until_ns(min(end_ns, self.clock.now_ns() + 25_000_000))
+            readings += self.driver.poll()
+        return readings
+
+
+def bench_line(
+    sense: Callable[[int], Motion] = turning,
+    settings: Vn100Settings = MISSION,
+    unit_settings: Vn100EmulatorSettings | None = None,
+    seed: int = 1,
+    baud_rate: int = 115200,
+) -> BenchLine:
+    clock = SimClock()
+    rng = np.random.default_rng(seed)
+    line = SerialLine(clock.now_ns, baud_rate, rng)
+    unit = Vn100Emulator(sense, line.device, rng, replace(unit_settings or Vn100EmulatorSettings()))
+    clock.attach(Alone(unit))
+    return BenchLine(clock, line, unit, Vn100(line.host, clock, settings))

@@ -1,0 +1,354 @@
+"""The driver against the emulated unit, in simulated time."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from flight.gnc.math.frames import NED_TO_TESTBED, attitude_map
+from flight.gnc.math.quaternion import about_axis_y, attitude_matrix, from_rotation_vector, multiply
+from hal.drivers.vn100.ascii import build
+from hal.drivers.vn100.codec import layout_of
+from hal.drivers.vn100.driver import OUTPUT_SET, Vn100, Vn100Settings
+from hal.drivers.vn100.set_up import Question
+from hal.interfaces.errors import CorruptData, NotResponding, OutOfRange, Refused
+from sim_hal.emulators.serial_line import SOUND, LineFaults
+from sim_hal.emulators.vn100 import Vn100EmulatorSettings
+from sim_hal.emulators.vn100_sensors import PROFILES
+from sim_hal.worlds.motion import Motion, about_thread
+from tests.hal.vn100.bench_line import MISSION, at_rest, bench_line, turning
+
+QUIET = Vn100EmulatorSettings(noise=PROFILES["none"])
+FLOAT32 = 2.0**-23
+
+
+def test_readings_come_at_40_hz_on_the_units_own_grid() -> None:
+    bench = bench_line()
+    bench.driver.configure()
+    start_ns = bench.clock.now_ns()
+    readings = bench.run(5.0)
+    assert len(readings) == pytest.approx(200, abs=1)
+    device_ns = np.array([reading.device_time_ns for reading in readings])
+    assert set(np.diff(device_ns)) == {25_000_000}
+    assert not (device_ns % 25_000_000).any()
+    times = np.array([reading.time_ns for reading in readings])
+    assert times.min() >= start_ns
+    assert abs(np.diff(times) - 25_000_000).max() <= 2
+    length = layout_of(OUTPUT_SET).length
+    assert {r.arrival_ns - r.time_ns for r in readings} == {round(length * 10e9 / 115200)}
+    assert bench.driver.link().bad_checksum == bench.driver.link().discarded_bytes == 0
+
+
+def test_without_noise_the_reading_is_the_motion_at_its_time() -> None:
+    bench = bench_line(unit_settings=QUIET)
+    bench.driver.configure()
+    for reading in bench.run(3.0):
+        truth = turning(reading.time_ns)
+        assert reading.quaternion == pytest.approx(truth.quaternion, abs=2 * FLOAT32)
+        assert reading.rate == pytest.approx(truth.rate, abs=FLOAT32)
+        assert reading.field == pytest.approx(truth.field_body, abs=1e-4 * 5 * FLOAT32)
+        assert reading.acceleration == pytest.approx(truth.specific_force_body, abs=10 * FLOAT32)
+
+
+def test_any_mounting_and_attitude_come_back_in_body_axes() -> None:
+    rng = np.random.default_rng(8)
+    mounting = from_rotation_vector(rng.normal(size=3))
+    attitude = from_rotation_vector(rng.normal(size=3))
+    field, force, rate = attitude_matrix(attitude) @ [0, 0, -4e-4], rng.normal(size=3), rng.normal(size=3)
+
+    def sense(time_ns: int) -> Motion:
+        return Motion(time_ns, attitude, rate, field, force)
+
+    settings = Vn100Settings(
+        attitude_map=attitude_map(mounting, NED_TO_TESTBED), mounting=attitude_matrix(mounting)
+    )
+    bench = bench_line(sense, settings, replace(QUIET, mounting=mounting))
+    bench.driver.configure()
+    reading = bench.run(0.1)[-1]
+    assert reading.quaternion == pytest.approx(attitude, abs=4 * FLOAT32)
+    assert reading.rate == pytest.approx(rate, abs=4 * FLOAT32)
+    assert reading.field == pytest.approx(field, abs=1e-10)
+    assert reading.acceleration == pytest.approx(force, abs=4 * FLOAT32)
+
+
+def test_both_signs_of_the_quaternion_read_as_the_shorter_turn() -> None:
+    def sense(time_ns: int) -> Motion:
+        return replace(about_thread(time_ns, 0.4, 0.0, 4.5e-4), quaternion=-about_axis_y(0.4))
+
+    bench = bench_line(sense, unit_settings=QUIET)
+    bench.driver.configure()
+    assert bench.run(0.1)[-1].quaternion == pytest.approx(about_axis_y(0.4), abs=2 * FLOAT32)
+
+
+def test_the_thesiss_noise_keeps_its_bounds_and_is_uniform() -> None:
+    bench = bench_line(at_rest, MISSION)
+    bench.driver.configure()
+    readings = bench.run(50.0)
+    truth = at_rest(0)
+    small = multiply(np.array([r.quaternion for r in readings]), truth.quaternion * [-1, -1, -1, 1])[:, :3]
+    rate = np.array([r.rate for r in readings])
+    for noise, bound in ((small, 1.75e-3), (rate, 1.75e-4)):
+        assert abs(noise).max() <= bound + 2 * FLOAT32
+        for axis in noise.T:
+            assert stats.kstest(axis, stats.uniform(-bound, 2 * bound).cdf).pvalue > 1e-3
+    q2 = np.array([r.quaternion[1] for r in readings]) - truth.quaternion[1]
+    assert 0.9 * 1.75e-3 < abs(q2).max() <= 1.75e-3 + 1e-6
+
+
+def test_the_data_sheets_noise_has_its_density_at_the_drivers_windows() -> None:
+    bench = bench_line(at_rest, MISSION, Vn100EmulatorSettings(noise=PROFILES["datasheet"]))
+    bench.driver.configure()
+    readings = bench.run(50.0)
+    # Window 20 gives 0.016 deg/s and 0.63 mG; 2000 samples tell a deviation to 1.6 %, five times that is 8 %.
+    rate = np.array([r.rate for r in readings])
+    field = np.array([r.field for r in readings])
+    assert rate.std(axis=0) == pytest.approx(np.full(3, np.radians(0.0035) * 20 / np.sqrt(20)), rel=0.08)
+    assert field.std(axis=0) == pytest.approx(np.full(3, 63e-9), rel=0.08)
+
+
+def test_ascii_output_gives_the_same_without_device_time() -> None:
+    bench = bench_line(settings=replace(MISSION, output="ascii"), unit_settings=QUIET)
+    bench.driver.configure()
+    readings = bench.run(2.0)
+    assert len(readings) == pytest.approx(80, abs=1)
+    for reading in readings:
+        truth = turning(reading.time_ns)
+        assert reading.device_time_ns == 0
+        assert reading.quaternion == pytest.approx(truth.quaternion, abs=2e-6)
+        assert reading.rate == pytest.approx(truth.rate, abs=1e-6)
+        assert reading.field == pytest.approx(truth.field_body, abs=5.1e-9)
+        assert reading.acceleration == pytest.approx(truth.specific_force_body, abs=5.1e-4)
+
+
+def test_the_unit_may_be_found_in_any_state() -> None:
+    """Other outputs running, and half a command in its buffer from a host that died."""
+    bench = bench_line()
+    bench.line.host.send(b"\r\n" + build("WRG", 76, 1, 40, "01", "0729"))
+    bench.clock.sleep_until_ns(100_000_000)
+    bench.line.host.send(b"$VNWRG,75,1,2")
+    bench.clock.sleep_until_ns(200_000_000)
+    bench.driver.configure()
+    readings = bench.run(1.0)
+    assert len(readings) == pytest.approx(40, abs=1)
+    assert bench.unit.registers.read(76)[0] == "0"
+
+
+def test_a_unit_set_up_beforehand_is_taken_as_it_is() -> None:
+    bench = bench_line(settings=replace(MISSION, configure=False), unit_settings=QUIET)
+    bench.line.host.send(build("WRG", 75, 1, 16, "15", "0001", "060F", "0004"))
+    bench.driver.configure()
+    readings = bench.run(1.0)
+    assert bench.unit.registers.read(6) == ("14",)
+    assert len(readings) > 45
+    # Packets wait behind the VNYMR lines: here the unit's own time tells when the sample was taken.
+    sampled_ns = readings[-1].device_time_ns - QUIET.uptime_ns
+    assert readings[-1].quaternion == pytest.approx(turning(sampled_ns).quaternion, abs=2 * FLOAT32)
+
+
+def test_silence_is_not_responding_and_names_what_was_tried() -> None:
+    bench = bench_line()
+    bench.line.to_host.faults = LineFaults(silent=True)
+    with pytest.raises(NotResponding, match=r"VNASY,0 in 3 tries of 100 ms at 115200 baud, not one byte"):
+        bench.driver.configure()
+    assert bench.clock.now_ns() == 300_000_000
+    assert bench.driver.link().last_byte_ns == -1
+
+
+def test_a_wrong_baud_rate_is_corrupt_data() -> None:
+    bench = bench_line()
+    bench.line.host.set_baud_rate(57600)
+    with pytest.raises(CorruptData, match="none made sense: check the baud rate"):
+        bench.driver.configure()
+    assert bench.driver.link().packets == 0
+
+
+def test_a_unit_that_talks_but_does_not_hear_is_told_from_a_silent_one() -> None:
+    bench = bench_line()
+    bench.line.to_device.faults = LineFaults(silent=True)
+    with pytest.raises(NotResponding, match="though its output arrives"):
+        bench.driver.configure()
+
+
+def test_a_port_that_is_gone_is_not_responding() -> None:
+    bench = bench_line()
+    bench.driver.configure()
+    bench.line.host.unplugged = True
+    with pytest.raises(NotResponding, match="unplugged"):
+        bench.driver.poll()
+
+
+def test_another_model_is_refused() -> None:
+    bench = bench_line()
+    bench.unit.registers.set_back(1, ("VN-200T-CR",))
+    with pytest.raises(Refused, match="VN-200T-CR"):
+        bench.driver.configure()
+
+
+def test_an_error_answer_is_refused_with_its_meaning() -> None:
+    bench = bench_line(baud_rate=115200)
+    with pytest.raises(Refused, match=r"error 0C, insufficient baud rate"):
+        bench.driver._ask(Question("WRG", (75, 1, 1, "01", "0531")))
+    with pytest.raises(Refused, match=r"error 08, invalid register"):
+        bench.driver._ask(Question("WRG", (200, 1)))
+
+
+def test_an_echo_of_other_values_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = bench_line()
+    keep = bench.unit.registers.write
+
+    def stubborn(number: int, fields: tuple[str, ...]) -> tuple[str, ...]:
+        return ("1", "3", "5") if number == 44 else keep(number, fields)
+
+    monkeypatch.setattr(bench.unit.registers, "write", stubborn)
+    with pytest.raises(Refused, match=r"register 44 was to be 0,1,5, the unit answered 1,3,5"):
+        bench.driver.configure()
+
+
+@pytest.mark.parametrize("failures", [1, 2, 3])
+def test_a_command_garbled_twice_is_sent_a_third_time_and_no_more(
+    failures: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = bench_line()
+    sound_send = bench.line.host.send
+    sent: Counter[bytes] = Counter()
+
+    def send(data: bytes) -> None:
+        sent[data] += 1
+        sound_send(data if sent[data] > failures else data.replace(b",", b";", 1))
+
+    monkeypatch.setattr(bench.line.host, "send", send)
+    if failures < 3:
+        bench.driver.configure()
+        assert set(sent.values()) == {failures + 1}
+    else:
+        with pytest.raises(CorruptData, match="error 03, invalid checksum"):
+            bench.driver.configure()
+
+
+@pytest.mark.parametrize(
+    ("faults", "least", "most"),
+    [
+        (LineFaults(silent=True), 0, 0),
+        (LineFaults(garbage=True), 0, 0),
+        (LineFaults(flip_probability=0.001), 30, 75),
+        (LineFaults(cut_probability=0.3), 35, 75),
+        (LineFaults(delay_ns=300_000_000), 60, 70),
+        (SOUND, 79, 81),
+    ],
+)
+def test_faults_on_the_wire_cost_readings_but_never_falsify_one(
+    faults: LineFaults, least: int, most: int
+) -> None:
+    bench = bench_line(unit_settings=QUIET)
+    bench.driver.configure()
+    bench.run(0.5)
+    before = bench.driver.link()
+    bench.line.to_host.faults = faults
+    readings = bench.run(2.0)
+    after = bench.driver.link()
+    # At most one packet was under way when the fault set in.
+    assert least <= len(readings) <= most + 1
+    for reading in readings:
+        truth = turning(reading.time_ns - faults.delay_ns)
+        assert reading.quaternion == pytest.approx(truth.quaternion, abs=2 * FLOAT32)
+    silent = after.bytes_received - before.bytes_received < 100
+    corrupt = after.discarded_bytes > before.discarded_bytes
+    assert silent == faults.silent
+    assert corrupt == bool(faults.garbage or faults.flip_probability or faults.cut_probability)
+    bench.line.to_host.faults = SOUND
+    assert len(bench.run(1.0)) >= 39
+
+
+def test_noise_between_packets_costs_no_packet() -> None:
+    bench = bench_line(unit_settings=QUIET)
+    bench.driver.configure()
+    readings = []
+    for _ in range(40):
+        bench.line.to_host.noise(30, bench.clock.now_ns(), 115200)
+        readings += bench.run(0.025)
+    readings += bench.run(0.1)
+    assert len(readings) == pytest.approx(44, abs=1)
+    assert bench.driver.link().discarded_bytes == 40 * 30
+
+
+def test_a_unit_that_must_not_be_set_up_is_left_alone_after_its_reset() -> None:
+    bench = bench_line()
+    bench.driver.configure()
+    bench.run(1.0)
+    silent = Vn100(bench.line.host, bench.clock, replace(MISSION, configure=False))
+    bench = replace(bench, driver=silent)
+    bench.line.host.send(build("RST"))
+    assert len(bench.run(3.0)) <= 1  # it boots, then speaks VNYMR, which is no reading
+    assert silent.link().last_byte_ns > bench.clock.now_ns() - 50_000_000
+    silent_to_unit = bench.unit.registers.read(6)
+    assert silent_to_unit == ("14",)
+    assert silent.recoveries == 0
+
+
+@pytest.mark.parametrize(
+    ("values", "not_finite", "out_of_range"),
+    [
+        ({}, 0, 0),
+        ({0: float("nan")}, 1, 0),
+        ({5: float("inf")}, 1, 0),
+        ({3: 0.9}, 0, 1),
+        ({3: 1.005}, 0, 0),
+        ({4: 36.0}, 0, 1),
+        ({8: 200.0}, 0, 1),
+        ({10: -6.1}, 0, 1),
+        ({10: -5.9}, 0, 0),
+    ],
+)
+def test_impossible_values_are_counted_not_given(
+    values: dict[int, float], not_finite: int, out_of_range: int
+) -> None:
+    bench = bench_line()
+    payload = [0.0, 0.0, 0.0, 1.0, *[0.0] * 9]
+    for index, value in values.items():
+        payload[index] = value
+    bench.line.host.send(build("ASY", 0))
+    bench.clock.sleep_until_ns(50_000_000)
+    bench.driver.poll()
+    bench.line.device.write(layout_of(OUTPUT_SET).pack([123, *payload]), bench.clock.now_ns())
+    bench.clock.sleep_until_ns(100_000_000)
+    readings = bench.driver.poll()
+    link = bench.driver.link()
+    assert (link.not_finite, link.out_of_range) == (not_finite, out_of_range)
+    assert len(readings) == 1 - not_finite - out_of_range
+    for reading in readings:
+        assert np.linalg.norm(reading.quaternion) == pytest.approx(1.0, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "match"),
+    [
+        ({"rate_hz": 30}, Refused, "rate_hz = 30"),
+        ({"rate_hz": 0}, Refused, "rate_hz = 0"),
+        ({"rate_hz": 200}, OutOfRange, "line load at 115200 baud"),
+        ({"rate_hz": 100, "output": "ascii"}, OutOfRange, "line load"),
+        ({"rate_hz": 80, "output": "ascii"}, Refused, "rate_hz = 80"),
+        ({"unit_port": 3}, Refused, "unit_port = 3"),
+    ],
+)
+def test_what_unit_or_line_cannot_do_is_refused(
+    change: dict[str, int], error: type[Exception], match: str
+) -> None:
+    make: Callable[..., Vn100Settings] = replace
+    bench = bench_line()
+    with pytest.raises(error, match=match):
+        Vn100(bench.line.host, bench.clock, make(MISSION, **change))
+
+
+def test_the_same_seed_gives_the_same_bytes() -> None:
+    def flight() -> list[tuple[int, bytes]]:
+        bench = bench_line(seed=11)
+        bench.line.to_host.faults = LineFaults(flip_probability=1e-4, cut_probability=0.01)
+        bench.clock.sleep_until_ns(2_000_000_000)
+        return bench.line.host.receive()
+
+    assert flight() == flight()

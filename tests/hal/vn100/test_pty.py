@@ -1,0 +1,156 @@
+"""The emulator on a pseudo-terminal, spoken to through real pyserial."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flight.gnc.math.frames import NED_TO_TESTBED, attitude_map
+from flight.gnc.math.quaternion import IDENTITY, angle_about_axis_y
+from hal.buses.clock import SystemClock
+from hal.buses.serial_port import PySerialPort
+from hal.drivers.vn100.driver import Vn100, Vn100Settings
+from hal.interfaces.errors import CorruptData, NotResponding
+from hal.interfaces.readings import ImuReading
+
+COMMAND = [sys.executable, "-m", "sim_hal", "emulate", "vn100"]
+SETTINGS = Vn100Settings(attitude_map=attitude_map(IDENTITY, NED_TO_TESTBED))
+
+
+@pytest.fixture
+def served(tmp_path: Path) -> Iterator[tuple[str, subprocess.Popen[str]]]:
+    link = tmp_path / "vn100"
+    process = subprocess.Popen(
+        [*COMMAND, "--rate-deg-s", "3", "--json", "--link", str(link)],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert process.stdout is not None
+        facts = json.loads(process.stdout.readline())
+        assert os.path.realpath(link) == facts["device"]
+        yield str(link), process
+    finally:
+        process.terminate()
+        process.communicate(timeout=5)
+    assert not link.is_symlink()
+
+
+def readings_for(seconds: float, driver: Vn100, clock: SystemClock) -> list[ImuReading]:
+    readings: list[ImuReading] = []
+    end_ns = clock.now_ns() + round(seconds * 1e9)
+    while clock.now_ns() < end_ns:
+        clock.sleep_until_ns(clock.now_ns() + 5_000_000)
+        readings += driver.poll()
+    return readings
+
+
+def test_the_driver_sets_it_up_and_reads_at_40_hz(served: tuple[str, subprocess.Popen[str]]) -> None:
+    name, process = served
+    clock = SystemClock()
+    port = PySerialPort(name, 115200, clock)
+    driver = Vn100(port, clock, SETTINGS)
+    driver.configure()
+    readings = readings_for(1.5, driver, clock)
+    driver.close()
+    driver.close()
+    with pytest.raises(NotResponding, match="closed"):
+        driver.poll()
+    assert len(readings) == pytest.approx(60, abs=8)
+    times = np.array([r.device_time_ns for r in readings])
+    assert set(np.diff(times)) == {25_000_000}
+    angles = np.array([angle_about_axis_y(r.quaternion) for r in readings])
+    slope = np.polyfit(times * 1e-9, angles, 1)[0]
+    # 60 angles with an error of 2 mrad over 1.5 s give the rate to 0.6 mrad/s.
+    assert slope == pytest.approx(np.radians(3.0), abs=3e-3)
+    assert driver.link().discarded_bytes < 200  # what was half across when the port was opened
+    process.send_signal(signal.SIGINT)
+    assert process.wait(timeout=5) == 0
+
+
+def test_the_wrong_speed_is_known_for_what_it_is(served: tuple[str, subprocess.Popen[str]]) -> None:
+    clock = SystemClock()
+    driver = Vn100(PySerialPort(served[0], 57600, clock), clock, SETTINGS)
+    with pytest.raises(CorruptData, match="check the baud rate"):
+        driver.configure()
+    driver.close()
+
+
+def test_the_port_is_exclusive(served: tuple[str, subprocess.Popen[str]]) -> None:
+    clock = SystemClock()
+    port = PySerialPort(served[0], 115200, clock)
+    with pytest.raises(NotResponding, match="port free"):
+        PySerialPort(served[0], 115200, clock)
+    port.close()
+
+
+def test_a_port_that_is_not_there_is_named() -> None:
+    with pytest.raises(NotResponding, match=r"/dev/no-such-port: cannot be opened at 115200 baud"):
+        PySerialPort("/dev/no-such-port", 115200, SystemClock())
+
+
+def test_a_patient_port_is_gone_until_it_is_there(tmp_path: Path) -> None:
+    clock, name = SystemClock(), tmp_path / "imu"
+    port = PySerialPort(str(name), 115200, clock, patient=True)
+    with pytest.raises(NotResponding, match=f"{name}: cannot be opened at 115200 baud"):
+        port.receive()
+    with pytest.raises(NotResponding):
+        port.send(b"?")
+    near, far = os.openpty()
+    name.symlink_to(os.ttyname(far))
+    deadline_ns, sent, words = clock.now_ns() + 3_000_000_000, False, b""
+    while words != b"first words" and clock.now_ns() < deadline_ns:
+        clock.sleep_until_ns(clock.now_ns() + 5_000_000)
+        with suppress(NotResponding):
+            words += b"".join(data for _, data in port.receive())
+            sent = sent or os.write(near, b"first words") > 0
+    assert words == b"first words"
+    port.close()
+    os.close(near)
+    os.close(far)
+
+
+def test_a_unit_that_is_unplugged_is_not_responding() -> None:
+    clock = SystemClock()
+    near, far = os.openpty()
+    port = PySerialPort(os.ttyname(far), 115200, clock)
+    os.write(near, b"last words")
+    words = b""
+    deadline_ns = clock.now_ns() + 2_000_000_000
+    while words != b"last words" and clock.now_ns() < deadline_ns:
+        clock.sleep_until_ns(clock.now_ns() + 5_000_000)
+        words += b"".join(data for _, data in port.receive())
+    assert words == b"last words"
+    os.close(far)
+    os.close(near)
+    deadline_ns = clock.now_ns() + 2_000_000_000
+    with pytest.raises(NotResponding, match="still there"):  # noqa: PT012 - the thread sees it in its own time
+        while clock.now_ns() < deadline_ns:
+            clock.sleep_until_ns(clock.now_ns() + 5_000_000)
+            port.receive()
+    port.close()
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--period-s", "0"], ["--rate-deg-s", "nan"], ["--baud", "1200"], ["--foo"]]
+)
+def test_wrong_use_ends_with_status_2_and_no_traceback(arguments: list[str]) -> None:
+    done = subprocess.run(
+        [*COMMAND, *arguments],
+        capture_output=True,
+        text=True,
+        timeout=20,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr
+    assert done.stdout == ""

@@ -1,0 +1,145 @@
+"""Scenes for tests and campaigns: low orbits at random, with horizon or Sun where they are wanted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal
+
+import numpy as np
+
+from flight.gnc.earth.figure import SEMI_MAJOR_AXIS
+from flight.gnc.earth.sun import ASTRONOMICAL_UNIT
+from flight.gnc.math import quaternion
+from flight.gnc.math.arrays import FloatArray
+from sim_hal.earth_camera import EarthCameraModel, EarthScene, limb_truth
+from sim_hal.earth_camera.sun_disc import visible_share
+from sim_hal.earth_camera.truth import limb_directions, sun_point
+
+View = Literal["sunlit", "terminator", "dark", "any"]
+
+LOW, HIGH = 200e3, 2000e3
+"""m above the equator's radius: the altitudes that are asked for."""
+DAY, NIGHT = 0.1, -0.1
+"""Solar cosines beyond which a limb point is plainly lit, and plainly not."""
+_MOST_DRAWS = 20_000
+_LEAST_POINTS = 60
+"""Of 720 all round the Earth: so many must be on the detector for the horizon to count as in view."""
+
+
+def random_direction(generator: np.random.Generator) -> FloatArray:
+    """Return a unit vector (3,), all directions equally likely."""
+    vector = generator.standard_normal(3)
+    return np.asarray(vector / np.linalg.norm(vector))
+
+
+def pointing(boresight: FloatArray, down: FloatArray) -> FloatArray:
+    """Return the attitude (4,) of which +z is `boresight` (3,) and +y, rows down, nearest to `down` (3,)."""
+    across = np.cross(down, boresight)
+    across = across / np.linalg.norm(across)
+    return quaternion.from_matrix(np.stack([across, np.cross(boresight, across), boresight]))
+
+
+def limb_scene(
+    altitude: float = 600e3, *, zenith: FloatArray, sun: FloatArray, dip: float = 0.0, texture: int = 0
+) -> EarthScene:
+    """Return a scene above `zenith` (3,) with the Sun towards `sun` (3,), the limb level in the middle.
+
+    `dip` rad turns the boresight below the limb's middle; the azimuth is the Sun's, or the pole's
+    when the Sun is overhead.
+    """
+    zenith = zenith / np.linalg.norm(zenith)
+    side = np.cross(zenith, sun)
+    if np.linalg.norm(side) < 1e-6:
+        side = np.cross(zenith, [0.0, 0.0, 1.0])
+    ahead = np.cross(side / np.linalg.norm(side), zenith)
+    angle = np.arcsin(SEMI_MAJOR_AXIS / (SEMI_MAJOR_AXIS + altitude)) - dip
+    boresight = -np.cos(angle) * zenith + np.sin(angle) * ahead
+    position = (SEMI_MAJOR_AXIS + altitude) * zenith
+    distant = ASTRONOMICAL_UNIT * sun / np.linalg.norm(sun)
+    return EarthScene(position, pointing(boresight, -zenith), distant, texture=texture)
+
+
+def random_scene(
+    generator: np.random.Generator,
+    model: EarthCameraModel,
+    view: View = "any",
+    altitudes: tuple[float, float] = (LOW, HIGH),
+    accept: Callable[[EarthScene], bool] | None = None,
+) -> EarthScene:
+    """Return a scene with the horizon in view, everything else at random.
+
+    `view` asks of the limb on the detector: all of it in daylight, some in day and some in night, all in
+    night, or any. `accept` may refuse a scene for reasons of its own. Raises RuntimeError when none is found.
+    """
+    for _ in range(_MOST_DRAWS):
+        scene = _draw(generator, model, altitudes)
+        cosines = limb_truth(scene, model, count=720).solar_cosines
+        if len(cosines) < _LEAST_POINTS:
+            continue
+        fits = {
+            "sunlit": cosines.min() > DAY,
+            "terminator": cosines.min() < NIGHT and cosines.max() > DAY,
+            "dark": cosines.max() < NIGHT,
+            "any": True,
+        }[view]
+        if fits and (accept is None or accept(scene)):
+            return scene
+    raise RuntimeError(f"no scene with {view} limb in {_MOST_DRAWS} draws")
+
+
+def random_sun_scene(
+    generator: np.random.Generator,
+    model: EarthCameraModel,
+    altitudes: tuple[float, float] = (LOW, HIGH),
+    margin: float = 0.0,
+) -> EarthScene:
+    """Return a scene whose whole Sun stands at a random pixel, `margin` px or more inside the edge.
+
+    A negative margin lets it stand outside by so much. Raises RuntimeError when none is found.
+    """
+    for _ in range(_MOST_DRAWS):
+        size = np.array([model.columns, model.rows])
+        point = generator.uniform(margin - 0.5, size - 0.5 - margin)
+        ray = model.lens.unit_vectors(point[None, :])[0]
+        sun = random_direction(generator)
+        roll = random_direction(generator)
+        # Camera axes and inertial ones, each from the Sun's direction and another: the attitude joins them.
+        camera = _triad(ray, np.array([0.6, 0.8, 0.0]))
+        attitude = quaternion.from_matrix(camera.T @ _triad(sun, roll))
+        position = (SEMI_MAJOR_AXIS + generator.uniform(*altitudes)) * random_direction(generator)
+        scene = EarthScene(
+            position,
+            attitude,
+            position + ASTRONOMICAL_UNIT * sun,
+            rotation=generator.uniform(0.0, 2.0 * np.pi),
+        )
+        if visible_share(scene) > 0.99 and np.allclose(sun_point(scene, model), point, atol=1e-3):
+            return scene
+    raise RuntimeError(f"no scene with the Sun in view in {_MOST_DRAWS} draws")
+
+
+def _triad(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return rows (3, 3): `first`, normal to both, normal to these."""
+    across = np.cross(first, second)
+    across = across / np.linalg.norm(across)
+    return np.stack([first, across, np.cross(first, across)])
+
+
+def _draw(
+    generator: np.random.Generator, model: EarthCameraModel, altitudes: tuple[float, float]
+) -> EarthScene:
+    position = (SEMI_MAJOR_AXIS + generator.uniform(*altitudes)) * random_direction(generator)
+    sun = ASTRONOMICAL_UNIT * random_direction(generator)
+    upright = EarthScene(position, quaternion.IDENTITY, sun)
+    limb, _ = limb_directions(upright, 720)
+    target = limb[generator.integers(len(limb))]
+    # A boresight that has the limb's point somewhere within the circle about the detector.
+    aside = generator.uniform(0.0, model.lens.half_diagonal)
+    boresight = np.cos(aside) * target + np.sin(aside) * _normal_to(target, generator)
+    attitude = pointing(boresight, _normal_to(boresight, generator))
+    return EarthScene(position, attitude, sun, rotation=generator.uniform(0.0, 2.0 * np.pi))
+
+
+def _normal_to(direction: FloatArray, generator: np.random.Generator) -> FloatArray:
+    normal = np.cross(direction, random_direction(generator))
+    return np.asarray(normal / np.linalg.norm(normal))

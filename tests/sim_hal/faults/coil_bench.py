@@ -1,0 +1,132 @@
+"""Coils, monitor, inertial unit and body in lock-step without a flight loop: only a coil watch looks on."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from flight.app.devices import coil_settings, unit_settings
+from flight.app.mission_time import next_whole_second
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import angle_about_axis_y
+from flight.loop.fdir.coils.response import ResponseSettings
+from flight.loop.fdir.coils.watch import CoilWatch, CoilWatchSettings
+from flight.schema import reader as configuration
+from flight.schema.sections import Config
+from hal.drivers.coils import PwmTorqueCoils
+from hal.drivers.ina219 import Ina219
+from hal.drivers.pca9685 import Pca9685
+from hal.drivers.vn100.driver import Vn100
+from hal.interfaces.readings import ImuReading
+from sim_hal import lockstep
+from sim_hal.clock import SimClock
+from sim_hal.settings import FaultEntry
+from tests.scenario.flights import demo_config, demo_world
+
+CYCLE_NS = 25_000_000
+
+Command = Callable[[float, ImuReading], FloatArray]
+"""Gives the currents (3,) A at a time in s, from the newest reading."""
+
+
+def hold(target: float, noise: float = 0.0, others: float = 0.0, seed: int = 0) -> Command:
+    """Return a controller to an angle, rad, with noise on its command and currents in the other coils, A."""
+    rng = np.random.default_rng(seed)
+
+    def command(time: float, reading: ImuReading) -> FloatArray:
+        angle = angle_about_axis_y(reading.quaternion)
+        wanted = 0.25 * (target - angle) - 0.45 * reading.rate[1] + 0.03 * target
+        y = others * math.sin(0.9 * time)
+        z = others * math.cos(0.5 * time)
+        return np.clip(np.array([wanted, y, z]) + noise * rng.normal(size=3), -0.14, 0.14)
+
+    return command
+
+
+def watch_settings(config: Config, monitor_only: bool = False) -> CoilWatchSettings:
+    """Return what the flight loop would tell a watch of the demonstration's hardware."""
+    coils, plant = config.coils, config.plant
+    full = [coils.supply_voltage / ohm for ohm in coils.resistance]
+    response = ResponseSettings(
+        inertia=np.eye(3) * plant.inertia,
+        dipole_per_ampere=plant.coil_turns * plant.coil_area,
+        rate_noise=config.inertial_unit.rate_noise,
+        free=(False, True, False),
+    )
+    return CoilWatchSettings((full[0], full[1], full[2]), response=None if monitor_only else response)
+
+
+@dataclass
+class Watched:
+    """What a watch saw: verdicts with the time at which they came, s; what the coils carried (k, 3) A."""
+
+    watch: CoilWatch
+    found: list[tuple[float, str, str]]
+    readings: int
+    suspicious: int
+    angle: float
+    times: FloatArray
+    carried: FloatArray
+
+
+def observe(
+    command: Command,
+    duration: float,
+    faults: Sequence[str] = (),
+    seed: int = 1,
+    monitor_only: bool = False,
+    gain: tuple[float, float, float] = (1.0, 1.0, 1.0),
+) -> Watched:
+    """Command the coils for a while and return what a watch says; `gain` spoils the believed resistance."""
+    config = demo_config(duration, camera=False)
+    entries = tuple(FaultEntry(fault=fault) for fault in faults)
+    ohms = config.coils.resistance
+    truth = configuration.replace(
+        demo_world().truth, resistance=(ohms[0] / gain[0], ohms[1] / gain[1], ohms[2] / gain[2])
+    )
+    section = configuration.replace(demo_world(), seed=seed, faults=entries, truth=truth)
+    clock = SimClock()
+    lock = lockstep.build(config, section, None, clock)
+    pca = Pca9685(lock.wires.i2c, config.coils.address, clock)
+    coils = PwmTorqueCoils(pca, clock, coil_settings(config))
+    coils.start()
+    monitor = Ina219(lock.wires.i2c, 0x45, clock)
+    unit = Vn100(lock.wires.serial, clock, unit_settings(config))
+    unit.configure()
+    watch = CoilWatch(watch_settings(config, monitor_only))
+    epoch_ns = next_whole_second(clock)
+    lock.release(epoch_ns)
+    seen = Watched(watch, [], 0, 0, 0.0, np.empty(0), np.empty((0, 3)))
+    carried: list[tuple[float, FloatArray]] = []
+    newest: ImuReading | None = None
+    for cycle in range(round(duration * 1e9) // CYCLE_NS):
+        clock.sleep_until_ns(epoch_ns + cycle * CYCLE_NS)
+        now_ns = clock.now_ns()
+        time = (now_ns - epoch_ns) * 1e-9
+        state = coils.state()
+        carried.append((time, lock.hardware.circuit.currents().copy()))
+        watch.commanded(now_ns, state.current, state.braked, state.written_ns)
+        for reading in unit.poll():
+            newest = reading
+            watch.felt(reading.time_ns, reading.rate, reading.field)
+        answer = monitor.latest()
+        if answer is not None and not monitor.error():
+            watch.measured(answer)
+            seen.readings += 1
+        seen.suspicious += bool(watch.suspicion)
+        for verdict in watch.verdicts[len(seen.found) :]:
+            assert verdict.fault is not None
+            seen.found.append((time, "xyz"[verdict.axis], verdict.fault.name))
+        if newest is not None:
+            wanted = command(time, newest)
+            usable = watch.available & (not watch.at_rest)
+            coils.command(np.where(usable, wanted, 0.0) + watch.probe)
+        coils.brake(watch.braked)
+    seen.times, seen.carried = (np.array(column) for column in zip(*carried, strict=True))
+    seen.angle = lock.hardware.world.angle
+    coils.close()
+    monitor.close()
+    return seen

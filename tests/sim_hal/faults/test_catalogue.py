@@ -1,0 +1,140 @@
+"""Every fault can be begun on the emulated hardware, breaks something, and leaves nothing broken behind."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flight.schema import reader as configuration
+from hal.drivers.pca9685 import PRE_SCALE
+from hal.interfaces.errors import NotResponding
+from sim_hal import lockstep
+from sim_hal.clock import SimClock
+from sim_hal.emulators.serial_line import SOUND, LineFaults
+from sim_hal.faults.bench import Bench
+from sim_hal.faults.catalogue import CATALOGUE
+from sim_hal.faults.grammar import parse
+from sim_hal.faults.kinds import FaultKind, Where
+from sim_hal.faults.schedule import put
+from sim_hal.lockstep import LockStep
+from sim_hal.worlds.coil_circuit import Condition
+from tests.scenario.flights import demo_config, demo_world
+
+OUTSIDE = [kind for kind in CATALOGUE.values() if kind.begin is not None and kind.where is Where.BOTH]
+SECOND_NS = 1_000_000_000
+
+
+@pytest.fixture
+def lock() -> LockStep:
+    config = configuration.replace(demo_config(10.0))
+    return lockstep.build(config, demo_world(), None, SimClock())
+
+
+def bench_of(lock: LockStep) -> Bench:
+    generator = np.random.default_rng(1)
+    return Bench(lock.hardware, lock.line, lock.clock.now_ns, generator, lock.line.host)
+
+
+def is_sound(lock: LockStep) -> bool:
+    """Tell whether nothing is left of any fault."""
+    hardware, line = lock.hardware, lock.line
+    assert hardware.monitor is not None
+    assert hardware.camera is not None
+    return (
+        line.to_host.faults == SOUND
+        and line.to_device.faults == SOUND
+        and not line.host.unplugged
+        and hardware.unit.spoil is None
+        and not hardware.bus._faults
+        and set(hardware.bus._parts) == {hardware.pwm, hardware.monitor}
+        and not hardware.monitor.frozen
+        and hardware.monitor.gain == 1.0
+        and set(hardware.circuit._conditions) == {Condition.SOUND}
+        and hardware.camera.fault == ""
+        and hardware.camera.late_ns == 0
+        and hardware.camera.one_of == 1
+        and hardware.monitor.lag_ns == 0
+    )
+
+
+@pytest.mark.parametrize("kind", OUTSIDE, ids=lambda kind: kind.name)
+def test_a_fault_that_is_lifted_leaves_nothing_broken(lock: LockStep, kind: FaultKind) -> None:
+    put([parse(f"{kind.name} @ 1 for 1.3")], bench_of(lock), 0)
+    assert is_sound(lock)
+    lock.clock.sleep_until_ns(round(1.1 * SECOND_NS))
+    # A unit without power is off in itself; what happens once leaves its mark in registers.
+    assert kind.momentary or kind.name == "imu: off" or not is_sound(lock)
+    lock.clock.sleep_until_ns(4 * SECOND_NS)
+    assert is_sound(lock)
+
+
+def test_two_faults_of_one_wire_last_each_its_own_time(lock: LockStep) -> None:
+    faults = [parse("imu: bits (chance=0.5) @ 1 for 3"), parse("imu: delayed (delay=0.3) @ 2 for 1")]
+    put(faults, bench_of(lock), 0)
+    wire = lock.line.to_host
+    lock.clock.sleep_until_ns(round(2.5 * SECOND_NS))
+    assert wire.faults == LineFaults(flip_probability=0.5, delay_ns=300_000_000)
+    lock.clock.sleep_until_ns(round(3.5 * SECOND_NS))
+    assert wire.faults == LineFaults(flip_probability=0.5)
+
+
+def test_an_intermittent_fault_comes_and_goes(lock: LockStep) -> None:
+    put([parse("imu: intermittent (period=1, share=0.3) @ 0 for 3")], bench_of(lock), 0)
+    seen = []
+    for tenth in range(40):
+        lock.clock.sleep_until_ns(tenth * SECOND_NS // 10 + 1)
+        seen.append(lock.line.to_host.faults.silent)
+    assert sum(seen[:30]) == 9
+    assert not any(seen[30:])
+
+
+def test_a_part_without_power_does_not_acknowledge_and_forgets(lock: LockStep) -> None:
+    bus, pwm = lock.hardware.bus, lock.hardware.pwm
+    bus.write_byte_data(0x40, 0x01, 0x1F)
+    put([parse("pwm: off @ 1 for 1")], bench_of(lock), 0)
+    lock.clock.sleep_until_ns(round(1.5 * SECOND_NS))
+    with pytest.raises(OSError, match="no acknowledge"):
+        bus.read_byte_data(0x40, 0x00)
+    lock.clock.sleep_until_ns(3 * SECOND_NS)
+    assert bus.read_byte_data(0x40, 0x01) == 0x04, "the power-on value"
+    assert pwm.register(PRE_SCALE) == 0x1E
+
+
+def test_a_stuck_chip_acknowledges_and_changes_nothing(lock: LockStep) -> None:
+    put([parse("pwm: stuck @ 1 for 1")], bench_of(lock), 0)
+    lock.clock.sleep_until_ns(round(1.5 * SECOND_NS))
+    lock.hardware.bus.write_byte_data(0x40, 0x01, 0x1F)
+    assert lock.hardware.bus.read_byte_data(0x40, 0x01) == 0x04
+
+
+def test_an_unplugged_line_raises_where_the_driver_asks(lock: LockStep) -> None:
+    put([parse("imu: unplugged @ 1 for 1")], bench_of(lock), 0)
+    lock.clock.sleep_until_ns(round(1.5 * SECOND_NS))
+    with pytest.raises(NotResponding):
+        lock.line.host.receive()
+
+
+def test_legs_that_are_stuck_drive_their_coil_and_are_braked_by_the_other(lock: LockStep) -> None:
+    """Table 5.2 of the thesis: the coil sees the difference of its two ends."""
+    circuit, pwm = lock.hardware.circuit, lock.hardware.pwm
+    full = 3.4 / 23.0
+    pwm.write(0x40, bytes([0x00, 0x20]))
+    circuit.become(0, Condition.A_HIGH)
+    assert circuit.currents()[0] == pytest.approx(full, abs=3.5e-3)
+    pwm.write(0x40, bytes([0x0A, 0x00, 0x10, 0x00, 0x00]))  # B full on
+    assert circuit.currents()[0] == 0.0
+    circuit.become(0, Condition.SOUND)
+    assert circuit.currents()[0] == pytest.approx(-full, abs=3.5e-3)
+    circuit.become(0, Condition.B_LOW)
+    assert circuit.currents()[0] == 0.0
+    circuit.become(0, Condition.REVERSED)
+    assert circuit.currents()[0] == pytest.approx(full, abs=3.5e-3)
+    circuit.become(0, Condition.OPEN)
+    assert circuit.currents()[0] == 0.0
+    now = lock.clock.now_ns()
+    lock.clock.sleep_until_ns(now + 200_000_000)
+    circuit.become(0, Condition.SHORTED, 5.0)
+    lock.clock.sleep_until_ns(now + 400_000_000)
+    assert circuit.currents()[0] == 0.0
+    _, drawn = circuit.mean_supply(now + 300_000_000, now + 400_000_000)
+    assert drawn == pytest.approx(3.4 / 5.0)

@@ -1,0 +1,173 @@
+"""A slice of the campaigns: in flight each fault rings its alarm, and without one everything is quiet."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+
+from flight.link.telemetry.reader import Run
+from flight.loop.fdir.events import EVENTS, Reaction, Severity
+from flight.schema import reader as configuration
+from sim_hal.faults.catalogue import CATALOGUE
+from sim_hal.faults.kinds import FaultKind
+from sim_hal.settings import FaultEntry
+from tests.scenario.flights import demo_world, event_names, fly
+from tests.studies.campaigns import fault_judgement, fault_table, faults, soak
+from tests.studies.campaigns.campaign import Case
+
+AT = 5.0
+
+
+def flown(fault: str, mode: str = "testbed-demo", span: float | None = 3.0) -> dict[str, Any]:
+    kind = CATALOGUE[fault.partition(" (")[0]]
+    return faults.fly_with(kind, mode, FaultEntry(fault=fault, at=AT, span=span), seed=3)
+
+
+@pytest.mark.parametrize(
+    ("fault", "events", "detected_in", "recovered_in"),
+    [
+        ("imu: reset", ["control-lost", "imu-silent"], 0.2, 2.0),
+        ("imu: baud", ["imu-corrupt"], 0.2, 2.0),
+        ("pwm: garbage", ["coil-fault"], 0.6, 2.0),
+        ("bus: hang", ["coil-fault"], 0.1, 2.0),
+        ("monitor: brown-out", ["power-fault"], 1.3, 2.0),
+        ("disk: full", ["log-fault"], 1.3, 2.0),
+        ("pwm: upset (register=0, bit=4)", ["coil-fault"], 0.6, 2.0),
+        ("imu: upset (register=75, bit=0)", ["control-lost", "imu-silent"], 0.2, 2.0),
+        ("monitor: delayed", ["coil-suspect"], 3.0, 2.0),
+    ],
+)
+def test_a_device_that_fails_is_told_and_good_again_within_two_seconds(
+    fault: str, events: list[str], detected_in: float, recovered_in: float
+) -> None:
+    result = flown(fault)
+    assert result["told"][: len(events)] == events
+    assert result["reaction_right"] is not False
+    assert result["detected_s"] <= detected_in
+    assert result["recovered_s"] <= recovered_in
+    assert result["blind_current_a"] == 0.0
+    assert result["log_intact"]
+    assert not result["task_failed"]
+
+
+def test_a_coil_that_breaks_is_taken_out_of_use() -> None:
+    result = flown("coil-x: open", span=None)
+    assert "isolate" in result["reactions"]
+    assert result["reaction_right"] is True
+    assert result["recovered_s"] <= 6.0
+
+
+def test_what_is_told_by_another_name_is_not_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(fault_table.OWN_OF_KIND, "imu: silent", frozenset({"clock-step"}))
+    result = flown("imu: silent")
+    assert result["detected_s"] is None
+    assert {"imu-silent", "control-lost"} <= set(result["others"])
+    assert result["exercised"]
+
+
+class Doctored(dict[str, Any]):
+    """Packets that can be written to, in a run's place."""
+
+    logs: Any
+
+
+def test_a_loop_that_steers_while_it_measures_nothing_is_found_out(tmp_path: Any) -> None:
+    """The log of a flight whose unit falls silent, as if the loop had gone on: both figures ring."""
+    entry = FaultEntry(fault="imu: silent", at=AT, span=3.0)
+    section = configuration.replace(demo_world(), seed=3, faults=(entry,))
+    run = fly(faults.config_for("testbed-demo", camera=False), tmp_path, section=section)
+    kind = CATALOGUE["imu: silent"]
+    sound = fault_judgement.judge(run, kind, entry)
+    assert (sound["reaction_right"], sound["blind_current_a"]) == (True, 0.0)
+    doctored = Doctored(
+        {name: run[name].copy() for name in ("control", "imu", "truth", "event", "housekeeping")}
+    )
+    doctored.logs = run.logs
+    during = (run["control"]["time_ns"] > 6.0e9) & (run["control"]["time_ns"] < 7.0e9)
+    doctored["control"]["state"][during] = 1
+    doctored["truth"]["current"][: len(during)][during] = 0.05
+    wrong = fault_judgement.judge(cast("Run", doctored), kind, entry)
+    assert wrong["reaction_right"] is False
+    assert wrong["blind_current_a"] == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize("kind", faults.faults(), ids=lambda kind: kind.name)
+def test_each_fault_has_events_of_its_own_that_exist(kind: FaultKind) -> None:
+    names = {event.name: event for event in EVENTS}
+    own = fault_table.own_events(kind)
+    assert own
+    assert all(names[name].severity is not Severity.INFORMATION for name in own)
+    reaction = fault_table.REACTION.get(fault_table.part_of(kind))
+    assert reaction is None or names[reaction].reaction is not Reaction.NOTE
+
+
+@pytest.mark.parametrize("mode", [mode for mode in faults.MODES if mode not in {"detumble", "slew"}])
+def test_the_twin_without_a_fault_tells_none_of_their_events(mode: str, tmp_path: Any) -> None:
+    """The same seed and mode as the flights with faults above; the two other modes are below."""
+    section = configuration.replace(demo_world(), seed=3)
+    run = fly(faults.config_for(mode, camera=False), tmp_path, section=section)
+    assert not set(event_names(run)) & frozenset().union(*fault_table.OWN.values(), {"stream-poor"})
+
+
+@pytest.mark.parametrize("mode", ["detumble", "slew"])
+def test_a_sound_flight_is_quiet_in_its_mode(mode: str, tmp_path: Any) -> None:
+    run = fly(faults.config_for(mode, camera=False), tmp_path)
+    told = set(event_names(run)) - {"started", "stopped", "target", "mode", "commanded", "plan-stretched"}
+    assert told == set()
+
+
+def test_the_campaign_meets_every_fault_in_every_mode() -> None:
+    kinds = faults.faults()
+    drawn = faults.cases(6 * len(kinds), seed=1)
+    met = {(case.parameters["fault"], case.parameters["mode"]) for case in drawn}
+    assert len(met) == len(drawn)
+
+
+def test_its_table_tells_the_worst_of_each_fault() -> None:
+    base = {
+        "exercised": True,
+        "detected_s": 0.5,
+        "event": "imu-silent",
+        "others": [],
+        "reaction_right": True,
+        "at": 5.0,
+        "end": 8.0,
+        "number": "0",
+        "reactions": ["coils off"],
+        "recovered_s": 1.0,
+        "blind_current_a": 0.0,
+        "largest_current_a": 0.1,
+        "task_failed": False,
+        "service_failing": True,
+        "log_intact": True,
+    }
+    worse = {**base, "detected_s": None, "event": None, "recovered_s": None, "blind_current_a": 0.02}
+    worse |= {"reaction_right": False, "others": ["tumbling"], "number": "71"}
+    idle = {**worse, "exercised": False, "reaction_right": None, "service_failing": False}
+    results = [{"fault": "imu: off", "mode": "hold", **one} for one in (base, worse, idle)]
+    summary = faults.summarise(results, Path())
+    row = summary.facts["faults"]["imu: off"]
+    assert (row["detected"], row["exercised"], row["runs"]) == (1, 2, 3)
+    assert row["not_recovered"] == 1
+    assert row["blind_current_a"] == 0.02
+    assert (row["reactions_right"], row["reactions_asked"]) == (1, 2)
+    assert summary.facts["service_failing"] == 2
+    named = "imu: off, hold, 5.00 to 8.00 s, number 71; told: tumbling"
+    assert summary.facts["not_told"] == summary.facts["wrong_reaction"] == [named]
+    assert summary.text.count(named) == 2
+
+
+def test_a_flight_of_the_campaign_is_flown_again_by_its_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(faults, "run", lambda case: {"case": case})
+    assert faults.refly(7, 100)["case"] == faults.cases(500, 7)[100]
+
+
+@pytest.mark.slow
+def test_two_minutes_of_the_soak_stay_within_all_limits() -> None:
+    result = soak.run(Case("slice", (5, 4), {"seconds": 120.0}))
+    assert result["faults"] >= 1
+    assert soak.broken({**result, "memory_slope": 0.0}) == []
+    assert soak.broken({**result, "memory_slope": 1e12}) == ["memory"]
+    assert soak.broken({**result, "largest_current_a": 0.2, "pointing_deg": float("nan")}) != []

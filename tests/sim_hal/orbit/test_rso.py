@@ -1,0 +1,222 @@
+"""Resident space objects' tracks, and when they can be observed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from flight.gnc.earth import sun
+from flight.gnc.earth.figure import EARTH_RADIUS
+from flight.gnc.earth.shadow import sunlit_share
+from flight.gnc.math import quaternion
+from flight.gnc.math.arrays import FloatArray
+from hal.interfaces.errors import OutOfRange
+from sim_hal.faults.opportunities import (
+    Scenario,
+    constant_slew,
+    exposure_attitudes,
+    observable,
+    opportunities,
+    table_4_3,
+    windows,
+)
+from sim_hal.star_camera import StarCameraModel, expected_electrons
+from sim_hal.star_camera.rso import TRACK_ERROR, ResidentSpaceObject, directions, source_tracks
+from sim_hal.worlds.orbit import KeplerianElements, propagate
+
+EPOCH = 2_461_041.5
+"""2026 January 1.0."""
+NO_STARS = np.zeros((0, 3))
+
+
+@cache
+def _table_4_3() -> Scenario:
+    return table_4_3(EPOCH, half_angle=np.radians(10.0))
+
+
+def _pair(ahead: float, duration: float = 6000.0) -> tuple[ResidentSpaceObject, ResidentSpaceObject]:
+    """Return two objects on one circular orbit, the second `ahead` rad in front."""
+    elements = KeplerianElements(semi_major_axis=7000e3, inclination=1.0)
+    leader = replace(elements, true_anomaly=ahead)
+    first, second = (propagate(part, duration, j2=0.0) for part in (elements, leader))
+    return ResidentSpaceObject(first, 4.0), ResidentSpaceObject(second, 4.0)
+
+
+def test_a_track_points_from_the_camera_to_the_object() -> None:
+    camera, leader = _pair(0.1)
+    (track,) = source_tracks(camera.orbit, [leader], EPOCH, 3000.0, 3000.5)
+    assert (track.times[0], track.times[-1]) == (3000.0, 3000.5)
+    expected = leader.orbit.positions_at(track.times) - camera.orbit.positions_at(track.times)
+    assert np.linalg.norm(expected[0]) == pytest.approx(2.0 * 7000e3 * np.sin(0.05), rel=1e-9)
+    assert np.cross(track.directions, expected) == pytest.approx(0.0, abs=1.0)
+    assert np.all(np.sum(track.directions * expected, axis=1) > 0.0)
+
+
+def test_a_track_counts_time_from_where_the_attitude_does() -> None:
+    camera, leader = _pair(0.1)
+    (track,) = source_tracks(camera.orbit, [leader], EPOCH, 3000.0, 3000.5, zero=3000.0)
+    assert (track.times[0], track.times[-1]) == (0.0, 0.5)
+
+
+@pytest.mark.parametrize("height", [100.0, 5e3, 330e3])
+def test_a_track_is_sampled_finely_enough_for_any_pass(height: float) -> None:
+    """Orbits that cross `height` m apart: even motion between samples misses by 1e-7 rad at most."""
+    low = KeplerianElements(semi_major_axis=7000e3)
+    high = KeplerianElements(semi_major_axis=7000e3 + height, inclination=1.5)
+    camera, other = propagate(low, 10.0, j2=0.0), propagate(high, 10.0, j2=0.0)
+    (track,) = source_tracks(camera, [ResidentSpaceObject(other, 4.0)], EPOCH, 0.0, 0.5)
+    times = np.linspace(0.0, 0.5, 30_001)
+    exact = directions(camera.positions_at(times), other.positions_at(times))
+    off = np.linalg.norm(np.cross(track.directions_at(times), exact), axis=1)
+    # The positions' own rounding is seen from very near.
+    assert off.max() < 1.1 * TRACK_ERROR + 1e-8 * 7000.0 / height
+
+
+def test_in_the_umbra_there_is_no_track_and_in_the_penumbra_a_fainter_one() -> None:
+    camera, leader = _pair(0.1)
+    times = np.linspace(0.0, 6000.0, 60_001)
+    lit = sunlit_share(leader.orbit.positions_at(times), sun.position(EPOCH + times / sun.DAY))
+    dark = times[np.flatnonzero(lit == 0.0)]
+    assert dark.size > 15_000
+    half = float(times[np.argmin(np.abs(lit - 0.4))])
+    assert source_tracks(camera.orbit, [leader], EPOCH, float(dark[5000]), float(dark[5000]) + 0.2) == []
+    (faint,) = source_tracks(camera.orbit, [leader], EPOCH, half - 0.1, half + 0.1)
+    assert faint.magnitude == pytest.approx(4.0 - 2.5 * np.log10(0.4), abs=0.1)
+    bright = float(times[np.flatnonzero(lit == 1.0)[5000]])
+    (whole,) = source_tracks(camera.orbit, [leader], EPOCH, bright, bright + 0.2)
+    assert whole.magnitude == 4.0
+    (cylinder,) = source_tracks(camera.orbit, [leader], EPOCH, bright, bright + 0.2, shadow="cylindrical")
+    assert cylinder.magnitude == 4.0
+
+
+def test_an_object_behind_the_earth_has_no_track() -> None:
+    """Two on one orbit see each other while the chord clears the Earth: to 2 acos(R/a) = 48.7 deg apart."""
+    clear = 2.0 * np.arccos(EARTH_RADIUS / 7000e3)
+    epochs = (EPOCH, EPOCH + 182.0)
+    for ahead, seen in ((clear - 0.01, True), (clear + 0.01, False)):
+        camera, leader = _pair(ahead, 10.0)
+        assert any(source_tracks(camera.orbit, [leader], epoch, 0.0, 0.5) for epoch in epochs) == seen
+
+
+def test_several_objects_come_in_their_order_and_brightness() -> None:
+    camera, leader = _pair(0.1)
+    other = ResidentSpaceObject(leader.orbit, 6.5)
+    times = np.linspace(0.0, 6000.0, 601)
+    lit = sunlit_share(leader.orbit.positions_at(times), sun.position(EPOCH + times / sun.DAY))
+    start = float(times[np.flatnonzero(lit == 1.0)[0]])
+    tracks = source_tracks(camera.orbit, [other, leader], EPOCH, start, start + 0.5)
+    assert [track.magnitude for track in tracks] == [6.5, 4.0]
+
+
+def test_a_track_that_cannot_be_is_refused() -> None:
+    camera, leader = _pair(0.1)
+    with pytest.raises(OutOfRange, match="end of the exposure"):
+        source_tracks(camera.orbit, [leader], EPOCH, 1.0, 1.0)
+    with pytest.raises(OutOfRange, match="time"):
+        source_tracks(camera.orbit, [leader], EPOCH, 5999.9, 6000.1)
+    with pytest.raises(OutOfRange, match="distance from the camera"):
+        source_tracks(camera.orbit, [camera], EPOCH, 0.0, 0.5)
+
+
+def test_the_thesis_scenario_has_the_orbits_of_table_4_3() -> None:
+    scenario = _table_4_3()
+    camera, spacecraft = scenario.camera, scenario.objects[0].orbit
+    start = np.array([0.0])
+    assert camera.positions_at(start)[0] == pytest.approx([6748e3, 0.0, 0.0], abs=1e-6)
+    # 150 deg from the node along an orbit tilted by 89 deg.
+    along, tilt = np.radians(150.0), np.radians(89.0)
+    place = 7078e3 * np.array([np.cos(along), np.sin(along) * np.cos(tilt), np.sin(along) * np.sin(tilt)])
+    assert spacecraft.positions_at(start)[0] == pytest.approx(place, abs=1.0)
+    assert scenario.duration == pytest.approx(10.0 * 5516.7, abs=1.0)
+    assert scenario.attitude(start)[0] == pytest.approx([0.0, 0.0, 0.0, 1.0])
+    turned = scenario.attitude(np.array([10.0]))[0]
+    assert quaternion.to_rotation_vector(turned) == pytest.approx([0.0, 0.5, 0.0])
+
+
+def test_at_a_frame_a_second_the_thesis_scenario_has_about_as_many_opportunities() -> None:
+    """The thesis had 14, at a date and a cadence not given; a frame a second brings 9 to 19 in a year."""
+    counts = [
+        len(opportunities(replace(_table_4_3(), epoch=EPOCH + day), cadence=1.0, exposure=0.5))
+        for day in (0.0, 91.0, 137.0)
+    ]
+    assert counts[0] > 14 > counts[1]
+    assert counts[2] == 14
+
+
+def test_every_window_holds_within_and_fails_just_outside() -> None:
+    scenario = _table_4_3()
+    found = windows(scenario)
+    assert len(found) >= 4
+    for window in found:
+        inside = np.linspace(window.start + 2e-3, window.end - 2e-3, 50)
+        assert observable(scenario, window.index, inside).all()
+        outside = np.array([window.start - 2e-3, window.end + 2e-3])
+        assert not observable(scenario, window.index, outside).any()
+
+
+def test_every_opportunity_lies_within_a_window() -> None:
+    scenario = _table_4_3()
+    found, stretches = opportunities(scenario, cadence=1.0, exposure=0.5), windows(scenario)
+    for item in found:
+        assert any(w.start - 2e-3 <= item.start and item.start + 0.5 <= w.end + 2e-3 for w in stretches)
+    # And none is missed: the starts on the grid that fit into the windows are as many.
+    fit = sum(
+        len([t for t in np.arange(np.ceil(w.start), w.end - 0.5)]) for w in stretches if w.end - w.start > 0.5
+    )
+    assert len(found) == fit
+    assert opportunities(scenario, cadence=2.0, exposure=0.5) == [x for x in found if x.start % 2.0 == 0.0]
+
+
+def test_a_wider_exclusion_leaves_fewer_opportunities() -> None:
+    wide = replace(_table_4_3(), half_angle=_table_4_3().pinhole.half_diagonal)
+    shaded = replace(wide, buffer=np.radians(60.0))
+    counts = [len(opportunities(each, 1.0, 0.5)) for each in (_table_4_3(), wide, shaded)]
+    assert counts[0] > counts[1] > counts[2] == 0
+
+
+def _centre_of_light(image: FloatArray) -> FloatArray:
+    rows, columns = np.indices(image.shape)
+    return np.asarray(np.array([(columns * image).sum(), (rows * image).sum()]) / image.sum())
+
+
+def test_the_object_is_in_the_frame_where_the_opportunity_has_it() -> None:
+    scenario = _table_4_3()
+    item = opportunities(scenario, cadence=1.0, exposure=0.5)[3]
+    times, attitudes = exposure_attitudes(scenario, item.start, 0.5)
+    tracks = source_tracks(scenario.camera, scenario.objects, scenario.epoch, times[0], times[-1])
+    image = expected_electrons(StarCameraModel(), NO_STARS, [], times, attitudes, extra=tracks)
+    assert image.sum() == pytest.approx(float(StarCameraModel().electrons(4.0, 0.5)), rel=1e-3)
+    middle = 0.5 * (np.array(item.first) + np.array(item.last))
+    assert _centre_of_light(image) == pytest.approx(middle, abs=0.3)
+    # 0.025 rad of turn are 73 px at the boresight, and the object itself moves by a few.
+    assert np.hypot(*(np.array(item.last) - np.array(item.first))) == pytest.approx(73.0, abs=15.0)
+
+
+def test_a_slew_that_follows_the_object_makes_the_stars_streak_and_not_the_object() -> None:
+    camera, leader = _pair(0.1)
+    rate = 2.0 * np.pi / KeplerianElements(semi_major_axis=7000e3).period
+    start = camera.orbit.states_at(np.array([0.0]))[0]
+    normal = np.cross(start[:3], start[3:])
+    ahead = directions(camera.orbit.positions_at(np.zeros(1)), leader.orbit.positions_at(np.zeros(1)))[0]
+    y = normal / np.linalg.norm(normal)
+    attitude = quaternion.from_matrix(np.stack([np.cross(y, ahead), y, ahead]))
+    times = np.linspace(0.0, 20.0, 201)
+    slew = constant_slew(np.array([0.0, rate, 0.0]), attitude)(times)
+    seen = (quaternion.attitude_matrix(slew) @ _direction(camera, leader, times)[..., None])[..., 0]
+    assert seen == pytest.approx(np.tile([0.0, 0.0, 1.0], (201, 1)), abs=1e-6)
+
+
+def _direction(camera: ResidentSpaceObject, other: ResidentSpaceObject, times: FloatArray) -> FloatArray:
+    return directions(camera.orbit.positions_at(times), other.orbit.positions_at(times))
+
+
+def test_a_search_that_would_never_end_is_refused() -> None:
+    with pytest.raises(OutOfRange, match="cadence"):
+        opportunities(_table_4_3(), cadence=0.0, exposure=0.5)
+    with pytest.raises(OutOfRange, match="exposure"):
+        opportunities(_table_4_3(), cadence=1.0, exposure=-0.5)
+    with pytest.raises(OutOfRange, match="step"):
+        windows(_table_4_3(), step=float("nan"))

@@ -1,0 +1,225 @@
+"""A camera that turns: where the light of a star goes during the exposure."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from flight.gnc.math import quaternion
+from flight.gnc.math.arrays import FloatArray
+from sim_hal.star_camera import SourceTrack, StarCameraModel, expected_electrons
+from sim_hal.star_camera.attitude_history import AttitudeHistory
+from tests.sim_hal.star_camera.scenes import POINTING, at_pixels, centroid, integrated_by_brute_force, turning
+
+MODEL = StarCameraModel(columns=200, rows=160, field_of_view=np.radians(4.0))
+FOCAL = MODEL.pinhole.focal_length
+FINE = 20_001
+
+
+def _path(model: StarCameraModel, star: FloatArray, times: FloatArray, attitudes: FloatArray) -> FloatArray:
+    """Return the star's pixels at the middles of equal steps, the attitudes by scipy's own interpolation."""
+    from scipy.spatial.transform import Rotation, Slerp  # noqa: PLC0415 - half a second, for these tests only
+
+    edges = np.linspace(times[0], times[-1], FINE)
+    middles = 0.5 * (edges[1:] + edges[:-1])
+    camera_to_reference = Slerp(times, Rotation.from_quat(attitudes))(middles)
+    return model.pinhole.project(camera_to_reference.inv().apply(star[0]))
+
+
+def _worst_against_brute_force(
+    model: StarCameraModel, star: FloatArray, times: FloatArray, attitudes: FloatArray
+) -> float:
+    """Return the largest error of a pixel, as a fraction of the streak's peak."""
+    image = expected_electrons(model, star, [2.0], times, attitudes)
+    electrons = float(model.electrons(2.0, float(times[-1] - times[0])))
+    path = _path(model, star, times, attitudes)
+    expected = integrated_by_brute_force(image.shape, path, electrons, model.psf_sigma)
+    return float(np.abs(image - expected).max() / expected.max())
+
+
+@pytest.mark.parametrize("sigma", [0.5, 1.0, 2.0])
+@pytest.mark.parametrize("streak", [0.1, 0.7, 3.3, 17.0, 90.0])
+def test_a_streak_is_the_integral_of_the_still_images(sigma: float, streak: float) -> None:
+    model = StarCameraModel(columns=200, rows=160, field_of_view=MODEL.field_of_view, psf_sigma=sigma)
+    star = at_pixels(model, [120.3, 60.8])
+    rate = streak / FOCAL * np.array([0.6, 0.8, 0.0])
+    assert _worst_against_brute_force(model, star, *turning(rate)) < 1e-3
+
+
+def test_a_curved_streak_about_the_boresight_is_exact() -> None:
+    star = at_pixels(MODEL, [150.3, 90.8])
+    assert _worst_against_brute_force(MODEL, star, *turning([0.0, 0.0, 1.2])) < 1e-3
+
+
+def test_a_streak_of_changing_rate_is_exact() -> None:
+    """It speeds up from rest: four times the light falls on the first half of the path as on an even one."""
+    times = np.linspace(0.0, 1.0, 101)
+    turn = np.outer(times**2, [60.0 / FOCAL, 30.0 / FOCAL, 0.0])
+    attitudes = quaternion.multiply(quaternion.from_rotation_vector(turn), POINTING)
+    assert _worst_against_brute_force(MODEL, at_pixels(MODEL, [80.0, 120.0]), times, attitudes) < 1e-3
+
+
+@pytest.mark.parametrize("jitter", [0.003, 0.03, 0.3, 1.0])
+def test_jitter_between_samples_is_followed(jitter: float) -> None:
+    """Kinks of up to a pixel or so at every one of 200 samples; the smallest is taken for smooth motion."""
+    rng = np.random.default_rng(8)
+    times = np.linspace(0.0, 1.0, 201)
+    turn = np.outer(times, [0.0, 50.0 / FOCAL, 0.0]) + rng.normal(0.0, jitter / FOCAL, (201, 3))
+    attitudes = quaternion.multiply(quaternion.from_rotation_vector(turn), POINTING)
+    assert _worst_against_brute_force(MODEL, at_pixels(MODEL, [140.0, 80.0]), times, attitudes) < 1e-3
+
+
+def test_a_stop_in_the_middle_of_a_slew_leaves_its_light_in_one_place() -> None:
+    times = np.array([0.0, 0.2, 0.8, 1.0])
+    turn = np.outer([0.0, 30.0, 30.0, 60.0], [0.0, 1.0 / FOCAL, 0.0])
+    attitudes = quaternion.multiply(quaternion.from_rotation_vector(turn), POINTING)
+    star = at_pixels(MODEL, [140.0, 80.0])
+    assert _worst_against_brute_force(MODEL, star, times, attitudes) < 1e-3
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.floats(0.0, 6.28), st.floats(20.0, 90.0), st.floats(-1.0, 1.0))
+def test_the_light_is_the_same_however_far_the_star_moves(heading: float, streak: float, roll: float) -> None:
+    rate = np.array([np.cos(heading) * streak / FOCAL, np.sin(heading) * streak / FOCAL, roll])
+    middle = quaternion.multiply(quaternion.from_rotation_vector(0.5 * rate), POINTING)
+    star = at_pixels(MODEL, [99.5, 79.5], middle)
+    image = expected_electrons(MODEL, star, [3.0], *turning(rate))
+    assert image.sum() == pytest.approx(float(MODEL.electrons(3.0, 1.0)), rel=2e-5)
+
+
+def test_a_streak_runs_along_minus_omega_cross_v_over_the_known_length() -> None:
+    """Turned by 80 px about +x, a star at the boresight moves from z towards +y: v' = -w x v = (0, +w, 0)."""
+    star = at_pixels(MODEL, MODEL.pinhole.centre)
+    angle = 70.0 / FOCAL
+    image = expected_electrons(MODEL, star, [0.0], *turning([angle, 0.0, 0.0]))
+    x, y = MODEL.pinhole.centre
+    length = FOCAL * np.tan(angle)
+    assert centroid(image) == pytest.approx([x, y + 0.5 * length], abs=0.01)
+    profile = image.sum(axis=0)
+    assert profile.argmax() in (int(x), int(x) + 1)
+    lit = image.sum(axis=1)
+    # Half the even brightness is reached at the ends; the middle of the streak is flat.
+    half = 0.5 * np.median(lit[int(y) + 10 : int(y + length) - 10])
+    start, *_, end = np.flatnonzero(lit > half)
+    first = start - (lit[start] - half) / (lit[start] - lit[start - 1])
+    last = end + (lit[end] - half) / (lit[end] - lit[end + 1])
+    assert first == pytest.approx(y, abs=0.02)
+    assert last == pytest.approx(y + length, abs=0.02)
+
+
+def test_a_turn_about_plus_y_moves_stars_to_the_left() -> None:
+    star = at_pixels(MODEL, [150.0, 80.0])
+    image = expected_electrons(MODEL, star, [0.0], *turning([0.0, 60.0 / FOCAL, 0.0]))
+    assert centroid(image)[0] == pytest.approx(120.0, abs=0.2)
+
+
+def test_a_star_on_the_axis_of_rotation_does_not_move() -> None:
+    """The image is the still star's, at any rate."""
+    point = np.array([[120.3, 60.8]])
+    axis = MODEL.pinhole.unit_vectors(point)[0]
+    image = expected_electrons(MODEL, at_pixels(MODEL, point), [2.0], *turning(1.5 * axis, samples=3))
+    expected = integrated_by_brute_force(image.shape, point, float(MODEL.electrons(2.0, 1.0)), 1.0)
+    assert np.abs(image - expected).max() < 2e-4 * expected.max()
+
+
+def test_sampling_the_same_motion_more_finely_changes_nothing() -> None:
+    star, rate = at_pixels(MODEL, [140.0, 80.0]), np.array([0.01, 0.03, 0.2])
+    coarse = expected_electrons(MODEL, star, [2.0], *turning(rate, samples=2))
+    fine = expected_electrons(MODEL, star, [2.0], *turning(rate, samples=1001))
+    assert np.abs(coarse - fine).max() < 1e-5 * coarse.max()
+
+
+def test_an_even_turn_needs_no_more_knots_for_being_sampled_finely() -> None:
+    rate = np.array([0.01, 0.03, 0.0])
+    assert len(AttitudeHistory(*turning(rate, samples=1001)).knots(1e-6, 0.05)) == 2
+    assert len(AttitudeHistory(*turning(10.0 * rate, samples=1001)).knots(1e-6, 0.05)) == 8
+
+
+def test_an_edge_cuts_a_streak_without_moving_the_rest() -> None:
+    """The small detector's image is the middle of the wide one's, pixel by pixel."""
+    wide = StarCameraModel(columns=400, rows=400, field_of_view=2.0 * np.arctan(200.0 / FOCAL))
+    rng = np.random.default_rng(4)
+    stars = at_pixels(MODEL, rng.uniform([-60.0, -60.0], [260.0, 220.0], (60, 2)))
+    magnitudes = rng.uniform(1.0, 3.0, 60)
+    history = turning(np.array([60.0, -40.0, 0.0]) / FOCAL, samples=5)
+    cut = expected_electrons(MODEL, stars, magnitudes, *history)
+    whole = expected_electrons(wide, stars, magnitudes, *history)[120:280, 100:300]
+    assert np.abs(cut - whole).max() < 2e-4 * whole.max()
+    assert np.count_nonzero(cut[:, 0] > 1.0) > 10
+
+
+@pytest.mark.parametrize(("when", "crossings"), [(0.0, 0.5), (0.1, 1.0), (0.5, 1.0), (0.9, 1.0), (1.0, 0.5)])
+def test_a_sweep_across_the_sky_shows_each_star_while_it_crosses(when: float, crossings: float) -> None:
+    """A turn of 0.5 rad, seven fields; the star is on the boresight at `when`."""
+    rate = np.array([0.0, 0.5, 0.0])
+    then = quaternion.multiply(quaternion.from_rotation_vector(when * rate), POINTING)
+    star = at_pixels(MODEL, MODEL.pinhole.centre, then)
+    image = expected_electrons(MODEL, star, [0.0], *turning(rate))
+    crossing = 2.0 * np.arctan(100.0 / FOCAL) / 0.5
+    assert image.sum() == pytest.approx(float(MODEL.electrons(0.0, 1.0)) * crossing * crossings, rel=2e-3)
+
+
+def test_the_thesis_model_streaks_too() -> None:
+    """The mean of still images at 2,000 steps, as Sease adds them up."""
+    model = StarCameraModel(columns=64, rows=48, field_of_view=0.03, psf="bilinear")
+    star = at_pixels(model, [20.0, 20.0])
+    times, attitudes = turning(np.array([-9.0, -25.0, 0.0]) / model.pinhole.focal_length)
+    streak = expected_electrons(model, star, [2.0], times, attitudes)
+    history = AttitudeHistory(times, attitudes)
+    steps = history.at(np.linspace(0.00025, 0.99975, 2000))
+    summed = np.zeros_like(streak)
+    for point in model.pinhole.project(quaternion.attitude_matrix(steps) @ star[0]):
+        column, row = np.floor(point).astype(int)
+        a, b = point - (column, row)
+        summed[row : row + 2, column : column + 2] += np.outer([1.0 - b, b], [1.0 - a, a])
+    kernel = np.exp(-0.5 * np.array([1.0, 0.0, 1.0]))
+    kernel /= kernel.sum()
+    for axis in (0, 1):
+        summed = sum(
+            weight * np.roll(summed, shift, axis) for weight, shift in zip(kernel, (-1, 0, 1), strict=True)
+        )
+    summed *= float(model.electrons(2.0, 1.0)) / 2000.0
+    assert np.abs(streak - summed).max() < 2e-3 * summed.max()
+
+
+def test_a_moving_source_streaks_while_the_stars_stand_still() -> None:
+    track = SourceTrack(np.array([0.0, 1.0]), at_pixels(MODEL, [[40.0, 40.0], [100.0, 70.0]]), 3.0)
+    history = turning([0.0, 0.0, 0.0])
+    star = at_pixels(MODEL, [150.0, 120.0])
+    image = expected_electrons(MODEL, star, [3.0], *history, extra=[track])
+    assert image[100:, :].sum() == pytest.approx(float(MODEL.electrons(3.0, 1.0)), rel=1e-4)
+    assert image[:100].sum() == pytest.approx(float(MODEL.electrons(3.0, 1.0)), rel=1e-4)
+    assert centroid(image[:100]) == pytest.approx([70.0, 55.0], abs=0.02)
+
+
+def test_a_source_that_the_camera_follows_is_a_point() -> None:
+    """It moves in the sky as the boresight does: the stars streak, it does not."""
+    times, attitudes = turning([0.0, 60.0 / FOCAL, 0.0], samples=101)
+    boresights = quaternion.attitude_matrix(attitudes)[:, 2]
+    nothing = np.zeros((0, 3))
+    track = SourceTrack(times, boresights, 3.0)
+    image = expected_electrons(MODEL, nothing, [], times, attitudes, extra=[track])
+    point = np.array([MODEL.pinhole.centre])
+    expected = integrated_by_brute_force(image.shape, point, float(MODEL.electrons(3.0, 1.0)), 1.0)
+    assert np.abs(image - expected).max() < 1e-3 * expected.max()
+
+
+def test_a_track_that_ends_before_the_exposure_is_refused() -> None:
+    track = SourceTrack(np.array([0.0, 0.5]), at_pixels(MODEL, [[40.0, 40.0], [100.0, 70.0]]), 3.0)
+    with pytest.raises(ValueError, match="cover the exposure"):
+        expected_electrons(MODEL, np.zeros((0, 3)), [], *turning([0.0, 0.0, 0.0]), extra=[track])
+
+
+def test_tracks_that_cannot_be_are_refused() -> None:
+    directions = at_pixels(MODEL, [[40.0, 40.0], [100.0, 70.0]])
+    times = np.array([0.0, 1.0])
+    with pytest.raises(ValueError, match="give"):
+        SourceTrack(times[:1], directions[:1], 3.0)
+    with pytest.raises(ValueError, match="increase"):
+        SourceTrack(times[::-1], directions, 3.0)
+    with pytest.raises(ValueError, match="unit vectors"):
+        SourceTrack(times, 2.0 * directions, 3.0)
+    with pytest.raises(ValueError, match="magnitude"):
+        SourceTrack(times, directions, float("nan"))

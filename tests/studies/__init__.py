@@ -1,0 +1,1 @@
+"""What measures rather than checks: campaigns, benches, fuzzers, pictures."""

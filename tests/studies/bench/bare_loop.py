@@ -1,0 +1,65 @@
+"""A bare absolute-sleep loop in a process of its own, in the flight's place: what the machine itself stalls.
+
+It does what the least C program would: clock_nanosleep with TIMER_ABSTIME to the next slot, and notes when it
+woke, and how much processor time the machine's host had given to others by then. Its slots lie on the
+multiples of the period in CLOCK_MONOTONIC, as those of a flight in real time do.
+Run as `python -m tests.studies.bench.bare_loop PERIOD_NS PRIORITY FILE`, under SCHED_FIFO with a priority
+above zero. At SIGTERM it writes what it noted to the file: rows of two int64, monotonic ns and ns stolen
+since boot.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import signal
+import sys
+import time
+from array import array
+from pathlib import Path
+
+from hal.buses import real_time
+from tests.studies.bench.process_watch import stolen_ns
+
+_CLOCK_MONOTONIC = 1
+_TIMER_ABSTIME = 1
+_SECOND_NS = 1_000_000_000
+
+
+class _Timespec(ctypes.Structure):
+    _fields_ = (("seconds", ctypes.c_long), ("nanoseconds", ctypes.c_long))
+
+
+def loop(period_ns: int, noted: array[int], stopped: list[int]) -> None:
+    """Wake at every slot until something is in `stopped`, and note when and what was stolen by then.
+
+    What has passed is skipped.
+    """
+    nanosleep = ctypes.CDLL(None).clock_nanosleep
+    deadline = _Timespec()
+    slot = time.monotonic_ns() // period_ns + 1
+    while not stopped:
+        deadline.seconds, deadline.nanoseconds = divmod(slot * period_ns, _SECOND_NS)
+        if nanosleep(_CLOCK_MONOTONIC, _TIMER_ABSTIME, ctypes.byref(deadline), None) == 0:
+            now_ns = time.monotonic_ns()
+            noted.extend((now_ns, stolen_ns()))
+            slot = now_ns // period_ns + 1
+
+
+def _serve(words: list[str]) -> None:
+    """Loop until SIGTERM, then write what was noted."""
+    period_ns, priority, path = int(words[0]), int(words[1]), Path(words[2])
+    noted: array[int] = array("q")
+    stopped: list[int] = []
+    signal.signal(signal.SIGTERM, lambda number, _: stopped.append(number))
+    if priority and (refusal := real_time.prioritise(0, priority)):
+        raise SystemExit(refusal)
+    gc.disable()
+    sys.stdout.write("looping\n")
+    sys.stdout.flush()
+    loop(period_ns, noted, stopped)
+    path.write_bytes(noted.tobytes())
+
+
+if __name__ == "__main__":
+    _serve(sys.argv[1:])

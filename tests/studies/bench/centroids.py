@@ -1,0 +1,178 @@
+"""Centroids against the Cramer-Rao bound, and their time: `python -m tests.studies.bench.centroids`.
+
+Frames of the simulator's default camera (1024 x 1024, 12 bits, 10 e- read noise) at rest, 0.2 s, each with 40
+stars of one magnitude at random places, none near another. The bound is that of place, light, sky and point
+spread in the pixels that are not saturated; detection knows none of them, nor the gain. A ratio is the rms
+error along one axis over the root of the mean bound. Seeds of its own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from scipy.special import ndtr
+
+from flight.gnc.math.arrays import FloatArray, Image, IntArray
+from flight.gnc.vision.startracker.detection import Detections, DetectionSettings, detect, measure_near
+from flight.gnc.vision.startracker.detection.settings import Method
+from sim_hal.star_camera import StarCameraModel, render
+from tests.sim_hal.star_camera.scenes import at_pixels, still
+
+_SEED = 27_182
+_EXPOSURE = 0.2
+_GRID = 7
+_MATCHED = 1.5
+_METHODS: tuple[Method, ...] = ("window", "psf")
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One line of the table: px along one axis."""
+
+    psf_sigma: float
+    magnitude: float
+    method: str
+    found: int
+    stars: int
+    false: int
+    rms: float
+    bias: float
+    bias_error: float
+    ratio: float
+    nees: float
+    detect_ms: float
+    track_ms: float
+
+
+def star_places(rng: np.random.Generator, size: int, count: int = 40) -> FloatArray:
+    """Return `count` places (count, 2) px, none within a twentieth of `size` of another or of the border."""
+    cell = size / _GRID
+    chosen = rng.permutation(_GRID * _GRID)[:count]
+    corner = np.stack([chosen % _GRID, chosen // _GRID], axis=-1) * cell
+    return np.asarray(corner + rng.uniform(0.2 * cell, 0.8 * cell, (count, 2)))
+
+
+def frame_of(
+    camera: StarCameraModel, places: FloatArray, magnitudes: FloatArray, seed: Sequence[int]
+) -> Image:
+    """Return a frame of stars of `magnitudes` (n,) at `places` (n, 2) px, the camera at rest."""
+    rng = np.random.default_rng(seed)
+    return render(camera, at_pixels(camera, places), magnitudes, *still(_EXPOSURE), rng)
+
+
+def point_bound(camera: StarCameraModel, place: FloatArray, electrons: float) -> FloatArray:
+    """Return the least covariance (2, 2) px^2 of a star's place, its light, sky and point spread unknown.
+
+    Poisson and read noise, rounding; pixels whose mean is saturated tell nothing.
+    """
+    reach = int(np.ceil(6.0 * camera.psf_sigma)) + 1
+    middle = np.rint(place)
+    pixel = np.arange(-reach, reach + 1)
+    shares = []
+    for axis in (0, 1):
+        edge = (np.append(pixel - 0.5, pixel[-1] + 0.5) + middle[axis] - place[axis]) / camera.psf_sigma
+        bell = np.exp(-0.5 * edge**2) / (np.sqrt(2.0 * np.pi) * camera.psf_sigma)
+        shares.append((np.diff(ndtr(edge)), -np.diff(bell), -np.diff(edge * bell)))
+    (x, dx, wx), (y, dy, wy) = shares
+    light = np.outer(y, x)
+    derivatives = np.stack(
+        [electrons * np.outer(y, dx), electrons * np.outer(dy, x), light, np.ones_like(light),
+         electrons * (np.outer(wy, x) + np.outer(y, wx))]
+    ).reshape(5, -1)  # fmt: skip
+    dark = camera.dark_current * _EXPOSURE
+    mean = electrons * light + dark
+    variance = mean + camera.read_noise**2 + camera.gain**2 / 12.0
+    top = min(camera.full_well, (camera.highest_count - camera.pedestal) * camera.gain)
+    good = (mean < top).reshape(-1)
+    scaled = derivatives[:, good] / np.sqrt(variance.reshape(-1)[good])
+    return np.asarray(np.linalg.inv(scaled @ scaled.T)[:2, :2])
+
+
+def compare(camera: StarCameraModel, magnitude: float, method: Method, frames: int, seed: int) -> Row:
+    """Return the errors of `frames` frames of stars of `magnitude`, and the times of one frame."""
+    settings = DetectionSettings(method=method)
+    bounds: list[FloatArray] = []
+    errors, nees, false, total = [], [], 0, 0
+    detecting, tracking = [], []
+    electrons = float(np.asarray(camera.electrons(np.array([magnitude]), _EXPOSURE))[0])
+    for frame in range(frames):
+        places = star_places(np.random.default_rng([seed, frame, 1]), camera.columns)
+        pixels = frame_of(camera, places, np.full(len(places), magnitude), [seed, frame, 2])
+        begin = time.process_time()
+        found = detect(pixels, settings).stars()
+        detecting.append(time.process_time() - begin)
+        begin = time.process_time()
+        measure_near(pixels, places[:30] + 1.0, settings)
+        tracking.append(time.process_time() - begin)
+        star, detection = matched(found, places)
+        off = found.points[detection] - places[star]
+        errors.append(off)
+        bounds.extend(point_bound(camera, place, electrons) for place in places[star])
+        weighted = np.linalg.solve(found.covariance[detection], off[:, :, None])[:, :, 0]
+        nees.append(np.sum(off * weighted, axis=1) / 2.0)
+        false += len(found) - len(detection)
+        total += len(places)
+    error = np.concatenate(errors)
+    least = float(np.sqrt(np.mean([np.trace(bound) / 2.0 for bound in bounds]))) if bounds else np.nan
+    rms = float(np.sqrt(np.mean(error**2))) if len(error) else np.nan
+    bias = error.mean(axis=0) if len(error) else np.full(2, np.nan)
+    return Row(
+        camera.psf_sigma, magnitude, method, len(error), total, false, rms, float(np.abs(bias).max()),
+        rms / np.sqrt(max(len(error), 1)), rms / least, float(np.mean(np.concatenate(nees))),
+        1e3 * float(np.median(detecting)), 1e3 * float(np.median(tracking)),
+    )  # fmt: skip
+
+
+def matched(found: Detections, places: FloatArray) -> tuple[IntArray, IntArray]:
+    """Return the numbers of the stars found (k,) and of the detections (k,) they are."""
+    if not len(found):
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+    apart = np.linalg.norm(places[:, None] - found.points, axis=-1)
+    star = np.flatnonzero(apart.min(axis=1) < _MATCHED)
+    return star, apart[star].argmin(axis=1)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print the table."""
+    parser = argparse.ArgumentParser(prog="python -m tests.studies.bench.centroids", description=__doc__)
+    parser.add_argument("--psf-sigma", type=float, nargs="+", default=[0.7, 1.0, 1.5], help="px")
+    parser.add_argument("--magnitudes", type=float, nargs="+", default=[1, 2, 3, 4, 5, 6, 7])
+    parser.add_argument("--frames", type=int, default=20, help="a row; default %(default)s")
+    parser.add_argument("--seed", type=int, default=_SEED, help="default %(default)s")
+    parser.add_argument("--json", action="store_true", help="one JSON object instead of the table")
+    options = parser.parse_args(arguments)
+    rows = []
+    if not options.json:
+        sys.stdout.write(
+            f"{options.frames} frames of 40 stars a row, seed {options.seed}; px; CPU ms a frame\n"
+        )
+        sys.stdout.write(
+            "PSF  mag method    found      false  rms     bias +-          ratio  NEES  detect  track 30\n"
+        )
+    for psf_sigma in options.psf_sigma:
+        camera = StarCameraModel(psf_sigma=psf_sigma)
+        for magnitude in options.magnitudes:
+            for method in _METHODS:
+                row = compare(camera, magnitude, method, options.frames, options.seed)
+                rows.append(row)
+                if options.json:
+                    continue
+                sys.stdout.write(
+                    f"{row.psf_sigma:.1f} {row.magnitude:4.1f} {row.method:7} {row.found:5d}/{row.stars:<5d}"
+                    f" {row.false:4d}  {row.rms:.4f}  {row.bias:.4f} +- {row.bias_error:.4f}"
+                    f" {row.ratio:7.2f} {row.nees:6.2f} {row.detect_ms:6.1f} {row.track_ms:6.1f}\n"
+                )
+                sys.stdout.flush()
+    if options.json:
+        sys.stdout.write(json.dumps({"frames": options.frames, "rows": [asdict(row) for row in rows]}) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

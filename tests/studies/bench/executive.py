@@ -1,0 +1,260 @@
+"""The 40 Hz loop with everything running: `python -m tests.studies.bench executive [--minutes M]`.
+
+The step demonstration flies in real time on emulated devices in processes of their own, as a board flies on
+its devices: planner and vision have work without pause, the guardian watches. Beside it a bare absolute-sleep
+loop at the same rate (`tests.studies.bench.bare_loop`) tells what the machine stalls by itself, and the
+kernel what a virtual machine's host takes, which a loop that works meets more often than one that sleeps.
+Where SCHED_FIFO
+is allowed the flight is flown twice, with it and without. Run it alone on two cores. The slope of memory is
+told by flights of 16 minutes and more.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import json
+import os
+import resource
+import select
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import yaml
+
+from tests.hal.guardian.live_flight import ROOT, LiveFlight
+from tests.scenario.flights import TEXT
+from tests.studies.bench import process_watch
+from tests.studies.bench.executive_figures import (
+    ASKED,
+    PERIOD_NS,
+    Began,
+    Figures,
+    Flown,
+    Watched,
+    evaluate,
+    misses,
+    table,
+)
+from tests.studies.bench.lateness import Grid, draw
+from tests.studies.bench.process_watch import ProcessWatch, answering
+
+PRIORITY = 50
+"""Of the bare loop under SCHED_FIFO: that of the flight's control thread."""
+
+_PR_CAPBSET_READ, _PR_CAPBSET_DROP, _CAP_SYS_NICE = 23, 24, 23  # linux/prctl.h, linux/capability.h
+_NO_BYTECODE, _BYTECODE = "PYTHONDONTWRITEBYTECODE", "PYTHONPYCACHEPREFIX"
+_IMPORTED = (
+    "flight.app.flight",
+    "flight.app.cli.run",
+    "flight.loop.executive.worker",
+    "flight.gnc.vision.streaks.maximum_likelihood.estimate",
+    "sim_hal.faults.host",
+    "sim_hal.serving.remote",
+)
+_ROLES = {
+    "flight.gnc.guidance.one_axis.job": "planner",
+    "flight.gnc.vision.startracker.frame_job": "vision",
+    "hal.guardian": "guardian",
+}
+
+
+@dataclass(frozen=True)
+class Load:
+    """How long to fly, how often frames and plans are wanted, and how long to warm up; all in s."""
+
+    duration: float
+    camera_period: float = 0.4
+    replan_period: float = 0.025
+    warm_up: float = 60.0
+    look_period: float = 0.5
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Fly, print what was asked beside what was measured; return 1 when something misses it."""
+    load, options = _load(arguments)
+    flights: dict[str, Figures] = {}
+    grids: dict[str, Grid] = {}
+    with _compiled():
+        for name in _schedulings(options.scheduling):
+            with tempfile.TemporaryDirectory() as folder:
+                flown = fly(Path(folder), load, name == "fifo")
+            flights[name] = flown.figures
+            grids |= {f"flight, {name}": flown.flight, f"bare loop, {name}": flown.machine}
+    if options.out is not None:
+        _write(options.out, load, flights, grids)
+    if options.json:
+        sys.stdout.write(json.dumps({"load": asdict(load), "asked": ASKED, "flights": flights}) + "\n")
+    else:
+        sys.stdout.write("\n".join(table(figures, name) for name, figures in flights.items()))
+    return int(any(misses(figures) for figures in flights.values()))
+
+
+def _load(arguments: Sequence[str]) -> tuple[Load, argparse.Namespace]:
+    """Return what to fly, and all options."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--minutes", type=float, default=10.0, metavar="M", help="of each flight (default 10)"
+    )
+    parser.add_argument(
+        "--camera-period", type=float, default=Load.camera_period, metavar="S", help="default %(default)s"
+    )
+    parser.add_argument(
+        "--replan-period", type=float, default=Load.replan_period, metavar="S", help="default %(default)s"
+    )
+    parser.add_argument(
+        "--warm-up", type=float, metavar="S", help="not in the figures (default 60, or a fifth of a flight)"
+    )
+    parser.add_argument(
+        "--scheduling", choices=["fifo", "ordinary", "both"], default="both", help="default %(default)s"
+    )
+    parser.add_argument("--out", type=Path, metavar="DIR", help="write executive.json and lateness.png")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    options = parser.parse_args(arguments)
+    duration = 60.0 * options.minutes
+    if not 3.0 <= duration < 1e6:
+        parser.error(f"--minutes {options.minutes:g}: a flight takes 0.05 minutes at least")
+    warm_up = min(60.0, 0.2 * duration) if options.warm_up is None else options.warm_up
+    if not 0.0 <= warm_up < duration:
+        parser.error(f"--warm-up {warm_up:g}: must be shorter than the flight of {duration:g} s")
+    for name, period in (("camera", options.camera_period), ("replan", options.replan_period)):
+        if not 0.0 < period < 10.0:
+            parser.error(f"--{name}-period {period:g}: must lie between 0 and 10 s")
+    return Load(duration, options.camera_period, options.replan_period, warm_up), options
+
+
+def _schedulings(wanted: str) -> list[str]:
+    """Return how to fly; with SCHED_FIFO where that is allowed."""
+    if wanted == "ordinary" or fifo_allowed():
+        return ["fifo", "ordinary"] if wanted == "both" else [wanted]
+    sys.stderr.write("SCHED_FIFO is refused here: flown without it\n")
+    return ["ordinary"]
+
+
+def _write(folder: Path, load: Load, flights: dict[str, Figures], grids: dict[str, Grid]) -> None:
+    """Write the figures, and the picture where matplotlib is installed."""
+    folder.mkdir(parents=True, exist_ok=True)
+    text = json.dumps({"load": asdict(load), "asked": ASKED, "flights": flights}, indent=2)
+    (folder / "executive.json").write_text(text + "\n", encoding="utf-8")
+    try:
+        draw(grids, folder / "lateness.png")
+    except ModuleNotFoundError:
+        sys.stderr.write("no picture: needs matplotlib, pip install '.[plots]'\n")
+
+
+def fifo_allowed() -> bool:
+    """Tell whether a process started from here may have SCHED_FIFO."""
+    able = ctypes.CDLL(None).prctl(_PR_CAPBSET_READ, _CAP_SYS_NICE, 0, 0, 0) == 1 and os.geteuid() == 0
+    return able or resource.getrlimit(resource.RLIMIT_RTPRIO)[0] >= PRIORITY
+
+
+def full_load(load: Load) -> str:
+    """Return the step demonstration's configuration with planner and vision at work without pause.
+
+    The receding strategy plans at every replanning, where the goal strategy rests once a step is over.
+    """
+    tree = yaml.safe_load(TEXT)
+    period = load.camera_period
+    tree["camera"] |= {"period": period, "exposure": min(tree["camera"]["exposure"], 0.75 * period)}
+    tree["guidance"] |= {"replan_period": load.replan_period, "strategy": "receding"}
+    return yaml.safe_dump(tree, sort_keys=False)
+
+
+@contextmanager
+def _compiled() -> Iterator[None]:
+    """Have Python find its modules compiled, as the installer leaves them, whatever this shell forbids."""
+    with tempfile.TemporaryDirectory() as folder:
+        before = {name: os.environ.pop(name, None) for name in (_NO_BYTECODE, _BYTECODE)}
+        os.environ[_BYTECODE] = folder
+        try:
+            modules = ", ".join((*_IMPORTED, *_ROLES))
+            subprocess.run([sys.executable, "-c", f"import {modules}"], cwd=ROOT, check=True)
+            yield
+        finally:
+            del os.environ[_BYTECODE]
+            os.environ.update({name: value for name, value in before.items() if value is not None})
+
+
+def fly(folder: Path, load: Load, fifo: bool) -> Flown:
+    """Fly once in `folder`, the bare loop beside it, and return what was measured."""
+    config, devices, wakes = folder / "flight.yaml", folder / "devices", folder / "wakes"
+    facts = devices / "facts.json"
+    config.write_text(full_load(load), encoding="utf-8")
+    devices.mkdir()
+    with ExitStack() as stack:
+        stack.enter_context(
+            answering(
+                "tests.studies.bench.bare_loop", str(PERIOD_NS), str(PRIORITY if fifo else 0), str(wakes)
+            )
+        )
+        # Devices as a board has its own: there before the flight.
+        told = "--folder", str(devices), "--facts", str(facts)
+        stack.enter_context(answering("sim_hal", "serve", str(config), *told))
+        notifications = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
+        notifications.bind(str(folder / "notify"))
+        flight = _started(folder, config, notifications, load.duration, facts, fifo)
+        stack.callback(flight.end)
+        ready_ns = flight.wait_for("READY=1")
+        busy = process_watch.look({"control": flight.process.pid}).processor["control"]
+        utc_offset_ns = time.time_ns() - time.monotonic_ns()
+        watched = _watch(flight, notifications, load)
+        error = flight.end()
+    if flight.process.returncode != 0:
+        raise RuntimeError(f"the flight ended with status {flight.process.returncode}: {error.strip()}")
+    began = Began(flight.begun_ns, ready_ns, busy, utc_offset_ns)
+    return evaluate(flight.folder, devices, wakes, began, watched, load.warm_up)
+
+
+def _watch(flight: LiveFlight, notifications: socket.socket, load: Load) -> Watched:
+    """Watch the flight to its end, reading the service manager's end of the socket."""
+    alone = None
+    enough = time.monotonic() + 0.5 * (load.duration + load.warm_up)
+    with closing(ProcessWatch(lambda: _members(flight), load.look_period)) as watch:
+        while flight.process.poll() is None:
+            if select.select([notifications], [], [], 0.5)[0]:
+                notifications.recv(4096)
+            if alone is None and time.monotonic() > enough:
+                with suppress(OSError, LookupError, ValueError):  # one of them has just ended: again then
+                    members = _members(flight)
+                    shared = sum(process_watch.look(members).memory.values())
+                    alone = process_watch.unshared(members) - shared
+    return Watched(watch.looks, alone or 0.0)
+
+
+def _members(flight: LiveFlight) -> dict[str, int]:
+    """Return the flight's processes by what they do."""
+    found = {"control": flight.process.pid}
+    for process in process_watch.below(flight.process.pid):
+        words = process_watch.command(process)
+        found |= {role: process for module, role in _ROLES.items() if module in words}
+    return found
+
+
+def _started(
+    folder: Path, config: Path, notifications: socket.socket, duration: float, facts: Path, fifo: bool
+) -> LiveFlight:
+    """Start the flight beside its devices, without a right to SCHED_FIFO when it is not to have it."""
+    started: list[LiveFlight] = []
+
+    def start() -> None:
+        if not fifo:
+            # Of this thread alone, and of what it starts.
+            ctypes.CDLL(None).prctl(_PR_CAPBSET_DROP, _CAP_SYS_NICE, 0, 0, 0)
+        started.append(LiveFlight(folder, config, notifications, duration, "--devices", str(facts)))
+        if not fifo:
+            resource.prlimit(started[0].process.pid, resource.RLIMIT_RTPRIO, (0, 0))
+
+    thread = threading.Thread(target=start)
+    thread.start()
+    thread.join()
+    return started[0]

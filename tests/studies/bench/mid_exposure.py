@@ -1,0 +1,273 @@
+"""The attitude at mid-exposure from a fit's stars, the true ones being known, and its least error.
+
+Part of `python -m tests.studies.bench endpoints`. Each star used in the fit is named by the true star whose
+path has both ends near its own; ESOQ2 takes its direction with an error that is the mean of both axes of its
+covariance. `refined` weighs the stars' pixels by their whole covariances, since along a streak a star is
+known several times worse than across, and does without stars that disagree with the rest by more than chance
+allows, the worst first: light of fainter stars hides in some streaks. `agreed` is ESOQ2 of those that remain.
+
+`flight` is the star tracker's own answer to the same fit, told roughly where the camera looks, and
+`known sky` its answer after the second fit, with the light of unseen stars taken out
+(`flight.gnc.vision.startracker.known_sky`); the rates of both fits are held against their bound too.
+
+The bound: all pixels of the brightest stars, whose directions are known and whose light and background are
+not, the turn, the width of the point spread and the attitude common to all (Fisher information as in
+`flight.gnc.vision.streaks.bound`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from flight.gnc.attitude import esoq2
+from flight.gnc.camera.pinhole import Pinhole
+from flight.gnc.errors import FlightError
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector, multiply
+from flight.gnc.vision.objects.olae import cross_matrices
+from flight.gnc.vision.startracker.index.build import default_index
+from flight.gnc.vision.startracker.known_sky import with_known_sky
+from flight.gnc.vision.startracker.solution import FrameSolution
+from flight.gnc.vision.startracker.solve import AttitudePrior, SolveSettings, solve_motion
+from flight.gnc.vision.streaks.bound import star_information
+from flight.gnc.vision.streaks.corners.two_attitudes import attitude_error, error_in_pixels
+from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion
+from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
+from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from sim_hal.star_camera import StarCameraModel
+from tests.studies.bench.streaks import estimated, scenes
+from tests.studies.campaigns import streaks as campaign
+from tests.studies.campaigns.scenes import FIELD, Scene, noise_floor
+
+_MATCH_PX = 6.0
+_STARS = 30
+# Turn (3), point spread, then attitude (3) or a star's x and y.
+_SHARED = 4
+_ROUNDS = 2
+# Chi-square of 2, exceeded by chance once in 1000: a star farther off is not where its pixels say.
+_FARTHEST = 13.8
+_LEAST_STARS = 4
+EXPOSURE = 0.2
+SOLUTIONS = ("all stars", "agreed", "refined", "flight", "known sky")
+FITS = ("first", "known sky")
+# rad: by how much the tracker's prior is wrong about each axis, and believed to be.
+_PRIOR_ERROR, _PRIOR_SIGMA = np.array([2e-4, -1e-4, 1e-4]), 3e-4
+# Median of the distance of a point whose two coordinates have the rms distance 1.
+_RAYLEIGH_MEDIAN = float(np.sqrt(np.log(2.0)))
+
+
+@dataclass(frozen=True, slots=True)
+class MidAttitude:
+    """An attitude at mid-exposure.
+
+    Attributes:
+        quaternion: (4,) ICRS into camera, by ESOQ2 of all stars; `agreed` (4,) of those that agree;
+            `refined` (4,) of the same by whole covariances.
+        dropped: part of the stars that do not agree.
+        sigma_across: rad, what the covariances say of the error of `refined`'s boresight, rms.
+    """
+
+    quaternion: FloatArray
+    agreed: FloatArray
+    refined: FloatArray
+    dropped: float
+    sigma_across: float
+
+
+def mid_attitude(found: MotionResult, scene: Scene, pinhole: Pinhole) -> MidAttitude | None:
+    """Return the attitude from the stars used, None when they are too few to fix one."""
+    used = np.flatnonzero(found.used)
+    star = _true_stars(found.endpoints[used], scene)
+    used, star = used[star >= 0], star[star >= 0]
+    stars = Seen(found.stars[used], found.star_covariance[used], scene.directions[star], pinhole)
+    try:
+        all_of_them = stars.attitude()
+        refined, covariance = stars.refined(all_of_them)
+        while len(stars.places) > _LEAST_STARS:
+            missed = stars.disagreement(refined)
+            if missed.max() <= _FARTHEST:
+                break
+            stars = stars.without(int(missed.argmax()))
+            refined, covariance = stars.refined(refined)
+        agreed = stars.attitude()
+    except FlightError:
+        return None
+    sigma = float(np.sqrt(covariance[0, 0] + covariance[1, 1]))
+    return MidAttitude(all_of_them, agreed, refined, 1.0 - len(stars.places) / len(used), sigma)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seen:
+    """Identified stars: `places` (n, 2) px, `covariance` (n, 2, 2) px^2, `reference` (n, 3) ICRS."""
+
+    places: FloatArray
+    covariance: FloatArray
+    reference: FloatArray
+    pinhole: Pinhole
+
+    def without(self, index: int) -> Seen:
+        """Return all stars but one."""
+        kept = np.delete(np.arange(len(self.places)), index)
+        return Seen(self.places[kept], self.covariance[kept], self.reference[kept], self.pinhole)
+
+    def attitude(self) -> FloatArray:
+        """Return the attitude (4,) by ESOQ2; raises AttitudeError when the stars fix none."""
+        sigma = np.sqrt(0.5 * np.trace(self.covariance, axis1=1, axis2=2)) / self.pinhole.focal_length
+        return esoq2.solve(self.pinhole.unit_vectors(self.places), self.reference, sigma).quaternion
+
+    def disagreement(self, quaternion: FloatArray) -> FloatArray:
+        """Return each star's squared distance (n,) from where the attitude puts it, in its deviations."""
+        missed = self.places - self.pinhole.project(self.reference @ attitude_matrix(quaternion).T)
+        return np.asarray(np.einsum("na,nab,nb->n", missed, np.linalg.inv(self.covariance), missed))
+
+    def refined(self, quaternion: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the attitude (4,) of least squares in the image, and its covariance (3, 3) rad^2."""
+        weight = np.linalg.inv(self.covariance)
+        for _ in range(_ROUNDS):
+            seen = self.reference @ attitude_matrix(quaternion).T
+            change = _by_attitude(seen, self.pinhole)
+            normal = np.einsum("nai,nab,nbj->ij", change, weight, change)
+            missed = self.places - self.pinhole.project(seen)
+            step = np.linalg.solve(normal, np.einsum("nai,nab,nb->i", change, weight, missed))
+            quaternion = multiply(from_rotation_vector(step), quaternion)
+        return quaternion, np.asarray(np.linalg.inv(normal))
+
+
+def _true_stars(ends: FloatArray, scene: Scene) -> FloatArray:
+    """Return the index (n,) of the star whose path has both ends near `ends` (n, 2, 2) px, -1 without one."""
+    true = np.stack([scene.start, scene.end], axis=1)
+    worst = np.linalg.norm(true[None] - ends[:, None], axis=-1).max(axis=-1)
+    worst = np.where(np.isfinite(worst), worst, np.inf)
+    nearest = worst.argmin(axis=1)
+    return np.where(worst[np.arange(len(ends)), nearest] < _MATCH_PX, nearest, -1)
+
+
+def _by_attitude(vectors: FloatArray, pinhole: Pinhole) -> FloatArray:
+    """Return d(pixel)/d(small turn of the camera), (n, 2, 3), of directions (n, 3): v moves by v x psi."""
+    x, y, z = vectors.T
+    projected = np.zeros((len(vectors), 2, 3))
+    projected[:, 0, 0] = projected[:, 1, 1] = 1.0 / z
+    projected[:, 0, 2], projected[:, 1, 2] = -x / z**2, -y / z**2
+    return np.asarray(pinhole.focal_length * projected @ cross_matrices(vectors))
+
+
+def across_bound(scene: Scene, camera: StarCameraModel) -> float:
+    """Return the least rms error of the boresight's direction, rad, of any unbiased attitude.
+
+    Raises numpy.linalg.LinAlgError when the stars fix none.
+    """
+    pinhole = camera.pinhole
+    seen = np.flatnonzero(
+        np.any([pinhole.contains(place) for place in (scene.start, scene.middle, scene.end)], axis=0)
+    )
+    brightest = seen[np.argsort(-scene.electrons[seen], kind="stable")][:_STARS]
+    motion = Motion.steady(scene.rate * scene.exposure)
+    floor = noise_floor(camera, scene.exposure)
+    total = np.zeros((_SHARED + 3, _SHARED + 3))
+    change = _by_attitude(pinhole.unit_vectors(scene.middle[brightest]), pinhole)
+    for place, electrons, moved in zip(
+        scene.middle[brightest], scene.electrons[brightest], change, strict=True
+    ):
+        information = star_information(pinhole, motion, place, float(electrons), camera.psf_sigma, floor)
+        geometry = slice(None, _SHARED + 2)
+        light = slice(_SHARED + 2, None)
+        known = np.linalg.pinv(information[light, light], hermitian=True)
+        left = information[geometry, geometry] - (
+            information[geometry, light] @ known @ information[light, geometry]
+        )
+        chain = np.zeros((_SHARED + 2, _SHARED + 3))
+        chain[:_SHARED, :_SHARED] = np.eye(_SHARED)
+        chain[_SHARED:, _SHARED:] = moved
+        total += chain.T @ left @ chain
+    scale = np.sqrt(np.diag(total))
+    if not np.all(scale > 0.0):
+        raise np.linalg.LinAlgError("the stars do not fix the attitude")
+    covariance = np.linalg.inv(total / np.outer(scale, scale)) / np.outer(scale, scale)
+    return float(np.sqrt(covariance[4, 4] + covariance[5, 5]))
+
+
+def tracked(
+    found: MotionResult, scene: Scene, camera: StarCameraModel, truth: FloatArray
+) -> tuple[FrameSolution, FrameSolution]:
+    """Return what the star tracker makes of the fit, and of a second one with all stars known."""
+    settings = SolveSettings(
+        likelihood=LikelihoodSettings(saturation=float(camera.highest_count), gain=camera.gain)
+    )
+    prior = AttitudePrior(multiply(from_rotation_vector(_PRIOR_ERROR), truth), _PRIOR_SIGMA)
+    first = solve_motion(found, camera.pinhole, (1.0, 1.0), default_index(), settings, prior)
+    return first, with_known_sky(scene.pixels, first, default_index(), settings, settings.likelihood)
+
+
+def attitude_row(percent: float, frames: int, seed: int, faintest: float, exposure: float) -> dict[str, Any]:
+    """Return errors of the attitude at mid-exposure across the boresight, px, and over the bound."""
+    camera = StarCameraModel(field_of_view=FIELD)
+    errors, bounds, claimed, dropped, rates = [], [], [], [], []
+    for scene in scenes(camera, frames, percent, (0.0, 90.0), exposure, (seed, 3), faintest):
+        found = estimated(scene.pixels, scene.rate, exposure, camera)
+        least = campaign._bound(scene, camera)
+        fix = mid_attitude(found, scene, camera.pinhole) if found.rate is not None else None
+        if fix is None or least is None:
+            continue
+        half = from_rotation_vector(0.5 * scene.rate * scene.exposure)
+        truth = multiply(half, scene.attitudes[0])
+        solved = tracked(found, scene, camera, truth)
+        motions, fixes = [one.motion for one in solved], [one.fix for one in solved]
+        attitudes = [fix.quaternion, fix.agreed, fix.refined]
+        attitudes += [np.full(4, np.nan) if one is None else one.quaternion for one in fixes]
+        errors.append([attitude_error(quaternion, truth)[1] for quaternion in attitudes])
+        bounds.append(across_bound(scene, camera))
+        claimed.append(
+            [fix.sigma_across]
+            + [np.nan if f is None else np.sqrt(np.trace(f.covariance[:2, :2])) for f in fixes]
+        )
+        dropped.append(fix.dropped)
+        size = float(np.linalg.norm(scene.rate))
+        rates.append(
+            [
+                float(np.linalg.norm(one.rate - scene.rate)) / size / least[1]
+                for one in motions
+                if one is not None and one.rate is not None
+            ]
+        )
+    angles = np.array(errors).reshape(-1, len(SOLUTIONS))
+    least_angles = np.array(bounds)
+    pixel = error_in_pixels(1.0, camera.columns, camera.field_of_view)
+    over_claimed = angles[:, 2:] / np.array(claimed).reshape(-1, 3)
+    return {
+        "percent": percent,
+        "attitudes": len(angles),
+        "frames": frames,
+        "bound_px": _root_mean_square(pixel * least_angles),
+        "solutions": {name: _figures(angles[:, k], least_angles, pixel) for k, name in enumerate(SOLUTIONS)},
+        "dropped": float(np.mean(dropped)) if dropped else None,
+        "over_claimed": {name: _root_mean_square(over_claimed[:, k]) for k, name in enumerate(SOLUTIONS[2:])},
+        "rate_over_bound": {
+            name: _root_mean_square(np.array(rates)[:, k]) if rates else None for k, name in enumerate(FITS)
+        },
+    }
+
+
+def _figures(angles: FloatArray, least: FloatArray, pixel: float) -> dict[str, Any]:
+    """Return how many attitudes (n,) rad there are, NaN for none, and their errors, px and over the bound."""
+    there = np.isfinite(angles)
+    if not there.any():
+        return {"attitudes": 0}
+    ratio = angles[there] / least[there]
+    pixels = pixel * angles[there]
+    return {
+        "attitudes": int(np.count_nonzero(there)),
+        "rms_px": float(np.sqrt(np.mean(pixels**2))),
+        "median_px": float(np.median(pixels)),
+        "largest_px": float(pixels.max()),
+        "over_bound": float(np.sqrt(np.mean(ratio**2))),
+        "over_bound_median": float(np.median(ratio) / _RAYLEIGH_MEDIAN),
+    }
+
+
+def _root_mean_square(values: FloatArray) -> float | None:
+    """Return that of the values that there are, None without any."""
+    there = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(np.square(there)))) if len(there) else None

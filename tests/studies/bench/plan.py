@@ -1,0 +1,160 @@
+"""Measure the planner against the optimum: `python -m tests.studies.bench plan [--runs N] [--picture PNG]`.
+
+Random slews over the testbed's range, with thread, disturbance and moving ends
+(tests.flight.gnc.guidance.problems), in two sets: horizons of 1.1 to 2.5 times the shortest feasible one, and
+too short ones, which are stretched.
+Solve times are of this process's processor time; cost is compared with the collocation oracle at the same
+horizon; limits are watched on 4001 points of the path.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flight.gnc.errors import PlanningError
+from flight.gnc.guidance.one_axis.plant import Q2_LIMIT
+from flight.gnc.guidance.one_axis.vmc import Plan, PlanStatus
+from tests.flight.gnc.guidance.oracle import solve
+from tests.flight.gnc.guidance.problems import STEPS, THESIS, Problem, feasible_problems
+
+FEASIBLE = (1.1, 2.5)
+TOO_SHORT = (0.6, 0.99)
+
+
+def measure(problems: list[tuple[Problem, float]]) -> dict[str, Any]:
+    """Return the figures of slews, each with its shortest feasible horizon in s."""
+    spans, costs, passed, beyond, failed, unsolved = [], [], [], [], 0, 0
+    stretched = 0
+    for problem, shortest in problems:
+        begun = time.process_time()
+        try:
+            found = problem.planned()
+        except PlanningError:
+            failed += 1
+            continue
+        spans.append(1e3 * (time.process_time() - begun))
+        stretched += found.status is PlanStatus.STRETCHED
+        passed.append(largest_ratio(problem, found))
+        beyond.append(found.horizon / shortest)
+        optimum = solve(problem.slew(found.horizon))
+        if optimum is None:
+            unsolved += 1
+        else:
+            costs.append(found.energy / optimum.energy)
+    return {
+        "runs": len(problems),
+        "failed": failed,
+        "stretched": stretched,
+        "median_ms": float(np.median(spans)),
+        "p99_ms": float(np.quantile(spans, 0.99)),
+        "max_ms": max(spans),
+        "compared": len(costs),
+        "oracle_failed": unsolved,
+        "median_cost_ratio": float(np.median(costs)),
+        "worst_cost_ratio": max(costs),
+        "worst_limit_ratio": max(passed),
+        "worst_horizon_over_shortest": max(beyond),
+    }
+
+
+def largest_ratio(problem: Problem, found: Plan) -> float:
+    """Return the largest of |I| and |q2| over their limits along the path."""
+    motion = found.path.motion(np.linspace(0.0, found.horizon * (1.0 - 1e-12), 4001))
+    current = float(np.abs(problem.plant.currents(*motion)).max()) / problem.plant.current_limit
+    return max(current, float(np.abs(np.sin(0.5 * motion[0])).max()) / Q2_LIMIT)
+
+
+def warm_gain(problems: list[tuple[Problem, float]]) -> dict[str, float]:
+    """Return evaluations of the second plan of a slew, a third on its way, begun anew and from the last."""
+    cold, warm = [], []
+    for problem, _ in problems:
+        first = problem.planned()
+        elapsed_ns = round(first.horizon * 1e9 / 3.0)
+        at = first.path.sample(elapsed_ns)
+        rest = Problem(
+            problem.plant,
+            float(np.sin(0.5 * at.angle)) + 1e-4,
+            at.rate + 1e-4,
+            problem.end_q2,
+            problem.end_rate,
+            first.horizon - elapsed_ns * 1e-9,
+        )
+        cold.append(rest.planned().evaluations)
+        warm.append(rest.planned(last=first.path.starting_at(-elapsed_ns)).evaluations)
+    return {"cold_evaluations": float(np.mean(cold)), "warm_evaluations": float(np.mean(warm))}
+
+
+def draw(problem: Problem, path: Path) -> None:
+    """Draw one solution: nodes, what is flown between them, and the oracle."""
+    from matplotlib.figure import Figure  # noqa: PLC0415 - an extra
+
+    found = problem.planned()
+    optimum = solve(problem.slew(found.horizon))
+    assert optimum is not None
+    times = np.linspace(0.0, found.horizon * (1.0 - 1e-12), 2001)
+    angle, rate, acceleration = found.path.motion(times)
+    nodes = found.path.motion(found.node_times * (1.0 - 1e-12))
+    grid = np.linspace(0.0, found.horizon, optimum.angle.size)
+    figure = Figure(figsize=(8.0, 6.0), layout="constrained")
+    above, below = figure.subplots(2, sharex=True)
+    above.plot(grid, np.sin(0.5 * optimum.angle), color="0.6", linewidth=4, label="oracle")
+    above.plot(times, np.sin(0.5 * angle), color="#0072B2", label="flown")
+    above.plot(found.node_times, found.node_q2, "o", color="#D55E00", markersize=4, label="nodes")
+    above.set_ylabel("q2")
+    above.legend(frameon=False)
+    below.plot(grid, 1e3 * optimum.current, color="0.6", linewidth=4)
+    below.plot(times, 1e3 * problem.plant.currents(angle, rate, acceleration), color="#0072B2")
+    below.plot(found.node_times, 1e3 * problem.plant.currents(*nodes), "o", color="#D55E00", markersize=4)
+    for sign in (-1.0, 1.0):
+        below.axhline(sign * 1e3 * problem.plant.current_limit, color="0.3", linestyle=":", linewidth=1)
+    below.set_ylabel("current (mA)")
+    below.set_xlabel("time (s)")
+    above.set_title(
+        f"q2 {problem.start_q2:.2f} to {problem.end_q2:.2f} in {found.horizon:.2f} s: "
+        f"{found.energy:.4f} J, oracle {optimum.energy:.4f} J",
+        fontsize=10,
+    )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+
+
+def main(arguments: list[str]) -> int:
+    """Print the figures."""
+    parser = argparse.ArgumentParser(prog="python -m tests.studies.bench plan", description=__doc__)
+    parser.add_argument("--runs", type=int, default=500)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--picture", type=Path, metavar="PNG", help="draw the tightest solution")
+    parser.add_argument("--json", action="store_true", help="one JSON object on standard output")
+    options = parser.parse_args(arguments)
+    if options.runs < 1:
+        parser.error("--runs must be at least 1")
+    THESIS.planned()  # fills the caches, as the worker's first plan does
+    STEPS[0].planned()
+    feasible = feasible_problems(options.runs, options.seed, FEASIBLE)
+    short = feasible_problems(max(1, options.runs // 5), options.seed + 1, TOO_SHORT)
+    figures = {
+        "seed": options.seed,
+        "feasible": measure(feasible) | warm_gain(feasible[:100]),
+        "too_short": measure(short),
+    }
+    if options.picture is not None:
+        tightest, _ = min(feasible, key=lambda pair: pair[0].horizon / pair[1])
+        draw(tightest, options.picture)
+    if options.json:
+        sys.stdout.write(json.dumps(figures) + "\n")
+        return 0
+    for name in ("feasible", "too_short"):
+        sys.stdout.write(f"{name.replace('_', ' ')} horizons\n")
+        sys.stdout.writelines(f"  {key:28s} {value:.6g}\n" for key, value in figures[name].items())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,145 @@
+"""Watches processes from outside through /proc: processor time, and the memory they hold together.
+
+The proportional set (PSS) shares each page among the processes that map it, so a sum over processes counts
+none twice (proc_pid_smaps(5)). Processes that are not watched take their share as well: `unshared` is what
+the watched ones would hold if they were alone.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+MIB = 1024.0 * 1024.0
+_TICKS = os.sysconf("SC_CLK_TCK")
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """One look: monotonic time in s; by name, processor seconds since start and proportional set in bytes.
+
+    `own` is the part of that which is no file's: other processes that come and go do not change it.
+    """
+
+    time: float
+    processor: dict[str, float]
+    memory: dict[str, float]
+    own: dict[str, float]
+
+
+class ProcessWatch:
+    """Looks at processes by name from a thread of its own, until closed."""
+
+    def __init__(self, processes: Callable[[], Mapping[str, int]], period: float) -> None:
+        """Take what tells the process identifiers anew at each look, and the period in s."""
+        self.looks: list[Look] = []
+        self._processes = processes
+        self._period = period
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._watch, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Look no more."""
+        self._stopped.set()
+        self._thread.join()
+
+    def _watch(self) -> None:
+        while not self._stopped.wait(self._period):
+            try:
+                self.looks.append(look(self._processes()))
+            except (OSError, LookupError, ValueError):
+                continue  # one of them has just ended
+
+
+def look(processes: Mapping[str, int]) -> Look:
+    """Look at processes. Raises OSError, ValueError or LookupError when one is not there."""
+    sets = {name: _proportional(process) for name, process in processes.items()}
+    return Look(
+        time.monotonic(),
+        {name: _processor(process) for name, process in processes.items()},
+        {name: parts["Pss:"] for name, parts in sets.items()},
+        {name: parts["Pss:"] - parts["Pss_File:"] for name, parts in sets.items()},
+    )
+
+
+@contextmanager
+def answering(module: str, *words: str) -> Iterator[None]:
+    """Run `python -m MODULE WORDS` from its first line on standard output on; end it with SIGTERM."""
+    root = Path(__file__).parents[3]
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+    with subprocess.Popen(
+        [sys.executable, "-m", module, *words], cwd=root, env=environment, stdout=subprocess.PIPE
+    ) as process:
+        try:
+            assert process.stdout is not None
+            if not process.stdout.readline():
+                raise RuntimeError(f"{module} ended with status {process.wait()} before it answered")
+            yield
+        finally:
+            process.terminate()
+
+
+def below(parent: int) -> list[int]:
+    """Return the processes below `parent`, at any depth."""
+    found = []
+    for task in Path(f"/proc/{parent}/task").glob("*/children"):
+        for word in task.read_text().split():
+            found += [int(word), *below(int(word))]
+    return found
+
+
+def command(process: int) -> str:
+    """Return a process's command line."""
+    return Path(f"/proc/{process}/cmdline").read_bytes().replace(b"\0", b" ").decode()
+
+
+def unshared(processes: Mapping[str, int]) -> float:
+    """Return the bytes that processes would hold together if no other process mapped their files.
+
+    Private memory as it is; of each piece of a file what the process that holds most of it holds, since the
+    same libraries are used alike.
+    """
+    private = 0.0
+    of_files: defaultdict[tuple[str, str], float] = defaultdict(float)
+    for process in processes.values():
+        piece = ("", "")
+        resident = 0.0
+        for line in Path(f"/proc/{process}/smaps").read_text().splitlines():
+            words = line.split()
+            if not words[0].endswith(":"):
+                piece = (words[2], " ".join(words[5:]))
+            elif words[0] == "Rss:":
+                resident = float(words[1]) * 1024.0
+            elif words[0] == "Anonymous:":
+                anonymous = float(words[1]) * 1024.0
+                private += anonymous
+                if piece[1].startswith("/"):
+                    of_files[piece] = max(of_files[piece], resident - anonymous)
+    return private + sum(of_files.values())
+
+
+def stolen_ns() -> int:
+    """Return the processor time, of all cores since boot, that the machine's host gave to others."""
+    with open("/proc/stat", "rb", buffering=0) as file:
+        return int(file.read(256).split(maxsplit=9)[8]) * (1_000_000_000 // _TICKS)
+
+
+def _processor(process: int) -> float:
+    # The name, in brackets, may hold anything; user and system time are words 14 and 15 of all (proc(5)).
+    words = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    return (int(words[11]) + int(words[12])) / _TICKS
+
+
+def _proportional(process: int) -> dict[str, float]:
+    """Return the proportional set and its parts in bytes."""
+    lines = [line.split() for line in Path(f"/proc/{process}/smaps_rollup").read_text().splitlines()]
+    return {words[0]: float(words[1]) * 1024.0 for words in lines if words[0].startswith("Pss")}

@@ -1,0 +1,360 @@
+"""The star tracker from pixels: real photographs, points and streaks: `python -m tests.studies.bench sky`.
+
+Photographs: those of a folder with a `truth.json` (right ascension and declination of the image's centre and
+the horizontal field, degrees), with the field known to 5 % and, where it is of 10 to 30 deg, unknown.
+Simulated frames: the simulator's camera of 12 deg and 0.1 s, with the field known to 0.1 deg, the axis of
+the turn 30 to 90 deg off the boresight, and across it. The bounds are Cramer-Rao's: `over bound`, the rms
+error across the boresight over that of the stars' places, and `bound`, that of the rate's magnitude. The
+names of the stars lower the latter by 2 % at most: a streak's length tells the rate, its middle the place.
+Times are of one core's CPU; peers extract the stars themselves, as they come and with their filters off.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flight.gnc.camera.images import read_image
+from flight.gnc.camera.pinhole import Pinhole
+from flight.gnc.math.arrays import FloatArray, Image
+from flight.gnc.math.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
+from flight.gnc.vision.startracker.pointing import Pointing
+from flight.gnc.vision.startracker.solution import FrameSolution
+from flight.gnc.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings, solve_frame
+from tests.flight.gnc.vision.startracker.frames import NARROW, SkyFrame, sky, sky_frame
+from tests.studies.bench.star_peers import PEERS
+from tests.studies.bench.starid import Answer, peer_answers
+
+_SEED = 16_018
+_PHOTOGRAPHS = Path(__file__).parents[4] / "shared" / "data" / "sky"
+_STREAKS_PX = (0.0, 10.0, 20.0, 40.0, 80.0)
+_OBLIQUE, _ACROSS = (30.0, 90.0), (90.0, 90.0)
+_EXPOSURE = 0.1
+# rad, of the prior for tracking: 1.5 px.
+_PRIOR_SIGMA = 3e-4
+_FIELD_SHARE = 0.05
+_LOWEST_DEG, _HIGHEST_DEG = 10.0, 30.0
+_NARROW_DEG, _NARROW_KNOWN_DEG = 12.0, 0.1
+_RIGHT_ARCSEC = 60.0
+ARCSECONDS = math.degrees(1.0) * 3600.0
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """What became of one photograph; arcsec and ms are NaN where it was not solved."""
+
+    name: str
+    known: bool
+    solved: bool
+    arcsec: float
+    stars: int
+    ms: float
+
+
+def believed(pixels: Image, fov_deg: float, low: float, high: float) -> tuple[Pinhole, tuple[float, float]]:
+    """Return a camera of `fov_deg` across and the range of its scale that fields `low` to `high` deg make."""
+    middle = math.tan(0.5 * math.radians(fov_deg))
+    rows, columns = pixels.shape
+    scale = tuple(math.tan(0.5 * math.radians(angle)) / middle for angle in (low, high))
+    return Pinhole(columns, rows, 0.5 * columns / middle), (scale[0], scale[1])
+
+
+def photograph(folder: Path, name: str, truth: dict[str, float], known: bool) -> Photograph:
+    """Return what the star tracker makes of one photograph."""
+    pixels = read_image(folder / name)
+    fov = truth["fov"]
+    low, high = (
+        (fov * (1.0 - _FIELD_SHARE), fov * (1.0 + _FIELD_SHARE)) if known else (_LOWEST_DEG, _HIGHEST_DEG)
+    )
+    camera, scale = believed(pixels, fov if known else 17.0, low, high)
+    begin = time.process_time()
+    found = solve_frame(pixels, camera, scale, 1.0, sky(), SolveSettings())
+    ms = 1e3 * (time.process_time() - begin)
+    if found.fix is None:
+        return Photograph(name, known, False, math.nan, 0, ms)
+    pointing = Pointing.of(found.fix.quaternion)
+    place = direction(pointing.right_ascension, pointing.declination)
+    off = angle_arcsec(place, centre_of(truth))
+    return Photograph(name, known, True, off, len(found.matched), ms)
+
+
+def centre_of(truth: dict[str, float]) -> FloatArray:
+    """Return the direction (3,) of the centre of a photograph."""
+    return direction(math.radians(truth["ra"]), math.radians(truth["dec"]))
+
+
+def direction(right_ascension: float, declination: float) -> FloatArray:
+    """Return the unit vector (3,) of a place of the sky."""
+    cosine = math.cos(declination)
+    return np.array(
+        [cosine * math.cos(right_ascension), cosine * math.sin(right_ascension), math.sin(declination)]
+    )
+
+
+def angle_arcsec(one: FloatArray, other: FloatArray) -> float:
+    """Return the angle between two unit vectors (3,)."""
+    return ARCSECONDS * math.atan2(float(np.linalg.norm(np.cross(one, other))), float(one @ other))
+
+
+def photographs(folder: Path) -> list[Photograph]:
+    """Return the results of every photograph of a folder that has a truth."""
+    return [photograph(folder, name, values, known) for name, values, known in _shown(folder)]
+
+
+def _shown(folder: Path) -> Iterator[tuple[str, dict[str, float], bool]]:
+    """Yield the photographs, each as often as it is tried: name, truth, whether the field is known."""
+    for name, values in json.loads((folder / "truth.json").read_text()).items():
+        yield name, values, True
+        if _LOWEST_DEG <= values["fov"] <= _HIGHEST_DEG:
+            yield name, values, False
+
+
+@dataclass(frozen=True)
+class Solved:
+    """One simulated frame: errors over the whole attitude and the rate, with their bounds, and times.
+
+    Attributes:
+        across: arcsec, of the boresight; NaN when refused.
+        across_bound: arcsec, rms that the bound allows.
+        nees: squared error of the attitude over its covariance, per degree of freedom.
+        rate, rate_bound: % of the rate's magnitude; NaN without one.
+    """
+
+    across: float
+    across_bound: float
+    nees: float
+    rate: float
+    rate_bound: float
+    ms: float
+    tracking_ms: float
+
+
+def scene_of(length: float, theta_deg: tuple[float, float], frame: int) -> SkyFrame:
+    """Return a frame with streaks of `length` px."""
+    key = [_SEED, frame, round(length)] + ([1] if theta_deg == _ACROSS else [])
+    return sky_frame(np.random.default_rng(key), length, _EXPOSURE, theta_deg=theta_deg)
+
+
+def solved(scene: SkyFrame, length: float) -> Solved:
+    """Return what the star tracker makes of a simulated frame, lost in space and with a prior."""
+    low, high = _NARROW_DEG - _NARROW_KNOWN_DEG, _NARROW_DEG + _NARROW_KNOWN_DEG
+    camera, scale = believed(scene.pixels, _NARROW_DEG, low, high)
+    rate_prior, settings = RatePrior(scene.rate, 1e-6), SolveSettings()
+    prior = AttitudePrior(scene.attitude, _PRIOR_SIGMA)
+    exposure = scene.exposure
+    begin = time.process_time()
+    found = solve_frame(scene.pixels, camera, scale, exposure, sky(), settings, None, rate_prior)
+    middle = time.process_time()
+    solve_frame(scene.pixels, NARROW.pinhole, (1.0, 1.0), exposure, sky(), settings, prior, rate_prior)
+    tracked = time.process_time()
+    bound = ARCSECONDS * math.sqrt(float(np.trace(scene.attitude_bound()[:2, :2])))
+    across, nees, rate, rate_bound = math.nan, math.nan, math.nan, math.nan
+    if found.fix is not None:
+        boresights = (attitude_matrix(q)[2] for q in (found.fix.quaternion, scene.attitude))
+        across, nees = angle_arcsec(*boresights), _nees(found, scene.attitude)
+    if length and found.fix is not None and found.motion is not None and found.motion.rate is not None:
+        speed = float(np.linalg.norm(scene.rate))
+        rate = 100.0 * (float(np.linalg.norm(found.motion.rate)) / speed - 1.0)
+        rate_bound = 100.0 * scene.rate_bound() / speed
+    return Solved(across, bound, nees, rate, rate_bound, 1e3 * (middle - begin), 1e3 * (tracked - middle))
+
+
+def _nees(found: FrameSolution, truth: FloatArray) -> float:
+    assert found.fix is not None
+    error = to_rotation_vector(multiply(found.fix.quaternion, conjugate(truth)))
+    return float(error @ np.linalg.solve(found.fix.covariance, error)) / 3.0
+
+
+def row_of(length: float, theta_deg: tuple[float, float], frames: int) -> dict[str, Any]:
+    """Return the figures of `frames` random frames with streaks of `length` px."""
+    each = [solved(scene_of(length, theta_deg, frame), length) for frame in range(frames)]
+    columns = {name: np.array([getattr(one, name) for one in each]) for name in asdict(each[0])}
+    told = ~np.isnan(columns["across"])
+    across, rate = columns["across"][told], columns["rate"][~np.isnan(columns["rate"])]
+    bound = columns["rate_bound"][~np.isnan(columns["rate_bound"])]
+    return {
+        "length_px": length,
+        "across": theta_deg == _ACROSS,
+        "frames": frames,
+        "right": int(np.sum(across <= _RIGHT_ARCSEC)),
+        "wrong": int(np.sum(across > _RIGHT_ARCSEC)),
+        "median_arcsec": _or_nan(np.median, across),
+        "worst_arcsec": _or_nan(np.max, across),
+        "over_bound": _or_nan(_rms, across) / _or_nan(_rms, columns["across_bound"][told]),
+        "nees": _or_nan(np.mean, columns["nees"][told]),
+        "rate_rms_percent": _or_nan(_rms, rate),
+        "rate_worst_percent": _or_nan(np.max, np.abs(rate)),
+        "rate_bound_percent": _or_nan(_rms, bound),
+        "median_ms": float(np.median(columns["ms"])),
+        "p95_ms": float(np.percentile(columns["ms"], 95.0)),
+        "tracking_ms": float(np.median(columns["tracking_ms"])),
+    }
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _or_nan(figure: Any, values: FloatArray) -> float:
+    return float(figure(values)) if len(values) else math.nan
+
+
+@dataclass(frozen=True)
+class Case:
+    """A frame for the peers: of which configuration, its truth (3,), and the job as they take it."""
+
+    configuration: str
+    boresight: FloatArray
+    job: dict[str, Any]
+
+
+def peer_cases(options: argparse.Namespace, folder: Path) -> list[Case]:
+    """Return every photograph and simulated frame, written to `folder`."""
+    cases: list[Case] = []
+
+    def add(configuration: str, boresight: FloatArray, pixels: Image, field: float, known: float) -> None:
+        path = folder / f"{len(cases)}.npy"
+        np.save(path, pixels)
+        cases.append(
+            Case(configuration, boresight, {"image": str(path), "field_deg": field, "known_deg": known})
+        )
+
+    if (options.photographs / "truth.json").is_file():
+        for name, values, known in _shown(options.photographs):
+            pixels, fov = read_image(options.photographs / name), values["fov"]
+            field, error = (fov, _FIELD_SHARE * fov) if known else (20.0, 10.0)
+            add(
+                f"photographs, field {'known' if known else 'unknown'}",
+                centre_of(values),
+                pixels,
+                field,
+                error,
+            )
+    for length in _STREAKS_PX:
+        for frame in range(options.frames):
+            scene = scene_of(length, _OBLIQUE, frame)
+            boresight = attitude_matrix(scene.attitude)[2]
+            add(f"{length:.0f} px, field known", boresight, scene.pixels, _NARROW_DEG, _NARROW_KNOWN_DEG)
+    return cases
+
+
+def peer_rows(options: argparse.Namespace) -> list[dict[str, Any]]:
+    """Return the figures of every peer by configuration."""
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        cases = peer_cases(options, Path(folder))
+        for peer in PEERS:
+            said = peer_answers(peer, options.peer_python, [case.job for case in cases])
+            if said is None:
+                continue
+            for configuration in dict.fromkeys(case.configuration for case in cases):
+                chosen = [
+                    (answer, case)
+                    for answer, case in zip(said[0], cases, strict=True)
+                    if case.configuration == configuration
+                ]
+                rows.append({"peer": peer, "configuration": configuration, **_peer_row(chosen)})
+    return rows
+
+
+def _peer_row(chosen: Sequence[tuple[Answer, Case]]) -> dict[str, Any]:
+    off = np.array(
+        [angle_arcsec(a.boresight, c.boresight) for a, c in chosen if a.boresight is not None], dtype=float
+    )
+    ms = [answer.ms for answer, _ in chosen]
+    return {
+        "frames": len(chosen),
+        "right": int(np.sum(off <= _RIGHT_ARCSEC)),
+        "wrong": int(np.sum(off > _RIGHT_ARCSEC)),
+        "refused": len(chosen) - len(off),
+        "median_arcsec": _or_nan(np.median, off),
+        "median_ms": float(np.median(ms)),
+        "p95_ms": float(np.percentile(ms, 95.0)),
+    }
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure and print; exit status 0."""
+    parser = argparse.ArgumentParser(prog="python -m tests.studies.bench sky", description=__doc__)
+    parser.add_argument("--frames", type=int, default=20, help="of each length (default %(default)s)")
+    parser.add_argument("--photographs", type=Path, default=_PHOTOGRAPHS, metavar="FOLDER")
+    parser.add_argument("--peers", action="store_true", help="cedar-solve and tetra3rs on the same frames")
+    parser.add_argument(
+        "--peer-python", default=sys.executable, metavar="PYTHON", help="that the peers are in"
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    options = parser.parse_args(arguments)
+    pictures: list[Photograph] = []
+    if (options.photographs / "truth.json").is_file():
+        pictures = photographs(options.photographs)
+    else:
+        sys.stderr.write(f"{options.photographs}: no truth.json: give --photographs; going on without\n")
+    rows = [row_of(length, _OBLIQUE, options.frames) for length in _STREAKS_PX]
+    rows += [row_of(length, _ACROSS, options.frames) for length in _STREAKS_PX if length]
+    peers = peer_rows(options) if options.peers else []
+    if options.json:
+        told = {"photographs": [asdict(one) for one in pictures], "frames": rows, "peers": peers}
+        sys.stdout.write(json.dumps(told) + "\n")
+    else:
+        sys.stdout.write(_table(pictures, rows) + _peer_table(peers))
+    return 0
+
+
+def _table(pictures: list[Photograph], rows: list[dict[str, Any]]) -> str:
+    lines = [f"{'photograph':26s} {'field':8s} {'off':>8s} {'stars':>6s} {'ms':>6s}"]
+    for one in pictures:
+        off = f'{one.arcsec:7.1f}"' if one.solved else " refused"
+        known = "known" if one.known else "unknown"
+        lines.append(f"{one.name:26s} {known:8s} {off} {one.stars:6d} {one.ms:6.1f}")
+    told = [one for one in pictures if one.solved]
+    right = sum(one.arcsec <= _RIGHT_ARCSEC for one in told)
+    lines.append(f'right to {_RIGHT_ARCSEC:.0f}": {right} of {len(pictures)}, wrong {len(told) - right}')
+    for across in (False, True):
+        lines.append(
+            f"\naxis {'across the boresight' if across else '30 to 90 deg off the boresight'}\n"
+            f"{'streak px':>9s} {'right':>9s} {'wrong':>6s} {'median':>8s} {'worst':>8s} {'over bound':>10s}"
+            f" {'NEES':>6s} {'rate rms %':>11s} {'worst %':>8s} {'bound %':>8s} {'ms':>6s} {'p95':>6s}"
+            f" {'track':>6s}"
+        )
+        lines += [_line(row) for row in rows if row["across"] == across]
+    return "\n".join(lines) + "\n"
+
+
+def _line(row: dict[str, Any]) -> str:
+    return (
+        f"{row['length_px']:9.0f} {row['right']:4d}/{row['frames']:<4d} {row['wrong']:6d}"
+        f' {row["median_arcsec"]:7.2f}" {row["worst_arcsec"]:7.2f}" {row["over_bound"]:10.2f}'
+        f" {row['nees']:6.2f} {row['rate_rms_percent']:11.3f} {row['rate_worst_percent']:8.3f}"
+        f" {row['rate_bound_percent']:8.3f} {row['median_ms']:6.1f} {row['p95_ms']:6.1f}"
+        f" {row['tracking_ms']:6.1f}"
+    )
+
+
+def _peer_table(rows: list[dict[str, Any]]) -> str:
+    lines = []
+    for peer in dict.fromkeys(row["peer"] for row in rows):
+        lines.append(
+            f"\n{peer:28s} {'frames':>6s} {'right':>6s} {'wrong':>6s} {'refused':>8s} {'median':>8s}"
+            f" {'ms':>7s} {'p95':>7s}"
+        )
+        lines += [
+            f"{row['configuration']:28s} {row['frames']:6d} {row['right']:6d} {row['wrong']:6d}"
+            f' {row["refused"]:8d} {row["median_arcsec"]:7.2f}" {row["median_ms"]:7.1f} {row["p95_ms"]:7.1f}'
+            for row in rows
+            if row["peer"] == peer
+        ]
+    return "".join(line + "\n" for line in lines)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,150 @@
+"""Synthetic star lists: what a perfect detector would hand over of a random part of the sky.
+
+A camera of 1024 x 1024 pixels looks anywhere with any roll; the guide stars down to the limit of its
+magnitude fall on the detector with Gaussian centroid noise; some are lost; false stars are strewn evenly,
+their brightness drawn from the true ones'. The order is by a magnitude with errors, as a detector would
+have it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flight.gnc.camera.pinhole import Pinhole
+from flight.gnc.math.arrays import FloatArray, IntArray
+from flight.gnc.math.quaternion import attitude_matrix, normalise
+from flight.gnc.vision.startracker.identification.field import StarField
+from flight.gnc.vision.startracker.index.guide_stars import GuideStars
+
+PIXELS = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class ListKind:
+    """What a list is like.
+
+    Attributes:
+        field_deg: of view, edge to edge.
+        noise_px: of a centroid along either axis.
+        false_stars: number of them.
+        faintest: V of the faintest star that is seen.
+        magnitude_error: of the instrumental magnitudes, one sigma.
+        lost: part of the stars that is missing.
+        order: "brightness", or "none" for a shuffled list without magnitudes.
+        known_deg: by which the field of view may differ from the believed one; None: 10 to 30 deg.
+        distortion_px: radial distortion at the corner.
+    """
+
+    field_deg: float = 12.0
+    noise_px: float = 0.1
+    false_stars: int = 0
+    faintest: float = 6.0
+    magnitude_error: float = 0.1
+    lost: float = 0.0
+    order: str = "brightness"
+    known_deg: float | None = 0.1
+    distortion_px: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StarList:
+    """One list and its truth.
+
+    Attributes:
+        pixels: (n, 2) centroids (x, y).
+        magnitude: (n,) instrumental.
+        star: (n,) true guide stars, -1 for the false.
+        attitude: (4,) true, ICRS to camera.
+        camera: the true one.
+        kind: what it was drawn from.
+    """
+
+    pixels: FloatArray
+    magnitude: FloatArray
+    star: IntArray
+    attitude: FloatArray
+    camera: Pinhole
+    kind: ListKind
+
+    def field(self) -> StarField:
+        """Return the list as the star tracker is given it."""
+        believed_deg, scale = believed_field(self.kind)
+        camera = Pinhole.from_field_of_view(PIXELS, PIXELS, float(np.deg2rad(believed_deg)))
+        half = 0.5 * PIXELS / camera.focal_length
+        sigma = np.full(len(self.pixels), self.kind.noise_px / camera.focal_length)
+        magnitude = None if self.kind.order == "none" else self.magnitude
+        return StarField(camera.unit_vectors(self.pixels), sigma, (half, half), scale, magnitude)
+
+
+def believed_field(kind: ListKind) -> tuple[float, tuple[float, float]]:
+    """Return the believed field of view in deg and the range of scale that goes with it."""
+    if kind.known_deg is None:
+        low, high = 10.0, 30.0
+        believed = float(np.rad2deg(2.0 * np.arctan(np.sqrt(_tangent(low) * _tangent(high)))))
+    else:
+        low, high = kind.field_deg - kind.known_deg, kind.field_deg + kind.known_deg
+        believed = kind.field_deg
+    return believed, (_tangent(low) / _tangent(believed), _tangent(high) / _tangent(believed))
+
+
+def _tangent(field_deg: float) -> float:
+    return float(np.tan(np.deg2rad(0.5 * field_deg)))
+
+
+def draw(kind: ListKind, stars: GuideStars, rng: np.random.Generator) -> StarList:
+    """Return a list of the sky; the camera's true field of view differs evenly within what is known."""
+    off = 0.0 if kind.known_deg is None else rng.uniform(-kind.known_deg, kind.known_deg)
+    camera = Pinhole.from_field_of_view(PIXELS, PIXELS, float(np.deg2rad(kind.field_deg + off)))
+    attitude = normalise(rng.standard_normal(4))
+    matrix = attitude_matrix(attitude)
+    near = np.flatnonzero(stars.direction @ matrix[2] > np.cos(1.05 * camera.half_diagonal))
+    seen_magnitude = stars.magnitude[near] + kind.magnitude_error * rng.standard_normal(len(near))
+    near, seen_magnitude = (
+        near[seen_magnitude < kind.faintest],
+        seen_magnitude[seen_magnitude < kind.faintest],
+    )
+    pixels = camera.project(stars.direction[near] @ matrix.T)
+    pixels = _distort(pixels, camera, kind.distortion_px)
+    pixels = pixels + kind.noise_px * rng.standard_normal(pixels.shape)
+    kept = camera.contains(pixels) & (rng.random(len(near)) >= kind.lost)
+    near, pixels, seen_magnitude = near[kept], pixels[kept], seen_magnitude[kept]
+    false = rng.uniform(-0.5, PIXELS - 0.5, (kind.false_stars, 2))
+    false_magnitude = (
+        rng.choice(seen_magnitude, kind.false_stars) + 0.1 * rng.standard_normal(kind.false_stars)
+        if len(near)
+        else np.full(kind.false_stars, kind.faintest)
+    )
+    pixels = np.concatenate([pixels, false])
+    magnitude = np.concatenate([seen_magnitude, false_magnitude])
+    star = np.concatenate([near, np.full(kind.false_stars, -1)])
+    order = np.argsort(magnitude) if kind.order == "brightness" else rng.permutation(len(magnitude))
+    return StarList(pixels[order], magnitude[order], star[order], attitude, camera, kind)
+
+
+def draw_random(kind: ListKind, count: int, rng: np.random.Generator) -> StarList:
+    """Return a list of `count` stars strewn at random: no part of the sky."""
+    camera = Pinhole.from_field_of_view(PIXELS, PIXELS, float(np.deg2rad(kind.field_deg)))
+    pixels = rng.uniform(-0.5, PIXELS - 0.5, (count, 2))
+    magnitude = np.sort(kind.faintest - rng.exponential(1.0, count))
+    nowhere = np.array([0.0, 0.0, 0.0, 1.0])
+    return StarList(pixels, magnitude, np.full(count, -1), nowhere, camera, kind)
+
+
+def _distort(pixels: FloatArray, camera: Pinhole, corner: float) -> FloatArray:
+    """Return pixels moved outwards with the cube of their distance from the centre, by `corner` px there."""
+    centre = np.array(camera.centre)
+    off = (pixels - centre) / (PIXELS / np.sqrt(2.0))
+    return np.asarray(pixels + corner * off * np.sum(off**2, axis=-1, keepdims=True))
+
+
+def configurations(known_deg: float | None = 0.1) -> list[ListKind]:
+    """Return the twelve kinds of list of issue 4: two fields, two noises, three numbers of false stars."""
+    base = ListKind(known_deg=known_deg)
+    return [
+        replace(base, field_deg=field, noise_px=noise, false_stars=false)
+        for field in (12.0, 20.0)
+        for noise in (0.1, 0.5)
+        for false in (0, 2, 5)
+    ]

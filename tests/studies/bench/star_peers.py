@@ -1,0 +1,120 @@
+"""Other people's star identification on our lists: tests/studies/bench/star_peers.py PEER JOBS.json.
+
+Runs by itself, with nothing of this repository, in whichever Python the peers are installed in: cedar-solve
+wants numpy below 2. A job is a list (`pixels`, `size`) or a frame (`image`, a file of numpy), with the field
+and what it is known to in degrees; of a frame the peer's own extraction is timed too. Prints one JSON
+object: of each job milliseconds of CPU and the boresight (3,), or null where the peer refused; and what the
+process grew by in resident memory with the catalogue and the index, after the peer itself was imported.
+"""
+
+import importlib
+import json
+import math
+import resource
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+Solver = Callable[[dict[str, Any]], "list[float] | None"]
+
+
+def direction(right_ascension: float, declination: float) -> list[float]:
+    """Return the unit vector of a place given in degrees."""
+    ra, dec = math.radians(right_ascension), math.radians(declination)
+    return [math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)]
+
+
+def cedar(**extraction: Any) -> Solver:
+    """Return cedar-solve with the database it comes with, 10 to 30 deg."""
+    import numpy as np  # noqa: PLC0415 - the peers are imported where they are asked for
+    import tetra3  # type: ignore[import-not-found]  # noqa: PLC0415 - of the peer's Python
+
+    solver = tetra3.Tetra3("default_database")
+
+    def solve(job: dict[str, Any]) -> "list[float] | None":
+        if "image" in job:
+            size = job["image"].shape
+            centroids = tetra3.get_centroids_from_image(job["image"], **extraction)
+        else:
+            size = (job["size"], job["size"])
+            centroids = np.array(job["pixels"]).reshape(-1, 2)[:, ::-1] + 0.5
+        found = solver.solve_from_centroids(
+            centroids, size, job["field_deg"], job["known_deg"], distortion=None, solve_timeout=5000
+        )
+        return None if found["RA"] is None else direction(found["RA"], found["Dec"])
+
+    return solve
+
+
+def tetra3rs(**extraction: Any) -> Solver:
+    """Return tetra3rs with a database for 10 to 30 deg."""
+    import numpy as np  # noqa: PLC0415
+    import tetra3rs as peer  # type: ignore[import-not-found]  # noqa: PLC0415 - of the peer's Python
+
+    database = peer.SolverDatabase.generate_from_gaia(
+        max_fov_deg=30.0, min_fov_deg=10.0, epoch_proper_motion_year=2026.5
+    )
+
+    def solve(job: dict[str, Any]) -> "list[float] | None":
+        if "image" in job:
+            rows, columns = job["image"].shape
+            centroids = peer.extract_centroids(job["image"], threads=1, **extraction).centroids
+        else:
+            rows = columns = job["size"]
+            places = np.array(job["pixels"]).reshape(-1, 2) - 0.5 * (columns - 1)
+            centroids = np.column_stack([places, np.linspace(2.0, 1.0, len(places))])
+        if len(centroids) < 4:
+            return None
+        found = database.solve_from_centroids(
+            centroids,
+            fov_estimate_deg=job["field_deg"],
+            image_width=columns,
+            image_height=rows,
+            fov_max_error_deg=job["known_deg"],
+        )
+        return direction(found.ra_deg, found.dec_deg) if found else None
+
+    return solve
+
+
+PEERS: dict[str, tuple[str, Callable[[], Solver]]] = {
+    "cedar-solve": ("tetra3", cedar),
+    "cedar-solve, any area": ("tetra3", lambda: cedar(max_area=None)),
+    "tetra3rs": ("tetra3rs", tetra3rs),
+    "tetra3rs, any shape": ("tetra3rs", lambda: tetra3rs(max_elongation=None, max_sharpness=None)),
+}
+"""Of each the module it is imported by, and what makes its solver: as it comes, or its filters off."""
+
+
+def main(peer: str, path: str) -> int:
+    """Print the peer's answers to the jobs of a file."""
+    with open(path, encoding="utf-8") as file:
+        jobs = json.load(file)
+    module, make = PEERS[peer]
+    try:
+        importlib.import_module(module)
+    except ImportError as error:
+        sys.stderr.write(f"{error}\n")
+        return 3
+    import numpy as np  # noqa: PLC0415 - the peer's
+
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    solve = make()
+    results = []
+    for number, job in enumerate(jobs):
+        if "image" in job:
+            job["image"] = np.load(job["image"])
+        if number == 0:
+            solve(job)
+            megabytes = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024.0
+        begin = time.process_time()
+        boresight = solve(job)
+        results.append({"ms": 1000.0 * (time.process_time() - begin), "boresight": boresight})
+        job.clear()
+    sys.stdout.write(json.dumps({"results": results, "megabytes": megabytes}))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))

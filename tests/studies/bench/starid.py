@@ -1,0 +1,317 @@
+"""Star identification beside cedar-solve and tetra3rs: `python -m tests.studies.bench starid`.
+
+The twelve configurations of issue 4 (1024 x 1024 pixels; 12 and 20 deg; 0.1 and 0.5 px of noise; 0, 2, 5
+false stars; the field known to 0.1 deg and really that far off), then the field unknown between 10 and 30
+deg, and lists that show no part of the sky. A list is right when its boresight is right to 0.05 deg and
+four in five of the stars named are those drawn. Times are of CPU, one core, one list a call; peers run in
+their own process.
+
+`bound`: the median over the lists of pointing error over the median that the centroid noise allows, from
+the Fisher information of all true stars of the list with attitude and scale unknown (1.1774 sigma: Rayleigh).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import attitude_matrix
+from flight.gnc.vision.startracker.identification.identification import Status
+from flight.gnc.vision.startracker.identification.lost_in_space import identify
+from flight.gnc.vision.startracker.identification.refinement import refine
+from flight.gnc.vision.startracker.index.build import default_index
+from flight.gnc.vision.startracker.index.sky_index import SkyIndex
+from tests.studies.bench.star_lists import PIXELS, ListKind, StarList, configurations, draw, draw_random
+
+_SEED = 271_828
+_RIGHT_DEG = 0.05
+_SHARE = 0.8
+_PEERS_RANDOM = 20
+_RAYLEIGH = 1.1774
+_ARCSECONDS = 3600.0 * 180.0 / np.pi
+_INSTALL = (
+    "give --peer-python the Python of an environment with them: pip install cedar-solve tetra3rs"
+    " (cedar-solve wants numpy below 2, so an environment of their own)"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What one solver said of one list: milliseconds, boresight (3,) or None, share of true names."""
+
+    ms: float
+    boresight: FloatArray | None
+    named: float = 1.0
+
+
+def our_answers(lists: Sequence[StarList], sky: SkyIndex) -> list[Answer]:
+    """Return the default method's answers."""
+    answers = []
+    for drawn in lists:
+        field = drawn.field()
+        begin = time.process_time()
+        found = identify(field, sky)
+        ms = 1000.0 * (time.process_time() - begin)
+        if found.status is not Status.IDENTIFIED or found.fix is None:
+            answers.append(Answer(ms, None))
+            continue
+        matched = found.star >= 0
+        named = float(np.mean(found.star[matched] == drawn.star[matched]))
+        answers.append(Answer(ms, attitude_matrix(found.fix.quaternion)[2], named))
+    return answers
+
+
+def peer_answers(peer: str, python: str, jobs: Sequence[dict[str, Any]]) -> tuple[list[Answer], float] | None:
+    """Return a peer's answers to jobs as `star_peers` takes them, and its resident megabytes.
+
+    None where it is not installed.
+    """
+    with tempfile.NamedTemporaryFile("w", suffix=".json") as file:
+        json.dump(jobs, file)
+        file.flush()
+        worker = Path(__file__).with_name("star_peers.py")
+        done = subprocess.run(
+            [python, str(worker), peer, file.name],
+            capture_output=True,
+            text=True,
+            env=_one_core(),
+            check=False,
+        )
+    if done.returncode != 0:
+        sys.stderr.write(f"{peer}: {(done.stderr.strip().splitlines() or ['failed'])[-1]}; {_INSTALL}\n")
+        return None
+    said = json.loads(done.stdout)
+    answers = [
+        Answer(row["ms"], None if row["boresight"] is None else np.array(row["boresight"]))
+        for row in said["results"]
+    ]
+    return answers, float(said["megabytes"])
+
+
+def _told(drawn: StarList) -> dict[str, Any]:
+    kind = drawn.kind
+    field, error = (20.0, 10.0) if kind.known_deg is None else (kind.field_deg, kind.known_deg)
+    return {"pixels": drawn.pixels.tolist(), "size": PIXELS, "field_deg": field, "known_deg": error}
+
+
+def _one_core() -> dict[str, str]:
+    return {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "RAYON_NUM_THREADS": "1"}
+
+
+def pointing_error(answer: Answer, drawn: StarList) -> float:
+    """Return the angle in rad between the boresight found and the true one."""
+    assert answer.boresight is not None
+    true = attitude_matrix(drawn.attitude)[2]
+    return float(np.arctan2(np.linalg.norm(np.cross(answer.boresight, true)), answer.boresight @ true))
+
+
+def pointing_bound(drawn: StarList, sky: SkyIndex) -> float:
+    """Return sigma in rad of the boresight, each axis, with all true stars and the scale unknown."""
+    true = np.flatnonzero(drawn.star >= 0)
+    field = drawn.field()
+    scale = PIXELS / (2.0 * drawn.camera.focal_length * field.half_width[0])
+    best = refine(
+        field.direction[true],
+        sky.stars.direction[drawn.star[true]],
+        field.sigma[true],
+        attitude_matrix(drawn.attitude),
+        scale,
+        True,
+    )
+    return float("nan") if best is None else float(np.sqrt(0.5 * np.trace(best.covariance[:2, :2])))
+
+
+def row_of(
+    solver: str, kind: str, answers: Sequence[Answer], lists: Sequence[StarList], bounds: Sequence[float]
+) -> dict[str, Any]:
+    """Return the figures of one solver on the lists of one kind."""
+    errors = np.array(
+        [np.nan if a.boresight is None else pointing_error(a, d) for a, d in zip(answers, lists, strict=True)]
+    )
+    named = np.array([answer.named for answer in answers])
+    sky = np.array([bool(np.any(drawn.star >= 0)) for drawn in lists])
+    right = sky & (errors < np.deg2rad(_RIGHT_DEG)) & (named >= _SHARE)
+    refused = np.isnan(errors)
+    ms = np.array([answer.ms for answer in answers])
+    ratio = errors[right] / (_RAYLEIGH * np.array(bounds)[right])
+    return {
+        "solver": solver,
+        "kind": kind,
+        "lists": len(lists),
+        "right": int(right.sum()),
+        "wrong": int((~right & ~refused).sum()),
+        "refused": int(refused.sum()),
+        "median_ms": float(np.median(ms)),
+        "p95_ms": float(np.percentile(ms, 95)),
+        "max_ms": float(ms.max()),
+        "error_arcsec": float(np.median(errors[right]) * _ARCSECONDS) if right.any() else None,
+        "over_bound": float(np.median(ratio)) if right.any() else None,
+        "ratios": ratio.tolist(),
+    }
+
+
+def memory_of_index() -> float:
+    """Return by how many megabytes a process grows that loads the index and identifies a list."""
+    script = (
+        "import resource, numpy as np\n"
+        "from flight.gnc.vision.startracker.index.build import default_index\n"
+        "from flight.gnc.vision.startracker.identification.field import StarField\n"
+        "from flight.gnc.vision.startracker.identification.lost_in_space import identify\n"
+        "def now(): return int(open('/proc/self/statm').read().split()[1]) * resource.getpagesize() / 2**20\n"
+        "before = now()\n"
+        "sky = default_index()\n"
+        "xy = np.random.default_rng(1).uniform(-0.1, 0.1, (20, 2))\n"
+        "v = np.column_stack([xy, np.ones(20)]); v /= np.linalg.norm(v, axis=1, keepdims=True)\n"
+        "identify(StarField(v, np.full(20, 1e-4), (0.1, 0.1), (0.5, 2.0)), sky)\n"
+        "print(now() - before)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, env=_one_core(), check=True
+    )
+    return float(done.stdout)
+
+
+def cases(count: int, sky: SkyIndex, seed: int) -> dict[str, list[StarList]]:
+    """Return the lists by the name of their kind."""
+    found = {}
+    for number, kind in enumerate(configurations()):
+        name = f"{kind.field_deg:.0f} deg, {kind.noise_px} px, {kind.false_stars} false"
+        found[name] = [draw(kind, sky.stars, np.random.default_rng([seed, number, i])) for i in range(count)]
+    for number, kind in enumerate(configurations(known_deg=None)[:3]):
+        rngs = [np.random.default_rng([seed, 100 + number, i]) for i in range(count)]
+        name = f"10-30 deg unknown, 0.3 px, {kind.false_stars} false"
+        found[name] = [
+            draw(replace(kind, noise_px=0.3, field_deg=float(rng.uniform(10.0, 30.0))), sky.stars, rng)
+            for rng in rngs
+        ]
+    for known in (0.1, None):
+        kind = ListKind(known_deg=known, noise_px=0.3)
+        rngs = [np.random.default_rng([seed, 200, i]) for i in range(5 * count)]
+        name = "random, field known" if known else "random, field unknown"
+        found[name] = [draw_random(kind, int(rng.integers(4, 41)), rng) for rng in rngs]
+    kind = ListKind()
+    found["star-less"] = [
+        draw_random(kind, i % 4, np.random.default_rng([seed, 300, i])) for i in range(count)
+    ]
+    return found
+
+
+def measure(options: argparse.Namespace) -> dict[str, Any]:
+    """Return all figures."""
+    sky = default_index()
+    everything = cases(options.lists, sky, options.seed)
+    # The first call of each numpy function and each list of triangles costs once a process.
+    our_answers(everything[next(iter(everything))][:20], sky)
+    rows = []
+    bounds = {
+        name: [pointing_bound(drawn, sky) if np.sum(drawn.star >= 0) > 2 else float("nan") for drawn in lists]
+        for name, lists in everything.items()
+    }
+    ours = {name: our_answers(lists, sky) for name, lists in everything.items()}
+    for name, lists in everything.items():
+        rows.append(row_of("flight", name, ours[name], lists, bounds[name]))
+    megabytes = {"flight": memory_of_index()}
+    ratios = {}
+    for peer in ("cedar-solve", "tetra3rs") if options.peers else ():
+        # A list of no sky may take a peer the whole of its time limit.
+        shown = {
+            name: lists[: _PEERS_RANDOM if "random" in name else None] for name, lists in everything.items()
+        }
+        flat = [_told(drawn) for lists in shown.values() for drawn in lists]
+        said = peer_answers(peer, options.peer_python, flat)
+        if said is None:
+            continue
+        answers, megabytes[peer] = said
+        begin = 0
+        theirs = {}
+        for name, lists in shown.items():
+            theirs[name] = answers[begin : begin + len(lists)]
+            begin += len(lists)
+            rows.append(row_of(peer, name, theirs[name], lists, bounds[name][: len(lists)]))
+        ratios[peer] = _ratio(ours, theirs)
+    ratios_to_bound = [row.pop("ratios") for row in rows]
+    over: dict[str, list[float]] = {solver: [] for solver in megabytes}
+    known = list(everything)[: len(configurations())]
+    for row, found in zip(rows, ratios_to_bound, strict=True):
+        if row["kind"] in known:
+            over[row["solver"]] += found
+    return {
+        "seed": options.seed,
+        "rows": rows,
+        "megabytes": megabytes,
+        "over_bound": {solver: float(np.median(found)) for solver, found in over.items() if found},
+        "time_over_peer": ratios,
+    }
+
+
+def _ratio(ours: dict[str, list[Answer]], theirs: dict[str, list[Answer]]) -> dict[str, float]:
+    """Return our time over the peer's on the lists with the field known: median and 95th percentile."""
+    known = list(ours)[: len(configurations())]
+    mine, other = ([answer.ms for name in known for answer in all_of[name]] for all_of in (ours, theirs))
+    return {
+        "median": float(np.median(mine) / np.median(other)),
+        "p95": float(np.percentile(mine, 95) / np.percentile(other, 95)),
+    }
+
+
+def _print(figures: dict[str, Any]) -> None:
+    head = "right wrong refused   median    p95    max ms   error  over bound"
+    for solver in figures["megabytes"]:
+        rows = [row for row in figures["rows"] if row["solver"] == solver]
+        sys.stdout.write(f"\n{solver}: catalogue and index {figures['megabytes'][solver]:.1f} MB\n")
+        sys.stdout.write(f"{'':34} {head}\n")
+        for row in rows:
+            error = (
+                "" if row["error_arcsec"] is None else f"{row['error_arcsec']:7.2f} {row['over_bound']:9.3f}"
+            )
+            sys.stdout.write(
+                f"{row['kind']:34} {row['right']:5d} {row['wrong']:5d} {row['refused']:7d}"
+                f" {row['median_ms']:8.2f} {row['p95_ms']:6.2f} {row['max_ms']:7.2f} {error}\n"
+            )
+        known = rows[: len(configurations())]
+        total = sum(row["lists"] for row in known)
+        right, wrong = (sum(row[what] for row in known) for what in ("right", "wrong"))
+        over = figures["over_bound"].get(solver, float("nan"))
+        sys.stdout.write(
+            f"field known: {right} of {total} right ({100 * right / total:.2f} %), {wrong} wrong,"
+            f" pointing error {over:.3f} of the bound\n"
+        )
+    for peer, ratio in figures["time_over_peer"].items():
+        sys.stdout.write(
+            f"our time over {peer}'s, field known: median {ratio['median']:.2f}, p95 {ratio['p95']:.2f}\n"
+        )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print the tables; 1 when a list was named wrongly."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--lists", type=int, default=200, help="of each configuration (default %(default)s)")
+    parser.add_argument("--seed", type=int, default=_SEED, help="default %(default)s")
+    parser.add_argument("--peers", action="store_true", help="cedar-solve and tetra3rs on the same lists")
+    parser.add_argument(
+        "--peer-python", default=sys.executable, metavar="PYTHON", help="that the peers are in"
+    )
+    parser.add_argument("--json", action="store_true", help="one JSON object instead of the tables")
+    options = parser.parse_args(arguments)
+    figures = measure(options)
+    if options.json:
+        sys.stdout.write(json.dumps(figures) + "\n")
+    else:
+        _print(figures)
+    return 1 if any(row["wrong"] for row in figures["rows"] if row["solver"] == "flight") else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

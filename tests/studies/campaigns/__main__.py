@@ -1,0 +1,70 @@
+"""`python -m tests.studies.campaigns`: run a campaign by name."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from flight.gnc.errors import UsageError
+from tests.studies.campaigns.campaign import Campaign, fly
+from tests.studies.campaigns.registry import CAMPAIGNS
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a campaign; return the exit status: 0 done, 2 wrong use, 130 broken off."""
+    listed = "\n".join(f"  {c.name:14} {c.purpose}" for c in CAMPAIGNS.values())
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.studies.campaigns",
+        description="Run a Monte Carlo campaign on all cores. Broken off, it goes on where it was.",
+        epilog=f"campaigns:\n{listed}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("name", choices=sorted(CAMPAIGNS), metavar="NAME", help="which campaign")
+    parser.add_argument("--runs", type=_positive, metavar="N", help="runs of each cell, or of the whole")
+    parser.add_argument("--hours", type=_positive, dest="runs", metavar="H", help="of soak: hours of flight")
+    parser.add_argument("--seed", type=int, default=1, metavar="S", help="seed of all draws (default 1)")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder (default runs/campaigns/NAME)")
+    parser.add_argument("--workers", type=_positive, metavar="N", help="processes (default: the cores)")
+    parser.add_argument(
+        "--dask", metavar="ADDRESS", help="scheduler of a Dask cluster, instead of this machine"
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of the table")
+    options = parser.parse_args(arguments)
+    campaign: Campaign = CAMPAIGNS[options.name]
+    out = options.out or Path("runs") / "campaigns" / campaign.name
+    try:
+        summary = fly(
+            campaign,
+            options.runs or campaign.default_runs,
+            options.seed,
+            out,
+            options.workers,
+            options.dask,
+            progress=sys.stderr.isatty(),
+        )
+    except UsageError as error:
+        sys.stderr.write(f"campaigns: {error}\n")
+        return 2
+    except KeyboardInterrupt:
+        sys.stderr.write(f"\nbroken off; the same command goes on where it was ({out})\n")
+        return 130
+    if options.json:
+        sys.stdout.write(json.dumps(summary.facts) + "\n")
+    else:
+        sys.stdout.write(summary.text)
+        sys.stdout.write("".join(f"{path}\n" for path in summary.pictures))
+    return 0
+
+
+def _positive(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{text} is not at least 1")
+    return value
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,273 @@
+"""Campaign `consistency`: is the filter as good as its covariance says? NEES and NIS with everything on.
+
+Each run is 100 s of sim_hal's testbed (suspended; a thread of 0..2e-5 N m/rad and 0..4e-6 N m s/rad that the
+filter is not told, and a draught; steps of q2 flown by the estimate itself) or of a body free in orbit (three
+axes, random attitude, a torque that walks at random, a field that turns). The coils' gain is off by 10 %
+(1 sigma). The VN-100 gives attitude and rate at 40 Hz with uniform noise and a constant gyro bias, loses 2 %
+of its packets and falls silent twice for 0.5..1 s. Every 5 s the star camera gives, 0.2..0.6 s late, the mean
+rate over 1 s with a full covariance when the stars streak; on the free body it gives an attitude too.
+
+NEES over its degrees of freedom is 1 for an honest covariance: 95 % band from chi-square over independent
+runs. NIS likewise, over all measurements that were taken in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2
+
+from flight.gnc.estimation.attitude_filter import AttitudeFilter, FilterSettings
+from flight.gnc.estimation.estimate import Estimate
+from flight.gnc.estimation.measurements import Measurement
+from flight.gnc.estimation.rigid_body import RigidBody
+from flight.gnc.math.arrays import FloatArray, IntArray
+from flight.gnc.math.quaternion import conjugate, multiply, to_rotation_vector
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.consistency_instruments import Camera, Pilot, Unit
+from tests.studies.campaigns.consistency_worlds import (
+    CYCLE_NS,
+    DIPOLE,
+    DRAG,
+    DRAUGHT,
+    GAIN_SIGMA,
+    INERTIA,
+    MOST_DAMPING,
+    MOST_STIFFNESS,
+    TESTBED_FIELD,
+    FreeWorld,
+    SuspendedWorld,
+    World,
+)
+
+SCENES = ("testbed", "free")
+SECONDS = 100
+INSTANTS = tuple(range(10, SECONDS + 1, 10))
+BIAS_SIGMA = 1e-3
+CURRENT_SIGMA = 3.5e-3 / np.sqrt(3.0)
+COMMAND_DELAY_NS = 8_000_000
+LOST_SHARE = 0.02
+
+
+@dataclass(slots=True)
+class Tally:
+    """What one run adds up."""
+
+    nis: dict[str, list[float]] = field(default_factory=dict)
+    nees: list[float] = field(default_factory=list)
+    refused: dict[str, int] = field(default_factory=dict)
+    widening: list[float] = field(default_factory=list)
+
+    def measured(self, filter_: AttitudeFilter, kind: str, measurement: Measurement) -> None:
+        """Give the filter a measurement and note what it made of it."""
+        used = filter_.measure(measurement)
+        if np.isfinite(filter_.nis):
+            self.nis.setdefault(kind, []).append(filter_.nis)
+        self.refused[kind] = self.refused.get(kind, 0) + (not used)
+
+
+def cases(runs: int, seed: int) -> list[Case]:
+    """Return `runs` flights of each scene."""
+    return [
+        Case(f"{scene}/{run}", (seed, index, run), {"scene": scene})
+        for index, scene in enumerate(SCENES)
+        for run in range(runs)
+    ]
+
+
+def filter_of(world: World) -> AttitudeFilter:
+    """Return the filter that is to follow a world: its noise, none of its surprises."""
+    push = DRAUGHT if world.suspended else DRAG
+    settings = FilterSettings(
+        CURRENT_SIGMA,
+        CYCLE_NS * 1e-9,
+        push.walk,
+        push.start,
+        bias_start=BIAS_SIGMA,
+        torsion_start=MOST_STIFFNESS / np.sqrt(3.0) / INERTIA[1, 1],
+        gain_start=GAIN_SIGMA,
+        damping_start=MOST_DAMPING / np.sqrt(3.0) / INERTIA[1, 1],
+    )
+    return AttitudeFilter(RigidBody(INERTIA, DIPOLE, TESTBED_FIELD, world.suspended), settings)
+
+
+def run(case: Case) -> Result:
+    """Fly one run."""
+    seconds = case.parameters.get("seconds", SECONDS)
+    rng = np.random.default_rng(case.seed)
+    world: World = SuspendedWorld(rng) if case.parameters["scene"] == "testbed" else FreeWorld(rng)
+    bias = rng.normal(0.0, BIAS_SIGMA, 3)
+    filter_, tally = filter_of(world), Tally()
+    silent = _drop_outs(rng, seconds)
+    unit = Unit(rng, bias, case.parameters.get("claimed", 1.0))
+    camera = Camera(rng, tracks=not world.suspended)
+    pilot = Pilot(rng, world.suspended)
+    for cycle in range(seconds * 40 + 1):
+        now_ns = cycle * CYCLE_NS
+        heard = cycle == 0 or not (silent[cycle] or rng.random() < LOST_SHARE)
+        attitude, rate = unit.sample(now_ns, world)
+        if not filter_.started:
+            filter_.start(attitude, rate)
+        elif heard:
+            tally.measured(filter_, "unit attitude", attitude)
+            tally.measured(filter_, "gyro", rate)
+        for kind, measurement in camera.due(cycle, world):
+            tally.measured(filter_, kind, measurement)
+        if not filter_.started:  # it gave up: told as a restart
+            filter_.start(attitude, rate)
+        estimate = filter_.at(now_ns)
+        if cycle and cycle % 40 == 0:
+            tally.nees.append(_nees(estimate, world, bias))
+        if cycle and silent[cycle] and not (cycle < len(silent) - 1 and silent[cycle + 1]):
+            tally.widening.append(_widening(filter_, estimate, cycle - int(np.argmin(silent[cycle::-1]))))
+        currents = pilot.currents(cycle, estimate)
+        world.advance(COMMAND_DELAY_NS)
+        world.command(currents)
+        filter_.command(now_ns + COMMAND_DELAY_NS, currents, world.field())
+        world.advance(CYCLE_NS - COMMAND_DELAY_NS)
+    return _result(case, filter_, tally, bias, estimate)
+
+
+def _result(case: Case, filter_: AttitudeFilter, tally: Tally, bias: FloatArray, last: Estimate) -> Result:
+    pick = _free_errors(case.parameters["scene"] == "testbed")
+    sigmas = np.sqrt(np.diag(last.covariance))
+    axes = [1] if case.parameters["scene"] == "testbed" else [0, 1, 2]
+    return {
+        **case.parameters,
+        "degrees": len(pick),
+        "nees": tally.nees,
+        "nis": {kind: [float(np.sum(v)), len(v)] for kind, v in tally.nis.items()},
+        "nis_degrees": len(axes),
+        "refused": tally.refused,
+        "restarts": filter_.restarts,
+        "widening": tally.widening,
+        "sigma": sigmas[pick].tolist(),
+        "bias_sigmas": [float((last.bias[a] - bias[a]) / sigmas[6 + a]) for a in axes],
+        "bias_sigma": [float(sigmas[6 + a]) for a in axes],
+    }
+
+
+def _nees(estimate: Estimate, world: World, bias: FloatArray) -> float:
+    """Return error^T P^-1 error of the free errors."""
+    turn = to_rotation_vector(multiply(world.attitude, conjugate(estimate.quaternion)))
+    error = np.concatenate(
+        [
+            turn,
+            world.rate - estimate.rate,
+            bias - estimate.bias,
+            world.disturbance - estimate.disturbance,
+            np.array(world.parameters) - np.array(estimate.parameters),
+        ]
+    )
+    pick = _free_errors(world.suspended)
+    scale = np.sqrt(np.diag(estimate.covariance)[pick])
+    correlation = estimate.covariance[np.ix_(pick, pick)] / np.outer(scale, scale)
+    whitened = error[pick] / scale
+    return float(whitened @ np.linalg.solve(correlation, whitened))
+
+
+def _free_errors(suspended: bool) -> IntArray:
+    """Return which errors of the filter's 15 there are."""
+    return np.array([1, 4, 7, 10, 12, 13, 14]) if suspended else np.array([*range(12), 14])
+
+
+def _widening(filter_: AttitudeFilter, estimate: Estimate, since: int) -> float:
+    """Return by how much the angle's sigma has grown since cycle `since`."""
+    before = filter_.past(since * CYCLE_NS)
+    return float(np.sqrt(estimate.covariance[1, 1] / before.covariance[1, 1])) if before else 0.0
+
+
+def _drop_outs(rng: np.random.Generator, seconds: int) -> list[bool]:
+    """Return for each cycle whether the unit is silent: one stretch in each half."""
+    silent = [False] * (seconds * 40 + 1)
+    for half in range(2):
+        begin = int(40 * seconds * (0.5 * half + rng.uniform(0.05, 0.4)))
+        for cycle in range(begin, begin + int(rng.uniform(20, 41))):
+            silent[cycle] = True
+    return silent
+
+
+def summarise(results: Sequence[Result], out: Path) -> Summary:
+    """Return NEES and NIS of each scene beside their 95 % bands."""
+    facts: dict[str, Any] = {}
+    lines: list[str] = []
+    for scene in SCENES:
+        mine = [result for result in results if result["scene"] == scene]
+        if mine:
+            facts[scene] = scene_facts(mine)
+            lines += _scene_lines(scene, facts[scene])
+    return Summary("\n".join(lines) + "\n", facts)
+
+
+def scene_facts(results: Sequence[Result]) -> dict[str, Any]:
+    """Return the figures of one scene's runs."""
+    runs, degrees = len(results), results[0]["degrees"]
+    nees = np.array([result["nees"] for result in results]) / degrees
+    low, high = band(runs * degrees)
+    means = nees.mean(axis=0)
+    instants = [second for second in INSTANTS if second <= len(means)]
+    kinds = sorted({kind for result in results for kind in result["nis"]})
+    bias = np.abs([result["bias_sigmas"] for result in results])
+    return {
+        "runs": runs,
+        "degrees": degrees,
+        "nees_band": [low, high],
+        "nees": {str(second): float(means[second - 1]) for second in instants},
+        "nees_final": float(means[-1]),
+        "nees_mean": float(means.mean()),
+        "share_in_band": float(np.mean((means >= low) & (means <= high))),
+        "nis": {kind: _nis(results, kind) for kind in kinds},
+        "refused": {kind: sum(r["refused"].get(kind, 0) for r in results) for kind in kinds},
+        "restarts": sum(result["restarts"] for result in results),
+        "least_widening": float(min(min(r["widening"], default=np.inf) for r in results)),
+        "sigma": np.median([result["sigma"] for result in results], axis=0).tolist(),
+        "bias_worst_sigmas": float(bias.max()),
+        "bias_share_in_3_sigma": float(np.mean(bias <= 3.0)),
+        "bias_sigma": float(np.median([result["bias_sigma"] for result in results])),
+    }
+
+
+def band(degrees: int, share: float = 0.95) -> tuple[float, float]:
+    """Return where `share` of a chi-square of so many degrees lies, over them."""
+    tail = 0.5 * (1.0 - share)
+    return float(chi2.ppf(tail, degrees)) / degrees, float(chi2.isf(tail, degrees)) / degrees
+
+
+def _nis(results: Sequence[Result], kind: str) -> dict[str, Any]:
+    total, count = np.sum([result["nis"].get(kind, [0.0, 0]) for result in results], axis=0)
+    degrees = int(count) * results[0]["nis_degrees"]
+    return {"measurements": int(count), "mean": float(total) / degrees, "band": list(band(degrees))}
+
+
+def _scene_lines(scene: str, facts: dict[str, Any]) -> list[str]:
+    low, high = facts["nees_band"]
+    lines = [
+        f"{scene}: {facts['runs']} runs, {facts['degrees']} errors; 1 is honest",
+        f"  NEES band {low:.3f}..{high:.3f}: final {facts['nees_final']:.3f}, mean {facts['nees_mean']:.3f}, "
+        f"{100.0 * facts['share_in_band']:.0f} % of seconds inside",
+        "  NEES at " + "  ".join(f"{second} s {value:.2f}" for second, value in facts["nees"].items()),
+    ]
+    for kind, found in facts["nis"].items():
+        low, high = found["band"]
+        lines.append(
+            f"  NIS {kind:14} {found['mean']:.4f}, band {low:.4f}..{high:.4f}, "
+            f"{found['measurements']} measurements, {facts['refused'][kind]} refused"
+        )
+    lines.append(
+        f"  gyro bias at the end: sigma {facts['bias_sigma']:.1e} rad/s, worst error "
+        f"{facts['bias_worst_sigmas']:.2f} sigma, {100.0 * facts['bias_share_in_3_sigma']:.1f} % within 3"
+    )
+    lines.append(
+        f"  drop-outs widen the angle's sigma at least x {facts['least_widening']:.2f}; "
+        f"{facts['restarts']} restarts; median sigmas {' '.join(f'{s:.1e}' for s in facts['sigma'])}"
+    )
+    return lines
+
+
+CONSISTENCY = Campaign(
+    "consistency", "NEES and NIS of the attitude filter, everything on", cases, run, summarise, 50
+)

@@ -1,0 +1,181 @@
+"""Two true worlds for the campaign `consistency`: sim_hal's testbed, and a body free in orbit.
+
+Both carry the noise that the filter must live with: coil currents off by a uniform draw each cycle while they
+are driven, a torque that the filter does not know of. The free body is integrated here, by classical
+Runge-Kutta on Euler's equation with matrices, apart from the flight code's formulas.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from flight.gnc.estimation.rigid_body import Parameters
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import about_axis_y, normalise
+from sim_hal.worlds.testbed import Testbed, TestbedModel
+
+CYCLE_NS = 25_000_000
+INERTIA: FloatArray = np.diag([1.10e-3, 1.05e-3, 0.99e-3])
+DIPOLE = 80 * 0.0081
+TESTBED_FIELD: FloatArray = np.array([0.0, 0.0, -4.5e-4])
+ORBIT_FIELD = 4.5e-5
+FIELD_TURN = 2.2e-3
+"""rad/s: the field along a low polar orbit turns twice in a revolution."""
+CURRENT_BOUND = 3.5e-3
+GAIN_SIGMA = 0.1
+"""Of the coils' torque over what is believed of it: field, area and inertia are not better known."""
+MOST_STIFFNESS, MOST_DAMPING = 2e-5, 4e-6
+"""N m/rad and N m s/rad of the thread."""
+
+
+@dataclass(frozen=True, slots=True)
+class Push:
+    """A torque that walks at random, over the inertia: rad/s^2 at the start, rad/s^2 per sqrt(s)."""
+
+    start: float
+    walk: float
+
+
+DRAUGHT = Push(1e-3, 5e-5)
+"""Of the air about the testbed: 1e-6 N m."""
+DRAG = Push(1e-4, 1e-5)
+"""Of the free body: 1e-7 N m of drag and residual dipole."""
+
+
+class World(Protocol):
+    """What the campaign asks of the truth."""
+
+    suspended: bool
+    attitude: FloatArray
+    rate: FloatArray
+    disturbance: FloatArray
+    parameters: Parameters
+
+    def field(self) -> FloatArray:
+        """Return the field of now (3,), T, reference axes."""
+
+    def command(self, currents: FloatArray) -> None:
+        """Drive the coils with (3,) A, noise added."""
+
+    def advance(self, span_ns: int) -> None:
+        """Let time pass."""
+
+
+class SuspendedWorld:
+    """sim_hal's testbed on a thread that the filter knows nothing of, in a draught.
+
+    The draught acts as the coil current that would give its torque: the testbed has no other handle.
+    """
+
+    suspended = True
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self._rng = rng
+        stiffness, damping = rng.uniform(0.0, MOST_STIFFNESS), rng.uniform(0.0, MOST_DAMPING)
+        about_y = float(INERTIA[1, 1])
+        self.parameters = Parameters(
+            stiffness / about_y, damping / about_y, 1.0 + rng.normal(0.0, GAIN_SIGMA)
+        )
+        self._draught = rng.normal(0.0, DRAUGHT.start)
+        self._currents: FloatArray = np.zeros(3)
+        model = TestbedModel(
+            inertia=float(INERTIA[1, 1]),
+            dipole_per_ampere=DIPOLE * self.parameters.gain,
+            field=float(-TESTBED_FIELD[2]),
+            stiffness=stiffness,
+            damping=damping,
+            resistance=(23.0, 23.0, 23.0),
+            supply_voltage=3.4,
+        )
+        self.testbed = Testbed(model, rng.normal(0.0, 0.3), rng.normal(0.0, 0.05), self._acting)
+        self.testbed.release_at(0)
+        self.advance(1)
+        self._follow()
+
+    def field(self) -> FloatArray:
+        """Return the Helmholtz coil's field."""
+        return TESTBED_FIELD
+
+    def command(self, currents: FloatArray) -> None:
+        """Drive the coils."""
+        self._currents = _felt(currents, self._rng)
+
+    def advance(self, span_ns: int) -> None:
+        """Let time pass."""
+        self.testbed.advance_to(self.testbed.time_ns + span_ns)
+        self._draught += DRAUGHT.walk * np.sqrt(span_ns * 1e-9) * self._rng.standard_normal()
+        self._follow()
+
+    def _acting(self) -> FloatArray:
+        torque = INERTIA[1, 1] * self._draught
+        per_ampere = DIPOLE * self.parameters.gain * -TESTBED_FIELD[2] * np.cos(self.testbed.angle)
+        return np.asarray(self._currents + np.array([torque / per_ampere, 0.0, 0.0]))
+
+    def _follow(self) -> None:
+        angle, rate = self.testbed.angle, self.testbed.rate
+        self.attitude = about_axis_y(angle)
+        self.rate = np.array([0.0, rate, 0.0])
+        self.disturbance = np.array([0.0, self._draught, 0.0])
+
+
+class FreeWorld:
+    """A body that turns about all axes, pushed by a torque that walks at random."""
+
+    suspended = False
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self._rng = rng
+        self._currents: FloatArray = np.zeros(3)
+        self._time = 0.0
+        self._field_axes = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+        self.parameters = Parameters(gain=1.0 + rng.normal(0.0, GAIN_SIGMA))
+        self.attitude = normalise(rng.standard_normal(4))
+        self.rate = rng.normal(0.0, 0.02, 3)
+        self.disturbance = rng.normal(0.0, DRAG.start, 3)
+
+    def field(self) -> FloatArray:
+        """Return a field that turns in a plane."""
+        angle = FIELD_TURN * self._time
+        along = np.array([np.cos(angle), np.sin(angle), 0.0])
+        return np.asarray(ORBIT_FIELD * (self._field_axes @ along))
+
+    def command(self, currents: FloatArray) -> None:
+        """Drive the coils."""
+        self._currents = _felt(currents, self._rng)
+
+    def advance(self, span_ns: int) -> None:
+        """Let time pass, in one step of Runge-Kutta; the torque walks afterwards."""
+        dt = span_ns * 1e-9
+        field = self.field()
+        x = np.concatenate([self.attitude, self.rate])
+        k1 = self._flow(x, field)
+        k2 = self._flow(x + 0.5 * dt * k1, field)
+        k3 = self._flow(x + 0.5 * dt * k2, field)
+        k4 = self._flow(x + dt * k3, field)
+        x = x + dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+        self.attitude, self.rate = normalise(x[:4]), x[4:]
+        self.disturbance = self.disturbance + DRAG.walk * np.sqrt(dt) * self._rng.standard_normal(3)
+        self._time += dt
+
+    def _flow(self, x: FloatArray, field: FloatArray) -> FloatArray:
+        """Return d(q, w)/dt: q' = Omega(w) q / 2 and Euler's equation, B turned by Rodrigues' formula."""
+        vector, scalar, rate = x[:3], x[3], x[4:]
+        q_dot = 0.5 * np.append(scalar * rate - np.cross(rate, vector), -rate @ vector)
+        field_body = (
+            (scalar**2 - vector @ vector) * field
+            + 2.0 * (vector @ field) * vector
+            - 2.0 * scalar * np.cross(vector, field)
+        )
+        torque = np.cross(DIPOLE * self.parameters.gain * self._currents, field_body) - np.cross(
+            rate, INERTIA @ rate
+        )
+        return np.concatenate([q_dot, np.linalg.solve(INERTIA, torque) + self.disturbance])
+
+
+def _felt(currents: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Return what the coils carry: off by a uniform draw where they are driven at all."""
+    noise = rng.uniform(-CURRENT_BOUND, CURRENT_BOUND, 3)
+    return np.asarray(np.where(currents != 0.0, currents + noise, 0.0))

@@ -1,0 +1,209 @@
+"""Campaign `controllers`: the 700 s step demonstration under each controller, on the same seeds.
+
+The thesis gives 0.10 W for its own loop, 0.15 W for PID and 0.66 W for adaptive control on its testbed (ch.
+5, Hardware Results). Here all fly the same simulated hardware with the same noise: this loop, the thesis's,
+the thesis's on raw readings (its filter made transparent), and PID and adaptive control, which are shown the
+targets themselves. PID and adaptive are tuned to be as fast as this loop, which decides what they spend: the
+slowest bandwidth that settles every step in 9 s on a thread of 1e-5 N m/rad, found by a sweep on seed 1.
+
+The floor is the clairvoyant optimum: the whole plant known, each target reached at rest 10 s after its
+command and held, by direct collocation (tests.flight.gnc.guidance.oracle). What reaches its targets later may
+lie below.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flight.gnc.guidance.one_axis.plant import SingleAxisPlant, angle_of
+from flight.schema import reader as configuration
+from flight.schema.sections import Config
+from ground import report
+from sim_hal.settings import Simulation
+from tests.flight.gnc.guidance.oracle import Slew, solve
+from tests.scenario.flights import demo_config, demo_world, fly, thesis_config
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+
+DURATION = 700.0
+REACHED_AFTER = 10.0
+FIGURES = (
+    ("steady_state_deg", "steady, deg"),
+    ("overshoot_percent", "overshoot, %"),
+    ("rise_s", "rise, s"),
+    ("settling_s", "settling, s"),
+)
+THESIS_W = {"thesis": 0.10, "thesis, raw readings": 0.10, "pid": 0.15, "adaptive": 0.66}
+
+
+def this_loop() -> Config:
+    """Return the demonstration as it is flown here, without its camera."""
+    return demo_config(DURATION, camera=False)
+
+
+def thesis_loop() -> Config:
+    """Return the thesis's guidance and tracker behind the filter."""
+    return thesis_config(DURATION)
+
+
+def raw_thesis_loop() -> Config:
+    """Return the thesis's loop on each reading as it comes: to the filter readings are without noise."""
+    config = thesis_config(DURATION)
+    unit = configuration.replace(config.inertial_unit, angle_noise=1e-5, rate_noise=1e-5)
+    estimation = configuration.replace(
+        config.estimation, current_noise=0.1, disturbance_walk=1.0, gate_sigma=1e9
+    )
+    return configuration.replace(config, inertial_unit=unit, estimation=estimation)
+
+
+def towards_steps(**control: Any) -> Config:
+    """Return the demonstration with another controller, which is shown the targets themselves."""
+    config = this_loop()
+    return configuration.replace(
+        config,
+        guidance=configuration.replace(config.guidance, strategy="step"),
+        control=configuration.replace(config.control, **control),
+    )
+
+
+def pid() -> Config:
+    """Return the demonstration under PID control."""
+    return towards_steps(tracker="pid", bandwidth=0.76)
+
+
+def adaptive() -> Config:
+    """Return the demonstration under adaptive control."""
+    return towards_steps(tracker="adaptive", bandwidth=1.0, adaptation=10.0, reference_bandwidth=0.56)
+
+
+CONTROLLERS: dict[str, Callable[[], Config]] = {
+    "this loop": this_loop,
+    "thesis": thesis_loop,
+    "thesis, raw readings": raw_thesis_loop,
+    "pid": pid,
+    "adaptive": adaptive,
+}
+
+
+def cases(runs: int, seed: int) -> list[Case]:
+    """Return every controller on each of `runs` seeds."""
+    return [
+        Case(f"{name}/{run}", (seed, run), {"controller": name, "flight_seed": seed + run})
+        for run in range(runs)
+        for name in CONTROLLERS
+    ]
+
+
+def run(case: Case) -> Result:
+    """Fly one demonstration."""
+    config = CONTROLLERS[case.parameters["controller"]]()
+    with tempfile.TemporaryDirectory() as place:
+        flown = fly(config, Path(place) / "run", seed=case.parameters["flight_seed"])
+        summary = report.summarise(flown)
+    rows = summary["steps"]
+    return {
+        **case.parameters,
+        "steady_state_deg": _worst(rows, "steady_state_deg"),
+        "overshoot_percent": _worst(rows, "overshoot_percent"),
+        "rise_s": _worst(rows[1:], "rise_s"),
+        "settling_s": _worst(rows, "settling_s"),
+        "power_w": summary["power"]["average_w"],
+    }
+
+
+def _worst(rows: Sequence[dict[str, Any]], key: str) -> float:
+    """Return the largest figure; infinite when a step never came to it."""
+    return max(np.inf if row[key] is None else row[key] for row in rows)
+
+
+def clairvoyant_power(config: Config, world: Simulation) -> float:
+    """Return the mean R I^2 in W of the clairvoyant optimum of a demonstration's steps in a world."""
+    true = SingleAxisPlant(
+        world.truth.inertia or config.plant.inertia,
+        config.plant.coil_turns * config.plant.coil_area * (world.truth.field or config.plant.field),
+        (world.truth.resistance or config.coils.resistance)[0],
+        config.coils.current_limit,
+        world.thread.stiffness,
+        world.thread.damping,
+    )
+    angle, rate = angle_of(world.release.q2), world.release.rate
+    ends = [step.at for step in config.steps[1:]] + [config.duration]
+    energy = 0.0
+    for step, end in zip(config.steps, ends, strict=True):
+        target = angle_of(step.q2)
+        slew = Slew(
+            angle,
+            rate,
+            target,
+            0.0,
+            REACHED_AFTER,
+            true.inertia,
+            true.torque_constant,
+            true.resistance,
+            true.current_limit,
+            true.stiffness,
+            true.damping,
+        )
+        best = solve(slew, intervals=800)
+        if best is None:
+            raise ValueError(f"no trajectory reaches q2 {step.q2} in {REACHED_AFTER} s")
+        held = true.current(target, 0.0, 0.0)
+        energy += best.energy + true.resistance * held * held * (end - step.at - REACHED_AFTER)
+        angle, rate = target, 0.0
+    return energy / config.duration
+
+
+def summarise(results: Sequence[Result], folder: Path) -> Summary:
+    """Return each controller's mean power and worst figures over the seeds, beside the floor."""
+    floor = clairvoyant_power(this_loop(), demo_world())
+    facts: dict[str, Any] = {"clairvoyant_w": floor, "controllers": {}}
+    head = "".join(f"{label:>14}" for _, label in FIGURES)
+    lines = [f"{'':22}{'power, mW':>11}{'over floor':>12}{head}{'on its testbed':>16}"]
+    lines.append(f"{'clairvoyant optimum':22}{1e3 * floor:11.2f}{1.0:12.3f}")
+    for name in CONTROLLERS:
+        own = [result for result in results if result["controller"] == name]
+        power = float(np.mean([result["power_w"] for result in own]))
+        worst = {key: float(max(result[key] for result in own)) for key, _ in FIGURES}
+        facts["controllers"][name] = {
+            "seeds": len(own),
+            "power_w": power,
+            "over_floor": power / floor,
+            **{key: value if np.isfinite(value) else None for key, value in worst.items()},
+        }
+        figures = "".join(f"{worst[key]:14.3f}" for key, _ in FIGURES)
+        thesis = f"{1e3 * THESIS_W[name]:13.0f} mW" if name in THESIS_W else f"{'-':>16}"
+        lines.append(f"{name:22}{1e3 * power:11.2f}{power / floor:12.3f}{figures}{thesis}")
+    picture = _draw(facts, folder / "controllers.png")
+    return Summary("\n".join(lines) + "\n", facts, (picture,))
+
+
+def _draw(facts: dict[str, Any], path: Path) -> Path:
+    """Draw power against settling time, the floor as a line."""
+    from matplotlib.figure import Figure  # noqa: PLC0415 - an extra
+
+    figure = Figure(figsize=(6.5, 4.0), layout="constrained")
+    axes = figure.subplots()
+    axes.axhline(1e3 * facts["clairvoyant_w"], color="0.5", linewidth=1, label="clairvoyant optimum")
+    for name, found in facts["controllers"].items():
+        if found["settling_s"] is not None:
+            axes.plot(found["settling_s"], 1e3 * found["power_w"], "o", label=name)
+    axes.set_xlabel("settling time, worst step (s)")
+    axes.set_ylabel("average coil power (mW)")
+    axes.set_ylim(bottom=0.0)
+    axes.legend(frameon=False, fontsize=8)
+    figure.savefig(path, dpi=110)
+    return path
+
+
+CONTROLLERS_CAMPAIGN = Campaign(
+    "controllers",
+    "the step demonstration under each controller on the same seeds, with the optimum as floor",
+    cases,
+    run,
+    summarise,
+    default_runs=3,
+)

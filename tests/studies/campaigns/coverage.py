@@ -1,0 +1,300 @@
+"""Campaign `coverage`: what the cameras of VT, UW and USU have in view along the orbit (Meller et al., 4).
+
+Each run is one revolution of the paper's orbit from a random date and node, for each suite and way to fly:
+level; rolled and pitched by up to 15 deg (4.1); tipped back and forth by 90 deg in pitch (4.3); any
+attitude at all. It gives the share of time with the horizon, lit or not, in 0, 1, 2, ... cameras, and that
+of the sunlit time with the Sun in a camera. For UW, level, the Sun's share is told against the Sun's height
+over the orbit's plane (beta) and three headings of the hexagon, for the square detector and for the cone in
+it: the paper names none of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flight.gnc.attitude.determination.references import sun_from
+from flight.gnc.earth.shadow import sunlit_share
+from flight.gnc.earth.sun import ASTRONOMICAL_UNIT
+from flight.gnc.math.arrays import BoolArray, FloatArray
+from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector, normalise
+from flight.schema.sensor_suite import SensorSuite
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.orbit_geometry import (
+    SUITES,
+    Pass,
+    in_cone,
+    in_field,
+    limb,
+    limb_in_daylight,
+    local_frame,
+    revolution,
+    suite,
+)
+from tests.studies.campaigns.orbit_world import FIRST_DATE
+
+STEP = 20.0
+MOST_TILT = np.radians(15.0)
+ATTITUDES = ("level", "within 15 deg", "tipped 90 deg", "any")
+HEADINGS = {"two to the Sun's side": -90.0, "one forward": 0.0, "one to the Sun's side": 90.0}
+"""deg, where the first camera looks, from forward towards the Sun's side of the orbit's plane."""
+BEST = "two to the Sun's side"
+BETA_STEP = 5.0
+PAPER = 74.0
+LEAST_ARC = 5
+"""Limb points of 720 that make a horizon: 2.5 deg of it."""
+
+
+def cases(runs: int, seed: int) -> list[Case]:
+    """Return `runs` revolutions, and the table of headings, which is no draw."""
+    drawn = [Case(f"orbit/{run}", (seed, run), {"kind": "orbit"}) for run in range(runs)]
+    betas = np.arange(0.0, 75.1, BETA_STEP)
+    return drawn + [
+        Case(f"heading/{beta:g}", (seed,), {"kind": "heading", "beta": float(beta)}) for beta in betas
+    ]
+
+
+def run(case: Case) -> Result:
+    """Look around for one revolution."""
+    if case.parameters["kind"] == "heading":
+        return {**case.parameters, "shares": sun_by_heading(suite("uw"), np.radians(case.parameters["beta"]))}
+    rng = np.random.default_rng(case.seed)
+    way = revolution(FIRST_DATE + rng.uniform(0.0, 365.25), rng.uniform(0.0, 2.0 * np.pi), STEP)
+    frame = local_frame(way.positions, way.velocities)
+    sun = _sun(way)
+    sun_local = np.einsum("nij,nj->ni", frame, sun)
+    lit = sunlit_share(way.positions, ASTRONOMICAL_UNIT * sun) > 0.5
+    edge = limb(way.positions)
+    day = limb_in_daylight(way.positions, edge, sun_local)
+    shares = {}
+    for attitude in ATTITUDES:
+        turn = attitude_matrix(_attitudes(attitude, len(lit), rng))
+        edge_body = np.einsum("nij,npj->npi", turn, edge)
+        sun_body = np.einsum("nij,nj->ni", turn, sun_local)
+        for name in SUITES:
+            shares[f"{name}/{attitude}"] = _shares(suite(name), edge_body, day, sun_body, lit)
+    beta = np.degrees(np.arcsin(np.clip(-sun_local[:, 1], -1.0, 1.0)))
+    return {**case.parameters, "beta": float(np.mean(beta)), "sunlit": float(np.mean(lit)), "shares": shares}
+
+
+def _shares(
+    sensors: SensorSuite, edge: FloatArray, day: BoolArray, sun: FloatArray, lit: BoolArray
+) -> dict[str, Any]:
+    """Return the shares of time with the horizon in 0..n cameras, all of it and by day, and with the Sun."""
+    count, count_day = np.zeros(len(lit), int), np.zeros(len(lit), int)
+    seen = np.zeros(len(lit), bool)
+    for camera in sensors.cameras:
+        inside = in_field(camera, edge)
+        count += np.count_nonzero(inside, axis=-1) >= LEAST_ARC
+        count_day += np.count_nonzero(inside & day, axis=-1) >= LEAST_ARC
+        if camera.sun:
+            seen |= in_field(camera, sun)
+    most = len(sensors.cameras) + 1
+    return {
+        "horizon": (np.bincount(count, minlength=most) / len(lit)).tolist(),
+        "lit horizon": (
+            np.bincount(count_day[lit], minlength=most) / max(1, int(np.count_nonzero(lit)))
+        ).tolist(),
+        "sun": float(np.mean(seen[lit])) if np.any(lit) else 0.0,
+    }
+
+
+def _attitudes(kind: str, n: int, rng: np.random.Generator) -> FloatArray:
+    """Return attitudes (n, 4) from the local vertical's axes into the body's."""
+    if kind == "level":
+        return from_rotation_vector(np.zeros((n, 3)))
+    if kind == "within 15 deg":
+        direction, tilt = rng.uniform(0.0, 2.0 * np.pi, n), MOST_TILT * np.sqrt(rng.random(n))
+        return from_rotation_vector(
+            tilt[:, None] * np.stack([np.cos(direction), np.sin(direction), np.zeros(n)], axis=-1)
+        )
+    if kind == "tipped 90 deg":
+        return from_rotation_vector(np.outer(np.linspace(-0.5 * np.pi, 0.5 * np.pi, n), [0.0, 1.0, 0.0]))
+    return normalise(rng.standard_normal((n, 4)))
+
+
+def _sun(way: Pass) -> FloatArray:
+    """Return the Sun's directions (n, 3); in a revolution it moves by 0.06 deg, and is held."""
+    seen, _ = sun_from(way.julian_date, way.positions[0], way.velocities[0])
+    return np.broadcast_to(seen, way.positions.shape)
+
+
+def sun_by_heading(sensors: SensorSuite, beta: float) -> dict[str, dict[str, float]]:
+    """Return the share of the sunlit orbit with the Sun in a camera, by heading and by shape of the field.
+
+    `beta` rad is the Sun's height over the orbit's plane, to the right: a circular orbit over a sphere.
+    """
+    along = np.linspace(0.0, 2.0 * np.pi, 2881)[:-1]
+    sun = np.stack(
+        [np.cos(beta) * np.sin(along), np.full_like(along, np.sin(beta)), -np.cos(beta) * np.cos(along)],
+        axis=-1,
+    )
+    radius = np.linalg.norm(revolution(FIRST_DATE, 0.0, 6000.0).positions[0])
+    lit = sunlit_share(np.broadcast_to([0.0, 0.0, -radius], sun.shape), ASTRONOMICAL_UNIT * sun) > 0.5
+    found: dict[str, dict[str, float]] = {}
+    for heading, degrees in HEADINGS.items():
+        # The body yawed so that its first camera, at azimuth 0, looks there.
+        turn = attitude_matrix(from_rotation_vector(np.array([0.0, 0.0, np.radians(degrees)])))
+        body = sun[lit] @ turn.T
+        found[heading] = {
+            shape: float(np.mean(np.any([inside(camera, body) for camera in sensors.cameras], axis=0)))
+            for shape, inside in (("square", in_field), ("cone", in_cone))
+        }
+    return found
+
+
+def all_three_up_to(name: str = "vt") -> float:
+    """Return the tilt, rad, up to which every camera has the horizon, whichever way it leans."""
+    edge = limb(revolution(FIRST_DATE, 0.0, 6000.0).positions[:1])[0]
+    direction = np.radians(np.arange(0.0, 360.0, 5.0))
+    axes = np.stack([np.cos(direction), np.sin(direction), np.zeros_like(direction)], axis=-1)
+
+    def all_see(tilt: float) -> bool:
+        body = np.einsum("nij,pj->npi", attitude_matrix(from_rotation_vector(tilt * axes)), edge)
+        counts = [np.count_nonzero(in_field(camera, body), axis=-1) for camera in suite(name).cameras]
+        return bool(np.min(counts) >= LEAST_ARC)
+
+    least, most = 0.0, float(np.radians(90.0))
+    while most - least > 1e-4:
+        middle = 0.5 * (least + most)
+        least, most = (middle, most) if all_see(middle) else (least, middle)
+    return least
+
+
+def summarise(results: Sequence[Result], out: Path) -> Summary:
+    """Return the mean shares, and the Sun's share in UW by heading and height of the Sun."""
+    orbits = [result for result in results if result["kind"] == "orbit"]
+    tables = [result for result in results if result["kind"] == "heading"]
+    facts: dict[str, Any] = {"orbits": len(orbits), "suites": _mean_shares(orbits)}
+    facts["sunlit"] = float(np.mean([result["sunlit"] for result in orbits]))
+    facts["vt_all_three_up_to_deg"] = float(np.degrees(all_three_up_to()))
+    facts["uw_sun_by_beta"] = {f"{r['beta']:g}": r["shares"] for r in tables}
+    facts["betas_of_paper"] = {
+        shape: [
+            (heading, result["beta"])
+            for result in tables
+            for heading in HEADINGS
+            if abs(100.0 * result["shares"][heading][shape] - PAPER) <= 3.0
+        ]
+        for shape in ("square", "cone")
+    }
+    facts["uw_sun_over_year"] = _over_year(orbits, tables)
+    pictures = (_draw(facts, out / "coverage.png"),)
+    return Summary("\n".join(_lines(facts)) + "\n", facts, pictures)
+
+
+def _mean_shares(orbits: Sequence[Result]) -> dict[str, Any]:
+    found = {}
+    for key in orbits[0]["shares"]:
+        mine = [orbit["shares"][key] for orbit in orbits]
+        found[key] = {
+            "horizon": np.mean([m["horizon"] for m in mine], axis=0).tolist(),
+            "lit horizon": np.mean([m["lit horizon"] for m in mine], axis=0).tolist(),
+            "sun": float(np.mean([m["sun"] for m in mine])),
+            "least_cameras": int(min(np.flatnonzero(m["horizon"])[0] for m in mine)),
+        }
+    return found
+
+
+def _over_year(orbits: Sequence[Result], tables: Sequence[Result]) -> dict[str, float]:
+    """Return UW's mean share of the Sun over the drawn orbits, its first camera kept on the Sun's side."""
+    betas = [result["beta"] for result in tables]
+    return {
+        shape: float(
+            np.mean(
+                np.interp(
+                    [abs(orbit["beta"]) for orbit in orbits],
+                    betas,
+                    [result["shares"][BEST][shape] for result in tables],
+                )
+            )
+        )
+        for shape in ("square", "cone")
+    }
+
+
+def _lines(facts: dict[str, Any]) -> list[str]:
+    lines = [f"{facts['orbits']} revolutions at 380 km, 51.6 deg; {100 * facts['sunlit']:.0f} % of it sunlit"]
+    lines.append(
+        f"{'':20}share of time with the horizon in 0, 1, 2, ... cameras, %  lit, in sunlight, %   Sun, %"
+    )
+    for key, found in facts["suites"].items():
+        horizon = " ".join(f"{100 * share:5.1f}" for share in found["horizon"])
+        lit = " ".join(f"{100 * share:5.1f}" for share in found["lit horizon"])
+        lines.append(f"{key:20}{horizon:33}{lit:33}{100 * found['sun']:6.1f}")
+    tilt = facts["vt_all_three_up_to_deg"]
+    lines.append(f"VT: the horizon is in all three cameras up to {tilt:.1f} deg of tilt, whichever way")
+    lines.append(
+        "    (15 deg in 4.1; a limb 19.3 deg down and 15 deg of tilt are past the field's edge at 33.5)"
+    )
+    lines.append("UW, level, Sun in a camera, % of the sunlit orbit, square field and (cone), side cameras:")
+    lines.append(f"{'beta, deg':>12}" + "".join(f"{heading:>22}" for heading in HEADINGS))
+    for beta, shares in facts["uw_sun_by_beta"].items():
+        cells = (
+            f"{100 * shares[heading]['square']:14.1f} ({100 * shares[heading]['cone']:5.1f})"
+            for heading in HEADINGS
+        )
+        lines.append(f"{beta:>12}" + "".join(cells))
+    year = facts["uw_sun_over_year"]
+    lines.append(f"    over the drawn orbits, {BEST}: {100 * year['square']:.1f} ({100 * year['cone']:.1f})")
+    for shape, found in facts["betas_of_paper"].items():
+        where = ", ".join(f"{beta:g} deg with {heading}" for heading, beta in found)
+        lines.append(f"    the paper's 74 +- 3 %, {shape} field: beta of {where}")
+    return lines
+
+
+def _draw(facts: dict[str, Any], path: Path) -> Path:
+    """Draw the shares of time with the horizon in each number of cameras, and the Sun's by its height."""
+    from matplotlib.figure import Figure  # noqa: PLC0415 - an extra
+
+    figure = Figure(figsize=(9.0, 3.6), layout="constrained")
+    bars, curves = figure.subplots(1, 2)
+    shown = [(name, attitude) for attitude in ("level", "tipped 90 deg", "any") for name in SUITES]
+    labels = [f"{name}\n{attitude}" if name == "uw" else name for name, attitude in shown]
+    keys = [f"{name}/{attitude}" for name, attitude in shown]
+    bottom = np.zeros(len(keys))
+    colours = ("#D55E00", "#E69F00", "#56B4E9", "#0072B2", "#009E73")
+    for count, colour in enumerate(colours):
+        shares = np.array(
+            [
+                100.0 * s[count] if count < len(s := facts["suites"][key]["lit horizon"]) else 0.0
+                for key in keys
+            ]
+        )
+        bars.bar(range(len(keys)), shares, bottom=bottom, color=colour, label=f"{count}")
+        bottom += shares
+    bars.set_xticks(range(len(keys)), labels, fontsize="x-small")
+    bars.set_ylabel("share of sunlight, %")
+    bars.legend(
+        title="lit horizon in cameras",
+        fontsize="x-small",
+        title_fontsize="x-small",
+        ncols=5,
+        loc="lower center",
+        bbox_to_anchor=(0.5, 1.0),
+    )
+    betas = [float(beta) for beta in facts["uw_sun_by_beta"]]
+    for heading, colour in zip(HEADINGS, ("#0072B2", "#009E73", "#D55E00"), strict=True):
+        for shape, style in (("square", "-"), ("cone", "--")):
+            shares = 100.0 * np.array([s[heading][shape] for s in facts["uw_sun_by_beta"].values()])
+            label = heading if shape == "square" else None
+            curves.plot(betas, shares, style, color=colour, linewidth=1.2, label=label)
+    curves.axhspan(PAPER - 3.0, PAPER + 3.0, color="0.5", alpha=0.25)
+    curves.set_xlabel("Sun over the orbit's plane, deg")
+    curves.set_ylabel("UW: Sun in a camera, % of sunlight")
+    curves.legend(title="side cameras (dashed: cone)", fontsize="x-small", title_fontsize="x-small")
+    figure.savefig(path, dpi=110)
+    return path
+
+
+COVERAGE = Campaign(
+    "coverage",
+    "share of an orbit with horizon and Sun in the cameras of VT, UW, USU",
+    cases,
+    run,
+    summarise,
+    60,
+)

@@ -1,0 +1,296 @@
+"""Campaign `failures`: random frames of the real sky, and what the likelihood estimator makes of each.
+
+Pointings are uniform over the sky, theta (axis to boresight) over 0..90 deg, turns over 0..50 % of the field
+(3.28), exposures 0.2 or 1 s; a sky with fewer than five usable stars is drawn again with the same motion.
+Usable is a star whose whole streak lies in the frame, 4 px off its border, and whose light exceeds eight
+standard deviations of the noise under its streak (`scenes.usable`).
+
+Right is an answer that is not wrong. Wrong is one more than 6 of its own standard deviations off (the square
+root of its NEES; chance: 1 in 13 million) and more than 1 % of the rate off, as a vector. Either alone is
+counted too: the first is a covariance that says too much, the second may be an honest answer from streaks of
+a few px. Any other outcome is a refusal, by its status; where the usable stars move less than the estimator's
+least length there is no rate to be had, and a refusal is right.
+"""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2
+
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.vision.streaks.corners.streak_rate import StreakStatus
+from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion
+from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
+from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from sim_hal.star_camera import StarCameraModel
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.scenes import FIELD, Scene, slew, usable
+
+EXPOSURES = (0.2, 1.0)
+MOST_TURN = 0.5
+LEAST_USABLE = 5
+SIGNIFICANCE = 8.0
+WRONG_SIGMAS = 6.0
+WRONG_SHARE = 0.01
+RIGHT, WRONG, AT_REST = "right", "wrong", "at rest"
+# Turns in percent of the field, upper edges: time and errors are told for each.
+TURNS = (5, 20, 35, 50)
+_MOST_SKIES = 1000
+_FREEDOM = 3
+
+
+def cases(runs: int, seed: int) -> list[Case]:
+    """Return `runs` random motions; the sky is drawn when one is run."""
+    found = []
+    for run in range(runs):
+        draw = np.random.default_rng((seed, run, 0))
+        parameters = {
+            "theta": float(np.rad2deg(draw.uniform(0.0, 0.5 * np.pi))),
+            "percent": float(100.0 * draw.uniform(0.0, MOST_TURN)),
+            "exposure": float(draw.choice(EXPOSURES)),
+        }
+        found.append(Case(str(run), (seed, run, 1), parameters))
+    return found
+
+
+def expose(case: Case, camera: StarCameraModel) -> tuple[Scene, int]:
+    """Return a case's frame, and how many skies were drawn until one had enough usable stars."""
+    generator = np.random.default_rng(case.seed)
+    theta, fraction = np.deg2rad(case.parameters["theta"]), case.parameters["percent"] / 100.0
+    for drawn in range(1, _MOST_SKIES + 1):
+        scene = slew(generator, float(theta), fraction, case.parameters["exposure"], model=camera)
+        if len(usable(scene, camera, SIGNIFICANCE)) >= LEAST_USABLE:
+            return scene, drawn
+    raise ValueError(f"no sky in {_MOST_SKIES} with {LEAST_USABLE} usable stars for {case.parameters}")
+
+
+def run(case: Case) -> Result:
+    """Estimate one frame's motion and judge the answer."""
+    camera = StarCameraModel(field_of_view=FIELD)
+    scene, drawn = expose(case, camera)
+    settings = LikelihoodSettings(saturation=float(camera.highest_count), gain=camera.gain)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        begun = time.process_time()
+        found = estimate_motion(scene.pixels, camera.pinhole, scene.exposure, settings, scene.rate, 0.0)
+        spent = time.process_time() - begun
+    good = usable(scene, camera, SIGNIFICANCE)
+    true_length = float(np.median(_path_lengths(scene)[good]))
+    return {
+        **case.parameters,
+        "seed": list(case.seed),
+        "skies": drawn,
+        "usable": len(good),
+        "length": true_length,
+        "status": found.status.value,
+        "milliseconds": 1e3 * spent,
+        "warnings": sorted({f"{Path(w.filename).name}:{w.lineno} {w.message}" for w in caught}),
+        **_judge(found, scene, true_length < settings.least_length),
+    }
+
+
+def _path_lengths(scene: Scene) -> FloatArray:
+    """Return the stars' paths (n,), px, from chords of their two halves."""
+    halves = (scene.middle - scene.start, scene.end - scene.middle)
+    return np.asarray(sum(np.linalg.norm(half, axis=1) for half in halves))
+
+
+def _judge(found: MotionResult, scene: Scene, still: bool) -> Result:
+    """Return the verdict, the errors of an answer, and what is known of why it is none or wrong."""
+    size = float(np.linalg.norm(scene.rate))
+    if found.status is not StreakStatus.RATE or found.rate is None or found.covariance is None:
+        verdict = AT_REST if still else found.status.value
+        return {"verdict": verdict, "reason": _why_refused(found), "nees": None}
+    error = found.rate - scene.rate
+    nees = float(error @ np.linalg.solve(found.covariance, error))
+    vector = float(np.linalg.norm(error)) / size
+    wrong = nees > WRONG_SIGMAS**2 and vector > WRONG_SHARE
+    suspicious = wrong or nees > WRONG_SIGMAS**2
+    return {
+        "verdict": WRONG if wrong else RIGHT,
+        "reason": _how_wrong(found, scene) if suspicious else "",
+        "nees": nees,
+        "vector": vector,
+        "magnitude": float(np.linalg.norm(found.rate)) / size - 1.0,
+    }
+
+
+def _why_refused(found: MotionResult) -> str:
+    """Return as much of the reason for a refusal as the result tells."""
+    if not found.found:
+        return "no motion that the regions agree on"
+    return f"{found.used_count} of {found.found} stars used, {found.length:.0f} px, misfit {found.misfit:.2f}"
+
+
+def _how_wrong(found: MotionResult, scene: Scene) -> str:
+    """Return how an answer differs from the truth."""
+    if found.rate is None:
+        return _why_refused(found)
+    sizes = float(np.linalg.norm(found.rate)), float(np.linalg.norm(scene.rate))
+    turned = np.arccos(np.clip(found.rate @ scene.rate / (sizes[0] * sizes[1]), -1.0, 1.0))
+    return (
+        f"{sizes[0] / sizes[1]:.4f} of the rate, axis {np.rad2deg(turned):.3f} deg off, misfit"
+        f" {found.misfit:.2f}, {found.used_count} stars, PSF {found.psf_sigma:.3f} px"
+    )
+
+
+def summarise(results: Sequence[Result], out: Path) -> Summary:
+    """Return the counts, the distribution of NEES, the times, every seed that failed, and the figure."""
+    facts = {
+        "frames": len(results),
+        "verdicts": dict(sorted(Counter(r["verdict"] for r in results).items())),
+        **_counts(results),
+        "nees": _nees(results),
+        "milliseconds": _times(results),
+        "by_turn": _by_turn(results),
+        "failures": [r for r in results if _worth_a_line(r)],
+    }
+    pictures = (_picture(results, out),) if any(r["nees"] is not None for r in results) else ()
+    return Summary("\n".join(_lines(facts)) + "\n", facts, pictures)
+
+
+def _worth_a_line(result: Result) -> bool:
+    """Tell whether a frame is to be looked at: wrong, overconfident, refused though stars move, or warned."""
+    if result["verdict"] == AT_REST:
+        return bool(result["warnings"])
+    return bool(result["reason"] or result["warnings"])
+
+
+def _counts(results: Sequence[Result]) -> dict[str, Any]:
+    answers = [r for r in results if r["nees"] is not None]
+    return {
+        "answers": len(answers),
+        "wrong": sum(r["verdict"] == WRONG for r in answers),
+        "beyond_sigmas": sum(r["nees"] > WRONG_SIGMAS**2 for r in answers),
+        "beyond_share": sum(r["vector"] > WRONG_SHARE for r in answers),
+        "refused": sum(r["nees"] is None and r["verdict"] != AT_REST for r in results),
+        "at_rest": sum(r["verdict"] == AT_REST for r in results),
+        "skies": sum(r["skies"] for r in results),
+    }
+
+
+def _nees(results: Sequence[Result]) -> dict[str, float] | None:
+    """Return the mean of NEES, and the parts of the answers beyond limits that chance exceeds so often."""
+    values = np.array([r["nees"] for r in results if r["nees"] is not None])
+    if not len(values):
+        return None
+    limits = {f"beyond_{100 * p:g}%": float(np.mean(values > chi2.isf(p, _FREEDOM))) for p in (0.05, 1e-3)}
+    return {
+        "mean": float(values.mean()),
+        "median": float(np.median(values)),
+        "largest": float(values.max()),
+        **limits,
+    }
+
+
+def _times(results: Sequence[Result]) -> dict[str, float]:
+    """Return median, 95 %, 99 % and largest processor time, ms."""
+    spent = np.array([r["milliseconds"] for r in results])
+    quantiles = {f"p{100 * q:.0f}": float(np.quantile(spent, q)) for q in (0.5, 0.95, 0.99)}
+    return {**quantiles, "largest": float(spent.max())}
+
+
+def _by_turn(results: Sequence[Result]) -> list[dict[str, Any]]:
+    rows = []
+    for low, high in zip((0, *TURNS[:-1]), TURNS, strict=True):
+        here = [r for r in results if low <= r["percent"] < high]
+        if not here:
+            continue
+        errors = [r["vector"] for r in here if r["nees"] is not None]
+        row = {"from": low, "to": high, "frames": len(here), **_counts(here), **_times(here)}
+        row["vector_median"] = float(np.median(errors)) if errors else None
+        rows.append(row)
+    return rows
+
+
+def _lines(facts: dict[str, Any]) -> list[str]:
+    verdicts = ", ".join(f"{count} {name}" for name, count in facts["verdicts"].items())
+    lines = [
+        f"{facts['frames']} frames ({facts['skies']} skies drawn): {verdicts}",
+        f"wrong, beyond {WRONG_SIGMAS:g} sigma and {100 * WRONG_SHARE:g} %: {facts['wrong']}"
+        f" (beyond {WRONG_SIGMAS:g} sigma {facts['beyond_sigmas']}, beyond {100 * WRONG_SHARE:g} %"
+        f" {facts['beyond_share']})   asked: 0",
+        f"refused with stars that move: {facts['refused']} of {facts['frames']}   asked: at most 2 of 1000",
+    ]
+    nees = facts["nees"]
+    if nees is not None:
+        lines.append(
+            f"NEES of 3: mean {nees['mean']:.2f} (honest: 3), median {nees['median']:.2f} (2.37), largest"
+            f" {nees['largest']:.1f}, beyond the 5 % limit {100 * nees['beyond_5%']:.1f} %, beyond the 0.1 %"
+            f" limit {100 * nees['beyond_0.1%']:.1f} %"
+        )
+    lines += [
+        "",
+        "turn, %   frames  refused  wrong  vector %, median   ms of processor: median  p95  p99  max",
+    ]
+    rows = [*facts["by_turn"], {"from": 0, "to": TURNS[-1], **_whole(facts)}]
+    for row in rows:
+        error = "-" if row["vector_median"] is None else f"{100 * row['vector_median']:.3f}"
+        lines.append(
+            f"{row['from']:2d} to {row['to']:2d}  {row['frames']:6d}  {row['refused']:7d}  {row['wrong']:5d}"
+            f"  {error:>16}   {row['p50']:23.0f}  {row['p95']:3.0f}  {row['p99']:3.0f}  {row['largest']:3.0f}"
+        )
+    lines += ["", "run  verdict      theta  turn %  T, s  usable  length px  NEES      why"]
+    for one in facts["failures"]:
+        nees_text = "-" if one["nees"] is None else f"{one['nees']:.1f}"
+        lines.append(
+            f"{one['seed'][1]:4d} {one['verdict']:11} {one['theta']:6.2f}  {one['percent']:6.2f}"
+            f"  {one['exposure']:4.1f}  {one['usable']:6d}  {one['length']:9.1f}  {nees_text:8}"
+            f"  {'; '.join([one['reason'] or 'no failure', *one['warnings']])}"
+        )
+    return lines
+
+
+def _whole(facts: dict[str, Any]) -> dict[str, Any]:
+    """Return the row of all turns together."""
+    return {**facts, **facts["milliseconds"], "vector_median": None}
+
+
+def _picture(results: Sequence[Result], out: Path) -> Path:
+    """Draw errors over the turn, the distribution of NEES beside that of chance, and the times."""
+    from matplotlib.figure import Figure  # noqa: PLC0415 - only here, an extra
+
+    answers = [r for r in results if r["nees"] is not None]
+    figure = Figure(figsize=(15.0, 4.2), layout="constrained")
+    errors, honesty, times = figure.subplots(1, 3)
+    for exposure in EXPOSURES:
+        here = [r for r in answers if r["exposure"] == exposure]
+        turns = [r["percent"] for r in here]
+        errors.semilogy(turns, [100 * r["vector"] for r in here], ".", markersize=3, label=f"{exposure:g} s")
+    bad = [r for r in answers if r["verdict"] == WRONG]
+    errors.semilogy([r["percent"] for r in bad], [100 * r["vector"] for r in bad], "rx", label="wrong")
+    refused = [r["percent"] for r in results if r["nees"] is None]
+    errors.plot(refused, [0.02] * len(refused), "k|", transform=errors.get_xaxis_transform(), label="refused")
+    errors.set(xlabel="turn, % of the field", ylabel="error of the rate, % (vector)")
+    errors.legend()
+    ordered = np.sort([r["nees"] for r in answers])
+    beyond = 1.0 - (np.arange(len(ordered)) + 0.5) / len(ordered)
+    honesty.semilogy(ordered, beyond, drawstyle="steps-post", label="here")
+    grid = np.linspace(0.0, max(20.0, float(ordered[-1])), 200)
+    chance = chi2.sf(grid, _FREEDOM)
+    honesty.semilogy(grid, chance, "--", label="chi-square of 3")
+    honesty.axvline(WRONG_SIGMAS**2, color="grey", linewidth=0.8)
+    honesty.set(xlabel="NEES", ylabel="part of the answers beyond", ylim=(0.3 / len(ordered), 1.0))
+    honesty.legend()
+    times.plot([r["percent"] for r in results], [r["milliseconds"] for r in results], ".", markersize=3)
+    times.set(xlabel="turn, % of the field", ylabel="ms of processor", ylim=(0.0, None))
+    path = out / "failures.png"
+    figure.savefig(path, dpi=100, facecolor="white")
+    return path
+
+
+FAILURES = Campaign(
+    "failures",
+    "random frames: right, refused, wrong; NEES and time of the likelihood estimator",
+    cases,
+    run,
+    summarise,
+    1000,
+)

@@ -1,0 +1,294 @@
+"""What became of a flight of campaign `faults`, told from its log and from the truth beside it.
+
+Times are of the log and the truth, not of the events alone, which a throttle holds back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from flight.gnc.math.arrays import BoolArray, FloatArray
+from flight.link.telemetry.packets import to_text
+from flight.link.telemetry.reader import Run
+from flight.loop.fdir.events import EVENTS, EventKind, Reaction, Severity
+from sim_hal.faults.kinds import FaultKind
+from sim_hal.settings import FaultEntry
+from tests.scenario.flights import demo_world
+from tests.studies.campaigns.campaign import Result
+from tests.studies.campaigns.fault_table import REACTION, own_events, part_of
+
+DURATION = 26.0
+"""s, of each flight."""
+CYCLE = 0.025
+TOLD_WITHIN = 20.0
+"""s after the end of a fault: what is told later is of something else."""
+BLIND_GRACE = 0.1
+"""s: within this the coils are at zero after the last measurement."""
+ZERO = 1e-3
+"""A: a coil that is off carries less."""
+FRAME_PERIOD, FRAME_EXPOSURE, FRAME_READOUT, FRAME_LATE = 2.0, 0.2, 0.05, 1.0
+"""s, of the campaign's camera."""
+DRIVEN = 6.0e-3
+"""A, of a coil that is driven enough for the monitor to tell."""
+
+OFF_SURELY, GAIN_ERROR = 0.015, 0.2
+"""A and relative: readings that differ by more are of different currents."""
+LOOKED_FROM, LOOKED = 2.0, 3.0
+"""s: from when in a flight the monitor's mean is whole, and how long an upset's trace is looked for."""
+FEW = 3
+"""Samples of the unit, more or less, that are nothing."""
+BACK_WITHIN = 2.0
+"""s, of a part that can be reached again."""
+_OUT_OF_REACH = {"nack", "slow", "intermittent"}
+_KINDS: dict[str, EventKind] = {kind.name: kind for kind in EVENTS}
+
+
+def judge(flown: Run, kind: FaultKind, entry: FaultEntry) -> Result:
+    """Tell from a flight's logs what a fault did."""
+    at = entry.at or 0.0
+    span = DURATION - at if entry.span is None else entry.span
+    end = at if kind.momentary else min(at + span, DURATION)
+    told = [(float(event["time_ns"]) * 1e-9, to_text(event["name"])) for event in flown["event"]]
+    warned = [
+        (time, name)
+        for time, name in told
+        if at - 1e-6 <= time < min(end + TOLD_WITHIN, DURATION - CYCLE)
+        and _KINDS[name].severity is not Severity.INFORMATION
+    ]
+    own = [(time, name) for time, name in warned if name in own_events(kind)]
+    reactions = {_KINDS[name].reaction for _, name in warned} - {Reaction.NOTE}
+    control = flown["control"]
+    return {
+        "at": at,
+        "end": end,
+        "exercised": bool(own) or _is_exercised(flown, kind, at, end),
+        "detected_s": own[0][0] - at if own else None,
+        "event": own[0][1] if own else None,
+        "others": sorted({name for _, name in warned} - own_events(kind)),
+        "reaction_right": _reaction_right(flown, kind, at, end, warned),
+        "told": list(dict.fromkeys(name for _, name in warned)),
+        "reactions": sorted(reaction.name.lower().replace("_", " ") for reaction in reactions),
+        "recovered_s": _recovered(flown, kind, at, end, told),
+        "blind_current_a": _blind_current(flown, part_of(kind) == "imu"),
+        "largest_current_a": float(np.abs(flown["truth"]["current"]).max()),
+        "task_failed": any(name == "task-failed" for _, name in told),
+        "service_failing": any(name == "service-failing" for _, name in told),
+        "log_intact": all(log.intact for log in flown.logs.values())
+        and len(control) == round(DURATION / CYCLE),
+    }
+
+
+def _is_exercised(flown: Run, kind: FaultKind, at: float, end: float) -> bool:
+    """Tell whether the broken thing was asked for anything while it was broken."""
+    control = flown["control"]
+    time = control["time_ns"] * 1e-9
+    inside = (time >= at) & (time < max(end, at + 1.0))
+    written = np.abs(control["current_written"][inside])
+    device, _, axis = kind.device.partition("-")
+    if device in {"coil", "bridge"}:
+        return _is_missed(control["current_written"][inside][:, "xyz".index(axis)], kind.kind)
+    if kind.name in {"pwm: stuck", "pwm: delayed", "pwm: bits"}:
+        return bool((written > DRIVEN).any(axis=1).sum() * CYCLE > 1.0)
+    if kind.name == "monitor: wrong":
+        asked = written.sum(axis=1)
+        return bool(_differs(asked, (kind.parameters["gain"].default or 0.0) * asked).sum() * CYCLE > 1.0)
+    if kind.name == "monitor: delayed":
+        return _is_behind(flown, kind, inside)
+    if kind.kind == "upset" or device == "camera":
+        return _is_upset(flown, device, at) if kind.kind == "upset" else _is_frame_spoiled(kind.kind, at, end)
+    return device not in {"planner", "vision"} or _is_worker_met(flown, kind, at, end)
+
+
+def _is_missed(own: FloatArray, kind: str) -> bool:
+    """Tell whether a broken coil or bridge was driven for long; A of the currents (n,) that were written.
+
+    A leg that is stuck low is missed only where it should be high: input A drives forwards, B backwards.
+    """
+    driven = {"a-low": own > DRIVEN, "b-low": own < -DRIVEN}.get(kind, np.abs(own) > DRIVEN)
+    return kind.endswith("high") or bool(driven.sum() * CYCLE > 2.5)
+
+
+def _is_worker_met(flown: Run, kind: FaultKind, at: float, end: float) -> bool:
+    """Tell whether a worker that was broken had a job."""
+    jobs = flown["job_timing"]
+    when = jobs["time_ns"] * 1e-9
+    mine = np.array([to_text(name) == kind.device for name in jobs["name"]], dtype=bool)
+    if kind.kind == "endless":  # a job that was under way ran into its time limit
+        return bool((mine & (when >= at) & (jobs["outcome"] == b"timed-out")).any())
+    # A result is told when the latency that the world models for it has passed.
+    begun = when - getattr(demo_world().latency, kind.device)
+    return bool((mine & (begun >= at - 1e-6) & (begun < end)).any())
+
+
+def _is_behind(flown: Run, kind: FaultKind, inside: BoolArray) -> bool:
+    """Tell whether the coils were told something else than what an old answer tells, for a second."""
+    asked = np.abs(flown["control"]["current_written"]).sum(axis=1)
+    behind = round((kind.parameters["delay"].default or 0.0) / CYCLE)
+    before = np.concatenate([np.full(behind, asked[0]), asked[:-behind]])
+    return bool((_differs(asked, before) & inside).sum() * CYCLE > 1.0)
+
+
+def _differs(one: FloatArray, other: FloatArray) -> BoolArray:
+    """Tell which supply currents (n,) A are further apart than the same one may be read twice."""
+    return np.asarray(np.abs(one - other) > OFF_SURELY + GAIN_ERROR * np.maximum(one, other))
+
+
+def _is_upset(flown: Run, device: str, at: float) -> bool:
+    """Tell whether a bit that flipped did anything: what nobody reads, or is soon written anew, does not."""
+    match device:
+        case "pwm":
+            obeyed = _obeyed(flown, at)
+            return obeyed is None or obeyed > BLIND_GRACE
+        case "monitor":
+            house = flown["housekeeping"]
+            time = house["time_ns"] * 1e-9
+            after = (time >= max(at, LOOKED_FROM)) & (time < at + LOOKED)
+            return not np.isfinite(house["coil_current"][after]).all()
+        case _:
+            time = flown["imu"]["time_ns"] * 1e-9
+            came = int(((time >= at) & (time < at + LOOKED)).sum())
+            return abs(came - round(LOOKED / CYCLE)) > FEW
+
+
+def _is_frame_spoiled(kind: str, at: float, end: float) -> bool:
+    """Tell whether a frame should have come while the camera was broken, and was the worse for it."""
+    due = np.arange(0.0, DURATION, FRAME_PERIOD) + FRAME_EXPOSURE + FRAME_READOUT
+    spoiled = due[(due >= at) & (due < end)]
+    if kind == "torn":
+        spoiled = spoiled[spoiled > FRAME_PERIOD]  # the first one has none before it
+    if kind == "slow":
+        # It is the triggers that are lost, and of a frame that is read out already nothing is.
+        triggers = np.arange(0.0, DURATION, FRAME_PERIOD)
+        spoiled = triggers[(triggers >= at) & (triggers < end)]
+    if kind == "delayed":
+        spoiled = spoiled[end - spoiled > FRAME_LATE]
+    return len(spoiled) > 0
+
+
+def _recovered(
+    flown: Run, kind: FaultKind, at: float, end: float, told: Sequence[tuple[float, str]]
+) -> float | None:
+    """Return how long after the fault's end the device's data are good again; None for never."""
+    house = flown["housekeeping"]
+    found: float | None = 0.0
+    match kind.device.partition("-")[0]:
+        case "imu":
+            found = _steady(flown["imu"]["time_ns"] * 1e-9, end, 0.06)
+        case "pwm" | "bus":
+            found = _obeyed(flown, end)
+        case "monitor":
+            finite, time = np.isfinite(house["coil_current"]), house["time_ns"] * 1e-9
+            lost = time[~finite & (time >= end) & (time < end + LOOKED)]
+            # What happens at once is noticed only after it.
+            found = _first(time[finite], end)
+            if kind.momentary and len(lost):
+                later = _first(time[finite], float(lost[-1]))
+                found = None if later is None else float(lost[-1]) + later - end
+            # Told four times a second, where housekeeping comes once.
+            known = [t for t, name in told if name == "power-recovered" and t < DURATION - CYCLE]
+            back = _first(np.array(known), end)
+            if back is not None:
+                found = back if found is None or kind.momentary else min(found, back)
+        case "camera":
+            grown = np.flatnonzero(np.diff(house["frames"].astype(int)) > 0) + 1
+            found = _first(house["time_ns"][grown] * 1e-9, end)
+        case "coil" | "bridge":
+            found = _first(np.array([time for time, name in told if name == "coil-broken"]), at)
+        case "disk":
+            found = _first(np.array([time for time, name in told if name == "log-recovered"]), end)
+        case _:
+            pass
+    return found
+
+
+def _first(times: FloatArray, end: float) -> float | None:
+    later = times[times >= end - 1e-6]
+    return float(later[0] - end) if len(later) else None
+
+
+def _steady(times: FloatArray, end: float, gap: float, count: int = 8) -> float | None:
+    """Return when after `end` samples come without a gap again."""
+    later = times[times >= end - 1e-6]
+    short = np.diff(later) < gap
+    for first in range(len(short) - count):
+        if short[first : first + count].all():
+            return float(later[first] - end)
+    return None
+
+
+def _obeyed(flown: Run, end: float) -> float | None:
+    """Return when after `end` the coils carry what the log says is written to them, half a second long."""
+    control, truth = flown["control"], flown["truth"]
+    count = min(len(control), len(truth) - 1)
+    # The truth's sample at a cycle's start is of the current before its command.
+    told, real = control["current_written"][:count], truth["current"][1 : count + 1]
+    agrees = (np.abs(told - real) < 8e-3).all(axis=1)
+    time = control["time_ns"][:count] * 1e-9
+    for first in np.flatnonzero(time >= end - 1e-6):
+        if agrees[first : first + 20].all():
+            return float(time[first] - end)
+    return None
+
+
+def _is_unmeasured(flown: Run) -> BoolArray:
+    """Return for each cycle whether the newest measurement in it was older than the grace and a cycle."""
+    time_ns = flown["control"]["time_ns"]
+    came_ns, sampled_ns = flown["imu"]["time_ns"], flown["imu"]["sample_time_ns"]
+    count = np.searchsorted(came_ns, time_ns, side="right")
+    newest = np.concatenate([[0], np.maximum.accumulate(sampled_ns)]) if len(sampled_ns) else np.zeros(1)
+    return np.asarray((time_ns - newest[count]) * 1e-9 > BLIND_GRACE + CYCLE)
+
+
+def _blind_current(flown: Run, also_unsteered: bool) -> float:
+    """Return the largest current in A while nothing was measured for longer than the grace.
+
+    The estimate may be carried on meanwhile; no coil may be driven by it. `also_unsteered` looks at cycles
+    in which the loop steered no more for that long as well: what came was refused.
+    """
+    off = flown["control"]["state"] == 0
+    cycles = round(BLIND_GRACE / CYCLE)
+    resting = np.array([off[max(0, place - cycles) : place + 1].all() for place in range(len(off))])
+    blind = _is_unmeasured(flown) | (resting & also_unsteered)
+    carried = _carried(flown)
+    return float(np.max(carried[: len(blind)][blind[: len(carried)]], initial=0.0))
+
+
+def _carried(flown: Run) -> FloatArray:
+    """Return the largest true current of a coil in each cycle, A: at the start of the cycle after it."""
+    current: FloatArray = np.abs(flown["truth"]["current"]).max(axis=1)[1:]
+    return current
+
+
+def _reaction_right(
+    flown: Run, kind: FaultKind, at: float, end: float, warned: Sequence[tuple[float, str]]
+) -> bool | None:
+    """Tell whether the reaction that the table asks for came; None where it asks for none."""
+    part = part_of(kind)
+    times = [time for time, name in warned if name == REACTION.get(part)]
+    control = flown["control"]
+    time = control["time_ns"] * 1e-9
+    driven = np.abs(control["current_written"]).max(axis=1) > DRIVEN
+    right: bool | None = None
+    match part:
+        case "imu":
+            lost = _is_unmeasured(flown) & (time >= at)
+            if lost.any() and driven[(time >= at - 0.5) & (time <= at + 0.5)].any():
+                right = bool(times) and not control["state"][lost].any()
+        case "coil" | "bridge":
+            # One that is soon taken out of use is driven for less than it takes to be sure that it could be.
+            if times or _is_exercised(flown, kind, at, end):
+                right = bool(times)
+        case "pwm" | "bus":
+            if times and driven[(time >= times[0] - 1.0) & (time <= times[0])].any():
+                # A chip out of reach holds what it has: then it has to obey soon after it is back.
+                carried = _carried(flown)
+                told = (time >= times[0] - CYCLE) & (time <= end + BACK_WITHIN)
+                zero = np.abs(control["current_written"]).max(axis=1) < ZERO
+                zero[: len(carried)] |= carried[: len(zero)] < ZERO
+                obeyed = _obeyed(flown, end) if part == "bus" or kind.kind in _OUT_OF_REACH else None
+                right = bool(zero[told].any()) or (obeyed is not None and obeyed <= BACK_WITHIN)
+        case _:
+            pass
+    return right

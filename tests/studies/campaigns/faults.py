@@ -1,0 +1,191 @@
+"""Campaign `faults`: every fault of the catalogue in every mode, at random times, in lock-step.
+
+Each run flies the demonstration's loop for half a minute in one mode and breaks one thing at a random time
+for a random span (coils and bridges to the end), at the wire; then it tells from the log whether the fault
+was told by an event of its own (`fault_table`), whether the reaction that the table asks for came, how long
+after the fault's end all was well again, what the coils carried while nothing was measured, and whether the
+log is whole. A fault that meets nothing (a coil that is not driven, a planner that is not asked) is told
+apart as not exercised: it cannot be seen, and does no harm. Flights in which a fault met something and was
+not told are listed with their numbers; `refly(seed, number)` flies one of them again.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flight.schema import reader as configuration
+from flight.schema.sections import Commands, CommandStep, Config, Modes
+from sim_hal.faults.catalogue import CATALOGUE
+from sim_hal.faults.kinds import FaultKind, Where
+from sim_hal.settings import FaultEntry
+from tests.scenario.flights import demo_config, demo_world, fly
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.fault_judgement import DURATION, FRAME_EXPOSURE, FRAME_LATE, FRAME_PERIOD, judge
+
+MODES = ("boot", "safe", "detumble", "hold", "slew", "testbed-demo")
+LASTING = ("coil", "bridge")
+
+_LOOKS = {"camera", "vision"}
+
+
+def faults() -> list[FaultKind]:
+    """Return the faults that make sense in lock-step."""
+    return [kind for kind in CATALOGUE.values() if kind.where is Where.BOTH]
+
+
+def cases(runs: int, seed: int) -> list[Case]:
+    """Return `runs` flights: fault by fault, mode by mode, over and over."""
+    kinds = faults()
+    found = []
+    for number in range(runs):
+        lap, place = divmod(number, len(kinds))
+        kind, mode = kinds[place], MODES[(lap + place) % len(MODES)]
+        found.append(Case(f"{number}", (seed, number), {"fault": kind.name, "mode": mode}))
+    return found
+
+
+def run(case: Case) -> Result:
+    """Fly one case and tell what became of it."""
+    kind, mode = CATALOGUE[case.parameters["fault"]], case.parameters["mode"]
+    rng = np.random.default_rng(case.seed)
+    at = 0.0 if mode == "boot" else float(rng.uniform(4.0, 11.0))
+    span = None if kind.device.startswith(LASTING) else float(rng.uniform(2.0, 6.0))
+    entry = FaultEntry(fault=kind.name, at=at, span=span)
+    return {"number": case.key, **fly_with(kind, mode, entry, int(rng.integers(1, 2**31)))}
+
+
+def refly(seed: int, number: int) -> Result:
+    """Fly one flight of the campaign of this seed again."""
+    return run(cases(number + 1, seed)[number])
+
+
+def fly_with(kind: FaultKind, mode: str, entry: FaultEntry, seed: int) -> Result:
+    """Fly half a minute with one fault."""
+    section = configuration.replace(demo_world(), seed=seed, faults=(entry,))
+    with tempfile.TemporaryDirectory() as place:
+        flown = fly(config_for(mode, kind.device in _LOOKS), Path(place) / "run", section=section)
+        return {"fault": kind.name, "mode": mode, **judge(flown, kind, entry)}
+
+
+def config_for(mode: str, camera: bool) -> Config:
+    """Return half a minute of the demonstration in a mode; with a camera a small and quick one."""
+    config = demo_config(DURATION)
+    eye = None
+    if camera and config.camera is not None:
+        eye = configuration.replace(
+            config.camera,
+            columns=512,
+            rows=512,
+            exposure=FRAME_EXPOSURE,
+            period=FRAME_PERIOD,
+            max_age=4.5,
+            late_after=FRAME_LATE,
+        )
+    timeline: tuple[CommandStep, ...] = ()
+    initial = mode
+    if mode == "slew":
+        initial, timeline = "hold", (CommandStep(at=3.5, slew=-0.3), CommandStep(at=14.0, slew=0.1))
+    elif mode == "boot":
+        initial = "testbed-demo"
+    return configuration.replace(
+        config,
+        camera=eye,
+        modes=configuration.replace(Modes(), initial=initial),
+        commands=configuration.replace(Commands(), timeline=timeline),
+    )
+
+
+def summarise(results: Sequence[Result], folder: Path) -> Summary:
+    """Return a row for each fault, and what is wrong over all."""
+    del folder
+    by_fault: dict[str, list[Result]] = defaultdict(list)
+    for result in results:
+        by_fault[result["fault"]].append(result)
+    lines = [
+        f"{len(results)} flights of {DURATION:g} s; detected: of those in which it met anything",
+        f"{'fault':22}{'detected':>10}{'in, s (worst)':>16}  {'first event':18}{'reaction':28}"
+        f"{'right':>7}{'recovered in, s':>16}{'blind mA':>10}{'log':>8}",
+    ]
+    facts: dict[str, Any] = {"runs": len(results), "faults": {}}
+    for name, own in by_fault.items():
+        row = _row(own)
+        facts["faults"][name] = row
+        lines.append(
+            f"{name:22}{row['detected']:>5}/{row['exercised']:<4}{_range(row['detected_s']):>16}  "
+            f"{', '.join(row['events'])[:17]:18}{', '.join(row['reactions'])[:27]:28}"
+            f"{row['reactions_right']:>4}/{row['reactions_asked']:<2}"
+            f"{_range(row['recovered_s']):>16}{1e3 * row['blind_current_a']:10.1f}"
+            f"{row['logs_intact']:>5}/{len(own)}"
+        )
+    for name in ("task_failed", "service_failing"):
+        facts[name] = sum(result[name] for result in results)
+    facts["logs_intact"] = sum(result["log_intact"] for result in results)
+    facts["detected"] = sum(row["detected"] for row in facts["faults"].values())
+    facts["exercised"] = sum(row["exercised"] for row in facts["faults"].values())
+    facts["not_told"] = [_named(one) for one in results if one["exercised"] and one["detected_s"] is None]
+    facts["wrong_reaction"] = [_named(one) for one in results if one["reaction_right"] is False]
+    lines.append(
+        f"detected {facts['detected']} of {facts['exercised']} that met anything; unhandled exceptions in "
+        f"{facts['task_failed']} flights, beside the loop in {facts['service_failing']}; log whole in "
+        f"{facts['logs_intact']} of {len(results)}"
+    )
+    for heading, found in (
+        ("met something and was not told", facts["not_told"]),
+        ("the table's reaction did not come", facts["wrong_reaction"]),
+    ):
+        lines += [f"{heading}: {len(found)} flights", *(f"  {text}" for text in found)]
+    return Summary("\n".join(lines) + "\n", facts)
+
+
+def _named(result: Result) -> str:
+    """Return a flight with all that is needed to fly it again."""
+    others = f"; told: {', '.join(result['others'])}" if result["others"] else ""
+    span = f"{result['at']:.2f} to {result['end']:.2f} s"
+    return f"{result['fault']}, {result['mode']}, {span}, number {result.get('number', '-')}{others}"
+
+
+def _row(own: Sequence[Result]) -> dict[str, Any]:
+    exercised = [result for result in own if result["exercised"]]
+    seen = [result for result in exercised if result["detected_s"] is not None]
+    back = [result["recovered_s"] for result in exercised]
+    asked = [result["reaction_right"] for result in own if result["reaction_right"] is not None]
+    finite = [value for value in back if value is not None]
+    return {
+        "runs": len(own),
+        "exercised": len(exercised),
+        "detected": len(seen),
+        "detected_s": _median_and_worst([result["detected_s"] for result in seen]),
+        "events": sorted({result["event"] for result in seen}),
+        "reactions_right": sum(asked),
+        "reactions_asked": len(asked),
+        "reactions": sorted({word for result in seen for word in result["reactions"]}),
+        "recovered_s": _median_and_worst(finite),
+        "not_recovered": len(back) - len(finite),
+        "blind_current_a": max(result["blind_current_a"] for result in own),
+        "largest_current_a": max(result["largest_current_a"] for result in own),
+        "logs_intact": sum(result["log_intact"] for result in own),
+    }
+
+
+def _median_and_worst(values: Sequence[float]) -> list[float] | None:
+    return [float(np.median(values)), float(max(values))] if values else None
+
+
+def _range(pair: list[float] | None) -> str:
+    return "-" if pair is None else f"{pair[0]:.2f} ({pair[1]:.2f})"
+
+
+FAULTS = Campaign(
+    "faults",
+    "every fault of the catalogue in every mode at random times",
+    cases,
+    run,
+    summarise,
+    default_runs=1000,
+)

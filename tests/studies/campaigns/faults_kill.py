@@ -1,0 +1,259 @@
+"""Campaign `faults-kill`: kill -9 of the flight process at random moments of a real-time run.
+
+A case is a board: its emulated devices live in a process of their own all the time, and so does its kept
+state, while one flight after the other is killed, a quarter of them before they are ready. After each kill
+the devices are asked for the coils' currents every few milliseconds, the log and the kept state are read, and
+the next flight must start. The last one ends politely: it must know of all kills, and fly in safe mode where
+they are as many as its configuration bears.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flight.gnc.errors import UsageError
+from flight.link.telemetry.packets import LONGEST_PACKET
+from flight.link.telemetry.reader import Run, read_run
+from flight.loop.modes.mode import Mode
+from sim_hal.serving.device_link import RemoteI2cBus
+from tests.hal.guardian.campaign import lives
+from tests.hal.guardian.live_flight import devices_running
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.kill_board import Board
+
+LIMIT_S = 0.5
+KILLS = 16
+"""Of a board: as many as the most crashes after which a configuration may lead to safe mode."""
+
+EARLY = 0.25
+"""Share of the kills that come before the flight is ready."""
+
+LONGEST_FLOWN_S = 1.5
+_BEFORE_S = 0.1
+_CALM_S = 0.15
+_GIVE_UP_S = 2.0
+_POLL_S = 0.004
+_LOGGED_S = 1.0  # a flight that was ready for so long has packets on disk
+_GONE_S = 3.0
+_TARGET = 0.3
+
+
+def cases(runs: int, seed: int) -> list[Case]:
+    """Return boards that come to `runs` kills together."""
+    sizes = [min(KILLS, runs - done) for done in range(0, runs, KILLS)]
+    return [Case(str(number), (seed, number), {"kills": size}) for number, size in enumerate(sizes)]
+
+
+def run(case: Case) -> Result:
+    """Kill one flight of a board after the other; let the last one end politely."""
+    rng = np.random.default_rng(case.seed)
+    begun = time.monotonic()
+    kills: list[Result] = []
+    end: Result | None = None
+    problem = ""
+    with tempfile.TemporaryDirectory() as name:
+        place = Path(name)
+        (place / "devices").mkdir()
+        with devices_running(place / "devices") as facts:
+            bus = RemoteI2cBus(json.loads(facts.read_text(encoding="utf-8"))["socket"])
+            board = Board(place, facts, bus)
+            try:
+                for number in range(case.parameters["kills"]):
+                    kills.append(_kill(board, number, rng))
+                end = _end(board, len(kills), rng)
+            except AssertionError as error:  # a flight did not start
+                problem = str(error)
+            bus.close()
+    return {"kills": kills, "end": end, "problem": problem, "took_s": time.monotonic() - begun}
+
+
+def _kill(board: Board, number: int, rng: np.random.Generator) -> Result:
+    """Start a flight, kill it, look at coils, log and state."""
+    early = bool(rng.random() < EARLY)
+    share, target = float(rng.random()), float(rng.uniform(-_TARGET, _TARGET))
+    with board.flight(number, target, KILLS) as flight:
+        if early:
+            ready_ns, kill_ns = None, flight.begun_ns + round(share * board.start_s * 1e9)
+        else:
+            ready_ns = flight.wait_for("READY=1")
+            board.start_s = (ready_ns - flight.begun_ns) * 1e-9
+            kill_ns = ready_ns + round(share * LONGEST_FLOWN_S * 1e9)
+        before = _current_until(board, kill_ns)
+        board.left += flight.children()
+        killed_ns = flight.do(signal.SIGKILL)
+        zero_after, current_after = _watch_coils(board, killed_ns, before)
+    ready_for = None if ready_ns is None else (killed_ns - ready_ns) * 1e-9
+    return {
+        "early": early,
+        "lived_s": (killed_ns - flight.begun_ns) * 1e-9,
+        "ready_for_s": ready_for,
+        "current_before_a": before,
+        "zero_after_s": zero_after,
+        "current_after_a": current_after,
+        "log": _log_of(flight.folder, ready_for),
+        "state": _state_of(board, counted=not early),
+    }
+
+
+def _current_until(board: Board, kill_ns: int) -> float:
+    """Wait for a moment; return the largest current of the last tenth of a second, or of the last question.
+
+    A flight takes its coils' current off now and then, to hear the magnetometer: one question is not enough.
+    """
+    time.sleep(max(0.0, (kill_ns - time.monotonic_ns()) * 1e-9 - _BEFORE_S))
+    current = board.current()
+    while time.monotonic_ns() < kill_ns:
+        time.sleep(_POLL_S)
+        current = max(current, board.current())
+    return current
+
+
+def _watch_coils(board: Board, killed_ns: int, before: float) -> tuple[float, float]:
+    """Return when the coils came to zero for good, s after the kill, and the largest current after the limit.
+
+    The first answer of zero counts: what is told is late by the time between two questions, never early.
+    Coils that carried current are watched beyond the limit, others for long enough to see them stay at zero.
+    """
+    zero_after = beyond = 0.0
+    driven = before > 0.0
+    while True:
+        current = board.current()
+        now = (time.monotonic_ns() - killed_ns) * 1e-9
+        if current > 0.0:
+            driven = True
+            zero_after = _GIVE_UP_S
+            beyond = max(beyond, current if now > LIMIT_S else 0.0)
+        elif driven:
+            driven = False
+            zero_after = now
+        calm = now - zero_after
+        if now > _GIVE_UP_S or (not driven and calm > _CALM_S and (before == 0.0 or now > LIMIT_S)):
+            return zero_after, beyond
+        time.sleep(_POLL_S)
+
+
+def _log_of(folder: Path, ready_for: float | None) -> Result:
+    """Tell whether the log reads to its last whole packet, and how much of the flight is in it."""
+    try:
+        flown = read_run(folder)
+    except UsageError as error:
+        # Nothing is on disk yet: that is right for the first moments only.
+        return {"readable": ready_for is None or ready_for < _LOGGED_S, "packets": 0, "problem": str(error)}
+    packets = sum(sum(log.counts.values()) for log in flown.logs.values())
+    return {"readable": _whole(flown), "packets": packets, "problem": ""}
+
+
+def _whole(flown: Run) -> bool:
+    """Tell whether nothing is amiss in a run's logs but for one packet cut short at the end of each."""
+    return all(
+        log.skipped_bytes + log.other_versions + sum(log.missing.values()) == 0
+        and log.truncated_bytes < LONGEST_PACKET
+        for log in flown.logs.values()
+    )
+
+
+def _state_of(board: Board, counted: bool) -> Result:
+    """Tell whether the kept state is whole and knows of all kills but perhaps an early one.
+
+    Of every boot so far it must know that it did not end cleanly: the last one by `running`, the others by
+    name. A flight that was ready must have counted itself.
+    """
+    state, problems = board.kept()
+    new = state.boot_count - board.boots
+    board.boots = state.boot_count
+    known = [shutdown.boot for shutdown in state.unclean]
+    right = known == list(range(1, state.boot_count)) and state.running == (state.boot_count > 0)
+    return {"whole": not problems, "counted": right and (new == 1 if counted else new in {0, 1})}
+
+
+def _end(board: Board, number: int, rng: np.random.Generator) -> Result:
+    """Let a flight end politely; tell whether that, and the mode that it flew in, was right.
+
+    The kills that were counted are as many as it may take, or one too few for safe mode.
+    """
+    crash_limit = int(np.clip(board.boots + rng.integers(2), 1, KILLS))
+    with board.flight(number, 0.1, crash_limit) as flight:
+        flight.wait_for("READY=1")
+        time.sleep(_CALM_S)
+        complaint = flight.end()
+    state, problems = board.kept()
+    modes = read_run(flight.folder)["mode"]["mode"]
+    safe_wanted = len(state.unclean) >= crash_limit
+    deadline = time.monotonic() + _GONE_S
+    while any(map(lives, board.left)) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return {
+        "status": flight.process.returncode,
+        "complaint": complaint,
+        "clean": not state.running and not problems,
+        "safe_wanted": safe_wanted,
+        "mode_right": (int(modes[-1]) == Mode.SAFE if len(modes) else False) == safe_wanted,
+        "remembered": len(state.unclean) == state.boot_count - 1 == board.boots,
+        "current_a": board.current(),
+        "left_behind": sum(map(lives, board.left)),
+    }
+
+
+def summarise(results: Sequence[Result], folder: Path) -> Summary:
+    """Return how long the coils stayed on, over those kills in which they were, and all that was judged."""
+    del folder
+    kills = [kill for result in results for kill in result["kills"]]
+    ends = [result["end"] for result in results if result["end"] is not None]
+    driven = [kill for kill in kills if kill["current_before_a"] > 0.0]
+    after = np.array([kill["zero_after_s"] for kill in driven] or [0.0])
+    facts: dict[str, Any] = {
+        "kills": len(kills),
+        "boards": len(results),
+        "starts_failed": sum(bool(result["problem"]) for result in results),
+        "early": sum(kill["early"] for kill in kills),
+        "driven": len(driven),
+        "zero_after_s": {
+            "median": float(np.median(after)),
+            "p99": float(np.quantile(after, 0.99)),
+            "worst": float(max(kill["zero_after_s"] for kill in kills)),
+        },
+        "beyond_limit": sum(kill["zero_after_s"] > LIMIT_S for kill in kills),
+        "current_after_a": max(kill["current_after_a"] for kill in kills),
+        "logs_readable": sum(kill["log"]["readable"] for kill in kills),
+        "states_whole": sum(kill["state"]["whole"] for kill in kills),
+        "kills_counted": sum(kill["state"]["counted"] for kill in kills),
+        "polite_ends": sum(end["status"] == 0 and end["clean"] and end["remembered"] for end in ends),
+        "modes_right": sum(end["mode_right"] for end in ends),
+        "safe_wanted": sum(end["safe_wanted"] for end in ends),
+        "left_behind": sum(end["left_behind"] for end in ends),
+        "wall_s_per_kill": sum(result["took_s"] for result in results) / len(kills),
+    }
+    spread = facts["zero_after_s"]
+    text = (
+        f"{facts['kills']} kills on {facts['boards']} boards, {facts['early']} of them before the flight was "
+        f"ready, {facts['driven']} with current in the coils\n"
+        f"coils at zero after: median {spread['median']:.3f} s, 99 % {spread['p99']:.3f} s, "
+        f"worst {spread['worst']:.3f} s (limit {LIMIT_S:g} s, beyond it {facts['beyond_limit']})\n"
+        f"largest current later than that: {1e3 * facts['current_after_a']:.1f} mA\n"
+        f"flight log readable: {facts['logs_readable']}, kept state whole: {facts['states_whole']}, "
+        f"kill remembered: {facts['kills_counted']} of {facts['kills']}\n"
+        f"flights that did not start: {facts['starts_failed']}\n"
+        f"last flight of a board ended cleanly: {facts['polite_ends']}, in the right mode: "
+        f"{facts['modes_right']} of {facts['boards']} (safe: {facts['safe_wanted']}), "
+        f"processes left behind: {facts['left_behind']}\n"
+        f"{facts['wall_s_per_kill']:.2f} s a kill\n"
+    )
+    return Summary(text, facts)
+
+
+FAULTS_KILL = Campaign(
+    "faults-kill",
+    "kill -9 of the flight process at random moments, in real time (use --workers 1)",
+    cases,
+    run,
+    summarise,
+    default_runs=1000,
+)

@@ -1,0 +1,238 @@
+"""Campaign `lost-in-space`: how every method of identification fares, one difficulty at a time.
+
+The survey that Michalski's thesis promised. About a nominal list (15 deg, 0.3 px, 2 false stars, 10 %
+missing, 0.2 mag) the centroid noise, the false stars, the missing stars, the field and the magnitudes'
+error are varied, each alone; the field of view is known. Every method sees the same lists. Right is an
+answer whose boresight is right to 0.05 deg and by which four in five of the stars named are those drawn;
+every other answer is wrong. Times are of the processor. `rate` is given what it needs besides: velocities,
+of a turn of 1 deg/s seen for 0.5 s; half of the false points stand still on the detector, half move as they
+please.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import attitude_matrix
+from flight.gnc.vision.startracker.classical import rate_matching
+from flight.gnc.vision.startracker.classical.known_sky import KnownSky
+from flight.gnc.vision.startracker.classical.methods import METHODS
+from flight.gnc.vision.startracker.classical.rate_matching import Motion
+from flight.gnc.vision.startracker.identification.field import StarField
+from flight.gnc.vision.startracker.identification.identification import Identification, Status
+from flight.gnc.vision.startracker.index.build import default_index
+from flight.gnc.vision.startracker.index.pair_table import angles
+from tests.studies.bench.star_lists import PIXELS, ListKind, StarList, draw
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+
+NOMINAL: dict[str, float] = {
+    "noise_px": 0.3,
+    "false_stars": 2,
+    "lost": 0.1,
+    "field_deg": 15.0,
+    "magnitude_error": 0.2,
+}
+AXES: dict[str, tuple[float, ...]] = {
+    "noise_px": (0.05, 0.1, 0.3, 0.5, 1.0, 2.0),
+    "false_stars": (0, 2, 5, 10),
+    "lost": (0.0, 0.1, 0.2, 0.3, 0.5),
+    "field_deg": (8.0, 10.0, 12.0, 15.0, 20.0, 25.0, 30.0),
+    "magnitude_error": (0.0, 0.2, 0.4, 0.7, 1.0),
+}
+LABELS = {
+    "noise_px": "centroid noise, px",
+    "false_stars": "false stars",
+    "lost": "part of the stars missing",
+    "field_deg": "field of view, deg",
+    "magnitude_error": "error of the magnitudes, mag",
+}
+_RIGHT_DEG = 0.05
+_RIGHT_SHARE = 0.8
+BODY_RATE = float(np.deg2rad(1.0))
+EXPOSURE = 0.5
+
+
+def cases(runs: int, seed: int) -> list[Case]:
+    """Return `runs` lists of each cell; the nominal cell stands once, under no axis."""
+    cells: list[tuple[str, float, int]] = [("nominal", 0.0, 0)]
+    for number, (axis, values) in enumerate(AXES.items()):
+        cells += [
+            (axis, value, 100 * (number + 1) + place)
+            for place, value in enumerate(values)
+            if value != NOMINAL[axis]
+        ]
+    return [
+        Case(f"{axis}/{value:g}/{run}", (seed, cell, run), {"axis": axis, "value": value})
+        for run in range(runs)
+        for axis, value, cell in cells
+    ]
+
+
+def run(case: Case) -> Result:
+    """Let every method see one list."""
+    axis, value = case.parameters["axis"], case.parameters["value"]
+    setting = {**NOMINAL, axis: value} if axis in NOMINAL else NOMINAL
+    sky = known_sky(setting["field_deg"])
+    kind = ListKind(
+        field_deg=setting["field_deg"],
+        noise_px=setting["noise_px"],
+        false_stars=int(setting["false_stars"]),
+        faintest=float(sky.stars.magnitude[-1]),
+        magnitude_error=setting["magnitude_error"],
+        lost=setting["lost"],
+        known_deg=0.0,
+    )
+    generator = np.random.default_rng(case.seed)
+    drawn = draw(kind, sky.index.stars, generator)
+    field, motion = drawn.field(), moving(drawn, generator)
+    result: Result = {**case.parameters, "stars": len(field)}
+    for name in METHODS:
+        begun = time.process_time()
+        answer = answer_of(name, field, sky, motion)
+        spent = time.process_time() - begun
+        result[name] = {"verdict": verdict(answer, drawn), "ms": 1000.0 * spent}
+    return result
+
+
+@lru_cache(maxsize=8)
+def known_sky(field_deg: float) -> KnownSky:
+    """Return what the methods know for a field, all tables made."""
+    half = float(np.tan(np.deg2rad(0.5 * field_deg)))
+    sky = KnownSky(default_index(), (half, half))
+    for table in ("pairs", "tree", "planar", "spherical", "grid"):
+        getattr(sky, table)
+    return sky
+
+
+def answer_of(name: str, field: StarField, sky: KnownSky, motion: Motion) -> Identification:
+    """Return the answer of a method, with all that it can use."""
+    if name == "rate":
+        return rate_matching.identify(field, sky, motion=motion)
+    return METHODS[name].identify(field, sky)
+
+
+def moving(drawn: StarList, generator: np.random.Generator) -> Motion:
+    """Return the velocities of a list's points as the two ends of their streaks would tell them."""
+    field = drawn.field()
+    axis = generator.standard_normal(3)
+    rate = BODY_RATE * axis / np.linalg.norm(axis)
+    velocity = np.cross(field.direction, rate)
+    false = np.flatnonzero(drawn.star < 0)
+    still = false[::2]
+    velocity[still] = 0.0
+    wild = false[1::2]
+    velocity[wild] = np.cross(field.direction[wild], BODY_RATE * generator.standard_normal((len(wild), 3)))
+    sigma = np.sqrt(2.0) * field.sigma / EXPOSURE
+    return Motion(velocity + sigma[:, None] * generator.standard_normal(velocity.shape), sigma)
+
+
+def verdict(answer: Identification, drawn: StarList) -> str:
+    """Return right, wrong or refused."""
+    if answer.status is not Status.IDENTIFIED or answer.fix is None:
+        return "refused"
+    true, found = (attitude_matrix(q) for q in (drawn.attitude, answer.fix.quaternion))
+    off = float(angles(true[2], found[2]))
+    matched = answer.star >= 0
+    named = np.mean(answer.star[matched] == drawn.star[matched])
+    return "right" if off < np.deg2rad(_RIGHT_DEG) and named >= _RIGHT_SHARE else "wrong"
+
+
+def summarise(results: Sequence[Result], out: Path) -> Summary:
+    """Return the table of all methods by axis, and a figure."""
+    cells = [
+        {"axis": axis, "value": value, **cell(_results_of(results, axis, value))}
+        for axis, values in AXES.items()
+        for value in values
+    ]
+    nominal = cell([r for r in results if r["axis"] == "nominal"])
+    lines = ["right / wrong / refused, median and p95 ms (processor)", "", *_nominal_lines(nominal)]
+    for axis in AXES:
+        lines += ["", LABELS[axis], *_axis_lines([c for c in cells if c["axis"] == axis])]
+    facts = {"nominal": {**NOMINAL, **nominal}, "cells": cells, "pixels": PIXELS}
+    return Summary("\n".join(lines) + "\n", facts, (_picture(cells, out),))
+
+
+def _results_of(results: Sequence[Result], axis: str, value: float) -> list[Result]:
+    wanted = ("nominal", 0.0) if value == NOMINAL[axis] else (axis, value)
+    return [r for r in results if (r["axis"], r["value"]) == wanted]
+
+
+def cell(results: Sequence[Result]) -> dict[str, Any]:
+    """Return the counts and times of every method over some lists."""
+    row: dict[str, Any] = {"lists": len(results)}
+    for name in METHODS:
+        verdicts = [r[name]["verdict"] for r in results]
+        spent = [r[name]["ms"] for r in results]
+        row[name] = {
+            **{kind: verdicts.count(kind) for kind in ("right", "wrong", "refused")},
+            "median_ms": float(np.median(spent)) if spent else None,
+            "p95_ms": float(np.quantile(spent, 0.95)) if spent else None,
+        }
+    return row
+
+
+def _nominal_lines(nominal: dict[str, Any]) -> list[str]:
+    lines = [f"nominal, {nominal['lists']} lists"]
+    for name in METHODS:
+        row = nominal[name]
+        counts = f"{row['right']:5d} / {row['wrong']} / {row['refused']}"
+        lines.append(f"  {name:20} {counts:18} {_ms(row['median_ms'])} {_ms(row['p95_ms'])} ms")
+    return lines
+
+
+def _axis_lines(cells: Sequence[dict[str, Any]]) -> list[str]:
+    """Return one line a method: at each value % right, wrong answers in brackets, median ms."""
+    lines = ["  " + f"{'% right (wrong) ms':20}" + "".join(f"{c['value']:>17g}" for c in cells)]
+    for name in METHODS:
+        entries = []
+        for one in cells:
+            row = one[name]
+            rate = 100.0 * row["right"] / one["lists"] if one["lists"] else float("nan")
+            entries.append(f"{rate:6.1f} ({row['wrong']}){_ms(row['median_ms'])}")
+        lines.append(f"  {name:20}" + "".join(f"{entry:>17}" for entry in entries))
+    return lines
+
+
+def _ms(value: float | None) -> str:
+    return "    -" if value is None else f"{value:6.1f}"
+
+
+def _picture(cells: Sequence[dict[str, Any]], out: Path) -> Path:
+    from matplotlib.figure import Figure  # noqa: PLC0415 - only here, an extra
+
+    figure = Figure(figsize=(18.0, 7.0), layout="constrained")
+    panels = figure.subplots(2, len(AXES), sharex="col")
+    for (axis, values), (above, below) in zip(AXES.items(), panels.T, strict=True):
+        here = [c for c in cells if c["axis"] == axis]
+        for name in METHODS:
+            right: FloatArray = np.array([100.0 * c[name]["right"] / max(c["lists"], 1) for c in here])
+            spent = [np.nan if (ms := c[name]["median_ms"]) is None else ms for c in here]
+            above.plot(values, right, marker="o", markersize=3, label=name)
+            below.semilogy(values, spent, marker="o", markersize=3)
+        above.set_ylim(-3.0, 103.0)
+        below.set_xlabel(LABELS[axis])
+        if axis == "noise_px":
+            below.set_xscale("log")
+    panels[0, 0].set_ylabel("identified rightly, %")
+    panels[1, 0].set_ylabel("median time, ms")
+    panels[0, -1].legend(fontsize=8)
+    path = out / "lost_in_space.png"
+    figure.savefig(path, dpi=100, facecolor="white")
+    return path
+
+
+LOST_IN_SPACE = Campaign(
+    "lost-in-space",
+    "identification rate of every method against noise, false and missing stars, field, magnitudes",
+    cases,
+    run,
+    summarise,
+    100,
+)

@@ -1,0 +1,208 @@
+"""Campaign `nadir`: the way down from random frames of the Earth's limb, in daylight and with the terminator.
+
+Positions, attitudes, Suns and ground are random, altitudes uniform over 200..2,000 km
+(`earth_camera.scenes`); the camera is the logarithmic Fuga 15d of 67 deg with distortion, noise and
+blemishes. The finder knows the position (GPS), the Sun's direction and the field's from models, and both
+coarsely in camera axes: solar strings to 5 deg an axis, magnetometer to 2 deg. Each view comes with air that
+the finder knows, its limb's height to 1 km, and with air that it does not: scale height and haze are drawn.
+
+Errors are angles between true and found nadir (both axes together); NEES is of the two axes, 2 by chance.
+Wrong is an accepted answer more than half a degree off; refused and ambiguous are no answers.
+"""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector
+from flight.gnc.vision.horizon.knowledge import HorizonKnowledge, SensedDirection
+from flight.gnc.vision.horizon.nadir import find_nadir
+from flight.gnc.vision.horizon.response import LogarithmicResponse
+from flight.gnc.vision.horizon.settings import EdgeSettings, HorizonSettings
+from flight.gnc.vision.horizon.solution import HorizonStatus
+from sim_hal.earth_camera import EarthCameraModel, EarthScene, nadir, render
+from sim_hal.earth_camera.atmosphere import Atmosphere
+from tests.sim_hal.earth_camera.scenes import random_direction, random_scene
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+
+VIEWS = ("sunlit", "terminator")
+AIRS = ("known", "unknown")
+KNOWN_LIMB = 1000.0
+"""m: to which the limb's height is believed where the air is known."""
+SCALE_HEIGHTS, HAZE = (6_500.0, 9_500.0), (0.7, 1.3)
+"""m, and times the standard optical depth: what is drawn where the air is not known."""
+SUN_SIGMA, FIELD_SIGMA = np.radians(5.0), np.radians(2.0)
+WRONG_DEG = 0.5
+K1, K2 = -0.05, 0.01
+RIGHT, WRONG = "right", "wrong"
+
+
+def camera_model() -> EarthCameraModel:
+    """Return the campaign's camera."""
+    return EarthCameraModel.fuga15d(seed=1, k1=K1, k2=K2)
+
+
+def finder_settings(model: EarthCameraModel, air: str = "unknown") -> HorizonSettings:
+    """Return the default settings with the camera's response, for one of `AIRS`."""
+    response = LogarithmicResponse(model.pedestal, model.counts_per_decade)
+    settings = HorizonSettings(edges=EdgeSettings(response=response, psf_sigma=model.blur))
+    return replace(settings, limb_height_sigma=KNOWN_LIMB) if air == "known" else settings
+
+
+def random_air(generator: np.random.Generator) -> Atmosphere:
+    """Return air thinner or thicker than the standard one, its limb some 2 km lower or higher."""
+    standard = Atmosphere()
+    return replace(
+        standard,
+        scale_height=generator.uniform(*SCALE_HEIGHTS),
+        optical_depth=standard.optical_depth * generator.uniform(*HAZE),
+    )
+
+
+def coarse_knowledge(scene: EarthScene, generator: np.random.Generator) -> HorizonKnowledge:
+    """Return what a satellite in that scene would know, its coarse sensors' errors drawn."""
+    sun, field = scene.sun / np.linalg.norm(scene.sun), random_direction(generator)
+    sensed = tuple(
+        SensedDirection(_misread(scene.camera_matrix @ true, sigma, generator), true, sigma)
+        for true, sigma in ((sun, SUN_SIGMA), (field, FIELD_SIGMA))
+    )
+    return HorizonKnowledge(position=scene.position, sun=sun, pole=scene.pole, sensed=sensed)
+
+
+def _misread(direction: FloatArray, sigma: float, generator: np.random.Generator) -> FloatArray:
+    error = from_rotation_vector(sigma * generator.standard_normal(3))
+    return np.asarray(attitude_matrix(error) @ direction)
+
+
+def cases(runs: int, seed: int) -> list[Case]:
+    """Return `runs` frames of each view with each air."""
+    return [
+        Case(f"{view}-{air}-{run}", (seed, number, run), {"view": view, "air": air})
+        for air in AIRS
+        for number, view in enumerate(VIEWS)
+        for run in range(runs)
+    ]
+
+
+def run(case: Case) -> Result:
+    """Find nadir in one frame and judge the answer."""
+    model = camera_model()
+    generator = np.random.default_rng(case.seed)
+    scene = random_scene(generator, model, case.parameters["view"])
+    air = case.parameters["air"]
+    if air == "unknown":
+        scene = replace(scene, atmosphere=random_air(generator))
+    frame = render(model, scene, generator)
+    knowledge, settings = coarse_knowledge(scene, generator), finder_settings(model, air)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        begun = time.process_time()
+        found = find_nadir(frame, model.lens, knowledge, settings)
+        spent = time.process_time() - begun
+    result: Result = {
+        **case.parameters,
+        "seed": list(case.seed),
+        "altitude_km": 1e-3 * (float(np.linalg.norm(scene.position)) - 6_371e3),
+        "status": found.status.value,
+        "reason": found.reason,
+        "milliseconds": 1e3 * spent,
+        "pixels_read": found.pixels_read,
+        "warnings": sorted({f"{Path(w.filename).name}:{w.lineno} {w.message}" for w in caught}),
+    }
+    truth = nadir(scene)
+    if found.nadir is None:
+        nearest = max((float(each.direction @ truth) for each in found.candidates), default=None)
+        off = None if nearest is None else float(np.degrees(np.arccos(min(1.0, nearest))))
+        return {**result, "verdict": found.status.value, "error_deg": None, "nees": None, "nearest_deg": off}
+    error = found.nadir.basis @ truth
+    return {
+        **result,
+        "error_deg": (size := float(np.degrees(np.linalg.norm(error)))),
+        "verdict": WRONG if size > WRONG_DEG or found.nadir.direction @ truth < 0.0 else RIGHT,
+        "nees": float(error @ np.linalg.solve(found.nadir.tangent_covariance, error)),
+        "sigma_deg": float(np.degrees(found.nadir.sigma)),
+        "edges": found.nadir.used,
+        "residual_px": found.nadir.residual,
+    }
+
+
+def summarise(results: Sequence[Result], _: Path) -> Summary:
+    """Return the table of both views, each with both airs, and the frames to look at."""
+    rows = [
+        {"view": view, "air": air, **row(of)}
+        for air in AIRS
+        for view in VIEWS
+        if (of := [r for r in results if (r["view"], r["air"]) == (view, air)])
+    ]
+    poor = [r for r in results if _worth_a_line(r)]
+    lines = [
+        "view        air      frames  right  wrong  ambiguous  refused  none   rms deg    p99  worst  NEES/2"
+        "   ms median   p95    max   px read"
+    ]
+    lines += [_line(each) for each in rows]
+    lines += ["", "seed  air  verdict  error deg  NEES  edges  altitude km  why"]
+    for one in poor:
+        error = "-" if one["error_deg"] is None else f"{one['error_deg']:.3f}"
+        nees = "-" if one["nees"] is None else f"{one['nees']:.1f}"
+        lines.append(
+            f"{one['seed']}  {one['air']:7}  {one['verdict']:10} {error:>7} {nees:>6}"
+            f" {one.get('edges', 0):5d}  {one['altitude_km']:8.0f}"
+            f"  {'; '.join([one['reason'], *one['warnings']])}"
+        )
+    return Summary("\n".join(lines) + "\n", {"views": rows, "to_look_at": poor})
+
+
+def row(results: Sequence[Result]) -> dict[str, Any]:
+    """Return counts, errors, NEES and times of some frames."""
+    verdicts = Counter(r["verdict"] for r in results)
+    answers = [r for r in results if r["nees"] is not None]
+    errors = np.array([r["error_deg"] for r in answers])
+    spent = np.array([r["milliseconds"] for r in results])
+    return {
+        "frames": len(results),
+        **{kind: verdicts[kind] for kind in (RIGHT, WRONG)},
+        **{kind.value: verdicts[kind.value] for kind in HorizonStatus if kind is not HorizonStatus.FOUND},
+        "rms_deg": float(np.sqrt(np.mean(errors**2))) if answers else None,
+        "p99_deg": float(np.quantile(errors, 0.99)) if answers else None,
+        "worst_deg": float(errors.max()) if answers else None,
+        "nees": float(np.mean([r["nees"] for r in answers])) if answers else None,
+        "median_ms": float(np.median(spent)),
+        "p95_ms": float(np.quantile(spent, 0.95)),
+        "most_ms": float(spent.max()),
+        "pixels_read": float(np.mean([r["pixels_read"] for r in results])),
+    }
+
+
+def _line(one: dict[str, Any]) -> str:
+    errors = [one[name] for name in ("rms_deg", "p99_deg", "worst_deg")]
+    told = "  ".join("    -" if error is None else f"{error:.4f}" for error in errors)
+    nees = "-" if one["nees"] is None else f"{0.5 * one['nees']:.2f}"
+    return (
+        f"{one['view']:11} {one['air']:7}  {one['frames']:6d}  {one['right']:5d}  {one['wrong']:5d}"
+        f"  {one['ambiguous']:9d}  {one['refused']:7d}  {one['no-horizon']:4d}   {told}  {nees:>6}"
+        f"   {one['median_ms']:9.1f}  {one['p95_ms']:4.1f}  {one['most_ms']:5.1f}  {one['pixels_read']:8.0f}"
+    )
+
+
+def _worth_a_line(result: Result) -> bool:
+    """Tell whether a frame is to be looked at: wrong, none, far beyond its covariance, or warned."""
+    return bool(result["verdict"] != RIGHT or result["nees"] > 20.0 or result["warnings"])
+
+
+NADIR = Campaign(
+    "nadir",
+    "nadir from frames of the Earth's limb, sunlit and with the terminator; counts frames of each",
+    cases,
+    run,
+    summarise,
+    1000,
+)

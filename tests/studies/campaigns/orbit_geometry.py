@@ -1,0 +1,102 @@
+"""What a satellite in orbit has in view: attitudes about the local vertical, limb and Sun in camera fields.
+
+The Earth is a sphere of its equatorial radius; the paper's orbit is that of a Shuttle deployment at 380 km
+(Meller et al., sections 1 and 4.1), its inclination 51.6 deg [assumed: the Shuttle's to the Station].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from flight.gnc.earth.figure import EARTH_RADIUS
+from flight.gnc.math.arrays import BoolArray, FloatArray
+from flight.schema import sensor_suite
+from flight.schema.sensor_suite import SensorSuite, WideCamera
+from sim_hal.worlds.orbit import KeplerianElements, propagate
+
+ALTITUDE = 380e3
+INCLINATION = np.radians(51.6)
+LIMB_POINTS = 720
+SUITES = ("vt", "uw", "usu")
+
+
+@cache
+def suite(name: str) -> SensorSuite:
+    """Return one of the paper's three."""
+    return sensor_suite.load(Path("config") / "sensors" / f"{name}.yaml")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pass:
+    """One revolution: times (n,) s, positions and velocities (n, 3), the Julian date UTC at time 0."""
+
+    julian_date: float
+    times: FloatArray
+    positions: FloatArray
+    velocities: FloatArray
+
+
+def revolution(
+    julian_date: float, node: float, step: float, begin: float = 0.0, latitude: float = 0.0
+) -> Pass:
+    """Return one revolution from `begin` s on, every `step` s; `latitude` rad: its argument at 0."""
+    elements = KeplerianElements(
+        semi_major_axis=EARTH_RADIUS + ALTITUDE,
+        inclination=float(INCLINATION),
+        ascending_node=node,
+        true_anomaly=latitude,
+    )
+    times = begin + np.arange(0.0, elements.period, step)
+    states = propagate(elements, float(times[-1]) + 1.0).states_at(times)
+    return Pass(julian_date, times, states[:, :3], states[:, 3:])
+
+
+def local_frame(positions: FloatArray, velocities: FloatArray) -> FloatArray:
+    """Return the matrices (n, 3, 3), ICRS into forward, right and down."""
+    down = -positions / np.linalg.norm(positions, axis=-1, keepdims=True)
+    right = np.cross(velocities, positions)
+    right /= np.linalg.norm(right, axis=-1, keepdims=True)
+    return np.stack([np.cross(right, down), right, down], axis=-2)
+
+
+def limb(positions: FloatArray) -> FloatArray:
+    """Return LIMB_POINTS directions (n, points, 3), forward, right and down: the Earth's edge."""
+    edge = np.arcsin(EARTH_RADIUS / np.linalg.norm(positions, axis=-1))[:, None]
+    around = np.linspace(0.0, 2.0 * np.pi, LIMB_POINTS, endpoint=False)
+    across = np.sin(edge)
+    return np.stack(
+        [
+            across * np.cos(around),
+            across * np.sin(around),
+            np.broadcast_to(np.cos(edge), (len(edge), LIMB_POINTS)),
+        ],
+        axis=-1,
+    )
+
+
+def limb_in_daylight(positions: FloatArray, directions: FloatArray, sun: FloatArray) -> BoolArray:
+    """Return which limb points (n, points) see the Sun; all in forward, right and down, `sun` (n, 3) unit."""
+    radius = np.linalg.norm(positions, axis=-1)
+    reach = np.sqrt(radius**2 - EARTH_RADIUS**2)
+    ground = reach[:, None, None] * directions
+    ground = ground - np.array([0.0, 0.0, 1.0]) * radius[:, None, None]
+    return np.asarray(np.einsum("npi,ni->np", ground, sun) > 0.0)
+
+
+def in_field(camera: WideCamera, directions: FloatArray) -> BoolArray:
+    """Return which body directions (..., 3) fall onto the camera's detector."""
+    x, y, z = np.moveaxis(directions @ camera.to_camera.T, -1, 0)
+    half = np.tan(np.radians(0.5 * camera.field_of_view_deg))
+    return np.asarray(
+        (z > 0.0) & (np.abs(x) < half * z) & (np.abs(y) < half * z * camera.rows / camera.columns)
+    )
+
+
+def in_cone(camera: WideCamera, directions: FloatArray) -> BoolArray:
+    """Return which body directions (..., 3) are within half the field of the boresight: the paper's cones."""
+    cosine = directions @ camera.to_camera[2]
+    return np.asarray(cosine > np.cos(np.radians(0.5 * camera.field_of_view_deg)))

@@ -1,0 +1,40 @@
+"""All campaigns by name."""
+
+from __future__ import annotations
+
+from tests.studies.campaigns.campaign import Campaign
+from tests.studies.campaigns.consistency import CONSISTENCY
+from tests.studies.campaigns.controllers import CONTROLLERS_CAMPAIGN
+from tests.studies.campaigns.coverage import COVERAGE
+from tests.studies.campaigns.failures import FAILURES
+from tests.studies.campaigns.faults import FAULTS
+from tests.studies.campaigns.faults_kill import FAULTS_KILL
+from tests.studies.campaigns.lost_in_space import LOST_IN_SPACE
+from tests.studies.campaigns.nadir import NADIR
+from tests.studies.campaigns.orbit_attitude import ORBIT_ATTITUDE
+from tests.studies.campaigns.rso import RSO_SLEW, RSO_TRACK
+from tests.studies.campaigns.rso_orbits import RSO_ORBITS
+from tests.studies.campaigns.soak import SOAK
+from tests.studies.campaigns.step_robust import STEP_ROBUST
+from tests.studies.campaigns.streaks import STREAKS
+
+CAMPAIGNS: dict[str, Campaign] = {
+    campaign.name: campaign
+    for campaign in (
+        STREAKS,
+        FAILURES,
+        RSO_SLEW,
+        RSO_TRACK,
+        RSO_ORBITS,
+        CONSISTENCY,
+        LOST_IN_SPACE,
+        NADIR,
+        CONTROLLERS_CAMPAIGN,
+        STEP_ROBUST,
+        FAULTS,
+        FAULTS_KILL,
+        SOAK,
+        COVERAGE,
+        ORBIT_ATTITUDE,
+    )
+}

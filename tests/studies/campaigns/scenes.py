@@ -1,0 +1,118 @@
+"""Frames with their truth for the campaigns: real stars, a random pointing, one constant body rate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from flight.gnc.catalogue import StarCatalogue, load
+from flight.gnc.math.arrays import FloatArray, Image
+from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
+from sim_hal.star_camera import StarCameraModel, render
+
+FIELD = float(np.deg2rad(20.0))
+YEAR = 2026.5
+SAMPLES = 41
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """A frame and what is true of it.
+
+    Attributes:
+        pixels: (rows, columns).
+        rate: (3,) rad/s, camera frame; `exposure` s.
+        start, middle, end: (n, 2) px of every catalogue star near the field; NaN behind the camera.
+        electrons: (n,) of the whole exposure; `magnitude` (n,).
+        directions: (n, 3) ICRS.
+        attitudes: (2, 4) at the start and the end, ICRS into camera.
+    """
+
+    pixels: Image
+    rate: FloatArray
+    exposure: float
+    start: FloatArray
+    middle: FloatArray
+    end: FloatArray
+    electrons: FloatArray
+    magnitude: FloatArray
+    directions: FloatArray
+    attitudes: FloatArray
+
+
+@lru_cache(maxsize=4)
+def catalogue(limit: float) -> tuple[StarCatalogue, FloatArray]:
+    """Return the stars brighter than `limit` and their directions (n, 3)."""
+    stars = load().brighter_than(limit)
+    return stars, stars.directions_at(YEAR)
+
+
+def slew(
+    generator: np.random.Generator,
+    theta: float,
+    fraction: float,
+    exposure: float,
+    limit: float = 8.5,
+    model: StarCameraModel | None = None,
+) -> Scene:
+    """Return a random sky seen while turning by `fraction` of the field, `theta` rad off the boresight."""
+    camera = model or StarCameraModel(field_of_view=FIELD)
+    azimuth = generator.uniform(0.0, 2.0 * np.pi)
+    axis = np.array([np.sin(theta) * np.cos(azimuth), np.sin(theta) * np.sin(azimuth), np.cos(theta)])
+    rate = axis * fraction * camera.field_of_view / exposure
+    middle = normalise(generator.normal(size=4))
+    return exposed(camera, middle, rate, exposure, generator, limit)
+
+
+def exposed(
+    camera: StarCameraModel,
+    middle: FloatArray,
+    rate: FloatArray,
+    exposure: float,
+    generator: np.random.Generator,
+    limit: float = 8.5,
+) -> Scene:
+    """Return a frame whose attitude at mid-exposure is `middle` (4,), turning at `rate` (3,) rad/s."""
+    stars, directions = catalogue(limit)
+    times = np.linspace(0.0, exposure, SAMPLES)
+    turns = from_rotation_vector((times - 0.5 * exposure)[:, None] * rate)
+    attitudes = multiply(turns, middle)
+    pixels = render(camera, directions, stars.magnitude, times, attitudes, generator)
+    pinhole = camera.pinhole
+    reach = np.cos(pinhole.half_diagonal + 0.5 * float(np.linalg.norm(rate)) * exposure)
+    near = directions @ attitude_matrix(middle)[2] > reach
+    start, mid, end = (
+        pinhole.project(directions[near] @ attitude_matrix(attitude).T)
+        for attitude in (attitudes[0], middle, attitudes[-1])
+    )
+    return Scene(
+        pixels=pixels,
+        rate=rate,
+        exposure=exposure,
+        start=start,
+        middle=mid,
+        end=end,
+        electrons=camera.electrons(stars.magnitude[near], exposure),
+        magnitude=stars.magnitude[near],
+        directions=directions[near],
+        attitudes=attitudes[[0, -1]],
+    )
+
+
+def usable(scene: Scene, camera: StarCameraModel, significance: float = 8.0) -> FloatArray:
+    """Return the indices of the stars wholly in the frame that stand out of the noise along their path."""
+    pinhole = camera.pinhole
+    inside = pinhole.contains(scene.start, -4.0) & pinhole.contains(scene.end, -4.0)
+    inside &= pinhole.contains(scene.middle, -4.0)
+    length = np.linalg.norm(scene.end - scene.start, axis=1)
+    noise = noise_floor(camera, scene.exposure) ** 0.5
+    pixels = 4.0 * camera.psf_sigma * (length + 4.0 * camera.psf_sigma)
+    bright = scene.electrons > significance * noise * np.sqrt(pixels)
+    return np.asarray(np.flatnonzero(inside & bright))
+
+
+def noise_floor(camera: StarCameraModel, exposure: float) -> float:
+    """Return the variance of a pixel without star light, e-^2: read, dark, rounding."""
+    return camera.read_noise**2 + camera.dark_current * exposure + camera.gain**2 / 12.0

@@ -1,0 +1,333 @@
+"""Campaign `streaks`: Table 3.1 and Figures 3.7-3.10 for five estimators, with the Cramer-Rao bound.
+
+A cell is one theta (axis to boresight) and one turn in percent of the field (3.28). Every estimator sees the
+same frames. The magnitude's error is the thesis's metric for the rate; the vector's is larger, since the
+boresight component is weak, and has its own column. The attitude is that at an end of the exposure by ESOQ2
+with the true stars injected, in px by 3.29, across the boresight and whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flight.gnc.errors import FlightError
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.vision.streaks.bound import rate_bound
+from flight.gnc.vision.streaks.corners.settings import DETECTOR_NAMES, StreakSettings
+from flight.gnc.vision.streaks.corners.streak_rate import StreakStatus, estimate_rate
+from flight.gnc.vision.streaks.corners.two_attitudes import attitude_error, error_in_pixels, solve
+from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion
+from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from sim_hal.star_camera import StarCameraModel
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.scenes import FIELD, Scene, noise_floor, slew, usable
+
+THETAS_DEG = (0, 3, 10, 20, 30, 45, 60, 75, 90)
+PERCENTS = (5, 10, 20, 30, 50)
+EXPOSURE = 0.2
+LIKELIHOOD = "likelihood"
+ESTIMATORS = (*DETECTOR_NAMES, LIKELIHOOD)
+BOUND_STARS = 30
+MATCH_PX = 6.0
+WRONG = 25.9
+# Table 3.1: rate % at 10 and 50 %, attitude px at 10 and 50 %, least theta in deg.
+THESIS = {
+    "harris": (0.69, 0.07, 0.10, 0.10, 20),
+    "minimum-eigenvalue": (1.20, 0.19, 0.19, 0.20, 30),
+    "trajkovic-4": (2.44, 0.38, 0.39, 0.37, 30),
+    "trajkovic-8": (3.49, 0.47, 0.55, 0.29, 30),
+}
+
+
+def cases(runs: int, seed: int) -> list[Case]:
+    """Return `runs` frames for each cell."""
+    return [
+        Case(f"{theta}/{percent}/{run}", (seed, theta, percent, run), {"theta": theta, "percent": percent})
+        for run in range(runs)
+        for theta in THETAS_DEG
+        for percent in PERCENTS
+    ]
+
+
+def run(case: Case) -> Result:
+    """Let every estimator see one frame."""
+    camera = StarCameraModel(field_of_view=FIELD)
+    generator = np.random.default_rng(case.seed)
+    theta, fraction = np.deg2rad(case.parameters["theta"]), case.parameters["percent"] / 100.0
+    scene = slew(generator, float(theta), fraction, EXPOSURE, model=camera)
+    saturation = float(camera.highest_count)
+    result: Result = {**case.parameters, "usable": len(usable(scene, camera)), "bound": _bound(scene, camera)}
+    for name in DETECTOR_NAMES:
+        settings = StreakSettings.of(name, saturation=saturation)
+        found = estimate_rate(scene.pixels, camera.pinhole, EXPOSURE, settings, scene.rate, 0.0)
+        result[name] = _errors(found, scene, camera)
+    likelihood = LikelihoodSettings(saturation=saturation, gain=camera.gain)
+    motion = estimate_motion(scene.pixels, camera.pinhole, EXPOSURE, likelihood, scene.rate, 0.0)
+    result[LIKELIHOOD] = _errors(motion, scene, camera)
+    return result
+
+
+def _bound(scene: Scene, camera: StarCameraModel) -> list[float] | None:
+    """Return the bound on magnitude and vector, 1 sigma, relative; None when the stars fix nothing."""
+    pinhole = camera.pinhole
+    places = (scene.start, scene.middle, scene.end)
+    seen = np.flatnonzero(np.any([pinhole.contains(place) for place in places], axis=0))
+    brightest = seen[np.argsort(-scene.electrons[seen])][:BOUND_STARS]
+    try:
+        covariance = rate_bound(
+            pinhole,
+            scene.middle[brightest],
+            scene.electrons[brightest],
+            scene.rate,
+            scene.exposure,
+            camera.psf_sigma,
+            noise_floor(camera, scene.exposure),
+        ).covariance
+    except np.linalg.LinAlgError:
+        return None
+    size = float(np.linalg.norm(scene.rate))
+    axis = scene.rate / size
+    return [float(np.sqrt(axis @ covariance @ axis)) / size, float(np.sqrt(np.trace(covariance))) / size]
+
+
+def _errors(found: Any, scene: Scene, camera: StarCameraModel) -> Result:
+    """Return status and relative errors of one estimate."""
+    if found.status is not StreakStatus.RATE:
+        return {"status": found.status.value}
+    size = float(np.linalg.norm(scene.rate))
+    error = found.rate - scene.rate
+    whole, across = _attitude(found, scene, camera)
+    return {
+        "status": "rate",
+        "magnitude": float(np.linalg.norm(found.rate)) / size - 1.0,
+        "vector": float(np.linalg.norm(error)) / size,
+        "nees": float(error @ np.linalg.solve(found.covariance, error)),
+        "whole_px": whole,
+        "across_px": across,
+    }
+
+
+def _attitude(found: Any, scene: Scene, camera: StarCameraModel) -> tuple[float | None, float | None]:
+    """Return the mean error of the two ends' attitudes in px (3.29), whole and across; None without one."""
+    ends = found.endpoints[found.used]
+    true = np.stack([scene.start, scene.end], axis=1)
+    distance = np.linalg.norm(true[None] - ends[:, None], axis=-1).max(axis=-1)
+    distance = np.where(np.isfinite(distance), distance, np.inf)
+    star = distance.argmin(axis=1)
+    known = distance[np.arange(len(ends)), star] < MATCH_PX
+    try:
+        fixes = solve(
+            ends[known],
+            scene.directions[star[known]],
+            np.ones(int(known.sum())),
+            camera.pinhole,
+            scene.exposure,
+        )
+    except FlightError:
+        return None, None
+    pairs = zip((fixes.start, fixes.end), scene.attitudes, strict=True)
+    errors = np.mean([attitude_error(fix.quaternion, truth) for fix, truth in pairs], axis=0)
+    resolution = camera.columns
+    whole, across = (error_in_pixels(float(e), resolution, camera.field_of_view) for e in errors)
+    return whole, across
+
+
+def summarise(results: Sequence[Result], out: Path) -> Summary:
+    """Return the table by cell and estimator, the table of the thesis, and Figures 3.7-3.10."""
+    cells = []
+    for theta in THETAS_DEG:
+        for percent in PERCENTS:
+            here = [r for r in results if r["theta"] == theta and r["percent"] == percent]
+            cells.append({"theta": theta, "percent": percent, "frames": len(here), **_cell(here)})
+    overall = _overall(results)
+    lines = [*_cell_lines(cells), "", *_overall_lines(overall), "", *_thesis_lines(results)]
+    pictures = _pictures(cells, out)
+    return Summary(
+        "\n".join(lines) + "\n", {"cells": cells, "overall": overall, "exposure_s": EXPOSURE}, pictures
+    )
+
+
+def _cell(results: Sequence[Result]) -> dict[str, Any]:
+    bounds = np.array([r["bound"] for r in results if r["bound"] is not None]).reshape(-1, 2)
+    row: dict[str, Any] = {
+        "bound_magnitude": _rms(bounds[:, 0]),
+        "bound_vector": _rms(bounds[:, 1]),
+    }
+    for name in ESTIMATORS:
+        good = [r for r in results if r[name]["status"] == "rate" and r["bound"] is not None]
+        own = np.array([r["bound"] for r in good]).reshape(-1, 2)
+        row[name] = {
+            "rates": len(good),
+            "magnitude": _rms(np.array([r[name]["magnitude"] for r in good])),
+            "vector": _rms(np.array([r[name]["vector"] for r in good])),
+            "ratio_magnitude": _ratio([r[name]["magnitude"] for r in good], own[:, 0]),
+            "ratio_vector": _ratio([r[name]["vector"] for r in good], own[:, 1]),
+            "nees": _mean([r[name]["nees"] for r in good]),
+            "across_px": _mean([r[name]["across_px"] for r in good if r[name]["across_px"] is not None]),
+            "whole_px": _mean([r[name]["whole_px"] for r in good if r[name]["whole_px"] is not None]),
+        }
+    return row
+
+
+def _overall(results: Sequence[Result]) -> list[dict[str, Any]]:
+    """Return the likelihood estimator's figures by turn, all theta together.
+
+    Wrong is a rate whose normalised squared error exceeds what one in 100,000 has (chi-square of 3).
+    """
+    rows = []
+    for percent in PERCENTS:
+        here = [r for r in results if r["percent"] == percent and r["bound"] is not None]
+        good = [r for r in here if r[LIKELIHOOD]["status"] == "rate"]
+        own = np.array([r["bound"] for r in good]).reshape(-1, 2)
+        squared = [r[LIKELIHOOD]["nees"] for r in good]
+        pixels = [r[LIKELIHOOD]["across_px"] for r in good if r[LIKELIHOOD]["across_px"] is not None]
+        rows.append(
+            {
+                "percent": percent,
+                "frames": len(here),
+                "rates": len(good),
+                "wrong": sum(value > WRONG for value in squared),
+                "ratio_magnitude": _ratio([r[LIKELIHOOD]["magnitude"] for r in good], own[:, 0]),
+                "ratio_vector": _ratio([r[LIKELIHOOD]["vector"] for r in good], own[:, 1]),
+                "nees": _mean(squared),
+                "across_px_median": float(np.median(pixels)) if pixels else None,
+            }
+        )
+    return rows
+
+
+def _overall_lines(rows: Sequence[dict[str, Any]]) -> list[str]:
+    lines = ["likelihood, all theta: rms error over the Cramer-Rao bound, NEES (3 is honest)"]
+    for row in rows:
+        lines.append(
+            f"turn {row['percent']:2d} %: {row['rates']} rates of {row['frames']}, {row['wrong']} wrong, "
+            f"magnitude {_number(row['ratio_magnitude'])}, vector {_number(row['ratio_vector'])} x bound, "
+            f"NEES {_number(row['nees'])}, attitude {_number(row['across_px_median'])} px median"
+        )
+    return lines
+
+
+def _rms(values: FloatArray) -> float | None:
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else None
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return float(np.mean(values)) if len(values) else None
+
+
+def _ratio(errors: Sequence[float], bound: FloatArray) -> float | None:
+    """Return the rms of errors over their own bounds."""
+    return _rms(np.array(errors) / bound) if len(errors) else None
+
+
+def _cell_lines(cells: Sequence[dict[str, Any]]) -> list[str]:
+    head = "theta  turn %  frames   bound: magn. %  vector %"
+    lines = [
+        head
+        + "".join(f" | {name}: rates  magn. %  x bound  vector %  x bound" for name in (LIKELIHOOD, "harris"))
+    ]
+    for cell in cells:
+        line = f"{cell['theta']:5d}  {cell['percent']:6d}  {cell['frames']:6d}"
+        line += f"  {_percent(cell['bound_magnitude']):>14}  {_percent(cell['bound_vector']):>8}"
+        for name in (LIKELIHOOD, "harris"):
+            row = cell[name]
+            line += f" | {row['rates']:>{len(name) + 7}d}  {_percent(row['magnitude']):>7}"
+            line += f"  {_number(row['ratio_magnitude']):>7}  {_percent(row['vector']):>8}"
+            line += f"  {_number(row['ratio_vector']):>7}"
+        lines.append(line)
+    return lines
+
+
+def _thesis_lines(results: Sequence[Result]) -> list[str]:
+    """Return Table 3.1: the largest mean error within each detector's precise region, thesis and here."""
+    lines = ["Table 3.1 (mean absolute error, largest over theta in the precise region)      thesis | here"]
+    for name in ESTIMATORS:
+        thesis = THESIS.get(name)
+        least = thesis[4] if thesis else 0
+        row = f"{name:20} theta >= {least:2d}"
+        for column, percent in enumerate((10, 50)):
+            here = _worst_mean(results, name, percent, least, "magnitude")
+            row += f"   rate {percent} %: {thesis[column] if thesis else '-':>5} | {_percent(here)} %"
+        for column, percent in enumerate((10, 50)):
+            here = _worst_mean(results, name, percent, least, "across_px")
+            row += f"   attitude {percent} %: {thesis[2 + column] if thesis else '-':>5} | {_number(here)} px"
+        lines.append(row)
+    return lines
+
+
+def _worst_mean(results: Sequence[Result], name: str, percent: int, least: int, key: str) -> float | None:
+    means = []
+    for theta in THETAS_DEG:
+        values = [
+            abs(r[name][key])
+            for r in results
+            if r["theta"] == theta and r["percent"] == percent and r[name].get(key) is not None
+        ]
+        if theta >= least and values:
+            means.append(float(np.mean(values)))
+    return max(means, default=None)
+
+
+def _percent(value: float | None) -> str:
+    return "-" if value is None else f"{100.0 * value:.3f}"
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
+
+
+def _pictures(cells: Sequence[dict[str, Any]], out: Path) -> tuple[Path, ...]:
+    """Draw rate and attitude errors over theta and turn for the five estimators, Figures 3.7-3.10."""
+    from matplotlib.colors import LogNorm  # noqa: PLC0415 - only here, an extra
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    paths = []
+    for key, title, scale, span in (
+        ("magnitude", "rms error of the rate's magnitude, %", 100.0, (0.003, 5.0)),
+        ("across_px", "mean error of the attitude at an end, across the boresight, px", 1.0, (0.005, 2.0)),
+    ):
+        figure = Figure(figsize=(15.0, 4.2), layout="constrained")
+        panels = figure.subplots(1, len(ESTIMATORS), sharey=True)
+        for axes, name in zip(panels, ESTIMATORS, strict=True):
+            grid = np.array(
+                [
+                    [
+                        np.nan if (v := _find(cells, theta, percent)[name][key]) is None else scale * v
+                        for percent in PERCENTS
+                    ]
+                    for theta in THETAS_DEG
+                ]
+            )
+            shown = axes.imshow(grid, norm=LogNorm(*span), cmap="viridis", origin="lower", aspect="auto")
+            for (row, column), value in np.ndenumerate(grid):
+                if np.isfinite(value):
+                    axes.text(
+                        column, row, f"{value:.2g}", ha="center", va="center", fontsize=7, color="white"
+                    )
+            axes.set_title(name, fontsize=10)
+            axes.set_xticks(range(len(PERCENTS)), [str(p) for p in PERCENTS])
+            axes.set_yticks(range(len(THETAS_DEG)), [str(t) for t in THETAS_DEG])
+            axes.set_xlabel("turn, % of the field")
+        panels[0].set_ylabel("theta, deg")
+        figure.colorbar(shown, ax=panels, label=title)
+        paths.append(out / f"streaks_{key.removesuffix('_px')}.png")
+        figure.savefig(paths[-1], dpi=100, facecolor="white")
+    return tuple(paths)
+
+
+def _find(cells: Sequence[dict[str, Any]], theta: int, percent: int) -> dict[str, Any]:
+    return next(c for c in cells if c["theta"] == theta and c["percent"] == percent)
+
+
+STREAKS = Campaign(
+    "streaks",
+    "Table 3.1: rate and attitude of five estimators over theta and turn",
+    cases,
+    run,
+    summarise,
+    10,
+)

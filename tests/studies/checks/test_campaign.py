@@ -1,0 +1,54 @@
+"""A campaign is the same however it is run, and goes on where it was broken off."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flight.gnc.errors import UsageError
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, fly, fly_here
+
+
+def cases(runs: int, seed: int) -> list[Case]:
+    return [Case(f"{k}", (seed, k), {"factor": k}) for k in range(runs)]
+
+
+def draw(case: Case) -> Result:
+    generator = np.random.default_rng(case.seed)
+    return {"value": case.parameters["factor"] + float(generator.random())}
+
+
+def summarise(results: Sequence[Result], out: Path) -> Summary:
+    total = sum(result["value"] for result in results)
+    return Summary(f"total {total:.3f}\n", {"total": total, "runs": len(results)})
+
+
+TOY = Campaign("toy", "adds draws", cases, draw, summarise, 6)
+
+
+@pytest.mark.slow
+def test_on_many_cores_it_gives_what_it_gives_on_one(tmp_path: Path) -> None:
+    expected = sum(result["value"] for result in fly_here(TOY, 6, 3))
+    assert fly(TOY, 6, 3, tmp_path, workers=2).facts == {"total": pytest.approx(expected), "runs": 6}
+    assert (tmp_path / "summary.txt").read_text().startswith("total")
+
+
+@pytest.mark.slow
+def test_broken_off_it_goes_on_and_runs_nothing_twice(tmp_path: Path) -> None:
+    whole = fly(TOY, 6, 3, tmp_path / "whole", workers=1).facts
+    fly(TOY, 6, 3, tmp_path / "part", workers=1)
+    log = tmp_path / "part" / "results.jsonl"
+    lines = log.read_text().splitlines(keepends=True)
+    log.write_text("".join(lines[:3]) + lines[3][:9])
+    assert fly(TOY, 6, 3, tmp_path / "part", workers=1).facts == whole
+    keys = [line.split('"')[3] for line in log.read_text().splitlines()]
+    assert sorted(keys) == list("012345")
+
+
+def test_the_folder_of_another_campaign_is_refused(tmp_path: Path) -> None:
+    fly(TOY, 0, 3, tmp_path)
+    with pytest.raises(UsageError, match="give another folder"):
+        fly(TOY, 0, 4, tmp_path)

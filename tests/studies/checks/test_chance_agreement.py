@@ -1,0 +1,30 @@
+"""Fragments of long streaks that agree by chance are refused: frames on which they once passed for a rate."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flight.gnc.vision.streaks.corners.settings import DetectorName, StreakSettings
+from flight.gnc.vision.streaks.corners.streak_rate import StreakStatus, estimate_rate
+from sim_hal.star_camera import StarCameraModel
+from tests.studies.campaigns.scenes import FIELD, slew
+from tests.studies.campaigns.streaks import EXPOSURE
+
+
+@pytest.mark.parametrize(
+    ("theta", "percent", "run", "detector"),
+    [
+        (90, 50, 0, "minimum-eigenvalue"),
+        (90, 50, 0, "trajkovic-8"),
+        (30, 30, 2, "minimum-eigenvalue"),
+    ],
+)
+def test_no_rate_comes_of_it(theta: int, percent: int, run: int, detector: DetectorName) -> None:
+    camera = StarCameraModel(field_of_view=FIELD)
+    generator = np.random.default_rng((99, theta, percent, run))
+    scene = slew(generator, float(np.deg2rad(theta)), percent / 100.0, EXPOSURE, model=camera)
+    settings = StreakSettings.of(detector, saturation=float(camera.highest_count))
+    found = estimate_rate(scene.pixels, camera.pinhole, EXPOSURE, settings, scene.rate, 0.0)
+    assert found.status is StreakStatus.FAILED
+    assert found.rate is None

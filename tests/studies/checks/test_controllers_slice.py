@@ -1,0 +1,80 @@
+"""A slice of the campaigns of control: the floor, one world that is unlike the loop's belief, the table."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from flight.schema import reader as configuration
+from sim_hal.settings import Thread
+from tests.scenario.flights import demo_config, demo_world
+from tests.studies.campaigns import controllers, step_robust
+
+
+@pytest.mark.parametrize(("stiffness", "milliwatts"), [(0.0, 3.81), (1e-5, 8.52), (2e-5, 25.05)])
+def test_the_clairvoyant_optimum_is_the_one_that_was_computed_elsewhere(
+    stiffness: float, milliwatts: float
+) -> None:
+    """Three threads, by Hermite-Simpson collocation and an interior-point solver: issue 2's definition."""
+    thread = Thread(stiffness=stiffness, damping=2e-6 if stiffness else 0.0)
+    world = configuration.replace(demo_world(), thread=thread)
+    power = controllers.clairvoyant_power(demo_config(700.0), world)
+    assert 1e3 * power == pytest.approx(milliwatts, abs=0.01)
+
+
+def test_every_controller_flies_its_own_configuration() -> None:
+    configs = {name: make() for name, make in controllers.CONTROLLERS.items()}
+    assert {config.control.tracker for config in configs.values()} == {"lq", "thesis", "pid", "adaptive"}
+    for config in configs.values():
+        assert config.steps == configs["this loop"].steps
+        assert config.camera is None
+
+
+def test_worlds_differ_and_stay_within_their_bounds() -> None:
+    worlds = [step_robust.draw(case.seed) for case in step_robust.cases(200, 1)]
+    for name, low, high in (
+        ("inertia", 0.8, 1.2),
+        ("field", 0.9, 1.1),
+        ("resistance", 0.9, 1.1),
+        ("stiffness", 0.0, 3.0),
+        ("noise", 1.0, 3.0),
+        ("delay_cycles", 1, 3),
+    ):
+        values = [world[name] for world in worlds]
+        assert low <= min(values) < low + 0.05 * (high - low) + 1e-9
+        assert high - 0.05 * (high - low) - 1e-9 < max(values) <= high
+    assert max(span for world in worlds for _, span in world["dropouts_s"]) <= 1.0
+    assert step_robust.draw((1, 0)) == worlds[0]
+
+
+@pytest.mark.slow
+def test_a_world_unlike_the_loops_belief_is_flown_to_its_targets() -> None:
+    """Seed 1, world 1: what `python -m tests.studies.campaigns step-robust` begins with."""
+    result = step_robust.run(step_robust.cases(2, 1)[1])
+    assert not result["lost"]
+    assert result["settling_s"] < 12.0
+    assert result["steady_state_deg"] < 0.15
+    assert result["excursion_deg"] < 1.0
+    assert {"imu-silent", "imu-corrupt", "control-lost", "control-regained"} <= set(result["events"])
+
+
+def test_the_table_counts_the_lost_and_tells_the_percentile(tmp_path: Path) -> None:
+    world = step_robust.draw((1, 0))
+    results = [
+        {
+            "world": world,
+            "steady_state_deg": 0.01 * k,
+            "excursion_deg": 0.02 * k,
+            "settling_s": 8.0 + 0.01 * k if k < 99 else float("inf"),
+            "overshoot_percent": 0.1,
+            "rise_s": 6.0,
+            "lost": k == 99,
+        }
+        for k in range(100)
+    ]
+    summary = step_robust.summarise(results, tmp_path)
+    assert summary.facts["lost"] == 1
+    assert summary.facts["steady_state_deg"]["p95"] == pytest.approx(0.94)
+    assert summary.facts["settling_s"]["worst"] is None
+    assert summary.pictures[0].exists()

@@ -1,0 +1,111 @@
+"""The campaign `failures`: its frames, its verdicts, and a small slice of it with a seed of its own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flight.gnc.vision.streaks.corners.streak_rate import StreakStatus
+from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
+from sim_hal.star_camera import StarCameraModel
+from tests.studies.campaigns import failures
+from tests.studies.campaigns.campaign import Case, Result, fly_here
+from tests.studies.campaigns.scenes import FIELD, Scene, slew, usable
+
+_SEED = 20_261_121
+_FRAMES = 6
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """Return a frame to judge answers about; its rate is what counts."""
+    return slew(np.random.default_rng(_SEED), 1.0, 0.1, 0.2, limit=4.0)
+
+
+def _answer(scene: Scene, error: float, sigma: float) -> MotionResult:
+    """Return an answer whose rate is `error` too large, and claimed to `sigma`, both in parts of the rate."""
+    size = float(np.linalg.norm(scene.rate))
+    covariance = (sigma * size) ** 2 * np.eye(3)
+    return MotionResult(
+        StreakStatus.RATE, 0, scene.exposure, rate=(1.0 + error) * scene.rate, covariance=covariance
+    )
+
+
+@pytest.mark.parametrize(
+    ("error", "sigma", "verdict"),
+    [
+        (0.02, 0.001, "wrong"),
+        (0.02, 0.01, "right"),
+        (0.005, 0.0001, "right"),
+        (0.0, 0.001, "right"),
+    ],
+)
+def test_wrong_is_far_from_the_truth_and_far_beyond_its_own_sigma(
+    scene: Scene, error: float, sigma: float, verdict: str
+) -> None:
+    found = failures._judge(_answer(scene, error, sigma), scene, still=False)
+    assert found["verdict"] == verdict
+    assert found["nees"] == pytest.approx((error / sigma) ** 2)
+    assert found["vector"] == pytest.approx(error)
+
+
+def test_an_answer_beyond_its_sigma_is_told_though_it_is_near(scene: Scene) -> None:
+    result = failures._judge(_answer(scene, 0.005, 0.0001), scene, still=False)
+    assert "1.0050 of the rate" in result["reason"]
+
+
+def test_a_refusal_is_counted_by_its_status_unless_nothing_moves(scene: Scene) -> None:
+    refused = replace(_answer(scene, 0.0, 0.01), status=StreakStatus.FAILED, rate=None, covariance=None)
+    assert failures._judge(refused, scene, still=False)["verdict"] == "failed"
+    assert failures._judge(refused, scene, still=True)["verdict"] == "at rest"
+
+
+def test_motions_fill_the_range_and_do_not_depend_on_how_many_are_run() -> None:
+    many = failures.cases(400, _SEED)
+    theta, percent = (np.array([case.parameters[key] for case in many]) for key in ("theta", "percent"))
+    assert theta.min() < 3.0
+    assert theta.max() > 87.0
+    assert percent.min() < 2.0
+    assert percent.max() > 48.0
+    assert {case.parameters["exposure"] for case in many} == {0.2, 1.0}
+    assert failures.cases(3, _SEED) == many[:3]
+
+
+def test_every_frame_has_five_usable_stars_and_is_the_same_again() -> None:
+    camera = StarCameraModel(field_of_view=FIELD)
+    case = Case("0", (_SEED, 0, 1), {"theta": 90.0, "percent": 50.0, "exposure": 0.2})
+    first, _ = failures.expose(case, camera)
+    again, _ = failures.expose(case, camera)
+    assert len(usable(first, camera)) >= failures.LEAST_USABLE
+    assert np.array_equal(first.pixels, again.pixels)
+
+
+@pytest.fixture(scope="module")
+def results() -> list[Result]:
+    """Return a slice of the campaign, as the command runs it."""
+    return fly_here(failures.FAILURES, _FRAMES, _SEED)
+
+
+@pytest.mark.slow
+def test_a_slice_has_no_wrong_answer_no_refusal_and_honest_covariances(results: list[Result]) -> None:
+    """NEES of 3 a frame: the sum is a chi-square, below its 99.99 % limit."""
+    assert [result["verdict"] for result in results] == ["right"] * _FRAMES
+    assert sum(result["nees"] for result in results) < 50.0
+    assert not any(result["warnings"] for result in results)
+
+
+@pytest.mark.slow
+def test_the_summary_counts_draws_and_names_the_frames_to_look_at(
+    results: list[Result], tmp_path: Path
+) -> None:
+    missed = {**results[0], "verdict": "failed", "nees": None, "reason": "no motion"}
+    off = {**results[1], "verdict": "wrong", "nees": 100.0, "vector": 0.5, "reason": "axis 30 deg off"}
+    summary = failures.summarise([missed, off, *results[2:]], tmp_path)
+    assert (summary.facts["refused"], summary.facts["wrong"], summary.facts["answers"]) == (1, 1, _FRAMES - 1)
+    assert [one["reason"] for one in summary.facts["failures"]] == ["no motion", "axis 30 deg off"]
+    assert "axis 30 deg off" in summary.text
+    assert all(path.stat().st_size > 10_000 for path in summary.pictures)
+    assert len(summary.pictures) == 1

@@ -1,0 +1,50 @@
+"""A small slice of the campaign `streaks`, with its own seed: five estimators against bound and truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.studies.campaigns import streaks
+from tests.studies.campaigns.campaign import Case, Result
+
+FRAMES = 5
+
+
+@pytest.fixture(scope="module")
+def results() -> list[Result]:
+    """Frames of a turn of 10 % of the field, 45 deg off the boresight."""
+    cases = [Case(f"45/10/{run}", (20_261_121, run), {"theta": 45, "percent": 10}) for run in range(FRAMES)]
+    return [streaks.run(case) for case in cases]
+
+
+@pytest.mark.slow
+def test_the_likelihood_estimator_is_at_the_bound_and_knows_it(results: list[Result]) -> None:
+    """Errors over their bounds, rms of magnitude and of vector; NEES of 15 degrees of freedom, 99.9 %."""
+    found = [result["likelihood"] for result in results]
+    assert all(one["status"] == "rate" for one in found)
+    ratios = [
+        [one["magnitude"] / result["bound"][0], one["vector"] / result["bound"][1]]
+        for one, result in zip(found, results, strict=True)
+    ]
+    magnitude, vector = np.sqrt(np.mean(np.square(ratios), axis=0))
+    assert magnitude < 2.0
+    assert vector < 2.0
+    assert sum(one["nees"] for one in found) < 37.7
+    assert max(one["across_px"] for one in found) < 0.1
+
+
+@pytest.mark.slow
+def test_the_thesis_detectors_stay_within_table_3_1(results: list[Result]) -> None:
+    """Harris and minimum eigenvalue, mean error of the magnitude at 10 %: 0.69 and 1.20 %."""
+    for name, limit in (("harris", 0.0069), ("minimum-eigenvalue", 0.0120)):
+        errors = [abs(r[name]["magnitude"]) for r in results if r[name]["status"] == "rate"]
+        assert len(errors) >= FRAMES - 1
+        assert np.mean(errors) < limit
+
+
+@pytest.mark.slow
+def test_the_summary_has_a_row_for_every_cell(results: list[Result]) -> None:
+    facts = streaks._cell(results)
+    assert facts["likelihood"]["rates"] == FRAMES
+    assert facts["bound_magnitude"] < facts["bound_vector"]

@@ -1,0 +1,95 @@
+"""Damaged and hostile command packets through the codec.
+
+Accepted corruption is: a command from bytes that were never sent and whose CRC, reckoned here, is wrong; one
+that no flight can obey. Damage that passes a CRC of 16 bits by chance is counted as a collision.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+
+from flight.gnc.guidance.one_axis.plant import Q2_LIMIT
+from flight.link.commands.codec import (
+    ChangeMode,
+    Clear,
+    Command,
+    CommandError,
+    CommandPacker,
+    Ping,
+    Slew,
+    check,
+    describe,
+    name_of,
+    unpack,
+)
+from flight.loop.modes.mode import COMMANDS, Mode
+from tests.studies.fuzz.harness import Finding
+from tests.studies.fuzz.logs import ccitt, hostile
+from tests.studies.fuzz.mutation import Draw, chance, damage, integer
+
+_MODES = [mode for mode in COMMANDS if mode is not Mode.SLEW]
+
+
+class Telecommands:
+    """The target."""
+
+    def __init__(self) -> None:
+        draw, packer = np.random.default_rng(20260115), CommandPacker()
+        self._commands = [_command(draw) for _ in range(300)]
+        self._packets = [packer.pack(c, integer(draw, 0, 2**62)) for c in self._commands]
+        self._sent = set(self._packets)
+        self._data = b""
+
+    def last(self) -> str:
+        """Return the last packet in hexadecimal."""
+        return self._data.hex()
+
+    def attempt(self, draw: Draw) -> Counter[str]:
+        """Unpack one command."""
+        which = integer(draw, 0, len(self._packets) - 1)
+        data, fate = self._packets[which], draw.random()
+        if fate < 0.05:
+            if unpack(data) != self._commands[which]:
+                raise Finding("a command that comes out as another")
+            return Counter(whole=1)
+        if fate < 0.15:
+            data = draw.bytes(integer(draw, 0, 300))
+        elif fate < 0.5:
+            data = hostile(draw, data)
+        else:
+            for _ in range(integer(draw, 1, 3)):
+                data = damage(draw, data)
+        self._data = data
+        try:
+            command = unpack(data)
+        except CommandError as error:
+            if not str(error) or "\n" in str(error):
+                raise Finding(f"a refusal that is not one line: {error}") from error
+            return Counter(refused=1)
+        return Counter(accepted=1) + self._judge(command, data)
+
+    def _judge(self, command: Command, data: bytes) -> Counter[str]:
+        if ccitt(data) != 0:
+            raise Finding("a command with a wrong CRC")
+        check(command)
+        describe(command)
+        name_of(command)
+        if isinstance(command, Slew) and not -Q2_LIMIT <= command.q2 <= Q2_LIMIT:
+            raise Finding(f"a slew to {command.q2}")
+        if isinstance(command, ChangeMode) and command.mode not in _MODES:
+            raise Finding(f"a change to {command.mode}")
+        if isinstance(command, Clear) and not command.event:
+            raise Finding("an event without a name")
+        return Counter(right_crc=int(data not in self._sent))
+
+
+def _command(draw: Draw) -> Command:
+    kind = integer(draw, 0, 3)
+    if kind == 0:
+        return Ping(integer(draw, 0, 2**16 - 1))
+    if kind == 1:
+        mode = _MODES[integer(draw, 0, len(_MODES) - 1)]
+        return ChangeMode(mode, "by hand" if mode is Mode.SAFE and chance(draw, 0.5) else "")
+    return Slew(float(draw.uniform(-Q2_LIMIT, Q2_LIMIT))) if kind == 2 else Clear("imu-silent")

@@ -1,0 +1,141 @@
+"""`python -m tests.studies.pictures`: makes the README's pictures anew, from a flight of the demonstration.
+
+The flight is simulated in lock-step with a fixed seed, so the pictures change only when the software does.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from flight.app.flight import fly
+from flight.app.request import Order
+from flight.bodies.testbed.plant_model import plant_of
+from flight.gnc import catalogue
+from flight.gnc.camera.images import grey_stretch, write_picture
+from flight.gnc.guidance.one_axis.vmc import plan
+from flight.gnc.math.quaternion import about_axis_y, from_rotation_vector, multiply
+from flight.gnc.vision.horizon.nadir import find_nadir
+from flight.gnc.vision.horizon.solution import HorizonStatus
+from flight.gnc.vision.startracker.index.build import default_index
+from flight.gnc.vision.startracker.pointing import Pointing
+from flight.gnc.vision.startracker.solution import SolveStatus
+from flight.gnc.vision.startracker.solve import SolveSettings, solve_frame
+from flight.gnc.vision.streaks.corners.streak_rate import StreakStatus
+from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion
+from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from flight.link.telemetry.reader import read_run
+from flight.schema import reader as configuration
+from flight.schema.camera_model import camera_model
+from ground.pictures.horizon import draw_horizon
+from ground.pictures.sky_picture import draw_solution
+from ground.report import draw, draw_path
+from sim_hal.assembly import StarRenderer
+from sim_hal.earth_camera import render as render_earth
+from sim_hal.settings import Sky
+from sim_hal.star_camera import StarCameraModel, render
+from tests.sim_hal.earth_camera.scenes import random_scene
+from tests.studies.campaigns import nadir
+
+ROOT = Path(__file__).resolve().parents[2]
+CONFIG = ROOT / "config" / "step_demo.yaml"
+RATE = 0.03
+"""rad/s: the peak of a 0.1 step."""
+ORION_DEG = 84.0, -2.0, 15.0
+"""Right ascension, declination and roll of the solved picture."""
+HORIZON_SEEDS = 2, 4, 6
+
+
+def main() -> int:
+    """Write the pictures and name them."""
+    parser = argparse.ArgumentParser(prog="python -m tests.studies.pictures", description=__doc__)
+    parser.add_argument("--out", type=Path, default=ROOT / "docs" / "pictures", metavar="DIR")
+    folder: Path = parser.parse_args().out
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as place:
+        run_folder = Path(place) / "run"
+        fly(Order(CONFIG, run_folder))
+        drawn = {path.name: path for path in draw(read_run(run_folder), Path(place) / "figures")}
+        for name in ("overview.png", "paths.png"):
+            (folder / name).write_bytes(drawn[name].read_bytes())
+    config = configuration.load(CONFIG)
+    plant = plant_of(config)
+    draw_path(plan(plant, 0.4, 0.015, -0.3, 0.0, 10.0), plant, folder / "path.png")
+    _draw_frame(folder / "frame.png")
+    _draw_solved(folder / "solved.png")
+    _draw_horizons(folder / "horizons.png")
+    for name in ("overview.png", "paths.png", "path.png", "frame.png", "solved.png", "horizons.png"):
+        sys.stdout.write(f"{folder / name}\n")
+    return 0
+
+
+def _draw_frame(path: Path) -> None:
+    """Draw a frame of a slew at its fastest, with the endpoints that the rate is from."""
+    camera = configuration.load(CONFIG).camera
+    assert camera is not None
+    times = np.linspace(0.0, camera.exposure, 101)
+    attitudes = np.array([about_axis_y(-0.3 + RATE * t) for t in times])
+    pixels = StarRenderer(camera, Sky(), 1).render(1, times, attitudes)
+    found = estimate_motion(
+        pixels,
+        camera_model(camera).ideal,
+        camera.exposure,
+        LikelihoodSettings(gain=camera.gain, saturation=camera.saturation),
+        np.array([0.0, RATE, 0.0]),
+        1e-3,
+    )
+    assert found.status is StreakStatus.RATE
+    assert found.rate is not None
+    figure = Figure(figsize=(9.0, 9.3), layout="constrained")
+    axes = figure.subplots()
+    low, high = np.percentile(pixels, (1.0, 99.8))
+    axes.imshow(pixels, cmap="gray_r", vmin=low, vmax=high, interpolation="nearest")
+    for ends in found.endpoints[found.used]:
+        axes.plot(ends[:, 0], ends[:, 1], "o", markersize=5, markerfacecolor="none", color="#D55E00")
+    axes.set_title(
+        f"true rate {1e3 * RATE:.3f} mrad/s, from {found.used_count} streaks "
+        f"{1e3 * found.rate[1]:.3f} mrad/s about y (negative image)",
+        fontsize=10,
+    )
+    axes.set_axis_off()
+    figure.savefig(path, dpi=90, facecolor="white")
+
+
+def _draw_solved(path: Path) -> None:
+    """Draw Orion, drawn out to streaks, with the stars that were told from it and their names."""
+    rng = np.random.default_rng(2026)
+    camera = StarCameraModel()
+    attitude = Pointing(*np.radians(ORION_DEG)).quaternion()
+    times = np.linspace(0.0, 0.5, 3)
+    turn = np.array([0.008, 0.006, 0.01])
+    attitudes = multiply(from_rotation_vector((times[:, None] - 0.25) * 2.0 * turn), attitude)
+    stars = catalogue.load()
+    pixels = render(camera, stars.directions_at(2026.5), stars.magnitude, times, attitudes, rng)
+    sky = default_index()
+    found = solve_frame(pixels, camera.pinhole, (0.95, 1.05), 0.5, sky, SolveSettings())
+    assert found.status is SolveStatus.SOLVED
+    write_picture(path, draw_solution(grey_stretch(pixels), found, sky))
+
+
+def _draw_horizons(path: Path) -> None:
+    """Draw the Earth with its terminator in view, three times: edges that were found, the limb they fit."""
+    model = nadir.camera_model()
+    pictures = []
+    for seed in HORIZON_SEEDS:
+        generator = np.random.default_rng(seed)
+        scene = random_scene(generator, model, "terminator")
+        pixels = render_earth(model, scene, generator)
+        knowledge = nadir.coarse_knowledge(scene, generator)
+        found = find_nadir(pixels, model.lens, knowledge, nadir.finder_settings(model))
+        assert found.status is HorizonStatus.FOUND
+        pictures.append(draw_horizon(grey_stretch(pixels), found, model.lens))
+    write_picture(path, np.hstack(pictures))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
