@@ -18,7 +18,7 @@ from flight.app.rig import Rig
 from flight.app.run_folder import begin_folder
 from flight.app.simulated import flown_faults, simulated_rig
 from flight.gnc.errors import UsageError
-from flight.loop.fdir import events
+from flight.link import events
 from flight.loop.loop import FlightLoop
 from flight.loop.progress import Progress
 from flight.loop.run_label import RunLabel

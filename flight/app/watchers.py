@@ -7,9 +7,9 @@ import threading
 from contextlib import ExitStack
 
 from flight.app.rig import Rig
+from flight.link import events
 from flight.link.telemetry.recorder import Recorder
 from flight.loop.executive import memory
-from flight.loop.fdir import events
 from flight.loop.fdir.supervision import Supervision
 from hal.buses import real_time
 from hal.buses.service_manager import ServiceManager

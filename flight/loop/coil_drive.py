@@ -12,10 +12,11 @@ import numpy as np
 
 from flight.gnc.control.allocation import allocate
 from flight.gnc.math.arrays import FloatArray
-from flight.loop.fdir import events, facts
+from flight.link import events
+from flight.loop.fdir import facts
 from flight.loop.fdir.coils.stuck_leg import NONE, Axes
 from flight.loop.fdir.coils.watch import CoilVerdict, CoilWatch
-from flight.loop.fdir.events import EventLog
+from flight.loop.fdir.event_log import EventLog
 from flight.loop.fdir.facts import Facts
 from hal.interfaces.devices import PowerMonitor, TorqueCoils
 from hal.interfaces.readings import CoilState, ImuReading

@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
+from flight.link import events
 from flight.link.commands.channel import Channel
 from flight.link.commands.codec import (
     ChangeMode,
@@ -21,16 +22,15 @@ from flight.link.commands.codec import (
     name_of,
     unpack,
 )
+from flight.link.modes import Mode
 from flight.link.telemetry.definitions import COMMAND
 from flight.link.telemetry.packets import Packer
 from flight.link.telemetry.recorder import Recorder
 from flight.loop.coil_drive import CoilDrive
 from flight.loop.executive.rate_group import Cycle
-from flight.loop.fdir import events
-from flight.loop.fdir.events import EventLog
+from flight.loop.fdir.event_log import EventLog
 from flight.loop.fdir.facts import Facts
 from flight.loop.modes.control import ModeControl
-from flight.loop.modes.mode import Mode
 from flight.schema.sections import CommandStep
 
 _REMEMBERED = 64

@@ -10,19 +10,20 @@ from flight.bodies.testbed.planning import Planning
 from flight.bodies.testbed.steering import Steering
 from flight.bodies.testbed.targets import KEPT, Target, TargetSequence
 from flight.gnc.estimation.estimate import ThreadEstimate
+from flight.link import events
+from flight.link.modes import Mode
 from flight.link.telemetry.definitions import CONTROL, TARGET
 from flight.link.telemetry.recorder import Recorder
 from flight.loop import imaging as imaging_task
 from flight.loop.coil_drive import CoilDrive
 from flight.loop.executive.jobs import JobRunner
 from flight.loop.executive.rate_group import Cycle
-from flight.loop.fdir import events
 from flight.loop.fdir.coils.knowledge import CoilKnowledge
-from flight.loop.fdir.events import EventLog
+from flight.loop.fdir.event_log import EventLog
 from flight.loop.fdir.streams import Streams
 from flight.loop.imaging import Imaging
 from flight.loop.modes.control import ModeControl
-from flight.loop.modes.mode import STEERING, Mode
+from flight.loop.modes.triggers import STEERING
 from flight.loop.navigation import Navigation
 from flight.loop.performance import PerformanceObserver
 from hal.interfaces.devices import TorqueCoils

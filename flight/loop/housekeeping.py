@@ -12,7 +12,7 @@ from flight.link.telemetry.definitions import HOUSEKEEPING
 from flight.link.telemetry.recorder import Recorder
 from flight.loop.executive.rate_group import Cycle
 from flight.loop.fdir import facts
-from flight.loop.fdir.events import EventLog
+from flight.loop.fdir.event_log import EventLog
 from flight.loop.fdir.facts import Facts
 from flight.loop.imaging import Imaging
 from flight.loop.navigation import Navigation

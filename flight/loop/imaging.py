@@ -23,12 +23,13 @@ from flight.gnc.vision.startracker.solve import AttitudePrior, RatePrior
 from flight.gnc.vision.streaks.corners.settings import StreakSettings
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from flight.gnc.vision.streaks.streak_result import StreakStatus
+from flight.link import events
 from flight.link.telemetry.definitions import STARS, STREAK
 from flight.link.telemetry.recorder import Recorder
 from flight.loop.executive.jobs import JobResult, JobRunner
 from flight.loop.executive.rate_group import Cycle
-from flight.loop.fdir import events, facts
-from flight.loop.fdir.events import EventLog
+from flight.loop.fdir import facts
+from flight.loop.fdir.event_log import EventLog
 from flight.loop.fdir.facts import Facts
 from flight.loop.fdir.repeated_rows import RepeatedRows
 from flight.loop.fdir.streams import Streams

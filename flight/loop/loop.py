@@ -11,13 +11,14 @@ from collections.abc import Callable, Sequence
 from flight.app.build.settings import SECOND_NS, attitude_filter
 from flight.app.build.tasks import build_rooms
 from flight.bodies.testbed.plant_model import plant_of
+from flight.link import events
 from flight.link.commands.channel import Channel
+from flight.link.events import EventKind
 from flight.link.telemetry.recorder import Recorder
 from flight.loop.executive.executive import Executive
 from flight.loop.executive.jobs import JobRunner
 from flight.loop.executive.rate_group import Cycle
-from flight.loop.fdir import events
-from flight.loop.fdir.events import EventKind, EventLog
+from flight.loop.fdir.event_log import EventLog
 from flight.loop.fdir.facts import Facts
 from flight.loop.fdir.resources import ResourceReader
 from flight.loop.fdir.streams import Streams, streams_of

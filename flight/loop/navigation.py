@@ -17,11 +17,12 @@ from flight.gnc.estimation.measurements import AttitudeMeasurement, Measurement,
 from flight.gnc.estimation.rigid_body import Parameters
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import about_axis_y, angle_about_axis_y, attitude_matrix
+from flight.link import events
 from flight.link.telemetry.definitions import IMU
 from flight.link.telemetry.recorder import Recorder
-from flight.loop.fdir import events, facts
+from flight.loop.fdir import facts
 from flight.loop.fdir.coils.knowledge import Known
-from flight.loop.fdir.events import EventLog
+from flight.loop.fdir.event_log import EventLog
 from flight.loop.fdir.facts import Facts
 from flight.loop.fdir.streams import Streams
 from hal.interfaces.devices import InertialUnit

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import traceback
 
+from flight.link import events
 from flight.link.telemetry.definitions import CYCLE_TIMING, JOB_TIMING, RATE_GROUP
 from flight.link.telemetry.recorder import Recorder
 from flight.loop.executive.jobs import JobResult
 from flight.loop.executive.rate_group import Cycle, RateGroup
-from flight.loop.fdir import events
-from flight.loop.fdir.events import EventLog
+from flight.loop.fdir.event_log import EventLog
 from hal.interfaces.devices import TorqueCoils
 from hal.interfaces.wires import Clock
 

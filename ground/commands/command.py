@@ -13,12 +13,12 @@ from pathlib import Path
 from flight.app.utc_label import utc_ns
 from flight.gnc.errors import FlightError, UsageError
 from flight.link.commands.codec import ChangeMode, Clear, Command, CommandPacker, Ping, Slew
+from flight.link.modes import COMMANDABLE, Mode
 from flight.link.telemetry.definitions import COMMAND
 from flight.link.telemetry.packets import LONGEST_PACKET, TelemetryError, to_text
 from flight.link.telemetry.scanner import decode
-from flight.loop.modes.mode import COMMANDS, Mode
 
-_MODES = [mode.label for mode in COMMANDS if mode is not Mode.SLEW]
+_MODES = [mode.label for mode in COMMANDABLE if mode is not Mode.SLEW]
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

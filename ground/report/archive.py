@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from flight.gnc.errors import UsageError
+from flight.link import events
 from flight.link.telemetry.archive import find_runs
 from flight.link.telemetry.packets import to_text
 from flight.link.telemetry.reader import Run, read_run
-from flight.loop.fdir import events
 from ground.report.text import number, table
 
 Object = dict[str, Any]

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from flight.gnc.math.arrays import FloatArray
+from flight.link.modes import Mode
 from flight.link.telemetry.packets import PacketArray, to_text
 from flight.link.telemetry.reader import Run
 from flight.loop.fdir.facts import FACTS
 from flight.loop.fdir.streams import StreamState
-from flight.loop.modes.mode import Mode
 from ground.report.signals import seconds
 
 Object = dict[str, Any]

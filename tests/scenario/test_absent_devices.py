@@ -10,7 +10,7 @@ import pytest
 
 from flight.app.devices import open_devices
 from flight.app.rig import Rig
-from flight.loop.modes.mode import Mode
+from flight.link.modes import Mode
 from hal.interfaces.errors import NotResponding
 from sim_hal import lockstep
 from sim_hal.emulators.serial_line import SOUND, LineFaults

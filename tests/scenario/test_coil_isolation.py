@@ -9,10 +9,10 @@ import pytest
 
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import attitude_matrix
+from flight.link.modes import Mode
 from flight.link.telemetry.packets import to_text
 from flight.link.telemetry.reader import Run
 from flight.loop.fdir.resources import ResourceSample
-from flight.loop.modes.mode import Mode
 from flight.schema.reader import replace
 from flight.schema.sections import Modes
 from sim_hal.settings import FaultEntry

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from flight.link.commands.codec import ChangeMode, Clear, Command, CommandPacker, Ping, Slew
+from flight.link.modes import Mode
 from flight.link.telemetry.packets import to_text
 from flight.link.telemetry.reader import Run
 from flight.link.telemetry.scanner import decode
-from flight.loop.modes.mode import Mode
 from tests.scenario.flights import Rigged, demo_config, event_names, fly
 from tests.scenario.test_modes import commanded, modes_of
 

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from flight.link.modes import Mode
 from flight.link.telemetry.reader import Run
 from flight.loop.fdir.facts import FACTS, IMU_POOR, TASK_FAILING
 from flight.loop.fdir.resources import ResourceSample
 from flight.loop.fdir.streams import StreamState
-from flight.loop.modes.mode import Mode
 from sim_hal.emulators.serial_line import SOUND, LineFaults
 from tests.scenario.flights import Rigged, demo_config, event_names, fly
 from tests.scenario.test_modes import commanded, modes_of

@@ -10,9 +10,9 @@ import pytest
 
 from flight.gnc.estimation.attitude_filter import AttitudeFilter
 from flight.gnc.math.arrays import FloatArray
+from flight.link.modes import Mode
 from flight.link.telemetry.packets import to_text
 from flight.link.telemetry.reader import Run
-from flight.loop.modes.mode import Mode
 from flight.loop.state.keeper import Notices, StateKeeper
 from flight.loop.state.store import StateStore
 from flight.schema import reader as configuration

@@ -20,12 +20,12 @@ from flight.gnc.guidance.one_axis.job import PlanJob
 from flight.gnc.guidance.one_axis.path import FARTHEST
 from flight.gnc.guidance.one_axis.plant import SingleAxisPlant, angle_of, q2_of
 from flight.gnc.guidance.one_axis.vmc import NODES, Plan, PlanStatus
+from flight.link import events
 from flight.link.telemetry.definitions import MAX_NODES, PLAN
 from flight.link.telemetry.recorder import Recorder
 from flight.loop.executive.jobs import JobResult, JobRunner
 from flight.loop.executive.rate_group import Cycle
-from flight.loop.fdir import events
-from flight.loop.fdir.events import EventLog
+from flight.loop.fdir.event_log import EventLog
 
 WORKER = "planner"
 _AGAIN_NS = 1_000_000_000

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from flight.gnc.errors import FlightError
 from flight.gnc.guidance.one_axis.plant import Q2_LIMIT
 from flight.link.commands.definitions import CLEAR, LAYOUTS, MODE, PING, SAFE, SLEW
+from flight.link.modes import COMMANDABLE, Mode
 from flight.link.telemetry.packets import HEADER_BYTES, Packer, TelemetryError, crc16, to_text
-from flight.loop.modes.mode import COMMANDS, Mode
 
 LONGEST = max(layout.length for layout in LAYOUTS.values())
 """Bytes of the longest command: what is longer is none."""
@@ -69,8 +69,8 @@ def name_of(command: Command) -> str:
 def check(command: Command) -> None:
     """Refuse values that no flight can obey; raises CommandError."""
     match command:
-        case ChangeMode(mode) if mode not in COMMANDS or mode is Mode.SLEW:
-            allowed = ", ".join(m.label for m in COMMANDS if m is not Mode.SLEW)
+        case ChangeMode(mode) if mode not in COMMANDABLE or mode is Mode.SLEW:
+            allowed = ", ".join(m.label for m in COMMANDABLE if m is not Mode.SLEW)
             raise CommandError(f"mode {mode.label} is not to be commanded so: one of {allowed}")
         case Slew(q2) if not abs(q2) <= Q2_LIMIT:  # NaN compares false
             raise CommandError(f"q2 = {q2} must lie within +-{Q2_LIMIT}")

@@ -119,7 +119,7 @@ MODE = Packet(
     (
         Field("before", "u1", "-", "mode until now, numbered as in mode"),
         Field("mode", "u1", "-", "0 boot, 1 safe, 2 detumble, 3 hold, 4 slew, 5 testbed-demo"),
-        Field("trigger", "S32", "-", "what led to it (flight.loop.modes.mode)"),
+        Field("trigger", "S32", "-", "what led to it (flight.loop.modes.triggers)"),
         Field("reason", "S96", "-", "of the trigger: the event, the values"),
         Field("target_q2", "f8", "-", "q2 wanted by a hold or a slew, NaN when not yet known"),
     ),
@@ -193,7 +193,7 @@ EVENT = Packet(
     "when it happens",
     "Something a reader of the log at night wants to know",
     (
-        Field("code", "u2", "-", "number of the event (flight.loop.fdir.events)"),
+        Field("code", "u2", "-", "number of the event (flight.link.events)"),
         Field("severity", "u1", "-", "0 information, 1 warning, 2 fault"),
         Field("suppressed", "u4", "-", "how many of its kind the throttle held back since the last one told"),
         Field("name", "S32", "-", "name of the event"),

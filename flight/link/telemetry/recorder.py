@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
+from flight.link.events import EventKind
 from flight.link.telemetry.definitions import EVENT, Packet
 from flight.link.telemetry.packets import Packer
-from flight.loop.fdir.events import EventKind
 
 
 class Log(Protocol):
@@ -39,7 +39,7 @@ class Recorder:
         self._performance.write(self._performance_packer.pack(packet, time_ns - self.epoch_ns, values))
 
     def event(self, kind: EventKind, time_ns: int, suppressed: int, text: str) -> None:
-        """Write an event: the sink of `flight.loop.fdir.events.EventLog`."""
+        """Write an event: the sink of `flight.loop.fdir.event_log.EventLog`."""
         self.record(
             EVENT,
             time_ns,

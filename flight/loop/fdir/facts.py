@@ -11,9 +11,11 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from flight.gnc.errors import FlightError
-from flight.loop.fdir import events
-from flight.loop.fdir.events import EventKind, EventLog, Reaction
-from flight.loop.modes.mode import STEERING, Mode
+from flight.link import events
+from flight.link.events import EventKind, Reaction
+from flight.link.modes import Mode
+from flight.loop.fdir.event_log import EventLog
+from flight.loop.modes.triggers import STEERING
 
 EVERYWHERE = frozenset(Mode)
 _DRIVEN = STEERING | {Mode.DETUMBLE}

@@ -6,12 +6,13 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from flight.link import events
 from flight.link.telemetry.definitions import HEALTH
 from flight.link.telemetry.recorder import Recorder
 from flight.loop.coil_drive import CoilDrive
 from flight.loop.executive.rate_group import Cycle, RateGroup
-from flight.loop.fdir import events, facts
-from flight.loop.fdir.events import EventLog
+from flight.loop.fdir import facts
+from flight.loop.fdir.event_log import EventLog
 from flight.loop.fdir.facts import FACTS, Facts
 from flight.loop.fdir.progress import GroupsAndWorkers, failing
 from flight.loop.fdir.resources import ClockWatch, ResourceMonitor, ResourceReader, ResourceSample

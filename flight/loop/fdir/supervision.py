@@ -9,9 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from flight.link import events
+from flight.link.events import EventKind
 from flight.link.telemetry.recorder import Recorder
-from flight.loop.fdir import events
-from flight.loop.fdir.events import EventKind, EventLog
+from flight.loop.fdir.event_log import EventLog
 from hal.interfaces.guardian import CoilGuardian, GuardianNews, Overseer
 from hal.interfaces.wires import Clock, Ticker
 

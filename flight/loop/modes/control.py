@@ -13,16 +13,19 @@ from flight.bodies.testbed.targets import COMMANDED, KEPT, Target
 from flight.gnc.estimation.estimate import ThreadEstimate
 from flight.gnc.guidance.one_axis.guidance import Guidance
 from flight.gnc.guidance.one_axis.plant import Q2_LIMIT, angle_of
+from flight.link import events
+from flight.link.events import EventKind, Reaction
+from flight.link.modes import Mode
 from flight.link.telemetry.definitions import MODE
 from flight.link.telemetry.recorder import Recorder
 from flight.loop.coil_drive import CoilDrive
-from flight.loop.fdir import events, facts
-from flight.loop.fdir.events import EventKind, EventLog, Reaction
+from flight.loop.fdir import facts
+from flight.loop.fdir.event_log import EventLog
 from flight.loop.fdir.facts import Facts
 from flight.loop.fdir.hold_timer import Dwell
 from flight.loop.modes.machine import Change, ModeMachine
-from flight.loop.modes.mode import COMMANDS, STARTS, STEERING, Mode, Trigger
 from flight.loop.modes.table import TRANSITIONS, Answer
+from flight.loop.modes.triggers import COMMANDS, STARTS, STEERING, Trigger
 from flight.schema.sections import Modes
 
 SAFING_REACTIONS = {

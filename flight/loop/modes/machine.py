@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from flight.loop.modes.mode import Mode, Trigger
+from flight.link.modes import Mode
 from flight.loop.modes.table import TRANSITIONS, Answer, Table, check
+from flight.loop.modes.triggers import Trigger
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,8 @@ from collections.abc import Mapping
 from enum import Enum
 
 from flight.gnc.errors import FlightError
-from flight.loop.modes.mode import COMMANDS, SAFING, STARTS, Mode, Trigger
+from flight.link.modes import Mode
+from flight.loop.modes.triggers import COMMANDS, SAFING, STARTS, Trigger
 
 
 class Answer(Enum):

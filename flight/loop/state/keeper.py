@@ -12,8 +12,8 @@ from collections import deque
 from collections.abc import Mapping
 from datetime import UTC, datetime
 
-from flight.loop.fdir import events
-from flight.loop.fdir.events import EventKind
+from flight.link import events
+from flight.link.events import EventKind
 from flight.loop.state import history
 from flight.loop.state.content import Learned
 from flight.loop.state.history import BootRecord

@@ -15,8 +15,8 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from flight.loop.fdir import events
-from flight.loop.fdir.events import EventKind
+from flight.link import events
+from flight.link.events import EventKind
 from flight.loop.state.content import StoredState, check
 from flight.loop.state.files import Files, LinuxFiles, replace_file
 

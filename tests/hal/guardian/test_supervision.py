@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from flight.link.events import EventKind
 from flight.link.telemetry.recorder import Recorder
-from flight.loop.fdir.events import EventKind
 from flight.loop.fdir.supervision import Supervision
 from hal.interfaces.guardian import GuardianNews
 from tests.manual_clock import ManualClock

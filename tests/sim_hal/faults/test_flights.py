@@ -7,8 +7,8 @@ from typing import Any, cast
 
 import pytest
 
+from flight.link.events import EVENTS, Reaction, Severity
 from flight.link.telemetry.reader import Run
-from flight.loop.fdir.events import EVENTS, Reaction, Severity
 from flight.schema import reader as configuration
 from sim_hal.faults.catalogue import CATALOGUE
 from sim_hal.faults.kinds import FaultKind

@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 
 from flight.gnc.errors import UsageError
+from flight.link.modes import Mode
 from flight.link.telemetry.packets import LONGEST_PACKET
 from flight.link.telemetry.reader import Run, read_run
-from flight.loop.modes.mode import Mode
 from sim_hal.serving.device_link import RemoteI2cBus
 from tests.hal.guardian.campaign import lives
 from tests.hal.guardian.live_flight import devices_running

@@ -20,9 +20,9 @@ from PIL import Image
 
 from flight.app import cli
 from flight.link.commands.codec import LONGEST
+from flight.link.modes import Mode
 from flight.link.telemetry.definitions import COMMAND
 from flight.link.telemetry.packets import Packer
-from flight.loop.modes.mode import Mode
 from sim_hal.star_camera import StarCameraModel
 from tests.flight.gnc.camera.test_fits import _file
 from tests.flight.gnc.vision.startracker.frames import sky_frame

@@ -24,12 +24,12 @@ from flight.link.commands.codec import (
     name_of,
     unpack,
 )
-from flight.loop.modes.mode import COMMANDS, Mode
+from flight.link.modes import COMMANDABLE, Mode
 from tests.studies.fuzz.harness import Finding
 from tests.studies.fuzz.logs import ccitt, hostile
 from tests.studies.fuzz.mutation import Draw, chance, damage, integer
 
-_MODES = [mode for mode in COMMANDS if mode is not Mode.SLEW]
+_MODES = [mode for mode in COMMANDABLE if mode is not Mode.SLEW]
 
 
 class Telecommands:

@@ -18,9 +18,9 @@ from flight.app.cli import main
 from flight.gnc.errors import FlightError, UsageError
 from flight.link.commands.channel import AT_MOST, Channel, DatagramChannel, open_udp, open_unix
 from flight.link.commands.codec import LONGEST, ChangeMode, Command, Slew, unpack
+from flight.link.modes import Mode
 from flight.link.telemetry.definitions import COMMAND
 from flight.link.telemetry.packets import Packer
-from flight.loop.modes.mode import Mode
 from ground.commands.command import exchange
 
 

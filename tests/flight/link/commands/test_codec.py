@@ -23,9 +23,9 @@ from flight.link.commands.codec import (
     unpack,
 )
 from flight.link.commands.definitions import COMMANDS, LAYOUTS
+from flight.link.modes import Mode
 from flight.link.telemetry.packets import LAYOUTS as TELEMETRY
 from flight.link.telemetry.packets import crc16
-from flight.loop.modes.mode import Mode
 
 PLAIN_MODES = [Mode.SAFE, Mode.DETUMBLE, Mode.HOLD, Mode.TESTBED_DEMO]
 

@@ -7,11 +7,14 @@ from dataclasses import replace
 import pytest
 
 from flight.gnc.errors import FlightError
-from flight.loop.fdir import events, facts
-from flight.loop.fdir.events import EventKind, EventLog
+from flight.link import events
+from flight.link.events import EventKind
+from flight.link.modes import Mode
+from flight.loop.fdir import facts
+from flight.loop.fdir.event_log import EventLog
 from flight.loop.fdir.facts import FACTS, Facts, check
 from flight.loop.modes.control import SAFING_REACTIONS, modes_moved_by
-from flight.loop.modes.mode import Mode, Trigger
+from flight.loop.modes.triggers import Trigger
 
 
 class Told:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from flight.link.modes import Mode
 from flight.loop.fdir.facts import FACTS
 from flight.loop.modes.control import SAFING_REACTIONS
-from flight.loop.modes.mode import Mode
 from flight.loop.modes.table import TRANSITIONS
 
 

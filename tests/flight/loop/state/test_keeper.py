@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.loop.fdir import events
+from flight.link import events
 from flight.loop.state.content import Learned, StoredState
 from flight.loop.state.keeper import Notices, StateKeeper
 from flight.loop.state.store import COPIES, StateStore

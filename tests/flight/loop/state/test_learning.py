@@ -11,7 +11,7 @@ from flight.gnc.estimation.attitude_filter import AttitudeFilter, slow_prior
 from flight.gnc.estimation.estimate import PARAMETERS, Estimate
 from flight.gnc.estimation.rigid_body import Parameters
 from flight.gnc.math.arrays import FloatArray
-from flight.loop.fdir import events
+from flight.link import events
 from flight.loop.state.content import Learned
 from flight.loop.state.keeper import Notices, StateKeeper
 from flight.loop.state.learning import GYRO_BIAS, IMU_LATENCY, PLANT, digest_of, learned_of, start_from

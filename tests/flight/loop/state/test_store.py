@@ -14,8 +14,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flight.loop.fdir import events
-from flight.loop.fdir.events import EventKind
+from flight.link import events
+from flight.link.events import EventKind
 from flight.loop.state.content import Learned, StoredState, UncleanShutdown
 from flight.loop.state.files import LinuxFiles
 from flight.loop.state.store import COPIES, StateStore, decode, encode

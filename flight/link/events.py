@@ -1,16 +1,9 @@
-"""The table of events: what can happen that a reader of the log wants to know, and how loudly.
-
-A throttle tells the first of a kind at once and then at most one each `THROTTLE_NS`, with the number held
-back: a fault at 40 Hz makes a line in the log every few seconds, not forty a second.
-"""
+"""The table of events: what can happen that a reader of the log wants to know, and how loudly."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
-
-THROTTLE_NS = 5_000_000_000
 
 
 class Severity(IntEnum):
@@ -165,47 +158,3 @@ REAL_TIME_REFUSED = EventKind(95, "real-time-refused", _WARNED, "scheduling or l
 EVENTS: tuple[EventKind, ...] = tuple(
     value for value in dict(vars()).values() if isinstance(value, EventKind)
 )
-
-Sink = Callable[[EventKind, int, int, str], None]
-"""Takes an event that is told: kind, time in ns, how many of its kind were held back before it, text."""
-
-Reactor = Callable[[EventKind, int, str], None]
-"""Does what an event's row asks for: kind, time in ns, text."""
-
-
-class EventLog:
-    """Tells events to a sink, throttled by kind."""
-
-    def __init__(self, sink: Sink, throttle_ns: int = THROTTLE_NS) -> None:
-        self._sink = sink
-        self._react: Reactor | None = None
-        self._throttle_ns = throttle_ns
-        self._last_told: dict[int, int] = {}
-        self._held_back: dict[int, int] = {}
-        self.count = 0
-
-    def react_by(self, react: Reactor) -> None:
-        """Have `react` called for every event whose row asks for more than a note, throttled or not."""
-        self._react = react
-
-    def tell(self, kind: EventKind, time_ns: int, text: str) -> None:
-        """Tell an event, or count it if one of its kind was told a moment ago; then react."""
-        self._tell(kind, time_ns, text)
-        if self._react is not None and kind.reaction is not Reaction.NOTE:
-            self._react(kind, time_ns, text)
-
-    def _tell(self, kind: EventKind, time_ns: int, text: str) -> None:
-        self.count += 1
-        last_ns = self._last_told.get(kind.code)
-        if last_ns is not None and time_ns - last_ns < self._throttle_ns:
-            self._held_back[kind.code] = self._held_back.get(kind.code, 0) + 1
-            return
-        self._last_told[kind.code] = time_ns
-        self._sink(kind, time_ns, self._held_back.pop(kind.code, 0), text)
-
-    def flush(self, time_ns: int) -> None:
-        """Tell what is still held back, at the end."""
-        by_code = {kind.code: kind for kind in EVENTS}
-        for code, held_back in list(self._held_back.items()):
-            self._sink(by_code[code], time_ns, held_back - 1, "the last one held back by the throttle")
-        self._held_back.clear()
