@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from contextlib import ExitStack, nullcontext, suppress
 
-from flight.app.build.settings import SECOND_NS
+from flight.app.composition.settings import SECOND_NS
 from flight.app.rig import Rig
 from flight.gnc.errors import ConfigError
 from flight.loop.state.opening import state_folder

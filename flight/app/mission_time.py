@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from flight.app.build.settings import SECOND_NS
+from flight.app.composition.settings import SECOND_NS
 from hal.interfaces.wires import Clock
 
 _GRID_NS = 25_000_000

@@ -6,7 +6,7 @@ import os
 from contextlib import ExitStack
 from pathlib import Path
 
-from flight.app.build.workers import workers
+from flight.app.composition.workers import workers
 from flight.app.devices import open_devices
 from flight.app.rig import Rig
 from flight.app.run_folder import open_log

@@ -6,7 +6,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
-from flight.app.build.settings import SECOND_NS
+from flight.app.composition.settings import SECOND_NS
 from flight.app.request import Order
 from flight.app.rig import Rig
 from flight.app.utc_label import utc_text

@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from flight.app.build.settings import SECOND_NS
+from flight.app.composition.settings import SECOND_NS
 from flight.app.request import Order
 from flight.app.rig import Rig
 from flight.gnc.errors import UsageError

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from flight.app.build.tasks import LoopRooms
-from flight.app.build.workers import worker_watches
+from flight.app.composition.tasks import LoopRooms
+from flight.app.composition.workers import worker_watches
 from flight.loop.executive.rate_group import RateGroup
 from flight.loop.fdir.health_watch import HealthRooms, HealthWatch
 from flight.loop.fdir.progress import GroupsAndWorkers

@@ -8,8 +8,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 
-from flight.app.build.settings import SECOND_NS, attitude_filter
-from flight.app.build.tasks import build_rooms
+from flight.app.composition.settings import SECOND_NS, attitude_filter
+from flight.app.composition.tasks import build_rooms
 from flight.bodies.testbed.plant_model import plant_of
 from flight.link import events
 from flight.link.commands.channel import Channel

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from flight.app.build.tasks import LoopRooms
+from flight.app.composition.tasks import LoopRooms
 from flight.loop.executive.rate_group import RateGroup
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from flight.app.build.settings import SECOND_NS
-from flight.app.build.tasks import LoopRooms
+from flight.app.composition.settings import SECOND_NS
+from flight.app.composition.tasks import LoopRooms
 from flight.loop.executive.rate_group import RateGroup, Task
 from flight.loop.performance import CONTROL
 from flight.schema.sections import Config

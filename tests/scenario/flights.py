@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from flight.app import preparation
-from flight.app.build.settings import SECOND_NS
+from flight.app.composition.settings import SECOND_NS
 from flight.app.mission_time import next_whole_second
 from flight.app.rig import Rig
 from flight.app.simulated import with_host_faults

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from flight.app.build.settings import SECOND_NS
-from flight.loop.executive.jobs import Worker
+from flight.app.composition.settings import SECOND_NS
+from flight.bodies.testbed import planning as planning_task
+from flight.bodies.testbed.planning import Planning
 from flight.gnc.guidance.one_axis import job as plan_job
-from flight.loop.fdir.progress import WorkerWatch
-from flight.schema.sections import (Config, Executive)
 from flight.gnc.vision.startracker import frame_job
 from flight.loop import imaging as imaging_task
-from flight.bodies.testbed import planning as planning_task
+from flight.loop.executive.jobs import Worker
+from flight.loop.fdir.progress import WorkerWatch
 from flight.loop.imaging import Imaging
-from flight.bodies.testbed.planning import Planning
+from flight.schema.sections import Config, Executive
 
 
 def workers(config: Config, planner_latency_ns: int = 0, vision_latency_ns: int = 0) -> list[Worker]:

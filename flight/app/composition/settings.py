@@ -8,26 +8,26 @@ from pathlib import Path
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
-from flight.schema.camera_model import camera_model
-from flight.gnc.control.detumble import (Braking, Detumbler, WindowSchedule, share_in_turning_field)
-from flight.gnc.estimation.attitude_filter import (AttitudeFilter, FilterSettings, slow_prior)
-from flight.gnc.estimation.rigid_body import (Parameters, RigidBody)
-from flight.gnc.guidance.one_axis.vmc import NODES
-from flight.loop.fdir.coils.response import ResponseSettings
-from flight.loop.fdir.coils.watch import (CoilWatch, CoilWatchSettings)
+from flight.bodies.testbed.planning import PlanningSettings, Strategy
+from flight.gnc.control.detumble import Braking, Detumbler, WindowSchedule, share_in_turning_field
+from flight.gnc.estimation.attitude_filter import AttitudeFilter, FilterSettings, slow_prior
+from flight.gnc.estimation.rigid_body import Parameters, RigidBody
 from flight.gnc.guidance.one_axis.plant import SingleAxisPlant
-from flight.schema.sections import (Camera, Config)
+from flight.gnc.guidance.one_axis.vmc import NODES
+from flight.gnc.math.arrays import FloatArray
 from flight.gnc.vision.startracker.detection import DetectionSettings
 from flight.gnc.vision.startracker.frame_job import TrackerSettings
 from flight.gnc.vision.startracker.solve import SolveSettings
-from flight.loop.state.content import Learned
-from flight.loop.state.learning import start_from
+from flight.gnc.vision.streaks.corners.settings import StreakSettings
+from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from flight.loop.fdir.coils.response import ResponseSettings
+from flight.loop.fdir.coils.watch import CoilWatch, CoilWatchSettings
 from flight.loop.imaging import ImagingSettings
 from flight.loop.navigation import NavigationSettings
-from flight.bodies.testbed.planning import (PlanningSettings, Strategy)
-from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
-from flight.gnc.vision.streaks.corners.settings import StreakSettings
+from flight.loop.state.content import Learned
+from flight.loop.state.learning import start_from
+from flight.schema.camera_model import camera_model
+from flight.schema.sections import Camera, Config
 
 SECOND_NS = 1_000_000_000
 

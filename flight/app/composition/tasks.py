@@ -11,27 +11,27 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.app.build import settings
-from flight.bodies.testbed.plant_model import (plant_of, unrest_of)
-from flight.link.commands.channel import Channel
+from flight.app.composition import settings
 from flight.bodies.testbed.controllers import controller_of
-from flight.gnc.estimation.attitude_filter import AttitudeFilter
-from flight.gnc.guidance.one_axis.guidance import (AcceptanceRules, Guidance)
-from flight.loop.services import Surroundings
-from flight.loop.modes.machine import ModeMachine
-from flight.gnc.guidance.one_axis.plant import SingleAxisPlant
-from flight.schema.sections import Config
-from flight.loop.coil_drive import CoilDrive
-from flight.loop.commanding import Commanding
-from flight.loop.control_cycle import (ControlCycle, Rooms)
-from flight.loop.housekeeping import (Housekeeping, Watched)
-from flight.loop.imaging import Imaging
-from flight.loop.modes.control import ModeControl
-from flight.loop.navigation import Navigation
-from flight.loop.performance import PerformanceObserver
-from flight.bodies.testbed.planning import (Planning, Strategy)
+from flight.bodies.testbed.planning import Planning, Strategy
+from flight.bodies.testbed.plant_model import plant_of, unrest_of
 from flight.bodies.testbed.steering import Steering
 from flight.bodies.testbed.targets import TargetSequence
+from flight.gnc.estimation.attitude_filter import AttitudeFilter
+from flight.gnc.guidance.one_axis.guidance import AcceptanceRules, Guidance
+from flight.gnc.guidance.one_axis.plant import SingleAxisPlant
+from flight.link.commands.channel import Channel
+from flight.loop.coil_drive import CoilDrive
+from flight.loop.commanding import Commanding
+from flight.loop.control_cycle import ControlCycle, Rooms
+from flight.loop.housekeeping import Housekeeping, Watched
+from flight.loop.imaging import Imaging
+from flight.loop.modes.control import ModeControl
+from flight.loop.modes.machine import ModeMachine
+from flight.loop.navigation import Navigation
+from flight.loop.performance import PerformanceObserver
+from flight.loop.services import Surroundings
+from flight.schema.sections import Config
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,1 @@
+"""From a configuration to settings and tasks: the one place that composes."""
