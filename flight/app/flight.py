@@ -19,7 +19,7 @@ from flight.app.run_folder import begin_folder
 from flight.app.simulated import flown_faults, simulated_rig
 from flight.gnc.errors import UsageError
 from flight.link import events
-from flight.loop.loop import FlightLoop
+from flight.loop.flight_loop import FlightLoop
 from flight.loop.progress import Progress
 from flight.loop.run_label import RunLabel
 from flight.loop.state.opening import service_folder

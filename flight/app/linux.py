@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from contextlib import ExitStack, nullcontext, suppress
 
-from flight.app.composition.settings import SECOND_NS
 from flight.app.rig import Rig
 from flight.gnc.errors import ConfigError
 from flight.loop.state.opening import state_folder
@@ -20,7 +19,7 @@ from hal.drivers.v4l2_camera import Stamp, V4l2Camera, V4l2Settings
 from hal.guardian.client import CoilReach
 from hal.interfaces.devices import FrameSource
 from hal.interfaces.errors import DeviceError
-from hal.interfaces.wires import Clock, Wires
+from hal.interfaces.wires import SECOND_NS, Clock, Wires
 
 
 def linux_rig(config: Config, stack: ExitStack, patient: bool) -> Rig:

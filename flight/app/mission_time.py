@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from flight.app.composition.settings import SECOND_NS
-from hal.interfaces.wires import Clock
+from hal.interfaces.wires import SECOND_NS, Clock
 
 _GRID_NS = 25_000_000
 

@@ -6,6 +6,7 @@ import os
 from contextlib import ExitStack
 from pathlib import Path
 
+from flight.app.composition.tasks import Opened, build_loop
 from flight.app.composition.workers import workers
 from flight.app.devices import open_devices
 from flight.app.rig import Rig
@@ -19,7 +20,7 @@ from flight.loop.executive.jobs import JobResult, JobRunner
 from flight.loop.executive.lockstep import LockStepRunner
 from flight.loop.executive.processes import ProcessRunner
 from flight.loop.fdir.board import Board
-from flight.loop.loop import FlightLoop, nothing
+from flight.loop.flight_loop import FlightLoop, Supervisors, nothing
 from flight.loop.state.opening import open_state
 from flight.schema.peers import peer_networks
 from flight.schema.sections import Config
@@ -48,19 +49,10 @@ def prepare(
         guardian.wait_ready(patient=patient)
         supervision = supervise(guardian, rig.clock, recorder, stack)
         feed, beat = supervision.feed, supervision.beat
-    loop = FlightLoop(
-        config,
-        rig.clock,
-        devices,
-        jobs,
-        recorder,
-        flight_log.error,
-        feed=feed,
-        beat=beat,
-        keeper=keeper,
-        board=Board(folder) if rig.realtime else None,
-        channels=_open_channels(config, stack),
-    )
+    channels = _open_channels(config, stack)
+    opened = Opened(rig.clock, devices, jobs, recorder, flight_log.error, channels, feed)
+    board = Board(folder) if rig.realtime else None
+    loop = build_loop(config, opened, Supervisors(beat, keeper, board))
     return loop, flight_log
 
 

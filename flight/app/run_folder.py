@@ -6,7 +6,6 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
-from flight.app.composition.settings import SECOND_NS
 from flight.app.request import Order
 from flight.app.rig import Rig
 from flight.app.utc_label import utc_text
@@ -15,6 +14,7 @@ from flight.link.telemetry.archive import DISK_TROUBLE, begin_run
 from flight.link.telemetry.log import FlightLog
 from flight.link.telemetry.segments import open_segment
 from flight.schema.sections import Config
+from hal.interfaces.wires import SECOND_NS
 
 
 def default_folder(config_path: Path) -> Path:

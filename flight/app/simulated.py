@@ -12,7 +12,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from flight.app.composition.settings import SECOND_NS
 from flight.app.request import Order
 from flight.app.rig import Rig
 from flight.gnc.errors import UsageError
@@ -20,7 +19,7 @@ from flight.schema import reader as configuration
 from flight.schema.sections import Config
 from hal.guardian.client import CoilReach
 from hal.interfaces.devices import FrameSource
-from hal.interfaces.wires import Clock
+from hal.interfaces.wires import SECOND_NS, Clock
 
 
 def fault_catalogue() -> tuple[str, str]:

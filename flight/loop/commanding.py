@@ -1,4 +1,4 @@
-"""Commanding: takes commands from channels and from the time line, has them obeyed, answers.
+"""Commanding: executes commands from channels and from the time line, and answers them.
 
 The dispatcher is one of the named containment boundaries: whatever is sent, the loop goes on.
 """
@@ -25,12 +25,10 @@ from flight.link.commands.codec import (
 from flight.link.modes import Mode
 from flight.link.telemetry.definitions import COMMAND
 from flight.link.telemetry.packets import Packer
-from flight.link.telemetry.recorder import Recorder
 from flight.loop.coil_drive import CoilDrive
 from flight.loop.executive.rate_group import Cycle
-from flight.loop.fdir.event_log import EventLog
-from flight.loop.fdir.facts import Facts
-from flight.loop.modes.control import ModeControl
+from flight.loop.modes.mode_control import ModeControl
+from flight.loop.services import Services
 from flight.schema.sections import CommandStep
 
 _REMEMBERED = 64
@@ -42,37 +40,35 @@ class Commanding:
     def __init__(
         self,
         modes: ModeControl,
-        facts_: Facts,
         drive: CoilDrive,
         timeline: Sequence[CommandStep],
         channels: Sequence[Channel],
-        recorder: Recorder,
-        event_log: EventLog,
+        services: Services,
     ) -> None:
         self._modes = modes
-        self._facts = facts_
         self._drive = drive
         self._timeline = deque(sorted(timeline, key=lambda step: step.at))
         self._channels = channels
-        self._recorder = recorder
-        self._events = event_log
+        self._facts = services.facts
+        self._recorder = services.recorder
+        self._events = services.events
         self._answers = Packer()
         self._seen: deque[bytes] = deque(maxlen=_REMEMBERED)
         self._count = 0
 
     def run(self, cycle: Cycle) -> None:
-        """Obey what is due and what has come."""
+        """Execute the commands that are due or have arrived."""
         now_ns = cycle.start_ns
         while self._timeline and self._timeline[0].at <= (now_ns - self._recorder.epoch_ns) * 1e-9:
             self._conclude("timeline", command_of(self._timeline.popleft()), "", now_ns)
         for channel in self._channels:
             for data, sender in channel.poll():
-                fields = self._take(channel.name, data, now_ns)
+                fields = self._execute(channel.name, data, now_ns)
                 mission_ns = now_ns - self._recorder.epoch_ns
                 channel.answer(self._answers.pack(COMMAND, mission_ns, fields), sender)
 
-    def _take(self, source: str, data: bytes, now_ns: int) -> dict[str, Any]:
-        """Obey a datagram; return what is answered."""
+    def _execute(self, source: str, data: bytes, now_ns: int) -> dict[str, Any]:
+        """Execute a datagram; return the fields of the answer."""
         command: Command | None = None
         problem = ""
         if data in self._seen:
@@ -86,7 +82,7 @@ class Commanding:
         return self._conclude(source, command, problem, now_ns)
 
     def _conclude(self, source: str, command: Command | None, problem: str, now_ns: int) -> dict[str, Any]:
-        """Obey a command that has no problem yet; tell and record what became of it."""
+        """Execute a command that has no problem yet; report and record the result."""
         self._count += 1
         if command is not None and not problem:
             try:
@@ -94,9 +90,9 @@ class Commanding:
             except Exception as error:  # noqa: BLE001 - containment boundary: the command dispatcher
                 problem = f"{type(error).__name__}: {error}"
         text = describe(command) if command is not None else ""
-        told = ": ".join(part for part in (text, problem) if part)
+        report = ": ".join(part for part in (text, problem) if part)
         self._events.tell(
-            events.COMMAND_REFUSED if problem else events.COMMANDED, now_ns, f"{source}: {told}"
+            events.COMMAND_REFUSED if problem else events.COMMANDED, now_ns, f"{source}: {report}"
         )
         fields = {
             "obeyed": int(not problem),
@@ -104,20 +100,20 @@ class Commanding:
             "source": source,
             "count": self._count,
             "mode": int(self._modes.mode),
-            "text": told,
+            "text": report,
         }
         self._recorder.record(COMMAND, now_ns, **fields)
         return fields
 
     def _obey(self, command: Command, now_ns: int) -> str:
-        """Do what a command says; return why not, empty when done."""
+        """Execute a command; return why it was refused, empty when done."""
         match command:
             case Ping():
                 return ""
             case ChangeMode(mode):
                 return self._modes.command(mode, now_ns)
-            case Slew(q2):
-                return self._modes.command(Mode.SLEW, now_ns, q2)
+            case Slew(wanted):
+                return self._modes.command(Mode.SLEW, now_ns, wanted)
             case Clear(event):
                 return self._clear(event, now_ns)
 

@@ -3,169 +3,198 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-from flight.bodies.testbed import planning as planning_task
-from flight.bodies.testbed.planning import Planning
-from flight.bodies.testbed.steering import Steering
-from flight.bodies.testbed.targets import KEPT, Target, TargetSequence
-from flight.gnc.estimation.estimate import ThreadEstimate
-from flight.link import events
+import numpy as np
+
+from flight.gnc.estimation.estimate import RATE, TURN, Estimate
 from flight.link.modes import Mode
-from flight.link.telemetry.definitions import CONTROL, TARGET
-from flight.link.telemetry.recorder import Recorder
+from flight.link.telemetry.definitions import ATTITUDE
 from flight.loop import imaging as imaging_task
+from flight.loop.body import PLANNER, Body, Target
 from flight.loop.coil_drive import CoilDrive
-from flight.loop.executive.jobs import JobRunner
+from flight.loop.executive.jobs import JobResult
 from flight.loop.executive.rate_group import Cycle
 from flight.loop.fdir.coils.knowledge import CoilKnowledge
-from flight.loop.fdir.event_log import EventLog
-from flight.loop.fdir.streams import Streams
 from flight.loop.imaging import Imaging
-from flight.loop.modes.control import ModeControl
+from flight.loop.modes.mode_control import ModeControl
 from flight.loop.modes.triggers import STEERING
 from flight.loop.navigation import Navigation
 from flight.loop.performance import PerformanceObserver
-from hal.interfaces.devices import TorqueCoils
+from flight.loop.services import Services
+from flight.loop.steering import Steered, Steering
+from hal.interfaces.readings import CoilState, ImuReading
+
+ATTITUDE_EVERY = 4
+"""Control cycles from one attitude packet to the next."""
+_NAN3 = np.full(3, np.nan)
+_NAN4 = np.full(4, np.nan)
 
 
 @dataclass(frozen=True, slots=True)
-class Rooms:
-    """What a cycle goes through."""
+class CycleTasks:
+    """The tasks that a cycle runs, in the order of the data."""
 
     navigation: Navigation
     modes: ModeControl
     steering: Steering
-    planning: Planning
-    imaging: Imaging | None
-    coils: TorqueCoils
     drive: CoilDrive
-    jobs: JobRunner
+    imaging: Imaging | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ControlOutput:
+    """The results of one control cycle.
+
+    Attributes:
+        estimate: None where there is none; it may be carried on by the model alone.
+        target: in force, None before the first.
+        written: what is on the wire at the end of the cycle.
+    """
+
+    cycle: Cycle
+    mode: Mode
+    estimate: Estimate | None
+    target: Target | None
+    steered: Steered
+    written: CoilState
 
 
 class ControlCycle:
     """The task of the control rate group."""
 
     def __init__(
-        self,
-        rooms: Rooms,
-        targets: TargetSequence,
-        recorder: Recorder,
-        event_log: EventLog,
-        observer: PerformanceObserver,
-        streams: Streams,
+        self, tasks: CycleTasks, body: Body, observer: PerformanceObserver, services: Services
     ) -> None:
-        self._rooms = rooms
-        self._targets = targets
-        self._recorder = recorder
-        self._events = event_log
+        self._tasks = tasks
+        self._body = body
         self._observer = observer
-        self._streams = streams
+        self._jobs = services.jobs
+        self._recorder = services.recorder
+        self._streams = services.streams
         self._knowledge = CoilKnowledge()
         self._ever_started = False
         self._blind = True
         self._measured = False
-        self.target: Target | None = None
-        self.estimate: ThreadEstimate | None = None
+        self._target: Target | None = None
 
-    def run(self, cycle: Cycle) -> None:
+    def run(self, cycle: Cycle) -> ControlOutput:
         """Run one cycle."""
-        rooms, now_ns = self._rooms, cycle.start_ns
-        # What the last command came to be on the wire, and when: the coils' thread may have needed a moment.
-        in_force = rooms.coils.state()
+        tasks, body, now_ns = self._tasks, self._body, cycle.start_ns
+        # The last command may have reached the wire late: the coils' thread sends it.
+        in_force = tasks.drive.state()
         known = self._knowledge.look(in_force, now_ns)
-        rooms.navigation.commanded(in_force, known)
-        rooms.navigation.update(now_ns)
+        tasks.navigation.commanded(in_force, known)
+        readings = tasks.navigation.update(now_ns)
         if not in_force.error:
             self._streams.note("coils", now_ns)
-        rooms.drive.look(in_force, rooms.navigation.readings, now_ns, known=known.until_now)
-        if rooms.imaging is not None:
-            rooms.imaging.serve(now_ns)
-        self.estimate = rooms.navigation.estimate(now_ns)
-        due = None if self.target is None else rooms.planning.due_angle(self.target, now_ns)
-        mode = rooms.modes.step(self.estimate, self._measured_rate(), due, not in_force.error, now_ns)
+        tasks.drive.look(in_force, readings, now_ns, known=known.until_now)
+        if tasks.imaging is not None:
+            tasks.imaging.serve(now_ns)
+        estimate = tasks.navigation.estimate(now_ns)
+        overdue = self._overdue(estimate, now_ns)
+        mode = tasks.modes.step(estimate, _newest_rate(readings), overdue, not in_force.error, now_ns)
         self._aim(now_ns)
-        measured = self._look_out(now_ns)
-        self._ever_started = self._ever_started or self.estimate is not None
-        self._collect(now_ns)
-        steered_by = self.estimate if measured else None
-        self._act(mode, steered_by, now_ns)
-        written = rooms.coils.state()
-        if mode in STEERING and self.target is not None:
-            rooms.planning.serve(steered_by, self.target, now_ns)
-        self._record(cycle, written.current.tolist(), written.saturated)
+        measured = self._replan_if_regained(estimate, now_ns)
+        self._ever_started = self._ever_started or estimate is not None
+        if self._collect(now_ns):
+            estimate = tasks.navigation.estimate(now_ns)
+        trusted = estimate if measured else None
+        steered = self._act(mode, trusted, readings, now_ns)
+        output = ControlOutput(cycle, mode, estimate, self._target, steered, tasks.drive.state())
+        if mode in STEERING and self._target is not None:
+            body.planner.serve(trusted, self._target, now_ns)
+        body.view.record_cycle(output)
+        if cycle.slot % ATTITUDE_EVERY == 0:
+            self._record(output)
+        return output
 
-    def _measured_rate(self) -> float | None:
-        """Return the length of the newest body rate of this cycle, rad/s."""
-        readings = self._rooms.navigation.readings
-        return math.hypot(*readings[-1].rate.tolist()) if readings else None
+    def coils_off(self) -> None:
+        """Switch all coils off: the flight is over."""
+        self._tasks.drive.off()
 
-    def _look_out(self, now_ns: int) -> bool:
-        """Tell whether the estimate is measured; see to a path from where the body is, after it was not."""
-        planning, measured = self._rooms.planning, self._rooms.navigation.is_measured(now_ns)
-        if self.estimate is not None and self._blind:
-            planning.request(now_ns)
+    def _overdue(self, estimate: Estimate | None, now_ns: int) -> float | None:
+        if estimate is None or self._target is None:
+            return None
+        return self._body.targets.error_when_due(estimate, self._target, now_ns)
+
+    def _replan_if_regained(self, estimate: Estimate | None, now_ns: int) -> bool:
+        """Return whether the estimate is measured; ask for a path from here where it was not before."""
+        planner, measured = self._body.planner, self._tasks.navigation.is_measured(now_ns)
+        if estimate is not None and self._blind:
+            planner.request(now_ns)
         elif measured and not self._measured:
-            planning.resume(now_ns)
-        self._blind = self.estimate is None
+            planner.resume(now_ns)
+        self._blind = estimate is None
         self._measured = measured
         return measured
 
-    def _act(self, mode: Mode, estimate: ThreadEstimate | None, now_ns: int) -> None:
+    def _act(
+        self, mode: Mode, estimate: Estimate | None, readings: Sequence[ImuReading], now_ns: int
+    ) -> Steered:
         """Use the coils as the mode wants, by an estimate that is measured."""
-        steering = self._rooms.steering
+        steering = self._tasks.steering
         if mode in STEERING:
-            steering.run(estimate, now_ns, self._ever_started)
-        elif mode is Mode.DETUMBLE:
-            steering.brake(now_ns)
-        else:
-            steering.rest(now_ns)
+            return steering.run(estimate, now_ns, self._ever_started)
+        if mode is Mode.DETUMBLE:
+            return steering.brake(readings, self._tasks.navigation.is_heard(now_ns), now_ns)
+        return steering.rest(now_ns)
 
     def _aim(self, now_ns: int) -> None:
-        """See which target is in force; want a path to a new one at once, and tell it."""
-        modes = self._rooms.modes
-        steps = modes.flies_steps
-        target = self._targets.at(now_ns - self._recorder.epoch_ns) if steps else modes.wanted
-        if target is self.target:
+        """Find the target in force; announce a new one and ask for a path to it at once."""
+        modes = self._tasks.modes
+        mission_ns = now_ns - self._recorder.epoch_ns
+        target = self._body.targets.configured(mission_ns) if modes.flies_steps else modes.wanted
+        if target is self._target:
             return
-        self.target = target
+        self._target = target
         if target is None:
             return
-        if target.index != KEPT:
-            self._recorder.record(TARGET, now_ns, index=target.index, q2=target.q2, rate=target.rate)
-            self._events.tell(events.TARGET, now_ns, f"step {target.index}: q2 = {target.q2:+.2f}")
-        self._rooms.planning.aim(target, now_ns)
+        self._body.view.announce(target, now_ns)
+        self._body.planner.aim(target, now_ns)
 
-    def _collect(self, now_ns: int) -> None:
-        """Take in what the workers have finished."""
-        for result in self._rooms.jobs.collect():
-            self._observer.job(result, now_ns)
-            if result.worker == planning_task.WORKER:
-                self._rooms.planning.finish(result, now_ns)
-            elif result.worker == imaging_task.WORKER and self._rooms.imaging is not None:
-                self._rooms.imaging.finish(result, now_ns)
-                self.estimate = self._rooms.navigation.estimate(now_ns)
+    def _collect(self, now_ns: int) -> bool:
+        """Accept what the workers have finished; return whether a frame was among it."""
+        framed = False
+        for result in self._jobs.collect():
+            framed |= self._accept(result, now_ns)
+        return framed
 
-    def _record(self, cycle: Cycle, written: list[float], saturated: bool) -> None:
-        estimate, sample = self.estimate, self._rooms.steering.sample
-        nan = math.nan
+    def _accept(self, result: JobResult, now_ns: int) -> bool:
+        self._observer.job(result, now_ns)
+        if result.worker == PLANNER:
+            self._body.planner.finish(result, now_ns)
+        elif result.worker == imaging_task.WORKER and self._tasks.imaging is not None:
+            self._tasks.imaging.finish(result, now_ns)
+            return True
+        return False
+
+    def _record(self, output: ControlOutput) -> None:
+        """Record the attitude packet, the same for every body."""
+        estimate, reference, target = output.estimate, output.steered.reference, output.target
+        now_ns = output.cycle.start_ns
         self._recorder.record(
-            CONTROL,
-            cycle.start_ns,
-            cycle=cycle.slot,
-            state=int(self._rooms.steering.state),
-            estimate_age=(cycle.start_ns - estimate.measured_ns) * 1e-9 if estimate else nan,
-            angle=estimate.angle if estimate else nan,
-            q2=estimate.q2 if estimate else nan,
-            rate=estimate.rate if estimate else nan,
-            angle_sigma=math.sqrt(estimate.covariance[0, 0]) if estimate else nan,
-            rate_sigma=math.sqrt(estimate.covariance[1, 1]) if estimate else nan,
-            target_q2=self.target.q2 if self.target else nan,
-            path_q2=math.sin(0.5 * sample.angle) if sample else nan,
-            path_rate=sample.rate if sample else nan,
-            path_acceleration=sample.acceleration if sample else nan,
-            plan=self._rooms.planning.flown,
-            current_command=self._rooms.steering.command.tolist(),
-            current_written=written,
-            saturated=int(saturated or self._rooms.steering.saturated),
+            ATTITUDE,
+            now_ns,
+            mode=int(output.mode),
+            quaternion=(_NAN4 if estimate is None else estimate.quaternion).tolist(),
+            rate=(_NAN3 if estimate is None else estimate.rate).tolist(),
+            angle_sigma=_sigmas(estimate, TURN),
+            rate_sigma=_sigmas(estimate, RATE),
+            wanted=(_NAN4 if reference is None else reference.quaternion).tolist(),
+            wanted_rate=(_NAN3 if reference is None else reference.body_rate).tolist(),
+            target=(_NAN4 if target is None else target.law.quaternion(now_ns)).tolist(),
+            dipole=output.steered.dipole.tolist(),
         )
+
+
+def _newest_rate(readings: Sequence[ImuReading]) -> float | None:
+    """Return the magnitude of the newest body rate of this cycle, rad/s."""
+    return math.hypot(*readings[-1].rate.tolist()) if readings else None
+
+
+def _sigmas(estimate: Estimate | None, part: slice) -> list[float]:
+    if estimate is None:
+        return _NAN3.tolist()
+    return [math.sqrt(max(value, 0.0)) for value in estimate.covariance.diagonal()[part].tolist()]

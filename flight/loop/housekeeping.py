@@ -1,4 +1,4 @@
-"""Housekeeping: once a second the health of devices and loop, as packets and as events when it changes."""
+"""Housekeeping: once a second the health of devices and loop, as packets and, where it changes, as events."""
 
 from __future__ import annotations
 
@@ -6,26 +6,23 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from flight.bodies.testbed.planning import Planning
-from flight.bodies.testbed.steering import Steering
 from flight.link.telemetry.definitions import HOUSEKEEPING
-from flight.link.telemetry.recorder import Recorder
+from flight.loop.body import Planner
 from flight.loop.executive.rate_group import Cycle
 from flight.loop.fdir import facts
-from flight.loop.fdir.event_log import EventLog
-from flight.loop.fdir.facts import Facts
 from flight.loop.imaging import Imaging
 from flight.loop.navigation import Navigation
+from flight.loop.services import Services
+from flight.loop.steering import SteeringState
 from hal.interfaces.devices import PowerMonitor, TorqueCoils
 
 
 @dataclass(frozen=True, slots=True)
 class Watched:
-    """What housekeeping looks at; `log_error` tells what is wrong with the flight log, empty when nothing."""
+    """What housekeeping reports on; `log_error` returns why the flight log fails, empty while it works."""
 
     navigation: Navigation
-    steering: Steering
-    planning: Planning
+    planner: Planner
     imaging: Imaging | None
     coils: TorqueCoils
     power: PowerMonitor | None
@@ -33,16 +30,16 @@ class Watched:
 
 
 class Housekeeping:
-    """The 1 Hz task."""
+    """Writes the housekeeping packet."""
 
-    def __init__(self, watched: Watched, recorder: Recorder, event_log: EventLog, facts_: Facts) -> None:
+    def __init__(self, watched: Watched, services: Services) -> None:
         self._watched = watched
-        self._recorder = recorder
-        self._events = event_log
-        self._facts = facts_
+        self._recorder = services.recorder
+        self._events = services.events
+        self._facts = services.facts
 
-    def run(self, cycle: Cycle) -> None:
-        """Write the housekeeping packet."""
+    def run(self, cycle: Cycle, state: SteeringState) -> None:
+        """Write the packet; `state` is that of the newest control cycle."""
         watched, now_ns = self._watched, cycle.start_ns
         error = watched.power.error() if watched.power else ""
         log_error = watched.log_error()
@@ -50,11 +47,12 @@ class Housekeeping:
         self._facts.state(facts.LOG_FAULT, bool(log_error), now_ns, text)
         reading = watched.power.latest() if watched.power and not error else None
         link = watched.navigation.link()
-        imaging = watched.imaging
+        accepted, refused = watched.planner.counts()
+        frames, streak_rates = watched.imaging.counts() if watched.imaging else (0, 0)
         self._recorder.record(
             HOUSEKEEPING,
             now_ns,
-            state=int(watched.steering.state),
+            state=int(state),
             imu_packets=link.packets,
             imu_bad_checksum=link.bad_checksum,
             imu_discarded_bytes=link.discarded_bytes,
@@ -64,9 +62,9 @@ class Housekeeping:
             coil_voltage=reading.voltage if reading else math.nan,
             coil_current=reading.current if reading else math.nan,
             coil_power=reading.power if reading else math.nan,
-            plans_accepted=watched.planning.accepted,
-            plans_refused=watched.planning.refused,
-            frames=imaging.frames if imaging else 0,
-            streak_rates=imaging.accepted if imaging else 0,
+            plans_accepted=accepted,
+            plans_refused=refused,
+            frames=frames,
+            streak_rates=streak_rates,
             events=self._events.count,
         )

@@ -25,15 +25,13 @@ from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSett
 from flight.gnc.vision.streaks.streak_result import StreakStatus
 from flight.link import events
 from flight.link.telemetry.definitions import STARS, STREAK
-from flight.link.telemetry.recorder import Recorder
-from flight.loop.executive.jobs import JobResult, JobRunner
+from flight.loop.body import BodyView
+from flight.loop.executive.jobs import JobResult
 from flight.loop.executive.rate_group import Cycle
 from flight.loop.fdir import facts
-from flight.loop.fdir.event_log import EventLog
-from flight.loop.fdir.facts import Facts
 from flight.loop.fdir.repeated_rows import RepeatedRows
-from flight.loop.fdir.streams import Streams
 from flight.loop.navigation import Navigation
+from flight.loop.services import Services
 from hal.interfaces.devices import FrameSource
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.readings import Frame
@@ -54,7 +52,7 @@ class ImagingSettings:
         late_ns: after the exposure, from which a frame is late.
         slow_ns: from which vision is slow over a frame.
         mounting: (4,) takes the body's axes to the camera's.
-        unrest: rad^2/s^3, density of the white angular acceleration that shakes the body.
+        angular_acceleration_psd: rad^2/s^3, density of the white angular acceleration that shakes the body.
     """
 
     camera: CameraModel
@@ -65,7 +63,7 @@ class ImagingSettings:
     mounting: FloatArray
     estimator: StreakSettings | LikelihoodSettings
     tracker: TrackerSettings | None
-    unrest: float
+    angular_acceleration_psd: float
 
 
 class Imaging:
@@ -76,18 +74,18 @@ class Imaging:
         camera: FrameSource,
         settings: ImagingSettings,
         navigation: Navigation,
-        jobs: JobRunner,
-        recorder: Recorder,
-        event_log: EventLog,
-        facts_: Facts,
-        streams: Streams,
+        view: BodyView,
+        services: Services,
     ) -> None:
         self._camera = camera
         self._settings = settings
         self._navigation = navigation
-        self._jobs = jobs
-        self._recorder = recorder
-        self._events = event_log
+        self._view = view
+        self._jobs = services.jobs
+        self._recorder = services.recorder
+        self._events = services.events
+        self._facts = services.facts
+        self._streams = services.streams
         self._body_to_camera = attitude_matrix(settings.mounting)
         self._frame: Frame | None = None
         self._last_sequence = -1
@@ -95,11 +93,13 @@ class Imaging:
         self._last_frame_ns = 0
         self._due_ns: int | None = None  # by when the oldest trigger without a frame should have one
         self._rows = RepeatedRows()
-        self._facts = facts_
-        self._streams = streams
         self._busy_since_ns = 0
-        self.frames = 0
-        self.accepted = 0
+        self._frames = 0
+        self._accepted = 0
+
+    def counts(self) -> tuple[int, int]:
+        """Return how many frames came, and how many rates from streaks entered the estimate."""
+        return self._frames, self._accepted
 
     def busy_since_ns(self) -> int | None:
         """Return since when a frame is being worked on, None when none is."""
@@ -152,7 +152,7 @@ class Imaging:
         if old:
             text = f"frame {frame.sequence}: {old} of the rows looked at are an earlier frame's"
             self._events.tell(events.CAMERA_TORN, now_ns, text)
-        self.frames += 1
+        self._frames += 1
         self._last_sequence = frame.sequence
         if old:
             self._record_rate(frame, StreakStatus.FAILED.value, None, now_ns, False)
@@ -195,7 +195,7 @@ class Imaging:
                 self._tell_stars(frame, found.solution, attitude, now_ns, taken)
 
         if late:
-            self._navigation.take_late(late, told)
+            self._navigation.ingest_late(late, told)
         else:
             told([])
 
@@ -255,10 +255,9 @@ class Imaging:
     def _tell_rate(
         self, frame: Frame, motion: Found, rate: MeanRateMeasurement | None, now_ns: int, accepted: bool
     ) -> None:
-        self.accepted += accepted
+        self._accepted += accepted
         if rate is not None and not accepted:
-            sigma = math.sqrt(rate.covariance[1, 1])
-            text = f"frame {frame.sequence}: {rate.rate[1]:.5f} rad/s +- {sigma:.1e}"
+            text = f"frame {frame.sequence}: {self._view.rate_text(rate)}"
             self._events.tell(events.STREAK_REFUSED, now_ns, text)
         self._record_rate(frame, motion.status.value, motion, now_ns, accepted)
 
@@ -314,7 +313,9 @@ class Imaging:
                 past = self._navigation.past(frame.exposure_start_ns + round(part * frame.exposure_ns))
                 if past is not None:
                     turns[number] = to_rotation_vector(multiply(past.quaternion, back))
-        return doubt(reading_of(motion), turns, self._settings.unrest, frame.exposure_ns * 1e-9)
+        return doubt(
+            reading_of(motion), turns, self._settings.angular_acceleration_psd, frame.exposure_ns * 1e-9
+        )
 
     def _rate_in_body(self, found: Found) -> tuple[FloatArray, FloatArray]:
         """Return rate and covariance in body axes; NaN when there is none."""

@@ -1,7 +1,7 @@
-"""Navigation: the inertial unit's samples, streaks' rates and stars' attitudes into one estimate, or none.
+"""Navigation: readings of the inertial unit, rates from streaks and attitudes from stars, into one estimate.
 
-It also watches the unit's line and tells silence from corruption: bytes that stand still are silence, bytes
-that make no packets are corruption, packets with impossible values are implausible.
+It also watches the unit's line: no bytes are silence, bytes that make no packets are corruption, packets with
+impossible values are implausible.
 """
 
 from __future__ import annotations
@@ -11,40 +11,33 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.estimation.attitude_filter import AttitudeFilter
-from flight.gnc.estimation.estimate import Estimate, ThreadEstimate
+from flight.gnc.estimation.estimate import Estimate
 from flight.gnc.estimation.measurements import AttitudeMeasurement, Measurement, RateMeasurement
-from flight.gnc.estimation.rigid_body import Parameters
 from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import about_axis_y, angle_about_axis_y, attitude_matrix
 from flight.link import events
 from flight.link.telemetry.definitions import IMU
-from flight.link.telemetry.recorder import Recorder
+from flight.loop.body import Body
 from flight.loop.fdir import facts
 from flight.loop.fdir.coils.knowledge import Known
-from flight.loop.fdir.event_log import EventLog
-from flight.loop.fdir.facts import Facts
-from flight.loop.fdir.streams import Streams
+from flight.loop.services import Services
 from hal.interfaces.devices import InertialUnit
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.readings import CoilState, ImuLink, ImuReading
 
 _AT_A_TIME = 16
-"""Measurements applied again in a cycle: some ms, so that a second of them takes a few cycles."""
+"""Measurements applied again per cycle: a few ms, so that a second of them takes a few cycles."""
 
 
 @dataclass(frozen=True, slots=True)
 class NavigationSettings:
-    """Noise of the unit, two ages, and what planner and controller know of the thread.
+    """Noise and age limits of the inertial unit.
 
     Attributes:
         angle_noise: rad, standard deviation of the unit's attitude about each axis.
         rate_noise: rad/s, of its rate.
         max_age_ns: of a reading that the coils are driven by.
         coast_ns: for how long the model carries the estimate on without a measurement; nothing steers by it.
-        period_ns: of the control cycle: a current that is commanded flows until the next one at least.
-        believed: torsion and damping of the thread in the plant: the disturbance told is the rest.
-        field: (3,) T, of the surroundings, reference axes.
+        period_ns: of the control cycle: a current that is commanded flows at least until the next cycle.
     """
 
     angle_noise: float
@@ -52,42 +45,29 @@ class NavigationSettings:
     max_age_ns: int
     coast_ns: int
     period_ns: int
-    believed: Parameters
-    field: FloatArray
 
 
 class Navigation:
-    """Owns the filter and the watch over the inertial unit's line.
-
-    Attributes:
-        readings: of this cycle, oldest first.
-    """
+    """Owns the filter and the watch over the inertial unit's line."""
 
     def __init__(
-        self,
-        unit: InertialUnit,
-        filter_: AttitudeFilter,
-        settings: NavigationSettings,
-        recorder: Recorder,
-        event_log: EventLog,
-        facts_: Facts,
-        streams: Streams,
+        self, unit: InertialUnit, body: Body, settings: NavigationSettings, services: Services
     ) -> None:
         self._unit = unit
-        self._filter = filter_
+        self._filter = body.filter
+        self._view = body.view
         self._settings = settings
         self._angle_covariance: FloatArray = np.eye(3) * settings.angle_noise**2
         self._rate_covariance: FloatArray = np.eye(3) * settings.rate_noise**2
-        self._recorder = recorder
-        self._events = event_log
+        self._recorder = services.recorder
+        self._events = services.events
+        self._facts = services.facts
+        self._streams = services.streams
         self._since_ns = 0
         self._heard_ns = 0  # the newest reading, and the newest that agreed with the estimate
         self._agreed_ns = 0
         self._link = unit.link()
         self._heard_since_ns = 0
-        self._facts = facts_
-        self._streams = streams
-        self.readings: tuple[ImuReading, ...] = ()
 
     def begin(self, time_ns: int) -> None:
         """Use samples from `time_ns` on only: the body is released then."""
@@ -106,23 +86,23 @@ class Navigation:
             self._filter.doubt(known.doubt_ns)
         self._filter.command(max(in_force.written_ns, known.since_ns), in_force.current, known=known.now)
 
-    def update(self, now_ns: int) -> None:
-        """Take in what the unit has sent, and go on with what came late."""
+    def update(self, now_ns: int) -> tuple[ImuReading, ...]:
+        """Apply new and late measurements; return the readings of this cycle, oldest first."""
         self._filter.catch_up(_AT_A_TIME)
         try:
-            readings = self._unit.poll()
+            polled = self._unit.poll()
         except DeviceError as error:
-            self.readings = ()
             self._facts.state(facts.IMU_LINE_LOST, True, now_ns, str(error))
-            return
+            return ()
         self._facts.state(facts.IMU_LINE_LOST, False, now_ns, "the serial port is back")
-        self.readings = tuple(reading for reading in readings if reading.time_ns >= self._since_ns)
-        for reading in self.readings:
-            self._take(reading)
+        readings = tuple(reading for reading in polled if reading.time_ns >= self._since_ns)
+        for reading in readings:
+            self._ingest(reading)
             self._streams.note("imu", reading.time_ns)
             self._streams.note("field", reading.time_ns, float(np.linalg.norm(reading.field)))
             self._heard_ns = reading.time_ns
         self._watch_line(now_ns)
+        return readings
 
     def is_heard(self, now_ns: int) -> bool:
         """Tell whether the coils may be driven by readings alone until the next cycle."""
@@ -139,27 +119,18 @@ class Navigation:
     def _is_fresh(self, time_ns: int, now_ns: int) -> bool:
         return now_ns + self._settings.period_ns - time_ns < self._settings.max_age_ns
 
-    def attitude(self, now_ns: int) -> Estimate | None:
-        """Return the whole estimate for now, measured or carried on by the model; None when there is none."""
+    def estimate(self, now_ns: int) -> Estimate | None:
+        """Return the estimate for now, measured or carried on by the model; None when there is none."""
         # Carried on over a long silence it would cost more with every cycle, and be of no use.
         if not self._filter.started or now_ns - self._filter.measured_ns > self._settings.coast_ns:
             return None
         return self._filter.at(now_ns)
 
-    def estimate(self, now_ns: int) -> ThreadEstimate | None:
-        """Return what it says of the turn about the thread, None when there is none."""
-        estimate = self.attitude(now_ns)
-        return None if estimate is None else estimate.about_thread(self._settings.believed)
-
-    def field(self, angle: float) -> FloatArray:
-        """Return the field (3,) T in body axes at `angle` rad about the thread."""
-        return np.asarray(attitude_matrix(about_axis_y(angle)) @ self._settings.field)
-
     def past(self, time_ns: int) -> Estimate | None:
         """Return the whole estimate as it stood at a past time, None when that is not remembered."""
         return self._filter.past(time_ns) if self._filter.started else None
 
-    def take_late(self, late: Sequence[Measurement], told: Callable[[list[bool]], None]) -> None:
+    def ingest_late(self, late: Sequence[Measurement], told: Callable[[list[bool]], None]) -> None:
         """Put measurements of a frame where they belong in time, over the next cycles.
 
         `told` is called, later or at once, with which of them passed the gate.
@@ -169,7 +140,7 @@ class Navigation:
         else:
             told([False] * len(late))
 
-    def _take(self, reading: ImuReading) -> None:
+    def _ingest(self, reading: ImuReading) -> None:
         self._recorder.record(
             IMU,
             reading.arrival_ns,
@@ -197,8 +168,7 @@ class Navigation:
             self._events.tell(
                 events.IMU_REFUSED,
                 reading.arrival_ns,
-                f"angle {angle_about_axis_y(reading.quaternion):.4f} rad, rate {reading.rate[1]:.5f} rad/s "
-                "disagree with the estimate",
+                f"{self._view.reading_text(reading)} disagree with the estimate",
             )
 
     def _watch_line(self, now_ns: int) -> None:

@@ -9,24 +9,22 @@ import traceback
 
 from flight.link import events
 from flight.link.telemetry.definitions import CYCLE_TIMING, JOB_TIMING, RATE_GROUP
-from flight.link.telemetry.recorder import Recorder
 from flight.loop.executive.jobs import JobResult
 from flight.loop.executive.rate_group import Cycle, RateGroup
-from flight.loop.fdir.event_log import EventLog
+from flight.loop.services import Services
 from hal.interfaces.devices import TorqueCoils
-from hal.interfaces.wires import Clock
 
 CONTROL = "control"
 
 
 class PerformanceObserver:
-    """Told by the executive of every cycle, slip and failure."""
+    """Records every cycle, slip and failure that the executive reports."""
 
-    def __init__(self, clock: Clock, coils: TorqueCoils, recorder: Recorder, event_log: EventLog) -> None:
-        self._clock = clock
+    def __init__(self, coils: TorqueCoils, services: Services) -> None:
         self._coils = coils
-        self._recorder = recorder
-        self._events = event_log
+        self._clock = services.clock
+        self._recorder = services.recorder
+        self._events = services.events
 
     def ran(self, group: RateGroup, cycle: Cycle, execution_ns: int) -> None:
         """Note each control cycle's lateness and length."""
@@ -40,14 +38,14 @@ class PerformanceObserver:
             )
 
     def slipped(self, group: RateGroup, slots: int) -> None:
-        """Tell of skipped slots of the control group: no other can slip without it."""
+        """Report skipped slots of the control group: no other group can slip without it."""
         if group.name != CONTROL:
             return
         text = f"{group.name}: {slots} slots skipped, {group.slips} since start"
         self._events.tell(events.CYCLE_SLIP, self._clock.now_ns(), text)
 
     def failed(self, group: RateGroup, error: Exception) -> None:
-        """Bring the coils to zero when it was the control task that failed, and tell where."""
+        """Bring the coils to zero when the control task failed, and report where."""
         if group.name == CONTROL:
             self._coils.off()
         last = traceback.extract_tb(error.__traceback__)[-1]

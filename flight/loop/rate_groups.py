@@ -4,37 +4,45 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from flight.app.composition.settings import SECOND_NS
-from flight.app.composition.tasks import LoopRooms
 from flight.loop.executive.rate_group import RateGroup, Task
 from flight.loop.performance import CONTROL
-from flight.schema.sections import Config
+from hal.interfaces.wires import SECOND_NS
 
 HEALTH_PERIOD_NS = SECOND_NS // 4
 COMMAND_PERIOD_NS = SECOND_NS // 10
 
 
 @dataclass(frozen=True, slots=True)
-class LoopTasks:
-    """The tasks that are the loop's own, beside those of single rooms."""
+class Periods:
+    """Periods from the configuration, ns; without a camera there is none of the camera."""
+
+    control_ns: int
+    replan_ns: int
+    camera_ns: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class GroupTasks:
+    """The task of each rate group; None where there is nothing to do."""
 
     control: Task
+    replan: Task
+    camera: Task | None
+    commands: Task | None
     health: Task
     housekeeping: Task
 
 
-def rate_groups(config: Config, rooms: LoopRooms, tasks: LoopTasks, commanded: bool) -> list[RateGroup]:
-    """Lay the groups, control first; nobody listens for commands where none can come (`commanded`)."""
-    control_ns = round(SECOND_NS / config.executive.control_rate_hz)
-    replan_ns = round(config.guidance.replan_period * SECOND_NS)
+def rate_groups(periods: Periods, tasks: GroupTasks) -> list[RateGroup]:
+    """Return the rate groups, control first."""
     groups = [
-        RateGroup(CONTROL, control_ns, tasks.control),
-        RateGroup("planning", replan_ns, rooms.planning.replan),
+        RateGroup(CONTROL, periods.control_ns, tasks.control),
+        RateGroup("planning", periods.replan_ns, tasks.replan),
     ]
-    if rooms.imaging is not None and config.camera is not None:
-        groups.append(RateGroup("camera", round(config.camera.period * SECOND_NS), rooms.imaging.trigger))
-    if commanded:
-        groups.append(RateGroup("commands", COMMAND_PERIOD_NS, rooms.commanding.run))
+    if tasks.camera is not None and periods.camera_ns is not None:
+        groups.append(RateGroup("camera", periods.camera_ns, tasks.camera))
+    if tasks.commands is not None:
+        groups.append(RateGroup("commands", COMMAND_PERIOD_NS, tasks.commands))
     groups.append(RateGroup("health", HEALTH_PERIOD_NS, tasks.health))
     groups.append(RateGroup("housekeeping", SECOND_NS, tasks.housekeeping))
     return groups

@@ -1,4 +1,4 @@
-"""What every room of the loop has around it."""
+"""What every task of the loop shares, and the devices that it flies."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hal.interfaces.wires import Clock
 
 @dataclass(frozen=True, slots=True)
 class Devices:
-    """The open devices; a monitor and a camera are not everywhere fitted."""
+    """The open devices; a current monitor and a camera are optional."""
 
     unit: InertialUnit
     coils: TorqueCoils
@@ -24,11 +24,10 @@ class Devices:
 
 
 @dataclass(frozen=True, slots=True)
-class Surroundings:
-    """Clock, devices and workers from outside; the recorder, and what the rooms state and tell each other."""
+class Services:
+    """The clock, the workers, the recorder, and the tables of events, facts and streams."""
 
     clock: Clock
-    devices: Devices
     jobs: JobRunner
     recorder: Recorder
     events: EventLog

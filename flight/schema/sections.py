@@ -12,9 +12,11 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
+from flight.gnc.guidance.one_axis.plant import Q2_LIMIT
+
 Positive = Annotated[float, Meta(gt=0.0)]
 NotNegative = Annotated[float, Meta(ge=0.0)]
-Q2 = Annotated[float, Meta(ge=-0.7, le=0.7)]
+Q2 = Annotated[float, Meta(ge=-Q2_LIMIT, le=Q2_LIMIT)]
 Address = Annotated[int, Meta(ge=0x08, le=0x77)]
 Bus = Annotated[int, Meta(ge=0, le=0xFFFFF)] | Annotated[str, Meta(pattern=r"^/[A-Za-z0-9_./:+-]+$")]
 Peer = Annotated[str, Meta(pattern=r"^[0-9]{1,3}(\.[0-9]{1,3}){3}(/[0-9]{1,2})?$")]
@@ -303,7 +305,7 @@ class CommandStep(Section, frozen=True, kw_only=True):
 
     at: NotNegative
     mode: PlainMode | None = None
-    slew: Annotated[float, Meta(ge=-0.68, le=0.68)] | None = None
+    slew: Q2 | None = None
     clear: Annotated[str, Meta(min_length=1, max_length=32)] | None = None
 
 
@@ -339,9 +341,10 @@ class State(Section, frozen=True, kw_only=True):
 
 
 class Config(Section, frozen=True, kw_only=True):
-    """A whole configuration."""
+    """A whole configuration; `body` is the one that is flown, or a third party's as `module:object`."""
 
     name: Annotated[str, Meta(min_length=1, max_length=64)]
+    body: Annotated[str, Meta(min_length=1, max_length=200)] = "testbed"
     plant: Plant
     inertial_unit: InertialUnit
     coils: Coils

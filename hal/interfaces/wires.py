@@ -12,6 +12,8 @@ from typing import Protocol
 
 from hal.interfaces.devices import FrameSource
 
+SECOND_NS = 1_000_000_000
+
 
 class Ticker(Protocol):
     """A small job that a clock runs again and again beside the control loop."""

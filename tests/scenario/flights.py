@@ -8,16 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from flight.app import preparation
-from flight.app.composition.settings import SECOND_NS
 from flight.app.mission_time import next_whole_second
 from flight.app.rig import Rig
 from flight.app.simulated import with_host_faults
 from flight.link.telemetry.packets import to_text
 from flight.link.telemetry.reader import Run, read_run
-from flight.loop.loop import FlightLoop
+from flight.loop.flight_loop import FlightLoop
 from flight.loop.run_label import RunLabel
 from flight.schema import reader as configuration
 from flight.schema.sections import Config
+from hal.interfaces.wires import SECOND_NS
 from sim_hal import lockstep
 from sim_hal.lockstep import LockStep
 from sim_hal.settings import Simulation

@@ -30,7 +30,7 @@ def flown(fault: str, folder: Path, duration: float, initial: str = "testbed-dem
     wishes: list[FloatArray] = []
 
     def listen(rigged: Rigged) -> None:
-        drive = rigged.loop._rooms.drive
+        drive = rigged.loop._tasks.control._tasks.drive
         send, zero = drive.send, drive.zero
 
         def sent(currents: FloatArray, field: object) -> None:
@@ -110,7 +110,7 @@ def test_a_board_that_is_too_hot_leads_to_safe_with_the_coils_at_zero(tmp_path: 
             hot = now_ns - rigged.epoch_ns > 3 * SECOND
             return ResourceSample(now_ns, 0.0, 5e7, 1e8, 1e10, 100.0 if hot else 50.0)
 
-        rigged.loop._health.read_resources(rigged.lock.clock, look, SECOND // 2)
+        rigged.loop._tasks.health.read_resources(look, SECOND // 2)
 
     run = fly(demo_config(8.0, camera=False), tmp_path, prepare)
     assert modes_of(run)[-1] is Mode.SAFE

@@ -47,7 +47,9 @@ def said(folder: Path, *script: tuple[float, bytes]) -> tuple[Run, Script]:
     channel = Script()
 
     def prepare(rigged: Rigged) -> None:
-        rigged.loop._rooms.commanding._channels = (channel,)
+        commanding = rigged.loop._tasks.commanding
+        assert commanding is not None
+        commanding._channels = (channel,)
         for at, data in script:
             rigged.at(at, partial(channel.say, data))
 
@@ -107,7 +109,7 @@ def test_a_defect_of_a_command_is_contained(tmp_path: Path, monkeypatch: pytest.
     def fall(*_: object) -> str:
         raise ZeroDivisionError("a defect")
 
-    monkeypatch.setattr("flight.loop.modes.control.ModeControl.command", fall)
+    monkeypatch.setattr("flight.loop.modes.mode_control.ModeControl.command", fall)
     (hold,) = packed(ChangeMode(Mode.HOLD))
     run, _ = said(tmp_path, (1.0, hold))
     (row,) = run["command"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -32,8 +33,8 @@ class Signs:
         def now() -> float:
             return (rigged.lock.clock.now_ns() - rigged.epoch_ns) / SECOND
 
-        rigged.loop._health._feed = lambda: self.fed.append(now())
-        rigged.loop._beat = lambda: self.beats.append(now())
+        rigged.loop._tasks.health._feed = lambda: self.fed.append(now())
+        rigged.loop._around = replace(rigged.loop._around, beat=lambda: self.beats.append(now()))
 
 
 def failing(rigged: Rigged, since: float, until: float) -> None:
@@ -120,7 +121,7 @@ def reading(memory: Callable[[float], float], rigged: Rigged) -> None:
         seconds = (now_ns - rigged.epoch_ns) / SECOND
         return ResourceSample(now_ns, 0.3 * seconds, 5e7, memory(seconds), 1e10, 50.0)
 
-    rigged.loop._health.read_resources(rigged.lock.clock, look, SECOND // 2)
+    rigged.loop._tasks.health.read_resources(look, SECOND // 2)
 
 
 def test_too_much_memory_ends_the_flight_politely_and_wants_a_restart(tmp_path: Path) -> None:

@@ -131,11 +131,11 @@ def progress_line(stream: TextIO) -> Callable[[Progress], None]:
         if now - last < 0.2:
             return
         last = now
-        q2 = "  -   " if progress.q2 is None else f"{progress.q2:+.4f}"
         of = f"/{progress.duration:.0f}"
+        currents = " ".join(f"{1e3 * current:+.1f}" for current in progress.currents)
         stream.write(
-            f"\r\x1b[K{progress.mission_time:6.0f}{of} s  q2 {q2} -> {progress.target_q2:+.2f}  "
-            f"coil {1e3 * progress.current:+6.1f} mA  {progress.state}  "
+            f"\r\x1b[K{progress.mission_time:6.0f}{of} s  {progress.attitude}  "
+            f"coils {currents} mA  {progress.state}  "
             f"slips {progress.slips}  events {progress.events}"
         )
         stream.flush()

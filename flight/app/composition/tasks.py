@@ -1,171 +1,111 @@
-"""The rooms of the loop, each built from the configuration and told only of those rooms that it needs.
-
-Data goes through them in the order in which they are built: from navigation by guidance and steering to the
-coils' drive; modes, commanding and housekeeping look on and say what is wanted.
-"""
+"""The tasks of the loop, built from the configuration in the order in which data goes through them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from flight.app.composition import settings
-from flight.bodies.testbed.controllers import controller_of
-from flight.bodies.testbed.planning import Planning, Strategy
-from flight.bodies.testbed.plant_model import plant_of, unrest_of
-from flight.bodies.testbed.steering import Steering
-from flight.bodies.testbed.targets import TargetSequence
-from flight.gnc.estimation.attitude_filter import AttitudeFilter
-from flight.gnc.guidance.one_axis.guidance import AcceptanceRules, Guidance
-from flight.gnc.guidance.one_axis.plant import SingleAxisPlant
+from flight.app.composition.bodies import body_kind
+from flight.app.composition.settings import imaging_settings, navigation_settings
+from flight.app.composition.workers import worker_watches
 from flight.link.commands.channel import Channel
-from flight.loop.coil_drive import CoilDrive
+from flight.link.telemetry.recorder import Recorder
+from flight.loop.body import Body
+from flight.loop.coil_drive import CoilDrive, CoilDriveSettings
 from flight.loop.commanding import Commanding
-from flight.loop.control_cycle import ControlCycle, Rooms
+from flight.loop.control_cycle import ControlCycle, CycleTasks
+from flight.loop.executive.jobs import JobRunner
+from flight.loop.fdir.event_log import EventLog
+from flight.loop.fdir.facts import Facts
+from flight.loop.fdir.health_watch import HealthInputs, HealthWatch
+from flight.loop.fdir.streams import Streams, streams_of
+from flight.loop.flight_loop import FlightLoop, LoopTasks, Supervisors, nothing
 from flight.loop.housekeeping import Housekeeping, Watched
 from flight.loop.imaging import Imaging
-from flight.loop.modes.control import ModeControl
-from flight.loop.modes.machine import ModeMachine
+from flight.loop.modes.mode_control import ModeControl, ModeSettings
 from flight.loop.navigation import Navigation
 from flight.loop.performance import PerformanceObserver
-from flight.loop.services import Surroundings
+from flight.loop.services import Devices, Services
+from flight.loop.state.content import Learned
+from flight.loop.steering import Steering
 from flight.schema.sections import Config
+from hal.interfaces.wires import Clock
 
 
 @dataclass(frozen=True, slots=True)
-class LoopRooms:
-    """The rooms; without a camera there is no imaging."""
+class Opened:
+    """What is open when a flight is composed.
 
-    navigation: Navigation
-    drive: CoilDrive
-    steering: Steering
-    planning: Planning
-    imaging: Imaging | None
-    modes: ModeControl
-    observer: PerformanceObserver
-    control: ControlCycle
-    housekeeping: Housekeeping
-    commanding: Commanding
-
-
-def build_rooms(
-    config: Config,
-    around: Surroundings,
-    channels: Sequence[Channel],
-    log_error: Callable[[], str],
-    stop: Callable[[str], None],
-    filter_: AttitudeFilter,
-) -> LoopRooms:
-    """Build the rooms of a configuration about its filter.
-
-    `channels` are where commands come from, `log_error` tells what is wrong with the flight log, and `stop`
-    ends the flight after the running cycle, for the reason that it is given.
+    Attributes:
+        log_error: returns why the flight log fails, empty while it works.
+        channels: where commands come from.
+        feed: the watchdog's food, about four times a second.
     """
-    plant = plant_of(config)
-    navigation = _navigation(config, plant, around, filter_)
-    planning_settings = settings.planning_settings(config)
-    guidance = Guidance(
-        plant,
-        AcceptanceRules(late_after=config.guidance.late_after),
-        arrives=planning_settings.strategy is not Strategy.RECEDING,
+
+    clock: Clock
+    devices: Devices
+    jobs: JobRunner
+    recorder: Recorder
+    log_error: Callable[[], str]
+    channels: Sequence[Channel] = ()
+    feed: Callable[[], None] = nothing
+
+
+def build_loop(config: Config, opened: Opened, supervisors: Supervisors) -> FlightLoop:
+    """Return the loop of a configuration. Raises ConfigError for a body that is not there."""
+    events = EventLog(opened.recorder.event)
+    services = Services(
+        opened.clock, opened.jobs, opened.recorder, events, Facts(events), Streams(streams_of(config))
     )
-    drive = _drive(config, plant, around)
-    steering = _steering(config, plant, around, guidance, navigation, drive)
-    planning = Planning(plant, planning_settings, guidance, around.jobs, around.recorder, around.events)
-    imaging = _imaging(config, plant, around, navigation)
-    modes = ModeControl(
-        config.modes,
-        ModeMachine(),
-        guidance,
-        steering,
-        drive,
-        around.facts,
-        around.recorder,
-        around.events,
-        (config.detumble.low_rate, config.detumble.low_for),
-        stop,
+    keeper = supervisors.keeper
+    learned: Mapping[str, Learned] = keeper.learned if keeper else {}
+    body = body_kind(config).make(config, services, learned)
+    loop: FlightLoop
+
+    def stop(reason: str) -> None:
+        loop.stop(reason)
+
+    loop = FlightLoop(config, body, _tasks(config, opened, services, body, stop), services, supervisors)
+    return loop
+
+
+def _tasks(
+    config: Config, opened: Opened, services: Services, body: Body, stop: Callable[[str], None]
+) -> LoopTasks:
+    devices, timeline = opened.devices, config.commands.timeline
+    navigation = Navigation(devices.unit, body, navigation_settings(config), services)
+    drive = _drive(config, devices, body, services)
+    steering = Steering(body, drive, services)
+    imaging = _imaging(config, devices, navigation, body, services)
+    low_rate, low_for = config.detumble.low_rate, config.detumble.low_for
+    modes = ModeControl(ModeSettings(config.modes, low_rate, low_for, stop), body, steering, services)
+    observer = PerformanceObserver(devices.coils, services)
+    control = ControlCycle(CycleTasks(navigation, modes, steering, drive, imaging), body, observer, services)
+    watches = worker_watches(config.executive, body.planner, imaging)
+    health = HealthWatch(
+        HealthInputs(modes, drive, devices.power, watches), config.health, opened.feed, services
     )
-    around.events.react_by(modes.react)
-    observer = PerformanceObserver(around.clock, around.devices.coils, around.recorder, around.events)
-    control = ControlCycle(
-        Rooms(navigation, modes, steering, planning, imaging, around.devices.coils, drive, around.jobs),
-        TargetSequence([(step.at, step.q2, step.rate) for step in config.steps]),
-        around.recorder,
-        around.events,
-        observer,
-        around.streams,
-    )
-    coils, power = around.devices.coils, around.devices.power
-    watched = Watched(navigation, steering, planning, imaging, coils, power, log_error)
-    housekeeping = Housekeeping(watched, around.recorder, around.events, around.facts)
-    timeline = config.commands.timeline
-    commanding = Commanding(modes, around.facts, drive, timeline, channels, around.recorder, around.events)
-    return LoopRooms(
-        navigation, drive, steering, planning, imaging, modes, observer, control, housekeeping, commanding
+    watched = Watched(navigation, body.planner, imaging, devices.coils, devices.power, opened.log_error)
+    commanded = bool(opened.channels or timeline)
+    commanding = Commanding(modes, drive, timeline, opened.channels, services) if commanded else None
+    return LoopTasks(
+        navigation, imaging, modes, control, observer, health, Housekeeping(watched, services), commanding
     )
 
 
-def _navigation(
-    config: Config, plant: SingleAxisPlant, around: Surroundings, filter_: AttitudeFilter
-) -> Navigation:
-    return Navigation(
-        around.devices.unit,
-        filter_,
-        settings.navigation_settings(config, plant),
-        around.recorder,
-        around.events,
-        around.facts,
-        around.streams,
-    )
-
-
-def _drive(config: Config, plant: SingleAxisPlant, around: Surroundings) -> CoilDrive:
-    return CoilDrive(
-        around.devices.coils,
-        settings.coil_watch(config, plant),
-        settings.dipole_per_ampere(config),
-        np.full(3, config.coils.current_limit),
-        around.facts,
-        around.events,
-        around.devices.power,
-    )
-
-
-def _steering(
-    config: Config,
-    plant: SingleAxisPlant,
-    around: Surroundings,
-    guidance: Guidance,
-    navigation: Navigation,
-    drive: CoilDrive,
-) -> Steering:
-    period = 1.0 / config.executive.control_rate_hz
-    return Steering(
-        guidance,
-        controller_of(config.control, plant, period, config.identification),
-        settings.detumbler(config, plant),
-        navigation,
-        around.devices.coils,
-        drive,
-        around.facts,
-    )
+def _drive(config: Config, devices: Devices, body: Body, services: Services) -> CoilDrive:
+    limits = np.full(3, config.coils.current_limit)
+    settings = CoilDriveSettings(body.dipole_per_ampere, limits, body.free_axis)
+    return CoilDrive(devices.coils, devices.power, body.coil_watch, settings, services)
 
 
 def _imaging(
-    config: Config, plant: SingleAxisPlant, around: Surroundings, navigation: Navigation
+    config: Config, devices: Devices, navigation: Navigation, body: Body, services: Services
 ) -> Imaging | None:
-    camera, source = config.camera, around.devices.camera
+    camera, source = config.camera, devices.camera
     if camera is None or source is None:
         return None
-    return Imaging(
-        source,
-        settings.imaging_settings(camera, unrest_of(config, plant)),
-        navigation,
-        around.jobs,
-        around.recorder,
-        around.events,
-        around.facts,
-        around.streams,
-    )
+    settings = imaging_settings(camera, body.angular_acceleration_psd)
+    return Imaging(source, settings, navigation, body.view, services)

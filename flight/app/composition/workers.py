@@ -2,31 +2,30 @@
 
 from __future__ import annotations
 
-from flight.app.composition.settings import SECOND_NS
-from flight.bodies.testbed import planning as planning_task
-from flight.bodies.testbed.planning import Planning
-from flight.gnc.guidance.one_axis import job as plan_job
+from flight.app.composition.bodies import body_kind
 from flight.gnc.vision.startracker import frame_job
 from flight.loop import imaging as imaging_task
+from flight.loop.body import PLANNER, Planner
 from flight.loop.executive.jobs import Worker
 from flight.loop.fdir.progress import WorkerWatch
 from flight.loop.imaging import Imaging
 from flight.schema.sections import Config, Executive
+from hal.interfaces.wires import SECOND_NS
 
 
 def workers(config: Config, planner_latency_ns: int = 0, vision_latency_ns: int = 0) -> list[Worker]:
     """Return the workers that a configuration needs; latencies hold in lock-step simulation only."""
     planner_timeout_ns = round(config.executive.planner_timeout * SECOND_NS)
     vision_timeout_ns = round(config.executive.vision_timeout * SECOND_NS)
-    made = [Worker(planning_task.WORKER, plan_job.run, planner_latency_ns, planner_timeout_ns)]
+    made = [Worker(PLANNER, body_kind(config).plan, planner_latency_ns, planner_timeout_ns)]
     if config.camera is not None:
         made.append(Worker(imaging_task.WORKER, frame_job.run, vision_latency_ns, vision_timeout_ns))
     return made
 
 
-def worker_watches(limits: Executive, planning: Planning, imaging: Imaging | None) -> list[WorkerWatch]:
-    """Return the workers with twice the time after which the runner kills them."""
-    busy = [(planning_task.WORKER, planning.busy_since_ns, limits.planner_timeout)]
+def worker_watches(limits: Executive, planner: Planner, imaging: Imaging | None) -> list[WorkerWatch]:
+    """Return the watch over each worker: twice the time after which the runner kills it."""
+    busy = [(PLANNER, planner.busy_since_ns, limits.planner_timeout)]
     if imaging is not None:
         busy.append((imaging_task.WORKER, imaging.busy_since_ns, limits.vision_timeout))
     return [WorkerWatch(name, since, round(2.0 * limit * SECOND_NS)) for name, since, limit in busy]

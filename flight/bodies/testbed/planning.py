@@ -13,21 +13,21 @@ import math
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
-from flight.bodies.testbed.targets import Target
-from flight.gnc.estimation.estimate import ThreadEstimate
+from flight.bodies.testbed.thread_estimate import ThreadEstimate, ThreadReader
+from flight.bodies.testbed.thread_law import ThreadLaw, law_of
+from flight.gnc.estimation.estimate import Estimate
 from flight.gnc.guidance.one_axis.guidance import Guidance
 from flight.gnc.guidance.one_axis.job import PlanJob
 from flight.gnc.guidance.one_axis.path import FARTHEST
 from flight.gnc.guidance.one_axis.plant import SingleAxisPlant, angle_of, q2_of
-from flight.gnc.guidance.one_axis.vmc import NODES, Plan, PlanStatus
+from flight.gnc.guidance.one_axis.vmc import Plan, PlanStatus
 from flight.link import events
 from flight.link.telemetry.definitions import MAX_NODES, PLAN
-from flight.link.telemetry.recorder import Recorder
-from flight.loop.executive.jobs import JobResult, JobRunner
+from flight.loop.body import PLANNER, Target
+from flight.loop.executive.jobs import JobResult
 from flight.loop.executive.rate_group import Cycle
-from flight.loop.fdir.event_log import EventLog
+from flight.loop.services import Services
 
-WORKER = "planner"
 _AGAIN_NS = 1_000_000_000
 
 
@@ -58,10 +58,10 @@ class PlanningSettings:
     horizon: float
     max_horizon: float
     late_after_ns: int
-    nodes: int = NODES
-    strategy: Strategy = Strategy.GOAL
-    time_price: float | None = None
-    current_share: float = 1.0
+    nodes: int
+    strategy: Strategy
+    time_price: float | None
+    current_share: float
     least_horizon: float = 2.0
     displaced: float = 0.05
 
@@ -74,25 +74,29 @@ class Planning:
         plant: SingleAxisPlant,
         settings: PlanningSettings,
         guidance: Guidance,
-        jobs: JobRunner,
-        recorder: Recorder,
-        event_log: EventLog,
+        reader: ThreadReader,
+        services: Services,
     ) -> None:
         self._plant = replace(plant, current_limit=plant.current_limit * settings.current_share)
         self._settings = settings
         self._guidance = guidance
-        self._jobs = jobs
-        self._recorder = recorder
-        self._events = event_log
+        self._read = reader.read
+        self._jobs = services.jobs
+        self._recorder = services.recorder
+        self._events = services.events
         self._wanted = False
         self._job: PlanJob | None = None
         self._goal_ns: int | None = None
         self._due_ns: int | None = None
         self._asked_ns = 0
         self._count = 0
+        self._accepted = 0
+        self._refused = 0
         self.flown = 0
-        self.accepted = 0
-        self.refused = 0
+
+    def counts(self) -> tuple[int, int]:
+        """Return how many plans were accepted and refused since the start."""
+        return self._accepted, self._refused
 
     def busy_since_ns(self) -> int | None:
         """Return since when a plan is being made, None when none is."""
@@ -100,14 +104,15 @@ class Planning:
 
     def aim(self, target: Target, now_ns: int) -> None:
         """Want another attitude, and a plan for it at once; the present path is flown until that comes."""
-        self._guidance.aim(target.q2, target.rate, now_ns)
+        law = law_of(target)
+        self._guidance.aim(law.q2, law.rate, now_ns)
         self._goal_ns = self._due_ns = None
         self._wanted = True
         if self._settings.strategy is Strategy.STEP:
-            self._guidance.hold(angle_of(target.q2), now_ns)
+            self._guidance.hold(angle_of(law.q2), now_ns)
             self._due_ns = now_ns + round(self._settings.horizon * 1e9)
 
-    def due_angle(self, target: Target, now_ns: int) -> float | None:
+    def due_angle(self, law: ThreadLaw, now_ns: int) -> float | None:
         """Return where the body should be by now, rad; None while it is on its way to the target.
 
         It is due at the end of the first path to the target, whatever is planned after that; where paths are
@@ -115,7 +120,7 @@ class Planning:
         """
         if self._due_ns is None or now_ns < self._due_ns:
             return None
-        return _moved(target, (now_ns - self._due_ns) * 1e-9)
+        return _moved(law, (now_ns - self._due_ns) * 1e-9)
 
     def request(self, now_ns: int) -> None:
         """Want a plan as soon as there is an estimate to start from and the worker is free."""
@@ -138,31 +143,32 @@ class Planning:
             )
             self._wanted = True
 
-    def serve(self, estimate: ThreadEstimate | None, target: Target, now_ns: int) -> None:
+    def serve(self, estimate: Estimate | None, target: Target, now_ns: int) -> None:
         """Hand the wanted job over."""
         if estimate is None or self._settings.strategy is Strategy.STEP:
             return
-        if self._is_displaced(estimate.angle, now_ns):
+        now = self._read(estimate)
+        if self._is_displaced(now.angle, now_ns):
             self.request(now_ns)
         if self._is_near_goal(now_ns):
             self._wanted = False  # by the time the worker was free the goal was near
         if not self._wanted or self._job is not None:
             return
-        job = self._job_from(estimate, target, now_ns)
-        if self._jobs.submit(WORKER, job):
+        job = self._job_from(now, law_of(target), now_ns)
+        if self._jobs.submit(PLANNER, job):
             self._wanted = False
             self._count = job.number
             self._job = job
             self._asked_ns = now_ns
 
-    def _job_from(self, estimate: ThreadEstimate, target: Target, now_ns: int) -> PlanJob:
+    def _job_from(self, estimate: ThreadEstimate, law: ThreadLaw, now_ns: int) -> PlanJob:
         settings, goal_ns = self._settings, self._goal_ns
         towards_goal = settings.strategy is Strategy.GOAL
         begun = goal_ns is not None
         horizon = (goal_ns - now_ns) * 1e-9 if goal_ns is not None else settings.horizon
-        end_q2 = self._due_q2(target, now_ns, horizon) if towards_goal else target.q2
+        end_q2 = self._due_q2(law, now_ns, horizon) if towards_goal else law.q2
         if end_q2 != self._guidance.target_q2:
-            self._guidance.aim(end_q2, target.rate, now_ns)
+            self._guidance.aim(end_q2, law.rate, now_ns)
         return PlanJob(
             self._count + 1,
             now_ns,
@@ -170,7 +176,7 @@ class Planning:
             estimate.q2,
             estimate.rate,
             end_q2,
-            target.rate,
+            law.rate,
             horizon,
             settings.max_horizon,
             settings.nodes,
@@ -178,12 +184,12 @@ class Planning:
             self._guidance.remains(now_ns) if begun else None,
         )
 
-    def _due_q2(self, target: Target, now_ns: int, horizon: float) -> float:
+    def _due_q2(self, law: ThreadLaw, now_ns: int, horizon: float) -> float:
         """Return q2 to be reached in `horizon` s: a target that moves has moved on since it was first due."""
-        if target.rate == 0.0 or self._due_ns is None:
-            return target.q2
+        if law.rate == 0.0 or self._due_ns is None:
+            return law.q2
         late = horizon - (self._due_ns - now_ns) * 1e-9
-        return q2_of(_moved(target, max(late, 0.0)))
+        return q2_of(_moved(law, max(late, 0.0)))
 
     def _is_near_goal(self, now_ns: int) -> bool:
         """Tell whether too little is left until the goal to plan for it."""
@@ -208,7 +214,7 @@ class Planning:
         if job is None:
             return
         if result.outcome != "done":
-            self.refused += 1
+            self._refused += 1
             self._events.tell(events.PLANNER_FAILED, now_ns, f"{result.outcome}: {result.error}")
             self._record(job, None, result.outcome, False, now_ns)
             return
@@ -223,10 +229,10 @@ class Planning:
         )
         reason = verdict.reason
         if reason:
-            self.refused += 1
+            self._refused += 1
             self._events.tell(events.PLAN_REFUSED, now_ns, f"plan {job.number}: {reason}")
         else:
-            self.accepted += 1
+            self._accepted += 1
             self.flown = job.number
             end_ns = job.origin_ns + round(plan.horizon * 1e9)
             self._due_ns = self._due_ns or end_ns
@@ -262,6 +268,6 @@ class Planning:
         )
 
 
-def _moved(target: Target, since: float) -> float:
-    """Return where a target is `since` s after it was due, rad: it moves as far as the coil has authority."""
-    return min(max(angle_of(target.q2) + target.rate * since, -FARTHEST), FARTHEST)
+def _moved(law: ThreadLaw, since: float) -> float:
+    """Return the angle of a law `since` s after it was due, rad, as far as the coil has authority."""
+    return min(max(angle_of(law.q2) + law.rate * since, -FARTHEST), FARTHEST)

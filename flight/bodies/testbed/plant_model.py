@@ -1,4 +1,4 @@
-"""The plant that a configuration believes in."""
+"""The plant model of a configuration."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from flight.schema.sections import Config
 
 
 def plant_of(config: Config) -> SingleAxisPlant:
-    """Return the plant that the configuration believes in."""
+    """Return the plant model that planner, tracker and filter use."""
     believed = config.plant
     return SingleAxisPlant(
         inertia=believed.inertia,
@@ -21,7 +21,7 @@ def plant_of(config: Config) -> SingleAxisPlant:
     )
 
 
-def unrest_of(config: Config, plant: SingleAxisPlant) -> float:
-    """Return the density of the angular acceleration that the coils' uncertain current makes, rad^2/s^3."""
+def angular_acceleration_psd_of(config: Config, plant: SingleAxisPlant) -> float:
+    """Return the power spectral density of the angular acceleration by current noise, rad^2/s^3."""
     noise = plant.torque_constant / plant.inertia * config.estimation.current_noise
     return noise**2 / config.executive.control_rate_hz

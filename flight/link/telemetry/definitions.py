@@ -99,6 +99,24 @@ CONTROL = Packet(
     ),
 )
 
+ATTITUDE = Packet(
+    "attitude",
+    0x114,
+    "10 Hz",
+    "The attitude of any body: estimate, path, target, dipole",
+    (
+        Field("mode", "u1", "-", "as in mode"),
+        Field("quaternion", "f8", "-", "estimated, reference frame into body, scalar last", 4),
+        Field("rate", "f8", "rad/s", "estimated body rate, body axes", 3),
+        Field("angle_sigma", "f4", "rad", "standard deviation of small turns about the body's axes", 3),
+        Field("rate_sigma", "f4", "rad/s", "standard deviation of the rate", 3),
+        Field("wanted", "f8", "-", "attitude of the path now, NaN without a path", 4),
+        Field("wanted_rate", "f8", "rad/s", "rate of the path now, body axes", 3),
+        Field("target", "f8", "-", "attitude to be reached, NaN without a target", 4),
+        Field("dipole", "f4", "A m^2", "dipole wanted of the coils, body axes", 3),
+    ),
+)
+
 TARGET = Packet(
     "target",
     0x112,
@@ -325,6 +343,7 @@ PACKETS: tuple[Packet, ...] = (
     RUN,
     IMU,
     CONTROL,
+    ATTITUDE,
     TARGET,
     MODE,
     PLAN,

@@ -1,17 +1,17 @@
-"""How long something has been so without a break."""
+"""A timer of how long a condition has held without a break."""
 
 from __future__ import annotations
 
 
-class Dwell:
-    """Tells when a condition has held for long enough."""
+class HoldTimer:
+    """Says when a condition has held for long enough."""
 
     def __init__(self, seconds: float) -> None:
         self._needed_ns = round(seconds * 1e9)
         self._since_ns: int | None = None
 
     def update(self, holds: bool, now_ns: int) -> bool:
-        """State whether it holds now; tell whether it has for as long as is needed."""
+        """Note whether the condition holds now; return whether it has held for long enough."""
         if not holds:
             self._since_ns = None
             return False
@@ -20,5 +20,5 @@ class Dwell:
         return now_ns - self._since_ns >= self._needed_ns
 
     def reset(self) -> None:
-        """Begin anew."""
+        """Start from zero."""
         self._since_ns = None

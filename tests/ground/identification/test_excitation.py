@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from flight.bodies.testbed.plant_model import plant_of
-from flight.gnc.control.one_axis.excitation import ExcitationController, ExcitationSettings, manoeuvres
+from flight.gnc.control.one_axis.excitation import ExcitationController, manoeuvres
 from flight.gnc.errors import UsageError
 from flight.gnc.guidance.one_axis.path import Sample
 from tests.ground.identification.conftest import Identified
-from tests.ground.identification.worlds import PERIOD, World, believed, drawn, fly_bare
+from tests.ground.identification.worlds import PERIOD, World, believed, drawn, fly_bare, usual_excitation
 
 REST = Sample(0.0, 0.0, 0.0)
 PLANT = plant_of(believed())
@@ -21,7 +21,7 @@ USUAL = World(inertia=1.05e-3, dipole=0.648, field=4.5e-4, stiffness=1.0e-5, dam
 
 
 def controller(**changes: float) -> ExcitationController:
-    return ExcitationController(PLANT, PERIOD, ExcitationSettings(**changes))
+    return ExcitationController(PLANT, PERIOD, replace(usual_excitation(), **changes))
 
 
 def test_each_manoeuvre_leaves_a_free_body_at_rest_and_the_swings_start_at_the_reach() -> None:
@@ -42,7 +42,7 @@ def test_each_manoeuvre_leaves_a_free_body_at_rest_and_the_swings_start_at_the_r
 def test_within_the_drawn_worlds_the_body_stays_within_half_and_the_current_within_its_share(
     identified: list[Identified],
 ) -> None:
-    limit = ExcitationSettings().current_share * PLANT.current_limit
+    limit = usual_excitation().current_share * PLANT.current_limit
     for _, record, _ in identified:
         assert np.max(np.abs(record.current)) <= limit + 1e-12
         assert 0.15 < np.sin(0.5 * np.max(np.abs(record.angle))) < 0.5
@@ -51,8 +51,8 @@ def test_within_the_drawn_worlds_the_body_stays_within_half_and_the_current_with
 def test_a_body_far_livelier_than_believed_is_caught_before_the_bound() -> None:
     """Three times the believed acceleration: flown blindly the pulses would carry it to q2 = 0.52."""
     record = fly_bare(replace(USUAL, inertia=USUAL.inertia / 3.0), 60.0)
-    assert np.sin(0.5 * np.max(np.abs(record.angle))) < ExcitationSettings().largest_q2
-    pulses = manoeuvres(1.0, 3.0 * 0.45 * 2.0 * math.asin(ExcitationSettings().largest_q2), 45.0)[1]
+    assert np.sin(0.5 * np.max(np.abs(record.angle))) < usual_excitation().largest_q2
+    pulses = manoeuvres(1.0, 3.0 * 0.45 * 2.0 * math.asin(usual_excitation().largest_q2), 45.0)[1]
     assert math.sin(0.5 * pulses[0].duration ** 2) > 0.5
 
 

@@ -13,7 +13,7 @@ from flight.gnc.control.one_axis.excitation import ExcitationController, Excitat
 from flight.gnc.guidance.one_axis.path import Sample
 from flight.gnc.math.arrays import FloatArray
 from flight.schema import reader as configuration
-from flight.schema.sections import Config
+from flight.schema.sections import Config, Identification
 from ground.identification.constants import Constants
 from ground.identification.preparation import excitation_config
 from ground.identification.record import FieldMeasurement, Record, read_record
@@ -95,13 +95,19 @@ def fly_stack(world: World, folder: Path, duration: float = 200.0) -> Record:
     return replace(record, field=field)
 
 
+def usual_excitation() -> ExcitationSettings:
+    """Return the excitation of a configuration that says nothing of it."""
+    move = Identification()
+    return ExcitationSettings(move.current_share, move.largest_q2, move.swing)
+
+
 def fly_bare(
     world: World, duration: float = 100.0, settings: ExcitationSettings | None = None, noise: float = 1.0
 ) -> Record:
     """Fly the excitation on the bare testbed: no wires, no filter; `noise` scales all of it."""
     rng = np.random.default_rng(world.seed)
     plant = plant_of(believed())
-    controller = ExcitationController(plant, PERIOD, settings or ExcitationSettings())
+    controller = ExcitationController(plant, PERIOD, settings or usual_excitation())
     felt: list[FloatArray] = [np.zeros(3)]
     testbed = Testbed(
         TestbedModel(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from flight.bodies.testbed.thread_estimate import about_thread
 from flight.gnc.estimation.estimate import Estimate
 from flight.gnc.estimation.measurements import (
     AttitudeMeasurement,
@@ -102,7 +103,7 @@ class Pilot:
         if not self._suspended:
             swing = np.sin(self._frequency * cycle * CYCLE_NS * 1e-9 + self._phase)
             return np.asarray(0.1 * swing)
-        now = estimate.about_thread()
+        now = about_thread(estimate)
         wanted = 0.5 * (self._targets[(cycle // 800) % 64] - now.angle) - 1.2 * now.rate - now.disturbance
         gain = DIPOLE * -TESTBED_FIELD[2] * np.cos(now.angle) / INERTIA[1, 1]
         return np.array([np.clip(wanted / gain, -0.148, 0.148), 0.0, 0.0])

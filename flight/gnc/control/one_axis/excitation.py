@@ -56,9 +56,9 @@ class ExcitationSettings:
         swing: s of each free swing.
     """
 
-    current_share: float = 0.6
-    largest_q2: float = 0.4
-    swing: float = 45.0
+    current_share: float
+    largest_q2: float
+    swing: float
 
 
 class ExcitationController:
@@ -78,7 +78,7 @@ class ExcitationController:
         if not 0.0 < settings.largest_q2 <= 0.5:
             raise UsageError(f"excitation largest_q2 is {settings.largest_q2}: it must lie between 0 and 0.5")
         gentle = replace(plant, current_limit=plant.current_limit * settings.current_share)
-        self._tracker = LqTracker(gentle, state_weight=2.0)
+        self._tracker = LqTracker(gentle, state_weight=2.0, input_weight=1.0)
         self._limit = gentle.current_limit
         self._strength = plant.torque_constant * self._limit / plant.inertia
         self._bound = angle_of(settings.largest_q2)

@@ -45,8 +45,8 @@ class LqTracker:
     def __init__(
         self,
         plant: SingleAxisPlant,
-        state_weight: float = 20.0,
-        input_weight: float = 1.0,
+        state_weight: float,
+        input_weight: float,
         largest_error: float = LARGEST_ERROR,
         least_authority: float = LEAST_AUTHORITY,
         as_in_thesis: bool = False,

@@ -155,6 +155,10 @@ class Guidance:
             return GuidanceState.NONE
         return GuidanceState.HOLDING if self._path.has_ended(now_ns) else GuidanceState.FOLLOWING
 
+    def is_following(self, now_ns: int) -> bool:
+        """Return whether a path is under way, rather than its end held."""
+        return self.state(now_ns) is GuidanceState.FOLLOWING
+
     def is_adrift(self, now_ns: int) -> bool:
         """Tell whether an attitude is held that nobody wanted held: no plan came in time."""
         if self._path is None or not self._path.has_ended(now_ns):

@@ -17,6 +17,7 @@ from numpy.polynomial import chebyshev
 from flight.gnc.guidance.lgl import lgl_rule
 from flight.gnc.guidance.one_axis.plant import Q2_LIMIT, acceleration_of, angle_of, motion_of, rate_of
 from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import about_axis_y
 
 FARTHEST = angle_of(Q2_LIMIT)
 """rad: where a coast ends."""
@@ -29,6 +30,16 @@ class Sample:
     angle: float
     rate: float
     acceleration: float
+
+    @property
+    def quaternion(self) -> FloatArray:
+        """The attitude (4,) that the angle about body y is."""
+        return about_axis_y(self.angle)
+
+    @property
+    def body_rate(self) -> FloatArray:
+        """The rate (3,), rad/s, body axes."""
+        return np.array([0.0, self.rate, 0.0])
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,13 +7,13 @@ import math
 import numpy as np
 import pytest
 
-from flight.bodies.testbed.controllers import controller_of
+from flight.bodies.testbed.tracker import controller_of
 from flight.gnc.control.one_axis.adaptive import AdaptiveController
 from flight.gnc.control.one_axis.lq_tracker import LqTracker
 from flight.gnc.control.one_axis.pid import PidController
 from flight.gnc.errors import UsageError
 from flight.gnc.guidance.one_axis.path import Sample
-from flight.schema.sections import Control
+from flight.schema.sections import Control, Identification
 from tests.flight.gnc.control.closed_loop import BELIEVED
 
 KINDS = {"lq": LqTracker, "thesis": LqTracker, "pid": PidController, "adaptive": AdaptiveController}
@@ -21,7 +21,7 @@ KINDS = {"lq": LqTracker, "thesis": LqTracker, "pid": PidController, "adaptive":
 
 @pytest.mark.parametrize("name", KINDS)
 def test_a_name_means_its_controller(name: str) -> None:
-    controller = controller_of(Control(tracker=name), BELIEVED, 0.025)  # type: ignore[arg-type]  # any of KINDS
+    controller = controller_of(Control(tracker=name), BELIEVED, 0.025, Identification())  # type: ignore[arg-type]  # any of KINDS
     assert isinstance(controller, KINDS[name])
     rng = np.random.default_rng(2)
     for numbers in rng.normal(0.0, 0.5, (200, 6)).tolist():
@@ -40,7 +40,7 @@ def test_only_the_lq_tracker_feeds_the_estimated_disturbance_forward() -> None:
     """3.6 A per rad/s^2 at theta = 0: what J / (n A B) says."""
     rest = Sample(0.0, 0.0, 0.0)
     for name in KINDS:
-        controller = controller_of(Control(tracker=name), BELIEVED, 0.025)  # type: ignore[arg-type]  # any of KINDS
+        controller = controller_of(Control(tracker=name), BELIEVED, 0.025, Identification())  # type: ignore[arg-type]  # any of KINDS
         current = controller.command(rest, 0.0, 0.0, 0.01).current
         expected = -0.01 * BELIEVED.inertia / BELIEVED.torque_constant if name == "lq" else 0.0
         assert current == pytest.approx(expected, abs=1e-9)

@@ -21,6 +21,7 @@ PLANT = SingleAxisPlant(1.05e-3, 2.916e-4, 23.0, 0.148)
 THREAD = SingleAxisPlant(1.05e-3, 2.916e-4, 23.0, 0.148, 1e-5, 2e-6)
 STRONG = SingleAxisPlant(1.05e-3, 2.916e-4, 23.0, 100.0, 1e-5, 2e-6)
 REST = Sample(0.0, 0.0, 0.0)
+WEIGHTS = 20.0, 1.0
 
 
 @settings(deadline=None)
@@ -34,7 +35,7 @@ def test_gains_are_those_of_a_general_solver(state_weight: float, input_weight: 
 
 
 def test_the_thesis_gains() -> None:
-    tracker = LqTracker(PLANT)
+    tracker = LqTracker(PLANT, *WEIGHTS)
     assert tracker.error_gain == pytest.approx(math.sqrt(20.0))
     assert tracker.rate_gain == pytest.approx(math.sqrt(20.0 + 2.0 * math.sqrt(20.0)))
 
@@ -73,7 +74,7 @@ def path() -> PolynomialPath:
 
 def test_the_error_follows_the_linear_system_exactly(path: PolynomialPath) -> None:
     """With e = sin(theta_p - theta), e'' = -K (e', e) from 0.6 rad off, while the coil is strong enough."""
-    tracker = LqTracker(STRONG)
+    tracker = LqTracker(STRONG, *WEIGHTS)
     start = path.sample(0)
     run = fly(STRONG, tracker, path, (start.angle - 0.6, start.rate + 0.1), 4.0)
     wanted = np.array([path.sample(round(t * 1e9)).angle for t in run[:, 0]])
@@ -96,7 +97,7 @@ def test_the_second_derivative_of_the_error_is_exact(path: PolynomialPath) -> No
     def error(time: float) -> float:
         return math.sin(path.sample(round(time * 1e9)).angle - angles(time)[0])
 
-    tracker = LqTracker(STRONG)
+    tracker = LqTracker(STRONG, *WEIGHTS)
     for time in (1.0, 3.3, 6.1, 8.7):
         wanted, (angle, rate, acceleration) = path.sample(round(time * 1e9)), angles(time)
         numeric = (error(time + step) - 2 * error(time) + error(time - step)) / step**2
@@ -113,7 +114,7 @@ def test_the_second_derivative_of_the_error_is_exact(path: PolynomialPath) -> No
 
 
 def test_on_the_path_the_current_is_the_planned_one(path: PolynomialPath) -> None:
-    tracker = LqTracker(THREAD)
+    tracker = LqTracker(THREAD, *WEIGHTS)
     for time in np.linspace(0.0, 9.9, 12).tolist():
         sample = path.sample(round(time * 1e9))
         planned = THREAD.current(sample.angle, sample.rate, sample.acceleration)
@@ -127,7 +128,7 @@ def test_the_body_returns_to_the_path_within_the_coils_limit(
     path: PolynomialPath, offset: float, rate: float
 ) -> None:
     start = path.sample(0)
-    run = fly(THREAD, LqTracker(THREAD), path, (start.angle + offset, start.rate + rate), 40.0)
+    run = fly(THREAD, LqTracker(THREAD, *WEIGHTS), path, (start.angle + offset, start.rate + rate), 40.0)
     assert np.abs(run[:, 3]).max() <= THREAD.current_limit
     final = path.sample(40_000_000_000).angle
     assert run[-1, 1] == pytest.approx(final, abs=2e-3)
@@ -135,7 +136,7 @@ def test_the_body_returns_to_the_path_within_the_coils_limit(
 
 
 def test_saturation_is_explicit() -> None:
-    tracker = LqTracker(PLANT)
+    tracker = LqTracker(PLANT, *WEIGHTS)
     strong = tracker.command(Sample(0.5, 0.0, 0.0), 0.0, 0.0)
     assert strong.saturated
     assert strong.current == 0.148 < strong.demanded
@@ -148,7 +149,7 @@ def test_saturation_is_explicit() -> None:
 @given(st.floats(1.01, math.pi - 0.01), st.sampled_from([-1.0, 1.0]))
 def test_beyond_the_largest_error_the_pull_stays_and_keeps_its_sign(size: float, sign: float) -> None:
     """sin(d) falls again after 90 degrees; the command does not."""
-    tracker = LqTracker(STRONG)
+    tracker = LqTracker(STRONG, *WEIGHTS)
     command = tracker.command(Sample(sign * size, 0.0, 0.0), 0.0, 0.0)
     edge = tracker.command(Sample(sign * 1.0, 0.0, 0.0), 0.0, 0.0)
     assert command.held
@@ -158,12 +159,12 @@ def test_beyond_the_largest_error_the_pull_stays_and_keeps_its_sign(size: float,
 
 
 def test_the_error_is_taken_the_short_way_round() -> None:
-    command = LqTracker(STRONG).command(Sample(3.0, 0.0, 0.0), -3.0, 0.0)
+    command = LqTracker(STRONG, *WEIGHTS).command(Sample(3.0, 0.0, 0.0), -3.0, 0.0)
     assert command.error == pytest.approx(6.0 - 2.0 * math.pi)
 
 
 def test_without_authority_the_coil_is_off_and_says_so() -> None:
-    tracker = LqTracker(PLANT)
+    tracker = LqTracker(PLANT, *WEIGHTS)
     lost = tracker.command(REST, math.pi / 2 - 0.01, 0.0)
     assert not lost.authority
     assert lost.current == 0.0
@@ -176,7 +177,7 @@ def test_an_input_that_is_not_finite_is_refused(position: int, value: float) -> 
     numbers = [0.1, 0.0, 0.0, 0.1, 0.0]
     numbers[position] = value
     with pytest.raises(UsageError, match="not finite"):
-        LqTracker(PLANT).command(Sample(*numbers[:3]), *numbers[3:])
+        LqTracker(PLANT, *WEIGHTS).command(Sample(*numbers[:3]), *numbers[3:])
 
 
 @pytest.mark.parametrize(
@@ -190,4 +191,4 @@ def test_an_input_that_is_not_finite_is_refused(position: int, value: float) -> 
 )
 def test_impossible_settings_are_refused_by_name(options: dict[str, Any], name: str) -> None:
     with pytest.raises(UsageError, match=name):
-        LqTracker(PLANT, **options)
+        LqTracker(PLANT, **({"state_weight": 20.0, "input_weight": 1.0} | options))

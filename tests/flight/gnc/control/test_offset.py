@@ -14,6 +14,7 @@ from flight.gnc.control.one_axis.pid import PidController
 from flight.gnc.guidance.one_axis.plant import SingleAxisPlant
 from tests.flight.gnc.control.closed_loop import BELIEVED, PERIOD, fly, held, largest_error
 
+WEIGHTS = 20.0, 1.0
 PUSHED = replace(BELIEVED, disturbance=4e-3)
 THREAD = replace(BELIEVED, stiffness=2e-5, damping=2e-6)
 
@@ -27,10 +28,12 @@ def test_the_tracker_holds_without_offset_where_the_thesis_keeps_one(true: Singl
     target = 0.5 if true is THREAD else 0.3
     errors = {}
     for thesis in (False, True):
-        rows = fly(LqTracker(BELIEVED, as_in_thesis=thesis), true, held(target), 30.0, (target, 0.0))
+        rows = fly(
+            LqTracker(BELIEVED, *WEIGHTS, as_in_thesis=thesis), true, held(target), 30.0, (target, 0.0)
+        )
         errors[thesis] = largest_error(rows, target, 10.0)
     torque = true.stiffness / true.inertia * target - true.disturbance
-    offset = np.degrees(abs(torque) / LqTracker(BELIEVED).error_gain)
+    offset = np.degrees(abs(torque) / LqTracker(BELIEVED, *WEIGHTS).error_gain)
     assert errors[False] < 0.03
     assert errors[True] == pytest.approx(offset, abs=0.03)
 
@@ -38,7 +41,7 @@ def test_the_tracker_holds_without_offset_where_the_thesis_keeps_one(true: Singl
 @pytest.mark.parametrize(
     "controller",
     [
-        LqTracker(BELIEVED),
+        LqTracker(BELIEVED, *WEIGHTS),
         PidController(BELIEVED, PERIOD, 0.76),
         AdaptiveController(BELIEVED, PERIOD, AdaptiveSettings(1.0, 10.0, 0.55)),
     ],
@@ -56,7 +59,7 @@ def test_all_controllers_bring_the_body_to_the_target_under_the_thread(controlle
 def test_a_sudden_step_that_saturates_the_coil_neither_overshoots_nor_winds_up(
     true: SingleAxisPlant, size: float
 ) -> None:
-    rows = fly(LqTracker(BELIEVED), true, held(size), 30.0)
+    rows = fly(LqTracker(BELIEVED, *WEIGHTS), true, held(size), 30.0)
     if abs(size) >= 0.3:
         assert (np.abs(rows[:, 3]) >= 0.148 - 1e-9).sum() > 20
     assert (rows[:, 1] / size).max() < 1.02
@@ -65,5 +68,5 @@ def test_a_sudden_step_that_saturates_the_coil_neither_overshoots_nor_winds_up(
 
 def test_the_thesis_tracker_overshoots_there() -> None:
     """Which is why it needs a path: its demand to brake comes when the coil can no longer meet it."""
-    rows = fly(LqTracker(BELIEVED, as_in_thesis=True), BELIEVED, held(0.7), 30.0)
+    rows = fly(LqTracker(BELIEVED, *WEIGHTS, as_in_thesis=True), BELIEVED, held(0.7), 30.0)
     assert rows[:, 1].max() > 0.7 * 1.3

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.estimation.estimate import ThreadEstimate as Estimate
+from flight.bodies.testbed.thread_estimate import ThreadEstimate as Estimate
 from flight.gnc.guidance.one_axis.plant import SingleAxisPlant
 from flight.gnc.math.arrays import FloatArray
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from flight.bodies.testbed.thread_estimate import about_thread
 from flight.gnc.estimation.attitude_filter import AttitudeFilter
 from flight.gnc.estimation.estimate import BIAS, PARAMETERS, RATE, TURN, Estimate
 from flight.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement, RateMeasurement
@@ -119,14 +120,14 @@ def test_about_the_thread_the_disturbance_is_what_the_believed_plant_leaves_out(
     follow(filter_, flight)
     last = filter_.at(400 * CYCLE_NS)
     true = last.parameters
-    pull = true.torsion * last.angle + true.damping * last.rate[1] - last.disturbance[1]
+    pull = true.torsion * about_thread(last).angle + true.damping * last.rate[1] - last.disturbance[1]
     for believed in (Parameters(), Parameters(0.01, 2e-3, 1.2), true):
-        there = last.about_thread(believed)
+        there = about_thread(last, believed)
         against = believed.torsion * there.angle + believed.damping * there.rate - there.disturbance
         assert against / believed.gain == pytest.approx(pull / true.gain, abs=1e-15)
         assert np.linalg.eigvalsh(there.covariance)[0] > 0.0
-    assert last.about_thread().q2 == last.q2 == pytest.approx(abs(last.quaternion[1]) * np.sign(last.angle))
-    own = last.about_thread(last.parameters)
+    assert about_thread(last).q2 == pytest.approx(abs(last.quaternion[1]) * np.sign(about_thread(last).angle))
+    own = about_thread(last, last.parameters)
     assert own.rate == last.rate[1]
     assert own.covariance[1, 1] == last.covariance[4, 4]
 

@@ -40,7 +40,7 @@ def follow_late(flight: Flight, late: int, settings: FilterSettings) -> tuple[At
 
 def sigmas(flight: Flight, last: Estimate) -> float:
     """Return by how many of its own sigmas the estimated turn is off."""
-    error = angle_about_axis_y(flight.attitudes[-1]) - last.angle
+    error = angle_about_axis_y(flight.attitudes[-1]) - angle_about_axis_y(last.quaternion)
     return float(abs(error) / np.sqrt(last.covariance[1, 1]))
 
 

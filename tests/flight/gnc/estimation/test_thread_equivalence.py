@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from flight.bodies.testbed.thread_estimate import about_thread
 from flight.gnc.estimation.attitude_filter import AttitudeFilter, FilterSettings
 from flight.gnc.estimation.measurements import (
     AttitudeMeasurement,
@@ -69,7 +70,7 @@ def largest_difference(driven: bool) -> tuple[float, float]:
         current = command if driven else 0.0
         one.command(cycle * PERIOD + 8_000_000, current)
         three.command(cycle * PERIOD + 8_000_000, np.array([current, 0.0, 0.0]))
-        a, b = one.at(cycle * PERIOD + 9_000_000), three.at(cycle * PERIOD + 9_000_000).about_thread()
+        a, b = one.at(cycle * PERIOD + 9_000_000), about_thread(three.at(cycle * PERIOD + 9_000_000))
         sigma = np.sqrt(np.diag(a.covariance))
         states = np.array([a.angle - b.angle, a.rate - b.rate, a.disturbance - b.disturbance])
         apart[0] = max(apart[0], float(np.max(np.abs(states) / sigma)))

@@ -50,7 +50,7 @@ def errors(filter_: AttitudeFilter, flown: Flight) -> FloatArray:
     """Return the errors of angle, rate and gain over their sigmas, at the last cycle."""
     estimate = filter_.at((END - 1) * CYCLE_NS)
     sigma = np.sqrt(np.diag(estimate.covariance))
-    found = np.array([estimate.angle, estimate.rate[1], estimate.parameters.gain])
+    found = np.array([angle_about_axis_y(estimate.quaternion), estimate.rate[1], estimate.parameters.gain])
     true = [angle_about_axis_y(flown.attitudes[-1]), flown.rates[-1, 1], flown.parameters.gain]
     return np.asarray(np.abs(found - true) / sigma[[1, 4, 14]])
 

@@ -13,7 +13,7 @@ from flight.link.modes import Mode
 from flight.loop.fdir import facts
 from flight.loop.fdir.event_log import EventLog
 from flight.loop.fdir.facts import FACTS, Facts, check
-from flight.loop.modes.control import SAFING_REACTIONS, modes_moved_by
+from flight.loop.modes.mode_control import SAFING_REACTIONS, modes_moved_by
 from flight.loop.modes.triggers import Trigger
 
 

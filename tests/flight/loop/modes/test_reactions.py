@@ -6,7 +6,7 @@ import pytest
 
 from flight.link.modes import Mode
 from flight.loop.fdir.facts import FACTS
-from flight.loop.modes.control import SAFING_REACTIONS
+from flight.loop.modes.mode_control import SAFING_REACTIONS
 from flight.loop.modes.table import TRANSITIONS
 
 

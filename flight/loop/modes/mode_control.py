@@ -1,31 +1,28 @@
-"""Mode control: reactions, commands and achievements become triggers; modes are entered with what they need.
+"""Mode control: turns reactions, commands and achievements into triggers, and enters the modes.
 
-Entering never waits for an estimate: what needs one is done in the first cycle that has it.
+Entering never waits for an estimate: a hold takes its attitude from the first cycle that has one.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
-from flight.bodies.testbed.steering import Steering
-from flight.bodies.testbed.targets import COMMANDED, KEPT, Target
-from flight.gnc.estimation.estimate import ThreadEstimate
-from flight.gnc.guidance.one_axis.guidance import Guidance
-from flight.gnc.guidance.one_axis.plant import Q2_LIMIT, angle_of
+from flight.gnc.errors import UsageError
+from flight.gnc.estimation.estimate import Estimate
 from flight.link import events
 from flight.link.events import EventKind, Reaction
 from flight.link.modes import Mode
 from flight.link.telemetry.definitions import MODE
-from flight.link.telemetry.recorder import Recorder
-from flight.loop.coil_drive import CoilDrive
+from flight.loop.body import Body, Target
 from flight.loop.fdir import facts
-from flight.loop.fdir.event_log import EventLog
-from flight.loop.fdir.facts import Facts
-from flight.loop.fdir.hold_timer import Dwell
+from flight.loop.fdir.hold_timer import HoldTimer
 from flight.loop.modes.machine import Change, ModeMachine
 from flight.loop.modes.table import TRANSITIONS, Answer
 from flight.loop.modes.triggers import COMMANDS, STARTS, STEERING, Trigger
+from flight.loop.services import Services
+from flight.loop.steering import Steering
 from flight.schema.sections import Modes
 
 SAFING_REACTIONS = {
@@ -44,51 +41,53 @@ def modes_moved_by(reaction: Reaction) -> frozenset[Mode]:
     return frozenset(mode for mode, row in TRANSITIONS.items() if isinstance(row[trigger], Mode))
 
 
+@dataclass(frozen=True, slots=True)
+class ModeSettings:
+    """Bounds of the modes.
+
+    Attributes:
+        low_rate, low_for: rad/s and s: a rate below it for that long ends detumbling.
+        stop: ends the flight politely, for a restart, with the reason it is given.
+    """
+
+    modes: Modes
+    low_rate: float
+    low_for: float
+    stop: Callable[[str], None]
+
+
 class ModeControl:
     """Owns the machine, and the attitude that a hold or a slew wants.
 
     Attributes:
         restart: why the process should end and be started again; empty when it should not.
+        wanted: the target of a hold or a slew, None in other modes.
     """
 
-    def __init__(
-        self,
-        settings: Modes,
-        machine: ModeMachine,
-        guidance: Guidance,
-        steering: Steering,
-        drive: CoilDrive,
-        facts_: Facts,
-        recorder: Recorder,
-        event_log: EventLog,
-        low_rate: tuple[float, float],
-        stop: Callable[[str], None],
-    ) -> None:
-        """Take the rooms that modes need.
-
-        `low_rate` rad/s, for s, ends detumbling; `stop` ends the flight politely, for a restart. Raises
-        FlightError where a fact's reaction would do nothing.
-        """
+    def __init__(self, settings: ModeSettings, body: Body, steering: Steering, services: Services) -> None:
+        """Take the tasks that modes act on. Raises FlightError where a fact's reaction would do nothing."""
         facts.check(facts.FACTS, modes_moved_by)
-        self._settings = settings
-        self._machine = machine
-        self._guidance = guidance
+        self._settings = settings.modes
+        self._stop = settings.stop
+        self._machine = ModeMachine()
+        self._targets = body.targets
+        self._paths = body.paths
+        self._view = body.view
         self._steering = steering
-        self._drive = drive
-        self._facts = facts_
-        self._recorder = recorder
-        self._events = event_log
-        self._low_rate = low_rate[0]
-        self._stop = stop
-        self._initial = Mode.named(settings.initial)
+        self._facts = services.facts
+        self._recorder = services.recorder
+        self._events = services.events
+        self._low_rate = settings.low_rate
+        self._initial = Mode.named(settings.modes.initial)
         self._crashed = 0
         self._commands = 0
         self._seen_ns = 0
-        self._slow = Dwell(low_rate[1])
-        self._arrived = Dwell(settings.arrived_for)
-        self._off = Dwell(settings.hold_patience)
+        self._slow = HoldTimer(settings.low_for)
+        self._arrived = HoldTimer(settings.modes.arrived_for)
+        self._off = HoldTimer(settings.modes.hold_patience)
         self.restart = ""
         self.wanted: Target | None = None
+        services.events.react_by(self.react)
 
     @property
     def mode(self) -> Mode:
@@ -114,16 +113,17 @@ class ModeControl:
 
     def step(
         self,
-        estimate: ThreadEstimate | None,
+        estimate: Estimate | None,
         rate: float | None,
-        due: float | None,
+        overdue: float | None,
         coils_answer: bool,
         now_ns: int,
     ) -> Mode:
-        """Look at what has been achieved in this cycle; return the mode to act in.
+        """Check what has been achieved in this cycle; return the mode to act in.
 
-        `rate` rad/s is the length of the newest body rate measured in this cycle, None when there was none;
-        `due` rad is where the demonstration should have brought the body, None while it is on its way.
+        `rate` rad/s is the magnitude of the newest body rate measured in this cycle, None without one;
+        `overdue` rad is the angle to where the demonstration should have brought the body by now, None while
+        the body is on its way.
         """
         if estimate is not None:
             self._seen_ns = now_ns
@@ -133,18 +133,18 @@ class ModeControl:
         text = f"no estimate for {blind:.0f} s"
         self._facts.state(facts.BLIND, blind > self._settings.blind_limit, now_ns, text)
         if self.mode is Mode.DETUMBLE and rate is not None:
-            # Where no current turns the body no hold is possible: wait there until the thread has turned it.
-            within = estimate is not None and abs(estimate.q2) < Q2_LIMIT
+            # Where no current turns the body no hold is possible: wait until it has turned further.
+            within = estimate is not None and self._targets.can_hold(estimate)
             if self._slow.update(rate < self._low_rate and within, now_ns):
                 self._fire(Trigger.DETUMBLED, f"below {self._low_rate:g} rad/s", now_ns)
         if estimate is not None and self.mode in {Mode.HOLD, Mode.SLEW}:
             self._keep(estimate, now_ns)
         elif estimate is not None and self.mode is Mode.TESTBED_DEMO:
-            self._watch(estimate, due, now_ns)
+            self._watch(estimate, overdue, now_ns)
         return self.mode
 
-    def command(self, mode: Mode, now_ns: int, q2: float | None = None) -> str:
-        """Obey a command; return why not, empty when obeyed. A slew needs its `q2`."""
+    def command(self, mode: Mode, now_ns: int, slew: float | None = None) -> str:
+        """Execute a command; return why it is refused, empty when done. SLEW needs `slew`, its argument."""
         trigger = COMMANDS.get(mode)
         if trigger is None:
             return f"{mode.label} cannot be commanded"
@@ -155,21 +155,24 @@ class ModeControl:
             return ""
         if self.mode is Mode.SAFE and (barred := self._barred()):
             return barred
+        text = ""
         if mode is Mode.SLEW:
-            if q2 is None or not abs(q2) <= Q2_LIMIT:
-                return f"q2 {q2} is not within +-{Q2_LIMIT}"
+            try:
+                wanted = self._targets.slew(math.nan if slew is None else slew, self._commands + 1, now_ns)
+            except UsageError as error:
+                return str(error)
             self._commands += 1
-            self.wanted = Target(COMMANDED + self._commands, now_ns, q2)
-        self._fire(trigger, "" if q2 is None else f"to q2 {q2:+.3f}", now_ns)
+            self.wanted, text = wanted, f"to {wanted.law.text}"
+        self._fire(trigger, text, now_ns)
         return ""
 
     def react(self, kind: EventKind, time_ns: int, text: str) -> None:
         """Do what an event's row asks for: the reactor of the event log."""
         reaction = kind.reaction
         if reaction is Reaction.COILS_OFF:
-            self._drive.zero()
+            self._steering.zero()
         elif reaction is Reaction.ISOLATE:
-            self._drive.isolate()
+            self._steering.isolate()
         elif reaction is Reaction.RESTART:
             self.restart = f"{kind.name}: {text}"
             self._stop(f"restart wanted: {self.restart}")
@@ -192,30 +195,28 @@ class ModeControl:
             late = waited > self._settings.boot_patience
             self._facts.state(facts.BOOT_WAITS, late, now_ns, f"for {waited:.1f} s: coils at zero")
 
-    def _keep(self, estimate: ThreadEstimate, now_ns: int) -> None:
-        """State how a hold or a slew gets on."""
+    def _keep(self, estimate: Estimate, now_ns: int) -> None:
+        """State the progress of a hold or a slew."""
         settings = self._settings
         if self.wanted is None:
-            q2 = min(max(estimate.q2, -Q2_LIMIT), Q2_LIMIT)
-            self.wanted = Target(KEPT, now_ns, q2)
-            self._guidance.hold(angle_of(q2), now_ns)
-        error = self._watch(estimate, angle_of(self.wanted.q2), now_ns)
+            self.wanted = self._targets.hold_here(estimate, now_ns)
+        error = self._watch(estimate, self._targets.error(estimate, self.wanted), now_ns)
         slewing = (now_ns - self._machine.since_ns) * 1e-9
-        near = error < settings.arrived_angle and abs(estimate.rate) < settings.arrived_rate
+        near = error < settings.arrived_angle and self._targets.speed(estimate) < settings.arrived_rate
         if self.mode is Mode.SLEW and self._arrived.update(near, now_ns):
             self._fire(Trigger.ARRIVED, f"{error:.4f} rad off", now_ns)
         text = f"{error:.3f} rad off after {slewing:.0f} s"
         self._facts.state(facts.SLEW_LATE, slewing > settings.slew_limit, now_ns, text)
 
-    def _watch(self, estimate: ThreadEstimate, wanted: float | None, now_ns: int) -> float:
-        """State whether the body turns too fast and stays too far off; return how far, rad.
+    def _watch(self, estimate: Estimate, off: float | None, now_ns: int) -> float:
+        """State whether the body turns too fast and stays too far `off`, rad; return how far.
 
-        `wanted` rad, None while nothing is: then it is not off.
+        `off` is None while nothing is wanted of the body: then it is not off.
         """
-        settings, speed = self._settings, abs(estimate.rate)
+        settings, speed = self._settings, self._targets.speed(estimate)
         text = f"{speed:.3f} rad/s, {settings.tumble_rate:g} allowed"
         self._facts.state(facts.TUMBLING, speed > settings.tumble_rate, now_ns, text)
-        error = 0.0 if wanted is None else abs(math.remainder(wanted - estimate.angle, 2.0 * math.pi))
+        error = 0.0 if off is None else off
         impossible = self._off.update(error > settings.hold_error, now_ns)
         text = f"{error:.2f} rad off for {settings.hold_patience:g} s"
         self._facts.state(facts.HOLD_IMPOSSIBLE, impossible, now_ns, text)
@@ -238,16 +239,16 @@ class ModeControl:
     def _enter(self, change: Change, reason: str, now_ns: int) -> None:
         """Prepare what the new mode needs."""
         self._facts.enter(change.after)
-        for dwell in (self._slow, self._arrived, self._off):
-            dwell.reset()
+        for timer in (self._slow, self._arrived, self._off):
+            timer.reset()
         if change.before not in STEERING | {Mode.BOOT}:
-            self._guidance.release()  # an old path says nothing of where the body is now
+            self._paths.release()  # an old path says nothing of where the body is now
         if change.after is Mode.DETUMBLE:
             self._steering.begin_braking(now_ns)
         if change.after is not Mode.SLEW and change.trigger is not Trigger.ARRIVED:
             self.wanted = None
         if change.after not in STEERING:
-            self._drive.zero()
+            self._steering.zero()
         self._record(change.before, change.trigger.value, reason, now_ns)
         if change.before is not Mode.BOOT:
             because = f": {reason}" if reason else ""
@@ -262,5 +263,5 @@ class ModeControl:
             mode=int(self.mode),
             trigger=trigger,
             reason=reason,
-            target_q2=self.wanted.q2 if self.wanted is not None else math.nan,
+            **self._view.mode_fields(self.wanted),
         )

@@ -1,13 +1,19 @@
-"""The controllers by name: which one a configuration means."""
+"""The tracker of the testbed: a controller of the turn about the thread behind the body seam."""
 
 from __future__ import annotations
 
+import numpy as np
+
+from flight.bodies.testbed.thread_estimate import ThreadReader
 from flight.gnc.control.one_axis.adaptive import AdaptiveController, AdaptiveSettings
 from flight.gnc.control.one_axis.controller import Controller
 from flight.gnc.control.one_axis.excitation import ExcitationController, ExcitationSettings
 from flight.gnc.control.one_axis.lq_tracker import LqTracker
 from flight.gnc.control.one_axis.pid import PidController
+from flight.gnc.estimation.estimate import Estimate
+from flight.gnc.guidance.one_axis.path import Sample
 from flight.gnc.guidance.one_axis.plant import SingleAxisPlant
+from flight.loop.body import CoilCommand
 from flight.schema.sections import Control, Identification
 
 
@@ -15,7 +21,7 @@ def controller_of(
     section: Control,
     plant: SingleAxisPlant,
     period: float,
-    identification: Identification = Identification(),  # noqa: B008 - frozen
+    identification: Identification,
 ) -> Controller:
     """Return the controller that `section` chooses for `plant`, commanded every `period` s."""
     if section.tracker == "excitation":
@@ -31,3 +37,23 @@ def controller_of(
     return LqTracker(
         plant, section.state_weight, section.control_weight, as_in_thesis=section.tracker == "thesis"
     )
+
+
+class ThreadTracker:
+    """Implements `flight.loop.body.Tracker` with the coil on body x (Sease 5.4)."""
+
+    def __init__(self, controller: Controller, reader: ThreadReader, dipole_per_ampere: float) -> None:
+        self._controller = controller
+        self._read = reader.read
+        self._dipole = dipole_per_ampere
+
+    def command(self, estimate: Estimate, reference: Sample) -> CoilCommand:
+        """Return the command that keeps the body on the reference."""
+        now = self._read(estimate)
+        wanted = self._controller.command(reference, now.angle, now.rate, now.disturbance)
+        currents = np.array([wanted.current, 0.0, 0.0])
+        return CoilCommand(self._dipole * currents, currents, wanted.saturated)
+
+    def reset(self) -> None:
+        """Forget integrated errors."""
+        self._controller.reset()

@@ -1,0 +1,27 @@
+"""The bodies that a configuration can name: one line each, or a third party's as `module:object`."""
+
+from __future__ import annotations
+
+import importlib
+
+from flight.gnc.errors import ConfigError
+from flight.loop.body import BodyKind
+from flight.schema.sections import Config
+
+BODIES = {"testbed": "flight.bodies.testbed.body:TESTBED"}
+
+
+def body_kind(config: Config) -> BodyKind:
+    """Return the kind of body that a configuration names. Raises ConfigError."""
+    place = BODIES.get(config.body, config.body)
+    module, colon, name = place.partition(":")
+    if not (module and colon and name):
+        known = ", ".join(BODIES)
+        raise ConfigError("body", f"is {config.body!r}: name one of {known}, or `module:object`")
+    try:
+        kind = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise ConfigError("body", f"is {config.body!r}, which cannot be had: {error}") from error
+    if not isinstance(kind, BodyKind):
+        raise ConfigError("body", f"is {config.body!r}: that is no BodyKind of flight.loop.body")
+    return kind

@@ -1,0 +1,156 @@
+"""The testbed: a body on a thread in a fixed horizontal field, turned about one axis by the coil on body x.
+
+`TESTBED` composes it from the configuration; no other folder of the flight knows about q2 and the thread.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from flight.bodies.testbed.planning import Planning, PlanningSettings, Strategy
+from flight.bodies.testbed.plant_model import angular_acceleration_psd_of, plant_of
+from flight.bodies.testbed.targets import ThreadTargets, TimedStep
+from flight.bodies.testbed.thread_estimate import ThreadReader
+from flight.bodies.testbed.tracker import ThreadTracker, controller_of
+from flight.bodies.testbed.view import ThreadView
+from flight.gnc.control.detumble import Braking, Detumbler, WindowSchedule, share_in_turning_field
+from flight.gnc.estimation.attitude_filter import AttitudeFilter, FilterSettings, slow_prior
+from flight.gnc.estimation.estimate import Estimate
+from flight.gnc.estimation.rigid_body import Parameters, RigidBody
+from flight.gnc.guidance.one_axis import job as plan_job
+from flight.gnc.guidance.one_axis.guidance import AcceptanceRules, Guidance
+from flight.gnc.guidance.one_axis.plant import SingleAxisPlant
+from flight.gnc.guidance.one_axis.vmc import NODES
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import about_axis_y, attitude_matrix
+from flight.loop.body import Body, BodyKind
+from flight.loop.fdir.coils.response import ResponseSettings
+from flight.loop.fdir.coils.watch import CoilWatch, CoilWatchSettings
+from flight.loop.services import Services
+from flight.loop.state.content import Learned
+from flight.loop.state.learning import start_from
+from flight.schema.sections import Config
+from hal.interfaces.wires import SECOND_NS
+
+_THREAD_AXIS = np.array([0.0, 1.0, 0.0])
+
+
+def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> Body:
+    """Return the testbed of a configuration, with what an earlier boot learned."""
+    plant = plant_of(config)
+    filter_, problems = attitude_filter(config, plant, learned)
+    believed = Parameters(plant.stiffness / plant.inertia, plant.damping / plant.inertia)
+    reader = ThreadReader(believed)
+    settings = planning_settings(config)
+    rules = AcceptanceRules(late_after=config.guidance.late_after)
+    guidance = Guidance(plant, rules, arrives=settings.strategy is not Strategy.RECEDING)
+    planning = Planning(plant, settings, guidance, reader, services)
+    steps = [TimedStep(step.at, step.q2, step.rate) for step in config.steps]
+    period = 1.0 / config.executive.control_rate_hz
+    controller = controller_of(config.control, plant, period, config.identification)
+    dipole = dipole_per_ampere(config)
+    reference_field = surrounding_field(config)
+
+    def field(estimate: Estimate) -> FloatArray:
+        angle = reader.read(estimate).angle
+        return np.asarray(attitude_matrix(about_axis_y(angle)) @ reference_field)
+
+    return Body(
+        filter=filter_,
+        learned_problems=problems,
+        paths=guidance,
+        planner=planning,
+        targets=ThreadTargets(steps, reader, guidance, planning),
+        tracker=ThreadTracker(controller, reader, dipole),
+        detumbler=detumbler(config, plant),
+        coil_watch=coil_watch(config, plant),
+        view=ThreadView(reader, planning, services),
+        field=field,
+        free_axis=_THREAD_AXIS,
+        dipole_per_ampere=dipole,
+        angular_acceleration_psd=angular_acceleration_psd_of(config, plant),
+    )
+
+
+TESTBED = BodyKind(plan_job.run, make)
+
+
+def surrounding_field(config: Config) -> FloatArray:
+    """Return the field (3,) T in which the testbed hangs, reference axes."""
+    return np.array([0.0, 0.0, -config.plant.field])
+
+
+def dipole_per_ampere(config: Config) -> float:
+    """Return n A of each coil, m^2."""
+    return config.plant.coil_turns * config.plant.coil_area
+
+
+def attitude_filter(
+    config: Config, plant: SingleAxisPlant, learned: Mapping[str, Learned]
+) -> tuple[AttitudeFilter, list[str]]:
+    """Return the filter of a body on the thread, and why some of what was `learned` was not taken."""
+    section, believed = config.estimation, config.plant
+    body = RigidBody(
+        np.eye(3) * plant.inertia,
+        believed.coil_turns * believed.coil_area,
+        surrounding_field(config),
+        suspended=True,
+        stiffness=plant.stiffness,
+        damping=plant.damping,
+    )
+    settings = FilterSettings(
+        current_noise=section.current_noise,
+        control_period=1.0 / config.executive.control_rate_hz,
+        disturbance_walk=section.disturbance_walk,
+        bias_start=section.bias_start,
+        torsion_start=section.torsion_start,
+        damping_start=section.damping_start,
+        gain_start=section.gain_start,
+        latency_start=section.latency_start,
+        latency_walk=section.latency_walk,
+        unknown_current=plant.current_limit,
+        gate_sigma=section.gate_sigma,
+        history_ns=round(section.history * SECOND_NS),
+    )
+    prior, problems = start_from(learned, slow_prior(body, settings), section.changed)
+    return AttitudeFilter(body, settings, prior), problems
+
+
+def detumbler(config: Config, plant: SingleAxisPlant) -> Detumbler:
+    """Return the law and the windows of detumbling."""
+    section = config.detumble
+    settle_ns, measure_ns, act_ns = (
+        round(seconds * SECOND_NS) for seconds in (section.settle, section.measure, section.act)
+    )
+    schedule = WindowSchedule(settle_ns, measure_ns, act_ns)
+    turning = section.field_turn > 0.0
+    share = share_in_turning_field(section.field_turn, schedule) if turning else section.share
+    return Detumbler(schedule, Braking(plant.inertia, dipole_per_ampere(config), plant.current_limit, share))
+
+
+def coil_watch(config: Config, plant: SingleAxisPlant) -> CoilWatch:
+    """Return the watch over the coils' circuit."""
+    x, y, z = (config.coils.supply_voltage / resistance for resistance in config.coils.resistance)
+    response = ResponseSettings(
+        np.eye(3) * plant.inertia,
+        dipole_per_ampere(config),
+        config.inertial_unit.rate_noise,
+        free=(False, True, False),
+    )
+    return CoilWatch(CoilWatchSettings((x, y, z), response=response))
+
+
+def planning_settings(config: Config) -> PlanningSettings:
+    """Return how paths are asked for."""
+    section = config.guidance
+    return PlanningSettings(
+        horizon=section.horizon,
+        max_horizon=section.max_horizon,
+        late_after_ns=round(section.late_after * SECOND_NS),
+        nodes=section.nodes or NODES,
+        strategy=Strategy(section.strategy),
+        time_price=section.time_price,
+        current_share=section.current_share,
+    )

@@ -1,0 +1,218 @@
+"""The body seam: what the loop asks of the body that it flies, whichever that is.
+
+The loop speaks of attitudes, rates and dipoles. A body says how targets are written, how a path to them is
+planned and tracked, and how its own packets show it. `flight.bodies` holds the bodies; a third party's is
+named in the configuration as `module:object`, a `BodyKind`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+from flight.gnc.control.detumble import Detumbler
+from flight.gnc.estimation.attitude_filter import AttitudeFilter
+from flight.gnc.estimation.estimate import Estimate
+from flight.gnc.estimation.measurements import MeanRateMeasurement
+from flight.gnc.math.arrays import FloatArray
+from flight.loop.executive.jobs import JobResult
+from flight.loop.executive.rate_group import Cycle
+from flight.loop.fdir.coils.watch import CoilWatch
+from hal.interfaces.readings import ImuReading
+
+if TYPE_CHECKING:
+    from flight.loop.control_cycle import ControlOutput
+    from flight.loop.services import Services
+    from flight.loop.state.content import Learned
+    from flight.schema.sections import Config
+
+PLANNER = "planner"
+"""The planner worker's name."""
+COMMANDED = 1000
+"""Commanded slews are numbered from here on."""
+KEPT = 65535
+"""The number of an attitude that is only held."""
+
+
+class Reference(Protocol):
+    """The motion wanted at one instant; each body has its own cheap form of it."""
+
+    @property
+    def quaternion(self) -> FloatArray:
+        """(4,) reference frame into body."""
+
+    @property
+    def body_rate(self) -> FloatArray:
+        """(3,) rad/s, body axes."""
+
+
+class AttitudeLaw(Protocol):
+    """Which attitude is wanted over time, as a body writes it."""
+
+    @property
+    def text(self) -> str:
+        """The law in words, for events."""
+
+    def quaternion(self, now_ns: int) -> FloatArray:
+        """Return the attitude (4,) to be reached, as it stands at `now_ns`, reference into body."""
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """An attitude law that is wanted; `index` numbers it in packets: a step, COMMANDED and up, or KEPT."""
+
+    index: int
+    law: AttitudeLaw
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CoilCommand:
+    """What a tracker asks of the coils: the dipole (3,) A m^2, and the currents (3,) A that make it."""
+
+    dipole: FloatArray
+    currents: FloatArray
+    saturated: bool = False
+
+
+class Tracker(Protocol):
+    """Turns estimate and reference into a command, once a control cycle."""
+
+    def command(self, estimate: Estimate, reference: Any) -> CoilCommand:
+        """Return the command that keeps the body on the reference."""
+
+    def reset(self) -> None:
+        """Forget integrated errors: the coils were off, or the estimate was lost."""
+
+
+class Paths(Protocol):
+    """The path being flown."""
+
+    def sample(self, now_ns: int) -> Any | None:
+        """Return the `Reference` now; None when there is no path yet."""
+
+    def is_following(self, now_ns: int) -> bool:
+        """Return whether a path is under way, rather than its end held."""
+
+    def is_adrift(self, now_ns: int) -> bool:
+        """Return whether an attitude is held only because no plan came in time."""
+
+    def release(self) -> None:
+        """Forget the path."""
+
+
+class Planner(Protocol):
+    """Asks the worker for paths and offers them to guidance."""
+
+    def busy_since_ns(self) -> int | None:
+        """Return since when a plan is being made, None when none is."""
+
+    def aim(self, target: Target, now_ns: int) -> None:
+        """Want another attitude, and a plan for it at once."""
+
+    def request(self, now_ns: int) -> None:
+        """Want a plan as soon as there is an estimate to start from and the worker is free."""
+
+    def resume(self, now_ns: int) -> None:
+        """Want the rest of a path after a time without control."""
+
+    def replan(self, cycle: Cycle) -> None:
+        """Want a plan because its time has come: the task of the replanning rate group."""
+
+    def serve(self, estimate: Estimate | None, target: Target, now_ns: int) -> None:
+        """Hand the wanted job over."""
+
+    def finish(self, result: JobResult, now_ns: int) -> None:
+        """Offer the worker's plan to guidance."""
+
+    def counts(self) -> tuple[int, int]:
+        """Return how many plans were accepted and refused since the start."""
+
+
+class Targets(Protocol):
+    """What can be wanted of the body, and how far it is from that."""
+
+    def configured(self, mission_time_ns: int) -> Target:
+        """Return the configured target in force at a mission time."""
+
+    def slew(self, wanted: float, number: int, now_ns: int) -> Target:
+        """Return the target of a commanded slew. Raises UsageError for one that cannot be flown."""
+
+    def hold_here(self, estimate: Estimate, now_ns: int) -> Target:
+        """Hold the present attitude, as near as the body can; return it as a target."""
+
+    def can_hold(self, estimate: Estimate) -> bool:
+        """Return whether the coils could hold the body where it is."""
+
+    def speed(self, estimate: Estimate) -> float:
+        """Return the rate of the turn that the coils control, rad/s, not negative."""
+
+    def error(self, estimate: Estimate, target: Target) -> float:
+        """Return the angle between body and target, rad."""
+
+    def error_when_due(self, estimate: Estimate, target: Target, now_ns: int) -> float | None:
+        """Return the angle to where the body should have arrived by now, rad; None while under way."""
+
+
+class BodyView(Protocol):
+    """How the body's own packets and texts show it."""
+
+    def record_cycle(self, output: ControlOutput) -> None:
+        """Record the body's own packet of a control cycle."""
+
+    def announce(self, target: Target, now_ns: int) -> None:
+        """Record a new target, and report it as an event."""
+
+    def mode_fields(self, wanted: Target | None) -> Mapping[str, float]:
+        """Return the body's fields of the mode packet."""
+
+    def reading_text(self, reading: ImuReading) -> str:
+        """Return a reading in words, for the event that it was refused."""
+
+    def rate_text(self, rate: MeanRateMeasurement) -> str:
+        """Return a rate from streaks in words, for the event that it was refused."""
+
+    def progress(self, output: ControlOutput | None) -> str:
+        """Return target and attitude in words, for the progress line."""
+
+
+@dataclass(frozen=True, slots=True)
+class Body:
+    """A body ready to fly.
+
+    Attributes:
+        filter: estimates attitude, rate and what else the body has.
+        learned_problems: why something that an earlier boot learned is not used.
+        field: the magnetic field (3,) T in body axes at an estimate, for reallocation of currents.
+        free_axis: (3,) the axis about which alone the body can turn; None for a free one.
+        coil_watch: compares commanded currents with supply and motion.
+        detumbler: brakes a tumble by the magnetometer alone.
+        angular_acceleration_psd: rad^2/s^3, of the white angular acceleration that shakes the body.
+    """
+
+    filter: AttitudeFilter
+    learned_problems: list[str]
+    paths: Paths
+    planner: Planner
+    targets: Targets
+    tracker: Tracker
+    detumbler: Detumbler
+    coil_watch: CoilWatch
+    view: BodyView
+    field: Callable[[Estimate], FloatArray]
+    free_axis: FloatArray | None
+    dipole_per_ampere: float
+    angular_acceleration_psd: float
+
+
+@dataclass(frozen=True, slots=True)
+class BodyKind:
+    """A kind of body.
+
+    Attributes:
+        plan: the planner worker's function: a job in, a plan out; both pickle.
+        make: builds the body of a configuration, with what an earlier boot learned.
+    """
+
+    plan: Callable[[Any], Any]
+    make: Callable[[Config, Services, Mapping[str, Learned]], Body]

@@ -1,0 +1,215 @@
+"""One flight from its release to its end: begun in every task, run by the executive, closed whatever happens.
+
+It knows devices only by their Protocols; `flight.app` opens them, composes the tasks and closes the devices.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from flight.link import events
+from flight.link.events import EventKind
+from flight.loop.body import Body
+from flight.loop.commanding import Commanding
+from flight.loop.control_cycle import ControlCycle, ControlOutput
+from flight.loop.executive.executive import Executive
+from flight.loop.executive.rate_group import Cycle, RateGroup
+from flight.loop.fdir.health_watch import HealthWatch
+from flight.loop.fdir.resources import ResourceReader
+from flight.loop.housekeeping import Housekeeping
+from flight.loop.imaging import Imaging
+from flight.loop.modes.mode_control import ModeControl
+from flight.loop.navigation import Navigation
+from flight.loop.performance import PerformanceObserver
+from flight.loop.progress import Progress
+from flight.loop.rate_groups import GroupTasks, Periods, rate_groups
+from flight.loop.run_label import RunLabel, record_run
+from flight.loop.services import Services
+from flight.loop.state.keeper import StateKeeper
+from flight.loop.state.learning import learned_of
+from flight.loop.steering import SteeringState
+from flight.schema.sections import Config
+from hal.interfaces.wires import SECOND_NS
+
+
+def nothing() -> None:
+    """No-op: lock-step simulation has no watchdog."""
+
+
+@dataclass(frozen=True, slots=True)
+class Supervisors:
+    """What lies around the loop in real time.
+
+    Attributes:
+        beat: called at the end of each control cycle that ran well: the guardian's heartbeat.
+        keeper: keeps the state of earlier boots; None where nothing is kept.
+        board: reads processor, memory, disk and temperature; None in lock-step.
+    """
+
+    beat: Callable[[], None] = nothing
+    keeper: StateKeeper | None = None
+    board: ResourceReader | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class LoopTasks:
+    """The tasks of the loop; without a camera there is no imaging, without channels no commanding.
+
+    Data goes through them in this order.
+    """
+
+    navigation: Navigation
+    imaging: Imaging | None
+    modes: ModeControl
+    control: ControlCycle
+    observer: PerformanceObserver
+    health: HealthWatch
+    housekeeping: Housekeeping
+    commanding: Commanding | None
+
+
+@dataclass(slots=True)
+class _Wishes:
+    """What the application asks of a running flight."""
+
+    stop_reason: str = ""
+    progress: Callable[[Progress], None] | None = None
+    notes: list[tuple[EventKind, str]] = field(default_factory=list)
+
+
+class FlightLoop:
+    """One flight: from the release at mission time zero to the end of the configured duration."""
+
+    def __init__(
+        self, config: Config, body: Body, tasks: LoopTasks, services: Services, around: Supervisors
+    ) -> None:
+        self._config = config
+        self._body = body
+        self._tasks = tasks
+        self._services = services
+        self._around = around
+        self._wishes = _Wishes()
+        self._wishes.notes += [(events.LEARNED_REFUSED, problem) for problem in body.learned_problems]
+        self._output: ControlOutput | None = None
+        self._groups = self._rate_groups()
+        tasks.health.watch(self._groups)
+        # Jobs done on the spot, in lock-step, are no part of a cycle's execution time.
+        jobs = services.jobs
+        self._executive = Executive(
+            services.clock, self._groups, tasks.observer, lambda: time.perf_counter_ns() - jobs.borrowed_ns
+        )
+
+    @property
+    def restart(self) -> str:
+        """Why the process should be started again after this flight; empty when it should not."""
+        return self._tasks.modes.restart
+
+    def stop(self, reason: str) -> None:
+        """End the flight after the running cycle. Safe from a signal handler."""
+        self._wishes.stop_reason = reason
+        self._executive.stop()
+
+    def note(self, kind: EventKind, text: str) -> None:
+        """Report an event of the time before the flight at its start."""
+        self._wishes.notes.append((kind, text))
+
+    def watch(self, progress: Callable[[Progress], None]) -> None:
+        """Call `progress` once a second of mission time."""
+        self._wishes.progress = progress
+
+    def run(self, epoch_ns: int, label: RunLabel) -> str:
+        """Fly from `epoch_ns` on; return why it ended. The coils are at zero when this returns or raises."""
+        services = self._services
+        self._begin(epoch_ns, label)
+        try:
+            self._executive.run(epoch_ns, epoch_ns + round(self._config.duration * SECOND_NS))
+        finally:
+            self._tasks.control.coils_off()
+            self._tasks.health.close()
+            now_ns = services.clock.now_ns()
+            reason = self._wishes.stop_reason or "the configured duration is over"
+            services.events.flush(now_ns)
+            services.events.tell(events.STOPPED, now_ns, reason)
+            self._record_performance(now_ns)
+        return reason
+
+    def _begin(self, epoch_ns: int, label: RunLabel) -> None:
+        """Give every task mission time zero, and the log what is flown."""
+        config, services, tasks, around = self._config, self._services, self._tasks, self._around
+        recorder, clock = services.recorder, services.clock
+        recorder.epoch_ns = epoch_ns
+        tasks.navigation.begin(epoch_ns)
+        if tasks.imaging is not None:
+            tasks.imaging.begin(epoch_ns)
+        services.streams.begin(epoch_ns)
+        utc_ns = clock.utc_ns() - (clock.now_ns() - epoch_ns)
+        record_run(recorder, config, label, epoch_ns, utc_ns, self._groups[0].period_ns)
+        tasks.modes.begin(epoch_ns, around.keeper.record.unclean_recent if around.keeper else 0)
+        services.events.tell(events.STARTED, epoch_ns, f"{config.name}, {config.duration:g} s")
+        for kind, text in self._wishes.notes:
+            services.events.tell(kind, epoch_ns, text)
+        tasks.health.begin(epoch_ns)
+        if around.board is not None:
+            tasks.health.read_resources(around.board, round(config.health.look_period * SECOND_NS))
+
+    def _rate_groups(self) -> list[RateGroup]:
+        config, tasks = self._config, self._tasks
+        camera = config.camera
+        periods = Periods(
+            round(SECOND_NS / config.executive.control_rate_hz),
+            round(config.guidance.replan_period * SECOND_NS),
+            round(camera.period * SECOND_NS) if camera is not None else None,
+        )
+        return rate_groups(
+            periods,
+            GroupTasks(
+                control=self._run_control,
+                replan=self._body.planner.replan,
+                camera=tasks.imaging.trigger if tasks.imaging is not None else None,
+                commands=tasks.commanding.run if tasks.commanding is not None else None,
+                health=tasks.health.run,
+                housekeeping=self._keep_house,
+            ),
+        )
+
+    def _run_control(self, cycle: Cycle) -> None:
+        self._output = self._tasks.control.run(cycle)
+        self._around.beat()
+
+    def _keep_house(self, cycle: Cycle) -> None:
+        now_ns, output = cycle.start_ns, self._output
+        state = output.steered.state if output is not None else SteeringState.OFF
+        self._tasks.housekeeping.run(cycle, state)
+        self._keep_state(now_ns)
+        self._record_performance(now_ns)
+        if self._wishes.progress is not None:
+            self._wishes.progress(self._progress(state, now_ns))
+
+    def _progress(self, state: SteeringState, now_ns: int) -> Progress:
+        output, services = self._output, self._services
+        x, y, z = output.steered.currents.tolist() if output is not None else (0.0, 0.0, 0.0)
+        return Progress(
+            (now_ns - services.recorder.epoch_ns) * 1e-9,
+            self._config.duration,
+            self._body.view.progress(output),
+            (x, y, z),
+            state.name.lower(),
+            sum(group.slips for group in self._groups),
+            services.events.count,
+        )
+
+    def _keep_state(self, now_ns: int) -> None:
+        """Hand the state that outlives the process to its keeper, and report its events; touches no disk."""
+        keeper = self._around.keeper
+        if keeper is None:
+            return
+        for kind, text in keeper.notices():
+            self._services.events.tell(kind, now_ns, text)
+        estimate = self._tasks.navigation.estimate(now_ns)
+        keeper.note(self._tasks.modes.mode.label, learned_of(estimate) if estimate else None)
+
+    def _record_performance(self, now_ns: int) -> None:
+        for group in self._groups:
+            self._tasks.observer.group(group, now_ns)

@@ -1,0 +1,139 @@
+"""Steering: from the estimate and the path to a coil command; zero without a trusted estimate."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+
+from flight.gnc.estimation.estimate import Estimate
+from flight.gnc.math.arrays import FloatArray
+from flight.loop.body import Body, CoilCommand
+from flight.loop.coil_drive import CoilDrive
+from flight.loop.fdir import facts
+from flight.loop.services import Services
+from hal.interfaces.readings import ImuReading
+
+_NO_DIPOLE: FloatArray = np.zeros(3)
+
+
+class SteeringState(IntEnum):
+    """What the coils are used for; the values are those of the control packet."""
+
+    OFF = 0
+    FOLLOWING = 1
+    HOLDING = 2
+    BRAKING = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Steered:
+    """What steering did in one cycle.
+
+    Attributes:
+        reference: the body's `Reference` now; None without a path.
+        dipole: (3,) A m^2, wanted of the coils.
+        currents: (3,) A, asked of the driver: after reallocation, with a probe of the coil watch, and zero
+            where a fault of this cycle switched the coils off.
+    """
+
+    state: SteeringState
+    reference: Any | None
+    dipole: FloatArray
+    currents: FloatArray
+    saturated: bool = False
+
+
+class Steering:
+    """Steers the body along its path, brakes it, or rests.
+
+    Control is lost when no reading within its age limit agrees with the estimate, or, while braking, when
+    there is no such reading. The model carries the estimate on over a silence, so that control returns
+    smoothly, but no current flows meanwhile: it is zero within a tenth of a second of the last reading.
+    Without a planner the body is steered along its last path and held at its end (event `holding`). Without a
+    path no current flows.
+    """
+
+    def __init__(self, body: Body, drive: CoilDrive, services: Services) -> None:
+        self._body = body
+        self._drive = drive
+        self._facts = services.facts
+
+    def run(self, estimate: Estimate | None, now_ns: int, ever_started: bool) -> Steered:
+        """Follow or hold in this cycle, by an `estimate` that is measured.
+
+        `ever_started`: there was an estimate once, so that None is a loss of control.
+        """
+        body = self._body
+        reference = body.paths.sample(now_ns)
+        text = "steering again" if estimate else "no measurement fresh enough to steer by: coils to zero"
+        self._facts.state(facts.CONTROL_LOST, estimate is None and ever_started, now_ns, text)
+        state, dipole, saturated, adrift = SteeringState.OFF, _NO_DIPOLE, False, False
+        if estimate is None or reference is None:
+            self._let_go()
+        else:
+            following = body.paths.is_following(now_ns)
+            state = SteeringState.FOLLOWING if following else SteeringState.HOLDING
+            wanted: CoilCommand = body.tracker.command(estimate, reference)
+            dipole, saturated = wanted.dipole, wanted.saturated
+            self._drive.send(wanted.currents, lambda: body.field(estimate))
+            adrift = not following and body.paths.is_adrift(now_ns)
+        self._facts.state(
+            facts.HOLDING, adrift, now_ns, "no newer path: holding the attitude at the end of the last"
+        )
+        return self._steered(state, now_ns, reference, dipole, saturated)
+
+    def begin_braking(self, now_ns: int) -> None:
+        """Begin the measuring and acting windows of detumbling."""
+        self._body.detumbler.begin(now_ns)
+
+    def brake(self, readings: Sequence[ImuReading], heard: bool, now_ns: int) -> Steered:
+        """Detumble in this cycle, by the magnetometer alone; `heard`: its newest reading is fresh enough."""
+        detumbler = self._body.detumbler
+        for reading in readings:
+            detumbler.sample(reading.time_ns, reading.field)
+        text = "braking again" if heard else "no reading fresh enough to brake by: coils to zero"
+        self._facts.state(facts.CONTROL_LOST, not heard, now_ns, text)
+        state, dipole = SteeringState.OFF, _NO_DIPOLE
+        if heard:
+            self._body.tracker.reset()
+            state, currents = SteeringState.BRAKING, detumbler.current(now_ns)
+            dipole = currents * self._body.dipole_per_ampere
+            self._drive.send(currents, lambda: detumbler.field(now_ns))
+        else:
+            self._let_go()
+        return self._steered(state, now_ns, None, dipole)
+
+    def rest(self, now_ns: int) -> Steered:
+        """Keep the coils at zero in this cycle."""
+        self._let_go()
+        return self._steered(SteeringState.OFF, now_ns, None, _NO_DIPOLE)
+
+    def zero(self) -> None:
+        """Bring the coils to zero now."""
+        self._drive.zero()
+
+    def isolate(self) -> None:
+        """Exclude the coils that have a verdict."""
+        self._drive.isolate()
+
+    def _let_go(self) -> None:
+        self._drive.zero()
+        self._body.tracker.reset()
+
+    def _steered(
+        self,
+        state: SteeringState,
+        now_ns: int,
+        reference: Any | None,
+        dipole: FloatArray,
+        saturated: bool = False,
+    ) -> Steered:
+        """Check the PWM chip, which may switch the coils off; return what was done in the end."""
+        error = self._drive.fault()
+        text = error or "the PWM chip takes commands again"
+        self._facts.state(facts.COIL_FAULT, bool(error), now_ns, text)
+        return Steered(state, reference, dipole, self._drive.command, saturated)
