@@ -12,7 +12,7 @@ from flight.gnc.vision.startracker.frame_job import TrackerSettings
 from flight.gnc.vision.startracker.solve import SolveSettings
 from flight.gnc.vision.streaks.corners.settings import StreakSettings
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
-from flight.loop.imaging import ImagingSettings
+from flight.loop.frame_measurements import ImagingSettings
 from flight.loop.navigation import NavigationSettings
 from flight.schema.camera_model import camera_model
 from flight.schema.sections import Camera, Config

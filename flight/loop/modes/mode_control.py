@@ -19,6 +19,7 @@ from flight.loop.body import Body, Target
 from flight.loop.fdir import facts
 from flight.loop.fdir.hold_timer import HoldTimer
 from flight.loop.modes.machine import Change, ModeMachine
+from flight.loop.modes.pointing_watch import PointingWatch
 from flight.loop.modes.table import TRANSITIONS, Answer
 from flight.loop.modes.triggers import COMMANDS, STARTS, STEERING, Trigger
 from flight.loop.services import Services
@@ -84,7 +85,7 @@ class ModeControl:
         self._seen_ns = 0
         self._slow = HoldTimer(settings.low_for)
         self._arrived = HoldTimer(settings.modes.arrived_for)
-        self._off = HoldTimer(settings.modes.hold_patience)
+        self._pointing = PointingWatch(settings.modes, body.targets, services.facts)
         self.restart = ""
         self.wanted: Target | None = None
         services.events.react_by(self.react)
@@ -106,7 +107,7 @@ class ModeControl:
         return self.mode is Mode.TESTBED_DEMO or (booting and not self._too_many_crashes)
 
     def begin(self, now_ns: int, unclean_recent: int) -> None:
-        """Begin to boot, after so many unclean shutdowns of late."""
+        """Begin to boot; `unclean_recent` shutdowns shortly before were unclean."""
         self._machine.since_ns = self._seen_ns = now_ns
         self._crashed = unclean_recent
         self._record(Mode.BOOT, "begin", "", now_ns)
@@ -140,7 +141,7 @@ class ModeControl:
         if estimate is not None and self.mode in {Mode.HOLD, Mode.SLEW}:
             self._keep(estimate, now_ns)
         elif estimate is not None and self.mode is Mode.TESTBED_DEMO:
-            self._watch(estimate, overdue, now_ns)
+            self._pointing.watch(estimate, overdue, now_ns)
         return self.mode
 
     def command(self, mode: Mode, now_ns: int, slew: float | None = None) -> str:
@@ -200,7 +201,7 @@ class ModeControl:
         settings = self._settings
         if self.wanted is None:
             self.wanted = self._targets.hold_here(estimate, now_ns)
-        error = self._watch(estimate, self._targets.error(estimate, self.wanted), now_ns)
+        error = self._pointing.watch(estimate, self._targets.error(estimate, self.wanted), now_ns)
         slewing = (now_ns - self._machine.since_ns) * 1e-9
         near = error < settings.arrived_angle and self._targets.speed(estimate) < settings.arrived_rate
         if self.mode is Mode.SLEW and self._arrived.update(near, now_ns):
@@ -208,22 +209,8 @@ class ModeControl:
         text = f"{error:.3f} rad off after {slewing:.0f} s"
         self._facts.state(facts.SLEW_LATE, slewing > settings.slew_limit, now_ns, text)
 
-    def _watch(self, estimate: Estimate, off: float | None, now_ns: int) -> float:
-        """State whether the body turns too fast and stays too far `off`, rad; return how far.
-
-        `off` is None while nothing is wanted of the body: then it is not off.
-        """
-        settings, speed = self._settings, self._targets.speed(estimate)
-        text = f"{speed:.3f} rad/s, {settings.tumble_rate:g} allowed"
-        self._facts.state(facts.TUMBLING, speed > settings.tumble_rate, now_ns, text)
-        error = 0.0 if off is None else off
-        impossible = self._off.update(error > settings.hold_error, now_ns)
-        text = f"{error:.2f} rad off for {settings.hold_patience:g} s"
-        self._facts.state(facts.HOLD_IMPOSSIBLE, impossible, now_ns, text)
-        return error
-
     def _barred(self) -> str:
-        """Return why safe may not be left: what led there and was not cleared; empty when it may."""
+        """Return why SAFE may not be left: latched facts that were not cleared; empty when it may."""
         held = [
             fact.begins.name
             for fact in self._facts.held()
@@ -237,9 +224,9 @@ class ModeControl:
             self._enter(change, reason, now_ns)
 
     def _enter(self, change: Change, reason: str, now_ns: int) -> None:
-        """Prepare what the new mode needs."""
+        """Enter a mode: reset timers, release an old path, zero the coils where nothing is steered."""
         self._facts.enter(change.after)
-        for timer in (self._slow, self._arrived, self._off):
+        for timer in (self._slow, self._arrived, self._pointing):
             timer.reset()
         if change.before not in STEERING | {Mode.BOOT}:
             self._paths.release()  # an old path says nothing of where the body is now

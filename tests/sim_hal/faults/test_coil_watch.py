@@ -92,7 +92,7 @@ def test_a_brake_that_is_no_cure_is_taken_back() -> None:
 def test_a_verdict_of_a_stuck_leg_that_the_brake_does_not_bear_out_is_braked_no_more() -> None:
     watch = CoilWatch(CoilWatchSettings((FULL, FULL, FULL)))
     watch._give(0, CoilFault.A_HIGH, 0, "a guess")
-    watch._unproven.add(0)
+    watch._proof.add(0)
     assert watch.braked == (True, False, False)
     for time in np.arange(0.0, 2.0, 0.025):
         watch.commanded(round(time * 1e9), np.zeros(3), watch.braked)

@@ -32,7 +32,6 @@ the chopped current (`hal.drivers.ina219`).
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from dataclasses import replace
 
@@ -40,6 +39,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flight.gnc.math.arrays import FloatArray
+from flight.loop.fdir.coils.brake_proof import BrakeProof
 from flight.loop.fdir.coils.commands import CoilCommands
 from flight.loop.fdir.coils.hypotheses import (
     ELECTRICAL,
@@ -52,8 +52,10 @@ from flight.loop.fdir.coils.hypotheses import (
     fits,
     foretell,
 )
+from flight.loop.fdir.coils.motion_witness import MotionWitness
+from flight.loop.fdir.coils.probe import Probe
 from flight.loop.fdir.coils.response import CoilResponse
-from flight.loop.fdir.coils.stuck_leg import NONE, Axes, StuckLeg, Supplied
+from flight.loop.fdir.coils.stuck_leg import NONE, Axes, StuckLeg
 from flight.loop.fdir.coils.verdict import CoilVerdict, CoilWatchSettings
 from hal.interfaces.readings import PowerReading
 
@@ -64,20 +66,15 @@ AXES = "xyz"
 BoolArray = npt.NDArray[np.bool_]
 
 
-# A leg stuck high drives its coil all the time, one way or the other.
-_STUCK = {CoilFault.A_HIGH: 1.0, CoilFault.B_HIGH: -1.0}
 _BRAKED = {CoilFault.A_HIGH, CoilFault.B_HIGH, CoilFault.HIGH}
-_STUCK_EXCESS = 0.3  # of a coil that is fully on: what a leg stuck high draws beyond all doubt
-_LITTLE_FELT = 0.4
+_STUCK_EXCESS = 0.3
+"""Of the current of a coil that is fully on: a leg stuck high draws more without doubt."""
 _LEAST_SHORT = 0.02
-"""A; of less that is too much the body would not feel whether the coil carries it."""
+"""A; a smaller excess is below what the body's motion could confirm."""
 _READING_NS = 200_000_000
 _MOST_EVIDENCE = 40
-_PROOFS = 2  # conversions that must agree on whether a brake is right
-_DOUBTED_FOR_NS = 60_000_000_000
-"""A monitor that lied is not believed for so long where the body cannot bear it out."""
 _IN_DOUBT = 5
-"""Readings until a verdict may be given that leaves open what is wrong with the axis."""
+"""Readings until a verdict may leave open what is wrong with the axis."""
 
 
 class CoilWatch:
@@ -100,17 +97,14 @@ class CoilWatch:
         self._sound_ns = 0  # when a coil that was driven last drew what it should
         self._unmixed_ns = 0  # from when on a reading's mean tells of one state of the circuit
         self._evidence: deque[Foretold] = deque(maxlen=_MOST_EVIDENCE)
-        self._probing: tuple[int, int] | None = None  # axis, and since when
-        self._probed: set[int] = set()
+        self._probe = Probe(settings.probe_current, settings.probe_half_ns)
         self._response = None if settings.response is None else CoilResponse(settings.response)
         self._verdicts: dict[int, CoilVerdict] = {}
         self._looked_ns = 0
         self._leg = StuckLeg(_STUCK_EXCESS * min(settings.full_current))
-        self._unproven: set[int] = set()  # braked on a verdict that no brake has confirmed
-        self._proofs: deque[bool] = deque(maxlen=_PROOFS)
+        self._proof = BrakeProof()
+        self._witness = MotionWitness(self._response, settings.full_current)
         self._strangeness = ""
-        self._doubted_ns = -_DOUBTED_FOR_NS
-        self.monitor_doubted = ""
 
     @property
     def verdicts(self) -> tuple[CoilVerdict, ...]:
@@ -144,7 +138,7 @@ class CoilWatch:
     def forget(self, axis: int) -> None:
         """Trust an axis again, by command; a fault that lasts will be found again."""
         self._verdicts.pop(axis, None)
-        self._unproven.discard(axis)
+        self._proof.discard(axis)
         self.interrupted(self._commands.newest_ns if self._commands else 0)
 
     def commanded(
@@ -206,15 +200,12 @@ class CoilWatch:
     @property
     def probe(self) -> FloatArray:
         """Return (3,) A to be added to the commands now: it makes no mean torque."""
-        wave = np.zeros(3)
-        if self._probing is not None and self._commands:
-            axis, since_ns = self._probing
-            half = (self._commands.newest_ns - since_ns) // self._settings.probe_half_ns
-            if half < 2:
-                wave[axis] = self._settings.probe_current * (1.0 if half == 0 else -1.0)
-            else:
-                self._probing = None
-        return wave
+        return self._probe.wave(self._commands.newest_ns) if self._commands else np.zeros(3)
+
+    @property
+    def monitor_doubted(self) -> str:
+        """Return why the monitor, not a coil, is doubted; empty while it is believed."""
+        return self._witness.doubt
 
     @property
     def _settle_ns(self) -> int:
@@ -235,26 +226,15 @@ class CoilWatch:
             return
         self._looked_ns = reading.time_ns
         seen = commands.supplied(reading, self._bounds, self._known)
-        if self._unproven:
-            self._prove(seen)
+        if self._proof:
+            for axis in self._proof.take(self._leg.exceeds(seen)):  # back to both inputs low
+                self._verdicts[axis] = replace(self._verdicts[axis], fault=CoilFault.UNCERTAIN)
             return
         found = self._leg.look(seen)
         if found is not None:
             text = f"{1e3 * reading.newest:.0f} mA without a command"
             self._give(found, CoilFault.HIGH, reading.time_ns, text)
             self.interrupted(reading.time_ns)
-
-    def _prove(self, seen: Supplied) -> None:
-        """See whether a brake on a mere verdict is right: where a leg is stuck low it drives the coil."""
-        self._proofs.append(self._leg.exceeds(seen))
-        if len(self._proofs) < _PROOFS:
-            return
-        if all(self._proofs):  # back to both inputs low
-            for axis in self._unproven:
-                self._verdicts[axis] = replace(self._verdicts[axis], fault=CoilFault.UNCERTAIN)
-        if len(set(self._proofs)) == 1:
-            self._unproven.clear()
-            self._proofs.clear()
 
     def _taken(self, reading: PowerReading) -> list[Foretold]:
         """Return what a reading says: its newest conversion, and its mean where nothing is mixed in it."""
@@ -271,7 +251,7 @@ class CoilWatch:
         asked = float(taken[0].mean[:, 0].sum())
         if all(fits([one], self._bounds, self._known) for one in taken):
             self._strange = 0
-            self.monitor_doubted = ""
+            self._witness.believe()
             if asked > self._bounds.uncertainty:
                 self._sound_ns = reading.newest_since_ns
             return
@@ -316,44 +296,33 @@ class CoilWatch:
         if fault is CoilFault.SHORTED and excess < _LEAST_SHORT:
             self._begin_anew()  # too little for the body to bear it out: it may be the monitor
             return
-        if self._body_disagrees(axis, fault):
-            self._doubted_ns = now_ns
-            self.monitor_doubted = f"{self._strangeness}; yet the body feels no change of coil {AXES[axis]}"
+        if self._is_contradicted(axis, fault):
+            why = f"{self._strangeness}; yet the body feels no change of coil {AXES[axis]}"
+            self._witness.doubt_monitor(why, now_ns)
         else:
             self._give(axis, fault, now_ns, self._strangeness)
             if fault in _BRAKED:
-                self._unproven.add(axis)
+                self._proof.add(axis)
                 self._fresh = 0
         self._begin_anew()
 
-    def _body_disagrees(self, axis: int, fault: CoilFault) -> bool:
-        """Tell whether the body feels a coil's torque as before, so that the monitor is wrong."""
-        if self._response is None or self._suspected_ns is None:
+    def _is_contradicted(self, axis: int, fault: CoilFault) -> bool:
+        if self._suspected_ns is None:
             return False
         begun_ns = min(self._sound_ns, self._suspected_ns - self._settings.window_ns)
-        carried = _STUCK.get(fault, 0.0) * self._settings.full_current[axis]
-        felt = self._response.felt_of(axis, carried, begun_ns, self._suspected_ns)
-        if (felt is None or math.isnan(felt)) and self._reading_ns - self._doubted_ns < _DOUBTED_FOR_NS:
-            return True
-        if felt is None:
-            return fault not in _STUCK and self._response.is_healthy(axis)
-        # Without memory of the time before: a coil that is driven at zero command would be felt by now.
-        return fault in _STUCK or self._response.is_healthy(axis) if math.isnan(felt) else felt < _LITTLE_FELT
+        return self._witness.contradicts(axis, fault, begun_ns, self._suspected_ns, self._reading_ns)
 
     def _look_further(self, axes: set[int], now_ns: int) -> None:
-        """Have a wave on one of the axes that cannot be told apart; where none explains it, begin anew.
+        """Put a wave on one of the axes that cannot be told apart; when all were tried, collect new evidence.
 
-        Nothing that is known explains an intermittent fault, or the monitor's own.
+        No hypothesis explains an intermittent fault, or a fault of the monitor.
         """
-        candidates = sorted(axes - self._probed)
-        if not candidates:
+        ends_ns = self._probe.begin(axes, now_ns)
+        if ends_ns is None:
             self._evidence.clear()
-            self._probed.clear()
             self._judge_ns = now_ns + _IN_DOUBT * _READING_NS
-            return
-        self._probed.add(candidates[0])
-        self._probing = (candidates[0], now_ns)
-        self._judge_ns = now_ns + 2 * self._settings.probe_half_ns + _READING_NS
+        else:
+            self._judge_ns = ends_ns + _READING_NS
 
     def _give(self, axis: int, fault: CoilFault, now_ns: int, why: str) -> None:
         text = f"coil {AXES[axis]} {fault.value} ({why})"
@@ -363,6 +332,5 @@ class CoilWatch:
         self._strange = 0
         self._suspected_ns = None
         self._evidence.clear()
-        self._probing = None
-        self._probed.clear()
+        self._probe.stop()
         self._strangeness = ""

@@ -1,0 +1,130 @@
+"""What a frame adds to the estimate: its job for the vision worker, and the measurements found in it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flight.gnc.camera.lens import CameraModel
+from flight.gnc.estimation.estimate import RATE, TURN, Estimate
+from flight.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
+from flight.gnc.vision.startracker.frame_job import Found, FrameFound, FrameJob, TrackerSettings
+from flight.gnc.vision.startracker.mid_exposure import NODES, doubt, reading_of
+from flight.gnc.vision.startracker.solve import AttitudePrior, RatePrior
+from flight.gnc.vision.streaks.corners.settings import StreakSettings
+from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from flight.gnc.vision.streaks.streak_result import StreakStatus
+from flight.loop.navigation import Navigation
+from hal.interfaces.readings import Frame
+
+# rad, of the mounting between the camera and the inertial unit that the estimate is of.
+_LEAST_PRIOR_SIGMA = 5e-4
+_NAN = np.full(3, np.nan), np.full((3, 3), np.nan)
+
+
+@dataclass(frozen=True, slots=True)
+class ImagingSettings:
+    """The camera as vision must know it.
+
+    Attributes:
+        late_ns: after the exposure, from which a frame is late.
+        slow_ns: from which vision is slow over a frame.
+        mounting: (4,) takes the body's axes to the camera's.
+        angular_acceleration_psd: rad^2/s^3, density of the white angular acceleration that shakes the body.
+    """
+
+    camera: CameraModel
+    exposure_ns: int
+    max_age_ns: int
+    late_ns: int
+    slow_ns: int
+    mounting: FloatArray
+    estimator: StreakSettings | LikelihoodSettings
+    tracker: TrackerSettings | None
+    angular_acceleration_psd: float
+
+
+class FrameMeasurer:
+    """Makes jobs of frames, and measurements of what the worker found in them."""
+
+    def __init__(self, settings: ImagingSettings, navigation: Navigation) -> None:
+        self._settings = settings
+        self._navigation = navigation
+        self._body_to_camera = attitude_matrix(settings.mounting)
+
+    def job(self, frame: Frame, last_checksum: int | None) -> FrameJob:
+        """Return the worker's job; `last_checksum` is that of the frame before, which may come again."""
+        past = self._navigation.past(middle_ns(frame))
+        return FrameJob(
+            frame.pixels,
+            self._settings.camera,
+            frame.exposure_ns * 1e-9,
+            self._estimator(past),
+            self._settings.tracker,
+            self._rate_prior(past) if past is not None else None,
+            self._attitude_prior(past) if past is not None else None,
+            last_checksum,
+        )
+
+    def _estimator(self, past: Estimate | None) -> StreakSettings | LikelihoodSettings:
+        estimator = self._settings.estimator
+        if past is None and isinstance(estimator, LikelihoodSettings):
+            # The change of rate moves the stars off mid-exposure: it must come from the pixels.
+            return replace(estimator, rate_model="accelerating")
+        return estimator
+
+    def _rate_prior(self, past: Estimate) -> RatePrior:
+        widest = float(np.linalg.eigvalsh(past.covariance[RATE, RATE])[-1])
+        return RatePrior(self._body_to_camera @ past.rate, math.sqrt(max(widest, 0.0)))
+
+    def _attitude_prior(self, past: Estimate) -> AttitudePrior:
+        widest = float(np.linalg.eigvalsh(past.covariance[TURN, TURN])[-1])
+        sigma = math.sqrt(max(widest, 0.0) + _LEAST_PRIOR_SIGMA**2)
+        return AttitudePrior(multiply(self._settings.mounting, past.quaternion), sigma)
+
+    def mean_rate(self, frame: Frame, motion: Found) -> MeanRateMeasurement | None:
+        """Return the mean body rate over the exposure, None without one or before there was an estimate."""
+        start_ns = frame.exposure_start_ns
+        if motion.status is not StreakStatus.RATE or self._navigation.past(start_ns) is None:
+            return None
+        return MeanRateMeasurement(start_ns, start_ns + frame.exposure_ns, *self.rate_in_body(motion))
+
+    def attitude(self, frame: Frame, found: FrameFound) -> AttitudeMeasurement | None:
+        """Return the attitude at mid-exposure, None where the stars do not give one."""
+        fix = found.solution.fix if found.solution is not None else None
+        if fix is None:
+            return None
+        turn = self._body_to_camera.T
+        covariance = turn @ fix.covariance @ turn.T + self._off_middle(frame, found.motion)
+        quaternion = multiply(conjugate(self._settings.mounting), fix.quaternion)
+        return AttitudeMeasurement(middle_ns(frame), quaternion, covariance)
+
+    def rate_in_body(self, found: Found | None) -> tuple[FloatArray, FloatArray]:
+        """Return rate and covariance in body axes; NaN when there is none."""
+        if found is None or found.rate is None or found.covariance is None:
+            return _NAN
+        turn = self._body_to_camera.T
+        return turn @ found.rate, turn @ found.covariance @ turn.T
+
+    def _off_middle(self, frame: Frame, motion: Found) -> FloatArray:
+        """Return by how much the stars' attitude may differ from that of mid-exposure, (3, 3) rad^2."""
+        turns = np.zeros((len(NODES), 3))
+        middle = self._navigation.past(middle_ns(frame))
+        if middle is not None:
+            back = conjugate(middle.quaternion)
+            for number, part in enumerate(NODES):
+                past = self._navigation.past(frame.exposure_start_ns + round(part * frame.exposure_ns))
+                if past is not None:
+                    turns[number] = to_rotation_vector(multiply(past.quaternion, back))
+        return doubt(
+            reading_of(motion), turns, self._settings.angular_acceleration_psd, frame.exposure_ns * 1e-9
+        )
+
+
+def middle_ns(frame: Frame) -> int:
+    """Return the time of mid-exposure."""
+    return frame.exposure_start_ns + frame.exposure_ns // 2

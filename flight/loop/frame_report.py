@@ -1,0 +1,106 @@
+"""Reports what was found in a frame: packets of rate and stars, and events for what is refused."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from flight.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.vision.startracker.frame_job import Found
+from flight.gnc.vision.startracker.solution import FrameSolution, SolveStatus
+from flight.link import events
+from flight.link.telemetry.definitions import STARS, STREAK
+from flight.loop.body import BodyView
+from flight.loop.frame_measurements import FrameMeasurer, middle_ns
+from flight.loop.services import Services
+from hal.interfaces.readings import Frame
+
+_MANY_STARS = 12
+"""A frame with as many detections that no sky matches does not show the sky: its pixels are out of order."""
+_NAN4, _NAN33 = np.full(4, np.nan), np.full((3, 3), np.nan)
+
+
+class FrameReport:
+    """Records frames; counts the rates from streaks that entered the estimate."""
+
+    def __init__(self, measurer: FrameMeasurer, view: BodyView, services: Services) -> None:
+        self._measurer = measurer
+        self._view = view
+        self._recorder = services.recorder
+        self._events = services.events
+        self.accepted = 0
+
+    def rate(
+        self, frame: Frame, motion: Found, rate: MeanRateMeasurement | None, now_ns: int, accepted: bool
+    ) -> None:
+        """Record the rate from the streaks, and report one that was refused."""
+        self.accepted += accepted
+        if rate is not None and not accepted:
+            text = f"frame {frame.sequence}: {self._view.rate_text(rate)}"
+            self._events.tell(events.STREAK_REFUSED, now_ns, text)
+        self.record(frame, motion.status.value, motion, now_ns, accepted)
+
+    def stars(
+        self,
+        frame: Frame,
+        solution: FrameSolution,
+        attitude: AttitudeMeasurement | None,
+        now_ns: int,
+        accepted: bool | None,
+    ) -> None:
+        """Record the attitude from the stars; `accepted` is None where it was not offered to the filter."""
+        if is_strange(solution):
+            text = f"frame {frame.sequence}: {len(solution.points)} stars that are nowhere in the sky"
+            self._events.tell(events.CAMERA_STRANGE, now_ns, text)
+        if accepted is False:
+            text = f"frame {frame.sequence}: {len(solution.matched)} stars"
+            self._events.tell(events.STARS_REFUSED, now_ns, text)
+        quaternion = _NAN4 if attitude is None else attitude.quaternion
+        covariance = _NAN33 if attitude is None else attitude.covariance
+        self._recorder.record(
+            STARS,
+            now_ns,
+            sequence=frame.sequence,
+            middle_ns=middle_ns(frame) - self._recorder.epoch_ns,
+            status=solution.status.value,
+            tracked=int(solution.tracked),
+            found=len(solution.points),
+            matched=len(solution.matched),
+            quaternion=quaternion.tolist(),
+            covariance=_packed(covariance),
+            log10_false_alarm=solution.log10_false_alarm,
+            accepted=int(bool(accepted)),
+        )
+
+    def record(self, frame: Frame, status: str, found: Found | None, now_ns: int, accepted: bool) -> None:
+        """Record the streak packet."""
+        rate, covariance = self._measurer.rate_in_body(found)
+        self._recorder.record(
+            STREAK,
+            now_ns,
+            sequence=frame.sequence,
+            exposure_start_ns=frame.exposure_start_ns - self._recorder.epoch_ns,
+            exposure=frame.exposure_ns * 1e-9,
+            status=status,
+            streaks=found.found if found else 0,
+            used=found.used_count if found else 0,
+            length=found.length if found else math.nan,
+            rate=rate.tolist(),
+            covariance=_packed(covariance),
+            residual=found.residual if found else math.nan,
+            accepted=int(accepted),
+        )
+
+
+def is_strange(solution: FrameSolution | None) -> bool:
+    """Return whether a frame shows many stars that are nowhere in the sky."""
+    if solution is None or solution.status is not SolveStatus.NO_MATCH:
+        return False
+    return len(solution.points) >= _MANY_STARS
+
+
+def _packed(c: FloatArray) -> list[float]:
+    """Return xx yy zz xy xz yz of a symmetric matrix (3, 3)."""
+    return [float(c[0, 0]), float(c[1, 1]), float(c[2, 2]), float(c[0, 1]), float(c[0, 2]), float(c[1, 2])]
