@@ -1,0 +1,49 @@
+"""A third party's body: the testbed with a PD controller of its own, as a configuration may name it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from flight.bodies.testbed.body import TESTBED
+from flight.gnc.estimation.estimate import Estimate
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import conjugate, multiply, to_rotation_vector
+from flight.loop.body import Body, BodyKind, CoilCommand, Reference
+from flight.loop.services import Services
+from flight.loop.state.content import Learned
+from flight.schema.sections import Config
+
+STIFFNESS, DAMPING = 4e-4, 1e-3
+"""N m/rad and N m s/rad."""
+
+
+class PlainTracker:
+    """Torque against turn and rate, in three axes; the dipole normal to the field that makes it."""
+
+    def __init__(self, field: FloatArray, limit: float, dipole_per_ampere: float) -> None:
+        self._field, self._limit, self._dipole_per_ampere = field, limit, dipole_per_ampere
+
+    def command(self, estimate: Estimate, reference: Reference) -> CoilCommand:
+        turn = to_rotation_vector(multiply(reference.quaternion, conjugate(estimate.quaternion)))
+        torque = STIFFNESS * turn + DAMPING * (reference.body_rate - estimate.rate)
+        field = self._field
+        dipole = np.cross(field, torque) / (field @ field)
+        currents = np.clip(dipole / self._dipole_per_ampere, -self._limit, self._limit)
+        return CoilCommand(currents * self._dipole_per_ampere, currents)
+
+    def reset(self) -> None:
+        pass
+
+
+def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> Body:
+    testbed = TESTBED.make(config, services, learned)
+    field = np.array([0.0, 0.0, -config.plant.field])
+    tracker = PlainTracker(field, config.coils.current_limit, testbed.dipole_per_ampere)
+    return replace(testbed, tracker=tracker)
+
+
+PLAIN = BodyKind(TESTBED.plan, make)
+NO_BODY = 3
