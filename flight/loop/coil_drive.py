@@ -101,8 +101,8 @@ class CoilDrive:
             self._state(verdict, now_ns)
         self._verdicts = len(found)
         self._brake(watch.braked)
-        self._facts.state(facts.COIL_SUSPECT, bool(watch.suspicion), now_ns, watch.suspicion)
-        self._facts.state(facts.POWER_DOUBTED, bool(watch.monitor_doubted), now_ns, watch.monitor_doubted)
+        self._facts.update(facts.COIL_SUSPECT, bool(watch.suspicion), now_ns, watch.suspicion)
+        self._facts.update(facts.POWER_DOUBTED, bool(watch.monitor_doubted), now_ns, watch.monitor_doubted)
 
     def isolate(self) -> None:
         """Exclude the axes that have a verdict: the reaction to `coil-broken`."""
@@ -114,7 +114,7 @@ class CoilDrive:
             self._watch.forget(axis)
         self._verdicts = 0
         self.isolate()
-        self._events.tell(events.COIL_TRUSTED, now_ns, "all three axes are in use again")
+        self._events.report(events.COIL_TRUSTED, now_ns, "all three axes are in use again")
 
     def send(self, currents: FloatArray, field: Callable[[], FloatArray | None]) -> None:
         """Command currents (3,) A; `field` gives the field (3,) T in body axes where they are reallocated."""
@@ -144,4 +144,4 @@ class CoilDrive:
         return allocate(torque, field, dipole, limits, usable, self._settings.free_axis).currents
 
     def _state(self, verdict: CoilVerdict, now_ns: int) -> None:
-        self._facts.state(_BROKEN[verdict.axis], True, now_ns, verdict.text)
+        self._facts.update(_BROKEN[verdict.axis], True, now_ns, verdict.text)

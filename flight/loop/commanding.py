@@ -91,7 +91,7 @@ class Commanding:
                 problem = f"{type(error).__name__}: {error}"
         text = describe(command) if command is not None else ""
         report = ": ".join(part for part in (text, problem) if part)
-        self._events.tell(
+        self._events.report(
             events.COMMAND_REFUSED if problem else events.COMMANDED, now_ns, f"{source}: {report}"
         )
         fields = {

@@ -131,7 +131,7 @@ class FlightLoop:
             now_ns = services.clock.now_ns()
             reason = self._wishes.stop_reason or "the configured duration is over"
             services.events.flush(now_ns)
-            services.events.tell(events.STOPPED, now_ns, reason)
+            services.events.report(events.STOPPED, now_ns, reason)
             self._record_performance(now_ns)
         return reason
 
@@ -147,9 +147,9 @@ class FlightLoop:
         utc_ns = clock.utc_ns() - (clock.now_ns() - epoch_ns)
         record_run(recorder, config, label, epoch_ns, utc_ns, self._groups[0].period_ns)
         tasks.modes.begin(epoch_ns, around.keeper.record.unclean_recent if around.keeper else 0)
-        services.events.tell(events.STARTED, epoch_ns, f"{config.name}, {config.duration:g} s")
+        services.events.report(events.STARTED, epoch_ns, f"{config.name}, {config.duration:g} s")
         for kind, text in self._wishes.notes:
-            services.events.tell(kind, epoch_ns, text)
+            services.events.report(kind, epoch_ns, text)
         tasks.health.begin(epoch_ns)
         if around.board is not None:
             tasks.health.read_resources(around.board, round(config.health.look_period * SECOND_NS))
@@ -206,7 +206,7 @@ class FlightLoop:
         if keeper is None:
             return
         for kind, text in keeper.notices():
-            self._services.events.tell(kind, now_ns, text)
+            self._services.events.report(kind, now_ns, text)
         estimate = self._tasks.navigation.estimate(now_ns)
         keeper.note(self._tasks.modes.mode.label, learned_of(estimate) if estimate else None)
 

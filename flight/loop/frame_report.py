@@ -39,7 +39,7 @@ class FrameReport:
         self.accepted += accepted
         if rate is not None and not accepted:
             text = f"frame {frame.sequence}: {self._view.rate_text(rate)}"
-            self._events.tell(events.STREAK_REFUSED, now_ns, text)
+            self._events.report(events.STREAK_REFUSED, now_ns, text)
         self.record(frame, motion.status.value, motion, now_ns, accepted)
 
     def stars(
@@ -53,10 +53,10 @@ class FrameReport:
         """Record the attitude from the stars; `accepted` is None where it was not offered to the filter."""
         if is_strange(solution):
             text = f"frame {frame.sequence}: {len(solution.points)} stars that are nowhere in the sky"
-            self._events.tell(events.CAMERA_STRANGE, now_ns, text)
+            self._events.report(events.CAMERA_STRANGE, now_ns, text)
         if accepted is False:
             text = f"frame {frame.sequence}: {len(solution.matched)} stars"
-            self._events.tell(events.STARS_REFUSED, now_ns, text)
+            self._events.report(events.STARS_REFUSED, now_ns, text)
         quaternion = _NAN4 if attitude is None else attitude.quaternion
         covariance = _NAN33 if attitude is None else attitude.covariance
         self._recorder.record(

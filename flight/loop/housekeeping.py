@@ -44,7 +44,7 @@ class Housekeeping:
         error = watched.power.error() if watched.power else ""
         log_error = watched.log_error()
         text = log_error or "packets reach the disk again"
-        self._facts.state(facts.LOG_FAULT, bool(log_error), now_ns, text)
+        self._facts.update(facts.LOG_FAULT, bool(log_error), now_ns, text)
         reading = watched.power.latest() if watched.power and not error else None
         link = watched.navigation.link()
         accepted, refused = watched.planner.counts()

@@ -72,7 +72,7 @@ class Imaging:
         try:
             self._camera.trigger(self._settings.exposure_ns)
         except DeviceError as error:
-            self._facts.state(facts.CAMERA_LOST, True, cycle.start_ns, str(error))
+            self._facts.update(facts.CAMERA_LOST, True, cycle.start_ns, str(error))
             return
         if self._due_ns is None:
             # A camera that runs free is in an exposure already, and begins another one after it.
@@ -86,14 +86,14 @@ class Imaging:
         age_ns = now_ns - self._last_frame_ns
         if frame is None:
             if self._due_ns is not None and now_ns > self._due_ns:
-                self._facts.state(facts.CAMERA_LATE, True, now_ns, "no frame yet after its trigger")
+                self._facts.update(facts.CAMERA_LATE, True, now_ns, "no frame yet after its trigger")
             if age_ns > self._settings.max_age_ns:
-                self._facts.state(facts.CAMERA_LOST, True, now_ns, f"no frame for {age_ns * 1e-9:.1f} s")
+                self._facts.update(facts.CAMERA_LOST, True, now_ns, f"no frame for {age_ns * 1e-9:.1f} s")
             return
         if frame.sequence <= self._last_sequence:
             # A repeated frame is no new one: its age goes on.
             text = f"frame {frame.sequence} comes again"
-            self._events.tell(events.CAMERA_FROZEN, now_ns, text)
+            self._events.report(events.CAMERA_FROZEN, now_ns, text)
             self._report.record(frame, StreakStatus.FROZEN.value, None, now_ns, False)
             return
         self._due_ns = None
@@ -102,14 +102,14 @@ class Imaging:
         age_ns = now_ns - self._last_frame_ns
         late = age_ns > self._settings.max_age_ns
         text = f"frame {frame.sequence} comes {age_ns * 1e-9:.1f} s after its exposure"
-        self._facts.state(facts.CAMERA_LOST, late, now_ns, text)
-        self._facts.state(facts.CAMERA_LATE, age_ns > self._settings.late_ns, now_ns, text)
+        self._facts.update(facts.CAMERA_LOST, late, now_ns, text)
+        self._facts.update(facts.CAMERA_LATE, age_ns > self._settings.late_ns, now_ns, text)
         if not late:
             self._streams.note("camera", now_ns)
         old = self._rows.look(frame.pixels)
         if old:
             text = f"frame {frame.sequence}: {old} of the rows looked at are an earlier frame's"
-            self._events.tell(events.CAMERA_TORN, now_ns, text)
+            self._events.report(events.CAMERA_TORN, now_ns, text)
         self._frames += 1
         self._last_sequence = frame.sequence
         if old:
@@ -118,7 +118,7 @@ class Imaging:
             self._frame = frame
             self._busy_since_ns = now_ns
         else:
-            self._events.tell(events.VISION_FAILED, now_ns, "the worker has not finished the last frame")
+            self._events.report(events.VISION_FAILED, now_ns, "the worker has not finished the last frame")
 
     def finish(self, result: JobResult, now_ns: int) -> None:
         """Take in what the worker found."""
@@ -127,18 +127,20 @@ class Imaging:
             return
         self._judge_speed(now_ns)
         if result.outcome != "done":
-            self._events.tell(events.VISION_FAILED, now_ns, f"{result.outcome}: {result.error}")
+            self._events.report(events.VISION_FAILED, now_ns, f"{result.outcome}: {result.error}")
             self._report.record(frame, StreakStatus.FAILED.value, None, now_ns, False)
             return
         found: FrameFound = result.value
         motion = found.motion
         self._last_checksum = motion.checksum
         if motion.status is StreakStatus.FROZEN:
-            self._events.tell(
+            self._events.report(
                 events.CAMERA_FROZEN, now_ns, f"frame {frame.sequence} has the pixels of the last"
             )
         elif motion.status in {StreakStatus.BLACK, StreakStatus.SATURATED}:
-            self._events.tell(events.CAMERA_BLACK, now_ns, f"frame {frame.sequence} is {motion.status.value}")
+            self._events.report(
+                events.CAMERA_BLACK, now_ns, f"frame {frame.sequence} is {motion.status.value}"
+            )
         rate, attitude = self._measurer.mean_rate(frame, motion), self._measurer.attitude(frame, found)
         if is_strange(found.solution):
             rate = None  # of pixels that are not in order
@@ -165,11 +167,11 @@ class Imaging:
     def _judge_speed(self, now_ns: int) -> None:
         taken_ns = now_ns - self._busy_since_ns
         text = f"{taken_ns * 1e-9:.2f} s over a frame, {self._settings.slow_ns * 1e-9:g} s expected"
-        self._facts.state(facts.VISION_SLOW, taken_ns > self._settings.slow_ns, now_ns, text)
+        self._facts.update(facts.VISION_SLOW, taken_ns > self._settings.slow_ns, now_ns, text)
 
     def _poll(self, now_ns: int) -> Frame | None:
         try:
             return self._camera.poll()
         except DeviceError as error:
-            self._facts.state(facts.CAMERA_LOST, True, now_ns, str(error))
+            self._facts.update(facts.CAMERA_LOST, True, now_ns, str(error))
             return None

@@ -92,9 +92,9 @@ class Navigation:
         try:
             polled = self._unit.poll()
         except DeviceError as error:
-            self._facts.state(facts.IMU_LINE_LOST, True, now_ns, str(error))
+            self._facts.update(facts.IMU_LINE_LOST, True, now_ns, str(error))
             return ()
-        self._facts.state(facts.IMU_LINE_LOST, False, now_ns, "the serial port is back")
+        self._facts.update(facts.IMU_LINE_LOST, False, now_ns, "the serial port is back")
         readings = tuple(reading for reading in polled if reading.time_ns >= self._since_ns)
         for reading in readings:
             self._ingest(reading)
@@ -165,7 +165,7 @@ class Navigation:
         if turned or moved:
             self._agreed_ns = reading.time_ns
         if not (turned and moved):
-            self._events.tell(
+            self._events.report(
                 events.IMU_REFUSED,
                 reading.arrival_ns,
                 f"{self._view.reading_text(reading)} disagree with the estimate",
@@ -178,21 +178,21 @@ class Navigation:
         quiet_ns = now_ns - max(link.last_byte_ns, self._since_ns)
         silent = quiet_ns > limit_ns
         text = f"no byte for {quiet_ns * 1e-9:.2f} s" if silent else "bytes come again"
-        self._facts.state(facts.IMU_SILENT, silent, now_ns, text)
+        self._facts.update(facts.IMU_SILENT, silent, now_ns, text)
         if silent:
             self._heard_since_ns = now_ns
         without_ns = now_ns - max(self._heard_ns, self._heard_since_ns)
         unusable = without_ns > limit_ns
         text = f"no reading in {without_ns * 1e-9:.2f} s of bytes: has the unit started anew?"
         text = text if unusable else "readings come again"
-        self._facts.state(facts.IMU_UNUSABLE, unusable, now_ns, text)
+        self._facts.update(facts.IMU_UNUSABLE, unusable, now_ns, text)
         bad = link.bad_checksum - before.bad_checksum
         stray = link.discarded_bytes - before.discarded_bytes
         if bad or stray:
             text = f"{bad} packets with a wrong checksum, {stray} bytes of no packet"
-            self._events.tell(events.IMU_CORRUPT, now_ns, text)
+            self._events.report(events.IMU_CORRUPT, now_ns, text)
         odd = link.out_of_range - before.out_of_range
         endless = link.not_finite - before.not_finite
         if odd or endless:
             text = f"{odd} packets out of range, {endless} not finite"
-            self._events.tell(events.IMU_IMPLAUSIBLE, now_ns, text)
+            self._events.report(events.IMU_IMPLAUSIBLE, now_ns, text)

@@ -42,7 +42,7 @@ class PerformanceObserver:
         if group.name != CONTROL:
             return
         text = f"{group.name}: {slots} slots skipped, {group.slips} since start"
-        self._events.tell(events.CYCLE_SLIP, self._clock.now_ns(), text)
+        self._events.report(events.CYCLE_SLIP, self._clock.now_ns(), text)
 
     def failed(self, group: RateGroup, error: Exception) -> None:
         """Bring the coils to zero when the control task failed, and report where."""
@@ -50,7 +50,7 @@ class PerformanceObserver:
             self._coils.off()
         last = traceback.extract_tb(error.__traceback__)[-1]
         text = f"{group.name}: {type(error).__name__}: {error} ({last.name}, line {last.lineno})"
-        self._events.tell(events.TASK_FAILED, self._clock.now_ns(), text)
+        self._events.report(events.TASK_FAILED, self._clock.now_ns(), text)
 
     def group(self, group: RateGroup, now_ns: int) -> None:
         """Note the state of a rate group."""

@@ -70,7 +70,7 @@ class Steering:
         body = self._body
         reference = body.paths.sample(now_ns)
         text = "steering again" if estimate else "no measurement fresh enough to steer by: coils to zero"
-        self._facts.state(facts.CONTROL_LOST, estimate is None and ever_started, now_ns, text)
+        self._facts.update(facts.CONTROL_LOST, estimate is None and ever_started, now_ns, text)
         state, dipole, saturated, adrift = SteeringState.OFF, _NO_DIPOLE, False, False
         if estimate is None or reference is None:
             self._let_go()
@@ -81,7 +81,7 @@ class Steering:
             dipole, saturated = wanted.dipole, wanted.saturated
             self._drive.send(wanted.currents, lambda: body.field(estimate))
             adrift = not following and body.paths.is_adrift(now_ns)
-        self._facts.state(
+        self._facts.update(
             facts.HOLDING, adrift, now_ns, "no newer path: holding the attitude at the end of the last"
         )
         return self._steered(state, now_ns, reference, dipole, saturated)
@@ -96,7 +96,7 @@ class Steering:
         for reading in readings:
             detumbler.sample(reading.time_ns, reading.field)
         text = "braking again" if heard else "no reading fresh enough to brake by: coils to zero"
-        self._facts.state(facts.CONTROL_LOST, not heard, now_ns, text)
+        self._facts.update(facts.CONTROL_LOST, not heard, now_ns, text)
         state, dipole = SteeringState.OFF, _NO_DIPOLE
         if heard:
             self._body.tracker.reset()
@@ -135,5 +135,5 @@ class Steering:
         """Check the PWM chip, which may switch the coils off; return what was done in the end."""
         error = self._drive.fault()
         text = error or "the PWM chip takes commands again"
-        self._facts.state(facts.COIL_FAULT, bool(error), now_ns, text)
+        self._facts.update(facts.COIL_FAULT, bool(error), now_ns, text)
         return Steered(state, reference, dipole, self._drive.command, saturated)

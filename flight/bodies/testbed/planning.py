@@ -138,7 +138,7 @@ class Planning:
         if self._job is None:
             self._wanted = self._wanted or not self._is_near_goal(cycle.start_ns)
         elif cycle.start_ns - self._job.origin_ns > self._settings.late_after_ns:
-            self._events.tell(
+            self._events.report(
                 events.PLANNER_BUSY, cycle.start_ns, f"plan {self._job.number} is not finished yet"
             )
             self._wanted = True
@@ -215,7 +215,7 @@ class Planning:
             return
         if result.outcome != "done":
             self._refused += 1
-            self._events.tell(events.PLANNER_FAILED, now_ns, f"{result.outcome}: {result.error}")
+            self._events.report(events.PLANNER_FAILED, now_ns, f"{result.outcome}: {result.error}")
             self._record(job, None, result.outcome, False, now_ns)
             return
         plan: Plan = result.value
@@ -230,7 +230,7 @@ class Planning:
         reason = verdict.reason
         if reason:
             self._refused += 1
-            self._events.tell(events.PLAN_REFUSED, now_ns, f"plan {job.number}: {reason}")
+            self._events.report(events.PLAN_REFUSED, now_ns, f"plan {job.number}: {reason}")
         else:
             self._accepted += 1
             self.flown = job.number
@@ -242,7 +242,7 @@ class Planning:
                 text = (
                     f"plan {job.number}: {plan.horizon_asked:g} s is too short, flying {plan.horizon:.2f} s"
                 )
-                self._events.tell(events.PLAN_STRETCHED, now_ns, text)
+                self._events.report(events.PLAN_STRETCHED, now_ns, text)
         self._record(job, plan, reason or plan.status.value, not reason, now_ns)
 
     def _record(self, job: PlanJob, plan: Plan | None, status: str, accepted: bool, now_ns: int) -> None:

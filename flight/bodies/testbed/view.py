@@ -59,7 +59,7 @@ class ThreadView:
             return
         law = law_of(target)
         self._recorder.record(TARGET, now_ns, index=target.index, q2=law.q2, rate=law.rate)
-        self._events.tell(events.TARGET, now_ns, f"step {target.index}: q2 = {law.q2:+.2f}")
+        self._events.report(events.TARGET, now_ns, f"step {target.index}: q2 = {law.q2:+.2f}")
 
     def mode_fields(self, wanted: Target | None) -> Mapping[str, float]:
         """Return the body's fields of the mode packet."""

@@ -26,7 +26,7 @@ class EventLog:
         self._sink = sink
         self._react: Reactor | None = None
         self._throttle_ns = throttle_ns
-        self._last_told: dict[int, int] = {}
+        self._last_written: dict[int, int] = {}
         self._held_back: dict[int, int] = {}
         self.count = 0
 
@@ -34,19 +34,19 @@ class EventLog:
         """Have `react` called for every event whose row asks for more than a note, throttled or not."""
         self._react = react
 
-    def tell(self, kind: EventKind, time_ns: int, text: str) -> None:
+    def report(self, kind: EventKind, time_ns: int, text: str) -> None:
         """Tell an event, or count it if one of its kind was told a moment ago; then react."""
-        self._tell(kind, time_ns, text)
+        self._write(kind, time_ns, text)
         if self._react is not None and kind.reaction is not Reaction.NOTE:
             self._react(kind, time_ns, text)
 
-    def _tell(self, kind: EventKind, time_ns: int, text: str) -> None:
+    def _write(self, kind: EventKind, time_ns: int, text: str) -> None:
         self.count += 1
-        last_ns = self._last_told.get(kind.code)
+        last_ns = self._last_written.get(kind.code)
         if last_ns is not None and time_ns - last_ns < self._throttle_ns:
             self._held_back[kind.code] = self._held_back.get(kind.code, 0) + 1
             return
-        self._last_told[kind.code] = time_ns
+        self._last_written[kind.code] = time_ns
         self._sink(kind, time_ns, self._held_back.pop(kind.code, 0), text)
 
     def flush(self, time_ns: int) -> None:

@@ -116,7 +116,7 @@ class Facts:
         self._states = {fact.name: _State() for fact in FACTS}
         self._mode = Mode.BOOT
 
-    def state(self, fact: Fact, holds: bool | None, now_ns: int, text: str) -> None:
+    def update(self, fact: Fact, holds: bool | None, now_ns: int, text: str) -> None:
         """State whether a fact holds now; None when that cannot be known. `text` goes with the event."""
         state = self._states[fact.name]
         if holds is None or self._mode not in fact.modes:
@@ -132,7 +132,7 @@ class Facts:
         state.holds, state.count = holds, 0
         kind = fact.begins if holds else fact.ends
         if kind is not None:
-            self._events.tell(kind, now_ns, text)
+            self._events.report(kind, now_ns, text)
 
     def holds(self, fact: Fact) -> bool:
         """Tell whether a fact counts now."""

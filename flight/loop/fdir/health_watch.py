@@ -87,7 +87,7 @@ class HealthWatch:
         self._look_at_services(now_ns)
         step = self._clock_watch.look()
         if step is not None:
-            self._events.tell(events.CLOCK_STEP, now_ns, f"by {step:+.3f} s")
+            self._events.report(events.CLOCK_STEP, now_ns, f"by {step:+.3f} s")
         sample, self._sample = self._sample, None
         if sample is not None:
             self._monitor.take(sample)
@@ -98,13 +98,13 @@ class HealthWatch:
     def _look_at_streams(self, now_ns: int) -> None:
         inputs = self._inputs
         error = inputs.power.error() if inputs.power is not None else ""
-        self._facts.state(facts.POWER_FAULT, bool(error), now_ns, error or "readings come again")
+        self._facts.update(facts.POWER_FAULT, bool(error), now_ns, error or "readings come again")
         reading = inputs.power.latest() if inputs.power is not None else None
         if reading is not None and reading.time_ns != self._power_ns:
             self._power_ns = reading.time_ns
             self._streams.note("power", reading.time_ns, reading.current)
         for stream, poor, text in self._streams.look(now_ns):
-            self._facts.state(stream.poor, poor, now_ns, text)
+            self._facts.update(stream.poor, poor, now_ns, text)
 
     def _look_at_progress(self, now_ns: int) -> None:
         """Feed the watchdog if all get on; leave the mode if the control task only fails."""
@@ -113,9 +113,9 @@ class HealthWatch:
             self._counted = (self._control.cycles, self._control.completed)
         failed = self._control.cycles - self._counted[0]
         text = f"{failed} control cycles in a row have failed"
-        self._facts.state(facts.TASK_FAILING, failed >= _FAILING_CYCLES, now_ns, text)
+        self._facts.update(facts.TASK_FAILING, failed >= _FAILING_CYCLES, now_ns, text)
         still = self._progress.standing_still(now_ns)
-        self._facts.state(facts.NO_PROGRESS, bool(still), now_ns, f"no progress: {', '.join(still)}")
+        self._facts.update(facts.NO_PROGRESS, bool(still), now_ns, f"no progress: {', '.join(still)}")
         if not still:
             self._feed()
             self._fed += 1
@@ -124,7 +124,7 @@ class HealthWatch:
         """Tell of the jobs beside the loop that fail or stand still."""
         poor = failing(self._clock.tickers, now_ns)
         text = "; ".join(poor) if poor else "all jobs run"
-        self._facts.state(facts.SERVICE_FAILING, bool(poor), now_ns, text)
+        self._facts.update(facts.SERVICE_FAILING, bool(poor), now_ns, text)
 
     def _record(self, now_ns: int) -> None:
         inputs, state = self._inputs, self._monitor.state

@@ -100,7 +100,7 @@ class ResourceMonitor:
             (facts.TOO_HOT, sample.temperature, limits.hottest, "{:.1f} deg C, {:g} allowed"),
         ):
             known = not math.isnan(value)
-            facts_.state(fact, value > limit if known else None, now_ns, text.format(abs(value), abs(limit)))
+            facts_.update(fact, value > limit if known else None, now_ns, text.format(abs(value), abs(limit)))
 
     def _slope(self) -> float:
         if len(self._warm) < _LEAST_SLOPE_SAMPLES:

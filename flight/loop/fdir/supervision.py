@@ -86,4 +86,4 @@ class Supervision:
         notes = self._notes + [(_EVENTS[news], news.value) for news in self._guardian.tend(now_ns)]
         self._notes.clear()
         for kind, text in notes:
-            self._events.tell(kind, now_ns, text)
+            self._events.report(kind, now_ns, text)

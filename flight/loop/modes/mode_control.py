@@ -132,7 +132,7 @@ class ModeControl:
             self._boot(estimate is not None and coils_answer, now_ns)
         blind = (now_ns - self._seen_ns) * 1e-9
         text = f"no estimate for {blind:.0f} s"
-        self._facts.state(facts.BLIND, blind > self._settings.blind_limit, now_ns, text)
+        self._facts.update(facts.BLIND, blind > self._settings.blind_limit, now_ns, text)
         if self.mode is Mode.DETUMBLE and rate is not None:
             # Where no current turns the body no hold is possible: wait until it has turned further.
             within = estimate is not None and self._targets.can_hold(estimate)
@@ -188,13 +188,13 @@ class ModeControl:
         waited = (now_ns - self._machine.since_ns) * 1e-9
         if self._too_many_crashes:
             text = f"{self._crashed} unclean shutdowns within {self._settings.crash_window:g} s of operation"
-            self._events.tell(events.CRASHED_OFTEN, now_ns, text)
+            self._events.report(events.CRASHED_OFTEN, now_ns, text)
             self._fire(Trigger.START_SAFE, text, now_ns)
         elif good:
             self._fire(STARTS[self._initial], "", now_ns)
         else:
             late = waited > self._settings.boot_patience
-            self._facts.state(facts.BOOT_WAITS, late, now_ns, f"for {waited:.1f} s: coils at zero")
+            self._facts.update(facts.BOOT_WAITS, late, now_ns, f"for {waited:.1f} s: coils at zero")
 
     def _keep(self, estimate: Estimate, now_ns: int) -> None:
         """State the progress of a hold or a slew."""
@@ -207,7 +207,7 @@ class ModeControl:
         if self.mode is Mode.SLEW and self._arrived.update(near, now_ns):
             self._fire(Trigger.ARRIVED, f"{error:.4f} rad off", now_ns)
         text = f"{error:.3f} rad off after {slewing:.0f} s"
-        self._facts.state(facts.SLEW_LATE, slewing > settings.slew_limit, now_ns, text)
+        self._facts.update(facts.SLEW_LATE, slewing > settings.slew_limit, now_ns, text)
 
     def _barred(self) -> str:
         """Return why SAFE may not be left: latched facts that were not cleared; empty when it may."""
@@ -240,7 +240,7 @@ class ModeControl:
         if change.before is not Mode.BOOT:
             because = f": {reason}" if reason else ""
             text = f"{change.before.label} -> {change.after.label}, {change.trigger.value}{because}"
-            self._events.tell(events.MODE, now_ns, text)
+            self._events.report(events.MODE, now_ns, text)
 
     def _record(self, before: Mode, trigger: str, reason: str, now_ns: int) -> None:
         self._recorder.record(

@@ -30,9 +30,9 @@ class PointingWatch:
         """
         settings, speed = self._settings, self._targets.speed(estimate)
         text = f"{speed:.3f} rad/s, {settings.tumble_rate:g} allowed"
-        self._facts.state(facts.TUMBLING, speed > settings.tumble_rate, now_ns, text)
+        self._facts.update(facts.TUMBLING, speed > settings.tumble_rate, now_ns, text)
         error = 0.0 if off is None else off
         impossible = self._off.update(error > settings.hold_error, now_ns)
         text = f"{error:.2f} rad off for {settings.hold_patience:g} s"
-        self._facts.state(facts.HOLD_IMPOSSIBLE, impossible, now_ns, text)
+        self._facts.update(facts.HOLD_IMPOSSIBLE, impossible, now_ns, text)
         return error

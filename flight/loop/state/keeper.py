@@ -31,7 +31,7 @@ class Notices:
     def __init__(self) -> None:
         self._kept: deque[tuple[EventKind, str]] = deque(maxlen=_NOTICES)
 
-    def tell(self, kind: EventKind, text: str) -> None:
+    def report(self, kind: EventKind, text: str) -> None:
         """Keep an event. Safe from any thread."""
         self._kept.append((kind, text))
 
@@ -71,7 +71,7 @@ class StateKeeper:
         self._begun = history.begin(loaded, self._label(), devices)
         if loaded.learned and not self._begun.learned:
             text = f"learned of the devices {loaded.devices or 'of an older version'}, these are {devices}"
-            notices.tell(events.LEARNED_REFUSED, text)
+            notices.report(events.LEARNED_REFUSED, text)
         self.record: BootRecord = history.boot_record(self._begun, window)
         self.learned: Mapping[str, Learned] = self._begun.learned
         self._noted: tuple[str, Mapping[str, Learned]] = (self._begun.mode, {})
@@ -80,7 +80,7 @@ class StateKeeper:
         if self.record.after_unclean:
             last = self._begun.unclean[-1]
             text = f"boot {last.boot}, last heard of {last.utc}: {self.record.unclean_recent} of late"
-            notices.tell(events.UNCLEAN_SHUTDOWN, text)
+            notices.report(events.UNCLEAN_SHUTDOWN, text)
         store.store(self._begun)
         self._ticker = clock.ticker("state", period_ns, self._write)
 
@@ -118,7 +118,7 @@ class StateKeeper:
             self._store.store(history.end(state) if ended else state)
         except ValueError as error:
             # What was learned is unfit to be kept; that the application ran, and how it ended, is not.
-            self._notices.tell(events.STATE_UNWRITTEN, str(error))
+            self._notices.report(events.STATE_UNWRITTEN, str(error))
             self._noted = (mode, {})
             state = history.go_on(self._begun, elapsed, mode, {}, self._label())
             self._store.store(history.end(state) if ended else state)

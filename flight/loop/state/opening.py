@@ -45,7 +45,7 @@ def open_state(
         folder.mkdir(parents=True, exist_ok=True)
     notices = Notices()
     keeper = StateKeeper(
-        StateStore(folder, notices.tell),
+        StateStore(folder, notices.report),
         notices,
         clock,
         window=config.modes.crash_window,

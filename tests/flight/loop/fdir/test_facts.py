@@ -28,7 +28,7 @@ class Told:
 
 def state(told: Told, fact: facts.Fact, *statements: bool | None) -> None:
     for holds in statements:
-        told.facts.state(fact, holds, 0, "text")
+        told.facts.update(fact, holds, 0, "text")
 
 
 def test_the_table_that_flies_is_sound() -> None:
@@ -98,8 +98,8 @@ def test_every_event_beyond_a_note_is_reacted_to_even_while_the_throttle_holds_i
     log = EventLog(lambda kind, *_: told.append(kind.name))
     log.react_by(lambda kind, _, text: reacted.append((kind, text)))
     for text in ("a", "b"):
-        log.tell(events.CONTROL_LOST, 0, text)
-        log.tell(events.CYCLE_SLIP, 0, text)
+        log.report(events.CONTROL_LOST, 0, text)
+        log.report(events.CYCLE_SLIP, 0, text)
     assert told == ["control-lost", "cycle-slip"]
     assert reacted == [(events.CONTROL_LOST, "a"), (events.CONTROL_LOST, "b")]
 

@@ -26,7 +26,7 @@ FOLDER = Path("/state")
 def keeper_on(disk: Disk | None, clock: Clock, folder: Path = FOLDER) -> StateKeeper:
     """Return the keeper of a new boot."""
     notices = Notices()
-    return StateKeeper(StateStore(folder, notices.tell, disk), notices, clock, window=600.0)
+    return StateKeeper(StateStore(folder, notices.report, disk), notices, clock, window=600.0)
 
 
 def on_disk(disk: Disk) -> StoredState:
@@ -113,7 +113,7 @@ def test_damaged_files_are_told_through_the_notices(tmp_path: Path) -> None:
 def test_notices_that_nobody_takes_do_not_pile_up() -> None:
     notices = Notices()
     for number in range(1000):
-        notices.tell(events.STATE_UNWRITTEN, str(number))
+        notices.report(events.STATE_UNWRITTEN, str(number))
     taken = notices.take()
     assert len(taken) <= 64
     assert taken[-1][1] == "999"
@@ -140,7 +140,7 @@ class HungDisk(Disk):
 def test_a_hung_disk_delays_neither_note_nor_close(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("flight.loop.state.keeper._HUNG_DISK_S", 0.1)
     disk, notices = HungDisk(), Notices()
-    store = StateStore(FOLDER, notices.tell, disk)
+    store = StateStore(FOLDER, notices.report, disk)
     keeper = StateKeeper(store, notices, SystemClock(), window=600.0, period_ns=1_000_000)
     disk.hangs.set()
     assert disk.hung.wait(5.0)

@@ -99,7 +99,7 @@ def test_an_age_that_is_known_for_sure_is_not_learned() -> None:
 
 def keeper_on(disk: Disk, devices: str) -> StateKeeper:
     notices = Notices()
-    store = StateStore(Path("/state"), notices.tell, disk)
+    store = StateStore(Path("/state"), notices.report, disk)
     return StateKeeper(store, notices, ManualClock(), window=600.0, devices=devices)
 
 
