@@ -37,3 +37,6 @@ class Mode(IntEnum):
 
 COMMANDABLE = (Mode.SAFE, Mode.DETUMBLE, Mode.HOLD, Mode.SLEW, Mode.TESTBED_DEMO)
 """The modes that can be commanded; BOOT ends by itself."""
+
+STEERING = frozenset({Mode.HOLD, Mode.SLEW, Mode.TESTBED_DEMO})
+"""The modes in which planner and controller turn the body."""

@@ -9,70 +9,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 from flight.gnc.control.detumble import Detumbler
 from flight.gnc.estimation.attitude_filter import AttitudeFilter
 from flight.gnc.estimation.estimate import Estimate
 from flight.gnc.estimation.measurements import MeanRateMeasurement
 from flight.gnc.math.arrays import FloatArray
+from flight.loop.control_output import CoilCommand, ControlOutput, Target
 from flight.loop.executive.jobs import JobResult
 from flight.loop.executive.rate_group import Cycle
 from flight.loop.fdir.coils.watch import CoilWatch
+from flight.loop.services import Services
+from flight.loop.state.content import Learned
+from flight.schema.sections import Config
 from hal.interfaces.readings import ImuReading
-
-if TYPE_CHECKING:
-    from flight.loop.control_cycle import ControlOutput
-    from flight.loop.services import Services
-    from flight.loop.state.content import Learned
-    from flight.schema.sections import Config
 
 PLANNER = "planner"
 """The planner worker's name."""
-COMMANDED = 1000
-"""Commanded slews are numbered from here on."""
-KEPT = 65535
-"""The number of an attitude that is only held."""
-
-
-class Reference(Protocol):
-    """The motion wanted at one instant; each body has its own cheap form of it."""
-
-    @property
-    def quaternion(self) -> FloatArray:
-        """(4,) reference frame into body."""
-
-    @property
-    def body_rate(self) -> FloatArray:
-        """(3,) rad/s, body axes."""
-
-
-class AttitudeLaw(Protocol):
-    """Which attitude is wanted over time, as a body writes it."""
-
-    @property
-    def text(self) -> str:
-        """The law in words, for events."""
-
-    def quaternion(self, now_ns: int) -> FloatArray:
-        """Return the attitude (4,) to be reached, as it stands at `now_ns`, reference into body."""
-
-
-@dataclass(frozen=True, slots=True)
-class Target:
-    """An attitude law that is wanted; `index` numbers it in packets: a step, COMMANDED and up, or KEPT."""
-
-    index: int
-    law: AttitudeLaw
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CoilCommand:
-    """What a tracker asks of the coils: the dipole (3,) A m^2, and the currents (3,) A that make it."""
-
-    dipole: FloatArray
-    currents: FloatArray
-    saturated: bool = False
 
 
 class Tracker(Protocol):

@@ -9,22 +9,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from flight.gnc.estimation.estimate import RATE, TURN, Estimate
-from flight.link.modes import Mode
+from flight.link.modes import STEERING, Mode
 from flight.link.telemetry.definitions import ATTITUDE
 from flight.loop import imaging as imaging_task
-from flight.loop.body import PLANNER, Body, Target
+from flight.loop.body import PLANNER, Body
 from flight.loop.coil_drive import CoilDrive
+from flight.loop.control_output import ControlOutput, Steered, Target
 from flight.loop.executive.jobs import JobResult
 from flight.loop.executive.rate_group import Cycle
 from flight.loop.fdir.coils.knowledge import CoilKnowledge
 from flight.loop.imaging import Imaging
 from flight.loop.modes.mode_control import ModeControl
-from flight.loop.modes.triggers import STEERING
 from flight.loop.navigation import Navigation
 from flight.loop.performance import PerformanceObserver
 from flight.loop.services import Services
-from flight.loop.steering import Steered, Steering
-from hal.interfaces.readings import CoilState, ImuReading
+from flight.loop.steering import Steering
+from hal.interfaces.readings import ImuReading
 
 ATTITUDE_EVERY = 4
 """Control cycles from one attitude packet to the next."""
@@ -41,24 +41,6 @@ class CycleTasks:
     steering: Steering
     drive: CoilDrive
     imaging: Imaging | None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ControlOutput:
-    """The results of one control cycle.
-
-    Attributes:
-        estimate: None where there is none; it may be carried on by the model alone.
-        target: in force, None before the first.
-        written: what is on the wire at the end of the cycle.
-    """
-
-    cycle: Cycle
-    mode: Mode
-    estimate: Estimate | None
-    target: Target | None
-    steered: Steered
-    written: CoilState
 
 
 class ControlCycle:

@@ -13,11 +13,12 @@ from flight.link import events
 from flight.link.events import EventKind
 from flight.loop.body import Body
 from flight.loop.commanding import Commanding
-from flight.loop.control_cycle import ControlCycle, ControlOutput
+from flight.loop.control_cycle import ControlCycle
+from flight.loop.control_output import ControlOutput, SteeringState
 from flight.loop.executive.executive import Executive
 from flight.loop.executive.rate_group import Cycle, RateGroup
-from flight.loop.fdir.health_watch import HealthWatch
 from flight.loop.fdir.resources import ResourceReader
+from flight.loop.health_watch import HealthWatch
 from flight.loop.housekeeping import Housekeeping
 from flight.loop.imaging import Imaging
 from flight.loop.modes.mode_control import ModeControl
@@ -29,7 +30,6 @@ from flight.loop.run_label import RunLabel, record_run
 from flight.loop.services import Services
 from flight.loop.state.keeper import StateKeeper
 from flight.loop.state.learning import learned_of
-from flight.loop.steering import SteeringState
 from flight.schema.sections import Config
 from hal.interfaces.wires import SECOND_NS
 

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 from flight.link.telemetry.definitions import HOUSEKEEPING
 from flight.loop.body import Planner
+from flight.loop.control_output import SteeringState
 from flight.loop.executive.rate_group import Cycle
 from flight.loop.fdir import facts
 from flight.loop.imaging import Imaging
 from flight.loop.navigation import Navigation
 from flight.loop.services import Services
-from flight.loop.steering import SteeringState
 from hal.interfaces.devices import PowerMonitor, TorqueCoils
 
 

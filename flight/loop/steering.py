@@ -3,48 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from enum import IntEnum
 from typing import Any
 
 import numpy as np
 
 from flight.gnc.estimation.estimate import Estimate
 from flight.gnc.math.arrays import FloatArray
-from flight.loop.body import Body, CoilCommand
+from flight.loop.body import Body
 from flight.loop.coil_drive import CoilDrive
+from flight.loop.control_output import CoilCommand, Steered, SteeringState
 from flight.loop.fdir import facts
 from flight.loop.services import Services
 from hal.interfaces.readings import ImuReading
 
 _NO_DIPOLE: FloatArray = np.zeros(3)
-
-
-class SteeringState(IntEnum):
-    """What the coils are used for; the values are those of the control packet."""
-
-    OFF = 0
-    FOLLOWING = 1
-    HOLDING = 2
-    BRAKING = 3
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Steered:
-    """What steering did in one cycle.
-
-    Attributes:
-        reference: the body's `Reference` now; None without a path.
-        dipole: (3,) A m^2, wanted of the coils.
-        currents: (3,) A, asked of the driver: after reallocation, with a probe of the coil watch, and zero
-            where a fault of this cycle switched the coils off.
-    """
-
-    state: SteeringState
-    reference: Any | None
-    dipole: FloatArray
-    currents: FloatArray
-    saturated: bool = False
 
 
 class Steering:

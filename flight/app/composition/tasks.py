@@ -19,9 +19,9 @@ from flight.loop.control_cycle import ControlCycle, CycleTasks
 from flight.loop.executive.jobs import JobRunner
 from flight.loop.fdir.event_log import EventLog
 from flight.loop.fdir.facts import Facts
-from flight.loop.fdir.health_watch import HealthInputs, HealthWatch
 from flight.loop.fdir.streams import Streams, streams_of
 from flight.loop.flight_loop import FlightLoop, LoopTasks, Supervisors, nothing
+from flight.loop.health_watch import HealthInputs, HealthWatch
 from flight.loop.housekeeping import Housekeeping, Watched
 from flight.loop.imaging import Imaging
 from flight.loop.modes.mode_control import ModeControl, ModeSettings

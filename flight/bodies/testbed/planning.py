@@ -23,7 +23,8 @@ from flight.gnc.guidance.one_axis.plant import SingleAxisPlant, angle_of, q2_of
 from flight.gnc.guidance.one_axis.vmc import Plan, PlanStatus
 from flight.link import events
 from flight.link.telemetry.definitions import MAX_NODES, PLAN
-from flight.loop.body import PLANNER, Target
+from flight.loop.body import PLANNER
+from flight.loop.control_output import Target
 from flight.loop.executive.jobs import JobResult
 from flight.loop.executive.rate_group import Cycle
 from flight.loop.services import Services

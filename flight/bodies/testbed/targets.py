@@ -14,7 +14,7 @@ from flight.gnc.errors import UsageError
 from flight.gnc.estimation.estimate import Estimate
 from flight.gnc.guidance.one_axis.guidance import Guidance
 from flight.gnc.guidance.one_axis.plant import Q2_LIMIT, angle_of
-from flight.loop.body import COMMANDED, KEPT, Target
+from flight.loop.control_output import COMMANDED, KEPT, Target
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from flight.gnc.guidance.one_axis.plant import angle_of
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import about_axis_y
-from flight.loop.body import Target
+from flight.loop.control_output import Target
 
 
 @dataclass(frozen=True, slots=True)

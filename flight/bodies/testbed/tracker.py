@@ -13,7 +13,7 @@ from flight.gnc.control.one_axis.pid import PidController
 from flight.gnc.estimation.estimate import Estimate
 from flight.gnc.guidance.one_axis.path import Sample
 from flight.gnc.guidance.one_axis.plant import SingleAxisPlant
-from flight.loop.body import CoilCommand
+from flight.loop.control_output import CoilCommand
 from flight.schema.sections import Control, Identification
 
 

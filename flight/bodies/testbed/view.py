@@ -12,8 +12,7 @@ from flight.gnc.estimation.measurements import MeanRateMeasurement
 from flight.gnc.math.quaternion import angle_about_axis_y
 from flight.link import events
 from flight.link.telemetry.definitions import CONTROL, TARGET
-from flight.loop.body import KEPT, Target
-from flight.loop.control_cycle import ControlOutput
+from flight.loop.control_output import KEPT, ControlOutput, Target
 from flight.loop.services import Services
 from hal.interfaces.readings import ImuReading
 

@@ -13,9 +13,8 @@ from dataclasses import dataclass
 from flight.gnc.errors import FlightError
 from flight.link import events
 from flight.link.events import EventKind, Reaction
-from flight.link.modes import Mode
+from flight.link.modes import STEERING, Mode
 from flight.loop.fdir.event_log import EventLog
-from flight.loop.modes.triggers import STEERING
 
 EVERYWHERE = frozenset(Mode)
 _DRIVEN = STEERING | {Mode.DETUMBLE}

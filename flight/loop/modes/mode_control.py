@@ -13,15 +13,16 @@ from flight.gnc.errors import UsageError
 from flight.gnc.estimation.estimate import Estimate
 from flight.link import events
 from flight.link.events import EventKind, Reaction
-from flight.link.modes import Mode
+from flight.link.modes import STEERING, Mode
 from flight.link.telemetry.definitions import MODE
-from flight.loop.body import Body, Target
+from flight.loop.body import Body
+from flight.loop.control_output import Target
 from flight.loop.fdir import facts
 from flight.loop.fdir.hold_timer import HoldTimer
 from flight.loop.modes.machine import Change, ModeMachine
 from flight.loop.modes.pointing_watch import PointingWatch
 from flight.loop.modes.table import TRANSITIONS, Answer
-from flight.loop.modes.triggers import COMMANDS, STARTS, STEERING, Trigger
+from flight.loop.modes.triggers import COMMANDS, STARTS, Trigger
 from flight.loop.services import Services
 from flight.loop.steering import Steering
 from flight.schema.sections import Modes

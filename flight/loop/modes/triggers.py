@@ -45,6 +45,3 @@ COMMANDS = {
 
 SAFING = (Trigger.COMMAND_SAFE, Trigger.REACT_SAFE)
 """What must lead to SAFE from wherever it comes."""
-
-STEERING = frozenset({Mode.HOLD, Mode.SLEW, Mode.TESTBED_DEMO})
-"""The modes in which planner and controller turn the body."""

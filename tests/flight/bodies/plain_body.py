@@ -11,7 +11,8 @@ from flight.bodies.testbed.body import TESTBED
 from flight.gnc.estimation.estimate import Estimate
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import conjugate, multiply, to_rotation_vector
-from flight.loop.body import Body, BodyKind, CoilCommand, Reference
+from flight.loop.body import Body, BodyKind
+from flight.loop.control_output import CoilCommand, Reference
 from flight.loop.services import Services
 from flight.loop.state.content import Learned
 from flight.schema.sections import Config
