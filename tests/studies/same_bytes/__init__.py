@@ -1,0 +1,1 @@
+"""Compares the logs of this checkout with those of another revision, packet by packet."""

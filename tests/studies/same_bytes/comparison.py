@@ -1,0 +1,204 @@
+"""Compares two logs packet by packet, each read with the packet table of the software that wrote it.
+
+Packets whose APID the old table does not have are counted as added and left out; sequence counts are kept per
+APID, so they do not disturb the others. A packet whose definition only had fields appended, with a higher
+version, is compared in the fields that the old one has. All else must be equal byte for byte, in the same
+order. Three labels of the RUN packet are not compared: UTC, the software's version, and the checksum of the
+configuration's text, in which a comment may change.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flight.link.telemetry.definitions import Field, Packet
+from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, Layout, compile_layouts, to_text
+from flight.link.telemetry.segments import find_segments
+from tests.studies.same_bytes.flights import TABLE_FILE
+
+STEMS = ("flight", "truth")
+LABELS = {"run": ("utc_ns", "software", "config_crc")}
+_APID_BITS = 0x7FF
+Table = Mapping[int, Layout]
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """The first place where two logs differ; `time` is mission time in s, of the old packet if any."""
+
+    log: str
+    packet: str
+    time: float
+    field: str
+    old: str
+    new: str
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What the comparison of one flight found.
+
+    Attributes:
+        compared: packets compared.
+        added: packets that only the new log has, by name.
+        extended: packets of which the new definition has more fields.
+        difference: the first difference, None when there is none.
+    """
+
+    flight: str
+    compared: int
+    added: dict[str, int]
+    extended: int
+    difference: Difference | None
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the verdict as plain values."""
+        return {**asdict(self), "equal": self.difference is None}
+
+
+def compare(flight: str, old: Path, new: Path) -> Verdict:
+    """Compare the logs in two folders."""
+    old_table, new_table = read_table(old), read_table(new)
+    compared = extended = 0
+    added: dict[str, int] = {}
+    difference = None
+    for stem in STEMS:
+        kept = []
+        for packet in split(read_log(new, stem)):
+            apid = _apid(packet)
+            if apid in old_table:
+                kept.append(packet)
+            else:
+                name = new_table[apid].packet.name if apid in new_table else f"APID {apid:#x}"
+                added[name] = added.get(name, 0) + 1
+        for a, b in zip_longest(split(read_log(old, stem)), kept):
+            if a is None or b is None:
+                difference = difference or _one_ended(stem, a, b, old_table, new_table)
+                break
+            compared += 1
+            same, longer = _same(a, b, old_table, new_table)
+            extended += longer
+            if not same and difference is None:
+                difference = _explain(stem, a, b, old_table, new_table)
+    return Verdict(flight, compared, added, extended, difference)
+
+
+def read_table(folder: Path) -> dict[int, Layout]:
+    """Return the layouts of the packet table kept beside a log, by APID."""
+    raw = json.loads((folder / TABLE_FILE).read_text(encoding="utf-8"))
+    packets = [Packet(**{**entry, "fields": tuple(Field(**f) for f in entry["fields"])}) for entry in raw]
+    return {layout.packet.apid: layout for layout in compile_layouts(packets).values()}
+
+
+def read_log(folder: Path, stem: str) -> bytes:
+    """Return the bytes of all segments of a log."""
+    return b"".join(path.read_bytes() for path in find_segments(folder, stem))
+
+
+def split(data: bytes) -> Iterator[bytes]:
+    """Yield the packets of an undamaged log, by the lengths in their headers."""
+    position = 0
+    while position < len(data):
+        header = data[position : position + HEADER_BYTES]
+        length = int.from_bytes(header[4:], "big") + HEADER_BYTES + 1
+        yield data[position : position + length]
+        position += length
+
+
+def _apid(packet: bytes) -> int:
+    return int.from_bytes(packet[:2], "big") & _APID_BITS
+
+
+def _same(a: bytes, b: bytes, old: Table, new: Table) -> tuple[bool, bool]:
+    """Return whether two packets are equal but for labels, and whether the new one only has more fields."""
+    if a == b:
+        return True, False
+    first, second = old.get(_apid(a)), new.get(_apid(b))
+    if first is None or second is None or first.packet.apid != second.packet.apid:
+        return False, False
+    longer = _extends(first, second)
+    if len(a) != first.length or len(b) != second.length or not (longer or len(a) == len(b)):
+        return False, False
+    return _core(a, first, longer) == _core(b, first, longer), longer
+
+
+def _extends(first: Layout, second: Layout) -> bool:
+    """Return whether the second definition is the first with fields appended and a higher version."""
+    shared = second.packet.fields[: len(first.packet.fields)]
+    more = len(second.packet.fields) > len(shared) == len(first.packet.fields)
+    raised = second.packet.version > first.packet.version
+    return more and raised and _kinds(first.packet.fields) == _kinds(shared)
+
+
+def _kinds(fields: Iterable[Field]) -> list[tuple[str, str, int]]:
+    return [(field.name, field.kind, field.count) for field in fields]
+
+
+def _core(packet: bytes, layout: Layout, longer: bool) -> bytes:
+    """Return a packet without checksum and labels; if `longer`, also without length, version, new fields."""
+    raw = bytearray(packet[: layout.length - CRC_BYTES])
+    for label in LABELS.get(layout.packet.name, ()):
+        if label in layout.offsets:
+            begin = layout.offsets[label]
+            raw[begin : begin + layout.dtype[label].itemsize] = bytes(layout.dtype[label].itemsize)
+    if longer:
+        raw[4 : HEADER_BYTES + 1] = bytes(3)
+    return bytes(raw)
+
+
+def _explain(stem: str, a: bytes, b: bytes, old: Table, new: Table) -> Difference:
+    """Return the first field in which two packets differ."""
+    first, second = old.get(_apid(a)), new.get(_apid(b))
+    time = _time(a)
+    if first is None or second is None or first.packet.name != second.packet.name:
+        return Difference(stem, _name(a, old), time, "packet", _name(a, old), _name(b, new))
+    name = first.packet.name
+    kinds = [_kinds(layout.packet.fields) for layout in (first, second)]
+    if kinds[0] != kinds[1] and not _extends(first, second):
+        return Difference(stem, name, time, "definition", _brief(kinds[0]), _brief(kinds[1]))
+    if len(a) != first.length or len(b) != second.length:
+        return Difference(stem, name, time, "length", str(len(a)), str(len(b)))
+    one, two = first.array(a)[0], second.array(b)[0]
+    labels = LABELS.get(name, ())
+    for field in first.offsets:
+        if field not in labels and one[field].tobytes() != two[field].tobytes():
+            return Difference(stem, name, time, field, *_values(one[field], two[field]))
+    return Difference(stem, name, time, "header", a[: HEADER_BYTES + 1].hex(), b[: HEADER_BYTES + 1].hex())
+
+
+def _one_ended(stem: str, a: bytes | None, b: bytes | None, old: Table, new: Table) -> Difference:
+    """Return the difference where one log ends before the other."""
+    name, time = (_name(a, old), _time(a)) if a is not None else (_name(b or b"", new), _time(b or b""))
+    return Difference(
+        stem, name, time, "packet", "end of log" if a is None else name, "end of log" if b is None else name
+    )
+
+
+def _name(packet: bytes, table: Table) -> str:
+    apid = _apid(packet)
+    return table[apid].packet.name if apid in table else f"APID {apid:#x}"
+
+
+def _time(packet: bytes) -> float:
+    return int.from_bytes(packet[HEADER_BYTES + 1 : HEADER_BYTES + 9], "big", signed=True) * 1e-9
+
+
+def _values(a: Any, b: Any) -> tuple[str, str]:
+    """Return two values of a field as text; of arrays the first element that differs."""
+    if isinstance(a, np.ndarray):
+        index = next(i for i in range(len(a)) if a[i].tobytes() != b[i].tobytes())
+        return f"[{index}] {a[index].item()!r}", f"[{index}] {b[index].item()!r}"
+    if isinstance(a, bytes):
+        return repr(to_text(a)), repr(to_text(b))
+    return repr(a.item()), repr(b.item())
+
+
+def _brief(fields: list[tuple[str, str, int]]) -> str:
+    return " ".join(name for name, _, _ in fields)
