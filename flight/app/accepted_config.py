@@ -30,7 +30,7 @@ def sum_file(path: Path) -> Path:
     return path.parent / f"{path.name}.sha256"  # a folder may be given, and has perhaps no name
 
 
-def choose(path: Path, environment: Mapping[str, str]) -> tuple[Path, str]:
+def accepted_config(path: Path, environment: Mapping[str, str]) -> tuple[Path, str]:
     """Return the configuration to fly and, where it is not `path`, what is wrong with that.
 
     Raises ConfigError, with the cure, for a damaged one where none has flown before.

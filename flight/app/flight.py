@@ -1,4 +1,4 @@
-"""A flight from its order to its outcome. Whatever happens, the coils are at zero when `fly` returns."""
+"""A flight from its request to its result. Whatever happens, the coils are at zero when `fly` returns."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from flight.app.accepted_config import FlownConfig
 from flight.app.linux import linux_rig
 from flight.app.mission_time import mission_zero, next_whole_second
 from flight.app.preparation import prepare
-from flight.app.request import Order, Outcome
-from flight.app.requested_config import ordered_config
+from flight.app.request import RunRequest, RunResult
+from flight.app.requested_config import requested_config
 from flight.app.rig import Rig
 from flight.app.run_folder import begin_folder
 from flight.app.simulated import flown_faults, simulated_rig
@@ -26,17 +26,17 @@ from flight.loop.state.opening import service_folder
 from flight.schema.sections import Config
 
 
-def fly(order: Order, progress: Callable[[Progress], None] | None = None) -> Outcome:
+def fly(request: RunRequest, progress: Callable[[Progress], None] | None = None) -> RunResult:
     """Fly a configuration to its end. Raises UsageError for the user to mend, DeviceError for a device."""
-    text, config = ordered_config(order)
-    order = begin_folder(order, text, config)
+    text, config = requested_config(request)
+    request = begin_folder(request, text, config)
     with ExitStack() as stack:
-        rig = _open_rig(order, text, config, stack)
-        loop, flight_log = prepare(config, rig, order.out, stack, patient=_is_patient(order))
+        rig = _open_rig(request, text, config, stack)
+        loop, flight_log = prepare(config, rig, request.out, stack, patient=_is_patient(request))
         if progress is not None:
             loop.watch(progress)
-        if order.config_problem:
-            loop.note(events.CONFIG_DAMAGED, order.config_problem)
+        if request.config_problem:
+            loop.note(events.CONFIG_DAMAGED, request.config_problem)
         elif rig.realtime and (folder := service_folder(os.environ)) is not None:
             stack.callback(FlownConfig(text, folder).serve(rig.clock).stop)
         label = RunLabel(text, rig.seed, config.simulation is not None, rig.realtime)
@@ -44,24 +44,24 @@ def fly(order: Order, progress: Callable[[Progress], None] | None = None) -> Out
             epoch_ns = mission_zero(rig.clock) if rig.realtime else next_whole_second(rig.clock)
             rig.release(epoch_ns)
             reason = loop.run(epoch_ns, label)
-    faults = () if config.simulation is None else flown_faults(order, text)
-    return Outcome(order.out, reason, bool(received), flight_log.error(), loop.restart, faults)
+    faults = () if config.simulation is None else flown_faults(request, text)
+    return RunResult(request.out, reason, bool(received), flight_log.error(), loop.restart, faults)
 
 
-def _open_rig(order: Order, text: str, config: Config, stack: ExitStack) -> Rig:
+def _open_rig(request: RunRequest, text: str, config: Config, stack: ExitStack) -> Rig:
     """Return the hardware that the configuration asks for."""
     if config.simulation is not None:
-        return simulated_rig(order, text, config, stack)
-    if order.seed is not None:
+        return simulated_rig(request, text, config, stack)
+    if request.seed is not None:
         raise UsageError("--seed: this configuration flies real devices, which draw their own noise")
-    if order.devices is not None:
+    if request.devices is not None:
         raise UsageError("--devices: this configuration flies real devices, not simulated ones")
-    return linux_rig(config, stack, _is_patient(order))
+    return linux_rig(config, stack, _is_patient(request))
 
 
-def _is_patient(order: Order) -> bool:
+def _is_patient(request: RunRequest) -> bool:
     """Tell whether the flight begins without what is missing: on a board, where nobody can see to it."""
-    return order.archive is not None
+    return request.archive is not None
 
 
 @contextmanager

@@ -7,8 +7,8 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from flight.app.linux import linux_camera
-from flight.app.request import Order
-from flight.app.requested_config import ordered_config
+from flight.app.request import RunRequest
+from flight.app.requested_config import requested_config
 from flight.app.simulated import simulated_camera
 from flight.gnc.errors import ConfigError
 from flight.schema.sections import Camera
@@ -23,7 +23,7 @@ def opened_camera(config_path: Path) -> Iterator[tuple[Clock, FrameSource, Camer
 
     Raises ConfigError when there is no camera in it, DeviceError.
     """
-    text, config = ordered_config(Order(config_path, Path()))
+    text, config = requested_config(RunRequest(config_path, Path()))
     if config.camera is None:
         raise ConfigError(str(config_path), "`camera` is none: give a configuration with a camera")
     with ExitStack() as stack:

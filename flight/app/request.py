@@ -1,4 +1,4 @@
-"""What the user asked for, and how it ended."""
+"""A request to fly and the result of the flight."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from pathlib import Path
 
 
 @dataclass(frozen=True, slots=True)
-class Order:
-    """What the user asked for. `duration` in s and `seed` replace the configuration's when given.
+class RunRequest:
+    """What to fly, and how. `duration` in s and `seed` replace the configuration's when given.
 
     `devices` is the file of a server of simulated devices that runs already; without it one is started.
     `archive` holds the runs of a board: the next of them is flown into, instead of into `out`.
@@ -28,7 +28,7 @@ class Order:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class RunResult:
     """How a flight ended; `interrupted` when a signal asked for it.
 
     `restart` says why the process should be started again, empty when it should not. `faults` were injected.

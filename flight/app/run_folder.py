@@ -6,7 +6,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
-from flight.app.request import Order
+from flight.app.request import RunRequest
 from flight.app.rig import Rig
 from flight.app.utc_label import utc_text
 from flight.gnc.errors import UsageError
@@ -22,27 +22,27 @@ def default_folder(config_path: Path) -> Path:
     return Path("runs") / f"{config_path.stem}-{utc_text()}"
 
 
-def begin_folder(order: Order, text: str, config: Config) -> Order:
-    """Make the run's folder, the archive's next where there is one; return the order that names it.
+def begin_folder(request: RunRequest, text: str, config: Config) -> RunRequest:
+    """Make the run's folder, the archive's next where there is one; return the request that names it.
 
     A folder that holds a run is not touched. Raises UsageError for that, and where nothing can be written;
     but a board that keeps an archive flies on, and its logs wait for the disk.
     """
-    if order.archive is not None:
+    if request.archive is not None:
         logs_bytes = (2 if config.simulation is None else 3) * config.telemetry.budget_bytes
-        run = begin_run(order.archive, config.telemetry.archive_bytes, logs_bytes)
-        order = replace(order, out=run.folder)
-    out = order.out
+        run = begin_run(request.archive, config.telemetry.archive_bytes, logs_bytes)
+        request = replace(request, out=run.folder)
+    out = request.out
     if any(out.glob("*.ccsds")):
         raise UsageError(f"{out} holds a run already: give another folder with --out, or remove it")
     try:
         out.mkdir(parents=True, exist_ok=True)
         (out / "config.yaml").write_text(text, encoding="utf-8")
     except OSError as error:
-        if order.archive is not None and error.errno in DISK_TROUBLE:
-            return order
+        if request.archive is not None and error.errno in DISK_TROUBLE:
+            return request
         raise UsageError(f"{out}: cannot be written: {error.strerror or error}") from error
-    return order
+    return request
 
 
 def open_log(folder: Path, stem: str, rig: Rig, config: Config, stack: ExitStack, patient: bool) -> FlightLog:

@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from flight.app.request import Order
+from flight.app.request import RunRequest
 from flight.app.rig import Rig
 from flight.gnc.errors import UsageError
 from flight.schema import reader as configuration
@@ -29,33 +29,33 @@ def fault_catalogue() -> tuple[str, str]:
     return grammar, listing
 
 
-def corrupted_text(order: Order, text: str) -> str:
-    """Return a configuration as the ordered faults spoil it; the same where none touches it."""
+def corrupted_text(request: RunRequest, text: str) -> str:
+    """Return a configuration as the requested faults corrupt it; unchanged where none does."""
     corrupted_by = importlib.import_module("sim_hal.faults.host").corrupted_by
-    spoiled: str = corrupted_by(order.faults, text, order.seed)
+    spoiled: str = corrupted_by(request.faults, text, request.seed)
     return spoiled
 
 
-def flown_faults(order: Order, text: str) -> tuple[str, ...]:
+def flown_faults(request: RunRequest, text: str) -> tuple[str, ...]:
     """Return what was to break in a flight, as it is written, the configuration's first."""
     grammar: Any = importlib.import_module("sim_hal.faults.grammar")
-    section = _simulation_section(text, order.config_path)
-    return tuple(map(str, (*grammar.schedule(section.faults), *map(grammar.parse, order.faults))))
+    section = _simulation_section(text, request.config_path)
+    return tuple(map(str, (*grammar.schedule(section.faults), *map(grammar.parse, request.faults))))
 
 
-def simulated_rig(order: Order, text: str, config: Config, stack: ExitStack) -> Rig:
-    """Return the emulated devices of a configuration, and what of the order breaks. Raises UsageError."""
-    section = _simulation_section(text, order.config_path)
-    if order.seed is not None:
-        section = configuration.replace(section, seed=order.seed)
+def simulated_rig(request: RunRequest, text: str, config: Config, stack: ExitStack) -> Rig:
+    """Return the emulated devices of a configuration, with the request's faults. Raises UsageError."""
+    section = _simulation_section(text, request.config_path)
+    if request.seed is not None:
+        section = configuration.replace(section, seed=request.seed)
     grammar = importlib.import_module("sim_hal.faults.grammar")
-    section = configuration.replace(section, faults=(*section.faults, *grammar.entries(order.faults)))
+    section = configuration.replace(section, faults=(*section.faults, *grammar.entries(request.faults)))
     # Before anything is opened, or a process started, for a fault that could do nothing.
-    importlib.import_module("sim_hal.faults.schedule").check(section.faults, config, order.realtime)
-    if order.realtime:
-        rig = _served_rig(order, config, section, stack)
+    importlib.import_module("sim_hal.faults.schedule").check(section.faults, config, request.realtime)
+    if request.realtime:
+        rig = _served_rig(request, config, section, stack)
     else:
-        rig = _lockstep_rig(order, config, section, stack)
+        rig = _lockstep_rig(request, config, section, stack)
     return with_host_faults(rig, section)
 
 
@@ -85,14 +85,14 @@ def _simulation_section(text: str, config_path: Path) -> Any:
     return configuration.simulation_section(text, str(config_path), sim_settings.Simulation)
 
 
-def _served_rig(order: Order, config: Config, section: Any, stack: ExitStack) -> Rig:
+def _served_rig(request: RunRequest, config: Config, section: Any, stack: ExitStack) -> Rig:
     """Return devices in a process of their own, in real time."""
     schedule = importlib.import_module("sim_hal.faults.schedule").scheduled
     remote = importlib.import_module("sim_hal.serving.remote")
-    if order.devices is not None:
-        served = stack.enter_context(remote.running(order.devices))
+    if request.devices is not None:
+        served = stack.enter_context(remote.running(request.devices))
     else:
-        served = stack.enter_context(remote.served(order.config_path, section.seed, order.out))
+        served = stack.enter_context(remote.served(request.config_path, section.seed, request.out))
     opener, where = served.bus
     reach = CoilReach(opener, where, config.coils.address)
     faults = [str(fault) for fault in schedule(section.faults, True)]
@@ -103,11 +103,11 @@ def _served_rig(order: Order, config: Config, section: Any, stack: ExitStack) ->
     return Rig(served.clock, served.wires, release, True, section.seed, reach=reach)
 
 
-def _lockstep_rig(order: Order, config: Config, section: Any, stack: ExitStack) -> Rig:
+def _lockstep_rig(request: RunRequest, config: Config, section: Any, stack: ExitStack) -> Rig:
     """Return devices beside the loop, which advance as it sleeps."""
-    if order.devices is not None:
+    if request.devices is not None:
         raise UsageError("--devices: a server's devices live in real time: give --realtime too")
     lockstep = importlib.import_module("sim_hal.lockstep")
-    hardware = stack.enter_context(lockstep.opened(config, section, order.out))
+    hardware = stack.enter_context(lockstep.opened(config, section, request.out))
     latency = round(section.latency.planner * SECOND_NS), round(section.latency.vision * SECOND_NS)
     return Rig(hardware.clock, hardware.wires, hardware.release, False, section.seed, latency)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from flight.app.cli.run import progress_line, seed_number
-from flight.app.request import Order
+from flight.app.request import RunRequest
 from flight.gnc.errors import UsageError
 from flight.link.telemetry.reader import read_run
 from flight.schema import reader as configuration
@@ -126,15 +126,15 @@ def _fly(options: argparse.Namespace) -> Path:
     with tempfile.TemporaryDirectory() as place:
         path = Path(place) / options.source.name
         path.write_text(to_yaml(config), encoding="utf-8")
-        order = Order(path, out, options.realtime, seed=options.seed)
-        outcome = fly(order, progress_line(sys.stderr) if with_line else None)
+        request = RunRequest(path, out, options.realtime, seed=options.seed)
+        result = fly(request, progress_line(sys.stderr) if with_line else None)
     if with_line:
         sys.stderr.write("\r\x1b[K")
-    if outcome.interrupted:
-        sys.stderr.write(f"flight: {outcome.reason}: identified from what was flown\n")
-    if outcome.log_error:
-        sys.stderr.write(f"flight: {outcome.log_error}\n")
-    return outcome.folder
+    if result.interrupted:
+        sys.stderr.write(f"flight: {result.reason}: identified from what was flown\n")
+    if result.log_error:
+        sys.stderr.write(f"flight: {result.log_error}\n")
+    return result.folder
 
 
 def _identify(folder: Path) -> _Identified:

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from flight.app.flight import fly
-from flight.app.request import Order
+from flight.app.request import RunRequest
 from flight.gnc.errors import ConfigError
 from hal.interfaces.errors import NotResponding
 from tests.deploy.scripts import (
@@ -173,7 +173,7 @@ def test_a_bus_that_is_neither_number_nor_path_is_refused(tmp_path: Path, bus: s
 def test_the_flight_opens_the_bus_by_its_lasting_name(tmp_path: Path) -> None:
     config = changed_testbed(tmp_path, coils_bus="/dev/knightcube-nowhere")
     with pytest.raises(NotResponding, match="/dev/knightcube-nowhere: no such bus"):
-        fly(Order(config, tmp_path / "run"))
+        fly(RunRequest(config, tmp_path / "run"))
 
 
 def board(folder: Path, below: str) -> Path:

@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from flight.app.flight import fly
-from flight.app.request import Order
+from flight.app.request import RunRequest
 from flight.bodies.testbed.plant_model import plant_of
 from flight.gnc import catalogue
 from flight.gnc.camera.images import grey_stretch, write_picture
@@ -59,7 +59,7 @@ def main() -> int:
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as place:
         run_folder = Path(place) / "run"
-        fly(Order(CONFIG, run_folder))
+        fly(RunRequest(CONFIG, run_folder))
         drawn = {path.name: path for path in draw(read_run(run_folder), Path(place) / "figures")}
         for name in ("overview.png", "paths.png"):
             (folder / name).write_bytes(drawn[name].read_bytes())

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TextIO
 
-from flight.app.request import Order
+from flight.app.request import RunRequest
 from flight.link.telemetry.reader import read_run
 from flight.loop.progress import Progress
 
@@ -67,15 +67,15 @@ def _faults_help() -> str:
 
 def run(options: argparse.Namespace) -> int:
     """Fly, showing progress on standard error when it is a terminal."""
-    from flight.app.accepted_config import choose  # noqa: PLC0415
+    from flight.app.accepted_config import accepted_config  # noqa: PLC0415
     from flight.app.flight import fly  # noqa: PLC0415 - no other command needs devices
     from flight.app.run_folder import default_folder  # noqa: PLC0415
 
-    config, problem = choose(options.config, os.environ)
+    config, problem = accepted_config(options.config, os.environ)
     if problem:
         sys.stderr.write(f"flight: {problem}\n")
     out = options.out or default_folder(options.config)
-    order = Order(
+    request = RunRequest(
         config,
         out,
         options.realtime,
@@ -88,37 +88,37 @@ def run(options: argparse.Namespace) -> int:
     )
     begun = time.perf_counter()
     with_line = sys.stderr.isatty()
-    outcome = fly(order, progress_line(sys.stderr) if with_line else None)
+    result = fly(request, progress_line(sys.stderr) if with_line else None)
     if with_line:
         sys.stderr.write("\r\x1b[K")
     elapsed = time.perf_counter() - begun
     # A service that is told to stop does not read days of packets first.
-    flown = None if options.archive else read_run(outcome.folder)["control"]
+    flown = None if options.archive else read_run(result.folder)["control"]
     seconds = elapsed if flown is None else float(flown["time_ns"][-1]) * 1e-9 if len(flown) else 0.0
     if options.json:
         facts = {
-            "folder": str(outcome.folder),
-            "reason": outcome.reason,
-            "interrupted": outcome.interrupted,
+            "folder": str(result.folder),
+            "reason": result.reason,
+            "interrupted": result.interrupted,
             "mission_time_s": seconds,
             "elapsed_s": elapsed,
             "packets": None if flown is None else len(flown),
-            "log_error": outcome.log_error or None,
-            "faults": outcome.faults,
+            "log_error": result.log_error or None,
+            "faults": result.faults,
         }
         sys.stdout.write(json.dumps(facts) + "\n")
     else:
-        broken = f"faults: {'; '.join(outcome.faults)}\n" if outcome.faults else ""
+        broken = f"faults: {'; '.join(result.faults)}\n" if result.faults else ""
         sys.stdout.write(
-            f"flown: {seconds:.0f} s in {elapsed:.1f} s, {outcome.reason}\n"
+            f"flown: {seconds:.0f} s in {elapsed:.1f} s, {result.reason}\n"
             f"{broken}"
-            f"log:   {outcome.folder}\n"
-            f"next:  python -m flight report {outcome.folder}\n"
+            f"log:   {result.folder}\n"
+            f"next:  python -m flight report {result.folder}\n"
         )
-    for problem in filter(None, (outcome.log_error, outcome.restart)):
+    for problem in filter(None, (result.log_error, result.restart)):
         sys.stderr.write(f"flight: {problem}\n")
     # A service manager starts again what ends with a failure.
-    return 1 if outcome.log_error or outcome.restart else 0
+    return 1 if result.log_error or result.restart else 0
 
 
 def progress_line(stream: TextIO) -> Callable[[Progress], None]:

@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flight.app.flight import fly
-from flight.app.request import Order
+from flight.app.request import RunRequest
 from flight.gnc.errors import UsageError
 from hal.interfaces.errors import NotResponding
 from sim_hal.serving.device_link import Inbox, RemoteI2cBus, open_bus, pack
@@ -94,12 +94,12 @@ def test_the_guardians_end_is_light() -> None:
 
 def test_devices_that_run_are_flown_in_real_time_only(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="--realtime"):
-        fly(Order(CONFIG, tmp_path / "run", devices=tmp_path / "facts.json"))
+        fly(RunRequest(CONFIG, tmp_path / "run", devices=tmp_path / "facts.json"))
 
 
 def test_real_devices_are_not_looked_for_in_a_file(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="--devices"):
-        fly(Order(ROOT / "config/testbed.yaml", tmp_path / "run", devices=tmp_path / "facts.json"))
+        fly(RunRequest(ROOT / "config/testbed.yaml", tmp_path / "run", devices=tmp_path / "facts.json"))
 
 
 @pytest.mark.parametrize("facts", [None, "{", "[]", "{}"])
@@ -108,7 +108,7 @@ def test_a_file_that_tells_of_no_server_is_said_so(tmp_path: Path, facts: str | 
     if facts is not None:
         path.write_text(facts, encoding="utf-8")
     with pytest.raises(NotResponding, match=r"facts\.json tells of no server"):
-        fly(Order(CONFIG, tmp_path / "run", realtime=True, devices=path))
+        fly(RunRequest(CONFIG, tmp_path / "run", realtime=True, devices=path))
 
 
 def test_a_server_that_has_gone_is_said_so(tmp_path: Path) -> None:
@@ -116,4 +116,4 @@ def test_a_server_that_has_gone_is_said_so(tmp_path: Path) -> None:
     gone = {"serial": "/dev/ptmx", "baud_rate": 115200, "socket": str(tmp_path / "gone"), "camera": False}
     path.write_text(json.dumps(gone), encoding="utf-8")
     with pytest.raises(NotResponding):
-        fly(Order(CONFIG, tmp_path / "run", realtime=True, devices=path))
+        fly(RunRequest(CONFIG, tmp_path / "run", realtime=True, devices=path))

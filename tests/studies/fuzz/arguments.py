@@ -26,8 +26,8 @@ from unittest import mock
 
 from flight.app import cli
 from flight.app import flight as flown
-from flight.app.request import Order, Outcome
-from flight.app.requested_config import ordered_config
+from flight.app.request import RunRequest, RunResult
+from flight.app.requested_config import requested_config
 from flight.gnc.errors import UsageError
 from flight.link.telemetry.segments import SUFFIX
 from ground.commands import COMMANDS as GROUND_COMMANDS
@@ -229,12 +229,12 @@ def _in_folder(folder: Path, drawn: bool) -> Iterator[None]:
         os.chdir(before)
 
 
-def _briefly(order: Order, progress: Callable[[Any], None] | None = None) -> Outcome:
+def _briefly(request: RunRequest, progress: Callable[[Any], None] | None = None) -> RunResult:
     """Fly for some control cycles; what would need the machine's clock is looked at, and refused."""
-    _, config = ordered_config(order)
-    if order.realtime or order.devices is not None or config.simulation is None:
+    _, config = requested_config(request)
+    if request.realtime or request.devices is not None or config.simulation is None:
         raise UsageError("this is a rehearsal: nothing is flown in real time")
-    return _fly(replace(order, duration=min(config.duration, _FLOWN_S)), progress)
+    return _fly(replace(request, duration=min(config.duration, _FLOWN_S)), progress)
 
 
 def _few_frames(clock: Any, source: Any, exposure_ns: int, count: int) -> Iterator[Any]:

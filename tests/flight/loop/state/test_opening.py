@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from flight.app.flight import fly
-from flight.app.request import Order
+from flight.app.request import RunRequest
 from flight.link.telemetry.packets import to_text
 from flight.link.telemetry.reader import read_run
 from flight.loop.state.content import StoredState
@@ -96,8 +96,8 @@ def test_a_service_flies_run_after_run_into_its_archive_and_tells_a_crash_before
     text = CONFIG.read_text(encoding="utf-8") + f"\nstate: {{folder: {tmp_path / 'state'}}}\n"
     path = tmp_path / "flight.yaml"
     path.write_text(text)
-    order = Order(path, tmp_path / "unused", duration=2.0, archive=tmp_path / "runs")
-    assert fly(order).folder == tmp_path / "runs" / "run-000001"
+    request = RunRequest(path, tmp_path / "unused", duration=2.0, archive=tmp_path / "runs")
+    assert fly(request).folder == tmp_path / "runs" / "run-000001"
     state = stored(tmp_path / "state")
     assert (state.boot_count, state.running) == (1, False)
     assert set(state.learned) == {"gyro-bias", "plant", "imu-latency", "magnetometer-bias"}
@@ -105,7 +105,7 @@ def test_a_service_flies_run_after_run_into_its_archive_and_tells_a_crash_before
     with ExitStack() as killed:
         open_state(configuration.load(path), {}, ManualClock(), killed)
         killed.pop_all()  # as kill -9 would: nobody closes anything
-    second = fly(order)
+    second = fly(request)
     assert second.folder.name == "run-000002"
     names = [to_text(name) for name in read_run(second.folder)["event"]["name"]]
     assert "unclean-shutdown" in names

@@ -7,11 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from flight.app import accepted_config
-from flight.app.accepted_config import GOOD_START_NS, KEPT, FlownConfig, choose, sum_file
+from flight.app.accepted_config import GOOD_START_NS, KEPT, FlownConfig, accepted_config, sum_file
 from flight.app.cli import main
 from flight.app.flight import fly
-from flight.app.request import Order
+from flight.app.request import RunRequest
 from flight.gnc.errors import ConfigError
 from flight.link.telemetry.packets import to_text
 from flight.link.telemetry.reader import read_run
@@ -50,7 +49,7 @@ def service(tmp_path: Path) -> dict[str, str]:
 def test_no_single_bit_that_flips_is_flown(accepted: Path, service: dict[str, str]) -> None:
     for seed in range(300):
         accepted.write_text(corrupted(TEXT, 1, seed), encoding="utf-8")
-        path, problem = choose(accepted, service)
+        path, problem = accepted_config(accepted, service)
         assert path.read_text(encoding="utf-8") == TEXT
         assert "is not what was accepted" in problem
 
@@ -62,18 +61,18 @@ def test_a_flip_that_reads_as_another_body_is_found_by_the_checksum_alone(
     assert ord("3") ^ ord("7") == 4
     accepted.write_text(TEXT.replace("1.05e-3", "1.05e-7", 1), encoding="utf-8")
     assert configuration.load(accepted).plant.inertia == 1.05e-7
-    assert configuration.load(choose(accepted, service)[0]).plant.inertia == 1.05e-3
+    assert configuration.load(accepted_config(accepted, service)[0]).plant.inertia == 1.05e-3
 
 
 def test_what_was_accepted_is_flown(accepted: Path, service: dict[str, str]) -> None:
-    assert choose(accepted, service) == (accepted, "")
-    assert choose(accepted, {}) == (accepted, "")
+    assert accepted_config(accepted, service) == (accepted, "")
+    assert accepted_config(accepted, {}) == (accepted, "")
 
 
 def test_without_a_checksum_a_file_is_taken_as_it_stands(tmp_path: Path, service: dict[str, str]) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text("name: whatever", encoding="utf-8")
-    assert choose(path, service) == (path, "")
+    assert accepted_config(path, service) == (path, "")
 
 
 def test_without_a_copy_that_flew_it_is_refused_with_the_cure(
@@ -82,7 +81,7 @@ def test_without_a_copy_that_flew_it_is_refused_with_the_cure(
     accepted.write_text(TEXT.replace("1.05e-3", "1.05e-7"), encoding="utf-8")
     for environment in ({}, {"STATE_DIRECTORY": str(tmp_path / "empty")}):
         with pytest.raises(ConfigError, match=r"no copy of one that flew is kept; .*install\.sh --accept"):
-            choose(accepted, environment)
+            accepted_config(accepted, environment)
     monkeypatch.delenv("STATE_DIRECTORY", raising=False)
     assert main(["run", str(accepted), "--out", str(tmp_path / "run")]) == 2
     assert "sha256" in capsys.readouterr().err
@@ -101,14 +100,14 @@ def test_a_copy_that_is_damaged_too_is_not_flown(
         else:
             path.write_text(content, encoding="utf-8")
         with pytest.raises(ConfigError, match="no copy"):
-            choose(accepted, service)
+            accepted_config(accepted, service)
 
 
 def test_a_file_that_is_gone_is_replaced_by_the_one_that_flew(
     accepted: Path, service: dict[str, str]
 ) -> None:
     accepted.unlink()
-    path, problem = choose(accepted, service)
+    path, problem = accepted_config(accepted, service)
     assert path.name == KEPT
     assert "No such file" in problem
 
@@ -135,26 +134,26 @@ def test_a_disk_that_fails_is_tried_again(tmp_path: Path) -> None:
     flown.keep()
     folder.mkdir()
     flown.keep()
-    assert choose(folder / KEPT, {}) == (folder / KEPT, "")
+    assert accepted_config(folder / KEPT, {}) == (folder / KEPT, "")
 
 
-def test_the_flight_of_a_kept_configuration_tells_it_as_an_event(tmp_path: Path) -> None:
-    order = Order(CONFIG, tmp_path / "run", duration=2.0, config_problem="a bit has flipped")
-    fly(order)
-    told = {to_text(row["name"]): to_text(row["text"]) for row in read_run(order.out)["event"]}
+def test_the_flight_of_a_kept_configuration_records_it_as_an_event(tmp_path: Path) -> None:
+    request = RunRequest(CONFIG, tmp_path / "run", duration=2.0, config_problem="a bit has flipped")
+    fly(request)
+    told = {to_text(row["name"]): to_text(row["text"]) for row in read_run(request.out)["event"]}
     assert told["config-damaged"] == "a bit has flipped"
 
 
 def test_the_command_line_flies_the_kept_one_and_says_so(
     accepted: Path, service: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    orders: list[Order] = []
+    requests: list[RunRequest] = []
 
     class Flown(Exception):
         """The flight would begin."""
 
-    def take(order: Order, _: object) -> None:
-        orders.append(order)
+    def take(request: RunRequest, _: object) -> None:
+        requests.append(request)
         raise Flown
 
     monkeypatch.setattr("flight.app.flight.fly", take)
@@ -162,6 +161,6 @@ def test_the_command_line_flies_the_kept_one_and_says_so(
     accepted.write_text(TEXT + "\n", encoding="utf-8")
     with pytest.raises(Flown):
         main(["run", str(accepted), "--out", str(tmp_path / "run")])
-    assert orders[0].config_path == Path(service["STATE_DIRECTORY"]) / KEPT
-    assert "the last one that flew" in orders[0].config_problem
-    assert accepted_config.choose(orders[0].config_path, {}) == (orders[0].config_path, "")
+    assert requests[0].config_path == Path(service["STATE_DIRECTORY"]) / KEPT
+    assert "the last one that flew" in requests[0].config_problem
+    assert accepted_config(requests[0].config_path, {}) == (requests[0].config_path, "")
