@@ -13,9 +13,9 @@ from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
-from flight.gnc.errors import ConfigError
 from flight.loop.state.files import LinuxFiles, replace_file
 from flight.loop.state.opening import service_folder
+from flight.schema.errors import ConfigError
 from hal.interfaces.wires import Clock, Ticker
 
 KEPT = "flown.yaml"

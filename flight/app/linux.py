@@ -6,8 +6,8 @@ import os
 from contextlib import ExitStack, nullcontext, suppress
 
 from flight.app.rig import Rig
-from flight.gnc.errors import ConfigError
 from flight.loop.state.opening import state_folder
+from flight.schema.errors import ConfigError
 from flight.schema.sections import AravisDevice, Camera, Config, V4l2Device
 from hal.buses.clock import SystemClock
 from hal.buses.i2c_bus import LinuxI2cBus

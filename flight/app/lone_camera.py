@@ -10,7 +10,7 @@ from flight.app.linux import linux_camera
 from flight.app.request import RunRequest
 from flight.app.requested_config import requested_config
 from flight.app.simulated import simulated_camera
-from flight.gnc.errors import ConfigError
+from flight.schema.errors import ConfigError
 from flight.schema.sections import Camera
 from hal.buses.clock import SystemClock
 from hal.interfaces.devices import FrameSource

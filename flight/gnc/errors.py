@@ -11,12 +11,12 @@ class UsageError(FlightError):
     """A mistake of the user's: one clear line, exit status 2, never a traceback."""
 
 
-class ConfigError(UsageError):
-    """A configuration value that cannot be flown.
+class InputError(UsageError):
+    """A file, or a value in one, that cannot be used.
 
     Attributes:
-        where: file, line and dotted name of the value, as far as known.
-        problem: what is wrong and what would be right.
+        where: the file or the dotted name of the value.
+        problem: the fault and its remedy.
     """
 
     def __init__(self, where: str, problem: str) -> None:

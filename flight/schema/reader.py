@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 import msgspec
 import yaml
 
-from flight.gnc.errors import ConfigError
+from flight.schema.errors import ConfigError
 from flight.schema.peers import peer_networks
 from flight.schema.sections import Camera, Commands, Config
 

@@ -13,10 +13,10 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta
 
-from flight.gnc.errors import ConfigError
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import attitude_matrix
 from flight.schema import reader
+from flight.schema.errors import ConfigError
 from flight.schema.sections import NotNegative, Positive, Quaternion, Section
 
 _UNIT_TOLERANCE = 1e-6

@@ -12,7 +12,7 @@ import pytest
 
 from flight.app.flight import fly
 from flight.app.request import RunRequest
-from flight.gnc.errors import ConfigError
+from flight.schema.errors import ConfigError
 from hal.interfaces.errors import NotResponding
 from tests.deploy.scripts import (
     DEPLOY,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import importlib
 
-from flight.gnc.errors import ConfigError
 from flight.loop.body import BodyKind
+from flight.schema.errors import ConfigError
 from flight.schema.sections import Config
 
 BODIES = {"testbed": "flight.bodies.testbed.body:TESTBED"}

@@ -15,7 +15,7 @@ from typing import Protocol, Self
 import numpy as np
 
 from flight.gnc.camera.pinhole import Pinhole
-from flight.gnc.errors import ConfigError, FlightError
+from flight.gnc.errors import FlightError, InputError
 from flight.gnc.math.arrays import BoolArray, FloatArray
 
 _MOST_STEPS = 60
@@ -117,15 +117,15 @@ class Lens:
     def from_mapping(cls, mapping: Mapping[str, object], where: str = "lens") -> Lens:
         """Return the lens of `to_mapping`'s keys, k1 and k2 not compulsory, as a YAML file holds them.
 
-        Raises ConfigError, with the place `where`, for a key or value that is wrong.
+        Raises InputError, with the place `where`, for a key or value that is wrong.
         """
         unknown = set(mapping) - set(_KEYS)
         if unknown:
-            raise ConfigError(f"{where}.{min(unknown)}", f"no such key; a lens has {', '.join(_KEYS)}")
+            raise InputError(f"{where}.{min(unknown)}", f"no such key; a lens has {', '.join(_KEYS)}")
         numbers = {key: _number(mapping, key, where) for key in _KEYS if key != "centre"}
         for key in ("columns", "rows"):
             if numbers[key] != int(numbers[key]):
-                raise ConfigError(f"{where}.{key}", f"{numbers[key]}: must be a whole number of pixels")
+                raise InputError(f"{where}.{key}", f"{numbers[key]}: must be a whole number of pixels")
         x, y = _centre(mapping, where)
         try:
             return cls(
@@ -137,7 +137,7 @@ class Lens:
                 numbers["k2"],
             )
         except LensError as error:
-            raise ConfigError(where, str(error)) from error
+            raise InputError(where, str(error)) from error
 
     def to_mapping(self) -> dict[str, int | float | list[float]]:
         """Return the lens as plain numbers for a YAML file: pixels, and k1, k2 of tangents."""
@@ -240,13 +240,13 @@ def _reach(k1: float, k2: float) -> float:
 def _number(mapping: Mapping[str, object], key: str, where: str) -> float:
     value = mapping.get(key, _OPTIONAL.get(key))
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ConfigError(f"{where}.{key}", f"{value!r}: must be a number")
+        raise InputError(f"{where}.{key}", f"{value!r}: must be a number")
     return float(value)
 
 
 def _centre(mapping: Mapping[str, object], where: str) -> tuple[float, float]:
     value = mapping.get("centre")
     if not isinstance(value, list | tuple) or len(value) != 2:
-        raise ConfigError(f"{where}.centre", f"{value!r}: must be two numbers, [x, y] in pixels")
+        raise InputError(f"{where}.centre", f"{value!r}: must be two numbers, [x, y] in pixels")
     pair = {"x": value[0], "y": value[1]}
     return _number(pair, "x", f"{where}.centre"), _number(pair, "y", f"{where}.centre")

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from flight.gnc.errors import ConfigError
+from flight.gnc.errors import InputError
 from flight.gnc.math.arrays import FloatArray
 
 EPOCH = 1991.25
@@ -79,13 +79,13 @@ class StarCatalogue:
 
 @cache
 def load(table: Path = TABLE) -> StarCatalogue:
-    """Return the catalogue, read once a process. Raises ConfigError when the table is missing or damaged."""
+    """Return the catalogue, read once a process. Raises InputError when the table is missing or damaged."""
     try:
         with table.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             columns = {name: stored[name] for name in COLUMNS}
     except (OSError, ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile) as error:
         cure = "make it again with `python -m flight.gnc.catalogue.build WHEEL_OR_PARQUET`"
-        raise ConfigError(str(table), f"no star table can be read here ({error}); {cure}") from error
+        raise InputError(str(table), f"no star table can be read here ({error}); {cure}") from error
     ra = columns["right_ascension"] * MILLIARCSECOND
     dec = columns["declination"] * MILLIARCSECOND
     cosine = np.cos(dec)

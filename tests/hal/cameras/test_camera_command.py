@@ -10,8 +10,8 @@ import pytest
 
 from flight.app.cli import main
 from flight.gnc.camera.images import read_image
-from flight.gnc.errors import ConfigError
 from flight.schema import reader as configuration
+from flight.schema.errors import ConfigError
 from flight.schema.sections import AravisDevice, V4l2Device
 from tests.hal.cameras.ioctl_camera import IoctlCamera
 from tests.hal.cameras.rig import kernel_in

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flight.gnc.errors import ConfigError
 from flight.loop.executive.jobs import JobResult, Worker
 from flight.loop.executive.lockstep import LockStepRunner
 from flight.schema import reader as configuration
+from flight.schema.errors import ConfigError
 from sim_hal.clock import SimClock
 from sim_hal.faults.grammar import parse
 from sim_hal.faults.host import HostFaults, corrupted, corrupted_by

@@ -18,8 +18,8 @@ import msgspec
 import numpy as np
 import yaml
 
-from flight.gnc.errors import ConfigError
 from flight.schema import reader as configuration
+from flight.schema.errors import ConfigError
 from flight.schema.sections import Config
 from hal.interfaces.errors import DeviceError
 from sim_hal.settings import Simulation

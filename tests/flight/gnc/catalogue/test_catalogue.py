@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flight.gnc import catalogue
-from flight.gnc.errors import ConfigError
+from flight.gnc.errors import InputError
 from flight.gnc.math.arrays import FloatArray
 
 STARS = catalogue.load()
@@ -143,7 +143,7 @@ def test_a_damaged_table_is_refused_with_its_cure(tmp_path: Path) -> None:
     for name, content in (("empty", b""), ("text", b"not a table"), ("cut", whole[: len(whole) // 2])):
         damaged = tmp_path / f"{name}.npz"
         damaged.write_bytes(content)
-        with pytest.raises(ConfigError, match=r"python -m flight\.gnc\.catalogue\.build"):
+        with pytest.raises(InputError, match=r"python -m flight\.gnc\.catalogue\.build"):
             catalogue.load(damaged)
-    with pytest.raises(ConfigError, match=r"missing\.npz"):
+    with pytest.raises(InputError, match=r"missing\.npz"):
         catalogue.load(tmp_path / "missing.npz")

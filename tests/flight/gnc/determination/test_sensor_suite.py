@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.gnc.errors import ConfigError
 from flight.gnc.math.arrays import FloatArray
 from flight.schema import sensor_suite
+from flight.schema.errors import ConfigError
 from tests.studies.campaigns.orbit_geometry import SUITES, suite
 
 DOWN = np.array([0.0, 0.0, 1.0])

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from flight.gnc.camera.lens import CameraModel, Lens, LensError
 from flight.gnc.camera.pinhole import Pinhole
-from flight.gnc.errors import ConfigError
+from flight.gnc.errors import InputError
 from flight.gnc.math.arrays import FloatArray
 
 _PINHOLE = Pinhole.from_field_of_view(1024, 768, np.radians(20.0))
@@ -120,6 +120,6 @@ def test_it_survives_a_yaml_file() -> None:
 )
 def test_a_wrong_value_is_named_by_its_place(change: dict[str, object], where: str) -> None:
     good = Lens.of(_PINHOLE).to_mapping()
-    with pytest.raises(ConfigError) as caught:
+    with pytest.raises(InputError) as caught:
         Lens.from_mapping({**good, **change}, "camera.lens")
     assert caught.value.where == where

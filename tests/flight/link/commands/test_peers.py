@@ -7,8 +7,8 @@ from ipaddress import IPv4Network
 
 import pytest
 
-from flight.gnc.errors import ConfigError
 from flight.link.commands.channel import open_udp
+from flight.schema.errors import ConfigError
 from flight.schema.peers import peer_networks
 from flight.schema.reader import parse
 from tests.scenario.flights import CONFIG

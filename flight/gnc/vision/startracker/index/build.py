@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from flight.gnc import catalogue
-from flight.gnc.errors import ConfigError, UsageError
+from flight.gnc.errors import InputError, UsageError
 from flight.gnc.vision.startracker.index.guide_stars import GuideStars, choose_guide_stars
 from flight.gnc.vision.startracker.index.sky_index import PATH, SkyIndex, load, save
 from flight.gnc.vision.startracker.index.triangle_index import build as build_triangles
@@ -83,7 +83,7 @@ def default_index() -> SkyIndex:
     path = PATH
     try:
         return load(path)
-    except ConfigError:
+    except InputError:
         sys.stderr.write(f"making the index of the sky, once, for {path} ...\n")
     sky = build()
     try:

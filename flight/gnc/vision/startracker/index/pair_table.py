@@ -104,7 +104,7 @@ def save(table: PairTable, path: Path) -> None:
 
 
 def load(path: Path) -> PairTable:
-    """Return the table of a file, mapped. Raises ConfigError when it is missing, damaged or outdated."""
+    """Return the table of a file, mapped. Raises InputError when it is missing, damaged or outdated."""
     columns, facts = table_file.load(path, KIND)
     key = KVector(columns["angle"], columns["count"], facts["slope"], facts["origin"])
     return PairTable(columns["first"], columns["second"], key, int(facts["stars"]), facts["widest"])

@@ -81,7 +81,7 @@ def save(sky: SkyIndex, path: Path) -> None:
 def load(path: Path = PATH) -> SkyIndex:
     """Return the index of a file, its triangles mapped and not read.
 
-    Raises ConfigError when the file is missing, damaged, or of another version.
+    Raises InputError when the file is missing, damaged, or of another version.
     """
     columns, facts = table_file.load(path, KIND)
     direction: FloatArray = columns["direction"].astype(np.float64)
@@ -93,5 +93,5 @@ def load(path: Path = PATH) -> SkyIndex:
 
 @cache
 def load_once(path: Path) -> SkyIndex:
-    """Return the index of a file, read once a process. Raises ConfigError as `load`."""
+    """Return the index of a file, read once a process. Raises InputError as `load`."""
     return load(path)

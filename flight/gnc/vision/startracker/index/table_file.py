@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from flight.gnc.errors import ConfigError
+from flight.gnc.errors import InputError
 
 Columns = dict[str, npt.NDArray[Any]]
 Facts = dict[str, float]
@@ -71,21 +71,21 @@ def save(path: Path, kind: Kind, columns: Columns, facts: Facts) -> None:
 def load(path: Path, kind: Kind) -> tuple[Columns, Facts]:
     """Return the columns, read-only and mapped, and the numbers.
 
-    Raises ConfigError when the file is missing, damaged, of another kind or of another version.
+    Raises InputError when the file is missing, damaged, of another kind or of another version.
     """
     name, cure = kind.name, kind.cure
     try:
         with path.open("rb") as file:
             mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     except (OSError, ValueError) as error:
-        raise ConfigError(str(path), f"no {name} can be read here ({error}); {cure}") from error
+        raise InputError(str(path), f"no {name} can be read here ({error}); {cure}") from error
     if len(mapped) < _HEADER.size or mapped[: len(kind.magic)] != kind.magic:
-        raise ConfigError(str(path), f"this is no {name}; {cure}")
+        raise InputError(str(path), f"this is no {name}; {cure}")
     _, version, checksum, length = _HEADER.unpack_from(mapped)
     if version != kind.version:
-        raise ConfigError(str(path), f"a {name} of version {version}, {kind.version} is wanted; {cure}")
+        raise InputError(str(path), f"a {name} of version {version}, {kind.version} is wanted; {cure}")
     if zlib.crc32(memoryview(mapped)[_HEADER.size :]) != checksum:
-        raise ConfigError(str(path), f"the {name} is damaged, its CRC-32 is wrong; {cure}")
+        raise InputError(str(path), f"the {name} is damaged, its CRC-32 is wrong; {cure}")
     contents = json.loads(mapped[_HEADER.size : _HEADER.size + length])
     begin = _HEADER.size + length
     columns = {

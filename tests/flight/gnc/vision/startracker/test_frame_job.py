@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.gnc.errors import ConfigError
+from flight.gnc.errors import InputError
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import angle_between, from_rotation_vector, multiply
 from flight.gnc.vision.startracker.frame_job import FrameFound, FrameJob, TrackerSettings, run
@@ -154,5 +154,5 @@ def test_a_job_and_what_it_found_pass_between_processes() -> None:
 def test_an_index_that_is_missing_is_told_with_its_cure(tmp_path: Path) -> None:
     job = _job(_frame(0.0), LikelihoodSettings())
     tracker = replace(_TRACKER, index=tmp_path / "sky.index")
-    with pytest.raises(ConfigError, match=r"startracker\.index\.build"):
+    with pytest.raises(InputError, match=r"startracker\.index\.build"):
         run(replace(job, tracker=tracker))

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from flight.gnc.errors import ConfigError
+from flight.gnc.errors import InputError
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.vision.startracker.index import k_vector, pair_table, table_file
 from flight.gnc.vision.startracker.index.guide_stars import GuideStars
@@ -143,18 +143,18 @@ def test_a_damaged_foreign_or_outdated_file_is_refused_with_its_name(
     table: PairTable, tmp_path: Path
 ) -> None:
     path = tmp_path / "pairs.table"
-    with pytest.raises(ConfigError, match=r"pairs\.table"):
+    with pytest.raises(InputError, match=r"pairs\.table"):
         pair_table.load(path)
     pair_table.save(table, path)
     whole = path.read_bytes()
     path.write_bytes(whole[:-70] + bytes([whole[-70] ^ 1]) + whole[-69:])
-    with pytest.raises(ConfigError, match="CRC-32"):
+    with pytest.raises(InputError, match="CRC-32"):
         pair_table.load(path)
     path.write_bytes(b"\x00" * 100)
-    with pytest.raises(ConfigError, match="no pair table"):
+    with pytest.raises(InputError, match="no pair table"):
         pair_table.load(path)
     table_file.save(path, replace(pair_table.KIND, version=pair_table.KIND.version + 1), {}, {})
-    with pytest.raises(ConfigError, match="version"):
+    with pytest.raises(InputError, match="version"):
         pair_table.load(path)
 
 

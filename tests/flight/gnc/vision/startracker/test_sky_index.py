@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from flight.gnc import catalogue
-from flight.gnc.errors import ConfigError
+from flight.gnc.errors import InputError
 from flight.gnc.math.quaternion import attitude_matrix, normalise
 from flight.gnc.vision.startracker.index import build as index_build
 from flight.gnc.vision.startracker.index.build import IndexSettings, default_index
@@ -115,7 +115,7 @@ def test_a_flipped_bit_is_told_with_its_cure(stored: Path, tmp_path: Path, place
     damaged[place] ^= 1
     path = tmp_path / "damaged.index"
     path.write_bytes(damaged)
-    with pytest.raises(ConfigError, match=r"damaged.*startracker\.index\.build"):
+    with pytest.raises(InputError, match=r"damaged.*startracker\.index\.build"):
         load(path)
 
 
@@ -131,16 +131,16 @@ def test_a_flipped_bit_is_told_with_its_cure(stored: Path, tmp_path: Path, place
 def test_another_file_is_told_with_its_cure(tmp_path: Path, content: bytes, said: str) -> None:
     path = tmp_path / "other.index"
     path.write_bytes(content)
-    with pytest.raises(ConfigError, match=said):
+    with pytest.raises(InputError, match=said):
         load(path)
-    with pytest.raises(ConfigError, match="no sky index can be read"):
+    with pytest.raises(InputError, match="no sky index can be read"):
         load(tmp_path / "missing.index")
 
 
 def test_a_truncated_file_is_refused(stored: Path, tmp_path: Path) -> None:
     path = tmp_path / "short.index"
     path.write_bytes(stored.read_bytes()[:-100])
-    with pytest.raises(ConfigError, match="damaged"):
+    with pytest.raises(InputError, match="damaged"):
         load(path)
 
 

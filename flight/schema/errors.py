@@ -1,0 +1,9 @@
+"""The exception for a configuration that is refused."""
+
+from __future__ import annotations
+
+from flight.gnc.errors import InputError
+
+
+class ConfigError(InputError):
+    """A configuration that cannot be flown; `where` is the file and, if known, the line of the value."""
