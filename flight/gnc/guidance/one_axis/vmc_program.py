@@ -200,60 +200,85 @@ class Program:
         return 1e-8 * self._bang * horizon
 
     def _minimise(self, start: Trial, limits: Limits | None, free: FreeHorizon | None) -> tuple[Trial, bool]:
-        """Run SLSQP once from `start`, over (parameters[, log-horizon]); tell if it converged.
-
-        The second variable is log(T/T0) over a scale that gives the price of time, like the whitened energy,
-        a curvature of about one.
-        """
-        size, origin = self.family.size, start.horizon
-        root = 1.0 / math.sqrt(free.price * origin) if free else 0.0
-        price = free.price if free else 0.0
-        last = np.append(start.parameters, 0.0) if free else start.parameters
-
-        def trial_of(x: FloatArray) -> Trial:
-            return Trial(x[:size].copy(), origin * math.exp(root * x[size]) if free else origin)
+        """Run SLSQP once from `start`; return where it ended, and whether it converged."""
+        variables = _Variables(start, self.family.size, free)
+        size, price = variables.size, variables.price
+        last = variables.first
 
         def objective(x: FloatArray, gradient: FloatArray) -> float:
             nonlocal last
             last = x.copy()
             self.evaluations += 1
-            trial = trial_of(x)
+            trial = variables.trial(x)
             energy, by_parameters, by_horizon = self.energy(trial)
             if gradient.size:
                 gradient[:size] = by_parameters
                 if free:
-                    gradient[size] = root * trial.horizon * (by_horizon + price)
+                    gradient[size] = variables.root * trial.horizon * (by_horizon + price)
             return energy + price * trial.horizon
 
         solver = nlopt.opt(nlopt.LD_SLSQP, last.size)
         solver.set_min_objective(objective)
         # A part of 1e-5 of a free horizon's objective is a horizon to 0.01 % or better.
+        origin = variables.origin
         solver.set_ftol_abs(_FREE_TOLERANCE * price * origin if free else self._energy_tolerance(origin))
         solver.set_maxeval(_EVALUATIONS)
-        if free is not None:
-            low, high = (math.log(bound / origin) / root for bound in (free.least, free.greatest))
-            solver.set_lower_bounds(np.append(np.full(size, -np.inf), low))
-            solver.set_upper_bounds(np.append(np.full(size, np.inf), high))
-            last[size] = min(max(0.0, low), high)
+        variables.bound(solver)
         if limits is not None and limits.index.size:
-            points = self.family.observed(self.family.grid.dense.take(limits.index))
-
-            def constraints(result: FloatArray, x: FloatArray, gradient: FloatArray) -> None:
-                trial = trial_of(x)
-                value, by_parameters, by_horizon = self.excess(limits, points, trial)
-                result[:] = value + IMPOSED_MARGIN
-                if gradient.size:
-                    gradient[:, :size] = by_parameters
-                    if free:
-                        gradient[:, size] = root * trial.horizon * by_horizon
-
-            solver.add_inequality_mconstraint(constraints, np.full(limits.index.size, 1e-6))
+            self._impose(solver, limits, variables)
         try:
             found = np.asarray(solver.optimize(last))
         except _SOLVER_STOPS:
             # Trivial and infeasible problems end so: the line search has shrunk onto the last point.
-            return trial_of(last), False
-        return trial_of(found), solver.last_optimize_result() in _CONVERGED
+            return variables.trial(last), False
+        return variables.trial(found), solver.last_optimize_result() in _CONVERGED
+
+    def _impose(self, solver: nlopt.opt, limits: Limits, variables: _Variables) -> None:
+        points = self.family.observed(self.family.grid.dense.take(limits.index))
+        size = variables.size
+
+        def constraints(result: FloatArray, x: FloatArray, gradient: FloatArray) -> None:
+            trial = variables.trial(x)
+            value, by_parameters, by_horizon = self.excess(limits, points, trial)
+            result[:] = value + IMPOSED_MARGIN
+            if gradient.size:
+                gradient[:, :size] = by_parameters
+                if variables.free:
+                    gradient[:, size] = variables.root * trial.horizon * by_horizon
+
+        solver.add_inequality_mconstraint(constraints, np.full(limits.index.size, 1e-6))
+
+
+class _Variables:
+    """What the optimiser varies: the path's parameters and, where the horizon is free, its logarithm.
+
+    The logarithm log(T/T0) is scaled so that the price of time has, like the whitened energy, a curvature of
+    about one.
+
+    Attributes:
+        first: where the optimiser begins.
+        root: the scale of the logarithm; zero for a fixed horizon.
+    """
+
+    def __init__(self, start: Trial, size: int, free: FreeHorizon | None) -> None:
+        self.size, self.origin, self.free = size, start.horizon, free
+        self.price = free.price if free else 0.0
+        self.root = 1.0 / math.sqrt(free.price * self.origin) if free else 0.0
+        self.first = np.append(start.parameters, 0.0) if free else start.parameters
+
+    def trial(self, x: FloatArray) -> Trial:
+        """Return the trial of the variables."""
+        horizon = self.origin * math.exp(self.root * x[self.size]) if self.free else self.origin
+        return Trial(x[: self.size].copy(), horizon)
+
+    def bound(self, solver: nlopt.opt) -> None:
+        """Keep a free horizon within its bounds."""
+        if self.free is not None:
+            bounds = self.free.least, self.free.greatest
+            low, high = (math.log(bound / self.origin) / self.root for bound in bounds)
+            solver.set_lower_bounds(np.append(np.full(self.size, -np.inf), low))
+            solver.set_upper_bounds(np.append(np.full(self.size, np.inf), high))
+            self.first[self.size] = min(max(0.0, low), high)
 
 
 def _contract(slopes: FloatArray, basis: FloatArray) -> FloatArray:
