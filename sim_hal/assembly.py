@@ -30,7 +30,7 @@ from sim_hal.settings import Simulation, Sky
 from sim_hal.truth import TruthRecorder
 from sim_hal.worlds.coil_circuit import CoilCircuit
 from sim_hal.worlds.simulation import TimedSimulation
-from sim_hal.worlds.testbed import Testbed, TestbedModel
+from sim_hal.worlds.world import World, WorldInputs, make_world
 
 if TYPE_CHECKING:
     from sim_hal.star_camera import StarCameraModel
@@ -47,7 +47,7 @@ class Hardware:
     """All of it; drivers are plugged into `bus` and `camera`, the rest is for faults and for looking."""
 
     simulation: TimedSimulation
-    world: Testbed
+    world: World
     unit: Vn100Emulator
     bus: EmulatedI2cBus
     pwm: EmulatedPca9685
@@ -91,21 +91,7 @@ def assemble(
         uncertainty=section.current_noise,
         bus_voltage=BUS_VOLTAGE,
     )
-    world = Testbed(
-        TestbedModel(
-            inertia=section.truth.inertia or config.plant.inertia,
-            dipole_per_ampere=config.plant.coil_turns * config.plant.coil_area,
-            field=section.truth.field or config.plant.field,
-            stiffness=section.thread.stiffness,
-            damping=section.thread.damping,
-            resistance=resistance,
-            supply_voltage=supply,
-        ),
-        angle=2.0 * float(np.arcsin(section.release.q2)),
-        release_rate=section.release.rate,
-        currents=circuit.currents,
-        start_ns=now_ns(),
-    )
+    world = make_world(WorldInputs(config, section, circuit.currents, now_ns()))
     unit = Vn100Emulator(
         world.motion,
         line,

@@ -83,10 +83,11 @@ class FaultEntry(Section, frozen=True, kw_only=True):
 
 
 class Simulation(Section, frozen=True, kw_only=True):
-    """The whole section."""
+    """The whole section; `world` is one of `sim_hal.worlds.world.WORLDS`, or `module:factory`."""
 
     seed: Annotated[int, Meta(ge=0)] = 1
     utc: str = "2026-01-01T00:00:00Z"
+    world: Annotated[str, Meta(min_length=1, max_length=200)] = "testbed"
     release: Release
     thread: Thread = Thread()
     current_noise: NotNegative = 0.0

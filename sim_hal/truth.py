@@ -7,7 +7,7 @@ from typing import Protocol
 from flight.link.telemetry.definitions import TRUTH
 from flight.link.telemetry.packets import Packer
 from sim_hal.emulators.device import NEVER
-from sim_hal.worlds.testbed import Testbed
+from sim_hal.worlds.world import World
 
 PERIOD_NS = 25_000_000
 
@@ -25,11 +25,11 @@ class TruthRecorder:
     def __init__(self, log: PacketLog) -> None:
         self._log = log
         self._packer = Packer()
-        self._world: Testbed | None = None
+        self._world: World | None = None
         self._epoch_ns = 0
         self._due_ns = NEVER
 
-    def watch(self, world: Testbed) -> None:
+    def watch(self, world: World) -> None:
         """Look at this world."""
         self._world = world
 
@@ -53,14 +53,15 @@ class TruthRecorder:
         if world is None:
             return
         motion = world.motion(time_ns)
+        truth = world.truth()
         self._log.write(
             self._packer.pack(
                 TRUTH,
                 time_ns - self._epoch_ns,
                 quaternion=motion.quaternion.tolist(),
                 rate=motion.rate.tolist(),
-                current=world.felt_current.tolist(),
-                energy=world.energy,
-                supply_energy=world.supply_energy,
+                current=truth.current.tolist(),
+                energy=truth.energy,
+                supply_energy=truth.supply_energy,
             )
         )

@@ -6,7 +6,6 @@ from contextlib import ExitStack, nullcontext, suppress
 
 import numpy as np
 
-from flight.app.rig import Rig
 from flight.gnc.math.frames import NED_TO_TESTBED, attitude_map
 from flight.gnc.math.quaternion import attitude_matrix
 from flight.loop.services import Devices
@@ -17,6 +16,7 @@ from hal.drivers.ina219 import Ina219
 from hal.drivers.pca9685 import Pca9685
 from hal.drivers.vn100.driver import Vn100, Vn100Settings
 from hal.interfaces.errors import DeviceError
+from hal.interfaces.rig import Rig
 
 
 def open_devices(config: Config, rig: Rig, stack: ExitStack, patient: bool) -> Devices:

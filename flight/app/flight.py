@@ -14,9 +14,8 @@ from flight.app.mission_time import mission_zero, next_whole_second
 from flight.app.preparation import prepare
 from flight.app.request import RunRequest, RunResult
 from flight.app.requested_config import requested_config
-from flight.app.rig import Rig
 from flight.app.run_folder import begin_folder
-from flight.app.simulated import flown_faults, simulated_rig
+from flight.app.simulated import injected_faults, simulated_rig
 from flight.gnc.errors import UsageError
 from flight.link import events
 from flight.loop.flight_loop import FlightLoop
@@ -24,6 +23,7 @@ from flight.loop.progress import Progress
 from flight.loop.run_label import RunLabel
 from flight.loop.state.opening import service_folder
 from flight.schema.sections import Config
+from hal.interfaces.rig import Rig
 
 
 def fly(request: RunRequest, progress: Callable[[Progress], None] | None = None) -> RunResult:
@@ -44,7 +44,7 @@ def fly(request: RunRequest, progress: Callable[[Progress], None] | None = None)
             epoch_ns = mission_zero(rig.clock) if rig.realtime else next_whole_second(rig.clock)
             rig.release(epoch_ns)
             reason = loop.run(epoch_ns, label)
-    faults = () if config.simulation is None else flown_faults(request, text)
+    faults = () if config.simulation is None else injected_faults(request, text)
     return RunResult(request.out, reason, bool(received), flight_log.error(), loop.restart, faults)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from contextlib import ExitStack, nullcontext, suppress
 
-from flight.app.rig import Rig
 from flight.loop.state.opening import state_folder
 from flight.schema.errors import ConfigError
 from flight.schema.sections import AravisDevice, Camera, Config, V4l2Device
@@ -19,6 +18,7 @@ from hal.drivers.v4l2_camera import Stamp, V4l2Camera, V4l2Settings
 from hal.guardian.client import CoilReach
 from hal.interfaces.devices import FrameSource
 from hal.interfaces.errors import DeviceError
+from hal.interfaces.rig import Rig
 from hal.interfaces.wires import SECOND_NS, Clock, Wires
 
 

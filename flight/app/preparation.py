@@ -9,7 +9,6 @@ from pathlib import Path
 from flight.app.composition.tasks import Opened, build_loop
 from flight.app.composition.workers import workers
 from flight.app.devices import open_devices
-from flight.app.rig import Rig
 from flight.app.run_folder import open_log
 from flight.app.watchers import start_guardian, supervise
 from flight.gnc.vision.startracker.index.build import ensure_default_index
@@ -24,6 +23,7 @@ from flight.loop.flight_loop import FlightLoop, Supervisors, nothing
 from flight.loop.state.opening import open_state
 from flight.schema.peers import peer_networks
 from flight.schema.sections import Config
+from hal.interfaces.rig import Rig
 
 
 def prepare(

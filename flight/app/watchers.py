@@ -6,7 +6,6 @@ import os
 import threading
 from contextlib import ExitStack
 
-from flight.app.rig import Rig
 from flight.link import events
 from flight.link.telemetry.recorder import Recorder
 from flight.loop.executive import memory
@@ -15,6 +14,7 @@ from hal.buses import real_time
 from hal.buses.service_manager import ServiceManager
 from hal.drivers.coil_settings import DEVICE as COILS
 from hal.guardian.client import GuardianLine
+from hal.interfaces.rig import Rig
 from hal.interfaces.wires import Clock
 
 CONTROL_PRIORITY = 50

@@ -16,6 +16,7 @@ import numpy as np
 
 from flight.gnc.math.arrays import FloatArray
 from sim_hal.worlds.motion import Motion, about_thread
+from sim_hal.worlds.world import WorldInputs, WorldTruth
 
 _LONGEST_STEP = 0.025
 
@@ -102,6 +103,10 @@ class Testbed:
         self.advance_to(time_ns)
         return about_thread(self.time_ns, self.angle, self.rate, self._model.field)
 
+    def truth(self) -> WorldTruth:
+        """Return currents and energies of the state as it is."""
+        return WorldTruth(self.felt_current, self.energy, self.supply_energy)
+
     def _acceleration(self, angle: float, rate: float, ix: float, iz: float) -> float:
         m = self._model
         dipole = m.dipole_per_ampere * (ix * math.cos(angle) + iz * math.sin(angle))
@@ -118,3 +123,20 @@ class Testbed:
         a4 = self._acceleration(angle + dt * v3, v4, ix, iz)
         self.angle = angle + dt / 6.0 * (rate + 2.0 * v2 + 2.0 * v3 + v4)
         self.rate = rate + dt / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4)
+
+
+def make(inputs: WorldInputs) -> Testbed:
+    """Return the testbed of a configuration, as far as its `simulation` section does not say otherwise."""
+    config, section = inputs.config, inputs.section
+    believed, truth = config.plant, section.truth
+    model = TestbedModel(
+        inertia=truth.inertia or believed.inertia,
+        dipole_per_ampere=believed.coil_turns * believed.coil_area,
+        field=truth.field or believed.field,
+        stiffness=section.thread.stiffness,
+        damping=section.thread.damping,
+        resistance=truth.resistance or config.coils.resistance,
+        supply_voltage=truth.supply_voltage or config.coils.supply_voltage,
+    )
+    angle = 2.0 * float(np.arcsin(section.release.q2))
+    return Testbed(model, angle, section.release.rate, inputs.currents, inputs.start_ns)

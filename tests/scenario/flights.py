@@ -9,18 +9,19 @@ from pathlib import Path
 
 from flight.app import preparation
 from flight.app.mission_time import next_whole_second
-from flight.app.rig import Rig
-from flight.app.simulated import with_host_faults
 from flight.link.telemetry.packets import to_text
 from flight.link.telemetry.reader import Run, read_run
 from flight.loop.flight_loop import FlightLoop
 from flight.loop.run_label import RunLabel
 from flight.schema import reader as configuration
 from flight.schema.sections import Config
+from hal.interfaces.rig import Rig
 from hal.interfaces.wires import SECOND_NS
 from sim_hal import lockstep
 from sim_hal.lockstep import LockStep
+from sim_hal.rig import with_host_faults
 from sim_hal.settings import Simulation
+from sim_hal.worlds.testbed import Testbed
 
 CONFIG = Path(__file__).resolve().parents[2] / "config" / "step_demo.yaml"
 TEXT = CONFIG.read_text(encoding="utf-8")
@@ -33,6 +34,13 @@ class Rigged:
     lock: LockStep
     loop: FlightLoop
     epoch_ns: int
+
+    @property
+    def testbed(self) -> Testbed:
+        """The world, which is the testbed."""
+        world = self.lock.hardware.world
+        assert isinstance(world, Testbed)
+        return world
 
     def at(self, seconds: float, action: Callable[[], None]) -> None:
         self.lock.hardware.faults.at(self.epoch_ns + round(seconds * SECOND_NS), action)

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from flight.app.devices import open_devices
-from flight.app.rig import Rig
 from flight.link.modes import Mode
 from hal.interfaces.errors import NotResponding
+from hal.interfaces.rig import Rig
 from sim_hal import lockstep
 from sim_hal.emulators.serial_line import SOUND, LineFaults
 from sim_hal.lockstep import LockStep

@@ -171,7 +171,7 @@ def test_a_body_that_has_been_detumbled_is_held(tmp_path: Path) -> None:
 
 def test_a_body_that_is_pushed_out_of_its_hold_is_detumbled_and_held_again(tmp_path: Path) -> None:
     def prepare(rigged: Rigged) -> None:
-        world = rigged.lock.hardware.world
+        world = rigged.testbed
         rigged.at(4.0, lambda: setattr(world, "rate", world.rate + 0.7))
 
     run = fly(commanded(60.0, initial="hold"), tmp_path, prepare)
@@ -191,7 +191,7 @@ def test_a_hold_that_is_impossible_ends_in_safe_with_the_coils_at_zero(
     tmp_path: Path, initial: str, strategy: str
 ) -> None:
     def prepare(rigged: Rigged) -> None:
-        world = rigged.lock.hardware.world
+        world = rigged.testbed
 
         def hand() -> None:
             world.angle, world.rate = 1.2, 0.0
@@ -225,7 +225,7 @@ def test_what_the_demonstration_is_on_its_way_to_and_a_target_that_moves_are_not
 
 def test_a_body_spun_up_in_the_demonstration_is_detumbled(tmp_path: Path) -> None:
     def prepare(rigged: Rigged) -> None:
-        rigged.at(4.0, lambda: setattr(rigged.lock.hardware.world, "rate", 0.9))
+        rigged.at(4.0, lambda: setattr(rigged.testbed, "rate", 0.9))
 
     run = fly(commanded(8.0, hold_patience=15.0), tmp_path, prepare)
     assert modes_of(run)[:3] == [Mode.BOOT, Mode.TESTBED_DEMO, Mode.DETUMBLE]

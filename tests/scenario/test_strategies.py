@@ -67,7 +67,7 @@ def test_a_moving_target_is_met_at_its_rate_and_followed(tmp_path: Path) -> None
 
 def test_a_body_that_is_pushed_off_its_hold_is_planned_for_again(tmp_path: Path) -> None:
     def push(rigged: Rigged) -> None:
-        world = rigged.lock.hardware.world
+        world = rigged.testbed
 
         def kick() -> None:
             world.rate += 0.25

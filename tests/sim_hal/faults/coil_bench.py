@@ -24,6 +24,7 @@ from hal.interfaces.readings import ImuReading
 from sim_hal import lockstep
 from sim_hal.clock import SimClock
 from sim_hal.settings import FaultEntry
+from sim_hal.worlds.testbed import Testbed
 from tests.scenario.flights import demo_config, demo_world
 
 CYCLE_NS = 25_000_000
@@ -126,6 +127,7 @@ def observe(
             coils.command(np.where(usable, wanted, 0.0) + watch.probe)
         coils.brake(watch.braked)
     seen.times, seen.carried = (np.array(column) for column in zip(*carried, strict=True))
+    assert isinstance(lock.hardware.world, Testbed)
     seen.angle = lock.hardware.world.angle
     coils.close()
     monitor.close()
