@@ -4,14 +4,14 @@ VENV   ?= .venv
 RUN    := $(VENV)/bin/python
 READY  := $(VENV)/.ready
 
-.PHONY: demo test lint types arrows unit pictures lock clean help
+.PHONY: demo test lint types arrows docs unit pictures lock clean help
 
 help:        ## list the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
 
 $(READY): pyproject.toml requirements.lock
 	$(PYTHON) -m venv $(VENV)
-	$(VENV)/bin/pip install --quiet --constraint requirements.lock --editable '.[plots,images,test]'
+	$(VENV)/bin/pip install --quiet --constraint requirements.lock --editable '.[plots,images,test,docs]'
 	@touch $@
 
 demo: $(READY)  ## fly the 700 s step demonstration on simulated hardware and print its report
@@ -20,7 +20,7 @@ demo: $(READY)  ## fly the 700 s step demonstration on simulated hardware and pr
 	$(RUN) -m flight report runs/demo
 
 test: $(READY)  ## every check, two at a time
-	@$(MAKE) --no-print-directory --jobs 2 lint types arrows unit
+	@$(MAKE) --no-print-directory --jobs 2 lint types arrows docs unit
 
 lint: $(READY)  ## style
 	$(VENV)/bin/ruff check . && $(VENV)/bin/ruff format --check --quiet .
@@ -30,6 +30,10 @@ types: $(READY)  ## strict types
 
 arrows: $(READY)  ## the architecture's import arrows
 	$(VENV)/bin/lint-imports --no-cache
+
+docs: $(READY)  ## the documentation site, strict, into build/site
+	@NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs build --strict --quiet --site-dir build/site
+	$(RUN) -m tests.docs.built_site build/site
 
 unit: $(READY)  ## the tests, on all cores
 	$(RUN) -m pytest -n auto --dist loadfile

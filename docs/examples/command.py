@@ -1,0 +1,46 @@
+"""Send the new command `note` to a flight; needs the tree with `command.diff` applied."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from flight.link.commands.codec import CommandPacker, Note
+from flight.link.telemetry.definitions import COMMAND
+from flight.link.telemetry.packets import to_text
+from flight.link.telemetry.reader import read_run
+from flight.link.telemetry.scanner import decode
+from ground.commands.command import exchange
+
+CONFIG = Path("config/step_demo.yaml")
+
+
+def main() -> None:
+    """Fly the demonstration without a camera, listening on a socket; send a remark; look into the log."""
+    with tempfile.TemporaryDirectory() as name:
+        folder, socket = Path(name), Path(name) / "commands"
+        text = CONFIG.read_text(encoding="utf-8")
+        before, _, after = text.partition("camera: ")
+        text = before + "camera: none\n\nestimation:" + after.partition("\nestimation:")[2]
+        config = folder / "listening.yaml"
+        config.write_text(text + f"\ncommands: {{socket: {socket}}}\n", encoding="utf-8")
+        words = ["run", str(config), "--out", str(folder / "run"), "--duration", "30"]
+        flight = subprocess.Popen([sys.executable, "-m", "flight", *words], stdout=subprocess.DEVNULL)
+        while not socket.exists() and flight.poll() is None:
+            time.sleep(0.01)
+        answer = exchange(str(socket), CommandPacker().pack(Note("lamp on"), utc_ns=1), timeout=10.0)
+        (row,) = decode(answer)[COMMAND.name]
+        print("answer:", "obeyed" if row["obeyed"] else "refused", "-", to_text(row["text"]))
+        flight.wait()
+        events = read_run(folder / "run")["event"]
+        for event in events[events["name"] == b"commanded"]:
+            print(
+                "log:   ", f"{event['time_ns'] * 1e-9:.1f} s,", to_text(event["name"]), to_text(event["text"])
+            )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,33 @@
+"""Record the new packet `thermal` and read it back; needs the tree with `packet.diff` applied."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+from flight.link.telemetry.definitions import THERMAL
+from flight.link.telemetry.log import FlightLog
+from flight.link.telemetry.reader import read_run
+from flight.link.telemetry.recorder import Recorder
+from ground.documentation import markdown
+from ground.export import export
+from sim_hal.clock import SimClock
+
+
+def main() -> None:
+    """Write one packet into a flight log; read it, export it, print its documentation."""
+    with tempfile.TemporaryDirectory() as name:
+        folder, clock = Path(name), SimClock()
+        log = FlightLog(folder, clock=clock, sync_period_ns=None)
+        # A task calls this line where the values arise.
+        Recorder(log, log).record(THERMAL, clock.now_ns(), celsius=[21.5, 19.0, 20.25, 20.5, 22.0, 18.75])
+        log.close()
+        run = read_run(folder)
+        print("read:  ", run["thermal"]["celsius"][0].tolist())
+        (table,) = export(run, folder / "csv")
+        print("export:", table.read_text(encoding="utf-8").splitlines()[1])
+        print("document:" + markdown().split("## thermal\n")[1])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,68 @@
+"""Checks the built site: `python -m tests.docs.built_site build/site`; exit 1 on a find.
+
+The pages must be readable without a network, so no page may load anything from another host. Links to
+follow are allowed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+
+_LOADED = {"script": "src", "img": "src", "iframe": "src", "source": "src", "link": "href", "object": "data"}
+_OTHER_HOST = re.compile(r"^(https?:)?//")
+_STYLE_URL = re.compile(r"(?:url\(|@import)\s*[\"']?((?:https?:)?//[^\"')\s]+)")
+_PLACEHOLDER = re.compile(r"to be filled by|\b(?:TODO|TBD|FIXME)\b")
+_STILL_OPEN = {"decisions/libraries-tried.html", "search/search_index.json"}
+
+
+class _Loads(HTMLParser):
+    """Collects what a page loads by itself, and its code blocks that a script of another host would draw."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        values = dict(attrs)
+        address = values.get(_LOADED.get(tag, "")) or ""
+        if _OTHER_HOST.match(address) and values.get("rel") != "canonical":
+            self.found.append(f"<{tag}> loads {address}")
+        if "mermaid" in (values.get("class") or ""):
+            self.found.append("a mermaid drawing loads a script")
+
+
+def problems_of(site: Path) -> list[str]:
+    """Return what is wrong with a site, one line each."""
+    found: list[str] = []
+    for page in sorted(site.rglob("*.html")):
+        name, text = str(page.relative_to(site)), page.read_text(encoding="utf-8")
+        loads = _Loads()
+        loads.feed(text)
+        found += [f"{name}: {load}" for load in loads.found]
+        if name not in _STILL_OPEN and (match := _PLACEHOLDER.search(text)):
+            found.append(f"{name}: placeholder {match[0]!r}")
+    for style in sorted(site.rglob("*.css")):
+        urls = _STYLE_URL.findall(style.read_text(encoding="utf-8"))
+        found += [f"{style.relative_to(site)}: loads {url}" for url in urls]
+    return found
+
+
+def main() -> int:
+    """Check a site; return the exit status."""
+    parser = argparse.ArgumentParser(prog="python -m tests.docs.built_site", description=__doc__)
+    parser.add_argument("site", type=Path)
+    site = parser.parse_args().site
+    pages = len(list(site.rglob("*.html")))
+    found = problems_of(site) if pages else [f"{site}: no pages"]
+    for line in found:
+        sys.stderr.write(f"{line}\n")
+    sys.stdout.write(f"documentation: {pages} pages in {site}, {len(found)} problems\n")
+    return 1 if found else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,124 @@
+"""Every command line in the documentation works, or its block says why it is not run here."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from flight.app.cli import COMMANDS as FLIGHT_COMMANDS
+from ground.commands import COMMANDS as GROUND_COMMANDS
+from tests.docs.blocks import ROOT, blocks, blocks_of, pages
+
+SHORT = "--duration 3"
+RUNNABLE = {block.page for block in blocks() if block.commands and not block.mark}
+
+
+def shortened(line: str) -> str:
+    """Return what is run for a line: a short flight with early faults, a report without pictures."""
+    if line.startswith("python -m flight run ") and "--help" not in line:
+        early = re.sub(r"@ \d+", "@ 1", re.sub(r" for \d+", " for 1", line))
+        return re.sub(r" --duration \d+", "", early) + f" {SHORT}"
+    if line.startswith("python -m flight report") and "--json" not in line:
+        return f"{line} --no-figures"
+    return line
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder that looks like the project's, where commands may write."""
+    folder = tmp_path_factory.mktemp("home")
+    for name in ("config", "deploy", "tests"):
+        (folder / name).symlink_to(ROOT / name)
+    (folder / "docs").mkdir()
+    (folder / "docs" / "examples").symlink_to(ROOT / "docs" / "examples")
+    run(f"python -m flight run config/step_demo.yaml --out runs/demo {SHORT}", folder)
+    return folder
+
+
+def run(line: str, folder: Path) -> None:
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PATH": path}
+    done = subprocess.run(
+        ["bash", "-c", line],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=100,
+        check=False,
+    )
+    assert done.returncode == 0, f"{line}\n{done.stderr[-2000:]}"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", sorted(RUNNABLE))
+def test_the_command_lines_of_a_page_work(page: str, home: Path) -> None:
+    """Runs them in the order of the page. The fixture has flown the demonstration already."""
+    for block in blocks():
+        if block.page == page and not block.mark:
+            for line in block.commands:
+                if line != "python -m flight run config/step_demo.yaml --out runs/demo":
+                    run(shortened(line), home)
+
+
+def test_every_mark_names_a_test_or_gives_a_reason() -> None:
+    for block in blocks():
+        where = f"{block.page}:{block.line}"
+        if block.mark == "run by":
+            assert (ROOT / block.reason).exists(), f"{where}: {block.reason} does not exist"
+        elif block.mark:
+            assert len(block.reason) > 10, f"{where}: the reason is missing"
+
+
+def test_a_block_without_a_language_is_no_hiding_place_for_commands() -> None:
+    for block in blocks():
+        if block.language in {"", "text", "bash", "shell"}:
+            assert not re.search(r"^\s*(\$ |python |make |sudo )", block.text, re.MULTILINE), (
+                f"{block.page}:{block.line}: commands belong into a block of `sh`"
+            )
+
+
+def test_the_collector_finds_commands_and_their_marks() -> None:
+    """One block is to be run; the other is marked, and indented in a list."""
+    text = "```sh\nmake a  # why\n# only a remark\nmake b \\\n  c\n```\n\n1. x\n\n"
+    text += "    <!-- not run: no need -->\n    ```console\n    $ make d\n    output\n    ```\n"
+    first, second = blocks_of(text)
+    assert (first.commands, first.mark) == (["make a", "make b    c"], "")
+    assert (second.commands, second.mark, second.reason) == (["make d"], "not run", "no need")
+
+
+def mentions() -> set[tuple[str, str]]:
+    """Return (module, first argument) of every `python -m ...` on the pages, within text as well."""
+    found = set()
+    for path in pages():
+        for module, word in re.findall(r"python -m ([\w.]+)(?: ([\w-]+))?", path.read_text(encoding="utf-8")):
+            found.add((module.rstrip("."), word))
+    return found
+
+
+def test_every_module_that_the_pages_call_exists() -> None:
+    later = {"tests.studies.same_bytes"}  # arrives with the studies of this step
+    for module, _ in mentions():
+        assert module in later or importlib.util.find_spec(module) is not None, module
+
+
+def test_every_flight_command_that_the_pages_name_exists() -> None:
+    known = {**FLIGHT_COMMANDS, **GROUND_COMMANDS}
+    for module, word in mentions():
+        if module == "flight" and word and not word.startswith("-"):
+            assert word in known, word
+
+
+@pytest.mark.parametrize("study", ["campaigns", "bench", "fuzz"])
+def test_every_study_that_the_pages_name_exists(study: str) -> None:
+    words = [sys.executable, "-m", f"tests.studies.{study}", "--help"]
+    listed = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    for module, word in mentions():
+        if module == f"tests.studies.{study}" and word and word.islower() and not word.startswith("-"):
+            assert re.search(rf"\b{re.escape(word)}\b", listed), word

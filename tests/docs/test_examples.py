@@ -1,0 +1,82 @@
+"""The examples of the pages "Extending": they run, and change as few files as the pages say."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.docs.blocks import ROOT
+
+EXAMPLES = ROOT / "docs" / "examples"
+
+
+def run(words: list[str], tree: Path, status: int = 0) -> subprocess.CompletedProcess[str]:
+    """Run Python in a tree, with the tree's packages."""
+    environment = {**os.environ, "PYTHONPATH": str(tree)}
+    words = [sys.executable, *words]
+    done = subprocess.run(
+        words, cwd=tree, env=environment, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == status, done.stderr
+    return done
+
+
+def patched(name: str, folder: Path) -> Path:
+    """Return a copy of the packages with `name`.diff applied."""
+    for package in ("flight", "hal", "sim_hal", "ground", "config"):
+        shutil.copytree(ROOT / package, folder / package, ignore=shutil.ignore_patterns("__pycache__"))
+    words = ["git", "apply", "-C1", "--unidiff-zero", str(EXAMPLES / f"{name}.diff")]
+    environment = {**os.environ, "GIT_CEILING_DIRECTORIES": str(folder.parent)}
+    done = subprocess.run(words, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, f"docs/examples/{name}.diff no longer fits the tree:\n{done.stderr}"
+    return folder
+
+
+def files_of(name: str) -> list[str]:
+    """Return the files that a diff changes."""
+    return re.findall(
+        r"^\+\+\+ b/(.+)$", (EXAMPLES / f"{name}.diff").read_text(encoding="utf-8"), re.MULTILINE
+    )
+
+
+@pytest.mark.parametrize(("name", "most"), [("command", 3), ("packet", 1), ("config_key", 2)])
+def test_an_extension_changes_few_files(name: str, most: int) -> None:
+    assert 1 <= len(files_of(name)) <= most
+
+
+def test_a_device_is_read_through_its_driver_and_fails_with_a_reason() -> None:
+    printed = run([str(EXAMPLES / "device.py")], ROOT).stdout.splitlines()
+    assert printed[:2] == ["+21.5000 degree C", "-25.0625 degree C"]
+    assert "tmp102 at 0x48: no acknowledge" in printed[2]
+
+
+@pytest.mark.slow
+def test_a_new_command_is_obeyed_and_logged(tmp_path: Path) -> None:
+    printed = run([str(EXAMPLES / "command.py")], patched("command", tmp_path / "tree")).stdout.splitlines()
+    assert printed[0] == "answer: obeyed - note lamp on"
+    assert printed[1].endswith("commanded socket: note lamp on")
+
+
+def test_a_new_packet_is_recorded_read_exported_and_documented(tmp_path: Path) -> None:
+    printed = run([str(EXAMPLES / "packet.py")], patched("packet", tmp_path / "tree")).stdout
+    assert "read:   [21.5, 19.0, 20.25, 20.5, 22.0, 18.75]" in printed
+    assert "# s,degree C" in printed
+    assert "| 15 | celsius | f4 x 6 | degree C |" in printed
+
+
+@pytest.mark.slow
+def test_a_new_configuration_key_is_flown_and_checked(tmp_path: Path) -> None:
+    tree = patched("config_key", tmp_path / "tree")
+    text = (tree / "config" / "step_demo.yaml").read_text(encoding="utf-8")
+    for value, status in ((3.0, 0), (-1.0, 2)):
+        changed = text.replace("  strategy: goal", f"  least_horizon: {value}\n  strategy: goal")
+        (tree / "changed.yaml").write_text(changed, encoding="utf-8")
+        words = ["-m", "flight", "run", "changed.yaml", "--duration", "2", "--out", f"run{status}"]
+        done = run(words, tree, status)
+        assert status == 0 or "least_horizon" in done.stderr
