@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import shutil
@@ -80,3 +81,13 @@ def test_a_new_configuration_key_is_flown_and_checked(tmp_path: Path) -> None:
         words = ["-m", "flight", "run", "changed.yaml", "--duration", "2", "--out", f"run{status}"]
         done = run(words, tree, status)
         assert status == 0 or "least_horizon" in done.stderr
+
+
+@pytest.mark.slow
+def test_a_body_of_its_own_module_flies_to_the_attitude_that_its_law_gives() -> None:
+    """Feedback alone leaves the angle by which the thread turns the body: k theta / (J w^2)."""
+    printed = run([str(EXAMPLES / "pointing_body.py")], ROOT).stdout
+    found = re.search(r"pointing error ([\d.]+) deg", printed)
+    assert found is not None
+    theta = 2.0 * math.asin(0.3)
+    assert float(found[1]) == pytest.approx(math.degrees(1e-5 * theta / (1.05e-3 * 0.6**2)), abs=0.1)

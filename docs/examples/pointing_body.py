@@ -1,0 +1,317 @@
+"""A body of our own: points in three axes by quaternion feedback, without a planner.
+
+The configuration names this body as `body: pointing_body:POINTING`. The law is the cross product law of
+magnetic control: from the wanted torque T, the dipole is m = (B x T) / |B|^2, so that m x B is the part of T
+across the field B. Filter, detumbling and coil watch are those of the testbed, whose plant this body has.
+
+Run with `python docs/examples/pointing_body.py`: it flies the demonstration's first step.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flight.bodies.testbed.body import (
+    attitude_filter,
+    coil_watch,
+    detumbler,
+    dipole_per_ampere,
+    surrounding_field,
+)
+from flight.bodies.testbed.plant_model import angular_acceleration_psd_of, plant_of
+from flight.gnc.estimation.estimate import Estimate
+from flight.gnc.estimation.measurements import MeanRateMeasurement
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import about_axis_y, attitude_matrix, conjugate, multiply, to_rotation_vector
+from flight.link import events
+from flight.link.telemetry.reader import read_run
+from flight.loop.body import COMMANDED, KEPT, Body, BodyKind, CoilCommand, Target
+from flight.loop.control_cycle import ControlOutput
+from flight.loop.executive.jobs import JobResult
+from flight.loop.executive.rate_group import Cycle
+from flight.loop.services import Services
+from flight.loop.state.content import Learned
+from flight.schema.sections import Config
+from hal.interfaces.readings import ImuReading
+
+DUE_NS = 60_000_000_000
+"""After this time a target should have been reached."""
+
+
+# --8<-- [start:law]
+@dataclass(frozen=True, slots=True)
+class FixedAttitude:
+    """An `AttitudeLaw`: an attitude that stands still."""
+
+    wanted: tuple[float, ...]
+
+    @property
+    def text(self) -> str:
+        """The law in words, for events."""
+        return "attitude " + " ".join(f"{part:+.3f}" for part in self.wanted)
+
+    def quaternion(self, now_ns: int) -> FloatArray:
+        """Return the attitude (4,) to be reached, reference into body."""
+        return np.array(self.wanted)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AtRest:
+    """A `Reference`: an attitude (4,) at rest."""
+
+    quaternion: FloatArray
+
+    @property
+    def body_rate(self) -> FloatArray:
+        """(3,) rad/s, body axes."""
+        return np.zeros(3)
+
+
+def error_of(estimate: Estimate, wanted: FloatArray) -> FloatArray:
+    """Return the rotation (3,) rad from the wanted attitude to the estimated one, body axes."""
+    return to_rotation_vector(multiply(estimate.quaternion, conjugate(wanted)))
+
+
+# --8<-- [end:law]
+
+
+# --8<-- [start:tracker]
+class CrossProductTracker:
+    """Implements `Tracker`: quaternion feedback, limited so that the dipole keeps its direction."""
+
+    def __init__(self, config: Config, reference_field: FloatArray) -> None:
+        plant, bandwidth = plant_of(config), config.control.bandwidth
+        self._stiffness = plant.inertia * bandwidth**2
+        self._damping = 2.0 * 0.9 * plant.inertia * bandwidth
+        self._dipole = dipole_per_ampere(config)
+        self._limit = plant.current_limit
+        self._field = reference_field
+
+    def field(self, estimate: Estimate) -> FloatArray:
+        """Return the field (3,) T in body axes."""
+        return attitude_matrix(estimate.quaternion) @ self._field
+
+    def command(self, estimate: Estimate, reference: AtRest) -> CoilCommand:
+        """Return the command that turns the body towards the reference."""
+        error = error_of(estimate, reference.quaternion)
+        torque = -self._stiffness * error - self._damping * estimate.rate
+        field = self.field(estimate)
+        currents = np.cross(field, torque) / (field @ field) / self._dipole
+        largest = float(np.abs(currents).max())
+        if largest > self._limit:
+            currents = currents * (self._limit / largest)
+        return CoilCommand(self._dipole * currents, currents, largest > self._limit)
+
+    def reset(self) -> None:
+        """Nothing is integrated."""
+
+
+# --8<-- [end:tracker]
+
+
+# --8<-- [start:paths]
+class Direct:
+    """Implements `Paths` and `Planner`: the target itself is the reference, and no plan is made."""
+
+    def __init__(self) -> None:
+        self._reference: AtRest | None = None
+        self.since_ns = 0
+
+    def hold(self, quaternion: FloatArray, now_ns: int) -> None:
+        """Make an attitude (4,) the reference from now on."""
+        self._reference, self.since_ns = AtRest(quaternion), now_ns
+
+    def sample(self, now_ns: int) -> AtRest | None:
+        """Return the reference now; None before the first target."""
+        return self._reference
+
+    def is_following(self, now_ns: int) -> bool:
+        """Return whether the target is still to be reached."""
+        return now_ns - self.since_ns < DUE_NS
+
+    def is_adrift(self, now_ns: int) -> bool:
+        """Return False: no plan can be missing."""
+        return False
+
+    def release(self) -> None:
+        """Forget the reference."""
+        self._reference = None
+
+    def busy_since_ns(self) -> int | None:
+        """Return None: the worker has no jobs."""
+        return None
+
+    def aim(self, target: Target, now_ns: int) -> None:
+        """Go to another attitude."""
+        self.hold(target.law.quaternion(now_ns), now_ns)
+
+    def request(self, now_ns: int) -> None:
+        """Plan nothing."""
+
+    def resume(self, now_ns: int) -> None:
+        """Plan nothing."""
+
+    def replan(self, cycle: Cycle) -> None:
+        """Plan nothing."""
+
+    def serve(self, estimate: Estimate | None, target: Target, now_ns: int) -> None:
+        """Take up the target again after the path was released."""
+        if self._reference is None:
+            self.aim(target, now_ns)
+
+    def finish(self, result: JobResult, now_ns: int) -> None:
+        """Accept nothing."""
+
+    def counts(self) -> tuple[int, int]:
+        """Return that no plan was accepted or refused."""
+        return 0, 0
+
+
+# --8<-- [end:paths]
+
+
+# --8<-- [start:targets]
+class Attitudes:
+    """Implements `Targets`: the configured steps as attitudes about the thread."""
+
+    def __init__(self, config: Config, direct: Direct) -> None:
+        self._times = [round(step.at * 1e9) for step in config.steps]
+        self._steps = [Target(index, _about_thread(step.q2)) for index, step in enumerate(config.steps)]
+        self._direct = direct
+
+    def configured(self, mission_time_ns: int) -> Target:
+        """Return the configured target in force."""
+        return self._steps[max(sum(time <= mission_time_ns for time in self._times) - 1, 0)]
+
+    def slew(self, wanted: float, number: int, now_ns: int) -> Target:
+        """Return the target of a commanded slew."""
+        return Target(COMMANDED + number, _about_thread(wanted))
+
+    def hold_here(self, estimate: Estimate, now_ns: int) -> Target:
+        """Hold the present attitude."""
+        self._direct.hold(estimate.quaternion, now_ns)
+        return Target(KEPT, FixedAttitude(tuple(estimate.quaternion.tolist())))
+
+    def can_hold(self, estimate: Estimate) -> bool:
+        """Return True: the coils turn the body about the thread wherever it points."""
+        return True
+
+    def speed(self, estimate: Estimate) -> float:
+        """Return the body rate, rad/s."""
+        return float(np.linalg.norm(estimate.rate))
+
+    def error(self, estimate: Estimate, target: Target) -> float:
+        """Return the angle between body and target, rad."""
+        return float(np.linalg.norm(error_of(estimate, target.law.quaternion(estimate.time_ns))))
+
+    def error_when_due(self, estimate: Estimate, target: Target, now_ns: int) -> float | None:
+        """Return the error once the target is due; None while under way."""
+        return None if self._direct.is_following(now_ns) else self.error(estimate, target)
+
+
+def _about_thread(q2: float) -> FixedAttitude:
+    return FixedAttitude(tuple(about_axis_y(2.0 * math.asin(q2)).tolist()))
+
+
+# --8<-- [end:targets]
+
+
+# --8<-- [start:view]
+class View:
+    """Implements `BodyView`: the packet `attitude`, which the loop records for every body, is enough."""
+
+    def __init__(self, services: Services) -> None:
+        self._events = services.events
+
+    def record_cycle(self, output: ControlOutput) -> None:
+        """Record nothing of its own."""
+
+    def announce(self, target: Target, now_ns: int) -> None:
+        """Report a new target."""
+        if target.index != KEPT:
+            self._events.tell(events.TARGET, now_ns, target.law.text)
+
+    def mode_fields(self, wanted: Target | None) -> Mapping[str, float]:
+        """Return the body's field of the mode packet."""
+        return {"target_q2": math.nan}
+
+    def reading_text(self, reading: ImuReading) -> str:
+        """Return a reading in words."""
+        return f"rate {reading.rate.round(5).tolist()} rad/s"
+
+    def rate_text(self, rate: MeanRateMeasurement) -> str:
+        """Return a rate from streaks in words."""
+        return f"rate {rate.rate.round(5).tolist()} rad/s"
+
+    def progress(self, output: ControlOutput | None) -> str:
+        """Return the target in words."""
+        return output.target.law.text if output is not None and output.target is not None else ""
+
+
+# --8<-- [end:view]
+
+
+# --8<-- [start:make]
+def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> Body:
+    """Return the body of a configuration, with what an earlier boot learned."""
+    plant = plant_of(config)
+    filter_, problems = attitude_filter(config, plant, learned)
+    tracker = CrossProductTracker(config, surrounding_field(config))
+    direct = Direct()
+    return Body(
+        filter=filter_,
+        learned_problems=problems,
+        paths=direct,
+        planner=direct,
+        targets=Attitudes(config, direct),
+        tracker=tracker,
+        detumbler=detumbler(config, plant),
+        coil_watch=coil_watch(config, plant),
+        view=View(services),
+        field=tracker.field,
+        free_axis=np.array([0.0, 1.0, 0.0]),
+        dipole_per_ampere=dipole_per_ampere(config),
+        angular_acceleration_psd=angular_acceleration_psd_of(config, plant),
+    )
+
+
+def plan(job: Any) -> Any:
+    """Plan nothing: this body submits no jobs."""
+    raise NotImplementedError
+
+
+POINTING = BodyKind(plan, make)
+# --8<-- [end:make]
+
+
+def main() -> None:
+    """Fly the demonstration's first step with this body, and print where it points in the end."""
+    text = Path("config/step_demo.yaml").read_text(encoding="utf-8")
+    before, _, after = text.partition("camera: ")
+    text = f"{before}camera: none\n\nestimation:" + after.partition("\nestimation:")[2]
+    text = text.replace("  tracker: lq", "  bandwidth: 0.6\n  tracker: lq")
+    with tempfile.TemporaryDirectory() as name:
+        config, folder = Path(name) / "pointing.yaml", Path(name) / "run"
+        config.write_text(f"body: pointing_body:POINTING\n{text}", encoding="utf-8")
+        here = str(Path(__file__).resolve().parent)
+        environment = {**os.environ, "PYTHONPATH": f"{here}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}
+        words = ["-m", "flight", "run", str(config), "--out", str(folder), "--duration", "90"]
+        subprocess.run([sys.executable, *words], env=environment, check=True, stdout=subprocess.DEVNULL)
+        last = read_run(folder)["attitude"][-1]
+    error = to_rotation_vector(multiply(last["quaternion"], conjugate(last["target"])))
+    print(f"pointing error {np.rad2deg(np.linalg.norm(error)):.2f} deg after 90 s")
+    print(f"body rate      {np.rad2deg(np.linalg.norm(last['rate'])):.3f} deg/s")
+
+
+if __name__ == "__main__":
+    main()
