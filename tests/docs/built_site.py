@@ -36,7 +36,7 @@ class _Loads(HTMLParser):
 
 
 def problems_of(site: Path) -> list[str]:
-    """Return what is wrong with a site, one line each."""
+    """Return the problems of a site, one line each."""
     found: list[str] = []
     for page in sorted(site.rglob("*.html")):
         name, text = str(page.relative_to(site)), page.read_text(encoding="utf-8")

@@ -20,7 +20,7 @@ RUNNABLE = {block.page for block in blocks() if block.commands and not block.mar
 
 
 def shortened(line: str) -> str:
-    """Return what is run for a line: a short flight with early faults, a report without pictures."""
+    """Return the command to run for a line: a short flight with early faults, a report without pictures."""
     if line.startswith("python -m flight run ") and "--help" not in line:
         early = re.sub(r"@ \d+", "@ 1", re.sub(r" for \d+", " for 1", line))
         return re.sub(r" --duration \d+", "", early) + f" {SHORT}"
