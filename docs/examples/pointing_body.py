@@ -35,8 +35,8 @@ from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import about_axis_y, attitude_matrix, conjugate, multiply, to_rotation_vector
 from flight.link import events
 from flight.link.telemetry.reader import read_run
-from flight.loop.body import COMMANDED, KEPT, Body, BodyKind, CoilCommand, Target
-from flight.loop.control_cycle import ControlOutput
+from flight.loop.body import Body, BodyKind
+from flight.loop.control_output import COMMANDED, KEPT, CoilCommand, ControlOutput, Target
 from flight.loop.executive.jobs import JobResult
 from flight.loop.executive.rate_group import Cycle
 from flight.loop.services import Services
@@ -239,7 +239,7 @@ class View:
     def announce(self, target: Target, now_ns: int) -> None:
         """Report a new target."""
         if target.index != KEPT:
-            self._events.tell(events.TARGET, now_ns, target.law.text)
+            self._events.report(events.TARGET, now_ns, target.law.text)
 
     def mode_fields(self, wanted: Target | None) -> Mapping[str, float]:
         """Return the body's field of the mode packet."""
