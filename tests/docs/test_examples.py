@@ -46,7 +46,7 @@ def files_of(name: str) -> list[str]:
     )
 
 
-@pytest.mark.parametrize(("name", "most"), [("command", 3), ("packet", 1), ("config_key", 2)])
+@pytest.mark.parametrize(("name", "most"), [("command", 3), ("packet", 1), ("field", 2), ("config_key", 2)])
 def test_an_extension_changes_few_files(name: str, most: int) -> None:
     assert 1 <= len(files_of(name)) <= most
 
@@ -69,6 +69,15 @@ def test_a_new_packet_is_recorded_read_exported_and_documented(tmp_path: Path) -
     assert "read:   [21.5, 19.0, 20.25, 20.5, 22.0, 18.75]" in printed
     assert "# s,degree C" in printed
     assert "| 15 | celsius | f4 x 6 | degree C |" in printed
+
+
+@pytest.mark.slow
+def test_a_new_field_is_flown_and_exported(tmp_path: Path) -> None:
+    tree = patched("field", tmp_path / "tree")
+    run(["-m", "flight", "run", "config/step_demo.yaml", "--duration", "2", "--out", "out"], tree)
+    run(["-m", "flight", "export", "out", "--out", "csv"], tree)
+    names = (tree / "csv" / "housekeeping.csv").read_text(encoding="utf-8").splitlines()[0]
+    assert names.endswith("events,braked_1,braked_2,braked_3")
 
 
 @pytest.mark.slow
