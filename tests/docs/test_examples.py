@@ -22,7 +22,7 @@ def run(words: list[str], tree: Path, status: int = 0) -> subprocess.CompletedPr
     environment = {**os.environ, "PYTHONPATH": str(tree)}
     words = [sys.executable, *words]
     done = subprocess.run(
-        words, cwd=tree, env=environment, capture_output=True, text=True, timeout=60, check=False
+        words, cwd=tree, env=environment, capture_output=True, text=True, timeout=110, check=False
     )
     assert done.returncode == status, done.stderr
     return done
