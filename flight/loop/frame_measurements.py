@@ -12,7 +12,7 @@ from flight.gnc.estimation.estimate import RATE, TURN, Estimate
 from flight.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
-from flight.gnc.vision.startracker.frame_job import Found, FrameFound, FrameJob, TrackerSettings
+from flight.gnc.vision.frame_job import Found, FrameFound, FrameJob, TrackerSettings
 from flight.gnc.vision.startracker.mid_exposure import NODES, doubt, reading_of
 from flight.gnc.vision.startracker.solve import AttitudePrior, RatePrior
 from flight.gnc.vision.streaks.corners.settings import StreakSettings

@@ -8,7 +8,7 @@ import numpy as np
 
 from flight.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement
 from flight.gnc.math.arrays import FloatArray
-from flight.gnc.vision.startracker.frame_job import Found
+from flight.gnc.vision.frame_job import Found
 from flight.gnc.vision.startracker.solution import FrameSolution, SolveStatus
 from flight.link import events
 from flight.link.telemetry.definitions import STARS, STREAK

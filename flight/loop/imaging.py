@@ -7,7 +7,7 @@ pixels are of the sky.
 from __future__ import annotations
 
 from flight.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement
-from flight.gnc.vision.startracker.frame_job import FrameFound
+from flight.gnc.vision.frame_job import FrameFound
 from flight.gnc.vision.streaks.streak_result import StreakStatus
 from flight.link import events
 from flight.loop.body import BodyView

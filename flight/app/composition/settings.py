@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from flight.gnc.vision.frame_job import TrackerSettings
 from flight.gnc.vision.startracker.detection import DetectionSettings
-from flight.gnc.vision.startracker.frame_job import TrackerSettings
 from flight.gnc.vision.startracker.solve import SolveSettings
 from flight.gnc.vision.streaks.corners.settings import StreakSettings
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from flight.app.composition.bodies import body_kind
-from flight.gnc.vision.startracker import frame_job
+from flight.gnc.vision import frame_job
 from flight.loop import imaging as imaging_task
 from flight.loop.body import PLANNER, Planner
 from flight.loop.executive.jobs import Worker

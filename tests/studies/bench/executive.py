@@ -62,7 +62,7 @@ _IMPORTED = (
 )
 _ROLES = {
     "flight.gnc.guidance.one_axis.job": "planner",
-    "flight.gnc.vision.startracker.frame_job": "vision",
+    "flight.gnc.vision.frame_job": "vision",
     "hal.guardian": "guardian",
 }
 

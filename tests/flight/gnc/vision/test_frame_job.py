@@ -13,7 +13,7 @@ import pytest
 from flight.gnc.errors import InputError
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import angle_between, from_rotation_vector, multiply
-from flight.gnc.vision.startracker.frame_job import FrameFound, FrameJob, TrackerSettings, run
+from flight.gnc.vision.frame_job import FrameFound, FrameJob, TrackerSettings, run
 from flight.gnc.vision.startracker.known_sky import with_known_sky
 from flight.gnc.vision.startracker.solution import FrameSolution, SolveStatus
 from flight.gnc.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings, solve_motion
