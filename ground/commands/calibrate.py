@@ -17,10 +17,11 @@ from flight.gnc.camera.images import read_image
 from flight.gnc.camera.lens import CameraModel, Lens
 from flight.gnc.errors import UsageError
 from flight.gnc.math.arrays import Image
+from flight.gnc.vision.frame_job import solve_frame
 from flight.gnc.vision.startracker.index.build import default_index
 from flight.gnc.vision.startracker.index.sky_index import SkyIndex
 from flight.gnc.vision.startracker.solution import FrameSolution
-from flight.gnc.vision.startracker.solve import SolveSettings, solve_frame
+from flight.gnc.vision.startracker.solve import SolveSettings
 from ground.calibration.calibration import PARAMETERS, Calibration, calibrate
 from ground.calibration.lens_fit import MatchedFrame
 from ground.commands.options import positive

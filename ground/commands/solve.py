@@ -21,6 +21,7 @@ from flight.gnc.catalogue.names import PROPER_NAMES
 from flight.gnc.earth.sun import DAY, J2000, earth_velocity
 from flight.gnc.errors import UsageError
 from flight.gnc.math.arrays import Image
+from flight.gnc.vision.frame_job import solve_frame
 from flight.gnc.vision.startracker.classical.methods import DEFAULT_METHOD, METHODS, method_of
 from flight.gnc.vision.startracker.detection import DetectionSettings
 from flight.gnc.vision.startracker.index import sky_index
@@ -28,7 +29,7 @@ from flight.gnc.vision.startracker.index.build import default_index
 from flight.gnc.vision.startracker.index.sky_index import SkyIndex
 from flight.gnc.vision.startracker.pointing import Pointing
 from flight.gnc.vision.startracker.solution import FrameSolution
-from flight.gnc.vision.startracker.solve import RatePrior, SolveSettings, solve_frame
+from flight.gnc.vision.startracker.solve import RatePrior, SolveSettings
 from flight.gnc.vision.streaks.corners.streak_rate import StreakStatus
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from flight.schema import reader as configuration

@@ -20,12 +20,13 @@ from flight.gnc import catalogue
 from flight.gnc.camera.images import grey_stretch, write_picture
 from flight.gnc.guidance.one_axis.vmc import plan
 from flight.gnc.math.quaternion import about_axis_y, from_rotation_vector, multiply
+from flight.gnc.vision.frame_job import solve_frame
 from flight.gnc.vision.horizon.nadir import find_nadir
 from flight.gnc.vision.horizon.solution import HorizonStatus
 from flight.gnc.vision.startracker.index.build import default_index
 from flight.gnc.vision.startracker.pointing import Pointing
 from flight.gnc.vision.startracker.solution import SolveStatus
-from flight.gnc.vision.startracker.solve import SolveSettings, solve_frame
+from flight.gnc.vision.startracker.solve import SolveSettings
 from flight.gnc.vision.streaks.corners.streak_rate import StreakStatus
 from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings

@@ -1,24 +1,35 @@
-"""The vision worker's job: one frame in; its rate, and the attitude that its stars give, out.
+"""From one frame to attitude and rate: the only decision tree, of the vision worker and of `flight solve`.
 
-The control process makes the job and takes in what was found. The estimators, and scipy with them, are tens
-of MB and of no use there: they are imported where the work is done.
+1. The motion over the exposure is estimated: of every frame in flight, which reports it; of any other
+   picture only where a survey of its bright areas shows streaks, for the survey is cheaper.
+2. Stars at rest are looked for near their predicted places if there is a prior attitude, else, or if that
+   fails, in the whole frame.
+3. Streaks give their stars' places at mid-exposure, which are identified like points. A focal length that
+   proves wrong, or the stars known by then, lead to a second fit of the streaks.
+
+The control process creates the job and receives its result. The estimators, and scipy with them, take tens
+of MB that it does not need: they are imported where the work is done.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+
+import numpy as np
 
 from flight.gnc.camera.lens import CameraModel
 from flight.gnc.math.arrays import Image
-from flight.gnc.vision.startracker.detection import measure_areas, survey
+from flight.gnc.vision.startracker.detection import FrameKind, measure_areas, survey
 from flight.gnc.vision.startracker.index import sky_index
 from flight.gnc.vision.startracker.index.build import default_index
 from flight.gnc.vision.startracker.index.sky_index import SkyIndex
-from flight.gnc.vision.startracker.solution import FrameSolution
+from flight.gnc.vision.startracker.mid_exposure import MOVED
+from flight.gnc.vision.startracker.solution import FrameSolution, SolveStatus
 from flight.gnc.vision.startracker.solve import (
+    PRIOR_SIGMAS,
     AttitudePrior,
     RatePrior,
     SolveSettings,
@@ -35,15 +46,18 @@ from flight.gnc.vision.streaks.streak_result import StreakResult, StreakStatus
 Found = StreakResult | MotionResult
 
 _AT_REST = {StreakStatus.TOO_SHORT, StreakStatus.TOO_FEW}
-_MOVED = {StreakStatus.RATE, StreakStatus.AMBIGUOUS}
+# The motion is fitted again where the focal length was wrong by more.
+_SCALE_TOLERANCE = 0.01
+# A star that moves by less over the exposure is a point.
+_POINT_PX = 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class TrackerSettings:
-    """What the star tracker must know.
+    """How stars are identified.
 
     Attributes:
-        solve: of its steps.
+        solve: settings of the steps.
         scale: (lowest, highest) factor by which the lens's focal length may be wrong: (1, 1) when calibrated.
         index: file of the sky index; None for the default one.
     """
@@ -55,9 +69,14 @@ class TrackerSettings:
 
 @dataclass(frozen=True, slots=True)
 class FrameJob:
-    """A frame (rows, columns), the camera, what is believed, and how to go about it.
+    """A frame (rows, columns) with its camera, priors and settings.
 
-    The kind of the estimator's settings says which is meant; without a tracker stars are not identified.
+    Attributes:
+        exposure: s.
+        estimator: its type selects the estimator of streaks.
+        tracker: None: stars are not identified.
+        previous_checksum: of the frame before; the same pixels again mean a frozen camera.
+        motion_first: whether the motion is estimated in any case, not only where a survey shows streaks.
     """
 
     pixels: Image
@@ -67,74 +86,129 @@ class FrameJob:
     tracker: TrackerSettings | None
     rate_prior: RatePrior | None
     attitude_prior: AttitudePrior | None
-    previous_checksum: int | None
+    previous_checksum: int | None = None
+    motion_first: bool = True
 
 
 @dataclass(frozen=True, slots=True)
 class FrameFound:
-    """The motion over the exposure, and the attitude in its middle; None when it was not asked for."""
+    """The motion over the exposure, and the attitude in its middle; None if stars were not looked for."""
 
     motion: Found
     solution: FrameSolution | None
 
 
 def run(job: FrameJob) -> FrameFound:
-    """Return what the frame tells; at the top level of a module, so that a worker process can import it."""
-    estimate_motion, estimate_rate = prepare()
-    lens, prior = job.camera.ideal, job.rate_prior
-    rate, sigma = (prior.rate, prior.sigma) if prior is not None else (None, math.inf)
-    if isinstance(job.estimator, LikelihoodSettings):
-        motion = estimate_motion(
-            job.pixels, lens, job.exposure, job.estimator, rate, sigma, job.previous_checksum
-        )
-        return _known_better(job, FrameFound(motion, _attitude(job, motion)))
-    streaks = estimate_rate(job.pixels, lens, job.exposure, job.estimator, rate, sigma, job.previous_checksum)
-    if job.tracker is None or streaks.status not in _MOVED:
-        return FrameFound(streaks, _attitude(job, streaks))
+    """Return attitude and rate of a frame; at the top level of a module for the worker process to import."""
     tracker = job.tracker
-    sky = _sky(tracker)
-    solution, found = solve_ends(streaks, job.camera, tracker.scale, sky, tracker.solve, job.attitude_prior)
-    return FrameFound(found, solution)
+    if tracker is None:
+        return FrameFound(_motion(job), None)
+    sky = default_index() if tracker.index is None else sky_index.load_once(tracker.index)
+    return attitude_and_rate(job, tracker, sky)
 
 
 def prepare() -> tuple[Callable[..., MotionResult], Callable[..., StreakResult]]:
-    """Import what `run` needs, and return the two estimators; a worker does so before its first job."""
+    """Import the two estimators and return them; a worker does so before its first job."""
     from flight.gnc.vision.streaks.corners.streak_rate import estimate_rate  # noqa: PLC0415
     from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion  # noqa: PLC0415
 
     return estimate_motion, estimate_rate
 
 
-def _known_better(job: FrameJob, found: FrameFound) -> FrameFound:
-    """Return what a second fit finds, the stars of a solved frame of streaks being known by then."""
-    solution, tracker = found.solution, job.tracker
-    if solution is None or solution.motion is None or tracker is None:
-        return found
-    if not isinstance(job.estimator, LikelihoodSettings):
-        return found
+def solve_frame(
+    pixels: Image,
+    camera: CameraModel,
+    scale: tuple[float, float],
+    exposure: float,
+    sky: SkyIndex,
+    settings: SolveSettings,
+    attitude_prior: AttitudePrior | None = None,
+    rate_prior: RatePrior | None = None,
+) -> FrameSolution:
+    """Return the attitude of any picture (rows, columns), and its rate if it shows streaks.
+
+    Args:
+        pixels: counts.
+        camera: as believed, of the frame's shape.
+        scale: (lowest, highest) factor of the tangents: (1, 1) for a calibrated camera.
+        exposure: s.
+        sky: the guide stars.
+        settings: of the steps.
+        attitude_prior: where to look first.
+        rate_prior: gives the direction of time, which one frame does not show.
+    """
+    tracker = TrackerSettings(settings, scale)
+    estimator = settings.likelihood
+    job = FrameJob(
+        pixels, camera, exposure, estimator, tracker, rate_prior, attitude_prior, motion_first=False
+    )
+    found = attitude_and_rate(job, tracker, sky).solution
+    assert found is not None  # only a flight does without one
+    return found
+
+
+def attitude_and_rate(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) -> FrameFound:
+    """Return attitude and rate of a frame: the decision tree."""
+    motion = _motion(job) if job.motion_first else None
+    rests = _predicted_at_rest(job) if motion is None else motion.status in _AT_REST
+    if rests and job.attitude_prior is not None:
+        near = solve_near(job.pixels, job.camera, tracker.scale, sky, tracker.solve, job.attitude_prior)
+        if near is not None:
+            return FrameFound(motion or _no_motion(job), near)
+    if rests or motion is None:
+        seen = survey(job.pixels, tracker.solve.detection)
+        if motion is not None or seen.shape.kind is not FrameKind.STREAKS:
+            stars = measure_areas(seen).stars()
+            points = solve_points(stars, job.camera, tracker.scale, sky, tracker.solve, job.attitude_prior)
+            return FrameFound(motion or _no_motion(job), points)
+    if motion is None:
+        motion = _motion(job)
+    elif motion.status not in MOVED:
+        return FrameFound(motion, None)
+    if isinstance(motion, StreakResult):
+        ends, rate = solve_ends(motion, job.camera, tracker.scale, sky, tracker.solve, job.attitude_prior)
+        return FrameFound(rate, ends)
+    return _from_streaks(job, tracker, sky, motion)
+
+
+def _from_streaks(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, motion: MotionResult) -> FrameFound:
+    """Return the attitude of a frame of streaks, and its motion, fitted again if the solution allows."""
+    settings, prior = tracker.solve, job.attitude_prior
+    solution = solve_motion(motion, job.camera, tracker.scale, sky, settings, prior)
+    if solution.status is not SolveStatus.SOLVED:
+        return FrameFound(motion, solution)
+    if abs(solution.camera.focal_length / job.camera.focal_length - 1.0) > _SCALE_TOLERANCE:
+        again = _motion(replace(job, camera=solution.camera))
+        assert isinstance(again, MotionResult)  # as `motion`, by the same estimator
+        return FrameFound(again, solve_motion(again, solution.camera, (1.0, 1.0), sky, settings, prior))
     from flight.gnc.vision.startracker.known_sky import with_known_sky  # noqa: PLC0415
 
-    better = with_known_sky(job.pixels, solution, _sky(tracker), tracker.solve, job.estimator)
-    return FrameFound(better.motion or found.motion, better)
+    assert isinstance(job.estimator, LikelihoodSettings)  # it made a MotionResult
+    better = with_known_sky(job.pixels, solution, sky, settings, job.estimator)
+    return FrameFound(better.motion or motion, better)
 
 
-def _attitude(job: FrameJob, motion: Found) -> FrameSolution | None:
-    """Return the attitude from the stars that the motion placed, or from points where nothing moved."""
-    tracker, prior = job.tracker, job.attitude_prior
-    if tracker is None:
-        return None
-    if isinstance(motion, MotionResult) and motion.status in _MOVED:
-        return solve_motion(motion, job.camera, tracker.scale, _sky(tracker), tracker.solve, prior)
-    if motion.status not in _AT_REST:
-        return None
-    sky = _sky(tracker)
-    if prior is not None:
-        near = solve_near(job.pixels, job.camera, tracker.scale, sky, tracker.solve, prior)
-        if near is not None:
-            return near
-    found = measure_areas(survey(job.pixels, tracker.solve.detection)).stars()
-    return solve_points(found, job.camera, tracker.scale, sky, tracker.solve, prior)
+def _motion(job: FrameJob) -> Found:
+    """Return the motion over the exposure, by the estimator that the job names."""
+    estimate_motion, estimate_rate = prepare()
+    prior = job.rate_prior
+    rate, sigma = (prior.rate, prior.sigma) if prior is not None else (None, math.inf)
+    lens, estimator, previous = job.camera.ideal, job.estimator, job.previous_checksum
+    if isinstance(estimator, LikelihoodSettings):
+        return estimate_motion(job.pixels, lens, job.exposure, estimator, rate, sigma, previous)
+    return estimate_rate(job.pixels, lens, job.exposure, estimator, rate, sigma, previous)
 
 
-def _sky(tracker: TrackerSettings) -> SkyIndex:
-    return default_index() if tracker.index is None else sky_index.load_once(tracker.index)
+def _no_motion(job: FrameJob) -> MotionResult:
+    """Return the motion of a frame of points of which none was estimated."""
+    return MotionResult(StreakStatus.TOO_SHORT, 0, job.exposure)
+
+
+def _predicted_at_rest(job: FrameJob) -> bool:
+    """Tell whether the priors have the stars at rest; without a rate they do."""
+    if job.attitude_prior is None:
+        return False
+    if job.rate_prior is None:
+        return True
+    most = float(np.linalg.norm(job.rate_prior.rate)) + PRIOR_SIGMAS * job.rate_prior.sigma
+    return most * job.exposure * job.camera.focal_length < _POINT_PX

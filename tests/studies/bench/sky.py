@@ -28,9 +28,10 @@ from flight.gnc.camera.images import read_image
 from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.math.arrays import FloatArray, Image
 from flight.gnc.math.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
+from flight.gnc.vision.frame_job import solve_frame
 from flight.gnc.vision.startracker.pointing import Pointing
 from flight.gnc.vision.startracker.solution import FrameSolution
-from flight.gnc.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings, solve_frame
+from flight.gnc.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings
 from tests.flight.gnc.vision.startracker.frames import NARROW, SkyFrame, sky, sky_frame
 from tests.studies.bench.star_peers import PEERS
 from tests.studies.bench.starid import Answer, peer_answers

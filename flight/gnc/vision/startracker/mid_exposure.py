@@ -19,7 +19,7 @@ from flight.gnc.vision.streaks.streak_result import StreakResult, StreakStatus
 
 NODES = (0.0, 0.25, 0.75, 1.0)
 """Parts of the exposure at which the turn away from its middle is asked."""
-_MOVED = {StreakStatus.RATE, StreakStatus.AMBIGUOUS}
+MOVED = {StreakStatus.RATE, StreakStatus.AMBIGUOUS}
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ MIDDLE = Reading((-2 / 35, 8 / 35, 8 / 35, -2 / 35), 1 / 4743)
 
 def reading_of(motion: StreakResult | MotionResult) -> Reading:
     """Return how the attitude of a frame of such motion comes about."""
-    if motion.status not in _MOVED:
+    if motion.status not in MOVED:
         return MEAN
     fitted = isinstance(motion, MotionResult) and motion.rate_model == "accelerating"
     return MIDDLE if fitted else ENDS

@@ -1,9 +1,8 @@
-"""From a frame to an attitude: the one way into the star tracker, for points and for streaks.
+"""The steps from stars in a frame to its attitude; `flight.gnc.vision.frame_job` chooses among them.
 
-A frame of points is measured by `detection`; one of streaks by the joint fit of `flight.gnc.vision.streaks`,
-whose stars' places at mid-exposure then serve as points. Identification asks the whole sky, or where a prior
-attitude
-tells where to look, only there, and the whole sky if that fails. The attitude is that of mid-exposure.
+Points are measured by `detection`; of streaks, the places of their stars at mid-exposure serve as points.
+Identification searches near a prior attitude first, where there is one, then the whole sky. The attitude is
+that of mid-exposure.
 """
 
 from __future__ import annotations
@@ -22,9 +21,7 @@ from flight.gnc.vision.startracker.detection import (
     Detections,
     DetectionSettings,
     FrameKind,
-    measure_areas,
     measure_near,
-    survey,
 )
 from flight.gnc.vision.startracker.identification.field import StarField
 from flight.gnc.vision.startracker.identification.identification import Identification, Status
@@ -38,18 +35,15 @@ from flight.gnc.vision.startracker.solution import FrameSolution, SolveStatus
 from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 
-# px: what a lens's distortion that is not known, or a star's colour, adds to the error of a place.
+# px: error of a place from unknown distortion of the lens or the star's colour.
 _LEAST_SIGMA_PX = 0.005
-# Of the motion's stars those so far below their noise are none.
+# Standard deviations of light; fainter stars of a motion are not identified.
 _LEAST_SIGNIFICANCE = 5.0
-# The motion is fitted anew where the focal length was wrong by more.
-_SCALE_TOLERANCE = 0.01
-# Tracking looks for so many stars, within so many sigmas of the prior; in wider circles it would not pay.
+# Tracking looks for this number of stars, within PRIOR_SIGMAS of the prior.
 _LOOKED_FOR = 30
-_PRIOR_SIGMAS = 4.0
+PRIOR_SIGMAS = 4.0
+# Above the larger radius a search of the whole frame is cheaper.
 _LEAST_RADIUS_PX, _MOST_RADIUS_PX = 3.0, 15.0
-# A star that moves by less over the exposure is a point.
-_POINT_PX = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,11 +51,11 @@ class SolveSettings:
     """How a frame is solved.
 
     Attributes:
-        detection: of points.
-        likelihood: of streaks.
-        identification: of both.
-        method: of identification, in place of the default one.
-        velocity: (3,) m/s of the camera about the Sun, for aberration; None leaves it out.
+        detection: settings for points.
+        likelihood: settings for the streaks of a picture; a flight's job names its own estimator.
+        identification: settings of the default method.
+        method: another method of identification.
+        velocity: (3,) m/s of the camera about the Sun, for aberration; None: no correction.
     """
 
     detection: DetectionSettings = field(default_factory=DetectionSettings)
@@ -73,7 +67,7 @@ class SolveSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AttitudePrior:
-    """Where the camera is believed to look: (4,) ICRS to camera, and rad of uncertainty about each axis."""
+    """Predicted attitude (4,), ICRS to camera, and its standard deviation about each axis, rad."""
 
     quaternion: FloatArray
     sigma: float
@@ -81,48 +75,10 @@ class AttitudePrior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RatePrior:
-    """How it is believed to turn: (3,) rad/s in the camera's axes, and its standard deviation."""
+    """Predicted rate (3,), rad/s in the camera's axes, and the standard deviation of each component."""
 
     rate: FloatArray
     sigma: float
-
-
-def solve_frame(
-    pixels: Image,
-    camera: CameraModel,
-    scale: tuple[float, float],
-    exposure: float,
-    sky: SkyIndex,
-    settings: SolveSettings,
-    attitude_prior: AttitudePrior | None = None,
-    rate_prior: RatePrior | None = None,
-) -> FrameSolution:
-    """Return the attitude of a frame (rows, columns), and its rate if it streaks.
-
-    Args:
-        pixels: counts.
-        camera: as believed, of the frame's shape.
-        scale: (lowest, highest) factor of the tangents: (1, 1) for a calibrated camera.
-        exposure: s.
-        sky: the guide stars.
-        settings: of the steps.
-        attitude_prior: where to look first.
-        rate_prior: tells the direction of time, which one frame does not.
-    """
-    if attitude_prior is not None and _at_rest(rate_prior, camera, exposure):
-        near = solve_near(pixels, camera, scale, sky, settings, attitude_prior)
-        if near is not None:
-            return near
-    seen = survey(pixels, settings.detection)
-    if seen.shape.kind is not FrameKind.STREAKS:
-        found = measure_areas(seen).stars()
-        return solve_points(found, camera, scale, sky, settings, attitude_prior)
-    motion = _motion(pixels, camera, exposure, settings, rate_prior)
-    solution = solve_motion(motion, camera, scale, sky, settings, attitude_prior)
-    if solution.status is SolveStatus.SOLVED and _far(solution.camera, camera):
-        motion = _motion(pixels, solution.camera, exposure, settings, rate_prior)
-        solution = solve_motion(motion, solution.camera, (1.0, 1.0), sky, settings, attitude_prior)
-    return solution
 
 
 def solve_points(
@@ -133,7 +89,7 @@ def solve_points(
     settings: SolveSettings,
     prior: AttitudePrior | None = None,
 ) -> FrameSolution:
-    """Return the attitude of a frame of points, as detected."""
+    """Return the attitude of a frame of detected points."""
     return solve_places(
         found.points, found.covariance, FrameKind.POINTS, camera, scale, sky, settings, prior, found.flux
     )
@@ -188,8 +144,8 @@ def solve_motion(
 def points_near(
     pixels: Image, camera: CameraModel, sky: SkyIndex, settings: SolveSettings, prior: AttitudePrior
 ) -> Detections:
-    """Return the stars found where a prior attitude expects the brightest, if it is sure enough to say."""
-    radius = _PRIOR_SIGMAS * prior.sigma * camera.focal_length + _LEAST_RADIUS_PX
+    """Return the stars found near the predicted places of the brightest; none for too uncertain a prior."""
+    radius = PRIOR_SIGMAS * prior.sigma * camera.focal_length + _LEAST_RADIUS_PX
     if radius > _MOST_RADIUS_PX:
         return Detections.none()
     matrix = attitude_matrix(prior.quaternion)
@@ -207,7 +163,7 @@ def solve_near(
     settings: SolveSettings,
     prior: AttitudePrior,
 ) -> FrameSolution | None:
-    """Return the attitude from stars about their predicted places alone, None where they do not agree."""
+    """Return the attitude from stars near their predicted places alone; None if they do not agree."""
     found = points_near(pixels, camera, sky, settings, prior)
     if not len(found):
         return None
@@ -215,29 +171,7 @@ def solve_near(
         SolveStatus.NO_STARS, "", FrameKind.POINTS, camera, found.points, found.covariance, tracked=True
     )
     near = track(star_field(seen, found.flux, scale), sky, prior.quaternion, prior.sigma)
-    return _told(seen, near, sky, settings) if near.status is Status.IDENTIFIED else None
-
-
-def _at_rest(prior: RatePrior | None, camera: CameraModel, exposure: float) -> bool:
-    """Tell whether stars are expected to be points."""
-    if prior is None:
-        return True
-    most = float(np.linalg.norm(prior.rate)) + _PRIOR_SIGMAS * prior.sigma
-    return most * exposure * camera.focal_length < _POINT_PX
-
-
-def _motion(
-    pixels: Image, camera: CameraModel, exposure: float, settings: SolveSettings, prior: RatePrior | None
-) -> MotionResult:
-    # Not where settings and results are only named.
-    from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion  # noqa: PLC0415
-
-    rate, sigma = (prior.rate, prior.sigma) if prior is not None else (None, 0.0)
-    return estimate_motion(pixels, camera.ideal, exposure, settings.likelihood, rate, sigma)
-
-
-def _far(found: CameraModel, believed: CameraModel) -> bool:
-    return abs(found.focal_length / believed.focal_length - 1.0) > _SCALE_TOLERANCE
+    return _with_attitude(seen, near, sky, settings) if near.status is Status.IDENTIFIED else None
 
 
 def _identify(
@@ -248,15 +182,15 @@ def _identify(
     settings: SolveSettings,
     prior: AttitudePrior | None,
 ) -> FrameSolution:
-    """Return `seen` with its stars identified, near the prior first, else anywhere."""
+    """Return `seen` with its stars identified, near the prior first, then in the whole sky."""
     stars = star_field(seen, flux, scale)
     if prior is not None:
         near = track(stars, sky, prior.quaternion, prior.sigma)
         if near.status is Status.IDENTIFIED:
-            return _told(replace(seen, tracked=True), near, sky, settings)
+            return _with_attitude(replace(seen, tracked=True), near, sky, settings)
     if settings.method is not None:
-        return _told(seen, settings.method(stars, sky), sky, settings)
-    return _told(seen, identify(stars, sky, settings.identification), sky, settings)
+        return _with_attitude(seen, settings.method(stars, sky), sky, settings)
+    return _with_attitude(seen, identify(stars, sky, settings.identification), sky, settings)
 
 
 def star_field(seen: FrameSolution, flux: FloatArray | None, scale: tuple[float, float]) -> StarField:
@@ -271,10 +205,10 @@ def star_field(seen: FrameSolution, flux: FloatArray | None, scale: tuple[float,
     return StarField(direction, sigma, half_width, scale, magnitude)
 
 
-def _told(
+def _with_attitude(
     seen: FrameSolution, found: Identification, sky: SkyIndex, settings: SolveSettings
 ) -> FrameSolution:
-    """Return `seen` with what the identification found, its attitude fitted to the places in the image."""
+    """Return `seen` with the identified stars and the attitude fitted to their places in the image."""
     if found.status is not Status.IDENTIFIED or found.fix is None:
         return replace(seen, status=SolveStatus(found.status.value), reason=_reason(found.status, seen))
     free_scale = found.scale_sigma > 0.0

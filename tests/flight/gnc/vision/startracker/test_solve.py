@@ -11,8 +11,9 @@ import pytest
 from flight.gnc.camera.images import read_image
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import conjugate, from_rotation_vector, multiply, to_rotation_vector
+from flight.gnc.vision.frame_job import solve_frame
 from flight.gnc.vision.startracker.solution import FrameSolution, SolveStatus
-from flight.gnc.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings, solve_frame
+from flight.gnc.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings
 from flight.gnc.vision.streaks.corners.two_attitudes import attitude_error
 from tests.flight.gnc.vision.startracker.frames import NARROW, SkyFrame, sky, sky_frame
 from tests.studies.bench.sky import ARCSECONDS, photograph
