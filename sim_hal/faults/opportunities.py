@@ -17,12 +17,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from flight.gnc.camera.pinhole import Pinhole
-from flight.gnc.earth import sun
 from flight.gnc.earth.shadow import Shadow, sunlit_share
+from flight.gnc.earth.sun import DAY
 from flight.gnc.math import quaternion
 from flight.gnc.math.arrays import BoolArray, FloatArray
 from hal.interfaces.errors import OutOfRange
 from sim_hal.star_camera.rso import ResidentSpaceObject, directions
+from sim_hal.worlds import sun
 from sim_hal.worlds.exclusion import boresights, earth_in_field, hidden_by_earth, in_field, sun_in_field
 from sim_hal.worlds.orbit import KeplerianElements, Orbit, propagate
 
@@ -148,7 +149,7 @@ def observable(scenario: Scenario, index: int, times: FloatArray) -> BoolArray:
     # Few of the times pass; the rest is asked of those alone.
     left = np.flatnonzero(good)
     camera, position, boresight = camera[left], position[left], boresights(attitudes[left])
-    sun_position = sun.position(scenario.epoch + np.asarray(times)[left] / sun.DAY)
+    sun_position = sun.position(scenario.epoch + np.asarray(times)[left] / DAY)
     spoilt = sun_in_field(boresight, camera, sun_position, scenario.half_angle, scenario.buffer)
     spoilt |= earth_in_field(boresight, camera, scenario.half_angle, scenario.buffer)
     spoilt |= hidden_by_earth(camera, position)

@@ -18,11 +18,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.earth import sun
 from flight.gnc.earth.shadow import Shadow, sunlit_share
+from flight.gnc.earth.sun import DAY
 from flight.gnc.math.arrays import FloatArray
 from hal.interfaces.errors import OutOfRange
 from sim_hal.star_camera import SourceTrack
+from sim_hal.worlds import sun
 from sim_hal.worlds.exclusion import hidden_by_earth
 from sim_hal.worlds.orbit import Orbit
 
@@ -66,7 +67,7 @@ def source_tracks(
         position = item.orbit.positions_at(times)
         observer = camera.positions_at(times)
         seen = np.where(hidden_by_earth(observer, position), 0.0, 1.0)
-        seen *= sunlit_share(position, sun.position(epoch + times / sun.DAY), shadow)
+        seen *= sunlit_share(position, sun.position(epoch + times / DAY), shadow)
         share = float(np.trapezoid(seen, times) / (end - start))
         if share > 0.0:
             direction = directions(observer, position)

@@ -1,13 +1,13 @@
-"""Where the Sun is, as seen from the Earth's centre: the Astronomical Almanac's low-precision series.
+"""The Earth's place from the Sun and its velocity, by ERFA's epv00 (VSOP2000: Moisson & Bretagnon 2001).
 
-The series gives the longitude from the equinox of date. Read as J2000 it would be 0.37 deg off by 2026, so
-the equinox's drift of 1.3972 deg a century is taken off; what remains is 42" by 2030. Good from 1950 to 2050.
+0.35 ms a call. The Almanac's series that stood here took 0.18 ms and was 31 m/s off, 0.02" of aberration.
 """
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
-import numpy.typing as npt
 
 from flight.gnc.math.arrays import FloatArray
 
@@ -20,32 +20,24 @@ J2000 = 2_451_545.0
 DAY = 86_400.0
 """s."""
 
-_PRECESSION = 1.3972 / 36_525.0
-"""deg a day, of the equinox along the ecliptic."""
 
+def earth_from_sun(julian_date: float) -> tuple[FloatArray, FloatArray]:
+    """Return the Earth's place from the Sun (3,) m and its velocity (3,) m/s about the barycentre, ICRS.
 
-def position(julian_date: npt.ArrayLike) -> FloatArray:
-    """Return the Sun's apparent geocentric position (..., 3), ICRS, in m, at Julian dates (...) TT.
-
-    Astronomical Almanac, "Low-precision formulas for the Sun" (0.01 deg, 1950 to 2050); the longitude made
-    J2000's by the drift of the equinox. The obliquity is J2000's; UTC instead of TT moves it by 3".
+    At a Julian date TT; from 1900 to 2100 within 12 km and 5 mm/s of JPL's DE405 (documentation of epv00).
     """
-    days = np.asarray(julian_date, dtype=float) - J2000
-    anomaly = np.radians(357.528 + 0.9856003 * days)
-    mean_longitude = 280.460 + (0.9856474 - _PRECESSION) * days
-    longitude = np.radians(mean_longitude + 1.915 * np.sin(anomaly) + 0.020 * np.sin(2.0 * anomaly))
-    distance = 1.00014 - 0.01671 * np.cos(anomaly) - 0.00014 * np.cos(2.0 * anomaly)
-    obliquity = np.radians(23.439)
-    across = np.sin(longitude)
-    unit = np.stack([np.cos(longitude), np.cos(obliquity) * across, np.sin(obliquity) * across], axis=-1)
-    return np.asarray(ASTRONOMICAL_UNIT * distance[..., None] * unit)
+    # Most users of this module need its constants only.
+    import erfa  # noqa: PLC0415
+
+    whole = math.floor(julian_date)
+    heliocentric, barycentric = erfa.epv00(float(whole), julian_date - whole)
+    place = ASTRONOMICAL_UNIT * np.asarray(heliocentric["p"])
+    return place, ASTRONOMICAL_UNIT / DAY * np.asarray(barycentric["v"])
 
 
 def earth_velocity(julian_date: float) -> FloatArray:
-    """Return the Earth's velocity about the Sun (3,), ICRS, in m/s, at a Julian date TT.
+    """Return the Earth's velocity (3,) m/s about the barycentre, ICRS, at a Julian date TT: for aberration.
 
-    The slope of `position` over a day, turned round: to 0.1 % of the speed. What it leaves out, the Sun's own
-    motion about the barycentre (13 m/s) and a satellite's about the Earth (7.6 km/s), is the user's to add.
+    A satellite's own about the Earth, 7.6 km/s or 5", comes on top.
     """
-    before, after = position(np.array([julian_date - 0.5, julian_date + 0.5]))
-    return np.asarray((before - after) / DAY)
+    return earth_from_sun(julian_date)[1]

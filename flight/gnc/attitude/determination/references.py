@@ -1,21 +1,20 @@
 """What Sun sensor, horizon cameras and magnetometer should see from where the satellite is, in ICRS.
 
-The Sun's place is ERFA's epv00 (Bretagnon's VSOP2000, 0.009" by 2030), from the satellite itself (9" of
-parallax) and aberrated by its motion (20.5" and 5"): the low-precision series of `flight.gnc.earth.sun`, 42"
-off, would show beside a sensor of 0.02 deg that is averaged over minutes.
+The Sun's place is from `flight.gnc.earth.sun` (0.009" by 2030), seen from the satellite (9" of parallax) and
+aberrated by its motion (20.5" and 5"): a series of 42" error would show beside a sensor of 0.02 deg that is
+averaged over minutes.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import erfa
 import numpy as np
 
 from flight.gnc.earth import geomagnetism
 from flight.gnc.earth.orbit_knowledge import OrbitState
 from flight.gnc.earth.orientation import terrestrial_time
-from flight.gnc.earth.sun import ASTRONOMICAL_UNIT, DAY, SUN_RADIUS
+from flight.gnc.earth.sun import SUN_RADIUS, earth_from_sun
 from flight.gnc.math.arrays import FloatArray
 
 SPEED_OF_LIGHT = 299_792_458.0
@@ -53,10 +52,9 @@ def sun_from(julian_date: float, position: FloatArray, velocity: FloatArray) -> 
 
     Seen from `position` (3,) m that moves with `velocity` (3,) m/s about the Earth, at a Julian date UTC.
     """
-    whole = np.floor(julian_date)
-    heliocentric, barycentric = erfa.epv00(whole, float(terrestrial_time(julian_date)) - whole)
-    towards = -ASTRONOMICAL_UNIT * np.asarray(heliocentric["p"]) - position
+    earth, earth_velocity = earth_from_sun(float(terrestrial_time(julian_date)))
+    towards = -earth - position
     distance = float(np.linalg.norm(towards))
-    moving = ASTRONOMICAL_UNIT / DAY * np.asarray(barycentric["v"]) + velocity
+    moving = earth_velocity + velocity
     seen = towards / distance + moving / SPEED_OF_LIGHT
     return np.asarray(seen / np.linalg.norm(seen)), distance

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from flight.gnc.attitude.determination.references import references, sun_from
-from flight.gnc.earth import sun
 from flight.gnc.earth.figure import EARTH_RADIUS
 from flight.gnc.earth.orbit_knowledge import GpsFix, OrbitError, OrbitState, TwoLineElements
 from flight.gnc.earth.orientation import (
@@ -19,6 +18,7 @@ from flight.gnc.earth.orientation import (
 )
 from flight.gnc.errors import UsageError
 from flight.gnc.math.arrays import FloatArray
+from sim_hal.worlds import sun
 from sim_hal.worlds.orbit import KeplerianElements, propagate
 
 DATE = 2_461_365.8
@@ -127,7 +127,7 @@ def test_a_decayed_orbit_is_told() -> None:
 
 
 def test_the_sun_is_where_the_almanac_has_it_and_leans_into_the_motion() -> None:
-    """`flight.gnc.earth.sun` is good to 42"; aberration by the satellite's own 7.6 km/s is 5.2"."""
+    """`sim_hal.worlds.sun` is good to 42"; aberration by the satellite's own 7.6 km/s is 5.2"."""
     for date in np.linspace(2_460_700.5, 2_462_400.5, 40):
         apparent, distance = sun_from(date, np.zeros(3), np.zeros(3))
         almanac = sun.position(terrestrial_time(date))
