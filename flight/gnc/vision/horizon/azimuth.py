@@ -22,38 +22,38 @@ from flight.gnc.vision.horizon.vector_method import shortest_turn
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Orientation:
-    """A camera's orientation about a supposed nadir.
+    """A camera's orientation about an assumed nadir.
 
     Attributes:
-        rotation: (3, 3), inertial into camera axes; nadir exactly as supposed.
+        rotation: (3, 3), inertial into camera axes; nadir exactly as assumed.
         sigma: rad, of the turn about nadir; infinite when nothing is known of it.
-        surprise: the worst disagreement of a known direction with this nadir, in its own standard deviations.
+        mismatch: the worst disagreement of a known direction with this nadir, in its own standard deviations.
     """
 
     rotation: FloatArray
     sigma: float
-    surprise: float
+    mismatch: float
 
 
 def orientation(nadir: FloatArray, inertial_nadir: FloatArray, knowledge: HorizonKnowledge) -> Orientation:
     """Return the orientation about `nadir` (3,), camera axes, that stands at `inertial_nadir` (3,)."""
     base = shortest_turn(inertial_nadir, nadir)
     down = _unit(nadir)
-    vote, weight, surprise = 0.0 + 0.0j, 0.0, 0.0
+    vote, weight, mismatch = 0.0 + 0.0j, 0.0, 0.0
     for camera, inertial, sigma in _known(knowledge, inertial_nadir):
         seen, expected = _unit(camera), _unit(base @ inertial)
-        below, supposed = _dot(down, seen), _dot(down, expected)
+        below, assumed = _dot(down, seen), _dot(down, expected)
         across = _length(_cross(down, expected))
-        apart = math.atan2(_length(_cross(down, seen)), below) - math.atan2(across, supposed)
-        surprise = max(surprise, abs(apart) / sigma)
+        apart = math.atan2(_length(_cross(down, seen)), below) - math.atan2(across, assumed)
+        mismatch = max(mismatch, abs(apart) / sigma)
         if across > 0.05:
-            angle = math.atan2(_dot(down, _cross(expected, seen)), _dot(seen, expected) - below * supposed)
+            angle = math.atan2(_dot(down, _cross(expected, seen)), _dot(seen, expected) - below * assumed)
             precision = (across / sigma) ** 2
             vote += precision * cmath.exp(1j * angle)
             weight += precision
     if weight == 0.0:
-        return Orientation(base, math.inf, surprise)
-    return Orientation(turn(cmath.phase(vote) * nadir) @ base, weight**-0.5, surprise)
+        return Orientation(base, math.inf, mismatch)
+    return Orientation(turn(cmath.phase(vote) * nadir) @ base, weight**-0.5, mismatch)
 
 
 def turned(rotation: FloatArray, nadir: FloatArray, angle: float) -> FloatArray:

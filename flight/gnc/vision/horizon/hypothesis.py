@@ -16,13 +16,13 @@ from flight.gnc.vision.horizon.illumination import (
     limb_rays,
     sun_elevation,
 )
+from flight.gnc.vision.horizon.initial_guess import InitialGuess, sun_from
 from flight.gnc.vision.horizon.knowledge import HorizonKnowledge
 from flight.gnc.vision.horizon.limb_equation import View
 from flight.gnc.vision.horizon.limb_fit import FittedLimb, Prior, fit_limb, stepped
 from flight.gnc.vision.horizon.limb_points import LimbPoints, limb_points, near_limb, placed_by_profile
 from flight.gnc.vision.horizon.observation import Observation
 from flight.gnc.vision.horizon.settings import HorizonSettings
-from flight.gnc.vision.horizon.supposition import Supposition, sun_from
 
 _UNKNOWN_TURN = 1.0
 """rad: the prior on a turn about nadir of which nothing is known; on a sphere it changes nothing."""
@@ -43,7 +43,7 @@ class Hypothesis:
         fit: the limb.
         members: (n,) the picture's edges that lie on it.
         residual: px rms normal to the limb, of the members.
-        supposition: what it was fitted from.
+        guess: what it was fitted from.
         lighting: how the picture agrees with it.
         coverage: the share of the lit limb that runs through the picture near a member; 1 where there is
             none.
@@ -54,7 +54,7 @@ class Hypothesis:
     fit: FittedLimb
     members: BoolArray
     residual: float
-    supposition: Supposition
+    guess: InitialGuess
     lighting: Agreement
     coverage: float
     night: float
@@ -69,17 +69,17 @@ class Hypothesis:
 
 
 def examine(
-    supposition: Supposition,
+    guess: InitialGuess,
     seen: Observation,
     knowledge: HorizonKnowledge,
     settings: HorizonSettings,
     camera: CameraModel,
 ) -> Hypothesis | None:
     """Return the supposed horizon fitted and judged, or None when no limb can be fitted to it."""
-    place, stand = supposition.place, supposition.orientation
+    place, stand = guess.place, guess.orientation
     sun = sun_from(place, knowledge)
     prior = Prior(min(stand.sigma, _UNKNOWN_TURN), settings.limb_height_sigma, place.altitude_sigma)
-    fitted = _fitted(supposition.view, seen, supposition.members, sun, settings, prior)
+    fitted = _fitted(guess.view, seen, guess.members, sun, settings, prior)
     if fitted is None:
         return None
     fit, limb = fitted
@@ -93,7 +93,7 @@ def examine(
         fit,
         used,
         float(np.sqrt(np.mean((fit.residuals / limb.pixel)[fit.used] ** 2))),
-        supposition,
+        guess,
         agreement(fit.view, sun, seen.samples),
         _coverage(fit.view, seen, used, sun, camera),
         night,

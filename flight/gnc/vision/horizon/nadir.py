@@ -21,17 +21,23 @@ from flight.gnc.math.arrays import Image
 from flight.gnc.vision.horizon.consensus import best_cone, left_free
 from flight.gnc.vision.horizon.edges import Nearby, find_edges
 from flight.gnc.vision.horizon.hypothesis import Hypothesis, examine
+from flight.gnc.vision.horizon.initial_guess import (
+    SPHERE_ALTITUDE_SIGMA,
+    InitialGuess,
+    Place,
+    initial_guess,
+    place_of,
+)
 from flight.gnc.vision.horizon.knowledge import HorizonKnowledge
 from flight.gnc.vision.horizon.limb_equation import ALTITUDE
 from flight.gnc.vision.horizon.limb_points import near_limb
 from flight.gnc.vision.horizon.observation import Observation, observe
 from flight.gnc.vision.horizon.settings import HorizonSettings
 from flight.gnc.vision.horizon.solution import HorizonSolution, HorizonStatus, NadirMeasurement
-from flight.gnc.vision.horizon.supposition import SPHERE_ALTITUDE_SIGMA, Place, Supposition, place_of, suppose
 
 _ALTITUDES = 100e3, 40_000e3
 """m: where an unknown altitude is looked for."""
-_SURPRISE = 4.0
+_MOST_MISMATCH = 4.0
 """Standard deviations by which a coarse sensor may disagree."""
 _STRAY, _COVERED, _NIGHT = 0.05, 0.6, 0.1
 _RIVAL = 0.3
@@ -137,7 +143,7 @@ def _closer(
     # The whole picture's light has been judged on the first look's samples.
     seen = observe(edges, lines, camera, look.seen.samples)
     members = near_limb(best.fit.view, seen, 2.0 * settings.tolerance)
-    again = replace(best.supposition, view=best.fit.view, members=members)
+    again = replace(best.guess, view=best.fit.view, members=members)
     found = examine(again, seen, knowledge, settings, camera)
     return _Look(seen, look.levels, [] if found is None else [found], lines.pixels)
 
@@ -156,7 +162,7 @@ def _hypotheses(
         low = high = place.cosine
     free = np.ones(len(seen.edges), dtype=bool)
     sound: list[Hypothesis] = []
-    doubtful: list[Supposition] = []
+    doubtful: list[InitialGuess] = []
     # What could not be a rival of one that stands need not be looked at.
     enough = float(settings.least_edges)
     for _ in range(settings.candidates):
@@ -166,11 +172,11 @@ def _hypotheses(
         if cone is None or np.count_nonzero(cone.members & free) < enough:
             break
         free = left_free(seen.rays, free, cone, settings.tolerance)
-        supposition = suppose(cone, seen, place, knowledge, settings)
-        if supposition.orientation.surprise > _SURPRISE:
-            doubtful.append(supposition)
+        guess = initial_guess(cone, seen, place, knowledge, settings)
+        if guess.orientation.mismatch > _MOST_MISMATCH:
+            doubtful.append(guess)
             continue
-        found = examine(supposition, seen, knowledge, settings, camera)
+        found = examine(guess, seen, knowledge, settings, camera)
         if found is not None:
             sound.append(found)
             if not _flaw(found):
@@ -200,8 +206,8 @@ def _judged(hypotheses: list[Hypothesis]) -> tuple[HorizonStatus, str]:
 def _flaw(one: Hypothesis) -> str:
     """Return what speaks against a hypothesis, or nothing."""
     light = one.lighting
-    if one.supposition.orientation.surprise > _SURPRISE:
-        return f"a coarse direction is {one.supposition.orientation.surprise:.1f} sigma off"
+    if one.guess.orientation.mismatch > _MOST_MISMATCH:
+        return f"a coarse direction is {one.guess.orientation.mismatch:.1f} sigma off"
     if light.stray > _STRAY:
         return f"{100.0 * light.stray:.0f} % of sky and night are bright"
     if one.coverage < _COVERED:
@@ -213,7 +219,7 @@ def _flaw(one: Hypothesis) -> str:
 
 def _measurement(one: Hypothesis) -> NadirMeasurement:
     view = one.fit.view
-    allowance = 0.0 if one.supposition.place.located else SPHERE_ALTITUDE_SIGMA
+    allowance = 0.0 if one.guess.place.located else SPHERE_ALTITUDE_SIGMA
     return NadirMeasurement(
         view.nadir,
         one.covariance,

@@ -14,19 +14,13 @@ import numpy as np
 
 from flight.gnc.vision.startracker.classical.known_sky import KnownSky
 from flight.gnc.vision.startracker.classical.polygon import matching_triangles
-from flight.gnc.vision.startracker.classical.search import Candidates, search
-from flight.gnc.vision.startracker.classical.settings import DEFAULT, ClassicalSettings
+from flight.gnc.vision.startracker.classical.search import Candidates
+from flight.gnc.vision.startracker.classical.settings import ClassicalSettings
 from flight.gnc.vision.startracker.classical.view import View
-from flight.gnc.vision.startracker.identification.field import StarField
-from flight.gnc.vision.startracker.identification.identification import Identification
 
 
-def identify(field: StarField, sky: KnownSky, settings: ClassicalSettings = DEFAULT) -> Identification:
-    """Return which stars the field shows. Raises FieldUnknown when its scale is known too badly."""
-    return search(field, sky, settings, _propose)
-
-
-def _propose(view: View, sky: KnownSky, settings: ClassicalSettings) -> Iterator[Candidates]:
+def propose(view: View, sky: KnownSky, settings: ClassicalSettings) -> Iterator[Candidates]:
+    """Yield the triangles that match, those of the brightest observed stars first."""
     triangles = sorted(combinations(range(view.stars), 3), key=lambda corners: corners[::-1])
     for corners in triangles[: settings.joins]:
         found = matching_triangles(view, sky, corners, settings.tolerance)

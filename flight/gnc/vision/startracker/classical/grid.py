@@ -13,23 +13,16 @@ import numpy as np
 from flight.gnc.math.arrays import IntArray
 from flight.gnc.vision.startracker.classical.grid_table import BUFFER, cells_of, tangent_places
 from flight.gnc.vision.startracker.classical.known_sky import KnownSky
-from flight.gnc.vision.startracker.classical.search import Candidates, search
-from flight.gnc.vision.startracker.classical.settings import DEFAULT, ClassicalSettings
+from flight.gnc.vision.startracker.classical.search import Candidates
+from flight.gnc.vision.startracker.classical.settings import ClassicalSettings
 from flight.gnc.vision.startracker.classical.view import View
-from flight.gnc.vision.startracker.identification.field import StarField
-from flight.gnc.vision.startracker.identification.identification import Identification
 
 _ALIGNMENTS = 3
 _BEST = 4
 _LEAST_CELLS = 3
 
 
-def identify(field: StarField, sky: KnownSky, settings: ClassicalSettings = DEFAULT) -> Identification:
-    """Return which stars the field shows. Raises FieldUnknown when its scale is known too badly."""
-    return search(field, sky, settings, _propose)
-
-
-def _propose(view: View, sky: KnownSky, settings: ClassicalSettings) -> Iterator[Candidates]:
+def propose(view: View, sky: KnownSky, settings: ClassicalSettings) -> Iterator[Candidates]:
     """Yield the guide stars whose patterns are most like each observed star's, the central first."""
     middle = np.argsort(-view.direction[:, 2], kind="stable")
     for centre in middle[: max(1, settings.patterns // _ALIGNMENTS)]:

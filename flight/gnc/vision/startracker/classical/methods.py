@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 from flight.gnc.vision.startracker.classical import (
     angle_matching,
@@ -14,6 +15,7 @@ from flight.gnc.vision.startracker.classical import (
     voting,
 )
 from flight.gnc.vision.startracker.classical.known_sky import KnownSky
+from flight.gnc.vision.startracker.classical.search import Propose, search
 from flight.gnc.vision.startracker.identification import lost_in_space
 from flight.gnc.vision.startracker.identification.field import StarField
 from flight.gnc.vision.startracker.identification.identification import Identification
@@ -27,9 +29,9 @@ class Method:
     """A method of identification.
 
     Attributes:
-        identify: takes a field and what is known of the sky; of a badly known scale all but the default raise
-            FieldUnknown.
-        source: where it is from.
+        identify: of a field, by tables of the sky. All but the default raise FieldUnknown for a scale that is
+            too uncertain.
+        source: publication.
     """
 
     identify: Callable[[StarField, KnownSky], Identification]
@@ -41,7 +43,7 @@ def _default(field: StarField, sky: KnownSky) -> Identification:
 
 
 def method_of(name: str) -> Callable[[StarField, SkyIndex], Identification]:
-    """Return the method `name` of METHODS as `SolveSettings` takes it: its tables are made for each field."""
+    """Return the method `name` of METHODS for `SolveSettings`; it builds its tables for each field."""
     method = METHODS[name]
 
     def identify(field: StarField, index: SkyIndex) -> Identification:
@@ -50,13 +52,17 @@ def method_of(name: str) -> Callable[[StarField, SkyIndex], Identification]:
     return identify
 
 
+def _classical(propose: Propose, source: str) -> Method:
+    return Method(partial(search, propose=propose), source)
+
+
 METHODS: dict[str, Method] = {
     DEFAULT_METHOD: Method(_default, "triangles by shape, turning and size, all at once; votes"),
-    "angle": Method(angle_matching.identify, "Gottlieb 1978"),
-    "spherical-triangle": Method(triangle_matching.identify_spherical, "Cole & Crassidis 2004"),
-    "planar-triangle": Method(triangle_matching.identify_planar, "Cole & Crassidis 2006"),
-    "pyramid": Method(pyramid.identify, "Mortari et al. 2004"),
+    "angle": _classical(angle_matching.propose, "Gottlieb 1978"),
+    "spherical-triangle": _classical(triangle_matching.propose_spherical, "Cole & Crassidis 2004"),
+    "planar-triangle": _classical(triangle_matching.propose_planar, "Cole & Crassidis 2006"),
+    "pyramid": _classical(pyramid.propose, "Mortari et al. 2004"),
     "rate": Method(rate_matching.identify, "Samaan, Mortari & Junkins 2005"),
-    "voting": Method(voting.identify, "Kolomenkin et al. 2008"),
-    "grid": Method(grid.identify, "Padgett & Kreutz-Delgado 1997"),
+    "voting": _classical(voting.propose, "Kolomenkin et al. 2008"),
+    "grid": _classical(grid.propose, "Padgett & Kreutz-Delgado 1997"),
 }

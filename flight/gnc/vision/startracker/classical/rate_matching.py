@@ -105,7 +105,7 @@ def identify(
             stars, sky.index, predicted, 1.0, previous.part_of_all_attitudes, settings.verification
         )
     if answer.status is not Status.IDENTIFIED:
-        answer = search(stars, sky, settings, pyramid.propose)
+        answer = search(stars, sky, pyramid.propose, settings)
     star = np.full(len(field), -1)
     star[kept] = answer.star
     return Identification(

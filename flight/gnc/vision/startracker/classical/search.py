@@ -1,8 +1,8 @@
-"""From patterns that look alike to an answer: the part that all classical methods share.
+"""From candidate patterns to an identification: the part that all classical methods share.
 
 A method yields batches of candidates, observed stars and the guide stars they may be. Each gives an attitude,
 the brightest observed stars are carried to the sky by it, and those that fall near guide stars are counted;
-the best counts are verified against the whole field. Whatever a method is misled by, it is this that refuses.
+the best counts are verified against the whole field, which rejects false candidates of any method.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 
 from flight.gnc.math.arrays import FloatArray, IntArray
 from flight.gnc.vision.startracker.classical.known_sky import KnownSky
-from flight.gnc.vision.startracker.classical.settings import ClassicalSettings
+from flight.gnc.vision.startracker.classical.settings import DEFAULT, ClassicalSettings
 from flight.gnc.vision.startracker.classical.view import View, views
 from flight.gnc.vision.startracker.identification.field import StarField
 from flight.gnc.vision.startracker.identification.identification import Identification, Status
@@ -44,7 +44,9 @@ _LEAST_JOINS = 4
 Propose = Callable[[View, KnownSky, ClassicalSettings], Iterator[Candidates]]
 
 
-def search(field: StarField, sky: KnownSky, settings: ClassicalSettings, propose: Propose) -> Identification:
+def search(
+    field: StarField, sky: KnownSky, propose: Propose, settings: ClassicalSettings = DEFAULT
+) -> Identification:
     """Return the first candidate of `propose` that the whole field verifies, within the budget of work.
 
     Raises FieldUnknown when the scale of the field is known too badly.

@@ -16,36 +16,24 @@ import numpy as np
 from flight.gnc.math.arrays import FloatArray, IntArray
 from flight.gnc.vision.startracker.classical import planar_triangle, spherical_triangle
 from flight.gnc.vision.startracker.classical.known_sky import KnownSky
-from flight.gnc.vision.startracker.classical.search import Candidates, search
-from flight.gnc.vision.startracker.classical.settings import DEFAULT, ClassicalSettings
+from flight.gnc.vision.startracker.classical.search import Candidates
+from flight.gnc.vision.startracker.classical.settings import ClassicalSettings
 from flight.gnc.vision.startracker.classical.triangle_shape import TriangleShape
 from flight.gnc.vision.startracker.classical.triangle_table import TriangleTable, ordered, side_lengths
 from flight.gnc.vision.startracker.classical.view import View
-from flight.gnc.vision.startracker.identification.field import StarField
-from flight.gnc.vision.startracker.identification.identification import Identification
 from flight.gnc.vision.startracker.index.k_vector import members
 
 _BATCH = 10
 Measure = Callable[[FloatArray, FloatArray], TriangleShape]
 
 
-def identify_planar(field: StarField, sky: KnownSky, settings: ClassicalSettings = DEFAULT) -> Identification:
-    """Return which stars the field shows, by plane triangles. Raises FieldUnknown for a badly known scale."""
-    return search(field, sky, settings, _propose_planar)
-
-
-def identify_spherical(
-    field: StarField, sky: KnownSky, settings: ClassicalSettings = DEFAULT
-) -> Identification:
-    """Return which stars the field shows, by spherical triangles. Raises FieldUnknown as the other."""
-    return search(field, sky, settings, _propose_spherical)
-
-
-def _propose_planar(view: View, sky: KnownSky, settings: ClassicalSettings) -> Iterator[Candidates]:
+def propose_planar(view: View, sky: KnownSky, settings: ClassicalSettings) -> Iterator[Candidates]:
+    """Yield the plane triangles that match, see `_propose`."""
     return _propose(view, sky, settings, sky.planar, planar_triangle.measured_shape)
 
 
-def _propose_spherical(view: View, sky: KnownSky, settings: ClassicalSettings) -> Iterator[Candidates]:
+def propose_spherical(view: View, sky: KnownSky, settings: ClassicalSettings) -> Iterator[Candidates]:
+    """Yield the spherical triangles that match, see `_propose`."""
     return _propose(view, sky, settings, sky.spherical, spherical_triangle.measured_shape)
 
 

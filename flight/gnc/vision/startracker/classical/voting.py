@@ -14,11 +14,9 @@ import numpy as np
 
 from flight.gnc.math.arrays import BoolArray, FloatArray, IntArray
 from flight.gnc.vision.startracker.classical.known_sky import KnownSky
-from flight.gnc.vision.startracker.classical.search import Candidates, search
-from flight.gnc.vision.startracker.classical.settings import DEFAULT, ClassicalSettings
+from flight.gnc.vision.startracker.classical.search import Candidates
+from flight.gnc.vision.startracker.classical.settings import ClassicalSettings
 from flight.gnc.vision.startracker.classical.view import View
-from flight.gnc.vision.startracker.identification.field import StarField
-from flight.gnc.vision.startracker.identification.identification import Identification
 from flight.gnc.vision.startracker.index.pair_table import angles
 
 _VOTERS = 16
@@ -27,12 +25,7 @@ _PARTNERS = 3
 _FAMILIES = 6
 
 
-def identify(field: StarField, sky: KnownSky, settings: ClassicalSettings = DEFAULT) -> Identification:
-    """Return which stars the field shows. Raises FieldUnknown when its scale is known too badly."""
-    return search(field, sky, settings, _propose)
-
-
-def _propose(view: View, sky: KnownSky, settings: ClassicalSettings) -> Iterator[Candidates]:
+def propose(view: View, sky: KnownSky, settings: ClassicalSettings) -> Iterator[Candidates]:
     """Yield the family of each of the assignments with the most agreement, one pair of it a candidate."""
     voters = min(len(view.direction), _VOTERS)
     one, other = np.triu_indices(voters, 1)

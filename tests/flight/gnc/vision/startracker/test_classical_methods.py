@@ -18,6 +18,7 @@ from flight.gnc.vision.startracker.classical.known_sky import KnownSky
 from flight.gnc.vision.startracker.classical.methods import DEFAULT_METHOD, METHODS
 from flight.gnc.vision.startracker.classical.pyramid import cycled_triangles
 from flight.gnc.vision.startracker.classical.rate_matching import Motion, Previous, shared_rate
+from flight.gnc.vision.startracker.classical.search import search
 from flight.gnc.vision.startracker.classical.settings import DEFAULT
 from flight.gnc.vision.startracker.classical.triangle_table import side_lengths
 from flight.gnc.vision.startracker.classical.view import FieldUnknown
@@ -107,7 +108,7 @@ def test_a_list_of_no_sky_takes_no_more_work_than_the_budget_however_badly_the_s
 
     monkeypatch.setattr(method, "matching_triangles", counting)
     drawn = draw_random(_kind(known_deg=known_deg), 40, np.random.default_rng(4))
-    answer = method.identify(drawn.field(), _sky())
+    answer = search(drawn.field(), _sky(), method.propose)
     assert answer.status is Status.NO_MATCH
     assert 0.8 * DEFAULT.joins <= len(joined) <= DEFAULT.joins
 

@@ -1,4 +1,4 @@
-"""One supposed horizon before it is fitted: where the camera would be, and how it would stand about nadir."""
+"""The first guess of one horizon: the camera's position and its orientation about nadir, before the fit."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from flight.gnc.vision.horizon.observation import Observation
 from flight.gnc.vision.horizon.settings import HorizonSettings
 
 SPHERE_ALTITUDE_SIGMA = 10e3
-"""m: what the Earth's flattening makes of an altitude above the mean sphere."""
+"""m: error of an altitude above the mean sphere that the Earth's flattening causes."""
 _TURNS = 24
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Place:
-    """Where the camera is, as far as is known.
+    """The camera's position, as far as known.
 
     Attributes:
         position: (3,) m, inertial axes where the real one is known.
@@ -48,13 +48,13 @@ class Place:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Supposition:
-    """A horizon before it is fitted.
+class InitialGuess:
+    """The start of a horizon's fit.
 
     Attributes:
-        place: where the camera is taken to be.
-        view: the view to begin with.
-        orientation: how the camera stands about nadir.
+        place: assumed place of the camera.
+        view: start of the fit.
+        orientation: of the camera about nadir.
         members: (n,) the picture's edges that may lie on it.
     """
 
@@ -65,7 +65,7 @@ class Supposition:
 
 
 def place_of(knowledge: HorizonKnowledge, settings: HorizonSettings) -> Place | None:
-    """Return where the camera is known to be; None where nothing is known of its altitude."""
+    """Return the known place of the camera; None if its altitude is unknown."""
     if knowledge.position is not None:
         position = np.asarray(knowledge.position, dtype=float)
         return Place(position, earth(knowledge.pole), settings.altitude_sigma, True)
@@ -78,23 +78,23 @@ def _above_sphere(altitude: float, sigma: float) -> Place:
     return Place(np.array([0.0, 0.0, MEAN_RADIUS + altitude]), mean_sphere(), sigma, False)
 
 
-def suppose(
+def initial_guess(
     candidate: ConeCandidate,
     seen: Observation,
     place: Place | None,
     knowledge: HorizonKnowledge,
     settings: HorizonSettings,
-) -> Supposition:
-    """Return what a cone would mean; `place` is None where nothing is known of the altitude."""
+) -> InitialGuess:
+    """Return the guess that a cone gives; `place` is None if the altitude is unknown."""
     if place is None:
         sine = float(np.sqrt(max(1.0 - candidate.cosine**2, 1e-6)))
         place = _above_sphere((MEAN_RADIUS + UNIT_DEPTH_HEIGHT) / sine - MEAN_RADIUS, UNKNOWN)
     view, stand = _first_view(candidate, seen, place, knowledge)
-    return Supposition(place, view, stand, candidate.members)
+    return InitialGuess(place, view, stand, candidate.members)
 
 
 def sun_from(place: Place, knowledge: HorizonKnowledge) -> FloatArray | None:
-    """Return the unit vector (3,) to the Sun in the axes of the place; None where either is not known."""
+    """Return the unit vector (3,) to the Sun in the axes of the place; None if either is unknown."""
     if knowledge.sun is None or not place.located:
         return None
     return np.asarray(knowledge.sun / np.linalg.norm(knowledge.sun))
@@ -106,7 +106,7 @@ def _first_view(
     place: Place,
     knowledge: HorizonKnowledge,
 ) -> tuple[View, Orientation]:
-    """Return the view to begin with, and how it stands about nadir; on a sphere where that is not known."""
+    """Return the first view and its orientation; on a sphere if the turn about nadir is unknown."""
     down = -place.position / np.linalg.norm(place.position)
     nothing = HorizonKnowledge()
     stand = orientation(candidate.direction, down, knowledge if place.located else nothing)
