@@ -13,7 +13,7 @@ from flight.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeas
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
 from flight.gnc.vision.frame_job import Found, FrameFound, FrameJob, TrackerSettings
-from flight.gnc.vision.startracker.mid_exposure import NODES, doubt, reading_of
+from flight.gnc.vision.startracker.mid_exposure import NODES, middle_covariance, weighting_of
 from flight.gnc.vision.startracker.solve import AttitudePrior, RatePrior
 from flight.gnc.vision.streaks.corners.settings import StreakSettings
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
@@ -120,8 +120,8 @@ class FrameMeasurer:
                 past = self._navigation.past(frame.exposure_start_ns + round(part * frame.exposure_ns))
                 if past is not None:
                     turns[number] = to_rotation_vector(multiply(past.quaternion, back))
-        return doubt(
-            reading_of(motion), turns, self._settings.angular_acceleration_psd, frame.exposure_ns * 1e-9
+        return middle_covariance(
+            weighting_of(motion), turns, self._settings.angular_acceleration_psd, frame.exposure_ns * 1e-9
         )
 
 

@@ -181,10 +181,10 @@ def _from_streaks(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, motion
         again = _motion(replace(job, camera=solution.camera))
         assert isinstance(again, MotionResult)  # as `motion`, by the same estimator
         return FrameFound(again, solve_motion(again, solution.camera, (1.0, 1.0), sky, settings, prior))
-    from flight.gnc.vision.startracker.known_sky import with_known_sky  # noqa: PLC0415
+    from flight.gnc.vision.startracker.catalogue_refit import refit_with_catalogue  # noqa: PLC0415
 
     assert isinstance(job.estimator, LikelihoodSettings)  # it made a MotionResult
-    better = with_known_sky(job.pixels, solution, sky, settings, job.estimator)
+    better = refit_with_catalogue(job.pixels, solution, sky, settings, job.estimator)
     return FrameFound(better.motion or motion, better)
 
 

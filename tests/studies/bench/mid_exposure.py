@@ -8,7 +8,7 @@ allows, the worst first: light of fainter stars hides in some streaks. `agreed` 
 
 `flight` is the star tracker's own answer to the same fit, told roughly where the camera looks, and
 `known sky` its answer after the second fit, with the light of unseen stars taken out
-(`flight.gnc.vision.startracker.known_sky`); the rates of both fits are held against their bound too.
+(`flight.gnc.vision.startracker.catalogue_refit`); the rates of both fits are held against their bound too.
 
 The bound: all pixels of the brightest stars, whose directions are known and whose light and background are
 not, the turn, the width of the point spread and the attitude common to all (Fisher information as in
@@ -28,8 +28,8 @@ from flight.gnc.errors import FlightError
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector, multiply
 from flight.gnc.vision.objects.olae import cross_matrices
+from flight.gnc.vision.startracker.catalogue_refit import refit_with_catalogue
 from flight.gnc.vision.startracker.index.build import default_index
-from flight.gnc.vision.startracker.known_sky import with_known_sky
 from flight.gnc.vision.startracker.solution import FrameSolution
 from flight.gnc.vision.startracker.solve import AttitudePrior, SolveSettings, solve_motion
 from flight.gnc.vision.streaks.bound import star_information
@@ -198,7 +198,7 @@ def tracked(
     )
     prior = AttitudePrior(multiply(from_rotation_vector(_PRIOR_ERROR), truth), _PRIOR_SIGMA)
     first = solve_motion(found, camera.pinhole, (1.0, 1.0), default_index(), settings, prior)
-    return first, with_known_sky(scene.pixels, first, default_index(), settings, settings.likelihood)
+    return first, refit_with_catalogue(scene.pixels, first, default_index(), settings, settings.likelihood)
 
 
 def attitude_row(percent: float, frames: int, seed: int, faintest: float, exposure: float) -> dict[str, Any]:

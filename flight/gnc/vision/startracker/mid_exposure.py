@@ -23,7 +23,7 @@ MOVED = {StreakStatus.RATE, StreakStatus.AMBIGUOUS}
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class Weighting:
     """How a frame's attitude comes from the attitudes during its exposure.
 
     Attributes:
@@ -35,15 +35,15 @@ class Reading:
     shaken: float
 
 
-MEAN = Reading((1 / 12, 1 / 3, 1 / 3, 1 / 12), 1 / 320)
+MEAN = Weighting((1 / 12, 1 / 3, 1 / 3, 1 / 12), 1 / 320)
 """Points: the mean over the exposure, by Simpson's rule."""
-ENDS = Reading((1 / 2, 0.0, 0.0, 1 / 2), 1 / 48)
+ENDS = Weighting((1 / 2, 0.0, 0.0, 1 / 2), 1 / 48)
 """Streaks fitted at a constant rate, whose ends hold them, or known by their ends alone."""
-MIDDLE = Reading((-2 / 35, 8 / 35, 8 / 35, -2 / 35), 1 / 4743)
+MIDDLE = Weighting((-2 / 35, 8 / 35, 8 / 35, -2 / 35), 1 / 4743)
 """Streaks fitted with an acceleration: the middle of the parabola nearest to the motion."""
 
 
-def reading_of(motion: StreakResult | MotionResult) -> Reading:
+def weighting_of(motion: StreakResult | MotionResult) -> Weighting:
     """Return how the attitude of a frame of such motion comes about."""
     if motion.status not in MOVED:
         return MEAN
@@ -51,20 +51,22 @@ def reading_of(motion: StreakResult | MotionResult) -> Reading:
     return MIDDLE if fitted else ENDS
 
 
-def doubt(reading: Reading, turns: FloatArray, unrest: float, exposure: float) -> FloatArray:
+def middle_covariance(
+    weighting: Weighting, turns: FloatArray, angular_acceleration_psd: float, exposure: float
+) -> FloatArray:
     """Return by how much the attitude is in doubt, (3, 3) rad^2.
 
     Args:
-        reading: of the frame.
+        weighting: of the frame.
         turns: (4, 3) rad, as the estimate has them, from mid-exposure to each of `NODES`.
-        unrest: rad^2/s^3, density of the white angular acceleration that nobody knows of.
+        angular_acceleration_psd: rad^2/s^3, density of the white angular acceleration that nobody knows of.
         exposure: s.
     """
-    known = np.asarray(reading.weights) @ turns
-    return np.outer(known, known) + np.eye(3) * unrest * reading.shaken * exposure**3
+    known = np.asarray(weighting.weights) @ turns
+    return np.outer(known, known) + np.eye(3) * angular_acceleration_psd * weighting.shaken * exposure**3
 
 
-def lateness(motion: MotionResult) -> FloatArray:
+def timing_covariance(motion: MotionResult) -> FloatArray:
     """Return the covariance (3, 3) rad^2 of the turn by which all stars of a frame may be off together.
 
     Where the rate changes, the ends hold a streak and only its light along the path tells where the middle

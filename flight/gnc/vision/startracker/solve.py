@@ -30,7 +30,7 @@ from flight.gnc.vision.startracker.identification.tracking import track
 from flight.gnc.vision.startracker.identification.verification import expected_stars
 from flight.gnc.vision.startracker.image_fit import fit_in_image
 from flight.gnc.vision.startracker.index.sky_index import SkyIndex
-from flight.gnc.vision.startracker.mid_exposure import lateness
+from flight.gnc.vision.startracker.mid_exposure import timing_covariance
 from flight.gnc.vision.startracker.solution import FrameSolution, SolveStatus
 from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
@@ -137,7 +137,7 @@ def solve_motion(
     solution = _identify(seen, motion.flux[chosen], scale, sky, settings, prior)
     if solution.fix is None:
         return solution
-    covariance = solution.fix.covariance + lateness(motion)
+    covariance = solution.fix.covariance + timing_covariance(motion)
     return replace(solution, fix=replace(solution.fix, covariance=covariance))
 
 

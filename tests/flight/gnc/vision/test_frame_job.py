@@ -14,7 +14,7 @@ from flight.gnc.errors import InputError
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import angle_between, from_rotation_vector, multiply
 from flight.gnc.vision.frame_job import FrameFound, FrameJob, TrackerSettings, run
-from flight.gnc.vision.startracker.known_sky import with_known_sky
+from flight.gnc.vision.startracker.catalogue_refit import refit_with_catalogue
 from flight.gnc.vision.startracker.solution import FrameSolution, SolveStatus
 from flight.gnc.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings, solve_motion
 from flight.gnc.vision.streaks.corners.settings import StreakSettings
@@ -130,7 +130,7 @@ def test_the_stars_of_a_solved_frame_of_streaks_serve_a_second_fit() -> None:
     assert isinstance(first, MotionResult)
     assert isinstance(job.estimator, LikelihoodSettings)
     solved = solve_motion(first, job.camera, _TRACKER.scale, sky(), _TRACKER.solve)
-    better = with_known_sky(job.pixels, solved, sky(), _TRACKER.solve, job.estimator)
+    better = refit_with_catalogue(job.pixels, solved, sky(), _TRACKER.solve, job.estimator)
     assert better.motion is not None
     assert found.solution is not None
     assert found.motion is found.solution.motion

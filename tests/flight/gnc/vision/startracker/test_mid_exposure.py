@@ -6,13 +6,21 @@ import numpy as np
 import pytest
 
 from flight.gnc.math.arrays import FloatArray
-from flight.gnc.vision.startracker.mid_exposure import ENDS, MEAN, MIDDLE, NODES, Reading, doubt, reading_of
+from flight.gnc.vision.startracker.mid_exposure import (
+    ENDS,
+    MEAN,
+    MIDDLE,
+    NODES,
+    Weighting,
+    middle_covariance,
+    weighting_of,
+)
 from flight.gnc.vision.streaks.corners.streak_rate import StreakResult, StreakStatus
 from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
 
 _EXPOSURE = 2.0
 _TIMES = _EXPOSURE * (np.array(NODES) - 0.5)
-# Weights over time, from -1 to 1, that a reading stands for: mean, ends, and the least squares' parabola.
+# Weights over time, from -1 to 1, that a weighting stands for: mean, ends, and the least squares' parabola.
 _EVEN = np.linspace(-1.0, 1.0, 401)
 _PARABOLA = np.linalg.pinv(np.stack([np.ones(401), _EVEN, _EVEN**2], axis=1))[0]
 _WEIGHTS = {
@@ -28,35 +36,35 @@ def _turns(*powers: float) -> FloatArray:
     return np.outer(angle, [1.0, 0.0, 0.0])
 
 
-@pytest.mark.parametrize(("reading", "part"), [(MEAN, 24.0), (ENDS, 8.0), (MIDDLE, np.inf)])
+@pytest.mark.parametrize(("weighting", "part"), [(MEAN, 24.0), (ENDS, 8.0), (MIDDLE, np.inf)])
 def test_a_steady_acceleration_draws_the_attitude_off_as_the_integral_says(
-    reading: Reading, part: float
+    weighting: Weighting, part: float
 ) -> None:
     """Of a t^2 / 2 the mean over T is a T^2 / 24, the ends are at a T^2 / 8, a parabola fitted at nothing."""
     acceleration = 0.3
-    off = doubt(reading, _turns(0.0, 0.5 * acceleration), 0.0, _EXPOSURE)
+    off = middle_covariance(weighting, _turns(0.0, 0.5 * acceleration), 0.0, _EXPOSURE)
     assert off[0, 0] == pytest.approx((acceleration * _EXPOSURE**2 / part) ** 2, abs=1e-30)
     assert np.count_nonzero(off) == np.count_nonzero(off[0, 0])
 
 
-@pytest.mark.parametrize("reading", [MEAN, ENDS, MIDDLE])
-def test_a_steady_rate_leaves_no_doubt_nor_does_what_is_odd_in_time(reading: Reading) -> None:
-    assert doubt(reading, _turns(0.7, 0.0, 0.4), 0.0, _EXPOSURE).max() < 1e-30
+@pytest.mark.parametrize("weighting", [MEAN, ENDS, MIDDLE])
+def test_a_steady_rate_leaves_no_doubt_nor_does_what_is_odd_in_time(weighting: Weighting) -> None:
+    assert middle_covariance(weighting, _turns(0.7, 0.0, 0.4), 0.0, _EXPOSURE).max() < 1e-30
 
 
 @pytest.mark.parametrize("name", list(_WEIGHTS))
 def test_the_nodes_stand_for_the_whole_exposure(name: str) -> None:
     """To the fourth power of time they give what the fine weights do."""
-    reading, fine = _WEIGHTS[name]
+    weighting, fine = _WEIGHTS[name]
     time = 0.5 * _EXPOSURE * _EVEN
-    off = doubt(reading, _turns(0.0, 0.2, 0.0, 0.9), 0.0, _EXPOSURE)
+    off = middle_covariance(weighting, _turns(0.0, 0.2, 0.0, 0.9), 0.0, _EXPOSURE)
     assert np.sqrt(off[0, 0]) == pytest.approx(abs(fine @ (0.2 * time**2 + 0.9 * time**4)), rel=0.05)
 
 
 @pytest.mark.parametrize("name", list(_WEIGHTS))
 def test_white_acceleration_scatters_the_attitude_as_much_as_is_said(name: str) -> None:
     """Monte Carlo of 4,000 exposures, each side of the middle integrated twice; its variance to 10 %."""
-    reading, fine = _WEIGHTS[name]
+    weighting, fine = _WEIGHTS[name]
     density, steps, trials = 0.03, 200, 4000
     step = 0.5 * _EXPOSURE / steps
     kicks = np.random.default_rng(1).standard_normal((2, trials, steps)) * np.sqrt(density * step)
@@ -64,15 +72,15 @@ def test_white_acceleration_scatters_the_attitude_as_much_as_is_said(name: str) 
     angle = np.cumsum(rate, axis=2) * step
     away = np.concatenate([angle[0, :, ::-1], np.zeros((trials, 1)), angle[1]], axis=1)
     found = np.var(away @ fine)
-    said = doubt(reading, np.zeros((4, 3)), density, _EXPOSURE)
+    said = middle_covariance(weighting, np.zeros((4, 3)), density, _EXPOSURE)
     assert found == pytest.approx(said[0, 0], rel=0.1)
     np.testing.assert_array_equal(said, said[0, 0] * np.eye(3))
 
 
 def test_the_kind_of_motion_tells_how_the_attitude_comes_about() -> None:
     rest, moved = StreakStatus.TOO_SHORT, StreakStatus.RATE
-    assert reading_of(StreakResult(rest, 0, 1.0)) is MEAN
-    assert reading_of(MotionResult(rest, 0, 1.0)) is MEAN
-    assert reading_of(StreakResult(moved, 0, 1.0)) is ENDS
-    assert reading_of(MotionResult(StreakStatus.AMBIGUOUS, 0, 1.0)) is ENDS
-    assert reading_of(MotionResult(moved, 0, 1.0, rate_model="accelerating")) is MIDDLE
+    assert weighting_of(StreakResult(rest, 0, 1.0)) is MEAN
+    assert weighting_of(MotionResult(rest, 0, 1.0)) is MEAN
+    assert weighting_of(StreakResult(moved, 0, 1.0)) is ENDS
+    assert weighting_of(MotionResult(StreakStatus.AMBIGUOUS, 0, 1.0)) is ENDS
+    assert weighting_of(MotionResult(moved, 0, 1.0, rate_model="accelerating")) is MIDDLE

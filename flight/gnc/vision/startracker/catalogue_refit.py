@@ -53,7 +53,7 @@ _ONE_MOTION = 25.9
 _PRIOR_PX = 1.0
 
 
-def with_known_sky(
+def refit_with_catalogue(
     pixels: Image,
     solution: FrameSolution,
     sky: SkyIndex,
@@ -72,7 +72,7 @@ def with_known_sky(
     motion, fix = solution.motion, solution.fix
     if motion is None or fix is None or solution.status is not SolveStatus.SOLVED or solution.scale_sigma:
         return solution
-    again = refitted(pixels, motion, solution, sky, settings, likelihood)
+    again = refit_motion(pixels, motion, solution, sky, settings, likelihood)
     if again is None:
         return solution
     sigma = np.sqrt(np.linalg.eigvalsh(fix.covariance)[-1]) + _PRIOR_PX / solution.camera.focal_length
@@ -83,7 +83,7 @@ def with_known_sky(
     return replace(better, tracked=solution.tracked, log10_false_alarm=solution.log10_false_alarm)
 
 
-def refitted(
+def refit_motion(
     pixels: Image,
     motion: MotionResult,
     solution: FrameSolution,

@@ -10,7 +10,7 @@ import numpy as np
 
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import conjugate, from_rotation_vector, multiply, to_rotation_vector
-from flight.gnc.vision.startracker.known_sky import with_known_sky
+from flight.gnc.vision.startracker.catalogue_refit import refit_with_catalogue
 from flight.gnc.vision.startracker.solution import FrameSolution, SolveStatus
 from flight.gnc.vision.startracker.solve import AttitudePrior, SolveSettings, solve_motion
 from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion
@@ -38,7 +38,7 @@ def _first(seed: int, streak_px: float = _STREAK_PX) -> tuple[SkyFrame, FrameSol
 @cache
 def _second(seed: int) -> FrameSolution:
     frame, first = _first(seed)
-    return with_known_sky(frame.pixels, first, sky(), _SETTINGS, _LIKELIHOOD)
+    return refit_with_catalogue(frame.pixels, first, sky(), _SETTINGS, _LIKELIHOOD)
 
 
 def _error(solution: FrameSolution, truth: FloatArray) -> FloatArray:
@@ -91,7 +91,7 @@ def test_it_needs_little_memory_in_the_milky_way() -> None:
     frame, first = _first(_MILKY_WAY, 120.0)
     tracemalloc.start()
     try:
-        with_known_sky(frame.pixels, first, sky(), _SETTINGS, _LIKELIHOOD)
+        refit_with_catalogue(frame.pixels, first, sky(), _SETTINGS, _LIKELIHOOD)
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
@@ -113,7 +113,7 @@ def test_what_is_in_no_catalogue_stays_among_the_stars_without_a_say() -> None:
     without = replace(known, stars=stars, motion=known.motion[kept])
     number = np.where(np.isin(first.star, [-1, struck]), -1, np.searchsorted(kept, first.star))
     renumbered = replace(first, star=number)
-    motion = with_known_sky(frame.pixels, renumbered, without, _SETTINGS, _LIKELIHOOD).motion
+    motion = refit_with_catalogue(frame.pixels, renumbered, without, _SETTINGS, _LIKELIHOOD).motion
     assert motion is not None
     assert motion is not first.motion
     place = first.points[first.star == struck][0]
@@ -130,7 +130,7 @@ def test_another_rate_than_before_is_not_believed() -> None:
     assert motion.rate is not None
     assert motion.covariance is not None
     off = replace(first, motion=replace(motion, rate=1.01 * motion.rate))
-    assert with_known_sky(frame.pixels, off, sky(), _SETTINGS, _LIKELIHOOD) is off
+    assert refit_with_catalogue(frame.pixels, off, sky(), _SETTINGS, _LIKELIHOOD) is off
 
 
 def test_what_is_not_solved_not_calibrated_or_no_streaks_is_left_alone() -> None:
@@ -140,4 +140,4 @@ def test_what_is_not_solved_not_calibrated_or_no_streaks_is_left_alone() -> None
         replace(first, scale_sigma=1e-4),
         replace(first, motion=None),
     ):
-        assert with_known_sky(frame.pixels, other, sky(), _SETTINGS, _LIKELIHOOD) is other
+        assert refit_with_catalogue(frame.pixels, other, sky(), _SETTINGS, _LIKELIHOOD) is other
