@@ -129,7 +129,7 @@ def solve_frame(
 
     Args:
         pixels: counts.
-        camera: as believed, of the frame's shape.
+        camera: assumed, of the frame's shape.
         scale: (lowest, highest) factor of the tangents: (1, 1) for a calibrated camera.
         exposure: s.
         sky: the guide stars.
@@ -205,7 +205,7 @@ def _no_motion(job: FrameJob) -> MotionResult:
 
 
 def _predicted_at_rest(job: FrameJob) -> bool:
-    """Tell whether the priors have the stars at rest; without a rate they do."""
+    """Return whether the priors predict stars at rest; without a rate prior they do."""
     if job.attitude_prior is None:
         return False
     if job.rate_prior is None:

@@ -1,6 +1,6 @@
-"""The star tracker: which stars a frame shows, and so where the camera looks (Michalski chapter 3).
+"""The star tracker: identifies the stars of a frame and determines its attitude (Michalski chapter 3).
 
     pixels -> detection -> StarField -> an identification method -> verification -> attitude
 
-`field` and `identification` hold what travels between the rooms, `guide_stars` the stars that one knows.
+`field` is the input of an identification method, `identification` its result; `guide_stars` is the catalogue.
 """

@@ -1,4 +1,4 @@
-"""Stellar aberration: a moving camera sees all stars displaced towards where it is going, by up to 20.8".
+"""Stellar aberration: a moving camera sees stars displaced towards its direction of motion, by up to 20.8".
 
 Special relativity's exact formula (Green, Spherical Astronomy, 1985, 8.3; the same in the Explanatory
 Supplement, 7.2.3), as cheap as its first order.

@@ -1,11 +1,11 @@
-"""The streaks fitted once more when it is known which stars there are, the unseen ones too.
+"""Refits the streaks of an identified frame with all stars of the catalogue, the unseen ones too.
 
-Where streaks are long most stars are below the noise of a pixel, yet their light lies under that of the
-bright ones and draws it off; close pairs are taken for one star. Once a frame is identified the catalogue
-tells where all stars lie and, by the light of those that were found, how bright they are. The light of those
-that are too faint, or too near to a brighter one, to be fitted is taken out of the frame, as uncertain as the
-catalogue's magnitudes are for the camera's colours; the others are fitted from their true places. What was
-found and is in no catalogue stays in the fit, without a say.
+In long streaks most stars are below the noise of a pixel, yet their light overlaps the bright streaks and
+shifts them; close pairs are taken for one star. Once a frame is identified, the catalogue gives the places of
+all stars and, scaled by the light of those found, their brightness. The light of stars too faint, or too near
+to a brighter star, to be fitted is subtracted from the frame, with the uncertainty of the catalogue's
+magnitudes for the camera's colours; the others are fitted from their true places. Objects found that are not
+in the catalogue are fitted but do not affect the motion.
 """
 
 from __future__ import annotations
@@ -35,21 +35,21 @@ from flight.gnc.vision.streaks.maximum_likelihood.shutter import Shutter
 from flight.gnc.vision.streaks.maximum_likelihood.wholeness import Wholeness
 from flight.gnc.vision.streaks.streak_result import StreakStatus
 
-# Streaks so many reaches beside a bright one's lie on its pixels.
+# Reaches: streaks closer than this to a bright one overlap its pixels.
 _NEAR = 1.4
-# Stars so close, px, are not fitted apart.
+# px: closer stars are not fitted separately.
 _TWIN = 2.0
-# A star found is one of the catalogue's that is within so many px and has at least this part of its light.
+# A found star is a catalogue star that is within this distance, px, and has at least this share of its light.
 _SAME, _ALIKE = 5.0, 0.3
-# Of a star's light, as the catalogue predicts it.
-_DOUBT = 0.15
-# Stars whose pixels are held at a time while their light is taken out.
+# Relative error of a star's light as the catalogue predicts it.
+_LIGHT_ERROR = 0.15
+# Stars whose pixels are held at a time while their light is subtracted.
 _AT_ONCE = 25
-# Instants at which it is asked whether a star is in the frame.
+# Instants at which a star is tested to be in the frame.
 _INSTANTS = 9
-# Chi-square of 3, exceeded by chance once in 100,000: two rates farther apart are not of one motion.
+# Chi-square of 3, exceeded by chance once in 100,000: two rates farther apart are different motions.
 _ONE_MOTION = 25.9
-# px: the attitude before is believed to so much besides its covariance.
+# px: added to the uncertainty of the previous attitude.
 _PRIOR_PX = 1.0
 
 
@@ -60,14 +60,14 @@ def refit_with_catalogue(
     settings: SolveSettings,
     likelihood: LikelihoodSettings,
 ) -> FrameSolution:
-    """Return `solution` with motion and attitude fitted anew; as it is where that leads nowhere.
+    """Return `solution` with motion and attitude refitted; unchanged if the refit fails.
 
     Args:
-        pixels: (rows, columns), of which `solution` is.
-        solution: of a frame of streaks; only a calibrated lens, whose scale was held, is served.
+        pixels: (rows, columns), the solved frame.
+        solution: of a frame of streaks; one whose scale was fitted is returned unchanged.
         sky: the guide stars.
         settings: with which it was solved.
-        likelihood: settings of the fit.
+        likelihood: settings of the streaks' fit.
     """
     motion, fix = solution.motion, solution.fix
     if motion is None or fix is None or solution.status is not SolveStatus.SOLVED or solution.scale_sigma:
@@ -91,7 +91,7 @@ def refit_motion(
     settings: SolveSettings,
     likelihood: LikelihoodSettings,
 ) -> MotionResult | None:
-    """Return `motion` fitted anew with all stars known; None where it fails or comes to another rate."""
+    """Return `motion` refitted with all stars known; None if that fails or gives another rate."""
     if motion.rate is None or motion.covariance is None:
         return None
     pinhole, exposure = solution.camera.ideal, motion.exposure
@@ -113,15 +113,15 @@ def refit_motion(
     done = joint_fit(camera, scene)
     if done is None:
         return None
-    told = with_rate(with_stars(motion, camera, done), camera, done, Wholeness.WHOLE)
-    if told.status is not StreakStatus.AMBIGUOUS or told.rate is None or told.covariance is None:
+    refit = with_rate(with_stars(motion, camera, done), camera, done, Wholeness.WHOLE)
+    if refit.status is not StreakStatus.AMBIGUOUS or refit.rate is None or refit.covariance is None:
         return None
-    apart = told.rate - motion.rate
-    if not apart @ np.linalg.solve(motion.covariance + told.covariance, apart) < _ONE_MOTION:
+    apart = refit.rate - motion.rate
+    if not apart @ np.linalg.solve(motion.covariance + refit.covariance, apart) < _ONE_MOTION:
         return None
-    left = _elsewhere(motion.faint_endpoints, told.endpoints)
+    left = _elsewhere(motion.faint_endpoints, refit.endpoints)
     return replace(
-        told,
+        refit,
         status=motion.status,
         faint_endpoints=motion.faint_endpoints[left],
         faint_flux=motion.faint_flux[left],
@@ -144,7 +144,7 @@ class _Known:
     def seen(
         cls, pinhole: Pinhole, course: Motion, places: FloatArray, light: FloatArray, most: int
     ) -> _Known:
-        """Return the `most` of stars (n, 2), (n,) that give the frame light, the most light in it first."""
+        """Return at most `most` of stars (n, 2), (n,) that are in the frame, the most light in it first."""
         n = len(places)
         time = np.tile(np.linspace(-0.5, 0.5, _INSTANTS), n)
         there = positions(pinhole, course, np.repeat(places, _INSTANTS, axis=0), time)
@@ -154,7 +154,7 @@ class _Known:
         return cls(places[order], light[order], inside[order])
 
     def twins(self) -> BoolArray:
-        """Tell which have a brighter one too near to be fitted apart."""
+        """Return which have a brighter star too near to be fitted separately."""
         order = np.argsort(self.places[:, 0], kind="stable")
         fainter = np.zeros(len(order), dtype=np.bool_)
         for places_on in range(1, len(order)):
@@ -175,15 +175,15 @@ def _known_stars(
     course: Motion,
     most: int,
 ) -> _Known | None:
-    """Return the stars that the frame sees; None where no fitted star was identified to tell their light."""
+    """Return the stars in the frame; None if no fitted star was identified, which scales their light."""
     matched = solution.matched
     apart = np.linalg.norm(solution.points[matched, None] - motion.stars, axis=-1)
     fitted = apart.argmin(axis=1)
-    sure = motion.used[fitted]
-    if solution.fix is None or not sure.any():
+    used = motion.used[fitted]
+    if solution.fix is None or not used.any():
         return None
     magnitude = sky.stars.magnitude
-    zero = np.median(np.log10(motion.flux[fitted[sure]]) + 0.4 * magnitude[solution.star[matched[sure]]])
+    zero = np.median(np.log10(motion.flux[fitted[used]]) + 0.4 * magnitude[solution.star[matched[used]]])
     pinhole, matrix = solution.camera.ideal, attitude_matrix(solution.fix.quaternion)
     reach = min(pinhole.half_diagonal + 0.5 * float(np.linalg.norm(course.turn)), 0.5 * np.pi)
     near = np.flatnonzero(matrix[2].astype(np.float32) @ sky.coarse > np.cos(reach))
@@ -197,7 +197,7 @@ def _known_stars(
 def _scenes(
     camera: ExposedCamera, course: Motion, known: _Known, motion: MotionResult
 ) -> tuple[Scene, Scene]:
-    """Return what is to be fitted, the brightest with a say, and the stars whose light is only taken out."""
+    """Return the stars to be fitted, the brightest trusted, and those whose light is only subtracted."""
     settings = camera.settings
     width = float(np.sqrt(motion.psf_sigma**2 + 1.0 / 12.0))
     leading = np.arange(len(known.light)) < settings.most_stars
@@ -223,14 +223,14 @@ def _scene(course: Motion, width: float, places: FloatArray, light: FloatArray, 
 
 
 def _foreign(motion: MotionResult, known: _Known) -> IntArray:
-    """Return which stars found are none of the catalogue's: no light like theirs is where they are."""
+    """Return which stars found are not in the catalogue: it has no such light at their place."""
     near = np.linalg.norm(motion.stars[:, None] - known.places, axis=2) < _SAME
     alike = known.light > _ALIKE * motion.flux[:, None]
     return np.flatnonzero(~(near & alike).any(axis=1))
 
 
 def _elsewhere(faint: FloatArray, ends: FloatArray) -> BoolArray:
-    """Tell which streaks (n, 2, 2) px are none of those with `ends` (m, 2, 2)."""
+    """Return which streaks (n, 2, 2) px are none of those with `ends` (m, 2, 2)."""
     worst = np.linalg.norm(faint[:, None] - ends, axis=-1).max(axis=-1)
     return np.asarray((worst > _SAME).all(axis=1))
 
@@ -246,7 +246,7 @@ def _without(camera: ExposedCamera, hidden: Scene) -> ExposedFrame:
         windows = camera.windows(some)
         light[windows.pixels] += light_of(camera.pinhole, camera.shutter, some, windows)
     signal = frame.signal - light
-    light *= np.float32(_DOUBT)
+    light *= np.float32(_LIGHT_ERROR)
     light *= light
     light += frame.floor
     return replace(frame, signal=signal, floor=light)

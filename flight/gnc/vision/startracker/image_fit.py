@@ -1,10 +1,10 @@
-"""The attitude from matched stars whose places in the image have covariances of their own.
+"""The attitude from matched stars whose places in the image have individual covariances.
 
-A star drawn out to a streak is known well across its path and badly along it. Each residual b - A r is taken
-in the two directions across the star, whitened by the place's covariance, and the sum of squares made least
-by Gauss-Newton: the maximum likelihood for Gaussian errors. A star in whose streak another's light hides is
-not where its pixels say: stars that disagree by more than chance allows, measured by how the most scatter,
-are found under Huber's weights, which bound any one star's pull, and have no say.
+A streaked star is measured well across its path and badly along it. Each residual b - A r is taken in the two
+directions across the star and whitened by the place's covariance; Gauss-Newton minimises the sum of squares:
+the maximum likelihood for Gaussian errors. Light of another star in a streak shifts its place: stars that
+disagree by more than chance allows, given the scatter of the majority, are found under Huber's weights, which
+bound the pull of any star, and are excluded.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _STEP_PX = 0.5
 # Of a chi-square of 2: exceeded by chance once in 1000, and its median.
 _FARTHEST = 13.8
 _MEDIAN = 2.0 * float(np.log(2.0))
-# Deviations beyond which a star's pull grows no more while it is asked who disagrees.
+# Deviations beyond which a star's pull is bounded while outliers are searched for.
 _PULL = 1.5
 _HUBER_ROUNDS = 10
 _LEAST_AGREEING = 4
@@ -35,14 +35,14 @@ _LEAST_AGREEING = 4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageFit:
-    """The attitude, and what the stars say of the fit.
+    """The attitude and the quality of its fit.
 
     Attributes:
-        fix: the attitude by the stars that agree; its covariance is widened where they scatter beyond theirs.
+        fix: the attitude by the stars that agree; its covariance is widened if they scatter beyond theirs.
         scale: factor of the tangents x/z, y/z; 1 when it was held.
         scale_sigma: relative standard deviation of the scale; 0 when it was held.
         squares: (n,) squared error of each star over its covariance, of two degrees of freedom.
-        agree: (n,) whether the star has a say.
+        agree: (n,) whether the star was used.
     """
 
     fix: AttitudeFix
@@ -70,13 +70,13 @@ def fit_in_image(
         start: (4,) an attitude near the answer, reference into camera.
         free_scale: whether the focal length may be wrong.
 
-    Raises AttitudeError when the stars do not fix what is asked.
+    Raises AttitudeError when the stars do not determine the parameters.
     """
     observed = camera.unit_vectors(points)
     seen = _Seen(observed, _whitener(points, observed, covariance, camera), reference, free_scale)
     pose = seen.fitted(_Pose(attitude_matrix(start), 1.0), np.ones(len(points)))
     squares, agree = seen.squares(pose), np.ones(len(points), dtype=np.bool_)
-    # One star far off draws all others off: their spread tells nothing before its pull is bounded.
+    # One outlier shifts all residuals: their spread is meaningless before its pull is bounded.
     if squares.max() > _FARTHEST:
         held = pose
         for _ in range(_HUBER_ROUNDS):
@@ -137,7 +137,7 @@ class _Seen:
 
 
 def _agreeing(squares: FloatArray) -> BoolArray:
-    """Tell which stars (n,) scatter as the most do; all where too few would be left to say who is right."""
+    """Return which stars (n,) scatter as the majority does; all if too few would remain to decide."""
     agree = squares <= _FARTHEST * max(1.0, float(np.median(squares)) / _MEDIAN)
     enough = np.count_nonzero(agree) >= max(_LEAST_AGREEING, len(squares) // 2)
     return agree if enough else np.ones(len(squares), dtype=np.bool_)

@@ -1,4 +1,4 @@
-"""Where a camera looks, in an astronomer's words: right ascension, declination and roll."""
+"""A camera's attitude as right ascension, declination and roll."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ class Pointing:
 
     Attributes:
         right_ascension, declination: of the boresight, ICRS; right ascension in [0, 2 pi).
-        roll: by which the image's upward direction (-y) stands off celestial north towards east, [0, 2 pi):
-            the position angle of up. At a celestial pole north is that of right ascension zero.
+        roll: position angle of the image's upward direction (-y), from north towards east, [0, 2 pi).
+            At a celestial pole north is that of right ascension zero.
     """
 
     right_ascension: float

@@ -1,4 +1,4 @@
-"""What the star tracker says of one frame."""
+"""The star tracker's result for one frame."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
 
 
 class SolveStatus(Enum):
-    """How a frame ended."""
+    """The outcome of one frame."""
 
     SOLVED = "solved"
     NO_STARS = "no-stars"
@@ -29,18 +29,18 @@ class FrameSolution:
     """Attitude at mid-exposure, and the rate where the stars are streaks.
 
     Attributes:
-        status: all below `camera` is meaningful for SOLVED only.
+        status: the fields below `camera` hold for SOLVED only.
         reason: why it is not solved, in a sentence; empty when it is.
         kind: what the frame shows.
-        points: (n, 2) px at mid-exposure of what was taken for stars, the brightest first.
+        points: (n, 2) px at mid-exposure of the points taken for stars, brightest first.
         covariance: (n, 2, 2) px^2.
-        camera: with the focal length that the stars gave, where it was not known.
+        camera: with the focal length fitted to the stars, if it was free.
         star: (n,) numbers of guide stars, -1 for none.
         expected: (n, 2) px, where the attitude puts the guide star; NaN for none.
         fix: attitude, ICRS to camera, and its covariance; the smaller scalar part is not negative.
         scale_sigma: relative standard deviation of the focal length; 0 where it was given.
-        log10_false_alarm: of the probability that a frame of strewn points would have been solved.
-        tracked: whether the prior told where to look.
+        log10_false_alarm: of the probability that a frame of random points would have been solved.
+        tracked: whether the stars were found near the prior attitude.
         motion: from the streaks, camera frame; None for points.
     """
 

@@ -1,8 +1,7 @@
 """Angle matching (Michalski 3.2.1; Gottlieb in Wertz 1978, 7.7): pairs by angle, triangles of pairs.
 
 The triangles of the brightest observed stars are taken in order of brightness. Pairs of guide stars with
-the angle of two sides are joined at the star they share, and the third angle decides; what is left is a
-candidate.
+the angle of two sides are joined at the star they share; those whose third angle agrees are candidates.
 """
 
 from __future__ import annotations

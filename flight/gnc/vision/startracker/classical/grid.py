@@ -1,7 +1,7 @@
 """The grid method (Michalski 3.2.7; Padgett & Kreutz-Delgado, IEEE TAES 33, 1997).
 
-Each observed star's pattern is compared with those of all guide stars by counting cells occupied in both. The
-nearest neighbour that aligns a pattern may be false, or its guide star lost: the next ones are tried too.
+Each observed star's pattern is compared with those of all guide stars by counting the cells occupied in both.
+The neighbour that aligns a pattern may be false or its guide star lost, so the next ones are tried too.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The grid pattern about a star: which cells its neighbours fall into (Padgett & Kreutz-Delgado 1997).
 
-The star is put in the middle of a tangent plane; its nearest neighbour beyond a buffer radius turns the plane
+The star is the origin of a tangent plane; its nearest neighbour beyond a buffer radius turns the plane
 to a standard position; each other star within the pattern radius occupies a cell.
 """
 
@@ -17,7 +17,7 @@ from flight.gnc.vision.startracker.index.k_vector import members
 
 CELLS = 40
 BUFFER = 0.15
-"""Least distance of the aligning star, in pattern radii: a near one turns the plane badly."""
+"""Least distance of the aligning star, in pattern radii: a near one aligns the plane badly."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

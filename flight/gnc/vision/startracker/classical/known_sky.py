@@ -1,6 +1,6 @@
-"""What the classical methods know of the sky: pairs, triangles and grids of guide stars for one field.
+"""The tables of the classical methods: pairs, triangles and grids of guide stars for one field of view.
 
-Each table is made when a method first asks for it: a camera that uses one method holds the tables of one.
+Each table is built at its first use: a camera that uses one method holds the tables of one.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class KnownSky:
     def __init__(
         self, index: SkyIndex, half_width: tuple[float, float], pairs: PairTable | None = None
     ) -> None:
-        """Take the `pairs` of a file where there are any, else make them when they are needed."""
+        """Use the `pairs` of a file if given, else build them at their first use."""
         self.index = index
         self.half_width = half_width
         x, y = half_width

@@ -26,7 +26,7 @@ def matching_triangles(
     a1, b1, a2, c2 = a[first], b[first], a[~first], b[~first]
     place, of = shared(a1, a2)
     triangles = np.stack([a1[of], b1[of], c2[place]], axis=-1)
-    # A range that reaches zero or pi is held there: the cosine turns back.
+    # A range that reaches zero or pi is clipped there: the cosine is not monotonic beyond.
     alike = within(sky, triangles[:, 1], triangles[:, 2], low[2], high[2])
     triangles = triangles[alike & (triangles[:, 1] != triangles[:, 2])]
     turns = _turning(sky.stars.direction[triangles]) == _turning(view.direction[[list(corners)]])
@@ -42,7 +42,7 @@ def shared(left: IntArray, right: IntArray) -> tuple[IntArray, IntArray]:
 
 
 def within(sky: KnownSky, one: IntArray, other: IntArray, low: FloatArray, high: FloatArray) -> BoolArray:
-    """Tell which pairs of guide stars (k,) have an angle within limits."""
+    """Return which pairs of guide stars (k,) have an angle within limits."""
     direction = sky.stars.direction
     cosine = np.einsum("kx,kx->k", direction[one], direction[other])
     least, most = np.cos(np.minimum(high, np.pi)), np.cos(np.maximum(low, 0.0))
@@ -50,6 +50,6 @@ def within(sky: KnownSky, one: IntArray, other: IntArray, low: FloatArray, high:
 
 
 def _turning(corners: FloatArray) -> BoolArray:
-    """Tell which triangles (k, 3, 3) turn left, seen from within the sphere."""
+    """Return which triangles (k, 3, 3) turn left, seen from within the sphere."""
     a, b, c = np.moveaxis(corners, -2, 0)
     return np.asarray(np.einsum("kx,kx->k", a, np.cross(b, c)) > 0.0)

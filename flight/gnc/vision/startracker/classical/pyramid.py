@@ -3,7 +3,7 @@
 Triangles are cycled so that no observed star stays in many of them one after the other: a false star spoils
 few. A triangle that matches, by the k-vector, becomes a pyramid when a fourth observed star has a guide
 star at the right angle from all three corners; only pyramids are candidates, and the fourth star is what
-makes them rare.
+makes chance matches rare.
 """
 
 from __future__ import annotations
@@ -57,6 +57,6 @@ def _pyramids(
         alike &= within(sky, found[of, corner], fourth, low[owner], high[owner])
     triangles, fourth, owner = found[of[alike]], fourth[alike], owner[alike]
     observed = np.column_stack([np.tile(corners, (len(owner), 1)), rest[owner]])
-    # One pyramid of each triangle is enough: the field's other stars are asked next.
+    # One pyramid of each triangle is enough: verification uses the other stars.
     _, once = np.unique(triangles, axis=0, return_index=True)
     return Candidates(observed[once], np.column_stack([triangles, fourth])[once])

@@ -1,11 +1,10 @@
-"""Rate matching: stars are told from the rest by how they move, and from one another by where they must be.
+"""Rate matching: stars are recognised by their common motion and identified by their predicted places.
 
 Michalski 3.2.5 has a title and one reference, Samaan, Mortari & Junkins, Recursive mode star identification
 algorithms (IEEE TAES 41, 2005); the method is built from these two. The ends of streaks, or two frames,
 give each point its velocity across the sky. A star fixed in the sky moves as v' = -w x v with the one body
-rate w that all stars share; a satellite, a hot pixel or a plane does not, and is left out. With an attitude
-known before, turned by that rate, each star is where it is predicted; without one, the pyramid identifies
-what is left.
+rate w that all stars share; satellites, hot pixels and planes do not and are excluded. A previous attitude,
+turned by that rate, predicts each star's place; without one, the pyramid identifies the remaining points.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ class Motion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Previous:
-    """An attitude that was known before.
+    """A previous attitude.
 
     Attributes:
         attitude: (4,) ICRS to camera.
@@ -87,10 +86,10 @@ def identify(
     motion: Motion | None = None,
     previous: Previous | None = None,
 ) -> Identification:
-    """Return which of the points of a field are stars, and which.
+    """Return which points of a field are which stars.
 
     Without `motion` all points are taken for stars, and a `previous` attitude is taken not to have turned.
-    Raises FieldUnknown when the scale is known too badly, ValueError when motion and field differ in length.
+    Raises FieldUnknown if the scale is too uncertain, ValueError if motion and field differ in length.
     """
     shared = None if motion is None else shared_rate(field.direction, motion)
     kept = np.arange(len(field)) if shared is None else np.flatnonzero(shared.shares)
@@ -122,21 +121,21 @@ def shared_rate(direction: FloatArray, motion: Motion) -> SharedRate:
     if len(motion.velocity) != len(direction):
         raise ValueError(f"{len(direction)} directions and {len(motion.velocity)} velocities: give one each")
     shares = np.zeros(len(direction), dtype=bool)
-    nobody = SharedRate(np.zeros(3), np.full((3, 3), np.inf), shares)
+    none = SharedRate(np.zeros(3), np.full((3, 3), np.inf), shares)
     for pair in combinations(range(min(len(direction), _SEEDS)), 2):
         chosen = np.array(pair)
         rate, covariance = _rate(direction[chosen], motion.velocity[chosen], motion.sigma[chosen])
         agrees = _agrees(direction, motion, rate, covariance)
         if agrees.sum() <= shares.sum():
             continue
-        # Two near points fix little, and everything agrees with that: a fit to all of them must hold too.
+        # Two close points give a poor rate that many points agree with: a fit to all must hold too.
         rate, _ = _rate(direction[agrees], motion.velocity[agrees], motion.sigma[agrees])
         agrees = _agrees(direction, motion, rate, np.zeros((3, 3)))
         if agrees.sum() > shares.sum():
             shares = agrees
     for _ in range(3):
         if shares.sum() < 2:
-            return nobody
+            return none
         rate, covariance = _rate(direction[shares], motion.velocity[shares], motion.sigma[shares])
         shares = _agrees(direction, motion, rate, np.zeros((3, 3)))
     return SharedRate(rate, covariance, shares)
@@ -151,7 +150,7 @@ def _rate(direction: FloatArray, velocity: FloatArray, sigma: FloatArray) -> tup
 
 
 def _agrees(direction: FloatArray, motion: Motion, rate: FloatArray, covariance: FloatArray) -> BoolArray:
-    """Tell which points (n,) move by `rate`, both errors considered."""
+    """Return which points (n,) move by `rate`, both errors considered."""
     residual = motion.velocity - np.cross(direction, rate)
     residual -= np.sum(residual * direction, axis=-1, keepdims=True) * direction
     # The largest variance that the rate's error gives to any direction across the line of sight.

@@ -1,4 +1,4 @@
-"""How hard the classical methods try."""
+"""Settings of the classical methods."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from flight.gnc.vision.startracker.identification.verification import Verificati
 
 @dataclass(frozen=True, slots=True)
 class ClassicalSettings:
-    """One set for all methods: each takes of it what it knows.
+    """One set for all methods; each uses some of it.
 
     Attributes:
         brightest: observed stars of which patterns are made.
         tolerance: of an angle, an area or a moment, in its sigmas.
         patterns: triangles or pivots that are looked up in a table at most.
-        joins: triangles made of pairs at most, over all scales together: each takes half a millisecond, and a
-            list of no sky takes them all.
+        joins: triangles made of pairs at most, over all scales: each takes half a millisecond, and a list
+            without a match takes them all.
         candidates: of all patterns together, that are laid over the field at most: the budget of work.
         screened: observed stars, the brightest, that a candidate is laid over before it is verified.
         verified: candidates of a pattern that the whole field verifies at most.
-        scale_step: relative half width of the scales that one look-up takes in.
-        scales: look-ups at most; a field that would need more is refused.
-        verification: when a candidate is believed.
+        scale_step: relative half width of the scales that one look-up covers.
+        scales: look-ups at most; a field that would need more is rejected.
+        verification: when a candidate is accepted.
     """
 
     brightest: int = 11

@@ -32,7 +32,7 @@ _POINTS, _WEIGHTS = _quadrature()
 def shape(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return area (...,) and polar moment (...,) of triangles (..., 3, 3) of unit vectors (32-34)."""
     p, q, r = np.moveaxis(corners, -2, 0)
-    # 32 squares small differences of the sides away; the solid angle by Van Oosterom & Strackee does not.
+    # 32 rounds small differences of the sides away; the solid angle by Van Oosterom & Strackee does not.
     volume = np.abs(np.sum(p * np.cross(q, r), axis=-1))
     sides = 1.0 + np.sum(p * q, axis=-1) + np.sum(q * r, axis=-1) + np.sum(r * p, axis=-1)
     area = 2.0 * np.arctan2(volume, sides)
@@ -55,7 +55,7 @@ def measured_shape(corners: FloatArray, sigma: FloatArray) -> TriangleShape:
         at = corners[:, corner]
         along = corners[:, (corner + 1) % 3] - at
         along = along - np.sum(along * at, axis=-1, keepdims=True) * at
-        # Two corners in one place leave no direction along their side: any will do.
+        # Two coincident corners define no direction along their side: any serves.
         length = np.linalg.norm(along, axis=-1, keepdims=True)
         along = np.where(length > 0.0, along / np.where(length > 0.0, length, 1.0), _across(at))
         for turn in (along, np.cross(at, along)):

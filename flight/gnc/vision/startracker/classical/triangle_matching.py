@@ -1,9 +1,9 @@
 """Triangles by area and polar moment (Michalski 3.2.2, 3.2.3; Cole & Crassidis 2004, 2006).
 
 An observed triangle's area, plus and minus its propagated standard deviation, is a range of the table's
-k-vector; of the triangles in it those are candidates whose polar moment agrees too, and whose sides, in order
-of length, do: which corner is which is known by them. The sources pivot to a neighbouring triangle when
-several are left; here each of them is laid over the field.
+k-vector; candidates are the triangles in it whose polar moment and sides, in order of length, agree too: the
+order of the sides matches the corners. The sources pivot to a neighbouring triangle when several remain; here
+each of them is compared with the field.
 """
 
 from __future__ import annotations
@@ -62,11 +62,11 @@ def _matches(
     reach = tolerance * found.sigma_area + 2.0 * view.slack * found.area
     # float32 rounds the table's values.
     reach = reach + 1e-7 * found.area
-    # The area of a flat triangle says nothing.
-    told = np.flatnonzero(reach < 0.2 * found.area)
-    low, high = found.area[told] - reach[told], found.area[told] + reach[told]
+    # The area of a flat triangle is too uncertain.
+    usable = np.flatnonzero(reach < 0.2 * found.area)
+    low, high = found.area[usable] - reach[usable], found.area[usable] + reach[usable]
     place, owner = members(*table.area.ranges(low, high))
-    owner = told[owner]
+    owner = usable[owner]
     reach = tolerance * found.sigma_moment + (4.0 * view.slack + 1e-7) * found.moment
     alike = np.abs(table.moment[place] - found.moment[owner]) <= reach[owner]
     place, owner = place[alike], owner[alike]

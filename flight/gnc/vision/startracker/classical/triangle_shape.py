@@ -1,4 +1,4 @@
-"""Two properties of a triangle of stars that no turn of the camera changes, and how well each is known."""
+"""Two properties of a triangle of stars that are invariant under rotation, with their errors."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Triangles of the brighter guide stars by area, with a k-vector, and beside each its polar moment.
 
-Every triangle whose sides one frame can hold. Corners stand opposite the shortest, the middle and the longest
-side, so that a match of shape is at once a match of corners.
+Every triangle whose sides fit into one frame. Corners stand opposite the shortest, the middle and the longest
+side, so that a match of shape matches the corners as well.
 """
 
 from __future__ import annotations
@@ -54,9 +54,9 @@ def build(
 
 
 def locally_bright(pairs: PairTable, radius: float, rank: int) -> BoolArray:
-    """Tell which guide stars (n,) have fewer than `rank` brighter ones within `radius` rad.
+    """Return which guide stars (n,) have fewer than `rank` brighter ones within `radius` rad.
 
-    A sparse part of the sky so has as many as a dense one.
+    So a sparse part of the sky has as many as a dense one.
     """
     start, stop = pairs.angle.ranges(0.0, radius)
     # The second of a pair has the larger number, and so is the fainter.

@@ -17,20 +17,20 @@ from flight.gnc.vision.startracker.index.pair_table import angles
 
 
 class FieldUnknown(FlightError):
-    """A field of view known too badly for the classical methods: the default method solves those."""
+    """A field of view too uncertain for the classical methods; the default method solves those."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """What a method sees.
+    """A field at one scale.
 
     Attributes:
-        field: as it was given.
+        field: as given.
         scale: by which its tangents are multiplied here.
         direction: (n, 3) unit vectors, so multiplied.
         sigma: (n,) rad.
-        slack: relative error that angles may have besides, of the scale.
-        stars: how many, the brightest, patterns are made of.
+        slack: relative error of angles by the scale.
+        stars: number of the brightest stars that patterns are made of.
     """
 
     field: StarField

@@ -1,8 +1,8 @@
 """Geometric voting (Michalski 3.2.6; Kolomenkin, Pollak, Shimshoni & Lindenbaum, IEEE TAES 44, 2008).
 
-Every pair of observed stars votes: a guide star that has a partner at the pair's angle gets its vote for
-being either of the two, one vote however many the partners (counted each, the crowded parts of the sky
-outvote the true stars from 0.3 px of noise on). The assignments with the most votes then vote among
+Every pair of observed stars votes: a guide star with a partner at the pair's angle gets one vote for being
+either of the two, however many partners it has (if each counted, crowded parts of the sky would outvote the
+true stars from 0.3 px of noise on). The assignments with the most votes then vote among
 themselves: those whose angles agree belong together, and the largest such family is the candidate.
 """
 
@@ -31,7 +31,7 @@ def propose(view: View, sky: KnownSky, settings: ClassicalSettings) -> Iterator[
     one, other = np.triu_indices(voters, 1)
     _, low, high = view.angles(one, other, settings.tolerance)
     ballot = _ballot(voters, one, other, low, high, sky)
-    # The best of each observed star: the true one is not always the first.
+    # Several for each observed star: the true one is not always first.
     star = np.argpartition(-ballot, _KEPT, axis=1)[:, :_KEPT].ravel()
     observed = np.repeat(np.arange(voters), _KEPT)
     agrees = _agreement(view, sky, observed, star, settings.tolerance)
@@ -62,7 +62,7 @@ def _ballot(
 
 
 def _agreement(view: View, sky: KnownSky, observed: IntArray, star: IntArray, tolerance: float) -> BoolArray:
-    """Tell which assignments (k, k) of observed to guide stars may be true together."""
+    """Return which assignments (k, k) of observed to guide stars are compatible."""
     count = len(observed)
     one, other = (index.ravel() for index in np.indices((count, count)))
     _, low, high = view.angles(observed[one], observed[other], tolerance)

@@ -1,9 +1,9 @@
-"""What a match of observed stars with the sky is worth: how many as good chance would make.
+"""The significance of a match with the sky: the expected number of equally good chance matches.
 
-A bound on the expected number of attitudes, in all that was searched, at which stars strewn at random match
-guide stars as well or better; so, when it is far below one, on the probability of accepting any. It does
-not depend on how a candidate was found, and every choice that the matching makes among gates, limits of
-brightness and tests is paid for (Bonferroni).
+An upper bound of the expected number of attitudes, among those searched, at which random stars match guide
+stars as well or better; far below one, also of the probability of a false match. The bound does not depend on
+how a candidate was found and is raised for every choice that the matching makes among gates, limits of
+brightness and tests (Bonferroni).
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ _MOST_ORDERED = 12
 
 @dataclass(frozen=True, slots=True)
 class Chance:
-    """What chance has to play with.
+    """The parameters of a chance match.
 
     Attributes:
         observed: number of stars.
         spread: sigma^2 of a star over the area of the field.
-        fields: how many such fields make up what was searched.
+        fields: number of such fields in the searched part of the sky.
         scales: ln of the highest over the lowest scale.
         choices: how many gates the matching chooses from.
-        least: the fewest stars that are believed.
-        enough: log10 below which it does not matter how much below.
+        least: the fewest stars that are accepted.
+        enough: log10 below which the exact value does not matter.
     """
 
     observed: int
@@ -41,8 +41,8 @@ class Chance:
     def log10(self, gate: float, observed: Sequence[int], ranks: Sequence[int]) -> float:
         """Return log10 of the bound for observed stars that match the expected ones of `ranks` within `gate`.
 
-        Both are numbered in order of brightness. The faintest star that is counted on is the matching's
-        choice: for the j-th choice, with j - 1 brighter expected stars missing, the bound is raised by j^2
+        Both are numbered in order of brightness. The matching chooses the faintest star that counts: for
+        the j-th choice, with j - 1 brighter expected stars missing, the bound is raised by j^2
         pi^2/6.
         """
         pairs = sorted(zip(ranks, observed, strict=True))

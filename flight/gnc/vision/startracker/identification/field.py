@@ -1,4 +1,4 @@
-"""The stars of one frame as an identification method is given them, and what is believed of the lens."""
+"""The stars of one frame and the assumed lens: the input of an identification method."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from flight.gnc.math.arrays import FloatArray, IntArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StarField:
-    """Observed stars, the brightest first; some of them may be no stars.
+    """Observed points, brightest first; some of them may not be stars.
 
     Attributes:
-        direction: (n, 3) unit vectors, camera frame, as the believed focal length gives them.
+        direction: (n, 3) unit vectors, camera frame, by the assumed focal length.
         sigma: (n,) rad, standard deviation of each direction along one axis.
-        half_width: (2,) tangents of the half field along x and y: where a star that is not seen could be.
-        scale: (lowest, highest) factor by which all tangents x/z, y/z may have to be multiplied, the true
-            scale of the image being unknown: (1, 1) for a calibrated camera.
-        magnitude: (n,) instrumental, up to one common constant; None where the order alone is known.
+        half_width: (2,) tangents of the half field along x and y.
+        scale: (lowest, highest) factor of all tangents x/z, y/z for the true focal length: (1, 1) for a
+            calibrated camera.
+        magnitude: (n,) instrumental, up to one common constant; None if only the order is known.
     """
 
     direction: FloatArray

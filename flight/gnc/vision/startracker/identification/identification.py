@@ -1,4 +1,4 @@
-"""What an identification method answers, whichever it is (Michalski 3.2)."""
+"""The result of an identification method (Michalski 3.2)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from flight.gnc.math.arrays import IntArray
 
 
 class Status(Enum):
-    """How an identification ended."""
+    """The outcome of an identification."""
 
     IDENTIFIED = "identified"
     TOO_FEW_STARS = "too-few-stars"
@@ -28,8 +28,8 @@ class Identification:
         fix: attitude from all matched stars, ICRS to camera, with its covariance; None unless identified.
         scale: by which the tangents of the observed directions had to be multiplied.
         scale_sigma: its standard deviation; 0 when the scale was given.
-        log10_false_alarm: of the probability that stars strewn at random would match as well anywhere in the
-            sky; -inf never, 0 when nothing is known.
+        log10_false_alarm: of the probability that random stars would match as well anywhere in the sky; 0 if
+            unknown.
     """
 
     status: Status

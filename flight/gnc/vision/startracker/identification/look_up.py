@@ -1,4 +1,4 @@
-"""Observed triangles among those of the guide stars: all of them, at all steps of scale, at once."""
+"""Looks up observed triangles in the index: all of them, at all steps of scale, at once."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ _LARGEST_SIZE = (1 << SIZE_BITS) - 1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScaleSteps:
-    """Ranges of scale that together cover what the lens may have, each narrow enough for one set of shapes.
+    """Ranges of scale that together cover the lens's range, each narrow enough for one set of shapes.
 
     Attributes:
-        middle: (s,) scale that the shapes are taken at.
+        middle: (s,) scale at which the shapes are computed.
         lowest, highest: (s,) ends of each range.
     """
 
@@ -41,7 +41,7 @@ class ScaleSteps:
 
     @classmethod
     def of(cls, field: StarField, tolerance: float) -> ScaleSteps:
-        """Return the steps for the scales of a field, ratios of sides being right to `tolerance` in each.
+        """Return the steps for the scales of a field, with ratios of sides within `tolerance` in each.
 
         At the tangent t from the boresight a gnomonic image is stretched by 1 + t^2 along the radius and by
         1 + t^2 / 2 across it, so the ratio of two sides at half the way to the corner varies by t^2 / 2.
@@ -54,7 +54,7 @@ class ScaleSteps:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Finds:
+class TriangleMatches:
     """Observed triangles that look like triangles of guide stars, corner by corner.
 
     Attributes:
@@ -71,8 +71,8 @@ class Finds:
         return len(self.scale)
 
     @classmethod
-    def of(cls, parts: Sequence[Finds]) -> Finds:
-        """Return several finds as one."""
+    def of(cls, parts: Sequence[TriangleMatches]) -> TriangleMatches:
+        """Return several as one."""
         if len(parts) == 1:
             return parts[0]
         return cls(
@@ -82,9 +82,9 @@ class Finds:
         )
 
     def votes(self) -> IntArray:
-        """Return for each pair of each find (k, 3) how many finds of about the same scale have it.
+        """Return for each pair of each match (k, 3) how many matches of about the same scale have it.
 
-        Scales are counted in two sets of bins, half a bin apart, and the better count holds: no scale is
+        Scales are counted in two sets of bins, half a bin apart, and the larger count is used: no scale is
         at the edge of both.
         """
         bins = np.log(self.scale) * _BINS_PER_LN_SCALE
@@ -94,7 +94,7 @@ class Finds:
 
     def _votes_in(self, scale_bin: FloatArray) -> IntArray:
         slots = 1 << max(13, (3 * self.star.size).bit_length())
-        # Spread by a multiplicative hash: that two pairs share a slot is as rare as it is harmless.
+        # A multiplicative hash: two pairs rarely share a slot, and if they do it is harmless.
         code = (self.star * 1021 + self.observed) * 257 + scale_bin.astype(np.int64)[:, None]
         slot = ((code * 2654435761) >> 11) & (slots - 1)
         return np.asarray(np.bincount(slot.ravel(), minlength=slots)[slot])
@@ -111,17 +111,17 @@ def look_up(
     tolerance: float,
     distortion: float,
     most: int,
-) -> tuple[Finds, int]:
-    """Return the finds of observed `triangles` (t, 3), and how many entries of the index were read.
+) -> tuple[TriangleMatches, int]:
+    """Return the matches of observed `triangles` (t, 3), and the number of index entries read.
 
     Args:
         field: the observed stars.
         sky: the guide stars' triangles.
-        steps: of scale.
+        steps: ranges of scale.
         triangles: numbers of observed stars.
         tolerance: of a ratio of sides, in its sigmas.
-        distortion: by which it may be wrong besides.
-        most: entries that may be read; the triangles that come first have them.
+        distortion: additional error of a ratio.
+        most: entries that may be read; the first triangles take precedence.
     """
     corners, sides, left = _forms(field, triangles, steps)
     size = np.maximum(sides[:, 2], SIZE_UNIT)
@@ -148,11 +148,11 @@ def look_up(
     longest = (sky.triangles.key[entry] & np.uint32(_LARGEST_SIZE)) * SIZE_UNIT
     scale = longest / size[query] * steps.middle[step[query]]
     star = sky.triangles.corners[entry].astype(np.int64)
-    return Finds(corners[query], star, scale), total
+    return TriangleMatches(corners[query], star, scale), total
 
 
 def _entries(begin: IntArray, end: IntArray, most: int) -> tuple[IntArray, IntArray]:
-    """Return the entries (k,) of the first runs that have no more than `most`, and the run of each."""
+    """Return the entries (k,) of the first runs, `most` at most, and the run of each."""
     count = end - begin
     read = np.cumsum(count)
     if len(read) and read[-1] > most:
@@ -196,15 +196,15 @@ def _runs(
 ) -> tuple[IntArray, IntArray, IntArray, IntArray, IntArray]:
     """Return the runs of keys that hold triangles like the queries.
 
-    Of each: the number of its query, the cells of the short and the middle ratio, where it begins and ends. A
-    query's ratios may lie in up to three cells each.
+    For each run: its query, the cells of the short and the middle ratio, its begin and end. A query's ratios
+    may lie in up to three cells each.
     """
     low = np.maximum(((ratio - slack[:, None]) * CELLS).astype(np.int64), 0)
     high = np.minimum(((ratio + slack[:, None]) * CELLS).astype(np.int64), CELLS - 1)
     spans = high - low
     widest = int(spans.max(initial=0)) + 1
     here = np.arange(widest) <= spans[:, :, None]
-    # In order of the queries: the triangles that come first have the first of the entries that may be read.
+    # In order of the queries: the first triangles get the first of the entries that may be read.
     query, along_short, along_middle = np.nonzero(here[:, 0, :, None] & here[:, 1, None, :])
     short = low[query, 0] + along_short
     middle = low[query, 1] + along_middle

@@ -1,10 +1,10 @@
-"""Lost in space: which stars of the whole sky a frame shows, from nothing but the frame.
+"""Lost in space: identifies the stars of a frame without prior information.
 
 Every triangle of the brightest observed stars is looked up by shape, turning and size among those of the
-guide stars, all at once. Each find votes for its three pairs of an observed and a guide star: pairs of the
-truth occur in many triangles, chance pairs in one. The finds with the most votes are verified against the
-whole field, one after the other, until one holds. If none does, more stars are taken, until the work
-allowed is done; and last the triangles of neighbours, for a list that is not in order of brightness.
+guide stars, all at once. Each match votes for its three pairs of an observed and a guide star: true pairs
+occur in many triangles, chance pairs in one. The matches with the most votes are verified against the whole
+field until one holds. If none does, fainter stars are added until the budget is spent; last come triangles of
+neighbours, for a list that is not in order of brightness.
 
 The shape on the sphere depends on the scale of the image, though little: a wide range of scales is tried in
 steps, each narrow enough for the ratios of the sides to stay within the tolerance.
@@ -21,7 +21,7 @@ import numpy as np
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.vision.startracker.identification.field import StarField
 from flight.gnc.vision.startracker.identification.identification import Identification, Status
-from flight.gnc.vision.startracker.identification.look_up import Finds, ScaleSteps, look_up
+from flight.gnc.vision.startracker.identification.look_up import ScaleSteps, TriangleMatches, look_up
 from flight.gnc.vision.startracker.identification.observed_triangles import batches_of
 from flight.gnc.vision.startracker.identification.refinement import stretched
 from flight.gnc.vision.startracker.identification.verification import (
@@ -34,15 +34,15 @@ from flight.gnc.vision.startracker.index.sky_index import SkyIndex
 
 @dataclass(frozen=True, slots=True)
 class IdentificationSettings:
-    """How hard to try.
+    """Tolerances and budget of the search.
 
     Attributes:
         tolerance: of the ratios of sides, in their sigmas.
-        distortion: by which a ratio of sides may be wrong besides, for a lens that is no pinhole.
-        batches: numbers of triangles that are looked up, one batch after the other; at each step of scale.
-        work: entries of the index that may be read in all.
+        distortion: additional error of a ratio of sides, for a lens that is no pinhole.
+        batches: numbers of triangles looked up, batch after batch, at each step of scale.
+        work: entries of the index that may be read in total.
         verified: candidates of each batch that are verified at most.
-        verification: when a candidate is believed.
+        verification: when a candidate is accepted.
     """
 
     tolerance: float = 3.0
@@ -59,11 +59,11 @@ DEFAULT = IdentificationSettings()
 def identify(
     observed: StarField, sky: SkyIndex, settings: IdentificationSettings = DEFAULT
 ) -> Identification:
-    """Return which stars the frame shows, and the attitude that they fix; or that it cannot be told."""
+    """Return which stars the frame shows and their attitude, or why it cannot be identified."""
     if len(observed) < settings.verification.least_matches:
         return nothing(observed, Status.TOO_FEW_STARS)
     steps = ScaleSteps.of(observed, settings.distortion)
-    found: list[Finds] = []
+    found: list[TriangleMatches] = []
     tried: set[tuple[int, int]] = set()
     work = 0
     for triangles in batches_of(observed, settings.batches, len(steps)):
@@ -71,7 +71,7 @@ def identify(
             observed, sky, steps, triangles, settings.tolerance, settings.distortion, settings.work - work
         )
         found.append(finds)
-        for matrix, scale in _candidates(observed, sky, Finds.of(found), tried, settings.verified):
+        for matrix, scale in _candidates(observed, sky, TriangleMatches.of(found), tried, settings.verified):
             answer = verify_matrix(observed, sky, matrix, scale, 1.0, settings.verification)
             if answer.status is Status.IDENTIFIED:
                 return answer
@@ -82,9 +82,9 @@ def identify(
 
 
 def _candidates(
-    observed: StarField, sky: SkyIndex, finds: Finds, tried: set[tuple[int, int]], most: int
+    observed: StarField, sky: SkyIndex, finds: TriangleMatches, tried: set[tuple[int, int]], most: int
 ) -> Iterator[tuple[FloatArray, float]]:
-    """Yield attitudes (3, 3) and scales of the finds with the most votes, those that agree but once."""
+    """Yield attitudes (3, 3) and scales of the matches with the most votes, without repetition."""
     if not len(finds):
         return
     votes = finds.votes().sum(axis=1)
@@ -95,7 +95,7 @@ def _candidates(
         if sum(pair in tried for pair in pairs) >= 2:
             continue
         tried.update(pairs)
-        # One triangle tells the scale badly: where the lens is known better, that is where it is looked from.
+        # One triangle gives a poor scale: it is clipped to the lens's range.
         scale = min(max(float(finds.scale[find]), observed.scale[0]), observed.scale[1])
         yield _attitude_of(observed, sky, finds, find), scale
         yielded += 1
@@ -103,8 +103,8 @@ def _candidates(
             return
 
 
-def _attitude_of(observed: StarField, sky: SkyIndex, finds: Finds, find: int) -> FloatArray:
-    """Return the attitude (3, 3) that lays a find's guide stars on the observed ones."""
+def _attitude_of(observed: StarField, sky: SkyIndex, finds: TriangleMatches, find: int) -> FloatArray:
+    """Return the attitude (3, 3) that maps a match's guide stars onto the observed ones."""
     seen = stretched(observed.direction[finds.observed[find]], float(finds.scale[find]))
     return np.asarray(_frame(seen).T @ _frame(sky.stars.direction[finds.star[find]]))
 

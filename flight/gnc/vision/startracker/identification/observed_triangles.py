@@ -1,4 +1,4 @@
-"""Which triangles of the observed stars to look up, and in which order."""
+"""The triangles of observed stars to be looked up, in order."""
 
 from __future__ import annotations
 
@@ -18,8 +18,7 @@ _CENTRES = 40
 def batches_of(field: StarField, sizes: tuple[int, ...], steps: int) -> Iterator[IntArray]:
     """Yield triangles (t, 3), those of the brightest stars first.
 
-    A batch of a wide range of scale, of many `steps`, is smaller by their number's root: most frames are
-    solved by the first.
+    With many `steps` of scale a batch is smaller, by the root of their number: the first solves most frames.
     """
     brightest = triples(min(len(field), _BRIGHTEST))
     begin = 0

@@ -1,6 +1,6 @@
 """Least squares of attitude and scale over matched stars, from a start near the answer.
 
-Wahba's problem with one unknown more: the factor k of all tangents x/z, y/z, by which the believed focal
+Wahba's problem with one unknown more: the factor k of all tangents x/z, y/z, by which the assumed focal
 length is wrong. Gauss-Newton on the residuals e = b(k) - A r, which for a small turn d about the camera's
 axes and a small change of ln k change by -[A r x] d + s dlnk, s = (x z^2, y z^2, -z (x^2 + y^2)). The least
 sum of |e|^2 / sigma^2 is the maximum likelihood of directions with sigma rad along either axis across them.
@@ -104,7 +104,7 @@ def refine(
     """Return attitude and scale that best turn `reference` into `observed` (n, 3), errors `sigma` (n,) rad.
 
     `observed` and `sigma` are those at scale 1; `matrix` (3, 3) and `scale` are the start. None where the
-    stars do not determine what is asked, or lead away from any camera.
+    stars do not determine the parameters, or the fit diverges.
     """
     parameters = 4 if free_scale else 3
     weight = (1.0 / (sigma * scale))[:, None]
@@ -132,13 +132,13 @@ def refine(
             scale *= math.exp(float(step[3]))
         if longest < _SETTLED:
             break
-    # What is left after the last step, to its square.
+    # The residuals after the last step, squared.
     left = (residual + flat @ step).reshape(-1, 3)
     return Refinement(matrix, scale, covariance, np.einsum("ij,ij->i", left, left))
 
 
 def _determined(normal: FloatArray, covariance: FloatArray) -> bool:
-    """Tell whether no combination of parameters is left to rounding.
+    """Return whether every combination of parameters is determined beyond rounding.
 
     The largest element of a positive definite matrix is on its diagonal.
     """

@@ -1,9 +1,9 @@
-"""Tracking: which stars the frame shows, told roughly where it looks.
+"""Tracking: identifies the stars of a frame with a prior attitude.
 
-Laid over the frame by a prior attitude that is off by a small turn, the expected stars are all shifted by
-nearly the same vector. Of all pairs of an observed and an expected star close enough to be the same, the
-largest set with one shift refines the attitude, and the whole field verifies it, as it does lost in space:
-only that chance has the prior's uncertainty to choose from, and not the whole sky.
+A prior attitude with a small error shifts all predicted stars by nearly the same vector. Of all pairs of
+an observed and a predicted star close enough to be the same, the largest set with one shift refines the
+attitude, and the whole field verifies it as in lost in space, with the prior's uncertainty in place of the
+whole sky as the searched part.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from flight.gnc.vision.startracker.index.sky_index import SkyIndex
 
 _BRIGHTEST = 16
 _PRIOR_SIGMAS = 4.0
-# More of them tell nothing apart, and compare in longer than the whole sky takes.
+# More pairs are ambiguous, and comparing them takes longer than a search of the whole sky.
 _MOST_PAIRS = 400
 _DEFAULT = VerificationSettings()
 
@@ -40,10 +40,10 @@ def track(
     sigma: float,
     settings: VerificationSettings = _DEFAULT,
 ) -> Identification:
-    """Return which stars the frame shows if it looks where the prior says, NO_MATCH if it does not.
+    """Return which stars the frame shows near the prior attitude, NO_MATCH if it points elsewhere.
 
-    `attitude` (4,) ICRS to camera is believed to be right to `sigma` rad about each axis; beyond some degrees
-    `identify` is faster and surer.
+    `attitude` (4,) ICRS to camera has the standard deviation `sigma` rad about each axis; beyond some degrees
+    `identify` is faster and more reliable.
     """
     if len(field) < settings.least_matches:
         return nothing(field, Status.TOO_FEW_STARS)
@@ -62,7 +62,7 @@ def track(
         )
         if found is not None:
             matrix, scale = found.matrix, found.scale
-    # A ball of turns, of all turns, 8 pi^2 in the same measure.
+    # Volume of the ball of turns over that of all turns, 8 pi^2 in the same measure.
     searched = min((_PRIOR_SIGMAS * sigma) ** 3 / (6.0 * math.pi), 1.0)
     return verify_matrix(field, sky, matrix, scale, searched, settings)
 
@@ -78,7 +78,7 @@ def _same_shift(
     expected = expected_stars(sky, matrix, wider, int((1.3 * min(len(field), _BRIGHTEST) + 8) * area))
     seen = stretched(field.direction[:_BRIGHTEST], scale)
     shift = seen[:, None, :] - sky.stars.direction[expected] @ matrix.T
-    # By roll, and by the scale where it is not known, the shifts of stars at the edge differ.
+    # Roll, and an unknown scale, make the shifts of stars at the edge differ.
     radius = math.hypot(across, down)
     star_sigma = float(field.sigma[:_BRIGHTEST].max()) * scale
     stretch = 0.5 * math.log(field.scale[1] / field.scale[0])
@@ -93,7 +93,7 @@ def _same_shift(
     apart = shifts[:, None, :] - shifts
     tolerance = 4.0 * star_sigma + (_PRIOR_SIGMAS * sigma + stretch) * radius
     agree = np.einsum("ijk,ijk->ij", apart, apart) <= tolerance**2
-    # Pairs of one observed star do not support one another, nor do those of one guide star.
+    # Pairs that share an observed or a guide star do not support each other.
     agree &= (one[:, None] != one) & (two[:, None] != two)
     best = int(agree.sum(axis=1).argmax())
     members = np.append(np.flatnonzero(agree[best]), best)

@@ -1,9 +1,9 @@
-"""Verification: how many stars of the whole field a candidate attitude matches, and whether by chance.
+"""Verification: counts the stars of the field that a candidate attitude matches and rules out chance.
 
-The guide stars that should be in the field are laid over the observed ones; those that fall together refine
-attitude and scale, and again, until the same stars match. What the match is worth does not depend on how the
-candidate was found: it is the number of equal or better ones to be expected in the whole sky, were the stars
-strewn at random (`chance`).
+The guide stars predicted in the field are compared with the observed ones; coincident stars refine attitude
+and scale, repeatedly, until the same stars match. The significance of the match does not depend on how the
+candidate was found: it is the expected number of equal or better matches in the whole sky if the stars were
+random (`chance`).
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from flight.gnc.vision.startracker.index.sky_index import SkyIndex
 
 @dataclass(frozen=True, slots=True)
 class VerificationSettings:
-    """When a candidate is believed.
+    """When a candidate is accepted.
 
     Attributes:
-        log10_false_alarm: the most that the expected number of chance matches in the whole sky may be.
-        gates: half widths within which a star matches, in its sigmas: of these the one that makes chance the
-            least likely. The wide ones serve a lens with distortion, or sigmas that are too small.
-        least_matches: fewer stars are not believed.
+        log10_false_alarm: limit of the expected number of chance matches in the whole sky.
+        gates: half widths within which a star matches, in its sigmas; the gate with the least chance is used.
+            The wide ones serve a lens with distortion, or sigmas that are too small.
+        least_matches: of stars, for acceptance.
         rounds: of matching and refining.
-        most: observed stars, the brightest, that decide; all are matched in the end.
+        most: number of the brightest observed stars that decide; all are matched in the end.
     """
 
     log10_false_alarm: float = -4.5
@@ -45,14 +45,14 @@ class VerificationSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Matching:
-    """Observed stars (k,) and the guide stars (k,) that they match, and what that is worth."""
+    """Observed stars (k,), the guide stars (k,) that they match, and the significance."""
 
     observed: IntArray
     star: IntArray
     log10_chance: float
 
 
-# A candidate that begins with less than this, in powers of ten, above what is believed will not get there.
+# A candidate that begins more than this, in powers of ten, above the limit is given up.
 _HOPELESS = 7.0
 
 
@@ -71,8 +71,8 @@ def verify(
         sky: the guide stars.
         attitude: (4,) of the candidate, ICRS to camera, within some sigmas of the answer.
         scale: of the candidate.
-        searched: part of all attitudes that candidates were taken from: 1 is lost in space.
-        settings: when a candidate is believed.
+        searched: share of all attitudes that candidates were taken from: 1 if lost in space.
+        settings: when a candidate is accepted.
     """
     return verify_matrix(field, sky, attitude_matrix(attitude), scale, searched, settings)
 
@@ -107,7 +107,7 @@ def verify_matrix(
 
 
 def nothing(field: StarField, status: Status = Status.NO_MATCH) -> Identification:
-    """Return the answer that no star was identified."""
+    """Return an identification without stars."""
     return Identification(status, np.full(len(field), -1))
 
 
@@ -137,7 +137,7 @@ def _settle(
     searched: float,
     settings: VerificationSettings,
 ) -> tuple[_Matching, Refinement] | None:
-    """Return matched stars and what they refine `start` to, when the two agree; None if it leads nowhere."""
+    """Return matched stars and the refinement of `start` by them, once both agree; None if they do not."""
     refined, previous = start, None
     for _ in range(settings.rounds):
         matching = _match(field, sky, expected, refined, searched, settings)
@@ -170,7 +170,7 @@ def _match(
     searched: float,
     settings: VerificationSettings,
 ) -> _Matching | None:
-    """Return which observed stars have an expected one within a gate, by the most telling gate."""
+    """Return which observed stars have an expected one within a gate, for the most significant gate."""
     if len(expected) < settings.least_matches:
         return None
     cosines = stretched(field.direction, at.scale) @ (at.matrix @ sky.stars.direction[expected].T)
@@ -193,7 +193,7 @@ def _match(
     matched = settings.least_matches - 1
     for gate in settings.gates:
         within = np.flatnonzero(squared <= gate * gate)
-        # A wider gate about the same stars tells less.
+        # A wider gate about the same stars is less significant.
         if len(within) <= matched:
             continue
         matched = len(within)
@@ -204,7 +204,7 @@ def _match(
 
 
 def _plausible(refined: Refinement, field: StarField) -> bool:
-    """Tell whether the scale found is one that the lens may have, within five of its sigmas."""
+    """Return whether the scale found lies in the lens's range, within five of its sigmas."""
     lowest, highest = field.scale
     if lowest == highest:
         return True

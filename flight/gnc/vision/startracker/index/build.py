@@ -26,15 +26,15 @@ from flight.gnc.vision.startracker.index.triangle_index import build as build_tr
 
 @dataclass(frozen=True, slots=True)
 class IndexSettings:
-    """What the index holds.
+    """Contents of the index.
 
     Attributes:
         faintest: V of the faintest guide star.
         epoch: Julian year of the directions; `SkyIndex.at` moves them to another.
         resolution: rad, below which two stars are seen as one.
         smallest, largest: rad, longest sides of the triangles.
-        density: how many stars are taken for bright within 2.5 deg of a triangle of that size; more in larger
-            ones, which cost less, so that the triangles of every octave of size are about as many.
+        density: number of stars that count as bright within 2.5 deg of a triangle of that size; larger for
+            larger ones, so that every octave of size has about as many triangles.
     """
 
     faintest: float = 8.5
@@ -72,7 +72,7 @@ def proper_motion(stars: GuideStars) -> npt.NDArray[np.float32]:
 
 
 def ensure_default_index() -> None:
-    """Make the default index now if it is missing, so that nobody waits for it in flight."""
+    """Make the default index now if it is missing, so that no flight waits for it."""
     if not PATH.exists():
         default_index()
 

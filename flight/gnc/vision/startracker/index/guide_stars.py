@@ -1,4 +1,4 @@
-"""The stars that a camera can tell apart: the catalogue as a given lens sees it (Michalski 3.3).
+"""The stars that a camera can resolve: the catalogue as a given lens images it (Michalski 3.3).
 
 Proper motion carried to the epoch of observation; stars closer than the image resolves merged into one, at
 their centre of light and with their joint magnitude, as a detector shows them. No aberration: it depends on
@@ -18,7 +18,7 @@ from flight.gnc.math.arrays import FloatArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GuideStars:
-    """Stars as the camera sees them, the brightest first.
+    """Stars as the camera resolves them, brightest first.
 
     Attributes:
         hip: (n,) int32 Hipparcos number, of a merged group its brightest.
@@ -46,7 +46,7 @@ def choose_guide_stars(
 ) -> GuideStars:
     """Return the stars with a joint V below `faintest` at Julian year `epoch`.
 
-    Stars nearer to one another than `resolution` rad, directly or by way of others, are one.
+    Stars closer together than `resolution` rad, directly or through others, are merged.
     Raises ValueError when `epoch` is not finite.
     """
     from scipy.spatial import cKDTree  # noqa: PLC0415 - to make a table, not to read one
@@ -70,7 +70,7 @@ def choose_guide_stars(
 
 
 def _connected(count: int, pairs: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
-    """Return for each of `count` stars (count,) the lowest number among those it hangs together with."""
+    """Return for each of `count` stars (count,) the lowest number of its connected group."""
     group = np.arange(count)
     while True:
         lowest = np.minimum(group[pairs[:, 0]], group[pairs[:, 1]])

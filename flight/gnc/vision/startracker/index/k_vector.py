@@ -1,9 +1,9 @@
-"""The k-vector range search: which sorted keys lie in a range, without a search through them.
+"""The k-vector range search: finds sorted keys in a range without a binary search.
 
 A straight line is drawn through the sorted keys; the k-vector counts the keys below each of its evenly
 spaced values, so that the line's inverse gives the cell of any value and two look-ups bound a range
 (Michalski 53-61; Mortari & Neta, K-vector range searching techniques, 2000). Ranges are half-open, low <=
-key < high, and both ends are tested against the keys of their cells: the answer is exact, where 61 returns
+key < high, and both ends are tested against the keys of their cells: the result is exact, where 61 returns
 some keys too many.
 
 Corrected: 54 needs 2 delta-epsilon, as in the source, for the line to end above the largest key, and 56 is
@@ -74,7 +74,7 @@ class KVector:
 
 
 def build(key: npt.NDArray[Any], cells: int | None = None) -> KVector:
-    """Return the k-vector of sorted keys (n,); as many cells as keys, as in the source, unless told.
+    """Return the k-vector of sorted keys (n,); as many cells as keys, as in the source, by default.
 
     Raises ValueError when the keys are not finite or not in order, or `cells` is not positive.
     """

@@ -1,7 +1,7 @@
-"""What identification knows of the sky, in one memory-mapped file: guide stars and their triangles.
+"""The sky index of identification, one memory-mapped file: guide stars and their triangles.
 
-`python -m flight.gnc.vision.startracker.index.build` makes the file (`table_file` tells its layout), the same
-bytes for the same stars and limits.
+`python -m flight.gnc.vision.startracker.index.build` makes it (layout: `table_file`), the same bytes for
+the same stars and limits.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class SkyIndex:
 
     @cached_property
     def coarse(self) -> npt.NDArray[np.float32]:
-        """The stars' directions, one axis a row (3, n): to tell quickly which are near a boresight."""
+        """The stars' directions, one axis a row (3, n): for a quick search near a boresight."""
         return np.ascontiguousarray(self.stars.direction.T, dtype=np.float32)
 
     def at(self, epoch: float) -> SkyIndex:

@@ -23,15 +23,15 @@ from flight.gnc.math.arrays import FloatArray, IntArray
 
 CELLS = 80
 CELL = 1.0 / CELLS
-"""Ratios of sides from 0 to 1 are counted in cells of this width; one byte more tells where in the cell."""
+"""Ratios of sides from 0 to 1 are counted in cells of this width; a byte gives the place in the cell."""
 FINE = 256
 SIZE_BITS = 18
 SIZE_UNIT = 2.0**-SIZE_BITS
 """Of the longest side's chord, which is below 1."""
 TIE = 1e-9
-"""A side longer than a limit by less than this part of it is as long: the limits are sides themselves."""
+"""Relative tolerance of a side against a limit: the limits are sides themselves."""
 LEAST_RATIO = 0.1
-"""Of the shortest to the longest side: flatter triangles say little more than a pair."""
+"""Of the shortest to the longest side: flatter triangles discriminate little better than a pair."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
