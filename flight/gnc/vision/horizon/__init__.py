@@ -1,8 +1,8 @@
-"""Nadir from pictures of the Earth's limb (Meller et al., chapter 3) and past it.
+"""Nadir from pictures of the Earth's limb (Meller et al., chapter 3, and beyond).
 
     solution = find_nadir(frame, camera, HorizonKnowledge(position=..., sun=..., attitude=...))
 
-`nadir` is the default method and its judgement: `edges` on scan lines, `consensus` on cones, each cone a
-`hypothesis` that is fitted (`limb_equation`, `limb_fit`, `profile_fit`) and held against what is known
+`nadir` is the default method and decides: `edges` on scan lines, `consensus` on cones; each cone makes a
+`hypothesis`, fitted (`limb_equation`, `limb_fit`, `profile_fit`) and tested against prior knowledge
 (`azimuth`, `illumination`). The paper's own: `binary_edges`, `circle`, `graphic_method`, `vector_method`.
 """

@@ -1,7 +1,7 @@
-"""The turn about nadir, from what else is known: a rough attitude, the coarse Sun, the magnetic field.
+"""The turn about nadir from other sensors: a rough attitude, the coarse Sun, the magnetic field.
 
-A horizon says nothing of it, but the Earth's flattening lies along the pole and the light along the Sun. And
-each such direction must stand at its known angle from nadir: a nadir for which it does not is wrong.
+A horizon does not determine it, but the flattening depends on the pole and the light on the Sun. Each such
+direction also has a known angle from nadir: a nadir that contradicts the angle is wrong.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Orientation:
 
     Attributes:
         rotation: (3, 3), inertial into camera axes; nadir exactly as assumed.
-        sigma: rad, of the turn about nadir; infinite when nothing is known of it.
+        sigma: rad, of the turn about nadir; infinite if unknown.
         mismatch: the worst disagreement of a known direction with this nadir, in its own standard deviations.
     """
 
@@ -36,7 +36,7 @@ class Orientation:
 
 
 def orientation(nadir: FloatArray, inertial_nadir: FloatArray, knowledge: HorizonKnowledge) -> Orientation:
-    """Return the orientation about `nadir` (3,), camera axes, that stands at `inertial_nadir` (3,)."""
+    """Return the orientation about `nadir` (3,), camera axes, which is `inertial_nadir` (3,)."""
     base = shortest_turn(inertial_nadir, nadir)
     down = _unit(nadir)
     vote, weight, mismatch = 0.0 + 0.0j, 0.0, 0.0
@@ -68,7 +68,7 @@ def _known(
     pairs = [(each.camera, each.inertial, each.sigma) for each in knowledge.sensed]
     if knowledge.attitude is not None:
         matrix, sigma = attitude_matrix(knowledge.attitude.quaternion), knowledge.attitude.sigma
-        # Nadir itself judges the tilt, a direction normal to it gives the turn.
+        # Nadir itself tests the tilt, a direction normal to it gives the turn.
         for axis in (inertial_nadir, tangent_basis(inertial_nadir)[0]):
             pairs.append((matrix @ axis, axis, sigma))
     return pairs

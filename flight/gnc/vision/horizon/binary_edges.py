@@ -11,13 +11,13 @@ import numpy as np
 from flight.gnc.math.arrays import BoolArray, FloatArray, Image, IntArray
 
 RUN = 5
-"""px: the window whose average decides; shorter fluctuations go."""
+"""px: window of the majority filter; shorter fluctuations are removed."""
 
 
 def high_average(lines: Image) -> FloatArray:
     """Return the average high intensity (n,) of lines (n, m): the mean of what lies above mid-range.
 
-    The paper does not say what is high; here it is above the middle between a line's least and most.
+    The paper does not define high; here it is above the middle between a line's least and most.
     """
     values = np.asarray(lines, dtype=float)
     middle = 0.5 * (values.min(axis=1, keepdims=True) + values.max(axis=1, keepdims=True))

@@ -1,6 +1,6 @@
 """The circular horizon in a picture: centre and radius by the pseudo-inverse (Meller et al. 3.2.1).
 
-It takes the picture for homogeneous: no distortion, and a horizon that is a circle on a flat detector, which
+It assumes a homogeneous picture: no distortion, and a horizon that is a circle on a flat detector, which
 holds near the optical axis only. `flight.gnc.vision.horizon.limb_fit` is the default.
 """
 

@@ -2,7 +2,7 @@
 
 All rays u of a sphere's limb make one angle rho with nadir n: u.g = 1 with g = n / cos rho, linear in g
 (Christian & Robinson 2016, for a sphere). With rho known two rays leave two directions for n; unknown, three
-rays leave one. Many pairs or triples at once, for the search among points that are not all limb.
+rays leave one. Vectorised over pairs or triples, for the search among points of which some are limb.
 """
 
 from __future__ import annotations

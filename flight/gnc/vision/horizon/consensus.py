@@ -1,9 +1,9 @@
-"""Which edges may lie on one horizon: cones through pairs or triples of them, by how many others agree.
+"""Groups edges that may lie on one horizon: cones through pairs or triples, by the number that agree.
 
 Every pair of edges, thinned evenly where there are many, gives a cone of the known half-angle (every triple,
 where the altitude is not known); an edge agrees when it lies near the cone and grows brighter towards nadir.
-The best cone takes its edges away with it and the search goes on: so the terminator, a coast or a band of
-cloud become candidates of their own. Random sample consensus (Fischler & Bolles 1981) without the chance.
+The edges of the best cone are removed and the search goes on, so the terminator, a coast or a band of cloud
+becomes a candidate of its own. Sample consensus (Fischler & Bolles 1981) without random choice.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class EdgeRays:
         return len(self.rays)
 
     def chosen(self, which: BoolArray | IntArray) -> EdgeRays:
-        """Return those of the edges that `which` tells, by flags (n,) or by indices."""
+        """Return the edges `which`, flags (n,) or indices."""
         return EdgeRays(self.rays[which], self.brighter[which], self.pixel[which])
 
 
@@ -58,7 +58,7 @@ def best_cone(
     """Return the cone through `free` edges (n,) with which most of these agree, or None.
 
     `cosines` is the half-angle's cosine (where known, a range of no width) or its least and greatest;
-    `tolerance` is in pixels, `tries` the number of pairs or triples looked at.
+    `tolerance` is in pixels, `tries` the number of pairs or triples tried.
     """
     chosen = np.flatnonzero(free)
     directions, half_angles = _hypotheses(edges, chosen, cosines, tries)
@@ -83,7 +83,7 @@ def _hypotheses(
         first, second = _pairs(len(free), tries)
         one, other = free[first], free[second]
         directions = nadirs_of_pairs(edges.rays[one], edges.rays[other], cosines[0])
-        # A pair that does not agree with its own cone need not be asked of others.
+        # A pair that does not agree with its own cone need not be compared with others.
         sides = edges.brighter[one], edges.brighter[other]
         agrees = [np.einsum("kij,ij->ki", directions, side) > 0.0 for side in sides]
         directions = directions[agrees[0] & agrees[1]]
@@ -121,7 +121,7 @@ def _triples(count: int, tries: int) -> tuple[IntArray, IntArray, IntArray]:
 
 
 def _agreeing(edges: EdgeRays, directions: FloatArray, cosines: FloatArray, tolerance: float) -> BoolArray:
-    """Tell (k, n) which edges lie within `tolerance` px of cones (k, 3), (k,), their bright side within."""
+    """Return (k, n) which edges lie within `tolerance` px of cones (k, 3), (k,), their bright side inside."""
     sines = np.sqrt(np.maximum(1.0 - cosines**2, 1e-6))
     # cos(angle) - cos(rho) is sin(rho) times the distance, near the cone.
     off = directions @ edges.rays.T

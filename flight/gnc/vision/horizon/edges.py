@@ -22,29 +22,29 @@ from flight.gnc.vision.horizon.settings import EdgeSettings
 _SCALES = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 """px, standard deviations of the Gaussian."""
 _REACH = 3.0
-"""Scales: how far from the change of the binary line the steepest place is looked for."""
+"""Scales: distance from the change of the binary line within which the steepest place is searched."""
 _TAIL = 3.5
 """Scales: where the Gaussian is cut off."""
 _OUTGROWN = 1.4
-"""A doubled scale that gains more has not held the edge: one whose own spread is 1.4 scales."""
+"""A doubled scale that gains more did not cover the edge: its spread is 1.4 scales."""
 _MARGIN = 4.0
-"""px: nearer to the picture's border is no edge; some detectors frame their picture in black."""
+"""px: edges nearer to the border are ignored; some detectors have a black frame."""
 _FLOOR, _SHARE = 0.1, 0.05
-"""px and scales: what an edge's place is believed to before its own scatter is known."""
+"""px and scales: error of an edge's place before the fit measures the scatter."""
 _SAMPLES = 2048
 _STEP_TO_SIGMA = 1.4826 / 2.0**0.5
 """Median of absolute differences of two pixels to one pixel's standard deviation, of normal noise."""
 _STANDS_OUT = 6.0
-"""Standard deviations of the dark: what is brighter is lit."""
+"""Standard deviations of the dark; brighter pixels are lit."""
 _LEAST_LIT = 16
-"""Samples: less light is a hot pixel or a star."""
+"""Samples: fewer lit ones are a hot pixel or a star."""
 _PROFILE: IntArray = np.arange(-9, 6)
 """px from an edge towards the bright side: the samples that are kept."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanLines:
-    """What was read: light along columns and rows.
+    """The lines that were read: light along columns and rows.
 
     Attributes:
         columns, rows: the indices of the lines.
@@ -62,7 +62,7 @@ class ScanLines:
 
     @property
     def pixels(self) -> int:
-        """How many were read."""
+        """The number of pixels read."""
         return self.column_bright.size + self.row_bright.size
 
 
@@ -86,7 +86,7 @@ class Edges:
         towards: (n, 2) unit steps along the line to the bright side.
         scale: (n,) px, the Gaussian's that found it.
         contrast: (n,) the step's height over high - low.
-        sigma: (n,) px along the line, what is believed before a fit.
+        sigma: (n,) px along the line, before a fit.
         background: (n,) light on the dark side: next to the limb and the terminator there is none, next to a
             coast or a cloud there is.
         profile: (n, m) light along the line from dark to bright, about the pixel nearest to the point; NaN
@@ -112,16 +112,16 @@ class Edges:
         return len(self.points)
 
     def chosen(self, which: BoolArray | IntArray) -> Edges:
-        """Return those of the edges that `which` tells, by flags (n,) or by indices."""
+        """Return the edges `which`, flags (n,) or indices."""
         return Edges(*(getattr(self, each.name)[which] for each in fields(self)))
 
 
 def find_edges(
     access: PixelAccess, settings: EdgeSettings, near: Nearby | None = None
 ) -> tuple[Edges, ScanLines]:
-    """Return the edges on evenly spaced columns and rows, and what was read; no other pixel is.
+    """Return the edges on evenly spaced columns and rows, and these lines; no other pixel is read.
 
-    `near` leaves out the lines that miss a part of the picture.
+    `near` restricts the lines to those that cross a part of the picture.
     """
     columns, rows = _places(access.columns, settings.lines), _places(access.rows, settings.lines)
     if near is not None:
@@ -157,7 +157,7 @@ def _places(size: int, lines: int) -> IntArray:
 def _levels(light: list[FloatArray]) -> tuple[float, float, float]:
     """Return the average light of the dark and of the bright, and the dark's noise; equal where all is dark.
 
-    Bright is what stands out of the dark's noise; its median leaves the Sun's disc and hot pixels out.
+    Pixels above the dark's noise are bright; their median excludes the Sun's disc and hot pixels.
     """
     samples, steps = (np.concatenate(each) for each in zip(*map(_samples, light), strict=True))
     order = np.sort(samples)
@@ -247,7 +247,7 @@ def _line_edges(
 def _refined(changes: _Changes, weak: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return offsets (k,) px from each start towards the bright, scales (k,), heights of the steps (k,).
 
-    A step lower than `weak` is no edge.
+    A step lower than `weak` is not an edge.
     """
     count = len(changes.start)
     offset, height = np.zeros(count), np.zeros(count)

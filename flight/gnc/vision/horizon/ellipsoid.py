@@ -1,4 +1,4 @@
-"""The Earth as an ellipsoid, seen from outside: where its limb lies among directions.
+"""The Earth as an ellipsoid and the directions of its limb.
 
 Stretched along its axes an ellipsoid becomes the unit sphere, whose limb is a circular cone about the way to
 its centre; the stretching takes rays to rays, so that a ray is on the limb exactly when its stretched self is

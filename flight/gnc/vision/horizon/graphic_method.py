@@ -3,12 +3,11 @@
 The limb is a circle in the horizon plane, whose distance below the satellite the altitude gives. Each
 camera's optical axis passes through the body's origin, so that the plane of its centre column holds the
 body's z axis and cuts the horizon plane in a line; where two such lines cross is Z, the point below on that
-axis. From Z to the circle's centre is how far the axis is off nadir.
+axis. The way from Z to the circle's centre is the axis's distance from nadir.
 
 The paper leaves the ratio of pixels to kilometres open. Taken here: the circle's centre is as many pixels
 below the optical axis as the horizon plane is kilometres below the satellite, which for level cameras is
-exact to first order in the tilt, and for a tilt about an optical axis altogether. Pictures are taken for
-homogeneous.
+exact to first order in the tilt, and for any tilt about an optical axis. Pictures are assumed homogeneous.
 """
 
 from __future__ import annotations

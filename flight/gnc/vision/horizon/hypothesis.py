@@ -1,4 +1,4 @@
-"""One supposed horizon: fitted in full, and held against everything that is known."""
+"""One possible horizon: fitted in full and tested against prior knowledge."""
 
 from __future__ import annotations
 
@@ -25,30 +25,30 @@ from flight.gnc.vision.horizon.observation import Observation
 from flight.gnc.vision.horizon.settings import HorizonSettings
 
 _UNKNOWN_TURN = 1.0
-"""rad: the prior on a turn about nadir of which nothing is known; on a sphere it changes nothing."""
+"""rad: the prior on an unknown turn about nadir; on a sphere it has no effect."""
 _NIGHT = np.radians(-8.0)
-"""Elevation of the Sun: an edge there is no limb's."""
+"""Elevation of the Sun: an edge there is not the limb."""
 _LIMB_RAYS = 120
 _BORDER = 8.0
 """px."""
 _NEAR = 0.0375
-"""Of the picture's size, little more than the space of two scan lines: an edge so near covers the limb."""
+"""Of the picture's size, little more than the space of two scan lines: a nearer edge covers the limb."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hypothesis:
-    """A fitted horizon and what speaks for and against it.
+    """A fitted horizon and the evidence for and against it.
 
     Attributes:
         fit: the limb.
         members: (n,) the picture's edges that lie on it.
         residual: px rms normal to the limb, of the members.
-        guess: what it was fitted from.
+        guess: start of the fit.
         lighting: how the picture agrees with it.
         coverage: the share of the lit limb that runs through the picture near a member; 1 where there is
             none.
         night: the share of members where the Sun is well below the horizon.
-        allowance: rad an axis, to be added to the covariance for what the model leaves out.
+        allowance: rad an axis, added to the covariance for unmodelled effects.
     """
 
     fit: FittedLimb
@@ -75,7 +75,7 @@ def examine(
     settings: HorizonSettings,
     camera: CameraModel,
 ) -> Hypothesis | None:
-    """Return the supposed horizon fitted and judged, or None when no limb can be fitted to it."""
+    """Return the horizon fitted from a guess and tested; None if no limb can be fitted."""
     place, stand = guess.place, guess.orientation
     sun = sun_from(place, knowledge)
     prior = Prior(min(stand.sigma, _UNKNOWN_TURN), settings.limb_height_sigma, place.altitude_sigma)
@@ -109,7 +109,7 @@ def _fitted(
     settings: HorizonSettings,
     prior: Prior,
 ) -> tuple[FittedLimb, LimbPoints] | None:
-    """Return the limb through the members, and the places it was fitted to; None where there is none.
+    """Return the limb through the members, and the places it was fitted to; None if the fit fails.
 
     One step towards the steepest places of the edges, and from there the fit to their profiles.
     """

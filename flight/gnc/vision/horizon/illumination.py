@@ -1,7 +1,7 @@
-"""How the picture should look from a view: where there is sky, sunlit ground or night, and a lit limb.
+"""Predicts a picture's light from a view: sky, sunlit ground, night and the lit limb.
 
-The paper leaves open how a horizon is told from the terminator (Meller 3.3). A view that is right predicts
-the whole picture: nothing bright in the sky or on the night side, and an edge all along the lit limb. One
+The paper leaves open how to distinguish a horizon from the terminator (Meller 3.3). A correct view predicts
+the whole picture: nothing bright in the sky or on the night side, and an edge all along the lit limb. A view
 fitted to the terminator does not.
 """
 
@@ -18,9 +18,9 @@ from flight.gnc.vision.horizon.limb_equation import View, limb_residuals
 from flight.gnc.vision.horizon.observation import Samples
 
 TWILIGHT = np.radians(12.0)
-"""Sun this far below the horizon: the ground is taken for night, air included."""
+"""Sun this far below the horizon: ground and air count as night."""
 DAYLIGHT = np.radians(8.0)
-"""Sun this far above the horizon: ground and limb are taken for lit."""
+"""Sun this far above the horizon: ground and limb count as lit."""
 GLARE = np.radians(12.0)
 """About the Sun, where stray light is as bright as the Earth."""
 _ATMOSPHERE = 60e3
@@ -29,12 +29,12 @@ _ATMOSPHERE = 60e3
 
 @dataclass(frozen=True, slots=True)
 class Agreement:
-    """How well a view explains the light that was read.
+    """How well a view explains the picture's light.
 
     Attributes:
         stray: the share of sky and night that is bright.
         missing: the share of sunlit ground that is dark.
-        dark_samples, lit_samples: how many samples each stands on.
+        dark_samples, lit_samples: number of samples of each share.
     """
 
     stray: float
@@ -61,10 +61,7 @@ def sun_elevation(view: View, rays: FloatArray, sun: FloatArray) -> FloatArray:
 
 
 def agreement(view: View, sun: FloatArray | None, samples: Samples) -> Agreement:
-    """Return how a view agrees with samples.
-
-    Without a Sun nothing is known of the ground's light and only the sky counts.
-    """
+    """Return how a view agrees with samples; without a Sun only the sky counts."""
     rays, bright = samples.rays, samples.bright
     outside = limb_residuals(view, rays)
     distance = float(np.linalg.norm(view.position))

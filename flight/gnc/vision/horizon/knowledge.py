@@ -1,4 +1,4 @@
-"""What is known beforehand of where the camera is and how it looks: all optional, each with its spread."""
+"""Prior knowledge of the camera's position and attitude: all optional, each with its spread."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from flight.gnc.math.arrays import FloatArray
 
 ICRS_POLE: FloatArray = np.array([0.0, 0.0, 1.0])
 LEAST_ALTITUDE = 50e3
-"""m: from lower down no limb is seen as one; within the air there is none."""
+"""m: lower down, within the air, no limb is visible."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensedDirection:
-    """A direction that is known in both frames: the coarse Sun of the solar strings, or the magnetic field.
+    """A direction known in both frames: the coarse Sun of the solar strings, or the magnetic field.
 
     Attributes:
         camera: (3,) as sensed, camera axes; of any length.
-        inertial: (3,) as it should be, from ephemeris or field model; of any length.
+        inertial: (3,) by ephemeris or field model; of any length.
         sigma: rad, of an axis.
     """
 
@@ -39,7 +39,7 @@ class RoughAttitude:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class HorizonKnowledge:
-    """What GPS, ephemerides and the coarse sensors say; without any of it the horizon is still fitted.
+    """Data of GPS, ephemerides and coarse sensors; the horizon is fitted without them, too.
 
     Attributes:
         position: (3,) m from the Earth's centre, inertial axes: sets the altitude and, with `pole`, the
@@ -47,10 +47,10 @@ class HorizonKnowledge:
         altitude: m above a sphere of the mean radius, where there is no position.
         sun: (3,) towards the Sun, inertial axes; of any length.
         pole: (3,) the Earth's axis, inertial axes.
-        attitude: a rough one, as the filter has it.
+        attitude: a rough one, from the filter.
         sensed: directions from coarse sensors.
 
-    Raises ValueError for what is not finite, of another shape, or inside the Earth.
+    Raises ValueError for a value that is not finite, of another shape, or inside the Earth.
     """
 
     position: FloatArray | None = None

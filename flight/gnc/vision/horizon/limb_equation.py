@@ -1,4 +1,4 @@
-"""How far a ray is from the limb, and how that changes with attitude, limb height and altitude.
+"""The angle of a ray from the limb, and its gradient by attitude, limb height and altitude.
 
 Stretched until the Earth is the unit sphere (`flight.gnc.vision.horizon.ellipsoid`), a ray of the camera
 makes an angle with the way to the centre; less the half-angle of the limb's cone that is the residual: 0 on
@@ -22,7 +22,7 @@ LIMB_HEIGHT, ALTITUDE = 3, 4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """Where the camera is and how it looks.
+    """The camera's position and attitude, and the limb's height.
 
     Attributes:
         rotation: (3, 3), inertial into camera axes.

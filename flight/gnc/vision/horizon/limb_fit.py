@@ -1,10 +1,9 @@
 """The robust fit of the limb's cone to edges: attitude, limb height and altitude with their covariance.
 
-Gauss-Newton on `flight.gnc.vision.horizon.limb_equation` with exact gradients. Huber's weights, and nothing
-for what lies beyond five spreads, keep clouds, glare and the terminator's ends out; the spread is the points'
-own (from the median of their residuals) where it exceeds the stated one. What the limb cannot tell - its own
-height, the turn about nadir, the altitude - enters as a prior, so that its uncertainty stands in the
-covariance.
+Gauss-Newton on `flight.gnc.vision.horizon.limb_equation` with exact gradients. Huber's weights, and none
+beyond five spreads, exclude clouds, glare and the terminator's ends; the spread is that of the points (from
+the median of their residuals) if it exceeds the stated one. Parameters that the limb does not determine - its
+height, the turn about nadir, the altitude - have a prior, so that the covariance includes their uncertainty.
 """
 
 from __future__ import annotations
@@ -32,16 +31,16 @@ _SAME_GRADIENTS = 3e-3
 _HUBER = 1.5
 _BEYOND = 5.0
 _MOST_ALIKE = 0.8
-"""Correlation of neighbours that is believed."""
+"""Largest correlation of neighbours that is assumed."""
 _TO_SIGMA = 1.4826
 """Of a normal distribution: standard deviation over the median of absolute values."""
 UNKNOWN = 1e9
-"""m: the spread of a height of which nothing is known."""
+"""m: the spread of an unknown height."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prior:
-    """How far the first view may be off: the turn about nadir in rad, limb height and altitude in m."""
+    """Standard deviations of the first view: the turn about nadir in rad, limb height and altitude in m."""
 
     azimuth: float
     limb_height: float
@@ -57,7 +56,7 @@ class FittedLimb:
         covariance: (5, 5) of the parameters of `View.moved`.
         residuals: (n,) rad, positive outside the limb.
         used: (n,) edges within five spreads.
-        spread: how much larger than stated the residuals are, at least 1.
+        spread: factor by which the residuals exceed the stated ones, at least 1.
         cost: the sum of squares in units of the spread, of the used edges and the prior.
     """
 
@@ -77,9 +76,9 @@ class FittedLimb:
 
 
 def fit_limb(start: View, rays: FloatArray, sigma: FloatArray, prior: Prior) -> FittedLimb | None:
-    """Return the limb through rays (n, 3) of spreads (n,) rad, from a view near it; None where there is none.
+    """Return the limb through rays (n, 3) of spreads (n,) rad, from a view near it.
 
-    A view whose edges leave the nadir open, or a fit that runs off the Earth, is none.
+    None if the edges do not determine the nadir, or the fit diverges.
     """
     information = _information(start, prior)
     view, moved = start, np.zeros(PARAMETERS)
@@ -140,17 +139,17 @@ def _weights(residuals: FloatArray, sigma: FloatArray) -> tuple[FloatArray, floa
 
 
 def _alike(nadir: FloatArray, rays: FloatArray, scaled: FloatArray) -> float:
-    """Return by how much more the mean of residuals `scaled` (n,) varies than if they were independent.
+    """Return the factor by which correlation raises the variance of the mean of residuals `scaled` (n,).
 
-    Clouds and coasts behind the limb draw its neighbouring points the same way: of a first-order process with
-    the correlation r of neighbours round the limb it is (1 + r)/(1 - r).
+    Clouds and coasts behind the limb shift neighbouring points alike: for a first-order process with the
+    correlation r of neighbours round the limb the factor is (1 + r)/(1 - r).
     """
     square = float(scaled @ scaled)
     if len(scaled) < 3 or square == 0.0:
         return 1.0
     aside = rays @ tangent_basis(nadir).T
     azimuth = np.arctan2(aside[:, 1], aside[:, 0])
-    # From the widest gap on: the first and the last are no neighbours.
+    # Starting at the widest gap: the first and the last are not neighbours.
     order = np.argsort(azimuth)
     gaps = np.diff(azimuth[order], append=azimuth[order[0]] + 2.0 * np.pi)
     along = scaled[np.roll(order, -1 - int(np.argmax(gaps)))]
@@ -159,7 +158,7 @@ def _alike(nadir: FloatArray, rays: FloatArray, scaled: FloatArray) -> float:
 
 
 def _solved(normal: FloatArray, right: FloatArray) -> FloatArray | None:
-    """Return the solution of normal equations whose unknowns have units of their own; None where open."""
+    """Return the solution of normal equations whose unknowns have different units; None if singular."""
     diagonal = normal.diagonal()
     if not diagonal.min() > 0.0:
         return None
@@ -173,7 +172,7 @@ def _solved(normal: FloatArray, right: FloatArray) -> FloatArray | None:
 
 
 def _sound(view: View) -> bool:
-    """Tell whether the camera is still outside the surface on which the limb lies."""
+    """Return whether the camera is still outside the surface on which the limb lies."""
     if view.surface.polar + view.limb_height <= 0.0:
         return False
     stretched = view.surface.stretching(view.limb_height) @ view.position

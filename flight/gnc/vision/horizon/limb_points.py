@@ -1,4 +1,4 @@
-"""Edges taken for the limb: where they lie, how well they are placed, and how a view would move them."""
+"""Edges assigned to the limb: their places, errors, and gradients by the view."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from flight.gnc.vision.horizon.profile_fit import fit_profiles
 from flight.gnc.vision.horizon.settings import HorizonSettings
 
 _GRAZING = 0.3
-"""Cosine: a scan line that meets the limb more obliquely places it badly."""
+"""Cosine: a scan line more oblique to the limb places it badly."""
 _LOWEST_SUN = np.radians(1.0)
 """Of a limb point's Sun: lower, the light reaches high air only, and the limb appears higher."""
 _FINE = SCALE_HEIGHT / 6.0
-"""m a pixel: in a closer picture the steepest place serves, and the profile is longer than what is kept."""
+"""m a pixel: with finer pixels the steepest place is used; the profile is longer than the samples kept."""
 _ALIKE = 10.0
-"""px: over this length the light behind the limb is one and the same."""
+"""px: length over which the light behind the limb is correlated."""
 _PIXEL_SIGMA = 12.0**-0.5
 """px: a square pixel's own blur."""
 _LEAST_SPREAD = 0.03
-"""px: what no profile is believed beyond."""
+"""px: least error of a profile's place."""
 _OTHER_AIR = 500.0
-"""m: by which bright and dark ground shift the limb unlike, in air thicker or thinner than believed."""
+"""m: shift of the limb between bright and dark ground in air thicker or thinner than assumed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LimbPoints:
-    """The edges taken for limb.
+    """The edges assigned to the limb.
 
     Attributes:
         index: (n,) which of the picture's edges they are.
@@ -52,18 +52,18 @@ class LimbPoints:
     gradients: FloatArray
 
     def chosen(self, which: BoolArray) -> LimbPoints:
-        """Return those that `which` (n,) tells."""
+        """Return the points `which` (n,)."""
         return LimbPoints(*(getattr(self, each.name)[which] for each in fields(self)))
 
 
 def near_limb(view: View, seen: Observation, tolerance: float) -> BoolArray:
-    """Tell which edges (n,) lie within `tolerance` px of a view's limb, their bright side towards nadir."""
+    """Return which edges (n,) lie within `tolerance` px of a view's limb, their bright side towards nadir."""
     near = np.abs(limb_residuals(view, seen.rays.rays)) < tolerance * seen.rays.pixel
     return np.asarray(near & (seen.rays.brighter @ view.nadir > 0.0))
 
 
 def limb_points(view: View, seen: Observation, members: BoolArray, sun: FloatArray | None) -> LimbPoints:
-    """Return the members in daylight that no line grazes."""
+    """Return the members in daylight whose scan line is not too oblique to the limb."""
     chosen = np.flatnonzero(members)
     rays = seen.rays.rays[chosen]
     if sun is not None:
@@ -81,7 +81,7 @@ def limb_points(view: View, seen: Observation, members: BoolArray, sun: FloatArr
 def placed_by_profile(
     view: View, seen: Observation, limb: LimbPoints, settings: HorizonSettings
 ) -> LimbPoints:
-    """Return the points placed by the limb's own profile, where a pixel holds enough of it."""
+    """Return the points placed by the limb's profile if pixels are coarse enough for it."""
     reach = np.sqrt(max(float(view.position @ view.position) - view.surface.equatorial**2, 1.0))
     metres = limb.pixel * reach
     if not len(metres) or float(np.median(metres)) < _FINE:
@@ -91,7 +91,7 @@ def placed_by_profile(
     shift, spread, sound = fit_profiles(edges.profile, edges.profile_steps, metres * limb.inward, blur)
     rays = limb.rays + shift[:, None] * seen.rays.brighter[limb.index]
     rays /= np.sqrt(np.einsum("ij,ij->i", rays, rays))[:, None]
-    # Lines closer together than the ground's features are long do not tell of it independently.
+    # Lines closer together than the ground's features are not independent.
     alike = np.sqrt(max(1.0, _ALIKE / seen.space))
     least = np.hypot(_LEAST_SPREAD, _OTHER_AIR / (metres * limb.inward))
     sigma = alike * np.hypot(spread, least) * limb.inward * limb.pixel
@@ -100,7 +100,7 @@ def placed_by_profile(
 
 def _slopes(seen: Observation, chosen: IntArray, rays: FloatArray, gradients: FloatArray) -> FloatArray:
     """Return the residuals' change (n, 2) rad a pixel to the right and downwards, from gradients (n, 5)."""
-    # What a turn d does to a residual, g (d x u), a step s of the ray u does with d = u x s.
+    # The effect of a turn d on a residual, g (d x u), a step s of the ray u does with d = u x s.
     turns = crossed(gradients[:, :3], rays)
     across, down = seen.across[chosen], seen.down[chosen]
     return -np.stack([np.einsum("ij,ij->i", turns, step) for step in (across, down)], axis=1)

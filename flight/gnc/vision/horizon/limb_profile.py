@@ -1,4 +1,4 @@
-"""How bright the sunlit limb is at each tangent height, by the physics of thin air alone.
+"""The brightness of the sunlit limb at each tangent height, by Rayleigh scattering alone.
 
 A line of sight of tangent height h passes the optical depth t(h) = t0 exp(-h/H), t0 = t_v sqrt(2 pi R/H),
 with t_v the vertical depth of Rayleigh scattering and H the air's scale height; lower down it ends on the
@@ -77,7 +77,7 @@ def _slant_depth(sines: FloatArray) -> FloatArray:
 
 
 def _blurred(profile: FloatArray, widths: FloatArray) -> FloatArray:
-    """Return the profile (m,) through Gaussian blurs (k,) m, (k, m); beyond its ends it is taken to go on."""
+    """Return the profile (m,) through Gaussian blurs (k,) m, (k, m); extended beyond its ends."""
     margin = int(4.0 * _BROADEST / _STEP)
     padded = np.pad(profile, margin, mode="edge")
     frequency = 2.0 * np.pi * np.fft.rfftfreq(len(padded), _STEP)

@@ -1,12 +1,12 @@
-"""From a picture to the way down: the default method, and its judgement.
+"""Nadir from a picture: the default method.
 
     solution = find_nadir(frame, camera, HorizonKnowledge(position=..., sun=..., attitude=...))
     if solution.nadir is not None:
         filter.update(solution.nadir.direction, solution.nadir.covariance, -position)
 
-Edges on scan lines, cones on which many of them agree, the ellipsoid's limb fitted to each, and each fit held
-against the light in the whole picture, the coarse sensors and the rough attitude. One that stands alone is
-found; several that stand are ambiguous, and said to be so; none is refused with the reason.
+Finds edges on scan lines and cones on which many of them agree, fits the ellipsoid's limb to each, and tests
+each fit against the light of the whole picture, the coarse sensors and the rough attitude. A single
+consistent fit is the result; several are ambiguous; without one the picture is refused with the reason.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ from flight.gnc.vision.horizon.settings import HorizonSettings
 from flight.gnc.vision.horizon.solution import HorizonSolution, HorizonStatus, NadirMeasurement
 
 _ALTITUDES = 100e3, 40_000e3
-"""m: where an unknown altitude is looked for."""
+"""m: range of an unknown altitude."""
 _MOST_MISMATCH = 4.0
 """Standard deviations by which a coarse sensor may disagree."""
 _STRAY, _COVERED, _NIGHT = 0.05, 0.6, 0.1
 _RIVAL = 0.3
-"""Of the best's edges: a second horizon of so many is a rival."""
+"""Of the best horizon's edges: a second horizon with this share of its own is a rival."""
 _SAME = np.radians(1.0)
 _GAIN = 1.5
-"""Thrice the lines must show so many times the edges on a horizon, or it is none."""
+"""Three times the lines must give this factor of the edges on a horizon, or it is rejected."""
 
 
 def find_nadir(
@@ -55,8 +55,8 @@ def find_nadir(
 ) -> HorizonSolution:
     """Return the nadir that the horizon in a frame gives, or why there is none.
 
-    Where a horizon of few edges runs, more lines are read; edges without a horizon are looked at a second
-    time on more lines everywhere. Raises ValueError for a frame of another size than the camera's, or with
+    Near a horizon of few edges more lines are read; edges without a horizon are searched again on more lines
+    everywhere. Raises ValueError for a frame of another size than the camera's, or with
     pixels that are not finite.
     """
     knowledge, settings = knowledge or HorizonKnowledge(), settings or HorizonSettings()
@@ -79,7 +79,7 @@ def find_nadir(
         read += closer.read
         second = closer.solution()
         if second.nadir is not None and second.nadir.used >= _GAIN * found.nadir.used:
-            # Its rivals have been judged in the first look.
+            # The first look has already compared it with its rivals.
             return replace(second, candidates=found.candidates, pixels_read=read)
     second = _look(access, camera, knowledge, again).solution()
     return replace(second, pixels_read=read + second.pixels_read)
@@ -87,7 +87,7 @@ def find_nadir(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Look:
-    """What was read at once: `levels` as in `ScanLines`, hypotheses, the best first; how many pixels."""
+    """One search: `levels` as in `ScanLines`, hypotheses, the best first; number of pixels read."""
 
     seen: Observation
     levels: tuple[float, float, float]
@@ -95,7 +95,7 @@ class _Look:
     read: int
 
     def solution(self) -> HorizonSolution:
-        """Return what becomes of it."""
+        """Return the result of this search."""
         points, hypotheses = self.seen.edges.points, self.hypotheses
         if not hypotheses:
             return HorizonSolution(
@@ -135,12 +135,12 @@ def _closer(
     knowledge: HorizonKnowledge,
     settings: HorizonSettings,
 ) -> _Look:
-    """Return the best horizon of a look once more, with the lines that cross it."""
+    """Return the best horizon of a look again, with more lines across it."""
     best = look.hypotheses[0]
     points = look.seen.edges.points[best.members]
     box = np.stack([points.min(axis=0) - look.seen.space, points.max(axis=0) + look.seen.space])
     edges, lines = find_edges(access, settings.edges, Nearby(box, look.levels))
-    # The whole picture's light has been judged on the first look's samples.
+    # The first look's samples have already tested the whole picture's light.
     seen = observe(edges, lines, camera, look.seen.samples)
     members = near_limb(best.fit.view, seen, 2.0 * settings.tolerance)
     again = replace(best.guess, view=best.fit.view, members=members)
@@ -155,15 +155,15 @@ def _hypotheses(
     settings: HorizonSettings,
     camera: CameraModel,
 ) -> list[Hypothesis]:
-    """Return what horizons there could be, those without a flaw first, then by their edges."""
+    """Return the possible horizons, those without a flaw first, then by their edges."""
     if place is None:
         low, high = (float(np.sqrt(1.0 - (6.37e6 / (6.37e6 + h)) ** 2)) for h in _ALTITUDES)
     else:
         low = high = place.cosine
     free = np.ones(len(seen.edges), dtype=bool)
     sound: list[Hypothesis] = []
-    doubtful: list[InitialGuess] = []
-    # What could not be a rival of one that stands need not be looked at.
+    contradicted: list[InitialGuess] = []
+    # Cones too small to rival an accepted horizon are skipped.
     enough = float(settings.least_edges)
     for _ in range(settings.candidates):
         if np.count_nonzero(free) < enough:
@@ -174,7 +174,7 @@ def _hypotheses(
         free = left_free(seen.rays, free, cone, settings.tolerance)
         guess = initial_guess(cone, seen, place, knowledge, settings)
         if guess.orientation.mismatch > _MOST_MISMATCH:
-            doubtful.append(guess)
+            contradicted.append(guess)
             continue
         found = examine(guess, seen, knowledge, settings, camera)
         if found is not None:
@@ -182,14 +182,14 @@ def _hypotheses(
             if not _flaw(found):
                 enough = max(enough, _RIVAL * np.count_nonzero(found.members))
     if all(_flaw(each) for each in sound):
-        # What is wrong for certain is fitted only to be told of.
-        fitted = (examine(each, seen, knowledge, settings, camera) for each in doubtful)
+        # Contradicted guesses are fitted only for the reason of the refusal.
+        fitted = (examine(each, seen, knowledge, settings, camera) for each in contradicted)
         sound += [each for each in fitted if each is not None]
     return sorted(sound, key=lambda each: (_flaw(each) != "", -np.count_nonzero(each.members)))
 
 
 def _judged(hypotheses: list[Hypothesis]) -> tuple[HorizonStatus, str]:
-    """Return what becomes of hypotheses, the best first: those without a flaw come before the others."""
+    """Return status and reason for hypotheses, the best first."""
     best = hypotheses[0]
     flaw = _flaw(best)
     if flaw:
@@ -204,7 +204,7 @@ def _judged(hypotheses: list[Hypothesis]) -> tuple[HorizonStatus, str]:
 
 
 def _flaw(one: Hypothesis) -> str:
-    """Return what speaks against a hypothesis, or nothing."""
+    """Return the reason against a hypothesis; empty without one."""
     light = one.lighting
     if one.guess.orientation.mismatch > _MOST_MISMATCH:
         return f"a coarse direction is {one.guess.orientation.mismatch:.1f} sigma off"

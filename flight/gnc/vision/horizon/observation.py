@@ -1,4 +1,4 @@
-"""What one picture shows, as directions: its edges, and samples of where it is bright."""
+"""One picture's edges as directions, and samples of where it is bright."""
 
 from __future__ import annotations
 
@@ -49,9 +49,9 @@ class Observation:
 def observe(
     edges: Edges, lines: ScanLines, camera: CameraModel, samples: Samples | None = None
 ) -> Observation:
-    """Return what the camera's pixels mean; edges beyond what the lens images are left out.
+    """Return edges and samples as directions; edges outside the lens's image are excluded.
 
-    `samples` serve in place of the lines' own.
+    `samples` replace those of the lines.
     """
     count = len(edges)
     rays = camera.unit_vectors(np.concatenate([edges.points, edges.points + _RIGHT, edges.points + _DOWN]))

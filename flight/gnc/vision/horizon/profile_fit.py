@@ -1,8 +1,8 @@
-"""Where the limb is on a scan line, by the light that it must have at each height.
+"""Places the limb on a scan line by the predicted light at each height.
 
 The profile across the edge is background + a air(h) + g ground(h), h falling by so many metres a pixel; the
-place where h is that of unit optical depth is fitted together with the three brightnesses. The steepest place
-would be drawn in by bright ground behind the limb and out by haze that thins below it: this is not.
+place where h is that of unit optical depth is fitted together with the three brightnesses. Unlike the
+steepest place, it is not shifted inwards by bright ground behind the limb nor outwards by thinning haze.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _OUTSIDE, _INSIDE = -8.0, 4.0
 _FLOOR, _SHARE = 0.02, 0.08
 """Noise of a sample: of the limb's brightness, and of the sample's own."""
 _FARTHEST = 2.0
-"""px from the steepest place: a limb farther away is none."""
+"""px from the steepest place: a limb farther away is rejected."""
 _LEAST = 7
 """Samples."""
 
@@ -40,8 +40,8 @@ def fit_profiles(
     weights = usable / (_FLOOR + _SHARE * np.clip(light, 0.0, 1.0)) ** 2
     place = np.zeros(len(profiles))
     amounts = np.zeros((len(profiles), 3))
-    # Weak beliefs that keep the equations sound where a profile leaves one of them open.
-    belief = np.diag([1.0, 1.0, 1.0, 0.1])
+    # Weak priors that keep the equations regular if a profile leaves a parameter open.
+    prior = np.diag([1.0, 1.0, 1.0, 0.1])
     of_place = np.zeros((len(profiles), 4, 1))
     of_place[:, 3] = 1.0
     for _ in range(_STEPS):
@@ -53,7 +53,7 @@ def fit_profiles(
         shift = (amounts[:, 1:2] * air_slope + amounts[:, 2:] * ground_slope) * metres[:, None]
         columns = np.stack([np.ones_like(air), air, ground, shift], axis=2)
         weighted = columns * weights[:, :, None]
-        normal = weighted.transpose(0, 2, 1) @ columns + belief
+        normal = weighted.transpose(0, 2, 1) @ columns + prior
         slope = weighted.transpose(0, 2, 1) @ (light - model)[:, :, None]
         # With the step the inverse's last column: the place's variance.
         answer = np.linalg.solve(normal, np.concatenate([slope, of_place], axis=2))

@@ -1,7 +1,7 @@
-"""From counts back to light: the logarithmic camera's curve undone, so that the limb has its true shape.
+"""Converts counts to light: inverts a logarithmic camera's curve, so that the limb has its true shape.
 
-A logarithmic detector draws the thin air high above the limb out to a long ramp; where the brightness falls
-to half, which is at a height that physics gives, is told in light, not in its logarithm.
+A logarithmic detector stretches the thin air above the limb to a long ramp; physics gives the height at which
+the light, not its logarithm, falls to half.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from flight.gnc.math.arrays import FloatArray, Image
 
 @dataclass(frozen=True, slots=True)
 class LogarithmicResponse:
-    """counts = pedestal + counts_per_decade log10(1 + light), light in units of the dark current's worth."""
+    """counts = pedestal + counts_per_decade log10(1 + light), light in units of the dark current."""
 
     pedestal: float
     counts_per_decade: float

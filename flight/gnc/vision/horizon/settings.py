@@ -1,4 +1,4 @@
-"""The numbers of the search for the horizon."""
+"""Settings of the search for the horizon."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from flight.gnc.vision.horizon.response import LogarithmicResponse
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EdgeSettings:
-    """How edges are looked for along scan lines.
+    """How edges are found along scan lines.
 
     Attributes:
-        lines: columns, and as many rows, that are read.
-        more_lines: the same, where those show too little.
+        lines: number of columns, and of rows, that are read.
+        more_lines: the same for a second look.
         run: px, odd: shorter fluctuations are filtered out (Meller 3.1).
-        threshold: what counts as bright, as a share of the way from the low to the high average.
-        contrast: an edge that is weaker, as a share of the same way, is none.
-        most: edges that are kept for each of `lines`, those with the darkest dark side.
+        threshold: of bright pixels, as a share of the way from the low to the high average.
+        contrast: of the weakest edge, as a share of the same way.
+        most: edges kept for each of `lines`, those with the darkest dark side.
         psf_sigma: px, the blur of the optics.
         response: the detector's, if it is not linear.
     """
@@ -45,20 +45,20 @@ class EdgeSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HorizonSettings:
-    """How the horizon is told among edges, and what is believed of it.
+    """How the horizon is chosen among edges, and its assumed errors.
 
     Attributes:
         edges: see `EdgeSettings`.
-        limb_height_sigma: m, by which the apparent limb may be off the height that physics gives: the default
-            for air of unknown scale height (6.5 to 9.5 km) and haze (a third more or less), 1,000 for known.
-        altitude_sigma: m, of a position that is given.
+        limb_height_sigma: m, of the apparent limb's height: the default is for air of unknown scale height
+            (6.5 to 9.5 km) and haze (a third more or less), 1,000 for known air.
+        altitude_sigma: m, of a given position.
         tolerance: px, within which edges agree with a circular cone; the Earth's flattening fits into it.
-        least_edges: a horizon of fewer is none.
-        enough_edges: a horizon of fewer is looked at again on more lines.
-        some_edges: in a picture of fewer nothing is looked at again.
-        candidates: how many horizons are looked for in one picture.
-        tries: pairs or triples of edges looked at for each.
-        sphere_sigma: rad an axis, what is added where the flattening's direction is not known.
+        least_edges: of a horizon.
+        enough_edges: a horizon of fewer edges is searched again on more lines.
+        some_edges: a picture of fewer edges is not searched again.
+        candidates: number of horizons searched for in one picture.
+        tries: pairs or triples of edges tried for each.
+        sphere_sigma: rad an axis, added where the flattening's direction is unknown.
     """
 
     edges: EdgeSettings = field(default_factory=EdgeSettings)

@@ -1,4 +1,4 @@
-"""What a picture tells of the way down: nadir in camera axes with its covariance, or why it tells none."""
+"""The result for one picture: nadir in camera axes with its covariance, or the reason for none."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from flight.gnc.vision.horizon.limb_equation import View
 
 
 class HorizonStatus(Enum):
-    """How the search for the horizon ended."""
+    """The outcome of the search for the horizon."""
 
     FOUND = "found"
     AMBIGUOUS = "ambiguous"
-    """Several fits stand, or one that nothing told from the terminator: see the candidates."""
+    """Several fits are possible, or one may be the terminator: see the candidates."""
     NO_HORIZON = "no-horizon"
     """Too few edges, or none that lie on one horizon."""
     REFUSED = "refused"
-    """A horizon was fitted, but it contradicts what is known: see the reason."""
+    """A horizon was fitted but contradicts prior knowledge: see the reason."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NadirMeasurement:
-    """The direction to the Earth's centre, as one horizon gives it.
+    """The direction to the Earth's centre from one horizon.
 
     Attributes:
         direction: (3,) unit vector in camera axes, towards the Earth's centre (geocentric nadir).
         covariance: (3, 3) rad^2, of the direction's error; of rank 2, nothing along the direction itself.
         altitude: m above the ellipsoid (or the sphere of the mean radius): given, or fitted where unknown.
         altitude_sigma: m.
-        residual: px rms, normal to the fitted horizon, of the points that were used.
-        used: how many points lie on the horizon.
+        residual: px rms, normal to the fitted horizon, of the points used.
+        used: number of points on the horizon.
     """
 
     direction: FloatArray
@@ -66,11 +66,11 @@ class HorizonSolution:
 
     Attributes:
         nadir: the measurement, when the status is FOUND.
-        candidates: what could be the horizon and was not chosen, or all of it when ambiguous.
+        candidates: the horizons that were not chosen; all of them if ambiguous.
         points: (n, 2) px, every edge from dark to bright that was found.
-        on_horizon: (n,) those that the fit used.
+        on_horizon: (n,) whether the fit used them.
         view: the camera's place and attitude by the best fit, accepted or not; see `limb_in_picture`.
-        pixels_read: how many of the picture's pixels were looked at.
+        pixels_read: number of pixels read.
     """
 
     status: HorizonStatus

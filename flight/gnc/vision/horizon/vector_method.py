@@ -1,8 +1,8 @@
-"""Nadir carried on by the Vector Method: two successive sights of the same place (Meller 3.2.2, equation 6).
+"""Nadir propagated by the Vector Method: two successive sights of one place (Meller 3.2.2, equation 6).
 
 A place on the horizon stood at Q, on the optical axis, and stands at P a moment later: the rotation that
 takes Q to P takes the old nadir to the new one. Two vectors leave the turn about themselves open; the
-shortest rotation is taken, and what the body turned about P meanwhile is not seen.
+shortest rotation is taken; a turn of the body about P is not observed.
 """
 
 from __future__ import annotations

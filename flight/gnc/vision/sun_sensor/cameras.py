@@ -1,4 +1,4 @@
-"""Which camera is to be read first: the one that has the coarse Sun in its field (Meller et al. 2)."""
+"""Orders cameras for reading: first the one with the coarse Sun in its field (Meller et al. 2)."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ _RING = 12
 
 @dataclass(frozen=True, slots=True)
 class CameraChoice:
-    """A camera as a place to look for the Sun.
+    """A camera and whether it may see the Sun.
 
     Attributes:
-        index: which of the cameras.
+        index: of the camera.
         likely: whether the coarse Sun itself is in its field.
         possible: whether the Sun is within three standard deviations.
         angle: rad from its boresight to the coarse Sun.
@@ -39,8 +39,8 @@ def cameras_by_sun(
     """Return the cameras in the order in which they are to be read for the Sun; none when it is dark.
 
     `mountings` are quaternions (4,), body into camera. With a coarse Sun those that have it in their field
-    come first, then those that may have; by the angle from the boresight in each. Strings that are uncertain
-    leave all cameras possible, in their own order. Raises ValueError for unlike numbers of both.
+    come first, then those that may have; by the angle from the boresight in each. With uncertain
+    strings all cameras are possible, in the given order. Raises ValueError for unlike numbers of both.
     """
     if len(cameras) != len(mountings):
         raise ValueError(f"{len(cameras)} cameras with {len(mountings)} mountings: give one for each")

@@ -1,4 +1,4 @@
-"""Where in a frame the Sun could be: bright patches on a few rows, as random access reads them first."""
+"""Places in a frame where the Sun could be: bright patches on a few rows, read first by random access."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from flight.gnc.camera.pixel_access import PixelAccess
 from flight.gnc.math.arrays import FloatArray, Image
 
 MOST = 4
-"""Patches that are looked at more closely, the largest first."""
+"""Patches that are examined, the largest first."""
 LEAST = 3
 """Pixels of a patch on the rows that are read: a chord of the Sun's disc, but not a hot pixel."""
 
@@ -29,14 +29,14 @@ def bright_patches(
 ) -> tuple[list[Patch], bool]:
     """Return the patches above `level` counts on every `stride`th row, largest first.
 
-    Patches narrower than `narrowest` px or wider than `widest` are left out; the second value tells whether
-    any of the wide were.
+    Patches narrower than `narrowest` px or wider than `widest` are excluded; the second value is whether
+    any wide one was.
     """
     rows = np.arange(stride // 2, pixels.rows, stride)
     bright = pixels.read_rows(rows) >= level
     if not bright.any():
         return [], False
-    # Labels cost by the pixel: only the box about all that is bright gets any.
+    # Labelling costs per pixel: only the box about all bright pixels is labelled.
     down, across = np.flatnonzero(bright.any(axis=1)), np.flatnonzero(bright.any(axis=0))
     top, left = int(down[0]), int(across[0])
     labels, count = label(bright[top : down[-1] + 1, left : across[-1] + 1])

@@ -1,8 +1,8 @@
-"""A circle through rim points of which some are not the disc's: centre, radius and their covariance.
+"""A robust circle through rim points: centre, radius and their covariance.
 
 A start by consensus among triples of points; then geometric least squares by Gauss and Newton, each point
-weighted by Tukey's biweight of its distance from the circle (Huber 1981, Robust Statistics, chapter 7): a
-cloud beside the disc or a hot pixel on its rim has no say.
+weighted by Tukey's biweight of its distance from the circle (Huber 1981, Robust Statistics, chapter 7), which
+excludes a cloud beside the disc or a hot pixel on its rim.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ LEAST_POINTS = 6
 
 _STEPS = 10
 _LAST_STEP = 1e-2
-"""Of a point's error: the steps shrink so fast that no more is to be gained."""
+"""Of a point's error: convergence is fast, further steps gain nothing."""
 _MOST_ALIKE = 0.9
-"""Correlation of neighbours' errors that is believed."""
+"""Largest correlation of neighbours' errors that is assumed."""
 _TUKEY = 4.685
 """Times the scale: 95 % efficient on Gaussian errors."""
 _NEARLY_AS_MANY = 0.75
-"""Of the best consensus: a smaller circle with so much of it is preferred, for light beside the disc adds."""
+"""Of the best consensus: a smaller circle with this share is preferred, as stray light enlarges the disc."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,8 +35,8 @@ class Circle:
         radius: greater than 0.
         used: which of the points (n,) it was fitted to.
         residual: rms of their distances from it.
-        shape: (2, 2), the centre's covariance for unit variance of each point; neighbours' errors being
-            as much alike as they were found to be.
+        shape: (2, 2), the centre's covariance for unit variance of each point; with the
+            measured correlation of neighbours' errors.
     """
 
     centre: FloatArray
@@ -47,7 +47,7 @@ class Circle:
 
 
 def fit_circle(points: FloatArray, scale: float) -> Circle | None:
-    """Return the circle of `points` (n, 2), in order round it, or None when they make none.
+    """Return the circle of `points` (n, 2), in order round it, or None without one.
 
     `scale` is the error of a good point.
     """
@@ -75,7 +75,7 @@ def fit_circle(points: FloatArray, scale: float) -> Circle | None:
     square = float(np.mean(left**2))
     if not (solution[2] > 0.0 and 0.0 < square < np.inf):
         return None
-    # Errors of neighbours that are alike average out less: by (1 + r)/(1 - r) for a first-order process.
+    # Correlated errors average out less: by (1 + r)/(1 - r) for a first-order process.
     alike = min(max(float(np.mean(left * np.roll(left, 1))) / square, 0.0), _MOST_ALIKE)
     shape = np.linalg.inv(slopes.T @ slopes)[:2, :2] * ((1.0 + alike) / (1.0 - alike))
     return Circle(solution[:2], float(solution[2]), used, float(np.sqrt(square)), np.asarray(shape))

@@ -2,9 +2,9 @@
 
     solution = find_sun(ArrayPixels(frame), camera, SunSettings())
 
-A few rows are read; what is brighter there than the level, and not too large, is looked at more closely: its
-rim is traced, and a circle on the sphere fitted to it. The circle's middle is the Sun's, however saturated
-the disc is, whether its glare belongs to the image or not, and though a part of it be cut off.
+A few rows are read; the rim of each patch brighter than the level and not too large is traced, and a circle
+on the sphere fitted to it. The circle's centre is the Sun's, whether the disc is saturated, has glare, or is
+partly cut off.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from flight.gnc.vision.sun_sensor.settings import SunSettings
 from flight.gnc.vision.sun_sensor.solution import SunMeasurement, SunSolution, SunStatus
 
 _ROUNDS = 3
-"""Tracings of the rim at the most, each from the middle that the last one found."""
+"""Most tracings of the rim, each from the centre that the last one found."""
 _NEAR = 0.5
-"""px: nearer than this to where its spokes start a middle is as good as traced from itself."""
+"""px: a centre this close to the start of its spokes needs no further tracing."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,7 +43,7 @@ class _Disc:
 
     @property
     def pixels_per_radian(self) -> float:
-        """The mean over all ways."""
+        """The mean over all directions."""
         return float(np.sqrt(abs(np.linalg.det(self.scale))))
 
 
@@ -60,19 +60,19 @@ def find_sun(pixels: PixelAccess, camera: CameraModel, settings: SunSettings) ->
     # Towards the corners a pinhole draws a disc out by the square of the angle's secant.
     stretch = 1.0 / np.cos(min(camera.half_diagonal, 1.2)) ** 2
     reach = settings.greatest_radius * camera.focal_length * stretch
-    # A disc that the frame's edge cuts still shows half its width, or too little of its rim.
+    # A disc cut by the frame's edge shows at least half its width, or too little of its rim.
     narrowest = settings.least_radius * camera.focal_length - settings.stride
     patches, wide = bright_patches(pixels, settings.level, settings.stride, narrowest, 2.0 * reach)
     read = pixels.columns * len(range(settings.stride // 2, pixels.rows, settings.stride))
     reasons = ["a patch larger than the Sun and its glare"] if wide else []
     found: list[SunMeasurement] = []
     for patch in patches:
-        # Twice the radius and some more, for a middle that the frame's edge has cut away.
+        # Twice the radius and a margin, for a centre outside the frame.
         near = min(2.5 * patch.half + 6.0, 2.0 * reach)
         strip, first = window(pixels, patch.middle, near)
         read += strip.size
         disc = _disc(strip, first, patch.middle, near / camera.focal_length, camera, settings)
-        reason = "no round rim" if disc is None else _doubt(disc, settings)
+        reason = "no round rim" if disc is None else _flaw(disc, settings)
         if disc is None or reason:
             reasons.append(f"{reason} about pixel ({patch.middle[0]:.0f}, {patch.middle[1]:.0f})")
         else:
@@ -103,7 +103,7 @@ def _disc(
         aside = float(np.linalg.norm(circle.centre))
         if aside > settings.greatest_radius:
             return None
-        # A radius that is far from the Sun's does not become it by another tracing.
+        # Another tracing does not turn a wrong radius into the Sun's.
         alien = not 0.5 * settings.least_radius < circle.radius < 2.0 * settings.greatest_radius
         if alien or aside * disc.pixels_per_radian < _NEAR:
             break
@@ -111,8 +111,8 @@ def _disc(
     return disc
 
 
-def _doubt(disc: _Disc, settings: SunSettings) -> str:
-    """Return what speaks against the disc's being the Sun, or nothing."""
+def _flaw(disc: _Disc, settings: SunSettings) -> str:
+    """Return the reason why the disc is not the Sun; empty without one."""
     circle, rim = disc.circle, disc.rim
     used = int(np.count_nonzero(circle.used))
     radius = np.degrees(circle.radius)
@@ -137,7 +137,7 @@ def _measurement(disc: _Disc, camera: CameraModel, settings: SunSettings) -> Sun
     backward = np.linalg.inv(disc.scale)
     floor = settings.floor_sigma**2 * backward @ backward.T
     axis = disc.axis
-    # The rim's basis, tilted to where the middle turned out to be.
+    # The rim's basis, tilted to the centre found.
     first = disc.rim.basis[0] - (disc.rim.basis[0] @ axis) * axis
     first /= np.linalg.norm(first)
     return SunMeasurement(

@@ -1,7 +1,7 @@
-"""The rim of a bright disc: where the light along spokes from within falls through a level.
+"""The rim of a bright disc: where the light along spokes from inside falls through a level.
 
-Spokes run along great circles, so that lens and perspective do not bend a disc's rim: round the Sun it is a
-circle on the sphere, wherever it stands in the frame.
+Spokes run along great circles, so that lens and perspective do not deform the rim: the Sun's is a circle on
+the sphere anywhere in the frame.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ class Rim:
         axis: (3,) unit vector in camera axes, where the spokes start.
         basis: (2, 3) axes of the plane.
         points: (n, 2) rad, of arc length from the axis: azimuthal equidistant.
-        cut: how many of the `SPOKES` left the frame before they met the rim.
-        endless: how many met none within reach.
+        cut: number of `SPOKES` that left the frame before the rim.
+        endless: number that met no rim within reach.
     """
 
     axis: FloatArray

@@ -1,4 +1,4 @@
-"""The numbers of the search for the Sun in a camera's frame."""
+"""Settings of the search for the Sun in a camera's frame."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from flight.gnc.errors import UsageError
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SunSettings:
-    """How the Sun is told from everything else that is bright, and how well it is found.
+    """How the Sun is distinguished from other bright objects, and its assumed errors.
 
-    The Sun shines always alike, so at one exposure its bright disc, glare included, has one radius: give
-    that within a fifth or so. The defaults are for a logarithmic camera like the Fuga 15d; for a linear one
-    whose white clouds come near to saturation `LINEAR` serves. Within wide bounds a cloud may pass for a Sun.
+    At one exposure the Sun's bright disc, glare included, has one radius: give that within about a fifth;
+    within wide bounds a cloud may pass for the Sun. The defaults are for a logarithmic camera like the Fuga
+    15d; `LINEAR` is for a linear one whose white clouds come near to saturation.
 
     Attributes:
-        level: counts; the Sun's image is what lies above. For a logarithmic camera well above the brightest
-            cloud, so that only the disc is left; for a linear one a little below where it saturates.
+        level: counts, exceeded by the Sun's image. For a logarithmic camera well above the brightest cloud,
+            so that only the disc remains; for a linear one a little below saturation.
         stride: px between the rows that are read first.
-        least_radius: rad; what is smaller is a hot pixel. The disc itself has 0.0047.
-        greatest_radius: rad; what is larger is a cloud, or the Earth.
+        least_radius: rad; smaller patches are hot pixels. The disc itself has 0.0047.
+        greatest_radius: rad; larger patches are clouds, or the Earth.
         tolerance: px rms by which the rim may be off a circle.
         least_agreement: share of the rim within the frame that must lie on the circle.
         least_arc: rad of the rim that must be seen.
         rim_sigma: px, a rim point's error that the fit's residuals may not show.
-        floor_sigma: px an axis, of the centre: what the pixels' pattern leaves however good the fit.
+        floor_sigma: px an axis, least error of the centre, from the pixels' pattern.
     """
 
     level: float = 200.0

@@ -1,4 +1,4 @@
-"""What a frame tells of the Sun: its direction with its covariance, or why it tells none."""
+"""The result for one frame: the Sun's direction with its covariance, or the reason for none."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from flight.gnc.math.arrays import FloatArray
 
 
 class SunStatus(Enum):
-    """How the search for the Sun ended."""
+    """The outcome of the search for the Sun."""
 
     FOUND = "found"
     PARTIAL = "partial"
@@ -24,14 +24,14 @@ class SunStatus(Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SunMeasurement:
-    """The direction to the Sun's centre, as one frame gives it.
+    """The direction to the Sun's centre from one frame.
 
     Attributes:
         direction: (3,) unit vector in camera axes.
         basis: (2, 3), two unit vectors normal to it and to one another.
-        tangent_covariance: (2, 2) rad^2, of the direction's error along `basis`; the lens's calibration
-            is taken to be perfect.
-        point: (2,) px, of the centre; NaN where the lens sees nothing.
+        tangent_covariance: (2, 2) rad^2, of the direction's error along `basis`; without the lens's
+            calibration.
+        point: (2,) px, of the centre; NaN outside the lens's image.
         radius: rad, of the bright disc, glare included.
         residual: px rms, of the rim points that were used.
         arc: rad of the rim that was used.
@@ -64,7 +64,7 @@ class SunSolution:
 
     Attributes:
         sun: the measurement, when the status is FOUND or PARTIAL.
-        pixels_read: how many of the frame's pixels were looked at.
+        pixels_read: number of pixels read.
     """
 
     status: SunStatus

@@ -1,9 +1,9 @@
 """The coarse Sun: from the currents of solar strings on the body's faces (Meller et al., chapter 2).
 
-A string's current goes with the cosine of the Sun's distance from its normal, and is none from behind. The
-Earth shines on the strings, too, up to a third as strongly as the Sun, from half the sky: with the share
-(1 + n e)/2 on a string of normal n, e the way down. Where nadir is known that makes the strings' errors alike
-in one known pattern; where it is not, in the mean pattern over all ways. Either goes into the covariance.
+A string's current is proportional to the cosine of the Sun's angle from its normal, zero from behind. The
+Earth shines on the strings, too, up to a third as strongly as the Sun, from half the sky: with the share (1 +
+n e)/2 on a string of normal n, e being nadir. This correlates the strings' errors: in one known pattern if
+nadir is known, else in the mean pattern over all directions. Either is part of the covariance.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from flight.gnc.math.directions import tangent_basis
 
 _STEPS = 15
 _SOFT = 0.05
-"""Cosine over which a string comes to see the Sun: its slope there tells a Sun straight upon a face."""
+"""Cosine over which a string's current sets in: the slope there determines a Sun normal to a face."""
 _RARE = 3.09
 """Standard deviations that one reading in a thousand exceeds."""
 
@@ -30,14 +30,13 @@ def _cube() -> FloatArray:
 
 
 class CoarseSunStatus(Enum):
-    """What the strings say."""
+    """The outcome of the strings' solution."""
 
     FOUND = "found"
     DARK = "dark"
-    """No string has a current: eclipse, or the strings are gone."""
+    """No string has a current: eclipse, or failed strings."""
     UNCERTAIN = "uncertain"
-    """Currents that no Sun makes, together with any Earth. One dead string is often not told from its face's
-    lying in the dark; one that gives too much is."""
+    """No Sun with any Earth makes these currents. A dead string often looks like a dark face."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,13 +76,13 @@ class SolarStrings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CoarseSun:
-    """The Sun as the strings know it.
+    """The Sun's direction by the strings.
 
     Attributes:
         direction: (3,) unit vector in body axes, when the status is FOUND.
         basis: (2, 3), two unit vectors normal to it and to one another.
         tangent_covariance: (2, 2) rad^2, of the direction's error along `basis`.
-        reason: why there is none.
+        reason: why there is no direction.
     """
 
     status: CoarseSunStatus
@@ -102,8 +101,8 @@ class CoarseSun:
 def coarse_sun(currents: FloatArray, strings: SolarStrings, nadir: FloatArray | None = None) -> CoarseSun:
     """Return the Sun's direction in body axes from `currents` (n,) A, those of `strings`.
 
-    `nadir` (3,), if known, is a unit vector in body axes; ten degrees off does no harm. Raises ValueError for
-    currents of another number or not finite.
+    `nadir` (3,), if known, is a unit vector in body axes; an error of ten degrees is harmless. Raises
+    ValueError for currents of another number or not finite.
     """
     currents = np.asarray(currents, dtype=float)
     if currents.shape != strings.peaks.shape or not np.all(np.isfinite(currents)):
@@ -124,16 +123,16 @@ def coarse_sun(currents: FloatArray, strings: SolarStrings, nadir: FloatArray | 
         weighted = slopes.T @ information
         inverse = np.linalg.inv(weighted @ slopes + 1e-6 * np.eye(2))
         step = inverse @ (weighted @ (readings - modelled))
-        # No longer than half a radian: far from the answer the slopes mislead.
+        # At most half a radian: far from the solution the slopes mislead.
         step *= min(1.0, 0.5 / max(float(np.hypot(*step)), 1e-12))
         direction = direction + step @ basis
         direction = direction / np.linalg.norm(direction)
         if np.hypot(*step) < 1e-6:
             break
     left = readings - _cosines(strings.normals @ direction)[0]
-    surprise = float(left @ information @ left)
-    if surprise > _chi_square(len(shares) - 2):
-        reason = f"the currents fit no Sun: chi-square {surprise:.0f} of {len(shares) - 2}"
+    square = float(left @ information @ left)
+    if square > _chi_square(len(shares) - 2):
+        reason = f"the currents fit no Sun: chi-square {square:.0f} of {len(shares) - 2}"
         return CoarseSun(CoarseSunStatus.UNCERTAIN, reason=reason)
     return CoarseSun(CoarseSunStatus.FOUND, direction, basis, np.asarray(inverse))
 
@@ -158,7 +157,7 @@ def _earthlight(strings: SolarStrings, nadir: FloatArray | None) -> tuple[FloatA
     if nadir is not None:
         pattern = 0.5 * (1.0 + normals @ nadir)
         return strings.albedo * pattern, own + square * np.outer(pattern, pattern)
-    # Over all ways e, (1 + n e)/2 has the mean 1/2 and the product's mean 1/4 + n n'/12.
+    # Over all directions e, (1 + n e)/2 has the mean 1/2 and the product's mean 1/4 + n n'/12.
     even = np.full(len(normals), 0.5)
     second = 0.25 + normals @ normals.T / 12.0
     covariance = (strings.albedo**2 + square) * second - strings.albedo**2 * np.outer(even, even)
