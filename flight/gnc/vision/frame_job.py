@@ -181,6 +181,10 @@ def _from_streaks(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, motion
         again = _motion(replace(job, camera=solution.camera))
         assert isinstance(again, MotionResult)  # as `motion`, by the same estimator
         return FrameFound(again, solve_motion(again, solution.camera, (1.0, 1.0), sky, settings, prior))
+    if not job.motion_first:
+        return FrameFound(
+            motion, solution
+        )  # for a picture the refit costs half as much again, and gains little
     from flight.gnc.vision.startracker.catalogue_refit import refit_with_catalogue  # noqa: PLC0415
 
     assert isinstance(job.estimator, LikelihoodSettings)  # it made a MotionResult
