@@ -1,4 +1,4 @@
-"""`python -m flight`: fly a configuration, report on a run, plan a path."""
+"""`python -m flight`, and the console script `knightcube`, which is the same."""
 
 import os
 

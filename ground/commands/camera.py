@@ -13,6 +13,7 @@ import numpy as np
 
 from flight.gnc.camera.images import write_picture
 from flight.gnc.errors import UsageError
+from flight.schema.carried import config_path
 from flight.schema.sections import Camera
 from hal.interfaces.devices import FrameSource
 from hal.interfaces.errors import NotResponding
@@ -35,7 +36,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "example: python -m flight camera --config /etc/knightcube/flight.yaml --out frame.png --count 5"
     )
-    parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="configuration file")
+    parser.add_argument(
+        "--config", type=config_path, required=True, metavar="CONFIG", help="file, or a carried name"
+    )
     parser.add_argument("--out", type=Path, metavar="PNG", help="keep the frame; of several, name-NUMBER.png")
     parser.add_argument("--count", type=int, default=1, metavar="N", help="frames to take (default 1)")
     parser.add_argument("--exposure", type=float, metavar="S", help="exposure instead of the configuration's")

@@ -15,6 +15,7 @@ from flight.app.request import RunRequest
 from flight.gnc.errors import UsageError
 from flight.link.telemetry.reader import read_run
 from flight.schema import reader as configuration
+from flight.schema.carried import config_path
 from flight.schema.sections import Config
 from ground.commands.options import positive
 from ground.identification.constants import NAMES, UNITS, Constants
@@ -68,7 +69,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "example: python -m flight identify config/testbed.yaml --out plant.yaml --picture fit.png"
     )
-    parser.add_argument("source", type=Path, metavar="CONFIG", help="YAML file, or the folder of a run")
+    parser.add_argument(
+        "source",
+        type=config_path,
+        metavar="CONFIG",
+        help="YAML file, carried name such as testbed, or the folder of a run",
+    )
     parser.add_argument("--out", type=Path, metavar="YAML", help="write the `plant` section here")
     parser.add_argument(
         "--run", type=Path, metavar="DIR", help="folder of the flight (default runs/NAME-TIME)"

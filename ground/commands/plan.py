@@ -15,8 +15,9 @@ from flight.bodies.testbed.plant_model import plant_of
 from flight.gnc.guidance.one_axis.plant import SingleAxisPlant
 from flight.gnc.guidance.one_axis.vmc import NODES, Plan, plan
 from flight.schema import reader as configuration
+from flight.schema.carried import config_path
 
-_DEFAULT_CONFIG = Path("config/step_demo.yaml")
+_DEFAULT_CONFIG = "step_demo"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -42,10 +43,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--nodes", type=int, metavar="N", help=f"nodes of the path (default {NODES})")
     parser.add_argument(
         "--config",
-        type=Path,
+        type=config_path,
         default=_DEFAULT_CONFIG,
-        metavar="YAML",
-        help=f"where the plant stands (default {_DEFAULT_CONFIG})",
+        metavar="CONFIG",
+        help=f"configuration of the plant, a file or a carried name (default {_DEFAULT_CONFIG})",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object, with the nodes")
     parser.add_argument("--picture", type=Path, metavar="PNG", help="draw the path, its rate and its current")

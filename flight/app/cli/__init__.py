@@ -11,6 +11,7 @@ import io
 import sys
 from collections.abc import Sequence
 from importlib import metadata
+from pathlib import Path
 
 from flight import __version__
 from flight.gnc.errors import FlightError, UsageError
@@ -22,14 +23,17 @@ COMMANDS = {"run": "fly a configuration"}
 GROUP = "knightcube.commands"
 """Entry points: each a table like `COMMANDS` in the package whose modules bear the commands' names."""
 
-_EXAMPLES = """\
+PROGRAM = "knightcube" if Path(sys.argv[0]).name == "knightcube" else "python -m flight"
+"""How this was started: by its console script or as a module."""
+
+_EXAMPLES = f"""\
 examples:
-  python -m flight run config/step_demo.yaml --out runs/demo
-  python -m flight report runs/demo
-  python -m flight plan --from 0.4 --to -0.3 --picture path.png
-  python -m flight rate frame.png --fov 20 --exposure 0.2 --overlay found.png
-  python -m flight solve night.jpg --fov 11.4 --overlay solved.png
-  python -m flight horizon limb.png --fov 67 --altitude 515 --overlay found.png
+  {PROGRAM} run step_demo --out runs/demo
+  {PROGRAM} report runs/demo
+  {PROGRAM} plan --from 0.4 --to -0.3 --picture path.png
+  {PROGRAM} rate frame.png --fov 20 --exposure 0.2 --overlay found.png
+  {PROGRAM} solve night.jpg --fov 11.4 --overlay solved.png
+  {PROGRAM} horizon limb.png --fov 67 --altitude 515 --overlay found.png
 """
 
 
@@ -56,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="python -m flight",
+        prog=PROGRAM,
         description="The on-board application of the KnightCube.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,

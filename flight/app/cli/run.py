@@ -11,9 +11,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TextIO
 
+from flight.app.cli import PROGRAM
 from flight.app.request import RunRequest
 from flight.link.telemetry.reader import read_run
 from flight.loop.progress import Progress
+from flight.schema.carried import config_path, names
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -23,7 +25,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "section. Simulated flights run as fast as they can; --realtime flies them on the machine's clock, "
         "the devices in a process of their own. Ctrl-C ends a flight, coils at zero, log whole."
     )
-    parser.add_argument("config", type=Path, metavar="CONFIG", help="YAML file, see config/step_demo.yaml")
+    parser.add_argument(
+        "config",
+        type=config_path,
+        metavar="CONFIG",
+        help=f"YAML file, or a carried name: {', '.join(names())}",
+    )
     place = parser.add_mutually_exclusive_group()
     place.add_argument("--out", type=Path, metavar="DIR", help="folder of the run (default runs/NAME-TIME)")
     place.add_argument("--archive", type=Path, metavar="DIR", help="folder of a board's runs: fly the next")
@@ -113,7 +120,7 @@ def run(options: argparse.Namespace) -> int:
             f"flown: {seconds:.0f} s in {elapsed:.1f} s, {result.reason}\n"
             f"{broken}"
             f"log:   {result.folder}\n"
-            f"next:  python -m flight report {result.folder}\n"
+            f"next:  {PROGRAM} report {result.folder}\n"
         )
     for problem in filter(None, (result.log_error, result.restart)):
         sys.stderr.write(f"flight: {problem}\n")
