@@ -25,9 +25,9 @@ from ground.identification.preparation import (
     DURATION,
     beliefs_of,
     believed_constants,
+    config_text,
     excitation_config,
     noise_of,
-    to_yaml,
 )
 from ground.identification.record import Record, read_record
 from ground.identification.scale import AbsolutePlant, absolute
@@ -131,7 +131,7 @@ def _fly(options: argparse.Namespace) -> Path:
     with_line = sys.stderr.isatty()
     with tempfile.TemporaryDirectory() as place:
         path = Path(place) / options.source.name
-        path.write_text(to_yaml(config), encoding="utf-8")
+        path.write_text(config_text(config), encoding="utf-8")
         request = RunRequest(path, out, options.realtime, seed=options.seed)
         result = fly(request, progress_line(sys.stderr) if with_line else None)
     if with_line:

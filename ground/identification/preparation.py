@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import msgspec
-import yaml
 
 from flight.schema import reader as configuration
+from flight.schema.document import to_yaml
 from flight.schema.sections import Config, Step
 from ground.identification.constants import Constants, Noise
 from ground.identification.scale import Belief, Beliefs
@@ -27,9 +27,9 @@ def excitation_config(config: Config, duration: float) -> Config:
     )
 
 
-def to_yaml(config: Config) -> str:
+def config_text(config: Config) -> str:
     """Return a configuration as text that `flight.schema.reader` reads back as the same."""
-    return yaml.safe_dump(msgspec.to_builtins(config), sort_keys=False)
+    return to_yaml(msgspec.to_builtins(config))
 
 
 def beliefs_of(config: Config) -> Beliefs:

@@ -36,9 +36,16 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> Path:
         shutil.copytree(ROOT / name, place / "source" / name, symlinks=True, ignore=leave)
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, place / "source")
-    pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
+    pip: list[str | Path] = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
     without = ["--no-deps", "--no-index"]
-    build = ["wheel", *without, "--no-build-isolation", "--wheel-dir", place, place / "source"]
+    build: list[str | Path] = [
+        "wheel",
+        *without,
+        "--no-build-isolation",
+        "--wheel-dir",
+        place,
+        place / "source",
+    ]
     subprocess.run([*pip, *build], check=True, timeout=60)
     (wheel,) = place.glob("*.whl")
     home = place / "venv"

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flight.schema import reader
+from flight.schema.document import read_document, to_yaml
 from flight.schema.errors import ConfigError
 from sim_hal.settings import Simulation
 
@@ -108,3 +109,35 @@ def test_a_damaged_configuration_is_valid_or_refused_clearly(place: int, letter:
     damaged = DEMO[:place] + letter + DEMO[place + cut :]
     with contextlib.suppress(ConfigError):  # anything else is a failure
         reader.parse(damaged)
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("a: &x 1\nb: *x\n", r"demo:2: is not YAML: an alias \(\*\): write the value out"),
+        ("[" * 5000, "demo: is nested too deeply"),
+        ("a: !!int x\n", "demo: is not YAML: invalid literal"),
+        ("a: !!bool maybe\n", "demo: is not YAML"),
+        ("a: " + "9" * 5000, "demo: is not YAML"),
+        ("a: 1\n---\nb: 2\n", "demo:2: is not YAML"),
+        ("a: {b: 1, c: [.inf]}\n", r"demo:1: `a.c\[0\]` is inf"),
+        ("a:\n  b: 1\n  b: 2\n", "demo:3: `a.b` stands twice, first in line 2"),
+        ("!!python/object:os.system x", "demo:1: is not YAML"),
+    ],
+)
+def test_text_that_is_no_plain_tree_is_refused_with_its_line(text: str, complaint: str) -> None:
+    with pytest.raises(ConfigError, match=f"^{complaint}") as caught:
+        reader.parse(text, "demo")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_configuration_is_written_in_its_order_and_read_back_the_same() -> None:
+    values = {
+        "z": 1e-05,
+        "a": ["1e5", "yes", "0x40", "none", None, True],
+        "text": "é: [\n",
+        "pair": (1, -0.0),
+    }
+    text = to_yaml(values)
+    assert list(read_document(text, "written").values) == list(values)
+    assert read_document(text, "written").values == values | {"pair": [1, -0.0]}

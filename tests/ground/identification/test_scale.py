@@ -12,7 +12,7 @@ from flight.schema.reader import parse
 from ground.identification.constants import Constants
 from ground.identification.fit import Fit
 from ground.identification.fragment import fragment, plant_section
-from ground.identification.preparation import beliefs_of, excitation_config, to_yaml
+from ground.identification.preparation import beliefs_of, config_text, excitation_config
 from ground.identification.record import FieldMeasurement
 from ground.identification.scale import AbsolutePlant, Belief, Beliefs, absolute
 from tests.ground.identification.conftest import Identified
@@ -109,6 +109,6 @@ def test_a_thread_that_comes_out_less_than_zero_is_none(identified: list[Identif
 
 def test_the_configuration_of_the_flight_survives_its_way_through_yaml() -> None:
     config = excitation_config(flights.demo_config(700.0), 200.0)
-    assert parse(to_yaml(config)) == config
+    assert parse(config_text(config)) == config
     assert config.camera is None
     assert config.control.tracker == "excitation"

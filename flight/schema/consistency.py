@@ -1,0 +1,105 @@
+"""Checks between values of a configuration that are each within their own limits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from flight.schema.document import Document
+from flight.schema.peers import peer_networks
+from flight.schema.sections import Camera, Commands, Config, Quaternion
+
+Refuse = Callable[[str, str], None]
+"""Raises the complaint about the value of a dotted name."""
+
+PIXEL_BITS = {
+    "GREY": range(8, 9),
+    "Mono8": range(8, 9),
+    "Y10": range(10, 11),
+    "Mono10": range(10, 11),
+    "Y12": range(12, 13),
+    "Mono12": range(12, 13),
+    "Y16": range(9, 17),
+    "Mono16": range(9, 17),
+}
+"""Bits of each pixel format; a converter of fewer bits may fill the formats of 16."""
+
+
+def check_consistency(config: Config, document: Document) -> None:
+    """Refuse values that are each possible but contradict each other. Raises ConfigError."""
+
+    def refuse(dotted: str, problem: str) -> None:
+        raise document.error(dotted, problem)
+
+    _check_steps(config, refuse)
+    _check_commands(config.commands, refuse)
+    _check_coils(config, refuse)
+    _check_times(config, refuse)
+    if config.camera is not None:
+        _check_camera(config.camera, refuse)
+        _check_length("camera.mounting", config.camera.mounting, refuse)
+    _check_length("inertial_unit.mounting", config.inertial_unit.mounting, refuse)
+
+
+def _check_steps(config: Config, refuse: Refuse) -> None:
+    times = [step.at for step in config.steps]
+    if times[0] != 0.0:
+        refuse("steps[0].at", f"is {times[0]!r}: the first target must be given at 0")
+    for index in range(1, len(times)):
+        if times[index] <= times[index - 1]:
+            refuse(f"steps[{index}].at", f"is {times[index]!r}: targets must stand in order of time")
+    if config.duration <= times[-1]:
+        refuse("duration", f"is {config.duration!r}: the last target is given at {times[-1]!r} s")
+
+
+def _check_coils(config: Config, refuse: Refuse) -> None:
+    used = [c for pair in config.coils.channels for c in pair] + list(config.coils.enable_channels or ())
+    if len(set(used)) != len(used):
+        refuse("coils.channels", f"{used} use a channel of the PWM chip twice")
+    if config.power_monitor is not None and config.power_monitor.address == config.coils.address:
+        refuse(
+            "power_monitor.address",
+            f"is 0x{config.power_monitor.address:02x}, the PWM chip's: both leave the factory at 0x40, "
+            "set the monitor's address pins (0x45) and say so here",
+        )
+
+
+def _check_times(config: Config, refuse: Refuse) -> None:
+    # A reading waits for its cycle, and the current that it leads to flows until the next.
+    unit = config.inertial_unit
+    least = 1.0 / unit.rate_hz + 2.0 / config.executive.control_rate_hz
+    if unit.max_age < least:
+        problem = f"is {unit.max_age!r}: at the rates of unit and control it must be {least:g} s at least"
+        refuse("inertial_unit.max_age", problem)
+    if config.guidance.replan_period >= config.guidance.horizon:
+        refuse("guidance.replan_period", "must be shorter than `guidance.horizon`")
+
+
+def _check_length(dotted: str, quaternion: Quaternion, refuse: Refuse) -> None:
+    norm = math.sqrt(sum(c * c for c in quaternion))
+    if abs(norm - 1.0) > 1e-6:
+        refuse(dotted, f"has length {norm:.6g}: a quaternion must have length 1")
+
+
+def _check_commands(commands: Commands, refuse: Refuse) -> None:
+    for index, step in enumerate(commands.timeline):
+        given = [name for name in ("mode", "slew", "clear") if getattr(step, name) is not None]
+        if len(given) != 1:
+            refuse(f"commands.timeline[{index}]", f"gives {given}: must give one of mode, slew, clear")
+    try:
+        peer_networks(commands)
+    except ValueError as error:
+        refuse("commands.peers" if commands.peers else "commands.udp", str(error))
+
+
+def _check_camera(camera: Camera, refuse: Refuse) -> None:
+    if camera.exposure >= camera.period:
+        refuse("camera.exposure", "must be shorter than `camera.period`")
+    if camera.device is not None:
+        pixel_format, possible = camera.device.pixel_format, PIXEL_BITS[camera.device.pixel_format]
+        if camera.bits not in possible:
+            refuse("camera.bits", f"is {camera.bits}: pixels of {pixel_format} have {_span(possible)}")
+
+
+def _span(numbers: range) -> str:
+    return f"{numbers[0]}" if len(numbers) == 1 else f"{numbers[0]} to {numbers[-1]}"
