@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from flight.link.telemetry.packets import to_text
 from flight.link.telemetry.reader import Run
 from ground.report import panels
-from ground.report.panels import Scene
+from ground.report.scene import Scene
 from ground.report.signals import seconds
 
 DPI = 110

@@ -1,24 +1,18 @@
 """The panels that the pictures are composed of, each drawn on axes it is given.
 
-Colours are of the Okabe-Ito palette, told apart by all common kinds of colour vision.
+Colours are of the Okabe-Ito palette, distinguishable with all common kinds of colour vision.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
-
 import numpy as np
 from matplotlib.axes import Axes
 
-from flight.gnc.guidance.lgl import lgl_rule
 from flight.gnc.math.arrays import FloatArray
 from flight.link.telemetry.definitions import MAX_NODES
-from flight.link.telemetry.packets import PacketArray
-from flight.link.telemetry.reader import Run
 from ground.report import performance as limits
-from ground.report.sensing import covariance_matrices, mean_rates, with_rate
-from ground.report.signals import Attitude, CoilPower, coil_power, estimated_attitude, seconds, true_attitude
+from ground.report.scene import Scene, planned_path, streak_rates
+from ground.report.signals import seconds
 
 BLACK, GREY = "#222222", "#8a8a8a"
 BLUE, ORANGE, GREEN, VERMILLION, PURPLE, SKY = (
@@ -32,45 +26,6 @@ BLUE, ORANGE, GREEN, VERMILLION, PURPLE, SKY = (
 PATH_COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, VERMILLION)
 COILS = ("x", "y", "z")
 _ABSURD = 1e9  # mrad/s: no rate, but what a damaged log may hold
-
-
-@dataclass(frozen=True)
-class Scene:
-    """The signals of one run, worked out once for all panels."""
-
-    run: Run
-
-    @cached_property
-    def truth(self) -> Attitude | None:
-        """What the body did, None when not known."""
-        return true_attitude(self.run)
-
-    @cached_property
-    def estimate(self) -> Attitude:
-        """What the estimator believed."""
-        return estimated_attitude(self.run)
-
-    @cached_property
-    def flown(self) -> Attitude:
-        """The best that is known of what the body did."""
-        return self.truth or self.estimate
-
-    @cached_property
-    def power(self) -> CoilPower | None:
-        """The coils' power."""
-        return coil_power(self.run)
-
-    @cached_property
-    def end(self) -> float:
-        """The last moment of the flight log, s."""
-        ends = [seconds(self.run[name])[-1] for name in ("control", "truth") if len(self.run[name])]
-        return max(ends, default=0.0)
-
-    @cached_property
-    def current_limit(self) -> float:
-        """The limit of a coil's current as configured, the thesis's where that is not known."""
-        run = self.run["run"]
-        return float(run["current_limit"][0]) if len(run) else limits.CURRENT_LIMIT_A
 
 
 def style(ax: Axes, ylabel: str, title: str = "", xlabel: str = "mission time, s") -> None:
@@ -204,20 +159,6 @@ def paths(ax: Axes, scene: Scene, start: float, stop: float, target: float, titl
     legend(ax)
 
 
-def planned_path(plan: PacketArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return time (m,) s and q2 (m,) along a plan packet's path, and both on its nodes (n,)."""
-    nodes = int(plan["nodes"])
-    values = plan["node_q2"][:nodes].astype(float)
-    rule = lgl_rule(nodes)
-    points = np.linspace(-1.0, 1.0, 201)
-    origin, horizon = float(plan["origin_ns"]) / 1e9, float(plan["horizon"])
-
-    def at(x: FloatArray) -> FloatArray:
-        return np.asarray(origin + 0.5 * horizon * (x + 1.0))
-
-    return at(points), rule.interpolation(points) @ values, at(rule.nodes), values
-
-
 def rate(ax: Axes, scene: Scene) -> None:
     """Draw the rate about the thread: estimated, true, and from streaks with their standard deviations."""
     if len(scene.estimate.time):
@@ -275,21 +216,6 @@ def rate_error(ax: Axes, scene: Scene) -> None:
         ax.set_ylim(-span, span)
     style(ax, "error, mrad/s", "Error of the rate")
     legend(ax)
-
-
-def streak_rates(run: Run) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return the rates (n,) about the thread from streaks.
-
-    In order: middle of the exposure, s; rate, its standard deviation, and rate less the true mean, rad/s.
-    The standard deviation is 0 and the difference NaN where not known.
-    """
-    rated = with_rate(run["streak"])
-    start = rated["exposure_start_ns"] / 1e9
-    stop = start + rated["exposure"]
-    variance = np.nan_to_num(covariance_matrices(rated["covariance"])[:, 1, 1])
-    difference = rated["rate"][:, 1] - mean_rates(run["truth"], start, stop)[:, 1]
-    value = rated["rate"][:, 1].astype(float)
-    return 0.5 * (start + stop), value, np.sqrt(np.maximum(variance, 0.0)), difference
 
 
 def exceedance(ax: Axes, values: dict[str, FloatArray], title: str) -> None:
