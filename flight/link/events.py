@@ -1,4 +1,4 @@
-"""The table of events: what can happen that a reader of the log wants to know, and how loudly."""
+"""The table of events, with the severity of each and the reaction to it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from enum import IntEnum
 
 
 class Severity(IntEnum):
-    """How much it matters."""
+    """The severity of an event."""
 
     INFORMATION = 0
     WARNING = 1
@@ -15,7 +15,7 @@ class Severity(IntEnum):
 
 
 class Reaction(IntEnum):
-    """What an event makes the satellite do, beyond being told."""
+    """The reaction to an event, beside recording it."""
 
     NOTE = 0
     COILS_OFF = 1

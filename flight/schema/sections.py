@@ -164,7 +164,7 @@ class Executive(Section, frozen=True, kw_only=True):
 class Estimation(Section, frozen=True, kw_only=True):
     """The multiplicative Kalman filter of attitude, rate, gyro bias and disturbance about the thread.
 
-    `*_start` are standard deviations at the start of what is estimated besides: the gyro's bias, rad/s; the
+    `*_start` are initial standard deviations of the other states: the gyro's bias, rad/s; the
     thread's torsion, 1/s^2, and damping, 1/s, beyond the plant's; the coils' gain; and the age, s, that the
     inertial unit's samples have at their stamp, which may walk by `latency_walk`, s per sqrt(s). Zero: known.
     `coast` is for how long, s, the model carries the estimate on without a measurement; no coil is driven by

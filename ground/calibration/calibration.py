@@ -4,7 +4,7 @@ Weighted least squares in pixels over all frames at once, each frame's attitude 
 first weighed down (Cauchy's weights, scaled by the residuals' own spread), then left out beyond five sigma.
 
 Some parameters may not be in the data: in a narrow field a shift of the axis is a turn of the camera, and a
-single frame hardly tells them apart. Each therefore has a prior about the lens one begins with, stated as a
+single frame hardly separates them. Each therefore has a prior about the initial lens, stated as a
 standard deviation; a parameter that is not known to half of that afterwards is named in `undetermined`.
 Without a prior, data that leave the lens open are refused.
 """
@@ -45,13 +45,13 @@ _CAUCHY = 2.385
 # The median of a residual's length in sigmas, of Rayleigh's distribution.
 _MEDIAN_LENGTH = np.sqrt(2.0 * np.log(2.0))
 _DETERMINED = 0.5
-# Standard deviations by which chi-square may exceed its degrees of freedom before the sigmas are doubted.
+# Standard deviations by which chi-square may exceed its degrees of freedom before the sigmas count as wrong.
 _DOUBT = 3.0
 
 
 @dataclass(frozen=True, slots=True)
 class LensPrior:
-    """What is known of a lens beforehand: standard deviations about the one begun with; inf for nothing.
+    """Prior knowledge of a lens: standard deviations about the initial lens; inf for none.
 
     Attributes:
         focal_length: a part of it; the default allows any lens whose field is roughly known.
@@ -67,7 +67,7 @@ class LensPrior:
     def information(self, lens: Lens) -> FloatArray:
         """Return the information (5,) about each of PARAMETERS.
 
-        Raises CalibrationError for a standard deviation that is none.
+        Raises CalibrationError unless all standard deviations are positive.
         """
         sigma = np.array([self.focal_length * lens.focal_length, self.centre, self.centre, self.k1, self.k2])
         if not np.all(sigma > 0.0):

@@ -131,7 +131,7 @@ def _solved(information: FloatArray, gradient: FloatArray) -> FloatArray:
         raise CalibrationError("nothing is known of some parameter of the lens: give a prior")
     scaled = information / np.outer(size, size)
     if not np.linalg.eigvalsh(scaled)[0] > _LEAST_INDEPENDENCE:
-        raise CalibrationError("the matches do not tell the lens's parameters apart: give a prior")
+        raise CalibrationError("the matches do not separate the lens's parameters: give a prior")
     return np.asarray(np.linalg.solve(scaled, gradient / size) / size)
 
 

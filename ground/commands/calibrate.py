@@ -33,7 +33,7 @@ _LEAST_SIGMA_PX = 0.02
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Picture:
-    """A picture and what was solved of it."""
+    """A picture and its solution."""
 
     path: Path
     pixels: Image
@@ -41,11 +41,11 @@ class Picture:
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Tell the parser what this command takes."""
+    """Add the arguments of this command to the parser."""
     parser.description = (
         "Calibrate a camera from pictures of the night sky: focal length, optical axis, radial distortion, "
         "with their errors. All pictures must be of one camera at one focus; ten that put stars into the "
-        "corners are worth more than a hundred that do not. What the stars leave open is named."
+        "corners are worth more than a hundred that do not. Undetermined parameters are named."
     )
     parser.epilog = "example: python -m flight calibrate night*.tiff --fov 11.4 --out camera.yaml"
     parser.add_argument("images", type=Path, nargs="+", metavar="IMAGE")
@@ -58,7 +58,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Solve, fit, print, write; exit status 1 when no picture could be solved."""
     if options.out is not None and options.out.exists():
-        raise UsageError(f"{options.out}: is there already: name another file")
+        raise UsageError(f"{options.out}: exists already: name another file")
     frames = _read(options.images)
     shape = frames[0][1].shape
     camera, scale = lens_of_field(options.fov, None, shape)
@@ -159,7 +159,7 @@ def _text(found: Calibration, pictures: Sequence[Picture]) -> str:
     lines.append(f"pictures:     {len(solved)} of {len(pictures)} solved, {stars} stars")
     for name, value in values.items():
         digits = places.get(name, 2)
-        note = "   the stars leave it open: this is the assumption" if name in found.undetermined else ""
+        note = "   not determined by the stars: the assumed value" if name in found.undetermined else ""
         lines.append(f"{name + ':':13s} {value:.{digits}f} +- {sigma[name]:.{digits}f}{note}")
     fov = 2.0 * math.degrees(math.atan(0.5 * lens.columns / lens.focal_length))
     lines.append(f"field:        {fov:.4f} deg across, without the distortion")

@@ -27,11 +27,11 @@ _MOST_EXPOSURES = 8
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Tell the parser what this command takes."""
+    """Add the arguments of this command to the parser."""
     parser.description = (
-        "Take frames from the camera of a configuration, real or simulated, one trigger each, and print of "
-        "each its number, how long after the exposure's end it came, and its counts; --out keeps the "
-        "counts as PNG, to be read by `flight solve` and `flight rate`. Coils and unit stay untouched."
+        "Take frames from the camera of a configuration, real or simulated, one trigger each. Print the "
+        "number of each, its delay after the end of the exposure, and its counts. --out writes the counts "
+        "as PNG, for `flight solve` and `flight rate`. Coils and inertial unit are not opened."
     )
     parser.epilog = (
         "example: python -m flight camera --config /etc/knightcube/flight.yaml --out frame.png --count 5"
@@ -39,7 +39,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--config", type=config_path, required=True, metavar="CONFIG", help="file, or a carried name"
     )
-    parser.add_argument("--out", type=Path, metavar="PNG", help="keep the frame; of several, name-NUMBER.png")
+    parser.add_argument("--out", type=Path, metavar="PNG", help="write the frame; several as name-NUMBER.png")
     parser.add_argument("--count", type=int, default=1, metavar="N", help="frames to take (default 1)")
     parser.add_argument("--exposure", type=float, metavar="S", help="exposure instead of the configuration's")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
@@ -47,7 +47,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Take the frames; exit status 1 when they stand still."""
+    """Take the frames; exit status 1 when the camera is frozen."""
     from flight.app.lone_camera import opened_camera  # noqa: PLC0415 - no other command needs devices
 
     if options.count < 1:
@@ -70,7 +70,7 @@ def run(options: argparse.Namespace) -> int:
     if options.json:
         sys.stdout.write(json.dumps({"frames": facts, "frozen": frozen}) + "\n")
     if frozen:
-        sys.stderr.write("flight: the camera's frame numbers do not grow: it is frozen\n")
+        sys.stderr.write("flight: the camera's frame numbers do not increase: it is frozen\n")
     return 1 if frozen else 0
 
 

@@ -22,10 +22,10 @@ _MODES = [mode.label for mode in COMMANDABLE if mode is not Mode.SLEW]
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Tell the parser what this command takes."""
+    """Add the arguments of this command to the parser."""
     parser.description = (
         "Send a command to a flight that listens (`commands` in its configuration) and print its answer. "
-        "Exit status 0 when it was obeyed, 1 when it was refused or nobody answered."
+        "Exit status 0 when the flight obeyed, 1 when it refused or did not answer."
     )
     parser.add_argument(
         "--to",
@@ -36,26 +36,26 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--timeout", type=float, default=2.0, metavar="S", help="for the answer (default 2)")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     words = parser.add_subparsers(required=True, metavar="WHAT", dest="what")
-    words.add_parser("ping", help="answer, and do nothing else")
+    words.add_parser("ping", help="answer and do nothing else")
     safe = words.add_parser("safe", help="abort: coils to zero, mode safe")
     safe.add_argument("reason", nargs="?", default="", help="for the log")
     words.add_parser("mode", help="change the mode").add_argument("mode", choices=_MODES)
     slew = words.add_parser("slew", help="go to an attitude, then hold it")
     slew.add_argument("q2", type=float, help="commanded final q2, within +-0.68")
-    clear = words.add_parser("clear", help="let a latched event begin anew")
+    clear = words.add_parser("clear", help="clear a latched event")
     clear.add_argument("event", help="its name, as in the log")
     parser.set_defaults(command=command)
 
 
 def command(options: argparse.Namespace) -> int:
     """Send, wait, print."""
-    data = CommandPacker().pack(_command_of(options), utc_ns())  # tells it from all others
+    data = CommandPacker().pack(_command_of(options), utc_ns())  # the time makes it unique
     raw = exchange(options.to, data, options.timeout)
     try:
         (row,) = decode(raw)[COMMAND.name]
         mode = Mode(int(row["mode"]))
     except (TelemetryError, ValueError) as error:
-        raise FlightError(f"{options.to}: its answer of {len(raw)} bytes is none") from error
+        raise FlightError(f"{options.to}: its answer of {len(raw)} bytes is invalid") from error
     obeyed, text = bool(row["obeyed"]), to_text(row["text"])
     if options.json:
         facts = {"obeyed": obeyed, "mode": mode.label, "text": text, "count": int(row["count"])}

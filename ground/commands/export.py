@@ -12,7 +12,7 @@ from ground.export import export as export_packets
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Tell the parser what this command takes."""
+    """Add the arguments of this command to the parser."""
     parser.description = (
         "Write one CSV file for each kind of packet; fields and units are in docs/telemetry.md."
     )

@@ -6,7 +6,6 @@ import argparse
 import json
 import math
 import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,38 +22,32 @@ from flight.gnc.vision.horizon.settings import EdgeSettings, HorizonSettings
 from flight.gnc.vision.horizon.solution import HorizonSolution, NadirMeasurement
 from flight.schema import reader as configuration
 from flight.schema.camera_model import camera_model
-from ground.commands.options import add_picture, positive, read_picture
+from ground.commands.options import add_field, add_output, add_picture, positive, read_picture
 from ground.pictures.horizon import draw_horizon
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Tell the parser what this command takes."""
+    """Add the arguments of this command to the parser."""
     parser.description = (
         "Find the Earth's limb in a picture and the direction to the Earth's centre, in camera axes: z along "
         "the boresight, x to the right, y down. PNG, TIFF, JPEG or FITS, colour too. Without --altitude the "
-        "altitude is fitted as well. The Earth is taken for a sphere, and what that leaves out stands in the "
-        "uncertainty."
+        "altitude is fitted as well. The Earth is taken as a sphere; the uncertainty includes the error of "
+        "that."
     )
     parser.epilog = (
         "example: python -m flight horizon limb.png --fov 67 --altitude 515 --overlay limb_found.png"
     )
     add_picture(parser)
-    camera = parser.add_mutually_exclusive_group(required=True)
-    camera.add_argument("--fov", type=positive, metavar="DEG", help="field of view across the columns")
-    camera.add_argument(
-        "--camera", type=Path, metavar="YAML", help="configuration or calibration of the camera"
-    )
+    add_field(parser, required=True)
     parser.add_argument("--altitude", type=positive, metavar="KM", help="above the mean Earth")
     parser.add_argument(
         "--log-response",
         type=positive,
         nargs=2,
         metavar=("PEDESTAL", "COUNTS"),
-        help="of a logarithmic detector: counts of darkness, and counts a decade of light",
+        help="of a logarithmic detector: dark counts, and counts per decade of light",
     )
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument("--overlay", type=Path, metavar="PNG", help="draw what was found on the picture")
-    parser.set_defaults(command=run)
+    add_output(parser, run)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -96,7 +89,7 @@ def _camera(options: argparse.Namespace, pixels: Image) -> CameraModel:
 
 def facts(solution: HorizonSolution, altitude_fitted: bool) -> dict[str, Any]:
     """Return all that is known of a solution, for `--json`."""
-    told: dict[str, Any] = {
+    values: dict[str, Any] = {
         "status": solution.status.value,
         "reason": solution.reason or None,
         "edges_found": len(solution.points),
@@ -104,9 +97,9 @@ def facts(solution: HorizonSolution, altitude_fitted: bool) -> dict[str, Any]:
         "candidates": [_nadir_facts(each, altitude_fitted) for each in solution.candidates],
     }
     if solution.nadir is not None:
-        told |= _nadir_facts(solution.nadir, altitude_fitted)
-        told["limb_points_px"] = solution.points[solution.on_horizon].tolist()
-    return told
+        values |= _nadir_facts(solution.nadir, altitude_fitted)
+        values["limb_points_px"] = solution.points[solution.on_horizon].tolist()
+    return values
 
 
 def _nadir_facts(nadir: NadirMeasurement, altitude_fitted: bool) -> dict[str, Any]:
@@ -131,14 +124,14 @@ def _text(solution: HorizonSolution, altitude_fitted: bool) -> str:
         lines.append(f"reason:           {solution.reason}")
     lines.append(f"edges:            {len(solution.points)} found")
     for nadir in solution.candidates if solution.nadir is None else (solution.nadir,):
-        told = _nadir_facts(nadir, altitude_fitted)
+        values = _nadir_facts(nadir, altitude_fitted)
         x, y, z = nadir.direction
         # Across and along the arc from the boresight to nadir the uncertainty differs.
         sigmas = np.degrees(np.sqrt(np.linalg.eigvalsh(nadir.tangent_covariance)))
         lines += [
             f"nadir x, y, z:    {x:+.5f} {y:+.5f} {z:+.5f}",
-            f"from boresight:   {told['from_boresight_deg']:.3f} deg, towards {told['towards_deg']:.3f} deg"
-            " from right to down",
+            f"from boresight:   {values['from_boresight_deg']:.3f} deg, "
+            f"towards {values['towards_deg']:.3f} deg from right to down",
             f"1 sigma:          {sigmas[1]:.3f} deg at worst, {sigmas[0]:.3f} deg at best",
             f"limb:             {nadir.used} edges, residual {nadir.residual:.2f} px rms",
         ]

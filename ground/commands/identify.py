@@ -58,13 +58,13 @@ class _Identified:
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Tell the parser what this command takes."""
+    """Add the arguments of this command to the parser."""
     parser.description = (
         "Identify torque constant, thread stiffness and damping from a short flight: pulses of the coil on x "
         "and free swings, on the testbed or simulated, by the same loop as any flight. Or from the folder of "
-        "a flight that was flown already. Motion shows the ratios to the inertia only; the scale rests on "
-        "the configuration (its `identification` section says how well inertia, dipole and field are known) "
-        "and on the magnetometer, and the answer says by how much. The coils are at zero in the end."
+        "an earlier flight. Motion shows the ratios to the inertia only; the scale comes from the "
+        "configuration (its `identification` section gives the errors of inertia, dipole and field) and "
+        "from the magnetometer; the result states the share of each. The coils end at zero."
     )
     parser.epilog = (
         "example: python -m flight identify config/testbed.yaml --out plant.yaml --picture fit.png"
@@ -80,7 +80,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--run", type=Path, metavar="DIR", help="folder of the flight (default runs/NAME-TIME)"
     )
     parser.add_argument(
-        "--duration", type=positive, metavar="S", help=f"fly so many seconds (default {DURATION:g})"
+        "--duration", type=positive, metavar="S", help=f"seconds to fly (default {DURATION:g})"
     )
     parser.add_argument("--seed", type=seed_number, metavar="N", help="seed of the simulation instead")
     parser.add_argument(
@@ -189,12 +189,12 @@ def _text(made: _Identified) -> str:
     before = believed_constants(made.config)
     lines = [
         f"flight: {made.folder}, {len(record.time)} samples in {record.time[-1] - record.time[0]:.0f} s, "
-        f"{len(found.innovations.restarts)} gone over",
+        f"{len(found.innovations.restarts)} restarts of the filter",
         "",
-        "seen in the motion, per inertia:",
+        "from the motion, per inertia:",
         *(_motion_line(name, found, before) for name in NAMES),
         "",
-        "with the scale that motion cannot show:",
+        "with the scale, which motion does not show:",
     ]
     rests = plant.rests_on()
     for name, unit in _ABSOLUTE_UNITS.items():
@@ -207,17 +207,16 @@ def _text(made: _Identified) -> str:
 
 def _motion_line(name: str, found: Fit, before: Constants) -> str:
     value, sigma = getattr(found.constants, name), found.sigma(name)
-    return (
-        f"  {name + ':':18s}{value:+12.5e} +- {sigma:.1e} {UNITS[name]}, believed {getattr(before, name):.4g}"
-    )
+    found_text = f"{value:+12.5e} +- {sigma:.1e} {UNITS[name]}"
+    return f"  {name + ':':18s}{found_text}, configured {getattr(before, name):.4g}"
 
 
 def _field_line(made: _Identified) -> str:
     field, known = made.record.field, made.config.identification
     if field is None:
-        return "field:  not measured, the coils were never off long enough: as believed"
+        return "field:  not measured, the coils were never off long enough: as configured"
     return (
-        f"field:  {1e4 * field.magnitude:.4f} gauss by the magnetometer, whose scale is trusted to "
+        f"field:  {1e4 * field.magnitude:.4f} gauss by the magnetometer, with a scale error of "
         f"{100.0 * known.magnetometer_error:g} %"
     )
 

@@ -1,14 +1,16 @@
-"""What the commands that read pictures have in common."""
+"""Arguments that several commands share."""
 
 from __future__ import annotations
 
 import argparse
 import math
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 from flight.gnc.camera.images import read_image, read_raw
 from flight.gnc.math.arrays import Image
+from flight.schema.carried import config_path
 
 _RAW = re.compile(r"([0-9]+)x([0-9]+)x(8|16)")
 
@@ -22,6 +24,25 @@ def add_picture(parser: argparse.ArgumentParser) -> None:
         metavar="CxRxB",
         help="IMAGE is bare pixels: columns x rows x bits (8, or 16 little-endian), such as 1280x960x16",
     )
+
+
+def add_field(parser: argparse.ArgumentParser, *, required: bool = False) -> None:
+    """Add the arguments that give the camera; where they are `required`, exactly one of them."""
+    group = parser.add_mutually_exclusive_group(required=True) if required else parser
+    group.add_argument("--fov", type=positive, metavar="DEG", help="field of view across the columns")
+    group.add_argument(
+        "--camera",
+        type=config_path,
+        metavar="YAML",
+        help="configuration (file or carried name) or calibration of the camera",
+    )
+
+
+def add_output(parser: argparse.ArgumentParser, run: Callable[[argparse.Namespace], int]) -> None:
+    """Add the arguments of the output, and the function that runs the command."""
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--overlay", type=Path, metavar="PNG", help="draw the result on the picture")
+    parser.set_defaults(command=run)
 
 
 def read_picture(options: argparse.Namespace) -> Image:

@@ -21,7 +21,7 @@ _DEFAULT_CONFIG = "step_demo"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Tell the parser what this command takes."""
+    """Add the arguments of this command to the parser."""
     parser.description = (
         "Plan the least-energy slew between two attitudes by virtual motion camouflage; print it "
         "or draw it. A horizon that is too short is stretched to the shortest feasible one."
@@ -38,7 +38,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--time-price",
         type=_number,
         metavar="W",
-        help="what a second is worth: the horizon of least energy plus price times time",
+        help="price of time: choose the horizon of least energy plus price times time",
     )
     parser.add_argument("--nodes", type=int, metavar="N", help=f"nodes of the path (default {NODES})")
     parser.add_argument(

@@ -6,7 +6,6 @@ import argparse
 import json
 import math
 import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,25 +22,24 @@ from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from flight.schema import reader as configuration
 from flight.schema.sections import Camera
-from ground.commands.options import add_picture, positive, read_picture
+from ground.commands.options import add_field, add_output, add_picture, positive, read_picture
 from ground.pictures.overlay import draw_marks
 
 LIKELIHOOD = "likelihood"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Tell the parser what this command takes."""
+    """Add the arguments of this command to the parser."""
     parser.description = (
         "Estimate the mean body rate over one exposure from the star streaks in a picture: PNG, TIFF, "
         "JPEG or FITS of 8 or 16 bits. The rate is of the camera, in its frame: boresight +z, x right, y "
         "down. "
-        "One picture cannot tell the direction of time: --prior says about which way it turned."
+        "One picture leaves the sign of the rate open: --prior gives the approximate rate."
     )
     parser.epilog = "example: python -m flight rate frame.png --fov 20 --exposure 0.2 --overlay found.png"
     add_picture(parser)
-    parser.add_argument("--fov", type=positive, metavar="DEG", help="field of view across the columns")
+    add_field(parser)
     parser.add_argument("--exposure", type=positive, metavar="S", help="exposure time")
-    parser.add_argument("--camera", type=Path, metavar="YAML", help="configuration whose camera this is")
     parser.add_argument("--prior", type=float, nargs=3, metavar=("X", "Y", "Z"), help="rough rate, rad/s")
     parser.add_argument(
         "--method",
@@ -49,9 +47,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         default=LIKELIHOOD,
         help="estimator (default likelihood); the others are the thesis's corner detectors",
     )
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument("--overlay", type=Path, metavar="PNG", help="draw what was found on the picture")
-    parser.set_defaults(command=run)
+    add_output(parser, run)
 
 
 def run(options: argparse.Namespace) -> int:

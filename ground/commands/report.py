@@ -15,7 +15,7 @@ from ground.report.archive import format_archive, summarise_archive
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Tell the parser what this command takes."""
+    """Add the arguments of this command to the parser."""
     parser.description = (
         "Print a run's performance against Table 5.3 of the thesis, and draw its figures. "
         "Judged on the simulation's truth where there is one, on the estimate otherwise."
@@ -23,7 +23,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run, or of an archive of runs")
     parser.add_argument("--json", action="store_true", help="print one JSON object instead, and draw nothing")
     parser.add_argument(
-        "--figures", type=Path, metavar="DIR", help="folder of the pictures (default RUN/figures)"
+        "--figures", type=Path, metavar="DIR", help="folder of the figures (default RUN/figures)"
     )
     parser.add_argument("--no-figures", action="store_true", help="draw nothing")
     parser.set_defaults(command=report)
@@ -49,7 +49,7 @@ def report(options: argparse.Namespace) -> int:
     try:
         paths = reporting.draw(run, options.figures or options.run / "figures")
     except UsageError as error:
-        # The numbers are told already: pictures that cannot be drawn are no failure of the report.
+        # The numbers are printed by now: missing figures do not fail the report.
         sys.stderr.write(f"flight: {error}\n")
         return 0 if options.figures is None else 2
     if not options.json:

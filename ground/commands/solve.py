@@ -1,4 +1,4 @@
-"""`flight solve`: where a picture of the sky was taken to, which stars it shows, and how it turned."""
+"""`flight solve`: where a picture of the sky points, which stars it shows, and how the camera turned."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSett
 from flight.schema import reader as configuration
 from flight.schema.camera_model import camera_model
 from flight.schema.sections import Camera
-from ground.commands.options import add_picture, positive, read_picture
+from ground.commands.options import add_field, add_output, add_picture, positive, read_picture
 from ground.pictures.sky_picture import draw_solution
 
 ARCSECONDS = math.degrees(1.0) * 3600.0
@@ -45,21 +45,18 @@ _FOV_TOLERANCE = 0.05
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Tell the parser what this command takes."""
+    """Add the arguments of this command to the parser."""
     parser.description = (
-        "Find out where a picture of the sky looks: right ascension, declination and roll (the position "
-        "angle of up, from north through east), ICRS; which stars it shows; and, where they are drawn out to "
-        "streaks, how the camera turned. PNG, TIFF, JPEG or FITS. Without --fov or --camera all fields from "
+        "Determine where a picture of the sky points: right ascension, declination and roll (the position "
+        "angle of up, from north through east), ICRS; which stars it shows; and, from star streaks, "
+        "how the camera turned. PNG, TIFF, JPEG or FITS. Without --fov or --camera all fields from "
         f"{UNKNOWN_DEG[0]:g} to {UNKNOWN_DEG[1]:g} deg are searched."
     )
     parser.epilog = "example: python -m flight solve night.jpg --fov 11.4 --overlay solved.png"
     add_picture(parser)
-    parser.add_argument("--fov", type=positive, metavar="DEG", help="field of view across the columns")
+    add_field(parser)
     parser.add_argument(
-        "--fov-error", type=positive, metavar="DEG", help="by which --fov may be wrong (default: 5 %% of it)"
-    )
-    parser.add_argument(
-        "--camera", type=Path, metavar="YAML", help="configuration or calibration of the camera"
+        "--fov-error", type=positive, metavar="DEG", help="tolerance of --fov (default 5 %% of it)"
     )
     parser.add_argument(
         "--exposure", type=positive, metavar="S", help="exposure time, for the rate of streaks"
@@ -73,11 +70,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--method",
         choices=tuple(METHODS),
         default=DEFAULT_METHOD,
-        help="of identification; all but the default want the field to 1.8 %%: see --fov-error",
+        help="of identification; all but the default need the field to 1.8 %%: see --fov-error",
     )
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument("--overlay", type=Path, metavar="PNG", help="draw what was found on the picture")
-    parser.set_defaults(command=run)
+    add_output(parser, run)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -142,7 +137,7 @@ def _belief(
 def calibrated(
     camera: Camera, error_deg: float | None, exposure: float | None
 ) -> tuple[CameraModel, tuple[float, float], float | None, SolveSettings]:
-    """Return the lens of a configuration; only one that was calibrated is believed without tolerance."""
+    """Return the lens of a configuration; only a calibrated lens has no tolerance."""
     model = camera_model(camera)
     fov = math.degrees(field_of_view(model))
     if camera.lens is not None and error_deg is None:
@@ -186,9 +181,9 @@ def lens_of_field(
 
 
 def facts(solution: FrameSolution, sky: SkyIndex, exposure: float | None, seconds: float) -> dict[str, Any]:
-    """Return all that is known of a solution, for `--json`."""
+    """Return the values of a solution, for `--json`."""
     camera = solution.camera
-    told: dict[str, Any] = {
+    values: dict[str, Any] = {
         "status": solution.status.value,
         "reason": solution.reason or None,
         "shows": solution.kind.value,
@@ -196,10 +191,10 @@ def facts(solution: FrameSolution, sky: SkyIndex, exposure: float | None, second
         "seconds": seconds,
     }
     if solution.fix is None:
-        return told
+        return values
     pointing = Pointing.of(solution.fix.quaternion)
     fov, chance = field_of_view(camera), solution.log10_false_alarm
-    return told | {
+    return values | {
         "right_ascension_deg": math.degrees(pointing.right_ascension),
         "declination_deg": math.degrees(pointing.declination),
         "roll_deg": math.degrees(pointing.roll),
@@ -247,23 +242,23 @@ def _text(solution: FrameSolution, sky: SkyIndex, exposure: float | None, second
     if solution.fix is None:
         lines.append(f"reason:           {solution.reason}")
         return "\n".join(lines) + "\n"
-    told = facts(solution, sky, exposure, seconds)
+    values = facts(solution, sky, exposure, seconds)
     sigma = ARCSECONDS * np.sqrt(np.diag(solution.fix.covariance))
     matched = solution.matched
     residual = solution.points[matched] - solution.expected[matched]
     rms = float(np.sqrt(np.mean(residual**2)))
     per_pixel = ARCSECONDS / solution.camera.focal_length
     lines += [
-        f"right ascension:  {told['right_ascension_deg']:.4f} deg",
-        f"declination:      {told['declination_deg']:+.4f} deg",
-        f"roll:             {told['roll_deg']:.3f} deg",
+        f"right ascension:  {values['right_ascension_deg']:.4f} deg",
+        f"declination:      {values['declination_deg']:+.4f} deg",
+        f"roll:             {values['roll_deg']:.3f} deg",
         f'1 sigma:          {sigma[0]:.2f}" x, {sigma[1]:.2f}" y, {sigma[2]:.1f}" about the boresight',
-        f'field of view:    {told["field_of_view_deg"]:.4f} deg across, {per_pixel:.2f}" a pixel',
+        f'field of view:    {values["field_of_view_deg"]:.4f} deg across, {per_pixel:.2f}" a pixel',
         f"stars:            {len(matched)} of {len(solution.points)} {solution.kind.value} matched,"
         f" residual {rms:.2f} px rms an axis",
         f"by chance:        10^{solution.log10_false_alarm:.0f}",
     ]
-    named = [PROPER_NAMES.get(star["hip"]) or f"HIP {star['hip']}" for star in told["stars"][:8]]
+    named = [PROPER_NAMES.get(star["hip"]) or f"HIP {star['hip']}" for star in values["stars"][:8]]
     lines.append(f"brightest:        {', '.join(named)}")
     lines += _motion_text(solution, exposure)
     lines.append(f"time:             {1e3 * seconds:.0f} ms")

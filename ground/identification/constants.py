@@ -11,7 +11,7 @@ from flight.gnc.math.arrays import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class Constants:
-    """What is fitted; each per inertia, as motion shows it.
+    """The fitted constants, each divided by the inertia, as motion shows it.
 
     Attributes:
         gain: g = n A B / J, rad/s^2/A.

@@ -73,9 +73,9 @@ class Fit:
 
 
 def fit(record: Record, noise: Noise, progress: Callable[[int, float], None] | None = None) -> Fit:
-    """Fit the constants to `record`; `noise` is what is believed of it.
+    """Fit the constants to `record`; `noise` is its assumed noise.
 
-    `progress` is told the number of each round and its step in standard deviations. Raises
+    `progress` is called with the number of each round and its step in standard deviations. Raises
     IdentificationError when the record does not determine the torque constant, or nothing explains it.
     """
     if not np.any(record.current):
@@ -200,7 +200,7 @@ def _inverse(information: FloatArray) -> FloatArray:
     scale = 1.0 / np.sqrt(np.diag(information))
     correlation = information * np.outer(scale, scale)
     if not np.all(np.isfinite(correlation)) or np.linalg.cond(correlation) > 1e12:
-        raise IdentificationError("this flight does not tell the constants apart: the body hardly moved")
+        raise IdentificationError("the constants cannot be separated: the body hardly moved")
     return np.asarray(np.linalg.inv(correlation) * np.outer(scale, scale))
 
 

@@ -21,7 +21,7 @@ def plant_section(plant: AbsolutePlant, coil_turns: int) -> Plant:
 
 
 def fragment(plant: AbsolutePlant, coil_turns: int, origin: str) -> str:
-    """Return the section as YAML text; `origin` tells which flight it is from."""
+    """Return the section as YAML text; `origin` names the flight."""
     section, rests = plant_section(plant, coil_turns), plant.rests_on()
     area = replace(plant.dipole, sigma=plant.dipole.sigma / coil_turns)
     lines = [

@@ -2,7 +2,7 @@
 
 The motion per inertia is theta'' = g I cos(theta) - kappa theta - delta theta' + d, each change of the
 current late by tau; measured are theta and theta' + b (Sease 2013, 5.4 with the thread). The current on the
-wire is not quite the one in the coil: a coil that is on makes process noise, one that is off makes none. So
+wire is not quite the one in the coil: a coil that is on adds process noise, a coil that is off adds none. So
 the predictor is the extended Kalman filter of the two states (the prediction-error method, Ljung 1999, System
 Identification, 7.2 and 10.2): an output-error fit would take that noise, summed up in flight, for signal.
 
@@ -10,8 +10,8 @@ Between events angle and rate are carried by their Taylor series; what that leav
 the noise. The derivatives follow the filter through prediction and update with its gains held: that those
 depend on the constants too leaves the expectation of the gradient at zero.
 
-What no noise explains - the hand that lets the body go, a jolt, a wild sample - is gone over: there the
-filter starts anew.
+What no noise explains - the hand that lets the body go, a jolt, a wild sample - is skipped: there the
+filter restarts.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Innovations:
         covariance: (n - 1, 2, 2) of them.
         gradient: (n - 1, 2, 6), of the prediction by the constants; (0, 2, 6) when not asked for.
         taken: (n - 1,) indices of the samples they are of.
-        restarts: indices of the samples at which the filter started anew, without an innovation.
+        restarts: indices of the samples at which the filter restarted, without an innovation.
     """
 
     error: FloatArray
@@ -69,7 +69,7 @@ def innovations(
 ) -> Innovations:
     """Run the filter over `record` with `constants` and `noise` believed true.
 
-    It starts anew at the samples `restarts`, and where an innovation is beyond `gate` standard deviations.
+    It restarts at the samples `restarts`, and where an innovation is beyond `gate` standard deviations.
     """
     angle, rate = record.angle.tolist(), record.rate.tolist()
     predictor = _Predictor(constants, noise, record.period, with_gradient)
@@ -121,7 +121,7 @@ class _Predictor:
         self._bias_row[_BIAS] = 1.0
 
     def start(self, angle: float, rate: float) -> None:
-        """Begin, or begin anew, from a sample."""
+        """Start, or restart, from a sample."""
         self._angle, self._rate = angle, rate - self._constants.bias
         self._paa, self._pab, self._pbb = self._r_angle, 0.0, self._r_rate
         self._by_angle, self._by_rate = np.zeros(len(NAMES)), -self._bias_row

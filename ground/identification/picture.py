@@ -1,4 +1,4 @@
-"""The picture of a fit: the measured turn and its prediction, the current, and what is left unexplained."""
+"""The picture of a fit: measured and predicted angle, current, and innovations."""
 
 from __future__ import annotations
 

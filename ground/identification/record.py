@@ -30,7 +30,7 @@ _LARGEST = {
 
 
 class IdentificationError(FlightError):
-    """A record that does not determine the constants; says what is missing."""
+    """A record that does not determine the constants; the message says what is missing."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,15 +71,15 @@ def read_record(run: Run, stale_after: float = 0.25) -> Record:
     """Return the record of a run.
 
     Without commands for `stale_after` s the driver lets the coils fall to zero. Raises UsageError for a run
-    in which another coil was driven too, IdentificationError for one that is too short, or whose log holds
-    what no flight writes.
+    in which another coil was driven too, IdentificationError for a run that is too short, or whose log holds
+    values that no flight writes.
     """
-    control, imu, told = run["control"], run["imu"], run["run"]
-    if len(control) < 2 or len(imu) < LEAST_SAMPLES or not len(told):
+    control, imu, label = run["control"], run["imu"], run["run"]
+    if len(control) < 2 or len(imu) < LEAST_SAMPLES or not len(label):
         raise IdentificationError(
             f"{run.folder}: {len(imu)} samples and {len(control)} control cycles: too short a flight"
         )
-    _refuse_impossible(run, told)
+    _refuse_impossible(run, label)
     written = control["current_written"].astype(float)
     if np.any(written[:, 1:]):
         raise UsageError(f"{run.folder}: coils y or z were driven: identification knows the one on x only")
@@ -94,9 +94,8 @@ def read_record(run: Run, stale_after: float = 0.25) -> Record:
         )
     quaternion = imu["quaternion"].astype(float)
     turn = 2.0 * np.arctan2(quaternion[:, 1], quaternion[:, 3])
-    limit = min(
-        float(told["current_limit"][0]), float(told["supply_voltage"][0] / told["coil_resistance"][0, 0])
-    )
+    saturation = float(label["supply_voltage"][0] / label["coil_resistance"][0, 0])
+    limit = min(float(label["current_limit"][0]), saturation)
     switch_time, current, clipped = _with_stale_ends(control, stale_after, limit)
     return Record(
         time=time,
@@ -105,12 +104,12 @@ def read_record(run: Run, stale_after: float = 0.25) -> Record:
         switch_time=switch_time,
         current=current,
         clipped=clipped,
-        period=float(told["control_period_ns"][0]) * 1e-9,
+        period=float(label["control_period_ns"][0]) * 1e-9,
         field=_field(time, imu["field"].astype(float), switch_time, current),
     )
 
 
-def _refuse_impossible(run: Run, told: PacketArray) -> None:
+def _refuse_impossible(run: Run, label: PacketArray) -> None:
     """Raise IdentificationError for values that no flight writes, NaN among them: they are damage."""
     for packet, fields in _LARGEST.items():
         for name, largest in fields.items():
@@ -120,7 +119,7 @@ def _refuse_impossible(run: Run, told: PacketArray) -> None:
                 value = float(values[tuple(bad[0])])
                 raise IdentificationError(f"{run.folder}: {packet}, {name} = {value:g}: the log is damaged")
     for name in ("control_period_ns", "current_limit", "supply_voltage", "coil_resistance"):
-        value = float(told[name].reshape(len(told), -1)[0, 0])
+        value = float(label[name].reshape(len(label), -1)[0, 0])
         if not 0.0 < value < np.inf:
             raise IdentificationError(f"{run.folder}: run, {name} = {value:g}: the log is damaged")
     if np.any(np.diff(run["control"]["time_ns"]) <= 0):
@@ -130,7 +129,7 @@ def _refuse_impossible(run: Run, told: PacketArray) -> None:
 def _sample_times(imu: PacketArray) -> FloatArray:
     """Return the times (n,) s of the samples: the unit's clock, laid along the earliest of the host's notes.
 
-    Where the unit's clock does not run on (it was started anew), the host's notes are all there is.
+    Where the unit's clock does not run on (it was restarted), the host's time stamps are used.
     """
     host, unit = imu["sample_time_ns"] * 1e-9, imu["device_time_ns"] * 1e-9
     unit = unit - unit[0]

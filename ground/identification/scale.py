@@ -1,9 +1,9 @@
-"""From constants per inertia to inertia, torque constant, stiffness and damping: what else must be known.
+"""From constants per inertia to inertia, torque constant, stiffness and damping.
 
 Motion under a known current shows g = n A B / J, k / J and c / J, never J itself: a body of twice the inertia
-in twice the field on twice the thread moves alike. The scale comes from what is believed of the inertia and
-the dipole per ampere n A, each with its error, and from the field, believed and measured by the magnetometer.
-The belief is Gaussian in the logarithms; g ties the three together (a measurement without error of
+in twice the field on twice the thread moves alike. The scale comes from prior values of the inertia and of
+the dipole per ampere n A, each with its error, and from the field, by prior and by magnetometer.
+The prior is Gaussian in the logarithms; g ties the three together (a measurement without error of
 ln n A + ln B - ln J - ln g = 0, all of them uncertain). Each is drawn towards what the other two say of it.
 """
 
@@ -33,7 +33,7 @@ class Belief:
 
 @dataclass(frozen=True, slots=True)
 class Beliefs:
-    """What is known before the flight, and how well.
+    """The values known before the flight, with their errors.
 
     Attributes:
         inertia: kg m^2.
@@ -84,7 +84,7 @@ class AbsolutePlant:
     covariance: FloatArray
 
     def rests_on(self) -> dict[str, str]:
-        """Tell of each constant what it rests on."""
+        """Return the sources of each constant, by name."""
         prior = "believed before"
         field = "magnetometer and belief" if self.field_measured else prior
 

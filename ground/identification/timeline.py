@@ -53,7 +53,7 @@ class Timeline:
 
 
 def _cuts(time: FloatArray) -> FloatArray:
-    """Return instants that divide what is longer than a step between samples."""
+    """Return instants that divide intervals between samples that are longer than a step."""
     gaps = np.diff(time)
     wide = np.flatnonzero(gaps > 1.5 * LONGEST_STEP)
     parts = [np.linspace(time[i], time[i + 1], int(gaps[i] / LONGEST_STEP) + 2)[1:-1] for i in wide.tolist()]

@@ -72,8 +72,8 @@ def _row(folder: Path) -> Object:
 
 def _end(run: Run) -> str:
     """Return the reason that the loop gave for its end; a log without one stopped in the middle."""
-    told = run["event"]
-    stops = told["text"][told["code"] == events.STOPPED.code]
+    recorded = run["event"]
+    stops = recorded["text"][recorded["code"] == events.STOPPED.code]
     return to_text(stops[-1]) if len(stops) else "unclean: the log just stops"
 
 

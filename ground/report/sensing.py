@@ -47,7 +47,7 @@ def streaks(run: Run) -> Object:
     """Return what vision made of the frames, and how far its rates were from the truth.
 
     `normalised` is the mean of e' P^-1 e / 3 over the rates with a positive definite covariance P: 1 when the
-    covariances tell the truth.
+    covariances are right.
     """
     packets = run["streak"]
     rated = with_rate(packets)

@@ -1,6 +1,6 @@
 """A run in one object, ready for JSON: what `flight report --json` prints and the text report is made from.
 
-`None` stands for what is not known, or does not apply, or was never reached; `notes` say which.
+`None` stands for a value that is unknown, does not apply or was never reached; `notes` say which.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from ground.report.signals import Attitude, coil_power, estimated_attitude, seco
 Object = dict[str, Any]
 
 
-@np.errstate(all="ignore")  # a packet may hold any number: what cannot be reckoned with comes out as None
+@np.errstate(all="ignore")  # a packet may hold any number: results that are not finite become None
 def summarise(run: Run) -> Object:
-    """Return everything the report tells of a run; only None, bool, int, float, str, list and dict."""
+    """Return all values of the report; only None, bool, int, float, str, list and dict."""
     attitude = true_attitude(run) or estimated_attitude(run)
     notes: list[str] = []
     identity = _identity(run, attitude, notes)
@@ -97,7 +97,7 @@ def _identity(run: Run, attitude: Attitude, notes: list[str]) -> Object:
 def _steps(
     targets: PacketArray, attitude: Attitude, planned_end: float, notes: list[str]
 ) -> list[tuple[Command, Response | None]]:
-    """Return each commanded step with its response, None for one that was cut short or not seen."""
+    """Return each commanded step with its response, None where the step was cut short or not observed."""
     if not len(targets):
         notes.append("no target packets: no steps to judge")
         return []
@@ -144,7 +144,7 @@ def _end_of_last_step(times: FloatArray, planned_end: float, seen_until: float) 
 
 
 def _rise_is_judged(command: Command) -> bool:
-    """Tell whether the thesis bounds this rise: a step between targets, not the slew from the release."""
+    """Return whether the thesis bounds this rise: a step between targets, not the slew from the release."""
     return command.index > 0
 
 
@@ -169,10 +169,10 @@ def _step_row(command: Command, found: Response | None) -> Object:
 def _power(run: Run, notes: list[str]) -> Object:
     """Return average and peak power of the coils and the largest currents."""
     written = np.abs(run["control"]["current_written"])
-    felt = np.abs(run["truth"]["current"])
+    actual = np.abs(run["truth"]["current"])
     found: Object = {
         "peak_current_a": float(written.max()) if written.size else math.nan,
-        "peak_current_felt_a": float(felt.max()) if felt.size else math.nan,
+        "peak_current_actual_a": float(actual.max()) if actual.size else math.nan,
     }
     power = coil_power(run)
     if power is None or power.duration <= 0.0:

@@ -43,7 +43,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
 
 
 def number(value: float | None, digits: int = 2, scale: float = 1.0) -> str:
-    """Return a number with so many decimals, "-" for None."""
+    """Return a number with a fixed count of decimals, "-" for None."""
     return "-" if value is None else f"{value * scale:.{digits}f}"
 
 
@@ -105,15 +105,15 @@ def _thesis(summary: Object) -> list[str]:
 def _power(power: Object) -> list[str]:
     if power["source"] is None:
         return []
-    felt = power["peak_current_felt_a"]
+    actual = power["peak_current_actual_a"]
     return [
-        f"Coil power, from the currents {'that the world felt' if power['source'] == 'truth' else 'written'}",
+        f"Coil power, from the currents {'in the coils' if power['source'] == 'truth' else 'written'}",
         f"  average R I^2   {number(power['average_w'], 3, 1e3)} mW   (thesis: on the order of 100 mW)",
         f"  peak R I^2      {number(power['peak_w'], 3)} W   (thesis: about 0.5 W)",
         f"  supply, V |I|   {number(power['supply_average_w'], 3, 1e3)} mW on average",
         f"  energy          {number(power['energy_j'], 3)} J",
         f"  largest current {number(power['peak_current_a'], 4)} A written"
-        + ("" if felt is None else f", {number(felt, 4)} A felt"),
+        + ("" if actual is None else f", {number(actual, 4)} A in the coils (truth)"),
     ]
 
 

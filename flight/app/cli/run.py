@@ -12,30 +12,27 @@ from pathlib import Path
 from typing import TextIO
 
 from flight.app.cli import PROGRAM
-from flight.app.request import RunRequest
+from flight.app.request import RunRequest, RunResult
+from flight.link.telemetry.packets import PacketArray
 from flight.link.telemetry.reader import read_run
 from flight.loop.progress import Progress
 from flight.schema.carried import config_path, names
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Tell the parser what this command takes."""
+    """Add the arguments of this command to the parser."""
     parser.description = (
-        "Fly a configuration: on real devices, or on simulated ones where it has a simulation "
-        "section. Simulated flights run as fast as they can; --realtime flies them on the machine's clock, "
-        "the devices in a process of their own. Ctrl-C ends a flight, coils at zero, log whole."
+        "Fly a configuration on real devices, or on simulated devices where it has a simulation section. "
+        "Simulated flights run as fast as they can; --realtime flies them on the machine's clock, with the "
+        "devices in a process of their own. Ctrl-C ends a flight with the coils at zero and the log closed."
     )
-    parser.add_argument(
-        "config",
-        type=config_path,
-        metavar="CONFIG",
-        help=f"YAML file, or a carried name: {', '.join(names())}",
-    )
+    carried = ", ".join(names())
+    parser.add_argument("config", type=config_path, metavar="CONFIG", help=f"YAML file, or one of {carried}")
     place = parser.add_mutually_exclusive_group()
     place.add_argument("--out", type=Path, metavar="DIR", help="folder of the run (default runs/NAME-TIME)")
     place.add_argument("--archive", type=Path, metavar="DIR", help="folder of a board's runs: fly the next")
-    parser.add_argument("--duration", type=float, metavar="S", help="fly so many seconds instead")
-    parser.add_argument("--seed", type=seed_number, metavar="N", help="seed of the simulation instead")
+    parser.add_argument("--duration", type=float, metavar="S", help="another duration")
+    parser.add_argument("--seed", type=seed_number, metavar="N", help="another seed of the simulation")
     parser.add_argument(
         "--realtime", action="store_true", help="fly simulated devices on the machine's clock"
     )
@@ -50,7 +47,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="FAULT",
-        help="break something in the simulation, as 'imu: silent @ 120 for 5'; may be given again (below)",
+        help="inject a fault in the simulation, such as 'imu: silent @ 120 for 5'; repeatable (list below)",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object when done")
     parser.set_defaults(command=run)
@@ -60,8 +57,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def _faults_help() -> str:
-    """Return how faults are written, and all of them."""
-    from flight.app.simulated import fault_catalogue  # noqa: PLC0415 - for those who ask for help only
+    """Return the grammar of faults and the list of them."""
+    from flight.app.simulated import fault_catalogue  # noqa: PLC0415 - only --help needs it
 
     grammar, listing = fault_catalogue()
     return (
@@ -98,38 +95,44 @@ def run(options: argparse.Namespace) -> int:
     result = fly(request, progress_line(sys.stderr) if with_line else None)
     if with_line:
         sys.stderr.write("\r\x1b[K")
-    elapsed = time.perf_counter() - begun
-    # A service that is told to stop does not read days of packets first.
-    flown = None if options.archive else read_run(result.folder)["control"]
-    seconds = elapsed if flown is None else float(flown["time_ns"][-1]) * 1e-9 if len(flown) else 0.0
-    if options.json:
+    # A service that is asked to stop does not read days of packets first.
+    control = None if options.archive else read_run(result.folder)["control"]
+    _print_result(result, control, time.perf_counter() - begun, options.json)
+    for problem in filter(None, (result.log_error, result.restart)):
+        sys.stderr.write(f"flight: {problem}\n")
+    # A service manager restarts a service that failed.
+    return 1 if result.log_error or result.restart else 0
+
+
+def _print_result(result: RunResult, control: PacketArray | None, elapsed: float, as_json: bool) -> None:
+    """Print how the flight went; `control` are its control packets, `elapsed` the seconds it took."""
+    seconds = elapsed
+    if control is not None:
+        seconds = float(control["time_ns"][-1]) * 1e-9 if len(control) else 0.0
+    if as_json:
         facts = {
             "folder": str(result.folder),
             "reason": result.reason,
             "interrupted": result.interrupted,
             "mission_time_s": seconds,
             "elapsed_s": elapsed,
-            "packets": None if flown is None else len(flown),
+            "packets": None if control is None else len(control),
             "log_error": result.log_error or None,
             "faults": result.faults,
         }
         sys.stdout.write(json.dumps(facts) + "\n")
-    else:
-        broken = f"faults: {'; '.join(result.faults)}\n" if result.faults else ""
-        sys.stdout.write(
-            f"flown: {seconds:.0f} s in {elapsed:.1f} s, {result.reason}\n"
-            f"{broken}"
-            f"log:   {result.folder}\n"
-            f"next:  {PROGRAM} report {result.folder}\n"
-        )
-    for problem in filter(None, (result.log_error, result.restart)):
-        sys.stderr.write(f"flight: {problem}\n")
-    # A service manager starts again what ends with a failure.
-    return 1 if result.log_error or result.restart else 0
+        return
+    faults = f"faults: {'; '.join(result.faults)}\n" if result.faults else ""
+    sys.stdout.write(
+        f"flown: {seconds:.0f} s in {elapsed:.1f} s, {result.reason}\n"
+        f"{faults}"
+        f"log:   {result.folder}\n"
+        f"next:  {PROGRAM} report {result.folder}\n"
+    )
 
 
 def progress_line(stream: TextIO) -> Callable[[Progress], None]:
-    """Return what writes one line again and again, a few times a second at most."""
+    """Return a function that rewrites one line of progress, at most five times a second."""
     last = 0.0
 
     def show(progress: Progress) -> None:

@@ -1,1 +1,1 @@
-"""Packets become commands: from whom they come, what they may say, what is done."""
+"""Commands: the channels they arrive by, their packets and their values."""

@@ -113,7 +113,7 @@ def open_udp(address: str, peers: Sequence[IPv4Network] | None = None) -> Datagr
 
 
 def _is_served(path: Path) -> bool:
-    """Tell whether somebody listens at a socket's file."""
+    """Return whether a process listens at a socket's file."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect(str(path))

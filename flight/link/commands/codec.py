@@ -1,4 +1,4 @@
-"""Commands as values, and as the bytes of one packet each; what is no command is refused with the reason."""
+"""Commands as values, and as the bytes of one packet each; other packets are refused with the reason."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from flight.link.modes import COMMANDABLE, Mode
 from flight.link.telemetry.packets import HEADER_BYTES, Packer, TelemetryError, crc16, to_text
 
 LONGEST = max(layout.length for layout in LAYOUTS.values())
-"""Bytes of the longest command: what is longer is none."""
+"""Bytes of the longest command; longer packets are refused."""
 
 _BY_IDENTIFIER = {layout.identifier: layout for layout in LAYOUTS.values()}
 
@@ -45,7 +45,7 @@ class Slew:
 
 @dataclass(frozen=True, slots=True)
 class Clear:
-    """Let a latched event begin anew."""
+    """Clear a latched event, so that it can be raised again."""
 
     event: str
 

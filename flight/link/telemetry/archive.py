@@ -1,7 +1,7 @@
 """The runs of a board: a folder for each boot under one roof, the oldest dropped to keep a budget.
 
-A full disk does not keep a satellite from flying: the oldest runs go until there is room, but never the last
-one, which tells how things came to be; and where nothing can be written the flight goes on without.
+A full disk does not keep a satellite from flying: the oldest runs go until there is room, but never the last,
+which holds the history; where nothing can be written the flight goes on without a log.
 
 A service restarts into the same place, and a run's folder is never written twice: `begin_run` makes the next,
 `run-000042`. Runs are in the order of their numbers: a board's wall clock may be wrong.
@@ -26,7 +26,7 @@ LEAST_FREE_BYTES = 64 << 20
 """On the disk, for a run to begin with: hours of packets."""
 
 DISK_TROUBLE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS})
-"""What a disk says that is full or failing, where others tell of a mistake in the path."""
+"""Errors of a full or failing disk; other errors are mistakes in the path."""
 
 _NAME = re.compile(r"run-(\d{6,})")
 
@@ -48,7 +48,7 @@ def begin_run(archive: Path, budget_bytes: int, coming_bytes: int) -> NewRun:
     """Make the folder of the next run, and room for `coming_bytes`, all that it may come to hold.
 
     Nothing but the folders of runs is ever removed. Raises UsageError when the budget holds not even the
-    coming run, or when the archive cannot be there; who writes into a disk that takes nothing will be told.
+    coming run, or when the path is wrong; a failing disk is reported by the log that writes to it.
     """
     if coming_bytes > budget_bytes:
         raise UsageError(

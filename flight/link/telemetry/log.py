@@ -1,8 +1,8 @@
-"""The flight log: packets queued by the control thread, put on disk beside it.
+"""The flight log: packets queued by the control thread, written to disk in another thread.
 
 `write` appends to a bounded queue and never waits; a ticker of the clock drains the queue into the segments.
-While the disk takes nothing (full, gone, hung) packets wait in the queue, and are written once it does again;
-what does not fit there is counted and told.
+While the disk fails (full, gone, hung) packets wait in the queue; packets that do not fit are counted and
+reported.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class FlightLog:
         `sync_period_ns` None leaves fsync to the end of each segment: right for lock-step simulation, where
         seconds are short. Raises UsageError when the folder holds such a log already and `overwrite` is not
         set, when the sizes make no sense, or when the folder cannot be written; but a `patient` log waits for
-        a disk that takes nothing, as it does later on.
+        a failing disk, as it does later on.
         """
         if not 0 < segment_bytes <= budget_bytes // 2:
             raise UsageError(
@@ -66,13 +66,13 @@ class FlightLog:
         self._retry_ns = 0
         self._busy_since_ns: int | None = None
         self._closed = False
-        self._draining = threading.Lock()  # held by whoever drains, never asked for by write()
+        self._draining = threading.Lock()  # held while draining, never taken by write()
         self._store: SegmentStore | None = None
 
         def begin() -> SegmentStore:
             nonlocal overwrite
             _clear(folder, stem, overwrite)
-            overwrite = True  # what a failed beginning leaves is its own
+            overwrite = True  # files of a failed attempt are our own
             return SegmentStore(folder, stem, segment_bytes, budget_bytes, opener)
 
         self._begin = begin
@@ -87,7 +87,7 @@ class FlightLog:
         self._ticker = clock.ticker(f"log-{stem}", drain_period_ns, self._drain)
 
     def write(self, packet: bytes) -> None:
-        """Take one packet. Never waits: what does not fit in the queue is lost and counted."""
+        """Queue one packet. Never waits: a packet that does not fit is lost and counted."""
         if self._closed or len(self._queue) >= self._queue_packets:
             self._refused += 1
             self._refused_ns = self._clock.now_ns()
@@ -107,7 +107,7 @@ class FlightLog:
     def error(self) -> str:
         """Return what is wrong and how many packets the log has lost so far, empty while nothing is wrong.
 
-        Of a closed log it tells of any loss in its life.
+        A closed log reports any loss since it was opened.
         """
         problem = self._problem()
         waiting = len(self._queue)
@@ -125,7 +125,7 @@ class FlightLog:
         return ""
 
     def close(self) -> None:
-        """Put the queue on disk, sync and close. Safe to call twice; never waits long for a hung disk."""
+        """Write the queue, sync and close. Safe to call twice; never waits long for a hung disk."""
         if self._closed:
             return
         self._ticker.stop()

@@ -200,7 +200,7 @@ def _unknown_fields(layout: Layout, given: Mapping[str, object]) -> TelemetryErr
 
 
 def _explain(layout: Layout, time_ns: int, given: Mapping[str, object]) -> TelemetryError:
-    """Return the error that names what is at fault in the values of a packet that would not pack."""
+    """Return the error that names the wrong value of a packet that cannot be packed."""
     name = layout.packet.name
     missing = [field.name for field in layout.packet.fields if field.name not in given]
     if missing:

@@ -1,8 +1,7 @@
 """Finds the packets in a stretch of bytes, whatever has happened to it, and makes arrays of them.
 
-A packet is believed when its version bits, APID, sequence flags, length and CRC are right. After anything
-else the search goes on at the next byte that could begin a packet, so that damage costs no more than the
-packets it touched.
+A packet is valid when its version bits, APID, sequence flags, length and CRC are right. After anything
+else the search goes on at the next byte that could begin a packet, so that only damaged packets are lost.
 """
 
 from __future__ import annotations
@@ -131,7 +130,7 @@ def _stated_length(data: bytes, position: int) -> int:
 
 
 def _cut_short(data: bytes, position: int) -> bool:
-    """Tell whether `position` may begin a packet of which the end is missing."""
+    """Return whether `position` may begin a packet of which the end is missing."""
     left = len(data) - position
     if left == 1:
         return any(identifier[:1] == data[position:] for identifier in _BY_IDENTIFIER)

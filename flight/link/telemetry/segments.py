@@ -93,7 +93,7 @@ class SegmentStore:
     def append(self, packets: Sequence[bytes]) -> None:
         """Write packets, turning to a new segment wherever one is full. Raises OSError.
 
-        After a failure `packets` tells how many were kept; the segment ends with the last of them, and may
+        After a failure `packets` counts the packets kept; the segment ends with the last of them, and may
         be appended to again.
         """
         chunk: list[bytes] = []
@@ -148,7 +148,7 @@ class SegmentStore:
         self.packets += len(chunk)
 
     def _make_room(self, coming: int) -> None:
-        """Delete the oldest segments until the budget holds what is coming; the newest is never deleted."""
+        """Delete the oldest segments until the budget holds the coming bytes; the newest is never deleted."""
         total = self._size + coming + sum(size for _, size in self._finished)
         while self._finished and total > self._budget_bytes:
             path, size = self._finished.popleft()

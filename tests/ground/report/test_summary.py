@@ -90,7 +90,7 @@ def test_without_truth_estimate_and_written_currents_are_judged(tmp_path: Path) 
     assert summary["power"]["source"] == "written"
     assert summary["power"]["average_w"] == pytest.approx(0.1 * RESISTANCE * CURRENT**2, rel=1e-9)
     assert summary["power"]["supply_average_w"] == pytest.approx(0.1 * VOLTAGE * CURRENT, rel=1e-9)
-    assert summary["power"]["peak_current_felt_a"] is None
+    assert summary["power"]["peak_current_actual_a"] is None
     assert summary["estimate"] is None
     assert summary["streaks"]["rms_error"] is None
     assert summary["steps"][1]["overshoot_percent"] == pytest.approx(OVERSHOOT, abs=0.05)
