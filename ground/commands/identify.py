@@ -94,7 +94,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Fly unless that is done, fit, print, write."""
     if options.out is not None and options.out.exists():
-        raise UsageError(f"{options.out}: is there already: name another file")
+        raise UsageError(f"{options.out}: exists already: name another file")
     folder = _flown(options) if options.source.is_dir() else _fly(options)
     made = _identify(folder)
     if options.out is not None:

@@ -59,5 +59,5 @@ def test_a_file_that_is_there_is_not_overwritten(pictures: list[Path], tmp_path:
     out.write_text("camera: mine\n")
     done = command("calibrate", *pictures, "--out", out)
     assert done.returncode == 2
-    assert "is there already" in done.stderr
+    assert "exists already" in done.stderr
     assert out.read_text() == "camera: mine\n"
