@@ -182,9 +182,8 @@ def _from_streaks(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, motion
         assert isinstance(again, MotionResult)  # as `motion`, by the same estimator
         return FrameFound(again, solve_motion(again, solution.camera, (1.0, 1.0), sky, settings, prior))
     if not job.motion_first:
-        return FrameFound(
-            motion, solution
-        )  # for a picture the refit costs half as much again, and gains little
+        # The refit costs a picture half as much again, for little.
+        return FrameFound(motion, solution)
     from flight.gnc.vision.startracker.catalogue_refit import refit_with_catalogue  # noqa: PLC0415
 
     assert isinstance(job.estimator, LikelihoodSettings)  # it made a MotionResult
