@@ -19,12 +19,12 @@ from flight.gnc.math.arrays import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class LglRule:
-    """One set of nodes; the arrays are read-only, the rule is shared.
+    """One set of nodes; the arrays are read-only because rules are shared.
 
     Attributes:
         nodes: (n,) ascending, from -1 to 1.
         weights: (n,) of the quadrature; their sum is 2.
-        differentiation: (n, n): values on the nodes into derivatives on the nodes.
+        differentiation: (n, n) from values on the nodes to derivatives on the nodes.
         barycentric: (n,) weights of Lagrange interpolation through the nodes.
     """
 
@@ -51,7 +51,7 @@ def lgl_rule(count: int) -> LglRule:
     series = legendre.Legendre.basis(degree)
     inner = np.sort(np.real(series.deriv().roots()))
     slope, curvature = series.deriv(), series.deriv(2)
-    for _ in range(3):  # the companion matrix gives 1e-12 or so; Newton takes that to rounding
+    for _ in range(3):  # the companion matrix is good to about 1e-12; Newton refines to rounding
         inner = inner - slope(inner) / curvature(inner)
     nodes = np.concatenate([[-1.0], 0.5 * (inner - inner[::-1]), [1.0]])
 
@@ -60,7 +60,7 @@ def lgl_rule(count: int) -> LglRule:
     barycentric = 1.0 / values
     gap = nodes[:, None] - nodes + np.eye(count)
     differentiation = barycentric / barycentric[:, None] / gap
-    # The diagonal as minus the sum of its row: the derivative of a constant is then zero to rounding.
+    # The diagonal is minus the sum of its row, so that the derivative of a constant is zero to rounding.
     np.fill_diagonal(differentiation, 0.0)
     np.fill_diagonal(differentiation, -differentiation.sum(axis=1))
     for array in (nodes, weights, differentiation, barycentric):

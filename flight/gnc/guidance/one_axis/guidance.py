@@ -1,7 +1,7 @@
-"""Which path is flown: new plans are accepted by rule, the last good one is flown on, then its end is held.
+"""Guidance about one axis: accepts or rejects plans, follows the last accepted path, then holds its end.
 
-A plan that is late, not finite, beyond the limits, out of order, for another target or not starting where
-the body then was is refused with its reason; refusing changes nothing.
+A plan is rejected, with its reason, when it is late, not finite, beyond the limits, out of order, for another
+target, or does not start at the estimated state. A rejected plan changes nothing.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from flight.gnc.guidance.one_axis.vmc import Plan
 
 _CHECKED_POINTS = 600
 _SAME = 1e-6
-"""Of q2 and rad/s: how near an end must be to the target."""
+"""Largest difference between a path's end and the target, in q2 and in rad/s."""
 
 
 class GuidanceState(StrEnum):
-    """What `Guidance.sample` gives: a path under way, an attitude held, or nothing yet."""
+    """What `Guidance.sample` returns: a path under way, a held attitude, or nothing yet."""
 
     NONE = "none"
     FOLLOWING = "following"
@@ -32,13 +32,13 @@ class GuidanceState(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class AcceptanceRules:
-    """What a plan must keep to be flown.
+    """The limits that a plan must keep to be accepted.
 
     Attributes:
         late_after: s from its origin to its arrival.
         angle_tolerance: rad, rate_tolerance: rad/s, between its start and the estimate at its origin.
-        q2_limit: bound of |q2|; a planner that overshoots by 1e-3 of it is forgiven.
-        current_excess: relative, over the plant's limit, everywhere.
+        q2_limit: bound of |q2|; an overshoot of 1e-3 of it is accepted.
+        current_excess: largest relative excess over the plant's current limit anywhere on the path.
     """
 
     late_after: float = 1.0
@@ -48,7 +48,7 @@ class AcceptanceRules:
     current_excess: float = 1e-3
 
     def __post_init__(self) -> None:
-        """Refuse bounds that are not positive and finite; raises UsageError."""
+        """Raise UsageError for a limit that is not positive and finite."""
         for name in ("late_after", "angle_tolerance", "rate_tolerance", "q2_limit", "current_excess"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
@@ -57,21 +57,21 @@ class AcceptanceRules:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Whether a plan is flown, and why not: `reason` is empty when it is."""
+    """Whether a plan was accepted; `reason` says why not and is empty otherwise."""
 
     accepted: bool
     reason: str = ""
 
 
 class Guidance:
-    """Owns the path being flown and the target wanted."""
+    """Owns the path being followed and the current target."""
 
     def __init__(
         self, plant: SingleAxisPlant, rules: AcceptanceRules | None = None, arrives: bool = True
     ) -> None:
-        """Take the plant whose limit holds; `arrives`: a path is meant to end, and its end to be held.
+        """Plan for `plant` and its limits; `arrives` says that paths end at the target and hold it.
 
-        Where it is not, as on a receding horizon, a path that ends tells of plans that did not come.
+        On a receding horizon (`arrives` false) a path that ends means that later plans are missing.
         """
         self._plant = plant
         self._rules = rules or AcceptanceRules()
@@ -84,18 +84,18 @@ class Guidance:
 
     @property
     def target_q2(self) -> float | None:
-        """The attitude wanted, as q2; None before the first."""
+        """The target attitude as q2; None before the first target."""
         return self._target_q2
 
     @property
     def path(self) -> PolynomialPath | None:
-        """The path being flown or held."""
+        """The path being followed or held; None without one."""
         return self._path
 
     def aim(self, target_q2: float, target_rate: float = 0.0, now_ns: int = 0) -> None:
-        """Want another attitude, at `target_rate` rad/s; the present path is flown until a plan for it comes.
+        """Set the target attitude and its rate in rad/s; the present path is followed until a new plan comes.
 
-        Raises UsageError when one is not finite or q2 is beyond its limit.
+        Raises UsageError when a value is not finite or q2 is beyond its limit.
         """
         if not abs(target_q2) <= self._rules.q2_limit:  # NaN compares false
             raise UsageError(f"target q2 is {target_q2}: it must lie within +-{self._rules.q2_limit}")
@@ -108,7 +108,7 @@ class Guidance:
     def hold(self, angle: float, now_ns: int) -> None:
         """Hold `angle` rad from now on; plans made earlier than now are then out of order.
 
-        Raises UsageError when it is not finite.
+        Raises UsageError when the angle is not finite.
         """
         if not math.isfinite(angle):
             raise UsageError(f"the angle to hold is {angle}: it must be finite")
@@ -116,7 +116,7 @@ class Guidance:
         self._planned_ns = now_ns - 1
 
     def release(self) -> None:
-        """Forget the path: there is none until the next plan or hold."""
+        """Drop the path; there is none until the next accepted plan or hold."""
         self._path = None
         self._planned_ns = None
 
@@ -129,9 +129,10 @@ class Guidance:
         estimate_rate: float,
         disturbance: float = 0.0,
     ) -> Verdict:
-        """Fly `plan` from `origin_ns` if it keeps the rules.
+        """Follow `plan` from `origin_ns` if it keeps the rules.
 
-        Estimates in rad and rad/s at its origin; `disturbance` in rad/s^2 is what it had to allow for.
+        The estimates are in rad and rad/s at its origin; the current limit is checked under `disturbance`
+        in rad/s^2.
         """
         reason = (
             self._untimely(origin_ns, now_ns)
@@ -146,11 +147,11 @@ class Guidance:
         return Verdict(True)
 
     def sample(self, now_ns: int) -> Sample | None:
-        """Return the motion wanted now; None when there is no path yet."""
+        """Return the commanded motion now; None without a path."""
         return None if self._path is None else self._path.sample(now_ns)
 
     def state(self, now_ns: int) -> GuidanceState:
-        """Return what is being done now."""
+        """Return whether a path is being followed or its end held now."""
         if self._path is None:
             return GuidanceState.NONE
         return GuidanceState.HOLDING if self._path.has_ended(now_ns) else GuidanceState.FOLLOWING
@@ -160,7 +161,7 @@ class Guidance:
         return self.state(now_ns) is GuidanceState.FOLLOWING
 
     def is_adrift(self, now_ns: int) -> bool:
-        """Tell whether an attitude is held that nobody wanted held: no plan came in time."""
+        """Return whether an attitude other than the target is held because no plan came in time."""
         if self._path is None or not self._path.has_ended(now_ns):
             return False
         if not self._arrives:
@@ -169,7 +170,7 @@ class Guidance:
         return not self._reaches_target(self._path) and waited > self._rules.late_after
 
     def remains(self, now_ns: int) -> PolynomialPath | None:
-        """Return the path under way to the present target, its origin counted from `now_ns`; None without."""
+        """Return the path under way to the target, its origin relative to `now_ns`; None without one."""
         path = self._path
         if path is None or path.has_ended(now_ns) or not self._reaches_target(path):
             return None

@@ -1,4 +1,4 @@
-"""The planner worker's job: one state and one target in, one plan out."""
+"""The planner worker's job: plans a path from one state to one target."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from flight.gnc.guidance.one_axis.vmc import NODES, Plan, plan
 
 @dataclass(frozen=True, slots=True)
 class PlanJob:
-    """From (q2, rad/s) at `origin_ns` to (q2, rad/s) within `horizon` s; `number` counts the jobs.
+    """Plan from (q2, rad/s) at `origin_ns` to (q2, rad/s) within `horizon` s; `number` counts the jobs.
 
-    With `time_price` in W the horizon is the planner's to choose, `horizon` a first guess. `last` is the path
-    flown until now, its origin counted from `origin_ns`.
+    With `time_price` in W the planner chooses the horizon and `horizon` is its initial guess. `last` is the
+    path followed until now, its origin relative to `origin_ns`.
     """
 
     number: int
@@ -32,7 +32,7 @@ class PlanJob:
 
 
 def run(job: PlanJob) -> Plan:
-    """Plan; at the top level of a module, so that a worker process can import it. Raises PlanningError."""
+    """Return the plan for `job` (module-level, so that a worker can import it); raises PlanningError."""
     return plan(
         job.plant,
         job.start_q2,

@@ -1,8 +1,8 @@
-"""A path in time: what the tracker follows at 40 Hz.
+"""A path in time, sampled by the tracker at 40 Hz.
 
-q2 is one polynomial in time, as the planner left it; angle, rate and acceleration follow from q2 exactly
-(Sease 5.9; 5.13 corrected), so that the current of the path between nodes is the current that was limited.
-Past its end a path holds its last attitude, or coasts on at its end's rate as far as the coil has authority.
+q2 is one polynomial in time, as the planner computed it; angle, rate and acceleration follow from q2 exactly
+(Sease 5.9; 5.13 corrected), so the current between nodes is the one that the planner limited.
+After its end a path holds its last attitude, or coasts at its end rate as far as the coil has authority.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import about_axis_y
 
 FARTHEST = angle_of(Q2_LIMIT)
-"""rad: where a coast ends."""
+"""rad: the largest angle of a coast."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """The wanted motion at one time: theta in rad, theta' in rad/s, theta'' in rad/s^2."""
+    """The commanded motion at one time: theta in rad, theta' in rad/s, theta'' in rad/s^2."""
 
     angle: float
     rate: float
@@ -48,7 +48,7 @@ class PolynomialPath:
 
     Attributes:
         origin_ns: monotonic time of its start.
-        horizon: s; zero for an attitude that is only held.
+        horizon: s; zero for a held attitude.
         series: Chebyshev coefficients of (q2, q2' in 1/s, q2'' in 1/s^2), highest degree first.
         end_angle: theta in rad at the horizon.
         end_rate: theta' in rad/s kept after the horizon; zero holds the end.
@@ -66,7 +66,7 @@ class PolynomialPath:
     ) -> PolynomialPath:
         """Return the polynomial path through q2 (N,) on the N Legendre-Gauss-Lobatto nodes of `horizon` s.
 
-        `end_rate` is kept after the horizon, rad/s.
+        The path coasts at `end_rate` rad/s after the horizon.
         """
         count = node_q2.size
         columns = np.zeros((count, 3))
@@ -78,24 +78,25 @@ class PolynomialPath:
 
     @classmethod
     def holding(cls, angle: float, origin_ns: int = 0) -> PolynomialPath:
-        """Return the path that holds `angle` rad for ever."""
+        """Return the path that holds `angle` rad without end."""
         return cls(origin_ns, 0.0, (), angle)
 
     def starting_at(self, origin_ns: int) -> PolynomialPath:
-        """Return the same path, started at another time."""
+        """Return the same path, starting at `origin_ns`."""
         return replace(self, origin_ns=origin_ns)
 
     def has_ended(self, now_ns: int) -> bool:
-        """Tell whether the horizon is over by now."""
+        """Return whether the horizon has passed at `now_ns`."""
         return (now_ns - self.origin_ns) * 1e-9 >= self.horizon
 
     def sample(self, now_ns: int) -> Sample:
-        """Return the motion wanted at `now_ns`: before the origin the start's, after the end a coast."""
+        """Return the commanded motion at `now_ns`: the start before the origin, a coast after the end."""
         elapsed = (now_ns - self.origin_ns) * 1e-9
         if elapsed >= self.horizon:
             return self._coast(elapsed - self.horizon)
         s = 2.0 * max(elapsed, 0.0) / self.horizon - 1.0
-        # Clenshaw's recurrence on three series at once; plain floats beat arrays of twenty.
+        # Clenshaw's recurrence on three series at once; floats are faster than numpy arrays of twenty
+        # elements.
         twice = 2.0 * s
         a1 = a2 = b1 = b2 = c1 = c2 = 0.0
         for a, b, c in self.series[:-1]:
@@ -107,7 +108,7 @@ class PolynomialPath:
         return Sample(angle_of(q2), rate_of(q2, q2_rate), acceleration_of(q2, q2_rate, q2_acceleration))
 
     def motion(self, times: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return theta, theta', theta'' (n,) at `times` (n,) s after the origin, NaN where |q2| passes 1."""
+        """Return theta, theta', theta'' (n,) at `times` (n,) s after the origin, NaN where |q2| > 1."""
         coasted = self.end_angle + self.end_rate * (times - self.horizon)
         farthest = max(FARTHEST, abs(self.end_angle))
         angle = np.clip(coasted, -farthest, farthest)

@@ -1,11 +1,11 @@
 """The single-axis plant: a rigid body on a thread, turned by one torque coil in a fixed horizontal field.
 
 Sease 2013, 5.4 with the thread and a constant disturbance d added: J (w' - d) = n A B I cos(theta) - k theta
-- c w, where theta is the turn about the thread and q2 = sin(theta/2) (5.5, 5.6). Planner, tracker and
-estimator share these relations, so that what is planned is what is tracked.
+- c w, where theta is the angle about the thread and q2 = sin(theta/2) (5.5, 5.6). Planner, tracker and
+estimator share these relations, so that the tracker can follow what was planned.
 
-Singular names (`current`) take floats and use `math`: they run in the 40 Hz loop. Plural names
-(`currents`) take arrays of one shape.
+Functions with singular names (`current`) take floats and use `math` because they run in the 40 Hz loop;
+those with plural names (`currents`) take arrays of one shape.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ SQUARE_Q2_WITHOUT_AUTHORITY = 0.5
 """cos(theta) = 1 - 2 q2^2 is zero here: the coil's axis lies along the field (5.15 corrected)."""
 
 Q2_LIMIT = 0.68
-"""No path leads beyond: cos(theta) is 0.075 there; at 0.707 no current turns the body at all."""
+"""Largest |q2| of a path: cos(theta) is 0.075 there; at 0.707 no current turns the body."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class SingleAxisPlant:
         current_limit: largest |I|, A.
         stiffness: k of the thread, N m/rad.
         damping: c, N m s/rad.
-        disturbance: d, rad/s^2: the acceleration that nothing else here explains, as the estimator gives it.
+        disturbance: d, rad/s^2: the acceleration that the other terms do not explain, from the estimator.
     """
 
     inertia: float

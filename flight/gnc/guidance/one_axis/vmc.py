@@ -1,9 +1,9 @@
 """The planner: least-energy paths by virtual motion camouflage (Sease 2013, 5.8-5.15 corrected).
 
-The free path control parameters are optimised with NLopt under |I| <= Imax and |q2| <= a bound at every
-time. When no path within the asked horizon keeps the limits, the horizon is stretched to the shortest that
-does and the plan says so; with a price of time the horizon is what the price makes best. Energy is the
-integral of R I^2 in J, without the factor 1/2 of 5.1.
+NLopt optimises the free path control parameters under |I| <= Imax and |q2| <= a bound at every time. When no
+path within the asked horizon keeps the limits, the horizon is stretched to the shortest that does and the
+plan's status says so; with a price of time the horizon is optimised too. Energy is the integral of R I^2 in
+J, without the factor 1/2 of 5.1.
 
 Pure and deterministic: the same arguments give the same plan, in any process.
 """
@@ -44,7 +44,7 @@ LEAST_PRICED = 1.0
 
 
 class PlanStatus(StrEnum):
-    """Whether the asked horizon could be kept; a price of time asks for none, its plans are optimal."""
+    """Whether the asked horizon was kept; plans with a price of time are always optimal."""
 
     OPTIMAL = "optimal"
     STRETCHED = "stretched"
@@ -52,16 +52,16 @@ class PlanStatus(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plan:
-    """A path and what is known about it.
+    """A path and its properties.
 
     Attributes:
-        path: to be flown; its origin is zero until guidance starts it.
+        path: its origin is zero until guidance starts it.
         status: optimal at the asked horizon, or stretched to the shortest feasible one.
-        horizon_asked, horizon: s; with a price of time they are the same.
+        horizon_asked, horizon: s; equal with a price of time.
         energy: integral of R I^2, J.
         peak_current: largest |I| on a dense grid, A.
-        evaluations: of the cost.
-        target_q2: where it ends.
+        evaluations: number of evaluations of the cost.
+        target_q2: q2 at the end.
         nu: (N,) path control parameters against the prey over `horizon`.
         node_times: (N,) s.
         node_q2: (N,).
@@ -101,11 +101,12 @@ def plan(
     the horizon is stretched to `max_stretch` times the asked one at most. A stretched horizon lies about
     0.3 % above the shortest of the paths on `nodes` nodes, within 1.5 % of the bang-bang time.
 
-    With `time_price` in W the path is that of the least energy plus price times horizon, from LEAST_PRICED s
-    to `max_stretch` times `horizon`, which is then a first guess. `last` is the path flown until now, its
-    origin counted from the new start (so not positive): what is left of it is where the optimiser begins.
+    With `time_price` in W the path minimises energy plus price times horizon, over horizons from LEAST_PRICED
+    s to `max_stretch` times `horizon`; `horizon` is then the initial guess. `last` is the path followed until
+    now, its origin relative to the new start (so not positive); its remainder is the initial guess of the
+    path.
 
-    Raises PlanningError when an argument is not finite or outside its limits, or when no horizon allowed is
+    Raises PlanningError when an argument is not finite or outside its limits, or when no allowed horizon is
     feasible.
     """
     states = {"start_q2": start_q2, "start_rate": start_rate, "end_q2": end_q2, "end_rate": end_rate}
@@ -133,9 +134,10 @@ def plan(
 
 
 def _remains(last: PolynomialPath | None, nodes: int) -> FloatArray | None:
-    """Return how far (N,) what is left of `last` lies from its own prey on the nodes; None when nothing is.
+    """Return the difference (N,) on the nodes between the rest of `last` and its prey; None without a rest.
 
-    Laid on another prey it is a path between that prey's states: the start need not lie on `last`.
+    Added to another prey, the difference gives a path between that prey's states, which need not lie on
+    `last`.
     """
     if last is None:
         return None
@@ -144,7 +146,7 @@ def _remains(last: PolynomialPath | None, nodes: int) -> FloatArray | None:
     if not 0.0 < left <= last.horizon:
         return None
     times = 0.5 * left * (lgl_rule(nodes).nodes + 1.0)
-    # Just inside the end: at the end itself the coast has begun.
+    # Just before the end: at the end itself the coast has begun.
     angle, rate, _ = last.motion(elapsed + times * (1.0 - 1e-12))
     q2 = np.sin(0.5 * angle)
     slope = 0.5 * rate * np.cos(0.5 * angle)
@@ -194,7 +196,7 @@ def _check(
     q2_limit: float,
     max_stretch: float,
 ) -> None:
-    """Raise PlanningError for arguments that no path can have."""
+    """Raise PlanningError for arguments outside their ranges."""
     for name, value in states.items():
         if not math.isfinite(value):
             raise PlanningError(f"{name} is {value}: a path needs finite states")

@@ -1,7 +1,7 @@
 """The paths that virtual motion camouflage searches: q2 = q_r + v (q_p - q_r) on N nodes (Sease 5.10-5.12).
 
-A path is the polynomial of degree N - 1 through its node values, so q2' and q2'' and with them the current
-are exact between nodes too. v is 1 at both ends; v_2 and v_(N-1) follow from the boundary rates, derived
+A path is the polynomial of degree N - 1 through its node values, so q2', q2'' and the current are exact
+between nodes too. v is 1 at both ends; v_2 and v_(N-1) follow from the boundary rates, derived
 from q' = D q at the ends (5.11 corrected): N - 4 path control parameters are free.
 
 The prey is affine in the horizon T and a path is affine in v - 1 at a fixed prey. Writing the paths as
@@ -25,7 +25,7 @@ DENSE_POINTS = 769
 
 @dataclass(frozen=True, slots=True)
 class Samples:
-    """Where paths are looked at: (m,) points; matrices (3, m, N) from nodes to q2, dq2/ds and d2q2/ds2."""
+    """Points (m,) to evaluate paths at, and matrices (3, m, N) from nodes to q2, dq2/ds and d2q2/ds2."""
 
     points: FloatArray
     matrices: FloatArray
@@ -38,20 +38,20 @@ class Samples:
         return cls(points, np.stack([value, slope, slope @ rule.differentiation]))
 
     def take(self, index: IntArray) -> Samples:
-        """Return the samples at some of the points."""
+        """Return the samples at the points of `index`."""
         return Samples(self.points[index], self.matrices[:, index])
 
 
 @dataclass(frozen=True, slots=True)
 class Discretisation:
-    """What depends on the number of nodes only.
+    """Matrices that depend on the number of nodes only.
 
     Attributes:
         rule: the N nodes.
         cost: samples on 2 N LGL nodes, where the energy is integrated: I^2 has about twice the path's degree,
             so that N nodes leave an error for the optimiser to exploit.
         cost_weights: (2 N,) of that quadrature, their sum 2.
-        dense: samples where the limits are watched, closer together towards the ends as the extrema are.
+        dense: samples where the limits are checked, denser towards the ends as the extrema are.
         free: (N, N - 4) from the free nodes' changes to all nodes' changes, ends and end slopes unchanged.
     """
 
@@ -69,7 +69,7 @@ def discretisation(count: int) -> Discretisation:
     fine = lgl_rule(2 * count)
     dense = -np.cos(np.linspace(0.0, np.pi, DENSE_POINTS))
     slopes = rule.differentiation[[0, -1]]
-    # 5.11, 5.12: the two nodes next to the ends take up what keeps q' there.
+    # 5.11, 5.12: the two nodes next to the ends change so that q' at the ends does not.
     next_to_ends = np.linalg.solve(slopes[:, [1, -2]], -slopes[:, 2:-2])
     free = np.zeros((count, count - 4))
     free[2:-2] = np.eye(count - 4)
@@ -98,7 +98,7 @@ class Family:
     Attributes:
         grid: the discretisation.
         still: (N,) the prey with both slopes zero, which no horizon changes.
-        drift: (N,) what one second of horizon adds through the slopes.
+        drift: (N,) change of the prey per second of horizon, through its end slopes.
         basis: (N, N - 4) node changes for each parameter y.
     """
 
@@ -131,7 +131,7 @@ class Family:
         return np.asarray(self.still + horizon * self.drift + self.basis @ parameters)
 
     def observed(self, samples: Samples) -> Observed:
-        """Return what the parameters do at `samples`."""
+        """Return the family evaluated at `samples`."""
         matrices = samples.matrices
         return Observed(matrices @ self.still, matrices @ self.drift, matrices @ self.basis)
 
@@ -149,15 +149,15 @@ class Observed:
         return time_scale(horizon) * (self.still + horizon * self.drift + self.basis @ parameters)
 
     def aging(self, trajectory: FloatArray, horizon: float) -> FloatArray:
-        """Return what each second of horizon does to `trajectory` (3, m), in units of the s-derivatives.
+        """Return the derivative of `trajectory` (3, m) by the horizon, in units of the s-derivatives.
 
-        The prey drifts, and s-derivatives turn into time derivatives by smaller factors.
+        A longer horizon changes the prey and lowers the factors from s-derivatives to time derivatives.
         """
         slower = np.array([[0.0], [-1.0], [-2.0]]) / (horizon * time_scale(horizon))
         return np.asarray(self.drift + slower * trajectory)
 
 
 def time_scale(horizon: float) -> FloatArray:
-    """Return the factors (3, 1) from s-derivatives to time derivatives: s covers 2 in `horizon` s (5.8)."""
+    """Return the factors (3, 1) from s-derivatives to time derivatives: s grows by 2 in `horizon` s (5.8)."""
     per_second = 2.0 / horizon
     return np.array([[1.0], [per_second], [per_second * per_second]])

@@ -1,8 +1,8 @@
-"""Which horizon a path gets: the one asked for, the shortest feasible one, or that of a price of time.
+"""Finds the horizon of a path: the one asked for, the shortest feasible one, or the best at a price of time.
 
-All three are one program, energy plus a price for each second, between a least and a greatest horizon. With a
-price far above the coil's power and the asked horizon as the least, it ends at the asked horizon where a path
-there keeps the limits, and else at the shortest that has one: no infeasible program is ever tried.
+All three minimise energy plus a price per second between a least and a greatest horizon. With a price far
+above the coil's power and the asked horizon as the least, the solution is the asked horizon if a path there
+keeps the limits, else the shortest feasible horizon: no infeasible program is ever solved.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from flight.gnc.guidance.one_axis.vmc_program import LIMIT_TOLERANCE, FreeHorizo
 from flight.gnc.math.arrays import FloatArray
 
 ProgramAt = Callable[[float], Program]
-"""Makes the program whose family is whitened around the prey over a horizon in s."""
+"""Builds the program whose family is whitened around the prey over a horizon in s."""
 
 PRICE_OF_HASTE = 7.0
-"""Of a second, in R Imax^2, where the shortest horizon is wanted. An infinite price would give the family's
-very shortest path, all bang, whose cost is up to 1 % above the true optimum's at that horizon; this one stops
+"""Price per second, in R Imax^2, to find the shortest horizon. An infinite price would give the family's
+shortest path, bang-bang, whose cost is up to 1 % above the true optimum at that horizon; this price ends
 about 0.3 % later, where the cost is within 0.25 %."""
 
 _START_BELOW = 1.7
@@ -36,11 +36,11 @@ _PRICED_CHANGE = 0.03
 
 @dataclass(slots=True)
 class Search:
-    """One search for a path; counts what it costs.
+    """One search for a path; counts the evaluations of the cost.
 
     Attributes:
-        program_at: makes programs.
-        warm: (N,) how far an earlier path lay from its prey on the nodes; None to start from the prey.
+        program_at: builds programs.
+        warm: (N,) difference between an earlier path and its prey on the nodes; None to start from the prey.
         evaluations: of the cost so far.
     """
 
@@ -51,8 +51,9 @@ class Search:
     def within(self, asked: float, longest: float) -> tuple[Program, Trial | None]:
         """Return the least-energy path over `asked` s, or over the shortest feasible time up to `longest` s.
 
-        Current scales with 1/T^2 for a slew at rest: unlimited solutions lead to a horizon near the shortest
-        feasible one, from where the program with a free horizon starts. Should it fail, it starts later.
+        Current scales with 1/T^2 for a rest-to-rest slew, so solutions without limits lead to a horizon near
+        the shortest feasible one, where the program with a free horizon starts. If the program fails, it is
+        solved again from a longer horizon.
         """
         if self.warm is not None:
             program = self.program_at(asked)
@@ -82,11 +83,11 @@ class Search:
     def priced(
         self, guess: float, least: float, longest: float, price: float
     ) -> tuple[Program, Trial | None]:
-        """Return the path of least energy plus `price` W times its horizon, begun from `guess` s.
+        """Return the path of least energy plus `price` W times its horizon; `guess` s is the initial horizon.
 
-        The slope of the least energy over the horizon is the partial derivative at that optimum. Where a
-        longer horizon saves more than its price it is a lower bound, else an upper one; in between leads that
-        the energy of an unlimited slew falls as 1/T^3. The limits come in with the last program only.
+        The slope of the least energy over the horizon is the partial derivative at that optimum. A horizon is
+        a lower bound where lengthening it saves more energy than its price, else an upper bound; the next
+        horizon follows from E ~ 1/T^3 for a slew without limits. Only the last program imposes the limits.
         """
         low, high, time = least, longest, min(max(guess, least), longest)
         price = min(price, PRICE_OF_HASTE * self.program_at(time).bang_power)
@@ -116,9 +117,9 @@ class Search:
         return self.within(time, longest)
 
     def _resumed(self, program: Program, warm: FloatArray, asked: float, longest: float) -> Trial | None:
-        """Return the path that an earlier one leads to; None when it leads nowhere.
+        """Return the path found when starting from an earlier one; None when that fails.
 
-        Where the earlier path ran along a limit the limits are imposed at once: no detour beyond them.
+        Where the earlier path ran along a limit, the limits are imposed at once.
         """
         start = program.beside_prey(warm, asked)
         worst = float(np.abs(program.ratios(start)).max())
@@ -132,7 +133,7 @@ class Search:
         return trial
 
     def _hasty(self, program: Program, start: Trial, asked: float, longest: float) -> Trial | None:
-        """Return the shortest path from `asked` s on, at its least energy when that is the asked horizon."""
+        """Return the shortest path of at least `asked` s; of least energy if its horizon is `asked`."""
         price = PRICE_OF_HASTE * program.bang_power
         trial = program.limited(start, FreeHorizon(asked, longest, price))
         if trial is None or trial.horizon > asked * (1.0 + _AT_BOUND):

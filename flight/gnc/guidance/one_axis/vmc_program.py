@@ -1,8 +1,8 @@
 """The programs of virtual motion camouflage, on NLopt's SLSQP with exact gradients (Sease 5.8, 5.14).
 
-Two programs share cost and limits: the least energy at a fixed horizon, and the least of energy and time at
-a price of time. The limits hold at every time, not on the nodes only: they are imposed at those points of a
-dense grid where a solution without them broke them, until none does (the exchange method of semi-infinite
+Two programs share cost and limits: least energy at a fixed horizon, and least energy plus price times
+horizon. The limits hold at every time, not only on the nodes: they are imposed at the points of a dense grid
+where the previous solution exceeded them, until no point does (the exchange method of semi-infinite
 programming).
 """
 
@@ -23,11 +23,11 @@ from flight.gnc.guidance.one_axis.vmc_family import Family, Observed, time_scale
 from flight.gnc.math.arrays import BoolArray, FloatArray, IntArray
 
 LIMIT_TOLERANCE = 3e-4
-"""Relative: what a limit may be exceeded by on the dense grid; leaves room under 1e-3 between its points."""
+"""Largest relative excess over a limit on the dense grid; leaves room under 1e-3 between its points."""
 
 IMPOSED_MARGIN = 2e-4
-"""Relative: how far within a limit it is imposed, so that the peaks between the imposed points keep it too;
-without it each exchange creeps up on the limit."""
+"""Relative margin by which a limit is tightened where imposed, so that peaks between those points keep it
+too; without the margin the exchanges converge slowly."""
 
 # NLopt 2.11 has a runtime_error of its own, older bindings raise Python's.
 _SOLVER_STOPS = (nlopt.RoundoffLimited, RuntimeError, getattr(nlopt, "runtime_error", RuntimeError))
@@ -49,7 +49,7 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class FreeHorizon:
-    """A horizon to be found between `least` and `greatest` s, each second at `price` W."""
+    """A horizon to be optimised between `least` and `greatest` s, at `price` W per second."""
 
     least: float
     greatest: float
@@ -58,7 +58,7 @@ class FreeHorizon:
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Where limits are imposed: (m,) dense points, the sign there, and which limit, q2's or the current's."""
+    """Imposed limits (m,): dense grid point, sign, and which limit, that of q2 or of the current."""
 
     index: IntArray
     sign: FloatArray
@@ -75,14 +75,15 @@ class Program:
     """One plant, one family of paths between two states, and their cost and limits.
 
     Attributes:
-        family: whitened around the prey at the horizon given.
+        family: whitened around the prey at the given horizon.
         evaluations: of the cost, over all solutions.
     """
 
     def __init__(self, plant: SingleAxisPlant, family: Family, q2_limit: float, horizon: float) -> None:
         self._plant = plant
         self._q2_limit = q2_limit
-        # Beyond its limit q2 is held for the current's sake: an iterate may wander past the singularity.
+        # An iterate may pass the singularity; q2 is clamped beyond its limit so that the current stays
+        # finite.
         self._q2_cap = 0.5 * (q2_limit + math.sqrt(SQUARE_Q2_WITHOUT_AUTHORITY))
         self._weights = 0.5 * plant.resistance * family.grid.cost_weights
         self._bang = plant.resistance * plant.current_limit**2
@@ -92,12 +93,12 @@ class Program:
 
     @property
     def current_limit(self) -> float:
-        """The plant's, A."""
+        """The plant's current limit, A."""
         return self._plant.current_limit
 
     @property
     def bang_power(self) -> float:
-        """R Imax^2, W: what the coil takes at its limit."""
+        """R Imax^2, W: the coil's power at its current limit."""
         return self._bang
 
     def prey(self, horizon: float) -> Trial:
@@ -105,9 +106,9 @@ class Program:
         return Trial(np.zeros(self.family.size), horizon)
 
     def _whitened(self, family: Family, horizon: float) -> Family:
-        """Return the family with the unit matrix for the energy's Gauss-Newton Hessian at the prey.
+        """Return the family whose Gauss-Newton Hessian of the energy at the prey is the unit matrix.
 
-        SLSQP starts from that matrix, so its first step is the Gauss-Newton step.
+        SLSQP starts from the unit matrix, so its first step is the Gauss-Newton step.
         """
         observed = family.observed(family.grid.cost)
         prey = observed.trajectory(np.zeros(family.size), horizon)
@@ -141,7 +142,7 @@ class Program:
     def excess(
         self, limits: Limits, points: Observed, trial: Trial
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return limit ratios minus one (m,), gradients (m, N - 4) and d/dT (m,), seen at `points` (m)."""
+        """Return limit ratios minus one (m,), gradients (m, N - 4) and d/dT (m,) at `points` (m)."""
         trajectory = points.trajectory(trial.parameters, trial.horizon)
         current, slopes = self._current(trajectory, trial.horizon)
         value = np.where(limits.is_q2, trajectory[0] / self._q2_limit, current / self._plant.current_limit)
@@ -159,16 +160,16 @@ class Program:
         return np.stack([current / self._plant.current_limit, trajectory[0] / self._q2_limit])
 
     def beside_prey(self, apart: FloatArray, horizon: float) -> Trial:
-        """Return the path that lies `apart` (N,) from the prey on the nodes, ends and end slopes aside."""
+        """Return the path that differs by `apart` (N,) from the prey on the nodes; its ends stay the same."""
         return Trial(np.asarray(np.linalg.solve(self.family.basis[2:-2], apart[2:-2]), dtype=float), horizon)
 
     def unlimited(self, start: Trial) -> Trial | None:
-        """Return the least-energy path over the horizon of `start`, limits aside; None when none is found."""
+        """Return the least-energy path over the horizon of `start` without limits; None if none is found."""
         trial, converged = self._minimise(start, None, None)
         if converged:
             return trial
-        # NLopt ends a problem that is solved from the start as limited by rounding. The whitened gradient
-        # tells that from a failure: half its square is the energy still to be saved.
+        # NLopt reports a problem that starts at its optimum as limited by rounding. The whitened gradient
+        # distinguishes that from a failure: half its square is the energy still to be saved.
         _, gradient, _ = self.energy(trial)
         return trial if 0.5 * float(gradient @ gradient) <= self._energy_tolerance(trial.horizon) else None
 
@@ -189,14 +190,14 @@ class Program:
             if worst <= 1.0 + LIMIT_TOLERANCE:
                 return trial if converged else None
             if not math.isfinite(worst) or np.any(np.abs(latest[chosen]) > 1.0 + LIMIT_TOLERANCE):
-                return None  # imposed, and broken all the same
+                return None  # exceeded although imposed
             added = _peaks(latest) & ~chosen
             ratios = np.where(added, latest, ratios)
             chosen = chosen | added
         return None
 
     def _energy_tolerance(self, horizon: float) -> float:
-        """Return what energy is solved to, J: 1e-8 of what the coil can spend in the time."""
+        """Return the tolerance on energy, J: 1e-8 of the energy at the current limit over the horizon."""
         return 1e-8 * self._bang * horizon
 
     def _minimise(self, start: Trial, limits: Limits | None, free: FreeHorizon | None) -> tuple[Trial, bool]:
@@ -287,7 +288,7 @@ def _contract(slopes: FloatArray, basis: FloatArray) -> FloatArray:
 
 
 def _peaks(ratios: FloatArray) -> BoolArray:
-    """Tell where |ratios| (2, m) has a local maximum along its rows above one."""
+    """Return where (2, m) |ratios| (2, m) has a local maximum above one along its rows."""
     size = np.abs(ratios)
     peak = size > 1.0
     peak[:, 1:] &= size[:, 1:] >= size[:, :-1]
