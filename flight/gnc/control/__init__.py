@@ -1,1 +1,1 @@
-"""Control: from the state and the path to a coil current."""
+"""Control: coil currents from the estimated state and the path."""

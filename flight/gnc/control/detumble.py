@@ -1,13 +1,13 @@
-"""Detumbling by the magnetometer alone: B-dot, the field taken while the coils are off.
+"""Detumbling by the magnetometer alone: B-dot, with the field measured while the coils are off.
 
-The coils' own field swamps the magnetometer, so time is cut into windows: the coils are off and settle, the
-field is averaged, then the coils act on what two windows in a row say. Seen from the body a field that stands
-still turns by B' = -w x B, which shows the rate across the field, w_p = B' x B / B^2. The dipole moment
-m = (k / B^2) w_p x B brakes it: its torque m x B is -k w_p, however the field stands, and nothing along it
-(B-dot: Wertz 1978, 18.3; Avanzini and Giulietti 2012, J. Guid. Control Dyn. 35(4)). The gain follows from the
-window: in the time that the coils act, k w_p is to take `share` of J w_p, J the smallest moment of inertia.
-Between windows the field is carried on by the rate just found, so that a fast body is braked, not pushed.
-The rate is right while the body turns by less than half a turn from window to window.
+The coils' own field swamps the magnetometer, so time is divided into windows: the coils are off and settle,
+the field is averaged, then the coils act on the means of two windows in a row. In body axes a constant field
+changes by B' = -w x B, which gives the rate across the field, w_p = B' x B / B^2. The dipole moment
+m = (k / B^2) w_p x B brakes that rate: its torque m x B is -k w_p for any direction of the field, with no
+component along it (B-dot: Wertz 1978, 18.3; Avanzini and Giulietti 2012, J. Guid. Control Dyn. 35(4)). The
+gain follows from the window: while the coils act, k w_p removes `share` of J w_p, J the smallest moment of
+inertia. Between windows the field is propagated with the last rate, so that a fast body is braked, not
+accelerated. The rate is right while the body turns by less than half a turn from window to window.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ _NO_CURRENT: FloatArray = np.zeros(3)
 
 @dataclass(frozen=True, slots=True)
 class WindowSchedule:
-    """One window: coils off to settle, off to measure, then on; all in ns."""
+    """The phases of one window: coils off to settle, off to measure, then on; all in ns."""
 
     settle_ns: int
     measure_ns: int
     act_ns: int
 
     def __post_init__(self) -> None:
-        """Refuse a window without measurement or action; raises UsageError."""
+        """Raise UsageError for a window without time to measure or to act."""
         if self.settle_ns < 0 or self.measure_ns <= 0 or self.act_ns <= 0:
             raise UsageError(f"detumble window {self}: measuring and acting need time")
 
     @property
     def period_ns(self) -> int:
-        """From window to window."""
+        """Time from window to window, ns."""
         return self.settle_ns + self.measure_ns + self.act_ns
 
 
@@ -53,7 +53,7 @@ class Braking:
         inertia: smallest principal moment, kg m^2.
         dipole_per_ampere: n A of each coil, m^2.
         current_limit: of each coil, A.
-        share: of the rate across the field that is to go in one window, below 1.
+        share: fraction of the rate across the field to remove in one window, below 1.
     """
 
     inertia: float
@@ -62,7 +62,7 @@ class Braking:
     share: float
 
     def __post_init__(self) -> None:
-        """Refuse constants that do not brake; raises UsageError."""
+        """Raise UsageError for constants that do not brake."""
         for name in ("inertia", "dipole_per_ampere", "current_limit", "share"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
@@ -74,11 +74,11 @@ class Braking:
 
 
 def share_in_turning_field(turn: float, schedule: WindowSchedule) -> float:
-    """Return the best `share` for a body in three axes where the field's direction turns by `turn` rad/s.
+    """Return the best `share` for a body free in three axes in a field that turns by `turn` rad/s.
 
-    Only the field's turn brings the rate along it within reach; with more gain than k = 2 Omega J the spin
-    locks to the field and stays (Avanzini and Giulietti 2012). In an orbit the field turns about twice
-    a round.
+    The rate along the field can be braked only as the field turns; with more gain than k = 2 Omega J the spin
+    aligns with the field and stays (Avanzini and Giulietti 2012). In an orbit the field turns about twice
+    per revolution.
     """
     return min(2.0 * turn * schedule.period_ns * _SECOND, MOST_SHARE)
 
@@ -86,9 +86,9 @@ def share_in_turning_field(turn: float, schedule: WindowSchedule) -> float:
 def rate_across(before: FloatArray, after: FloatArray, seconds: float) -> FloatArray:
     """Return the rate (3,) across the field, rad/s, that turned `before` into `after` (3,) T in the body.
 
-    Exact for a steady turn across the field by less than half a turn. Zero where there is no field.
+    Exact for a steady rotation across the field by less than half a turn. Zero without a field.
     """
-    turned = np.cross(after, before)  # -w x B: the field goes the other way round than the body
+    turned = np.cross(after, before)  # -w x B: the field turns opposite to the body
     length = float(np.linalg.norm(turned))
     if length == 0.0:
         return np.zeros(3)
@@ -99,7 +99,7 @@ def rate_across(before: FloatArray, after: FloatArray, seconds: float) -> FloatA
 def braking_current(braking: Braking, rate: FloatArray, field: FloatArray, act_time: float) -> FloatArray:
     """Return currents (3,) A that brake `rate` (3,) rad/s across `field` (3,) T, acting for `act_time` s.
 
-    One scale for all three keeps the direction where a coil would be beyond its limit.
+    All three are scaled by one factor when a coil would exceed its limit, to preserve the direction.
     """
     square = float(field @ field)
     if square == 0.0:
@@ -111,7 +111,7 @@ def braking_current(braking: Braking, rate: FloatArray, field: FloatArray, act_t
 
 
 class Detumbler:
-    """Runs the windows: told of each magnetometer sample, asked for currents each cycle."""
+    """Runs the windows: takes each magnetometer sample and returns currents each cycle."""
 
     def __init__(self, schedule: WindowSchedule, braking: Braking) -> None:
         self._schedule = schedule
@@ -124,33 +124,33 @@ class Detumbler:
         self._rate: FloatArray | None = None
 
     def begin(self, now_ns: int) -> None:
-        """Begin a first window; nothing is known of the field."""
+        """Begin the first window with no knowledge of the field."""
         self._begun_ns = now_ns
         self._samples.clear()
         self._window = self._closed = -1
         self._before = self._field = self._rate = None
 
     def listens(self, time_ns: int) -> bool:
-        """Tell whether a sample taken at `time_ns` is of a time at which the coils were off and settled."""
+        """Return whether the coils were off and settled at `time_ns`."""
         schedule = self._schedule
         phase_ns = (time_ns - self._begun_ns) % schedule.period_ns
         inside = schedule.settle_ns <= phase_ns < schedule.settle_ns + schedule.measure_ns
         return time_ns >= self._begun_ns and inside
 
     def sample(self, time_ns: int, field: FloatArray) -> None:
-        """Take in a field (3,) T measured at `time_ns`; outside the windows it is not used."""
+        """Accept a field (3,) T measured at `time_ns`; ignored unless the coils were off and settled."""
         if not self.listens(time_ns):
             return
         window = (time_ns - self._begun_ns) // self._schedule.period_ns
         if window <= self._closed:
-            return  # it came too late for its window
+            return  # too late: its window is closed
         if window != self._window:
             self._samples.clear()
             self._window = window
         self._samples.append((time_ns, field))
 
     def current(self, now_ns: int) -> FloatArray:
-        """Return the currents (3,) A for now: zero while the field is measured, or not known well enough."""
+        """Return the currents (3,) A now: zero while the field is measured or the rate is not known."""
         schedule = self._schedule
         phase_ns = (now_ns - self._begun_ns) % schedule.period_ns
         if phase_ns < schedule.settle_ns + schedule.measure_ns:
@@ -159,11 +159,11 @@ class Detumbler:
         window = (now_ns - self._begun_ns) // schedule.period_ns
         field = self.field(now_ns)
         if self._rate is None or field is None or window != self._closed:
-            return _NO_CURRENT  # no field of this window: an old one says nothing of now
+            return _NO_CURRENT  # no field measured in this window, and an older one is out of date
         return braking_current(self._braking, self._rate, field, schedule.act_ns * _SECOND)
 
     def field(self, now_ns: int) -> FloatArray | None:
-        """Return the field (3,) T in body axes now, as the last windows let it be carried on; None before."""
+        """Return the field (3,) T in body axes, propagated to `now_ns`; None before a rate is known."""
         if self._rate is None or self._field is None:
             return None
         since = (now_ns - self._field[0]) * _SECOND
@@ -171,11 +171,11 @@ class Detumbler:
 
     @property
     def rate(self) -> FloatArray | None:
-        """The rate (3,) across the field, rad/s, that the last two windows told; None before."""
+        """The rate (3,) across the field from the last two windows, rad/s; None before."""
         return self._rate
 
     def _close_window(self) -> None:
-        """Make one field of the window's samples, and a rate with that of the window before."""
+        """Average the window's samples, and derive the rate from this and the previous window's field."""
         if not self._samples:
             return
         time_ns = round(sum(time for time, _ in self._samples) / len(self._samples))
@@ -186,5 +186,5 @@ class Detumbler:
         self._rate = None
         if self._before is not None:
             span_ns = time_ns - self._before[0]
-            if span_ns < 2 * self._schedule.period_ns:  # else a window was missed
+            if span_ns < 2 * self._schedule.period_ns:  # otherwise a window was missed
                 self._rate = rate_across(self._before[1], field, span_ns * _SECOND)

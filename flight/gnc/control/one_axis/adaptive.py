@@ -4,10 +4,10 @@ Slotine and Li 1991, 8.5: with the composite error s = e' + l e and a_r = theta_
 
     I cos(theta) = p . Y + g s,     Y = (a_r, theta, w, -1),     p' = G Y s
 
-tracks whatever the inertia, stiffness, damping and constant torque in p (each over the torque constant).
-theta_m follows the target through a critically damped model of second order, so that a step of the target
-is one that the body can make. Adaptation rests while the coil saturates and while |s| is within what the
-noise makes of it, and p stays within bounds: noise alone would carry it away.
+tracks for any inertia, stiffness, damping and constant torque in p (each over the torque constant).
+theta_m follows the target through a critically damped model of second order, so that the body can follow a
+step of the target. p is adapted only while the coil does not saturate and |s| exceeds the level of noise, and
+is bounded, because noise alone would make it drift.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ _LEAST_AUTHORITY = 0.05
 
 @dataclass(frozen=True, slots=True)
 class AdaptiveSettings:
-    """How an adaptive controller is tuned.
+    """Settings of the adaptive controller.
 
     Attributes:
-        bandwidth: l in rad/s; the gain on s is as much in s^-1.
-        adaptation: how fast p learns: its gain over the square of each parameter's range, s/rad^2.
-        reference_bandwidth: of the reference model, rad/s; None follows the wanted motion itself.
-        dead_zone: rad/s of s within which nothing is learnt.
+        bandwidth: l in rad/s; also the gain on s, in s^-1.
+        adaptation: rate of adaptation of p: its gain over the square of each parameter's range, s/rad^2.
+        reference_bandwidth: of the reference model, rad/s; None follows the commanded motion directly.
+        dead_zone: rad/s; p is not adapted while |s| is below.
     """
 
     bandwidth: float
@@ -43,7 +43,7 @@ class AdaptiveSettings:
     dead_zone: float = 1e-3
 
     def __post_init__(self) -> None:
-        """Refuse values that are not finite and positive; raises UsageError."""
+        """Raise UsageError for values that are not finite and positive."""
         for name in ("bandwidth", "adaptation", "reference_bandwidth", "dead_zone"):
             value = getattr(self, name)
             if value is not None and not (math.isfinite(value) and value > 0.0):
@@ -51,7 +51,7 @@ class AdaptiveSettings:
 
 
 class AdaptiveController:
-    """Holds the parameters p (4,) in A s^2, A, A s and A, and the reference model's state."""
+    """Owns the parameters p (4,) in A s^2, A, A s and A, and the reference model's state."""
 
     def __init__(self, plant: SingleAxisPlant, period: float, settings: AdaptiveSettings) -> None:
         """Begin with the plant's inertia, stiffness and damping; `period` in s between commands.
@@ -94,11 +94,11 @@ class AdaptiveController:
         return made
 
     def reset(self) -> None:
-        """Let the reference model begin anew where the body then is; what was learnt is kept."""
+        """Restart the reference model from the body's state at the next command; p is kept."""
         self._model = None
 
     def _follow(self, wanted: Sample, angle: float, rate: float) -> Sample:
-        """Return the reference model's motion and carry it on by one period."""
+        """Return the reference model's motion and propagate the model by one period."""
         w = self._settings.reference_bandwidth
         if w is None:
             return wanted

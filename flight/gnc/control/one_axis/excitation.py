@@ -1,10 +1,11 @@
-"""The excitation: a controller that goes no path but moves the body so that its constants show.
+"""Excitation: a controller that follows no path but moves the body so that its constants can be identified.
 
-Brought to rest by the tracker, the body is turned out and back by long and by short pulses (torque constant,
-delay), then put aside and let go with the coils at zero (stiffness, damping: a coil that is off has no error
-in its current). Then the same with the other sign. Between the manoeuvres, and whenever the body would leave
-the bound even if braked at once, the tracker has the coil; if that cannot bring the body to rest, the current
-stays zero for good. Whoever wanted a current, it stands in the log.
+The tracker brings the body to rest. Long and short pulses then turn the body out and back (torque constant,
+delay), and further pulses displace it and release it with the coils at zero (stiffness, damping: the current
+of a coil that is off is known exactly). The same follows with the other sign. Between manoeuvres, and
+whenever the body would leave the bound even if braked at once, the tracker commands the coil; if the tracker
+cannot bring the body to rest, the current stays zero for good. The log holds the current, whichever commanded
+it.
 """
 
 from __future__ import annotations
@@ -23,14 +24,14 @@ _REST_ANGLE = 0.03
 _REST_RATE = 4.0e-3
 _REST_TIME = 1.0
 _PATIENCE = 60.0
-_REACH = 0.45  # of the bound: a body 1.4 times as lively as believed stays clear of it
-_WEAK = 0.7  # of the believed torque counts when the room to brake is reckoned
+_REACH = 0.45  # of the bound: a body with 1.4 times the modelled response stays within it
+_WEAK = 0.7  # of the modelled torque is assumed available for braking
 _SHORT_PULSE = 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class Pulse:
-    """A share of the excitation's current, in [-1, 1], for some s."""
+    """A share of the excitation's current, in [-1, 1], for `duration` s."""
 
     share: float
     duration: float
@@ -47,13 +48,13 @@ class _Phase(Enum):
 
 @dataclass(frozen=True, slots=True)
 class ExcitationSettings:
-    """How hard and how far.
+    """Amplitudes of the excitation.
 
     Attributes:
-        current_share: of the coil's limit, for pulses and tracker: at the limit itself the true current is
-            not the commanded one.
-        largest_q2: which the body never leaves by the excitation's doing.
-        swing: s of each free swing.
+        current_share: fraction of the coil's limit, for pulses and tracker; at the limit itself the true
+            current differs from the commanded one.
+        largest_q2: the excitation never moves the body beyond.
+        swing: duration of each free swing, s.
     """
 
     current_share: float
@@ -62,10 +63,10 @@ class ExcitationSettings:
 
 
 class ExcitationController:
-    """Flies the manoeuvres one after the other, for as long as it is asked for commands."""
+    """Runs the manoeuvres in turn for as long as commands are requested."""
 
     def __init__(self, plant: SingleAxisPlant, period: float, settings: ExcitationSettings) -> None:
-        """Lay the manoeuvres out for the believed `plant`, commanded every `period` s.
+        """Build the manoeuvres for the plant model `plant`, commanded every `period` s.
 
         Raises UsageError when a value is outside its range.
         """
@@ -92,13 +93,13 @@ class ExcitationController:
 
     @property
     def gave_up(self) -> bool:
-        """Whether the tracker could not bring the body to rest."""
+        """Whether the tracker failed to bring the body to rest."""
         return self._phase is _Phase.GIVEN_UP
 
     def command(self, wanted: Sample, angle: float, rate: float, disturbance: float = 0.0) -> CoilCommand:
         """Return the command at `angle` rad, `rate` rad/s under `disturbance` rad/s^2, all estimated.
 
-        `wanted` is where the body rests between manoeuvres. Raises UsageError when an input is not finite.
+        `wanted` is the rest position between manoeuvres. Raises UsageError when an input is not finite.
         """
         error = attitude_error(wanted, angle, rate, disturbance)
         if self._phase is _Phase.GIVEN_UP:
@@ -113,13 +114,13 @@ class ExcitationController:
         return self._tracker.command(wanted, angle, rate, disturbance)
 
     def reset(self) -> None:
-        """Begin again with bringing the body to rest; the manoeuvre that was under way is left out."""
+        """Bring the body to rest again; a manoeuvre that was under way is skipped."""
         if self._phase is _Phase.MOVING:
             self._come_to_rest()
         self._resting = 0.0
 
     def _pulse(self) -> Pulse | None:
-        """Return the pulse of now, None when the manoeuvre is over."""
+        """Return the current pulse; None when the manoeuvre is over."""
         begin = 0.0
         for pulse in self._manoeuvres[self._next % len(self._manoeuvres)]:
             begin += pulse.duration
@@ -128,7 +129,7 @@ class ExcitationController:
         return None
 
     def _has_room(self, angle: float, rate: float) -> bool:
-        """Tell whether the body can be stopped within the bound, or turns back by itself."""
+        """Return whether the body can be stopped within the bound, or moves inwards."""
         outward = rate if angle >= 0.0 else -rate
         braking = _WEAK * self._strength * math.cos(min(abs(angle), self._bound))
         run_out = 0.5 * max(outward, 0.0) ** 2 / braking
@@ -140,7 +141,7 @@ class ExcitationController:
         self._elapsed = self._resting = self._waited = 0.0
 
     def _wait(self, error: float, rate: float) -> None:
-        """Begin the next manoeuvre once the body has been at rest for a while."""
+        """Begin the next manoeuvre once the body has rested long enough; give up when that takes too long."""
         quiet = abs(error) < _REST_ANGLE and abs(rate) < _REST_RATE
         self._resting = self._resting + self._period if quiet else 0.0
         self._waited += self._period
@@ -151,7 +152,7 @@ class ExcitationController:
 
 
 def manoeuvres(strength: float, reach: float, swing: float) -> tuple[Manoeuvre, ...]:
-    """Return the manoeuvres for pulses of `strength` rad/s^2 that turn the body out to `reach` rad.
+    """Return the manoeuvres with pulses of `strength` rad/s^2 that turn the body by up to `reach` rad.
 
     From rest a pulse and its opposite, T s each, turn the body by strength T^2.
     """

@@ -1,4 +1,4 @@
-"""The LQ tracker: the attitude error made linear by feedback, then a linear-quadratic regulator.
+"""The LQ tracker: feedback linearisation of the attitude error, then a linear-quadratic regulator.
 
 Sease 2013, 5.16-5.32. With p the path and q the body, 5.17-5.20 give e = sin(theta_p - theta) exactly
 (5.21), and 5.24-5.27 corrected are
@@ -6,17 +6,19 @@ Sease 2013, 5.16-5.32. With p the path and q the body, 5.17-5.20 give e = sin(th
     e'  = cos(d) (theta_p' - w)
     e'' = cos(d) (theta_p'' - w') - sin(d) (theta_p' - w)^2,     d = theta_p - theta.
 
-e'' = v is solved for w' and the plant gives the current; v = -K (e', e) with K from the Riccati equation.
+e'' = v is solved for w' and the plant model gives the current; v = -K (e', e) with K from the Riccati
+equation.
 
-Two things go beyond the thesis, whose own loop is had with `as_in_thesis`. The estimated disturbance is fed
-forward: its estimator integrates what the model did not foresee, so that no constant torque leaves an offset,
-and it is told the current that was written, limits included, so that nothing winds up while the coil
-saturates. And an error is taken back no faster than the coil can brake: at the rate s e, s = K_e / K_e', up
-to a distance, and beyond it at sqrt(2 A |e| - (A / s)^2), from which a constant braking A leads there (the
-proximate time-optimal servo, Workman 1987, here continuous in slope too). A linear law overshoots there.
+Two things go beyond the thesis; `as_in_thesis` restores its loop. First, the estimated disturbance is fed
+forward: the estimator integrates the acceleration that the model did not predict, so that a constant torque
+leaves no offset, and it knows the current that was written, limits included, so that nothing winds up while
+the coil saturates. Second, an error is reduced no faster than the coil can brake: at the rate s e,
+s = K_e / K_e', up to a distance, and beyond it at sqrt(2 A |e| - (A / s)^2), from which constant braking A
+leads to that distance (the proximate time-optimal servo, Workman 1987, here with a continuous slope too).
+A linear law overshoots there.
 
-e is monotone in d only to 90 degrees. Beyond `largest_error` d is held there, its sign kept: the tracker
-then turns the body back at a bounded demand instead of giving up its grip as sin(d) falls again.
+e is monotone in d only up to 90 degrees. Beyond `largest_error` d is clamped, its sign kept, so that the
+demand stays bounded and does not weaken as sin(d) falls again.
 """
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ _LEAST_BRAKING = 0.05
 
 
 class LqTracker:
-    """Gains and plant; keeps nothing from call to call.
+    """Computes commands from gains and a plant model; has no state.
 
     Attributes:
         error_gain, rate_gain: K on e in 1/s^2 and on e' in 1/s.
@@ -54,7 +56,7 @@ class LqTracker:
         """Solve the Riccati equation for Q = state_weight I and R = input_weight (5.28-5.32).
 
         `largest_error` is in rad, below pi/2; `least_authority` bounds |cos(theta)|; `as_in_thesis` leaves
-        disturbance and braking out of account. Raises UsageError when a value is outside its range.
+        out disturbance and braking. Raises UsageError when a value is outside its range.
         """
         for name, value in (("Q", state_weight), ("R", input_weight)):
             if not (math.isfinite(value) and value > 0.0):
@@ -93,13 +95,13 @@ class LqTracker:
         return CoilCommand.within(self._plant.current_limit, demanded, error, held)
 
     def _braking(self, wanted_angle: float, angle: float, disturbance: float) -> float:
-        """Return the deceleration to count on between here and the path, rad/s^2."""
+        """Return the deceleration available between here and the path, rad/s^2."""
         authority = max(min(math.cos(angle), math.cos(wanted_angle)), 0.0)
         taken = abs(disturbance - self._plant.stiffness * angle / self._plant.inertia)
         return max(_BRAKING_SHARE * self._strength * authority - taken, _LEAST_BRAKING * self._strength)
 
     def _approach(self, error: float, braking: float) -> float:
-        """Return the rate at which to take `error` back, 1/s, of its sign."""
+        """Return the rate at which to reduce `error`, 1/s, with its sign."""
         slope = self.error_gain / self.rate_gain
         reach = braking / slope
         if abs(error) * slope <= reach:
@@ -107,14 +109,14 @@ class LqTracker:
         return math.copysign(math.sqrt(2.0 * braking * abs(error) - reach * reach), error)
 
     def reset(self) -> None:
-        """Do nothing: no call depends on the one before."""
+        """Do nothing: the tracker has no state."""
 
 
 def lq_gains(state_weight: float, input_weight: float) -> tuple[float, float]:
     """Return K, on e' in 1/s and on e in 1/s^2, for Q = state_weight I and R = input_weight (5.28-5.32).
 
-    The plant e'' = v is two integrators in series, whose Riccati equation is solved by hand: with w = Q / R,
-    K_e = sqrt(w) and K_e' = sqrt(w + 2 K_e). A general solver would cost a fifth of a second of the start.
+    The plant e'' = v is a double integrator, whose Riccati equation has the solution, with w = Q / R,
+    K_e = sqrt(w) and K_e' = sqrt(w + 2 K_e). A general solver would take 0.2 s at start.
     """
     weight = state_weight / input_weight
     error_gain = math.sqrt(weight)

@@ -1,10 +1,10 @@
 """A PID controller of the angle about the thread, for comparison (Sease 2013, ch. 5: 0.15 W on the testbed).
 
-Its gains are those of three poles at -w for a double integrator: 3 w, 3 w^2 and w^3 on rate, angle and its
-integral. The reference enters the proportional part by a weight b (two degrees of freedom, Astrom and
-Hagglund 1995, 3.4): with b = 0 a step of the target does not kick the coil and does not overshoot. The
-integral stops where the limit is in force and would be pushed further (conditional integration). It knows
-the ratio of inertia to torque constant, which scales the gains, and nothing else of the plant.
+The gains place three poles of a double integrator at -w: 3 w, 3 w^2 and w^3 on rate, angle and its integral.
+The reference enters the proportional part with a weight b (two degrees of freedom, Astrom and Hagglund 1995,
+3.4): with b = 0 a step of the target makes no step of the current and no overshoot. The integral stops while
+the limit is applied and the error would push it further (conditional integration). Of the plant the
+controller uses only the ratio of inertia to torque constant, which scales the gains.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from flight.gnc.guidance.one_axis.plant import SingleAxisPlant
 
 
 class PidController:
-    """Holds the integral of the error, rad s."""
+    """Owns the integral of the error, rad s."""
 
     def __init__(
         self, plant: SingleAxisPlant, period: float, bandwidth: float, target_weight: float = 0.0
@@ -49,8 +49,8 @@ class PidController:
         Raises UsageError when an input is not finite.
         """
         error = attitude_error(wanted, angle, rate, disturbance)
-        # The whole target is in the integral; what of it is not in the proportional part is made up for
-        # there at the start, so that taking over at rest asks for no current.
+        # The integral starts with the part of the target that the proportional part leaves out, so that the
+        # first command at rest is zero.
         unweighted = (1.0 - self._weight) * wanted.angle
         if self._sum is None:
             self._sum = self._proportional / self._integral * ((1.0 - self._weight) * angle)
@@ -67,5 +67,5 @@ class PidController:
         return made
 
     def reset(self) -> None:
-        """Forget the integral."""
+        """Clear the integral."""
         self._sum = None
