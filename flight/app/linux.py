@@ -14,7 +14,8 @@ from hal.buses.serial_port import PySerialPort
 from hal.drivers.aravis_camera import AravisCamera, AravisSettings
 from hal.drivers.camera import CameraDevice, ServedCamera
 from hal.drivers.pca9685 import switch_off
-from hal.drivers.v4l2_camera import Stamp, V4l2Camera, V4l2Settings
+from hal.drivers.v4l2_camera import V4l2Camera
+from hal.drivers.v4l2_settings import Stamp, V4l2Settings
 from hal.guardian.client import CoilReach
 from hal.interfaces.devices import FrameSource
 from hal.interfaces.errors import DeviceError

@@ -190,7 +190,7 @@ class VideoDevice:
         self._streaming = True
         return int(request.count)
 
-    def take(self) -> Filled | None:
+    def dequeue(self) -> Filled | None:
         """Return the oldest filled buffer, None when there is none. Hand it back with `queue`."""
         buffer = _numbered(0)
         try:

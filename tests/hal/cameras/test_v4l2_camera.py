@@ -11,7 +11,7 @@ import pytest
 
 from hal.buses import videodev2 as v4l2
 from hal.buses.v4l2 import VideoDevice
-from hal.drivers.v4l2_camera import Stamp
+from hal.drivers.v4l2_settings import Stamp
 from hal.interfaces.errors import DeviceError, NotResponding, OutOfRange, Refused
 from tests.hal.cameras.ioctl_camera import IoctlCamera, Knob
 from tests.hal.cameras.rig import EXPOSURE_NS, VideoRig, video_rig
@@ -48,12 +48,12 @@ def test_frames_that_lay_in_the_queue_are_not_the_triggered_one(
         assert device.start(3) == 3
         clock.advance(SECOND_NS)  # nobody fetches: three old frames lie there, the others are lost
         numbers = []
-        while (filled := device.take()) is not None:
+        while (filled := device.dequeue()) is not None:
             numbers.append(filled.sequence)
             device.queue(filled.index)
         assert numbers == [0, 1, 2]
         clock.advance(60_000_000)
-        later = device.take()
+        later = device.dequeue()
         assert later is not None
         assert later.sequence > 30
 
