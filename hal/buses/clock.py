@@ -17,7 +17,7 @@ class SystemClock:
     """CLOCK_MONOTONIC of the machine.
 
     Attributes:
-        tickers: those that run, in the order in which they were made.
+        tickers: the running ones, in the order in which they were made.
     """
 
     def __init__(self) -> None:
@@ -30,8 +30,8 @@ class SystemClock:
     def sleep_until_ns(self, deadline_ns: int) -> None:
         """Sleep to an absolute deadline.
 
-        CPython sleeps with clock_nanosleep; a signal that interrupts it resumes it, so one call is enough,
-        but the conversion to float seconds can end a few ns early: the loop closes that gap.
+        CPython sleeps with clock_nanosleep and resumes after a signal, so one call is enough, but the
+        conversion to float seconds can end a few ns early: the loop closes that gap.
         """
         while (left := deadline_ns - time.monotonic_ns()) > 0:
             time.sleep(left * 1e-9)
@@ -48,7 +48,7 @@ class SystemClock:
 
 
 class ThreadTicker(ContainedJob):
-    """A job on a daemon thread, run every period and whenever kicked; a failure does not end the thread."""
+    """Runs a job on a daemon thread, every period and when kicked; a failure does not end the thread."""
 
     def __init__(self, clock: SystemClock, name: str, period_ns: int, job: Callable[[], None]) -> None:
         super().__init__(name, job, clock.now_ns)
@@ -60,7 +60,7 @@ class ThreadTicker(ContainedJob):
         self._thread.start()
 
     def kick(self) -> None:
-        """Wake the thread now."""
+        """Run the job now."""
         self._wake.set()
 
     def stop(self) -> None:

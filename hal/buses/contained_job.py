@@ -1,4 +1,4 @@
-"""A background job that may fail without ending the thread, or the simulation, that runs it."""
+"""A background job whose failure does not end the thread, or the simulation, that runs it."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from collections.abc import Callable
 
 
 class ContainedJob:
-    """Runs a job; an exception that escapes it is kept, not raised.
+    """Runs a job; keeps an exception that escapes instead of raising it.
 
     Attributes:
-        name: of the job, for people.
-        error: what escaped from the last run, empty when it came to its end.
-        served_ns: when a run last came to its end, or the time given at the making.
+        name: of the job.
+        error: the exception of the last run as text, empty when it completed.
+        served_ns: when a run last completed, or when this object was made.
     """
 
     def __init__(self, name: str, job: Callable[[], None], now_ns: Callable[[], int]) -> None:

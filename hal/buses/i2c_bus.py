@@ -1,7 +1,7 @@
-"""An I2C bus of Linux through smbus2: one file descriptor, one lock, one bounded wait.
+"""A Linux I2C bus through smbus2: one file descriptor, one lock, bounded waits.
 
-A call waits for the transaction before it and then no longer than the adapter's own time-out, which is set
-here (ioctl I2C_TIMEOUT). The adapter repeats nothing by itself (I2C_RETRIES 0): drivers count each failure.
+A call waits for the previous transaction and then at most for the adapter's own time-out, which is set here
+(ioctl I2C_TIMEOUT). The adapter does not retry by itself (I2C_RETRIES 0), so that drivers count each failure.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ I2C_TIMEOUT = 0x0702
 _TIMEOUT_UNIT_NS = 10_000_000
 _BLOCK_LIMIT = 32
 
-# What the kernel's fault codes mean on a bus (Documentation/i2c/fault-codes).
+# Meanings of the kernel's fault codes (Documentation/i2c/fault-codes).
 _MEANING = {
     errno.EREMOTEIO: "no acknowledge",
     errno.ENXIO: "no acknowledge of the address",
@@ -34,7 +34,7 @@ _MEANING = {
     errno.EBUSY: "the address is held by a kernel driver",
     errno.EBADF: "the bus has been closed",
 }
-# After these the line is in order and the descriptor is worth keeping.
+# After these the line is in order, and the descriptor is kept.
 _LINE_IN_ORDER = frozenset({errno.EREMOTEIO, errno.ENXIO, errno.EAGAIN, errno.EBUSY})
 
 
@@ -44,15 +44,15 @@ class LinuxI2cBus:
     def __init__(self, device: int | str, timeout_ns: int = 20_000_000, patient: bool = False) -> None:
         """Open bus number N, or the device file of a udev name.
 
-        The kernel counts the time-out in steps of 10 ms; it is rounded up. Raises NotResponding when there is
-        no such bus, Refused when it may not be opened or cannot do block transfers; a `patient` bus that is
-        not there yet is opened by the first transaction that finds it.
+        The time-out is rounded up to the kernel's steps of 10 ms. Raises NotResponding when there is no such
+        bus, Refused without permission to open it or when it cannot do block transfers; a `patient` bus that
+        does not exist yet is opened by the first transaction that finds it.
         """
         if timeout_ns <= 0:
             raise OutOfRange("i2c bus", "time-out", timeout_ns * 1e-9, 0.01, 1.0, "s")
         self.name = device_file(device)
         self._timeout_units = -(-timeout_ns // _TIMEOUT_UNIT_NS)
-        # A transaction is at most two messages, each of which may run into the time-out.
+        # A transaction has at most two messages, each of which may time out.
         self._patience = 2.0 * self._timeout_units * _TIMEOUT_UNIT_NS * 1e-9
         self._lock = threading.Lock()
         self._bus: SMBus | None = None
@@ -95,7 +95,7 @@ class LinuxI2cBus:
     def close(self) -> None:
         """Close the bus. Safe to call twice."""
         self._closed = True
-        # Without the lock after a bounded wait: a hung transaction must not keep the program from ending.
+        # Closed even without the lock: a hung transaction must not keep the program from ending.
         locked = self._lock.acquire(timeout=self._patience)
         self._drop()
         if locked:
@@ -138,12 +138,12 @@ class LinuxI2cBus:
 
 
 def device_file(bus: int | str) -> str:
-    """Return the device file of a bus that is given by its number or by a file, as a udev name is one."""
+    """Return the device file of a bus given by its number or by a file, such as a udev name."""
     return f"/dev/i2c-{bus}" if isinstance(bus, int) else bus
 
 
 def adapters(folder: Path = Path("/sys/bus/i2c/devices")) -> list[tuple[int, str]]:
-    """Return the (number, name) of every I2C adapter that the kernel knows."""
+    """Return (number, name) of every I2C adapter of the kernel."""
     found = []
     for entry in folder.glob("i2c-*"):
         number = entry.name.removeprefix("i2c-")

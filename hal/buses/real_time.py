@@ -1,7 +1,8 @@
-"""Real-time scheduling and locked memory of Linux: asked for, and reported as obtained.
+"""Requests real-time scheduling and locked memory from Linux and reports what was obtained.
 
 Both are privileges (RLIMIT_RTPRIO, RLIMIT_MEMLOCK, capabilities) that a machine may refuse; a flight goes on
-without them, later under load. Nothing is raised here: each function returns why not, "" when obtained.
+without them, with more jitter under load. Nothing is raised: each function returns the reason of a refusal,
+"" when obtained.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ _MCL_ONFAULT = 4
 
 
 def prioritise(thread_id: int, priority: int) -> str:
-    """Run a thread (0: this one) under SCHED_FIFO; threads and processes it starts do not inherit it."""
+    """Run a thread (0: this one) under SCHED_FIFO; threads and processes started by it do not inherit it."""
     policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
     try:
         os.sched_setscheduler(thread_id, policy, os.sched_param(priority))
@@ -27,18 +28,18 @@ def prioritise(thread_id: int, priority: int) -> str:
 
 
 def relinquish() -> None:
-    """Put this thread back among all others. A thread may always do that."""
+    """Return this thread to ordinary scheduling, which is always permitted."""
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
 def lock_memory() -> str:
     """Keep every page that this process touches in memory.
 
-    Pages are locked when they are touched and not before (MCL_ONFAULT): whole thread stacks and the workers'
-    shared memory would otherwise be made resident. Under a limit only what is mapped already is locked: what
-    is mapped later would count against the limit and might fail.
+    Pages are locked only when touched (MCL_ONFAULT), otherwise whole thread stacks and the workers' shared
+    memory would become resident. Under a limit only present mappings are locked: later ones would count
+    against the limit and might fail.
     """
-    import ctypes  # noqa: PLC0415 - the guardian asks for its priority before it pays for this import
+    import ctypes  # noqa: PLC0415 - the guardian requests its priority before this slow import
 
     unlimited = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY
     future = _MCL_FUTURE if unlimited or os.geteuid() == 0 else 0
@@ -50,7 +51,7 @@ def lock_memory() -> str:
 
 @dataclass(frozen=True, slots=True)
 class Obtained:
-    """What was granted, and why the rest was not."""
+    """What was obtained, and the reasons of the refusals."""
 
     priority: int
     locked: bool
@@ -63,7 +64,7 @@ class Obtained:
 
 
 def obtain(thread_ids: list[int], priority: int) -> Obtained:
-    """Prioritise threads and lock the memory; return what was obtained."""
+    """Prioritise threads and lock the memory; return the result."""
     refused = next(filter(None, [prioritise(thread_id, priority) for thread_id in thread_ids]), "")
     unlocked = lock_memory()
     return Obtained(0 if refused else priority, not unlocked, tuple(filter(None, (refused, unlocked))))

@@ -1,7 +1,7 @@
-"""A serial port of Linux through pyserial: a thread waits for bytes and stamps them as they come.
+"""A Linux serial port through pyserial: a thread waits for bytes and stamps them on arrival.
 
-The same thread opens the port again when it has gone: an adapter that was pulled out and plugged in comes
-back under the name that udev gives it.
+The same thread reopens the port after it was lost: an adapter that was unplugged and plugged in again gets
+the same name from udev.
 """
 
 from __future__ import annotations
@@ -15,29 +15,29 @@ import serial
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.wires import Clock
 
-_READ_TIMEOUT_S = 0.1  # only how soon the thread sees that the port is to close
+_READ_TIMEOUT_S = 0.1  # bounds how late the thread notices that the port is closing
 _WRITE_TIMEOUT_S = 0.5
 _PENDING_LIMIT = 1 << 16
 _REOPEN_S = 0.25
 
-# What pyserial lets through besides its own (which are OSErrors): see its posix back end.
+# What pyserial raises besides its own exceptions (which are OSErrors): see its posix back end.
 _PORT_ERRORS = (OSError, termios.error, ValueError, TypeError)
 
 
 class PySerialPort:
     """An exclusive, raw 8N1 line without flow control; implements `hal.interfaces.wires.SerialPort`.
 
-    The modem lines are neither read nor set by us, so a pseudo-terminal serves as well.
+    The modem lines are neither read nor set, so a pseudo-terminal works as well.
 
     Attributes:
-        baud_rate: bits a second.
-        lost_bytes: bytes dropped, oldest first, because nobody called `receive` for too long.
+        baud_rate: bits per second.
+        lost_bytes: bytes dropped, oldest first, because `receive` was not called for too long.
     """
 
     def __init__(self, device: str, baud_rate: int, clock: Clock, patient: bool = False) -> None:
         """Open the port.
 
-        Raises NotResponding, with the cure, when it cannot be; a `patient` one is gone until it is there.
+        Raises NotResponding, with the cure, when that fails; a `patient` port counts as lost until it opens.
         """
         self.baud_rate = baud_rate
         self.lost_bytes = 0
@@ -62,9 +62,9 @@ class PySerialPort:
         self._thread.start()
 
     def receive(self) -> list[tuple[int, bytes]]:
-        """Return what came since the last call as (arrival_ns, bytes), oldest first.
+        """Return what arrived since the last call as (arrival_ns, bytes), oldest first.
 
-        Raises NotResponding when the port is gone, after all that came before has been handed out.
+        Raises NotResponding when the port is lost, after everything that arrived before was returned.
         """
         with self._lock:
             chunks = list(self._pending)
@@ -75,7 +75,7 @@ class PySerialPort:
         return chunks
 
     def send(self, data: bytes) -> None:
-        """Hand bytes to the kernel. Raises NotResponding when the port is gone or takes no more."""
+        """Write bytes. Raises NotResponding when the port is lost or its queue is full."""
         if self._failure:
             raise NotResponding(self._device, self._failure)
         try:
@@ -85,8 +85,8 @@ class PySerialPort:
             raise NotResponding(self._device, message) from error
 
     def set_baud_rate(self, baud_rate: int) -> None:
-        """Change the line's speed. Raises NotResponding when the port does not take it."""
-        # Kept whatever happens: a port that is gone is opened again at this speed.
+        """Change the line's speed. Raises NotResponding when the port rejects it."""
+        # Kept in any case: a lost port is reopened at this speed.
         self.baud_rate = baud_rate
         try:
             self._serial.baudrate = baud_rate
@@ -118,7 +118,7 @@ class PySerialPort:
             self._open_again()
         while not self._closing.is_set():
             try:
-                # The first byte wakes the thread; what lies ready behind it comes along.
+                # The first byte wakes the thread; the bytes that are ready behind it are read too.
                 data = self._serial.read(1)
                 if data:
                     data += self._serial.read(self._serial.in_waiting)
@@ -131,7 +131,7 @@ class PySerialPort:
                 self._keep(self._clock.now_ns(), data)
 
     def _open_again(self) -> None:
-        """Try until the port is back or to be closed; nobody else waits for that."""
+        """Try to open the port until that succeeds or the port is closed; runs on its own thread."""
         self._serial.close()
         while not self._closing.wait(_REOPEN_S):
             try:

@@ -1,12 +1,12 @@
-"""One byte into one register over a Linux I2C adapter: of the standard library alone, and also a command.
+"""Writes one byte to one register over a Linux I2C adapter with the standard library alone; also a command.
 
-The guardian switches the coils off through it, and so does `deploy/coils-off`, which runs this file by
-itself under any Python where i2cset is missing:
+The guardian switches the coils off through this module, and `deploy/coils-off` runs this file alone under any
+Python where i2cset is missing:
 
     python3 smbus_byte.py /dev/i2c-1 0x40 0xfd 0x10
 
-The kernel's SMBus call (ioctl I2C_SMBUS, linux/i2c-dev.h) is used and not write(2), so that adapters which
-know SMBus only will do; ctypes, slow to load, is not needed for its one pointer.
+It uses the kernel's SMBus call (ioctl I2C_SMBUS, linux/i2c-dev.h) instead of write(2), so that adapters with
+SMBus only work too, and avoids ctypes, which is slow to load.
 """
 
 import fcntl
@@ -25,7 +25,7 @@ _TIMEOUT_UNITS = 2  # of 10 ms
 
 
 class ByteBus:
-    """An I2C adapter that is written to; each failure is an OSError with the kernel's fault code."""
+    """An I2C adapter for writing; each failure is an OSError with the kernel's fault code."""
 
     def __init__(self, device: str) -> None:
         """Open an adapter's device file. Raises OSError."""
@@ -53,12 +53,12 @@ class ByteBus:
 
 
 def open_bus(where: str) -> ByteBus:
-    """Return the adapter `where`: what the guardian is given to open."""
+    """Return the open adapter `where`; the guardian's opener."""
     return ByteBus(where)
 
 
 def main(arguments: list[str]) -> int:
-    """Write the byte that the arguments tell; return 0 done, 1 failed, 2 wrong use."""
+    """Write the byte given by the arguments; return 0 done, 1 failed, 2 wrong use."""
     try:
         device, *numbers = arguments
         address, register, value = (int(number, 0) for number in numbers)

@@ -1,6 +1,6 @@
-"""A video capture device of Linux: the calls that a monochrome camera needs, nothing besides.
+"""A Linux video capture device: the calls that a monochrome camera needs.
 
-Every call raises OSError with the kernel's errno; none waits for a frame: the device is opened non-blocking.
+Every call raises OSError with the kernel's errno; none waits for a frame, because the device is non-blocking.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ _MOST_FORMATS = 64
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """How the pixels lie in a buffer: `fourcc` names their kind, `stride` bytes are from row to row."""
+    """Layout of the pixels in a buffer: `fourcc` names their format, rows are `stride` bytes apart."""
 
     columns: int
     rows: int
@@ -68,7 +68,7 @@ class Layout:
 
 @dataclass(frozen=True, slots=True)
 class ControlRange:
-    """What a control takes."""
+    """The range of a control."""
 
     name: str
     minimum: int
@@ -78,7 +78,7 @@ class ControlRange:
 
 @dataclass(frozen=True, slots=True)
 class Filled:
-    """A buffer that the kernel has given back: which, how much, when, the how-manieth, in what state."""
+    """A filled buffer: its index, bytes used, time stamp, sequence number and flags."""
 
     index: int
     used_bytes: int
@@ -88,7 +88,7 @@ class Filled:
 
 
 def fourcc(name: str) -> int:
-    """Return the code of a pixel format of up to four letters, filled up with blanks."""
+    """Return the code of a pixel format of up to four letters, padded with blanks."""
     return int.from_bytes(name.ljust(4).encode("ascii"), "little")
 
 
@@ -115,7 +115,7 @@ class VideoDevice:
         self.close()
 
     def capability(self) -> tuple[str, str, int]:
-        """Return the driver's name, the card's, and the capabilities of this node."""
+        """Return the names of driver and card, and the capabilities of this node."""
         answer = Capability()
         self._ask(QUERYCAP, answer)
         own = answer.device_caps if answer.capabilities & CAP_DEVICE_CAPS else answer.capabilities
@@ -134,7 +134,7 @@ class VideoDevice:
             yield fourcc_name(answer.pixelformat)
 
     def set_format(self, columns: int, rows: int, name: str) -> Layout:
-        """Ask for a format; return what the device made of it, which may differ."""
+        """Request a format; return the one that the device set, which may differ."""
         answer = Format(type=VIDEO_CAPTURE)
         pix = answer.fmt.pix
         pix.width, pix.height, pix.pixelformat, pix.field = columns, rows, fourcc(name), FIELD_NONE
@@ -142,7 +142,7 @@ class VideoDevice:
         return Layout(pix.width, pix.height, fourcc_name(pix.pixelformat), pix.bytesperline)
 
     def set_interval(self, interval_ns: int) -> int:
-        """Ask for a time from frame to frame; return the device's, 0 when it has none to set."""
+        """Request an interval between frames; return the device's, 0 when it cannot be set."""
         answer = StreamParameters(type=VIDEO_CAPTURE)
         try:
             self._ask(G_PARM, answer)
@@ -158,7 +158,7 @@ class VideoDevice:
         return time.numerator * _SECOND_NS // time.denominator if time.denominator else 0
 
     def control_range(self, control: int) -> ControlRange | None:
-        """Return what a control takes, None when the device has no such control."""
+        """Return the range of a control, None when the device has no such control."""
         answer = QueryControl(id=control)
         try:
             self._ask(QUERYCTRL, answer)
@@ -171,14 +171,14 @@ class VideoDevice:
         return ControlRange(_text(answer.name), answer.minimum, answer.maximum, max(answer.step, 1))
 
     def set_control(self, control: int, value: int) -> int:
-        """Set a control; return the value that it then has."""
+        """Set a control; return its resulting value."""
         answer = Control(control, value)
         self._ask(S_CTRL, answer)
         self._ask(G_CTRL, answer)
         return int(answer.value)
 
     def start(self, count: int) -> int:
-        """Map and queue buffers and start streaming; return how many the device gave."""
+        """Map and queue buffers and start streaming; return how many buffers the device granted."""
         request = RequestBuffers(count=count, type=VIDEO_CAPTURE, memory=MMAP)
         self._ask(REQBUFS, request)
         for index in range(request.count):
@@ -191,7 +191,7 @@ class VideoDevice:
         return int(request.count)
 
     def dequeue(self) -> Filled | None:
-        """Return the oldest filled buffer, None when there is none. Hand it back with `queue`."""
+        """Return the oldest filled buffer, None when there is none. Return it with `queue`."""
         buffer = _numbered(0)
         try:
             self._ask(DQBUF, buffer)
@@ -202,11 +202,11 @@ class VideoDevice:
         return Filled(buffer.index, buffer.bytesused, stamp_ns, buffer.sequence, buffer.flags)
 
     def queue(self, index: int) -> None:
-        """Give a buffer to the kernel, to be filled again."""
+        """Return a buffer to the kernel to be filled again."""
         self._ask(QBUF, _numbered(index))
 
     def pixels(self, index: int, layout: Layout, kind: np.dtype[Any]) -> npt.NDArray[Any]:
-        """Return a copy (rows, columns) of a buffer's pixels, without what fills its rows up."""
+        """Return a copy (rows, columns) of a buffer's pixels, without the padding of its rows."""
         memory = self._maps[index]
         view: npt.NDArray[Any] = np.ndarray(
             (layout.rows, layout.columns), kind, memory, strides=(layout.stride, kind.itemsize)
@@ -219,7 +219,7 @@ class VideoDevice:
             return
         if self._streaming:
             self._streaming = False
-            with contextlib.suppress(OSError):  # a camera that is gone has stopped
+            with contextlib.suppress(OSError):  # a lost camera has stopped
                 self._ask(STREAMOFF, ctypes.c_int(VIDEO_CAPTURE))
         for memory in self._maps:
             memory.close()
@@ -233,7 +233,7 @@ class VideoDevice:
 
 
 def _text(name: bytes) -> str:
-    """Return a name of the device's: one too long for its field is cut, perhaps inside a character."""
+    """Return a name of the device; one too long for its field may be cut inside a character."""
     return name.decode("utf-8", "replace")
 
 

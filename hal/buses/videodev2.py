@@ -1,7 +1,7 @@
-"""The kernel's structures and requests for video capture, as far as `hal.buses.v4l2` uses them.
+"""The kernel's structures and requests for video capture that `hal.buses.v4l2` uses.
 
-They are those of linux/videodev2.h (Linux Media Infrastructure userspace API, part "Video for Linux"), laid
-out by ctypes for the machine that this runs on; a request's code holds its structure's size.
+They are from linux/videodev2.h (Linux Media Infrastructure userspace API, part "Video for Linux"); ctypes
+lays them out for this machine. The code of a request contains the size of its structure.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """A GenICam camera (USB3 Vision, GigE Vision) through Aravis, each exposure started by a software trigger.
 
-Aravis (https://aravisproject.github.io/aravis) is a library of the system that Python reaches by
-introspection; it is imported when a camera of this kind is opened, and needed nowhere else.
+Aravis (https://aravisproject.github.io/aravis) is a system library that Python calls by introspection; it is
+imported only when such a camera is opened.
 
-An exposure is taken to begin half-way between sending the trigger and its acknowledge: within about a
-millisecond on USB. The camera's own clock is not asked, for its relation to the host's is not known.
+An exposure is assumed to begin half-way between sending the trigger and its acknowledge, right to about a
+millisecond on USB. The camera's own clock is not used because its relation to the host's is not known.
 """
 
 from __future__ import annotations
@@ -29,30 +29,30 @@ PIXEL_KINDS: dict[str, np.dtype[Any]] = {
     "Mono12": np.dtype("<u2"),
     "Mono16": np.dtype("<u2"),
 }
-"""Grey pixel formats that are not packed (GenICam PFNC 2.4, table "Mono"): low bits of 8 or 16."""
+"""Unpacked grey pixel formats (GenICam PFNC 2.4, table "Mono"): low bits of 8 or 16."""
 
 CURE = (
     "needs Aravis: apt install gir1.2-aravis-0.8 python3-gi, the virtual environment made with "
     "--system-site-packages; or apt install libusb-1.0-0 and pip install 'knightcube-flight[genicam]'"
 )
 FAKE_PREFIX = "Fake"
-"""Aravis' own camera without hardware is called Fake_1."""
+"""Aravis' simulated camera is called Fake_1."""
 
-# GigE Vision numbers its frames in 16 bits and leaves out 0; USB3 Vision has 64 bits.
+# GigE Vision numbers frames in 16 bits without 0; USB3 Vision in 64 bits.
 _FRAME_IDS = (1 << 16) - 1
 _MICROSECOND_NS = 1_000
 
 
 @dataclass(frozen=True, slots=True)
 class AravisSettings:
-    """What is asked of the camera.
+    """Settings of an Aravis camera.
 
     Attributes:
         name: as `arv-tool-0.8` lists it, such as "FLIR-1E10015B2E2F" or "Fake_1".
-        columns, rows: of the region in the middle of the sensor that is read.
+        columns, rows: of the region that is read, in the middle of the sensor.
         pixel_format: a key of PIXEL_KINDS.
-        exposure_ns: the usual one.
-        gain: in the camera's own unit (dB as a rule), None to leave it.
+        exposure_ns: the usual exposure.
+        gain: in the camera's own unit (usually dB), None to leave it unchanged.
         buffers: how many frames Aravis may hold.
     """
 
@@ -69,7 +69,7 @@ class AravisCamera:
     """A `hal.drivers.camera.CameraDevice`."""
 
     def __init__(self, settings: AravisSettings, clock: Clock) -> None:
-        """Take what is asked; nothing is opened, or imported, yet."""
+        """Keep the settings; nothing is opened or imported yet."""
         self.name = settings.name
         self.counts = CameraCounts()
         self._settings = settings
@@ -82,7 +82,7 @@ class AravisCamera:
         self._success: Any = None
         self._bounds = 1, 1 << 62
         self._asked_ns = 0
-        self._exposure_ns = 0  # what the camera made of it
+        self._exposure_ns = 0  # as the camera set it
         self._start_ns: int | None = None
         self._lost = False
 
@@ -102,7 +102,7 @@ class AravisCamera:
                 f"{error}; there is {', '.join(found) or 'no camera at all'}: is it plugged in, and "
                 "may this user open it (udev rule for USB3 Vision)?",
             ) from error
-        with self._told("setting it up"):
+        with self._during("setting it up"):
             self._set_up(aravis, self._camera)
 
     def check(self, exposure_ns: int) -> None:
@@ -112,9 +112,9 @@ class AravisCamera:
             raise OutOfRange(self.name, "exposure", exposure_ns * 1e-9, low * 1e-9, high * 1e-9, "s")
 
     def expose(self, exposure_ns: int, trigger_ns: int) -> None:
-        """Trigger the exposure; what has come before it is given back. Raises DeviceError."""
+        """Trigger the exposure; earlier frames are dropped. Raises DeviceError."""
         camera, stream = self._opened()
-        with self._told("triggering"):
+        with self._during("triggering"):
             while (buffer := stream.try_pop_buffer()) is not None:
                 self._number_of(buffer)
                 stream.push_buffer(buffer)
@@ -125,7 +125,7 @@ class AravisCamera:
             self._start_ns = (before_ns + self._clock.now_ns()) // 2
 
     def collect(self) -> Frame | None:
-        """Return the triggered frame once, None until it has come. Raises NotResponding."""
+        """Return the triggered frame once, None until it arrives. Raises NotResponding."""
         _, stream = self._opened()
         if self._lost:
             raise NotResponding(self.name, "gone: was it unplugged?")
@@ -141,7 +141,7 @@ class AravisCamera:
         """Stop and release the camera. Safe to call when it is not open."""
         camera, self._camera, self._stream, self._start_ns = self._camera, None, None, None
         if camera is not None:
-            with contextlib.suppress(_glib_error()):  # a camera that is gone has stopped
+            with contextlib.suppress(_glib_error()):  # a lost camera has stopped
                 camera.stop_acquisition()
 
     def _opened(self) -> tuple[Any, Any]:
@@ -150,8 +150,8 @@ class AravisCamera:
         return self._camera, self._stream
 
     @contextlib.contextmanager
-    def _told(self, doing: str) -> Iterator[None]:
-        """Turn Aravis' errors into a DeviceError that says what was being done."""
+    def _during(self, doing: str) -> Iterator[None]:
+        """Convert Aravis' errors into a DeviceError that states the failed step."""
         try:
             yield
         except _glib_error() as error:
@@ -198,7 +198,7 @@ class AravisCamera:
         self._lost = True
 
     def _set_region(self, camera: Any) -> None:
-        """Read the middle of the sensor, or left of it and above where the camera's steps want it."""
+        """Read the middle of the sensor, rounded down to the camera's steps."""
         columns, rows = self._settings.columns, self._settings.rows
         width, height = camera.get_sensor_size()
         if columns > width or rows > height:
@@ -246,7 +246,7 @@ class AravisCamera:
         if buffer.get_status() != self._success:
             self.counts.spoiled += 1
             return None
-        # What comes before the exposure can be over is not of it: a camera that also runs free.
+        # A frame that arrives before the exposure can be over is from a camera that also runs free.
         if self._start_ns is None or now_ns < self._start_ns + self._exposure_ns:
             return None
         rows, columns = self._settings.rows, self._settings.columns
@@ -263,7 +263,7 @@ def library(name: str) -> Any:
     """Return Aravis. Raises Refused, with the cure, when it is not installed."""
     try:
         if importlib.util.find_spec("aravis") is not None:
-            importlib.import_module("aravis")  # PyPI's: tells introspection where its library lies
+            importlib.import_module("aravis")  # the package from PyPI registers its library for introspection
         gi = importlib.import_module("gi")
         gi.require_version("Aravis", "0.8")
         importlib.import_module("gi.repository.GLib")

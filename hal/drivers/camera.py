@@ -1,8 +1,8 @@
-"""A camera served beside the control loop: a `FrameSource` over a device that may take its time.
+"""Serves a camera beside the control loop: a `FrameSource` over a device whose calls may take long.
 
-Triggering, fetching, setting controls and opening a camera again may each take milliseconds to seconds (a
-USB control transfer that goes unanswered: five). All of it happens on a job of the clock; `trigger` and
-`poll`, which the control loop calls, only exchange words with that job.
+Triggering, fetching, setting controls and reopening a camera may each take milliseconds to seconds (an
+unanswered USB control transfer: five). A job of the clock does all of it; `trigger` and `poll`, which the
+control loop calls, only exchange requests and frames with that job.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ _MOST_EXPOSURES = 6
 
 @dataclass(slots=True)
 class CameraCounts:
-    """What became of the frames since start; the numbers only grow.
+    """Counts of frames by outcome since start; they only grow.
 
     Attributes:
-        delivered: frames handed on.
-        spoiled: frames that the device itself flagged as damaged.
-        short: frames that came with less than all their pixels.
-        contradictory: frames that followed each other faster than their exposure allows.
-        missed: frames that the sequence numbers say were taken, and that never came.
+        delivered: frames returned by `poll` or ready for it.
+        spoiled: frames that the device flagged as damaged.
+        short: frames with fewer than all their pixels.
+        contradictory: frames that followed the previous one sooner than their exposure allows.
+        missed: frames that never arrived, by the gaps in the sequence numbers.
         openings: how often the camera was opened.
     """
 
@@ -43,36 +43,36 @@ class CameraCounts:
 
 
 class CameraDevice(Protocol):
-    """A camera as its driver knows it; all calls come from one thread at a time.
+    """A camera's driver; calls come from one thread at a time, except `check`.
 
-    `check` is the exception: it must be safe beside the others.
+    `check` must be safe beside the other calls.
     """
 
     name: str
     counts: CameraCounts
 
     def open(self) -> None:
-        """Open and set the camera up. Raises DeviceError, with the cure."""
+        """Open the camera and set it up. Raises DeviceError, with the cure."""
 
     def check(self, exposure_ns: int) -> None:
         """Raise OutOfRange for an exposure that the camera cannot make."""
 
     def expose(self, exposure_ns: int, trigger_ns: int) -> None:
-        """Begin to wait for an exposure that starts no sooner than the trigger. Raises DeviceError."""
+        """Start, or select, an exposure that begins at the trigger or later. Raises DeviceError."""
 
     def collect(self) -> Frame | None:
-        """Return that exposure's frame once, None until it has come. Never waits. Raises DeviceError."""
+        """Return that exposure's frame once, None until it arrives. Never waits. Raises DeviceError."""
 
     def close(self) -> None:
         """Release the camera. Safe to call when it is not open."""
 
 
 class ServedCamera:
-    """Implements `hal.interfaces.devices.FrameSource`; opens a camera that went away again and again.
+    """Implements `hal.interfaces.devices.FrameSource`; reopens a lost camera.
 
     Attributes:
         name: of the device.
-        counts: what became of its frames.
+        counts: of its frames.
     """
 
     def __init__(
@@ -80,10 +80,10 @@ class ServedCamera:
     ) -> None:
         """Open the camera and serve it.
 
-        Raises DeviceError when it cannot be opened; a `patient` one is gone until it can be.
+        Raises DeviceError when it cannot be opened; a `patient` camera counts as lost until it opens.
 
-        A camera that has not delivered `patience_ns` and six exposures after a trigger is opened anew: one
-        that runs free may be in an exposure, and may take more of them before a new setting holds.
+        A camera that delivers nothing within `patience_ns` and six exposures after a trigger is reopened; a
+        free-running camera may be in an exposure, and may need several more to apply a new setting.
         """
         self.name = device.name
         self.counts = device.counts
@@ -91,7 +91,7 @@ class ServedCamera:
         self._clock = clock
         self._patience_ns = patience_ns
         self._lock = threading.Lock()
-        self._asked: tuple[int, int] | None = None  # exposure, trigger: not yet told to the device
+        self._asked: tuple[int, int] | None = None  # exposure, trigger: not yet passed to the device
         self._frame: Frame | None = None
         self._failure: DeviceError | None = None
         self._deadline_ns: int | None = None
@@ -107,9 +107,9 @@ class ServedCamera:
         self._ticker = clock.ticker(f"camera {device.name}", PERIOD_NS, self._serve)
 
     def trigger(self, exposure_ns: int) -> None:
-        """Start one exposure now; one that is under way is abandoned.
+        """Start one exposure now; an exposure that is under way is abandoned.
 
-        Raises NotResponding while the camera is gone, OutOfRange for an exposure that it cannot make.
+        Raises NotResponding while the camera is lost, OutOfRange for an exposure that it cannot make.
         """
         self._device.check(exposure_ns)
         with self._lock:
@@ -118,9 +118,9 @@ class ServedCamera:
         self._ticker.kick()
 
     def poll(self) -> Frame | None:
-        """Return the newest finished frame once, None when there is no new one. Never blocks.
+        """Return the newest finished frame once, None without a new one. Never blocks.
 
-        Raises the DeviceError that keeps frames from coming, while it lasts.
+        Raises the DeviceError that prevents frames, while it lasts.
         """
         with self._lock:
             frame, self._frame = self._frame, None
@@ -140,11 +140,11 @@ class ServedCamera:
 
     def _raise_failure(self) -> None:
         if self._failure is not None:
-            # Anew each time: an exception that is raised again and again grows its traceback.
+            # A new exception each time: one that is raised repeatedly grows its traceback.
             raise type(self._failure)(self._failure.device, self._failure.message)
 
     def _serve(self) -> None:
-        """Do what there is to do: the job of the ticker."""
+        """Exchange requests and frames with the device; the job of the ticker."""
         if not self._open and not self._reopened():
             return
         try:
@@ -155,7 +155,7 @@ class ServedCamera:
         if frame is not None:
             self._deadline_ns = None
             with self._lock:
-                if self._asked is None:  # else it was abandoned while the device was busy
+                if self._asked is None:  # otherwise abandoned while the device was busy
                     self._frame = frame
                     self.counts.delivered += 1
 
@@ -172,7 +172,7 @@ class ServedCamera:
         return frame
 
     def _reopened(self) -> bool:
-        """Try to open the camera when it is time to, and tell whether it is open."""
+        """Try to open the camera when a retry is due; return whether it is open."""
         now_ns = self._clock.now_ns()
         if now_ns < self._retry_ns or self._closed:
             return False
@@ -196,7 +196,7 @@ class ServedCamera:
         self._open = True
 
     def _drop(self, error: DeviceError) -> None:
-        """Let go of a camera that fails; what was asked of it is forgotten."""
+        """Close a camera that fails and drop the pending request."""
         self._device.close()
         self._open = False
         self._deadline_ns = None
@@ -209,20 +209,20 @@ class ServedCamera:
 
 
 class FrameNumbers:
-    """The camera's own count made to go on where it wraps around or begins again.
+    """Continues the camera's frame numbers where they wrap around or restart.
 
-    A number that stands still stays still, and one that goes back a little stays back: by that a frozen
-    camera is known.
+    A repeated number stays repeated, and one that goes back a little stays back, so that a frozen camera can
+    be detected.
     """
 
     def __init__(self, modulus: int) -> None:
-        """Take the number after the highest that the camera counts to."""
+        """Count modulo `modulus`, one more than the camera's highest number."""
         self._modulus = modulus
         self._last = -1
         self._offset = 0
 
     def begin_again(self) -> None:
-        """Go on from the last number whatever the camera's next one is: it was opened anew."""
+        """Continue from the last number whatever the camera's next one is: it was reopened."""
         self._offset = self._last + 1
 
     def number(self, count: int) -> int:

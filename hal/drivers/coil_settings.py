@@ -1,4 +1,4 @@
-"""How the torque coils are wired to the PWM chip and driven: what a configuration says of them."""
+"""Wiring and drive settings of the torque coils."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ DEVICE = "coils"
 
 @dataclass(frozen=True, slots=True)
 class CoilWiring:
-    """How one coil hangs on the PWM chip, as measured.
+    """Wiring of one coil to the PWM chip, as measured.
 
     Attributes:
         channel_a: PWM channel of bridge input A, high for a positive current.
         channel_b: PWM channel of input B.
         resistance: ohm, of the coil.
-        sign: +1, or -1 for a coil that is connected the other way round.
+        sign: +1, or -1 for a coil with its leads swapped.
         enable_channel: PWM channel of the bridge's enable input, None when it is tied high.
     """
 
@@ -44,13 +44,13 @@ class CoilWiring:
 
 @dataclass(frozen=True, slots=True)
 class CoilSettings:
-    """The three coils and how they are driven; the thesis's values (Sease 2013 ch. 5) are the defaults.
+    """Wiring and drive of the three coils; the defaults are those of the thesis (Sease 2013 ch. 5).
 
     Attributes:
         coils: wiring of the coils on body x, y, z.
         supply_voltage: V across a coil that is fully on, after the losses of the bridge.
-        current_limit: A, of each coil; V/R limits it too.
-        stale_after: s without a command until the coils fall to zero; at most 0.4, so that they are at zero
+        current_limit: A, of each coil; V/R is a limit too.
+        stale_after: s without a command until the coils go to zero; at most 0.4, so that they are at zero
             within 0.5.
         tries: attempts of one write before it counts as failed.
         retry_wait: s between them.
@@ -72,7 +72,7 @@ class CoilSettings:
             ("tries", self.tries, 1, 5, ""),
             ("retry_wait", self.retry_wait, 0.0, 0.01, "s"),
         ):
-            # Written so that NaN is refused as well.
+            # Written so that NaN is rejected too.
             if not low <= value <= high:
                 raise OutOfRange(DEVICE, quantity, value, low, high, unit)
         used = [channel for coil in self.coils for channel in coil.channels]
@@ -81,7 +81,7 @@ class CoilSettings:
                 raise OutOfRange(DEVICE, "PWM channel (each once)", channel, 0, CHANNELS - 1, "")
 
     def blocks(self) -> tuple[tuple[int, tuple[int, ...]], ...]:
-        """Group the pins into blocks of neighbouring channels: (first channel, pins).
+        """Return the pins grouped into blocks of neighbouring channels: (first channel, pins).
 
         Pins are numbered coil by coil, in the order of `CoilWiring.channels`; a block is one transaction.
         """

@@ -1,8 +1,8 @@
 """A torque coil on two inputs of an SN754410: current to PWM counts and back (Sease 2013, Table 5.2, 5.33).
 
-A signed count says both direction and duty: +n drives input A for n/4096 of the period with input B low, -n
-the reverse, 0 keeps both low. The coil's L/R of 0.1 ms is far below the 20 ms period, so the period's mean
-voltage makes the period's mean current: n/4096 V/R.
+A signed count gives direction and duty: +n drives input A for n/4096 of the period with input B low, -n the
+reverse, 0 keeps both low. The coil's L/R of 0.1 ms is far below the 20 ms period, so the mean current over a
+period follows from the mean voltage: n/4096 V/R.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ def current_step(resistance: float, supply_voltage: float) -> float:
 
 
 def largest_counts(step: float, current_limit: float) -> int:
-    """Return the most counts whose current exceeds neither the limit in A nor V/R."""
+    """Return the largest count whose current exceeds neither the limit in A nor V/R."""
     # A limit that is a whole number of steps must not lose one to rounding.
     return min(COUNTS, math.floor(current_limit / step * (1.0 + 1e-12)))
 
 
 def counts_for(current: float, step: float, largest: int) -> tuple[int, bool]:
-    """Return the signed counts nearest to a mean current in A, and whether it had to be limited.
+    """Return the signed counts nearest to a mean current in A, and whether it was limited.
 
     Raises ValueError for NaN.
     """
@@ -37,12 +37,12 @@ def counts_for(current: float, step: float, largest: int) -> tuple[int, bool]:
 
 
 def mean_current(counts: int, step: float) -> float:
-    """Return the mean current in A that signed counts make."""
+    """Return the mean current in A of signed counts."""
     return counts * step
 
 
 def inputs_for(counts: int) -> tuple[PwmCounts, PwmCounts]:
-    """Return what inputs A and B are driven with; the idle one is low the whole period (Table 5.2)."""
+    """Return the PWM counts of inputs A and B; the idle one is low the whole period (Table 5.2)."""
     if counts > 0:
         return _pulse(counts), FULL_OFF
     if counts < 0:
@@ -51,15 +51,15 @@ def inputs_for(counts: int) -> tuple[PwmCounts, PwmCounts]:
 
 
 def brake() -> tuple[PwmCounts, PwmCounts]:
-    """Return what both inputs are driven with to hold a coil at zero whose bridge has a leg stuck high.
+    """Return the PWM counts of both inputs that hold a coil at zero although a leg is stuck high.
 
-    Both ends of the coil are at the upper rail then, whichever leg it is; those of a sound bridge are too.
+    Both ends of the coil are then at the upper rail, for either leg and for a sound bridge.
     """
     return FULL_ON, FULL_ON
 
 
 def enable_for(counts: int) -> PwmCounts:
-    """Return what a wired enable input is driven with: low at zero, so that the coil coasts, not brakes."""
+    """Return the PWM counts of a wired enable input: low at zero, so that the coil floats, not brakes."""
     return FULL_ON if counts else FULL_OFF
 
 

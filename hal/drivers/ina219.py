@@ -1,8 +1,8 @@
 """The INA219: current of all coils together, bus voltage and power (TI SBOS448G).
 
 The current is shunt voltage over shunt resistance; the chip's Calibration register, which a brown-out clears,
-is not used. Each conversion averages 128 samples in 68 ms, not a whole number of the 20 ms periods in which
-the supply current is chopped, so it may be 18 % off; the mean of five, 7 % (a test computes both).
+is not used. Each conversion averages 128 samples in 68 ms, not a whole number of the 20 ms PWM periods, so it
+may be 18 % off; the mean of five may be 7 % off (a test computes both).
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ OVERFLOW = 0b01
 _SHUNT_RANGES_V = (0.04, 0.08, 0.16, 0.32)  # in the order of the PG bits
 _SILENCE_NS = 1_000_000_000
 _SURE_STUCK = 3
-"""Conversions in a row after which the flag has stayed: one may just have become ready anew."""
+"""Conversions in a row after which the ready flag was still set: once, a new conversion may be ready."""
 _REACH_NS = 300_000_000
-"""A conversion of shunt and bus takes 136 ms, 10 % more at most, and may be as old when it is read."""
+"""A conversion of shunt and bus takes 136 ms +10 %, and may be as old again when it is read."""
 
 
 def range_for(maximum_current: float, shunt_ohm: float) -> int:
@@ -38,7 +38,7 @@ def range_for(maximum_current: float, shunt_ohm: float) -> int:
     Raises OutOfRange when none does.
     """
     for bits, full_scale in enumerate(_SHUNT_RANGES_V):
-        # 0.8 A in 0.1 ohm is 80 mV, whatever its last bit says.
+        # 0.8 A in 0.1 ohm is 80 mV, despite rounding.
         if maximum_current * shunt_ohm <= full_scale * (1.0 + 1e-12):
             return bits
     raise OutOfRange("ina219", "maximum current", maximum_current, 0.0, _SHUNT_RANGES_V[-1] / shunt_ohm, "A")
@@ -50,7 +50,7 @@ def config_for(range_bits: int) -> int:
 
 
 class Ina219:
-    """One monitor, read on a job of the clock; the job sets it up, and again after a brown-out."""
+    """One monitor, read by a job of the clock, which also sets it up, again after a brown-out."""
 
     def __init__(
         self,
@@ -93,7 +93,7 @@ class Ina219:
             return self._latest
 
     def error(self) -> str:
-        """Return the last failure while it lasts, empty when readings come."""
+        """Return the last failure while it lasts, empty when readings arrive."""
         with self._lock:
             return self._error
 
@@ -120,12 +120,13 @@ class Ina219:
         newest, since_ns = conversion[1], now_ns - _REACH_NS
         with self._lock:
             self._latest = PowerReading(now_ns, voltage, current, voltage * current, newest, since_ns)
-            # A failure is told until the mean is whole again: who looks once a second must not miss it.
+            # A failure is reported until the mean is complete again: a reader once per second must not miss
+            # it.
             if count == self._conversions.maxlen:
                 self._error = ""
 
     def _convert(self) -> tuple[float, float] | None:
-        """Return bus voltage in V and current in A of a new conversion, None while there is none."""
+        """Return bus voltage in V and current in A of a new conversion, None without one."""
         if self._read(CONFIG) != self._config:
             self._set_up()
             return None

@@ -1,6 +1,6 @@
 """The PCA9685: sixteen PWM outputs of 12 bits on I2C (NXP data sheet).
 
-Free of numpy and of threads: a guardian process imports this module to switch the coils off.
+Uses neither numpy nor threads: the guardian process imports this module to switch the coils off.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from hal.interfaces.errors import DeviceError, NotResponding, OutOfRange, Refused
 
-if TYPE_CHECKING:  # at run time the Protocols would bring numpy in, with the readings' types
+if TYPE_CHECKING:  # at run time the Protocols would import numpy, with the readings' types
     from hal.interfaces.wires import Clock, I2cBus
 
 MODE1 = 0x00
@@ -23,11 +23,11 @@ RESTART = 0x80
 AUTO_INCREMENT = 0x20
 SLEEP = 0x10
 TOTEM_POLE = 0x04
-FULL = 0x10  # bit 4 of an ON_H or OFF_H register: the whole period, without counting
+FULL = 0x10  # bit 4 of an ON_H or OFF_H register: the whole period
 
 CHANNELS = 16
 COUNTS = 4096
-BLOCK_CHANNELS = 8  # what fits into the 32 bytes of one SMBus block
+BLOCK_CHANNELS = 8  # fit into the 32 bytes of one SMBus block
 OSCILLATOR_HZ = 25e6
 OSCILLATOR_START_NS = 500_000
 
@@ -39,9 +39,9 @@ FULL_OFF: PwmCounts = (0, COUNTS)
 
 
 def switch_off(bus: I2cBus, address: int, tries: int = 3) -> None:
-    """Switch every output of the chip off, whatever state it is in.
+    """Switch every output of the chip off, whatever its state.
 
-    One byte to ALL_LED_OFF_H, valid without any set-up and with or without auto-increment. Raises
+    Writes one byte to ALL_LED_OFF_H, which needs no set-up and works with or without auto-increment. Raises
     NotResponding after `tries` failures in a row.
     """
     for left in reversed(range(tries)):
@@ -56,17 +56,17 @@ def switch_off(bus: I2cBus, address: int, tries: int = 3) -> None:
 def prescale_for(frequency_hz: float) -> int:
     """Return the PRE_SCALE value of a PWM frequency: round(25 MHz / (4096 f)) - 1; 50 Hz gives 121.
 
-    Raises OutOfRange outside the 24 .. 1526 Hz that the chip can do.
+    Raises OutOfRange outside 24 .. 1526 Hz, the range of the chip.
     """
     low, high = OSCILLATOR_HZ / (COUNTS * 256), OSCILLATOR_HZ / (COUNTS * 4)
-    # Written so that NaN is refused as well.
+    # Written so that NaN is rejected too.
     if not low <= frequency_hz <= high:
         raise OutOfRange("pca9685", "PWM frequency", frequency_hz, low, high, "Hz")
     return round(OSCILLATOR_HZ / (COUNTS * frequency_hz)) - 1
 
 
 class Pca9685:
-    """One chip on a bus. Nothing is retried here: a failure is the caller's to answer."""
+    """One chip on a bus. Nothing is retried here; the caller handles failures."""
 
     def __init__(self, bus: I2cBus, address: int, clock: Clock, frequency_hz: float = 50.0) -> None:
         self._bus = bus
@@ -78,13 +78,13 @@ class Pca9685:
     def configure(self) -> None:
         """Set the chip up with every output off, and read the set-up back.
 
-        All off comes first: a chip that a dead process left running must not drive a coil meanwhile. Raises
-        NotResponding, or Refused when the registers do not take their values.
+        All outputs go off first: a chip that a dead process left running must not drive a coil meanwhile.
+        Raises NotResponding, or Refused when a register does not keep its value.
         """
         self.all_off()
         asleep = self._read(MODE1) & ~RESTART | SLEEP
         self._write(MODE1, asleep)
-        self._write(PRE_SCALE, self._prescale)  # taken only while the chip sleeps
+        self._write(PRE_SCALE, self._prescale)  # writable only while the chip sleeps
         self._write(MODE1, AUTO_INCREMENT)
         self._clock.sleep_until_ns(self._clock.now_ns() + OSCILLATOR_START_NS)
         self._write(MODE2, TOTEM_POLE)
@@ -97,11 +97,11 @@ class Pca9685:
                 )
 
     def is_configured(self) -> bool:
-        """Tell whether the chip still holds its set-up, lost in a brown-out. Raises NotResponding."""
+        """Return whether the chip still holds its set-up, lost in a brown-out. Raises NotResponding."""
         return all(found == wanted for _, wanted, found in self._set_up())
 
     def holds(self, first: int, counts: Sequence[PwmCounts]) -> bool:
-        """Tell whether up to 8 neighbouring channels hold these counts. Raises NotResponding."""
+        """Return whether up to 8 neighbouring channels hold these counts. Raises NotResponding."""
         wanted = _values(counts)
         try:
             held = self._bus.read_i2c_block_data(self._address, LED0_ON_L + 4 * first, len(wanted))
@@ -112,7 +112,7 @@ class Pca9685:
     def write_channels(self, first: int, counts: Sequence[PwmCounts]) -> None:
         """Write up to 8 neighbouring channels in one block; their outputs change together, at its end.
 
-        Raises OutOfRange for counts that the chip leaves undefined (equal ones among them), NotResponding.
+        Raises OutOfRange for counts that the chip does not define (equal ones among them), NotResponding.
         """
         if not (1 <= len(counts) <= BLOCK_CHANNELS and 0 <= first <= CHANNELS - len(counts)):
             raise OutOfRange(self.name, "last channel", first + len(counts) - 1, 0, CHANNELS - 1, "")
@@ -130,7 +130,7 @@ class Pca9685:
         switch_off(self._bus, self._address, tries=1)
 
     def _set_up(self) -> list[tuple[str, int, int]]:
-        # RESTART only remembers that the chip once slept with channels running; it changes no output.
+        # RESTART only records that the chip slept with channels running; it changes no output.
         return [
             ("MODE1", AUTO_INCREMENT, self._read(MODE1) & ~RESTART),
             ("MODE2", TOTEM_POLE, self._read(MODE2)),
@@ -154,7 +154,7 @@ class Pca9685:
 
 
 def _values(counts: Sequence[PwmCounts]) -> list[int]:
-    """Return what the four registers of each channel hold."""
+    """Return the values of the four registers of each channel."""
     return [byte for on, off in counts for byte in (on & 0xFF, on >> 8, off & 0xFF, off >> 8)]
 
 

@@ -1,7 +1,7 @@
-"""The flight process's end of the guardian: started before the coils can be energised, fed each cycle.
+"""The flight process's end of the guardian: starts it before the coils can be energised, sends heartbeats.
 
-A guardian that dies, or does not read its line any more, is replaced; what became of it is told as news.
-Nothing here waits once the flight has begun: a beat is one byte that is written or dropped.
+A guardian that dies, or stops reading its line, is replaced and the replacement reported. Nothing here waits
+once the flight has begun: a heartbeat is one byte that is written or dropped.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from hal.interfaces.guardian import GuardianNews
 DEVICE = "guardian"
 NOTE = "coils"
 _ROOT = Path(__file__).resolve().parents[2]
-_QUEUE_BYTES = 16384  # room for about a second of heartbeats: each byte takes its own bookkeeping
+_QUEUE_BYTES = 16384  # about a second of heartbeats, each with the kernel's bookkeeping
 _RETRY_NS = 1_000_000_000
-_FAREWELL_S = 0.5
+_END_TIMEOUT_S = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class CoilReach:
-    """How a process without numpy reaches the coils' PWM chip.
+    """How a process without numpy accesses the coils' PWM chip.
 
-    `opener` is `module:function` of what opens the bus, `where` that function's argument.
+    `opener` names the function that opens the bus as `module:function`, `where` is its argument.
     """
 
     opener: str
@@ -39,7 +39,7 @@ class CoilReach:
     address: int
 
     def note(self, folder: Path) -> None:
-        """Leave word of bus and address, durably, in a folder, for `deploy/coils-off`. Never raises."""
+        """Write bus and address durably to a file in a folder, for `deploy/coils-off`. Never raises."""
         beside = folder / f"{NOTE}.part"
         with contextlib.suppress(OSError):
             with beside.open("wb") as note:
@@ -58,10 +58,10 @@ _NEWS = {line.READY: GuardianNews.READY, line.ACTED: GuardianNews.ACTED, line.FA
 
 
 class GuardianLine:
-    """A guardian on watch. For one thread, the control loop's."""
+    """A running guardian. For one thread, the control loop's."""
 
     def __init__(self, reach: CoilReach) -> None:
-        """Start the guardian; `wait_ready` tells when it is on watch."""
+        """Start the guardian; `wait_ready` waits until it guards."""
         self._reach = reach
         self._lost = False
         self._retry_ns = 0
@@ -74,10 +74,10 @@ class GuardianLine:
         return self._process.pid
 
     def wait_ready(self, patience: float = 2.0, *, patient: bool = False) -> None:
-        """Wait until the guardian has told the coils zero.
+        """Wait until the guardian has zeroed the coils.
 
-        Raises NotResponding when it has not within `patience` s; not where the flight is `patient` and waits
-        for its coils as well: the guardian goes on trying, and tells when it succeeds.
+        Raises NotResponding when that takes more than `patience` s, except where the flight is `patient` and
+        waits for its coils as well: the guardian then keeps trying and reports when it succeeds.
         """
         heard = b""
         if select.select([self._line], [], [], patience)[0]:
@@ -87,22 +87,22 @@ class GuardianLine:
             raise NotResponding(DEVICE, "it does not reach the coils' PWM chip, see above: nothing is flown")
 
     def beat(self) -> None:
-        """Tell that a control cycle ran well. Never waits, never raises."""
+        """Report that a control cycle succeeded. Never waits, never raises."""
         if self._lost:
             return
         try:
             self._line.send(line.BEAT, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
-        except OSError:  # it has died; or, BlockingIOError, it has not read for a second
+        except OSError:  # it died; or, BlockingIOError, it has not read for a second
             self._lost = True
 
     def tend(self, now_ns: int) -> list[GuardianNews]:
-        """Replace a guardian that is lost; return what has happened since the last call."""
+        """Replace a lost guardian; return what happened since the last call."""
         news = self._hear()
         if self._lost and now_ns >= self._retry_ns:
             self._retry_ns = now_ns + _RETRY_NS
             news.append(GuardianNews.LOST)
             self._drop()
-            # One that cannot be started now is tried again; the task that asks must not fail for that.
+            # A failed start is tried again later; the calling task must not fail.
             with contextlib.suppress(NotResponding):
                 self._process, self._line = self._start()
                 self._lost = False
@@ -110,10 +110,10 @@ class GuardianLine:
         return news
 
     def close(self) -> None:
-        """Say goodbye, the coils being off; the guardian zeroes them once more. Safe to call twice."""
+        """End the guardian, the coils being off; it zeroes them once more. Safe to call twice."""
         try:
             self._line.send(line.BYE, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
-            self._process.wait(_FAREWELL_S)
+            self._process.wait(_END_TIMEOUT_S)
         except (OSError, subprocess.TimeoutExpired):
             self._process.kill()
             self._process.wait()
@@ -131,7 +131,7 @@ class GuardianLine:
         return [_NEWS[word] for value in words if (word := bytes([value])) in _NEWS]
 
     def _drop(self) -> None:
-        """Part with a lost guardian; it is reaped when it has ended, which is not waited for."""
+        """Kill a lost guardian; it is reaped later, without waiting here."""
         self._process.kill()
         self._ended.append(self._process)
         self._line.close()
@@ -146,13 +146,13 @@ class GuardianLine:
         words = [str(theirs.fileno()), reach.opener, reach.where, str(reach.address)]
         try:
             process = subprocess.Popen(
-                # Without site-packages and the user's environment: nothing to slow it down or lead it astray.
+                # Without site-packages and the user's environment, for a fast and predictable start.
                 [sys.executable, "-S", "-E", "-m", "hal.guardian", *words],
                 cwd=_ROOT,
                 pass_fds=(theirs.fileno(),),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
-                start_new_session=True,  # what is sent to the flight's process group is not for the guardian
+                start_new_session=True,  # signals to the flight's process group must not reach the guardian
             )
         except OSError as error:
             ours.close()

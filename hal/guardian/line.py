@@ -1,16 +1,16 @@
-"""What flight process and guardian say to each other: single bytes on a socket pair."""
+"""The messages between flight process and guardian: single bytes on a socket pair."""
 
 BEAT = b"."
-"""Flight: a control cycle ran well."""
+"""Flight: a control cycle succeeded."""
 
 BYE = b"q"
 """Flight: the coils are off and the flight is over."""
 
 READY = b"r"
-"""Guardian: the bus is open and the coils have been told zero."""
+"""Guardian: the bus is open and the coils are zeroed."""
 
 ACTED = b"z"
-"""Guardian: the heart fell silent, the coils are at zero."""
+"""Guardian: the heartbeat stopped, the coils are zeroed."""
 
 FAILED = b"x"
-"""Guardian: the coils could not be told zero; it goes on trying."""
+"""Guardian: the coils could not be zeroed; it keeps trying."""

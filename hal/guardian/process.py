@@ -1,8 +1,8 @@
 """The guardian's process: listens on its line, zeroes the coils through a bus of its own.
 
-Its start is told the descriptor of the line, what opens the bus (`module:function` and the function's
-argument) and the PWM chip's address. SIGTERM and SIGINT are not for it: they end the flight process, whose
-farewell, or whose death, ends the guardian.
+Its arguments are the descriptor of the line, the function that opens the bus (`module:function` and its
+argument) and the PWM chip's address. It ignores SIGTERM and SIGINT: they end the flight process, whose
+goodbye or death ends the guardian.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from hal.guardian.watch import Watch
 from hal.interfaces.errors import NotResponding
 
 PRIORITY = 60
-"""Of SCHED_FIFO, above the control loop: a loop that spins must not keep the guardian from a processor."""
+"""SCHED_FIFO priority, above the control loop: a loop that spins must not starve the guardian."""
 
 
 class ByteWriter(Protocol):
-    """As much of an I2C bus as zero takes."""
+    """The part of an I2C bus that switching the coils off needs."""
 
     def write_byte_data(self, address: int, register: int, value: int) -> None:
         """Write one byte. Raises OSError."""
@@ -39,7 +39,7 @@ class ByteWriter(Protocol):
 
 
 class CoilSwitch:
-    """The means to zero the coils; opened again after each failure."""
+    """Zeroes the coils over a bus that is reopened after each failure."""
 
     def __init__(self, opener: Callable[[str], ByteWriter], where: str, address: int) -> None:
         self._opener = opener
@@ -48,11 +48,11 @@ class CoilSwitch:
         self._bus: ByteWriter | None = None
 
     def off(self) -> bool:
-        """Say zero once; tell whether it was taken."""
+        """Write zero once; return whether it was acknowledged."""
         try:
             if self._bus is None:
                 self._bus = self._opener(self._where)
-            # The protocol of switch_off is a whole bus; it writes one byte.
+            # switch_off declares a whole bus, but it writes one byte.
             switch_off(self._bus, self._address, tries=1)  # type: ignore[arg-type]
         except (OSError, NotResponding):
             self.close()
@@ -68,20 +68,20 @@ class CoilSwitch:
 
 
 class Guardian:
-    """Listens and acts until the flight process says goodbye or has died."""
+    """Listens and acts until the flight process says goodbye or dies."""
 
     def __init__(self, flight: socket.socket, switch: CoilSwitch, now_ns: Callable[[], int]) -> None:
         self._flight = flight
         self._switch = switch
         self._now_ns = now_ns
         self._watch = Watch(now_ns())
-        self._told = 0  # outages
+        self._reported = 0  # outages
         self._failing = False
 
     def serve(self) -> None:
         """Guard."""
         if self._switch.off():
-            self._tell(line.READY)
+            self._send(line.READY)
         while not self._watch.over(self._now_ns()):
             if self._listen():
                 self._switch.off()
@@ -90,7 +90,7 @@ class Guardian:
                 self._zero()
 
     def _listen(self) -> bool:
-        """Wait for a word until zero is due; tell whether it was the farewell."""
+        """Wait for a message until zero is due; return whether it was the goodbye."""
         left = max(0, self._watch.due_ns - self._now_ns()) * 1e-9
         ears = [] if self._watch.orphaned else [self._flight]
         if not select.select(ears, [], [], left)[0]:
@@ -110,22 +110,22 @@ class Guardian:
     def _zero(self) -> None:
         if not self._switch.off():
             if not self._failing:
-                self._tell(line.FAILED)
+                self._send(line.FAILED)
             self._failing = True
             return
         self._failing = False
         self._watch.acknowledged()
-        if self._watch.outages > self._told:
-            self._told = self._watch.outages
-            self._tell(line.ACTED)
+        if self._watch.outages > self._reported:
+            self._reported = self._watch.outages
+            self._send(line.ACTED)
 
-    def _tell(self, word: bytes) -> None:
+    def _send(self, message: bytes) -> None:
         with contextlib.suppress(OSError):
-            self._flight.send(word, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
+            self._flight.send(message, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
 
 
 def main(arguments: list[str]) -> int:
-    """Guard as the arguments tell: LINE OPENER WHERE ADDRESS. Started by `hal.guardian.client` only."""
+    """Guard with the arguments LINE OPENER WHERE ADDRESS. Started by `hal.guardian.client` only."""
     descriptor, opener, where, address = arguments
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
@@ -143,7 +143,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _survive() -> None:
-    """Ask to be served first and killed last. What is refused is done without: `real_time` tells why."""
+    """Request to be scheduled first and killed last; go on where that is refused."""
     real_time.prioritise(0, PRIORITY)
     real_time.lock_memory()
     with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "w", encoding="ascii") as score:

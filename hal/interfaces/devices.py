@@ -1,4 +1,4 @@
-"""Protocols of the devices as the flight application uses them."""
+"""Protocols of the devices that the flight application uses."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from hal.interfaces.readings import CoilState, FloatArray, Frame, ImuLink, ImuRe
 
 
 class InertialUnit(Protocol):
-    """Attitude, rate, field and acceleration at a steady rate."""
+    """Measures attitude, rate, field and acceleration at a steady rate."""
 
     def configure(self) -> None:
-        """Set the unit up; may take seconds. Raises DeviceError when it does not answer or refuses."""
+        """Set the unit up; may take seconds. Raises DeviceError when the unit does not answer or refuses."""
 
     def poll(self) -> list[ImuReading]:
         """Return the samples since the last call, oldest first. Never blocks.
 
-        Raises NotResponding when the line itself is gone. Corrupt and implausible packets are
+        Raises NotResponding when the line itself is lost. Corrupt and implausible packets are
         counted in `link`.
         """
 
@@ -28,13 +28,13 @@ class InertialUnit(Protocol):
 
 
 class TorqueCoils(Protocol):
-    """Three torque coils: currents in, zero on any doubt."""
+    """Three torque coils; any failure leads to zero current."""
 
     def start(self) -> None:
         """Set the PWM chip up with every output off. Raises DeviceError when it does not answer."""
 
     def command(self, currents: FloatArray) -> None:
-        """Ask for currents (3,) in A; limited explicitly. Never waits for the bus.
+        """Request currents (3,) in A; values beyond the limit are limited. Never waits for the bus.
 
         Raises OutOfRange, and brings the coils to zero, if a value is not finite.
         """
@@ -42,43 +42,43 @@ class TorqueCoils(Protocol):
     def brake(self, axes: tuple[bool, bool, bool]) -> None:
         """Hold both inputs of these bridges high from now on, whatever is commanded: never waits for the bus.
 
-        A leg stuck high then drives nothing; nor does a sound bridge. Until `start` or another call.
+        A bridge then drives no current, even with a leg stuck high. Valid until `start` or another call.
         """
 
     def off(self) -> None:
         """Bring all coils to zero now, with retries; returns when written or given up.
 
-        What is braked stays so: low inputs would let a leg that is stuck high drive its coil.
+        Braked bridges stay braked: with low inputs a leg that is stuck high would drive its coil.
         """
 
     def state(self) -> CoilState:
         """Return what is on the wire."""
 
     def close(self) -> None:
-        """Coils off, then release the bus."""
+        """Bring the coils to zero, then release the bus."""
 
 
 class PowerMonitor(Protocol):
-    """The total coil current and power."""
+    """Measures the total coil current and power."""
 
     def latest(self) -> PowerReading | None:
         """Return the newest reading, None before the first."""
 
     def error(self) -> str:
-        """Return the last failure while it lasts, empty when readings come."""
+        """Return the last failure while it lasts, empty when readings arrive."""
 
     def close(self) -> None:
         """Stop reading."""
 
 
 class FrameSource(Protocol):
-    """A camera that exposes when told to."""
+    """A camera that exposes on a trigger."""
 
     def trigger(self, exposure_ns: int) -> None:
-        """Start one exposure now. Raises NotResponding when the camera is gone."""
+        """Start one exposure now. Raises NotResponding when the camera is lost."""
 
     def poll(self) -> Frame | None:
-        """Return the newest finished frame once, None when there is no new one. Never blocks."""
+        """Return the newest finished frame once, None without a new one. Never blocks."""
 
     def close(self) -> None:
         """Release the camera."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 class DeviceError(Exception):
-    """A device could not do what was asked of it."""
+    """A device failed to do what was requested."""
 
     def __init__(self, device: str, message: str) -> None:
         super().__init__(f"{device}: {message}")
@@ -13,19 +13,19 @@ class DeviceError(Exception):
 
 
 class NotResponding(DeviceError):
-    """Nothing came back: no acknowledge, no bytes, a closed port, a bus that hangs."""
+    """No answer: no acknowledge, no bytes, a closed port, a bus that hangs."""
 
 
 class CorruptData(DeviceError):
-    """Something came back, but not what the protocol allows."""
+    """An answer that the protocol does not allow."""
 
 
 class Refused(DeviceError):
-    """The device understood and said no (an error answer, a register that will not take the value)."""
+    """The device refused: an error answer, or a register that does not keep the value."""
 
 
 class OutOfRange(DeviceError):
-    """A command or a reading lies outside what the device can do or the world allows."""
+    """A command or a reading is outside the range of the device or of physics."""
 
     def __init__(self, device: str, quantity: str, value: float, low: float, high: float, unit: str) -> None:
         super().__init__(device, f"{quantity} = {value!r} {unit} is outside {low!r} .. {high!r} {unit}")

@@ -1,4 +1,4 @@
-"""The Protocol of what stands behind the control loop and zeroes the coils when that falls silent."""
+"""Protocols of the processes that watch the control loop: coil guardian and service manager."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Protocol
 
 
 class GuardianNews(Enum):
-    """What became of the guardian, or what it had to do."""
+    """Events of the guardian; the values are texts for the event log."""
 
     LOST = "it has died or hangs: another is started"
     READY = "it is on watch"
@@ -16,20 +16,20 @@ class GuardianNews(Enum):
 
 
 class CoilGuardian(Protocol):
-    """A guardian on watch."""
+    """A running guardian: zeroes the coils when heartbeats stop."""
 
     def beat(self) -> None:
-        """Tell that a control cycle ran well. Never waits, never raises."""
+        """Report that a control cycle succeeded. Never waits, never raises."""
 
     def tend(self, now_ns: int) -> list[GuardianNews]:
-        """Replace a guardian that is lost; return what has happened since the last call."""
+        """Replace a lost guardian; return what happened since the last call."""
 
 
 class Overseer(Protocol):
-    """The service manager, as far as the flight speaks to it."""
+    """The service manager, as far as the flight uses it."""
 
     def ready(self, status: str) -> None:
-        """Say that the start is over."""
+        """Report that the start is complete."""
 
     def feed_watchdog(self) -> None:
-        """Say that everything makes progress."""
+        """Report that every task makes progress."""

@@ -1,7 +1,7 @@
-"""The values that devices give: each with its time, its arrival and its validity.
+"""Readings of the devices, each with its time of measurement and of arrival.
 
-Times are nanoseconds of the injected clock (`hal.interfaces.wires.Clock`), integers, so that a grid of
-25 ms stays a grid for years. Arrays are float64 and must be treated as read-only.
+Times are integer nanoseconds of the injected clock (`hal.interfaces.wires.Clock`), so that a grid of 25 ms
+stays exact for years. Arrays are float64 and must be treated as read-only.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ FloatArray = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class ImuReading:
-    """One sample of the inertial unit, already in the body frame and the reference frame of the mission.
+    """One sample of the inertial unit, in the body frame and the mission's reference frame.
 
     Attributes:
         time_ns: host clock at the instant of the sample (arrival less the time on the wire).
@@ -40,9 +40,9 @@ class ImuReading:
 
 @dataclass(frozen=True, slots=True)
 class ImuLink:
-    """Counters of the inertial unit's line since start: they only grow, so a rate is their difference.
+    """Counters of the inertial unit's line since start; they only grow, so differences give rates.
 
-    Silence is `last_byte_ns` standing still; corruption is bytes arriving without packets.
+    On a silent line `last_byte_ns` does not change; on a corrupt one bytes arrive without packets.
     `last_byte_ns` and `last_packet_ns` are -1 before the first.
     """
 
@@ -60,8 +60,8 @@ class ImuLink:
 class Frame:
     """One image: `pixels` is (rows, columns), uint8 or uint16; times are of the host clock.
 
-    The exposure runs from `exposure_start_ns` for `exposure_ns`; `sequence` is the camera's own count,
-    by which a frozen camera is known.
+    The exposure lasts `exposure_ns` from `exposure_start_ns`; `sequence` is the camera's own count, which
+    reveals a frozen camera.
     """
 
     sequence: int
@@ -73,10 +73,10 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class PowerReading:
-    """What the current monitor measured: bus voltage (V), current of all coils together (A), power (W).
+    """A measurement of bus voltage (V), total current of the coils (A) and power (W).
 
-    They are means over about a second; `newest` A is the last conversion's current alone, of a window that
-    lies between `newest_since_ns` and `time_ns`.
+    The values are means over about a second; `newest` (A) is the current of the last conversion alone, whose
+    window lies between `newest_since_ns` and `time_ns`.
     """
 
     time_ns: int
@@ -89,18 +89,18 @@ class PowerReading:
 
 @dataclass(frozen=True, slots=True)
 class CoilState:
-    """What the coil driver last put on the wire.
+    """The coil driver's last command and last acknowledged output.
 
     Attributes:
-        command: (3,) A, as asked for, finite.
-        current: (3,) A, as written after saturation and the resolution of the PWM chip; zeros when off.
+        command: (3,) A, as requested, finite.
+        current: (3,) A, as written, after limiting and rounding to PWM counts; zeros when off.
         written_ns: host clock since when that current is on the wire, -1 before the first.
         saturated: whether any axis was limited.
         command_ns: host clock of the newest command, -1 before the first.
-        stale: the command was too old and the driver has let the coils decay to zero.
+        stale: the command was too old, so the driver brought the coils to zero.
         faults: failed transactions since start.
         error: the text of the last failure while it lasts, empty when the last transaction succeeded.
-        braked: (3,) which bridges have both inputs high, so that a leg stuck high drives nothing.
+        braked: (3,) bridges with both inputs high, so that a leg stuck high drives no current.
     """
 
     command: FloatArray

@@ -1,7 +1,6 @@
-"""Protocols at the wire: clock, serial port, I2C bus. hal binds them to Linux, sim_hal to emulators.
+"""Protocols at the wire: clock, serial port, I2C bus. hal implements them on Linux, sim_hal with emulators.
 
-The swap between flight and simulation happens here and nowhere above: every simulated run exercises
-the driver that flies.
+Flight and simulation differ here and nowhere above, so every simulated run exercises the flight drivers.
 """
 
 from __future__ import annotations
@@ -16,33 +15,33 @@ SECOND_NS = 1_000_000_000
 
 
 class Ticker(Protocol):
-    """A small job that a clock runs again and again beside the control loop."""
+    """A small job that a clock runs periodically beside the control loop."""
 
     @property
     def name(self) -> str:
-        """The job's name, for people."""
+        """The job's name."""
 
     @property
     def period_ns(self) -> int:
-        """How often it runs, unless it is kicked."""
+        """The period of the job, unless kicked."""
 
     @property
     def error(self) -> str:
-        """What escaped from the job's last run, empty when it came to its end."""
+        """The exception of the last run as text, empty when it completed."""
 
     @property
     def served_ns(self) -> int:
-        """When a run last came to its end, or when the ticker was made."""
+        """When a run last completed, or when the ticker was made."""
 
     def kick(self) -> None:
         """Run the job as soon as possible, without waiting for its next period."""
 
     def stop(self) -> None:
-        """Run the job no more; returns when it is not running. Safe to call twice."""
+        """Stop running the job; returns when it is not running. Safe to call twice."""
 
 
 class Clock(Protocol):
-    """Monotonic time, in integer nanoseconds. The only source of time there is."""
+    """Monotonic time in integer nanoseconds; the only source of time."""
 
     def now_ns(self) -> int:
         """Return the monotonic time."""
@@ -53,13 +52,13 @@ class Clock(Protocol):
     def ticker(self, name: str, period_ns: int, job: Callable[[], None]) -> Ticker:
         """Run `job` every `period_ns`, beside the caller: on a thread in real time, in turn in simulation.
 
-        A job must not block for long and must be safe beside the control loop. One that raises is told by its
-        ticker, and run again in its next period.
+        A job must not block for long and must be safe beside the control loop. The ticker reports a job that
+        raises, and runs it again in its next period.
         """
 
     @property
     def tickers(self) -> Sequence[Ticker]:
-        """The tickers that run, in the order in which they were made."""
+        """The running tickers, in the order in which they were made."""
 
     def utc_ns(self) -> int:
         """Return UTC as nanoseconds since 1970: a label for telemetry, never an input of control."""
@@ -71,13 +70,13 @@ class SerialPort(Protocol):
     baud_rate: int
 
     def receive(self) -> list[tuple[int, bytes]]:
-        """Return what came since the last call as (arrival_ns, bytes), oldest first; [] when nothing did.
+        """Return what arrived since the last call as (arrival_ns, bytes), oldest first.
 
-        Raises NotResponding when the port itself is gone.
+        Raises NotResponding when the port itself is lost.
         """
 
     def send(self, data: bytes) -> None:
-        """Queue bytes for sending. Raises NotResponding when the port is gone."""
+        """Queue bytes for sending. Raises NotResponding when the port is lost."""
 
     def set_baud_rate(self, baud_rate: int) -> None:
         """Change the line's speed."""
@@ -87,10 +86,10 @@ class SerialPort(Protocol):
 
 
 class I2cBus(Protocol):
-    """The part of smbus2's interface that the drivers use; one transaction a call.
+    """The part of smbus2's interface that the drivers use; one transaction per call.
 
-    Every call raises OSError (with the errno of the kernel's I2C fault codes) when the bus or the part does
-    not answer, and returns within the bus's time-out whatever happens. Safe to call from several threads.
+    Every call raises OSError (with the errno of the kernel's I2C fault codes) when the bus or the device does
+    not answer, and always returns within the bus's time-out. Safe to call from several threads.
     """
 
     def read_byte_data(self, address: int, register: int) -> int:
@@ -111,7 +110,7 @@ class I2cBus(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Wires:
-    """What drivers are plugged into: one serial line, one I2C bus, and a camera or none."""
+    """The connections of the drivers: one serial line, one I2C bus, and a camera or None."""
 
     serial: SerialPort
     i2c: I2cBus

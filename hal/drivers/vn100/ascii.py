@@ -1,8 +1,8 @@
 """ASCII sentences of the VN-100: `$VNxxx,field,...*checksum` and a line end.
 
 The checksum covers the bytes strictly between `$` and `*`: two hex digits are the XOR of the bytes, four are
-CRC-16/XMODEM, and `XX`, to the unit only, is none (VectorNav UM001 v2.43 section 4.2; its remark on
-polynomial 0x07 is a slip).
+CRC-16/XMODEM, and `XX`, to the unit only, means none (VectorNav UM001 v2.43 section 4.2; its remark on
+polynomial 0x07 is an error).
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ ERRORS = {
 
 @dataclass(frozen=True, slots=True)
 class Sentence:
-    """One sentence: `command` is the part after `$VN` ("QMR"), `fields` what follows, as text."""
+    """One sentence: `command` is the part after `$VN` ("QMR"), `fields` the rest, as text."""
 
     command: str
     fields: tuple[str, ...]
@@ -44,7 +44,7 @@ class Sentence:
 
 @dataclass(frozen=True, slots=True)
 class AsciiLine:
-    """A sentence whose checksum holds; `arrival_ns` is the host's time of its last byte."""
+    """A sentence with a valid checksum; `arrival_ns` is the host's time of its last byte."""
 
     arrival_ns: int
     length: int
@@ -53,7 +53,7 @@ class AsciiLine:
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """What an asynchronous VNQMR or VNYMR line says, in the unit's own units.
+    """The values of an asynchronous VNQMR or VNYMR line, in the unit's own units.
 
     `attitude` is (q0, q1, q2, q3), scalar last, or (yaw, pitch, roll) in degrees; `mag` gauss, `accel` m/s^2,
     `gyro` rad/s.
@@ -80,9 +80,9 @@ def build(command: str, *fields: object, checksum: Checksum = "crc16") -> bytes:
 
 
 def parse(line: bytes, *, allow_none: bool = False) -> Sentence | None:
-    """Return the sentence of a whole line, or None when it is not one or its checksum fails.
+    """Return the sentence of a whole line, or None when it is no sentence or its checksum fails.
 
-    `XX` in place of a checksum passes only with `allow_none`: a unit never sends it.
+    `XX` instead of a checksum is accepted only with `allow_none`: a unit never sends it.
     """
     text = line.rstrip(b"\r\n")
     body, star, digits = text[1:].partition(b"*")  # a sentence has one star
@@ -98,7 +98,7 @@ def parse(line: bytes, *, allow_none: bool = False) -> Sentence | None:
 def _verify(body: bytes, digits: bytes, allow_none: bool) -> Checksum | None:
     if allow_none and digits == b"XX":
         return "none"
-    # bytes.isalnum keeps out what int() would take besides digits: a sign, an underscore, blanks.
+    # bytes.isalnum excludes what int() accepts besides digits: a sign, an underscore, blanks.
     if len(digits) not in {2, 4} or not digits.isalnum():
         return None
     try:
@@ -111,10 +111,10 @@ def _verify(body: bytes, digits: bytes, allow_none: bool) -> Checksum | None:
 
 
 def measurement(sentence: Sentence) -> Measurement | None:
-    """Return what a VNQMR or VNYMR sentence says; None for other sentences and for unreadable numbers.
+    """Return the values of a VNQMR or VNYMR sentence; None for other sentences and for unreadable numbers.
 
-    Trailing `T...` and `S...` fields (register 30: count and status) are passed over. A value may be NaN or
-    infinite if the unit says so: the driver judges that.
+    Trailing `T...` and `S...` fields (register 30: count and status) are ignored. A value may be NaN or
+    infinite as the unit sent it; the driver rejects those.
     """
     heads = {"QMR": 4, "YMR": 3}.get(sentence.command)
     if heads is None or len(sentence.fields) < heads + 9:

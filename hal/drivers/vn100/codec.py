@@ -1,8 +1,8 @@
 """Binary packets of the VN-100: field tables, layouts, checksum.
 
 A packet is `FA | group byte | one u16 LE word of field bits per group | payload LE | CRC16 big-endian`
-(VectorNav UM001 v2.43 section 4.3). The CRC is CRC-16/XMODEM over all between the FA and itself. Units are
-the unit's own: gauss, degrees, m/s^2, rad/s, ns.
+(VectorNav UM001 v2.43 section 4.3). The CRC is CRC-16/XMODEM over the bytes between the FA and itself. Units
+are the unit's own: gauss, degrees, m/s^2, rad/s, ns.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from functools import lru_cache
 
 SYNC = 0xFA
 
-# (name, struct code) by bit. Groups 4 and 7 (GNSS) are in no VN-100 and their sizes are not known here.
+# (name, struct code) by bit. No VN-100 has groups 4 and 7 (GNSS); their sizes are not listed.
 _COMMON = (
     ("time_startup", "Q"), ("time_gps", "Q"), ("time_sync_in", "Q"), ("yaw_pitch_roll", "3f"),
     ("quaternion", "4f"), ("angular_rate", "3f"), ("position", "3d"), ("velocity", "3f"),
@@ -54,10 +54,10 @@ Value = float | bytes
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """How a packet of one output set is built.
+    """Layout of the packets of one output set.
 
     Attributes:
-        header: the bytes after the sync byte that announce it: group byte and field words.
+        header: the bytes after the sync byte: group byte and field words.
         fields: ((group bit, field bit), ...) in the order of the payload.
         places: field as "group.name" -> slice of the unpacked values.
         payload: the payload's struct.
@@ -71,14 +71,14 @@ class Layout:
     length: int
 
     def pack(self, values: Iterable[Value]) -> bytes:
-        """Return the packet that carries the payload's `values`, flat, in the order of the fields."""
+        """Return the packet with the payload `values`, flat, in the order of the fields."""
         body = self.header + self.payload.pack(*values)
         return b"".join((b"\xfa", body, crc16(body).to_bytes(2, "big")))
 
 
 @dataclass(frozen=True, slots=True)
 class BinaryPacket:
-    """A packet whose checksum holds.
+    """A packet with a valid checksum.
 
     `arrival_ns` is the host's time of its last byte; `values` is the payload, flat.
     """
@@ -88,7 +88,7 @@ class BinaryPacket:
     values: tuple[Value, ...]
 
     def __getitem__(self, field: str) -> tuple[Value, ...]:
-        """Return the values of a field named "group.name"; raises KeyError when the packet has none."""
+        """Return the values of a field named "group.name"; raises KeyError without one."""
         return self.values[self.layout.places[field]]
 
 
@@ -111,7 +111,7 @@ def layout_of(words: Mapping[int, int]) -> Layout:
 
 
 def header_length(group_byte: int) -> int:
-    """Return the bytes of group byte and field words; 0 when no known unit sends this group byte."""
+    """Return the length of group byte and field words; 0 when no known unit sends this group byte."""
     if group_byte == 0 or any(group_byte >> bit & 1 and bit not in FIELDS for bit in range(8)):
         return 0
     return 1 + 2 * group_byte.bit_count()
@@ -119,7 +119,7 @@ def header_length(group_byte: int) -> int:
 
 @lru_cache(maxsize=256)
 def layout_of_header(header: bytes) -> Layout | None:
-    """Return the layout that `header` (group byte and its field words) announces; None when there is none."""
+    """Return the layout of `header` (group byte and its field words); None when there is none."""
     if not header:
         return None
     bits = [bit for bit in range(8) if header[0] >> bit & 1]

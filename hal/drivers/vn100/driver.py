@@ -114,7 +114,7 @@ class Vn100:
         before = self.link()
         self._unit_error = ""
         for _ in range(self._settings.tries):
-            self._port.send(question.words())
+            self._port.send(question.message())
             answer = self._await(question)
             if answer is not None:
                 return answer

@@ -1,9 +1,9 @@
-"""Gets a VN-100 that was lost in flight to speak again, a little at each poll: nothing here waits.
+"""Recovers a VN-100 that was lost in flight, one step at each poll; nothing here waits.
 
-A unit that lost its power or was reset runs on what its flash holds, perhaps at another speed; one that was
-unplugged may have come back as any of these. While no reading comes the line is listened to: packets tell
-that the speed is right, bytes without packets that it may not be, and then others are tried, the own one
-every second time. At the right speed the unit is set up anew, one question at a time.
+A unit that lost power or was reset runs on the settings in its flash, perhaps at another baud rate; one that
+was unplugged may return in any of these states. Without readings the line is observed: packets show that the
+baud rate is right; bytes without packets that it may be wrong, and then others are tried, ours every second
+time. At the right baud rate the unit is set up again, one question at a time.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from hal.drivers.vn100.settings import Vn100Settings
 from hal.interfaces.errors import DeviceError, Refused
 from hal.interfaces.wires import SerialPort
 
-# By how likely they are: the factory's first.
+# In order of likelihood, the factory's setting first.
 BAUD_RATES = (115200, 230400, 921600, 460800, 57600, 38400, 19200, 9600)
 
-_PATIENCE_NS = 150_000_000  # without a reading, until something is done
-_LISTEN_NS = 90_000_000  # at one speed: three packets of 40 Hz
+_PATIENCE_NS = 150_000_000  # without a reading, before recovery begins
+_LISTEN_NS = 90_000_000  # at one baud rate: three packets of 40 Hz
 _REFUSED_WAIT_NS = 1_000_000_000
 
 
@@ -28,8 +28,8 @@ class Recovery:
     """The dialogue with a lost unit.
 
     Attributes:
-        completed: how often a unit was set up anew.
-        refusal: what the unit said no to, empty when nothing.
+        completed: how often a unit was set up again.
+        refusal: the unit's last refusal, empty without one.
     """
 
     def __init__(self, port: SerialPort, settings: Vn100Settings) -> None:
@@ -53,14 +53,14 @@ class Recovery:
         self._has_written = False
 
     def reset(self) -> None:
-        """Be told that the unit has started anew: readings or not, its settings are the saved ones."""
-        # The first sample after a unit was set up anew tells of the start that was found already.
+        """Note that the unit has restarted: even with readings, its settings are those in its flash."""
+        # The first sample after a recovery shows the restart that was handled already.
         self._was_reset = not self._is_fresh
 
     def advance(
         self, now_ns: int, readings: int, sentences: Sequence[Sentence], packets: int, received: int
     ) -> None:
-        """Take what a poll brought: readings, sentences; and all packets and bytes until now.
+        """Advance by one poll with its number of readings, its sentences, and all packets and bytes so far.
 
         Raises NotResponding when the port is gone.
         """
@@ -95,19 +95,19 @@ class Recovery:
         self._dialogue = None
 
     def _seek(self, now_ns: int, packets: int, received: int) -> None:
-        """Listen at this speed; begin to speak when it is right or when nothing comes; else try another."""
+        """Listen at this baud rate; begin the dialogue if it is right or nothing comes; else try another."""
         assert self._listening_since_ns is not None
         if packets > self._packets:
             self._begin(now_ns)
         elif now_ns - self._listening_since_ns >= _LISTEN_NS:
             if received == self._bytes:
-                # Silence: the unit may have been told to be silent.
+                # Silence: its output may be switched off.
                 self._begin(now_ns)
             else:
-                self._take_next_rate()
+                self._change_rate()
                 self._listen(now_ns, packets, received)
 
-    def _take_next_rate(self) -> None:
+    def _change_rate(self) -> None:
         if self._port.baud_rate == self._own_rate:
             self._port.set_baud_rate(self._others[self._other])
             self._other = (self._other + 1) % len(self._others)
@@ -121,7 +121,7 @@ class Recovery:
 
     def _whole_dialogue(self) -> Dialogue:
         if self._port.baud_rate != self._own_rate:
-            # Answered at the old speed.
+            # Answered at the old baud rate.
             yield Question("WRG", (5, self._own_rate))
             self._port.set_baud_rate(self._own_rate)
         yield from set_up(self._settings)
@@ -134,7 +134,7 @@ class Recovery:
         for sentence in sentences:
             answer = question.answer(sentence)
             if answer is not None:
-                self._take(answer, now_ns)
+                self._accept(answer, now_ns)
                 return
             complaint = question.complaint(sentence)
             if complaint is not None:
@@ -144,7 +144,7 @@ class Recovery:
         if again:
             self._repeat(question, now_ns)
 
-    def _take(self, answer: tuple[str, ...], now_ns: int) -> None:
+    def _accept(self, answer: tuple[str, ...], now_ns: int) -> None:
         assert self._dialogue is not None
         self._tries = 0
         try:
@@ -155,7 +155,7 @@ class Recovery:
             self._is_fresh = True
             self.completed += 1
             self.refusal = ""
-            # Readings should come now; if they do not, it begins anew after the same patience.
+            # Readings should arrive now; if not, recovery begins again after the same time.
             self._reading_ns = now_ns
 
     def _repeat(self, question: Question, now_ns: int) -> None:
@@ -168,7 +168,7 @@ class Recovery:
             self._port.set_baud_rate(self._own_rate)
 
     def _give_up(self) -> None:
-        """Be where it was before the dialogue; whoever listens again begins a new one."""
+        """Return to the state before the dialogue; the next step listens again."""
         self._dialogue = None
         self._listening_since_ns = None
         self._has_written = False
@@ -177,7 +177,7 @@ class Recovery:
         self._question, self._asked_ns = question, now_ns
         self._has_written = self._has_written or question.command == "WRG"
         try:
-            self._port.send(question.words())
+            self._port.send(question.message())
         except DeviceError:
             self._give_up()
             raise

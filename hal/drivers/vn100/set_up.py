@@ -1,4 +1,4 @@
-"""The dialogue that sets a VN-100 up, as questions one by one: who asks them may wait for answers or not."""
+"""The dialogue that sets a VN-100 up, as a generator of questions; the caller decides how to wait."""
 
 from __future__ import annotations
 
@@ -9,27 +9,27 @@ from hal.drivers.vn100.ascii import Sentence, build, error_meaning
 from hal.drivers.vn100.settings import DEVICE, IMU_RATE_HZ, OUTPUT_SET, Vn100Settings
 from hal.interfaces.errors import Refused
 
-# The unit met our bytes, or itself, in a bad moment: worth another try. All other codes are a no.
+# Transient errors, worth another try. All other codes are refusals.
 PASSING_ERRORS = frozenset({-1, 0x01, 0x02, 0x03, 0x0A, 0x0B, 0xFF})
 
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """A command and its fields; the first field tells its answer from others."""
+    """A command and its fields; the first field identifies its answer."""
 
     command: str
     fields: tuple[object, ...]
 
-    def words(self) -> bytes:
-        """Return it as it stands on the wire."""
+    def message(self) -> bytes:
+        """Return the bytes for the wire."""
         return build(self.command, *self.fields)
 
     def text(self) -> str:
-        """Return it for people."""
+        """Return the text for messages."""
         return f"$VN{self.command},{','.join(map(str, self.fields))}"
 
     def answer(self, sentence: Sentence) -> tuple[str, ...] | None:
-        """Return the fields after the first if `sentence` answers this; numbers may be zero-padded."""
+        """Return the fields after the first if `sentence` is the answer; numbers may be zero-padded."""
         if sentence.command != self.command or not sentence.fields:
             return None
         return sentence.fields[1:] if _same(str(self.fields[0]), sentence.fields[0], False) else None
@@ -41,7 +41,7 @@ class Question:
 
 
 Dialogue = Generator[Question, tuple[str, ...], None]
-"""Yields questions and is sent the fields of their answers. Raises Refused when an answer is no."""
+"""Yields questions and receives the fields of their answers. Raises Refused when the unit refuses."""
 
 
 def set_up(settings: Vn100Settings) -> Dialogue:
@@ -50,9 +50,9 @@ def set_up(settings: Vn100Settings) -> Dialogue:
     if not model or not model[0].startswith("VN-100"):
         raise Refused(DEVICE, f"the unit calls itself {','.join(model)!r}: this line needs a VN-100")
     yield from _write(6, 0)
-    # The unit's own learning of hard and soft iron would take the coils' field for the unit's.
+    # The unit's own hard and soft iron estimation would mistake the coils' field for the unit's.
     yield from _write(44, 0, 1, 5)
-    # Boxcar filters as long as one 40 Hz period (magnetometer, accelerometer, gyro), on both outputs.
+    # Boxcar filters of one 40 Hz period (magnetometer, accelerometer, gyro), on both outputs.
     yield from _write(85, 20, 20, 20, 4, 0, 3, 3, 3, 3, 0)
     yield from _switch_off(76)
     yield from _switch_off(77)
@@ -63,7 +63,7 @@ def set_up(settings: Vn100Settings) -> Dialogue:
         yield from _write(75, settings.unit_port, divisor, groups, *words)
     else:
         yield from _switch_off(75)
-        # CRC16 on the lines too: 8 bits of XOR let two flips in one column pass.
+        # CRC16 on the lines too: XOR of 8 bits misses two flips in one column.
         yield from _write(30, 0, 0, 0, 0, 3, 0, 1)
         yield from _write(7, settings.rate_hz)
         yield from _write(6, 8)
@@ -80,7 +80,7 @@ def _write(register: int, *values: object) -> Dialogue:
 
 
 def _switch_off(register: int) -> Dialogue:
-    """Switch a binary output off; what the unit remembers of the fields is its own affair."""
+    """Switch a binary output off; the remaining fields do not matter then."""
     echo = yield Question("WRG", (register, 0, 20, "01", "0001"))
     if not echo or not _same("0", echo[0], True):
         raise Refused(DEVICE, f"register {register} was to be off, the unit answered {','.join(echo)}")

@@ -1,4 +1,4 @@
-"""How a VN-100 is mounted and what is asked of it, and the bounds of what it can do."""
+"""Settings of a VN-100, and a check against the limits of the unit and its line."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ IMU_RATE_HZ = 800
 ASCII_RATES_HZ = (1, 2, 4, 5, 10, 20, 25, 40, 50, 100, 200)
 STANDARD_GRAVITY = 9.80665
 
-# TimeStartup, Quaternion, AngularRate, Accel of group 1 and Mag of group 3: all of a reading in 67 bytes.
+# TimeStartup, Quaternion, AngularRate, Accel of group 1 and Mag of group 3: one reading in 67 bytes.
 OUTPUT_SET = {0: 0x0131, 2: 0x0100}
 _QMR_LENGTH = 137  # with a CRC16
 _LINE_LOAD_LIMIT = 0.8  # the rest is left for answers
@@ -25,21 +25,21 @@ _LINE_LOAD_LIMIT = 0.8  # the rest is left for answers
 
 @dataclass(frozen=True, slots=True)
 class Vn100Settings:
-    """How the unit is mounted, and what is asked of it.
+    """Mounting and output of the unit.
 
     Attributes:
-        attitude_map: (4, 4), takes the unit's quaternion (NED into sensor) to ours (reference into body).
+        attitude_map: (4, 4), maps the unit's quaternion (NED into sensor) to ours (reference into body).
         mounting: (3, 3) rotation matrix, sensor axes into body axes.
-        rate_hz: samples a second; binary rates divide 800, ASCII rates are register 7's.
+        rate_hz: samples per second; binary rates divide 800, ASCII rates are register 7's.
         output: binary packets, or ASCII VNQMR lines (which carry no device time).
         unit_port: the unit's own serial port that the cable is on, 1 or 2.
-        rate_range, field_range, acceleration_range: rad/s, T, m/s^2, per axis; beyond is refused. The field's
-            default is the 6 G of the testbed's unit; present-day units state 2.5 G.
-        configure: False leaves the unit as it is; any output that carries a whole reading is then taken.
+        rate_range, field_range, acceleration_range: rad/s, T, m/s^2, per axis; samples beyond are
+            rejected. The field's default is the 6 G of the testbed's unit; present-day units state 2.5 G.
+        configure: False leaves the unit unchanged; any output with a complete reading is then accepted.
         response_timeout_ns: the wait for an answer, each try.
         tries: how often a command is sent before the unit counts as silent.
-        stuck_after: samples in a row with the very same values after which they count as out of range: no
-            sensor is without noise. 0: never.
+        stuck_after: samples in a row with identical values after which they count as out of range, because
+            every sensor has noise. 0: never.
     """
 
     attitude_map: FloatArray = field(default_factory=lambda: np.eye(4))
@@ -57,7 +57,7 @@ class Vn100Settings:
 
 
 def check(settings: Vn100Settings, baud_rate: int) -> None:
-    """Raise Refused or OutOfRange when the unit or the line cannot do what is asked."""
+    """Raise Refused or OutOfRange for settings beyond the unit or the line."""
     if settings.output == "binary":
         possible = tuple(rate for rate in range(1, IMU_RATE_HZ + 1) if IMU_RATE_HZ % rate == 0)
         length = layout_of(OUTPUT_SET).length

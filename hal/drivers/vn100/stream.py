@@ -1,7 +1,7 @@
-"""From the bytes of the line to packets and sentences: finds them again after any garbage.
+"""Parses the bytes of the line into packets and sentences; resynchronises after any garbage.
 
-A candidate that proves false gives up one byte only, so a good packet behind or inside a broken one is
-still found. Work and memory are bounded: a candidate is at most `longest` bytes.
+A false candidate costs one byte only, so a good packet behind or inside a broken one is still found. Work and
+memory are bounded: a candidate is at most `longest` bytes.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ class StreamParser:
 
     Attributes:
         bytes_received: all bytes fed.
-        packets: packets and lines whose checksum held.
-        bad_checksum: whole packets and lines whose checksum failed.
-        discarded_bytes: bytes that belonged to none that held.
+        packets: packets and lines with a valid checksum.
+        bad_checksum: complete packets and lines whose checksum failed.
+        discarded_bytes: bytes outside valid packets and lines.
     """
 
     def __init__(self, byte_ns: float = 0.0, longest: int = 512) -> None:
-        """Take the time of one byte on the wire in ns, and the longest binary packet that can be meant.
+        """Parse with `byte_ns`, the time of a byte on the wire, and packets of at most `longest` bytes.
 
-        A small `longest` keeps a false start in noise from holding up the next good packet.
+        A small `longest` prevents a false start in noise from delaying the next good packet.
         """
         self.byte_ns = byte_ns
         self.bytes_received = 0
@@ -48,9 +48,10 @@ class StreamParser:
         self._previous_ns = _LONG_AGO_NS
 
     def feed(self, arrival_ns: int, data: bytes) -> list[BinaryPacket | AsciiLine]:
-        """Take a chunk whose last byte came at `arrival_ns`; return what it completed, oldest first.
+        """Accept a chunk whose last byte arrived at `arrival_ns`; return what it completed, oldest first.
 
-        What ends inside the chunk came earlier by the bytes behind it, but not before the chunk before.
+        An item that ends inside the chunk arrived earlier by the bytes behind it, but not before the
+        previous chunk.
         """
         self.bytes_received += len(data)
         buffer = self._buffer
@@ -111,7 +112,7 @@ class StreamParser:
             sentence = parse(raw)
             if sentence is not None:
                 return AsciiLine(arrival_ns, span, sentence)
-        # The CRC of a sound packet together with its own checksum is zero.
+        # The CRC over a valid packet including its checksum is zero.
         elif crc16(raw[1:]) == 0:
             header = raw[1 : 1 + HEADER_LENGTHS[raw[1]]]
             layout = layout_of_header(header)

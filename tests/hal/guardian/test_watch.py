@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hal.guardian.watch import LAST_WORDS, PATIENCE_NS, REPEAT_NS, SILENCE_NS, Watch
+from hal.guardian.watch import FINAL_ZEROS, PATIENCE_NS, REPEAT_NS, SILENCE_NS, Watch
 
 MS = 1_000_000
 
@@ -50,7 +50,7 @@ def test_an_orphan_acts_at_once_and_ends_after_its_last_words() -> None:
     watch, now_ns = Watch(0), 5 * MS
     watch.beat(0)
     watch.orphan(now_ns)
-    for _ in range(LAST_WORDS):
+    for _ in range(FINAL_ZEROS):
         assert not watch.over(now_ns)
         assert watch.attempt(now_ns)
         watch.acknowledged()
