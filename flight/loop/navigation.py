@@ -83,7 +83,7 @@ class Navigation:
     def commanded(self, in_force: CoilState, known: Known) -> None:
         """Tell the filter what the coils carry, as far as that is known."""
         if known.doubt_ns is not None:
-            self._filter.doubt(known.doubt_ns)
+            self._filter.mark_unknown(known.doubt_ns)
         self._filter.command(max(in_force.written_ns, known.since_ns), in_force.current, known=known.now)
 
     def update(self, now_ns: int) -> tuple[ImuReading, ...]:
@@ -136,7 +136,7 @@ class Navigation:
         `told` is called, later or at once, with which of them passed the gate.
         """
         if self._filter.started:
-            self._filter.measure_in_turn(late, told)
+            self._filter.measure_late(late, told)
         else:
             told([False] * len(late))
 

@@ -16,8 +16,9 @@ from flight.bodies.testbed.thread_estimate import ThreadReader
 from flight.bodies.testbed.tracker import ThreadTracker, controller_of
 from flight.bodies.testbed.view import ThreadView
 from flight.gnc.control.detumble import Braking, Detumbler, WindowSchedule, share_in_turning_field
-from flight.gnc.estimation.attitude_filter import AttitudeFilter, FilterSettings, slow_prior
+from flight.gnc.estimation.attitude_filter import AttitudeFilter
 from flight.gnc.estimation.estimate import Estimate
+from flight.gnc.estimation.filter_settings import FilterSettings, slow_prior
 from flight.gnc.estimation.rigid_body import Parameters, RigidBody
 from flight.gnc.guidance.one_axis import job as plan_job
 from flight.gnc.guidance.one_axis.guidance import AcceptanceRules, Guidance

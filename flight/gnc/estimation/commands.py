@@ -1,4 +1,4 @@
-"""What the coils were commanded, and from when on: read again when a measurement comes late."""
+"""The recent coil commands with their times; a replay of late measurements reads them again."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from flight.gnc.math.arrays import FloatArray
 
 
 class CommandHistory:
-    """The recent commands in order of time; before the first one nothing is driven."""
+    """The recent commands in order of time; before the first no coil is driven."""
 
     def __init__(self, body: RigidBody, history_ns: int) -> None:
         self._body = body
@@ -25,19 +25,21 @@ class CommandHistory:
     def __len__(self) -> int:
         return len(self._times)
 
-    def note(self, time_ns: int, currents: FloatArray, field: FloatArray | None, known: bool = True) -> None:
-        """Note the coil currents (3,) A in force from `time_ns` on, in the field (3,) T, reference axes."""
+    def record(
+        self, time_ns: int, currents: FloatArray, field: FloatArray | None, known: bool = True
+    ) -> None:
+        """Record the coil currents (3,) A in force from `time_ns` on, in the field (3,) T, reference axes."""
         torquing = self._body.torquing(currents, field, known)
         if self._torquings and self._torquings[-1] == torquing:
             return
         self._times.append(time_ns)
         self._torquings.append(torquing)
         oldest = bisect.bisect_right(self._times, time_ns - self._history_ns) - 1
-        if oldest > 64:  # now and then, not each cycle
+        if oldest > 64:  # in batches, not each cycle
             del self._times[:oldest], self._torquings[:oldest]
 
-    def doubt(self, since_ns: int) -> None:
-        """Take nothing that was noted for the time from `since_ns` on for known."""
+    def mark_unknown(self, since_ns: int) -> None:
+        """Treat the currents in force from `since_ns` on as unknown."""
         first = bisect.bisect_left(self._times, since_ns)
         if self._torquings and (first == len(self._times) or self._times[first] > since_ns):
             self._torquings.insert(first, self.at(since_ns))
@@ -45,12 +47,12 @@ class CommandHistory:
         self._torquings[first:] = [replace(torquing, known=False) for torquing in self._torquings[first:]]
 
     def at(self, time_ns: int) -> Torquing:
-        """Return what the coils do at a time."""
+        """Return the torquing in force at a time."""
         index = max(bisect.bisect_right(self._times, time_ns) - 1, 0)
         return self._torquings[index] if self._torquings else self._idle
 
     def spans(self, from_ns: int, to_ns: int) -> Iterator[tuple[Torquing, int]]:
-        """Yield what is in force between two times and for how many ns, piece by piece, forward only."""
+        """Yield each torquing in force between two times and its duration in ns, in order of time."""
         time_ns = from_ns
         index = max(bisect.bisect_right(self._times, from_ns) - 1, 0)
         while time_ns < to_ns:

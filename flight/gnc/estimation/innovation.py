@@ -1,7 +1,7 @@
-"""What a measurement says beyond the state, and how that would change with the state's error.
+"""The innovation of a measurement and its derivative by the state's error.
 
-A direction is compared in the plane across it: two numbers, whatever its covariance says along it. A field is
-compared as a vector: its strength too tells of the magnetometer's bias.
+A direction is compared in the plane across it: two components, so its covariance along it has no effect. A
+field is compared as a vector: its strength too depends on the magnetometer's bias.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from flight.gnc.math.directions import tangent_basis
 
 
 class Innovation(NamedTuple):
-    """What a measurement says beyond the state: y = H error + noise of covariance R."""
+    """The innovation y = H error + noise: `value` y, `rows` H, `noise` its covariance R."""
 
     value: tuple[float, ...]
     rows: FloatArray
@@ -38,12 +38,12 @@ class Innovation(NamedTuple):
 def innovation(
     state: State, measurement: Measurement, suspended: bool, motion: Motion | None = None
 ) -> Innovation:
-    """Return what `measurement` says beyond `state`; of a suspended body, about the thread alone.
+    """Return the innovation of `measurement`; of a suspended body, only its part about the thread.
 
-    `motion` is asked for a rate whose time is not known for sure.
+    `motion` is needed for a rate whose age is estimated.
     """
     size, noise = SIZE + 3 * len(state.kept), measurement.covariance
-    # About the thread alone: of a suspended body the turns about x and z have no variance to be corrected by.
+    # The turns of a suspended body about x and z have no variance, so whole directions and fields work too.
     if isinstance(measurement, DirectionMeasurement):
         return _direction(state, measurement, size)
     if isinstance(measurement, FieldMeasurement):
@@ -72,7 +72,7 @@ def innovation(
 
 
 def _mean_rate(state: State, measurement: MeanRateMeasurement, size: int) -> tuple[Vector, FloatArray]:
-    """Return innovation and rows of the mean rate between the attitude kept and that of now.
+    """Return innovation and rows of the mean rate between the kept attitude and the present one.
 
     With p the rotation vector from one to the other, p changes by Jr^-1(p) (turn now - A turn then).
     """
@@ -83,7 +83,7 @@ def _mean_rate(state: State, measurement: MeanRateMeasurement, size: int) -> tup
     x, y, z = measurement.rate.tolist()
     square = px * px + py * py + pz * pz
     angle = math.sqrt(square)
-    # 1/p^2 - (1 + cos p) / (2 p sin p), which tends to 1/12 and is that to 1e-6 below 0.03 rad.
+    # 1/p^2 - (1 + cos p) / (2 p sin p) tends to 1/12, and differs by less than 1e-6 below 0.03 rad.
     second = 1.0 / 12.0 if angle < 0.03 else 1.0 / square - 0.5 / (angle * math.tan(0.5 * angle))
     by_turn = np.array(skew((px, py, pz)))
     by_turn = (_EYE + 0.5 * by_turn + second * (by_turn @ by_turn)) / span
@@ -97,7 +97,7 @@ def _mean_rate(state: State, measurement: MeanRateMeasurement, size: int) -> tup
 def _direction(state: State, measurement: DirectionMeasurement, size: int) -> Innovation:
     """Return innovation and rows of a direction: b - A r, in the plane across A r, is [A r x] e.
 
-    With A the believed attitude and e its error, b is A r - e x A r.
+    With A the estimated attitude and e its error, b is A r - e x A r.
     """
     rx, ry, rz = measurement.reference.tolist()
     expected = times(matrix(state.quaternion), (rx, ry, rz))

@@ -1,13 +1,13 @@
-"""The age that the inertial unit's samples have at their stamp: a constant that the filter estimates.
+"""The age of the inertial unit's samples at their stamp: a constant that the filter estimates.
 
-A line, a driver's buffer or the unit's own filters make a sample older than it says. Held for new, samples
-of a slew lag behind the model, and the loop behind the body. What is older by an age has turned less by rate
-times age, and its rate is off by acceleration times age: so the age shows in the innovations.
+The line, a driver's buffer or the unit's own filters make a sample older than its stamp. Treated as new,
+samples during a slew lag behind the model, and the loop behind the body. A sample of some age has turned less
+by rate times age, and its rate differs by acceleration times age, so the innovations depend on the age.
 
-Attitudes estimate it. A rate sample's acceleration is mostly the coils', which answer to the noise of the
-samples before: to correlate the one with the other would be to identify in closed loop, and in a hold the
-age would walk off with the noise. So by rates it is considered (Schmidt 1966), not estimated: its doubt and
-its correlations count in the gain of all else.
+Attitudes estimate the age. The acceleration at a rate sample comes mostly from the coils, which respond to
+the noise of earlier samples: correlating both would be identification in closed loop, and in a hold the age
+would drift with the noise. For rates the age is therefore considered (Schmidt 1966), not estimated: its
+variance and correlations enter the gains of all other states.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from flight.gnc.estimation.turn import Vector
 from flight.gnc.math.arrays import FloatArray
 
 LONGEST_LATENCY = 0.25
-"""s: an estimate beyond it is no latency."""
+"""s: the largest plausible latency."""
 
 _PUSHES = slice(DISTURBANCE.start, PARAMETERS.stop)
 
 
 class Motion(NamedTuple):
-    """How the rate changes about the time of a sample.
+    """The change of the rate around the time of a sample.
 
-    `acceleration` rad/s^2; `uncertainty` (3, 3) rad^2/s^2 of the rate, from what is not linear in the age.
+    `acceleration` rad/s^2; `uncertainty` (3, 3) rad^2/s^2 of the rate, from effects not linear in the age.
     """
 
     acceleration: Vector
@@ -40,22 +40,22 @@ class Motion(NamedTuple):
 def motion(before: Linearised, after: Linearised, disturbance: Vector, covariance: FloatArray) -> Motion:
     """Return how the rate changes with the age, from the model one sigma of the age to either side.
 
-    A command that begins or ends between them makes a bend, of which half the difference is taken for noise;
-    so is age times acceleration where neither is known.
+    A command that begins or ends between them makes a bend, half of whose difference is treated as noise; so
+    is the product of the errors of age and acceleration.
     """
     pairs = zip(before.acceleration, after.acceleration, disturbance, strict=True)
     x, y, z = (0.5 * (a + b) + d for a, b, d in pairs)
     bend = 0.5 * (np.array(after.acceleration) - before.acceleration)
     by_parameters = 0.5 * (np.array(before.by_parameters) + after.by_parameters)
     rows = np.hstack([np.eye(3), by_parameters])
-    doubt = rows @ covariance[_PUSHES, _PUSHES] @ rows.T
-    return Motion((x, y, z), covariance[LATENCY, LATENCY] * (doubt + np.outer(bend, bend)))
+    spread = rows @ covariance[_PUSHES, _PUSHES] @ rows.T
+    return Motion((x, y, z), covariance[LATENCY, LATENCY] * (spread + np.outer(bend, bend)))
 
 
 def aged(more: float, change: Vector, value: Vector, rows: FloatArray) -> tuple[Vector, FloatArray]:
-    """Return innovation and rows of a sample of what changes by `change` a second.
+    """Return innovation and rows, corrected for age, of a quantity that changes by `change` per second.
 
-    `more` is by how many s the age believed now differs from that made up for in the sample's time.
+    `more` is the estimated age now less the age already subtracted from the sample's stamp, s.
     """
     x, y, z = change
     rows = rows.copy()
@@ -64,7 +64,7 @@ def aged(more: float, change: Vector, value: Vector, rows: FloatArray) -> tuple[
 
 
 def considered(gain: FloatArray) -> FloatArray:
-    """Return the gain of a measurement that is not to estimate the age."""
+    """Return the gain of a measurement that does not estimate the age."""
     gain = gain.copy()
     gain[LATENCY] = 0.0
     return gain

@@ -1,7 +1,7 @@
-"""What the filter takes in: attitudes, rates of the gyro, mean rates, directions, fields; each with its time.
+"""The filter's measurements: attitudes, gyro rates, mean rates, directions, fields; each with its time.
 
-`latency` is for a unit whose samples are older than their stamp says, by how much the filter is estimating:
-the s that have been taken off the stamp to make `time_ns`. None: the time is known.
+`latency` is for a unit whose samples are older than their stamps by an age that the filter estimates: the s
+that were subtracted from the stamp to give `time_ns`. None: the time is known.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class RateMeasurement:
 class MeanRateMeasurement:
     """The mean body rate (3,) rad/s of an exposure, free of the gyro's bias, and its covariance (3, 3).
 
-    It is the one constant rate that turns the attitude at `since_ns` into that at `time_ns`.
+    The constant rate that turns the attitude at `since_ns` into that at `time_ns`.
     """
 
     since_ns: int
@@ -61,10 +61,10 @@ class MeanRateMeasurement:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DirectionMeasurement:
-    """A direction seen from the body: of the Sun, of nadir.
+    """A direction observed from the body, such as of the Sun or nadir.
 
     `observed` (3,) in body axes and `reference` (3,) in reference axes are unit vectors; `covariance` (3, 3)
-    rad^2 is of the observed in body axes, and what it holds along the direction does not count.
+    rad^2 is of `observed` in body axes; its part along the direction has no effect.
     """
 
     time_ns: int
@@ -80,9 +80,9 @@ class DirectionMeasurement:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FieldMeasurement:
-    """A magnetometer's `field` (3,) T in body axes, bias included, where a model has `reference` (3,) T.
+    """A magnetometer's `field` (3,) T in body axes, bias included, and the model's `reference` (3,) T.
 
-    `covariance` (3, 3) T^2, body axes, is of noise that is new each time; what stays is the filter's to find.
+    `covariance` (3, 3) T^2, body axes, is of white noise; the filter estimates the constant part.
     """
 
     time_ns: int

@@ -1,10 +1,10 @@
-"""The correction of a multiplicative extended Kalman filter, and the attitudes of the past that it keeps.
+"""The correction of a multiplicative extended Kalman filter, and the past attitudes that it keeps.
 
-The error of the attitude is a small turn about the body's axes (Lefferts, Markley and Shuster 1982), put into
-the quaternion at each correction and taken out of the covariance with the frame it was written in (Markley
-and Crassidis 2014, 6.2.4: the reset). The rate is a state of its own, driven by Euler's equation and not by
-the gyro: what the plant model knows makes the rate better than the gyro's. Attitudes of the past that are
-still needed stand behind the state (stochastic cloning, Roumeliotis and Burdick 2002).
+The error of the attitude is a small turn about the body's axes (Lefferts, Markley and Shuster 1982), moved
+into the quaternion at each correction; the covariance is then rotated to the new axes (Markley and Crassidis
+2014, 6.2.4: the reset). The rate is a state driven by Euler's equation instead of the gyro, because the plant
+model makes it better than the gyro's. Past attitudes that are still needed are appended to the state
+(stochastic cloning, Roumeliotis and Burdick 2002).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from flight.gnc.math.arrays import FloatArray
 
 
 def normalised_square(found: Innovation, covariance: FloatArray) -> tuple[float, FloatArray]:
-    """Return y^T S^-1 y, chi-square of as many degrees as y has components, and the gain P H^T S^-1."""
+    """Return y^T S^-1 y, a chi-square with the degrees of freedom of y, and the gain P H^T S^-1."""
     cross = covariance @ found.rows.T
     weight = _inverted(found.rows @ cross + found.noise)
     y = np.array(found.value)
@@ -31,11 +31,11 @@ def normalised_square(found: Innovation, covariance: FloatArray) -> tuple[float,
 def correct(
     state: State, covariance: FloatArray, found: Innovation, gain: FloatArray
 ) -> tuple[State, FloatArray]:
-    """Put the correction into the state; covariance in Joseph's form, symmetric and positive."""
+    """Return the corrected state and covariance, by Joseph's form, symmetric and positive."""
     keep = -(gain @ found.rows)
     keep.reshape(-1)[:: len(keep) + 1] += 1.0
     error = (gain @ np.array(found.value)).tolist()
-    # The reset: the turn that is left is written in axes turned by half the correction.
+    # The reset: the remaining turn refers to axes turned by half the correction.
     for first in (0, *range(SIZE, len(covariance), 3)):
         x, y, z = error[first : first + 3]
         reset = np.array(((1.0, 0.5 * z, -0.5 * y), (-0.5 * z, 1.0, 0.5 * x), (0.5 * y, -0.5 * x, 1.0)))
@@ -62,7 +62,7 @@ def correct(
 def keep_attitude(
     state: State, covariance: FloatArray, measurement: MeanRateMeasurement
 ) -> tuple[State, FloatArray]:
-    """Keep the attitude of now for the end of the exposure that begins here."""
+    """Append the present attitude, for the end of the exposure that begins now."""
     pick = [*range(len(covariance)), 0, 1, 2]
     kept = (*state.kept, (measurement, state.quaternion))
     return state._replace(kept=kept), covariance[np.ix_(pick, pick)]
@@ -71,7 +71,7 @@ def keep_attitude(
 def release_attitude(
     state: State, covariance: FloatArray, measurement: MeanRateMeasurement
 ) -> tuple[State, FloatArray]:
-    """Forget the attitude that was kept for this exposure."""
+    """Remove the attitude that was kept for this exposure."""
     place = place_of(state, measurement)
     first = SIZE + 3 * place
     pick = [*range(first), *range(first + 3, len(covariance))]

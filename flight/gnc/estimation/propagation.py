@@ -1,6 +1,6 @@
-"""How state and covariance are carried over time: Euler's equation, and the walks of what is not modelled.
+"""Propagates state and covariance: Euler's equation, and random walks of what is not modelled.
 
-The error of the attitude is a small turn about the body's axes; attitudes kept stay what they were.
+The error of the attitude is a small turn about the body's axes; kept attitudes do not change.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from flight.gnc.estimation.turn import Vector, compose, exponential
 from flight.gnc.math.arrays import FloatArray
 
 LONGEST_STEP = 0.025
-"""s: also without measurements no step is longer than in the testbed's loop, unless the filter is told so."""
+"""s: the default limit of a step, the period of the testbed's loop."""
 
 
 class ProcessNoise(NamedTuple):
-    """What drives the state beside the model: spectral densities.
+    """Spectral densities of the process noise.
 
-    `current` of one driven coil, A^2 s; `rate` (3, 3) rad^2/s^3; `walks` (6,) of bias (rad^2/s^3)
-    and disturbance (rad^2/s^5); `latency` of that, s; `field_bias` of that, T^2/s; `unknown_current` of each
-    coil while it is not known what they do, A^2 s.
+    `current` of one driven coil, A^2 s; `rate` (3, 3) rad^2/s^3; `walks` (6,) of bias (rad^2/s^3) and
+    disturbance (rad^2/s^5); `latency` s; `field_bias` T^2/s; `unknown_current` of each coil while its current
+    is not known, A^2 s.
     """
 
     current: float
@@ -36,7 +36,7 @@ class ProcessNoise(NamedTuple):
     unknown_current: float = 0.0
 
 
-def carry(
+def propagate(
     body: RigidBody,
     noise: ProcessNoise,
     state: State,
@@ -45,7 +45,7 @@ def carry(
     duration: float,
     longest_step: float = LONGEST_STEP,
 ) -> tuple[State, FloatArray]:
-    """Carry state and covariance over `duration` s under one torquing, no step above `longest_step` s."""
+    """Propagate over `duration` s under one torquing, in steps of at most `longest_step` s."""
     steps = max(1, math.ceil(duration / longest_step - 1e-9))
     for _ in range(steps):
         state, covariance = _step(body, noise, state, covariance, torquing, duration / steps)
@@ -60,14 +60,14 @@ def _step(
     torquing: Torquing,
     dt: float,
 ) -> tuple[State, FloatArray]:
-    """Carry by one step of the midpoint rule; kept attitudes stay what they were."""
+    """Propagate by one step of the midpoint rule; kept attitudes do not change."""
     half = 0.5 * dt
     wx, wy, wz = state.rate
     middle = compose(exponential(half * wx, half * wy, half * wz), state.quaternion)
     model = body.linearise(middle, state.rate, state.parameters, torquing, half)
     ax, ay, az = (a + d for a, d in zip(model.acceleration, state.disturbance, strict=True))
     moved = exponential(dt * (wx + half * ax), dt * (wy + half * ay), dt * (wz + half * az))
-    carried = State(
+    propagated = State(
         compose(moved, state.quaternion),
         (wx + dt * ax, wy + dt * ay, wz + dt * az),
         state.bias,
@@ -85,7 +85,7 @@ def _step(
     else:
         covariance = transition @ covariance @ transition.T
     _add_noise(covariance, noise, model.by_current, torquing, dt)
-    return carried, covariance
+    return propagated, covariance
 
 
 def _transition(rate: Vector, model: Linearised, dt: float) -> FloatArray:
@@ -102,7 +102,7 @@ def _transition(rate: Vector, model: Linearised, dt: float) -> FloatArray:
 def _add_noise(
     covariance: FloatArray, noise: ProcessNoise, by_current: FloatArray, torquing: Torquing, dt: float
 ) -> None:
-    """Add what white angular acceleration and the two walks make in dt, in place."""
+    """Add the effect of white angular acceleration and the random walks over dt, in place."""
     density = noise.rate
     if noise.current and any(torquing.driven):
         density = density + noise.current * ((by_current * torquing.driven) @ by_current.T)

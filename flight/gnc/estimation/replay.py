@@ -1,7 +1,7 @@
-"""Measurements applied one after another from a checkpoint on: at once, or a few at a time.
+"""Applies measurements in order of time from a checkpoint on, at once or a few at a time.
 
-A measurement that comes late makes all those after it be applied once more. A second of them costs more than
-a control cycle has, so the work can be spread over cycles while the filter goes on as it was.
+After a late measurement all later ones are applied again. A second of them costs more than the time of a
+control cycle, so the work can be spread over cycles while the filter continues unchanged.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from flight.gnc.estimation.innovation import innovation
 from flight.gnc.estimation.latency import Motion, considered, motion
 from flight.gnc.estimation.measurements import MeanRateMeasurement, Measurement, RateMeasurement
 from flight.gnc.estimation.mekf import correct, keep_attitude, normalised_square, release_attitude
-from flight.gnc.estimation.propagation import ProcessNoise, carry
+from flight.gnc.estimation.propagation import ProcessNoise, propagate
 from flight.gnc.estimation.rigid_body import RigidBody
 from flight.gnc.estimation.state import SIZE, State
 from flight.gnc.math.arrays import FloatArray
@@ -41,7 +41,7 @@ class Checkpoint:
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """What carries a state on: the body, its noise and its commands; `gate` by a measurement's numbers."""
+    """The model of propagation: body, noise and commands; `gate` by a measurement's degrees of freedom."""
 
     body: RigidBody
     noise: ProcessNoise
@@ -52,15 +52,15 @@ class Model:
     def propagate(
         self, state: State, covariance: FloatArray, from_ns: int, to_ns: int
     ) -> tuple[State, FloatArray]:
-        """Carry state and covariance over the commands in force between two times, forward only."""
+        """Propagate state and covariance over the commands in force between two times, forward only."""
         for torquing, span_ns in self.commands.spans(from_ns, to_ns):
-            state, covariance = carry(
+            state, covariance = propagate(
                 self.body, self.noise, state, covariance, torquing, span_ns * 1e-9, self.longest_step
             )
         return state, covariance
 
     def motion(self, state: State, covariance: FloatArray, time_ns: int) -> Motion:
-        """Return how the rate changes about the time of a sample whose age is not known for sure."""
+        """Return how the rate changes around the time of a sample whose age is estimated."""
         half_ns = round(0.5e9 * math.sqrt(covariance[LATENCY, LATENCY]))
         before, after = (
             self.body.linearise(
@@ -72,38 +72,38 @@ class Model:
 
 
 class Replay:
-    """Applies measurements in order of time; `taken` are the checkpoints that they make."""
+    """Applies measurements in order of time; `checkpoints` are the results so far."""
 
     def __init__(self, model: Model, start: Checkpoint, measurements: Sequence[Measurement]) -> None:
         self._model = model
         self._state, self._covariance, self._time_ns = start.state, start.covariance, start.time_ns
         self._pending = deque(measurements)
-        # Exposures that have yet to begin, the first one last.
+        # Exposures that have not begun yet, the first one last.
         self._exposures = [m for m in measurements if isinstance(m, MeanRateMeasurement)]
         self._exposures.sort(key=lambda m: m.since_ns, reverse=True)
-        self.taken: list[Checkpoint] = []
+        self.checkpoints: list[Checkpoint] = []
 
     @property
     def done(self) -> bool:
-        """Whether none is left."""
+        """Whether all measurements are applied."""
         return not self._pending
 
     def add(self, measurement: Measurement) -> None:
-        """Put one more at the end: it is no older than the others, and no mean over an exposure."""
+        """Append a measurement that is not older than the others and not a mean over an exposure."""
         self._pending.append(measurement)
 
-    def go_on(self, most: int | None = None) -> None:
-        """Apply the next `most` measurements, or all that are left."""
+    def advance(self, most: int | None = None) -> None:
+        """Apply the next `most` measurements, or all remaining."""
         for _ in range(len(self._pending) if most is None else min(most, len(self._pending))):
-            self._take(self._pending.popleft())
+            self._ingest(self._pending.popleft())
 
-    def _take(self, measurement: Measurement) -> None:
+    def _ingest(self, measurement: Measurement) -> None:
         model = self._model
         while self._exposures and self._exposures[-1].since_ns <= measurement.time_ns:
             exposure = self._exposures.pop()
-            self._carry_to(exposure.since_ns)
+            self._propagate_to(exposure.since_ns)
             self._state, self._covariance = keep_attitude(self._state, self._covariance, exposure)
-        self._carry_to(measurement.time_ns)
+        self._propagate_to(measurement.time_ns)
         state, covariance = self._state, self._covariance
         aging = None
         if isinstance(measurement, RateMeasurement) and measurement.latency is not None:
@@ -119,9 +119,9 @@ class Replay:
             state, covariance = release_attitude(state, covariance, measurement)
         self._state, self._covariance = state, covariance
         alone = state._replace(kept=()) if state.kept else state
-        self.taken.append(Checkpoint(measurement, used, alone, covariance[:SIZE, :SIZE], nis))
+        self.checkpoints.append(Checkpoint(measurement, used, alone, covariance[:SIZE, :SIZE], nis))
 
-    def _carry_to(self, time_ns: int) -> None:
+    def _propagate_to(self, time_ns: int) -> None:
         self._state, self._covariance = self._model.propagate(
             self._state, self._covariance, self._time_ns, time_ns
         )

@@ -1,9 +1,9 @@
-"""The rigid body that the filter believes in: Euler's equation under coils in a known field, and a thread.
+"""The filter's model of the rigid body: Euler's equation under coils in a known field, and a thread.
 
-J w' = -w x J w + m x A(q) B + thread (Sease 5.2 corrected), m the coils' dipole moment. Hung on the testbed's
-thread the body turns about its y axis alone: the constraint's torques take what is not about y, so the
-response to a torque T is T_y / J22 about y and nothing else, and the thread adds -k theta - c w (5.4). The
-parameters that the filter may be estimating are handed in.
+J w' = -w x J w + m x A(q) B + thread (Sease 5.2 corrected), m the coils' dipole moment. On the testbed's
+thread the body turns about its y axis alone: the constraint balances all other torques, so the response to a
+torque T is T_y / J22 about y only, and the thread adds -k theta - c w (5.4). The parameters that the filter
+may estimate are arguments.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from flight.gnc.math.arrays import FloatArray
 
 
 class Parameters(NamedTuple):
-    """What is not known for sure of the model, and may be estimated.
+    """Uncertain parameters of the model, which may be estimated.
 
     Attributes:
         torsion: 1/s^2, k / J22 of the thread.
         damping: 1/s, c / J22 of the thread.
-        gain: true over believed acceleration by the coils: of their dipole times the field over the inertia.
+        gain: true over modelled acceleration by the coils (dipole times field over inertia).
     """
 
     torsion: float = 0.0
@@ -39,9 +39,9 @@ NOMINAL = Parameters()
 
 @dataclass(frozen=True, slots=True)
 class Torquing:
-    """What the coils do: dipole moment (body, A m^2) in a field (reference, T); which of them are driven.
+    """The action of the coils: dipole moment (body, A m^2) in a field (reference, T); which are driven.
 
-    What they do is not `known` where the PWM chip does not answer to its commands: any of them may be driven.
+    Not `known` while the PWM chip does not respond to commands: any coil may then be driven.
     """
 
     dipole: Vector
@@ -51,10 +51,10 @@ class Torquing:
 
 
 class Linearised(NamedTuple):
-    """Angular acceleration w' (rad/s^2) and how it changes.
+    """Angular acceleration w' (rad/s^2) and its derivatives.
 
     `by_turn` and `by_rate` (3, 3) are its derivatives by a small turn about the body's axes and by the rate;
-    `by_current` (3, 3) rad/s^2/A is what each coil adds, `by_parameters` (3, 3) the derivatives by torsion,
+    `by_current` (3, 3) rad/s^2/A are those by the coils' currents, `by_parameters` (3, 3) those by torsion,
     damping and gain.
     """
 
@@ -67,14 +67,14 @@ class Linearised(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigidBody:
-    """The constants of the body and of its surroundings.
+    """The constants of the body, its coils, the field and the thread.
 
     Attributes:
         inertia: (3, 3) kg m^2, body axes.
         dipole_per_ampere: n A of each coil, m^2.
-        field: (3,) T, reference axes; a command may tell another.
+        field: (3,) T, reference axes; a command may give another.
         suspended: on the thread, free to turn about body y only.
-        stiffness: k of the thread, N m/rad, as far as it is known.
+        stiffness: k of the thread, N m/rad, nominal.
         damping: c, N m s/rad, likewise.
     """
 
@@ -89,7 +89,7 @@ class RigidBody:
     _inertia: Matrix = dataclasses.field(init=False)
 
     def __post_init__(self) -> None:
-        """Refuse what no body has; raises UsageError."""
+        """Raise UsageError for constants that no body has."""
         inertia = np.asarray(self.inertia, dtype=float)
         if inertia.shape != (3, 3) or not np.all(np.isfinite(inertia)):
             raise UsageError(f"inertia {inertia.tolist()} must be (3, 3) and finite")
@@ -113,7 +113,7 @@ class RigidBody:
     def torquing(
         self, currents: FloatArray, reference_field: FloatArray | None = None, known: bool = True
     ) -> Torquing:
-        """Return what `currents` (3,) A do in `reference_field` (3,) T, by default the body's own."""
+        """Return the torquing of `currents` (3,) A in `reference_field` (3,) T, by default the body's own."""
         x, y, z = (float(i) for i in currents)
         bx, by, bz = (float(b) for b in (self.field if reference_field is None else reference_field))
         n = self.dipole_per_ampere
@@ -121,7 +121,7 @@ class RigidBody:
 
     @property
     def parameters(self) -> Parameters:
-        """What is believed of them."""
+        """The nominal parameters."""
         return Parameters(self.stiffness * self._response[1][1], self.damping * self._response[1][1])
 
     def linearise(
@@ -129,8 +129,8 @@ class RigidBody:
     ) -> Linearised:
         """Return the acceleration under `torquing` at attitude q, with its derivatives.
 
-        The gyroscopic torque is that of the rate `ahead` s later, which it changes itself: second order for
-        a body that tumbles.
+        The gyroscopic torque is taken at the rate `ahead` s later, which makes it second order for a body
+        that tumbles.
         """
         torque_free = times(self._response, self._gyroscopic(rate))
         rate = (

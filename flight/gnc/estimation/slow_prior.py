@@ -1,4 +1,4 @@
-"""What the filter believes, before its first measurement, of what changes slowly or not at all."""
+"""The filter's prior of the states that change slowly or not at all."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ def _known(size: int) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlowPrior:
-    """Values and covariances; a variance of zero stands for what is known and not estimated.
+    """Values and covariances; a variance of zero means known and not estimated.
 
     Attributes:
         bias: (3,) rad/s of the gyro, and `bias_covariance` (3, 3).
         parameters: of the model, and `parameters_covariance` (3, 3).
-        latency: s, by which the inertial unit's samples are older than they say, and `latency_variance`.
+        latency: s, age of the inertial unit's samples at their stamp, and `latency_variance`.
     """
 
     bias: FloatArray = dataclasses.field(default_factory=lambda: np.zeros(3))

@@ -1,4 +1,4 @@
-"""What the filter believes at one time, as tuples, and where its parts stand in the error's covariance."""
+"""The filter's state at one time, as tuples."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from flight.gnc.estimation.rigid_body import Parameters
 from flight.gnc.estimation.turn import Quaternion, Vector
 
 SIZE = 19
-"""Of the error: see `flight.gnc.estimation.estimate` for its parts."""
+"""Size of the error state; `flight.gnc.estimation.estimate` names its parts."""
 
 
 class State(NamedTuple):
-    """The estimate; `kept` are attitudes at starts of exposures, as they came.
+    """The estimate; `kept` are attitudes at the starts of exposures, in order of time.
 
-    `latency` is by how much the inertial unit's samples are older than they say, s; `field_bias` what the
-    magnetometer reads too much, T, body axes.
+    `latency` is the age of the inertial unit's samples at their stamp, s; `field_bias` the magnetometer's
+    bias, T, body axes.
     """
 
     quaternion: Quaternion
@@ -30,5 +30,5 @@ class State(NamedTuple):
 
 
 def place_of(state: State, measurement: MeanRateMeasurement) -> int:
-    """Return which of the attitudes kept is the one at the start of this exposure."""
+    """Return the index of the kept attitude at the start of this exposure."""
     return next(place for place, (owner, _) in enumerate(state.kept) if owner is measurement)

@@ -1,7 +1,7 @@
-"""Turns on tuples of floats: the algebra of `gnc.math.quaternion` for what runs many times in a cycle.
+"""Rotations as tuples of floats: the algebra of `gnc.math.quaternion` for code that runs often in a cycle.
 
-Same conventions (scalar last, A(compose(p, q)) = A(p) A(q)), held to that module by a test; numpy's cost of a
-call on three or four numbers is ten times the arithmetic.
+Same conventions (scalar last, A(compose(p, q)) = A(p) A(q)), compared with that module by a test; a numpy
+call on three or four numbers costs ten times the arithmetic.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ Matrix = tuple[Vector, Vector, Vector]
 
 
 def compose(p: Quaternion, q: Quaternion) -> Quaternion:
-    """Return the turn q followed by p, of unit length."""
+    """Return the rotation q followed by p, of unit length."""
     p1, p2, p3, p4 = p
     q1, q2, q3, q4 = q
     a = p4 * q1 + p3 * q2 - p2 * q3 + p1 * q4
@@ -31,10 +31,10 @@ def inverse(q: Quaternion) -> Quaternion:
 
 
 def exponential(x: float, y: float, z: float) -> Quaternion:
-    """Return the turn by the rotation vector (x, y, z), rad."""
+    """Return the rotation by the rotation vector (x, y, z), rad."""
     square = 0.25 * (x * x + y * y + z * z)
     half = math.sqrt(square)
-    # Below 1e-4 rad the next term of the series, x^4/120, is under the rounding.
+    # Below 1e-4 rad the next term of the series, x^4/120, is below rounding.
     scale = 0.5 * (math.sin(half) / half if half > 1e-4 else 1.0 - square / 6.0)
     return scale * x, scale * y, scale * z, math.cos(half)
 
@@ -48,7 +48,7 @@ def logarithm(q: Quaternion) -> Vector:
 
 
 def twist(q: Quaternion) -> float:
-    """Return the turn about the y axis that q holds, rad, [-pi, pi]."""
+    """Return the angle of q about the y axis, rad, in [-pi, pi]."""
     return 2.0 * math.atan2(q[1], q[3]) if q[3] >= 0.0 else 2.0 * math.atan2(-q[1], -q[3])
 
 

@@ -21,8 +21,9 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from flight.gnc.estimation.attitude_filter import AttitudeFilter, FilterSettings
+from flight.gnc.estimation.attitude_filter import AttitudeFilter
 from flight.gnc.estimation.estimate import Estimate
+from flight.gnc.estimation.filter_settings import FilterSettings
 from flight.gnc.estimation.measurements import Measurement
 from flight.gnc.estimation.rigid_body import RigidBody
 from flight.gnc.math.arrays import FloatArray, IntArray

@@ -19,8 +19,9 @@ from scipy.special import chdtri
 
 from flight.gnc.attitude.determination.single_frame import Sight, field_sight, optimum
 from flight.gnc.attitude.wahba import AttitudeError, AttitudeFix
-from flight.gnc.estimation.attitude_filter import AttitudeFilter, FilterSettings
+from flight.gnc.estimation.attitude_filter import AttitudeFilter
 from flight.gnc.estimation.estimate import FIELD_BIAS, TURN, Estimate
+from flight.gnc.estimation.filter_settings import FilterSettings
 from flight.gnc.estimation.measurements import (
     AttitudeMeasurement,
     DirectionMeasurement,

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.estimation.attitude_filter import AttitudeFilter, FilterSettings
+from flight.gnc.estimation.attitude_filter import AttitudeFilter
+from flight.gnc.estimation.filter_settings import FilterSettings
 from flight.gnc.estimation.measurements import AttitudeMeasurement, RateMeasurement
 from flight.gnc.estimation.rigid_body import Parameters, RigidBody
 from flight.gnc.math.arrays import FloatArray

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flight.gnc.estimation.attitude_filter import AttitudeFilter, FilterSettings
+from flight.gnc.estimation.attitude_filter import AttitudeFilter
+from flight.gnc.estimation.filter_settings import FilterSettings
 from flight.gnc.estimation.measurements import (
     AttitudeMeasurement,
     MeanRateMeasurement,
@@ -64,7 +65,7 @@ def test_the_estimate_is_that_of_measurements_put_in_at_once(at_a_time: int) -> 
     for measurement in _frame():
         assert at_once.measure(measurement)
     told: list[list[bool]] = []
-    in_turn.measure_in_turn(_frame(), told.append)
+    in_turn.measure_late(_frame(), told.append)
     for measurement in _samples(80, 120):
         at_once.measure(measurement)
         in_turn.measure(measurement)
@@ -79,7 +80,7 @@ def test_the_estimate_is_that_of_measurements_put_in_at_once(at_a_time: int) -> 
 
 def test_until_it_is_done_the_estimate_is_that_without_the_late_ones() -> None:
     plain, in_turn = _begun(), _begun()
-    in_turn.measure_in_turn(_frame(), lambda used: pytest.fail(f"told {used} too early"))
+    in_turn.measure_late(_frame(), lambda used: pytest.fail(f"told {used} too early"))
     in_turn.catch_up(10)
     now_ns = 80 * PERIOD_NS
     assert np.array_equal(plain.at(now_ns).covariance, in_turn.at(now_ns).covariance)
@@ -89,7 +90,7 @@ def test_a_late_one_that_cannot_be_is_refused_and_costs_nothing() -> None:
     plain, in_turn = _begun(), _begun()
     told: list[list[bool]] = []
     mean_rate, _ = _frame(rate=5.0 * RATE)
-    in_turn.measure_in_turn([mean_rate], told.append)
+    in_turn.measure_late([mean_rate], told.append)
     in_turn.catch_up()
     assert told == [[False]]
     assert in_turn.refused == 1
@@ -100,14 +101,14 @@ def test_a_late_one_that_cannot_be_is_refused_and_costs_nothing() -> None:
 def test_one_from_before_all_that_is_remembered_is_refused_at_once() -> None:
     in_turn = AttitudeFilter(BODY, SETTINGS)
     told: list[list[bool]] = []
-    in_turn.measure_in_turn(_frame(), told.append)
+    in_turn.measure_late(_frame(), told.append)
     assert told == [[False, False]]
 
 
 def test_a_filter_that_starts_anew_tells_that_the_late_ones_were_not_used() -> None:
     in_turn = _begun()
     told: list[list[bool]] = []
-    in_turn.measure_in_turn(_frame(), told.append)
+    in_turn.measure_late(_frame(), told.append)
     for number in range(80, 200):
         turned = AttitudeMeasurement(number * PERIOD_NS, about_axis_y(1.5), np.eye(3) * 4e-6)
         if in_turn.started:

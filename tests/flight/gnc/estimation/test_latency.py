@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flight.gnc.estimation.attitude_filter import AttitudeFilter, FilterSettings
+from flight.gnc.estimation.attitude_filter import AttitudeFilter
 from flight.gnc.estimation.estimate import LATENCY, Estimate
+from flight.gnc.estimation.filter_settings import FilterSettings
 from flight.gnc.estimation.latency import LONGEST_LATENCY, motion
 from flight.gnc.estimation.measurements import RateMeasurement
 from flight.gnc.math.quaternion import angle_about_axis_y

@@ -12,7 +12,7 @@ from flight.gnc.estimation.innovation import innovation
 from flight.gnc.estimation.latency import Motion
 from flight.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement, RateMeasurement
 from flight.gnc.estimation.mekf import correct, keep_attitude, normalised_square, release_attitude
-from flight.gnc.estimation.propagation import ProcessNoise, carry
+from flight.gnc.estimation.propagation import ProcessNoise, propagate
 from flight.gnc.estimation.rigid_body import Parameters
 from flight.gnc.estimation.state import SIZE, State
 from flight.gnc.estimation.turn import compose, exponential, inverse, logarithm
@@ -60,10 +60,10 @@ def test_the_transition_is_how_errors_grow() -> None:
         step = 1e-5
         for column in free:
             bump = step * np.eye(SIZE)[column]
-            up, _ = carry(body, STILL, moved(state, bump), np.eye(SIZE), TORQUING, 0.025)
-            down, _ = carry(body, STILL, moved(state, -bump), np.eye(SIZE), TORQUING, 0.025)
+            up, _ = propagate(body, STILL, moved(state, bump), np.eye(SIZE), TORQUING, 0.025)
+            down, _ = propagate(body, STILL, moved(state, -bump), np.eye(SIZE), TORQUING, 0.025)
             covariance = np.outer(bump, bump) / step**2
-            _, carried = carry(body, STILL, state, covariance, TORQUING, 0.025)
+            _, carried = propagate(body, STILL, state, covariance, TORQUING, 0.025)
             # The square root of a covariance of rank one is the column, but for its sign.
             grown = difference(up, down) / (2.0 * step)
             np.testing.assert_allclose(carried, np.outer(grown, grown), atol=3e-5)
@@ -77,7 +77,7 @@ def test_the_process_noise_is_what_random_currents_and_walks_make() -> None:
     noise = ProcessNoise(sigma**2 * dt, np.zeros((3, 3)), np.repeat([bias_walk**2, walk**2], 3))
     still = State((0.0, 0.0, 0.0, 1.0), (0.0,) * 3, (0.0,) * 3, (0.0,) * 3, Parameters())
     torquing = FREE.torquing(np.full(3, 1e-9))
-    _, covariance = carry(FREE, noise, still, np.zeros((SIZE, SIZE)), torquing, cycles * dt)
+    _, covariance = propagate(FREE, noise, still, np.zeros((SIZE, SIZE)), torquing, cycles * dt)
     per_ampere = FREE.linearise(still.quaternion, still.rate, Parameters(), torquing, 0.0).by_current
     turn, rate, push = (np.zeros((draws, 3)) for _ in range(3))
     for _ in range(cycles):
@@ -154,7 +154,7 @@ def test_the_covariance_stays_symmetric_and_positive(seed: int) -> None:
             felt = np.array(state.rate) + np.array(state.bias)
             found = innovation(state, RateMeasurement(0, felt, size * np.eye(3)), False)
         state, covariance = correct(state, covariance, found, normalised_square(found, covariance)[1])
-        state, covariance = carry(FREE, noise, state, covariance, TORQUING, 0.025)
+        state, covariance = propagate(FREE, noise, state, covariance, TORQUING, 0.025)
         np.testing.assert_allclose(covariance, covariance.T, rtol=1e-9, atol=1e-12 * covariance.max())
         scale = np.sqrt(np.diag(covariance))
         assert np.linalg.eigvalsh(covariance / np.outer(scale, scale))[0] > -1e-9

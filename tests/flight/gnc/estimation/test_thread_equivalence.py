@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from flight.bodies.testbed.thread_estimate import about_thread
-from flight.gnc.estimation.attitude_filter import AttitudeFilter, FilterSettings
+from flight.gnc.estimation.attitude_filter import AttitudeFilter
+from flight.gnc.estimation.filter_settings import FilterSettings
 from flight.gnc.estimation.measurements import (
     AttitudeMeasurement,
     MeanRateMeasurement,

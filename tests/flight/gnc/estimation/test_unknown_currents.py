@@ -36,7 +36,7 @@ def told(flown: Flight, doubted: bool) -> tuple[AttitudeFilter, int]:
     refused = filter_.refused
     assert refused > 0, "half a second of it was enough to disagree"
     if doubted:
-        filter_.doubt((STUCK - 4) * CYCLE_NS)
+        filter_.mark_unknown((STUCK - 4) * CYCLE_NS)
     for cycle in range(FOUND, END):
         filter_.catch_up(16)
         for sample in flown.samples[cycle]:
@@ -70,8 +70,8 @@ def test_not_told_it_refuses_what_it_measures_and_begins_anew(flown: Flight) -> 
 def test_a_doubt_reaches_back_to_its_time_and_no_further() -> None:
     history = CommandHistory(SUSPENDED, 6_000_000_000)
     for second in range(5):
-        history.note(second * 1_000_000_000, np.array([0.01 * second, 0.0, 0.0]), None)
-    history.doubt(2_500_000_000)
+        history.record(second * 1_000_000_000, np.array([0.01 * second, 0.0, 0.0]), None)
+    history.mark_unknown(2_500_000_000)
     assert [(history.at(t).dipole[0] > 0.0, history.at(t).known) for t in (1_000_000_000, 2_499_999_999)] == [
         (True, True),
         (True, True),
@@ -82,5 +82,5 @@ def test_a_doubt_reaches_back_to_its_time_and_no_further() -> None:
 
 def test_a_doubt_before_anything_was_noted_or_measured_does_nothing() -> None:
     filter_ = AttitudeFilter(SUSPENDED, SETTINGS)
-    filter_.doubt(0)
+    filter_.mark_unknown(0)
     assert not filter_.started

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.gnc.estimation.attitude_filter import AttitudeFilter, slow_prior
+from flight.gnc.estimation.attitude_filter import AttitudeFilter
 from flight.gnc.estimation.estimate import PARAMETERS, Estimate
+from flight.gnc.estimation.filter_settings import slow_prior
 from flight.gnc.estimation.rigid_body import Parameters
 from flight.gnc.math.arrays import FloatArray
 from flight.link import events
