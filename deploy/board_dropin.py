@@ -1,8 +1,7 @@
-"""Print the drop-in of the units that a configuration needs: its devices, its network, its bus.
+"""Print the drop-in that a configuration needs for a unit: its devices, network and bus.
 
-Run by install.sh with the installed Python: board_dropin.py [--safe] CONFIG; with --safe that of
-knightcube-safe.service, else that of knightcube.service. Exit status 2, and one line, for a configuration
-that is wrong.
+Run by install.sh with the installed Python: board_dropin.py [--safe] CONFIG; with --safe for
+knightcube-safe.service, else for knightcube.service. Exit status 2, and one line, for a wrong configuration.
 """
 
 from __future__ import annotations
@@ -20,30 +19,30 @@ from flight.schema.sections import Config, V4l2Device
 from hal.buses.i2c_bus import device_file
 
 SERIAL, VIDEO, I2C = ("ttyUSB", "ttyACM"), ("video4linux",), ()
-"""Drivers' classes of the devices that may be plugged in after the start, by kind."""
+"""Driver classes of the devices that may be plugged in after the start, by kind."""
 
 
 def dropin(config: Config) -> str:
-    """Return the text for the flight's unit."""
+    """Return the drop-in of the flight's unit."""
     lines = []
     if config.simulation is None:
         awaited = [device_unit(path) for path, _ in _nodes(config)]
         lines += ["[Unit]", *(f"{word}={unit}" for unit in awaited for word in ("Wants", "After"))]
     lines += ["[Service]", *_devices(config)]
     if peers := peer_networks(config.commands):
-        # IPAddressDeny=any of the unit stays: what is not allowed here goes neither in nor out.
+        # IPAddressDeny=any of the unit stays in force for all other addresses, both ways.
         lines += ["PrivateNetwork=no", "RestrictAddressFamilies=AF_INET"]
         lines += [f"IPAddressAllow={peer}" for peer in peers]
     return _text(lines)
 
 
 def safe_dropin(config: Config) -> str:
-    """Return the text for the unit that is left when the flight is given up: it reaches the coils alone."""
+    """Return the drop-in of the safe state's unit, which accesses the coils alone."""
     return _text(["[Service]", *(_bus(config) if config.simulation is None else [])])
 
 
 def device_unit(path: str) -> str:
-    """Return the name of systemd's unit for a device's file (systemd.unit(5), "string escaping")."""
+    """Return the name of systemd's unit of a device file (systemd.unit(5), "string escaping")."""
     kept = {ord(letter) for letter in string.ascii_letters + string.digits + ":_."}
     name = path.strip("/").encode()
     escaped = ["-" if byte == ord("/") else chr(byte) if byte in kept else f"\\x{byte:02x}" for byte in name]
@@ -51,11 +50,11 @@ def device_unit(path: str) -> str:
 
 
 def allowed(path: str, plugged: tuple[str, ...], root: Path = Path("/")) -> list[str]:
-    """Return the DeviceAllow lines of a device's file, a udev name or the node itself.
+    """Return the DeviceAllow lines of a device file, a udev name or the node itself.
 
-    systemd turns a file into one device number when the unit starts. What hangs on USB may come back under
-    another number, ttyUSB1 for ttyUSB0, so it is let through by its driver's class; and so is, by the classes
-    `plugged`, what is not there yet. `root` holds proc and sys.
+    systemd resolves a file to one device number when the unit starts. A USB device may return under another
+    number, ttyUSB1 for ttyUSB0, so its driver's class is allowed; a device that does not exist yet is allowed
+    by the classes `plugged`. `root` holds proc and sys.
     """
     try:
         mode, number = (found := os.stat(path)).st_mode, found.st_rdev
@@ -69,7 +68,7 @@ def allowed(path: str, plugged: tuple[str, ...], root: Path = Path("/")) -> list
 
 
 def _driver_classes(major: int, root: Path) -> tuple[str, ...]:
-    """Return the name of a character device's driver, as /proc/devices has it."""
+    """Return the driver name of a character device from /proc/devices."""
     listed = (root / "proc/devices").read_text(encoding="ascii").partition("Block devices:")[0]
     pairs = (words for line in listed.splitlines() if len(words := line.split()) == 2)
     return tuple(name for number, name in pairs if number == str(major))
@@ -81,14 +80,14 @@ def _text(lines: list[str]) -> str:
 
 
 def _nodes(config: Config) -> list[tuple[str, tuple[str, ...]]]:
-    """Return the files of the configured devices, each with the classes it may be plugged in as."""
+    """Return the files of the configured devices, each with the classes in which it may appear."""
     nodes = [(device_file(config.coils.bus), I2C), (config.inertial_unit.device, SERIAL)]
     camera = config.camera.device if config.camera is not None else None
     return [*nodes, (camera.path, VIDEO)] if isinstance(camera, V4l2Device) else nodes
 
 
 def _devices(config: Config) -> list[str]:
-    """Return what lets the real devices through."""
+    """Return the lines that allow the real devices."""
     if config.simulation is not None:
         return []
     lines = _bus(config)
@@ -102,7 +101,7 @@ def _devices(config: Config) -> list[str]:
 
 
 def _bus(config: Config) -> list[str]:
-    """Return what `coils-off` must know and have."""
+    """Return the lines that `coils-off` needs."""
     i2c = device_file(config.coils.bus)
     return [
         f"Environment=KNIGHTCUBE_I2C={i2c} KNIGHTCUBE_PWM=0x{config.coils.address:02x}",
@@ -111,7 +110,7 @@ def _bus(config: Config) -> list[str]:
 
 
 def main(words: list[str]) -> int:
-    """Print the drop-in of the configuration that the command line names."""
+    """Print the drop-in of a configuration."""
     make = safe_dropin if words[:1] == ["--safe"] else dropin
     try:
         sys.stdout.write(make(load(Path(words[-1]))))

@@ -1,5 +1,5 @@
 #!/bin/sh
-# Install the KnightCube flight software as a systemd service; run again at any time to bring it up to date.
+# Install the KnightCube flight software as a systemd service; run it again to update.
 set -eu
 
 usage() {
@@ -8,22 +8,22 @@ usage: install.sh [--config FILE] [--wheels DIR | --venv DIR] [--python PYTHON] 
        install.sh --accept [--dry-run]
        install.sh --uninstall [--purge] [--dry-run]
 
-  --config FILE   configuration to fly; kept as /etc/knightcube/flight.yaml with its
-                  checksum, and not overwritten (default: config/testbed.yaml)
+  --config FILE   configuration to fly; stored as /etc/knightcube/flight.yaml with its
+                  checksum and never overwritten (default: config/testbed.yaml)
   --wheels DIR    install without a network, from the wheels in DIR
-  --venv DIR      use this virtual environment instead of making one
+  --venv DIR      use this virtual environment, unchanged, instead of making one
   --python PYTHON make the virtual environment with this Python (default python3)
-  --dry-run       say what would be done, do nothing
-  --accept        take /etc/knightcube/flight.yaml as it is now, after it was edited
+  --dry-run       print the steps without doing them
+  --accept        accept /etc/knightcube/flight.yaml after it was edited
   --uninstall     stop and remove the service, the software and the udev rules
-  --purge         with --uninstall: configuration, flight logs, state and user too
+  --purge         with --uninstall: also configuration, flight logs, state and user
 
-What goes where:
-  /opt/knightcube/venv   the software           /etc/knightcube          configuration
+Folders:
+  /opt/knightcube/venv   software, no ground    /etc/knightcube          configuration
   /opt/knightcube/bin    coils-off              /var/lib/knightcube      flight logs, state
   /etc/systemd/system    the units              /etc/udev/rules.d        device names
   /etc/modules-load.d    i2c-dev
-DESTDIR=FOLDER in the environment: into an image that is mounted there, whose user you make.
+DESTDIR=FOLDER in the environment installs into an image mounted there; make its user yourself.
 TEXT
 }
 
@@ -79,7 +79,7 @@ while [ $# -gt 0 ]; do
     shift
 done
 
-# Do a command, or say it.
+# Run a command, or print it in a dry run.
 run() {
     if [ -n "$dry" ]; then
         echo "would run: $*"
@@ -88,17 +88,17 @@ run() {
     fi
 }
 
-# Put a file in place unless the very same is there: nothing is touched by a second run.
+# Install a file unless an identical one is there, so that a second run changes nothing.
 place() {
     if ! cmp -s "$2" "$3" 2>/dev/null; then
         run install -D -m "$1" "$2" "$3"
     fi
 }
 
-# Say what the checksum file of a configuration holds, as sha256sum writes and checks it.
+# Print the checksum file of a configuration, in the format of sha256sum.
 sum_of() { sha256sum <"$1" | sed 's/-$/flight.yaml/'; }
 
-# Refuse what is wrong before the first step is done.
+# Reject wrong options before the first step.
 check_inputs() {
     [ "$action" != uninstall ] || return 0
     [ -z "$purge" ] || fail "--purge goes with --uninstall"
@@ -124,7 +124,7 @@ check_inputs() {
         fail "$flown is not what was accepted: was it edited? Then: install.sh --accept"
 }
 
-# systemd and udev are told where they run; an image that is being built has neither.
+# systemd and udev are reloaded only where they run; an image has neither.
 systemd_runs() { [ -z "$root" ] && [ -d /run/systemd/system ]; }
 
 in_root() { systemctl ${root:+--root="$root"} "$@"; }
@@ -164,6 +164,10 @@ install_software() {
             set --
         fi
         run "$prefix/venv/bin/pip" install --quiet --upgrade --constraint "$source/requirements.lock" "$@" "$source"
+        # The distribution carries the ground tools too, which have no place on a board.
+        for ground in "$prefix"/venv/lib/python3*/site-packages/ground; do
+            [ ! -d "$ground" ] || run rm -rf "$ground"
+        done
     fi
     place 755 "$deploy/coils-off" "$prefix/bin/coils-off"
     place 644 "$source/hal/buses/smbus_byte.py" "$prefix/bin/smbus_byte.py"
@@ -178,7 +182,7 @@ install_settings() {
     fi
     made=$(mktemp -d)
     trap 'rm -rf "$made"' EXIT
-    # First of all these, which refuse a configuration that is wrong.
+    # These come first because they reject a wrong configuration.
     "$python" "$deploy/board_dropin.py" "$flown" >"$made/flight" || exit 2
     "$python" "$deploy/board_dropin.py" --safe "$flown" >"$made/safe" || exit 2
     place 644 "$flown" "$settings/flight.yaml"
@@ -188,12 +192,12 @@ install_settings() {
     place 644 "$made/safe" "$units/knightcube-safe.service.d/board.conf"
     wanted=$(XDG_CACHE_HOME="$cache" "$python" "$deploy/sky_index.py" --wanted "$flown")
     if [ -n "$wanted" ]; then
-        run install -d "$cache" # systemd gives it to its user
+        run install -d "$cache" # systemd hands it to the service's user
         run env XDG_CACHE_HOME="$cache" "$python" "$deploy/sky_index.py" "$flown"
     fi
 }
 
-# Device names are for editing: what was edited since it was put there is kept.
+# The rules are meant to be edited: edited rules are kept.
 install_rules() {
     if [ -e "$rules" ] && [ -e "$shipped" ] && ! cmp -s "$rules" "$shipped"; then
         cmp -s "$deploy/99-knightcube.rules" "$shipped" ||
@@ -204,7 +208,7 @@ install_rules() {
     place 644 "$deploy/99-knightcube.rules" "$shipped"
 }
 
-# The module behind /dev/i2c-*, which nothing else asks for: at each boot, and now.
+# The module behind /dev/i2c-*, which nothing else loads: at each boot, and now.
 install_modules() {
     place 644 "$deploy/modules.conf" "$modules"
     if systemd_runs && [ ! -d /sys/class/i2c-dev ]; then
@@ -245,7 +249,7 @@ say_next() {
     if [ -z "$dry" ]; then
         verb=start
         if systemd_runs && systemctl is-active --quiet knightcube.service; then
-            verb=restart # what flies now is what was there before
+            verb=restart # the previous version is flying
         fi
         echo "$1. Fly: systemctl $verb knightcube    Watch: journalctl -fu knightcube"
     fi
@@ -270,7 +274,7 @@ uninstall_all() {
     [ -n "$dry" ] || echo "uninstalled${purge:+, with configuration, logs and user}"
 }
 
-[ -n "$dry$root" ] || [ "$(id -u)" -eq 0 ] || fail "run it as root (or look with --dry-run)"
+[ -n "$dry$root" ] || [ "$(id -u)" -eq 0 ] || fail "run it as root (or preview with --dry-run)"
 command -v systemctl >/dev/null || fail "no systemd on this machine: fly by hand with python -m flight run"
 check_inputs
 case $action in

@@ -1,7 +1,7 @@
-"""Make the star tracker's sky index, which takes seconds, now and not at the start of a flight.
+"""Build the star tracker's sky index at installation, because it takes seconds at the start of a flight.
 
-Run by install.sh with the installed Python: sky_index.py [--wanted] CONFIG; with --wanted it only says
-whether there is one to be made, by a word or none.
+Run by install.sh with the installed Python: sky_index.py [--wanted] CONFIG; with --wanted it only prints a
+word when there is an index to build.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from flight.schema.reader import load
 
 
 def main(words: list[str]) -> None:
-    """Make the index that the configuration of the command line wants, or tell that it is missing."""
+    """Build the index that the configuration needs, or print that it is missing."""
     camera = load(Path(words[-1])).camera
     tracker = camera.star_tracker if camera is not None else None
     if tracker is None or tracker.index is not None:

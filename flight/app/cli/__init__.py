@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import importlib.util
 import io
 import sys
 from collections.abc import Sequence
@@ -81,6 +82,8 @@ def _available(words: Sequence[str]) -> dict[str, tuple[str, str]]:
         return own
     others: dict[str, tuple[str, str]] = {}
     for found in metadata.entry_points(group=GROUP):
+        if importlib.util.find_spec(found.module.partition(".")[0]) is None:
+            continue  # on a board: the installer leaves the ground package out
         table: dict[str, str] = found.load()
         others |= {name: (purpose, f"{found.module}.{name}") for name, purpose in table.items()}
     return own | others
