@@ -4,11 +4,11 @@ from __future__ import annotations
 
 
 class FlightError(Exception):
-    """Anything the flight application refuses or cannot do."""
+    """The base of all errors of the flight application."""
 
 
 class UsageError(FlightError):
-    """A mistake of the user's: one clear line, exit status 2, never a traceback."""
+    """A user's mistake: reported in one line, exit status 2, never a traceback."""
 
 
 class InputError(UsageError):
@@ -26,4 +26,4 @@ class InputError(UsageError):
 
 
 class PlanningError(FlightError):
-    """No path could be made; says why."""
+    """No path was found; the message says why."""

@@ -1,8 +1,8 @@
-"""Directions to an attitude: solvers of Wahba's problem.
+"""Attitude from directions: solvers of Wahba's problem.
 
     observed, reference, sigma -> sightings -> B -> a solver's quaternion -> settle -> AttitudeFix
 
-`wahba` checks the directions, holds their sums and settles an attitude on the least loss with its covariance;
-`profile` is what solvers take from the profile matrix B; each other module is one solver of the same
-signature; `solvers` has them by name.
+`wahba` checks the directions, computes their sums and refines an attitude to the least loss, with its
+covariance; `profile` holds the functions of the profile matrix B that solvers share; each other module is one
+solver of the same signature; `solvers` lists them by name.
 """

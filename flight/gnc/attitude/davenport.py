@@ -1,7 +1,7 @@
 """Davenport's q-method: the eigenvector of K's largest eigenvalue, by decomposition (Michalski 3.4.2).
 
-No angle is singular and no iteration can fail. LAPACK decomposes a 4 x 4 in less time than the closed forms
-take in an interpreter, so this, the most robust of them, is also the fastest here: the default.
+No angle is singular and no iteration can fail. LAPACK decomposes a 4 x 4 matrix faster than the closed forms
+run in an interpreter, so this most robust solver is also the fastest here, and the default.
 """
 
 from __future__ import annotations

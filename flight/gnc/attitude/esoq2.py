@@ -2,8 +2,8 @@
 
 Davenport's K has the optimal quaternion as eigenvector of its largest eigenvalue. ESOQ2 takes that eigenvalue
 from the characteristic polynomial and the rotation axis from a 3 x 3 singular matrix by cross products, so no
-matrix is decomposed. The axis is lost as the rotation tends to none: the frame after that half turn is taken
-which leaves B the least trace, and so the directions the most to turn (sequential rotation).
+matrix is decomposed. The axis becomes undefined for small rotations: the reference frame is first turned by
+the half turn that gives B the least trace, and so leaves the largest rotation (sequential rotation).
 
 References: Mortari, ESOQ-2 single-point algorithm, Advances in the Astronautical Sciences 95 (1997); Markley
 and Mortari, Quaternion attitude estimation using vector observations, J. Astronautical Sciences 48 (2000).
@@ -23,7 +23,7 @@ from flight.gnc.math.quaternion import normalise
 def solve(observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> AttitudeFix:
     """Return the attitude that best turns `reference` into `observed` (n, 3), errors `sigma` (n,) rad.
 
-    Raises AttitudeError when fewer than two distinct directions are left to fix it.
+    Raises AttitudeError when the directions fix no attitude.
     """
     seen = sightings(observed, reference, sigma)
     return fix(seen, optimal_quaternion(seen.profile))
@@ -38,8 +38,8 @@ def optimal_quaternion(profile: FloatArray) -> FloatArray:
 def _from_axis(profile: FloatArray, eigenvalue: float) -> FloatArray:
     """Return the quaternion (4,) whose axis is the null vector of (t - l)(B + B^T - t - l) - z z^T.
 
-    That is symmetric of rank 2: the cross products of its rows, its adjugate's, all lie along the axis; the
-    longest is best.
+    That matrix is symmetric of rank 2: the cross products of its rows, the rows of its adjugate, all lie
+    along the axis; the longest is the most precise.
     """
     trace = float(profile.trace())
     z = skew_part(profile)

@@ -1,7 +1,7 @@
 """FOAM, Markley's Fast Optimal Attitude Matrix (Michalski 3.4.6).
 
-The attitude matrix itself from B, its adjugate and the characteristic polynomial's largest root; no angle is
-singular.
+Computes the attitude matrix from B, its adjugate and the characteristic polynomial's largest root; no angle
+is singular.
 
 Reference: Markley, Attitude determination using vector observations: a fast optimal matrix algorithm,
 J. Astronautical Sciences 41 (1993).

@@ -1,11 +1,11 @@
 """OLAE, the Optimal Linear Attitude Estimator: linear least squares for the Gibbs vector (Sease 4.1-4.6).
 
-With b = A r and g the Gibbs vector of A, b - r = [(b + r) x] g exactly: d = [s x] g. Sequential rotation,
-from what TRIAD says of the attitude, keeps the angle at 120 deg or less, |g| below 1.74. An error e of b
-stands in the equation as (1 + [g x]) e, larger than e by up to the root of 1 + g^2 and not alike in all
-directions, so the weights 1/sigma^2 are not the best: the result differs from Wahba's by an amount of the
-order of the noise, and the covariance is that of this estimator, not the optimal one. Since that one is
-efficient, the difference of the two attitudes has the difference of the two covariances.
+With b = A r and g the Gibbs vector of A, b - r = [(b + r) x] g exactly: d = [s x] g. Sequential rotation from
+TRIAD's attitude keeps the angle at 120 deg or less, |g| below 1.74. An error e of b enters the equation as (1
++ [g x]) e, larger than e by up to the root of 1 + g^2 and different by direction, so the weights 1/sigma^2
+are not optimal: the result differs from Wahba's by the order of the noise, and the covariance is that of this
+estimator. Because Wahba's is efficient, the difference of the two attitudes has the difference of the two
+covariances.
 
 Reference: Mortari, Markley and Singla, Optimal linear attitude estimator, J. Guidance, Control, and Dynamics
 30 (2007). The rotation between a streak's ends, with its residuals, is `flight.gnc.vision.objects.olae`.
@@ -49,7 +49,7 @@ def solve(observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> Att
     inverse = np.linalg.inv(normal)
     difference = observed - turned
     gibbs = inverse @ (seen.weight @ np.cross(difference, sums))
-    # The normal equations have lost the digits that B loses; the equations' own residuals have them.
+    # The normal equations lose the same digits as B; the residuals of the equations recover them.
     gibbs += inverse @ (seen.weight @ np.cross(difference - np.cross(sums, gibbs), sums))
     quaternion = upright(multiply(normalise(np.append(gibbs, 1.0)), turn))
     return AttitudeFix(quaternion, _covariance(seen, sums, gibbs, inverse), seen.loss(quaternion))
@@ -58,12 +58,12 @@ def solve(observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> Att
 def _covariance(seen: Sightings, sums: FloatArray, gibbs: FloatArray, inverse: FloatArray) -> FloatArray:
     """Return the covariance (3, 3) rad^2 of small turns about the observer's axes.
 
-    (1 + [g x]) e of each error e goes through the normal equations and through the turn
-    2 (1 - [g x]) dg/(1 + g^2) that a change of g is.
+    Propagates (1 + [g x]) e of each error e through the normal equations, and the change of g to the small
+    turn 2 (1 - [g x]) dg/(1 + g^2).
     """
     square = 1.0 + gibbs @ gibbs
     across = np.cross(sums, gibbs)
-    # An error has no part along its direction.
+    # An error has no component along its direction.
     along = np.cross(sums, seen.observed + np.cross(gibbs, seen.observed))
     spread = (
         square * np.linalg.inv(inverse)

@@ -1,9 +1,9 @@
-"""Predictive attitude determination: the turn that makes the predicted directions meet the observed ones.
+"""Predictive attitude determination: the rotation that brings predicted directions to the observed ones.
 
 Michalski 3.4.1 names it without a formula. Crassidis and Markley's predictive filter chooses, at each step,
 the body rate for which the directions predicted to first order leave the least weighted residual; with
-measurements of one instant the steps converge on Wahba's optimum, because the turn is none only where the
-gradient of Wahba's loss is. It works on residuals, never on the profile matrix, and loses no digits to it.
+measurements of one instant the steps converge to Wahba's optimum, because the rotation vanishes only with the
+gradient of Wahba's loss. It uses residuals instead of the profile matrix, and so loses no digits.
 
 References: Crassidis and Markley, Predictive filtering for attitude estimation without rate sensors,
 J. Guidance, Control, and Dynamics 20 (1997); Park and Crassidis, Attitude determination methods using
@@ -20,7 +20,8 @@ from flight.gnc.math.arrays import FloatArray
 def solve(observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> AttitudeFix:
     """Return the attitude that best turns `reference` into `observed` (n, 3), errors `sigma` (n,) rad.
 
-    Starts from TRIAD's. Raises AttitudeError when the directions fix no attitude, or none is converged upon.
+    Starts from TRIAD's. Raises AttitudeError when the directions fix no attitude or the steps do not
+    converge.
     """
     seen = sightings(observed, reference, sigma)
     return fix(seen, attitude_of_pair(seen, *best_pair(seen, sigma)))
@@ -29,7 +30,7 @@ def solve(observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> Att
 def follow(
     previous: FloatArray, observed: FloatArray, reference: FloatArray, sigma: FloatArray
 ) -> AttitudeFix:
-    """Return the attitude from `previous` (4,), that of an instant before: in tracking, no TRIAD is needed.
+    """Return the attitude, starting from the `previous` one (4,) instead of TRIAD's, for tracking.
 
     Raises AttitudeError as `solve` does.
     """

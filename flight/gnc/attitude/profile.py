@@ -1,4 +1,4 @@
-"""What solvers take from the attitude profile matrix B (3, 3), its weights summing to one.
+"""Functions of the attitude profile matrix B (3, 3), with weights of sum one, that solvers share.
 
 Davenport's K, whose eigenvector of largest eigenvalue is the optimal quaternion (Michalski 69-75), that
 eigenvalue from the characteristic polynomial, and the reference frame turned by 180 deg about one of its axes
@@ -19,7 +19,7 @@ from flight.gnc.math.quaternion import multiply
 _MOST_STEPS = 100
 # The product of the largest eigenvalue's gaps, of which two are of the order of one in a narrow field.
 _LEAST_SLOPE = 1e-13
-# Half a turn about each axis, and none: the diagonal of its matrix, and its quaternion.
+# Half a turn about each axis, and the identity: the diagonal of the matrix, and the quaternion.
 _SIGNS = np.array([[1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0], [1.0, 1.0, 1.0]])
 _TURNS = np.eye(4)
 
@@ -49,7 +49,8 @@ def largest_eigenvalue(profile: FloatArray) -> float:
     """Return the largest root of K's characteristic polynomial, l^4 + b l^2 + c l + d.
 
     Newton's method from 1, the sum of the weights: no root is larger, and beyond the largest the polynomial
-    is convex, so the steps go down to it and never past; the first that does not go down is rounding.
+    is convex, so the steps descend to the root without passing it; the first that does not descend is
+    rounding.
     """
     b, c, d = _characteristic(profile)
     root = 1.0
@@ -67,15 +68,15 @@ def by_eigenvalue(
 ) -> FloatArray:
     """Return the optimal quaternion (4,) by a solver's formula of profile and largest eigenvalue.
 
-    The polynomial leaves the eigenvalue with an error of rounding over the product of the gaps, which two
-    close directions make large; the quaternion's quotient has the square of the quaternion's error. Raises
-    AttitudeError where the largest eigenvalue is double and the formulas are of nothing.
+    The polynomial gives the eigenvalue with an error of rounding over the product of the gaps, large for two
+    close directions; the Rayleigh quotient has the square of the quaternion's error. Raises AttitudeError
+    where the largest eigenvalue is double and the attitude undefined.
     """
     root = largest_eigenvalue(profile)
-    _refuse_double(profile, root)
+    _check_single(profile, root)
     quaternion = quaternion_at(profile, root)
     quotient = float(quaternion @ davenport_matrix(profile) @ quaternion)
-    _refuse_double(profile, quotient)
+    _check_single(profile, quotient)
     return quaternion_at(profile, quotient)
 
 
@@ -87,8 +88,8 @@ def _characteristic(profile: FloatArray) -> tuple[float, float, float]:
     return -2.0 * square, -8.0 * determinant(rows, cofactors), square**2 - 4.0 * _square(cofactors)
 
 
-def _refuse_double(profile: FloatArray, root: float) -> None:
-    """Raise AttitudeError where the polynomial is as flat at its largest root as rounding."""
+def _check_single(profile: FloatArray, root: float) -> None:
+    """Raise AttitudeError where the polynomial's slope at its largest root is within rounding."""
     b, c, _ = _characteristic(profile)
     if (4.0 * root**2 + 2.0 * b) * root + c <= _LEAST_SLOPE:
         raise AttitudeError("the directions fit several attitudes equally well: they share none")
@@ -97,8 +98,8 @@ def _refuse_double(profile: FloatArray, root: float) -> None:
 def half_turn(component: int) -> tuple[FloatArray, FloatArray]:
     """Return the signs (3,) of half a turn's diagonal matrix, and its quaternion (4,).
 
-    About axis 0, 1 or 2, or for 3 no turn. The turn moves that component of a quaternion into the scalar
-    part: if it is the largest, no more than 120 deg of rotation are left.
+    About axis 0, 1 or 2, or for 3 the identity. The turn moves that component of a quaternion into the scalar
+    part: if it is the largest, at most 120 deg of rotation remain.
     """
     return _SIGNS[component], _TURNS[component]
 

@@ -1,12 +1,13 @@
 """QUEST: the Gibbs vector from the characteristic polynomial's largest root (Michalski 3.4.4, 78, 79).
 
-Cayley and Hamilton give the adjugate that solves [(l + t) - S] y = z without a division, so that 180 deg is
-no infinity; there the quaternion still loses its digits, det M with it, and the reference frame after that
-half turn is used which leaves the smallest rotation (sequential rotation).
+The Cayley-Hamilton theorem gives the adjugate that solves [(l + t) - S] y = z without a division, so 180 deg
+gives no infinity; there the quaternion still loses digits with det M, so the reference frame is first turned
+by the half turn that leaves the smallest rotation (sequential rotation).
 
 Reference: Shuster and Oh, Three-axis attitude determination from vector observations, J. Guidance and Control
 4 (1981); Cheng and Shuster, Improvement to the implementation of the QUEST algorithm, J. Guidance, Control,
-and Dynamics 37 (2014), on the digits that Newton's root loses: here the quotient of `by_eigenvalue`.
+and Dynamics 37 (2014), on the digits that Newton's root loses; here the quotient of `by_eigenvalue` recovers
+them.
 """
 
 from __future__ import annotations
@@ -44,8 +45,8 @@ def optimal_quaternion(profile: FloatArray) -> FloatArray:
 def _largest_component(profile: FloatArray, eigenvalue: float) -> int:
     """Return which component of the optimal quaternion is the largest.
 
-    det M is the scalar part's square times the eigenvalue's gaps, in each frame after a half turn that of
-    another component. B's trace, cheaper, would not do: in a narrow field it knows nothing of the roll.
+    det M is the scalar part's square times the eigenvalue's gaps, and after each half turn that of another
+    component. B's trace is cheaper but does not contain the roll in a narrow field.
     """
     frames = [half_turn(component)[0] * profile for component in range(4)]
     return int(np.argmax(np.linalg.det([_gibbs_matrix(frame, eigenvalue) for frame in frames])))

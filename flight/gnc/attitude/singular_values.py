@@ -1,6 +1,6 @@
 """The attitude (direction cosine) matrix by singular values of B (Michalski 80-84 corrected).
 
-A = U diag(1, 1, det U det V) V^T: the determinants stand in the middle once, so that A is a rotation.
+A = U diag(1, 1, det U det V) V^T: the determinants appear once, in the middle, so that A is a rotation.
 
 Reference: Markley, Attitude determination using vector observations and the singular value decomposition,
 J. Astronautical Sciences 36 (1988).

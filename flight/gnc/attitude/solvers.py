@@ -10,7 +10,7 @@ from flight.gnc.math.arrays import FloatArray
 
 
 class Solver(Protocol):
-    """A way from directions to an attitude."""
+    """Computes an attitude from directions."""
 
     def __call__(self, observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> AttitudeFix:
         """Return the attitude that turns `reference` into `observed` (n, 3), errors `sigma` (n,) rad.

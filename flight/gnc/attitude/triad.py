@@ -1,8 +1,8 @@
-"""TRIAD: the attitude from two directions, the first taken as exact (Michalski 3.4.5).
+"""TRIAD: the attitude from two directions, the first assumed exact (Michalski 3.4.5).
 
-Of more than two directions that ordered pair is used whose covariance has the least trace. The result has
-not the least loss: its covariance is its own, larger than an optimal solver's. Since that one is efficient,
-the difference of the two attitudes has the difference of the two covariances.
+Of more than two directions it uses the ordered pair whose covariance has the least trace. The result does not
+have the least loss, and its covariance is larger than an optimal solver's. Because the optimal one is
+efficient, the difference of the two attitudes has the difference of the two covariances.
 
 Reference: Shuster and Oh, Three-axis attitude determination from vector observations, J. Guidance and Control
 4 (1981), the covariance after the TRIAD algorithm.
@@ -46,19 +46,19 @@ def best_pair(seen: Sightings, sigma: FloatArray) -> tuple[int, int]:
 
 
 def attitude_of_pair(seen: Sightings, first: int, second: int) -> FloatArray:
-    """Return the quaternion (4,) that brings the first onto its observed, the second into their plane."""
+    """Return the quaternion (4,) that maps the first onto its observed, the second into their plane."""
     body = _triad(seen.observed[first], seen.observed[second])
     return from_matrix(body.T @ _triad(seen.reference[first], seen.reference[second]))
 
 
 def _squared_sines(vectors: FloatArray) -> FloatArray:
-    """Return the squared sines (n, n) of the angles between unit vectors (n, 3), of none on the diagonal."""
+    """Return the squared sines (n, n) of the angles between unit vectors (n, 3), zero on the diagonal."""
     normal = np.cross(vectors[:, None], vectors)
     return np.asarray(np.einsum("ijk,ijk->ij", normal, normal))
 
 
 def _triad(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return the orthonormal rows (3, 3): the first direction, the pair's normal, and what completes them."""
+    """Return the orthonormal rows (3, 3): the first direction, the pair's normal, and their cross product."""
     normal = np.cross(first, second)
     normal /= np.linalg.norm(normal)
     return np.stack([first, normal, np.cross(first, normal)])

@@ -4,9 +4,9 @@ Loss: half the sum of |b - A r|^2 / sigma^2 (Michalski 77 corrected), so that tw
 chi-square of 2n - 3 degrees of freedom when each sigma is an observation's error in rad across its direction.
 All arrays are (n, 3) unit vectors and (n,) sigmas; the thesis's uniform weights 1/N are equal sigmas.
 
-Every solver that works from the profile matrix B loses the digits that B has rounded away: two directions d
-rad apart differ in B by d^2, so its quaternion is off by rounding over d^2. `settle` wins them back from the
-residuals themselves, where the same two differ by d.
+Every solver that uses the profile matrix B loses digits to its rounding: two directions d rad apart differ in
+B by d^2, so the quaternion has an error of rounding over d^2. `refine` recovers them from the residuals,
+where the same two differ by d.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ from flight.gnc.errors import FlightError
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
 
-# Directions within about 1e-6 rad of one line leave the turn about it to rounding.
+# For directions within about 1e-6 rad of one line the turn about it is rounding.
 _LEAST_SPREAD = 1e-12
 _UNIT_TOLERANCE = 1e-6
 _EYE = np.eye(3)
 _MOST_TURNS = 100
 # rad: each turn is at most a tenth of the last, so after one this small less than 1e-12 is left.
 _SETTLED = 1e-11
-# Rounding of the residuals, a few times over: turns do not get smaller than this over the directions' spread.
+# Several times the rounding of the residuals: turns do not get smaller than this over the directions' spread.
 _ROUNDING = 3e-15
-# The square of the ratio by which turns that neglect the residuals' curvature converge.
+# The square of the convergence ratio of turns that neglect the residuals' curvature.
 _CLOSE_FIT = 1e-2
 
 
 class AttitudeError(FlightError):
-    """Directions that fix no attitude, or are none."""
+    """Directions that fix no attitude, or invalid ones."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AttitudeFix:
-    """An attitude that a solver found.
+    """A solver's attitude.
 
     Attributes:
         quaternion: (4,) reference into the observer's frame, scalar part not negative.
@@ -54,7 +54,7 @@ class AttitudeFix:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sightings:
-    """Directions that fix an attitude, checked, and the sums that solvers share.
+    """Checked directions that fix an attitude, and the sums that solvers share.
 
     Attributes:
         observed, reference: (n, 3) unit vectors.
@@ -81,17 +81,17 @@ class Sightings:
 def sightings(observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> Sightings:
     """Return checked directions (n, 3), (n, 3) with errors (n,) rad, ready to be solved.
 
-    Raises AttitudeError for arguments that are no directions or do not fix an attitude.
+    Raises AttitudeError for invalid directions and for directions that fix no attitude.
     """
     n = len(observed)
-    _refuse_malformed(n, observed, reference, sigma)
+    _check_shapes(n, observed, reference, sigma)
     weight = 1.0 / (sigma * sigma)
     total = float(np.add.reduce(weight))
     weight /= total
     both = np.empty((n, 6))
     both[:, :3], both[:, 3:] = observed, reference
-    _refuse_no_directions(both)
-    # The one product holds B and, in its diagonal blocks, the two sums of weight v v^T.
+    _check_unit_length(both)
+    # One product contains B and, in its diagonal blocks, the two sums of weight v v^T.
     gram = (both * weight[:, None]).T @ both
     cofactors, volume = _cofactors(gram[:3, :3], n, "observed")
     _cofactors(gram[3:, 3:], n, "reference")
@@ -112,7 +112,7 @@ def information(observed: FloatArray, sigma: FloatArray) -> FloatArray:
 
 def fix(seen: Sightings, quaternion: FloatArray) -> AttitudeFix:
     """Return the optimal attitude from a solver's `quaternion` (4,), with its covariance and loss (3.23)."""
-    optimum, loss = settle(seen, quaternion)
+    optimum, loss = refine(seen, quaternion)
     return AttitudeFix(upright(optimum), seen.covariance, loss)
 
 
@@ -121,10 +121,10 @@ def upright(quaternion: FloatArray) -> FloatArray:
     return -quaternion if quaternion[3] < 0.0 else quaternion
 
 
-def settle(seen: Sightings, quaternion: FloatArray) -> tuple[FloatArray, float]:
-    """Return the least loss's attitude (4,), in Newton's turns from `quaternion` (4,), and that loss.
+def refine(seen: Sightings, quaternion: FloatArray) -> tuple[FloatArray, float]:
+    """Return the attitude (4,) of least loss, by Newton's method from `quaternion` (4,), and that loss.
 
-    Raises AttitudeError where the turns do not end, or end where the loss is least along no other way.
+    Raises AttitudeError where the method does not converge, or converges to a point that is no minimum.
     """
     weight = seen.weight[:, None]
     # Of the order of the inverse square of the directions' spread, rad.
@@ -152,12 +152,12 @@ def settle(seen: Sightings, quaternion: FloatArray) -> tuple[FloatArray, float]:
 def _curvature(
     seen: Sightings, moment: FloatArray, turned: FloatArray, neglected: float
 ) -> tuple[FloatArray, bool]:
-    """Return the inverse (3, 3) of the loss's second derivative, and whether the loss curves up every way.
+    """Return the inverse (3, 3) of the loss's second derivative, and whether that is positive definite.
 
-    That derivative differs from the information by no more than |moment| <= sqrt(2 loss/total), a part of it
-    whose square is below `neglected`: where that is small the information serves (Gauss and Newton). The four
-    stationary attitudes are K's eigenvectors and only one is a minimum, unless the largest eigenvalue is
-    double, as of a field seen in a mirror: then there is a circle of them.
+    That derivative differs from the information by at most |moment| <= sqrt(2 loss/total), a relative
+    difference whose square is below `neglected`: where that is small the information is used (Gauss-Newton).
+    The four stationary attitudes are K's eigenvectors and only one is a minimum, unless the largest
+    eigenvalue is double, as for mirrored directions: then a circle of attitudes is.
     """
     if neglected < _CLOSE_FIT:
         return seen.covariance, True
@@ -172,13 +172,13 @@ def _turned(quaternion: FloatArray, turn: FloatArray, small: bool) -> FloatArray
     """Return the attitude (4,) turned by `turn` (3,) rad about the observer's axes."""
     if small:
         x, y, z = turn.tolist()
-        # Of unit length to the square of the turn, below rounding.
+        # Of unit length to the square of the turn, which is below rounding.
         return multiply(np.array([0.5 * x, 0.5 * y, 0.5 * z, 1.0]), quaternion)
     return normalise(multiply(from_rotation_vector(turn), quaternion))
 
 
-def _refuse_malformed(n: int, observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> None:
-    """Raise AttitudeError for shapes that do not fit and for errors that are none."""
+def _check_shapes(n: int, observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> None:
+    """Raise AttitudeError for wrong shapes and invalid errors."""
     if observed.shape != (n, 3) or reference.shape != (n, 3) or sigma.shape != (n,):
         raise AttitudeError(
             f"observed {observed.shape}, reference {reference.shape}, sigma {sigma.shape}:"
@@ -191,11 +191,11 @@ def _refuse_malformed(n: int, observed: FloatArray, reference: FloatArray, sigma
         raise AttitudeError(f"sigma {sigma}: each must be finite and positive, in rad")
 
 
-def _refuse_no_directions(both: FloatArray) -> None:
+def _check_unit_length(both: FloatArray) -> None:
     """Raise AttitudeError unless both halves of the rows (n, 6) are of unit length."""
     vectors = both.reshape(-1, 2, 3)
     excess = np.einsum("nij,nij->ni", vectors, vectors) - 1.0
-    # One number tells at once that all are right; a NaN fails the comparisons too.
+    # One number shows that all are right; a NaN fails the comparison too.
     if np.vdot(excess, excess) <= (2.0 * _UNIT_TOLERANCE) ** 2:
         return
     right = np.abs(excess) <= 2.0 * _UNIT_TOLERANCE

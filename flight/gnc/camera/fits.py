@@ -1,4 +1,4 @@
-"""The primary image of a FITS file (FITS Standard 4.0, sections 3, 4.4.1 and 5), from its bytes.
+"""Reads the primary image of a FITS file (FITS Standard 4.0, sections 3, 4.4.1 and 5) from its bytes.
 
 Read: BITPIX 8, 16, 32, -32 and -64, two axes, BZERO, BSCALE and BLANK. Not read: extensions, tables,
 compressed images, cubes.
@@ -26,8 +26,8 @@ UNSIGNED = {"i2": (32768.0, np.uint16), "i4": (2147483648.0, np.uint32)}
 def primary_image(content: bytes, name: str) -> Image:
     """Return the image (rows, columns) of a FITS file's `content`, row 0 the file's first.
 
-    Whole numbers without a scale keep their type; unsigned 16 and 32-bit numbers become what they are; any
-    other scale makes float64. Raises UsageError, with `name`, for what is no such image.
+    Whole numbers without a scale keep their type; shifted unsigned 16 and 32-bit numbers become unsigned; any
+    other scale gives float64. Raises UsageError, with `name`, for other content.
     """
     header, start = _header(content, name)
     bits = _whole(header, "BITPIX", name)
@@ -56,7 +56,7 @@ def _scaled(stored: npt.NDArray[np.generic], zero: float, scale: float) -> Image
         return native
     offset, unsigned = UNSIGNED.get(native.dtype.str[1:], (0.0, None))
     if unsigned is not None and (zero, scale) == (offset, 1.0):
-        # Adding the offset turns over the highest bit, and nothing else.
+        # Adding the offset flips the highest bit only.
         return np.asarray(native.view(unsigned) ^ unsigned(offset))
     return np.asarray(zero + scale * native.astype(np.float64))
 

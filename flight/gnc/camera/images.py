@@ -1,11 +1,11 @@
-"""Image files as arrays (PNG, TIFF and JPEG through Pillow, FITS by `fits`), and pictures to draw upon.
+"""Reads image files as arrays (PNG, TIFF and JPEG through Pillow, FITS by `fits`); writes pictures.
 
     pixels = read_image(Path("night.fits"))      # (rows, columns), the counts as they stand in the file
     pixels = read_raw(Path("night.raw"), columns=1280, rows=960, bits=16)      # bare pixels
     write_picture(Path("found.png"), grey_stretch(pixels))
 
-Row 0 is the file's first row. FITS viewers show it at the bottom, the others at the top: a sky read from the
-wrong one is mirrored. A photograph's note of how the camera was held (EXIF) is not followed.
+Row 0 is the file's first row. FITS viewers show it at the bottom, others at the top; confusing them mirrors
+the sky. The orientation in a photograph's EXIF data is ignored.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ COLOUR_MODES = ("LA", "La", "P", "PA", "RGB", "RGBA", "RGBa", "RGBX", "CMYK", "Y
 def read_image(path: Path) -> Image:
     """Return the image (rows, columns): uint8 or uint16, from FITS also signed, 32-bit or floating.
 
-    What the file holds decides, not its name. Colour becomes luminance (ITU-R BT.601). Raises UsageError when
-    the file is missing, damaged or none of these, or has pixels that are not finite.
+    The content decides the format, not the name. Colour becomes luminance (ITU-R BT.601). Raises UsageError
+    when the file is missing, damaged or none of these, or has pixels that are not finite.
     """
     try:
         with path.open("rb") as file:
@@ -54,7 +54,7 @@ def read_image(path: Path) -> Image:
 def read_raw(path: Path, columns: int, rows: int, bits: int) -> Image:
     """Return the image (rows, columns) of a file of bare pixels, row by row: 8 bits, or 16 little-endian.
 
-    What stands before the pixels, a header of whatever kind, is passed over: the file's last bytes count.
+    Any header before the pixels is skipped: the file's last bytes count.
     Raises UsageError when the file is missing or too short.
     """
     kind = np.dtype("<u2") if bits == 16 else np.dtype("u1")
@@ -72,7 +72,7 @@ def read_raw(path: Path, columns: int, rows: int, bits: int) -> Image:
 
 
 def grey_stretch(image: Image, low: float = 1.0, high: float = 99.7) -> npt.NDArray[np.uint8]:
-    """Return a grey picture (rows, columns, 3), red, green, blue, to draw upon.
+    """Return a grey picture (rows, columns, 3), red, green, blue, to draw on.
 
     The `low`th percentile of the pixels becomes black and the `high`th white. Raises UsageError unless
     0 <= low < high <= 100.
@@ -107,7 +107,7 @@ def _through_pillow(path: Path) -> Image:
     except ImportError as error:
         raise UsageError(f"{path}: {', '.join(FORMATS)} need Pillow: {EXTRA}") from error
     try:
-        # Its warnings are of descriptions, which are not read here: the pixels are sound, or it raises.
+        # Its warnings concern metadata, which is not used here; damaged pixels raise.
         with warnings.catch_warnings(action="ignore"), pillow.open(path, formats=FORMATS) as picture:
             _check_kept(path, picture)
             picture.load()
@@ -122,7 +122,7 @@ def _through_pillow(path: Path) -> Image:
 
 
 def _check_kept(path: Path, picture: Picture) -> None:
-    """Refuse what Pillow reads otherwise than meant: 16-bit colour cut to 8, negatives as they are."""
+    """Raise UsageError for images that Pillow would misread: 16-bit colour cut to 8, inverted grey."""
     if picture.mode in COLOUR_MODES and any(";16" in str(tile[3]) for tile in getattr(picture, "tile", ())):
         raise UsageError(f"{path}: 16-bit colour is not read: convert it to 16-bit grey")
     interpretation = getattr(picture, "tag_v2", {}).get(PHOTOMETRIC_INTERPRETATION)
@@ -133,7 +133,7 @@ def _check_kept(path: Path, picture: Picture) -> None:
 def _grey(path: Path, picture: Picture) -> Image:
     mode = picture.mode
     if mode in COLOUR_MODES:
-        # Through RGB: Pillow has no direct way from all of them. A picture's transparency is let go.
+        # Through RGB: Pillow has no direct way from all of them. Transparency is dropped.
         return np.asarray(picture.convert("RGB").convert("L"))
     if mode in GREY_MODES:
         grey = picture.convert("L") if mode == "1" else picture

@@ -1,9 +1,9 @@
-"""A calibrated camera: a pinhole whose image is stretched radially about its optical axis.
+"""A calibrated camera: a pinhole with radial distortion about its optical axis.
 
-A direction of tangents u = (x/z, y/z) falls on the pixel f u (1 + k1 |u|^2 + k2 |u|^4) + centre (Brown 1966,
+A direction of tangents u = (x/z, y/z) maps to the pixel f u (1 + k1 |u|^2 + k2 |u|^4) + centre (Brown 1966,
 radial terms). Frame and pixels are those of `flight.gnc.camera.pinhole`. Beyond the tangent where the
-stretched radius stops to grow the polynomial folds back on itself: nothing is seen there, and a lens that
-folds within its own detector is refused.
+distorted radius stops growing the polynomial folds back on itself: nothing is imaged there, and a lens that
+folds within its own detector is rejected.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from flight.gnc.math.arrays import BoolArray, FloatArray
 _MOST_STEPS = 60
 # Newton's error is of the order of its last step's square: 1e-8 in tangent leaves rounding.
 _LAST_STEP = 1e-8
-# A fold at a million tangents is none.
+# A fold at a tangent of a million is ignored.
 _NO_FOLD = 1e-12
 
 
 class LensError(FlightError):
-    """A lens that cannot be: no size, or a distortion that cannot be undone."""
+    """An impossible lens: no size, or a distortion that cannot be inverted."""
 
 
 class CameraModel(Protocol):
-    """What a camera does to directions: `Pinhole` and `Lens` alike."""
+    """The interface of `Pinhole` and `Lens`: directions to pixels and back."""
 
     @property
     def columns(self) -> int:
@@ -66,7 +66,7 @@ class CameraModel(Protocol):
         """Return unit vectors (n, 3) in the camera frame of pixels (n, 2)."""
 
     def contains(self, points: FloatArray, margin: float = 0.0) -> BoolArray:
-        """Tell which pixels (n, 2) lie on the detector, widened by `margin` pixels."""
+        """Return which pixels (n, 2) lie on the detector, widened by `margin` pixels."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +79,7 @@ class Lens:
         k1, k2: of the second and the fourth power of the undistorted tangent.
         reach: the largest tangent that is imaged, infinite where the distortion never folds.
 
-    Raises LensError when the distortion cannot be undone over the whole detector.
+    Raises LensError when the distortion cannot be inverted over the whole detector.
     """
 
     columns: int
@@ -108,14 +108,14 @@ class Lens:
 
     @classmethod
     def of(cls, camera: CameraModel) -> Lens:
-        """Return the lens that is that camera: itself, or a pinhole without distortion."""
+        """Return `camera` as a lens; a pinhole becomes one without distortion."""
         if isinstance(camera, Lens):
             return camera
         return cls(camera.columns, camera.rows, camera.focal_length, camera.centre)
 
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, object], where: str = "lens") -> Lens:
-        """Return the lens of `to_mapping`'s keys, k1 and k2 not compulsory, as a YAML file holds them.
+        """Return the lens of a mapping with the keys of `to_mapping`; k1 and k2 are optional.
 
         Raises InputError, with the place `where`, for a key or value that is wrong.
         """
@@ -180,7 +180,7 @@ class Lens:
         return np.asarray(v / np.sqrt(1.0 + square))
 
     def contains(self, points: FloatArray, margin: float = 0.0) -> BoolArray:
-        """Tell which pixels (n, 2) lie on the detector, widened by `margin` pixels; NaN does not."""
+        """Return which pixels (n, 2) lie on the detector, widened by `margin` pixels; NaN does not."""
         return Pinhole(self.columns, self.rows, self.focal_length).contains(points, margin)
 
     @property
@@ -198,16 +198,16 @@ class Lens:
         return self.reach * (1.0 + square * (self.k1 + square * self.k2)) if square < np.inf else np.inf
 
     def _undistorted(self, stretched: FloatArray) -> FloatArray:
-        """Return the tangents whose stretched ones are given, any shape; NaN beyond the image's edge.
+        """Return the undistorted tangents, any shape; NaN beyond the image's edge.
 
-        Newton's method from the stretched tangent, or from the curve's inflection if that is nearer the axis:
-        from there it passes the root once at most and then nears it from one side.
+        Newton's method from the distorted tangent, or from the curve's inflection if that is nearer the axis:
+        from there it passes the root at most once and then approaches it from one side.
         """
         k1, k2 = self.k1, self.k2
         if k1 == k2 == 0.0:
             return stretched
         seen = stretched < self._limit()
-        # A NaN, too, must not tell the others when to stop.
+        # A NaN must not affect when the iteration stops.
         target = np.where(seen, stretched, 0.0)
         inflection = np.sqrt(-0.3 * k1 / k2) if k1 * k2 < 0.0 else np.inf
         radius = np.minimum(target, inflection)
@@ -228,7 +228,7 @@ _OPTIONAL = {"k1": 0.0, "k2": 0.0}
 
 
 def _reach(k1: float, k2: float) -> float:
-    """Return the least tangent where r (1 + k1 r^2 + k2 r^4) stops to grow: 1 + 3 k1 r^2 + 5 k2 r^4 = 0."""
+    """Return the least tangent where r (1 + k1 r^2 + k2 r^4) stops growing: 1 + 3 k1 r^2 + 5 k2 r^4 = 0."""
     discriminant = 9.0 * k1 * k1 - 20.0 * k2
     if discriminant < 0.0 or (k1 >= 0.0 and k2 >= 0.0):
         return np.inf

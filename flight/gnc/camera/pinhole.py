@@ -28,7 +28,7 @@ class Pinhole:
 
     @property
     def ideal(self) -> Pinhole:
-        """The camera itself: it has no lens."""
+        """The camera itself, which has no distortion."""
         return self
 
     def rescaled(self, factor: float) -> Pinhole:

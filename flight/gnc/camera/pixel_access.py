@@ -1,7 +1,7 @@
-"""Random access to a camera's pixels: whole columns or rows, nothing else is read.
+"""Random access to a camera's pixels by whole columns or rows.
 
-The Fuga 15d of Meller et al. answers an address with that pixel's light, like a memory (chapter 1); a
-detector that must be read out whole stands behind the same two calls.
+The Fuga 15d of Meller et al. is read by address, like a memory (chapter 1); a detector that must be read out
+whole implements the same two calls.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from flight.gnc.math.arrays import Image, IntArray
 
 
 class PixelAccess(Protocol):
-    """A camera or a picture whose lines can be read one by one."""
+    """A camera or picture whose rows and columns can be read individually."""
 
     @property
     def rows(self) -> int:
@@ -32,10 +32,10 @@ class PixelAccess(Protocol):
 
 
 class ArrayPixels:
-    """A picture in memory that counts how many of its pixels were read.
+    """An image in memory that counts the pixels read.
 
     Attributes:
-        pixels_read: since it was made; a pixel on a row and a column that were read counts twice.
+        pixels_read: since creation; a pixel read by row and by column counts twice.
     """
 
     def __init__(self, image: Image) -> None:

@@ -1,11 +1,11 @@
 """The star catalogue: Hipparcos to V 8.5, positions in ICRS at epoch J1991.25, proper motions, magnitudes.
 
 The table `hipparcos.npz` holds whole numbers, so that it is the same on every machine: milliarcseconds of
-right ascension and declination (at most 0.71 mas from the source), hundredths of a milliarcsecond a year of
-proper motion and hundredths of a magnitude, both as published. `flight.gnc.catalogue.build` makes it.
+right ascension and declination (at most 0.71 mas from the source), hundredths of a milliarcsecond per year of
+proper motion and hundredths of a magnitude, both as published. `flight.gnc.catalogue.build` builds it.
 
-Directions are of the star as the Hipparcos frame gives it: no parallax (at most 0.75"), no aberration (20").
-A close pair stands as Hipparcos lists it: one entry with the joint magnitude where it was not resolved.
+Directions are in the Hipparcos frame, without parallax (at most 0.75") and aberration (20"). An unresolved
+close pair is one entry with the joint magnitude, as in Hipparcos.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class StarCatalogue:
     def directions_at(self, year: float) -> FloatArray:
         """Return unit vectors (n, 3), ICRS, at Julian year `year`.
 
-        Each star keeps its speed along the tangent at J1991.25; its radial velocity is taken as zero
+        Each star keeps its speed along the tangent at J1991.25; its radial velocity is assumed zero
         (ESA SP-1200, vol. 1, 1.5.5). Raises ValueError when `year` is not finite.
         """
         if not np.isfinite(year):

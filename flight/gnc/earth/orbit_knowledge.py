@@ -1,8 +1,8 @@
-"""Where the satellite is, in ICRS: from its GPS receiver's last fix, or from two-line elements.
+"""The satellite's position and velocity in ICRS, from the last GPS fix or from two-line elements.
 
-A fix is carried on by Newton's law with the Earth's oblateness J2, in Runge-Kutta steps of at most 30 s.
-Two-line elements go through SGP4 (Vallado, Crawford, Hujsak and Kelso, AIAA 2006-6753), good to one to three
-km about their epoch.
+A fix is propagated by Newton's law with the Earth's oblateness J2, in Runge-Kutta steps of at most 30 s.
+Two-line elements use SGP4 (Vallado, Crawford, Hujsak and Kelso, AIAA 2006-6753), accurate to one to three km
+near their epoch.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _LONGEST_STEP = 30.0
 
 
 class OrbitError(FlightError):
-    """An orbit that cannot be told at a time: it has decayed, or the fix is too old."""
+    """No orbit is known at this time: it has decayed, or the fix is too old."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,7 +43,7 @@ class OrbitState:
 
 
 class OrbitKnowledge(Protocol):
-    """What tells where the satellite is."""
+    """A source of the satellite's position and velocity."""
 
     def at(self, julian_date: float) -> OrbitState:
         """Return the state at a Julian date UTC. Raises OrbitError."""
@@ -54,7 +54,8 @@ class OrbitKnowledge(Protocol):
 class GpsFix:
     """A GPS receiver's fix, ITRS axes: position (3,) m, velocity (3,) m/s with respect to the ground.
 
-    `sigma` m is of the position, `velocity_sigma` m/s of the velocity; it is of no use after `longest_age` s.
+    `sigma` m is of the position, `velocity_sigma` m/s of the velocity; the fix is not used after
+    `longest_age` s.
     """
 
     julian_date: float
@@ -65,7 +66,7 @@ class GpsFix:
     longest_age: float = 1500.0
 
     def __post_init__(self) -> None:
-        """Refuse what no receiver in orbit would say; raises OrbitError."""
+        """Raise OrbitError for values that no receiver in orbit would send."""
         numbers = np.array([self.julian_date, *self.position, *self.velocity])
         if numbers.shape != (7,) or not np.all(np.isfinite(numbers)):
             raise OrbitError(f"fix at {self.julian_date}: position and velocity must be (3,) and finite")
@@ -73,7 +74,7 @@ class GpsFix:
             raise OrbitError(f"fix at {self.julian_date}: {self.position} m is within the Earth")
 
     def at(self, julian_date: float) -> OrbitState:
-        """Return the state at a Julian date UTC, carried on. Raises OrbitError for an old fix."""
+        """Return the state propagated to a Julian date UTC. Raises OrbitError for an old fix."""
         age = (julian_date - self.julian_date) * DAY
         if not abs(age) <= self.longest_age:
             raise OrbitError(f"the last fix is {age:.0f} s old: none is of use after {self.longest_age:g} s")
@@ -81,7 +82,7 @@ class GpsFix:
         with_ground = self.velocity + np.cross([0.0, 0.0, ROTATION_RATE], self.position)
         state = np.concatenate([self.position @ to_ground, with_ground @ to_ground])
         carried = carried_on(state, age)
-        # The velocity's error goes along the orbit three times as fast as it would in empty space.
+        # Along the orbit an error of velocity grows three times as fast as in free space.
         sigma = math.hypot(self.sigma, 3.0 * age * self.velocity_sigma)
         return OrbitState(julian_date, carried[:3], carried[3:], sigma)
 
@@ -90,14 +91,14 @@ class TwoLineElements:
     """A two-line element set; `sigma` m of an axis grows by `growth` m a day from its epoch."""
 
     def __init__(self, first: str, second: str, sigma: float = 1500.0, growth: float = 1500.0) -> None:
-        """Read the two lines. Raises UsageError for lines that are none, or whose checksum is wrong."""
+        """Read the two lines. Raises UsageError for invalid lines or a wrong checksum."""
         for number, line in (("1", first), ("2", second)):
-            _refuse_line(number, line)
+            _check_line(number, line)
         self._satellite = Satrec.twoline2rv(first.rstrip(), second.rstrip())
         self._sigma, self._growth = sigma, growth
 
     def at(self, julian_date: float) -> OrbitState:
-        """Return the state at a Julian date UTC. Raises OrbitError where SGP4 has none."""
+        """Return the state at a Julian date UTC. Raises OrbitError where SGP4 fails."""
         whole = math.floor(julian_date)
         code, position, velocity = self._satellite.sgp4(whole, julian_date - whole)
         if code:
@@ -111,7 +112,7 @@ class TwoLineElements:
 
 
 def carried_on(state: FloatArray, duration: float) -> FloatArray:
-    """Return position and velocity (6,), m and m/s, `duration` s on, by classical Runge-Kutta."""
+    """Return position and velocity (6,), m and m/s, after `duration` s, by classical Runge-Kutta."""
     steps = max(1, math.ceil(abs(duration) / _LONGEST_STEP))
     dt = duration / steps
     for _ in range(steps):
@@ -124,7 +125,7 @@ def carried_on(state: FloatArray, duration: float) -> FloatArray:
 
 
 def _flow(state: FloatArray) -> FloatArray:
-    """Return velocity and acceleration (6,): the sphere's and J2's (Sease 2.14)."""
+    """Return velocity and acceleration (6,) under a spherical Earth and J2 (Sease 2.14)."""
     position = state[:3]
     squared = float(position @ position)
     pull = -GRAVITATIONAL_PARAMETER / squared**1.5
@@ -134,7 +135,7 @@ def _flow(state: FloatArray) -> FloatArray:
     return np.concatenate([state[3:], scale * position])
 
 
-def _refuse_line(number: str, line: str) -> None:
+def _check_line(number: str, line: str) -> None:
     """Raise UsageError unless `line` is that line of a two-line element set."""
     line = line.rstrip()
     if len(line) != 69 or not line.startswith(f"{number} "):

@@ -1,8 +1,8 @@
-"""How the Earth is turned: between ICRS (GCRS), the frame of the stars, and ITRS, the frame of the ground.
+"""The Earth's orientation: rotations between ICRS (GCRS, the stars) and ITRS (the ground).
 
-IAU 2006/2000B through ERFA, to a milliarcsecond of the pole. UT1 is taken for UTC unless told (they differ by
-at most 0.9 s, 13" of turn), polar motion (0.3") for zero. Julian dates are UTC; TT is 69.184 s ahead of UTC
-since 2017. A float of a Julian date is good to 40 us, 0.3 m along a low orbit.
+IAU 2006/2000B through ERFA, to a milliarcsecond of the pole. UT1 is assumed equal to UTC unless given (they
+differ by at most 0.9 s, 13" of rotation), polar motion (0.3") zero. Julian dates are UTC; TT is 69.184 s
+ahead of UTC since 2017. A Julian date as a float resolves 40 us, 0.3 m along a low orbit.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def julian_epoch(julian_date: npt.ArrayLike) -> FloatArray:
 def celestial_to_terrestrial(julian_date: npt.ArrayLike, ut1_minus_utc: float = 0.0) -> FloatArray:
     """Return the matrices (..., 3, 3) that take vectors from ICRS to ITRS at Julian dates UTC (...)."""
     date = np.asarray(julian_date, dtype=float)
-    # TT in two parts, whole and fraction, as ERFA likes it; the same for UT1.
+    # TT and UT1 in two parts, whole and fraction, as ERFA recommends.
     whole = np.floor(date)
     day = date - whole
     return np.asarray(
@@ -46,7 +46,7 @@ def celestial_to_terrestrial(julian_date: npt.ArrayLike, ut1_minus_utc: float = 
 def mean_equator_to_celestial(julian_date: npt.ArrayLike, ut1_minus_utc: float = 0.0) -> FloatArray:
     """Return the matrices (..., 3, 3) that take vectors from TEME, the frame of SGP4, to ICRS.
 
-    By way of the ground: TEME differs from it by the mean sidereal time of 1982 alone (Vallado, Crawford,
+    Through ITRS: TEME differs from it by the mean sidereal time of 1982 alone (Vallado, Crawford,
     Hujsak and Kelso, Revisiting Spacetrack Report #3, AIAA 2006-6753, appendix C).
     """
     date = np.asarray(julian_date, dtype=float)
@@ -78,7 +78,7 @@ def geodetic(position: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 def north_east_down(longitude: npt.ArrayLike, latitude: npt.ArrayLike) -> FloatArray:
     """Return the matrices (..., 3, 3) whose rows are north, east and down in ITRS.
 
-    With the geodetic latitude of the ellipsoid's, with the geocentric one of the sphere's.
+    Geodetic latitude gives those of the ellipsoid, geocentric latitude those of the sphere.
     """
     along, up = np.asarray(longitude, dtype=float), np.asarray(latitude, dtype=float)
     ca, sa, cu, su = np.cos(along), np.sin(along), np.cos(up), np.sin(up)

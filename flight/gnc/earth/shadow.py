@@ -1,6 +1,6 @@
-"""The Earth's shadow: how much of the Sun an object sees.
+"""The Earth's shadow: the visible share of the Sun's disc.
 
-Sease 2.15 corrected: asked of the object's own position, and by default with the half-shadow about the cone.
+Sease 2.15 corrected: evaluated at the object's own position, and by default with the penumbra.
 The Earth is a sphere of its equatorial radius without an atmosphere.
 """
 
@@ -18,7 +18,7 @@ Shadow = Literal["conical", "cylindrical"]
 
 
 def sunlit_share(position: FloatArray, sun: FloatArray, shadow: Shadow = "conical") -> FloatArray:
-    """Return the share (...) of the Sun's disc that is seen from `position` (..., 3) m: 0 in the umbra.
+    """Return the share (...) of the Sun's disc visible from `position` (..., 3) m: 0 in the umbra.
 
     `sun` (..., 3) m is its geocentric position. "conical" takes the overlap of the discs of Sun and Earth
     (Montenbruck & Gill 2000, 3.4.2); "cylindrical" gives 0 or 1 (Sease 2.15 corrected).
@@ -34,14 +34,14 @@ def sunlit_share(position: FloatArray, sun: FloatArray, shadow: Shadow = "conica
     sun_disc = np.arcsin(SUN_RADIUS / sun_distance)
     earth_disc = np.arcsin(np.minimum(1.0, EARTH_RADIUS / distance))
     cosine = -np.sum(position * to_sun, axis=-1) / (distance * sun_distance)
-    # Through the cross product: near zero, where it matters, the arc cosine is coarse.
+    # By the cross product, because the arc cosine is imprecise near zero.
     sine = np.linalg.norm(np.cross(position, to_sun), axis=-1) / (distance * sun_distance)
     apart = np.arctan2(sine, cosine)
     return 1.0 - _covered(sun_disc, earth_disc, apart)
 
 
 def eclipsed(position: FloatArray, sun: FloatArray, shadow: Shadow = "conical") -> BoolArray:
-    """Tell which of `position` (..., 3) m see nothing of the Sun at `sun` (..., 3) m; arguments as above."""
+    """Return which of `position` (..., 3) m are in the umbra; arguments as above."""
     return np.asarray(sunlit_share(position, sun, shadow) <= 0.0)
 
 
@@ -56,8 +56,8 @@ def _in_cylinder(position: FloatArray, sun: FloatArray) -> BoolArray:
 def _covered(disc: FloatArray, cover: FloatArray, apart: FloatArray) -> FloatArray:
     """Return the share of a disc of radius `disc` that another of radius `cover` hides, centres `apart`, rad.
 
-    Of two plane discs that cross: the two segments beyond their common chord. The Sun's disc is so small that
-    the Earth's limb is all but straight across it, and the plane serves.
+    Two plane discs that overlap hide the two segments beyond their common chord. The plane is accurate enough
+    because the Sun's disc is small and the Earth's limb nearly straight across it.
     """
     crossing = (apart < disc + cover) & (apart > np.abs(disc - cover))
     safe = np.where(crossing, apart, disc + cover)

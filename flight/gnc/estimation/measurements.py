@@ -11,8 +11,20 @@ from dataclasses import dataclass
 from flight.gnc.math.arrays import FloatArray
 
 
+class _AtOneTime:
+    """A measurement of the state at `time_ns` alone."""
+
+    __slots__ = ()
+    time_ns: int
+
+    @property
+    def begin_ns(self) -> int:
+        """The first time that the measurement depends on."""
+        return self.time_ns
+
+
 @dataclass(frozen=True, slots=True, eq=False)
-class AttitudeMeasurement:
+class AttitudeMeasurement(_AtOneTime):
     """An attitude: quaternion (4,) reference into body, covariance (3, 3) rad^2 of small turns, body axes."""
 
     time_ns: int
@@ -20,25 +32,15 @@ class AttitudeMeasurement:
     covariance: FloatArray
     latency: float | None = None
 
-    @property
-    def begin_ns(self) -> int:
-        """The first time it says something about."""
-        return self.time_ns
-
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RateMeasurement:
+class RateMeasurement(_AtOneTime):
     """A gyro's body rate (3,) rad/s, bias included, and its covariance (3, 3)."""
 
     time_ns: int
     rate: FloatArray
     covariance: FloatArray
     latency: float | None = None
-
-    @property
-    def begin_ns(self) -> int:
-        """The first time it says something about."""
-        return self.time_ns
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,12 +57,12 @@ class MeanRateMeasurement:
 
     @property
     def begin_ns(self) -> int:
-        """The first time it says something about."""
+        """The start of the exposure."""
         return self.since_ns
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class DirectionMeasurement:
+class DirectionMeasurement(_AtOneTime):
     """A direction observed from the body, such as of the Sun or nadir.
 
     `observed` (3,) in body axes and `reference` (3,) in reference axes are unit vectors; `covariance` (3, 3)
@@ -72,14 +74,9 @@ class DirectionMeasurement:
     reference: FloatArray
     covariance: FloatArray
 
-    @property
-    def begin_ns(self) -> int:
-        """The first time it says something about."""
-        return self.time_ns
-
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FieldMeasurement:
+class FieldMeasurement(_AtOneTime):
     """A magnetometer's `field` (3,) T in body axes, bias included, and the model's `reference` (3,) T.
 
     `covariance` (3, 3) T^2, body axes, is of white noise; the filter estimates the constant part.
@@ -89,11 +86,6 @@ class FieldMeasurement:
     field: FloatArray
     reference: FloatArray
     covariance: FloatArray
-
-    @property
-    def begin_ns(self) -> int:
-        """The first time it says something about."""
-        return self.time_ns
 
 
 Measurement = (

@@ -1,7 +1,7 @@
-"""The bound that a chi-square of few degrees of freedom passes with a given chance.
+"""The value that a chi-square of few degrees of freedom exceeds with a given probability.
 
-The chance to pass x has a closed form (Abramowitz and Stegun 26.4.4, 26.4.5, and 26.4.8 for two degrees
-more), whose root is bracketed. In place of scipy's: the control process would hold 13 MB for three numbers.
+That probability has a closed form (Abramowitz and Stegun 26.4.4, 26.4.5, and 26.4.8 for two more degrees),
+whose root is bracketed. scipy would cost the control process 13 MB for three numbers.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ _TURNS = 200
 
 
 def chance_beyond(x: float, degrees: int) -> float:
-    """Return the chance that a chi-square of `degrees`, 1 at least, exceeds x >= 0."""
+    """Return the probability that a chi-square of `degrees` >= 1 exceeds x >= 0."""
     half = 0.5 * x
     chance = math.erfc(math.sqrt(half)) if degrees % 2 else math.exp(-half)
     for below in range(2 - degrees % 2, degrees, 2):
@@ -21,7 +21,7 @@ def chance_beyond(x: float, degrees: int) -> float:
 
 
 def bound(chance: float, degrees: int) -> float:
-    """Return what a chi-square of `degrees` exceeds with `chance`, 0 < chance <= 1."""
+    """Return the value that a chi-square of `degrees` exceeds with probability 0 < `chance` <= 1."""
     low, high = 0.0, 1.0
     while chance_beyond(high, degrees) > chance:
         low, high = high, 2.0 * high

@@ -15,9 +15,9 @@ def tangent_basis(direction: Iterable[float]) -> FloatArray:
 
     With the direction itself last they are a right-handed frame.
     """
-    # Plain floats: for one vector numpy costs ten times as much.
+    # Plain floats: numpy takes ten times as long for one vector.
     x, y, z = map(float, direction)
-    # Off the axis that is farthest from it.
+    # Across the coordinate axis farthest from it.
     least = min((abs(x), 0), (abs(y), 1), (abs(z), 2))[1]
     first = ((0.0, z, -y), (-z, 0.0, x), (y, -x, 0.0))[least]
     length = math.hypot(*first)

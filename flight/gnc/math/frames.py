@@ -15,9 +15,9 @@ NED_TO_TESTBED: FloatArray = np.array([0.5, -0.5, -0.5, 0.5])
 
 
 def attitude_map(mounting: FloatArray, reference: FloatArray) -> FloatArray:
-    """Return the matrix M (4, 4) that takes the attitude of a unit to that of the body.
+    """Return the matrix M (4, 4) that maps the attitude of a unit to that of the body.
 
-    The unit gives q (4,), NED into sensor. With `mounting` (4,) sensor into body and `reference` (4,) NED
+    The unit measures q (4,), NED into sensor. With `mounting` (4,) sensor into body and `reference` (4,) NED
     into the mission's reference frame, M q = mounting q conj(reference), the reference frame into the body.
     """
     return np.asarray(multiply(multiply(mounting, np.eye(4)), conjugate(reference)).T)

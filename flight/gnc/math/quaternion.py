@@ -2,7 +2,7 @@
 
 The convention of Sease 2013 and Wertz 1978. Composition follows the matrices: A(multiply(p, q)) = A(p) A(q).
 The attitude matrix is 4.8 corrected (its printed lower triangle repeats the upper one), the kinematics 2.12
-corrected (the upper left block is minus the cross-product matrix). Nothing else writes these formulas.
+corrected (the upper left block is minus the cross-product matrix). No other module repeats these formulas.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def from_rotation_vector(vector: FloatArray) -> FloatArray:
 
 
 def to_rotation_vector(q: FloatArray) -> FloatArray:
-    """Return the rotation vector (..., 3), rad, of the shorter way round."""
+    """Return the rotation vector (..., 3), rad, of the shorter rotation."""
     q = np.asarray(q)
     q = np.where(q[..., 3:] < 0, -q, q)
     sine = np.linalg.norm(q[..., :3], axis=-1, keepdims=True)
@@ -120,6 +120,6 @@ def about_axis_y(angle: float) -> FloatArray:
 
 
 def angle_about_axis_y(q: FloatArray) -> float:
-    """Return the turn about the y axis that q (4,) holds, its twist about the thread: rad, [-pi, pi)."""
+    """Return the rotation of q (4,) about the y axis, its twist about the thread: rad, [-pi, pi)."""
     angle = 2.0 * np.arctan2(q[1], q[3])
     return float(np.remainder(angle + np.pi, 2.0 * np.pi) - np.pi)

@@ -1,10 +1,9 @@
-"""The attitude determination of Fig. 3: gyros carry the attitude, every direction corrects it and their bias.
+"""Attitude determination of Fig. 3: gyros propagate the attitude, directions correct attitude and bias.
 
-The filter is the flight application's MEKF (`flight.gnc.estimation`), of a body free in orbit. It begins from
-the first two directions that fix an attitude well enough and agree; from then on each of Sun, nadir and field
-is
-taken when it comes, alone or not. The magnetometer's bias is estimated beside the gyros' (with the error that
-the field model has there, which changes no faster): sunlight finds it, eclipse lives from it.
+The filter is the flight application's MEKF (`flight.gnc.estimation`) for a body free in orbit. It starts from
+the first directions that fix an attitude well enough and agree; then each measurement of Sun, nadir and field
+is used at its own time, alone or not. The magnetometer's bias is estimated beside the gyros' (with the field
+model's error, which changes as slowly): the estimate from sunlight is used in eclipse.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ _UNIT_TOLERANCE = 1e-6
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DeterminationSettings:
-    """What is known of the sensors and of the body.
+    """Sensor noise, body and limits.
 
     Attributes:
         inertia: (3, 3) kg m^2, body axes.
@@ -46,11 +45,11 @@ class DeterminationSettings:
         field_sigma: T of a magnetometer sample.
         field_bias_start, field_bias_walk: T and T per sqrt(s), of the magnetometer, hard iron and model.
         disturbance_start, disturbance_walk: rad/s^2 and per sqrt(s), of all torques over the inertia.
-        start_sigma: rad, the attitude must be known so well on its worst axis to begin.
-        start_age: s, directions that old may still begin it together.
-        lost_sigma: rad, an estimate worse than this is given up: the filter is linear no more.
-        fresh: s, a sensor not taken in for so long is out of use.
-        gate_sigma: a measurement less likely than so many sigma is refused.
+        start_sigma: rad, largest sigma of the worst axis to start.
+        start_age: s, largest age of directions to start from.
+        lost_sigma: rad, a worse estimate is discarded because linearisation no longer holds.
+        fresh: s, a sensor without accepted measurements for longer is not in use.
+        gate_sigma: a measurement less likely than this many sigma is rejected.
         longest_step: s, of the filter.
     """
 
@@ -72,26 +71,26 @@ class DeterminationSettings:
 
 
 class Status(Enum):
-    """What the attitude rests on."""
+    """The sensors on which the attitude is based."""
 
     ACQUIRING = "acquiring"
-    """There is none: no two directions yet that fix one."""
+    """No attitude: no directions yet that fix one."""
     OBSERVED = "observed"
-    """Two directions at least, the field among them or not, are coming in."""
+    """At least two directions are in use, with or without the field."""
     AIDED = "aided"
-    """One direction is: the turn about it drifts with the gyros until the direction moves."""
+    """One direction is in use: the turn about it drifts with the gyros until the direction moves."""
     COASTING = "coasting"
-    """None is: the gyros alone carry it."""
+    """Gyros alone."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Report:
-    """The attitude at `time_ns` and what it is worth.
+    """The attitude at `time_ns` and its accuracy.
 
     Attributes:
         estimate: None while acquiring.
         sigma: (3,) rad about the body's axes, infinite while acquiring.
-        in_use: the sensors taken in of late, gyros apart.
+        in_use: the sensors with recent accepted measurements, without the gyros.
     """
 
     time_ns: int
@@ -103,19 +102,19 @@ class Report:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Waiting:
-    """A direction that came before there was an attitude."""
+    """A direction measured before there was an attitude."""
 
     time_ns: int
     sight: Sight
 
 
 class AttitudeDetermination:
-    """Holds the filter, or the directions with which it will begin.
+    """Owns the filter, or the directions from which it will start.
 
     Attributes:
         refused: how many measurements of each sensor did not pass their gate.
-        starts: how often it began.
-        nis: normalised innovation squared of the measurement last given, NaN when there was none.
+        starts: how often the filter started.
+        nis: normalised innovation squared of the last measurement, NaN without one.
     """
 
     def __init__(self, settings: DeterminationSettings) -> None:
@@ -130,41 +129,41 @@ class AttitudeDetermination:
         self.nis = math.nan
 
     def rate(self, time_ns: int, rate: FloatArray) -> None:
-        """Take in the gyros' rate (3,) rad/s, body axes."""
+        """Accept the gyros' rate (3,) rad/s, body axes."""
         self.nis = math.nan
         if not np.all(np.isfinite(rate)):
             return
         self._rate = RateMeasurement(time_ns, rate, self._settings.rate_sigma**2 * np.eye(3))
         if self._filter.started:
-            self._take("gyro", self._rate)
+            self._ingest("gyro", self._rate)
 
     def direction(
         self, sensor: str, time_ns: int, observed: FloatArray, reference: FloatArray, covariance: FloatArray
     ) -> None:
-        """Take in a direction: unit vectors (3,) in body and inertial axes, covariance (3, 3) rad^2, body.
+        """Accept a direction: unit vectors (3,) in body and inertial axes, covariance (3, 3) rad^2, body.
 
-        `sensor` is any name but that of the field.
+        `sensor` is any name except that of the field.
         """
         self.nis = math.nan
         if not (_is_unit(observed) and _is_unit(reference) and np.all(np.isfinite(covariance))):
             self._refuse(sensor)
         elif self._filter.started:
-            self._take(sensor, DirectionMeasurement(time_ns, observed, reference, covariance))
+            self._ingest(sensor, DirectionMeasurement(time_ns, observed, reference, covariance))
         else:
             self._wait(sensor, time_ns, Sight(observed, reference, covariance))
 
     def field(self, time_ns: int, field: FloatArray, reference: FloatArray) -> None:
-        """Take in the magnetometer's field (3,) T, body axes, where the model has `reference` (3,) T."""
+        """Accept the magnetometer's field (3,) T, body axes, and the model's `reference` (3,) T."""
         self.nis = math.nan
         settings = self._settings
         if not (np.all(np.isfinite(field)) and np.all(np.isfinite(reference))):
             self._refuse(FIELD)
         elif self._filter.started:
             covariance = settings.field_sigma**2 * np.eye(3)
-            self._take(FIELD, FieldMeasurement(time_ns, field, reference, covariance))
+            self._ingest(FIELD, FieldMeasurement(time_ns, field, reference, covariance))
         else:
-            # Its bias goes into the attitude it begins, and comes again with the next sample as if it were
-            # another's: twice the bias's sigma leaves that attitude with its own weight.
+            # The bias enters the first attitude, and again the next sample as if independent: twice the
+            # bias's sigma keeps the attitude's weight right.
             spread = settings.field_sigma**2 + (2.0 * settings.field_bias_start) ** 2
             try:
                 self._wait(FIELD, time_ns, field_sight(field, reference, spread * np.eye(3)))
@@ -172,7 +171,7 @@ class AttitudeDetermination:
                 self._refuse(FIELD)
 
     def report(self, time_ns: int) -> Report:
-        """Return the attitude at `time_ns` and its accuracy there; one that is worth nothing is given up."""
+        """Return the attitude at `time_ns` and its accuracy; discards an estimate that is too uncertain."""
         fresh_ns = round(self._settings.fresh * 1e9)
         in_use = frozenset(name for name, then in self._taken_ns.items() if time_ns - then <= fresh_ns)
         estimate = self._filter.at(time_ns) if self._filter.started else None
@@ -183,7 +182,7 @@ class AttitudeDetermination:
             self._filter = self._new_filter()
         return Report(time_ns, Status.ACQUIRING, None, np.full(3, np.inf), in_use)
 
-    def _take(
+    def _ingest(
         self, sensor: str, measurement: RateMeasurement | DirectionMeasurement | FieldMeasurement
     ) -> None:
         if self._filter.measure(measurement):
@@ -197,7 +196,7 @@ class AttitudeDetermination:
         self.refused[sensor] = self.refused.get(sensor, 0) + 1
 
     def _wait(self, sensor: str, time_ns: int, sight: Sight) -> None:
-        """Keep a direction, and begin if those at hand fix an attitude."""
+        """Keep a direction, and start if the directions at hand fix an attitude."""
         self._waiting[sensor] = _Waiting(time_ns, sight)
         oldest_ns = time_ns - round(self._settings.start_age * 1e9)
         self._waiting = {name: w for name, w in self._waiting.items() if w.time_ns >= oldest_ns}
@@ -214,7 +213,7 @@ class AttitudeDetermination:
         self.starts += 1
 
     def _moved(self, waiting: _Waiting, time_ns: int) -> Sight:
-        """Return a direction as it may be at `time_ns`: the body has turned since, and nobody knows how."""
+        """Return a direction at `time_ns`, its covariance enlarged by the possible turn of the body since."""
         assert self._rate is not None
         rate = float(np.linalg.norm(self._rate.rate)) + 3.0 * self._settings.bias_start
         turned = rate * (time_ns - waiting.time_ns) * 1e-9
@@ -253,7 +252,7 @@ def begin(sights: Sequence[Sight], improbable: float = 1e-4) -> AttitudeFix | No
 
 
 def field_bias(estimate: Estimate) -> tuple[FloatArray, FloatArray]:
-    """Return what the magnetometer reads too much, (3,) T body axes, and its sigmas (3,)."""
+    """Return the magnetometer's bias, (3,) T body axes, and its sigmas (3,)."""
     return estimate.field_bias, np.sqrt(np.diag(estimate.covariance)[FIELD_BIAS])
 
 

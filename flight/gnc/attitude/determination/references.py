@@ -1,8 +1,8 @@
-"""What Sun sensor, horizon cameras and magnetometer should see from where the satellite is, in ICRS.
+"""The reference directions of Sun and nadir and the field at the satellite's position, in ICRS.
 
-The Sun's place is from `flight.gnc.earth.sun` (0.009" by 2030), seen from the satellite (9" of parallax) and
-aberrated by its motion (20.5" and 5"): a series of 42" error would show beside a sensor of 0.02 deg that is
-averaged over minutes.
+The Sun's direction is from `flight.gnc.earth.sun` (0.009" by 2030), as seen from the satellite (9" of
+parallax) with aberration by its motion (20.5" and 5"): a series with an error of 42" would be visible in a
+sensor of 0.02 deg averaged over minutes.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ SPEED_OF_LIGHT = 299_792_458.0
 class References:
     """Unit vectors (3,) of Sun and nadir, and the field (3,) T.
 
-    `nadir_sigma` rad an axis is of where one believes to be, `sun_radius` rad is half the Sun's disc.
+    `nadir_sigma` rad per axis follows from the error of position; `sun_radius` rad is the Sun's angular
+    radius.
     """
 
     sun: FloatArray
@@ -35,7 +36,7 @@ class References:
 
 
 def references(state: OrbitState) -> References:
-    """Return what there is to be seen from `state`. Raises GeomagneticError outside the model's years."""
+    """Return the references at `state`. Raises GeomagneticError outside the model's years."""
     sun, distance = sun_from(state.julian_date, state.position, state.velocity)
     radius = float(np.linalg.norm(state.position))
     return References(

@@ -1,9 +1,9 @@
-"""The attitude of one moment from the directions of that moment: cameras' Sun and nadir, and the field.
+"""The attitude at one time from the directions at that time: cameras' Sun and nadir, and the field.
 
-TRIAD and QUEST (Meller et al., section 2) know of each direction one sigma; `optimum` weighs it by its
-whole covariance, and reaches the bound that the covariances set. A single direction, the magnetometer's,
-fixes two of three axes (the paper has it fix all): `with_direction` combines it with the cameras' attitude
-by information, `combined` two attitudes that are both whole.
+TRIAD and QUEST (Meller et al., section 2) use one sigma per direction; `optimum` uses whole covariances and
+reaches the bound that they set. A single direction, the magnetometer's, fixes two of three axes (the paper
+assumes all): `with_direction` combines it with the cameras' attitude by information, `combined` combines two
+complete attitudes.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from flight.gnc.math.quaternion import (
 
 _MOST_TURNS = 20
 _SETTLED = 1e-9
-"""rad: each turn is the square of the last, or nearly."""
+"""rad: the limit of the last turn; convergence is nearly quadratic."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sight:
     """One direction: `observed` (3,) body and `reference` (3,) inertial axes, unit vectors.
 
-    `covariance` (3, 3) rad^2 is of the observed, body axes; what it holds along the direction does not count.
+    `covariance` (3, 3) rad^2 is of `observed`, body axes; its part along the direction has no effect.
     """
 
     observed: FloatArray
@@ -46,7 +46,7 @@ class Sight:
 
     @property
     def sigma(self) -> float:
-        """The one sigma an axis that has the covariance's mean across the direction, rad."""
+        """The mean sigma per axis across the direction, rad."""
         along = float(self.observed @ self.covariance @ self.observed)
         return float(np.sqrt(0.5 * (np.trace(self.covariance) - along)))
 
@@ -58,10 +58,10 @@ def camera_sight(
     reference: FloatArray,
     reference_sigma: float = 0.0,
 ) -> Sight:
-    """Return the sight of what a camera measured: `direction` (3,) and `covariance` (3, 3) rad^2, its axes.
+    """Return the sight of a camera's measurement: `direction` (3,), `covariance` (3, 3) rad^2, camera axes.
 
-    `to_camera` (3, 3) takes body vectors to those axes. `reference_sigma` rad an axis is of `reference` (3,),
-    as of nadir where the position is not known for sure, or of the mounting.
+    `to_camera` (3, 3) maps body vectors to those axes. `reference_sigma` rad per axis is the error of
+    `reference` (3,), such as of nadir for an uncertain position, or of the mounting.
     """
     spread = to_camera.T @ covariance @ to_camera + reference_sigma**2 * np.eye(3)
     return Sight(to_camera.T @ direction, reference, spread)
@@ -72,7 +72,7 @@ def field_sight(
 ) -> Sight:
     """Return the sight of a field: `field` (3,) T body, `reference` (3,) T, covariance (3, 3) T^2.
 
-    The covariance must hold what is not known of the magnetometer's bias. Raises AttitudeError where the
+    The covariance must include the error of the magnetometer's bias. Raises AttitudeError where the
     field is so weak that its direction is off by more than `longest_angle` rad.
     """
     strength = float(np.linalg.norm(reference))
@@ -82,7 +82,7 @@ def field_sight(
 
 
 def attitude(sights: Sequence[Sight], solver: Literal["triad", "quest"] = "quest") -> AttitudeFix:
-    """Return TRIAD's or QUEST's attitude, each direction's errors taken as equal across it.
+    """Return TRIAD's or QUEST's attitude, each direction's errors assumed equal across it.
 
     Raises AttitudeError when the directions fix no attitude.
     """
@@ -110,7 +110,7 @@ def optimum(sights: Sequence[Sight]) -> AttitudeFix:
 
 
 def with_direction(fix: AttitudeFix, sight: Sight) -> AttitudeFix:
-    """Return the optimal combination of an attitude and one direction more."""
+    """Return the optimal combination of an attitude and one more direction."""
     quaternion = fix.quaternion
     prior = np.linalg.inv(fix.covariance)
     for _ in range(_MOST_TURNS):
@@ -125,9 +125,9 @@ def with_direction(fix: AttitudeFix, sight: Sight) -> AttitudeFix:
 
 
 def combined(first: AttitudeFix, second: AttitudeFix) -> AttitudeFix:
-    """Return the optimal combination of two attitudes whose errors have nothing to do with each other.
+    """Return the optimal combination of two attitudes with independent errors.
 
-    What it adds to their losses is half a chi-square of three degrees of freedom: how well they agree.
+    The added loss is half a chi-square of three degrees of freedom and measures their agreement.
     """
     apart = to_rotation_vector(multiply(second.quaternion, conjugate(first.quaternion)))
     both = np.linalg.inv(first.covariance + second.covariance)
@@ -149,7 +149,7 @@ def _normal_equations(
         x, y, z = expected.tolist()
         across = tangent_basis((x, y, z))
         weight = np.linalg.inv(across @ sight.covariance @ across.T)
-        # The direction of a body turned by e more is A r + [A r x] e.
+        # After a further small turn e of the body the direction is A r + [A r x] e.
         rows = across @ np.array(skew((x, y, z)))
         residual = across @ (sight.observed - expected)
         information += rows.T @ weight @ rows
