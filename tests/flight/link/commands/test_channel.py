@@ -117,7 +117,7 @@ def test_an_answer_of_a_mode_that_there_is_not_is_none(
     thread.join()
     channel.close()
     assert status == 1
-    assert capsys.readouterr().err.endswith("bytes is none\n")
+    assert capsys.readouterr().err.endswith("bytes is invalid\n")
 
 
 def flood(to: Path, count: int, data: bytes) -> None:
