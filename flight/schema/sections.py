@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
-from flight.gnc.guidance.one_axis.plant import Q2_LIMIT
+from flight.gnc.guidance.one_axis.limits import Q2_LIMIT
 
 Positive = Annotated[float, Meta(gt=0.0)]
 NotNegative = Annotated[float, Meta(ge=0.0)]

@@ -13,7 +13,8 @@ from flight.bodies.testbed.thread_law import ThreadLaw, law_of
 from flight.gnc.errors import UsageError
 from flight.gnc.estimation.estimate import Estimate
 from flight.gnc.guidance.one_axis.guidance import Guidance
-from flight.gnc.guidance.one_axis.plant import Q2_LIMIT, angle_of
+from flight.gnc.guidance.one_axis.limits import Q2_LIMIT
+from flight.gnc.guidance.one_axis.plant import angle_of
 from flight.loop.control_output import COMMANDED, KEPT, Target
 
 

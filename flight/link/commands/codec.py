@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from flight.gnc.errors import FlightError
-from flight.gnc.guidance.one_axis.plant import Q2_LIMIT
+from flight.gnc.guidance.one_axis.limits import Q2_LIMIT
 from flight.link.commands.definitions import CLEAR, LAYOUTS, MODE, PING, SAFE, SLEW
 from flight.link.modes import COMMANDABLE, Mode
 from flight.link.telemetry.packets import HEADER_BYTES, Packer, TelemetryError, crc16, to_text

@@ -9,7 +9,7 @@ import pytest
 from msgspec import structs
 
 from flight.app.composition.bodies import body_kind
-from flight.gnc.guidance.one_axis.plant import Q2_LIMIT
+from flight.gnc.guidance.one_axis.limits import Q2_LIMIT
 from flight.gnc.math.quaternion import about_axis_y, angle_about_axis_y
 from flight.link.telemetry.reader import Run
 from flight.loop.control_cycle import ATTITUDE_EVERY

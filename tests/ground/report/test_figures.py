@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from ground.report import panels
+from ground.report.scene import Scene, planned_path
 
 EVERY = ["attitude", "current", "power", "paths", "cycle_times", "rate", "overview"]
 ROOT = Path(__file__).resolve().parents[3]
@@ -53,7 +54,7 @@ def test_every_picture_that_the_run_has_something_for_is_drawn(
 
 def test_the_panels_show_the_values_of_the_log(tmp_path: Path) -> None:
     run = read_run(make_run(tmp_path, Recipe(duration=120.0, rate_hz=10.0)))
-    scene, figure = panels.Scene(run), Figure()
+    scene, figure = Scene(run), Figure()
     top, bottom = figure.subplots(2)
     panels.attitude(top, scene)
     lines = {str(line.get_label()): line for line in top.get_lines()}
@@ -72,14 +73,14 @@ def test_values_that_only_a_damaged_log_has_do_not_keep_a_panel_from_being_drawn
     run.truth.packets["truth"] = damaged
     axes = Figure().subplots()
     with np.errstate(invalid="ignore"):
-        panels.rate_error(axes, panels.Scene(run))
+        panels.rate_error(axes, Scene(run))
     assert np.isfinite(axes.get_ylim()).all()
 
 
 def test_a_planned_path_passes_through_its_nodes_and_is_the_polynomial_between(tmp_path: Path) -> None:
     run = read_run(make_run(tmp_path, Recipe(duration=5.0, rate_hz=10.0)))
     plan = run["plan"][0]
-    time, q2, node_time, node_q2 = panels.planned_path(plan)
+    time, q2, node_time, node_q2 = planned_path(plan)
     assert (time[0], time[-1]) == (node_time[0], node_time[-1]) == (0.0, 13.0)
     part = time / 13.0
     np.testing.assert_allclose(q2, 0.2 - 0.5 * (3.0 * part**2 - 2.0 * part**3), atol=1e-12)

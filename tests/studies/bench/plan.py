@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from flight.gnc.errors import PlanningError
-from flight.gnc.guidance.one_axis.plant import Q2_LIMIT
+from flight.gnc.guidance.one_axis.limits import Q2_LIMIT
 from flight.gnc.guidance.one_axis.vmc import Plan, PlanStatus
 from tests.flight.gnc.guidance.oracle import solve
 from tests.flight.gnc.guidance.problems import STEPS, THESIS, Problem, feasible_problems

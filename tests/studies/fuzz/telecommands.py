@@ -10,7 +10,7 @@ from collections import Counter
 
 import numpy as np
 
-from flight.gnc.guidance.one_axis.plant import Q2_LIMIT
+from flight.gnc.guidance.one_axis.limits import Q2_LIMIT
 from flight.link.commands.codec import (
     ChangeMode,
     Clear,

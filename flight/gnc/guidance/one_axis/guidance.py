@@ -13,8 +13,9 @@ from enum import StrEnum
 import numpy as np
 
 from flight.gnc.errors import UsageError
+from flight.gnc.guidance.one_axis.limits import Q2_LIMIT
 from flight.gnc.guidance.one_axis.path import PolynomialPath, Sample
-from flight.gnc.guidance.one_axis.plant import Q2_LIMIT, SingleAxisPlant, q2_of
+from flight.gnc.guidance.one_axis.plant import SingleAxisPlant, q2_of
 from flight.gnc.guidance.one_axis.vmc import Plan
 
 _CHECKED_POINTS = 600

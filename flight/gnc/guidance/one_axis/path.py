@@ -15,7 +15,8 @@ import numpy as np
 from numpy.polynomial import chebyshev
 
 from flight.gnc.guidance.lgl import lgl_rule
-from flight.gnc.guidance.one_axis.plant import Q2_LIMIT, acceleration_of, angle_of, motion_of, rate_of
+from flight.gnc.guidance.one_axis.limits import Q2_LIMIT
+from flight.gnc.guidance.one_axis.plant import acceleration_of, angle_of, motion_of, rate_of
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import about_axis_y
 

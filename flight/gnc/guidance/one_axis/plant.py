@@ -21,9 +21,6 @@ from flight.gnc.math.arrays import FloatArray
 SQUARE_Q2_WITHOUT_AUTHORITY = 0.5
 """cos(theta) = 1 - 2 q2^2 is zero here: the coil's axis lies along the field (5.15 corrected)."""
 
-Q2_LIMIT = 0.68
-"""Largest |q2| of a path: cos(theta) is 0.075 there; at 0.707 no current turns the body."""
-
 
 @dataclass(frozen=True, slots=True)
 class SingleAxisPlant:

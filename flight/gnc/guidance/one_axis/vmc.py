@@ -18,13 +18,9 @@ import numpy as np
 
 from flight.gnc.errors import PlanningError
 from flight.gnc.guidance.lgl import lgl_rule
+from flight.gnc.guidance.one_axis.limits import Q2_LIMIT
 from flight.gnc.guidance.one_axis.path import PolynomialPath
-from flight.gnc.guidance.one_axis.plant import (
-    Q2_LIMIT,
-    SQUARE_Q2_WITHOUT_AUTHORITY,
-    SingleAxisPlant,
-    q2_rate_of,
-)
+from flight.gnc.guidance.one_axis.plant import SQUARE_Q2_WITHOUT_AUTHORITY, SingleAxisPlant, q2_rate_of
 from flight.gnc.guidance.one_axis.prey import CubicPrey
 from flight.gnc.guidance.one_axis.vmc_family import Boundary, Family
 from flight.gnc.guidance.one_axis.vmc_horizon import Search
