@@ -11,7 +11,7 @@ from types import FrameType
 from flight.app.accepted_config import FlownConfig
 from flight.app.linux import linux_rig
 from flight.app.mission_time import mission_zero, next_whole_second
-from flight.app.preparation import prepare
+from flight.app.opening import open_flight
 from flight.app.request import RunRequest, RunResult
 from flight.app.requested_config import requested_config
 from flight.app.run_folder import begin_folder
@@ -32,7 +32,7 @@ def fly(request: RunRequest, progress: Callable[[Progress], None] | None = None)
     request = begin_folder(request, text, config)
     with ExitStack() as stack:
         rig = _open_rig(request, text, config, stack)
-        loop, flight_log = prepare(config, rig, request.out, stack, patient=_is_patient(request))
+        loop, flight_log = open_flight(config, rig, request.out, stack, patient=_is_patient(request))
         if progress is not None:
             loop.watch(progress)
         if request.config_problem:

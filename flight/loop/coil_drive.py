@@ -92,7 +92,7 @@ class CoilDrive:
         if not known:
             watch.interrupted(now_ns)
         for reading in readings:
-            watch.felt(reading.time_ns, reading.rate, reading.field)
+            watch.observe_motion(reading.time_ns, reading.rate, reading.field)
         answer = self._power.latest() if self._power is not None and not self._power.error() else None
         if answer is not None:
             watch.measured(answer)

@@ -71,7 +71,7 @@ class ControlCycle:
         readings = tasks.navigation.update(now_ns)
         if not in_force.error:
             self._streams.note("coils", now_ns)
-        tasks.drive.look(in_force, readings, now_ns, known=known.until_now)
+        tasks.drive.look(in_force, readings, now_ns, known=known.since_last_look)
         if tasks.imaging is not None:
             tasks.imaging.serve(now_ns)
         estimate = tasks.navigation.estimate(now_ns)

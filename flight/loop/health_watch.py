@@ -90,7 +90,7 @@ class HealthWatch:
             self._events.report(events.CLOCK_STEP, now_ns, f"by {step:+.3f} s")
         sample, self._sample = self._sample, None
         if sample is not None:
-            self._monitor.take(sample)
+            self._monitor.ingest(sample)
             self._monitor.report(self._facts, now_ns)
         if cycle.slot % LOOKS_A_PACKET == 0:
             self._record(now_ns)
@@ -114,7 +114,7 @@ class HealthWatch:
         failed = self._control.cycles - self._counted[0]
         text = f"{failed} control cycles in a row have failed"
         self._facts.update(facts.TASK_FAILING, failed >= _FAILING_CYCLES, now_ns, text)
-        still = self._progress.standing_still(now_ns)
+        still = self._progress.stalled(now_ns)
         self._facts.update(facts.NO_PROGRESS, bool(still), now_ns, f"no progress: {', '.join(still)}")
         if not still:
             self._feed()

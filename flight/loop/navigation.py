@@ -18,7 +18,7 @@ from flight.link import events
 from flight.link.telemetry.definitions import IMU
 from flight.loop.body import Body
 from flight.loop.fdir import facts
-from flight.loop.fdir.coils.knowledge import Known
+from flight.loop.fdir.coils.knowledge import CurrentValidity
 from flight.loop.services import Services
 from hal.interfaces.devices import InertialUnit
 from hal.interfaces.errors import DeviceError
@@ -80,10 +80,10 @@ class Navigation:
         """Return the unit's counters."""
         return self._link
 
-    def commanded(self, in_force: CoilState, known: Known) -> None:
+    def commanded(self, in_force: CoilState, known: CurrentValidity) -> None:
         """Tell the filter what the coils carry, as far as that is known."""
-        if known.doubt_ns is not None:
-            self._filter.mark_unknown(known.doubt_ns)
+        if known.uncertain_since_ns is not None:
+            self._filter.mark_unknown(known.uncertain_since_ns)
         self._filter.command(max(in_force.written_ns, known.since_ns), in_force.current, known=known.now)
 
     def update(self, now_ns: int) -> tuple[ImuReading, ...]:

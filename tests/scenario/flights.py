@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from flight.app import preparation
+from flight.app import opening
 from flight.app.mission_time import next_whole_second
 from flight.link.telemetry.packets import to_text
 from flight.link.telemetry.reader import Run, read_run
@@ -97,7 +97,7 @@ def fly(
         rig = with_host_faults(rig, section)
         if absent is not None:
             absent(lock)
-        loop, _ = preparation.prepare(config, rig, folder, stack, patient=absent is not None)
+        loop, _ = opening.open_flight(config, rig, folder, stack, patient=absent is not None)
         epoch_ns = next_whole_second(lock.clock)
         rig.release(epoch_ns)
         prepare(Rigged(lock, loop, epoch_ns))

@@ -33,7 +33,7 @@ class _GroupWatch:
         self._completed = group.completed
         self.since_ns = 0
 
-    def stands_still(self, now_ns: int) -> bool:
+    def is_stalled(self, now_ns: int) -> bool:
         if self.group.completed != self._completed:
             self._completed, self.since_ns = self.group.completed, now_ns
         return now_ns - self.since_ns > self.patience_ns
@@ -51,9 +51,9 @@ class GroupsAndWorkers:
         for watch in self._groups:
             watch.since_ns = time_ns
 
-    def standing_still(self, now_ns: int) -> list[str]:
+    def stalled(self, now_ns: int) -> list[str]:
         """Return the names of the groups and workers that do not get on."""
-        names = [watch.group.name for watch in self._groups if watch.stands_still(now_ns)]
+        names = [watch.group.name for watch in self._groups if watch.is_stalled(now_ns)]
         for worker in self._workers:
             since_ns = worker.busy_since_ns()
             if since_ns is not None and now_ns - since_ns > worker.patience_ns:

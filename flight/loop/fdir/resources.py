@@ -73,7 +73,7 @@ class ResourceMonitor:
         self._begun_ns: int | None = None
         self.state = ResourceState()
 
-    def take(self, sample: ResourceSample) -> None:
+    def ingest(self, sample: ResourceSample) -> None:
         """Take in a sample."""
         share = math.nan
         if self.state.sample is not None:

@@ -36,7 +36,7 @@ class StreamState(IntEnum):
 class Stream:
     """One row: rate in Hz, age limit in s, and the range of its value, in the value's unit.
 
-    `told_stale`: another alarm tells when it falls silent, so that its own fact need not.
+    `has_silence_alarm`: another alarm tells when it falls silent, so that its own fact need not.
     """
 
     name: str
@@ -45,7 +45,7 @@ class Stream:
     poor: Fact
     low: float = float("-inf")
     high: float = float("inf")
-    told_stale: bool = True
+    has_silence_alarm: bool = True
 
 
 def streams_of(config: Config) -> tuple[Stream, ...]:
@@ -147,7 +147,7 @@ def _poor(watch: StreamWatch, now_ns: int) -> tuple[bool | None, str]:
     stream, state = watch.stream, watch.state(now_ns)
     if state is StreamState.GOOD:
         return False, f"{stream.name}: good again"
-    if state is StreamState.NEVER or (state is StreamState.STALE and stream.told_stale):
+    if state is StreamState.NEVER or (state is StreamState.STALE and stream.has_silence_alarm):
         return None, ""
     reason = {
         StreamState.STALE: f"{watch.age(now_ns):.2f} s old, {stream.max_age:g} s allowed",

@@ -35,7 +35,7 @@ class Notices:
         """Keep an event. Safe from any thread."""
         self._kept.append((kind, text))
 
-    def take(self) -> list[tuple[EventKind, str]]:
+    def drain(self) -> list[tuple[EventKind, str]]:
         """Return the events since the last call, oldest first."""
         return [self._kept.popleft() for _ in range(len(self._kept))]
 
@@ -90,7 +90,7 @@ class StateKeeper:
 
     def notices(self) -> list[tuple[EventKind, str]]:
         """Return what happened to the state since the last call, for the event log."""
-        return self._notices.take()
+        return self._notices.drain()
 
     def close(self, clean: bool) -> None:
         """Write the last state, as that of a clean end or not. Safe to call twice; never waits long."""

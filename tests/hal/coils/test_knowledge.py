@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from flight.loop.fdir.coils.knowledge import STOOD_NS, CoilKnowledge, Known
+from flight.loop.fdir.coils.knowledge import STOOD_NS, CoilKnowledge, CurrentValidity
 from hal.guardian.watch import SILENCE_NS
 from hal.interfaces.readings import CoilState
 
@@ -18,27 +18,27 @@ REFUSES = replace(OBEYS, error="pca9685 at 0x40: does not keep what is written t
 def test_what_a_chip_carries_that_obeys_is_known() -> None:
     knowledge = CoilKnowledge()
     looks = [knowledge.look(OBEYS, 1000 * MS + 25 * MS * cycle) for cycle in range(4)]
-    assert looks == [Known(True, True, -1, None)] * 4
+    assert looks == [CurrentValidity(True, True, -1, None)] * 4
 
 
 def test_what_a_chip_does_not_keep_is_in_doubt_since_it_was_last_read_back() -> None:
     knowledge = CoilKnowledge()
     knowledge.look(OBEYS, 1000 * MS)
     first, second = (knowledge.look(REFUSES, now * MS) for now in (1025, 1050))
-    assert first == Known(False, False, -1, 425 * MS)
-    assert second == Known(False, False, -1, None)
+    assert first == CurrentValidity(False, False, -1, 425 * MS)
+    assert second == CurrentValidity(False, False, -1, None)
     again, then = (knowledge.look(OBEYS, now * MS) for now in (1075, 1100))
-    assert again == Known(True, False, 1075 * MS, None), "what it carried before it obeyed again is not known"
-    assert then == Known(True, True, 1075 * MS, None)
+    assert again == CurrentValidity(True, False, 1075 * MS, None), "unknown before the chip obeyed again"
+    assert then == CurrentValidity(True, True, 1075 * MS, None)
 
 
 def test_what_the_coils_carried_while_the_loop_stood_still_is_in_doubt() -> None:
     knowledge = CoilKnowledge()
     knowledge.look(OBEYS, 1000 * MS)
-    assert knowledge.look(OBEYS, 1150 * MS).until_now, "no guardian has acted yet"
+    assert knowledge.look(OBEYS, 1150 * MS).since_last_look, "no guardian has acted yet"
     stood = knowledge.look(OBEYS, 1450 * MS)
-    assert stood == Known(True, False, 1450 * MS, 1150 * MS)
-    assert knowledge.look(OBEYS, 1475 * MS) == Known(True, True, 1450 * MS, None)
+    assert stood == CurrentValidity(True, False, 1450 * MS, 1150 * MS)
+    assert knowledge.look(OBEYS, 1475 * MS) == CurrentValidity(True, True, 1450 * MS, None)
 
 
 def test_no_guardian_acts_in_a_gap_that_is_not_seen() -> None:

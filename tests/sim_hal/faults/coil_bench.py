@@ -112,7 +112,7 @@ def observe(
         watch.commanded(now_ns, state.current, state.braked, state.written_ns)
         for reading in unit.poll():
             newest = reading
-            watch.felt(reading.time_ns, reading.rate, reading.field)
+            watch.observe_motion(reading.time_ns, reading.rate, reading.field)
         answer = monitor.latest()
         if answer is not None and not monitor.error():
             watch.measured(answer)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from flight.gnc.math.arrays import FloatArray
-from flight.loop.fdir.coils.hypotheses import MEAN, NEWEST, Bounds, CoilFault, fits, foretell, supply_current
+from flight.loop.fdir.coils.hypotheses import MEAN, NEWEST, Bounds, CoilFault, fits, predict, supply_current
 from flight.loop.fdir.coils.stuck_leg import NONE, StuckLeg, Supplied
 from flight.loop.fdir.coils.watch import CoilWatch, CoilWatchSettings
 from hal.interfaces.readings import ImuReading, PowerReading
@@ -197,10 +197,10 @@ def test_in_eight_minutes_of_wild_commands_there_is_no_false_alarm() -> None:
         chopped = conversions * rng.uniform(0.82, 1.18, len(conversions))
         for last in range(5, len(conversions)):
             end = 8 * (last + 1)
-            mean = foretell(
+            mean = predict(
                 round(conversions[last - 4 : last + 1].mean(), 4), commands[end - 44 : end], BOUNDS, MEAN
             )
-            newest = foretell(round(chopped[last], 4), commands[end - 12 : end], BOUNDS, NEWEST)
+            newest = predict(round(chopped[last], 4), commands[end - 12 : end], BOUNDS, NEWEST)
             sound = all(fits([one], BOUNDS, {}) for one in (mean, newest))
             in_a_row = 0 if sound else in_a_row + 1
             suspected += in_a_row >= 3

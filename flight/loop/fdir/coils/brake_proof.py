@@ -27,7 +27,7 @@ class BrakeProof:
         """Forget an axis."""
         self._axes.discard(axis)
 
-    def take(self, exceeds: bool) -> frozenset[int]:
+    def ingest(self, exceeds: bool) -> frozenset[int]:
         """Note whether a conversion shows current in spite of the brakes; return the axes braked wrongly."""
         self._exceeds.append(exceeds)
         if len(self._exceeds) < _PROOFS:

@@ -13,7 +13,7 @@ from flight.loop.fdir.coils.stuck_leg import NONE, Axes, Supplied
 from hal.interfaces.readings import PowerReading
 
 _SAMPLES_NS = 25_000_000
-_TOLD_LATE_NS = 25_000_000
+_NOTED_LATE_NS = 25_000_000
 """A command is told a cycle after it was written."""
 
 
@@ -57,7 +57,7 @@ class CoilCommands:
         """Return the commands (k, 3) A that may have been in force between two times, at even distances."""
         times = np.array([time_ns for time_ns, _ in self._commands])
         values = np.array([currents for _, currents in self._commands])
-        at = np.arange(begin_ns, end_ns + _TOLD_LATE_NS + 1, _SAMPLES_NS)
+        at = np.arange(begin_ns, end_ns + _NOTED_LATE_NS + 1, _SAMPLES_NS)
         newest: FloatArray = values[np.maximum(np.searchsorted(times, at, side="right") - 1, 0)]
         return newest
 

@@ -82,7 +82,7 @@ MEAN = Sampling(0.02, 0.25)
 
 
 @dataclass(frozen=True, slots=True)
-class Foretold:
+class Predicted:
     """A reading in A, and what each axis (rows) would add under each variant: mean and slack (3, v) A."""
 
     current: float
@@ -91,7 +91,7 @@ class Foretold:
     scatter: float
 
 
-def foretell(current: float, commands: FloatArray, bounds: Bounds, sampling: Sampling) -> Foretold:
+def predict(current: float, commands: FloatArray, bounds: Bounds, sampling: Sampling) -> Predicted:
     """Work out what each variant would have drawn under the commands (k, 3) A of a reading's window."""
     drawn = np.empty((3, len(_VARIANTS), len(commands)))
     for axis in range(3):
@@ -99,7 +99,7 @@ def foretell(current: float, commands: FloatArray, bounds: Bounds, sampling: Sam
             drawn[axis, place] = supply_current(commands[:, axis], fault, bounds.full_current[axis])
     driven = np.count_nonzero(drawn, axis=2) / len(commands)
     slack = bounds.uncertainty * driven + sampling.range_share * np.ptp(drawn, axis=2)
-    return Foretold(current, drawn.mean(axis=2), slack, sampling.scatter)
+    return Predicted(current, drawn.mean(axis=2), slack, sampling.scatter)
 
 
 def supply_current(command: FloatArray, fault: CoilFault | None, full: float) -> FloatArray:
@@ -124,7 +124,7 @@ def supply_current(command: FloatArray, fault: CoilFault | None, full: float) ->
 
 
 def fits(
-    evidence: Sequence[Foretold],
+    evidence: Sequence[Predicted],
     bounds: Bounds,
     known: Mapping[int, CoilFault],
     axis: int | None = None,

@@ -13,20 +13,20 @@ STOOD_NS = 200_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class Known:
+class CurrentValidity:
     """What a look at the coils' driver says of the currents.
 
     Attributes:
         now: whether the currents in force are known.
-        until_now: whether those since the look before are, too.
+        since_last_look: whether those since the look before are, too.
         since_ns: from when on they are.
-        doubt_ns: from when on what was believed until now is newly in doubt; None when nothing is.
+        uncertain_since_ns: from when on what was believed until now is newly in doubt; None when nothing is.
     """
 
     now: bool
-    until_now: bool
+    since_last_look: bool
     since_ns: int
-    doubt_ns: int | None
+    uncertain_since_ns: int | None
 
 
 class CoilKnowledge:
@@ -37,15 +37,15 @@ class CoilKnowledge:
         self._since_ns = -1
         self._looked_ns: int | None = None
 
-    def look(self, in_force: CoilState, now_ns: int) -> Known:
+    def look(self, in_force: CoilState, now_ns: int) -> CurrentValidity:
         """Tell what is known, by what the driver says and by how long nobody looked."""
         obeyed, self._known = self._known, not in_force.error
         looked_ns, self._looked_ns = self._looked_ns, now_ns
         stood = looked_ns is not None and now_ns - looked_ns > STOOD_NS
-        until_now = obeyed and self._known and not stood
-        if self._known and not until_now:
+        since_last_look = obeyed and self._known and not stood
+        if self._known and not since_last_look:
             self._since_ns = now_ns
         doubts = [now_ns - _UNSEEN_NS] if obeyed and not self._known else []
         if looked_ns is not None and stood:
             doubts.append(looked_ns)
-        return Known(self._known, until_now, self._since_ns, min(doubts, default=None))
+        return CurrentValidity(self._known, since_last_look, self._since_ns, min(doubts, default=None))

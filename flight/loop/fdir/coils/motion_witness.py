@@ -45,7 +45,7 @@ class MotionWitness:
         if self._response is None:
             return False
         carried = _DRIVEN.get(fault, 0.0) * self._full_current[axis]
-        felt = self._response.felt_of(axis, carried, begun_ns, suspected_ns)
+        felt = self._response.observed_share(axis, carried, begun_ns, suspected_ns)
         if (felt is None or math.isnan(felt)) and now_ns - self._doubted_ns < _DOUBTED_FOR_NS:
             return True
         if felt is None:

@@ -7,7 +7,7 @@ is reversed. Where the commands of the last seconds do not move enough to tell, 
 says so, and nothing is claimed.
 
 What is left of an acceleration when all coils are taken to be sound is kept longer: whether it changed when
-the supply current did tells a broken coil from a monitor that lies (`felt_of`).
+the supply current did tells a broken coil from a monitor that lies (`observed_share`).
 """
 
 from __future__ import annotations
@@ -82,9 +82,9 @@ class CoilResponse:
         self._sound_for = [0, 0, 0]
         self.gain: FloatArray = np.ones(3)
         self.sigma: FloatArray = np.full(3, np.inf)
-        self.begin_anew()
+        self.reset()
 
-    def begin_anew(self) -> None:
+    def reset(self) -> None:
         """Forget all samples."""
         self._asked: FloatArray = np.zeros((3, 3))
         self._asked_sum: FloatArray = np.zeros((3, 3))
@@ -115,16 +115,16 @@ class CoilResponse:
     def interrupted(self, until_ns: int) -> None:
         """Make nothing of samples of the time until `until_ns`: what the coils carried is not known."""
         self._known_ns = until_ns
-        self.begin_anew()
+        self.reset()
 
-    def felt(self, time_ns: int, rate: FloatArray, field: FloatArray) -> bool:
+    def observe_motion(self, time_ns: int, rate: FloatArray, field: FloatArray) -> bool:
         """Take a sample of rate (3,) and field (3,); tell whether there is a new fit."""
         if time_ns < self._known_ns:
             return False
         since_ns = time_ns - self._last_ns
         self._last_ns = time_ns
         if not 0 < since_ns < _STALE_NS:
-            self.begin_anew()
+            self.reset()
             return False
         # Row a: what one ampere in coil a alone asks of the rate, J^-1 (n e_a x B).
         x, y, z = field.tolist()
@@ -153,7 +153,7 @@ class CoilResponse:
         """Tell whether an axis has turned the body as it should, fit after fit, until now."""
         return self._sound_for[axis] >= self._settings.persistence
 
-    def felt_of(self, axis: int, constant: float, since_ns: int, settled_ns: int) -> float | None:
+    def observed_share(self, axis: int, constant: float, since_ns: int, settled_ns: int) -> float | None:
         """Return which part of a change of a coil's current the body felt.
 
         None where it would not feel any, NaN where that is not remembered.

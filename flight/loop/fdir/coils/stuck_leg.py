@@ -70,9 +70,9 @@ class StuckLeg:
         self._excess = excess
         self._pause = self._unclear = 0
         self._high = self._short = self._normal = self._looks = 0
-        self.begin_anew()
+        self.reset()
 
-    def begin_anew(self) -> None:
+    def reset(self) -> None:
         """Let all go and watch again."""
         self._step = _Step.WATCHING
         self._left: list[int] = []
@@ -130,7 +130,7 @@ class StuckLeg:
                 self._brake_all(seen)
             case _Step.ONE_RELEASED:
                 found = self._left[0]
-                self.begin_anew()
+                self.reset()
                 return found
             case _:
                 self._give_up()
@@ -139,7 +139,7 @@ class StuckLeg:
     def _judge_normal(self) -> None:
         match self._step:
             case _Step.RESTING if not self.suspicion:
-                self.begin_anew()
+                self.reset()
             case _Step.RESTING:
                 self._pause = _PAUSE
                 self._give_up()
@@ -149,7 +149,7 @@ class StuckLeg:
                 del self._left[0]
                 self._release_next()
             case _Step.NO_CURE:
-                self.begin_anew()
+                self.reset()
             case _Step.WATCHING:
                 pass
 
@@ -174,7 +174,7 @@ class StuckLeg:
     def _release_next(self) -> None:
         """Let the next go; where none is left nothing was broken, or it is whole again."""
         if not self._left:
-            self.begin_anew()
+            self.reset()
             return
         self._step = _Step.ONE_RELEASED
         self.brake = _only([axis for axis in self._braked if axis != self._left[0]])
@@ -182,7 +182,7 @@ class StuckLeg:
 
     def _give_up(self) -> None:
         """Leave it to others, until all is normal again."""
-        self.begin_anew()
+        self.reset()
         self._step = _Step.NO_CURE
 
     def _await(self) -> None:

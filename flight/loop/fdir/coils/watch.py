@@ -5,7 +5,7 @@ For the loop (all calls are cheap, none waits):
     watch = CoilWatch(CoilWatchSettings(full_current=..., ...))
     watch.commanded(time_ns, currents, braked, written_ns)  # each cycle: what is on the wire (CoilState)
     watch.interrupted(time_ns)           # in cycles before which nobody knows what the coils carried
-    watch.felt(time_ns, rate, field)     # each sample of the inertial unit: rad/s, T, body axes
+    watch.observe_motion(time_ns, rate, field)     # each sample of the inertial unit: rad/s, T, body axes
     watch.measured(power_reading)        # each look at the monitor; the same reading twice is no matter
     watch.verdicts                       # tuple of CoilVerdict, one an axis at most; they stay until `forget`
     watch.available                      # (3,) bool, for `flight.gnc.control.allocation`
@@ -47,10 +47,10 @@ from flight.loop.fdir.coils.hypotheses import (
     NEWEST,
     Bounds,
     CoilFault,
-    Foretold,
+    Predicted,
     Sampling,
     fits,
-    foretell,
+    predict,
 )
 from flight.loop.fdir.coils.motion_witness import MotionWitness
 from flight.loop.fdir.coils.probe import Probe
@@ -96,7 +96,7 @@ class CoilWatch:
         self._judge_ns = 0  # when a verdict may be given in doubt of the kind of fault
         self._sound_ns = 0  # when a coil that was driven last drew what it should
         self._unmixed_ns = 0  # from when on a reading's mean tells of one state of the circuit
-        self._evidence: deque[Foretold] = deque(maxlen=_MOST_EVIDENCE)
+        self._evidence: deque[Predicted] = deque(maxlen=_MOST_EVIDENCE)
         self._probe = Probe(settings.probe_current, settings.probe_half_ns)
         self._response = None if settings.response is None else CoilResponse(settings.response)
         self._verdicts: dict[int, CoilVerdict] = {}
@@ -152,13 +152,13 @@ class CoilWatch:
         self._commands.note(time_ns, values, braked)
         # Without readings nobody would end a rest or a brake.
         if self._leg.is_at_work and time_ns - self._looked_ns > self._settings.window_ns:
-            self._leg.begin_anew()
+            self._leg.reset()
         if self._response is not None:
             self._response.commanded(time_ns if written_ns is None else written_ns, values)
 
-    def felt(self, time_ns: int, rate: FloatArray, field: FloatArray) -> None:
+    def observe_motion(self, time_ns: int, rate: FloatArray, field: FloatArray) -> None:
         """Take a sample of the body rate (3,) rad/s and the magnetic field (3,) T, body axes."""
-        if self._response is None or not self._response.felt(time_ns, rate, field):
+        if self._response is None or not self._response.observe_motion(time_ns, rate, field):
             return
         for axis in self._response.reversed_axes():
             # A current that nobody asked for turns the body too.
@@ -168,8 +168,8 @@ class CoilWatch:
     def interrupted(self, now_ns: int) -> None:
         """Know nothing of the time until now: the driver, or nobody, can say what was on the wire."""
         self._fresh = 0
-        self._leg.begin_anew()
-        self._begin_anew()
+        self._leg.reset()
+        self._reset()
         if self._response is not None:
             self._response.interrupted(now_ns)
 
@@ -187,7 +187,7 @@ class CoilWatch:
             return
         self._fresh = self._fresh + 1 if gap_ns < self._settings.window_ns else 1
         if self._fresh <= self._settings.settle:
-            self._begin_anew()
+            self._reset()
             self._unmixed_ns = reading.time_ns
             return
         taken = self._taken(reading)
@@ -227,7 +227,7 @@ class CoilWatch:
         self._looked_ns = reading.time_ns
         seen = commands.supplied(reading, self._bounds, self._known)
         if self._proof:
-            for axis in self._proof.take(self._leg.exceeds(seen)):  # back to both inputs low
+            for axis in self._proof.ingest(self._leg.exceeds(seen)):  # back to both inputs low
                 self._verdicts[axis] = replace(self._verdicts[axis], fault=CoilFault.UNCERTAIN)
             return
         found = self._leg.look(seen)
@@ -236,18 +236,18 @@ class CoilWatch:
             self._give(found, CoilFault.HIGH, reading.time_ns, text)
             self.interrupted(reading.time_ns)
 
-    def _taken(self, reading: PowerReading) -> list[Foretold]:
+    def _taken(self, reading: PowerReading) -> list[Predicted]:
         """Return what a reading says: its newest conversion, and its mean where nothing is mixed in it."""
         windows: list[tuple[float, int, Sampling]] = [(reading.newest, reading.newest_since_ns, NEWEST)]
         begin_ns = reading.time_ns - self._settings.window_ns
         if begin_ns >= self._unmixed_ns:
             windows.append((reading.current, begin_ns, MEAN))
         return [
-            foretell(current, self._commands.window(since_ns, reading.time_ns), self._bounds, sampling)
+            predict(current, self._commands.window(since_ns, reading.time_ns), self._bounds, sampling)
             for current, since_ns, sampling in windows
         ]
 
-    def _look_healthy(self, taken: list[Foretold], reading: PowerReading) -> None:
+    def _look_healthy(self, taken: list[Predicted], reading: PowerReading) -> None:
         asked = float(taken[0].mean[:, 0].sum())
         if all(fits([one], self._bounds, self._known) for one in taken):
             self._strange = 0
@@ -274,7 +274,7 @@ class CoilWatch:
         if len(evidence) < self._settings.evidence:
             return
         if fits(evidence[-8:], self._bounds, self._known):
-            self._begin_anew()
+            self._reset()
             return
         sound = [axis for axis in range(3) if axis not in self._verdicts]
         left = [
@@ -294,7 +294,7 @@ class CoilWatch:
     def _conclude(self, axis: int, fault: CoilFault, now_ns: int) -> None:
         excess = max(one.current - float(one.mean[:, 0].sum()) for one in self._evidence)
         if fault is CoilFault.SHORTED and excess < _LEAST_SHORT:
-            self._begin_anew()  # too little for the body to bear it out: it may be the monitor
+            self._reset()  # too little for the body to bear it out: it may be the monitor
             return
         if self._is_contradicted(axis, fault):
             why = f"{self._strangeness}; yet the body feels no change of coil {AXES[axis]}"
@@ -304,7 +304,7 @@ class CoilWatch:
             if fault in _BRAKED:
                 self._proof.add(axis)
                 self._fresh = 0
-        self._begin_anew()
+        self._reset()
 
     def _is_contradicted(self, axis: int, fault: CoilFault) -> bool:
         if self._suspected_ns is None:
@@ -328,7 +328,7 @@ class CoilWatch:
         text = f"coil {AXES[axis]} {fault.value} ({why})"
         self._verdicts[axis] = CoilVerdict(axis, fault, now_ns, text)
 
-    def _begin_anew(self) -> None:
+    def _reset(self) -> None:
         self._strange = 0
         self._suspected_ns = None
         self._evidence.clear()

@@ -43,7 +43,7 @@ def _fly(driver_lets_go: bool, told: bool, cycles: int = 1200) -> tuple[list[flo
         elif stood == STANDS and told:
             response.interrupted(now_ns)
         for time_ns, seen in waiting:
-            if response.felt(time_ns, np.array([0.0, seen, 0.0]), FIELD):
+            if response.observe_motion(time_ns, np.array([0.0, seen, 0.0]), FIELD):
                 wrong += len(response.reversed_axes())
                 if response.sigma[0] < settings.sure:
                     believed.append(float(response.gain[0]))

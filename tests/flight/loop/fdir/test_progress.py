@@ -24,7 +24,7 @@ def test_groups_that_complete_their_cycles_get_on_and_one_that_only_fails_does_n
         control.account(1000, completed=k < 20)
         planning.account(1000)
         expected = ["control"] if k * SECOND // 4 - 19 * SECOND // 4 > 2 * SECOND else []
-        assert watch.standing_still(k * SECOND // 4) == expected
+        assert watch.stalled(k * SECOND // 4) == expected
 
 
 def test_a_slow_group_has_three_of_its_periods() -> None:
@@ -33,19 +33,19 @@ def test_a_slow_group_has_three_of_its_periods() -> None:
     watch.begin(0)
     for quarter in range(1, 80):
         control.account(1000)
-        still = watch.standing_still(quarter * SECOND // 4)
+        still = watch.stalled(quarter * SECOND // 4)
         assert still == (["planning"] if quarter > 60 else [])
 
 
 def test_a_worker_gets_on_while_idle_and_until_its_patience_is_over() -> None:
     busy: list[int | None] = [None]
     watch = GroupsAndWorkers([], [WorkerWatch("planner", lambda: busy[0], 4 * SECOND)])
-    assert watch.standing_still(100 * SECOND) == []
+    assert watch.stalled(100 * SECOND) == []
     busy[0] = 100 * SECOND
-    assert watch.standing_still(104 * SECOND) == []
-    assert watch.standing_still(104 * SECOND + 1) == ["planner"]
+    assert watch.stalled(104 * SECOND) == []
+    assert watch.stalled(104 * SECOND + 1) == ["planner"]
     busy[0] = None
-    assert watch.standing_still(200 * SECOND) == []
+    assert watch.stalled(200 * SECOND) == []
 
 
 def test_a_job_beside_the_loop_that_raises_is_told_and_runs_again() -> None:

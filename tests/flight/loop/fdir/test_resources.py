@@ -27,7 +27,7 @@ def sample(seconds: float, **changes: float) -> ResourceSample:
 def watched(samples: list[ResourceSample]) -> tuple[ResourceMonitor, Told]:
     monitor, told = ResourceMonitor(SETTINGS), Told()
     for one in samples:
-        monitor.take(one)
+        monitor.ingest(one)
         monitor.report(told.facts, one.time_ns)
     return monitor, told
 

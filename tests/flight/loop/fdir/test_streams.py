@@ -64,7 +64,7 @@ def test_what_is_not_fitted_takes_no_notes() -> None:
 
 
 def test_silence_that_another_alarm_tells_is_not_told_twice_and_any_other_is() -> None:
-    quiet = Stream("power", 4.0, 3.0, POWER_POOR, told_stale=False)
+    quiet = Stream("power", 4.0, 3.0, POWER_POOR, has_silence_alarm=False)
     streams = Streams((ROW, quiet))
     for name in ("imu", "power"):
         streams.note(name, 0, 0.5)

@@ -114,7 +114,7 @@ def test_notices_that_nobody_takes_do_not_pile_up() -> None:
     notices = Notices()
     for number in range(1000):
         notices.report(events.STATE_UNWRITTEN, str(number))
-    taken = notices.take()
+    taken = notices.drain()
     assert len(taken) <= 64
     assert taken[-1][1] == "999"
 

@@ -26,7 +26,7 @@ from flight.schema.sections import Config
 from hal.interfaces.rig import Rig
 
 
-def prepare(
+def open_flight(
     config: Config, rig: Rig, folder: Path, stack: ExitStack, *, patient: bool = False
 ) -> tuple[FlightLoop, FlightLog]:
     """Open logs, devices and workers; `stack` closes them in the opposite order, the coils at zero.
