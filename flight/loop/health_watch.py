@@ -1,4 +1,4 @@
-"""Health: looks at streams, progress and resources, and feeds the watchdog while everything gets on."""
+"""Health: checks streams, progress and resources, and feeds the watchdog while all of them progress."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from flight.schema.sections import Health
 from hal.interfaces.devices import PowerMonitor
 from hal.interfaces.wires import Ticker
 
-LOOKS_A_PACKET = 4
+RUNS_PER_PACKET = 4
 _FAILING_CYCLES = 60
 
 
 @dataclass(frozen=True, slots=True)
 class HealthInputs:
-    """What health looks at, beside the streams."""
+    """The tasks and devices that health checks, beside the streams."""
 
     modes: ModeControl
     drive: CoilDrive
@@ -62,25 +62,25 @@ class HealthWatch:
         self._counted = (self._control.cycles, self._control.completed)
 
     def read_resources(self, read: ResourceReader, period_ns: int) -> None:
-        """Have the board looked at beside the loop, by a ticker, until `close`."""
+        """Read the board's resources on a ticker, outside the loop, until `close`."""
 
-        def look() -> None:
+        def sample() -> None:
             self._sample = read(self._clock.now_ns())
 
-        self._ticker = self._clock.ticker("resources", period_ns, look)
+        self._ticker = self._clock.ticker("resources", period_ns, sample)
 
     def begin(self, time_ns: int) -> None:
         """Count from here."""
         self._progress.begin(time_ns)
 
     def close(self) -> None:
-        """Look at the board no more. Safe to call twice."""
+        """Stop reading the board. Safe to call twice."""
         ticker, self._ticker = self._ticker, None
         if ticker is not None:
             ticker.stop()
 
     def run(self, cycle: Cycle) -> None:
-        """Look once."""
+        """Run all checks once."""
         now_ns = cycle.start_ns
         self._look_at_streams(now_ns)
         self._look_at_progress(now_ns)
@@ -92,7 +92,7 @@ class HealthWatch:
         if sample is not None:
             self._monitor.ingest(sample)
             self._monitor.report(self._facts, now_ns)
-        if cycle.slot % LOOKS_A_PACKET == 0:
+        if cycle.slot % RUNS_PER_PACKET == 0:
             self._record(now_ns)
 
     def _look_at_streams(self, now_ns: int) -> None:
@@ -107,7 +107,7 @@ class HealthWatch:
             self._facts.update(stream.poor, poor, now_ns, text)
 
     def _look_at_progress(self, now_ns: int) -> None:
-        """Feed the watchdog if all get on; leave the mode if the control task only fails."""
+        """Feed the watchdog if nothing is stalled; update the fact that the control task keeps failing."""
         before = self._counted
         if self._control.completed != before[1]:
             self._counted = (self._control.cycles, self._control.completed)
@@ -121,7 +121,7 @@ class HealthWatch:
             self._fed += 1
 
     def _look_at_services(self, now_ns: int) -> None:
-        """Tell of the jobs beside the loop that fail or stand still."""
+        """Update the fact that a job outside the loop fails or is stalled."""
         poor = failing(self._clock.tickers, now_ns)
         text = "; ".join(poor) if poor else "all jobs run"
         self._facts.update(facts.SERVICE_FAILING, bool(poor), now_ns, text)

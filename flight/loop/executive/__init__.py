@@ -1,1 +1,1 @@
-"""Fixed-rate groups on an injected clock, and the workers beside them."""
+"""Fixed-rate groups on an injected clock, and the workers for long jobs."""

@@ -1,8 +1,8 @@
 """The executive: runs rate groups on an injected clock, in order of their due times, one at a time.
 
-Groups are given in order of importance: among those due at the same time the first runs first. What must not
-hold up the control group runs in workers (`flight.loop.executive.jobs`), never here. The executive's task
-runner is one of the named containment boundaries: whatever a task raises is reported and the loop goes on.
+Groups are given in order of importance: among those due at the same time the first runs first. Long jobs run
+in workers (`flight.loop.executive.jobs`), never here. The executive's task runner is one of the named
+containment boundaries: an exception of a task is reported and the loop goes on.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from hal.interfaces.wires import Clock
 
 
 class Observer(Protocol):
-    """What the executive tells, as it happens; must be quick and must not raise."""
+    """Receives the executive's reports; must be quick and must not raise."""
 
     def ran(self, group: RateGroup, cycle: Cycle, execution_ns: int) -> None:
         """Report a cycle that ended."""
@@ -25,11 +25,11 @@ class Observer(Protocol):
         """Report slots that were skipped."""
 
     def failed(self, group: RateGroup, error: Exception) -> None:
-        """Report that a task raised: bring things to a safe state."""
+        """Report that a task raised, and bring the devices to a safe state."""
 
 
 class Executive:
-    """The loop. `stopwatch` measures execution times; it never steers anything."""
+    """The loop. `stopwatch` measures execution times, for telemetry only."""
 
     def __init__(
         self,
@@ -49,7 +49,7 @@ class Executive:
         self._stop = True
 
     def run(self, epoch_ns: int, until_ns: int) -> None:
-        """Run every group on the grid that starts at `epoch_ns`, up to but without `until_ns`."""
+        """Run every group on the grid that starts at `epoch_ns`, up to but excluding `until_ns`."""
         for group in self._groups:
             group.begin(epoch_ns)
         while not self._stop:

@@ -1,7 +1,7 @@
-"""Jobs beside the control loop: what a worker is, what its result is, and who runs it.
+"""Jobs outside the control loop: workers, their results, and the runner's interface.
 
-The control thread hands a job over and later collects finished results; it never waits. Two runners keep this
-contract: `lockstep.LockStepRunner` in simulated time and `processes.ProcessRunner` in real time.
+The control thread submits a job and later collects the finished result; it never waits. There are two
+runners: `lockstep.LockStepRunner` in simulated time and `processes.ProcessRunner` in real time.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ class Worker:
     Attributes:
         name: short name for telemetry.
         function: runs in a process of its own in real time, so argument and result must pickle.
-        latency_ns: how long a result takes to arrive in lock-step simulation.
-        timeout_ns: in real time, a job that takes longer is killed.
+        latency_ns: delay of a result in lock-step simulation.
+        timeout_ns: in real time, a job that runs for longer is killed.
     """
 
     name: str
@@ -32,7 +32,7 @@ class Worker:
 
 @dataclass(frozen=True, slots=True)
 class JobResult:
-    """What became of a job. `value` is the function's result when the outcome is "done"."""
+    """The outcome of a job. `value` is the function's result when the outcome is "done"."""
 
     worker: str
     outcome: Outcome
@@ -47,14 +47,14 @@ class JobRunner(Protocol):
     """Runs the jobs of several workers, at most one at a time for each."""
 
     def submit(self, worker: str, argument: Any) -> bool:
-        """Hand a job over; False when that worker is still busy. Never waits."""
+        """Submit a job; return False when that worker is busy. Never waits."""
 
     def collect(self) -> list[JobResult]:
         """Return the results that have arrived. Never waits."""
 
     @property
     def borrowed_ns(self) -> int:
-        """Time that jobs have taken from the calling thread: none where they have processes of their own."""
+        """Time spent on jobs in the calling thread; zero for jobs in processes of their own."""
 
     def close(self) -> None:
         """Stop the workers. Safe to call twice."""

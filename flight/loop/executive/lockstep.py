@@ -1,6 +1,6 @@
 """Jobs in lock-step simulation: a result arrives after the worker's modelled latency of simulated time.
 
-The work itself is done on the spot, so a flight is the same bit for bit whatever the machine is doing.
+The job itself runs at once, in `submit`, so a flight is bit for bit the same on a busy machine.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ class LockStepRunner:
     """A JobRunner on simulated time.
 
     Attributes:
-        borrowed_ns: time that the jobs have taken from the calling thread.
+        borrowed_ns: time spent on jobs in the calling thread.
     """
 
     def __init__(
@@ -26,12 +26,12 @@ class LockStepRunner:
         self._clock = clock
         self._workers = {worker.name: worker for worker in workers}
         self._stopwatch = stopwatch
-        self._under_way: dict[str, JobResult] = {}
+        self._pending: dict[str, JobResult] = {}
         self.borrowed_ns = 0
 
     def submit(self, worker: str, argument: Any) -> bool:
-        """Do the job and keep its result until its latency has passed."""
-        if worker in self._under_way:
+        """Run the job and keep its result until its latency has passed."""
+        if worker in self._pending:
             return False
         spec = self._workers[worker]
         now_ns = self._clock.now_ns()
@@ -44,7 +44,7 @@ class LockStepRunner:
             outcome, error = "failed", f"{type(failure).__name__}: {failure}"
         spent_ns = self._stopwatch() - begun
         self.borrowed_ns += spent_ns
-        self._under_way[worker] = JobResult(
+        self._pending[worker] = JobResult(
             worker, outcome, value, error, now_ns, now_ns + spec.latency_ns, spent_ns
         )
         return True
@@ -52,11 +52,11 @@ class LockStepRunner:
     def collect(self) -> list[JobResult]:
         """Return the results whose latency has passed."""
         now_ns = self._clock.now_ns()
-        ready = [result for result in self._under_way.values() if result.delivered_ns <= now_ns]
+        ready = [result for result in self._pending.values() if result.delivered_ns <= now_ns]
         for result in ready:
-            del self._under_way[result.worker]
+            del self._pending[result.worker]
         return ready
 
     def close(self) -> None:
-        """Forget what is under way."""
-        self._under_way.clear()
+        """Discard pending results."""
+        self._pending.clear()

@@ -1,7 +1,7 @@
-"""Jobs in real time: each worker is a process of its own, fed over a socket, arrays through shared memory.
+"""Jobs in real time: each worker is a process of its own, with a socket, and shared memory for arrays.
 
-A worker that dies is told and started again; one that takes too long is killed first. Frames of megabytes go
-through a memory file that both sides map, so the control thread copies bytes and never waits for a pipe.
+A worker that dies is reported and restarted; a worker that exceeds its timeout is killed first. Frames of
+megabytes go through a memory file that both sides map, so the control thread never waits for a pipe.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from flight.loop.executive.jobs import JobResult, Outcome, Worker
 from hal.interfaces.wires import Clock
 
 SLAB_BYTES = 64 * 1024 * 1024
-"""Room for a job's arrays: address space, not memory, until it is used."""
+"""Shared memory for a job's arrays: only address space until used."""
 
 _HEADER = struct.Struct("<QQ")
 _CHUNK_BYTES = 1 << 16
@@ -58,7 +58,7 @@ def unpack_message(message: bytes, slab: mmap.mmap) -> Any:
 
 
 def message_length(data: bytes | bytearray) -> int | None:
-    """Return the length of the message that `data` begins with, None while even that is not known."""
+    """Return the length of the message that `data` begins with, None before the header is complete."""
     if len(data) < _HEADER.size:
         return None
     head_length, body_length = _HEADER.unpack_from(data)
@@ -102,7 +102,7 @@ class _WorkerProcess:
         return self.submitted_ns >= 0
 
     def send(self, argument: Any, now_ns: int) -> bool:
-        """Hand a job over; False when the process is gone (which `receive` will tell)."""
+        """Submit a job; return False when the process has died (`receive` then raises)."""
         message = pack_message(argument, self._slab)
         try:
             if self._socket.send(message) != len(message):
@@ -115,9 +115,9 @@ class _WorkerProcess:
     def receive(self) -> tuple[bool, Any]:
         """Return (True, message) when one has arrived, else (False, None). Raises EOFError at a death."""
         try:
-            # Into room that is there: this is asked in every cycle, mostly in vain.
-            while taken := self._socket.recv_into(self._chunk):
-                self._received += self._chunk[:taken]
+            # Into a buffer that exists: this runs in every cycle, mostly without data.
+            while count := self._socket.recv_into(self._chunk):
+                self._received += self._chunk[:count]
             raise EOFError(self.worker.name)
         except BlockingIOError:
             pass
@@ -131,7 +131,7 @@ class _WorkerProcess:
         return True, unpack_message(message, self._slab)
 
     def kill(self) -> None:
-        """End the process now and release what it held."""
+        """Kill the process and release its socket and memory."""
         self._process.kill()
         self._process.wait()
         self._socket.close()
@@ -148,12 +148,12 @@ class ProcessRunner:
         self._processes = {worker.name: _WorkerProcess(worker) for worker in workers}
 
     def submit(self, worker: str, argument: Any) -> bool:
-        """Hand a job over, False when that worker is still busy or being replaced."""
+        """Submit a job; return False when that worker is busy or has died."""
         process = self._processes[worker]
         return not process.busy and process.send(argument, self._clock.now_ns())
 
     def collect(self) -> list[JobResult]:
-        """Return what has arrived; replace workers that died or took too long."""
+        """Return the results that have arrived; replace workers that died or exceeded their timeout."""
         now_ns = self._clock.now_ns()
         results = []
         for name, process in list(self._processes.items()):

@@ -1,8 +1,8 @@
-"""A rate group: a task on a fixed grid of time, with its count of what ran, slipped and overran.
+"""A rate group: a task on a fixed time grid, with counts of its runs, slips and overruns.
 
 A late cycle re-phases to the grid. A slot is run if it is less than half a period late, otherwise it is
 skipped and counted, so two cycles are never closer than half a period: there is no burst of catch-up cycles.
-Slots run and slots skipped together are always the slots that time has passed.
+Slots run plus slots skipped always equal the slots elapsed.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Task = Callable[[Cycle], None]
 
 
 class RateGroup:
-    """One period, one task, and the statistics of both."""
+    """A task, its period, and their statistics."""
 
     def __init__(self, name: str, period_ns: int, task: Task, offset_ns: int = 0) -> None:
         if period_ns <= 0:
@@ -45,7 +45,7 @@ class RateGroup:
         self._epoch_ns = 0
 
     def begin(self, epoch_ns: int) -> None:
-        """Lay the grid: slot 0 is due at the epoch plus this group's offset."""
+        """Start the grid: slot 0 is due at the epoch plus this group's offset."""
         self._epoch_ns = epoch_ns + self._offset_ns
         self._slot = 0
 
@@ -60,7 +60,7 @@ class RateGroup:
         return self.total_execution_ns / self.cycles if self.cycles else 0.0
 
     def claim(self, now_ns: int) -> tuple[Cycle | None, int]:
-        """Take the slot to run now, if there is one, and tell how many slots slipped since the last claim."""
+        """Return the cycle to run now (None: none is due), and the slots slipped since the last call."""
         late_ns = now_ns - self.due_ns
         if late_ns < 0:
             return None, 0
@@ -76,7 +76,7 @@ class RateGroup:
         return cycle, skipped
 
     def account(self, execution_ns: int, completed: bool = True) -> bool:
-        """Note the time a cycle took and whether its task came to its end; tell whether it overran."""
+        """Count a cycle, its execution time and whether its task completed; return whether it overran."""
         self.cycles += 1
         self.completed += completed
         self.total_execution_ns += execution_ns

@@ -1,8 +1,7 @@
-"""The other end of `flight.loop.executive.processes`: serves one function until its socket closes.
+"""A worker process of `flight.loop.executive.processes`: serves one function until its socket closes.
 
-What the control process need not hold the function's module imports in its `prepare`, if it has one: that is
-called before the first job. Run as `python -m flight.loop.executive.worker MODULE:FUNCTION SOCKET_FD
-MEMORY_FD`, by the runner only.
+The function's module may define `prepare`, for imports that only the worker needs: called before the first
+job. Run as `python -m flight.loop.executive.worker MODULE:FUNCTION SOCKET_FD MEMORY_FD`, by the runner only.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ def serve(function: Any, line: socket.socket, slab: mmap.mmap) -> None:
             del received[:length]
             line.sendall(pack_message(_run(function, argument), slab))
             del argument
-            # The result is on its way: nobody waits for this.
+            # After the result was sent, so that nothing waits for this.
             give_back()
 
 
@@ -43,7 +42,7 @@ def _run(function: Any, argument: Any) -> tuple[str, Any, str, int]:
 
 
 def _nothing() -> None:
-    """Be prepared without more."""
+    """No-op."""
 
 
 def main(arguments: list[str]) -> None:

@@ -1,1 +1,1 @@
-"""Is all well? Facts become events, events reactions, reactions a mode."""
+"""Fault detection, isolation and recovery: facts become events, events reactions, reactions a mode."""

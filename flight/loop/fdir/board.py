@@ -1,4 +1,4 @@
-"""Looks at a Linux board through /proc and /sys: the `ResourceReader` of real time."""
+"""Reads a Linux board's resources from /proc and /sys: the `ResourceReader` of real-time flights."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ _PAGE = os.sysconf("SC_PAGE_SIZE")
 
 
 class Board:
-    """Reads what the kernel tells; what it does not tell is NaN."""
+    """Reads resources from the kernel; values that the kernel does not provide are NaN."""
 
     def __init__(self, log_folder: Path, proc: Path = Path("/proc"), thermal: Path | None = None) -> None:
-        """Take the folder that the flight log goes to; the others are where the kernel tells."""
+        """Take the flight log's folder, and the kernel's folders of processes and thermal zones."""
         self._folder = log_folder
         self._proc = proc
         self._thermal = thermal or Path("/sys/class/thermal")
 
     def __call__(self, now_ns: int) -> ResourceSample:
-        """Return what the board is like now."""
+        """Return the board's resources now."""
         process = os.getpid()
         members = [process, *self._below(process)]
         return ResourceSample(
@@ -36,14 +36,14 @@ class Board:
         )
 
     def _below(self, parent: int) -> Iterator[int]:
-        """Yield the processes below `parent`, its workers."""
+        """Yield all descendants of `parent`, its workers."""
         for task in sorted((self._proc / str(parent) / "task").glob("*/children")):
             for word in _read(task).split():
                 yield int(word)
                 yield from self._below(int(word))
 
     def _cpu(self, process: int) -> float:
-        # The name, in brackets, may hold anything; user and system time are words 14 and 15 of all (proc(5)).
+        # The name in brackets may hold any character; user and system time are fields 14 and 15 (proc(5)).
         words = _read(self._proc / str(process) / "stat").rpartition(")")[2].split()
         return (int(words[11]) + int(words[12])) / _TICKS if len(words) > 12 else math.nan
 
@@ -52,7 +52,7 @@ class Board:
         return float(words[1]) * _PAGE if len(words) > 1 else math.nan
 
     def _proportional(self, process: int) -> float:
-        """Return the proportional set in bytes; 0 of a process that has just ended."""
+        """Return the proportional set size in bytes; 0 for a process that has just ended."""
         for line in _read(self._proc / str(process) / "smaps_rollup").splitlines():
             if line.startswith("Pss:"):
                 return float(line.split()[1]) * 1024.0
@@ -75,7 +75,7 @@ class Board:
 
 
 def _read(path: Path) -> str:
-    """Return what stands in a file of the kernel's, nothing where it is not to be read."""
+    """Return the content of a kernel file; empty when it cannot be read."""
     try:
         return path.read_text(encoding="utf-8", errors="replace")
     except OSError:

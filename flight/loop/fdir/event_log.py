@@ -1,7 +1,7 @@
-"""Tells events to the flight log, throttled by kind, and has them reacted to.
+"""Writes events to the flight log, throttled by kind, and triggers their reactions.
 
-A throttle tells the first of a kind at once and then at most one each `THROTTLE_NS`, with the number held
-back: a fault at 40 Hz makes a line in the log every few seconds, not forty a second.
+The first event of a kind is written at once, then at most one every `THROTTLE_NS`, with the number held back:
+a fault at 40 Hz writes one event every few seconds, not forty a second.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from flight.link.events import EVENTS, EventKind, Reaction
 THROTTLE_NS = 5_000_000_000
 
 Sink = Callable[[EventKind, int, int, str], None]
-"""Takes an event that is told: kind, time in ns, how many of its kind were held back before it, text."""
+"""Writes an event: kind, time in ns, how many of its kind were held back before it, text."""
 
 Reactor = Callable[[EventKind, int, str], None]
-"""Does what an event's row asks for: kind, time in ns, text."""
+"""Carries out the reaction of an event: kind, time in ns, text."""
 
 
 class EventLog:
-    """Tells events to a sink, throttled by kind."""
+    """Passes events to a sink, throttled by kind; `count` includes those held back."""
 
     def __init__(self, sink: Sink, throttle_ns: int = THROTTLE_NS) -> None:
         self._sink = sink
@@ -31,11 +31,11 @@ class EventLog:
         self.count = 0
 
     def react_by(self, react: Reactor) -> None:
-        """Have `react` called for every event whose row asks for more than a note, throttled or not."""
+        """Call `react` for every event whose reaction is more than a note, throttled or not."""
         self._react = react
 
     def report(self, kind: EventKind, time_ns: int, text: str) -> None:
-        """Tell an event, or count it if one of its kind was told a moment ago; then react."""
+        """Write an event, or count it if one of its kind was written less than a throttle ago; then react."""
         self._write(kind, time_ns, text)
         if self._react is not None and kind.reaction is not Reaction.NOTE:
             self._react(kind, time_ns, text)
@@ -50,7 +50,7 @@ class EventLog:
         self._sink(kind, time_ns, self._held_back.pop(kind.code, 0), text)
 
     def flush(self, time_ns: int) -> None:
-        """Tell what is still held back, at the end."""
+        """Write the events that are still held back, at the end."""
         by_code = {kind.code: kind for kind in EVENTS}
         for code, held_back in list(self._held_back.items()):
             self._sink(by_code[code], time_ns, held_back - 1, "the last one held back by the throttle")

@@ -1,8 +1,8 @@
-"""The table of facts: what monitors state, how often in a row before it counts, and which event it becomes.
+"""The table of facts: conditions that monitors update, their persistence, and the events they raise.
 
-After NASA's Limit Checker: act after N violations in a row; what cannot be known now (None) neither counts
-nor mends. A latching fact stays until it is cleared by command. In a mode in which a fact is not watched its
-count begins anew.
+As in NASA's Limit Checker, a fact counts after N violations in a row; an unknown state (None) changes no
+count. A latching fact stays until it is cleared by command. A mode in which a fact is not watched resets its
+count.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ _DRIVEN = STEERING | {Mode.DETUMBLE}
 
 @dataclass(frozen=True, slots=True)
 class Fact:
-    """One row: the events that tell when the fact begins and ends, and when it counts.
+    """One row: a fact's persistence, and the events that report its begin and end.
 
-    Facts of the 40 Hz cycle count cycles, the others looks of health.
+    Facts of the 40 Hz cycle count cycles, the others count runs of the health task.
 
     Attributes:
-        after: statements in a row that it holds until it counts.
-        mended_after: statements in a row that it does not until it is over.
-        latching: it is over only when cleared by command.
-        modes: in which it is watched.
+        after: updates in a row in which the condition holds, until the fact counts.
+        mended_after: updates in a row in which the condition does not hold, until the fact ends.
+        latching: the fact ends only when cleared by command.
+        modes: in which the fact is watched.
     """
 
     name: str
@@ -83,9 +83,9 @@ FACTS: tuple[Fact, ...] = tuple(value for value in dict(vars()).values() if isin
 
 
 def check(facts: Iterable[Fact], modes_of: Callable[[Reaction], frozenset[Mode]]) -> None:
-    """Refuse a table that cannot work; raises FlightError naming the row.
+    """Validate the table; raises FlightError naming the row.
 
-    `modes_of` tells in which modes a reaction does something: a fact watched in none is no safeguard.
+    `modes_of` returns the modes in which a reaction has an effect: a fact watched in none of them is useless.
     """
     seen: set[str] = set()
     for fact in facts:
@@ -108,7 +108,7 @@ class _State:
 
 
 class Facts:
-    """What is stated, and what of it counts. Tells its events when that changes."""
+    """Holds the state of every fact, and reports an event when a fact begins or ends."""
 
     def __init__(self, event_log: EventLog) -> None:
         self._events = event_log
@@ -116,7 +116,7 @@ class Facts:
         self._mode = Mode.BOOT
 
     def update(self, fact: Fact, holds: bool | None, now_ns: int, text: str) -> None:
-        """State whether a fact holds now; None when that cannot be known. `text` goes with the event."""
+        """Update whether a fact's condition holds now, None when unknown. `text` goes with the event."""
         state = self._states[fact.name]
         if holds is None or self._mode not in fact.modes:
             return
@@ -134,7 +134,7 @@ class Facts:
             self._events.report(kind, now_ns, text)
 
     def holds(self, fact: Fact) -> bool:
-        """Tell whether a fact counts now."""
+        """Return whether a fact counts now."""
         return self._states[fact.name].holds
 
     def held(self) -> tuple[Fact, ...]:
@@ -142,14 +142,14 @@ class Facts:
         return tuple(fact for fact in FACTS if self._states[fact.name].holds)
 
     def clear(self, event_name: str) -> bool:
-        """Let what was latched under an event's name begin anew; tell whether there was any."""
+        """Reset the facts latched under an event's name; return whether there were any."""
         found = [fact for fact in self.held() if fact.latching and fact.begins.name == event_name]
         for fact in found:
             self._states[fact.name] = _State()
         return bool(found)
 
     def enter(self, mode: Mode) -> None:
-        """Watch what is watched in `mode`; the rest begins anew when it is watched again."""
+        """Watch the facts of `mode`; reset the others."""
         self._mode = mode
         for fact in FACTS:
             if mode not in fact.modes:

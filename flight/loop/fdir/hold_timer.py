@@ -1,17 +1,17 @@
-"""A timer of how long a condition has held without a break."""
+"""A timer for how long a condition has held without interruption."""
 
 from __future__ import annotations
 
 
 class HoldTimer:
-    """Says when a condition has held for long enough."""
+    """Detects that a condition has held for a given time."""
 
     def __init__(self, seconds: float) -> None:
         self._needed_ns = round(seconds * 1e9)
         self._since_ns: int | None = None
 
     def update(self, holds: bool, now_ns: int) -> bool:
-        """Note whether the condition holds now; return whether it has held for long enough."""
+        """Update whether the condition holds now; return whether the condition has held for long enough."""
         if not holds:
             self._since_ns = None
             return False

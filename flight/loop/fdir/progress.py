@@ -1,8 +1,8 @@
-"""Does everything get on? The watchdog is fed only while every rate group and every worker does.
+"""Detects stalled rate groups and workers: the watchdog is fed only while none is stalled.
 
-A group gets on when a cycle of it has run to its end within its patience; a worker, when no job has been
-under way for longer than it may take. The jobs beside the loop, on tickers, are looked at too; a slow disk or
-a hung bus may hold them up, which another process would not mend, so they are told and no more.
+A rate group is stalled when no cycle has completed within its patience; a worker, when a job has been running
+for longer than its patience. Jobs on tickers are only reported: a slow disk or a hung bus may delay them,
+which a restart would not cure.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _LEAST_PATIENCE_NS = 2_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class WorkerWatch:
-    """A worker by name; `busy_since_ns` tells since when a job is under way, None when none is."""
+    """A worker by name; `busy_since_ns` returns since when a job has been running, None when none is."""
 
     name: str
     busy_since_ns: Callable[[], int | None]
@@ -52,7 +52,7 @@ class GroupsAndWorkers:
             watch.since_ns = time_ns
 
     def stalled(self, now_ns: int) -> list[str]:
-        """Return the names of the groups and workers that do not get on."""
+        """Return the names of the stalled groups and workers."""
         names = [watch.group.name for watch in self._groups if watch.is_stalled(now_ns)]
         for worker in self._workers:
             since_ns = worker.busy_since_ns()
@@ -62,12 +62,12 @@ class GroupsAndWorkers:
 
 
 def failing(tickers: Sequence[Ticker], now_ns: int) -> list[str]:
-    """Return what is to be told of the jobs beside the loop: those that raise and those that stand still."""
-    told = []
+    """Return a text for each job outside the loop that raises or is stalled."""
+    problems = []
     for ticker in tickers:
         stood_ns = now_ns - ticker.served_ns
         if ticker.error:
-            told.append(f"{ticker.name}: {ticker.error}")
+            problems.append(f"{ticker.name}: {ticker.error}")
         elif stood_ns > max(_PERIODS * ticker.period_ns, _LEAST_PATIENCE_NS):
-            told.append(f"{ticker.name}: stands still for {stood_ns * 1e-9:.1f} s")
-    return told
+            problems.append(f"{ticker.name}: stands still for {stood_ns * 1e-9:.1f} s")
+    return problems

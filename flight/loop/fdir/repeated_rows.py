@@ -1,8 +1,8 @@
-"""Is a frame of one piece? Rows that an earlier frame had, noise and all, were not exposed anew.
+"""Detects torn frames: buffers that were only partly overwritten.
 
-Read noise makes every row of a living sensor unlike all others. So where some rows are those of an earlier
-frame and others are not, the frame is torn: a buffer that was only partly written. Where all are, the camera
-is frozen, which is told elsewhere. Rows without noise, as of a dark sensor of few bits, say nothing.
+Read noise makes every row of a working sensor unique, so a row that equals an earlier frame's is a copy. A
+frame with some copied rows is torn. A frame of copied rows only means a frozen camera, which is detected
+elsewhere. Rows without noise, as of a dark sensor of few bits, are ignored.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from flight.gnc.math.arrays import Image
 
 _ROWS = 32
 _FRAMES = 4
-"""As many as a driver has buffers."""
+"""The number of a driver's buffers."""
 _LEAST_CHANGES = 0.125
-"""Part of a row's neighbours that differ where there is noise."""
+"""A row has noise when at least this fraction of neighbouring pixels differ."""
 
 
 class RepeatedRows:
-    """Remembers checksums of some rows of the last frames."""
+    """Keeps checksums of some rows of the last frames."""
 
     def __init__(self) -> None:
         self._seen: deque[dict[int, int]] = deque(maxlen=_FRAMES)
 
     def look(self, pixels: Image) -> int:
-        """Take a frame (rows, columns); return at how many rows of those looked at it is an earlier one's.
+        """Check a frame (rows, columns); return how many sampled rows are copies of an earlier frame's.
 
-        0 for a frame of one piece, and for one that is an earlier frame altogether.
+        0 for an intact frame, and for a frame of copied rows only.
         """
         rows = np.unique(np.linspace(0, len(pixels) - 1, _ROWS).astype(int)).tolist()
         here = {row: zlib.crc32(pixels[row].tobytes()) for row in rows if _has_noise(pixels[row])}

@@ -1,7 +1,7 @@
-"""What the flight takes of its board: processor, memory, disk, warmth; and whether the wall clock was set.
+"""Monitors processor, memory, disk and temperature of the board, and steps of the wall clock.
 
-A `ResourceReader` looks (`flight.loop.fdir.board` on Linux, a script in tests); this judges. Looks are made
-on a ticker of the clock, beside the control loop, because the kernel may take milliseconds to answer.
+A `ResourceReader` takes the samples (`flight.loop.fdir.board` on Linux, a script in tests) on a ticker
+outside the control loop, because the kernel may take milliseconds to answer.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ _LEAST_SLOPE_SAMPLES = 8
 
 @dataclass(frozen=True, slots=True)
 class ResourceSample:
-    """One look at the board; NaN stands for what it does not have.
+    """One sample of the board's resources; NaN for values that are not available.
 
     Attributes:
         time_ns: monotonic.
-        cpu: s of processor time that the control process has taken since it began.
-        resident: bytes, resident set of the control process.
-        proportional: bytes, proportional set of all flight processes together.
-        disk_free: bytes that are left where the flight log goes.
+        cpu: s, processor time of the control process since its start.
+        resident: bytes, resident set size of the control process.
+        proportional: bytes, proportional set size of all flight processes together.
+        disk_free: bytes, free on the flight log's file system.
         temperature: degree C of the warmest zone.
     """
 
@@ -44,15 +44,15 @@ class ResourceSample:
 
 
 class ResourceReader(Protocol):
-    """Looks at the board."""
+    """Samples the board's resources."""
 
     def __call__(self, now_ns: int) -> ResourceSample:
-        """Return what it is like now. Must not raise."""
+        """Return a sample. Must not raise."""
 
 
 @dataclass(frozen=True, slots=True)
 class ResourceState:
-    """What the samples say; NaN where they do not yet.
+    """Values derived from the samples; NaN before there are enough.
 
     Attributes:
         cpu_share: of one core, between the last two samples.
@@ -65,7 +65,7 @@ class ResourceState:
 
 
 class ResourceMonitor:
-    """Keeps the newest samples and states facts of them."""
+    """Keeps the newest samples and updates the facts about resources."""
 
     def __init__(self, settings: Health) -> None:
         self._settings = settings
@@ -74,7 +74,7 @@ class ResourceMonitor:
         self.state = ResourceState()
 
     def ingest(self, sample: ResourceSample) -> None:
-        """Take in a sample."""
+        """Add a sample."""
         share = math.nan
         if self.state.sample is not None:
             span = (sample.time_ns - self.state.sample.time_ns) * 1e-9
@@ -86,7 +86,7 @@ class ResourceMonitor:
         self.state = ResourceState(sample, share, self._slope())
 
     def report(self, facts_: Facts, now_ns: int) -> None:
-        """State what the newest sample says."""
+        """Update the facts from the newest sample."""
         sample, limits = self.state.sample, self._settings
         if sample is None:
             return
@@ -114,17 +114,17 @@ class ResourceMonitor:
 
 
 class ClockWatch:
-    """Sees the wall clock being set: UTC should run beside monotonic time."""
+    """Detects steps of the wall clock by comparing UTC with monotonic time."""
 
     def __init__(self, clock: Clock, threshold: float) -> None:
-        """Take a clock and the step in s that counts."""
+        """Watch `clock` for steps larger than `threshold` s."""
         self._clock = clock
         self._threshold_ns = round(threshold * 1e9)
         self._offset_ns: int | None = None
         self.steps = 0
 
     def look(self) -> float | None:
-        """Return the step in s since the last look, None without one; slow drift is followed."""
+        """Return the step in s since the last call, None without one; slow drift is followed."""
         offset_ns = self._clock.utc_ns() - self._clock.now_ns()
         before_ns, self._offset_ns = self._offset_ns, offset_ns
         if before_ns is None or abs(offset_ns - before_ns) <= self._threshold_ns:

@@ -1,7 +1,7 @@
-"""The table of streams: how often each reading should come, how old it may be, where it must lie.
+"""The table of streams: nominal rate, age limit and valid range of each kind of reading.
 
-After openpilot's SubMaster a stream is alive, at its rate, and valid, each told apart. Stale is not good: a
-value that was fine ten seconds ago says nothing of now.
+As in openpilot's SubMaster, liveness, rate and validity are checked separately. A stale value is not good,
+however plausible the value was.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from flight.loop.fdir.facts import Fact
 from flight.schema.sections import Config
 
 LEAST_RATE = 0.8
-"""Of the nominal rate: below it a stream is slow."""
+"""Fraction of the nominal rate below which a stream is slow."""
 _SPAN = 2.0
 _SECOND = 1e-9
 _PERIODS = 5
 
 
 class StreamState(IntEnum):
-    """What a stream is worth; the values are those of the health packet."""
+    """The quality of a stream; the values are those of the health packet."""
 
     NOT_FITTED = 0
     NEVER = 1
@@ -36,7 +36,7 @@ class StreamState(IntEnum):
 class Stream:
     """One row: rate in Hz, age limit in s, and the range of its value, in the value's unit.
 
-    `has_silence_alarm`: another alarm tells when it falls silent, so that its own fact need not.
+    `has_silence_alarm`: another fact covers the silence of this stream, so that `poor` does not.
     """
 
     name: str
@@ -69,7 +69,7 @@ def streams_of(config: Config) -> tuple[Stream, ...]:
 
 
 class StreamWatch:
-    """Watches one stream: told of each reading, asked now and then."""
+    """Computes the age, rate and state of one stream from its readings."""
 
     def __init__(self, stream: Stream, time_ns: int) -> None:
         self.stream = stream
@@ -79,14 +79,14 @@ class StreamWatch:
         self._valid = True
 
     def begin(self, time_ns: int) -> None:
-        """Count from here."""
+        """Discard earlier readings; count from `time_ns`."""
         self._times.clear()
         self._since_ns = time_ns
 
     def note(self, time_ns: int, value: float | None = None) -> None:
         """Note a reading taken at `time_ns`, with the value that has a range."""
         if self._times and time_ns - self._times[-1] > self._window_ns // 2:
-            self._since_ns = time_ns  # it was silent, which is told apart from being slow
+            self._since_ns = time_ns  # a gap is reported as stale, not as slow
         self._times.append(time_ns)
         if value is not None:
             self._valid = self.stream.low <= value <= self.stream.high  # NaN compares false
@@ -104,42 +104,42 @@ class StreamWatch:
         return count / (self._window_ns * _SECOND)
 
     def state(self, now_ns: int) -> StreamState:
-        """Return what the stream is worth now."""
+        """Return the state of the stream now."""
         if not self._times:
             return StreamState.NEVER
         if self.age(now_ns) > self.stream.max_age:
             return StreamState.STALE
         if not self._valid:
             return StreamState.INVALID
-        if self.rate(now_ns) < LEAST_RATE * self.stream.rate_hz:  # not yet known is not slow
+        if self.rate(now_ns) < LEAST_RATE * self.stream.rate_hz:  # False for NaN: an unknown rate is not slow
             return StreamState.SLOW
         return StreamState.GOOD
 
 
 class Streams:
-    """All streams of a flight, by name; what is not fitted takes no notes."""
+    """All streams of a flight, by name; readings of streams that are not fitted are ignored."""
 
     def __init__(self, rows: tuple[Stream, ...], time_ns: int = 0) -> None:
         self._watches = {row.name: StreamWatch(row, time_ns) for row in rows}
 
     def begin(self, time_ns: int) -> None:
-        """Count from here."""
+        """Discard earlier readings; count from `time_ns`."""
         for watch in self._watches.values():
             watch.begin(time_ns)
 
     def note(self, name: str, time_ns: int, value: float | None = None) -> None:
-        """Note a reading of the stream of that name, if there is one."""
+        """Note a reading of the named stream, if fitted."""
         watch = self._watches.get(name)
         if watch is not None:
             watch.note(time_ns, value)
 
     def state(self, name: str, now_ns: int) -> StreamState:
-        """Return the state of the stream of that name."""
+        """Return the state of the named stream."""
         watch = self._watches.get(name)
         return StreamState.NOT_FITTED if watch is None else watch.state(now_ns)
 
     def look(self, now_ns: int) -> list[tuple[Stream, bool | None, str]]:
-        """Return of each stream whether it is poor, None when not known or told elsewhere, and why."""
+        """Return for each stream whether it is poor, None when unknown or covered elsewhere, and why."""
         return [(watch.stream, *_poor(watch, now_ns)) for watch in self._watches.values()]
 
 

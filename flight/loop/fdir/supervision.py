@@ -1,8 +1,8 @@
-"""Who watches the flight from outside: the guardian of the coils and the service manager.
+"""Connects the flight to its external supervisors: the guardian of the coils and the service manager.
 
-The loop calls `beat` at the end of every control cycle that ran well, and `feed` while everything makes
-progress. A loop that turns is no sign that its commands reach the coils: the heartbeat is passed on only
-while the coils' own job gets on. READY is said with the first: the devices are open and the loop turns.
+The loop calls `beat` at the end of every control cycle without an error, and `feed` while nothing is stalled.
+A running loop does not prove that commands reach the coils: heartbeats are passed on only while the coil
+driver's job runs. The first heartbeat also reports READY: the devices are open and the loop runs.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from hal.interfaces.guardian import CoilGuardian, GuardianNews, Overseer
 from hal.interfaces.wires import Clock, Ticker
 
 _THROTTLE_NS = 1_000_000_000
-"""Of its events: as often as a guardian is replaced at most."""
+"""Of the supervision's events: a guardian is replaced at most once per second."""
 _UNSERVED_NS = 150_000_000
-"""Without a run of the coils' job for so long the guardian should act: three of its periods."""
+"""After this time without a run of the coil driver's job (three periods) the guardian should act."""
 
 _EVENTS = {
     GuardianNews.LOST: events.GUARDIAN_LOST,
@@ -30,11 +30,11 @@ _EVENTS = {
 
 
 def _nothing() -> None:
-    """Settle nothing."""
+    """No-op."""
 
 
 class Supervision:
-    """Passes the loop's signs of life on; tells what becomes of the guardian as events."""
+    """Passes heartbeats on; reports the guardian's state changes as events."""
 
     def __init__(
         self,
@@ -46,14 +46,14 @@ class Supervision:
         coils: Ticker,
         settle: Callable[[], None] = _nothing,
     ) -> None:
-        """Take who watches; `status` is what people are shown once ready, `coils` serves the coils.
+        """Take the supervisors; `status` is shown to people once ready, `coils` is the coil driver's job.
 
-        `settle` is called once, before READY is said: everything that a flight consists of is there by then.
+        `settle` is called once, before READY is reported: all parts of the flight exist by then.
         """
         self._guardian = guardian
         self._overseer = overseer
         self._clock = clock
-        # Of its own: it tells things while there is no loop yet, and none of them asks for a reaction.
+        # A log of its own: events occur before there is a loop, and none of them needs a reaction.
         self._events = EventLog(recorder.event, _THROTTLE_NS)
         self._status = status
         self._coils = coils
@@ -62,11 +62,11 @@ class Supervision:
         self._notes: list[tuple[EventKind, str]] = []
 
     def note(self, kind: EventKind, text: str) -> None:
-        """Have an event of the start told once the flight has begun."""
+        """Keep an event of the start, to be reported once the flight has begun."""
         self._notes.append((kind, text))
 
     def beat(self) -> None:
-        """Pass a heartbeat on, if the coils are served; never waits."""
+        """Pass a heartbeat on, unless the coil driver's job is stalled; never waits."""
         if self._clock.now_ns() - self._coils.served_ns > _UNSERVED_NS:
             return
         self._guardian.beat()
@@ -76,11 +76,11 @@ class Supervision:
             self._overseer.ready(self._status)
 
     def close(self) -> None:
-        """Tell what is still held back."""
+        """Write the events that are still held back."""
         self._events.flush(self._clock.now_ns())
 
     def feed(self) -> None:
-        """Feed the watchdog and look after the guardian."""
+        """Feed the watchdog; restart the guardian if needed and report its state changes."""
         self._overseer.feed_watchdog()
         now_ns = self._clock.now_ns()
         notes = self._notes + [(_EVENTS[news], news.value) for news in self._guardian.tend(now_ns)]

@@ -1,4 +1,4 @@
-"""The state machine: a mode, a table, and triggers."""
+"""The state machine of the modes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from flight.loop.modes.triggers import Trigger
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """What a trigger did: from one mode into another, or into the same anew."""
+    """A transition from one mode to another, or to the same mode again."""
 
     before: Mode
     after: Mode
@@ -19,14 +19,10 @@ class Change:
 
 
 class ModeMachine:
-    """Holds the mode. Pure: what a mode does is for others to do.
-
-    Attributes:
-        since_ns: when the mode was entered, or entered anew.
-    """
+    """Holds the mode and follows the table; without side effects. `since_ns`: when the mode was entered."""
 
     def __init__(self, time_ns: int = 0, table: Table = TRANSITIONS) -> None:
-        """Begin in BOOT. Raises FlightError for a table that leaves something to chance."""
+        """Begin in BOOT. Raises FlightError for an invalid table."""
         check(table)
         self._table = table
         self.mode = Mode.BOOT

@@ -1,6 +1,6 @@
-"""Mode control: turns reactions, commands and achievements into triggers, and enters the modes.
+"""Mode control: turns reactions, commands and achievements into triggers, and enters modes.
 
-Entering never waits for an estimate: a hold takes its attitude from the first cycle that has one.
+Entering a mode never waits for an estimate: a hold takes its attitude from the first cycle with an estimate.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ SAFING_REACTIONS = {
 
 
 def modes_moved_by(reaction: Reaction) -> frozenset[Mode]:
-    """Return the modes in which a reaction does something: all, for one that leaves the mode alone."""
+    """Return the modes in which a reaction has an effect: all, for a reaction that changes no mode."""
     trigger = SAFING_REACTIONS.get(reaction)
     if trigger is None:
         return frozenset(Mode)
@@ -48,8 +48,8 @@ class ModeSettings:
     """Bounds of the modes.
 
     Attributes:
-        low_rate, low_for: rad/s and s: a rate below it for that long ends detumbling.
-        stop: ends the flight politely, for a restart, with the reason it is given.
+        low_rate, low_for: rad/s and s: a rate below `low_rate` for `low_for` ends detumbling.
+        stop: ends the flight after the running cycle, with a reason.
     """
 
     modes: Modes
@@ -59,15 +59,15 @@ class ModeSettings:
 
 
 class ModeControl:
-    """Owns the machine, and the attitude that a hold or a slew wants.
+    """Owns the state machine, and the target of a hold or a slew.
 
     Attributes:
-        restart: why the process should end and be started again; empty when it should not.
+        restart: why the process should be restarted; empty when it should not.
         wanted: the target of a hold or a slew, None in other modes.
     """
 
     def __init__(self, settings: ModeSettings, body: Body, steering: Steering, services: Services) -> None:
-        """Take the tasks that modes act on. Raises FlightError where a fact's reaction would do nothing."""
+        """Take the tasks that modes act on. Raises FlightError for a fact whose reaction has no effect."""
         facts.check(facts.FACTS, modes_moved_by)
         self._settings = settings.modes
         self._stop = settings.stop
@@ -103,7 +103,7 @@ class ModeControl:
 
     @property
     def flies_steps(self) -> bool:
-        """Whether the configured steps are flown, or will be as soon as the devices give good data."""
+        """Whether the configured steps are flown, or will be once the devices give good data."""
         booting = self.mode is Mode.BOOT and self._initial is Mode.TESTBED_DEMO
         return self.mode is Mode.TESTBED_DEMO or (booting and not self._too_many_crashes)
 
@@ -121,7 +121,7 @@ class ModeControl:
         coils_answer: bool,
         now_ns: int,
     ) -> Mode:
-        """Check what has been achieved in this cycle; return the mode to act in.
+        """Check the conditions of the present mode; return the mode to act in.
 
         `rate` rad/s is the magnitude of the newest body rate measured in this cycle, None without one;
         `overdue` rad is the angle to where the demonstration should have brought the body by now, None while
@@ -135,7 +135,7 @@ class ModeControl:
         text = f"no estimate for {blind:.0f} s"
         self._facts.update(facts.BLIND, blind > self._settings.blind_limit, now_ns, text)
         if self.mode is Mode.DETUMBLE and rate is not None:
-            # Where no current turns the body no hold is possible: wait until it has turned further.
+            # Where the coils have no authority no hold is possible: wait until the body has turned further.
             within = estimate is not None and self._targets.can_hold(estimate)
             if self._slow.update(rate < self._low_rate and within, now_ns):
                 self._fire(Trigger.DETUMBLED, f"below {self._low_rate:g} rad/s", now_ns)
@@ -169,7 +169,7 @@ class ModeControl:
         return ""
 
     def react(self, kind: EventKind, time_ns: int, text: str) -> None:
-        """Do what an event's row asks for: the reactor of the event log."""
+        """Carry out the reaction of an event: the reactor of the event log."""
         reaction = kind.reaction
         if reaction is Reaction.COILS_OFF:
             self._steering.zero()
@@ -198,7 +198,7 @@ class ModeControl:
             self._facts.update(facts.BOOT_WAITS, late, now_ns, f"for {waited:.1f} s: coils at zero")
 
     def _keep(self, estimate: Estimate, now_ns: int) -> None:
-        """State the progress of a hold or a slew."""
+        """Check the progress of a hold or a slew."""
         settings = self._settings
         if self.wanted is None:
             self.wanted = self._targets.hold_here(estimate, now_ns)
@@ -211,7 +211,7 @@ class ModeControl:
         self._facts.update(facts.SLEW_LATE, slewing > settings.slew_limit, now_ns, text)
 
     def _barred(self) -> str:
-        """Return why SAFE may not be left: latched facts that were not cleared; empty when it may."""
+        """Return why SAFE may not be left: latched facts that are not cleared; empty when it may."""
         held = [
             fact.begins.name
             for fact in self._facts.held()
@@ -225,12 +225,12 @@ class ModeControl:
             self._enter(change, reason, now_ns)
 
     def _enter(self, change: Change, reason: str, now_ns: int) -> None:
-        """Enter a mode: reset timers, release an old path, zero the coils where nothing is steered."""
+        """Enter a mode: reset timers, release an old path, zero the coils of a mode without steering."""
         self._facts.enter(change.after)
         for timer in (self._slow, self._arrived, self._pointing):
             timer.reset()
         if change.before not in STEERING | {Mode.BOOT}:
-            self._paths.release()  # an old path says nothing of where the body is now
+            self._paths.release()  # an old path does not start where the body is now
         if change.after is Mode.DETUMBLE:
             self._steering.begin_braking(now_ns)
         if change.after is not Mode.SLEW and change.trigger is not Trigger.ARRIVED:

@@ -1,4 +1,4 @@
-"""Watches rate and pointing error of a body that is steered."""
+"""Monitors the rate and the pointing error of a steered body."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from flight.schema.sections import Modes
 
 
 class PointingWatch:
-    """States the facts TUMBLING and HOLD_IMPOSSIBLE."""
+    """Updates the facts TUMBLING and HOLD_IMPOSSIBLE."""
 
     def __init__(self, settings: Modes, targets: Targets, facts_: Facts) -> None:
         self._settings = settings
@@ -20,13 +20,13 @@ class PointingWatch:
         self._off = HoldTimer(settings.hold_patience)
 
     def reset(self) -> None:
-        """Forget how long the body has been off: another mode is entered."""
+        """Restart the timer of the pointing error: another mode is entered."""
         self._off.reset()
 
     def watch(self, estimate: Estimate, off: float | None, now_ns: int) -> float:
-        """State whether the body turns too fast and stays too far `off`, rad; return how far.
+        """Update both facts from the pointing error `off`, rad; return the error, 0 where `off` is None.
 
-        `off` is None while nothing is wanted of the body: then it is not off.
+        `off` is None while there is no attitude to be reached yet.
         """
         settings, speed = self._settings, self._targets.speed(estimate)
         text = f"{speed:.3f} rad/s, {settings.tumble_rate:g} allowed"

@@ -1,6 +1,6 @@
-"""The transitions, as data: every mode with every trigger, so that nothing is left to chance.
+"""The transition table: the result of every trigger in every mode.
 
-`Answer.STAY` is for a trigger that means nothing in that mode, `Answer.REFUSE` for a command not obeyed.
+`Answer.STAY` is for a trigger without effect in that mode, `Answer.REFUSE` for a command that is refused.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from flight.loop.modes.triggers import COMMANDS, SAFING, STARTS, Trigger
 
 
 class Answer(Enum):
-    """What a trigger does that leads nowhere."""
+    """The result of a trigger that changes no mode."""
 
     STAY = "stays"
     REFUSE = "is refused"
@@ -89,7 +89,7 @@ TRANSITIONS: Table = {
 
 
 def check(table: Table) -> None:
-    """Refuse a table that leaves something to chance; raises FlightError naming the first fault."""
+    """Validate a table; raises FlightError naming the first error."""
     for mode in Mode:
         row = table.get(mode)
         if row is None:

@@ -8,7 +8,7 @@ from flight.link.modes import Mode
 
 
 class Trigger(Enum):
-    """What may change the mode: the end of the start, a command, a reaction, or something achieved."""
+    """What may change the mode: the end of the boot, a command, a reaction, or an achievement."""
 
     START_SAFE = "start in safe"
     START_DETUMBLE = "start in detumble"
@@ -32,7 +32,7 @@ STARTS = {
     Mode.HOLD: Trigger.START_HOLD,
     Mode.TESTBED_DEMO: Trigger.START_DEMO,
 }
-"""The trigger that ends the start in each mode that can be configured."""
+"""The trigger that ends the boot, for each mode that can be configured."""
 
 COMMANDS = {
     Mode.SAFE: Trigger.COMMAND_SAFE,
@@ -41,7 +41,7 @@ COMMANDS = {
     Mode.SLEW: Trigger.COMMAND_SLEW,
     Mode.TESTBED_DEMO: Trigger.COMMAND_DEMO,
 }
-"""The trigger of a command for each mode; BOOT is not to be commanded."""
+"""The trigger of a command for each mode; BOOT cannot be commanded."""
 
 SAFING = (Trigger.COMMAND_SAFE, Trigger.REACT_SAFE)
-"""What must lead to SAFE from wherever it comes."""
+"""The triggers that must lead to SAFE from every mode."""

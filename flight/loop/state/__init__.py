@@ -1,1 +1,1 @@
-"""What must outlive the process: boots, unclean shutdowns, what was learned, the last mode."""
+"""State that outlives the process: boot count, unclean shutdowns, learned parameters, the last mode."""

@@ -1,4 +1,4 @@
-"""What is kept: typed, bounded, checked. UTC is a label for people; nothing is reckoned with it."""
+"""The stored state: typed, bounded, validated. UTC is a label for people, never used in computations."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ REMEMBERED = 32
 
 
 class Kept(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A part of the state; unknown keys are refused."""
+    """A part of the state; unknown keys are rejected."""
 
 
 class Learned(Kept, frozen=True):
@@ -32,7 +32,7 @@ class Learned(Kept, frozen=True):
 
     @staticmethod
     def of(values: FloatArray, covariance: FloatArray) -> Learned:
-        """Return arrays as what is kept; the covariance is made symmetric to the last bit."""
+        """Return the stored form of arrays; the covariance is made exactly symmetric."""
         even = 0.5 * (covariance + covariance.T)
         return Learned(tuple(values.tolist()), tuple(map(tuple, even.tolist())))
 
@@ -42,7 +42,7 @@ class Learned(Kept, frozen=True):
 
 
 class UncleanShutdown(Kept, frozen=True):
-    """A boot that ended without saying so: its number, the operating time when last heard of, a label."""
+    """An unclean shutdown: boot number, and operating time and UTC label of its last stored state."""
 
     boot: Count
     operated: Seconds
@@ -50,17 +50,17 @@ class UncleanShutdown(Kept, frozen=True):
 
 
 class StoredState(Kept, frozen=True, kw_only=True):
-    """All that is kept.
+    """The stored state.
 
     Attributes:
         boot_count: how often the application has started.
-        operated: s, that it has run in all, by the monotonic clock: the time in which crashes are counted.
+        operated: s, total operating time by the monotonic clock: the time scale of crash counts.
         running: set at the start and cleared at a clean end.
-        unclean: shutdowns that were not clean, oldest first.
-        mode: the mode when last heard of.
-        utc: when it was last heard of: a label.
+        unclean: unclean shutdowns, oldest first.
+        mode: the mode at the last write.
+        utc: a label of the last write.
         learned: parameters by name.
-        devices: of which devices they were learned: a digest of what the configuration says of them.
+        devices: digest of the configuration of the devices that the parameters belong to.
     """
 
     boot_count: Count = 0
@@ -74,7 +74,7 @@ class StoredState(Kept, frozen=True, kw_only=True):
 
 
 def check(state: StoredState) -> None:
-    """Raise ValueError for what must not be kept: a number that is not finite, a covariance that is none."""
+    """Raise ValueError for a state that must not be stored: a non-finite number, an invalid covariance."""
     if not all(
         math.isfinite(t) for t in (state.operated, *(shutdown.operated for shutdown in state.unclean))
     ):

@@ -1,8 +1,8 @@
-"""Replaces a small file so that a crash at any moment leaves the old content or the new one, whole.
+"""Replaces a small file atomically: a crash at any moment leaves either the old or the new content.
 
 The order is that of Pillai et al., "All File Systems Are Not Created Equal" (OSDI 2014), section 2: write a
 temporary file, sync it, rename it over the old one, sync the folder. Each call goes through `Files`, so that
-a test can stop the machine before any of them.
+a test can simulate a power loss before any of them.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from typing import Protocol
 
 
 class Files(Protocol):
-    """The calls that keeping a file takes; each raises OSError."""
+    """The file system calls that are used; each raises OSError."""
 
     def read(self, path: Path) -> bytes | None:
         """Return a file's content, None when there is no such file."""
 
     def create(self, path: Path) -> int:
-        """Open an empty file for writing, over an old one if need be; returns its descriptor."""
+        """Open an empty file for writing, replacing an old one; return its descriptor."""
 
     def write(self, file: int, data: bytes) -> int:
-        """Write at most all of `data`; returns how many bytes were taken."""
+        """Write at most all of `data`; return how many bytes were written."""
 
     def sync(self, file: int) -> None:
         """Make the file's content durable."""
@@ -32,14 +32,14 @@ class Files(Protocol):
         """Close a descriptor."""
 
     def rename(self, old: Path, new: Path) -> None:
-        """Give a file a new name, atomically, over what has that name."""
+        """Rename a file atomically, replacing a file of the new name."""
 
     def sync_folder(self, folder: Path) -> None:
         """Make the names in a folder durable."""
 
 
 class LinuxFiles:
-    """The real ones."""
+    """The calls of the operating system."""
 
     def read(self, path: Path) -> bytes | None:
         """Return a file's content, None when there is no such file."""
@@ -49,7 +49,7 @@ class LinuxFiles:
             return None
 
     def create(self, path: Path) -> int:
-        """Open an empty file for writing, over an old one if need be."""
+        """Open an empty file for writing, replacing an old one."""
         return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o640)
 
     def write(self, file: int, data: bytes) -> int:
@@ -65,7 +65,7 @@ class LinuxFiles:
         os.close(file)
 
     def rename(self, old: Path, new: Path) -> None:
-        """Give a file a new name, atomically."""
+        """Rename a file atomically."""
         os.rename(old, new)
 
     def sync_folder(self, folder: Path) -> None:
@@ -78,7 +78,7 @@ class LinuxFiles:
 
 
 def replace_file(files: Files, path: Path, data: bytes) -> None:
-    """Put `data` in place of the file's content; durable when this returns. Raises OSError, the old kept."""
+    """Replace the file's content, durably. Raises OSError; the old content then remains."""
     temporary = path.with_suffix(".tmp")
     file = files.create(temporary)
     try:

@@ -1,8 +1,7 @@
-"""How the kept state goes on from boot to boot: pure functions.
+"""How the stored state changes from boot to boot: pure functions.
 
-Crashes are counted in the application's own operating time, the sum over all boots of the monotonic time it
-ran: a wrong or stepped clock changes nothing, and a board that crashes at once, again and again, makes no
-operating time in which its crashes could be forgotten.
+Crashes are counted per operating time, the sum over all boots of monotonic running time: a wrong or stepped
+clock has no effect, and a board that crashes at once, repeatedly, does not age its crashes out.
 """
 
 from __future__ import annotations
@@ -17,12 +16,12 @@ from flight.loop.state.content import LONGEST_LABEL, REMEMBERED, Learned, Stored
 
 @dataclass(frozen=True, slots=True)
 class BootRecord:
-    """What a starting application wants to know of its past.
+    """The history of earlier boots, as needed at the start.
 
     Attributes:
         boot_count: this boot's number, 1 the first.
-        unclean_recent: unclean shutdowns within the window of operating time that was asked for.
-        after_unclean: whether the boot before this one ended uncleanly.
+        unclean_recent: unclean shutdowns within the given window of operating time.
+        after_unclean: whether the previous boot ended uncleanly.
         mode: the mode at the last stop; empty when there was none.
     """
 
@@ -33,9 +32,9 @@ class BootRecord:
 
 
 def begin(state: StoredState, utc: str, devices: str = "") -> StoredState:
-    """Return the state of the next boot: running, and with the last one's crash remembered.
+    """Return the state of the next boot: running, and with a crash of the last boot recorded.
 
-    What was learned of other `devices` than these is forgotten.
+    Parameters learned of other `devices` are discarded.
     """
     unclean = state.unclean
     if state.running:
@@ -54,7 +53,7 @@ def begin(state: StoredState, utc: str, devices: str = "") -> StoredState:
 def go_on(
     begun: StoredState, elapsed: float, mode: str, learned: Mapping[str, Learned], utc: str
 ) -> StoredState:
-    """Return the state of a boot that `begun`, `elapsed` s later; what is learned anew replaces the old."""
+    """Return the state `elapsed` s after the start `begun`; new learned parameters replace the old."""
     return msgspec.structs.replace(
         begun,
         operated=begun.operated + max(elapsed, 0.0),
@@ -70,7 +69,7 @@ def end(state: StoredState) -> StoredState:
 
 
 def boot_record(begun: StoredState, window: float) -> BootRecord:
-    """Return what the state of a boot just begun says of the past; `window` in s of operating time."""
+    """Return the boot record of the state of a new boot; `window` in s of operating time."""
     recent = sum(begun.operated - shutdown.operated <= window for shutdown in begun.unclean)
     after = bool(begun.unclean) and begun.unclean[-1].boot == begun.boot_count - 1
     return BootRecord(begun.boot_count, recent, after, begun.mode)

@@ -1,8 +1,7 @@
-"""Keeps the state up to date beside the loop: the control thread notes, a ticker's thread writes.
+"""Stores the state outside the loop: the control thread sets values in memory, a ticker's thread writes them.
 
-`note` and `notices` touch memory only. The disk is touched at the start, before there is a loop, by the
-clock's ticker while it runs, and at the end, when the coils are at zero; a disk that hangs delays only the
-ticker.
+The disk is written at the start, before the loop, by the clock's ticker during the flight, and at the end,
+when the coils are at zero; a hanging disk delays only the ticker.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ _NOTICES = 64
 
 
 class Notices:
-    """Events that happen where there is no event log: kept, the oldest dropped, until the loop takes them."""
+    """Keeps the newest events of threads without an event log, until the loop collects them."""
 
     def __init__(self) -> None:
         self._kept: deque[tuple[EventKind, str]] = deque(maxlen=_NOTICES)
@@ -44,7 +43,7 @@ class StateKeeper:
     """The state of one boot, from its begin to its end.
 
     Attributes:
-        record: what the past says.
+        record: the history of earlier boots.
         learned: what earlier boots learned, by name.
     """
 
@@ -58,10 +57,10 @@ class StateKeeper:
         devices: str = "",
         period_ns: int = PERIOD_NS,
     ) -> None:
-        """Load the state, count this boot and write that it runs.
+        """Load the state, count this boot and store it as running.
 
-        `window` is the operating time, s, in which unclean shutdowns count as recent; `devices` stands for
-        those that are flown: what was learned of others is not taken.
+        `window` is the operating time, s, in which unclean shutdowns count as recent; `devices` is the digest
+        of the devices flown: parameters learned of others are discarded.
         """
         self._store = store
         self._notices = notices
@@ -75,7 +74,7 @@ class StateKeeper:
         self.record: BootRecord = history.boot_record(self._begun, window)
         self.learned: Mapping[str, Learned] = self._begun.learned
         self._noted: tuple[str, Mapping[str, Learned]] = (self._begun.mode, {})
-        self._writing = threading.Lock()  # held by whoever writes, never asked for by note()
+        self._writing = threading.Lock()  # held while writing, never acquired by note()
         self._closed = False
         if self.record.after_unclean:
             last = self._begun.unclean[-1]
@@ -85,15 +84,15 @@ class StateKeeper:
         self._ticker = clock.ticker("state", period_ns, self._write)
 
     def note(self, mode: str, learned: Mapping[str, Learned] | None = None) -> None:
-        """Remember the mode and what is learned until the next write. Never waits."""
+        """Set the mode and the learned parameters for the next write. Never waits."""
         self._noted = (mode, self._noted[1] if learned is None else learned)
 
     def notices(self) -> list[tuple[EventKind, str]]:
-        """Return what happened to the state since the last call, for the event log."""
+        """Return the events of the state since the last call, for the event log."""
         return self._notices.drain()
 
     def close(self, clean: bool) -> None:
-        """Write the last state, as that of a clean end or not. Safe to call twice; never waits long."""
+        """Write the last state, as a clean end or not. Safe to call twice; waits 5 s at most."""
         self._ticker.stop()
         if self._closed or not self._writing.acquire(timeout=_HUNG_DISK_S):
             self._closed = True
@@ -105,7 +104,7 @@ class StateKeeper:
             self._writing.release()
 
     def _write(self) -> None:
-        """Write what was noted: the ticker's job."""
+        """Write the newest values: the ticker's job."""
         with self._writing:
             if not self._closed:
                 self._put(ended=False)
@@ -117,12 +116,12 @@ class StateKeeper:
         try:
             self._store.store(history.end(state) if ended else state)
         except ValueError as error:
-            # What was learned is unfit to be kept; that the application ran, and how it ended, is not.
+            # Only the learned parameters are invalid; operating time and ending must still be stored.
             self._notices.report(events.STATE_UNWRITTEN, str(error))
             self._noted = (mode, {})
             state = history.go_on(self._begun, elapsed, mode, {}, self._label())
             self._store.store(history.end(state) if ended else state)
 
     def _label(self) -> str:
-        """Return UTC as text, for people."""
+        """Return UTC as text."""
         return f"{datetime.fromtimestamp(self._clock.utc_ns() * 1e-9, UTC):%Y-%m-%dT%H:%M:%SZ}"

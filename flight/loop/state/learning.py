@@ -1,7 +1,7 @@
-"""What of an estimate is worth keeping over a boot: what belongs to the devices, not to the motion.
+"""The learned parameters: the parts of an estimate that belong to the devices, not to the motion.
 
-The next boot starts from it, with a spread that allows for what may have changed meanwhile: a share of what
-the configuration allows a start that knows nothing. What lies outside of that belief is not taken.
+The next boot starts from them, with the covariance increased by a fraction of the configured prior, for
+changes meanwhile. Values that the prior makes implausible are rejected.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from flight.schema.sections import Config
 GYRO_BIAS, PLANT, IMU_LATENCY, MAGNETOMETER_BIAS = "gyro-bias", "plant", "imu-latency", "magnetometer-bias"
 
 _BELIEVED = 4.0
-"""Sigmas of a start that knows nothing: what was learned further from it is not believed."""
+"""Sigmas of the configured prior: learned values further from the prior are rejected."""
 
 
 def learned_of(estimate: Estimate) -> dict[str, Learned]:
     """Return the estimate's slow parts by name, in its units and axes.
 
     The gyro's bias; torsion, damping and coil gain of the plant; the age of the inertial unit's samples; the
-    magnetometer's bias. What they have to do with each other is left out: each has its own covariance.
+    magnetometer's bias. Cross-covariances are dropped.
     """
     parts: dict[str, tuple[FloatArray, slice]] = {
         GYRO_BIAS: (estimate.bias, BIAS),
@@ -44,22 +44,22 @@ def learned_of(estimate: Estimate) -> dict[str, Learned]:
 
 
 def digest_of(config: Config) -> str:
-    """Return what stands for the devices of a configuration: what was learned of others is of no use."""
+    """Return a digest of the devices of a configuration."""
     devices = (config.plant, config.coils, config.inertial_unit)
     return f"{zlib.crc32(msgspec.json.encode(devices)):08x}"
 
 
 def start_from(
-    learned: Mapping[str, Learned], believed: SlowPrior, changed: float
+    learned: Mapping[str, Learned], configured: SlowPrior, changed: float
 ) -> tuple[SlowPrior, list[str]]:
-    """Return what the filter may start from, and why some of what was learned was not taken.
+    """Return the filter's prior, and why learned parameters were rejected.
 
-    `believed` is what holds without any learning; since the last boot a value may have changed by the part
-    `changed` of its standard deviation there.
+    `configured` is the prior without learning; since the last boot a value may have changed by the fraction
+    `changed` of its standard deviation in `configured`.
     """
     problems: list[str] = []
 
-    def take(name: str, values: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def accept(name: str, values: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
         if name not in learned:
             return values, covariance
         found, spread = learned[name].arrays()
@@ -69,14 +69,14 @@ def start_from(
             return values, covariance
         return _widened(found, spread, values, covariance, changed)
 
-    bias, bias_covariance = take(GYRO_BIAS, believed.bias, believed.bias_covariance)
-    plant, plant_covariance = take(PLANT, np.array(believed.parameters), believed.parameters_covariance)
-    age, age_covariance = take(
-        IMU_LATENCY, np.array([believed.latency]), np.array([[believed.latency_variance]])
+    bias, bias_covariance = accept(GYRO_BIAS, configured.bias, configured.bias_covariance)
+    plant, plant_covariance = accept(PLANT, np.array(configured.parameters), configured.parameters_covariance)
+    age, age_covariance = accept(
+        IMU_LATENCY, np.array([configured.latency]), np.array([[configured.latency_variance]])
     )
     torsion, damping, gain = plant.tolist()
     prior = dataclasses.replace(
-        believed,
+        configured,
         bias=bias,
         bias_covariance=bias_covariance,
         parameters=Parameters(torsion, damping, gain),
@@ -88,7 +88,7 @@ def start_from(
 
 
 def _problem(found: FloatArray, values: FloatArray, covariance: FloatArray) -> str:
-    """Return why what was learned cannot be true; empty where it can."""
+    """Return why a learned value is implausible; empty when plausible."""
     if found.shape != values.shape:
         return f"{len(values)} values are wanted"
     sigma = np.sqrt(np.diag(covariance))
@@ -100,7 +100,7 @@ def _problem(found: FloatArray, values: FloatArray, covariance: FloatArray) -> s
 def _widened(
     found: FloatArray, spread: FloatArray, values: FloatArray, covariance: FloatArray, changed: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return what was learned with what may have changed; what is not estimated stays what it is."""
+    """Return learned values with the increased covariance; values not estimated stay as configured."""
     variance = np.diag(covariance)
     estimated = variance > 0.0
     both = np.outer(estimated, estimated)

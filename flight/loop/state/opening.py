@@ -1,4 +1,4 @@
-"""Opens the kept state of a boot, where there is a place for it, and sees to its end."""
+"""Opens the stored state of a boot, where there is a folder for it, and closes it at the flight's end."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hal.interfaces.wires import Clock
 
 
 def state_folder(config: Config, environment: Mapping[str, str]) -> Path | None:
-    """Return where the state is kept: as configured, else systemd's folder where real devices are flown."""
+    """Return the state's folder: as configured, else systemd's for a flight of real devices, else None."""
     if config.state.folder is not None:
         return Path(config.state.folder)
     if config.simulation is not None:
@@ -24,8 +24,8 @@ def state_folder(config: Config, environment: Mapping[str, str]) -> Path | None:
 
 
 def service_folder(environment: Mapping[str, str]) -> Path | None:
-    """Return the state folder that systemd gives a service, None where there is none."""
-    # systemd puts colons between several folders; the first is the application's own.
+    """Return the state folder that systemd gives a service, None without one."""
+    # systemd separates several folders by colons; the first is the application's own.
     first = environment.get("STATE_DIRECTORY", "").partition(":")[0]
     return Path(first) if first else None
 
@@ -33,15 +33,15 @@ def service_folder(environment: Mapping[str, str]) -> Path | None:
 def open_state(
     config: Config, environment: Mapping[str, str], clock: Clock, stack: ExitStack
 ) -> StateKeeper | None:
-    """Count this boot; None where no state is kept.
+    """Count this boot; return None where no state is stored.
 
-    `stack` ends it: cleanly, unless an exception passes. A device that does not answer is no crash: it is
-    told, and safe mode would not mend it.
+    `stack` closes the state: cleanly, unless an exception passes. A DeviceError counts as clean: the device
+    is reported, and safe mode would not help.
     """
     folder = state_folder(config, environment)
     if folder is None:
         return None
-    with suppress(OSError):  # the first write will fail and tell; the flight goes on
+    with suppress(OSError):  # the first write will fail and be reported; the flight goes on
         folder.mkdir(parents=True, exist_ok=True)
     notices = Notices()
     keeper = StateKeeper(

@@ -1,7 +1,7 @@
-"""The state on disk: two copies, each with its generation and a CRC, each replaced atomically.
+"""The state on disk: two copies, each with a generation number and a CRC, each replaced atomically.
 
 A copy is one line of JSON and a line with the CRC-32 of the first. Both are written each time, one after the
-other, so that a crash leaves one of them whole, and damage to one of them loses nothing.
+other, so that one copy survives a crash or damage to the other.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from flight.loop.state.files import Files, LinuxFiles, replace_file
 COPIES = ("state-a.json", "state-b.json")
 LARGEST_FILE = 1 << 20
 
-Tell = Callable[[EventKind, str], None]
-"""Takes an event: its kind and what happened."""
+Report = Callable[[EventKind, str], None]
+"""Reports an event: kind and text."""
 
 
 class _Copy(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -36,7 +36,7 @@ class _Copy(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True, slots=True)
 class _Read:
-    """One file as it was found; `problem` is empty when it is whole, or not there."""
+    """One file as read; `problem` is empty when the copy is valid, or missing."""
 
     name: str
     copy: _Copy | None
@@ -44,36 +44,36 @@ class _Read:
 
 
 class StateStore:
-    """Keeps a StoredState in a folder. Not for two processes at once."""
+    """Stores a StoredState in a folder. Not for two processes at once."""
 
-    def __init__(self, folder: Path, tell: Tell, files: Files | None = None) -> None:
+    def __init__(self, folder: Path, report: Report, files: Files | None = None) -> None:
         self._folder = folder
-        self._tell = tell
+        self._report = report
         self._files = files or LinuxFiles()
         self._generation = 0
 
     def load(self) -> StoredState:
-        """Return the newest whole copy; defaults when there is none. Never raises.
+        """Return the newest valid copy; defaults when there is none. Never raises.
 
-        A lost state comes back as that of an application which did not end cleanly.
+        A lost state counts as an unclean shutdown.
         """
         read = [self._read(name) for name in COPIES]
         whole = [r for r in read if r.copy is not None]
-        # One that is not there was perhaps never written: the first writes may have been cut short.
+        # A missing copy is no problem: the very first write may have been interrupted.
         bad = "; ".join(f"{r.name}: {r.problem}" for r in read if r.problem)
         newest = max(whole, key=lambda r: r.copy.generation if r.copy else 0, default=None)
         if newest is None or newest.copy is None:
             if not bad:
                 return StoredState()
-            self._tell(events.STATE_LOST, f"{bad}: defaults, taken for an unclean shutdown")
+            self._report(events.STATE_LOST, f"{bad}: defaults, taken for an unclean shutdown")
             return StoredState(running=True)
         self._generation = newest.copy.generation
         if bad:
-            self._tell(events.STATE_RECOVERED, f"{bad}: read from {newest.name}")
+            self._report(events.STATE_RECOVERED, f"{bad}: read from {newest.name}")
         return newest.copy.state
 
     def store(self, state: StoredState) -> bool:
-        """Write both copies; returns whether one at least is durable. Raises ValueError if unfit."""
+        """Write both copies; return whether at least one is durable. Raises ValueError if invalid."""
         data = encode(self._generation + 1, state)
         failures = []
         for name in COPIES:
@@ -82,8 +82,8 @@ class StateStore:
             except OSError as error:
                 failures.append(f"{name}: {error.strerror or error}")
         if failures:
-            self._tell(events.STATE_UNWRITTEN, "; ".join(failures))
-        # A copy that failed late may be on disk all the same: a generation is never used twice.
+            self._report(events.STATE_UNWRITTEN, "; ".join(failures))
+        # A copy whose write failed late may still be on disk: a generation is never used twice.
         self._generation += 1
         return len(failures) < len(COPIES)
 
@@ -101,7 +101,7 @@ class StateStore:
 
 
 def encode(generation: int, state: StoredState) -> bytes:
-    """Return the bytes of one copy. Raises ValueError for a state that `decode` would not take."""
+    """Return the bytes of one copy. Raises ValueError for a state that `decode` would reject."""
     check(state)
     line = msgspec.json.encode(_Copy(generation, state)) + b"\n"
     data = line + b"%08x\n" % zlib.crc32(line)
@@ -110,7 +110,7 @@ def encode(generation: int, state: StoredState) -> bytes:
 
 
 def decode(data: bytes) -> _Copy:
-    """Return the content of one copy. Raises ValueError for all that `encode` does not make."""
+    """Return the content of one copy. Raises ValueError for anything that `encode` does not produce."""
     if len(data) > LARGEST_FILE:
         raise ValueError(f"{len(data)} bytes are too many")
     line, end, crc = data.partition(b"\n")

@@ -1,15 +1,15 @@
-"""Whether a brake on an unconfirmed verdict is right: a leg stuck low drives its coil while braked."""
+"""Verifies brakes that rest on an unconfirmed verdict: a leg stuck low drives its coil while braked."""
 
 from __future__ import annotations
 
 from collections import deque
 
 _PROOFS = 2
-"""Conversions that must agree."""
+"""Conversions in a row that must agree."""
 
 
 class BrakeProof:
-    """Collects conversions made under brakes that no measurement has confirmed yet."""
+    """Collects conversions made under brakes that are not confirmed yet."""
 
     def __init__(self) -> None:
         self._axes: set[int] = set()
@@ -20,15 +20,15 @@ class BrakeProof:
         return bool(self._axes)
 
     def add(self, axis: int) -> None:
-        """Note a brake that rests on a verdict alone."""
+        """Add an axis that is braked on a verdict alone."""
         self._axes.add(axis)
 
     def discard(self, axis: int) -> None:
-        """Forget an axis."""
+        """Remove an axis."""
         self._axes.discard(axis)
 
     def ingest(self, exceeds: bool) -> frozenset[int]:
-        """Note whether a conversion shows current in spite of the brakes; return the axes braked wrongly."""
+        """Note whether a conversion shows current despite the brakes; return the axes braked wrongly."""
         self._exceeds.append(exceeds)
         if len(self._exceeds) < _PROOFS:
             return frozenset()

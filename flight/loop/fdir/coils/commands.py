@@ -1,4 +1,4 @@
-"""What has been on the wire of late, and what a sound circuit would have taken from the supply for it."""
+"""The recent coil commands, and the supply current that a healthy circuit would draw for them."""
 
 from __future__ import annotations
 
@@ -14,34 +14,30 @@ from hal.interfaces.readings import PowerReading
 
 _SAMPLES_NS = 25_000_000
 _NOTED_LATE_NS = 25_000_000
-"""A command is told a cycle after it was written."""
+"""A command is noted one cycle after it was written."""
 
 
 class CoilCommands:
-    """Currents and brakes with their times.
-
-    Attributes:
-        braked: which bridges are braked on the wire.
-    """
+    """Commanded currents and brakes with their times; `braked` holds which bridges are braked now."""
 
     def __init__(self, reach_ns: int) -> None:
-        """Remember so far back."""
+        """Keep the commands of the last `reach_ns`."""
         self._reach_ns = reach_ns
         self._commands: deque[tuple[int, tuple[float, ...]]] = deque()
         self._braked_ns = 0
         self.braked = NONE
 
     def __bool__(self) -> bool:
-        """Tell whether anything has been told yet."""
+        """Return whether a command was noted yet."""
         return bool(self._commands)
 
     @property
     def newest_ns(self) -> int:
-        """When the newest was told."""
+        """Time of the newest command."""
         return self._commands[-1][0]
 
     def note(self, time_ns: int, currents: tuple[float, ...], braked: Axes) -> None:
-        """Take what is on the wire from `time_ns` on: currents (3,) A."""
+        """Note the currents (3,) A and brakes in force from `time_ns` on."""
         if braked != self.braked:
             self._braked_ns, self.braked = time_ns, braked
         self._commands.append((time_ns, currents))
@@ -50,11 +46,11 @@ class CoilCommands:
             self._commands.popleft()
 
     def is_known_since(self, time_ns: int) -> bool:
-        """Tell whether all since `time_ns` is known, and under the present brakes."""
+        """Return whether all commands since `time_ns` are known and made under the present brakes."""
         return time_ns >= max(self._braked_ns, self._commands[0][0])
 
     def window(self, begin_ns: int, end_ns: int) -> FloatArray:
-        """Return the commands (k, 3) A that may have been in force between two times, at even distances."""
+        """Return the commands (k, 3) A that may have been in force between two times, evenly sampled."""
         times = np.array([time_ns for time_ns, _ in self._commands])
         values = np.array([currents for _, currents in self._commands])
         at = np.arange(begin_ns, end_ns + _NOTED_LATE_NS + 1, _SAMPLES_NS)
@@ -62,7 +58,10 @@ class CoilCommands:
         return newest
 
     def supplied(self, reading: PowerReading, bounds: Bounds, known: Mapping[int, CoilFault]) -> Supplied:
-        """Return the newest conversion with what coils that are sound, but for `known`, would have drawn."""
+        """Return the newest conversion with the bounds of the current that healthy coils would draw.
+
+        `known` holds the known faults by axis.
+        """
         sizes = np.abs(self.window(reading.newest_since_ns, reading.time_ns))
         free = [axis for axis, fault in known.items() if fault in {CoilFault.SHORTED, CoilFault.UNCERTAIN}]
         sure = sizes.copy()

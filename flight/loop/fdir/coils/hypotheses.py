@@ -1,7 +1,7 @@
-"""What the supply current should be if an axis were broken in one way or another, and which of that fits.
+"""Predicts the supply current for each coil fault, and tests which fault explains the readings.
 
 Input A of a bridge is pulsed for a positive current, B for a negative one. A leg that is stuck high drives
-its coil by itself, and the other input takes that away again for the length of its pulse.
+its coil continuously; a pulse on the other input cancels the drive for its duration.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from flight.gnc.math.arrays import FloatArray
 
 
 class CoilFault(Enum):
-    """What is wrong with an axis, in words for the log."""
+    """The fault of an axis; the values are the log's texts."""
 
     OPEN = "open: no current when driven"
     SHORTED = "shorted: too much current when driven"
@@ -42,16 +42,16 @@ _PLACE = {fault: place for place, fault in enumerate(_VARIANTS)}
 _SHORTED_FACTORS = np.geomspace(1.6, 20.0, 40)
 _SHORTED_SLACK = 0.04
 _OUTLIERS = 0.15
-"""Part of the readings that a hypothesis may miss: those in whose window the fault itself fell."""
+"""Fraction of the readings that a hypothesis may miss: those whose window contains the fault's onset."""
 
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """How exactly a reading can be foretold.
+    """Bounds of the error of a predicted reading.
 
     Attributes:
         full_current: A, of a coil that is fully on.
-        uncertainty: A, of each driven coil.
+        uncertainty: A, for each driven coil.
         gain: relative, common to all readings.
         noise: A, of the monitor.
     """
@@ -64,11 +64,11 @@ class Bounds:
 
 @dataclass(frozen=True, slots=True)
 class Sampling:
-    """How a reading samples the chopped and changing current of its window.
+    """Error bounds of a reading of a chopped current that changes within the reading's window.
 
     Attributes:
-        scatter: relative, by which it may miss what is chopped.
-        range_share: part of the range in its window by which it may miss the mean.
+        scatter: relative error caused by chopping.
+        range_share: error of the mean, as a fraction of the range in the window.
     """
 
     scatter: float
@@ -76,14 +76,14 @@ class Sampling:
 
 
 NEWEST = Sampling(0.2, 1.0)
-"""A single conversion, somewhere in its window; 18 % (`hal.drivers.ina219`)."""
+"""A single conversion, at an unknown time in its window; 18 % (`hal.drivers.ina219`)."""
 MEAN = Sampling(0.02, 0.25)
-"""The mean of five, over the window; the 7 % are the gain's, which is common to readings in a row."""
+"""The mean of five conversions; the remaining 7 % are in the gain, common to readings in a row."""
 
 
 @dataclass(frozen=True, slots=True)
 class Predicted:
-    """A reading in A, and what each axis (rows) would add under each variant: mean and slack (3, v) A."""
+    """A reading in A, and the prediction of each axis (rows) under each variant: mean and slack (3, v) A."""
 
     current: float
     mean: FloatArray
@@ -92,7 +92,7 @@ class Predicted:
 
 
 def predict(current: float, commands: FloatArray, bounds: Bounds, sampling: Sampling) -> Predicted:
-    """Work out what each variant would have drawn under the commands (k, 3) A of a reading's window."""
+    """Predict the current of each variant under the commands (k, 3) A of a reading's window."""
     drawn = np.empty((3, len(_VARIANTS), len(commands)))
     for axis in range(3):
         for place, fault in enumerate(_VARIANTS):
@@ -103,9 +103,9 @@ def predict(current: float, commands: FloatArray, bounds: Bounds, sampling: Samp
 
 
 def supply_current(command: FloatArray, fault: CoilFault | None, full: float) -> FloatArray:
-    """Return what a bridge takes from the supply for commands (k,) A, `full` A when fully on.
+    """Return the supply current of a bridge for commands (k,) A, `full` A when fully on.
 
-    Of a coil that is shorted, this is what a sound one would take.
+    For a shorted coil, return that of a healthy coil.
     """
     nothing = np.zeros_like(command)
     match fault:
@@ -130,13 +130,13 @@ def fits(
     axis: int | None = None,
     fault: CoilFault | None = None,
 ) -> bool:
-    """Tell whether nearly all readings are explained by `fault` on `axis` beside the known faults."""
+    """Return whether `fault` on `axis`, beside the known faults, explains nearly all readings."""
     variants: list[CoilFault | None] = [known.get(number) for number in range(3)]
     if axis is not None:
         variants[axis] = fault
     current = np.array([one.current for one in evidence])
     mean, slack = np.zeros(len(evidence)), np.full(len(evidence), bounds.noise)
-    free = np.zeros(len(evidence))  # what an axis of unknown state may add
+    free = np.zeros(len(evidence))  # current that an axis of unknown state may add
     own = np.zeros(len(evidence))
     for number, variant in enumerate(variants):
         if variant is CoilFault.UNCERTAIN or (variant is CoilFault.SHORTED and number != axis):

@@ -1,4 +1,4 @@
-"""Is it known what the coils carry? Not while their chip does not obey, nor while the loop stands."""
+"""Tracks whether the coil currents are known; not while the PWM driver fails or the loop has stalled."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from dataclasses import dataclass
 from hal.interfaces.readings import CoilState
 
 _UNSEEN_NS = 600_000_000
-"""The coils' driver reads its outputs back twice a second: what it finds wrong may be so since then."""
+"""The coil driver reads its outputs back twice a second: an error may be this old when found."""
 STOOD_NS = 200_000_000
-"""A loop that stood still for longer may have been taken for dead, the coils zeroed by the guardian."""
+"""If the loop stalls for longer, the guardian may have zeroed the coils."""
 
 
 @dataclass(frozen=True, slots=True)
 class CurrentValidity:
-    """What a look at the coils' driver says of the currents.
+    """Whether the coil currents are known.
 
     Attributes:
         now: whether the currents in force are known.
-        since_last_look: whether those since the look before are, too.
-        since_ns: from when on they are.
-        uncertain_since_ns: from when on what was believed until now is newly in doubt; None when nothing is.
+        since_last_look: whether all currents since the previous look are known.
+        since_ns: time since which they are known.
+        uncertain_since_ns: time from which currents assumed so far turn out to be uncertain; None if none do.
     """
 
     now: bool
@@ -30,7 +30,7 @@ class CurrentValidity:
 
 
 class CoilKnowledge:
-    """Looks at the coils' driver once a cycle."""
+    """Checks the coil driver once a cycle."""
 
     def __init__(self) -> None:
         self._known = True
@@ -38,14 +38,14 @@ class CoilKnowledge:
         self._looked_ns: int | None = None
 
     def look(self, in_force: CoilState, now_ns: int) -> CurrentValidity:
-        """Tell what is known, by what the driver says and by how long nobody looked."""
+        """Return which currents are known, from the driver's state and the time since the last look."""
         obeyed, self._known = self._known, not in_force.error
         looked_ns, self._looked_ns = self._looked_ns, now_ns
         stood = looked_ns is not None and now_ns - looked_ns > STOOD_NS
         since_last_look = obeyed and self._known and not stood
         if self._known and not since_last_look:
             self._since_ns = now_ns
-        doubts = [now_ns - _UNSEEN_NS] if obeyed and not self._known else []
+        uncertain = [now_ns - _UNSEEN_NS] if obeyed and not self._known else []
         if looked_ns is not None and stood:
-            doubts.append(looked_ns)
-        return CurrentValidity(self._known, since_last_look, self._since_ns, min(doubts, default=None))
+            uncertain.append(looked_ns)
+        return CurrentValidity(self._known, since_last_look, self._since_ns, min(uncertain, default=None))

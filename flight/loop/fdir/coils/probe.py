@@ -1,4 +1,4 @@
-"""A small wave of current on one axis at a time, which tells apart coil faults that readings alone do not."""
+"""A small current wave on one axis at a time, to distinguish coil faults that readings alone cannot."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from flight.gnc.math.arrays import FloatArray
 
 
 class Probe:
-    """Puts a wave without a mean on one axis after the other.
+    """Applies a zero-mean square wave to one axis after the other.
 
-    Its two halves last `half_ns` each and carry +`current` and -`current` A: they make no mean torque.
+    The two halves last `half_ns` each and carry +`current` and -`current` A: they make no mean torque.
     """
 
     def __init__(self, current: float, half_ns: int) -> None:
@@ -20,7 +20,7 @@ class Probe:
         self._tried: set[int] = set()
 
     def begin(self, axes: set[int], now_ns: int) -> int | None:
-        """Begin a wave on the next untried of `axes`; return when it ends, None where all were tried."""
+        """Begin a wave on the next untried of `axes`; return the wave's end, None when all were tried."""
         candidates = sorted(axes - self._tried)
         if not candidates:
             self._tried.clear()
@@ -30,7 +30,7 @@ class Probe:
         return now_ns + 2 * self._half_ns
 
     def stop(self) -> None:
-        """End the wave, and forget which axes were tried."""
+        """End the wave; count all axes as untried."""
         self._running = None
         self._tried.clear()
 

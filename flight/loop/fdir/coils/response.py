@@ -1,13 +1,12 @@
-"""How much of each coil's torque the body really feels: a fit of its angular acceleration over some seconds.
+"""Estimates the torque gain of each coil from the body's angular acceleration over some seconds.
 
-Rate and commanded rate change (the integral of J^-1 (m x B)) are averaged over short bins alike; differences
-of neighbouring bins are accelerations, and least squares over the last bins gives each coil's gain beside a
-constant disturbance, a torsion and a damping of each free axis. One is sound, zero feels nothing, minus one
-is reversed. Where the commands of the last seconds do not move enough to tell, the gain's standard deviation
-says so, and nothing is claimed.
+Rate and commanded rate change (the integral of J^-1 (m x B)) are averaged over short bins; differences of
+neighbouring bins are accelerations. Least squares over the last bins estimates each coil's gain, with a
+constant disturbance, a torsion and a damping of each free axis. Gain 1 is healthy, 0 is without torque, -1 is
+reversed. When the commands vary too little, the gain's standard deviation is large and no axis is judged.
 
-What is left of an acceleration when all coils are taken to be sound is kept longer: whether it changed when
-the supply current did tells a broken coil from a monitor that lies (`observed_share`).
+The residual accelerations, with all coils assumed healthy, are kept longer: whether they changed when the
+supply current did distinguishes a broken coil from a wrong monitor (`observed_share`).
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from flight.gnc.math.arrays import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class ResponseSettings:
-    """The body as the coils see it.
+    """The body's response to the coils, and the settings of the fit.
 
     Attributes:
         inertia: (3, 3) kg m^2.
@@ -32,11 +31,11 @@ class ResponseSettings:
         free: (3,) whether the body can turn about each axis; on a thread only about y.
         bin_samples: samples of the rate in a bin.
         bins: differences of bins in the fit.
-        torsion, damping: 1/s^2 and 1/s, standard deviations of a thread's (or of drag) about each free axis.
-        sure: standard deviation of a gain below which it is believed.
+        torsion, damping: 1/s^2 and 1/s, prior standard deviations about each free axis (thread or drag).
+        sure: standard deviation below which a gain is used.
         persistence: fits in a row that must agree.
-        lowest_sound, highest_reversed: bounds of the gains that are believed to be so.
-        memory_ns: how long the remainders of the acceleration are kept.
+        lowest_sound, highest_reversed: bounds of a healthy and of a reversed coil's gain.
+        memory_ns: how long the residual accelerations are kept.
     """
 
     inertia: FloatArray
@@ -56,11 +55,11 @@ class ResponseSettings:
 
 _STALE_NS = 200_000_000
 _REACH_NS = 3_000_000_000
-"""For how long commands are remembered: samples of a loop that stood still come late, and in a burst."""
+"""For how long commands are kept: after a stall of the loop, samples arrive late and in a burst."""
 _MODEL_ERROR = 8.0e-4
-"""rad/s^2: what the delay between command and current and its uncertainty leave unexplained in a bin."""
+"""rad/s^2: error of a bin due to the delay between command and current, and its uncertainty."""
 _LEAST_CHANGE = 4.0e-3
-"""rad/s^2: torques below are too small to be missed."""
+"""rad/s^2: smaller changes cannot be detected."""
 _GAIN_PRIOR = 10.0
 
 
@@ -68,7 +67,7 @@ class CoilResponse:
     """Sliding fit of the three gains.
 
     Attributes:
-        gain, sigma: (3,) newest fit; sigma is infinite where the commands do not tell.
+        gain, sigma: (3,) newest fit; sigma is infinite before the first.
     """
 
     def __init__(self, settings: ResponseSettings) -> None:
@@ -85,7 +84,7 @@ class CoilResponse:
         self.reset()
 
     def reset(self) -> None:
-        """Forget all samples."""
+        """Discard all samples."""
         self._asked: FloatArray = np.zeros((3, 3))
         self._asked_sum: FloatArray = np.zeros((3, 3))
         self._rate_sum: FloatArray = np.zeros(3)
@@ -93,11 +92,11 @@ class CoilResponse:
         self._count = 0
         self._previous: tuple[float, FloatArray, FloatArray] | None = None
         self._turned: FloatArray = np.zeros(3)
-        # Accelerations asked by each coil (3, 3), felt (3,), and the mean rate and angle (3,) of that time.
+        # Commanded accelerations of each coil (3, 3), observed (3,), mean rate and angle (3,) of the bin.
         self._rows: deque[tuple[FloatArray, FloatArray, FloatArray, FloatArray]] = deque(
             maxlen=self._settings.bins
         )
-        # Time; accelerations asked by each coil and those of one ampere in it (3, 3); what is left (3,).
+        # Time; commanded accelerations of each coil and those per ampere (3, 3); residual (3,).
         self._remainders: deque[tuple[int, FloatArray, FloatArray, FloatArray]] = deque()
         self._per_ampere: FloatArray = np.zeros((3, 3))
         self._wrong_for = [0, 0, 0]
@@ -105,7 +104,7 @@ class CoilResponse:
         self.sigma = np.full(3, np.inf)
 
     def commanded(self, time_ns: int, currents: tuple[float, ...]) -> None:
-        """Tell which currents (3,) A are in force from `time_ns` on."""
+        """Note the currents (3,) A in force from `time_ns` on."""
         if currents == self._commands[-1][1]:
             return
         self._commands.append((time_ns, currents))
@@ -113,12 +112,12 @@ class CoilResponse:
             self._commands.popleft()
 
     def interrupted(self, until_ns: int) -> None:
-        """Make nothing of samples of the time until `until_ns`: what the coils carried is not known."""
+        """Ignore samples up to `until_ns`: the coil currents of that time are unknown."""
         self._known_ns = until_ns
         self.reset()
 
     def observe_motion(self, time_ns: int, rate: FloatArray, field: FloatArray) -> bool:
-        """Take a sample of rate (3,) and field (3,); tell whether there is a new fit."""
+        """Add a sample of rate (3,) rad/s and field (3,) T; return whether there is a new fit."""
         if time_ns < self._known_ns:
             return False
         since_ns = time_ns - self._last_ns
@@ -126,7 +125,7 @@ class CoilResponse:
         if not 0 < since_ns < _STALE_NS:
             self.reset()
             return False
-        # Row a: what one ampere in coil a alone asks of the rate, J^-1 (n e_a x B).
+        # Row a: acceleration per ampere in coil a alone, J^-1 (n e_a x B).
         x, y, z = field.tolist()
         self._per_ampere = np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))) @ self._per_field
         currents = np.array(self._command_at(time_ns))[:, None]
@@ -146,20 +145,19 @@ class CoilResponse:
         return self._commands[0][1]
 
     def reversed_axes(self) -> list[int]:
-        """Return the axes that have turned the body the wrong way, fit after fit."""
+        """Return the axes whose gain was reversed in the last `persistence` fits."""
         return [axis for axis in range(3) if self._wrong_for[axis] >= self._settings.persistence]
 
     def is_healthy(self, axis: int) -> bool:
-        """Tell whether an axis has turned the body as it should, fit after fit, until now."""
+        """Return whether the gain of an axis was healthy in the last `persistence` fits."""
         return self._sound_for[axis] >= self._settings.persistence
 
     def observed_share(self, axis: int, constant: float, since_ns: int, settled_ns: int) -> float | None:
-        """Return which part of a change of a coil's current the body felt.
+        """Return the observed fraction of a change of torque.
 
-        None where it would not feel any, NaN where that is not remembered.
-
-        The change: the coil carries `constant` A in place of what it is told. Compared are the seconds
-        before `since_ns` with those after `settled_ns`.
+        The assumed change: the coil carries `constant` A instead of its command. The residuals before
+        `since_ns` are compared with those after `settled_ns`. None if the change is too small to be observed,
+        NaN if there are too few residuals.
         """
         before = [row[3] for row in self._remainders if row[0] < since_ns]
         after = [row for row in self._remainders if row[0] >= settled_ns]

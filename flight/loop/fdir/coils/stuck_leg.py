@@ -1,13 +1,12 @@
-"""Which bridge has a leg that is stuck high: found by rest and by braking, not by driving.
+"""Finds the bridge with a leg stuck high, by setting the coils to zero and braking bridges.
 
-Such a leg drives its coil while nothing is commanded. With both inputs of its bridge high no voltage is
-across the coil, whichever leg it is; nor is there across that of a sound bridge. So when the supply gives far
-too much or too little, all that is driven is put to rest: a current that stays is nobody's command. Then all
-bridges are braked at once, and if that ends it, they are let go one after the other: the one with which it
-comes back is broken. No coil but the broken one carries anything meanwhile; and where rest or brakes show
-nothing, as with a shorted coil or a monitor that lies, they are taken back. Where commands come and go all
-the time, as in B-dot's windows, a conversion may be of the one or of the other and tells nothing: then there
-is a rest every few seconds without a suspicion, only to look.
+Such a leg drives its coil at zero command. Braking (both inputs high) removes the voltage from any coil,
+whether its bridge is healthy or not. When the supply current is far too large or too small, all coils are
+commanded to zero: a remaining current was not commanded. Then all bridges are braked at once. If the current
+stops, they are released one by one: the bridge with which the current returns is broken. No healthy coil
+carries current meanwhile. If neither rest nor brakes change the current, as with a shorted coil or a wrong
+monitor, the search ends. When commands change all the time, as in B-dot's windows, the command of a
+conversion is ambiguous: then there is a rest every few seconds without a suspicion, as a check.
 """
 
 from __future__ import annotations
@@ -23,20 +22,20 @@ _SURE = 2
 _PATIENCE = 12
 """Conversions without agreement after which a step is given up."""
 _PAUSE = 50
-"""Conversions after a rest that showed nothing before there may be another: control goes first."""
+"""Conversions between a rest without a finding and the next rest: control has priority."""
 _UNCLEAR = 20
-"""Conversions in a row that could have been of one command or of quite another, until one looks at rest."""
+"""Conversions in a row whose command is ambiguous, after which there is a rest as a check."""
 
 
 @dataclass(frozen=True, slots=True)
 class Supplied:
-    """A conversion that was made wholly under the present brakes, and what sound coils would have drawn.
+    """A conversion made entirely under the present brakes, and the current that healthy coils would draw.
 
     Attributes:
         current: A, measured.
-        least, most: A, that all sound coils would have drawn together.
-        spread: A, between the least and the most of what was commanded in its window.
-        at_rest: the axes that were not driven and are not known to be broken.
+        least, most: A, bounds of the total current of healthy coils.
+        spread: A, range of the total command in the conversion's window.
+        at_rest: the axes that were not driven and have no known fault.
         driven: whether any axis was driven.
     """
 
@@ -57,23 +56,23 @@ class _Step(Enum):
 
 
 class StuckLeg:
-    """Takes conversions of the monitor, asks for rest and brakes, and names an axis.
+    """Searches for a stuck leg: processes conversions, requests rest and brakes, and returns an axis.
 
     Attributes:
-        brake: which bridges are to be braked now to find out.
-        rest: whether nothing is to be driven now, to find out.
-        suspicion: why that is so, empty while it is not.
+        brake: which bridges are to be braked now.
+        rest: whether all commands are to be zero now.
+        suspicion: why there is a search, empty without a suspicion.
     """
 
     def __init__(self, excess: float) -> None:
-        """Take how much more than is due, in A, only a fault can draw."""
+        """Take the excess current, A, that only a fault can draw."""
         self._excess = excess
         self._pause = self._unclear = 0
         self._high = self._short = self._normal = self._looks = 0
         self.reset()
 
     def reset(self) -> None:
-        """Let all go and watch again."""
+        """Release all bridges and end the search."""
         self._step = _Step.WATCHING
         self._left: list[int] = []
         self._braked: tuple[int, ...] = ()
@@ -83,21 +82,21 @@ class StuckLeg:
         self.suspicion = ""
 
     @property
-    def is_at_work(self) -> bool:
-        """Tell whether coils are at rest, and perhaps braked, to find out."""
+    def is_searching(self) -> bool:
+        """Whether a search is running: coils at rest, and perhaps braked."""
         return self.rest
 
     def exceeds(self, seen: Supplied) -> bool:
-        """Tell whether a conversion is more than sound coils can have drawn."""
+        """Return whether a conversion is more than healthy coils can draw."""
         return seen.current > seen.most + self._excess
 
     def ask_for_rest(self, why: str) -> None:
-        """Have what is driven put to rest, unless there was a rest a moment ago or something is under way."""
+        """Request a rest, unless a search is running or the last rest was too recent."""
         if self._step is _Step.WATCHING and not self._pause:
             self._rest(why)
 
     def look(self, seen: Supplied) -> int | None:
-        """Take a conversion; return an axis that is found."""
+        """Process a conversion; return the axis of a stuck leg when found."""
         self._pause = max(self._pause - 1, 0)
         if self.rest and seen.driven:
             return None  # not yet at rest
@@ -107,8 +106,8 @@ class StuckLeg:
         self._short = self._short + 1 if short else 0
         self._normal = 0 if high or short else self._normal + 1
         self._looks += 1
-        if self.is_at_work and self._looks > _PATIENCE:
-            self._give_up()  # what comes and goes is no leg that is stuck
+        if self.is_searching and self._looks > _PATIENCE:
+            self._give_up()  # an intermittent current is no stuck leg
             return None
         self._unclear = self._unclear + 1 if seen.spread > self._excess else 0
         if self._unclear >= _UNCLEAR and self._step is _Step.WATCHING:
@@ -172,7 +171,7 @@ class StuckLeg:
         self._await()
 
     def _release_next(self) -> None:
-        """Let the next go; where none is left nothing was broken, or it is whole again."""
+        """Release the next bridge; end the search when none is left."""
         if not self._left:
             self.reset()
             return
@@ -181,7 +180,7 @@ class StuckLeg:
         self._await()
 
     def _give_up(self) -> None:
-        """Leave it to others, until all is normal again."""
+        """End the search until the current is normal again."""
         self.reset()
         self._step = _Step.NO_CURE
 

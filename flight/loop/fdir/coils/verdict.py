@@ -1,4 +1,4 @@
-"""What is known of the coils' circuit beforehand, and what is found to be wrong with it."""
+"""The settings of the coil watch, and its verdicts."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ class CoilVerdict:
 
 @dataclass(frozen=True, slots=True)
 class CoilWatchSettings:
-    """What is known of the circuit and of the monitor.
+    """Properties of the coils' circuit and of the monitor.
 
     Attributes:
         full_current: A, of a coil that is fully on: supply voltage over resistance.
-        current_uncertainty: A, bound on each driven coil's current beside its command.
-        gain_error: relative bound: resistance, supply, and the monitor's windows in the chopped current.
+        current_uncertainty: A, bound on each driven coil's deviation from its command.
+        gain_error: relative bound: resistance, supply, and the monitor's sampling of the chopped current.
         monitor_noise: A, bound, at any current.
-        window_ns: how far back a reading's mean reaches. Readings further apart than this begin anew.
-        persistence: readings in a row without a healthy explanation until there is a suspicion.
-        settle: readings after that until one tells of the time after the fault only.
-        evidence: readings that a verdict takes.
-        probe_current: A, of the wave by which axes that are not driven are told apart.
-        probe_half_ns: half of its period.
-        response: how the body answers to the coils; None where it cannot tell.
+        window_ns: averaging time of a reading's mean. A longer gap between readings resets the watch.
+        persistence: readings in a row that fit no healthy circuit, until there is a suspicion.
+        settle: readings after that until the window lies wholly after the fault.
+        evidence: readings that a verdict needs.
+        probe_current: A, of the wave that distinguishes faults of axes at rest.
+        probe_half_ns: half the wave's period.
+        response: the body's response to the coils; None where the motion is not used.
     """
 
     full_current: tuple[float, float, float]

@@ -1,33 +1,19 @@
-"""Which coil is broken, and how: commanded currents against the supply current and the body's answer.
+"""Detects broken coils and identifies the fault, from commands, supply current and the body's motion.
 
-For the loop (all calls are cheap, none waits):
+All calls are cheap, none waits. Each cycle the loop reports the commands (`commanded`, `interrupted`), the
+samples of the inertial unit (`observe_motion`) and the newest reading of the monitor (`measured`), and then
+reads `verdicts`, `available`, `braked`, `at_rest`, `probe`, `suspicion` and `monitor_doubted`.
 
-    watch = CoilWatch(CoilWatchSettings(full_current=..., ...))
-    watch.commanded(time_ns, currents, braked, written_ns)  # each cycle: what is on the wire (CoilState)
-    watch.interrupted(time_ns)           # in cycles before which nobody knows what the coils carried
-    watch.observe_motion(time_ns, rate, field)     # each sample of the inertial unit: rad/s, T, body axes
-    watch.measured(power_reading)        # each look at the monitor; the same reading twice is no matter
-    watch.verdicts                       # tuple of CoilVerdict, one an axis at most; they stay until `forget`
-    watch.available                      # (3,) bool, for `flight.gnc.control.allocation`
-    watch.braked                         # which bridges are to be braked now (TorqueCoils.brake)
-    watch.at_rest                        # whether nothing is to be commanded now, for half a second
-    watch.suspicion                      # text while the readings fit no healthy circuit, else empty
-    watch.probe                          # (3,) A to be added to the commands: zero, or a wave without a mean
-    watch.monitor_doubted                # why the monitor, not a coil, is to be doubted; empty when nothing
-
-The monitor tells the sum of |I| of three bridges, so it cannot see a reversed coil, and sees an open one only
-while that axis is commanded: of what is not driven nothing is known, and nothing is claimed. Every reading is
-compared with what each hypothesis (healthy; each axis open, shorted, either leg of either input stuck) says
-it should be (`flight.loop.fdir.coils.hypotheses`); one is held while it explains the readings since the
-trouble began. A verdict is given when healthy is not held and one axis alone is left; where several are left
-that are
-not driven, a small wave is asked for on each in turn, which tells them apart. A reversed coil is found from
-the angular acceleration (`flight.loop.fdir.coils.response`), which also tells a monitor that lies from a coil
-that is broken. Current that nobody asked for is told sooner: `flight.loop.fdir.coils.stuck_leg` brakes what
-is at rest, in every mode; while it is at work no other verdict is given. The bounds are the thesis's 3.5 mA
-on each
-coil's current (Sease 2013 ch. 5), the resistance's error, and the 18 % by which a single conversion may miss
-the chopped current (`hal.drivers.ina219`).
+The monitor measures the sum of |I| of three bridges, so it cannot detect a reversed coil, and detects an open
+one only while that axis is commanded: axes that are not driven are not judged. Every reading is compared with
+the prediction of each hypothesis (healthy; each axis open, shorted, either leg of either input stuck;
+`flight.loop.fdir.coils.hypotheses`). There is a verdict when `healthy` is rejected and the hypotheses that
+explain the readings since then all name one axis; between axes that are not driven, a small wave on each in
+turn decides. A reversed coil is found from the angular acceleration (`flight.loop.fdir.coils.response`),
+which also distinguishes a wrong monitor from a broken coil. Uncommanded current is handled faster, in every
+mode: `flight.loop.fdir.coils.stuck_leg` brakes the axes at rest; during its search there is no other verdict.
+The bounds are the thesis's 3.5 mA on each coil's current (Sease 2013 ch. 5), the resistance's error, and the
+18 % error of a single conversion of the chopped current (`hal.drivers.ina219`).
 """
 
 from __future__ import annotations
@@ -68,17 +54,20 @@ BoolArray = npt.NDArray[np.bool_]
 
 _BRAKED = {CoilFault.A_HIGH, CoilFault.B_HIGH, CoilFault.HIGH}
 _STUCK_EXCESS = 0.3
-"""Of the current of a coil that is fully on: a leg stuck high draws more without doubt."""
+"""Of the current of a coil that is fully on: a leg stuck high certainly draws more."""
 _LEAST_SHORT = 0.02
-"""A; a smaller excess is below what the body's motion could confirm."""
+"""A; a smaller excess could not be confirmed by the body's motion."""
 _READING_NS = 200_000_000
 _MOST_EVIDENCE = 40
 _IN_DOUBT = 5
-"""Readings until a verdict may leave open what is wrong with the axis."""
+"""Readings after which a verdict may leave the kind of fault open."""
 
 
 class CoilWatch:
-    """Holds the commands and readings of the last seconds, and the verdicts."""
+    """Judges the coils by the commands and readings of the last seconds.
+
+    Longer than 200 lines because all methods share the state of one suspicion, from detection to verdict.
+    """
 
     def __init__(self, settings: CoilWatchSettings) -> None:
         self._settings = settings
@@ -93,9 +82,9 @@ class CoilWatch:
         self._fresh = 0
         self._strange = 0
         self._suspected_ns: int | None = None
-        self._judge_ns = 0  # when a verdict may be given in doubt of the kind of fault
-        self._sound_ns = 0  # when a coil that was driven last drew what it should
-        self._unmixed_ns = 0  # from when on a reading's mean tells of one state of the circuit
+        self._judge_ns = 0  # from when on a verdict may leave the kind of fault open
+        self._sound_ns = 0  # when a driven coil last drew the expected current
+        self._unmixed_ns = 0  # from when on a reading's mean covers one state of the circuit
         self._evidence: deque[Predicted] = deque(maxlen=_MOST_EVIDENCE)
         self._probe = Probe(settings.probe_current, settings.probe_half_ns)
         self._response = None if settings.response is None else CoilResponse(settings.response)
@@ -108,22 +97,22 @@ class CoilWatch:
 
     @property
     def verdicts(self) -> tuple[CoilVerdict, ...]:
-        """Return the broken axes, in the order in which they were found."""
+        """The broken axes, at most one verdict each, in the order found; kept until `forget`."""
         return tuple(self._verdicts.values())
 
     @property
     def available(self) -> BoolArray:
-        """Return (3,) which axes may be used."""
+        """(3,) which axes may be used, for `flight.gnc.control.allocation`."""
         return np.array([axis not in self._verdicts for axis in range(3)])
 
     @property
     def suspicion(self) -> str:
-        """Return why a coil is suspected, empty while none is."""
+        """Why a coil is suspected; empty while the readings fit a healthy circuit."""
         return self._leg.suspicion or self._strangeness
 
     @property
     def braked(self) -> Axes:
-        """Return which bridges are to be braked: those with a leg stuck high, or to find out which has."""
+        """Which bridges are to be braked: those with a leg stuck high, and those of a search for one."""
         x, y, z = (
             asked or (axis in self._verdicts and self._verdicts[axis].fault in _BRAKED)
             for axis, asked in enumerate(self._leg.brake)
@@ -132,11 +121,11 @@ class CoilWatch:
 
     @property
     def at_rest(self) -> bool:
-        """Tell whether nothing is to be commanded now, so that a leg stuck high shows."""
+        """Whether all commands are to be zero now, to reveal a leg stuck high."""
         return self._leg.rest
 
     def forget(self, axis: int) -> None:
-        """Trust an axis again, by command; a fault that lasts will be found again."""
+        """Trust an axis again, by command; a lasting fault will be found again."""
         self._verdicts.pop(axis, None)
         self._proof.discard(axis)
         self.interrupted(self._commands.newest_ns if self._commands else 0)
@@ -144,29 +133,26 @@ class CoilWatch:
     def commanded(
         self, time_ns: int, currents: FloatArray, braked: Axes = NONE, written_ns: int | None = None
     ) -> None:
-        """Tell which currents (3,) A are on the wire at `time_ns`, and which bridges are braked.
-
-        They have been since `written_ns`, by default since now.
-        """
+        """Note the currents (3,) A and brakes on the wire at `time_ns`, written at `written_ns` or now."""
         values = tuple(currents.tolist())
         self._commands.note(time_ns, values, braked)
-        # Without readings nobody would end a rest or a brake.
-        if self._leg.is_at_work and time_ns - self._looked_ns > self._settings.window_ns:
+        # Without readings, a rest or a brake would never end.
+        if self._leg.is_searching and time_ns - self._looked_ns > self._settings.window_ns:
             self._leg.reset()
         if self._response is not None:
             self._response.commanded(time_ns if written_ns is None else written_ns, values)
 
     def observe_motion(self, time_ns: int, rate: FloatArray, field: FloatArray) -> None:
-        """Take a sample of the body rate (3,) rad/s and the magnetic field (3,) T, body axes."""
+        """Add a sample of the body rate (3,) rad/s and the magnetic field (3,) T, body axes."""
         if self._response is None or not self._response.observe_motion(time_ns, rate, field):
             return
         for axis in self._response.reversed_axes():
-            # A current that nobody asked for turns the body too.
+            # An uncommanded current turns the body too.
             if axis not in self._verdicts and not self.suspicion:
                 self._give(axis, CoilFault.REVERSED, time_ns, self._response.text(axis))
 
     def interrupted(self, now_ns: int) -> None:
-        """Know nothing of the time until now: the driver, or nobody, can say what was on the wire."""
+        """Discard the evidence until now: the coil currents of that time are unknown."""
         self._fresh = 0
         self._leg.reset()
         self._reset()
@@ -174,13 +160,13 @@ class CoilWatch:
             self._response.interrupted(now_ns)
 
     def measured(self, reading: PowerReading) -> None:
-        """Take a reading of the monitor."""
+        """Add a reading of the monitor; a repeated reading is ignored."""
         gap_ns = reading.time_ns - self._reading_ns
         if gap_ns <= 0 or not self._commands:
             return
         self._reading_ns = reading.time_ns
         self._look_at_legs(reading)
-        if self._leg.is_at_work:
+        if self._leg.is_searching:
             self._unmixed_ns = reading.time_ns
             if self._suspected_ns is None and self._leg.suspicion:
                 self._suspect(self._leg.suspicion)
@@ -190,21 +176,21 @@ class CoilWatch:
             self._reset()
             self._unmixed_ns = reading.time_ns
             return
-        taken = self._taken(reading)
+        predictions = self._predictions(reading)
         if self._suspected_ns is None:
-            self._look_healthy(taken, reading)
+            self._check_healthy(predictions, reading)
         elif reading.time_ns - self._suspected_ns > self._settle_ns:
-            self._evidence.extend(taken)
+            self._evidence.extend(predictions)
             self._judge(reading.time_ns)
 
     @property
     def probe(self) -> FloatArray:
-        """Return (3,) A to be added to the commands now: it makes no mean torque."""
+        """(3,) A to be added to the commands now: zero, or a zero-mean wave."""
         return self._probe.wave(self._commands.newest_ns) if self._commands else np.zeros(3)
 
     @property
     def monitor_doubted(self) -> str:
-        """Return why the monitor, not a coil, is doubted; empty while it is believed."""
+        """Why the monitor, not a coil, is doubted; empty while the monitor is trusted."""
         return self._witness.doubt
 
     @property
@@ -213,14 +199,14 @@ class CoilWatch:
 
     @property
     def _known(self) -> dict[int, CoilFault]:
-        """Return what the circuit does of each broken axis: one that is braked takes nothing."""
+        """The fault of each broken axis as the supply sees it: a braked axis draws no current."""
         return {
             axis: CoilFault.OPEN if verdict.fault in _BRAKED else verdict.fault
             for axis, verdict in self._verdicts.items()
         }
 
     def _look_at_legs(self, reading: PowerReading) -> None:
-        """Look whether a leg is stuck high, where this conversion was made under the present brakes."""
+        """Search for a leg stuck high, if this conversion was made under the present brakes."""
         commands = self._commands
         if commands.braked != self.braked or not commands.is_known_since(reading.newest_since_ns):
             return
@@ -236,8 +222,8 @@ class CoilWatch:
             self._give(found, CoilFault.HIGH, reading.time_ns, text)
             self.interrupted(reading.time_ns)
 
-    def _taken(self, reading: PowerReading) -> list[Predicted]:
-        """Return what a reading says: its newest conversion, and its mean where nothing is mixed in it."""
+    def _predictions(self, reading: PowerReading) -> list[Predicted]:
+        """Return a reading's newest conversion, and its mean unless it mixes states, with predictions."""
         windows: list[tuple[float, int, Sampling]] = [(reading.newest, reading.newest_since_ns, NEWEST)]
         begin_ns = reading.time_ns - self._settings.window_ns
         if begin_ns >= self._unmixed_ns:
@@ -247,11 +233,11 @@ class CoilWatch:
             for current, since_ns, sampling in windows
         ]
 
-    def _look_healthy(self, taken: list[Predicted], reading: PowerReading) -> None:
-        asked = float(taken[0].mean[:, 0].sum())
-        if all(fits([one], self._bounds, self._known) for one in taken):
+    def _check_healthy(self, predictions: list[Predicted], reading: PowerReading) -> None:
+        asked = float(predictions[0].mean[:, 0].sum())
+        if all(fits([one], self._bounds, self._known) for one in predictions):
             self._strange = 0
-            self._witness.believe()
+            self._witness.trust_monitor()
             if asked > self._bounds.uncertainty:
                 self._sound_ns = reading.newest_since_ns
             return
@@ -269,7 +255,7 @@ class CoilWatch:
         self._strangeness = why
 
     def _judge(self, now_ns: int) -> None:
-        """Give a verdict if the evidence leaves one axis; give the suspicion up if all is healthy again."""
+        """Give a verdict if the evidence leaves one axis; drop the suspicion if the readings are healthy."""
         evidence = tuple(self._evidence)
         if len(evidence) < self._settings.evidence:
             return
@@ -294,7 +280,7 @@ class CoilWatch:
     def _conclude(self, axis: int, fault: CoilFault, now_ns: int) -> None:
         excess = max(one.current - float(one.mean[:, 0].sum()) for one in self._evidence)
         if fault is CoilFault.SHORTED and excess < _LEAST_SHORT:
-            self._reset()  # too little for the body to bear it out: it may be the monitor
+            self._reset()  # too small to be confirmed by the motion: it may be the monitor
             return
         if self._is_contradicted(axis, fault):
             why = f"{self._strangeness}; yet the body feels no change of coil {AXES[axis]}"
@@ -313,7 +299,7 @@ class CoilWatch:
         return self._witness.contradicts(axis, fault, begun_ns, self._suspected_ns, self._reading_ns)
 
     def _look_further(self, axes: set[int], now_ns: int) -> None:
-        """Put a wave on one of the axes that cannot be told apart; when all were tried, collect new evidence.
+        """Probe the next of the axes in question; when all were tried, collect new evidence.
 
         No hypothesis explains an intermittent fault, or a fault of the monitor.
         """
