@@ -2,7 +2,7 @@
 
 import os
 
-# Matrices here are small: a BLAS that starts a thread a core only makes them wait for each other.
+# Matrices here are small: multithreaded BLAS would slow them down.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from flight.app.cli import main

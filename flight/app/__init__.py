@@ -1,5 +1,5 @@
-"""The composing root: from a configuration to a flight that has ended, with everything closed behind it.
+"""The composition root: opens, flies and closes a configured flight.
 
-The one room of the flight application that knows which hardware there is: Linux's, simulated in lock-step,
+The only package of the flight application that knows the kind of hardware: Linux's, simulated in lock-step,
 or simulated in real time in a process of its own.
 """

@@ -1,4 +1,4 @@
-"""The devices on a rig's wires: drivers set up as the configuration wants them."""
+"""Opens the drivers of the devices on a rig's wires, as configured."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from hal.interfaces.rig import Rig
 
 
 def open_devices(config: Config, rig: Rig, stack: ExitStack, patient: bool) -> Devices:
-    """Set the devices up, the coils first: they are at zero before anything else happens.
+    """Open the devices, the coils first, so that they are at zero before anything else happens.
 
-    Raises DeviceError for one that does not answer; a `patient` flight has its driver go on trying.
+    Raises DeviceError for a device that does not answer; the drivers of a `patient` flight keep trying.
     """
     coils = PwmTorqueCoils(
         Pca9685(rig.wires.i2c, config.coils.address, rig.clock), rig.clock, coil_settings(config)
@@ -45,7 +45,7 @@ def open_devices(config: Config, rig: Rig, stack: ExitStack, patient: bool) -> D
 
 
 def coil_settings(config: Config) -> CoilSettings:
-    """Return the coils as the configuration believes them."""
+    """Return the settings of the coil driver."""
     coils = config.coils
     enables = coils.enable_channels or (None, None, None)
     x, y, z = (
@@ -58,7 +58,7 @@ def coil_settings(config: Config) -> CoilSettings:
 
 
 def unit_settings(config: Config) -> Vn100Settings:
-    """Return what is asked of the inertial unit; its readings come out in the testbed frame."""
+    """Return the settings of the inertial unit's driver; readings are in the testbed frame."""
     unit = config.inertial_unit
     mounting = np.array(unit.mounting)
     return Vn100Settings(

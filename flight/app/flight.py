@@ -27,7 +27,7 @@ from hal.interfaces.rig import Rig
 
 
 def fly(request: RunRequest, progress: Callable[[Progress], None] | None = None) -> RunResult:
-    """Fly a configuration to its end. Raises UsageError for the user to mend, DeviceError for a device."""
+    """Fly a configuration to its end. Raises UsageError for a user mistake, DeviceError for a device."""
     text, config = requested_config(request)
     request = begin_folder(request, text, config)
     with ExitStack() as stack:
@@ -49,7 +49,7 @@ def fly(request: RunRequest, progress: Callable[[Progress], None] | None = None)
 
 
 def _open_rig(request: RunRequest, text: str, config: Config, stack: ExitStack) -> Rig:
-    """Return the hardware that the configuration asks for."""
+    """Return the configured hardware."""
     if config.simulation is not None:
         return simulated_rig(request, text, config, stack)
     if request.seed is not None:
@@ -66,7 +66,7 @@ def _is_patient(request: RunRequest) -> bool:
 
 @contextmanager
 def _signals_stop(loop: FlightLoop) -> Iterator[list[int]]:
-    """End the flight politely on Ctrl-C and on systemd's SIGTERM; the list holds the signals received."""
+    """End the flight after the running cycle on SIGINT or SIGTERM; the list holds the signals received."""
     received: list[int] = []
 
     def stop(number: int, _: FrameType | None) -> None:

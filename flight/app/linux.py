@@ -1,4 +1,4 @@
-"""Linux's hardware: the serial port, the I2C bus and the camera that the configuration names."""
+"""Linux's hardware: the configured serial port, I2C bus and camera."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from hal.interfaces.wires import SECOND_NS, Clock, Wires
 
 
 def linux_rig(config: Config, stack: ExitStack, patient: bool) -> Rig:
-    """Open the wires, the coils off before anything else can fail.
+    """Open the wires, and switch the coils off before anything else can fail.
 
-    Raises ConfigError; DeviceError for what is not there, but `patient` wires are opened when they come.
+    Raises ConfigError; DeviceError for missing hardware, but `patient` wires are opened once they appear.
     """
     clock = SystemClock()
     i2c = LinuxI2cBus(config.coils.bus, patient=patient)
     stack.callback(i2c.close)
     with suppress(DeviceError) if patient else nullcontext():
-        switch_off(i2c, config.coils.address)  # before anything else can fail
+        switch_off(i2c, config.coils.address)
     unit = config.inertial_unit
     serial = PySerialPort(unit.device, unit.baud_rate, clock, patient)
     stack.callback(serial.close)
@@ -44,9 +44,9 @@ def linux_rig(config: Config, stack: ExitStack, patient: bool) -> Rig:
 
 
 def linux_camera(camera: Camera, clock: Clock, stack: ExitStack, patient: bool = False) -> FrameSource:
-    """Open the camera that the configuration names.
+    """Open the configured camera.
 
-    Raises ConfigError when it names none; DeviceError, but a `patient` one is opened when it comes.
+    Raises ConfigError when none is named; DeviceError, but a `patient` camera is opened once it appears.
     """
     device, shape = camera.device, (camera.columns, camera.rows)
     exposure_ns = round(camera.exposure * SECOND_NS)

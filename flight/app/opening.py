@@ -1,4 +1,4 @@
-"""From a rig to a loop ready to run: logs, guardian, devices, workers and channels, opened in order."""
+"""Opens a flight on a rig: logs, guardian, devices, workers and channels, in this order."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ from hal.interfaces.rig import Rig
 def open_flight(
     config: Config, rig: Rig, folder: Path, stack: ExitStack, *, patient: bool = False
 ) -> tuple[FlightLoop, FlightLog]:
-    """Open logs, devices and workers; `stack` closes them in the opposite order, the coils at zero.
+    """Open logs, devices and workers; return the loop, ready to run, and its log.
 
-    Raises DeviceError for a device that does not answer; a `patient` flight begins without and waits for it
-    in BOOT, as it waits for a disk that takes nothing.
+    `stack` closes everything in the opposite order, the coils at zero. Raises DeviceError for a device that
+    does not answer; a `patient` flight waits in BOOT for devices and for a disk that cannot be written.
     """
     flight_log = open_log(folder, "flight", rig, config, stack, patient)
     performance_log = open_log(folder, "performance", rig, config, stack, patient)
@@ -65,7 +65,7 @@ def _open_jobs(config: Config, rig: Rig, stack: ExitStack) -> JobRunner:
 
 
 def _open_channels(config: Config, stack: ExitStack) -> list[Channel]:
-    """Listen where the configuration says."""
+    """Open the configured command channels."""
     channels: list[Channel] = []
     if config.commands.socket is not None:
         channels.append(open_unix(Path(config.commands.socket)))

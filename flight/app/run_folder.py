@@ -1,4 +1,4 @@
-"""The folder of a run: where it is, made with its configuration in it, and the logs opened there."""
+"""The folder of a run: its path, its creation with the configuration in it, and its logs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from hal.interfaces.wires import SECOND_NS
 
 
 def default_folder(config_path: Path) -> Path:
-    """Return the folder of a run that was given none: its configuration's name and the time, as labels."""
+    """Return the default folder of a run, named after its configuration and the time."""
     return Path("runs") / f"{config_path.stem}-{utc_text()}"
 
 

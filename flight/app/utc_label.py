@@ -1,4 +1,4 @@
-"""UTC for labels, of a run's folder or of a command: never an input of control."""
+"""UTC for labels of run folders and commands: never an input of control."""
 
 from __future__ import annotations
 
@@ -13,5 +13,5 @@ def utc_ns() -> int:
 
 
 def utc_text() -> str:
-    """Return the machine's UTC as it stands in the name of a folder."""
+    """Return the machine's UTC as text, for names of folders."""
     return f"{datetime.fromtimestamp(utc_ns() * 1e-9, UTC):%Y%m%d-%H%M%S}"

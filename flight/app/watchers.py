@@ -1,4 +1,4 @@
-"""Who watches a flight from outside, the guardian and the service manager, and the scheduler told of it."""
+"""Starts the flight's external supervisors, and sets the scheduling priorities of its threads."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from hal.interfaces.rig import Rig
 from hal.interfaces.wires import Clock
 
 CONTROL_PRIORITY = 50
-"""Of SCHED_FIFO, for the control thread and the coils' own."""
+"""SCHED_FIFO priority of the control thread and of the coil driver's thread."""
 NEXT_PRIORITY = CONTROL_PRIORITY - 10
-"""Of the other threads of the control process."""
+"""Priority of the other threads of the control process."""
 
 
 def start_guardian(rig: Rig, stack: ExitStack) -> GuardianLine | None:
-    """Start the guardian before any coil can be energised; it is the last to go, the coils being off."""
+    """Start the guardian before any coil can be energised; close the guardian last, with the coils off."""
     if rig.reach is None:
         return None
     guardian = GuardianLine(rig.reach)
@@ -33,7 +33,7 @@ def start_guardian(rig: Rig, stack: ExitStack) -> GuardianLine | None:
 
 
 def supervise(guardian: GuardianLine, clock: Clock, recorder: Recorder, stack: ExitStack) -> Supervision:
-    """Have the flight watched, and the control loop with its coils served first."""
+    """Connect the supervisors, and give the control loop and the coil driver priority."""
     overseer = ServiceManager(os.environ, os.getpid())
     stack.callback(overseer.close)
     first = [thread for thread in threading.enumerate() if thread.name == COILS]
@@ -45,7 +45,7 @@ def supervise(guardian: GuardianLine, clock: Clock, recorder: Recorder, stack: E
     def settle() -> None:
         memory.settle()
         if obtained.priority:
-            serve_the_rest_next()
+            prioritise_other_threads()
 
     status = f"flying; {obtained}"
     supervision = Supervision(guardian, overseer, clock, recorder, status, coils, settle)
@@ -54,11 +54,11 @@ def supervise(guardian: GuardianLine, clock: Clock, recorder: Recorder, stack: E
     return supervision
 
 
-def serve_the_rest_next() -> None:
-    """Have the other threads of this process, those of log, serial line and disk, served next.
+def prioritise_other_threads() -> None:
+    """Give the other threads of this process, for log, serial line and disk, the next lower priority.
 
-    Whichever of them holds the interpreter's lock while another process has its core holds up the control
-    thread as well: by a time slice and more where much else runs.
+    A thread that is preempted while it holds the interpreter's lock blocks the control thread too, for a time
+    slice or more on a busy machine.
     """
     for thread in threading.enumerate():
         if thread is not threading.main_thread() and thread.name != COILS:

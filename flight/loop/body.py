@@ -1,8 +1,8 @@
-"""The body seam: what the loop asks of the body that it flies, whichever that is.
+"""The body seam: the interface between the loop and the body that it flies.
 
-The loop speaks of attitudes, rates and dipoles. A body says how targets are written, how a path to them is
-planned and tracked, and how its own packets show it. `flight.bodies` holds the bodies; a third party's is
-named in the configuration as `module:object`, a `BodyKind`.
+The loop uses attitudes, rates and dipoles. A body defines the form of targets, how a path to a target is
+planned and tracked, and its own packets. `flight.bodies` holds the bodies; a third party's `BodyKind` is
+named in the configuration as `module:object`.
 """
 
 from __future__ import annotations
@@ -46,35 +46,35 @@ class Paths(Protocol):
         """Return the `Reference` now; None when there is no path yet."""
 
     def is_following(self, now_ns: int) -> bool:
-        """Return whether a path is under way, rather than its end held."""
+        """Return whether a path is being followed, rather than its end held."""
 
     def is_adrift(self, now_ns: int) -> bool:
-        """Return whether an attitude is held only because no plan came in time."""
+        """Return whether an attitude is held only because no plan arrived in time."""
 
     def release(self) -> None:
-        """Forget the path."""
+        """Discard the path."""
 
 
 class Planner(Protocol):
-    """Asks the worker for paths and offers them to guidance."""
+    """Requests paths from the worker and offers them to guidance."""
 
     def busy_since_ns(self) -> int | None:
-        """Return since when a plan is being made, None when none is."""
+        """Return since when the worker has been planning, None while idle."""
 
     def aim(self, target: Target, now_ns: int) -> None:
-        """Want another attitude, and a plan for it at once."""
+        """Set a new target, and request a plan for it at once."""
 
     def request(self, now_ns: int) -> None:
-        """Want a plan as soon as there is an estimate to start from and the worker is free."""
+        """Request a plan, made once there is an estimate and the worker is free."""
 
     def resume(self, now_ns: int) -> None:
-        """Want the rest of a path after a time without control."""
+        """Request the rest of a path after a time without control."""
 
     def replan(self, cycle: Cycle) -> None:
-        """Want a plan because its time has come: the task of the replanning rate group."""
+        """Request the periodic plan: the task of the replanning rate group."""
 
     def serve(self, estimate: Estimate | None, target: Target, now_ns: int) -> None:
-        """Hand the wanted job over."""
+        """Submit the requested job to the worker."""
 
     def finish(self, result: JobResult, now_ns: int) -> None:
         """Offer the worker's plan to guidance."""
@@ -84,7 +84,7 @@ class Planner(Protocol):
 
 
 class Targets(Protocol):
-    """What can be wanted of the body, and how far it is from that."""
+    """The body's targets, and the distance from them."""
 
     def configured(self, mission_time_ns: int) -> Target:
         """Return the configured target in force at a mission time."""
@@ -96,7 +96,7 @@ class Targets(Protocol):
         """Hold the present attitude, as near as the body can; return it as a target."""
 
     def can_hold(self, estimate: Estimate) -> bool:
-        """Return whether the coils could hold the body where it is."""
+        """Return whether the coils could hold the present attitude."""
 
     def speed(self, estimate: Estimate) -> float:
         """Return the rate of the turn that the coils control, rad/s, not negative."""
@@ -105,11 +105,11 @@ class Targets(Protocol):
         """Return the angle between body and target, rad."""
 
     def error_when_due(self, estimate: Estimate, target: Target, now_ns: int) -> float | None:
-        """Return the angle to where the body should have arrived by now, rad; None while under way."""
+        """Return the angle to the attitude due by now, rad; None before one is due."""
 
 
 class BodyView(Protocol):
-    """How the body's own packets and texts show it."""
+    """The body's own packets and texts."""
 
     def record_cycle(self, output: ControlOutput) -> None:
         """Record the body's own packet of a control cycle."""
@@ -121,13 +121,13 @@ class BodyView(Protocol):
         """Return the body's fields of the mode packet."""
 
     def reading_text(self, reading: ImuReading) -> str:
-        """Return a reading in words, for the event that it was refused."""
+        """Return a reading as text, for the event of its rejection."""
 
     def rate_text(self, rate: MeanRateMeasurement) -> str:
-        """Return a rate from streaks in words, for the event that it was refused."""
+        """Return a rate from streaks as text, for the event of its rejection."""
 
     def progress(self, output: ControlOutput | None) -> str:
-        """Return target and attitude in words, for the progress line."""
+        """Return target and attitude as text, for the progress line."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,13 +135,13 @@ class Body:
     """A body ready to fly.
 
     Attributes:
-        filter: estimates attitude, rate and what else the body has.
-        learned_problems: why something that an earlier boot learned is not used.
-        field: the magnetic field (3,) T in body axes at an estimate, for reallocation of currents.
-        free_axis: (3,) the axis about which alone the body can turn; None for a free one.
+        filter: estimates attitude, rate and the body's parameters.
+        learned_problems: why parameters that an earlier boot learned were rejected.
+        field: returns the magnetic field (3,) T in body axes at an estimate, for reallocation of currents.
+        free_axis: (3,) the only axis about which the body can turn; None for a free body.
         coil_watch: compares commanded currents with supply and motion.
         detumbler: brakes a tumble by the magnetometer alone.
-        angular_acceleration_psd: rad^2/s^3, of the white angular acceleration that shakes the body.
+        angular_acceleration_psd: rad^2/s^3, density of the body's white angular acceleration.
     """
 
     filter: AttitudeFilter
@@ -165,7 +165,7 @@ class BodyKind:
 
     Attributes:
         plan: the planner worker's function: a job in, a plan out; both pickle.
-        make: builds the body of a configuration, with what an earlier boot learned.
+        make: builds the body of a configuration, with the parameters that an earlier boot learned.
     """
 
     plan: Callable[[Any], Any]

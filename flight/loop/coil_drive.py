@@ -1,8 +1,7 @@
 """Sends coil commands: excludes failed axes and reallocates the rest to preserve the torque direction.
 
-What is on the wire is compared with what the supply current and the body's motion show
-(`flight.loop.fdir.coils.watch`). A verdict becomes a fact, the fact an event, and the event's reaction takes
-the axis out of use.
+Written commands are compared with the supply current and the body's motion (`flight.loop.fdir.coils.watch`).
+A verdict becomes a fact, the fact an event, and the event's reaction excludes the axis.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ class CoilDriveSettings:
     Attributes:
         dipole_per_ampere: n A of each, m^2.
         limits: (3,) A.
-        free_axis: (3,) the axis about which alone the body can turn; None for a free one.
+        free_axis: (3,) the only axis about which the body can turn; None for a free body.
     """
 
     dipole_per_ampere: float
@@ -68,7 +67,7 @@ class CoilDrive:
         self.command: FloatArray = np.zeros(3)
 
     def state(self) -> CoilState:
-        """Return what is on the wire."""
+        """Return the command on the wire."""
         return self._coils.state()
 
     def off(self) -> None:
@@ -82,9 +81,9 @@ class CoilDrive:
     def look(
         self, in_force: CoilState, readings: Sequence[ImuReading], now_ns: int, *, known: bool = True
     ) -> None:
-        """Compare what is on the wire with the monitor and the motion, once a cycle.
+        """Compare the command on the wire with the monitor and the motion, once a cycle.
 
-        Where the currents until now are not `known`, nothing is concluded from that time.
+        Unless the currents since the last cycle are `known`, the evidence until now is discarded.
         """
         watch = self._watch
         if in_force.written_ns >= 0:
@@ -109,7 +108,7 @@ class CoilDrive:
         self.available = self._watch.available
 
     def trust(self, now_ns: int) -> None:
-        """Use all axes again, by command; a coil that is still broken will be found again."""
+        """Use all axes again, by command; a lasting fault will be found again."""
         for axis in range(3):
             self._watch.forget(axis)
         self._verdicts = 0
@@ -117,7 +116,7 @@ class CoilDrive:
         self._events.report(events.COIL_TRUSTED, now_ns, "all three axes are in use again")
 
     def send(self, currents: FloatArray, field: Callable[[], FloatArray | None]) -> None:
-        """Command currents (3,) A; `field` gives the field (3,) T in body axes where they are reallocated."""
+        """Command currents (3,) A; `field` returns the field (3,) T in body axes, for a reallocation."""
         if not self.available.all() and currents.any():
             currents = self._reallocated(currents, field())
         self.command = np.zeros(3) if self._watch.at_rest else currents + self._watch.probe
@@ -135,7 +134,7 @@ class CoilDrive:
             self._braked = axes
 
     def _reallocated(self, currents: FloatArray, field: FloatArray | None) -> FloatArray:
-        """Return currents of the axes in use that make the torque of `currents`."""
+        """Return currents of the available axes that make the torque of `currents`."""
         if field is None:
             return np.where(self.available, currents, 0.0)
         dipole, limits = self._settings.dipole_per_ampere, self._settings.limits

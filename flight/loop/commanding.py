@@ -1,6 +1,6 @@
 """Commanding: executes commands from channels and from the time line, and answers them.
 
-The dispatcher is one of the named containment boundaries: whatever is sent, the loop goes on.
+The dispatcher is one of the named containment boundaries: no command can end the loop.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class Commanding:
         return self._conclude(source, command, problem, now_ns)
 
     def _conclude(self, source: str, command: Command | None, problem: str, now_ns: int) -> dict[str, Any]:
-        """Execute a command that has no problem yet; report and record the result."""
+        """Execute a command, unless there is a `problem`; report and record the result."""
         self._count += 1
         if command is not None and not problem:
             try:

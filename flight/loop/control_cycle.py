@@ -102,7 +102,7 @@ class ControlCycle:
         return self._body.targets.error_when_due(estimate, self._target, now_ns)
 
     def _replan_if_regained(self, estimate: Estimate | None, now_ns: int) -> bool:
-        """Return whether the estimate is measured; ask for a path from here where it was not before."""
+        """Return whether the estimate is measured; request a path when measured again."""
         planner, measured = self._body.planner, self._tasks.navigation.is_measured(now_ns)
         if estimate is not None and self._blind:
             planner.request(now_ns)
@@ -115,7 +115,7 @@ class ControlCycle:
     def _act(
         self, mode: Mode, estimate: Estimate | None, readings: Sequence[ImuReading], now_ns: int
     ) -> Steered:
-        """Use the coils as the mode wants, by an estimate that is measured."""
+        """Use the coils as the mode requires; `estimate` is None unless measured."""
         steering = self._tasks.steering
         if mode in STEERING:
             return steering.run(estimate, now_ns, self._ever_started)
@@ -124,7 +124,7 @@ class ControlCycle:
         return steering.rest(now_ns)
 
     def _aim(self, now_ns: int) -> None:
-        """Find the target in force; announce a new one and ask for a path to it at once."""
+        """Set the target in force; announce a new target and request a path at once."""
         modes = self._tasks.modes
         mission_ns = now_ns - self._recorder.epoch_ns
         target = self._body.targets.configured(mission_ns) if modes.flies_steps else modes.wanted
@@ -137,7 +137,7 @@ class ControlCycle:
         self._body.planner.aim(target, now_ns)
 
     def _collect(self, now_ns: int) -> bool:
-        """Accept what the workers have finished; return whether a frame was among it."""
+        """Accept the workers' results; return whether a frame was among them."""
         framed = False
         for result in self._jobs.collect():
             framed |= self._accept(result, now_ns)

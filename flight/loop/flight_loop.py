@@ -1,6 +1,6 @@
-"""One flight from its release to its end: begun in every task, run by the executive, closed whatever happens.
+"""One flight from its release to its end: starts the tasks, runs the executive, switches the coils off.
 
-It knows devices only by their Protocols; `flight.app` opens them, composes the tasks and closes the devices.
+`flight.app` opens and closes the devices and composes the tasks.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ def nothing() -> None:
 
 @dataclass(frozen=True, slots=True)
 class Supervisors:
-    """What lies around the loop in real time.
+    """The parts around the loop in real time.
 
     Attributes:
-        beat: called at the end of each control cycle that ran well: the guardian's heartbeat.
-        keeper: keeps the state of earlier boots; None where nothing is kept.
+        beat: the guardian's heartbeat, called after each control cycle without an error.
+        keeper: stores the state that outlives the process; None where none is stored.
         board: reads processor, memory, disk and temperature; None in lock-step.
     """
 
@@ -57,7 +57,7 @@ class Supervisors:
 class LoopTasks:
     """The tasks of the loop; without a camera there is no imaging, without channels no commanding.
 
-    Data goes through them in this order.
+    The order is that of the data flow.
     """
 
     navigation: Navigation
@@ -71,8 +71,8 @@ class LoopTasks:
 
 
 @dataclass(slots=True)
-class _Wishes:
-    """What the application asks of a running flight."""
+class _Requests:
+    """Requests of the application to the flight."""
 
     stop_reason: str = ""
     progress: Callable[[Progress], None] | None = None
@@ -83,19 +83,19 @@ class FlightLoop:
     """One flight: from the release at mission time zero to the end of the configured duration."""
 
     def __init__(
-        self, config: Config, body: Body, tasks: LoopTasks, services: Services, around: Supervisors
+        self, config: Config, body: Body, tasks: LoopTasks, services: Services, supervisors: Supervisors
     ) -> None:
         self._config = config
         self._body = body
         self._tasks = tasks
         self._services = services
-        self._around = around
-        self._wishes = _Wishes()
-        self._wishes.notes += [(events.LEARNED_REFUSED, problem) for problem in body.learned_problems]
+        self._supervisors = supervisors
+        self._requests = _Requests()
+        self._requests.notes += [(events.LEARNED_REFUSED, problem) for problem in body.learned_problems]
         self._output: ControlOutput | None = None
         self._groups = self._rate_groups()
         tasks.health.watch(self._groups)
-        # Jobs done on the spot, in lock-step, are no part of a cycle's execution time.
+        # In lock-step, jobs run in the calling thread: their time is not a cycle's execution time.
         jobs = services.jobs
         self._executive = Executive(
             services.clock, self._groups, tasks.observer, lambda: time.perf_counter_ns() - jobs.borrowed_ns
@@ -103,24 +103,24 @@ class FlightLoop:
 
     @property
     def restart(self) -> str:
-        """Why the process should be started again after this flight; empty when it should not."""
+        """Why the process should be restarted after this flight; empty when it should not."""
         return self._tasks.modes.restart
 
     def stop(self, reason: str) -> None:
         """End the flight after the running cycle. Safe from a signal handler."""
-        self._wishes.stop_reason = reason
+        self._requests.stop_reason = reason
         self._executive.stop()
 
     def note(self, kind: EventKind, text: str) -> None:
-        """Report an event of the time before the flight at its start."""
-        self._wishes.notes.append((kind, text))
+        """Keep an event from before the flight, to be reported at its start."""
+        self._requests.notes.append((kind, text))
 
     def watch(self, progress: Callable[[Progress], None]) -> None:
         """Call `progress` once a second of mission time."""
-        self._wishes.progress = progress
+        self._requests.progress = progress
 
     def run(self, epoch_ns: int, label: RunLabel) -> str:
-        """Fly from `epoch_ns` on; return why it ended. The coils are at zero when this returns or raises."""
+        """Fly from `epoch_ns` on; return why the flight ended. The coils are at zero on return or error."""
         services = self._services
         self._begin(epoch_ns, label)
         try:
@@ -129,15 +129,15 @@ class FlightLoop:
             self._tasks.control.coils_off()
             self._tasks.health.close()
             now_ns = services.clock.now_ns()
-            reason = self._wishes.stop_reason or "the configured duration is over"
+            reason = self._requests.stop_reason or "the configured duration is over"
             services.events.flush(now_ns)
             services.events.report(events.STOPPED, now_ns, reason)
             self._record_performance(now_ns)
         return reason
 
     def _begin(self, epoch_ns: int, label: RunLabel) -> None:
-        """Give every task mission time zero, and the log what is flown."""
-        config, services, tasks, around = self._config, self._services, self._tasks, self._around
+        """Start every task at mission time zero, and record the run."""
+        config, services, tasks, supervisors = self._config, self._services, self._tasks, self._supervisors
         recorder, clock = services.recorder, services.clock
         recorder.epoch_ns = epoch_ns
         tasks.navigation.begin(epoch_ns)
@@ -146,13 +146,13 @@ class FlightLoop:
         services.streams.begin(epoch_ns)
         utc_ns = clock.utc_ns() - (clock.now_ns() - epoch_ns)
         record_run(recorder, config, label, epoch_ns, utc_ns, self._groups[0].period_ns)
-        tasks.modes.begin(epoch_ns, around.keeper.record.unclean_recent if around.keeper else 0)
+        tasks.modes.begin(epoch_ns, supervisors.keeper.record.unclean_recent if supervisors.keeper else 0)
         services.events.report(events.STARTED, epoch_ns, f"{config.name}, {config.duration:g} s")
-        for kind, text in self._wishes.notes:
+        for kind, text in self._requests.notes:
             services.events.report(kind, epoch_ns, text)
         tasks.health.begin(epoch_ns)
-        if around.board is not None:
-            tasks.health.read_resources(around.board, round(config.health.look_period * SECOND_NS))
+        if supervisors.board is not None:
+            tasks.health.read_resources(supervisors.board, round(config.health.look_period * SECOND_NS))
 
     def _rate_groups(self) -> list[RateGroup]:
         config, tasks = self._config, self._tasks
@@ -176,7 +176,7 @@ class FlightLoop:
 
     def _run_control(self, cycle: Cycle) -> None:
         self._output = self._tasks.control.run(cycle)
-        self._around.beat()
+        self._supervisors.beat()
 
     def _keep_house(self, cycle: Cycle) -> None:
         now_ns, output = cycle.start_ns, self._output
@@ -184,8 +184,8 @@ class FlightLoop:
         self._tasks.housekeeping.run(cycle, state)
         self._keep_state(now_ns)
         self._record_performance(now_ns)
-        if self._wishes.progress is not None:
-            self._wishes.progress(self._progress(state, now_ns))
+        if self._requests.progress is not None:
+            self._requests.progress(self._progress(state, now_ns))
 
     def _progress(self, state: SteeringState, now_ns: int) -> Progress:
         output, services = self._output, self._services
@@ -201,8 +201,8 @@ class FlightLoop:
         )
 
     def _keep_state(self, now_ns: int) -> None:
-        """Hand the state that outlives the process to its keeper, and report its events; touches no disk."""
-        keeper = self._around.keeper
+        """Pass the state that outlives the process to its keeper, and report its events; no disk access."""
+        keeper = self._supervisors.keeper
         if keeper is None:
             return
         for kind, text in keeper.notices():

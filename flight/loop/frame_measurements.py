@@ -1,4 +1,4 @@
-"""What a frame adds to the estimate: its job for the vision worker, and the measurements found in it."""
+"""Builds the vision worker's job for a frame, and measurements from the job's result."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ _NAN = np.full(3, np.nan), np.full((3, 3), np.nan)
 
 @dataclass(frozen=True, slots=True)
 class ImagingSettings:
-    """The camera as vision must know it.
+    """Properties and time limits of the camera, and the settings of vision.
 
     Attributes:
-        late_ns: after the exposure, from which a frame is late.
-        slow_ns: from which vision is slow over a frame.
-        mounting: (4,) takes the body's axes to the camera's.
-        angular_acceleration_psd: rad^2/s^3, density of the white angular acceleration that shakes the body.
+        late_ns: age after the exposure from which a frame is late.
+        slow_ns: processing time from which vision is slow.
+        mounting: (4,) body axes to camera axes.
+        angular_acceleration_psd: rad^2/s^3, density of the body's white angular acceleration.
     """
 
     camera: CameraModel
@@ -49,7 +49,7 @@ class ImagingSettings:
 
 
 class FrameMeasurer:
-    """Makes jobs of frames, and measurements of what the worker found in them."""
+    """Builds jobs from frames, and measurements from the worker's results."""
 
     def __init__(self, settings: ImagingSettings, navigation: Navigation) -> None:
         self._settings = settings
@@ -57,7 +57,7 @@ class FrameMeasurer:
         self._body_to_camera = attitude_matrix(settings.mounting)
 
     def job(self, frame: Frame, last_checksum: int | None) -> FrameJob:
-        """Return the worker's job; `last_checksum` is that of the frame before, which may come again."""
+        """Return the worker's job; `last_checksum` is that of the previous frame, to detect a repetition."""
         past = self._navigation.past(middle_ns(frame))
         return FrameJob(
             frame.pixels,
@@ -73,7 +73,7 @@ class FrameMeasurer:
     def _estimator(self, past: Estimate | None) -> StreakSettings | LikelihoodSettings:
         estimator = self._settings.estimator
         if past is None and isinstance(estimator, LikelihoodSettings):
-            # The change of rate moves the stars off mid-exposure: it must come from the pixels.
+            # A change of rate moves the stars off mid-exposure: without an estimate, fit it to the pixels.
             return replace(estimator, rate_model="accelerating")
         return estimator
 
@@ -87,14 +87,14 @@ class FrameMeasurer:
         return AttitudePrior(multiply(self._settings.mounting, past.quaternion), sigma)
 
     def mean_rate(self, frame: Frame, motion: Found) -> MeanRateMeasurement | None:
-        """Return the mean body rate over the exposure, None without one or before there was an estimate."""
+        """Return the mean body rate over the exposure, None without a rate or without an estimate then."""
         start_ns = frame.exposure_start_ns
         if motion.status is not StreakStatus.RATE or self._navigation.past(start_ns) is None:
             return None
         return MeanRateMeasurement(start_ns, start_ns + frame.exposure_ns, *self.rate_in_body(motion))
 
     def attitude(self, frame: Frame, found: FrameFound) -> AttitudeMeasurement | None:
-        """Return the attitude at mid-exposure, None where the stars do not give one."""
+        """Return the attitude at mid-exposure, None without a fix."""
         fix = found.solution.fix if found.solution is not None else None
         if fix is None:
             return None
@@ -111,7 +111,7 @@ class FrameMeasurer:
         return turn @ found.rate, turn @ found.covariance @ turn.T
 
     def _off_middle(self, frame: Frame, motion: Found) -> FloatArray:
-        """Return by how much the stars' attitude may differ from that of mid-exposure, (3, 3) rad^2."""
+        """Return the covariance (3, 3) rad^2 of the stars' attitude relative to that of mid-exposure."""
         turns = np.zeros((len(NODES), 3))
         middle = self._navigation.past(middle_ns(frame))
         if middle is not None:

@@ -1,4 +1,4 @@
-"""Reports what was found in a frame: packets of rate and stars, and events for what is refused."""
+"""Records the results of a frame: packets of rate and stars, and events for rejected measurements."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from flight.loop.services import Services
 from hal.interfaces.readings import Frame
 
 _MANY_STARS = 12
-"""A frame with as many detections that no sky matches does not show the sky: its pixels are out of order."""
+"""A frame with at least this many unmatched detections does not show the sky: its pixels are invalid."""
 _NAN4, _NAN33 = np.full(4, np.nan), np.full((3, 3), np.nan)
 
 
 class FrameReport:
-    """Records frames; counts the rates from streaks that entered the estimate."""
+    """Records frames; `accepted` counts the rates from streaks that entered the estimate."""
 
     def __init__(self, measurer: FrameMeasurer, view: BodyView, services: Services) -> None:
         self._measurer = measurer
@@ -35,7 +35,7 @@ class FrameReport:
     def rate(
         self, frame: Frame, motion: Found, rate: MeanRateMeasurement | None, now_ns: int, accepted: bool
     ) -> None:
-        """Record the rate from the streaks, and report one that was refused."""
+        """Record the rate from the streaks, and report a rejected rate."""
         self.accepted += accepted
         if rate is not None and not accepted:
             text = f"frame {frame.sequence}: {self._view.rate_text(rate)}"
@@ -50,7 +50,7 @@ class FrameReport:
         now_ns: int,
         accepted: bool | None,
     ) -> None:
-        """Record the attitude from the stars; `accepted` is None where it was not offered to the filter."""
+        """Record the attitude from the stars; `accepted` is None when not offered to the filter."""
         if is_strange(solution):
             text = f"frame {frame.sequence}: {len(solution.points)} stars that are nowhere in the sky"
             self._events.report(events.CAMERA_STRANGE, now_ns, text)
@@ -95,7 +95,7 @@ class FrameReport:
 
 
 def is_strange(solution: FrameSolution | None) -> bool:
-    """Return whether a frame shows many stars that are nowhere in the sky."""
+    """Return whether a frame shows many stars but matches no part of the sky."""
     if solution is None or solution.status is not SolveStatus.NO_MATCH:
         return False
     return len(solution.points) >= _MANY_STARS

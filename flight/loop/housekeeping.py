@@ -1,4 +1,4 @@
-"""Housekeeping: once a second the health of devices and loop, as packets and, where it changes, as events."""
+"""Housekeeping: records the counters of devices and loop once a second, and checks the flight log."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from hal.interfaces.devices import PowerMonitor, TorqueCoils
 
 @dataclass(frozen=True, slots=True)
 class Watched:
-    """What housekeeping reports on; `log_error` returns why the flight log fails, empty while it works."""
+    """The sources of housekeeping; `log_error` returns why the flight log fails, empty while it works."""
 
     navigation: Navigation
     planner: Planner

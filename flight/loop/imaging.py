@@ -1,7 +1,7 @@
-"""Imaging: triggers the star camera, hands frames to the vision worker and its results to navigation.
+"""Imaging: triggers the star camera, passes frames to the vision worker and results to navigation.
 
-Sequence number, pixels and age of a frame show whether the camera is alive; its stars show whether the
-pixels are of the sky.
+The camera is checked by sequence number, pixels and age of its frames, and by whether the stars match the
+sky.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ WORKER = "vision"
 
 
 class Imaging:
-    """Owns the frame that is being worked on and the watch over the camera."""
+    """Owns the frame in process, and monitors the camera."""
 
     def __init__(
         self,
@@ -50,21 +50,21 @@ class Imaging:
         self._last_sequence = -1
         self._last_checksum: int | None = None
         self._last_frame_ns = 0
-        self._due_ns: int | None = None  # by when the oldest trigger without a frame should have one
+        self._due_ns: int | None = None  # when the frame of the oldest open trigger is due
         self._rows = RepeatedRows()
         self._busy_since_ns = 0
         self._frames = 0
 
     def counts(self) -> tuple[int, int]:
-        """Return how many frames came, and how many rates from streaks entered the estimate."""
+        """Return the number of frames, and of rates from streaks that entered the estimate."""
         return self._frames, self._report.accepted
 
     def busy_since_ns(self) -> int | None:
-        """Return since when a frame is being worked on, None when none is."""
+        """Return since when a frame has been in process, None when none is."""
         return None if self._frame is None else self._busy_since_ns
 
     def begin(self, time_ns: int) -> None:
-        """Count the camera's age from here."""
+        """Measure the age of the newest frame from `time_ns` on."""
         self._last_frame_ns = time_ns
 
     def trigger(self, cycle: Cycle) -> None:
@@ -75,12 +75,12 @@ class Imaging:
             self._facts.update(facts.CAMERA_LOST, True, cycle.start_ns, str(error))
             return
         if self._due_ns is None:
-            # A camera that runs free is in an exposure already, and begins another one after it.
+            # A free-running camera first completes the exposure in progress.
             patience_ns = 2 * self._settings.exposure_ns + self._settings.late_ns
             self._due_ns = cycle.start_ns + patience_ns
 
     def serve(self, now_ns: int) -> None:
-        """Take in a finished frame, if there is one, and hand it to the worker."""
+        """Check the camera; pass a new frame to the worker."""
         self._look_at_worker(now_ns)
         frame = self._poll(now_ns)
         age_ns = now_ns - self._last_frame_ns
@@ -91,7 +91,7 @@ class Imaging:
                 self._facts.update(facts.CAMERA_LOST, True, now_ns, f"no frame for {age_ns * 1e-9:.1f} s")
             return
         if frame.sequence <= self._last_sequence:
-            # A repeated frame is no new one: its age goes on.
+            # A repeated frame does not reset the age.
             text = f"frame {frame.sequence} comes again"
             self._events.report(events.CAMERA_FROZEN, now_ns, text)
             self._report.record(frame, StreakStatus.FROZEN.value, None, now_ns, False)
@@ -121,7 +121,7 @@ class Imaging:
             self._events.report(events.VISION_FAILED, now_ns, "the worker has not finished the last frame")
 
     def finish(self, result: JobResult, now_ns: int) -> None:
-        """Take in what the worker found."""
+        """Accept the worker's result."""
         frame, self._frame = self._frame, None
         if frame is None:
             return
@@ -143,7 +143,7 @@ class Imaging:
             )
         rate, attitude = self._measurer.mean_rate(frame, motion), self._measurer.attitude(frame, found)
         if is_strange(found.solution):
-            rate = None  # of pixels that are not in order
+            rate = None  # its pixels are invalid
         known = self._navigation.past(middle_ns(frame)) is not None
         late = [m for m in (rate, attitude if known else None) if m is not None]
 
@@ -160,7 +160,7 @@ class Imaging:
             report([])
 
     def _look_at_worker(self, now_ns: int) -> None:
-        """Tell of a worker that is slow while it still is at it."""
+        """Report a slow worker while the frame is still in process."""
         if self._frame is not None and now_ns - self._busy_since_ns > self._settings.slow_ns:
             self._judge_speed(now_ns)
 

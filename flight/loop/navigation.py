@@ -1,7 +1,7 @@
-"""Navigation: readings of the inertial unit, rates from streaks and attitudes from stars, into one estimate.
+"""Navigation: fuses readings of the inertial unit, rates from streaks and attitudes from stars.
 
-It also watches the unit's line: no bytes are silence, bytes that make no packets are corruption, packets with
-impossible values are implausible.
+Also monitors the unit's line for silence (no bytes), corruption (bytes without valid packets) and implausible
+values.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from hal.interfaces.errors import DeviceError
 from hal.interfaces.readings import CoilState, ImuLink, ImuReading
 
 _AT_A_TIME = 16
-"""Measurements applied again per cycle: a few ms, so that a second of them takes a few cycles."""
+"""Measurements applied again per cycle: takes a few ms, so that a second of them takes a few cycles."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,9 +35,9 @@ class NavigationSettings:
     Attributes:
         angle_noise: rad, standard deviation of the unit's attitude about each axis.
         rate_noise: rad/s, of its rate.
-        max_age_ns: of a reading that the coils are driven by.
-        coast_ns: for how long the model carries the estimate on without a measurement; nothing steers by it.
-        period_ns: of the control cycle: a current that is commanded flows at least until the next cycle.
+        max_age_ns: age limit of a reading by which the coils are driven.
+        coast_ns: for how long the estimate is propagated without a measurement, for telemetry only.
+        period_ns: of the control cycle: a commanded current flows at least until the next cycle.
     """
 
     angle_noise: float
@@ -48,7 +48,7 @@ class NavigationSettings:
 
 
 class Navigation:
-    """Owns the filter and the watch over the inertial unit's line."""
+    """Owns the filter, and monitors the inertial unit's line."""
 
     def __init__(
         self, unit: InertialUnit, body: Body, settings: NavigationSettings, services: Services
@@ -81,7 +81,7 @@ class Navigation:
         return self._link
 
     def commanded(self, in_force: CoilState, known: CurrentValidity) -> None:
-        """Tell the filter what the coils carry, as far as that is known."""
+        """Give the filter the coil currents, as far as they are known."""
         if known.uncertain_since_ns is not None:
             self._filter.mark_unknown(known.uncertain_since_ns)
         self._filter.command(max(in_force.written_ns, known.since_ns), in_force.current, known=known.now)
@@ -105,14 +105,14 @@ class Navigation:
         return readings
 
     def is_heard(self, now_ns: int) -> bool:
-        """Tell whether the coils may be driven by readings alone until the next cycle."""
+        """Return whether the coils may be driven by readings alone until the next cycle."""
         return self._is_fresh(self._heard_ns, now_ns)
 
     def is_measured(self, now_ns: int) -> bool:
-        """Tell whether the coils may be driven by the estimate until the next cycle.
+        """Return whether the coils may be driven by the estimate until the next cycle.
 
-        The newest reading that agreed with it must be within the age limit until then: an estimate that the
-        model alone carries is told, but steers nothing.
+        The newest reading that agreed with the estimate must be within the age limit until then. An estimate
+        propagated by the model alone is recorded, but not used for steering.
         """
         return self._filter.started and self._is_fresh(self._agreed_ns, now_ns)
 
@@ -120,25 +120,25 @@ class Navigation:
         return now_ns + self._settings.period_ns - time_ns < self._settings.max_age_ns
 
     def estimate(self, now_ns: int) -> Estimate | None:
-        """Return the estimate for now, measured or carried on by the model; None when there is none."""
-        # Carried on over a long silence it would cost more with every cycle, and be of no use.
+        """Return the estimate for now, measured or propagated by the model; None when there is none."""
+        # Over a long silence, propagation would cost more with every cycle, for an estimate of no use.
         if not self._filter.started or now_ns - self._filter.measured_ns > self._settings.coast_ns:
             return None
         return self._filter.at(now_ns)
 
     def past(self, time_ns: int) -> Estimate | None:
-        """Return the whole estimate as it stood at a past time, None when that is not remembered."""
+        """Return the estimate of a past time, None beyond the filter's history."""
         return self._filter.past(time_ns) if self._filter.started else None
 
-    def ingest_late(self, late: Sequence[Measurement], told: Callable[[list[bool]], None]) -> None:
-        """Put measurements of a frame where they belong in time, over the next cycles.
+    def ingest_late(self, late: Sequence[Measurement], report: Callable[[list[bool]], None]) -> None:
+        """Apply measurements of a frame at their times, over the next cycles.
 
-        `told` is called, later or at once, with which of them passed the gate.
+        `report` is called, later or at once, with whether each of them passed the gate.
         """
         if self._filter.started:
-            self._filter.measure_late(late, told)
+            self._filter.measure_late(late, report)
         else:
-            told([False] * len(late))
+            report([False] * len(late))
 
     def _ingest(self, reading: ImuReading) -> None:
         self._recorder.record(
@@ -159,7 +159,7 @@ class Navigation:
             self._filter.start(attitude, rate)
             self._agreed_ns = reading.time_ns
             return
-        # Each for itself: a gyro that is right keeps the rate while the attitude is in doubt.
+        # Gated separately: a correct gyro keeps the rate while the attitude is rejected.
         turned = self._filter.measure(attitude)
         moved = self._filter.started and self._filter.measure(rate)
         if turned or moved:

@@ -1,4 +1,4 @@
-"""The performance record: when cycles ran and how long they took, apart from the flight log.
+"""The performance record: times and execution times of cycles, in a log of its own.
 
 Also the executive's observer: slips and failures become events, and a failed control cycle zeroes the coils.
 """
@@ -27,7 +27,7 @@ class PerformanceObserver:
         self._events = services.events
 
     def ran(self, group: RateGroup, cycle: Cycle, execution_ns: int) -> None:
-        """Note each control cycle's lateness and length."""
+        """Record a control cycle's lateness and execution time."""
         if group.name == CONTROL:
             self._recorder.time(
                 CYCLE_TIMING,
@@ -45,7 +45,7 @@ class PerformanceObserver:
         self._events.report(events.CYCLE_SLIP, self._clock.now_ns(), text)
 
     def failed(self, group: RateGroup, error: Exception) -> None:
-        """Bring the coils to zero when the control task failed, and report where."""
+        """Switch the coils off when the control task failed, and report the error's place."""
         if group.name == CONTROL:
             self._coils.off()
         last = traceback.extract_tb(error.__traceback__)[-1]
@@ -53,7 +53,7 @@ class PerformanceObserver:
         self._events.report(events.TASK_FAILED, self._clock.now_ns(), text)
 
     def group(self, group: RateGroup, now_ns: int) -> None:
-        """Note the state of a rate group."""
+        """Record the statistics of a rate group."""
         self._recorder.time(
             RATE_GROUP,
             now_ns,
@@ -67,7 +67,7 @@ class PerformanceObserver:
         )
 
     def job(self, result: JobResult, now_ns: int) -> None:
-        """Note how long a worker took."""
+        """Record the execution time of a job."""
         self._recorder.time(
             JOB_TIMING,
             now_ns,

@@ -1,4 +1,4 @@
-"""The state of a flight for the person who watches it, once a second."""
+"""The state of a flight for the progress line, once a second."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """Times in s, currents (3,) in A; `attitude` is the body's own account of target and attitude."""
+    """Times in s, currents (3,) in A; `attitude` is the body's text of target and attitude."""
 
     mission_time: float
     duration: float

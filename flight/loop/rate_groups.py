@@ -1,4 +1,4 @@
-"""Which task runs when: the rate groups of the loop, in order of importance."""
+"""The rate groups of the loop, in order of importance."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ COMMAND_PERIOD_NS = SECOND_NS // 10
 
 @dataclass(frozen=True, slots=True)
 class Periods:
-    """Periods from the configuration, ns; without a camera there is none of the camera."""
+    """Periods from the configuration, ns; `camera_ns` is None without a camera."""
 
     control_ns: int
     replan_ns: int

@@ -1,4 +1,4 @@
-"""The first packet of a run: what was flown, with which software, on what."""
+"""The first packet of a run: configuration, software and kind of hardware."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from flight.schema.sections import Config
 
 @dataclass(frozen=True, slots=True)
 class RunLabel:
-    """What the first packet of a run says of it."""
+    """The properties of a run."""
 
     config_text: str
     seed: int
@@ -24,7 +24,7 @@ class RunLabel:
 def record_run(
     recorder: Recorder, config: Config, label: RunLabel, epoch_ns: int, utc_ns: int, period_ns: int
 ) -> None:
-    """Record the run that begins at `epoch_ns`, in UTC `utc_ns`; `period_ns` is that of control."""
+    """Record the run that begins at `epoch_ns`, UTC `utc_ns`; `period_ns` is the control period."""
     coils = config.coils
     recorder.record(
         RUN,

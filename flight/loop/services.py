@@ -1,4 +1,4 @@
-"""What every task of the loop shares, and the devices that it flies."""
+"""The services that all tasks of the loop share, and the devices."""
 
 from __future__ import annotations
 

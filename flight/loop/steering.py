@@ -35,9 +35,9 @@ class Steering:
         self._facts = services.facts
 
     def run(self, estimate: Estimate | None, now_ns: int, ever_started: bool) -> Steered:
-        """Follow or hold in this cycle, by an `estimate` that is measured.
+        """Follow or hold in this cycle; `estimate` is None unless measured.
 
-        `ever_started`: there was an estimate once, so that None is a loss of control.
+        `ever_started`: there was an estimate before, so that None is a loss of control.
         """
         body = self._body
         reference = body.paths.sample(now_ns)
@@ -45,7 +45,7 @@ class Steering:
         self._facts.update(facts.CONTROL_LOST, estimate is None and ever_started, now_ns, text)
         state, dipole, saturated, adrift = SteeringState.OFF, _NO_DIPOLE, False, False
         if estimate is None or reference is None:
-            self._let_go()
+            self._release()
         else:
             following = body.paths.is_following(now_ns)
             state = SteeringState.FOLLOWING if following else SteeringState.HOLDING
@@ -76,23 +76,23 @@ class Steering:
             dipole = currents * self._body.dipole_per_ampere
             self._drive.send(currents, lambda: detumbler.field(now_ns))
         else:
-            self._let_go()
+            self._release()
         return self._steered(state, now_ns, None, dipole)
 
     def rest(self, now_ns: int) -> Steered:
         """Keep the coils at zero in this cycle."""
-        self._let_go()
+        self._release()
         return self._steered(SteeringState.OFF, now_ns, None, _NO_DIPOLE)
 
     def zero(self) -> None:
-        """Bring the coils to zero now."""
+        """Command zero current."""
         self._drive.zero()
 
     def isolate(self) -> None:
         """Exclude the coils that have a verdict."""
         self._drive.isolate()
 
-    def _let_go(self) -> None:
+    def _release(self) -> None:
         self._drive.zero()
         self._body.tracker.reset()
 
@@ -104,7 +104,7 @@ class Steering:
         dipole: FloatArray,
         saturated: bool = False,
     ) -> Steered:
-        """Check the PWM chip, which may switch the coils off; return what was done in the end."""
+        """Check the PWM chip, which may switch the coils off; return the currents commanded in the end."""
         error = self._drive.fault()
         text = error or "the PWM chip takes commands again"
         self._facts.update(facts.COIL_FAULT, bool(error), now_ns, text)

@@ -1,1 +1,1 @@
-"""From a configuration to settings and tasks: the one place that composes."""
+"""Builds settings and tasks from a configuration."""

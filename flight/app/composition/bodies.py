@@ -1,4 +1,4 @@
-"""The bodies that a configuration can name: one line each, or a third party's as `module:object`."""
+"""The bodies that a configuration can name: those of `BODIES`, or a third party's as `module:object`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ BODIES = {"testbed": "flight.bodies.testbed.body:TESTBED"}
 
 
 def body_kind(config: Config) -> BodyKind:
-    """Return the kind of body that a configuration names. Raises ConfigError."""
+    """Return the configured kind of body. Raises ConfigError."""
     place = BODIES.get(config.body, config.body)
     module, colon, name = place.partition(":")
     if not (module and colon and name):

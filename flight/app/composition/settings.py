@@ -1,4 +1,4 @@
-"""From a configuration to the settings of those tasks that every body has."""
+"""Derives the settings of the tasks that every body has from a configuration."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def navigation_settings(config: Config) -> NavigationSettings:
 
 
 def imaging_settings(camera: Camera, angular_acceleration_psd: float) -> ImagingSettings:
-    """Return the camera as vision must know it; the density is in rad^2/s^3."""
+    """Return the settings of imaging; the density is in rad^2/s^3."""
     return ImagingSettings(
         camera=camera_model(camera),
         exposure_ns=round(camera.exposure * SECOND_NS),
@@ -47,7 +47,7 @@ def imaging_settings(camera: Camera, angular_acceleration_psd: float) -> Imaging
 
 
 def _tracker(camera: Camera) -> TrackerSettings | None:
-    """Return what the star tracker must know of the configured camera, None where it is not wanted."""
+    """Return the settings of the star tracker, None without one."""
     section = camera.star_tracker
     if section is None:
         return None
@@ -66,7 +66,7 @@ def _saturation(camera: Camera) -> float:
 
 
 def _estimator(camera: Camera) -> StreakSettings | LikelihoodSettings:
-    """Return the settings of the estimator that the configuration chose, for its camera."""
+    """Return the settings of the configured streak estimator."""
     saturation = _saturation(camera)
     if camera.estimator == "likelihood":
         return LikelihoodSettings(

@@ -1,4 +1,4 @@
-"""The tasks of the loop, built from the configuration in the order in which data goes through them."""
+"""Builds the tasks of the loop from the configuration, in the order of the data flow."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ from hal.interfaces.wires import Clock
 
 @dataclass(frozen=True, slots=True)
 class Opened:
-    """What is open when a flight is composed.
+    """The open devices, workers and logs of a flight.
 
     Attributes:
         log_error: returns why the flight log fails, empty while it works.
-        channels: where commands come from.
-        feed: the watchdog's food, about four times a second.
+        channels: sources of commands.
+        feed: feeds the watchdog, called about four times a second.
     """
 
     clock: Clock
@@ -54,7 +54,7 @@ class Opened:
 
 
 def build_loop(config: Config, opened: Opened, supervisors: Supervisors) -> FlightLoop:
-    """Return the loop of a configuration. Raises ConfigError for a body that is not there."""
+    """Return the loop of a configuration. Raises ConfigError for an unknown body."""
     events = EventLog(opened.recorder.event)
     services = Services(
         opened.clock, opened.jobs, opened.recorder, events, Facts(events), Streams(streams_of(config))

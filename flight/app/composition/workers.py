@@ -1,4 +1,4 @@
-"""The workers that a configuration needs, and for how long they may be busy."""
+"""The workers that a configuration needs, and their time limits."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hal.interfaces.wires import SECOND_NS
 
 
 def workers(config: Config, planner_latency_ns: int = 0, vision_latency_ns: int = 0) -> list[Worker]:
-    """Return the workers that a configuration needs; latencies hold in lock-step simulation only."""
+    """Return the workers that a configuration needs; latencies apply to lock-step simulation only."""
     planner_timeout_ns = round(config.executive.planner_timeout * SECOND_NS)
     vision_timeout_ns = round(config.executive.vision_timeout * SECOND_NS)
     made = [Worker(PLANNER, body_kind(config).plan, planner_latency_ns, planner_timeout_ns)]
@@ -24,7 +24,7 @@ def workers(config: Config, planner_latency_ns: int = 0, vision_latency_ns: int 
 
 
 def worker_watches(limits: Executive, planner: Planner, imaging: Imaging | None) -> list[WorkerWatch]:
-    """Return the watch over each worker: twice the time after which the runner kills it."""
+    """Return the watch over each worker, with twice the timeout of the runner as its patience."""
     busy = [(PLANNER, planner.busy_since_ns, limits.planner_timeout)]
     if imaging is not None:
         busy.append((imaging_task.WORKER, imaging.busy_since_ns, limits.vision_timeout))

@@ -1,6 +1,6 @@
 """The testbed: a body on a thread in a fixed horizontal field, turned about one axis by the coil on body x.
 
-`TESTBED` composes it from the configuration; no other folder of the flight knows about q2 and the thread.
+`TESTBED` builds the testbed from the configuration; q2 and the thread appear only in this package.
 """
 
 from __future__ import annotations
@@ -39,11 +39,10 @@ _THREAD_AXIS = np.array([0.0, 1.0, 0.0])
 
 
 def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> Body:
-    """Return the testbed of a configuration, with what an earlier boot learned."""
+    """Return the testbed of a configuration, with the parameters that an earlier boot learned."""
     plant = plant_of(config)
     filter_, problems = attitude_filter(config, plant, learned)
-    believed = Parameters(plant.stiffness / plant.inertia, plant.damping / plant.inertia)
-    reader = ThreadReader(believed)
+    reader = ThreadReader(Parameters(plant.stiffness / plant.inertia, plant.damping / plant.inertia))
     settings = planning_settings(config)
     rules = AcceptanceRules(late_after=config.guidance.late_after)
     guidance = Guidance(plant, rules, arrives=settings.strategy is not Strategy.RECEDING)
@@ -79,7 +78,7 @@ TESTBED = BodyKind(plan_job.run, make)
 
 
 def surrounding_field(config: Config) -> FloatArray:
-    """Return the field (3,) T in which the testbed hangs, reference axes."""
+    """Return the surrounding field (3,) T, reference axes."""
     return np.array([0.0, 0.0, -config.plant.field])
 
 
@@ -91,11 +90,11 @@ def dipole_per_ampere(config: Config) -> float:
 def attitude_filter(
     config: Config, plant: SingleAxisPlant, learned: Mapping[str, Learned]
 ) -> tuple[AttitudeFilter, list[str]]:
-    """Return the filter of a body on the thread, and why some of what was `learned` was not taken."""
-    section, believed = config.estimation, config.plant
+    """Return the filter of a body on the thread, and why `learned` parameters were rejected."""
+    section = config.estimation
     body = RigidBody(
         np.eye(3) * plant.inertia,
-        believed.coil_turns * believed.coil_area,
+        dipole_per_ampere(config),
         surrounding_field(config),
         suspended=True,
         stiffness=plant.stiffness,
@@ -144,7 +143,7 @@ def coil_watch(config: Config, plant: SingleAxisPlant) -> CoilWatch:
 
 
 def planning_settings(config: Config) -> PlanningSettings:
-    """Return how paths are asked for."""
+    """Return the settings of planning."""
     section = config.guidance
     return PlanningSettings(
         horizon=section.horizon,

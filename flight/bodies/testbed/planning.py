@@ -1,10 +1,10 @@
-"""Planning: asks the worker for paths and offers them to guidance.
+"""Planning: requests paths from the worker and offers them to guidance.
 
-Three strategies. GOAL plans a step at its command for a goal time, and again every few seconds from the
-newest estimate for what is left until then: each new plan is the optimal rest of the step. When little is
-left the path is flown to its end, which is held; a body that is carried off its path is planned for again.
-RECEDING is the thesis's: each plan reaches the target a whole horizon after it is made (Sease ch. 5, Optimal
-Path Planning). STEP makes no plan: the controller is shown the target itself.
+Three strategies. GOAL plans a step for a goal time when commanded, and again every few seconds from the
+newest estimate for the time left: each plan is the optimal rest of the step. Near the goal time the path is
+flown to its end, which is held; a body displaced from its path gets a new plan. RECEDING is the thesis's:
+each plan reaches the target a whole horizon later (Sease ch. 5, Optimal Path Planning). STEP makes no plan:
+the controller tracks the target itself.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _AGAIN_NS = 1_000_000_000
 
 
 class Strategy(StrEnum):
-    """What a path is planned towards."""
+    """How paths are planned: see the module."""
 
     GOAL = "goal"
     RECEDING = "receding"
@@ -42,18 +42,18 @@ class Strategy(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class PlanningSettings:
-    """How paths are asked for.
+    """Settings of planning.
 
     Attributes:
-        horizon: s, asked for at a new target; a first guess where time has a price.
+        horizon: s, requested for a new target; an initial guess where time has a price.
         max_horizon: s, the longest allowed.
-        late_after_ns: after which a plan is late.
-        nodes: of the path.
+        late_after_ns: planning time after which a plan is late.
+        nodes: number of nodes of the path.
         strategy: see the module.
-        time_price: W, what a second of a slew is worth; None for the horizon as it is.
-        current_share: of the coil's limit that a plan may use; the rest is the controller's.
-        least_horizon: s before the goal from which on no plan is made any more.
-        displaced: rad off the path from which on there is a new plan.
+        time_price: W, cost of a second of a slew; None for a fixed horizon.
+        current_share: fraction of the coil's limit that a plan may use; the rest is the controller's.
+        least_horizon: s, time to the goal below which there is no new plan.
+        displaced: rad, distance from the path above which there is a new plan.
     """
 
     horizon: float
@@ -68,7 +68,7 @@ class PlanningSettings:
 
 
 class Planning:
-    """Owns the job that is under way, the wish for the next one and the goal time."""
+    """Owns the running job, the request for the next one and the goal time."""
 
     def __init__(
         self,
@@ -100,11 +100,11 @@ class Planning:
         return self._accepted, self._refused
 
     def busy_since_ns(self) -> int | None:
-        """Return since when a plan is being made, None when none is."""
+        """Return since when the worker has been planning, None while idle."""
         return None if self._job is None else self._asked_ns
 
     def aim(self, target: Target, now_ns: int) -> None:
-        """Want another attitude, and a plan for it at once; the present path is flown until that comes."""
+        """Set a new target, and request a plan for it at once; the present path is flown until then."""
         law = law_of(target)
         self._guidance.aim(law.q2, law.rate, now_ns)
         self._goal_ns = self._due_ns = None
@@ -114,28 +114,28 @@ class Planning:
             self._due_ns = now_ns + round(self._settings.horizon * 1e9)
 
     def due_angle(self, law: ThreadLaw, now_ns: int) -> float | None:
-        """Return where the body should be by now, rad; None while it is on its way to the target.
+        """Return the angle due by now, rad; None before the target is due.
 
-        It is due at the end of the first path to the target, whatever is planned after that; where paths are
-        not planned, a horizon after the command.
+        The target is due at the end of the first path to it, whatever is planned later; without plans, a
+        horizon after the command.
         """
         if self._due_ns is None or now_ns < self._due_ns:
             return None
         return _moved(law, (now_ns - self._due_ns) * 1e-9)
 
     def request(self, now_ns: int) -> None:
-        """Want a plan as soon as there is an estimate to start from and the worker is free."""
+        """Request a plan, made once there is an estimate and the worker is free."""
         self._wanted = True
         if self._is_near_goal(now_ns):
             self._goal_ns = None
 
     def resume(self, now_ns: int) -> None:
-        """Want the rest of a path anew after nobody steered along it; an end that is held is held on."""
+        """Request the rest of a path after a time without control, unless its end is near."""
         if now_ns - self._asked_ns > _AGAIN_NS and not self._is_near_goal(now_ns):
             self._wanted = True
 
     def replan(self, cycle: Cycle) -> None:
-        """Want a plan because its time has come: the task of the replanning rate group."""
+        """Request the periodic plan: the task of the replanning rate group."""
         if self._job is None:
             self._wanted = self._wanted or not self._is_near_goal(cycle.start_ns)
         elif cycle.start_ns - self._job.origin_ns > self._settings.late_after_ns:
@@ -145,14 +145,14 @@ class Planning:
             self._wanted = True
 
     def serve(self, estimate: Estimate | None, target: Target, now_ns: int) -> None:
-        """Hand the wanted job over."""
+        """Submit the requested job to the worker."""
         if estimate is None or self._settings.strategy is Strategy.STEP:
             return
         now = self._read(estimate)
         if self._is_displaced(now.angle, now_ns):
             self.request(now_ns)
         if self._is_near_goal(now_ns):
-            self._wanted = False  # by the time the worker was free the goal was near
+            self._wanted = False  # the goal came near while the worker was busy
         if not self._wanted or self._job is not None:
             return
         job = self._job_from(now, law_of(target), now_ns)
@@ -186,20 +186,20 @@ class Planning:
         )
 
     def _due_q2(self, law: ThreadLaw, now_ns: int, horizon: float) -> float:
-        """Return q2 to be reached in `horizon` s: a target that moves has moved on since it was first due."""
+        """Return q2 to be reached in `horizon` s: a moving target has moved on since first due."""
         if law.rate == 0.0 or self._due_ns is None:
             return law.q2
         late = horizon - (self._due_ns - now_ns) * 1e-9
         return q2_of(_moved(law, max(late, 0.0)))
 
     def _is_near_goal(self, now_ns: int) -> bool:
-        """Tell whether too little is left until the goal to plan for it."""
+        """Return whether too little time is left until the goal for a new plan."""
         if self._settings.strategy is not Strategy.GOAL or self._goal_ns is None:
             return False
         return self._goal_ns - now_ns < self._settings.least_horizon * 1e9
 
     def _is_displaced(self, angle: float, now_ns: int) -> bool:
-        """Tell whether the body is off its path, so that the path is of no more use; not each cycle anew."""
+        """Return whether the body is off its path, at most once a second, so that the path is useless."""
         sample = self._guidance.sample(now_ns)
         if self._settings.strategy is not Strategy.GOAL or sample is None:
             return False
@@ -210,7 +210,7 @@ class Planning:
         )
 
     def finish(self, result: JobResult, now_ns: int) -> None:
-        """Offer the worker's plan to guidance, which flies it or says why not."""
+        """Offer the worker's plan to guidance, and record whether the plan was accepted."""
         job, self._job = self._job, None
         if job is None:
             return
@@ -270,5 +270,5 @@ class Planning:
 
 
 def _moved(law: ThreadLaw, since: float) -> float:
-    """Return the angle of a law `since` s after it was due, rad, as far as the coil has authority."""
+    """Return the angle of a law `since` s after it was due, rad, limited to where the coil has authority."""
     return min(max(angle_of(law.q2) + law.rate * since, -FARTHEST), FARTHEST)

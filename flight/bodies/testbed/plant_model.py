@@ -8,20 +8,20 @@ from flight.schema.sections import Config
 
 def plant_of(config: Config) -> SingleAxisPlant:
     """Return the plant model that planner, tracker and filter use."""
-    believed = config.plant
+    section = config.plant
     return SingleAxisPlant(
-        inertia=believed.inertia,
-        torque_constant=believed.coil_turns * believed.coil_area * believed.field,
+        inertia=section.inertia,
+        torque_constant=section.coil_turns * section.coil_area * section.field,
         resistance=config.coils.resistance[0],
         current_limit=min(
             config.coils.current_limit, config.coils.supply_voltage / config.coils.resistance[0]
         ),
-        stiffness=believed.thread_stiffness,
-        damping=believed.thread_damping,
+        stiffness=section.thread_stiffness,
+        damping=section.thread_damping,
     )
 
 
 def angular_acceleration_psd_of(config: Config, plant: SingleAxisPlant) -> float:
-    """Return the power spectral density of the angular acceleration by current noise, rad^2/s^3."""
+    """Return the power spectral density of the angular acceleration due to current noise, rad^2/s^3."""
     noise = plant.torque_constant / plant.inertia * config.estimation.current_noise
     return noise**2 / config.executive.control_rate_hz

@@ -33,7 +33,7 @@ class ThreadTargets:
     def __init__(
         self, steps: Sequence[TimedStep], reader: ThreadReader, guidance: Guidance, planning: Planning
     ) -> None:
-        """Take the configured steps in order of time; the first stands at 0."""
+        """Take the configured steps in order of time; the first is at 0."""
         self._steps = [Target(i, ThreadLaw(step.q2, step.rate)) for i, step in enumerate(steps)]
         self._times = [round(step.at * 1e9) for step in steps]
         self._read = reader.read
@@ -69,7 +69,7 @@ class ThreadTargets:
         return self._off(estimate, angle_of(law_of(target).q2))
 
     def error_when_due(self, estimate: Estimate, target: Target, now_ns: int) -> float | None:
-        """Return the angle to where the body should have arrived by now, rad; None while under way."""
+        """Return the angle to the attitude due by now, rad; None before one is due."""
         due = self._planning.due_angle(law_of(target), now_ns)
         return None if due is None else self._off(estimate, due)
 

@@ -12,7 +12,7 @@ from flight.loop.control_output import Target
 
 @dataclass(frozen=True, slots=True)
 class ThreadLaw:
-    """Reach `q2` at `rate` rad/s and keep that rate: zero holds the attitude."""
+    """Reach `q2` at `rate` rad/s and keep that rate; zero holds the attitude."""
 
     q2: float
     rate: float = 0.0

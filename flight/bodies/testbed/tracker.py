@@ -1,4 +1,4 @@
-"""The tracker of the testbed: a controller of the turn about the thread behind the body seam."""
+"""The tracker of the testbed: a controller of the turn about the thread."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def controller_of(
     period: float,
     identification: Identification,
 ) -> Controller:
-    """Return the controller that `section` chooses for `plant`, commanded every `period` s."""
+    """Return the controller of `plant` that `section` chooses, called every `period` s."""
     if section.tracker == "excitation":
         move = identification
         return ExcitationController(

@@ -1,4 +1,4 @@
-"""How the testbed shows in packets and texts: in q2 and the turn about the thread."""
+"""The testbed's packets and texts, in q2 and the turn about the thread."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class ThreadView:
         )
 
     def announce(self, target: Target, now_ns: int) -> None:
-        """Record a new target, and report it as an event; not an attitude that is only held."""
+        """Record and report a new target, unless the present attitude is held."""
         if target.index == KEPT:
             return
         law = law_of(target)
@@ -65,16 +65,16 @@ class ThreadView:
         return {"target_q2": math.nan if wanted is None else law_of(wanted).q2}
 
     def reading_text(self, reading: ImuReading) -> str:
-        """Return a reading in words."""
+        """Return a reading as text."""
         angle = angle_about_axis_y(reading.quaternion)
         return f"angle {angle:.4f} rad, rate {reading.rate[1]:.5f} rad/s"
 
     def rate_text(self, rate: MeanRateMeasurement) -> str:
-        """Return a rate from streaks in words."""
+        """Return a rate from streaks as text."""
         return f"{rate.rate[1]:.5f} rad/s +- {math.sqrt(rate.covariance[1, 1]):.1e}"
 
     def progress(self, output: ControlOutput | None) -> str:
-        """Return target and attitude in words, for the progress line."""
+        """Return target and attitude as text, for the progress line."""
         target, estimate = (None, None) if output is None else (output.target, output.estimate)
         wanted = law_of(target).q2 if target else 0.0
         if estimate is None:

@@ -66,7 +66,7 @@ def test_the_threads_beside_the_control_thread_are_served_next(monkeypatch: pyte
     for thread in (beside, coils):
         thread.start()
     try:
-        watchers.serve_the_rest_next()
+        watchers.prioritise_other_threads()
     finally:
         done.set()
         beside.join()
