@@ -1,4 +1,4 @@
-"""A flight from its request to its result. Whatever happens, the coils are at zero when `fly` returns."""
+"""A flight from its request to its result. The coils are at zero when `fly` returns or raises."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def _open_rig(request: RunRequest, text: str, config: Config, stack: ExitStack) 
 
 
 def _is_patient(request: RunRequest) -> bool:
-    """Tell whether the flight begins without what is missing: on a board, where nobody can see to it."""
+    """Return whether the flight waits for missing devices: on a board, where nobody can reconnect them."""
     return request.archive is not None
 
 

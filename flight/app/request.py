@@ -8,12 +8,12 @@ from pathlib import Path
 
 @dataclass(frozen=True, slots=True)
 class RunRequest:
-    """What to fly, and how. `duration` in s and `seed` replace the configuration's when given.
+    """A request to fly. `duration` in s and `seed` replace the configuration's when given.
 
-    `devices` is the file of a server of simulated devices that runs already; without it one is started.
-    `archive` holds the runs of a board: the next of them is flown into, instead of into `out`.
-    `config_problem` says why `config_path` is not the file that was asked for, empty where it is.
-    `faults` are injected in simulation, beside those of the configuration, see `sim_hal.faults.grammar`.
+    `devices` is the file of a running server of simulated devices; without it, a server is started.
+    `archive` holds the runs of a board: the flight's folder is the archive's next, instead of `out`.
+    `config_problem` says why `config_path` is not the requested file, empty where it is.
+    `faults` are injected in simulation, in addition to the configuration's, see `sim_hal.faults.grammar`.
     """
 
     config_path: Path
@@ -29,9 +29,9 @@ class RunRequest:
 
 @dataclass(frozen=True, slots=True)
 class RunResult:
-    """How a flight ended; `interrupted` when a signal asked for it.
+    """How a flight ended; `interrupted` when by a signal.
 
-    `restart` says why the process should be started again, empty when it should not. `faults` were injected.
+    `restart` says why the process should be restarted, empty when it should not. `faults` were injected.
     """
 
     folder: Path

@@ -23,10 +23,10 @@ def default_folder(config_path: Path) -> Path:
 
 
 def begin_folder(request: RunRequest, text: str, config: Config) -> RunRequest:
-    """Make the run's folder, the archive's next where there is one; return the request that names it.
+    """Create the run's folder, the archive's next if there is an archive; return the request with its path.
 
-    A folder that holds a run is not touched. Raises UsageError for that, and where nothing can be written;
-    but a board that keeps an archive flies on, and its logs wait for the disk.
+    Raises UsageError for a folder that holds a run, and for a folder that cannot be written; a board with an
+    archive flies on in spite of disk trouble, and its logs wait for the disk.
     """
     if request.archive is not None:
         logs_bytes = (2 if config.simulation is None else 3) * config.telemetry.budget_bytes
@@ -46,7 +46,7 @@ def begin_folder(request: RunRequest, text: str, config: Config) -> RunRequest:
 
 
 def open_log(folder: Path, stem: str, rig: Rig, config: Config, stack: ExitStack, patient: bool) -> FlightLog:
-    """Open one log of the run; on real time it is synchronised to disk once a second."""
+    """Open one log of the run, synchronised to disk once a second in real time."""
     log = FlightLog(
         folder,
         stem,

@@ -90,7 +90,7 @@ class Targets(Protocol):
         """Return the configured target in force at a mission time."""
 
     def slew(self, wanted: float, number: int, now_ns: int) -> Target:
-        """Return the target of a commanded slew. Raises UsageError for one that cannot be flown."""
+        """Return the target of a commanded slew. Raises UsageError if it cannot be flown."""
 
     def hold_here(self, estimate: Estimate, now_ns: int) -> Target:
         """Hold the present attitude, as near as the body can; return it as a target."""

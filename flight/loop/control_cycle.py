@@ -1,4 +1,4 @@
-"""One cycle at 40 Hz: bytes to estimate, mode and path to currents, all of it into the log."""
+"""One cycle at 40 Hz: from bytes to estimate, and by mode and path to currents; recorded in the log."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ KEPT = 65535
 
 
 class Reference(Protocol):
-    """The motion wanted at one instant; each body has its own cheap form of it."""
+    """The reference motion at one instant; each body has its own implementation."""
 
     @property
     def quaternion(self) -> FloatArray:
@@ -31,19 +31,19 @@ class Reference(Protocol):
 
 
 class AttitudeLaw(Protocol):
-    """Which attitude is wanted over time, as a body writes it."""
+    """The attitude to be reached over time, in a body's own form."""
 
     @property
     def text(self) -> str:
-        """The law in words, for events."""
+        """The law as text, for events."""
 
     def quaternion(self, now_ns: int) -> FloatArray:
-        """Return the attitude (4,) to be reached, as it stands at `now_ns`, reference into body."""
+        """Return the attitude (4,) to be reached at `now_ns`, reference into body."""
 
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """An attitude law that is wanted; `index` numbers it in packets: a step, COMMANDED and up, or KEPT."""
+    """An attitude law with its number in packets: that of a step, COMMANDED and up, or KEPT."""
 
     index: int
     law: AttitudeLaw
@@ -51,7 +51,7 @@ class Target:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CoilCommand:
-    """What a tracker asks of the coils: the dipole (3,) A m^2, and the currents (3,) A that make it."""
+    """A tracker's command: the dipole (3,) A m^2, and the currents (3,) A that make the dipole."""
 
     dipole: FloatArray
     currents: FloatArray
@@ -59,7 +59,7 @@ class CoilCommand:
 
 
 class SteeringState(IntEnum):
-    """What the coils are used for; the values are those of the control packet."""
+    """The use of the coils; the values are those of the control packet."""
 
     OFF = 0
     FOLLOWING = 1
@@ -69,13 +69,13 @@ class SteeringState(IntEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Steered:
-    """What steering did in one cycle.
+    """The result of steering in one cycle.
 
     Attributes:
         reference: the body's `Reference` now; None without a path.
-        dipole: (3,) A m^2, wanted of the coils.
-        currents: (3,) A, asked of the driver: after reallocation, with a probe of the coil watch, and zero
-            where a fault of this cycle switched the coils off.
+        dipole: (3,) A m^2, commanded.
+        currents: (3,) A, sent to the driver: after reallocation, with the coil watch's probe, and zero when a
+            fault of this cycle switched the coils off.
     """
 
     state: SteeringState
@@ -90,9 +90,9 @@ class ControlOutput:
     """The results of one control cycle.
 
     Attributes:
-        estimate: None where there is none; it may be carried on by the model alone.
+        estimate: measured, or propagated by the model alone; None without one.
         target: in force, None before the first.
-        written: what is on the wire at the end of the cycle.
+        written: the coil command on the wire at the end of the cycle.
     """
 
     cycle: Cycle

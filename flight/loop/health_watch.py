@@ -26,7 +26,7 @@ _FAILING_CYCLES = 60
 
 @dataclass(frozen=True, slots=True)
 class HealthInputs:
-    """The tasks and devices that health checks, beside the streams."""
+    """The tasks and devices that health checks, in addition to the streams."""
 
     modes: ModeControl
     drive: CoilDrive

@@ -1,1 +1,1 @@
-"""What the satellite is doing, and what makes it do something else."""
+"""The modes of the satellite and their transitions."""

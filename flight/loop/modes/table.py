@@ -75,7 +75,7 @@ TRANSITIONS: Table = {
         Trigger.DETUMBLED: Answer.STAY,
         Trigger.ARRIVED: Mode.HOLD,
     },
-    Mode.TESTBED_DEMO: {  # holds by itself while there is no plan, and goes on when there is one
+    Mode.TESTBED_DEMO: {  # without a plan it holds the attitude, and continues with the next plan
         **_STARTED,
         **_COMMANDED,
         Trigger.COMMAND_DEMO: Answer.STAY,

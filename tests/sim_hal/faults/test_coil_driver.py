@@ -1,4 +1,4 @@
-"""The coils' driver against a chip that lies: found by reading back, told while it lasts, mended after."""
+"""The coil driver with a faulty PWM chip: errors are read back, reported while they last, then corrected."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def errors_under(fault: str) -> tuple[list[tuple[float, str]], float]:
     seen = []
     for cycle in range(240):
         lock.clock.sleep_until_ns(epoch_ns + cycle * CYCLE_NS)
-        # A command that moves, as in flight: what is stuck shows.
+        # A changing command, as in flight, reveals a stuck output.
         coils.command(WANTED * (1.0 + 0.003 * cycle))
         seen.append((0.025 * cycle, coils.state().error))
     miss = float(np.abs(lock.hardware.circuit.currents() - coils.state().current).max())

@@ -1,4 +1,4 @@
-"""A broken coil is found and named from what the supply and the body say; sound ones are left alone."""
+"""A broken coil is detected and identified from supply current and motion; healthy coils never are."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_a_broken_axis_is_found_and_named(fault: str, names: set[str], within: f
 
 
 def test_sound_coils_of_another_resistance_raise_no_suspicion() -> None:
-    """15 % is copper at 60 degrees C; the commands of all three axes move."""
+    """15 % is copper at 60 degrees C; the commands of all three axes change."""
     seen = observe(hold(TARGET, noise=0.005, others=0.04), 20.0, gain=(0.87, 1.1, 1.0))
     assert seen.found == []
     assert seen.suspicious == 0
@@ -65,7 +65,7 @@ def test_an_axis_that_is_never_driven_is_not_judged() -> None:
 
 @pytest.mark.parametrize("fault", ["bridge-y: a-high", "bridge-y: b-high"])
 def test_a_leg_stuck_high_is_braked_and_its_coil_carries_nothing(fault: str) -> None:
-    """Whichever leg it is: both ends of the coil are high. Nothing but the broken coil carries a current."""
+    """With either leg, both ends of the coil are high. Only the broken coil carries a current."""
     seen = observe(hold(0.0), 10.0, [f"{fault} @ {FAULT_AT}"])
     assert seen.watch.braked == (False, True, False)
     time, carried = seen.times, np.abs(seen.carried)
@@ -76,7 +76,7 @@ def test_a_leg_stuck_high_is_braked_and_its_coil_carries_nothing(fault: str) -> 
 
 
 def test_a_brake_that_is_no_cure_is_taken_back() -> None:
-    """Too much current that does not fall: a monitor that lies, or a leg stuck low where one brakes."""
+    """Too much current that does not fall: a wrong monitor, or a leg stuck low under a brake."""
     leg = StuckLeg(0.04)
     at_rest = Supplied(0.148, -0.002, 0.002, (0, 1, 2), False)
     asked = []
@@ -105,13 +105,13 @@ def test_a_verdict_of_a_stuck_leg_that_the_brake_does_not_bear_out_is_braked_no_
 
 
 def reading(time: float, current: float) -> PowerReading:
-    """Return what a monitor says at `time` s of a current in A."""
+    """Return a monitor's reading at `time` s of a current in A."""
     now_ns = round(time * 1e9)
     return PowerReading(now_ns, 5.0, current, 5.0 * current, current, now_ns - 300_000_000)
 
 
 def test_a_stuck_leg_of_an_axis_that_is_driven_is_told_from_one_that_carries_nothing() -> None:
-    """With the command against it a stuck leg takes no supply current, as an open coil does: rest tells."""
+    """Under an opposing command a stuck leg draws no supply current, like an open coil: rest decides."""
     command = np.array([-FULL])
     assert supply_current(command, CoilFault.A_HIGH, FULL) == pytest.approx(0.0)
     leg = StuckLeg(0.04)
@@ -130,12 +130,12 @@ def test_a_stuck_leg_of_an_axis_that_is_driven_is_told_from_one_that_carries_not
 
 
 def windows(time: float, _: ImuReading) -> FloatArray:
-    """Return B-dot's currents of a body that turns fast: off and fully on, four times a second."""
+    """Return B-dot's currents for a fast rotation: off and fully on, four times a second."""
     return np.array([0.0 if time % 0.25 < 0.1 else FULL, 0.0, 0.0])
 
 
 def test_a_leg_stuck_high_that_drives_in_the_pauses_of_the_command_is_found() -> None:
-    """As much flows in the pauses as should flow between them: no conversion tells one from the other."""
+    """The current in the pauses equals that between them: no conversion can distinguish the two."""
     seen = observe(windows, FAULT_AT + 7.0, [f"bridge-x: b-high @ {FAULT_AT}"])
     assert [(axis, name) for _, axis, name in seen.found] == [("x", "HIGH")]
     assert seen.watch.braked == (True, False, False)
@@ -150,7 +150,7 @@ def test_to_look_at_rest_only_is_no_suspicion() -> None:
 
 
 def test_a_rest_ends_when_the_monitor_falls_silent() -> None:
-    """Whoever has the coils put to rest must not leave them there."""
+    """Without readings, a rest must still end."""
     watch = CoilWatch(CoilWatchSettings((FULL, FULL, FULL)))
     rested = []
     for cycle in range(160):
@@ -178,7 +178,7 @@ def wander(rng: np.random.Generator, samples: int) -> FloatArray:
 
 
 def test_in_eight_minutes_of_wild_commands_there_is_no_false_alarm() -> None:
-    """Readings as the driver makes them, 2,388, seed 11: not one is suspected.
+    """2,388 readings as made by the driver, seed 11: none is suspected.
 
     Each with a gain within 15 %, an error within the thesis's 3.5 mA on every driven coil in every cycle, and
     the monitor's steps; single conversions miss the chopped current by 18 %. With none in N the rate of

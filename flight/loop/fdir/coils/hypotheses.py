@@ -130,7 +130,7 @@ def fits(
     axis: int | None = None,
     fault: CoilFault | None = None,
 ) -> bool:
-    """Return whether `fault` on `axis`, beside the known faults, explains nearly all readings."""
+    """Return whether `fault` on `axis`, together with the known faults, explains nearly all readings."""
     variants: list[CoilFault | None] = [known.get(number) for number in range(3)]
     if axis is not None:
         variants[axis] = fault

@@ -12,7 +12,7 @@ MS = 1_000_000
 
 
 class Notes:
-    """An observer that remembers."""
+    """An observer that records all reports."""
 
     def __init__(self) -> None:
         self.cycles: list[tuple[str, int]] = []

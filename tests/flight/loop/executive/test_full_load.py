@@ -1,7 +1,6 @@
-"""The bench of the executive: what it concludes from known lateness, and a few seconds of the flight itself.
+"""The bench of the executive: its conclusions from known lateness, and a few seconds of a flight.
 
-The flight's bounds leave room for a machine that others use; a loop that waits for its workers, or bursts,
-breaks them all the same.
+The flight's bounds allow for a shared machine; a loop that waits for its workers, or bursts, exceeds them.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ _kept: list[npt.NDArray[np.float64]] = []
 
 
 def _grid(late_ns: npt.ArrayLike) -> Grid:
-    """Return a loop that was so late at each slot; one that was later than the next slot skipped that."""
+    """Return a loop with the given lateness at each slot; lateness beyond the next slot skips that slot."""
     late = np.asarray(late_ns, dtype=np.int64)
     starts = np.maximum.accumulate((FIRST + np.arange(len(late))) * PERIOD_NS + late)
     return on_grid(np.unique(starts), PERIOD_NS, FIRST, len(late))
@@ -72,7 +71,7 @@ def test_a_lost_slot_is_the_machines_only_when_the_bare_loop_lost_it_or_its_neig
     [
         (15, 20, True),
         (15, 10, False),
-        # Whoever is late for long of himself is not excused by the little that is always taken meanwhile.
+        # Lateness of its own is not excused by the small load that is always present.
         (90, 40, False),
         (90, 50, True),
     ],
@@ -90,7 +89,7 @@ def test_a_slot_is_the_hosts_when_it_took_what_makes_it_lost(
 
 
 def test_a_leak_is_seen_through_the_memory_of_jobs_that_come_and_go() -> None:
-    """Half of all looks find a job's 50 MiB; of 20 seeds the 95 % interval holds the truth in 16 or more."""
+    """Half of the samples hold a job of 50 MiB; the 95 % interval covers the truth for 16 of 20 seeds or more."""
     seconds = np.arange(0.0, 600.0, 0.5)
     held = {0.0: 0, 5.0: 0}
     for seed in range(20):
@@ -125,15 +124,15 @@ def test_the_bare_loop_wakes_at_its_slots_and_never_before() -> None:
     assert np.diff(slots).min() >= 1
     assert slots[0] > begun // 5_000_000
     assert np.median(wakes % 5_000_000) < 2_500_000
-    # No more than all cores are there to be taken from.
+    # At most all cores can be used.
     assert 0 <= stolen_ns[-1] - stolen_ns[0] <= (os.cpu_count() or 1) * (wakes[-1] - wakes[0]) + 20_000_000
 
 
 def test_memory_that_a_process_touches_is_seen_and_its_processor_time_too() -> None:
     me = {"me": os.getpid()}
-    process_watch.unshared(me)  # what looking itself takes is there then
+    process_watch.unshared(me)  # includes the memory that sampling itself needs
     before, alone = process_watch.look(me), process_watch.unshared(me)
-    # Mapped, not from the heap: what earlier tests of this process freed there would be taken again.
+    # Mapped, not from the heap, where memory freed by earlier tests would be reused.
     held = np.frombuffer(mmap.mmap(-1, 32 << 20))
     spent = time.process_time()
     while time.process_time() - spent < 0.1:
@@ -153,7 +152,7 @@ def test_a_slope_is_told_from_minutes_on_and_not_before() -> None:
 
 
 def fill_and_free(_: Any) -> tuple[int, float]:
-    """Take 48 MiB in pieces and free all but the last: the heap cannot shrink, as after a frame's work.
+    """Allocate 48 MiB in pieces and free all but the last: the heap cannot shrink, as after a frame.
 
     Returns this process and the bytes that it holds then.
     """
@@ -185,9 +184,9 @@ def test_six_seconds_of_flight_keep_the_grid_with_planner_and_vision_at_work(tmp
     flown = fly(tmp_path, Load(6.0, camera_period=1.0, replan_period=0.25, warm_up=0.0), fifo=False)
     figures = flown.figures
     assert figures["slots"] == pytest.approx(240, abs=40)
-    # Counted by the loop and found in its times; slots after the last cycle are in the first alone.
+    # Counted by the loop and computed from its times; only the first includes slots after the last cycle.
     assert figures["slips"] == pytest.approx(figures["lost"], abs=12)
-    # A loop that waits for its workers loses most slots; a machine that others use, some.
+    # A loop that waits for its workers loses most slots; a loop on a shared machine, some.
     assert figures["lost_beyond_machine"] < 0.4 * figures["slots"]
     assert figures["lateness_s"]["p50"] < 0.5e-9 * PERIOD_NS
     assert figures["execution_s"]["p50"] < 1e-9 * PERIOD_NS
@@ -197,7 +196,7 @@ def test_six_seconds_of_flight_keep_the_grid_with_planner_and_vision_at_work(tmp
     assert 40.0 < figures["memory_median_mib"] < 300.0
     assert figures["memory_alone_max_mib"] >= figures["memory_max_mib"]
     assert 0.0 < figures["ready_s"] < figures["first_command_s"] < 30.0
-    # The same flight with half a core more, and with one cycle more lost, would be told.
+    # The same flight with half a core more, and with one more lost cycle, would fail.
     assert "processor_control" in misses(figures | {"processor_control": 0.36})
     assert "lost_beyond_machine" in misses(figures | {"lost_beyond_machine": 1})
     assert "memory_slope_mib_per_hour" in misses(figures | {"memory_slope_interval": (1.5, 3.0)})

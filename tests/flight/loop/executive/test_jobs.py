@@ -42,7 +42,7 @@ def die(_: Any) -> Any:
 
 
 def worker(name: str, function: Callable[[Any], Any]) -> Worker:
-    # Short where the time itself is asked for; to start takes seconds on a machine that others use.
+    # Short where the timeout itself is tested; starting takes seconds on a shared machine.
     patience = 1500 if function is hang else 20_000
     return Worker(name, function, latency_ns=50 * MS, timeout_ns=patience * MS)
 

@@ -1,4 +1,4 @@
-"""What a process does about its memory, each seen in a process of its own."""
+"""Memory settings of a process, each tested in a process of its own."""
 
 from __future__ import annotations
 

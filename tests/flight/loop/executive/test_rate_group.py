@@ -1,4 +1,4 @@
-"""Rate groups keep to their grid, whatever the clock does."""
+"""Rate groups keep to their grid with any clock."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How much of a coil's torque the body feels, where the loop stands still now and then."""
+"""The gain of a coil, estimated across stalls of the loop."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ FIELD = np.array([0.0, 0.0, 60e-6])
 INERTIA, DIPOLE = 0.02, 60.0
 TICK_NS = 25_000_000
 STAND_EVERY = 176
-"""Cycles from one stand of the loop to the next: 4.4 s."""
+"""Cycles from one stall of the loop to the next: 4.4 s."""
 STANDS = 36
 STALE = 12
-"""Cycles after which the coils' driver, or the guardian, lets a command go."""
+"""Cycles after which the coil driver, or the guardian, zeroes a command."""
 
 
 def _fly(driver_lets_go: bool, told: bool, cycles: int = 1200) -> tuple[list[float], int]:
-    """Drive coil x; the loop stands still now and then, its samples coming in a burst after.
+    """Drive coil x with a loop that stalls now and then; its samples arrive in a burst after each stall.
 
-    The driver lets the coils go meanwhile, and says when; or a guardian does, of which nobody hears, unless
-    the loop is `told` that it knows nothing of that time.
-    Returns the gains of coil x that were believed, and how often an axis was taken to be reversed.
+    Meanwhile the driver zeroes the coils, and reports when; or a guardian does without a report, unless the
+    loop is `told` that the currents of that time are unknown.
+    Returns the trusted gains of coil x, and how often an axis was found reversed.
     """
     settings = ResponseSettings(np.eye(3) * INERTIA, DIPOLE, 1e-4, free=(False, True, False))
     response, noise = CoilResponse(settings), np.random.default_rng(3)

@@ -1,4 +1,4 @@
-"""Facts count after so many statements in a row, latch, rest where they are not watched, and tell once."""
+"""Facts count after N updates in a row, latch, reset in modes without watch, and report once."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from flight.loop.modes.triggers import Trigger
 
 
 class Told:
-    """A sink that remembers."""
+    """A sink that records events."""
 
     def __init__(self) -> None:
         self.names: list[str] = []

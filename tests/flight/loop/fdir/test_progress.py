@@ -1,4 +1,4 @@
-"""The watchdog is fed only while every group and every worker gets on."""
+"""The watchdog is fed only while no group and no worker is stalled."""
 
 from __future__ import annotations
 

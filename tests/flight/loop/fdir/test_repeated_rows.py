@@ -1,4 +1,4 @@
-"""A frame that is partly an earlier one is told from its rows; a living camera's frames never are."""
+"""A partly overwritten frame is detected by its rows; a working camera's frames never are."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Resources: shares and slopes of what was read, bounds with persistence, and a wall clock that is set."""
+"""Resources: shares and slopes of the samples, bounds with persistence, and steps of the wall clock."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A stream is alive, at its rate and valid, each told apart; stale is never good."""
+"""Liveness, rate and validity of a stream are checked separately; a stale stream is never good."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PERIOD = 25_000_000
 
 
 def fed(seconds: float, every: int = 1, value: float = 0.5, row: Stream = ROW) -> tuple[StreamWatch, int]:
-    """Return a watch that took every so-manieth sample for some seconds, and the time then."""
+    """Return a watch that got every n-th sample for some seconds, and the time after them."""
     watch = StreamWatch(row, 0)
     count = round(seconds * 40)
     for k in range(0, count, every):

@@ -1,4 +1,4 @@
-"""Reactions and the table of transitions fit: what the table answers can happen."""
+"""Reactions and the transition table agree: every answer of the table can happen."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Tests of what outlives the process."""
+"""Tests of the state that outlives the process."""

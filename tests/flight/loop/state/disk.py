@@ -1,4 +1,4 @@
-"""A disk in memory that can lose its power: what was not synced may be there, in part, or not at all."""
+"""A disk in memory that can lose power: unsynced data may be present, partly present, or absent."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class PowerLostError(BaseException):
 @dataclass
 class _Inode:
     durable: bytes | None
-    """What a sync made safe, None for a file that never was synced."""
+    """The content at the last sync, None for a file that was never synced."""
     cached: bytes
 
 
@@ -45,11 +45,11 @@ class Disk:
         """The names that power loss may find: the durable ones, and those after each change since."""
 
     def start(self, stop_before: int | None, failure: int = 0) -> None:
-        """Count anew, and fail at another call."""
+        """Reset the count, and fail at another call."""
         self.calls, self._stop_before, self._failure = 0, stop_before, failure
 
     def read(self, path: Path) -> bytes | None:
-        """Return what software sees while the power is on."""
+        """Return the content as seen while the power is on."""
         return self._inodes[self._names[path]].cached if path in self._names else None
 
     def create(self, path: Path) -> int:
@@ -68,7 +68,7 @@ class Disk:
         return descriptor
 
     def write(self, file: int, data: bytes) -> int:
-        """Take at most a bite."""
+        """Write at most `bite` bytes."""
         self._count()
         taken = data[: self._bite]
         self._inodes[self._open[file]].cached += taken
@@ -82,7 +82,7 @@ class Disk:
             inode.durable = inode.cached
 
     def close(self, file: int) -> None:
-        """Forget a descriptor."""
+        """Close a descriptor."""
         del self._open[file]
 
     def rename(self, old: Path, new: Path) -> None:
@@ -101,7 +101,7 @@ class Disk:
             self._steps = [self._names]
 
     def after_power_loss(self) -> Iterator[Disk]:
-        """Yield every disk that may be found when the power is back."""
+        """Yield every disk state that is possible after a power loss."""
         for names in self._steps:
             present = sorted(set(names.values()))
             for contents in product(*(_possible(self._inodes[i]) for i in present)):

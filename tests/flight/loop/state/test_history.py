@@ -1,4 +1,4 @@
-"""Crashes are remembered, counted in operating time, and forgotten by nothing but operating time."""
+"""Crashes are counted per operating time, and only operating time ages them out."""
 
 from __future__ import annotations
 

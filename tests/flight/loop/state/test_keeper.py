@@ -1,4 +1,4 @@
-"""The keeper writes beside the loop, tells what goes wrong, and never makes the loop wait."""
+"""The keeper writes outside the loop, reports failures, and never makes the loop wait."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def test_notices_that_nobody_takes_do_not_pile_up() -> None:
 
 
 class HungDisk(Disk):
-    """A disk whose sync does not return until it is let go."""
+    """A disk whose sync does not return until released."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""What one boot learned is the next one's start: believed as far as it may hold, and no further."""
+"""Parameters learned in one boot are the prior of the next, with an increased covariance."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.scenario import flights
 from tests.studies.campaigns.consistency_worlds import CYCLE_NS
 
 BOOT, SETTLED, AGAIN = 0, 600, 640
-"""Cycles: the first boot and its end, the second one's end a second after its start."""
+"""Cycles: the end of the first boot, and the end of the second, a second after its start."""
 CHANGED = 0.3
 
 
@@ -41,13 +41,13 @@ def booted(flown: Flight, begin: int, end: int, learned: dict[str, Learned]) -> 
 
 
 def error(estimate: Estimate, flown: Flight) -> FloatArray:
-    """Return the errors of torsion, damping and gain, over their spread at a start that knows nothing."""
+    """Return the errors of torsion, damping and gain, relative to the standard deviations of the prior."""
     spread = np.sqrt(np.diag(slow_prior(SUSPENDED, SETTINGS).parameters_covariance))
     return np.asarray((np.array(estimate.parameters) - np.array(flown.parameters)) / spread)
 
 
 def test_the_second_boot_knows_the_plant_better_after_a_second_than_the_first_did() -> None:
-    """Four plants; rms of each parameter. In the first boot's 15 s a damping is hardly to be seen."""
+    """Four plants; rms of each parameter. In the first boot's 15 s the damping is hardly observable."""
     begun, begun_again = [], []
     for seed in range(4):
         flown = fly(seed, AGAIN, suspended=True)
@@ -132,7 +132,7 @@ def test_a_plant_that_is_configured_otherwise_is_another_one() -> None:
 
 def test_a_flight_begins_where_the_last_one_ended_and_with_a_lost_state_anew(tmp_path: Path) -> None:
     def torsion_after(seconds: float, folder: Path, run: str) -> tuple[float, float, list[str]]:
-        """Fly; return the thread's torsion that is kept at the end, its sigma, and the events."""
+        """Fly; return the stored torsion of the thread, its sigma, and the events."""
         config = flights.demo_config(seconds, camera=False)
         config = configuration.replace(config, state=configuration.replace(config.state, folder=str(folder)))
         names = flights.event_names(flights.fly(config, tmp_path / run))

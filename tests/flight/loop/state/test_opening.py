@@ -104,7 +104,7 @@ def test_a_service_flies_run_after_run_into_its_archive_and_tells_a_crash_before
     assert state.operated == pytest.approx(3.0, abs=1.1), "a second of preparation and two of flight"
     with ExitStack() as killed:
         open_state(configuration.load(path), {}, ManualClock(), killed)
-        killed.pop_all()  # as kill -9 would: nobody closes anything
+        killed.pop_all()  # like kill -9: nothing is closed
     second = fly(request)
     assert second.folder.name == "run-000002"
     names = [to_text(name) for name in read_run(second.folder)["event"]["name"]]

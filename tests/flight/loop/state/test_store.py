@@ -1,4 +1,4 @@
-"""Whatever happens while the state is written, the old or the new one is read back, never anything else."""
+"""After any failure while the state is written, either the old or the new state is read back."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def _stored(disk: Disk, told: Told) -> StateStore:
 
 
 def calls_of_one_write(bite: int) -> int:
-    """Return how many calls that change the disk one `store` takes."""
+    """Return how many calls of one `store` change the disk."""
     disk = Disk(bite=bite)
     store = _stored(disk, Told())
     disk.start(None)
@@ -84,7 +84,7 @@ def calls_of_one_write(bite: int) -> int:
 
 @pytest.mark.parametrize("bite", [1 << 30, 100])
 def test_power_loss_before_every_call_leaves_the_old_state_or_the_new(bite: int) -> None:
-    """Every call of the write, and for each every content and name the disk may then be found with."""
+    """Every call of the write, and for each every content and name that the disk may then have."""
     calls, found = calls_of_one_write(bite), 0
     assert calls >= 10
     for stop in range(calls + 1):
@@ -160,7 +160,7 @@ def test_the_newer_copy_wins_and_its_loss_falls_back_to_the_older(tmp_path: Path
 
 
 def test_a_copy_that_is_not_there_is_no_damage(tmp_path: Path) -> None:
-    """First writes that were cut short, again and again, leave the first copy alone."""
+    """First writes that are interrupted repeatedly leave the first copy alone."""
     (tmp_path / COPIES[0]).write_bytes(encode(3, state_of(3)))
     told = Told()
     assert StateStore(tmp_path, told).load() == state_of(3)
@@ -251,7 +251,7 @@ from tests.flight.loop.state.test_store import Told, state_of
 from flight.loop.state.store import StateStore
 
 # A child for each round: it stores 1, 2, 3 ... until it is killed. The parent, which pays the imports once,
-# kills it at a random moment, and tells what may then be found.
+# kills it at a random moment, and knows which states may then be found.
 import random, time
 folder, rounds, draw = Path(sys.argv[1]), int(sys.argv[2]), random.Random(int(sys.argv[3]))
 number = midway = 0
@@ -286,7 +286,7 @@ print(midway)
 
 
 def test_two_hundred_kills_at_random_moments_leave_the_old_state_or_the_new(tmp_path: Path) -> None:
-    """SIGKILL, 200 times, in the middle of writing: what is read back is what was done last or being done."""
+    """SIGKILL, 200 times, while writing: the state read back is the last written or the one in progress."""
     seed = 20260115
     done = subprocess.run(
         [sys.executable, "-c", WRITER, str(tmp_path), "200", str(seed)],
