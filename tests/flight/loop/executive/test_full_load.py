@@ -89,7 +89,7 @@ def test_a_slot_is_the_hosts_when_it_took_what_makes_it_lost(
 
 
 def test_a_leak_is_seen_through_the_memory_of_jobs_that_come_and_go() -> None:
-    """Half of the samples hold a job of 50 MiB; the 95 % interval covers the truth for 16 of 20 seeds or more."""
+    """Half of the samples hold a job of 50 MiB; the 95 % interval covers the truth for at least 16 seeds."""
     seconds = np.arange(0.0, 600.0, 0.5)
     held = {0.0: 0, 5.0: 0}
     for seed in range(20):

@@ -40,7 +40,7 @@ def state_of(number: int) -> StoredState:
     )
 
 
-class Told:
+class Reports:
     """Collects events."""
 
     def __init__(self) -> None:
@@ -53,22 +53,22 @@ class Told:
 
 
 def test_what_is_stored_is_read_back_by_another_process_of_the_application(tmp_path: Path) -> None:
-    told = Told()
-    store = StateStore(tmp_path, told)
+    reports = Reports()
+    store = StateStore(tmp_path, reports)
     assert store.load() == StoredState(), "a folder without a state is a first boot"
     for number in (1, 2, 3):
         assert store.store(state_of(number))
-        assert StateStore(tmp_path, told).load() == state_of(number)
-    assert not told.kinds
+        assert StateStore(tmp_path, reports).load() == state_of(number)
+    assert not reports.kinds
     assert {path.name for path in tmp_path.iterdir()} == set(COPIES)
 
 
-def _stored(disk: Disk, told: Told) -> StateStore:
+def _stored(disk: Disk, reports: Reports) -> StateStore:
     """Return a store on a disk that holds the states 1 and 2, as a new process sees it."""
-    first = StateStore(FOLDER, told, disk)
+    first = StateStore(FOLDER, reports, disk)
     first.store(state_of(1))
     first.store(state_of(2))
-    store = StateStore(FOLDER, told, disk)
+    store = StateStore(FOLDER, reports, disk)
     assert store.load() == state_of(2)
     return store
 
@@ -76,7 +76,7 @@ def _stored(disk: Disk, told: Told) -> StateStore:
 def calls_of_one_write(bite: int) -> int:
     """Return how many calls of one `store` change the disk."""
     disk = Disk(bite=bite)
-    store = _stored(disk, Told())
+    store = _stored(disk, Reports())
     disk.start(None)
     store.store(state_of(3))
     return disk.calls
@@ -88,8 +88,8 @@ def test_power_loss_before_every_call_leaves_the_old_state_or_the_new(bite: int)
     calls, found = calls_of_one_write(bite), 0
     assert calls >= 10
     for stop in range(calls + 1):
-        disk, told = Disk(bite=bite), Told()
-        store = _stored(disk, told)
+        disk, reports = Disk(bite=bite), Reports()
+        store = _stored(disk, reports)
         disk.start(stop)
         if stop < calls:
             with pytest.raises(PowerLostError):
@@ -97,10 +97,10 @@ def test_power_loss_before_every_call_leaves_the_old_state_or_the_new(bite: int)
         else:
             store.store(state_of(3))
         for after in disk.after_power_loss():
-            told = Told()
+            reports = Reports()
             allowed = [state_of(3)] if stop == calls else [state_of(2), state_of(3)]
-            assert StateStore(FOLDER, told, after).load() in allowed
-            assert not told.kinds, "a crash is no damage"
+            assert StateStore(FOLDER, reports, after).load() in allowed
+            assert not reports.kinds, "a crash is no damage"
             found += 1
     assert found > 30
 
@@ -109,82 +109,82 @@ def test_power_loss_before_every_call_leaves_the_old_state_or_the_new(bite: int)
 def test_the_model_of_power_loss_tells_a_write_that_forgets_to_sync(forgotten: str) -> None:
     """The test above can fail: without either sync the disk may hold an old state, or none."""
     disk = Disk(forget=forgotten)
-    _stored(disk, Told()).store(state_of(3))
-    states = [StateStore(FOLDER, Told(), after).load() for after in disk.after_power_loss()]
+    _stored(disk, Reports()).store(state_of(3))
+    states = [StateStore(FOLDER, Reports(), after).load() for after in disk.after_power_loss()]
     assert any(state != state_of(3) for state in states)
 
 
 @pytest.mark.parametrize("error", [errno.ENOSPC, errno.EIO, errno.EROFS])
 def test_a_disk_that_fails_at_any_call_keeps_a_whole_state_and_says_so(error: int) -> None:
     for stop in range(calls_of_one_write(1 << 30)):
-        disk, told = Disk(), Told()
-        store = _stored(disk, told)
+        disk, reports = Disk(), Reports()
+        store = _stored(disk, reports)
         disk.start(stop, error)
         durable = store.store(state_of(3))
-        assert told.kinds == [events.STATE_UNWRITTEN]
-        assert "state-b.json" in told.texts[0]
-        assert durable == ("state-a.json" not in told.texts[0])
+        assert reports.kinds == [events.STATE_UNWRITTEN]
+        assert "state-b.json" in reports.texts[0]
+        assert durable == ("state-a.json" not in reports.texts[0])
         disk.start(None)
-        assert StateStore(FOLDER, Told(), disk).load() in [state_of(2), state_of(3)]
+        assert StateStore(FOLDER, Reports(), disk).load() in [state_of(2), state_of(3)]
         assert store.store(state_of(4)), "a disk that works again is written again"
-        assert StateStore(FOLDER, Told(), disk).load() == state_of(4)
+        assert StateStore(FOLDER, Reports(), disk).load() == state_of(4)
 
 
 @pytest.mark.parametrize("copy", COPIES)
 def test_damage_to_one_copy_at_any_byte_loses_nothing_and_is_told(tmp_path: Path, copy: str) -> None:
-    StateStore(tmp_path, Told()).store(state_of(1))
+    StateStore(tmp_path, Reports()).store(state_of(1))
     path = tmp_path / copy
     whole = path.read_bytes()
     torn = [whole[:end] for end in range(len(whole))]
     flipped = [bytes([*whole[:i], whole[i] ^ (1 << i % 8), *whole[i + 1 :]]) for i in range(len(whole))]
     for data in [*torn, *flipped, whole + b"x", bytes(len(whole))]:
         path.write_bytes(data)
-        told = Told()
-        assert StateStore(tmp_path, told).load() == state_of(1)
-        assert told.kinds == [events.STATE_RECOVERED]
-        assert copy in told.texts[0]
+        reports = Reports()
+        assert StateStore(tmp_path, reports).load() == state_of(1)
+        assert reports.kinds == [events.STATE_RECOVERED]
+        assert copy in reports.texts[0]
 
 
 def test_the_newer_copy_wins_and_its_loss_falls_back_to_the_older(tmp_path: Path) -> None:
     (tmp_path / COPIES[0]).write_bytes(encode(7, state_of(7)))
     (tmp_path / COPIES[1]).write_bytes(encode(8, state_of(8)))
-    told = Told()
-    assert StateStore(tmp_path, told).load() == state_of(8)
+    reports = Reports()
+    assert StateStore(tmp_path, reports).load() == state_of(8)
     (tmp_path / COPIES[1]).write_bytes(encode(8, state_of(8))[:-1])
-    assert StateStore(tmp_path, told).load() == state_of(7)
-    assert told.kinds == [events.STATE_RECOVERED]
-    store = StateStore(tmp_path, told)
+    assert StateStore(tmp_path, reports).load() == state_of(7)
+    assert reports.kinds == [events.STATE_RECOVERED]
+    store = StateStore(tmp_path, reports)
     store.load()
     store.store(state_of(9))
-    assert StateStore(tmp_path, Told()).load() == state_of(9)
+    assert StateStore(tmp_path, Reports()).load() == state_of(9)
 
 
 def test_a_copy_that_is_not_there_is_no_damage(tmp_path: Path) -> None:
     """First writes that are interrupted repeatedly leave the first copy alone."""
     (tmp_path / COPIES[0]).write_bytes(encode(3, state_of(3)))
-    told = Told()
-    assert StateStore(tmp_path, told).load() == state_of(3)
-    assert not told.kinds
+    reports = Reports()
+    assert StateStore(tmp_path, reports).load() == state_of(3)
+    assert not reports.kinds
     (tmp_path / COPIES[0]).write_bytes(b"torn")
-    assert StateStore(tmp_path, told).load() == StoredState(running=True)
-    assert told.kinds == [events.STATE_LOST]
+    assert StateStore(tmp_path, reports).load() == StoredState(running=True)
+    assert reports.kinds == [events.STATE_LOST]
 
 
 def test_two_damaged_copies_give_defaults_that_count_as_an_unclean_shutdown(tmp_path: Path) -> None:
     for name in COPIES:
         (tmp_path / name).write_bytes(b"\0" * 300)
-    told = Told()
-    assert StateStore(tmp_path, told).load() == StoredState(running=True)
-    assert told.kinds == [events.STATE_LOST]
+    reports = Reports()
+    assert StateStore(tmp_path, reports).load() == StoredState(running=True)
+    assert reports.kinds == [events.STATE_LOST]
 
 
 def test_a_copy_that_cannot_be_read_is_told_with_the_systems_words(tmp_path: Path) -> None:
-    StateStore(tmp_path, Told()).store(state_of(1))
+    StateStore(tmp_path, Reports()).store(state_of(1))
     (tmp_path / COPIES[1]).unlink()
     (tmp_path / COPIES[1]).mkdir()
-    told = Told()
-    assert StateStore(tmp_path, told).load() == state_of(1)
-    assert "Is a directory" in told.texts[0]
+    reports = Reports()
+    assert StateStore(tmp_path, reports).load() == state_of(1)
+    assert "Is a directory" in reports.texts[0]
 
 
 def _with_crc(text: str) -> bytes:
@@ -218,7 +218,7 @@ def test_a_right_checksum_does_not_make_a_wrong_content_right(key: str, value: o
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])
 def test_what_is_not_finite_is_refused_before_anything_is_written(tmp_path: Path, bad: float) -> None:
-    store = StateStore(tmp_path, Told())
+    store = StateStore(tmp_path, Reports())
     with pytest.raises(ValueError, match="finite"):
         store.store(StoredState(learned={"b": Learned((bad,), ((1.0,),))}))
     with pytest.raises(ValueError, match="finite"):
@@ -234,20 +234,20 @@ def test_random_bytes_are_never_a_state(data: bytes) -> None:
 
 
 def test_real_files_are_replaced_by_name_and_the_temporary_one_is_gone(tmp_path: Path) -> None:
-    store = StateStore(tmp_path, Told(), LinuxFiles())
+    store = StateStore(tmp_path, Reports(), LinuxFiles())
     store.store(state_of(1))
     inodes = [(tmp_path / name).stat().st_ino for name in COPIES]
     (tmp_path / "state-a.tmp").write_bytes(b"left by a crash, longer than what comes now" * 100)
     store.store(state_of(2))
     assert [(tmp_path / name).stat().st_ino for name in COPIES] != inodes
     assert {path.name for path in tmp_path.iterdir()} == set(COPIES)
-    assert StateStore(tmp_path, Told()).load() == state_of(2)
+    assert StateStore(tmp_path, Reports()).load() == state_of(2)
 
 
 WRITER = """
 import os, signal, sys
 from pathlib import Path
-from tests.flight.loop.state.test_store import Told, state_of
+from tests.flight.loop.state.test_store import Reports, state_of
 from flight.loop.state.store import StateStore
 
 # A child for each round: it stores 1, 2, 3 ... until it is killed. The parent, which pays the imports once,
@@ -259,7 +259,7 @@ for round in range(rounds):
     read, write = os.pipe()
     child = os.fork()
     if child == 0:
-        store = StateStore(folder, Told())
+        store = StateStore(folder, Reports())
         store.load()
         while True:
             number += 1
@@ -274,12 +274,12 @@ for round in range(rounds):
     while piece := os.read(read, 65536):
         trace += piece
     os.close(read)
-    told = Told()
-    found = StateStore(folder, told).load().boot_count
+    reports = Reports()
+    found = StateStore(folder, reports).load().boot_count
     begun, ended = int(trace.rstrip(b">").rpartition(b"<")[2]), trace.endswith(b">")
     assert begun - (not ended) <= found <= begun, (round, trace, found)
     midway += not ended
-    assert not told.kinds, told.texts
+    assert not reports.kinds, reports.texts
     number = found
 print(midway)
 """
