@@ -34,7 +34,7 @@ class Signs:
             return (rigged.lock.clock.now_ns() - rigged.epoch_ns) / SECOND
 
         rigged.loop._tasks.health._feed = lambda: self.fed.append(now())
-        rigged.loop._around = replace(rigged.loop._around, beat=lambda: self.beats.append(now()))
+        rigged.loop._supervisors = replace(rigged.loop._supervisors, beat=lambda: self.beats.append(now()))
 
 
 def failing(rigged: Rigged, since: float, until: float) -> None:
