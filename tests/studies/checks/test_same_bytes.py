@@ -12,7 +12,14 @@ from flight.link.telemetry.definitions import EVENT, IMU, RUN, TARGET, Field, Pa
 from flight.link.telemetry.packets import Packer, compile_layouts
 from tests.studies.same_bytes.__main__ import main
 from tests.studies.same_bytes.comparison import Verdict, compare
-from tests.studies.same_bytes.flights import FLIGHTS, TABLE_FILE, FlightError, check_out, resolve
+from tests.studies.same_bytes.flights import (
+    FLIGHTS,
+    TABLE_FILE,
+    FlightError,
+    check_out,
+    packet_table,
+    resolve,
+)
 
 OLD = (RUN, IMU, TARGET)
 RUN_VALUES: dict[str, object] = {
@@ -172,6 +179,18 @@ def test_seven_flights_are_compared() -> None:
 def test_an_unknown_revision_is_wrong_use(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--against", "no-such-revision"]) == 2
     assert capsys.readouterr().err.startswith("same_bytes: git rev-parse")
+
+
+def test_the_packet_table_is_the_checkouts_own_in_the_old_layout_too(tmp_path: Path) -> None:
+    """An editable installation of this project must not stand in for a module that the checkout lacks."""
+    definitions = tmp_path / "flight/telemetry/definitions.py"
+    definitions.parent.mkdir(parents=True)
+    for folder in (tmp_path / "flight", definitions.parent):
+        (folder / "__init__.py").touch()
+    definitions.write_text(
+        "from dataclasses import dataclass\n@dataclass\nclass P:\n    name: str\nPACKETS = (P('own'),)\n"
+    )
+    assert json.loads(packet_table(tmp_path)) == [{"name": "own"}]
 
 
 @pytest.mark.slow

@@ -21,15 +21,20 @@ from pathlib import Path
 TABLE_FILE = "packets.json"
 _FLIGHT_LIMIT = 3600.0  # s of the machine's time for one flight
 _DUMP_TABLE = """
-import dataclasses, importlib, json, sys
+import dataclasses, importlib, json, os, sys
+# A project installed as editable serves the modules that this checkout does not have.
+sys.meta_path = [finder for finder in sys.meta_path if "editable" not in str(finder).lower()]
 for name in ("flight.link.telemetry.definitions", "flight.telemetry.definitions"):
     try:
-        table = importlib.import_module(name).PACKETS
+        table = importlib.import_module(name)
         break
     except ModuleNotFoundError:
         continue
 else:
     sys.exit("no packet definitions found")
+if not table.__file__.startswith(os.getcwd()):
+    sys.exit(f"{table.__file__} is not of this checkout")
+table = table.PACKETS
 json.dump([dataclasses.asdict(packet) for packet in table], sys.stdout)
 """
 
@@ -118,7 +123,7 @@ def fly(checkout: Path, flight: Flight, out: Path) -> None:
     work.parent.mkdir(parents=True, exist_ok=True)
     try:
         _python(checkout, "-m", "flight", "run", *flight.arguments, "--out", str(work), "--json")
-        (work / TABLE_FILE).write_text(_python(checkout, "-c", _DUMP_TABLE), encoding="utf-8")
+        (work / TABLE_FILE).write_text(packet_table(checkout), encoding="utf-8")
     except FlightError as error:
         shutil.rmtree(work, ignore_errors=True)
         raise FlightError(f"{flight.name} in {checkout}: {error}") from error
@@ -126,9 +131,14 @@ def fly(checkout: Path, flight: Flight, out: Path) -> None:
     work.rename(out)
 
 
+def packet_table(checkout: Path) -> str:
+    """Return a checkout's packet definitions as JSON. Raises FlightError when it has none."""
+    return _python(checkout, "-c", _DUMP_TABLE)
+
+
 def cache_folder(root: Path, commit: str, flight: Flight) -> Path:
     """Return where a commit's flight is kept: commit, flight, and a hash of all else it depends on."""
-    key = json.dumps([flight.arguments, _machine(), sys.version, _libraries()])
+    key = json.dumps([_DUMP_TABLE, flight.arguments, _machine(), sys.version, _libraries()])
     return root / commit[:12] / f"{flight.name}-{hashlib.sha256(key.encode()).hexdigest()[:12]}"
 
 
