@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -29,6 +28,7 @@ from tests.flight.gnc.estimation.flights import (
     fly,
     follow,
 )
+from tests.pace import ordinary_seconds
 from tests.studies.campaigns.consistency_worlds import CYCLE_NS
 
 BOTH = pytest.mark.parametrize("suspended", [True, False], ids=["suspended", "free"])
@@ -305,13 +305,14 @@ def test_a_cycle_and_a_replay_fit_into_the_40_hz_loop(suspended: bool) -> None:
     """Mean of a cycle under 0.5 ms, a replay of 1.6 s under 20 ms of CPU; asserted at twice that."""
     flight = fly(14, 400, suspended)
     filter_ = begin(flight, suspended)
-    begun = time.process_time()
-    for cycle in range(1, 400):
-        follow(filter_, flight, cycle, cycle + 1)
-        filter_.at(cycle * CYCLE_NS + 2_000_000)
-    spent = time.process_time() - begun
-    assert spent / 399 < 1e-3
+
+    def cycles() -> None:
+        for cycle in range(1, 400):
+            follow(filter_, flight, cycle, cycle + 1)
+            filter_.at(cycle * CYCLE_NS + 2_000_000)
+
+    assert ordinary_seconds(cycles, 1) / 399 < 1e-3
     mean = exposure(flight, 336, 376, 1e-9 * np.eye(3))
-    begun = time.process_time()
-    assert filter_.measure(mean)
-    assert time.process_time() - begun < 40e-3
+    accepted = []
+    assert ordinary_seconds(lambda: accepted.append(filter_.measure(mean)), 1) < 40e-3
+    assert accepted == [True]

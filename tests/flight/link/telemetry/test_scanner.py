@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flight.link.telemetry.definitions import CONTROL, EVENT, IMU, TARGET, TRUTH
+from flight.link.telemetry.definitions import CONTROL, EVENT, IMU, TARGET
 from flight.link.telemetry.packets import LAYOUTS, Packer, TelemetryError, crc16
 from flight.link.telemetry.scanner import ScanResult, decode, scan
 from tests.flight.link.telemetry.samples import plain_contents, timing_packets
+from tests.pace import ordinary_seconds
+from tests.studies.bench.scan import log
 
 
 def cycles(result: ScanResult) -> list[int]:
@@ -135,14 +135,11 @@ def test_kinds_of_packets_are_told_apart_in_order() -> None:
     assert result.intact
 
 
-def test_the_log_of_700_s_is_scanned_in_about_a_second() -> None:
-    packer = Packer()
-    kinds = [(kind, plain_contents(kind)) for kind in (IMU, CONTROL, TRUTH)]
-    second = b"".join(packer.pack(kind, i, values) for i in range(1000) for kind, values in kinds)
-    start = time.perf_counter()
-    result = scan(second * 28)
-    assert time.perf_counter() - start < 1.5
-    assert result.counts == {"imu": 28_000, "control": 28_000, "truth": 28_000}
+def test_a_log_four_times_as_long_takes_about_four_times_as_long() -> None:
+    """`python -m tests.studies.bench scan` measures the log of 700 s."""
+    short, long = log(1_000), log(4_000)
+    assert scan(long).counts == {"imu": 4_000, "control": 4_000, "truth": 4_000}
+    assert ordinary_seconds(lambda: scan(long), 5) < 6.0 * ordinary_seconds(lambda: scan(short), 5)
 
 
 def test_noise_holds_no_packets() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +12,7 @@ from flight.gnc.vision.startracker.identification.field import StarField
 from flight.gnc.vision.startracker.identification.identification import Identification, Status
 from flight.gnc.vision.startracker.identification.lost_in_space import identify
 from flight.gnc.vision.startracker.index.build import default_index
+from tests.pace import ordinary_seconds
 from tests.studies.bench.star_lists import ListKind, StarList, configurations, draw, draw_random
 
 SKY = default_index()
@@ -97,9 +97,7 @@ def test_a_refusal_keeps_to_its_work() -> None:
     drawn = draw_random(ListKind(known_deg=None), 40, np.random.default_rng(99))
     field = drawn.field()
     identify(field, SKY)
-    begin = time.process_time()
-    identify(field, SKY)
-    assert time.process_time() - begin < 0.2
+    assert ordinary_seconds(lambda: identify(field, SKY)) < 0.2
 
 
 @pytest.mark.parametrize("count", [0, 1, 3])

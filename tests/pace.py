@@ -1,0 +1,35 @@
+"""Processor time in seconds of an ordinary machine, so that a slow or busy one fails no limit.
+
+Each measurement is divided by what short vector additions take on the machine just before and after it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+ORDINARY_PACE_S = 4.5e-4
+"""Processor time of `pace_s` on the two-core machines that the limits are meant for."""
+
+
+def pace_s() -> float:
+    """Return the processor time of 1,000 additions of short vectors, s."""
+    vector = np.ones(3)
+    begun = time.process_time()
+    for _ in range(1_000):
+        np.add(vector, vector)
+    return time.process_time() - begun
+
+
+def ordinary_seconds(work: Callable[[], object], runs: int = 3) -> float:
+    """Return the least processor time of several runs of `work`, s; on a slower machine, scaled down."""
+    spans = []
+    for _ in range(runs):
+        before = pace_s()
+        begun = time.process_time()
+        work()
+        spent = time.process_time() - begun
+        spans.append(spent / max(1.0, (before + pace_s()) / 2.0 / ORDINARY_PACE_S))
+    return min(spans)
