@@ -3,11 +3,12 @@ PYTHON ?= python3
 VENV   ?= .venv
 RUN    := $(VENV)/bin/python
 READY  := $(VENV)/.ready
+TESTS  := $(RUN) -m pytest -n auto
 
-.PHONY: demo test lint types arrows docs unit pictures lock clean help
+.PHONY: demo quick test test-container lint types arrows docs house unit fast slow-list pictures lock clean help
 
-help:        ## list the targets
-	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
+help:           ## list the targets
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
 
 $(READY): pyproject.toml requirements.lock
 	$(PYTHON) -m venv $(VENV)
@@ -19,30 +20,45 @@ demo: $(READY)  ## fly the 700 s step demonstration on simulated hardware and pr
 	$(RUN) -m flight run config/step_demo.yaml --out runs/demo
 	$(RUN) -m flight report runs/demo
 
+quick: $(READY) ## style, import arrows and the fast tests: under 90 s on two cores
+	@$(MAKE) --no-print-directory lint arrows fast
+
 test: $(READY)  ## every check, two at a time
 	@$(MAKE) --no-print-directory --jobs 2 lint types arrows docs unit
+
+test-container: $(READY)  ## the service installed and booted under systemd in a container; needs root and nspawn
+	$(RUN) -m pytest -rs tests/deploy/test_container.py
 
 lint: $(READY)  ## style
 	$(VENV)/bin/ruff check . && $(VENV)/bin/ruff format --check --quiet .
 
-types: $(READY)  ## strict types
+types: $(READY) ## strict types
 	$(VENV)/bin/mypy
 
-arrows: $(READY)  ## the architecture's import arrows
+arrows: $(READY) ## the architecture's import arrows
 	$(VENV)/bin/lint-imports --no-cache
 
 docs: $(READY)  ## the documentation site, strict, into build/site
 	@NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs build --strict --quiet --site-dir build/site
 	$(RUN) -m tests.docs.built_site build/site
 
-unit: $(READY)  ## the tests, on all cores
-	$(RUN) -m pytest -n auto --dist loadfile
+house: $(READY) ## rooms, floors, arrows and sizes, drawn from the source
+	$(RUN) -m tests.studies.house
 
-pictures: $(READY)  ## the README's pictures
+unit: $(READY)  ## the tests, on all cores
+	$(TESTS) --dist loadfile
+
+fast: $(READY)  ## the tests that are not slow, on all cores
+	$(TESTS) --dist worksteal -m "not slow"
+
+slow-list: $(READY)  ## measure every test alone and write tests/slow.txt
+	$(RUN) -m pytest --write-slow-list
+
+pictures: $(READY) ## the README's pictures
 	$(RUN) -m tests.studies.pictures
 
 lock: $(READY)  ## write down the versions in use
 	$(VENV)/bin/pip freeze --exclude-editable > requirements.lock
 
-clean:       ## forget the virtual environment and the runs
+clean:          ## forget the virtual environment and the runs
 	rm -rf $(VENV) runs build *.egg-info

@@ -31,6 +31,9 @@ ReadWritePaths={_SHARE}/told.txt
 Environment=PATH={_SHARE}/bin:/usr/bin PYTHONPATH={ROOT}"""
 """What the sandbox must let through here: an interpreter in a home, and the stand-in for i2cset."""
 
+_HIDDEN = tuple(map(Path, ("/tmp", "/run", "/mnt", "/dev", "/proc", "/sys")))
+"""Where the container has mounts of its own, which cover this machine's files."""
+
 _TOOLS = ("systemd-nspawn", "unshare", "systemctl", "mount", "useradd")
 
 
@@ -45,6 +48,9 @@ def why_not() -> str:
         return f"{', '.join(missing)} missing: install systemd-container"
     if "overlay" not in Path("/proc/filesystems").read_text(encoding="ascii"):
         return "the kernel has no overlay file system"
+    for place in (ROOT, Path(sys.prefix), Path(sys.base_prefix)):
+        if reason := why_not_visible(place):
+            return reason
     trial = "mount -t cgroup2 cgroup2 /sys/fs/cgroup && test -w /sys/fs/cgroup/cgroup.procs"
     tried = subprocess.run(
         ["unshare", "--mount", "--propagation", "private", "sh", "-c", trial],
@@ -53,6 +59,16 @@ def why_not() -> str:
     )
     if tried.returncode != 0:
         return f"no writable cgroup2 hierarchy: {tried.stderr.decode().strip()}"
+    return ""
+
+
+def why_not_visible(place: Path) -> str:
+    """Return why the container would not see a folder of this machine, "" where it would."""
+    real = place.resolve()
+    if any(real.is_relative_to(hidden) for hidden in _HIDDEN):
+        return f"{place} is hidden in the container, which mounts {', '.join(map(str, _HIDDEN))} itself"
+    if real.stat().st_dev != Path("/").stat().st_dev:
+        return f"{place} is on a file system of its own, which the container's overlay of / leaves out"
     return ""
 
 
