@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from flight.bodies.testbed import body as testbed
 from flight.gnc.errors import PlanningError
 from flight.gnc.guidance.one_axis import job as plan_job
 from flight.gnc.guidance.one_axis.job import PlanJob
@@ -26,6 +27,11 @@ GOOD_PLANS = 2
 """The second is made at 5 s and ends at 15 s."""
 
 Spoil = Callable[[PlanJob, Plan], Plan]
+
+
+def use_planner(monkeypatch: pytest.MonkeyPatch, plan: Callable[[PlanJob], Plan]) -> None:
+    """Give the testbed another planner."""
+    monkeypatch.setattr(testbed, "TESTBED", replace(testbed.TESTBED, plan=plan))
 
 
 def fail(job: PlanJob, plan: Plan) -> Plan:
@@ -62,9 +68,9 @@ def start_elsewhere(job: PlanJob, plan: Plan) -> Plan:
 def test_after_two_good_plans_only_bad_ones_come(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spoil: Spoil, event: str
 ) -> None:
-    good = plan_job.run
-    monkeypatch.setattr(
-        plan_job, "run", lambda job: good(job) if job.number <= GOOD_PLANS else spoil(job, good(job))
+    use_planner(
+        monkeypatch,
+        lambda job: plan_job.run(job) if job.number <= GOOD_PLANS else spoil(job, plan_job.run(job)),
     )
     run = fly(thesis_config(DURATION), tmp_path)
     names = event_names(run)
@@ -85,8 +91,9 @@ def test_on_a_goal_horizon_one_good_plan_is_enough_to_arrive(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spoil: Spoil
 ) -> None:
     """The first path leads to the target; to hold its end is what is wanted then, and no alarm."""
-    good = plan_job.run
-    monkeypatch.setattr(plan_job, "run", lambda job: good(job) if job.number == 1 else spoil(job, good(job)))
+    use_planner(
+        monkeypatch, lambda job: plan_job.run(job) if job.number == 1 else spoil(job, plan_job.run(job))
+    )
     run = fly(demo_config(DURATION, camera=False), tmp_path)
     assert "holding" not in event_names(run)
     assert run["plan"]["accepted"].tolist() == [1, 0]
@@ -97,9 +104,8 @@ def test_on_a_goal_horizon_one_good_plan_is_enough_to_arrive(
 def test_a_new_target_without_a_plan_for_it_is_told_while_the_old_attitude_is_held(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    good = plan_job.run
-    monkeypatch.setattr(
-        plan_job, "run", lambda job: good(job) if job.end_q2 < -0.25 else fail(job, good(job))
+    use_planner(
+        monkeypatch, lambda job: plan_job.run(job) if job.end_q2 < -0.25 else fail(job, plan_job.run(job))
     )
     steps = (Step(at=0.0, q2=-0.3), Step(at=15.0, q2=-0.2))
     run = fly(configuration.replace(demo_config(20.0, camera=False), steps=steps), tmp_path)
