@@ -107,7 +107,7 @@ def _text(house: House, bars: Sequence[Bar], reached: Sequence[Any]) -> str:
             imported = sorted(house.rooms[room], key=lambda other: (-house.floors[other], other))
             lines.append(f"{floor + 1}  {room:14} {'-> ' if imported else ''}{', '.join(imported)}")
     lines += ["", f"{'product lines':34} {house.sizes.total:8}", *map(str, bars), ""]
-    lists = {
+    lists: dict[str, Sequence[object]] = {
         "arrows back": house.back,
         "circles": [" <-> ".join(circle) for circle in house.circles],
         "largest files": house.sizes.files[:5],

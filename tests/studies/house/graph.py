@@ -58,7 +58,7 @@ def room_graph(modules: Graph) -> dict[str, frozenset[str]]:
         if room is None:
             continue
         found = edges.setdefault(room, set())
-        found.update(other for target in targets if (other := room_of(target)) not in (None, room))  # type: ignore[misc]  # None is excluded
+        found.update(other for target in targets if (other := room_of(target)) not in (None, room))
     return {room: frozenset(targets) for room, targets in edges.items()}
 
 

@@ -1,7 +1,8 @@
 """Which lines of `flight/` outside `gnc` the flights reach, measured by coverage.py in every process.
 
-The flights: the step demonstration's first 110 s in lock-step (two targets), 12 s of it in real time with
-workers, guardian and devices in processes of their own, and the five fault flights of
+The flights: the step demonstration's first 110 s in lock-step (two targets); 12 s of it in real time with
+workers, guardian and devices in processes of their own; two runs into one archive, as the service flies
+them, with a kept state and a time line of commands; and the five fault flights of
 `tests.studies.same_bytes`. A line is a statement as coverage.py counts them.
 """
 
@@ -22,6 +23,17 @@ FLOWN: tuple[tuple[Flight, tuple[str, ...]], ...] = (
     (Flight("realtime", "config/step_demo.yaml", 12), ("--realtime",)),
     *((flight, ()) for flight in FLIGHTS if flight.faults),
 )
+_SERVICE = """
+state: {{folder: {folder}/state}}
+commands:
+  socket: {folder}/commands
+  timeline:
+    - {{at: 4, mode: hold}}
+    - {{at: 8, slew: 0.1}}
+    - {{at: 20, mode: detumble}}
+    - {{at: 26, mode: safe}}
+    - {{at: 28, clear: safe}}
+"""
 _SETTINGS = """
 [run]
 source = {root}/flight
@@ -70,10 +82,14 @@ def measure(root: Path) -> list[FileReach]:
         settings.write_text(_SETTINGS.format(root=root, folder=folder), encoding="utf-8")
         (folder / "sitecustomize.py").write_text(_SAVE_OFTEN, encoding="utf-8")
         environment = {**os.environ, "PYTHONPATH": f"{folder}{os.pathsep}{root}"}
-        for flight, more in FLOWN:
-            out = folder / flight.name
+        service = folder / "service.yaml"
+        demonstration = (root / "config/step_demo.yaml").read_text(encoding="utf-8")
+        service.write_text(demonstration + _SERVICE.format(folder=folder), encoding="utf-8")
+        flown = [(flight, [*more, "--out", str(folder / flight.name)]) for flight, more in FLOWN]
+        archived = (Flight("service", str(service), 30), ["--archive", str(folder / "archive")])
+        for flight, more in (*flown, archived, archived):
             command = ["-m", "coverage", "run", f"--rcfile={settings}", "-m", "flight", "run"]
-            words = [*command, *flight.arguments, *more, "--out", str(out)]
+            words = [*command, *flight.arguments, *more]
             subprocess.run(
                 [sys.executable, *words], cwd=root, env=environment, check=True, stdout=subprocess.DEVNULL
             )
