@@ -48,9 +48,13 @@ def why_not() -> str:
         return f"{', '.join(missing)} missing: install systemd-container"
     if "overlay" not in Path("/proc/filesystems").read_text(encoding="ascii"):
         return "the kernel has no overlay file system"
-    for place in (ROOT, Path(sys.prefix), Path(sys.base_prefix)):
-        if reason := why_not_visible(place):
-            return reason
+    hidden = [why_not_visible(place) for place in (ROOT, Path(sys.prefix), Path(sys.base_prefix))]
+    if any(hidden):
+        return "; ".join(filter(None, hidden))
+    return _why_no_cgroup()
+
+
+def _why_no_cgroup() -> str:
     trial = "mount -t cgroup2 cgroup2 /sys/fs/cgroup && test -w /sys/fs/cgroup/cgroup.procs"
     tried = subprocess.run(
         ["unshare", "--mount", "--propagation", "private", "sh", "-c", trial],
