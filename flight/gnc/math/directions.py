@@ -23,3 +23,12 @@ def tangent_basis(direction: Iterable[float]) -> FloatArray:
     length = math.hypot(*first)
     a, b, c = first[0] / length, first[1] / length, first[2] / length
     return np.array(((a, b, c), (y * c - z * b, z * a - x * c, x * b - y * a)))
+
+
+def cross_matrices(vectors: FloatArray) -> FloatArray:
+    """Return [v x] (n, 3, 3) of vectors (n, 3)."""
+    matrices = np.zeros((len(vectors), 3, 3))
+    x, y, z = vectors.T
+    matrices[:, 0, 1], matrices[:, 0, 2], matrices[:, 1, 2] = -z, y, -x
+    matrices[:, 1, 0], matrices[:, 2, 0], matrices[:, 2, 1] = z, -y, x
+    return matrices

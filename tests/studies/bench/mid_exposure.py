@@ -26,8 +26,8 @@ from flight.gnc.attitude import esoq2
 from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.errors import FlightError
 from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.directions import cross_matrices
 from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector, multiply
-from flight.gnc.vision.objects.olae import cross_matrices
 from flight.gnc.vision.startracker.catalogue_refit import refit_with_catalogue
 from flight.gnc.vision.startracker.index.build import default_index
 from flight.gnc.vision.startracker.solution import FrameSolution

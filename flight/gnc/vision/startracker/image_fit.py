@@ -16,8 +16,8 @@ import numpy as np
 from flight.gnc.attitude.wahba import AttitudeError, AttitudeFix
 from flight.gnc.camera.lens import CameraModel
 from flight.gnc.math.arrays import BoolArray, FloatArray
+from flight.gnc.math.directions import cross_matrices
 from flight.gnc.math.quaternion import attitude_matrix, from_matrix
-from flight.gnc.vision.objects.olae import cross_matrices
 from flight.gnc.vision.startracker.identification.refinement import inflation, scale_slope, stretched, turned
 
 _MOST_STEPS = 8

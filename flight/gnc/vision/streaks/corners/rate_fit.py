@@ -11,9 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flight.gnc.attitude.olae import OlaeSolution, gain, rotation_between
 from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.math.arrays import BoolArray, FloatArray
-from flight.gnc.vision.objects.olae import OlaeSolution, cross_matrices, gain, solve
+from flight.gnc.math.directions import cross_matrices
 from flight.gnc.vision.streaks.corners.endpoints import chord_outward, extend
 from flight.gnc.vision.streaks.corners.grouping import rotation_angles, rotation_axis
 from flight.gnc.vision.streaks.corners.settings import StreakSettings
@@ -101,7 +102,7 @@ def _reject_and_solve(
     Raises numpy.linalg.LinAlgError when what remains does not fix a rotation.
     """
     weights = 1.0 / errors**2
-    solution = solve(vectors[used, 0], vectors[used, 1], weights[used])
+    solution = rotation_between(vectors[used, 0], vectors[used, 1], weights[used])
     for _ in range(_MOST_ROUNDS):
         z = np.stack(_components(vectors, solution)) / errors
         scale = np.maximum(_MAD_TO_SIGMA * np.median(np.abs(z[:, used]), axis=1), _LEAST_SCALE)
@@ -109,7 +110,7 @@ def _reject_and_solve(
         if np.array_equal(kept, used):
             break
         used = kept
-        solution = solve(vectors[used, 0], vectors[used, 1], weights[used])
+        solution = rotation_between(vectors[used, 0], vectors[used, 1], weights[used])
     return solution, used
 
 

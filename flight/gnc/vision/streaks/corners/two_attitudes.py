@@ -18,8 +18,8 @@ from flight.gnc.attitude.wahba import AttitudeFix
 from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.errors import FlightError
 from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.directions import cross_matrices
 from flight.gnc.math.quaternion import angle_between, attitude_matrix, conjugate, multiply, to_rotation_vector
-from flight.gnc.vision.objects.olae import cross_matrices
 
 
 @dataclass(frozen=True, slots=True)

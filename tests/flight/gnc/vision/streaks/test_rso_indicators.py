@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from flight.gnc.attitude.olae import rotation_between
 from flight.gnc.math.arrays import FloatArray
-from flight.gnc.vision.objects.olae import solve
 from flight.gnc.vision.objects.rso_indicators import (
     angular_displacements,
     centre_residuals,
@@ -48,7 +48,7 @@ def test_the_residual_is_that_of_olae() -> None:
     ends, _ = _stars(60.0)
     noisy = ends + np.random.default_rng(2).normal(0.0, 0.5, ends.shape)
     vectors = _PINHOLE.unit_vectors(noisy)
-    solution = solve(vectors[:, 0], vectors[:, 1], np.ones(len(ends)))
+    solution = rotation_between(vectors[:, 0], vectors[:, 1], np.ones(len(ends)))
     found = olae_residuals(vectors, solution.rotation_vector)
     np.testing.assert_allclose(found, np.linalg.norm(solution.residuals, axis=-1), rtol=1e-6)
 
