@@ -21,10 +21,10 @@ import numpy as np
 from flight.gnc.errors import FlightError
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import from_rotation_vector
+from flight.gnc.vision.startracker.two_ends import attitudes_of_ends
 from flight.gnc.vision.streaks.corners.rate_fit import RotationFit, fit_rotation
 from flight.gnc.vision.streaks.corners.settings import DETECTOR_NAMES, DetectorName, StreakSettings
 from flight.gnc.vision.streaks.corners.streaks import Segmented, measure_streaks, segment_frame
-from flight.gnc.vision.streaks.corners.two_attitudes import attitude_error, error_in_pixels, solve
 from tests.flight.gnc.vision.streaks.frames import (
     Camera,
     expose,
@@ -34,6 +34,7 @@ from tests.flight.gnc.vision.streaks.frames import (
     star_camera,
     true_endpoints,
 )
+from tests.studies.attitude_errors import attitude_error, error_in_pixels
 
 _SEED = 141_421
 _FIELD = float(np.deg2rad(20.0))
@@ -94,7 +95,7 @@ def _attitude_errors(
     star = distance.argmin(axis=1)
     known = distance[np.arange(len(ends)), star] < _MATCH_PX
     try:
-        found = solve(
+        found = attitudes_of_ends(
             ends[known], view.stars[star[known]], sigma[fit.used][known], camera.pinhole, exposure=1.0
         )
     except FlightError:

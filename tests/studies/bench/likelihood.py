@@ -15,7 +15,6 @@ import time
 import numpy as np
 
 from flight.gnc.math.arrays import FloatArray
-from flight.gnc.vision.streaks.bound import endpoint_bound
 from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from sim_hal.star_camera import render
@@ -28,6 +27,7 @@ from tests.flight.gnc.vision.maximum_likelihood.scenes import (
     turn_of,
 )
 from tests.sim_hal.star_camera.scenes import at_pixels, turning
+from tests.studies.streak_bound import endpoint_bound
 
 _SEED = 31_415
 _SETTINGS = LikelihoodSettings(saturation=SATURATION)

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from flight.gnc.math.arrays import FloatArray
-from flight.gnc.vision.streaks.bound import endpoint_bound, star_information
 from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion, paths, sensitivities
 from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
 from sim_hal.star_camera import StarCameraModel, render
@@ -24,6 +23,7 @@ from tests.flight.gnc.vision.maximum_likelihood.scenes import turn_of
 from tests.sim_hal.star_camera.scenes import at_pixels, turning
 from tests.studies.bench.streaks import estimated
 from tests.studies.campaigns.scenes import FIELD, noise_floor
+from tests.studies.streak_bound import endpoint_bound, star_information
 
 EXPOSURE = 0.2
 STARS = 4

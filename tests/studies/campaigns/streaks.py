@@ -16,15 +16,16 @@ import numpy as np
 
 from flight.gnc.errors import FlightError
 from flight.gnc.math.arrays import FloatArray
-from flight.gnc.vision.streaks.bound import rate_bound
+from flight.gnc.vision.startracker.two_ends import attitudes_of_ends
 from flight.gnc.vision.streaks.corners.settings import DETECTOR_NAMES, StreakSettings
 from flight.gnc.vision.streaks.corners.streak_rate import StreakStatus, estimate_rate
-from flight.gnc.vision.streaks.corners.two_attitudes import attitude_error, error_in_pixels, solve
 from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from sim_hal.star_camera import StarCameraModel
+from tests.studies.attitude_errors import attitude_error, error_in_pixels
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.scenes import FIELD, Scene, noise_floor, slew, usable
+from tests.studies.streak_bound import rate_bound
 
 THETAS_DEG = (0, 3, 10, 20, 30, 45, 60, 75, 90)
 PERCENTS = (5, 10, 20, 30, 50)
@@ -120,7 +121,7 @@ def _attitude(found: Any, scene: Scene, camera: StarCameraModel) -> tuple[float 
     star = distance.argmin(axis=1)
     known = distance[np.arange(len(ends)), star] < MATCH_PX
     try:
-        fixes = solve(
+        fixes = attitudes_of_ends(
             ends[known],
             scene.directions[star[known]],
             np.ones(int(known.sum())),

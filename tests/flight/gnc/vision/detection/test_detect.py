@@ -14,12 +14,12 @@ from flight.gnc.vision.startracker.detection import (
     kind_of_frame,
 )
 from flight.gnc.vision.startracker.detection.settings import Method
-from flight.gnc.vision.streaks.bound import star_information
 from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion
 from sim_hal.star_camera import StarCameraModel, render
 from tests.flight.gnc.vision.maximum_likelihood.scenes import real_sky
 from tests.sim_hal.star_camera.scenes import at_pixels, still
 from tests.studies.bench.centroids import compare, frame_of, matched, point_bound, star_places
+from tests.studies.streak_bound import star_information
 
 SMALL = StarCameraModel(columns=320, rows=256, field_of_view=np.radians(6.25))
 MIDDLE = np.array([[160.3, 128.2]])

@@ -9,9 +9,9 @@ import numpy as np
 from flight.gnc import catalogue
 from flight.gnc.math import quaternion
 from flight.gnc.math.arrays import FloatArray, Image
-from flight.gnc.vision.streaks.bound import RateBound, rate_bound
 from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion, paths
 from sim_hal.star_camera import StarCameraModel, render
+from tests.studies.streak_bound import RateBound, rate_bound
 
 CAMERA = StarCameraModel()
 SATURATION = float(CAMERA.highest_count)

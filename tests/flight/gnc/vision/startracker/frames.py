@@ -12,9 +12,9 @@ from flight.gnc.math.arrays import FloatArray, Image
 from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
 from flight.gnc.vision.startracker.index.build import default_index
 from flight.gnc.vision.startracker.index.sky_index import SkyIndex
-from flight.gnc.vision.streaks.bound import rate_bound, star_information
 from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion
 from sim_hal.star_camera import StarCameraModel, render
+from tests.studies.streak_bound import rate_bound, star_information
 
 EPOCH = 2026.5
 NARROW = StarCameraModel(field_of_view=float(np.radians(12.0)))

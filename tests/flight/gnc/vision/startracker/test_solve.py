@@ -14,8 +14,8 @@ from flight.gnc.math.quaternion import conjugate, from_rotation_vector, multiply
 from flight.gnc.vision.frame_job import solve_frame
 from flight.gnc.vision.startracker.solution import FrameSolution, SolveStatus
 from flight.gnc.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings
-from flight.gnc.vision.streaks.corners.two_attitudes import attitude_error
 from tests.flight.gnc.vision.startracker.frames import NARROW, SkyFrame, sky, sky_frame
+from tests.studies.attitude_errors import attitude_error
 from tests.studies.bench.sky import ARCSECONDS, photograph
 
 _KNOWN_TO_A_PERCENT = 0.99, 1.01

@@ -15,14 +15,9 @@ from flight.gnc.math.quaternion import (
     multiply,
     normalise,
 )
+from flight.gnc.vision.startracker.two_ends import attitudes_of_ends
 from flight.gnc.vision.streaks.corners.settings import StreakSettings
 from flight.gnc.vision.streaks.corners.streak_rate import StreakStatus, estimate_rate
-from flight.gnc.vision.streaks.corners.two_attitudes import (
-    attitude_error,
-    error_in_pixels,
-    field_fraction,
-    solve,
-)
 from tests.flight.gnc.vision.streaks.frames import (
     expose,
     random_stars,
@@ -30,6 +25,11 @@ from tests.flight.gnc.vision.streaks.frames import (
     read_out,
     star_camera,
     true_endpoints,
+)
+from tests.studies.attitude_errors import (
+    attitude_error,
+    error_in_pixels,
+    field_fraction,
 )
 
 _CAMERA = star_camera()
@@ -49,10 +49,12 @@ def test_exact_endpoints_give_back_the_rate_its_angle_and_axis(theta_deg: float,
     rate = rate_at(np.deg2rad(theta_deg), fraction * _FIELD / exposure, 0.7)
     stars = _field(1)
     ends = true_endpoints(_CAMERA, stars, rate * exposure)
-    found = solve(ends, stars, np.full(len(stars), 0.1), _CAMERA.pinhole, exposure)
+    found = attitudes_of_ends(ends, stars, np.full(len(stars), 0.1), _CAMERA.pinhole, exposure)
     np.testing.assert_allclose(found.rate, rate, atol=1e-11 / exposure)
-    assert found.principal_angle == pytest.approx(fraction * _FIELD, abs=1e-11)
-    np.testing.assert_allclose(found.principal_axis, rate / np.linalg.norm(rate), atol=1e-8)
+    assert np.linalg.norm(found.rotation_vector) == pytest.approx(fraction * _FIELD, abs=1e-11)
+    np.testing.assert_allclose(
+        found.rotation_vector / np.linalg.norm(found.rotation_vector), rate / np.linalg.norm(rate), atol=1e-8
+    )
     assert field_fraction(found.rate, exposure, _FIELD) == pytest.approx(fraction, rel=1e-8)
     # Half the turn either way of mid-exposure, whose axes the stars are given in.
     for fix, sign in ((found.start, -0.5), (found.end, 0.5)):
@@ -63,7 +65,7 @@ def test_the_sign_is_that_of_a_star_fixed_in_the_sky() -> None:
     """A camera turning about +y sees its stars go to -x: v' = -omega x v at v = z is (-omega_y, omega_x)."""
     stars = _field(2)
     ends = _CAMERA.pinhole.project(stars)[:, None] + np.array([[4.0, 0.0], [-4.0, 0.0]])
-    found = solve(ends, stars, np.full(len(stars), 0.1), _CAMERA.pinhole, 1.0)
+    found = attitudes_of_ends(ends, stars, np.full(len(stars), 0.1), _CAMERA.pinhole, 1.0)
     assert found.rate[1] > 0.0
     assert abs(found.rate[0]) < 0.05 * found.rate[1]
 
@@ -72,12 +74,18 @@ def test_the_equations_as_printed_hold_with_the_sign_corrected() -> None:
     """3.24-3.26 by their matrices: Delta from start to end, its trace, its skew part."""
     rate = rate_at(np.deg2rad(50.0), 0.1, 0.3)
     stars = _field(3)
-    found = solve(true_endpoints(_CAMERA, stars, rate), stars, np.full(12, 0.1), _CAMERA.pinhole, 1.0)
+    found = attitudes_of_ends(
+        true_endpoints(_CAMERA, stars, rate), stars, np.full(12, 0.1), _CAMERA.pinhole, 1.0
+    )
     delta = attitude_matrix(found.end.quaternion) @ attitude_matrix(found.start.quaternion).T
     angle = np.arccos(0.5 * (np.trace(delta) - 1.0))
     skew = (delta.T - delta) / (2.0 * np.sin(angle))
-    assert found.principal_angle == pytest.approx(angle, abs=1e-12)
-    np.testing.assert_allclose(found.principal_axis, [skew[2, 1], skew[0, 2], skew[1, 0]], atol=1e-10)
+    assert np.linalg.norm(found.rotation_vector) == pytest.approx(angle, abs=1e-12)
+    np.testing.assert_allclose(
+        found.rotation_vector / np.linalg.norm(found.rotation_vector),
+        [skew[2, 1], skew[0, 2], skew[1, 0]],
+        atol=1e-10,
+    )
 
 
 def test_the_attitudes_are_of_the_frame_the_reference_is_given_in() -> None:
@@ -87,7 +95,7 @@ def test_the_attitudes_are_of_the_frame_the_reference_is_given_in() -> None:
     ends = true_endpoints(_CAMERA, stars, rate)
     # Catalogue directions of the same stars: mid-exposure's axes are A(q) of the catalogue's.
     catalogue = stars @ attitude_matrix(q)
-    found = solve(ends, catalogue, np.full(12, 0.1), _CAMERA.pinhole, 1.0)
+    found = attitudes_of_ends(ends, catalogue, np.full(12, 0.1), _CAMERA.pinhole, 1.0)
     middle = multiply(from_rotation_vector(0.5 * found.rotation_vector), found.start.quaternion)
     assert angle_between(middle, q) < 1e-11
 
@@ -101,7 +109,7 @@ def test_the_covariance_is_that_of_the_errors() -> None:
     squared = []
     for _ in range(runs):
         noisy = ends + sigma[:, None, None] * rng.normal(size=ends.shape)
-        found = solve(noisy, stars, sigma, _CAMERA.pinhole, exposure)
+        found = attitudes_of_ends(noisy, stars, sigma, _CAMERA.pinhole, exposure)
         error = found.rate - rate
         squared.append(error @ np.linalg.solve(found.covariance, error))
     assert np.mean(squared) == pytest.approx(3.0, abs=3.0 * np.sqrt(6.0 / runs))
@@ -134,7 +142,7 @@ def test_a_frame_with_its_stars_known_gives_both_attitudes_to_a_fifth_of_a_pixel
     distance = np.linalg.norm(truth[None] - ends[:, None], axis=-1).max(axis=-1)
     star = np.nanargmin(distance, axis=1)
     assert distance[np.arange(len(ends)), star].max() < 1.0
-    found = solve(ends, stars[star], np.full(len(ends), 0.1), _CAMERA.pinhole, 1.0)
+    found = attitudes_of_ends(ends, stars[star], np.full(len(ends), 0.1), _CAMERA.pinhole, 1.0)
     for fix, sign in ((found.start, -0.5), (found.end, 0.5)):
         across = attitude_error(fix.quaternion, from_rotation_vector(sign * rate))[1]
         assert error_in_pixels(across, 1024, _FIELD) < 0.2
@@ -146,4 +154,4 @@ def test_an_impossible_exposure_is_refused() -> None:
     ends = true_endpoints(_CAMERA, stars, rate_at(1.0, 0.02))
     for exposure in (0.0, -1.0, float("nan")):
         with pytest.raises(FlightError, match="exposure"):
-            solve(ends, stars, np.full(12, 0.1), _CAMERA.pinhole, exposure)
+            attitudes_of_ends(ends, stars, np.full(12, 0.1), _CAMERA.pinhole, exposure)

@@ -1,0 +1,30 @@
+"""How far an attitude or a rate is from the truth, in the thesis's measures (Sease 3.28, 3.29)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import angle_between, attitude_matrix, conjugate, multiply
+
+
+def field_fraction(rate: FloatArray, exposure: float, field_of_view: float) -> float:
+    """Return the turn during the exposure as a part of the field of view, rad (3.28)."""
+    return float(np.linalg.norm(rate)) * exposure / field_of_view
+
+
+def error_in_pixels(angle: float, resolution: int, field_of_view: float) -> float:
+    """Return an angular error in rad as px, for a camera of `resolution` px across its field, rad (3.29)."""
+    return angle * resolution / field_of_view
+
+
+def attitude_error(estimate: FloatArray, truth: FloatArray) -> tuple[float, float]:
+    """Return the errors (whole, across) of an attitude (4,), rad.
+
+    Whole is the angle of the turn from truth to estimate; across is the angle between the two boresights,
+    free of the turn about the boresight, which a narrow field knows some ten times worse.
+    """
+    difference = multiply(estimate, conjugate(truth))
+    boresight = attitude_matrix(difference)[:, 2]
+    across = np.arctan2(np.hypot(boresight[0], boresight[1]), boresight[2])
+    return float(angle_between(estimate, truth)), float(across)
