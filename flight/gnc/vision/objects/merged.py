@@ -16,6 +16,7 @@ from scipy import ndimage
 
 from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.math.arrays import BoolArray, FloatArray
+from flight.gnc.vision.frame.regions import label_pixels, line_of
 from flight.gnc.vision.objects.star_light import (
     SHAPE_ERROR,
     spread_over,
@@ -23,8 +24,8 @@ from flight.gnc.vision.objects.star_light import (
     star_path,
     straight_path,
 )
+from flight.gnc.vision.streaks.corners.segmentation import Regions
 from flight.gnc.vision.streaks.corners.streaks import Segmented
-from flight.gnc.vision.streaks.segmentation import Regions
 
 # Room about a region, px: more than the point spread reaches.
 _ROOM = 8
@@ -130,15 +131,13 @@ def brightest_left(patch: Patch, left: FloatArray) -> FloatArray | None:
     lit = np.maximum(patch.signal, 0.0)
     error = np.hypot(patch.smoothed_noise, SHAPE_ERROR * patch.smoothed(lit))
     seen = patch.smoothed(left)
-    labels, count = ndimage.label(seen > _LEFT_SIGMAS * error, structure=np.ones((3, 3)))
-    if count == 0:
-        return None
+    pixel = np.flatnonzero(seen > _LEFT_SIGMAS * error)
+    owner, count = label_pixels(pixel, seen.shape[1])
     inside = np.where(patch.mask, np.maximum(left, 0.0), 0.0)
-    flux = np.bincount(labels.ravel(), inside.ravel())
-    flux[0] = 0.0
-    if flux.max() <= 0.0:
+    flux = np.bincount(owner, inside.reshape(-1)[pixel], count)
+    if flux.max(initial=0.0) <= 0.0:
         return None
-    y, x = np.nonzero(labels == int(np.argmax(flux)))
+    y, x = np.divmod(pixel[owner == int(np.argmax(flux))], seen.shape[1])
     guess = _moment_line(np.stack([x, y], axis=-1).astype(float), seen[y, x])
     ends = _fit_line(patch, left, guess + patch.corner)
     longer = _grown(patch, seen, ends)
@@ -148,11 +147,8 @@ def brightest_left(patch: Patch, left: FloatArray) -> FloatArray | None:
 def _moment_line(points: FloatArray, weight: FloatArray) -> FloatArray:
     """Return the ends (2, 2) px of the uniform line with the moments of the bright ones of pixels (n, 2)."""
     points = points[weight >= 0.5 * np.percentile(weight, 80.0)]
-    centre = points.mean(axis=0)
-    (across, along), axes = np.linalg.eigh(np.cov(points.T, bias=True) if len(points) > 1 else np.eye(2))
-    length = float(np.sqrt(12.0 * max(along - across, 0.0)))
-    half = 0.5 * length * axes[:, 1] if length > _LEAST_LINE_PX else np.zeros(2)
-    return np.stack([centre - half, centre + half])
+    spread = np.cov(points.T, bias=True) if len(points) > 1 else np.eye(2)
+    return line_of(points.mean(axis=0), spread, _LEAST_LINE_PX)
 
 
 def _grown(patch: Patch, seen: FloatArray, ends: FloatArray) -> FloatArray | None:

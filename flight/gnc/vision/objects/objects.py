@@ -21,11 +21,13 @@ import numpy as np
 from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.errors import FlightError
 from flight.gnc.math.arrays import BoolArray, FloatArray, Image, IntArray
+from flight.gnc.vision.frame.regions import line_of, positions
 from flight.gnc.vision.objects.merged import brightest_left, cut_patch, fit_stars
 from flight.gnc.vision.objects.rso_indicators import INDICATORS, Indicators, evaluate, star_ends
 from flight.gnc.vision.objects.star_light import Explanation, StarLight, carried_to_middle
 from flight.gnc.vision.streaks.corners.endpoints import chord_outward, extend
 from flight.gnc.vision.streaks.corners.rate_fit import fit_rotation
+from flight.gnc.vision.streaks.corners.segmentation import Regions
 from flight.gnc.vision.streaks.corners.settings import StreakSettings
 from flight.gnc.vision.streaks.corners.streaks import (
     Segmented,
@@ -35,7 +37,6 @@ from flight.gnc.vision.streaks.corners.streaks import (
     near_border,
     segment_frame,
 )
-from flight.gnc.vision.streaks.segmentation import Regions, positions
 
 # Corners nearer to one another are one, seen twice.
 _LEAST_CROSSING_PX = 10.0
@@ -392,8 +393,5 @@ def _line_of(segmented: Segmented, regions: Regions, index: int) -> FloatArray:
     weight = weight[bright] / weight[bright].sum()
     centre = weight @ points
     offset = points - centre
-    (across, along), axes = np.linalg.eigh((offset * weight[:, None]).T @ offset)
-    length = np.sqrt(12.0 * (along - across))
     # Shorter than the point spread the moments tell noise, not length.
-    half = 0.5 * length * axes[:, 1] if length > _LEAST_LINE_PX else np.zeros(2)
-    return np.stack([centre - half, centre + half])
+    return line_of(centre, (offset * weight[:, None]).T @ offset, _LEAST_LINE_PX)

@@ -24,10 +24,10 @@ import numpy as np
 from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.math.arrays import BoolArray, FloatArray
 from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector
+from flight.gnc.vision.frame.background import MAD_TO_SIGMA
 from flight.gnc.vision.streaks.corners.grouping import centre_of_rotation
 
 INDICATORS = ("centre", "displacement", "residual")
-_MAD_TO_SIGMA = 1.4826
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,5 +167,5 @@ def _fired(deviations: FloatArray, bounds: tuple[float, float, float], strict: f
     """
     if not len(deviations):
         return np.zeros((0, 3), dtype=np.bool_)
-    spread = _MAD_TO_SIGMA * np.median(np.abs(deviations), axis=0)
+    spread = MAD_TO_SIGMA * np.median(np.abs(deviations), axis=0)
     return np.asarray(np.abs(deviations) > np.maximum(bounds, strict * spread))

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from flight.gnc.math.arrays import BoolArray, FloatArray, Image, IntArray
+from flight.gnc.vision.frame.regions import label_pixels, moments
+from flight.gnc.vision.frame.saturation import saturation_of_bright
 from flight.gnc.vision.startracker.detection.sky import BrightPixels, Sky
 
 _BLOCK = 32
-# A count that so many pixels share, and none exceeds, may be where the converter saturates: it is, if so many
-# times fewer stand within this part of it below.
-_PLATEAU, _PILED_UP, _PLATEAU_REACH = 4, 2.0, 0.02
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,50 +54,28 @@ class Areas:
 
 def find_areas(pixels: Image, sky: Sky, bright: BrightPixels, saturation: float | None) -> Areas:
     """Return the 8-connected areas of `bright` pixels, with moments in `pixels` less the sky."""
-    first, second = adjoining(bright.index, bright.shape[1])
-    count, owner = connected(first, second, len(bright.index))
+    owner, count = label_pixels(bright.index, bright.shape[1])
     row, column = np.divmod(bright.index, bright.shape[1])
     counts = pixels[row, column].astype(np.float64)
     light = np.maximum(counts - sky.level.at(column, row), 0.0)
-    flux = np.bincount(owner, light, count).astype(np.float64)
-    whole = np.where(flux > 0.0, flux, np.inf)
-    x, y = np.bincount(owner, light * column, count) / whole, np.bincount(owner, light * row, count) / whole
-    dx, dy = column - x[owner], row - y[owner]
-    xx = np.bincount(owner, light * dx * dx, count) / whole
-    yy = np.bincount(owner, light * dy * dy, count) / whole
-    xy = np.bincount(owner, light * dx * dy, count) / whole
-    spread = np.hypot(xx - yy, 2.0 * xy)
-    ceiling = _ceiling(counts, pixels, saturation)
+    found = moments(owner, column, row, light, count)
+    ceiling = saturation_of_bright(counts, pixels, saturation)
     return Areas(
         row,
         column,
         owner,
         bright.smooth,
-        _peaks(bright.smooth, first, second),
+        _peaks(bright.smooth, *_adjoining(bright.index, bright.shape[1])),
         counts >= ceiling,
         ceiling,
         np.bincount(owner, minlength=count),
-        flux,
-        np.stack([x, y], axis=-1),
-        np.sqrt(12.0 * spread),
-        np.sqrt(np.maximum(0.5 * (xx + yy - spread), 0.0)),
-        0.5 * np.arctan2(2.0 * xy, xx - yy),
+        found.flux,
+        found.centre,
+        found.length,
+        found.thickness,
+        found.direction,
         bright.shape,
     )
-
-
-def adjoining(index: IntArray, columns: int) -> tuple[IntArray, IntArray]:
-    """Return the pairs (p,) of pixels that touch, by number in `index` (m,), flat and increasing.
-
-    Two pixels that the frame's border parts are never both given: the outermost columns hold none.
-    """
-    pairs = []
-    for step in (1, columns - 1, columns, columns + 1):
-        other = np.searchsorted(index, index + step)
-        other[other == len(index)] = 0
-        first = np.flatnonzero(index[other] == index + step) if len(index) else other
-        pairs.append((first, other[first]))
-    return np.concatenate([p[0] for p in pairs]), np.concatenate([p[1] for p in pairs])
 
 
 def cluttered(areas: Areas, place: IntArray, share: float) -> BoolArray:
@@ -117,16 +94,18 @@ def cluttered(areas: Areas, place: IntArray, share: float) -> BoolArray:
     return found
 
 
-def connected(first: IntArray, second: IntArray, count: int) -> tuple[int, IntArray]:
-    """Return how many groups the pairs (p,) make of `count` pixels, and each one's group (count,)."""
-    from scipy import sparse  # noqa: PLC0415 - a process that only names the detection need not hold it
-    from scipy.sparse import csgraph  # noqa: PLC0415
+def _adjoining(index: IntArray, columns: int) -> tuple[IntArray, IntArray]:
+    """Return the pairs (p,) of pixels that touch, by number in `index` (m,), flat and increasing.
 
-    if not count:
-        return 0, np.zeros(0, dtype=np.int64)
-    graph = sparse.coo_matrix((np.ones(len(first), dtype=np.int8), (first, second)), (count, count))
-    groups, owner = csgraph.connected_components(graph, directed=False)
-    return int(groups), owner.astype(np.int64)
+    Two pixels that the frame's border parts are never both given: the outermost columns hold none.
+    """
+    pairs = []
+    for step in (1, columns - 1, columns, columns + 1):
+        other = np.searchsorted(index, index + step)
+        other[other == len(index)] = 0
+        first = np.flatnonzero(index[other] == index + step) if len(index) else other
+        pairs.append((first, other[first]))
+    return np.concatenate([p[0] for p in pairs]), np.concatenate([p[1] for p in pairs])
 
 
 def _peaks(smooth: FloatArray, first: IntArray, second: IntArray) -> BoolArray:
@@ -138,21 +117,3 @@ def _peaks(smooth: FloatArray, first: IntArray, second: IntArray) -> BoolArray:
     best[first[smooth[first] <= smooth[second]]] = False
     best[second[smooth[second] < smooth[first]]] = False
     return best
-
-
-def _ceiling(counts: FloatArray, pixels: Image, given: float | None) -> float:
-    """Return the count at which pixels clip: given, seen as a plateau, or the type's top; inf for none."""
-    if given is not None:
-        return given
-    top = float(np.iinfo(pixels.dtype).max) if pixels.dtype.kind in "ui" else np.inf
-    highest = counts.max(initial=-np.inf)
-    if highest >= top:
-        return top
-    # Counts pile up where the converter ends; in a dim frame's noise the last count is the rarest.
-    if not len(counts):
-        return top
-    at_top = int(np.count_nonzero(counts == highest))
-    step = max(1.0, _PLATEAU_REACH * float(highest - np.median(counts)))
-    below = int(np.count_nonzero(counts >= highest - step)) - at_top
-    flat = at_top >= _PLATEAU and at_top > _PILED_UP * below
-    return float(highest) if flat else top

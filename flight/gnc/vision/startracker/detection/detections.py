@@ -8,6 +8,7 @@ from enum import Enum, IntFlag
 import numpy as np
 
 from flight.gnc.math.arrays import BoolArray, FloatArray, IntArray
+from flight.gnc.vision.records import select
 
 
 class Quality(IntFlag):
@@ -89,18 +90,7 @@ class Detections:
 
     def select(self, chosen: BoolArray | IntArray) -> Detections:
         """Return those that `chosen` picks, by mask (n,) or by number in the order given."""
-        return Detections(
-            self.points[chosen],
-            self.sigma[chosen],
-            self.covariance[chosen],
-            self.flux[chosen],
-            self.background[chosen],
-            self.signal_to_noise[chosen],
-            self.width[chosen],
-            self.quality[chosen],
-            self.prediction[chosen],
-            self.psf_sigma,
-        )
+        return select(self, chosen, "psf_sigma")
 
     def in_order(self) -> Detections:
         """Return them with the brightest first."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from flight.gnc.math.arrays import BoolArray, FloatArray, Image, IntArray
+from flight.gnc.vision.frame.background import MAD_TO_SIGMA
+from flight.gnc.vision.frame.saturation import saturation_level
 from flight.gnc.vision.startracker.detection.detect import assemble, confirmed, plain_ones, quality_of
 from flight.gnc.vision.startracker.detection.detections import Detections
 from flight.gnc.vision.startracker.detection.first_look import first_look, frame_spread
@@ -16,7 +18,6 @@ from flight.gnc.vision.startracker.detection.windows import Windows, cut, smooth
 
 # Room about the search: the sky is taken from the pixels of its rim.
 _RIM = 5
-_MAD_TO_SIGMA = 1.4826
 _ROUNDING = 12.0**-0.5
 _TAIL_PART = 0.97725
 _SAME_STAR = 1.5
@@ -40,7 +41,7 @@ def measure_near(
     asked = np.flatnonzero(((predicted > -0.5) & (predicted < limits)).all(axis=1))
     if not len(asked):
         return Detections.none(settings.psf_sigma or np.nan)
-    ceiling = _ceiling(pixels, settings)
+    ceiling = saturation_level(pixels, settings.saturation)
     half = int(np.ceil(settings.search_radius)) + _RIM
     whole = np.zeros(len(asked))
     # Saturated pixels are light too in the search for the peak.
@@ -94,7 +95,7 @@ def _sky_of(windows: Windows, radius: float) -> tuple[FloatArray, FloatArray, Fl
     level = _median(values)
     apart = np.abs(values - level[:, None])
     # Other stars and a rim of few counts widen or narrow single windows: they are taken together.
-    kept = apart <= 3.0 * np.maximum(_MAD_TO_SIGMA * _median(apart), 0.5)[:, None]
+    kept = apart <= 3.0 * np.maximum(MAD_TO_SIGMA * _median(apart), 0.5)[:, None]
     count = np.maximum(kept.sum(axis=1), 1)
     mean = np.where(kept, values, 0.0).sum(axis=1) / count
     variance = np.where(kept, values - mean[:, None], 0.0)
@@ -112,12 +113,6 @@ def _median(values: FloatArray) -> FloatArray:
     """Return the lower median of each line of `values` (n, k), in which inf stands for nothing."""
     count = np.maximum(np.isfinite(values).sum(axis=1), 1)
     return np.asarray(np.sort(values, axis=1)[np.arange(len(values)), (count - 1) // 2])
-
-
-def _ceiling(pixels: Image, settings: DetectionSettings) -> float:
-    if settings.saturation is not None:
-        return settings.saturation
-    return float(np.iinfo(pixels.dtype).max) if pixels.dtype.kind in "ui" else np.inf
 
 
 def _nearest(points: IntArray, apart: FloatArray) -> BoolArray:

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from flight.gnc.math.arrays import BoolArray, FloatArray, IntArray
-from flight.gnc.vision.startracker.detection.areas import Areas, adjoining, connected
+from flight.gnc.vision.frame.regions import label_pixels
+from flight.gnc.vision.records import select
+from flight.gnc.vision.startracker.detection.areas import Areas
 
 # Real optics leave bumps on a star's wings: light falls no faster than (1 + (d / a)^2)^-b of the peak's.
 _WING_SCALE, _WING_POWER, _WING_SHARE = 2.0, 2.0, 0.7
@@ -34,7 +36,7 @@ class Peaks:
 
     def select(self, chosen: BoolArray | IntArray) -> Peaks:
         """Return those that `chosen` picks."""
-        return Peaks(self.place[chosen], self.height[chosen], self.area[chosen], self.core[chosen])
+        return select(self, chosen)
 
     def __len__(self) -> int:
         return len(self.height)
@@ -82,8 +84,7 @@ def on_wings(peaks: Peaks) -> BoolArray:
 def _with_cores(peaks: Peaks, areas: Areas) -> Peaks:
     """Return the peaks with one at each saturated disc's centre, and none else on the disc or its rim."""
     row, column = areas.row[areas.saturated], areas.column[areas.saturated]
-    pairs = adjoining(row * areas.shape[1] + column, areas.shape[1])
-    count, owner = connected(*pairs, len(row))
+    owner, count = label_pixels(row * areas.shape[1] + column, areas.shape[1])
     size = np.bincount(owner, minlength=count)
     x, y = np.bincount(owner, column, count) / size, np.bincount(owner, row, count) / size
     radius = np.sqrt(size / np.pi)

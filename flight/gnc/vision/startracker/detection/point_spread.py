@@ -17,7 +17,7 @@ def profile(offset: FloatArray, sigma: FloatArray, half: int) -> tuple[FloatArra
     `offset` (n,) px is the star's place from the middle pixel's centre, `sigma` (n,) px. The derivatives
     (n, k) are by place and by sigma.
     """
-    from scipy.special import ndtr  # noqa: PLC0415 - see `areas.connected`
+    from scipy.special import ndtr  # noqa: PLC0415 - see `regions.label_pixels`
 
     edges = (np.arange(-half, half + 2) - 0.5 - offset[:, None]) / sigma[:, None]
     whole = ndtr(edges)

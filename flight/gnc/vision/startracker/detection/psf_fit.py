@@ -12,6 +12,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from flight.gnc.math.arrays import BoolArray, FloatArray, IntArray
+from flight.gnc.vision.records import select
 from flight.gnc.vision.startracker.detection.noise_model import NoiseModel
 from flight.gnc.vision.startracker.detection.point_spread import profile
 from flight.gnc.vision.startracker.detection.windows import Windows
@@ -55,7 +56,7 @@ class PsfFit:
 
     def select(self, chosen: IntArray) -> PsfFit:
         """Return the stars `chosen` (k,) by number."""
-        return PsfFit(**{item.name: getattr(self, item.name)[chosen] for item in fields(self)})
+        return select(self, chosen)
 
     def replaced(self, chosen: IntArray, part: PsfFit) -> PsfFit:
         """Return these with `part` in the place of the stars `chosen` (k,)."""

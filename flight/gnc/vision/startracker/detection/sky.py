@@ -14,7 +14,12 @@ import numpy as np
 import numpy.typing as npt
 
 from flight.gnc.math.arrays import FloatArray, Image, IntArray
-from flight.gnc.vision.streaks.background import estimate_background
+from flight.gnc.vision.frame.background import (
+    MAD_TO_SIGMA,
+    estimate_background,
+    interpolation_weights,
+    place_among_blocks,
+)
 
 Float32Array = npt.NDArray[np.float32]
 
@@ -38,8 +43,10 @@ class Surface:
 
     def at(self, column: npt.ArrayLike, row: npt.ArrayLike) -> FloatArray:
         """Return the values (n,) at pixels `column` (n,), `row` (n,)."""
-        top, down = _place(np.asarray(row, dtype=float), self.shape[0], self.values.shape[0])
-        left, across = _place(np.asarray(column, dtype=float), self.shape[1], self.values.shape[1])
+        top, down = place_among_blocks(np.asarray(row, dtype=float), self.shape[0], self.values.shape[0])
+        left, across = place_among_blocks(
+            np.asarray(column, dtype=float), self.shape[1], self.values.shape[1]
+        )
         bottom = np.minimum(top + 1, self.values.shape[0] - 1)
         right = np.minimum(left + 1, self.values.shape[1] - 1)
         high = self.values[top, left] * (1.0 - across) + self.values[top, right] * across
@@ -48,14 +55,11 @@ class Surface:
 
     def factors(self) -> tuple[Float32Array, Float32Array]:
         """Return (rows, down) and (down, columns), whose product is the whole frame."""
-        weights = []
-        for pixels, blocks in zip(self.shape, self.values.shape, strict=True):
-            first, share = _place(np.arange(pixels, dtype=float), pixels, blocks)
-            weight = np.zeros((pixels, blocks))
-            weight[np.arange(pixels), first] += 1.0 - share
-            weight[np.arange(pixels), np.minimum(first + 1, blocks - 1)] += share
-            weights.append(weight)
-        return weights[0].astype(np.float32), (self.values @ weights[1].T).astype(np.float32)
+        down, across = (
+            interpolation_weights(pixels, blocks)
+            for pixels, blocks in zip(self.shape, self.values.shape, strict=True)
+        )
+        return down.astype(np.float32), (self.values @ across.T).astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,7 +112,7 @@ def in_counts(pixels: Image) -> tuple[Image, float]:
     if not np.all(np.isfinite(pixels)):
         raise ValueError("a frame with pixels that are not finite")
     sample = pixels[::4, ::4].astype(float)
-    spread = 1.4826 * float(np.median(np.abs(sample - np.median(sample))))
+    spread = MAD_TO_SIGMA * float(np.median(np.abs(sample - np.median(sample))))
     spread = spread or float(sample.std()) or 1.0
     unit = spread / _FLOATING_NOISE
     return (pixels / unit).astype(np.float32), unit
@@ -190,11 +194,3 @@ def _tail(sample: Float32Array, level: FloatArray, noise: FloatArray) -> float:
     relative = (sample - level[block]) / noise[block]
     place = min(relative.size - 1, int(_TAIL_PART * relative.size))
     return max(1.0, 0.5 * float(np.partition(relative, place, axis=None)[place]))
-
-
-def _place(pixel: FloatArray, pixels: int, blocks: int) -> tuple[IntArray, FloatArray]:
-    """Return the block (n,) whose centre is before `pixel` (n,), and how far it is to the next one."""
-    width = pixels // blocks
-    place = np.clip((pixel - 0.5 * (width - 1)) / width, 0.0, blocks - 1.0)
-    first = place.astype(np.int64)
-    return first, place - first

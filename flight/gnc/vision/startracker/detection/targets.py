@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from flight.gnc.math.arrays import BoolArray, FloatArray, Image, IntArray
+from flight.gnc.vision.records import select
 from flight.gnc.vision.startracker.detection.windows import Windows, cut
 
 
@@ -36,15 +37,7 @@ class Targets:
 
     def select(self, chosen: BoolArray | IntArray) -> Targets:
         """Return the targets that `chosen` picks."""
-        return Targets(
-            self.pixels,
-            self.middle[chosen],
-            self.level[chosen],
-            self.noise[chosen],
-            self.ceiling,
-            self.core[chosen],
-            self.correlation,
-        )
+        return select(self, chosen, "pixels", "ceiling", "correlation")
 
     def __len__(self) -> int:
         return len(self.middle)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from flight.gnc.math.arrays import BoolArray, FloatArray, Image, IntArray
+from flight.gnc.vision.records import select
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,13 +30,7 @@ class Windows:
 
     def select(self, chosen: BoolArray | IntArray) -> Windows:
         """Return the windows that `chosen` picks."""
-        return Windows(
-            self.middle[chosen],
-            self.half,
-            self.light[chosen],
-            self.good[chosen],
-            self.noise[chosen],
-        )
+        return select(self, chosen, "half")
 
     def without(self, light: FloatArray) -> Windows:
         """Return the windows with `light` (n, k, k) taken off."""

@@ -15,11 +15,11 @@ from flight.gnc.attitude.olae import OlaeSolution, gain, rotation_between
 from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.math.arrays import BoolArray, FloatArray
 from flight.gnc.math.directions import cross_matrices
+from flight.gnc.vision.frame.background import MAD_TO_SIGMA
 from flight.gnc.vision.streaks.corners.endpoints import chord_outward, extend
 from flight.gnc.vision.streaks.corners.grouping import rotation_angles, rotation_axis
 from flight.gnc.vision.streaks.corners.settings import StreakSettings
 
-_MAD_TO_SIGMA = 1.4826
 # Fewer streaks than this part of the measured ones agreeing on one rotation is no agreement.
 _LEAST_AGREEMENT = 0.5
 # Robust scales below this part of the expected errors are luck of a small sample, not precision.
@@ -105,7 +105,7 @@ def _reject_and_solve(
     solution = rotation_between(vectors[used, 0], vectors[used, 1], weights[used])
     for _ in range(_MOST_ROUNDS):
         z = np.stack(_components(vectors, solution)) / errors
-        scale = np.maximum(_MAD_TO_SIGMA * np.median(np.abs(z[:, used]), axis=1), _LEAST_SCALE)
+        scale = np.maximum(MAD_TO_SIGMA * np.median(np.abs(z[:, used]), axis=1), _LEAST_SCALE)
         kept = np.all(np.abs(z) <= settings.outlier_sigmas * scale[:, None], axis=0)
         if np.array_equal(kept, used):
             break

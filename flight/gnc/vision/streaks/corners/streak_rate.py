@@ -15,11 +15,11 @@ import numpy as np
 from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.errors import FlightError
 from flight.gnc.math.arrays import FloatArray, Image
-from flight.gnc.vision.streaks.background import FrameState, frame_state, saturation_level
+from flight.gnc.vision.frame.saturation import FrameState, frame_state, saturation_level
 from flight.gnc.vision.streaks.corners.rate_fit import fit_rotation
+from flight.gnc.vision.streaks.corners.segmentation import Regions
 from flight.gnc.vision.streaks.corners.settings import StreakSettings
 from flight.gnc.vision.streaks.corners.streaks import Streaks, measure_streaks, segment_frame
-from flight.gnc.vision.streaks.segmentation import Regions
 from flight.gnc.vision.streaks.streak_result import StreakResult, StreakStatus
 
 __all__ = ["StreakResult", "StreakStatus", "direction_of_time", "estimate_rate", "refuse_nonsense"]

@@ -11,18 +11,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from flight.gnc.math.arrays import BoolArray, FloatArray, Image, IntArray
-from flight.gnc.vision.streaks.background import Background, estimate_background, saturation_level
+from flight.gnc.vision.frame.background import Background, estimate_background
+from flight.gnc.vision.frame.hot_pixels import repair_hot_pixels
+from flight.gnc.vision.frame.regions import positions
+from flight.gnc.vision.frame.saturation import saturation_level
 from flight.gnc.vision.streaks.corners.detectors import cornerness
 from flight.gnc.vision.streaks.corners.endpoints import find_corners
-from flight.gnc.vision.streaks.corners.settings import StreakSettings
-from flight.gnc.vision.streaks.segmentation import (
+from flight.gnc.vision.streaks.corners.segmentation import (
     Regions,
     find_regions,
-    positions,
-    repair_hot_pixels,
     threshold_local,
     threshold_mean,
 )
+from flight.gnc.vision.streaks.corners.settings import StreakSettings
 
 # Room around a region's box: the window and the derivative reach that far.
 _PADDING = 8

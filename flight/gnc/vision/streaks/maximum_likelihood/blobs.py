@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from flight.gnc.math.arrays import BoolArray, FloatArray, IntArray
+from flight.gnc.vision.frame.regions import label_pixels, moments
 from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import ExposedFrame, Float32Array
 
 # One noise peak fills nine pixels of the 3 x 3 sum.
@@ -47,7 +46,7 @@ class Blobs:
 def find_blobs(frame: ExposedFrame, sigmas: float, most: int) -> Blobs:
     """Return the `most` brightest regions whose 3 x 3 sum exceeds `sigmas` of its noise."""
     pixel = _above(frame.sums, frame.floor, 3.0 * sigmas)
-    number, count = _connected(pixel, frame.shape[1])
+    number, count = label_pixels(pixel, frame.shape[1])
     light = np.maximum(frame.signal[pixel], 0.0).astype(np.float64)
     area = np.bincount(number, minlength=count)
     flux = np.bincount(number, light, count)
@@ -68,43 +67,17 @@ def _above(sums: Float32Array, floor: Float32Array, sigmas: float) -> IntArray:
     return pixel[sums[pixel] > np.float32(sigmas) * np.sqrt(floor[pixel])]
 
 
-def _connected(pixel: IntArray, columns: int) -> tuple[IntArray, int]:
-    """Return which region each flat `pixel` (m,), ascending, belongs to, and how many regions there are.
-
-    Runs of pixels along rows are joined, which are many times fewer. None goes on in the next row: the
-    frame's outermost sums are zero.
-    """
-    first = np.flatnonzero(np.diff(pixel, prepend=-2) > 1)
-    length = np.diff(first, append=len(pixel))
-    start, stop = pixel[first], pixel[first] + length
-    # A run touches those of the next row from one column before it to one after.
-    low = np.searchsorted(stop, start + columns)
-    count = np.searchsorted(start, stop + columns, side="right") - low
-    one = np.repeat(np.arange(len(first)), count)
-    other = np.arange(len(one)) + np.repeat(low - np.cumsum(count) + count, count)
-    touching = coo_array((np.ones(len(one), dtype=np.bool_), (one, other)), shape=(len(first), len(first)))
-    regions, number = connected_components(touching, directed=False)
-    return np.repeat(number, length), int(regions)
-
-
 def _measured(
     frame: ExposedFrame, owner: IntArray, column: IntArray, row: IntArray, light: FloatArray, count: int
 ) -> Blobs:
-    flux = np.bincount(owner, light, count).astype(np.float64)
-    x = np.bincount(owner, light * column, count) / flux
-    y = np.bincount(owner, light * row, count) / flux
-    dx, dy = column - x[owner], row - y[owner]
-    xx = np.bincount(owner, light * dx * dx, count) / flux
-    yy = np.bincount(owner, light * dy * dy, count) / flux
-    xy = np.bincount(owner, light * dx * dy, count) / flux
-    angle = 0.5 * np.arctan2(2.0 * xy, xx - yy)
+    found = moments(owner, column, row, light, count)
     rows, columns = frame.shape
     edge = (row < _BORDER) | (row >= rows - _BORDER) | (column < _BORDER) | (column >= columns - _BORDER)
     return Blobs(
-        np.stack([x, y], axis=-1),
-        np.stack([-np.sin(angle), np.cos(angle)], axis=-1),
-        np.sqrt(12.0 * np.hypot(xx - yy, 2.0 * xy)),
-        flux,
+        found.centre,
+        np.stack([-np.sin(found.direction), np.cos(found.direction)], axis=-1),
+        found.length,
+        found.flux,
         np.bincount(owner, edge.astype(float), count) > 0.0,
         owner,
         column,

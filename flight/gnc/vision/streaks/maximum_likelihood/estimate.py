@@ -15,11 +15,11 @@ import numpy as np
 
 from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.math.arrays import FloatArray, Image
-from flight.gnc.vision.streaks.background import FrameState, frame_state
+from flight.gnc.vision.frame.saturation import FrameState, frame_state, saturation_count
 from flight.gnc.vision.streaks.corners.streak_rate import StreakStatus, direction_of_time, refuse_nonsense
 from flight.gnc.vision.streaks.maximum_likelihood.blobs import Blobs, find_blobs
 from flight.gnc.vision.streaks.maximum_likelihood.description import with_faint, with_rate, with_stars
-from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import expose_frame, saturation_count
+from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import expose_frame
 from flight.gnc.vision.streaks.maximum_likelihood.fitting import last_fit
 from flight.gnc.vision.streaks.maximum_likelihood.frame_scan import frame_angles
 from flight.gnc.vision.streaks.maximum_likelihood.hypotheses import (

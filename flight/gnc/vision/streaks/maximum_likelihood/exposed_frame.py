@@ -7,14 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from flight.gnc.math.arrays import BoolArray, Image, IntArray
-from flight.gnc.vision.streaks.background import at_least, estimate_background
-from flight.gnc.vision.streaks.segmentation import box_sum, positions
+from flight.gnc.math.arrays import BoolArray, Image
+from flight.gnc.vision.frame.background import estimate_background
+from flight.gnc.vision.frame.box_sums import box_sum
+from flight.gnc.vision.frame.hot_pixels import find_hot_pixels
+from flight.gnc.vision.frame.saturation import at_least, saturation_count
 
 Float32Array = npt.NDArray[np.float32]
-
-# A count that so many pixels share, and none exceeds, is where the converter saturates.
-_PLATEAU = 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,30 +68,3 @@ def expose_frame(pixels: Image, saturation: float | None, gain: float) -> Expose
         gain,
         len(hot[0]),
     )
-
-
-def saturation_count(pixels: Image) -> float:
-    """Return the count at which `pixels` clip: their highest when several share it, else the type's top."""
-    highest = pixels.max()
-    if np.count_nonzero(pixels == highest) >= _PLATEAU:
-        return float(highest)
-    return float(np.iinfo(pixels.dtype).max)
-
-
-def find_hot_pixels(
-    signal: Float32Array, variance: Float32Array, sharpness: float = 0.15, sigmas: float = 8.0
-) -> tuple[IntArray, IntArray]:
-    """Return rows and columns of pixels above `sigmas` times the noise that no optics could make.
-
-    `variance` is the noise squared. Their every neighbour stays below `sharpness` of them and 3 sigma.
-    """
-    row, column = positions(signal > np.float32(sigmas * np.sqrt(variance.min())))
-    noise = np.sqrt(variance[row, column])
-    bright = signal[row, column] > sigmas * noise
-    row, column, noise = row[bright], column[bright], noise[bright]
-    inside = (row > 0) & (row < signal.shape[0] - 1) & (column > 0) & (column < signal.shape[1] - 1)
-    row, column, noise = row[inside], column[inside], noise[inside]
-    steps = [(dr, dc) for dr in (-1, 0, 1) for dc in (-1, 0, 1) if (dr, dc) != (0, 0)]
-    around = np.stack([signal[row + dr, column + dc] for dr, dc in steps])
-    hot = around.max(axis=0) < sharpness * signal[row, column] + 3.0 * noise
-    return row[hot], column[hot]

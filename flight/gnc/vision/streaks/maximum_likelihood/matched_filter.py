@@ -14,6 +14,7 @@ import numpy as np
 
 from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.math.arrays import FloatArray, IntArray
+from flight.gnc.vision.frame.box_sums import less_boxes
 from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import ExposedFrame, Float32Array
 from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion, paths
 from flight.gnc.vision.streaks.maximum_likelihood.polar_grid import ACROSS, PolarGrid, polar_grid
@@ -26,7 +27,6 @@ from flight.gnc.vision.streaks.maximum_likelihood.responses import (
     standing_peaks,
 )
 from flight.gnc.vision.streaks.maximum_likelihood.running_sums import RunningSums, running_sums
-from flight.gnc.vision.streaks.segmentation import less_boxes
 
 # Samples are rounded to this part of their noise.
 _ROUNDING = 30.0

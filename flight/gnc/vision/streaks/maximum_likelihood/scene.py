@@ -8,6 +8,7 @@ import numpy as np
 
 from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.math.arrays import BoolArray, FloatArray, IntArray
+from flight.gnc.vision.records import select
 from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion, positions
 from flight.gnc.vision.streaks.maximum_likelihood.shutter import Shutter
 
@@ -39,15 +40,9 @@ class Scene:
         """The standard deviation of the point spread without the pixel's square, px."""
         return float(np.sqrt(max(self.width**2 - _PIXEL_VARIANCE, 0.01)))
 
-    def select(self, keep: BoolArray | IntArray) -> Scene:
-        """Return the scene with the stars that `keep` picks, by mask or index."""
-        return replace(
-            self,
-            stars=self.stars[keep],
-            light=self.light[keep],
-            sky=self.sky[keep],
-            trusted=self.trusted[keep],
-        )
+    def select(self, chosen: BoolArray | IntArray) -> Scene:
+        """Return the scene with the stars that `chosen` picks, by mask or index."""
+        return select(self, chosen, "motion", "width")
 
     def with_stars(self, stars: FloatArray, light: FloatArray) -> Scene:
         """Return the scene with more stars (m, 2) of `light` (m,), which have no say in what is shared."""

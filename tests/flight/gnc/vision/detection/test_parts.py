@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from flight.gnc.math.arrays import FloatArray
+from flight.gnc.vision.frame.background import Background
 from flight.gnc.vision.startracker.detection.areas import find_areas
 from flight.gnc.vision.startracker.detection.noise_model import NoiseModel, measure_noise
 from flight.gnc.vision.startracker.detection.peaks import find_peaks
@@ -16,7 +17,6 @@ from flight.gnc.vision.startracker.detection.point_spread import light, profile
 from flight.gnc.vision.startracker.detection.sky import Surface, find_bright, measure_sky
 from flight.gnc.vision.startracker.detection.window_centroid import centre_of_mass
 from flight.gnc.vision.startracker.detection.windows import cut
-from flight.gnc.vision.streaks.background import Background
 from tests.sim_hal.star_camera.scenes import integrated_by_brute_force
 
 

@@ -6,14 +6,9 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from flight.gnc.vision.streaks.segmentation import (
-    box_sum,
-    find_regions,
-    less_boxes,
-    repair_hot_pixels,
-    threshold_local,
-    threshold_mean,
-)
+from flight.gnc.vision.frame.box_sums import box_sum, less_boxes
+from flight.gnc.vision.frame.hot_pixels import repair_hot_pixels
+from flight.gnc.vision.streaks.corners.segmentation import find_regions, threshold_local, threshold_mean
 from tests.flight.gnc.vision.streaks.frames import rate_at, star_camera, star_frame
 
 

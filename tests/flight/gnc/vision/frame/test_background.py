@@ -5,12 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flight.gnc.vision.streaks.background import (
-    FrameState,
-    estimate_background,
-    frame_state,
-    saturation_level,
-)
+from flight.gnc.vision.frame.background import estimate_background
+from flight.gnc.vision.frame.saturation import FrameState, frame_state, saturation_level
 from tests.flight.gnc.vision.streaks.frames import rate_at, star_camera, star_frame
 
 

@@ -1,0 +1,51 @@
+"""Hot pixels: bright ones with dark neighbours, which no optics could make.
+
+A star's image wider than sigma 0.5 px gives its brightest pixel's neighbours at least 15 % of that pixel's
+light. Corner detectors need an image without gaps, so there hot pixels are replaced, the certain ones only.
+A fit of pixels leaves them out instead, which costs nothing if one of them was a star's.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flight.gnc.math.arrays import FloatArray, Image, IntArray
+from flight.gnc.vision.frame.regions import positions
+
+# Part of a pixel's light that its neighbours would get from a star, and sigmas of their noise on top.
+_SHARPNESS, _NOISE = 0.15, 3.0
+
+
+def repair_hot_pixels(signal: Image, noise: Image, sigmas: float = 10.0) -> int:
+    """Replace the hot pixels of `signal` (rows, columns) in place by their neighbours' mean; return how many.
+
+    `noise` (rows, columns) is of one pixel; only pixels above `sigmas` times it are examined.
+    """
+    row, column = positions(signal > sigmas * noise)
+    row, column, around = _hot(signal, row, column, noise[row, column])
+    signal[row, column] = around.mean(axis=0)
+    return len(row)
+
+
+def find_hot_pixels(signal: Image, variance: Image, sigmas: float = 8.0) -> tuple[IntArray, IntArray]:
+    """Return rows and columns of the hot pixels of `signal` that exceed `sigmas` of their noise.
+
+    `variance` (rows, columns) is the noise squared.
+    """
+    row, column = positions(signal > np.float32(sigmas * np.sqrt(variance.min())))
+    noise = np.sqrt(variance[row, column])
+    bright = signal[row, column] > sigmas * noise
+    row, column, _ = _hot(signal, row[bright], column[bright], noise[bright])
+    return row, column
+
+
+def _hot(
+    signal: Image, row: IntArray, column: IntArray, noise: FloatArray
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Return those of the pixels (m,) that are hot, and the eight pixels (8, k) about each."""
+    inside = (row > 0) & (row < signal.shape[0] - 1) & (column > 0) & (column < signal.shape[1] - 1)
+    row, column, noise = row[inside], column[inside], noise[inside]
+    steps = [(dr, dc) for dr in (-1, 0, 1) for dc in (-1, 0, 1) if (dr, dc) != (0, 0)]
+    around = np.stack([signal[row + dr, column + dc] for dr, dc in steps])
+    hot = around.max(axis=0) < _SHARPNESS * signal[row, column] + _NOISE * noise
+    return row[hot], column[hot], around[:, hot]

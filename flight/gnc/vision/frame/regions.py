@@ -1,0 +1,95 @@
+"""Connected regions of bright pixels, and the moments of their light."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flight.gnc.math.arrays import BoolArray, FloatArray, IntArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Moments:
+    """The light of `n` regions.
+
+    Attributes:
+        flux: (n,) counts.
+        centre: (n, 2) px, x and y, of light.
+        length: (n,) px, of the uniform line with the region's second moments; about 0 for a round one.
+        thickness: (n,) px, rms across.
+        direction: (n,) rad, from the rows to the line.
+    """
+
+    flux: FloatArray
+    centre: FloatArray
+    length: FloatArray
+    thickness: FloatArray
+    direction: FloatArray
+
+
+def positions(mask: BoolArray) -> tuple[IntArray, IntArray]:
+    """Return rows and columns of a mask's true pixels: as nonzero, much faster when they are few."""
+    row, column = np.divmod(np.flatnonzero(mask), mask.shape[1])
+    return row, column
+
+
+def label_pixels(pixel: IntArray, columns: int) -> tuple[IntArray, int]:
+    """Return which 8-connected region each flat `pixel` (m,), ascending, is of, and how many regions there are.
+
+    Regions are numbered in the order of their first pixels. Runs of pixels along rows are joined: there are
+    many times fewer of them than pixels.
+    """
+    from scipy import sparse  # noqa: PLC0415 - a process that only names the methods need not hold it
+    from scipy.sparse import csgraph  # noqa: PLC0415
+
+    # One column more, which is empty: no run goes on in the next row.
+    pixel, columns = pixel + pixel // columns, columns + 1
+    first = np.flatnonzero(np.diff(pixel, prepend=-2) > 1)
+    length = np.diff(first, append=len(pixel))
+    start, stop = pixel[first], pixel[first] + length
+    # A run touches those of the next row from one column before it to one after.
+    low = np.searchsorted(stop, start + columns)
+    count = np.searchsorted(start, stop + columns, side="right") - low
+    one = np.repeat(np.arange(len(first)), count)
+    other = np.arange(len(one)) + np.repeat(low - np.cumsum(count) + count, count)
+    touching = sparse.coo_array(
+        (np.ones(len(one), dtype=np.bool_), (one, other)), shape=(len(first), len(first))
+    )
+    regions, number = csgraph.connected_components(touching, directed=False)
+    return np.repeat(number, length), int(regions)
+
+
+def moments(owner: IntArray, column: IntArray, row: IntArray, light: FloatArray, count: int) -> Moments:
+    """Return the moments of `count` regions of pixels (m,), each with its region's number and its `light`.
+
+    A region without light has none: zeros.
+    """
+    flux = np.bincount(owner, light, count).astype(np.float64)
+    whole = np.where(flux > 0.0, flux, np.inf)
+    x, y = np.bincount(owner, light * column, count) / whole, np.bincount(owner, light * row, count) / whole
+    dx, dy = column - x[owner], row - y[owner]
+    xx = np.bincount(owner, light * dx * dx, count) / whole
+    yy = np.bincount(owner, light * dy * dy, count) / whole
+    xy = np.bincount(owner, light * dx * dy, count) / whole
+    # The difference of the principal moments is free of the point spread, which widens both alike; a line of
+    # length L has L^2/12.
+    spread = np.hypot(xx - yy, 2.0 * xy)
+    return Moments(
+        flux,
+        np.stack([x, y], axis=-1),
+        np.sqrt(12.0 * spread),
+        np.sqrt(np.maximum(0.5 * (xx + yy - spread), 0.0)),
+        0.5 * np.arctan2(2.0 * xy, xx - yy),
+    )
+
+
+def line_of(centre: FloatArray, covariance: FloatArray, least_length: float) -> FloatArray:
+    """Return the ends (2, 2) px of the uniform line about `centre` (2,) with second moments (2, 2) px^2.
+
+    Both are the centre where it is not longer than `least_length` px.
+    """
+    (across, along), axes = np.linalg.eigh(covariance)
+    length = float(np.sqrt(12.0 * max(along - across, 0.0)))
+    half = 0.5 * length * axes[:, 1] if length > least_length else np.zeros(2)
+    return np.stack([centre - half, centre + half])
