@@ -16,10 +16,11 @@ from flight.gnc.errors import UsageError
 from flight.gnc.math.arrays import FloatArray, Image
 from flight.gnc.vision.objects.objects import ObjectSettings, SpaceObject, detect
 from flight.gnc.vision.streaks.corners.settings import DETECTOR_NAMES, StreakSettings
-from flight.gnc.vision.streaks.corners.streak_rate import StreakResult, StreakStatus, estimate_rate
+from flight.gnc.vision.streaks.corners.streak_rate import estimate_rate
 from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion
 from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from flight.gnc.vision.streaks.streak_result import StreakResult, StreakStatus
 from flight.schema import reader as configuration
 from flight.schema.sections import Camera
 from ground.commands.options import add_field, add_output, add_picture, positive, read_picture

@@ -30,8 +30,8 @@ from flight.gnc.vision.startracker.index.sky_index import SkyIndex
 from flight.gnc.vision.startracker.pointing import Pointing
 from flight.gnc.vision.startracker.solution import FrameSolution
 from flight.gnc.vision.startracker.solve import RatePrior, SolveSettings
-from flight.gnc.vision.streaks.corners.streak_rate import StreakStatus
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from flight.gnc.vision.streaks.streak_result import StreakStatus
 from flight.schema import reader as configuration
 from flight.schema.camera_model import camera_model
 from flight.schema.sections import Camera

@@ -27,9 +27,9 @@ from flight.gnc.vision.startracker.index.build import default_index
 from flight.gnc.vision.startracker.pointing import Pointing
 from flight.gnc.vision.startracker.solution import SolveStatus
 from flight.gnc.vision.startracker.solve import SolveSettings
-from flight.gnc.vision.streaks.corners.streak_rate import StreakStatus
 from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from flight.gnc.vision.streaks.streak_result import StreakStatus
 from flight.link.telemetry.reader import read_run
 from flight.schema import reader as configuration
 from flight.schema.camera_model import camera_model

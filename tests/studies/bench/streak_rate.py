@@ -16,8 +16,9 @@ import numpy as np
 from flight.gnc.math.arrays import FloatArray, Image
 from flight.gnc.vision.streaks.corners.rate_fit import fit_rotation
 from flight.gnc.vision.streaks.corners.settings import StreakSettings
-from flight.gnc.vision.streaks.corners.streak_rate import StreakStatus, estimate_rate
+from flight.gnc.vision.streaks.corners.streak_rate import estimate_rate
 from flight.gnc.vision.streaks.corners.streaks import measure_streaks, segment_frame
+from flight.gnc.vision.streaks.streak_result import StreakStatus
 from tests.flight.gnc.vision.streaks.frames import Camera, rate_at, star_camera, star_frame
 
 _SEED = 27_182

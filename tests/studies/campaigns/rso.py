@@ -20,9 +20,10 @@ from flight.gnc.math.arrays import FloatArray, Image
 from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
 from flight.gnc.vision.objects.objects import ObjectReport, ObjectSettings, detect
 from flight.gnc.vision.streaks.corners.settings import StreakSettings
-from flight.gnc.vision.streaks.corners.streak_rate import StreakStatus, estimate_rate
+from flight.gnc.vision.streaks.corners.streak_rate import estimate_rate
 from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from flight.gnc.vision.streaks.streak_result import StreakStatus
 from sim_hal.star_camera import SourceTrack, StarCameraModel, render
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.rso_pictures import draw_detection_rate, draw_frames

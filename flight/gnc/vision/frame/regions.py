@@ -35,7 +35,7 @@ def positions(mask: BoolArray) -> tuple[IntArray, IntArray]:
 
 
 def label_pixels(pixel: IntArray, columns: int) -> tuple[IntArray, int]:
-    """Return which 8-connected region each flat `pixel` (m,), ascending, is of, and how many regions there are.
+    """Return the region number (m,) of each flat `pixel` (m,), ascending, and the count of regions: 8-connected.
 
     Regions are numbered in the order of their first pixels. Runs of pixels along rows are joined: there are
     many times fewer of them than pixels.

@@ -18,9 +18,9 @@ from flight.gnc.vision.startracker.catalogue_refit import refit_with_catalogue
 from flight.gnc.vision.startracker.solution import FrameSolution, SolveStatus
 from flight.gnc.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings, solve_motion
 from flight.gnc.vision.streaks.corners.settings import StreakSettings
-from flight.gnc.vision.streaks.corners.streak_rate import StreakResult, StreakStatus
 from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from flight.gnc.vision.streaks.streak_result import StreakResult, StreakStatus
 from tests.flight.gnc.vision.startracker.frames import NARROW, SkyFrame, sky, sky_frame
 
 _TRACKER = TrackerSettings(SolveSettings(), (1.0, 1.0))

@@ -7,22 +7,19 @@ made for a worker process.
 
 from __future__ import annotations
 
-import zlib
 from dataclasses import replace
 
 import numpy as np
 
 from flight.gnc.camera.pinhole import Pinhole
-from flight.gnc.errors import FlightError
 from flight.gnc.math.arrays import FloatArray, Image
-from flight.gnc.vision.frame.saturation import FrameState, frame_state, saturation_level
+from flight.gnc.vision.frame.saturation import saturation_level
+from flight.gnc.vision.streaks.admission import admit, in_time, validate
 from flight.gnc.vision.streaks.corners.rate_fit import fit_rotation
 from flight.gnc.vision.streaks.corners.segmentation import Regions
 from flight.gnc.vision.streaks.corners.settings import StreakSettings
 from flight.gnc.vision.streaks.corners.streaks import Streaks, measure_streaks, segment_frame
 from flight.gnc.vision.streaks.streak_result import StreakResult, StreakStatus
-
-__all__ = ["StreakResult", "StreakStatus", "direction_of_time", "estimate_rate", "refuse_nonsense"]
 
 
 def estimate_rate(
@@ -49,19 +46,17 @@ def estimate_rate(
     Raises FlightError for a frame, exposure or prior that cannot be meant. What the scene does is told as a
     status.
     """
-    refuse_nonsense(pixels, pinhole, exposure, prior_rate, prior_sigma)
-    checksum = zlib.crc32(pixels.tobytes())
-    state = frame_state(pixels, saturation_level(pixels, settings.saturation), settings.saturated_fraction)
-    if state is not FrameState.USABLE:
-        return StreakResult(StreakStatus(state.value), checksum, exposure)
-    if checksum == previous_checksum:
-        return StreakResult(StreakStatus.FROZEN, checksum, exposure)
+    validate(pixels, pinhole, exposure, prior_rate, prior_sigma)
+    saturation = saturation_level(pixels, settings.saturation)
+    checksum, unusable = admit(pixels, previous_checksum, saturation, settings.saturated_fraction)
+    if unusable is not None:
+        return StreakResult(unusable, checksum, exposure)
     segmented = segment_frame(pixels, settings)
     seen = StreakResult(StreakStatus.FAILED, checksum, exposure, hot_pixels=segmented.hot_pixels)
     streaks = measure_streaks(segmented, settings)
     result = _rate(streaks, pinhole, exposure, settings, seen)
     if result.rate is not None:
-        return _in_time(result, prior_rate, prior_sigma, settings.sign_sigmas)
+        return in_time(result, prior_rate, prior_sigma, settings.sign_sigmas)
     typical = _typical_length(segmented.regions, settings)
     if typical < settings.least_length:
         # Stars nearly at rest: what looked like streaks were blends.
@@ -101,52 +96,9 @@ def _rate(
     )
 
 
-def _in_time(
-    result: StreakResult, prior_rate: FloatArray | None, prior_sigma: float, sigmas: float
-) -> StreakResult:
-    """Return an ambiguous `result` in the direction of time that the prior tells, if it can."""
-    if result.rate is None or prior_rate is None:
-        return result
-    sign = direction_of_time(result.rate, prior_rate, prior_sigma, sigmas)
-    if sign == 0:
-        return result
-    endpoints = result.endpoints if sign > 0 else result.endpoints[:, ::-1]
-    return replace(result, status=StreakStatus.RATE, rate=sign * result.rate, endpoints=endpoints)
-
-
-def direction_of_time(rate: FloatArray, prior_rate: FloatArray, prior_sigma: float, sigmas: float) -> int:
-    """Return the sign (+1, -1) that a prior gives `rate` (3,), or 0 when it is too weak.
-
-    The prior's projection on the axis decides where it exceeds `sigmas` times its deviation `prior_sigma`.
-    """
-    projection = float(rate @ prior_rate / np.linalg.norm(rate))
-    if abs(projection) <= sigmas * prior_sigma:
-        return 0
-    return 1 if projection > 0.0 else -1
-
-
 def _typical_length(regions: Regions, settings: StreakSettings) -> float:
     """Return the median length in px of the brightest regions, infinity when there are too few to say."""
     if len(regions) < settings.least_streaks:
         return float("inf")
     brightest = np.argsort(-regions.flux, kind="stable")[: settings.most_streaks]
     return float(np.median(regions.length[brightest]))
-
-
-def refuse_nonsense(
-    pixels: Image, pinhole: Pinhole, exposure: float, prior_rate: FloatArray | None, prior_sigma: float
-) -> None:
-    """Raise FlightError for arguments that cannot be meant."""
-    expected = (pinhole.rows, pinhole.columns)
-    if pixels.shape != expected:
-        raise FlightError(f"frame of shape {pixels.shape}, the camera has {expected}: set the camera's size")
-    if not np.issubdtype(pixels.dtype, np.unsignedinteger):
-        raise FlightError(
-            f"frame of {pixels.dtype}: pixels must be unsigned integers, as the camera gave them"
-        )
-    if not (np.isfinite(exposure) and exposure > 0.0):
-        raise FlightError(f"exposure of {exposure} s: must be finite and positive")
-    if prior_rate is not None and not (np.shape(prior_rate) == (3,) and np.all(np.isfinite(prior_rate))):
-        raise FlightError(f"prior rate {prior_rate}: must be three finite values in rad/s, or None")
-    if not prior_sigma >= 0.0:
-        raise FlightError(f"prior sigma {prior_sigma} rad/s: must not be negative or NaN")

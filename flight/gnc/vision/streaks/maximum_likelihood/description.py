@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 
 from flight.gnc.math.arrays import BoolArray, FloatArray, IntArray
-from flight.gnc.vision.streaks.corners.streak_rate import StreakStatus
 from flight.gnc.vision.streaks.maximum_likelihood.agreement import disagreement, opinions
 from flight.gnc.vision.streaks.maximum_likelihood.matched_filter import FaintStars
 from flight.gnc.vision.streaks.maximum_likelihood.motion import positions, sensitivities
@@ -17,6 +16,7 @@ from flight.gnc.vision.streaks.maximum_likelihood.rounds import ExposedCamera, F
 from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene, path_lengths, window_times
 from flight.gnc.vision.streaks.maximum_likelihood.solution import shared_covariance
 from flight.gnc.vision.streaks.maximum_likelihood.wholeness import Wholeness
+from flight.gnc.vision.streaks.streak_result import StreakStatus
 
 # Rounds of conjugate gradients for the covariance.
 _CONJUGATE = 12

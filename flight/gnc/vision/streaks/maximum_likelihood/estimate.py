@@ -7,7 +7,6 @@ worker process. One frame cannot tell omega from -omega; a prior (gyro, or the l
 
 from __future__ import annotations
 
-import zlib
 from dataclasses import dataclass, replace
 from itertools import chain, islice
 
@@ -15,8 +14,8 @@ import numpy as np
 
 from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.math.arrays import FloatArray, Image
-from flight.gnc.vision.frame.saturation import FrameState, frame_state, saturation_count
-from flight.gnc.vision.streaks.corners.streak_rate import StreakStatus, direction_of_time, refuse_nonsense
+from flight.gnc.vision.frame.saturation import saturation_count
+from flight.gnc.vision.streaks.admission import admit, in_time, validate
 from flight.gnc.vision.streaks.maximum_likelihood.blobs import Blobs, find_blobs
 from flight.gnc.vision.streaks.maximum_likelihood.description import with_faint, with_rate, with_stars
 from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import expose_frame
@@ -33,6 +32,7 @@ from flight.gnc.vision.streaks.maximum_likelihood.rounds import ExposedCamera, F
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from flight.gnc.vision.streaks.maximum_likelihood.shutter import Shutter
 from flight.gnc.vision.streaks.maximum_likelihood.wholeness import Wholeness, wholeness
+from flight.gnc.vision.streaks.streak_result import StreakStatus
 
 _MOST_BLOBS = 48
 # So many motions are fitted in full before the frame is given up.
@@ -70,14 +70,11 @@ def estimate_motion(
     Raises FlightError for a frame, exposure or prior that cannot be meant. What the scene does is told as a
     status.
     """
-    refuse_nonsense(pixels, pinhole, exposure, prior_rate, prior_sigma)
-    checksum = zlib.crc32(pixels.tobytes())
+    validate(pixels, pinhole, exposure, prior_rate, prior_sigma)
     saturation = settings.saturation if settings.saturation is not None else saturation_count(pixels)
-    state = frame_state(pixels, saturation, settings.saturated_fraction)
-    if state is not FrameState.USABLE:
-        return MotionResult(StreakStatus(state.value), checksum, exposure)
-    if checksum == previous_checksum:
-        return MotionResult(StreakStatus.FROZEN, checksum, exposure)
+    checksum, unusable = admit(pixels, previous_checksum, saturation, settings.saturated_fraction)
+    if unusable is not None:
+        return MotionResult(unusable, checksum, exposure)
     frame = expose_frame(pixels, saturation, settings.gain)
     growing = settings.rate_model == "accelerating"
     camera = ExposedCamera(frame, pinhole, _shutter(pinhole, exposure, settings), settings, growing)
@@ -89,7 +86,7 @@ def estimate_motion(
     told = None if _resting(blobs) else _told(camera, seen, blobs, near)
     if told is None:
         return _without_rate(seen, camera, blobs)
-    return _in_time(told, prior_rate, prior_sigma, settings.sign_sigmas)
+    return in_time(told, prior_rate, prior_sigma, settings.sign_sigmas)
 
 
 def _told(camera: ExposedCamera, seen: MotionResult, blobs: Blobs, near: float | None) -> MotionResult | None:
@@ -166,26 +163,3 @@ def _without_rate(seen: MotionResult, camera: ExposedCamera, blobs: Blobs) -> Mo
     if resting is None:
         return replace(seen, status=StreakStatus.TOO_SHORT, length=length)
     return replace(with_stars(seen, camera, resting), status=StreakStatus.TOO_SHORT)
-
-
-def _in_time(
-    result: MotionResult, prior_rate: FloatArray | None, prior_sigma: float, sigmas: float
-) -> MotionResult:
-    """Return an ambiguous `result` in the direction of time that the prior tells, if it can."""
-    if result.rate is None or prior_rate is None:
-        return result
-    sign = direction_of_time(result.rate, np.asarray(prior_rate, dtype=float), prior_sigma, sigmas)
-    if sign == 0:
-        return result
-    if sign > 0:
-        return replace(result, status=StreakStatus.RATE)
-    return replace(
-        result,
-        status=StreakStatus.RATE,
-        rate=-result.rate,
-        endpoints=result.endpoints[:, ::-1],
-        endpoint_covariance=result.endpoint_covariance[:, ::-1],
-        directions=result.directions[:, ::-1],
-        faint_endpoints=result.faint_endpoints[:, ::-1],
-        # Backwards in time the rate changes sign, its change does not.
-    )

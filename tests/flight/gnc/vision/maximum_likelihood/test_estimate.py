@@ -11,10 +11,10 @@ import pytest
 from flight.gnc.errors import FlightError
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import attitude_matrix
-from flight.gnc.vision.streaks.corners.streak_rate import StreakStatus
 from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion
 from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from flight.gnc.vision.streaks.streak_result import StreakStatus
 from sim_hal.star_camera import scatter_hot_pixels
 from tests.flight.gnc.vision.maximum_likelihood.scenes import (
     CAMERA,

@@ -17,7 +17,8 @@ from flight.gnc.math.quaternion import (
 )
 from flight.gnc.vision.startracker.two_ends import attitudes_of_ends
 from flight.gnc.vision.streaks.corners.settings import StreakSettings
-from flight.gnc.vision.streaks.corners.streak_rate import StreakStatus, estimate_rate
+from flight.gnc.vision.streaks.corners.streak_rate import estimate_rate
+from flight.gnc.vision.streaks.streak_result import StreakStatus
 from tests.flight.gnc.vision.streaks.frames import (
     expose,
     random_stars,

@@ -15,8 +15,8 @@ from flight.gnc.vision.startracker.mid_exposure import (
     middle_covariance,
     weighting_of,
 )
-from flight.gnc.vision.streaks.corners.streak_rate import StreakResult, StreakStatus
 from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
+from flight.gnc.vision.streaks.streak_result import StreakResult, StreakStatus
 
 _EXPOSURE = 2.0
 _TIMES = _EXPOSURE * (np.array(NODES) - 0.5)

@@ -14,7 +14,8 @@ from flight.gnc.vision.startracker.solution import FrameSolution, SolveStatus
 from flight.gnc.vision.startracker.solve import AttitudePrior, SolveSettings
 from flight.gnc.vision.startracker.two_ends import solve_ends
 from flight.gnc.vision.streaks.corners.settings import DetectorName, StreakSettings
-from flight.gnc.vision.streaks.corners.streak_rate import StreakResult, StreakStatus, estimate_rate
+from flight.gnc.vision.streaks.corners.streak_rate import estimate_rate
+from flight.gnc.vision.streaks.streak_result import StreakResult, StreakStatus
 from tests.flight.gnc.vision.startracker.frames import NARROW, SkyFrame, sky, sky_frame
 
 _EXPOSURE = 0.5

@@ -10,8 +10,9 @@ import pytest
 
 from flight.gnc.math.arrays import FloatArray, Image
 from flight.gnc.vision.streaks.corners.settings import DETECTOR_NAMES, DetectorName, StreakSettings
-from flight.gnc.vision.streaks.corners.streak_rate import StreakStatus, estimate_rate
+from flight.gnc.vision.streaks.corners.streak_rate import estimate_rate
 from flight.gnc.vision.streaks.corners.streaks import segment_frame
+from flight.gnc.vision.streaks.streak_result import StreakStatus
 from tests.flight.gnc.vision.streaks.frames import expose, random_stars, rate_at, star_camera, star_frame
 
 _CAMERA = star_camera()

@@ -10,13 +10,10 @@ import pytest
 
 from flight.gnc.errors import FlightError
 from flight.gnc.math.arrays import FloatArray, Image
+from flight.gnc.vision.streaks.admission import direction_of_time
 from flight.gnc.vision.streaks.corners.settings import StreakSettings
-from flight.gnc.vision.streaks.corners.streak_rate import (
-    StreakResult,
-    StreakStatus,
-    direction_of_time,
-    estimate_rate,
-)
+from flight.gnc.vision.streaks.corners.streak_rate import estimate_rate
+from flight.gnc.vision.streaks.streak_result import StreakResult, StreakStatus
 from tests.flight.gnc.vision.streaks.frames import (
     Camera,
     expose,
