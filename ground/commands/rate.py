@@ -14,7 +14,9 @@ from flight.gnc.camera.images import grey_stretch, write_picture
 from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.errors import UsageError
 from flight.gnc.math.arrays import FloatArray, Image
-from flight.gnc.vision.objects.objects import ObjectSettings, SpaceObject, detect
+from flight.gnc.vision.objects.detect import detect
+from flight.gnc.vision.objects.report import SpaceObject
+from flight.gnc.vision.objects.settings import ObjectSettings
 from flight.gnc.vision.streaks.corners.settings import DETECTOR_NAMES, StreakSettings
 from flight.gnc.vision.streaks.corners.streak_rate import estimate_rate
 from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion

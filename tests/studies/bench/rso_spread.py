@@ -18,8 +18,10 @@ from typing import Any
 import numpy as np
 
 from flight.gnc.math.arrays import BoolArray, FloatArray
-from flight.gnc.vision.objects.objects import ObjectReport, ObjectSettings, detect
+from flight.gnc.vision.objects.detect import detect
+from flight.gnc.vision.objects.report import ObjectReport
 from flight.gnc.vision.objects.rso_indicators import INDICATORS
+from flight.gnc.vision.objects.settings import ObjectSettings
 from flight.gnc.vision.streaks.corners.settings import DETECTOR_NAMES, StreakSettings
 from tests.flight.gnc.vision.streaks.frames import rate_at, star_camera, true_endpoints
 from tests.flight.gnc.vision.streaks.space_objects import frame_with, motion_across, object_path, star_field

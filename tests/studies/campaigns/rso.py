@@ -18,7 +18,9 @@ import numpy as np
 
 from flight.gnc.math.arrays import FloatArray, Image
 from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
-from flight.gnc.vision.objects.objects import ObjectReport, ObjectSettings, detect
+from flight.gnc.vision.objects.detect import detect
+from flight.gnc.vision.objects.report import ObjectReport
+from flight.gnc.vision.objects.settings import ObjectSettings
 from flight.gnc.vision.streaks.corners.settings import StreakSettings
 from flight.gnc.vision.streaks.corners.streak_rate import estimate_rate
 from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion

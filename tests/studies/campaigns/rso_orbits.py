@@ -20,7 +20,7 @@ import numpy as np
 
 from flight.gnc.math.arrays import BoolArray, FloatArray, Image
 from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector
-from flight.gnc.vision.objects.objects import ObjectReport
+from flight.gnc.vision.objects.report import ObjectReport
 from sim_hal.faults.opportunities import (
     Opportunity,
     Scenario,

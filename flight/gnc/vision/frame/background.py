@@ -30,6 +30,16 @@ class Background:
     noise: FloatArray
     shape: tuple[int, int]
 
+    @property
+    def typical_level(self) -> float:
+        """The median level, counts."""
+        return float(np.median(self.level))
+
+    @property
+    def typical_noise(self) -> float:
+        """The median noise, counts."""
+        return float(np.median(self.noise))
+
     def map(self, grid: FloatArray) -> Image:
         """Return the block values `grid` interpolated bilinearly to every pixel: float32 of `shape`."""
         down, across = (

@@ -19,6 +19,7 @@ from flight.gnc.math.arrays import BoolArray, FloatArray
 from flight.gnc.vision.frame.regions import label_pixels, line_of
 from flight.gnc.vision.objects.star_light import (
     SHAPE_ERROR,
+    pixel_weights,
     spread_over,
     spread_with_slopes,
     star_path,
@@ -95,17 +96,14 @@ def cut_patch(
     top, left = max(top - _ROOM, 0), max(left - _ROOM, 0)
     bottom, right = min(bottom + _ROOM, rows), min(right + _ROOM, columns)
     signal = segmented.signal[top:bottom, left:right].astype(np.float64)
-    noise = float(np.median(segmented.background.noise))
-    light = np.maximum(signal, 0.0)
-    clipped = signal + float(np.median(segmented.background.level)) >= 0.95 * saturation
-    error = np.sqrt(noise**2 + light / gain + (SHAPE_ERROR * light) ** 2)
+    weight = pixel_weights(signal, segmented.background, gain, saturation)
     mask = regions.labels[top:bottom, left:right] == regions.label[index]
     corner = np.array([left, top], dtype=float)
     above, below, before, after = (
         np.inf if off else 0.0 for off in (top == 0, bottom == rows, left == 0, right == columns)
     )
     beyond = ((above, below), (before, after))
-    return Patch(signal, np.where(clipped, 0.0, 1.0 / error), noise, corner, mask, beyond, psf_sigma)
+    return Patch(signal, weight, segmented.background.typical_noise, corner, mask, beyond, psf_sigma)
 
 
 def fit_stars(patch: Patch, rotation: FloatArray, pinhole: Pinhole) -> tuple[list[FloatArray], FloatArray]:

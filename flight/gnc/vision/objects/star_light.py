@@ -21,6 +21,7 @@ from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.errors import FlightError
 from flight.gnc.math.arrays import FloatArray, IntArray
 from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector
+from flight.gnc.vision.frame.background import Background
 from flight.gnc.vision.streaks.corners.streaks import Segmented
 
 # Star paths along a region are tried at every eighth of a path; a longer chain of stars is a rarity.
@@ -85,11 +86,7 @@ class StarLight:
         self._psf_sigma, self._rotation, self._pinhole = psf_sigma, rotation, pinhole
         self._near = _pixels_near([*stars, *lines], _REACH * psf_sigma, rows, columns)
         signal = segmented.signal[self._near[:, 1], self._near[:, 0]].astype(np.float64)
-        noise = float(np.median(segmented.background.noise))
-        light = np.maximum(signal, 0.0)
-        clipped = signal + float(np.median(segmented.background.level)) >= 0.95 * saturation
-        error = np.sqrt(noise**2 + light / gain + (SHAPE_ERROR * light) ** 2)
-        self._weight = np.where(clipped, 0.0, 1.0 / error)
+        self._weight = pixel_weights(signal, segmented.background, gain, saturation)
         self._target = signal * self._weight
         self._stars = np.stack([self._weighted_image(path) for path in (*stars, *known)], axis=1)
         self.pixels = len(self._near)
@@ -121,6 +118,17 @@ class StarLight:
         (left, top), (right, bottom) = self._near.min(axis=0), self._near.max(axis=0)
         light = spread_over(path - (left, top), right - left + 1, bottom - top + 1, self._psf_sigma)
         return np.asarray(light[self._near[:, 1] - top, self._near[:, 0] - left] * self._weight)
+
+
+def pixel_weights(signal: FloatArray, background: Background, gain: float, saturation: float) -> FloatArray:
+    """Return 1/error of pixels with `signal` counts above `background`; 0 within 5 % of `saturation` counts.
+
+    The error holds the noise, the photons (`gain` in e-/count) and the badly known shape of bright streaks.
+    """
+    light = np.maximum(signal, 0.0)
+    clipped = signal + background.typical_level >= 0.95 * saturation
+    error = np.sqrt(background.typical_noise**2 + light / gain + (SHAPE_ERROR * light) ** 2)
+    return np.where(clipped, 0.0, 1.0 / error)
 
 
 def _brightnesses(images: FloatArray, target: FloatArray) -> tuple[FloatArray, float]:

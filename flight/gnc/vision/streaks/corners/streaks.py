@@ -128,7 +128,7 @@ def measure_streaks(segmented: Segmented, settings: StreakSettings) -> Streaks:
 def expected_sigma(regions: Regions, background: Background, settings: StreakSettings) -> FloatArray:
     """Return the expected error (n,) in px of an endpoint of each region, from its counts and the noise."""
     density = regions.flux / (regions.length + 3.0)
-    variance = float(np.median(background.noise)) ** 2 + _PEAK_FRACTION * density / settings.gain
+    variance = background.typical_noise**2 + _PEAK_FRACTION * density / settings.gain
     return np.asarray(
         np.hypot(settings.endpoint_floor, settings.endpoint_noise * np.sqrt(variance) / density)
     )

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from flight.gnc.math.arrays import FloatArray
-from flight.gnc.vision.objects.objects import ObjectReport, ObjectSettings, SpaceObject, Verdict, detect
+from flight.gnc.vision.objects.detect import detect
+from flight.gnc.vision.objects.report import ObjectReport, SpaceObject, Verdict
+from flight.gnc.vision.objects.settings import ObjectSettings
 from flight.gnc.vision.streaks.corners.settings import StreakSettings
 from tests.flight.gnc.vision.streaks.frames import expose, rate_at, read_out, star_camera
 from tests.flight.gnc.vision.streaks.space_objects import (
