@@ -37,8 +37,8 @@ def positions(mask: BoolArray) -> tuple[IntArray, IntArray]:
 def label_pixels(pixel: IntArray, columns: int) -> tuple[IntArray, int]:
     """Return the region number (m,) of each flat `pixel` (m,), ascending, and the count of regions.
 
-    Regions are 8-connected, numbered in the order of their first pixels. Runs of pixels along rows are joined: there are
-    many times fewer of them than pixels.
+    Regions are 8-connected and numbered in the order of their first pixels. Runs of pixels along rows are
+    joined: there are many times fewer of them than pixels.
     """
     from scipy import sparse  # noqa: PLC0415 - a process that only names the methods need not hold it
     from scipy.sparse import csgraph  # noqa: PLC0415

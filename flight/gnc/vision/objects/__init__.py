@@ -1,1 +1,5 @@
-"""Resident space objects among the streaks of one frame (Sease chapter 4)."""
+"""Resident space objects among the streaks of one frame (Sease chapter 4).
+
+`detect` composes: `rso_indicators` (which streaks do not move as the stars do), `short_regions` (points),
+`judge` (whether stars explain the pixels: `star_light`; with the stars removed: `merged`), `report`.
+"""

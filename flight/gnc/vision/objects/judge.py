@@ -53,7 +53,7 @@ class Judge:
         return self._stars_or_unclear(light), None
 
     def crowd(self, corners: FloatArray) -> tuple[Verdict, SpaceObject | None]:
-        """Return the verdict on a region with more than two corners (k, 2): stars, or an object across them."""
+        """Return the verdict on a region with more than two corners (k, 2): stars, or an object."""
         if len(corners) > self.objects.most_corners:
             return Verdict.UNCLEAR, None
         pairs = np.array([corners[list(pair)] for pair in itertools.combinations(range(len(corners)), 2)])

@@ -22,13 +22,13 @@ from flight.gnc.vision.startracker.index.sky_index import SkyIndex
 from flight.gnc.vision.startracker.solution import FrameSolution, SolveStatus
 from flight.gnc.vision.startracker.solve import AttitudePrior, SolveSettings, solve_motion
 from flight.gnc.vision.streaks.maximum_likelihood.chains import close_by
-from flight.gnc.vision.streaks.maximum_likelihood.description import with_rate, with_stars
 from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import ExposedFrame, expose_frame
-from flight.gnc.vision.streaks.maximum_likelihood.fitting import joint_fit
+from flight.gnc.vision.streaks.maximum_likelihood.iteration import ExposedCamera
+from flight.gnc.vision.streaks.maximum_likelihood.joint_fit import joint_fit
 from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion, positions
 from flight.gnc.vision.streaks.maximum_likelihood.normal_equations import light_of
 from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
-from flight.gnc.vision.streaks.maximum_likelihood.rounds import ExposedCamera
+from flight.gnc.vision.streaks.maximum_likelihood.result_of_fit import with_rate, with_stars
 from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene, path_lengths
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from flight.gnc.vision.streaks.maximum_likelihood.shutter import Shutter

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from flight.gnc.math.arrays import BoolArray, FloatArray, IntArray
+from flight.gnc.vision.streaks.maximum_likelihood.equation_solver import eliminate
 from flight.gnc.vision.streaks.maximum_likelihood.normal_equations import SHARED, Evaluation
 from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene
-from flight.gnc.vision.streaks.maximum_likelihood.solution import eliminate
 
 # The error of a median over that of a mean.
 _MEDIAN = 1.25

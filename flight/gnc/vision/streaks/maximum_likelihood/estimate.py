@@ -17,20 +17,20 @@ from flight.gnc.math.arrays import FloatArray, Image
 from flight.gnc.vision.frame.saturation import saturation_count
 from flight.gnc.vision.streaks.admission import admit, in_time, validate
 from flight.gnc.vision.streaks.maximum_likelihood.blobs import Blobs, find_blobs
-from flight.gnc.vision.streaks.maximum_likelihood.description import with_faint, with_rate, with_stars
 from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import expose_frame
-from flight.gnc.vision.streaks.maximum_likelihood.fitting import last_fit
-from flight.gnc.vision.streaks.maximum_likelihood.frame_scan import frame_angles
 from flight.gnc.vision.streaks.maximum_likelihood.hypotheses import (
     alike,
     first_fits,
     rescanned_fits,
     still_fit,
 )
+from flight.gnc.vision.streaks.maximum_likelihood.iteration import ExposedCamera, Fit
+from flight.gnc.vision.streaks.maximum_likelihood.joint_fit import last_fit
 from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
-from flight.gnc.vision.streaks.maximum_likelihood.rounds import ExposedCamera, Fit
+from flight.gnc.vision.streaks.maximum_likelihood.result_of_fit import with_faint, with_rate, with_stars
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from flight.gnc.vision.streaks.maximum_likelihood.shutter import Shutter
+from flight.gnc.vision.streaks.maximum_likelihood.whole_frame_scan import frame_angles
 from flight.gnc.vision.streaks.maximum_likelihood.wholeness import Wholeness, wholeness
 from flight.gnc.vision.streaks.streak_result import StreakStatus
 

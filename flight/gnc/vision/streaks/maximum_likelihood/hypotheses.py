@@ -11,17 +11,14 @@ import numpy as np
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.vision.streaks.maximum_likelihood.angle_scan import SCANNED_STARS, Circles, scan_angles
 from flight.gnc.vision.streaks.maximum_likelihood.blobs import Blobs
-from flight.gnc.vision.streaks.maximum_likelihood.ends import true_ends, unbroken
+from flight.gnc.vision.streaks.maximum_likelihood.end_checks import true_ends, unbroken
 from flight.gnc.vision.streaks.maximum_likelihood.first_guess import (
     Guess,
     find_turning,
     scanned_motions,
     voted_motions,
 )
-from flight.gnc.vision.streaks.maximum_likelihood.matched_filter import find_faint
-from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion
-from flight.gnc.vision.streaks.maximum_likelihood.polar_grid import polar_grid
-from flight.gnc.vision.streaks.maximum_likelihood.rounds import (
+from flight.gnc.vision.streaks.maximum_likelihood.iteration import (
     FIRST,
     LAST,
     SETTLED,
@@ -30,6 +27,9 @@ from flight.gnc.vision.streaks.maximum_likelihood.rounds import (
     iterate,
     misfit,
 )
+from flight.gnc.vision.streaks.maximum_likelihood.matched_filter import find_faint
+from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion
+from flight.gnc.vision.streaks.maximum_likelihood.polar_grid import polar_grid
 from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene, window_times
 
 _FIRST_STARS = 12

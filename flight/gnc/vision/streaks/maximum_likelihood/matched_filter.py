@@ -16,9 +16,7 @@ from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.math.arrays import FloatArray, IntArray
 from flight.gnc.vision.frame.box_sums import less_boxes
 from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import ExposedFrame, Float32Array
-from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion, paths
-from flight.gnc.vision.streaks.maximum_likelihood.polar_grid import ACROSS, PolarGrid, polar_grid
-from flight.gnc.vision.streaks.maximum_likelihood.responses import (
+from flight.gnc.vision.streaks.maximum_likelihood.filter_peaks import (
     FARTHEST,
     LEAST_SEEN,
     profile,
@@ -26,6 +24,8 @@ from flight.gnc.vision.streaks.maximum_likelihood.responses import (
     sharp_peaks,
     standing_peaks,
 )
+from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion, paths
+from flight.gnc.vision.streaks.maximum_likelihood.polar_grid import ACROSS, PolarGrid, polar_grid
 from flight.gnc.vision.streaks.maximum_likelihood.running_sums import RunningSums, running_sums
 
 # Samples are rounded to this part of their noise.

@@ -7,10 +7,10 @@ from enum import Enum
 import numpy as np
 
 from flight.gnc.vision.streaks.maximum_likelihood.chains import in_chains
-from flight.gnc.vision.streaks.maximum_likelihood.ends import true_ends, unbroken
+from flight.gnc.vision.streaks.maximum_likelihood.end_checks import true_ends, unbroken
+from flight.gnc.vision.streaks.maximum_likelihood.iteration import ExposedCamera
 from flight.gnc.vision.streaks.maximum_likelihood.matched_filter import FaintStars
 from flight.gnc.vision.streaks.maximum_likelihood.motion import positions
-from flight.gnc.vision.streaks.maximum_likelihood.rounds import ExposedCamera
 from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene, window_times
 
 # Share of the stars that may seem pieces of longer streaks by chance.

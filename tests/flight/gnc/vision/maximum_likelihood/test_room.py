@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flight.gnc.vision.streaks.maximum_likelihood import fitting
+from flight.gnc.vision.streaks.maximum_likelihood import joint_fit
 from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import expose_frame
+from flight.gnc.vision.streaks.maximum_likelihood.iteration import ExposedCamera
 from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion
-from flight.gnc.vision.streaks.maximum_likelihood.rounds import ExposedCamera
 from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from flight.gnc.vision.streaks.maximum_likelihood.shutter import Shutter
@@ -49,8 +49,8 @@ def test_a_crowd_is_fitted_as_far_as_there_is_room(monkeypatch: pytest.MonkeyPat
     """In whatever order they come: the faintest are taken out, and the rate is as true as it claims."""
     camera, scene = _taken(60.0, 300.0)
     room = float(window_areas(camera.pinhole, scene, camera.settings.reach)[:_ROOM].sum())
-    monkeypatch.setattr(fitting, "_MOST_PIXELS", room * 1.001)
-    done = fitting.joint_fit(camera, scene.select(np.arange(len(scene.light))[::-1]))
+    monkeypatch.setattr(joint_fit, "_MOST_PIXELS", room * 1.001)
+    done = joint_fit.joint_fit(camera, scene.select(np.arange(len(scene.light))[::-1]))
     assert done is not None
     assert len(done.scene.light) == _ROOM
     apart = np.linalg.norm(done.scene.stars[:, None] - scene.stars[:_ROOM], axis=2).min(axis=0)
@@ -62,8 +62,8 @@ def test_a_crowd_is_fitted_as_far_as_there_is_room(monkeypatch: pytest.MonkeyPat
 def test_stars_with_a_say_are_fitted_whatever_they_need(monkeypatch: pytest.MonkeyPatch) -> None:
     """However little room there is."""
     camera, scene = _taken(60.0, 300.0)
-    monkeypatch.setattr(fitting, "_MOST_PIXELS", 1.0)
-    done = fitting.joint_fit(camera, scene)
+    monkeypatch.setattr(joint_fit, "_MOST_PIXELS", 1.0)
+    done = joint_fit.joint_fit(camera, scene)
     assert done is not None
     assert len(done.scene.light) == _TRUSTED
 
@@ -71,5 +71,5 @@ def test_stars_with_a_say_are_fitted_whatever_they_need(monkeypatch: pytest.Monk
 def test_a_fit_whose_point_spread_outgrows_the_first_is_none() -> None:
     """Stars twice as wide as the fit set out with are not those it was given."""
     camera, scene = _taken(60.0, 300.0)
-    assert fitting.joint_fit(camera, scene) is not None
-    assert fitting.joint_fit(camera, replace(scene, width=0.5 * scene.width)) is None
+    assert joint_fit.joint_fit(camera, scene) is not None
+    assert joint_fit.joint_fit(camera, replace(scene, width=0.5 * scene.width)) is None

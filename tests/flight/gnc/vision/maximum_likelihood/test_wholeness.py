@@ -7,13 +7,13 @@ import pytest
 
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.vision.streaks.maximum_likelihood.chains import in_chains
-from flight.gnc.vision.streaks.maximum_likelihood.ends import true_ends, unbroken
+from flight.gnc.vision.streaks.maximum_likelihood.end_checks import true_ends, unbroken
 from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion
 from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import expose_frame
-from flight.gnc.vision.streaks.maximum_likelihood.frame_scan import frame_angles
 from flight.gnc.vision.streaks.maximum_likelihood.matched_filter import find_faint
 from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from flight.gnc.vision.streaks.maximum_likelihood.whole_frame_scan import frame_angles
 from sim_hal.star_camera import StarCameraModel
 from tests.flight.gnc.vision.maximum_likelihood.scenes import CAMERA, SATURATION, Scene, real_sky
 from tests.studies.campaigns import failures

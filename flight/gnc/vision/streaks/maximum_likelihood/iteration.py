@@ -10,13 +10,13 @@ from scipy.special import fdtri
 from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.math.arrays import BoolArray
 from flight.gnc.vision.streaks.maximum_likelihood.agreement import agreed_step
+from flight.gnc.vision.streaks.maximum_likelihood.equation_solver import Solution, moved, solve
 from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import ExposedFrame
 from flight.gnc.vision.streaks.maximum_likelihood.motion import positions
 from flight.gnc.vision.streaks.maximum_likelihood.normal_equations import ALONE, SHARED, Evaluation, evaluate
 from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from flight.gnc.vision.streaks.maximum_likelihood.shutter import Shutter
-from flight.gnc.vision.streaks.maximum_likelihood.solution import Solution, moved, solve
 from flight.gnc.vision.streaks.maximum_likelihood.windows import Windows, cut_windows
 
 _LONGEST_STEP = 3.0

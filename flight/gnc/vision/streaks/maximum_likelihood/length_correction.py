@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from flight.gnc.math.arrays import FloatArray
-from flight.gnc.vision.streaks.maximum_likelihood.ends import brightness, expected_brightness
+from flight.gnc.vision.streaks.maximum_likelihood.end_checks import brightness, expected_brightness
+from flight.gnc.vision.streaks.maximum_likelihood.iteration import ExposedCamera
 from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion, positions
-from flight.gnc.vision.streaks.maximum_likelihood.rounds import ExposedCamera
 from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene, path_lengths, window_times
 
 # Looked at is this part of a streak's length to either side of its end, between so many px, in so many steps.

@@ -9,12 +9,8 @@ import numpy as np
 from flight.gnc.math.arrays import BoolArray, IntArray
 from flight.gnc.vision.streaks.maximum_likelihood.agreement import Opinions, agreeing, opinions
 from flight.gnc.vision.streaks.maximum_likelihood.chains import close_by
-from flight.gnc.vision.streaks.maximum_likelihood.edges import stretched
 from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import Float32Array
-from flight.gnc.vision.streaks.maximum_likelihood.matched_filter import FaintStars, find_faint
-from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion
-from flight.gnc.vision.streaks.maximum_likelihood.normal_equations import light_of
-from flight.gnc.vision.streaks.maximum_likelihood.rounds import (
+from flight.gnc.vision.streaks.maximum_likelihood.iteration import (
     GROWING,
     LAST,
     ROUGH,
@@ -22,6 +18,10 @@ from flight.gnc.vision.streaks.maximum_likelihood.rounds import (
     Fit,
     iterate,
 )
+from flight.gnc.vision.streaks.maximum_likelihood.length_correction import stretched
+from flight.gnc.vision.streaks.maximum_likelihood.matched_filter import FaintStars, find_faint
+from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion
+from flight.gnc.vision.streaks.maximum_likelihood.normal_equations import light_of
 from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene, path_lengths
 from flight.gnc.vision.streaks.maximum_likelihood.windows import window_areas
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flight.gnc.vision.streaks.maximum_likelihood.edges import find_edges, stretched
 from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import expose_frame
+from flight.gnc.vision.streaks.maximum_likelihood.iteration import ExposedCamera
+from flight.gnc.vision.streaks.maximum_likelihood.length_correction import find_edges, stretched
 from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion, positions
-from flight.gnc.vision.streaks.maximum_likelihood.rounds import ExposedCamera
 from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from flight.gnc.vision.streaks.maximum_likelihood.shutter import Shutter

@@ -8,13 +8,13 @@ import numpy as np
 
 from flight.gnc.math.arrays import BoolArray, FloatArray, IntArray
 from flight.gnc.vision.streaks.maximum_likelihood.agreement import disagreement, opinions
+from flight.gnc.vision.streaks.maximum_likelihood.equation_solver import shared_covariance
+from flight.gnc.vision.streaks.maximum_likelihood.iteration import ExposedCamera, Fit
 from flight.gnc.vision.streaks.maximum_likelihood.matched_filter import FaintStars
 from flight.gnc.vision.streaks.maximum_likelihood.motion import positions, sensitivities
 from flight.gnc.vision.streaks.maximum_likelihood.normal_equations import ALONE, Evaluation
 from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
-from flight.gnc.vision.streaks.maximum_likelihood.rounds import ExposedCamera, Fit
 from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene, path_lengths, window_times
-from flight.gnc.vision.streaks.maximum_likelihood.solution import shared_covariance
 from flight.gnc.vision.streaks.maximum_likelihood.wholeness import Wholeness
 from flight.gnc.vision.streaks.streak_result import StreakStatus
 
