@@ -37,7 +37,7 @@ def less_boxes(sums: Image, shape: tuple[int, int], pixels: IntArray, taken: Ima
     out, (rows, columns) = sums.copy(), shape
     for down in (-columns, 0, columns):
         for beside in (-1, 0, 1):
-            # What runs over the frame's edge ends on its outermost pixels, which are zero.
+            # Sums that run over the frame's edge end on its outermost pixels, which are zero.
             out[np.clip(pixels + (down + beside), 0, out.size - 1)] -= taken
     framed = out.reshape(rows, columns)
     framed[[0, -1]] = 0

@@ -1,8 +1,8 @@
-"""What is left of a region when the stars that run through it are taken away.
+"""A region without the stars that run through it.
 
 A star's streak is evenly bright from its one end to its other: it cannot be brighter than its faintest piece.
 So the erosion of the region by the path of a star bounds what a star may have lit, from above; objects that
-cross the streaks, and points on them, all but vanish in it. Stars are taken away one by one, brightest first,
+cross the streaks, and points on them, all but vanish in it. Stars are removed one by one, brightest first,
 their places and brightnesses fitted together, pixels that are too bright for them left out. The brightest
 thing left is then fitted as a point or a line.
 """
@@ -107,7 +107,7 @@ def cut_patch(
 
 
 def fit_stars(patch: Patch, rotation: FloatArray, pinhole: Pinhole) -> tuple[list[FloatArray], FloatArray]:
-    """Return the paths (m, 2) px of the stars in a patch, and what they leave of it (rows, columns)."""
+    """Return the paths (m, 2) px of the stars in a patch, and the rest of it (rows, columns)."""
     middles: list[FloatArray] = []
     left = patch.signal
     offsets = _offsets(patch, rotation, pinhole)
@@ -124,7 +124,7 @@ def fit_stars(patch: Patch, rotation: FloatArray, pinhole: Pinhole) -> tuple[lis
 def brightest_left(patch: Patch, left: FloatArray) -> FloatArray | None:
     """Return the ends (2, 2) px of the brightest thing that the stars left in the region, None if nothing.
 
-    A point's ends are one. What is left of a bright star's badly known shape does not count.
+    A point's ends are one. Residuals of a bright star's badly known shape do not count.
     """
     lit = np.maximum(patch.signal, 0.0)
     error = np.hypot(patch.smoothed_noise, SHAPE_ERROR * patch.smoothed(lit))
@@ -152,7 +152,7 @@ def _moment_line(points: FloatArray, weight: FloatArray) -> FloatArray:
 def _grown(patch: Patch, seen: FloatArray, ends: FloatArray) -> FloatArray | None:
     """Return the ends (2, 2) px to which a line goes on beyond gaps, None where it does not.
 
-    A star that crosses it, taken away with what is below it, leaves a gap.
+    A star that crosses it, removed with what is below it, leaves a gap.
     """
     length = float(np.linalg.norm(ends[1] - ends[0]))
     if length < 2.0 * _LEAST_LINE_PX:
@@ -181,7 +181,7 @@ def _run(lit: BoolArray) -> int:
 
 
 def _fit_line(patch: Patch, left: FloatArray, ends: FloatArray) -> FloatArray:
-    """Return the ends (2, 2) px fitted to what is left, from a guess; Gauss-Newton."""
+    """Return the ends (2, 2) px fitted to the rest, from a guess; Gauss-Newton."""
     is_point = bool(np.all(ends[0] == ends[1]))
     for _ in range(_FITS):
         path = straight_path(ends)
@@ -229,7 +229,7 @@ def _eroded(patch: Patch, left: FloatArray, offsets: FloatArray) -> FloatArray:
 def _fit_together(
     patch: Patch, middles: list[FloatArray], rotation: FloatArray, pinhole: Pinhole
 ) -> tuple[list[FloatArray], FloatArray]:
-    """Return the stars' middles (2,) px fitted together, and what is left; the last is new."""
+    """Return the stars' middles (2,) px fitted together, and the rest; the last is new."""
     stars = np.zeros_like(patch.signal)
     theirs = np.ones(patch.signal.shape, dtype=np.bool_)
     for _ in range(3):

@@ -6,7 +6,7 @@ nearly normal to the boresight the centre runs to infinity; the slope takes its 
 the angle.
 
 The pinhole's projection bends slopes and lengths across a wide field by far more than their errors, so each
-indicator is compared with what a star in the same place would show, and the difference is expressed in
+indicator is compared with a star in the same place, and the difference is expressed in
 expected errors of an endpoint. All three are then one scale, fair to bright and faint streaks, and without an
 RSO their
 spread is a constant of the detector: `python -m tests.studies.bench.rso_spread` measures it, for the lower
@@ -36,7 +36,7 @@ class Indicators:
 
     Attributes:
         endpoints: (n, 2, 2) px, in the order of time in which a star would have gone.
-        deviations: (n, 3) standard deviations from what a star in the same place shows.
+        deviations: (n, 3) standard deviations from a star in the same place.
         fired: (n, 3) which exceed their thresholds.
         centre: (2,) px, of rotation, by least squares; worthless when `degenerate`.
         degenerate: whether slope and length stand in for centre and angle.

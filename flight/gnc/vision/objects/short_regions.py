@@ -61,5 +61,5 @@ def _line_of(segmented: Segmented, regions: Regions, index: int) -> FloatArray:
     weight = weight[bright] / weight[bright].sum()
     centre = weight @ points
     offset = points - centre
-    # Shorter than the point spread the moments tell noise, not length.
+    # Shorter than the point spread the moments measure noise, not length.
     return line_of(centre, (offset * weight[:, None]).T @ offset, _LEAST_LINE_PX)

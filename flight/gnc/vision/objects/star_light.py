@@ -29,7 +29,7 @@ _PATHS_PER_LENGTH = 8
 _LONGEST_CHAIN = 5.0
 # A streak is a row of Gaussians this far apart: its ripple is 0.2 % at a point spread of 0.6 px.
 _STEP_PX = 1.0
-# Light farther than this from all paths says nothing about them: in sigmas of the point spread.
+# Light farther than this from all paths is ignored: in sigmas of the point spread.
 _REACH = 3.0
 # A point's light ends here, in sigmas: 6e-7 of it lies beyond.
 _FARTHEST = 5.0
@@ -75,8 +75,8 @@ class StarLight:
         """Take the pixels along all star paths and all lines between the `corners` (k, 2) px, k at least 2.
 
         Stars may start or stop at each corner and pass the corners' middle anywhere on their path. Pixels
-        within 5 % of `saturation` counts say nothing; `gain` is in e-/count. Stars on `known` paths (m, 2) px
-        may have lit them as well. Raises FlightError when the brightnesses cannot be solved for.
+        within 5 % of `saturation` counts weigh nothing; `gain` is in e-/count. Stars on `known` paths (m, 2)
+        px may have lit them as well. Raises FlightError when the brightnesses cannot be solved for.
         """
         stars = _star_paths(corners, rotation, pinhole)
         lines = [
@@ -213,7 +213,7 @@ def _pixels_near(paths: list[FloatArray], reach: float, rows: int, columns: int)
     x, y = np.meshgrid(np.arange(-r, r + 1), np.arange(-r, r + 1))
     disc = np.stack([x[x**2 + y**2 <= reach**2], y[x**2 + y**2 <= reach**2]], axis=-1)
     points = points[inside].astype(np.int64)
-    # On a map of the frame's part, with room for what lies off the frame: no sorting.
+    # On a map of the frame's part, with room beyond the frame: no sorting.
     first = points.min(axis=0, initial=columns + rows) - r
     width, height = np.maximum(points.max(axis=0, initial=0) + r + 1 - first, 1)
     marked = np.zeros((height, width), dtype=np.bool_)
@@ -269,7 +269,7 @@ def _edges(centres: FloatArray, sigma: float) -> tuple[IntArray, FloatArray]:
 
 
 def _placed(values: FloatArray, first: IntArray, count: int) -> FloatArray:
-    """Return `values` (m, k) of the pixels from `first` (m,) on as (m, count); what lies off is dropped."""
+    """Return `values` (m, k) of the pixels from `first` (m,) on as (m, count), those on the frame."""
     number, width = values.shape
     start = np.clip(first, -width, count) + width
     placed = np.zeros((number, count + 2 * width))

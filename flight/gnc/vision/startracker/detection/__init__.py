@@ -4,11 +4,10 @@
     found.points, found.covariance, found.flux        # brightest first
 
 `sky` measures the background and finds what stands above it, `areas` puts that together: that is the
-`survey`, which tells points from streaks (`frame_kind`); streaks are `flight.gnc.vision.streaks`'s. `peaks`
-chooses what is worth a measurement, `first_look` tells the frame's own point spread and noise
-(`noise_model`), and
-`measurement` fits each star with them (`psf_fit`, `blending`) or takes the centre of mass
-(`window_centroid`); `detect` composes. `nearby` measures about predicted places only.
+`survey`, which distinguishes points from streaks (`frame_kind`); streaks are `flight.gnc.vision.streaks`'s.
+`peaks` chooses the peaks to measure, `first_look` measures the frame's own point spread and noise
+(`noise_model`), and `measurement` fits each star with them (`psf_fit`, `blending`) or takes the centre of
+mass (`window_centroid`); `detect` composes. `nearby` measures about predicted places only.
 """
 
 from flight.gnc.vision.startracker.detection.detect import detect, measure_areas

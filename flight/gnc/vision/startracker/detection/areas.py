@@ -79,7 +79,7 @@ def find_areas(pixels: Image, sky: Sky, bright: BrightPixels, saturation: float 
 
 
 def cluttered(areas: Areas, place: IntArray, share: float) -> BoolArray:
-    """Tell which pixels `place` (p, 2) lie in blocks of 32 px of which the areas fill more than `share`.
+    """Return which pixels `place` (p, 2) lie in blocks of 32 px of which the areas fill more than `share`.
 
     Half a block's step each way is looked at too, so that where the blocks begin does not matter.
     """
@@ -111,7 +111,7 @@ def _adjoining(index: IntArray, columns: int) -> tuple[IntArray, IntArray]:
 def _peaks(smooth: FloatArray, first: IntArray, second: IntArray) -> BoolArray:
     """Return which pixels (m,) are higher than all that touch them; of equals the last one wins.
 
-    What is not above the noise is lower than what is.
+    Pixels below the noise threshold are lower than those above it.
     """
     best = np.ones(len(smooth), dtype=bool)
     best[first[smooth[first] <= smooth[second]]] = False

@@ -1,4 +1,4 @@
-"""Stars so close that each lies in the other's window: whose light is where, and what is lost by it."""
+"""Stars so close that each lies in the other's window: whose light is where, and the precision lost."""
 
 from __future__ import annotations
 

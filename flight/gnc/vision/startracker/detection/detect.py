@@ -16,10 +16,10 @@ from flight.gnc.vision.startracker.detection.sky import Sky
 from flight.gnc.vision.startracker.detection.survey import Survey, survey
 from flight.gnc.vision.startracker.detection.targets import Targets
 
-# So many times the stars wanted are measured: some will prove to be none.
+# This many times the stars wanted are measured: some will prove to be none.
 _MEASURED_FOR_ONE = 1.5
 _CLUTTERED_SHARE = 0.25
-# Where the sky itself seems so many times as noisy as elsewhere it is no sky.
+# Where the sky itself seems this many times as noisy as elsewhere it is no sky.
 _RESTLESS = 2.5
 # A saturated disc wider than this is no star's but a planet's, the Moon's, a lamp's.
 _WIDEST_CORE = 7.0
@@ -35,7 +35,7 @@ _FARTHEST = 2.0
 
 
 def detect(pixels: Image, settings: DetectionSettings | None = None) -> Detections:
-    """Return the sources of a frame (rows, columns) of counts, brightest first; `stars()` drops what is none.
+    """Return the sources of a frame (rows, columns) of counts, brightest first; `stars()` selects stars.
 
     Raises ValueError when `pixels` is no finite frame of real numbers, 16 x 16 or larger.
     """
@@ -81,26 +81,26 @@ def quality_of(found: Measured, shapes: Shapes, spread: FrameSpread, targets: Ta
 
 
 def plain_ones(sound: BoolArray, targets: Targets) -> BoolArray:
-    """Return which of the `sound` (n,) are to tell the point spread: the unsaturated, where there are any."""
+    """Return which of the `sound` (n,) give the point spread: the unsaturated, where there are any."""
     plain = sound & (targets.core == 0.0)
     return plain if plain.any() else sound
 
 
 def looks_odd(quality: IntArray, shapes: Shapes, spread: FrameSpread) -> BoolArray:
-    """Tell which sources (n,) look like no star: streaks, clutter, or broader than the point spread."""
+    """Return which sources (n,) look like no star: streaks, clutter, or broader than the point spread."""
     refused = (quality & REFUSED & ~int(Quality.HOT)) != 0
     return np.asarray(refused | (shapes.width - shapes.error > _ODD_WIDTH * spread.psf_sigma))
 
 
 def among_odd(odd: BoolArray, points: FloatArray) -> BoolArray:
-    """Tell which sources (n,) at `points` (n, 2) px stand among sources most of which are `odd` (n,)."""
+    """Return which sources (n,) at `points` (n, 2) px stand among sources most of which are `odd` (n,)."""
     near = np.sum((points[:, None] - points) ** 2, axis=-1) < _ABOUT**2
     strange = near @ odd.astype(float)
     return np.asarray((strange >= _LEAST_ODD) & (strange > _ODD_PART * near.sum(axis=1)))
 
 
 def confirmed(found: Measured, targets: Targets, settings: DetectionSettings) -> BoolArray:
-    """Tell which stars (n,) the measurement bears out: enough light, near its peak, inside the frame."""
+    """Return which stars (n,) the measurement confirms: enough light, near its peak, inside the frame."""
     far = np.maximum(_FARTHEST, targets.core)[:, None]
     near = (np.abs(found.points - targets.middle) < far).all(axis=1)
     limits = np.array(targets.pixels.shape)[::-1] - 0.5

@@ -12,7 +12,7 @@ from flight.gnc.vision.records import select
 
 
 class Quality(IntFlag):
-    """What is the matter with a detection. The first line's are stars still, their errors widened."""
+    """Faults of a detection. Those of the first line are still stars, their errors widened."""
 
     POINT = 0
     SATURATED, BLENDED, CLIPPED = 1, 2, 4
@@ -23,7 +23,7 @@ REFUSED = int(Quality.HOT | Quality.EXTENDED | Quality.STREAK | Quality.CLUTTER)
 
 
 class FrameKind(Enum):
-    """What a frame shows: stars at rest, stars drawn out to streaks, or neither."""
+    """The content of a frame: stars at rest, stars drawn out to streaks, or neither."""
 
     POINTS = "points"
     STREAKS = "streaks"

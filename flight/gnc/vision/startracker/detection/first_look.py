@@ -19,7 +19,7 @@ LEAST_HALF, MOST_HALF = 3, 9
 REACH = 2.7
 """Half a window, in sigmas of the point spread, and its least and greatest, px."""
 _FIRST_NOISE = NoiseModel(0.0, 0.1)
-# Of the shape, where no star tells.
+# Of the shape, where no star shows it.
 _UNKNOWN_MISMATCH = 0.02
 _MOST_OF_CELL = 4
 _LEAST_LONE = 3
@@ -29,7 +29,7 @@ _APART = 2 * _HALF_OF_FIRST + 1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shapes:
-    """What a fit of each star alone says: its width (n,) px, its error (n,) px, whether it is hot (n,)."""
+    """Each star fitted alone: its width (n,) px, its error (n,) px, whether it is hot (n,)."""
 
     width: FloatArray
     error: FloatArray
@@ -64,7 +64,7 @@ def first_look(targets: Targets) -> Shapes:
 def frame_spread(shapes: Shapes, plain: BoolArray, settings: DetectionSettings) -> FrameSpread:
     """Return the point spread and noise that the stars `plain` (n,), the brightest first, show.
 
-    What is given in the settings is kept. Without a star that tells, the width is 1 px and no photon noise is
+    Settings that are given are kept. Without a usable star the width is 1 px and no photon noise is
     known.
     """
     fitted = shapes.fitted
@@ -113,7 +113,7 @@ def start(windows: Windows) -> tuple[FloatArray, FloatArray]:
 
 
 def single_pixels(windows: Windows) -> BoolArray:
-    """Tell which windows (n,) hold one bright pixel with dark neighbours, which no optics make.
+    """Return which windows (n,) hold one bright pixel with dark neighbours, which no optics make.
 
     A star's image of sigma 0.5 px gives its brightest pixel's neighbours 15 % of it and more.
     """
@@ -126,7 +126,7 @@ def single_pixels(windows: Windows) -> BoolArray:
 
 
 def crowded(middle: IntArray) -> BoolArray:
-    """Tell which targets (n,) have another in their window of the first look."""
+    """Return which targets (n,) have another in their window of the first look."""
     apart = np.abs(middle[:, None] - middle).max(axis=-1)
     np.fill_diagonal(apart, _APART)
     return np.asarray(apart.min(axis=1) < _APART)

@@ -8,7 +8,7 @@ from flight.gnc.math.arrays import BoolArray, FloatArray
 from flight.gnc.vision.startracker.detection.areas import Areas
 from flight.gnc.vision.startracker.detection.detections import FrameKind, FrameShape
 
-# The brightest areas tell; a rate shows in all of them, or in all but those on its axis.
+# The brightest areas decide; a rate shows in all of them, or in all but those on its axis.
 _LOOKED_AT = 20
 _LEAST_PIXELS = 4
 _SHORTEST_STREAK = 5.0
@@ -22,12 +22,12 @@ _CROOKED = 0.12
 
 
 def is_streak(areas: Areas) -> BoolArray:
-    """Tell which areas (n,) are thin and long."""
+    """Return which areas (n,) are thin and long."""
     return np.asarray((areas.length > _SHORTEST_STREAK) & (areas.length > _SLENDER * areas.thickness))
 
 
 def frame_shape(areas: Areas) -> FrameShape:
-    """Return what the frame shows; four streaks are needed, of no less than four in ten of its areas."""
+    """Return the kind of the frame; four streaks are needed, at least four in ten of its areas."""
     chosen = np.argsort(-areas.flux, kind="stable")[: 3 * _LOOKED_AT]
     usable = (areas.pixels[chosen] >= _LEAST_PIXELS) & (areas.thickness[chosen] < _THICKEST)
     chosen = chosen[usable][:_LOOKED_AT]
@@ -46,7 +46,7 @@ def frame_shape(areas: Areas) -> FrameShape:
 
 
 def share_one_rotation(centre: FloatArray, direction: FloatArray) -> bool:
-    """Tell whether lines at `centre` (n, 2) px, `direction` (n,) rad, follow one rotation of the camera.
+    """Return whether lines at `centre` (n, 2) px, `direction` (n,) rad, follow one rotation of the camera.
 
     Near the boresight its flow is t + w (-y, x): normal to no line that follows it. The t and w that are
     the least so are the smallest singular vector of the normals' products with the flow.

@@ -25,7 +25,7 @@ from flight.gnc.vision.startracker.detection.windows import Windows
 
 _BLEND_ROUNDS = 5
 _STEPS, _STEPS_SATURATED = 3, 12
-# What the pixels' own differences and a shape that is no Gaussian leave at best, px.
+# Least error, px: pixels differ, and no star is exactly a Gaussian.
 _FLOOR = 0.002
 
 

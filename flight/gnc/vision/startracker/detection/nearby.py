@@ -26,7 +26,7 @@ _SAME_STAR = 1.5
 def measure_near(
     pixels: Image, predicted: FloatArray, settings: DetectionSettings | None = None
 ) -> Detections:
-    """Return the stars found near `predicted` (m, 2) px, brightest first; `prediction` tells whose each is.
+    """Return the stars found near `predicted` (m, 2) px, brightest first; `prediction` says of which.
 
     Only windows about the predictions are read. Nothing is reported where no peak within the settings'
     search radius exceeds the threshold, and one star is given to the nearest prediction only. Raises
@@ -116,7 +116,7 @@ def _median(values: FloatArray) -> FloatArray:
 
 
 def _nearest(points: IntArray, apart: FloatArray) -> BoolArray:
-    """Tell which (n,) are the nearest to their prediction of all that found the same peak."""
+    """Return which (n,) are the nearest to their prediction of all that found the same peak."""
     same = np.linalg.norm(points[:, None] - points, axis=-1) < _SAME_STAR
     order = np.arange(len(points))
     better = (apart < apart[:, None]) | ((apart == apart[:, None]) & (order < order[:, None]))

@@ -1,4 +1,4 @@
-"""The variance of a pixel under a star: sky, photons, and what the Gaussian cannot follow.
+"""The variance of a pixel under a star: sky, photons, and the Gaussian's mismatch.
 
 variance = noise^2 + light / gain + (mismatch light)^2. Where the gain is unknown, it and the mismatch are
 measured from the stars' own residuals: noise of photons grows as the light, a wrong shape as its square.
@@ -46,7 +46,7 @@ def measure_noise(
     """Return the noise model that the residuals (n, k, k) of a fit show; a given `gain` is kept.
 
     Least squares of residual^2 - noise^2 on light and light^2, weighted by the spread of squared normal
-    residuals and never negative. `leverage` is what the fit took out of each residual.
+    residuals and never negative. `leverage` is the part of each residual that the fit absorbed.
     """
     used = np.isfinite(variance) & (light > 0.5 * noise[:, None, None]) & (leverage < 0.8)
     given = 0.0 if gain is None else 1.0 / gain

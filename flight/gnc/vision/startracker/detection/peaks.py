@@ -69,7 +69,7 @@ def worth_measuring(peaks: Peaks, shape: tuple[int, ...], most: int) -> Peaks:
 
 
 def on_wings(peaks: Peaks) -> BoolArray:
-    """Tell which peaks (p,), highest first, are no higher than a brighter one's wings might be there."""
+    """Return which peaks (p,), highest first, are no higher than a brighter one's wings might be there."""
     x, y = peaks.place.T.astype(np.float32)
     square = (x[:, None] - x) ** 2 + (y[:, None] - y) ** 2
     # Only a few pairs are near enough to ask: at 60 px wings are a millionth of the peak.

@@ -22,7 +22,7 @@ NARROWEST, WIDEST = 0.25, 6.0
 # Steps are cut to this, px: a start one pixel off must not fly away.
 _LONGEST_STEP = 0.7
 _WIDEST_STEP = 0.35
-# Residuals beyond so many sigmas, in the last steps, are another thing's light.
+# Residuals beyond this many sigmas, in the last steps, are another thing's light.
 _CLIP = 6.0
 _CLIP_FROM_END = 1
 # The condition is made by this, in units of the scaled diagonal: a star without information stays put.

@@ -26,7 +26,7 @@ Float32Array = npt.NDArray[np.float32]
 KERNEL_NORM = 6.0
 """Root of the sum of squares of the smoothing kernel: the noise of white noise of 1."""
 LEAST_SIDE = 16
-# A frame without whole counts is brought to so many counts of noise.
+# A frame without whole counts is brought to this many counts of noise.
 _FLOATING_NOISE = 16.0
 _BAND = 32
 _BLOCK, _STRIDE, _SINGLE_STRIDE = 64, 4, 8
@@ -64,7 +64,7 @@ class Surface:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sky:
-    """What a frame is like between its stars.
+    """The sky of a frame between its stars.
 
     Attributes:
         level, noise: counts of single pixels.
@@ -187,7 +187,7 @@ def _tail(sample: Float32Array, level: FloatArray, noise: FloatArray) -> float:
     """Return how much farther the noise reaches upwards than a normal one; 1 or more.
 
     2.3 % of a frame should stand above twice its noise. A sky cut off at zero counts has noise on one side
-    only, whose clipped moments say too little of it.
+    only, whose clipped moments underestimate it.
     """
     (rows, columns), (down, across) = sample.shape, level.shape
     block = np.ix_(np.arange(rows) * down // rows, np.arange(columns) * across // columns)

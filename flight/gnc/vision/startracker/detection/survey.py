@@ -14,7 +14,7 @@ from flight.gnc.vision.startracker.detection.sky import Sky, find_bright, in_cou
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Survey:
-    """What one pass over a frame sees: its sky, and the areas that stand above the noise.
+    """One pass over a frame: its sky, and the areas that stand above the noise.
 
     Attributes:
         pixels: (rows, columns) in counts, `unit` of the frame's own numbers each.

@@ -1,4 +1,4 @@
-"""Where stars are to be measured, and what is known of the sky there."""
+"""Where stars are to be measured, and the sky there."""
 
 from __future__ import annotations
 

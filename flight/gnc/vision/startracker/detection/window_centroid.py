@@ -26,7 +26,7 @@ class WindowCentroids:
     Attributes:
         offset: (n, 2) px from the middle pixel; clipped to the window where the light is noise.
         flux, sky: (n,) counts within the border, and a pixel on the border.
-        variance: (n,) px^2 along one axis, of the noise and of what the window cuts off.
+        variance: (n,) px^2 along one axis, of the noise and of the light that the window cuts off.
         flux_variance: (n,) counts^2.
     """
 
@@ -38,7 +38,7 @@ class WindowCentroids:
 
 
 def centre_of_mass(windows: Windows, noise: NoiseModel, psf_sigma: float) -> WindowCentroids:
-    """Return the centres of mass of `windows` (eq. 12-20); those cut by the edge are of what is there."""
+    """Return the centres of mass of `windows` (eq. 12-20); those cut by the edge are of the pixels there."""
     half = windows.half
     offset, flux, sky = _moments(windows.light)
     step = np.arange(1 - half, half)

@@ -18,7 +18,7 @@ class Windows:
         middle: (n, 2) column and row of the middle pixel.
         half: px.
         light: (n, k, k) counts above the sky, 0 where there is no pixel; saturated ones as they are.
-        good: (n, k, k) which pixels exist and tell something.
+        good: (n, k, k) which pixels exist and are usable.
         noise: (n,) counts, of a pixel without a star.
     """
 
@@ -46,7 +46,7 @@ def cut(
     """Return the windows of `pixels` (rows, columns) about the pixels `middle` (n, 2), which are inside.
 
     `level` (n,) is the sky's, `noise` (n,) its noise; pixels at `ceiling` counts or above are saturated and
-    tell nothing.
+    not used.
     """
     rows, columns = pixels.shape
     step = np.arange(-half, half + 1)

@@ -53,7 +53,7 @@ class StreakSettings:
         outlier_sigmas: robust standard deviations from which a streak is dropped (RSO, overlap, fragment).
         worst_residual: px, rms of an endpoint above which the streaks do not share one rotation: fragments
             that agree by chance leave 1 to 4, stars 0.6 at most (frames of the campaign `streaks`).
-        sign_sigmas: the prior's projection on the axis must exceed so many of its sigmas to decide the
+        sign_sigmas: the prior's projection on the axis must exceed this many of its sigmas to decide the
             direction.
     """
 

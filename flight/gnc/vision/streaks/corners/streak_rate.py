@@ -1,8 +1,8 @@
 """The body rate from one long exposure: Sease chapters 3 and 4, corrected by the errata.
 
 A frame becomes regions, regions streaks, streaks one rotation, the rotation over the exposure a rate. One
-frame cannot tell omega from -omega; a prior (gyro, or the last estimate) decides. Pure and deterministic,
-made for a worker process.
+frame cannot distinguish omega from -omega; a prior (gyro, or the last estimate) decides. Pure and
+deterministic, made for a worker process.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ def estimate_rate(
         prior_sigma: rad/s, standard deviation of each component of `prior_rate`.
         previous_checksum: of the frame before: the same pixels again are a frozen camera.
 
-    Raises FlightError for a frame, exposure or prior that cannot be meant. What the scene does is told as a
-    status.
+    Raises FlightError for a frame, exposure or prior that is impossible. A scene without a rate is reported
+    by the status.
     """
     validate(pixels, pinhole, exposure, prior_rate, prior_sigma)
     saturation = saturation_level(pixels, settings.saturation)
@@ -97,7 +97,7 @@ def _rate(
 
 
 def _typical_length(regions: Regions, settings: StreakSettings) -> float:
-    """Return the median length in px of the brightest regions, infinity when there are too few to say."""
+    """Return the median length in px of the brightest regions, infinity when there are too few."""
     if len(regions) < settings.least_streaks:
         return float("inf")
     brightest = np.argsort(-regions.flux, kind="stable")[: settings.most_streaks]

@@ -1,8 +1,8 @@
-"""Which stars agree about what all share.
+"""Which stars agree about the shared parameters.
 
 A close pair taken for one star is wider or longer than the rest; another's light in a streak shifts its ends.
 Each star's own estimate of the shared parameters, with its deviation, shows it: most stars agree, to what
-their information allows, and those that do not lose their say.
+their information allows, and those that do not are no longer trusted.
 """
 
 from __future__ import annotations
@@ -20,38 +20,40 @@ from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene
 _MEDIAN = 1.25
 
 
-# A star that knows less than this part of what the best one does says nothing.
+# A star with less than this part of the best one's information is ignored.
 _NOTHING = 1e-9
-# Stars of unequal say count as fewer equal ones, of which no fewer than this have a spread.
+# Stars of unequal weight count as fewer equal ones; fewer than this have no spread.
 _LEAST_EFFECTIVE = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Opinions:
-    """What each star alone says of what all share: change (n, k) along k directions, and its deviation."""
+class OwnEstimates:
+    """Each star's own estimate of the shared parameters: change (n, k) along k directions; deviation."""
 
     change: FloatArray
     deviation: FloatArray
 
 
-def opinions(evaluation: Evaluation, scene: Scene, free: BoolArray) -> Opinions | None:
+def own_estimates(evaluation: Evaluation, scene: Scene, free: BoolArray) -> OwnEstimates | None:
     """Return each star's own estimate of the turn, along it and across it twice, and of the width.
 
     All are steps from the scene's; the units are rad, and px for the width.
     """
-    said = _alone(evaluation, free)
-    if said is None:
+    alone = _alone(evaluation, free)
+    if alone is None:
         return None
-    kept, schur, score = said
+    kept, schur, score = alone
     axis = scene.motion.turn / max(float(np.linalg.norm(scene.motion.turn)), 1e-12)
     across = np.linalg.svd(axis[None])[2][1:]
     directions = np.zeros((4, SHARED))
     directions[0, :3], directions[1:3, :3], directions[3, 6] = axis, across, 1.0
     directions = directions[:, kept]
     information = np.einsum("ai,nij,aj->na", directions, schur, directions)
-    told = information > _NOTHING * information.max(axis=0)
-    information = np.where(told, information, _NOTHING * information.max(axis=0) + 1e-300)
-    return Opinions(np.where(told, score @ directions.T / information, 0.0), 1.0 / np.sqrt(information))
+    informed = information > _NOTHING * information.max(axis=0)
+    information = np.where(informed, information, _NOTHING * information.max(axis=0) + 1e-300)
+    return OwnEstimates(
+        np.where(informed, score @ directions.T / information, 0.0), 1.0 / np.sqrt(information)
+    )
 
 
 def agreed_step(evaluation: Evaluation, step: FloatArray) -> tuple[float, int]:
@@ -60,10 +62,10 @@ def agreed_step(evaluation: Evaluation, step: FloatArray) -> tuple[float, int]:
     Each star asks for its own part of the step. The spread of what they ask is the measure, where it is more
     than the noise: one star in whose light another's is hidden moves no agreement.
     """
-    said = _alone(evaluation, step != 0.0)
-    if said is None:
+    alone = _alone(evaluation, step != 0.0)
+    if alone is None:
         return 0.0, 0
-    kept, schur, score = said
+    kept, schur, score = alone
     asked, due = score @ step[kept], np.einsum("i,nij,j->n", step[kept], schur, step[kept])
     count = int(np.count_nonzero(due > 0.0))
     spread = float(np.sum((asked - due) ** 2)) * count / max(count - 1, 1)
@@ -74,7 +76,7 @@ def agreed_step(evaluation: Evaluation, step: FloatArray) -> tuple[float, int]:
 def _alone(evaluation: Evaluation, free: BoolArray) -> tuple[IntArray, FloatArray, FloatArray] | None:
     """Return the free shared parameters (k,), each star's information (n, k, k) and score (n, k) of them.
 
-    Its own numbers are eliminated; None when what is shared is not determined.
+    Its own numbers are eliminated; None when the shared parameters are not determined.
     """
     eliminated = eliminate(evaluation, free)
     if eliminated is None:
@@ -86,14 +88,14 @@ def _alone(evaluation: Evaluation, free: BoolArray) -> tuple[IntArray, FloatArra
     return kept, schur, score
 
 
-def agreeing(said: Opinions, floors: FloatArray, sigmas: float) -> BoolArray:
-    """Tell which stars (n,) say the same as most: within `sigmas` of the weighted median in all directions.
+def agreeing(estimates: OwnEstimates, floors: FloatArray, sigmas: float) -> BoolArray:
+    """Return which stars (n,) agree with most: within `sigmas` of the weighted median in all directions.
 
     A star in whose light another's is hidden is wider or longer than the rest; `floors` (k,) are added to the
     deviations for what the model does not describe.
     """
-    agree = np.ones(len(said.change), dtype=np.bool_)
-    for change, deviation, floor in zip(said.change.T, said.deviation.T, floors, strict=True):
+    agree = np.ones(len(estimates.change), dtype=np.bool_)
+    for change, deviation, floor in zip(estimates.change.T, estimates.deviation.T, floors, strict=True):
         spread = np.hypot(deviation, floor)
         order = np.argsort(change)
         weight = np.cumsum(1.0 / spread[order])
@@ -104,14 +106,14 @@ def agreeing(said: Opinions, floors: FloatArray, sigmas: float) -> BoolArray:
     return agree
 
 
-def disagreement(said: Opinions, which: BoolArray) -> float:
+def disagreement(estimates: OwnEstimates, which: BoolArray) -> float:
     """Return the chi-square per degree of freedom between stars `which` (n,): 1 when all obey the model."""
-    change, weight = said.change[which], said.deviation[which] ** -2
+    change, weight = estimates.change[which], estimates.deviation[which] ** -2
     if len(change) < 3:
         return 1.0
     total = weight.sum(axis=0)
     mean = np.sum(weight * change, axis=0) / total
-    # Each counts by its say in the whole: the spread of a few bright ones is not lost among many faint.
+    # Each counts by its weight: the spread of a few bright ones is not lost among many faint.
     effective = np.maximum(total**2 / np.sum(weight**2, axis=0), _LEAST_EFFECTIVE)
     found = np.sum(weight**2 * (change - mean) ** 2, axis=0) / total * effective / (effective - 1.0)
     # The largest of several is larger than one, by about a standard deviation.

@@ -19,19 +19,19 @@ from flight.gnc.math.arrays import BoolArray, FloatArray, IntArray
 from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import ExposedFrame
 
 SCANNED_STARS = 14
-"""So many of the brightest regions tell the angle."""
+"""This many of the brightest regions are used for the angle."""
 
 # Spacing of the samples on the fastest circle, px; lengths tried, in samples, differ by this factor.
 _STEP = 2.0
 _FACTOR = 1.04
 _SHORTEST = 6
-# So many of the likeliest angles are weighed against one that is told.
+# This many of the likeliest angles are weighed against a given one.
 _WEIGHED = 3
-# A crossing star adds no more than so many times the region's own light to a sample.
+# A crossing star adds at most this many times the region's own light to a sample.
 _CAP = 2.0
-# No star counts more than so many sigmas.
+# No star counts more than this many sigmas.
 _ENOUGH = 60.0
-# A star is used from so many sigmas; the border takes no more than this part of it.
+# A star is used from this many sigmas; the border takes at most this part of it.
 _CERTAIN = 8.0
 _LEAST_SEEN = 0.25
 
@@ -74,10 +74,10 @@ def scan_angles(
     count = int(np.log(longest / _SHORTEST) / np.log(_FACTOR)) + 1
     widths = np.unique(np.rint(_SHORTEST * _FACTOR ** np.arange(count)).astype(np.int64))
     gain = np.array([boxes.held(int(width)).gain for width in widths])
-    # A bright star has much more to say than others, but may be two.
+    # A bright star weighs much more than others, but may be two.
     scale = _weights(gain)
     score = gain @ scale
-    # Where the border cuts all that would tell, longer turns explain no more: the shortest stands for them.
+    # Where the border cuts all useful ones, longer turns explain no more: the shortest stands for them.
     before, after = np.append(0.0, score[:-1]), np.append(score[1:], 0.0)
     peak = np.flatnonzero((score > before) & (score >= after))
     peak = peak[np.argsort(-score[peak], kind="stable")]
@@ -130,7 +130,7 @@ class _Boxes:
 
 
 def _boxes(frame: ExposedFrame, pinhole: Pinhole, circles: Circles) -> _Boxes:
-    """Return the light on the circles, a crossing star's no more than `_CAP` times the region's own."""
+    """Return the light on the circles, a crossing star's at most `_CAP` times the region's own."""
     sine = np.sqrt(np.maximum(1.0 - circles.height**2, 1e-12))
     step = _STEP / (pinhole.focal_length * float(sine.max()))
     inside_field = float(np.arccos(np.clip(abs(circles.frame[2, 2]), 0.0, 1.0)))
@@ -188,13 +188,13 @@ def _sharpened(boxes: _Boxes, pinhole: Pinhole, circles: Circles, scale: FloatAr
 
 
 def _bounded(boxes: _Boxes, sample: IntArray) -> BoolArray:
-    """Tell whether the sample (n,) at an end of a box exists."""
+    """Return whether the sample (n,) at an end of a box exists."""
     here = np.clip(sample, 0, boxes.exist.shape[1] - 2)
     each = np.arange(len(here))
     return np.asarray((here == sample) & (boxes.exist[each, here + 1] > boxes.exist[each, here]))
 
 
 def _distinct(pixel: FloatArray) -> BoolArray:
-    """Tell which places (n, 2), brightest first, are not taken already."""
+    """Return which places (n, 2), brightest first, are not taken already."""
     near = np.linalg.norm(pixel[:, None] - pixel, axis=2) < 4.0 * _STEP
     return np.asarray(~np.triu(near, k=1).any(axis=0))

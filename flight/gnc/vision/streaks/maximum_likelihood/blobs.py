@@ -1,4 +1,4 @@
-"""Connected regions of light with their moments: what the first guess is made of."""
+"""Connected regions of light with their moments: the basis of the first guess."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.math.arrays import BoolArray, FloatArray
 from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion
 
-# Pieces lie within so many px of one circle, are so many turns apart, and differ in light by this factor.
+# Pieces lie within this many px of one circle, are this many turns apart, and differ in light by this factor.
 _ASIDE = 1.3
 _NEXT = (0.55, 1.7)
 _ALIKE = 2.5
@@ -35,9 +35,9 @@ def apart(azimuth: FloatArray, other: FloatArray) -> FloatArray:
 def in_chains(
     pinhole: Pinhole, motion: Motion, stars: FloatArray, light: FloatArray, asked: int | None = None
 ) -> BoolArray:
-    """Tell which stars (n, 2) of `light` (n,) have another like them before or behind on their circle.
+    """Return which stars (n, 2) of `light` (n,) have another like them before or behind on their circle.
 
-    Only the first `asked` of them are told of, when that is given.
+    Only the first `asked` of them are judged, when that is given.
     """
     polar, azimuth = circles(pinhole, motion, stars)
     turns = apart(azimuth[:asked], azimuth) / max(float(np.linalg.norm(motion.turn)), 1e-12)
@@ -50,7 +50,7 @@ def in_chains(
 def close_by(
     pinhole: Pinhole, motion: Motion, stars: FloatArray, others: FloatArray, distance: float
 ) -> BoolArray:
-    """Tell which of `stars` (n, 2) draw streaks within `distance` px of a streak of `others` (m, 2)."""
+    """Return which of `stars` (n, 2) draw streaks within `distance` px of a streak of `others` (m, 2)."""
     polar, azimuth = circles(pinhole, motion, stars)
     other_polar, other_azimuth = circles(pinhole, motion, others)
     beside = np.abs(polar[:, None] - other_polar) * pinhole.focal_length < distance

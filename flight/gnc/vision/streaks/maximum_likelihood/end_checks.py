@@ -1,8 +1,9 @@
-"""Whether streaks are as long as the motion says: light from end to end, and none beyond.
+"""Whether streaks are as long as the motion implies: light from end to end, and none beyond.
 
 The fit sees only a few pixels beyond the ends. A turn too small by a fifth can fit what it is given, one end
-of every streak and the middle; the frame beyond the other end tells. A turn too large has stretches without
-light, which a fit makes little of that lays several streaks end to end, or the far end outside the frame.
+of every streak and the middle; the frame beyond the other end shows it. A turn too large has stretches
+without light, which a fit makes little of that lays several streaks end to end, or the far end outside the
+frame.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ _ASIDE = np.array([-1.0, 0.0, 1.0])
 _MIDDLE = 0.287
 _HALF = 0.5
 _LEAST_VALID = 0.7
-# A stretch tells of light when what is expected exceeds so many deviations of its mean.
+# A stretch can be judged when the light expected exceeds this many deviations of its mean.
 _TELLING = 4.0
 # So much of a streak may be dark for reasons of its own.
 _DARK = 0.15
@@ -45,7 +46,7 @@ def true_ends(
     """Return (n, 2) 1 for the ends that are where they should be, 0 for those that are not.
 
     `times` (n, 2) are when stars (n, 2) of `light` (n,) counts begin and end to be exposed. Ends that are not
-    on the detector, and those of streaks too short to tell, are NaN.
+    on the detector, and those of streaks too short to judge, are NaN.
     """
     out = np.full((len(stars), 2), np.nan)
     length = path_lengths(pinhole, motion, stars)
@@ -63,9 +64,9 @@ def true_ends(
     time = np.concatenate([end[:, None] - delay, end[:, None] + delay])
     mean, _ = brightness(frame, pinhole, motion, np.tile(stars, (4, 1)), time)
     within, beyond = mean.reshape(2, 2, -1)
-    told = np.isfinite(within) & np.isfinite(beyond)
+    known = np.isfinite(within) & np.isfinite(beyond)
     true = (within > _HALF * expected) & (beyond < _HALF * expected)
-    out[long] = np.where(told, true, np.nan).T
+    out[long] = np.where(known, true, np.nan).T
     return out
 
 
@@ -79,7 +80,7 @@ def unbroken(
 ) -> FloatArray:
     """Return 1 for each star that is bright all along its path on the detector, else 0, in one row (k,).
 
-    Arguments as of `true_ends`; stars too short or too faint to tell are left out.
+    Arguments as of `true_ends`; stars too short or too faint to judge are left out.
     """
     length = path_lengths(pinhole, motion, stars)
     long = length > _WITHIN * _LEAST_STRETCH
@@ -91,11 +92,11 @@ def unbroken(
     each = np.repeat(stars, _WITHIN, axis=0)
     mean, deviation = brightness(frame, pinhole, motion, each, time.reshape(len(each), _WITHIN_SAMPLES))
     expected = np.repeat(expected_brightness(light, length), _WITHIN)
-    told = np.isfinite(mean) & (expected > _TELLING * deviation)
-    dark = (told & (mean < _HALF * expected)).reshape(-1, _WITHIN).sum(axis=1)
-    told_of = told.reshape(-1, _WITHIN).sum(axis=1)
-    judged = told_of > 0
-    return np.asarray(dark[judged] <= _DARK * told_of[judged], dtype=float)
+    known = np.isfinite(mean) & (expected > _TELLING * deviation)
+    dark = (known & (mean < _HALF * expected)).reshape(-1, _WITHIN).sum(axis=1)
+    known_of = known.reshape(-1, _WITHIN).sum(axis=1)
+    judged = known_of > 0
+    return np.asarray(dark[judged] <= _DARK * known_of[judged], dtype=float)
 
 
 def expected_brightness(light: FloatArray, length: FloatArray) -> FloatArray:

@@ -1,7 +1,7 @@
 """Steps and covariances: the normal equations solved.
 
-What the stars share (turn, growth, width) is solved after each star's own four numbers are eliminated, a
-small Schur complement a star. Stars that share pixels couple; conjugate gradients account for it in a few
+The shared parameters (turn, growth, width) are solved for after each star's own four numbers are eliminated,
+a small Schur complement a star. Stars that share pixels couple; conjugate gradients account for it in a few
 rounds.
 """
 
@@ -32,7 +32,7 @@ class Solution:
     """One step and the covariance.
 
     Attributes:
-        shared: (SHARED,) step of what is shared; alone: (n, ALONE) of each star's own.
+        shared: (SHARED,) step of the shared parameters; alone: (n, ALONE) of each star's own.
         eliminated: the equations that gave it, stars not sharing pixels.
     """
 
@@ -42,7 +42,7 @@ class Solution:
 
     @property
     def covariance(self) -> FloatArray:
-        """The covariance (SHARED, SHARED) of what is shared."""
+        """The covariance (SHARED, SHARED) of the shared parameters."""
         kept = self.eliminated.kept
         out = np.zeros((SHARED, SHARED))
         out[kept[:, None], kept] = self.eliminated.inner
@@ -50,7 +50,7 @@ class Solution:
 
     @property
     def joint(self) -> FloatArray:
-        """The covariance (n, SHARED + ALONE, SHARED + ALONE) of what is shared and each star's own."""
+        """The covariance (n, SHARED + ALONE, SHARED + ALONE) of the shared parameters and each star's."""
         kept, gain, inner = self.eliminated.kept, self.eliminated.gain, self.eliminated.inner
         joint = np.zeros((len(gain), SHARED + ALONE, SHARED + ALONE))
         joint[:, :SHARED, :SHARED] = self.covariance
@@ -68,7 +68,7 @@ class Eliminated:
     Attributes:
         kept: (k,) which shared parameters are fitted.
         own: (n, ALONE, ALONE) inverse of each star's block; gain: (n, k, ALONE).
-        inner: (k, k) covariance of what is shared.
+        inner: (k, k) covariance of the shared parameters.
     """
 
     kept: IntArray
@@ -85,9 +85,9 @@ class Eliminated:
 
 
 def eliminate(evaluation: Evaluation, free: BoolArray) -> Eliminated | None:
-    """Return the eliminated equations, None when what is shared is not determined.
+    """Return the eliminated equations, None when the shared parameters are not determined.
 
-    `free` (SHARED,) tells which shared parameters are fitted.
+    `free` (SHARED,): which shared parameters are fitted.
     """
     alone = evaluation.information[:, SHARED:, SHARED:].copy()
     diagonal = np.einsum("nii->ni", alone)
@@ -110,7 +110,7 @@ def eliminate(evaluation: Evaluation, free: BoolArray) -> Eliminated | None:
 
 
 def solve(evaluation: Evaluation, scene: Scene, free: BoolArray, rounds: int) -> Solution | None:
-    """Return the step to the maximum, None when what is shared is not determined.
+    """Return the step to the maximum, None when the shared parameters are not determined.
 
     At most `rounds` conjugate gradients account for the pixels that stars share; 0 neglects them.
     """
@@ -129,7 +129,7 @@ def _from_prior(scene: Scene) -> FloatArray:
 
 
 def shared_covariance(evaluation: Evaluation, free: BoolArray, rounds: int) -> FloatArray | None:
-    """Return the covariance (SHARED, SHARED) of what is shared, the pixels that stars share accounted for."""
+    """Return the covariance (SHARED, SHARED) of the shared parameters, shared pixels accounted for."""
     eliminated = eliminate(evaluation, free)
     if eliminated is None:
         return None
@@ -195,7 +195,7 @@ def _scaled_inverse(matrices: FloatArray) -> FloatArray:
 def moved(scene: Scene, solution: Solution, pinhole: Pinhole, longest: float) -> tuple[Scene, float]:
     """Return the scene after a step that moves no end of a streak by more than `longest` px.
 
-    Also returned is by how many px what is shared asked to move an end, or the width.
+    Also returned is by how many px the shared parameters' step would have moved an end, or the width.
     """
     n = len(scene.stars)
     growing = bool(solution.shared[3:6].any())

@@ -2,7 +2,7 @@
 
 Regions give a first guess, the brightest stars a first fit, the motion a matched filter for the faint; the
 joint fit of the bright with the faint accounted for gives the answer. Pure and deterministic, made for a
-worker process. One frame cannot tell omega from -omega; a prior (gyro, or the last estimate) decides.
+worker process. One frame cannot distinguish omega from -omega; a prior (gyro, or the last estimate) decides.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from flight.gnc.vision.streaks.maximum_likelihood.wholeness import Wholeness, wh
 from flight.gnc.vision.streaks.streak_result import StreakStatus
 
 _MOST_BLOBS = 48
-# So many motions are fitted in full before the frame is given up.
+# This many motions are fitted in full before the frame is given up.
 _MOST_MOTIONS = 2
-# So many angles of the whole frame's light are tried, and told apart to this part.
+# This many angles of the whole frame's light are tried, and distinguished to this part.
 _MOST_ANGLES = 2
 _SAME_ANGLE = 0.05
 # Median length, px, of regions below which a frame without an agreed motion is one of stars at rest.
@@ -63,12 +63,12 @@ def estimate_motion(
         pinhole: the camera, of the same shape.
         exposure: s.
         settings: of the camera and the fit.
-        prior_rate: (3,) rad/s, camera frame: tells the direction of rotation; None when unknown.
+        prior_rate: (3,) rad/s, camera frame: decides the direction of rotation; None when unknown.
         prior_sigma: rad/s, standard deviation of each component of `prior_rate`.
         previous_checksum: of the frame before: the same pixels again are a frozen camera.
 
-    Raises FlightError for a frame, exposure or prior that cannot be meant. What the scene does is told as a
-    status.
+    Raises FlightError for a frame, exposure or prior that is impossible. Why a scene gives no rate is
+    reported by the status.
     """
     validate(pixels, pinhole, exposure, prior_rate, prior_sigma)
     saturation = settings.saturation if settings.saturation is not None else saturation_count(pixels)
@@ -83,14 +83,16 @@ def estimate_motion(
     seen = MotionResult(StreakStatus.FAILED, checksum, exposure, hot_pixels=frame.hot_pixels)
     if len(blobs) < settings.least_stars:
         return replace(seen, status=StreakStatus.TOO_FEW)
-    told = None if _resting(blobs) else _told(camera, seen, blobs, near)
-    if told is None:
+    answer = None if _resting(blobs) else _answer(camera, seen, blobs, near)
+    if answer is None:
         return _without_rate(seen, camera, blobs)
-    return in_time(told, prior_rate, prior_sigma, settings.sign_sigmas)
+    return in_time(answer, prior_rate, prior_sigma, settings.sign_sigmas)
 
 
-def _told(camera: ExposedCamera, seen: MotionResult, blobs: Blobs, near: float | None) -> MotionResult | None:
-    """Return what the first motion that stands every test says, else the likeliest; None without one."""
+def _answer(
+    camera: ExposedCamera, seen: MotionResult, blobs: Blobs, near: float | None
+) -> MotionResult | None:
+    """Return the first motion that passes every test, else the likeliest; None without one."""
     rivals = islice(first_fits(camera, blobs, near), _MOST_MOTIONS)
     first = next(rivals, None)
     if first is None:
@@ -106,23 +108,25 @@ def _told(camera: ExposedCamera, seen: MotionResult, blobs: Blobs, near: float |
         return leading.result
     candidates = [leading]
     for fit in chain(rescanned_fits(camera, leading.turn, angles), rivals):
-        said = _fitted(camera, seen, fit)
-        again = any(other.stands and alike(said.turn, other.turn) for other in candidates)
-        if said.whole is Wholeness.WHOLE or (said.stands and (again or _witnessed(said.turn, angles))):
-            return said.result
-        candidates.append(said)
+        candidate = _fitted(camera, seen, fit)
+        again = any(other.stands and alike(candidate.turn, other.turn) for other in candidates)
+        if candidate.whole is Wholeness.WHOLE or (
+            candidate.stands and (again or _witnessed(candidate.turn, angles))
+        ):
+            return candidate.result
+        candidates.append(candidate)
     return replace(leading.result, status=StreakStatus.FAILED, rate=None, covariance=None)
 
 
 def _witnessed(turn: FloatArray, angles: list[float]) -> bool:
-    """Tell whether `turn` (3,) is by the likeliest of the frame's `angles`."""
+    """Return whether `turn` (3,) is by the likeliest of the frame's `angles`."""
     size = float(np.linalg.norm(turn))
     return bool(angles) and abs(size - angles[0]) < _SAME_ANGLE * size
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Told:
-    """What a motion says: the result, its turn (3,), and whether its streaks are whole."""
+class _Candidate:
+    """A motion that was fitted: the result, its turn (3,), and whether its streaks are whole."""
 
     result: MotionResult
     turn: FloatArray
@@ -133,16 +137,16 @@ class _Told:
         return self.whole is not Wholeness.BROKEN
 
 
-def _fitted(camera: ExposedCamera, seen: MotionResult, first: Fit) -> _Told:
+def _fitted(camera: ExposedCamera, seen: MotionResult, first: Fit) -> _Candidate:
     """Return what the joint fit from `first` says; a fit that failed is broken."""
     last, faint = last_fit(camera, first)
     if last is None:
-        return _Told(seen, first.scene.motion.turn, Wholeness.BROKEN)
+        return _Candidate(seen, first.scene.motion.turn, Wholeness.BROKEN)
     whole = wholeness(camera, last.scene, faint)
-    told = with_faint(with_stars(seen, camera, last), camera, last.scene, faint)
-    told = with_rate(told, camera, last, whole)
-    failed = told.status is StreakStatus.FAILED
-    return _Told(told, last.scene.motion.turn, Wholeness.BROKEN if failed else whole)
+    answer = with_faint(with_stars(seen, camera, last), camera, last.scene, faint)
+    answer = with_rate(answer, camera, last, whole)
+    failed = answer.status is StreakStatus.FAILED
+    return _Candidate(answer, last.scene.motion.turn, Wholeness.BROKEN if failed else whole)
 
 
 def _shutter(pinhole: Pinhole, exposure: float, settings: LikelihoodSettings) -> Shutter:
@@ -150,7 +154,7 @@ def _shutter(pinhole: Pinhole, exposure: float, settings: LikelihoodSettings) ->
 
 
 def _resting(blobs: Blobs) -> bool:
-    """Tell whether the brightest regions, most of them at least, are spots: no motion is looked for then."""
+    """Return whether most of the brightest regions are spots: then no motion is searched for."""
     return float(np.median(blobs.length[:_BRIGHTEST])) < _SPOT
 
 

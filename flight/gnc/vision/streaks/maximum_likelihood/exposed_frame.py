@@ -1,4 +1,4 @@
-"""A frame made ready for the fit: light above the background, its noise, and which pixels tell nothing."""
+"""A frame made ready for the fit: light above the background, its noise, and which pixels to leave out."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class ExposedFrame:
         signal: counts above the background; sums: of it, over 3 x 3 pixels.
         floor: counts^2, variance of a pixel without a star.
         counts: as the camera gave them; top: at which a pixel saturates.
-        bad: pixels that tell nothing: saturated or hot.
+        bad: pixels to leave out: saturated or hot.
         gain: electrons a count.
         hot_pixels: how many of `bad` are hot.
     """

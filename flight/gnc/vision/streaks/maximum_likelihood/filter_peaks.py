@@ -23,8 +23,8 @@ FARTHEST = 5
 
 # Width of the point spread and the pixel together that the filter supposes, px.
 _WIDTH = 1.05
-# Samples between a response and its neighbours by which two ends are told, from so many samples to a streak
-# on; how much it takes, in sigmas and as a share of the height.
+# Samples between a response and its neighbours by which two ends are separated, used for streaks of this many
+# samples or more; how much it takes, in sigmas and as a share of the height.
 _SHARP_STEP = 3
 _SHARP_FROM = 40.0
 _SHARP_SIGMAS = 6.0
@@ -38,7 +38,7 @@ _NEIGHBOURS = sorted(
     key=lambda step: abs(step[0]) + abs(step[1]),
 )
 
-# The response of circles beside a star's own, every so many parts of a px.
+# The response of circles beside a star's own is tabulated in this many steps a px.
 _PER_PX = 50.0
 _PROFILE = ndtr((np.arange(400) / _PER_PX + 1.5) / _WIDTH) - ndtr((np.arange(400) / _PER_PX - 1.5) / _WIDTH)
 _PROFILE /= _PROFILE[0]
@@ -79,10 +79,10 @@ def sharp_peaks(
     # Of the height that a lone star's bend gives; its noise is that of few samples, times the leverage.
     own = flat[place]
     leverage = grid.length / (2.0 * step) * np.sqrt(6.0 * step / np.maximum(count, 1))
-    told = (bend > _SHARP_SIGMAS * leverage * deviation) & (bend > _SHARP_SHARE * own)
+    sharply = (bend > _SHARP_SIGMAS * leverage * deviation) & (bend > _SHARP_SHARE * own)
     sharp = np.zeros(held.light.shape, dtype=np.float32)
     sharp.reshape(-1)[place] = bend
-    row, column = _summits(sharp, place[told])
+    row, column = _summits(sharp, place[sharply])
     return _refined(sharp, row, column, 0), _refined(sharp, row, column, 1)
 
 
@@ -116,7 +116,7 @@ def _summits(values: Float32Array, place: IntArray) -> tuple[IntArray, IntArray]
 def _standing(
     row: IntArray, column: IntArray, value: FloatArray, span: FloatArray, grid: PolarGrid, sigmas: float
 ) -> BoolArray:
-    """Tell which peaks (n,), strongest first, rise above the shoulders of those kept before them."""
+    """Return which peaks (n,), strongest first, rise above the shoulders of those kept before them."""
     by_row = np.argsort(row, kind="stable")
     first = np.searchsorted(row[by_row], row - FARTHEST + 1)
     count = np.searchsorted(row[by_row], row + FARTHEST) - first

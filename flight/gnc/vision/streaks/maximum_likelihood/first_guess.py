@@ -23,7 +23,7 @@ from flight.gnc.vision.streaks.maximum_likelihood.motion import image_flow
 
 _PROPOSERS = 16
 _PARALLEL = 1e-9
-# Error of a region's orientation: so many px over its length, and no less than rad.
+# Error of a region's orientation: this many px over its length, at least this many rad.
 _SIDE_ERROR = 1.2
 _LEAST_ERROR = 0.012
 # Regions shorter than this, px, have no orientation to trust.
@@ -262,7 +262,7 @@ def _stars(
     reach = np.abs(arcs.last - arcs.first)
     one = arcs.cut_first ^ arcs.cut_last
     cut = agree & blobs.cut & one & (reach < angle + 6.0 * spread) & (reach > 0.25 * angle)
-    # Where the border cuts, the other end tells; a region reaches about 2 px beyond it.
+    # Where the border cuts, the other end decides; a region reaches about 2 px beyond it.
     past = 2.0 / arcs.speed
     middle = np.where(arcs.cut_first, arcs.last - past - 0.5 * angle, arcs.first + past + 0.5 * angle)
     middle = np.where(whole, arcs.middle, middle)

@@ -33,17 +33,17 @@ from flight.gnc.vision.streaks.maximum_likelihood.polar_grid import polar_grid
 from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene, window_times
 
 _FIRST_STARS = 12
-# So many guesses are tried at most.
+# This many guesses are tried at most.
 _MOST_GUESSES = 5
 _STILL_ROUNDS = 12
-# A guess is made of so many whole streaks, or of a scan; regions longer than it speak against it.
+# A guess is made of this many whole streaks, or of a scan; regions longer than it speak against it.
 _WHOLE = 8
 _CONTRADICTED = 0.3
-# A hypothesis with so many stars, this part of which it explains, needs no rival.
+# A hypothesis with this many stars, this part of which it explains, needs no rival.
 _MANY = 3
 _MOST = 0.6
 _WORST_FIRST = 12.0
-# A star is explained when no more than this part of its light is left; none counts more than so many sigmas.
+# A star is explained when at most this part of its light is left; none counts more than this many sigmas.
 _LEFT_OVER = 0.01
 _ENOUGH = 200.0
 # Regions longer than a hypothesis allows speak against it, but may be two streaks in one.
@@ -56,9 +56,9 @@ _BY_CHANCE = 0.4
 
 
 def first_fits(camera: ExposedCamera, blobs: Blobs, near: float | None) -> Iterator[Fit]:
-    """Yield fits of the brightest stars, the likeliest motion first: one that they bear out, then its rivals.
+    """Yield fits of the brightest stars, the likeliest motion first: one that they support, then its rivals.
 
-    `near` rad is a turn that something else tells, None when nothing does.
+    `near` rad is a turn known from elsewhere, None when unknown.
     """
     rivals: list[tuple[float, Fit]] = []
     yielded: list[FloatArray] = []
@@ -102,7 +102,7 @@ def rescanned_fits(camera: ExposedCamera, turn: FloatArray, angles: list[float])
 
 
 def alike(one: FloatArray, other: FloatArray) -> bool:
-    """Tell whether two turns (3,) are one motion, forwards or backwards in time."""
+    """Return whether two turns (3,) are one motion, forwards or backwards in time."""
     apart = min(np.linalg.norm(one - other), np.linalg.norm(one + other))
     return float(apart) < _SAME_MOTION * float(np.linalg.norm(one))
 
@@ -150,13 +150,13 @@ def still_fit(camera: ExposedCamera, blobs: Blobs) -> Fit | None:
 def _ending(camera: ExposedCamera, scene: Scene) -> float:
     """Return what part of the ends is where it should be, or of the streaks unbroken, whichever is less.
 
-    1 when none can be told.
+    1 when none can be judged.
     """
     times = window_times(camera.pinhole, scene.motion, camera.shutter, scene.stars)
     seen = camera.frame, camera.pinhole, scene.motion, scene.stars, scene.light, times
     ends = true_ends(*seen)
-    told = ends[np.isfinite(ends)], unbroken(*seen)
-    return min(float(np.mean(share)) if len(share) else 1.0 for share in told)
+    judged = ends[np.isfinite(ends)], unbroken(*seen)
+    return min(float(np.mean(share)) if len(share) else 1.0 for share in judged)
 
 
 def _borne_out(done: Fit) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""Rounds of the fit: evaluate, solve, move, until what all stars share has settled."""
+"""Rounds of the fit: evaluate, solve, move, until the shared parameters have settled."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from flight.gnc.vision.streaks.maximum_likelihood.windows import Windows, cut_wi
 _LONGEST_STEP = 3.0
 # An end so far, px, from where its window was cut has left the window's middle.
 _DRIFT = 1.5
-# Ends of stars without a say may be farther from it; after the first round by any distance: all windows are
+# Ends of untrusted stars may be farther from it; after the first round by any distance: all windows are
 # not cut again for those whose light hardly fixes their place.
 _FAINT_DRIFT = 2.5
 # Converged: no shared parameter moves by more than this part of its standard deviation. The step is
@@ -30,17 +30,17 @@ _FAINT_DRIFT = 2.5
 SETTLED = 0.4
 # Out of patience, a step that is not so much shorter than the one before ends the rounds.
 _LEAST_PROGRESS = 0.7
-# After so many looks at what is no noise it is settled which pixels are left out.
+# After this many rounds the choice of pixels left out is final.
 _LOOKS = 1
-# A constant rate seems to change once in so many.
+# Probability of a constant rate being taken for a changing one.
 _BY_CHANCE = 1e-4
-# What is below this part of the limit needs no closer look.
+# Below this part of the limit no closer test is needed.
 _FAR_BELOW = 0.5
 # The parameters of the change.
 _GROWTHS = 3
 GROWING = np.ones(SHARED, dtype=np.bool_)
 _WIDEST = 6.0
-# A joint fit whose point spread grows beyond so many of the first fit's has no streaks to hold on to.
+# A joint fit whose point spread grows beyond this many of the first fit's has lost the streaks.
 _WIDER = 1.6
 
 
@@ -50,7 +50,7 @@ class Rounds:
 
     Attributes:
         rounds: at most.
-        clipped: whether what is no noise is left out.
+        clipped: whether pixels far beyond the noise are left out.
         tolerance: steps of an end or the width that are as good as none, px; settled: in deviations.
         conjugate: gradients at most for the pixels that stars share.
         patience: rounds that are spent whether or not they bring the fit on.
@@ -71,7 +71,7 @@ LAST = Rounds(10, clipped=True, tolerance=0.003, settled=SETTLED, conjugate=12, 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExposedCamera:
-    """A frame with all that is known of how it was taken; `growing` tells whether the rate may change."""
+    """A frame with all that is known of how it was taken; `growing`: whether the rate may change."""
 
     frame: ExposedFrame
     pinhole: Pinhole
@@ -105,7 +105,7 @@ class Fit:
 
     Attributes:
         windows: its pixels; free: (SHARED,) which shared parameters were fitted.
-        restless: the last step of what is shared, in standard deviations; 0 when the fit has settled.
+        restless: the last step of the shared parameters, in standard deviations; 0 when the fit has settled.
     """
 
     scene: Scene
@@ -116,21 +116,21 @@ class Fit:
     free: BoolArray
 
     def grows(self) -> bool:
-        """Tell whether the pixels show that the rate changes: a score test of the constant one.
+        """Return whether the pixels show that the rate changes: a score test of the constant one.
 
         The stars' agreement on the change is held against their spread (Hotelling).
         """
-        # As if no stars shared pixels first: mostly that says enough.
+        # As if no stars shared pixels first: mostly that decides.
         for conjugate, share in ((0, _FAR_BELOW), (LAST.conjugate, 1.0)):
             solution = solve(self.evaluation, self.scene, GROWING, conjugate)
             if solution is None:
                 return False
-            told, stars = agreed_step(self.evaluation, solution.shared)
+            agreed, stars = agreed_step(self.evaluation, solution.shared)
             freedom = stars - _GROWTHS
             if freedom < 1:
                 return False
             limit = float(fdtri(_GROWTHS, freedom, 1.0 - _BY_CHANCE)) * _GROWTHS * (stars - 1) / freedom
-            if told <= share * limit:
+            if agreed <= share * limit:
                 return False
         return True
 
@@ -186,7 +186,7 @@ def _possible(scene: Scene) -> bool:
 
 
 def _drifted(camera: ExposedCamera, before: Scene, after: Scene, faint: float) -> bool:
-    """Tell whether an end of a streak has left its window's middle; those without a say by `faint` px."""
+    """Return whether an end of a streak has left its window's middle; untrusted ones by `faint` px."""
     n = len(before.stars)
     at = np.repeat([-0.5, 0.5], n)
     there = positions(camera.pinhole, after.motion, np.tile(after.stars, (2, 1)), at)

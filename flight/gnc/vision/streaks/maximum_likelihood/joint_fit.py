@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from flight.gnc.math.arrays import BoolArray, IntArray
-from flight.gnc.vision.streaks.maximum_likelihood.agreement import Opinions, agreeing, opinions
+from flight.gnc.vision.streaks.maximum_likelihood.agreement import OwnEstimates, agreeing, own_estimates
 from flight.gnc.vision.streaks.maximum_likelihood.chains import close_by
 from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import Float32Array
 from flight.gnc.vision.streaks.maximum_likelihood.iteration import (
@@ -27,11 +27,12 @@ from flight.gnc.vision.streaks.maximum_likelihood.windows import window_areas
 
 # A rate that changes by more than this part of itself is beyond the model.
 _MOST_GROWTH = 0.5
-# A star is trusted within so many deviations; ends (px) and width (px) are never modelled better than this.
+# A star is trusted within this many deviations; ends (px) and width (px) are never modelled better than this.
 _TRUST_SIGMAS = 3.5
 _END_FLOOR = 0.01
 _WIDTH_FLOOR = 0.002
-# Streaks so many reaches beside a bright one's are fitted with it: farther ones touch only its window's edge.
+# Streaks this many reaches beside a bright one's are fitted with it: farther ones touch only its window's
+# edge.
 _NEAR = 1.4
 # Ends that move by more px than this from the first fit to the last make the stars to be found again.
 _FAR = 6.0
@@ -41,7 +42,7 @@ _DOUBT = 0.35
 # Pixels of all windows that a fit looks at, those that stars share once for each: what a crowd of long
 # streaks needs of memory and time is bounded so, and the brightest stars hold most of the information.
 _MOST_PIXELS = 200_000
-# So many stars' light is taken out at a time.
+# This many stars' light is taken out at a time.
 _AT_ONCE = 16
 
 
@@ -49,7 +50,8 @@ def last_fit(camera: ExposedCamera, first: Fit) -> tuple[Fit | None, FaintStars]
     """Return the joint fit of the brightest stars, and the faint ones that it left to the matched filter.
 
     Where it comes far from `first`, the stars found along that motion are not where they seemed: once more.
-    So where the streaks do not end where it says: from where they do. One that they contradict again is none.
+    Likewise from where the streaks really end, where the fit has other ends. A fit that they contradict again
+    is dropped.
     """
     other = None
     for _ in range(_MOST_REPEATS):
@@ -70,7 +72,7 @@ def last_fit(camera: ExposedCamera, first: Fit) -> tuple[Fit | None, FaintStars]
 
 
 def _far(camera: ExposedCamera, before: Scene, after: Scene) -> bool:
-    """Tell whether the ends of the streaks have moved by more than the fit sees."""
+    """Return whether the ends of the streaks have moved by more than the fit can follow."""
     changed = float(np.linalg.norm(after.motion.turn - before.motion.turn))
     turn = float(np.linalg.norm(after.motion.turn))
     length = float(np.median(path_lengths(camera.pinhole, after.motion, before.stars)))
@@ -80,7 +82,8 @@ def _far(camera: ExposedCamera, before: Scene, after: Scene) -> bool:
 def _fit_from(camera: ExposedCamera, first: Fit) -> tuple[Fit | None, FaintStars]:
     """Return the joint fit of the stars that are found along the motion of `first`, and the faint ones left.
 
-    Of the models of the rate the fit takes the constant one unless told otherwise, or shown by the pixels.
+    Of the models of the rate the fit takes the constant one unless the settings or the pixels demand the
+    other.
     """
     settings, before = camera.settings, first.scene
     light = light_of(camera.pinhole, camera.shutter, before, first.windows)
@@ -114,7 +117,7 @@ def _fit_from(camera: ExposedCamera, first: Fit) -> tuple[Fit | None, FaintStars
 def joint_fit(camera: ExposedCamera, scene: Scene) -> Fit | None:
     """Return the fit of `scene` by the stars that agree, under the rate's model that the pixels ask for.
 
-    Of the stars without a say the brightest are fitted, as far as there is room; the others' light is taken
+    Of the untrusted stars the brightest are fitted, as far as there is room; the others' light is taken
     out as it is known. None where the fit fails.
     """
     fitted = _affordable(camera, scene)
@@ -134,22 +137,22 @@ def joint_fit(camera: ExposedCamera, scene: Scene) -> Fit | None:
 
 
 def _beyond(motion: Motion) -> bool:
-    """Tell whether the rate changes by more than the model describes."""
+    """Return whether the rate changes by more than the model can describe."""
     return float(np.linalg.norm(motion.growth)) > _MOST_GROWTH * float(np.linalg.norm(motion.turn))
 
 
 def _trusted(camera: ExposedCamera, rough: Fit) -> BoolArray:
-    """Return which stars keep a say in what is shared: those that agree with most; all when too few do."""
-    said = opinions(rough.evaluation, rough.scene, camera.free)
+    """Return which stars stay trusted: those that agree with most; all when too few do."""
+    estimates = own_estimates(rough.evaluation, rough.scene, camera.free)
     before = rough.scene.trusted
-    if said is None:
+    if estimates is None:
         return before
     had = np.flatnonzero(before)
     moved = path_lengths(camera.pinhole, rough.scene.motion, rough.scene.stars[had])
     turn = float(np.linalg.norm(rough.scene.motion.turn))
     angle = _END_FLOOR * turn / max(float(np.median(moved)), 1.0)
     floors = np.array([angle, angle, angle, _WIDTH_FLOOR])
-    agree = agreeing(Opinions(said.change[had], said.deviation[had]), floors, _TRUST_SIGMAS)
+    agree = agreeing(OwnEstimates(estimates.change[had], estimates.deviation[had]), floors, _TRUST_SIGMAS)
     if np.count_nonzero(agree) < max(camera.settings.least_stars, len(had) // 3):
         return before
     after = before.copy()
@@ -158,7 +161,7 @@ def _trusted(camera: ExposedCamera, rough: Fit) -> BoolArray:
 
 
 def _affordable(camera: ExposedCamera, scene: Scene) -> BoolArray:
-    """Return which stars (n,) the fit has room for: those with a say, of the others the brightest."""
+    """Return which stars (n,) the fit has room for: the trusted, of the others the brightest."""
     room = window_areas(camera.pinhole, scene, camera.settings.reach)
     order = np.lexsort((-scene.light, ~scene.trusted))
     needed = np.empty(len(room))

@@ -1,9 +1,9 @@
 """Where streaks really end, about where a motion puts their ends.
 
-Once an end lies more than a few widths of the point spread beyond the light, the pixels about it say nothing
-any more but that they are dark: the fit may settle there, each star pulled a little to and fro by others that
-cross it. The whole stretch tells: light ends where that much of it, rather than none, explains the most from
-the inside on. Where another star crosses an end that is somewhere else; most streaks agree.
+Once an end lies more than a few widths of the point spread beyond the light, the pixels about it only show
+that they are dark: the fit may settle there, each star pulled a little to and fro by others that
+cross it. The whole stretch decides: light ends where that much of it, rather than none, explains the most
+from the inside on. Where another star crosses an end that is somewhere else; most streaks agree.
 """
 
 from __future__ import annotations
@@ -18,16 +18,17 @@ from flight.gnc.vision.streaks.maximum_likelihood.iteration import ExposedCamera
 from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion, positions
 from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene, path_lengths, window_times
 
-# Looked at is this part of a streak's length to either side of its end, between so many px, in so many steps.
+# Looked at is this part of a streak's length to either side of its end, between this many px, in this many
+# steps.
 _REACH = 0.08
 _LEAST_REACH, _MOST_REACH = 10.0, 40.0
 _STEPS = 41
-# An end tells when its stretch of light stands out by so many deviations.
+# An end can be judged when its stretch of light stands out by this many deviations.
 _TELLING = 5.0
-# Light of others counts no more than so many times the star's own.
+# Light of others counts at most this many times the star's own.
 _CAP = 2.0
-# So many streaks at least must be too long or too short, by so many px, by the same to so many, and so many
-# times as many as are as long as they should be.
+# This many streaks at least must be too long or too short, by this many px, by the same to this many, and
+# this many times as many as are as long as they should be.
 _LEAST_STREAKS = 3
 _LEAST_OFF = 4.0
 _ALIKE = 3.0
@@ -36,7 +37,7 @@ _MORE = 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Edges:
-    """By how many px (n, 2) streaks go on beyond where they should end, NaN where it cannot be told."""
+    """By how many px (n, 2) streaks go on beyond where they should end, NaN where unknown."""
 
     beyond: FloatArray
     length: FloatArray
@@ -45,8 +46,8 @@ class Edges:
     def stretch(self) -> float:
         """The part of itself by which the motion is too small, 0 where streaks do not agree against it."""
         off = self.beyond.sum(axis=1)
-        told = np.isfinite(off)
-        off, length = off[told], self.length[told]
+        known = np.isfinite(off)
+        off, length = off[known], self.length[known]
         wrong = off[np.abs(off) > _LEAST_OFF]
         if len(wrong) < _LEAST_STREAKS:
             return 0.0
@@ -80,10 +81,10 @@ def find_edges(camera: ExposedCamera, scene: Scene) -> Edges:
         # What light explains more than darkness does, from the inside on.
         explained = np.cumsum((seen - 0.5 * expected) * expected / deviation**2, axis=1)
         last = np.argmax(explained, axis=1)
-        telling = np.sum((expected / deviation) ** 2, axis=1) > _TELLING**2
-        told = np.isfinite(mean).all(axis=1) & telling
+        sure = np.sum((expected / deviation) ** 2, axis=1) > _TELLING**2
+        known = np.isfinite(mean).all(axis=1) & sure
         found = outward[np.arange(len(last)), last] + 0.5 * (outward[:, 1] - outward[:, 0])
-        beyond[long, end] = np.where(told, found, np.nan)
+        beyond[long, end] = np.where(known, found, np.nan)
     return Edges(beyond, length)
 
 
@@ -99,8 +100,8 @@ def stretched(camera: ExposedCamera, scene: Scene) -> Scene | None:
     off = edges.beyond / np.maximum(edges.length, 1.0)[:, None]
     # Mid-exposure, in exposures of the old motion, from the one end and from the other.
     middle = np.stack([0.5 * stretch - off[:, 0], off[:, 1] - 0.5 * stretch], axis=-1)
-    told = np.isfinite(middle)
-    time = np.where(told, middle, 0.0).sum(axis=1) / np.maximum(told.sum(axis=1), 1)
+    known = np.isfinite(middle)
+    time = np.where(known, middle, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
     moved = positions(camera.pinhole, scene.motion, scene.stars, time)
     motion = Motion((1.0 + stretch) * scene.motion.turn, scene.motion.growth)
     return replace(scene, motion=motion, stars=moved)

@@ -34,7 +34,7 @@ _ROUNDING = 30.0
 _PASSES = 3
 _RIDGE = 0.01
 _TINY = 1e-6
-# Heights are solved for to this part of them, by so many conjugate gradients at most.
+# Heights are solved for to this part of them, by this many conjugate gradients at most.
 _SOLVED = 1e-4
 _MOST_GRADIENTS = 200
 # Places that stars reach, worked on at a time.
@@ -72,7 +72,7 @@ def find_faint(
     grid = polar_grid(pinhole, motion)
     usual = _SAMPLE_NOISE * float(np.sqrt(np.median(frame.floor[::97])))
     held = running_sums(_left_over(frame, modelled), pinhole, grid, usual / _ROUNDING)
-    # The noise for every number of samples; too few tell nothing.
+    # The noise for every number of samples; too few are ignored.
     noise = usual * np.sqrt(np.arange(max(round(grid.length), 1) + 1.0))
     noise[: math.ceil(LEAST_SEEN * grid.length)] = np.inf
     row, column, height = _cleaned(held, noise, grid, sigmas, most)
@@ -87,7 +87,7 @@ def find_faint(
 
 
 def _left_over(frame: ExposedFrame, modelled: tuple[IntArray, Float32Array]) -> Float32Array:
-    """Return the 3 x 3 sums (rows * columns,) of the frame less `modelled` light and what tells nothing."""
+    """Return the 3 x 3 sums (rows * columns,) of the frame less `modelled` light and pixels to leave out."""
     pixels, light = modelled
     signal, floor = frame.signal[pixels], frame.floor[pixels]
     # Where a bright star was taken out, what is left is mostly its own noise.
@@ -148,7 +148,7 @@ def _significance(
     column: FloatArray,
     height: FloatArray,
 ) -> FloatArray:
-    """Return how many deviations of the noise what is seen of stars (k,) makes."""
+    """Return how many deviations of the noise the visible part of stars (k,) makes."""
     middle = np.rint(row).astype(int)
     seen = shared(column, column, held.span[middle], grid.length)
     own = noise[held.count[middle, _wrapped(column, held.light)]] * held.excess[middle]
@@ -167,7 +167,7 @@ def _given(
     column: FloatArray,
     height: FloatArray,
 ) -> FloatArray:
-    """Return what stars (k,) of `height` put at the flat places (p,), ascending."""
+    """Return the responses of stars (k,) of `height` at the flat places (p,), ascending."""
     rows, columns = held.light.shape
     # On each circle near a star's its response is one stretch of places.
     circle = row.astype(np.int64)[:, None] + np.arange(1 - FARTHEST, FARTHEST + 1)
@@ -178,14 +178,14 @@ def _given(
     high = np.minimum(np.floor(column + grid.length), columns - 1.0).astype(np.int64)
     first = np.searchsorted(place, (circle * columns + low[:, None]).reshape(-1))
     count = np.searchsorted(place, (circle * columns + high[:, None]).reshape(-1), side="right") - first
-    told = np.flatnonzero((count > 0) & (weight.reshape(-1) > 0.0))
-    first, count = first[told], count[told]
-    circle, weight = circle.reshape(-1)[told], weight.reshape(-1)[told]
-    star = told // (2 * FARTHEST)
+    reached = np.flatnonzero((count > 0) & (weight.reshape(-1) > 0.0))
+    first, count = first[reached], count[reached]
+    circle, weight = circle.reshape(-1)[reached], weight.reshape(-1)[reached]
+    star = reached // (2 * FARTHEST)
     out = np.zeros(len(place))
     # A crowd of stars gives a multiple of the frame: some stretches at a time.
     cuts = np.searchsorted(np.cumsum(count), np.arange(_SOME_PLACES, int(count.sum()), _SOME_PLACES))
-    for some in np.split(np.arange(len(told)), np.unique(cuts)):
+    for some in np.split(np.arange(len(reached)), np.unique(cuts)):
         many = count[some]
         which = np.arange(many.sum()) + np.repeat(first[some] - np.cumsum(many) + many, many)
         at = (place[which] - np.repeat(circle[some] * columns, many)).astype(np.float64)

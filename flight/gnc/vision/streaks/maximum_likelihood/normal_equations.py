@@ -23,14 +23,14 @@ SHARED = 7
 ALONE = 4
 """x, y, light, sky of a star."""
 
-# So many blocks are multiplied at a time: what is weighted stays in the processor's cache.
+# This many blocks are multiplied at a time: the weighted ones stay in the processor's cache.
 _AT_ONCE = 128
 # A star's place along a streak whose ends are both outside is not known: this keeps its step finite, px.
 _LOOSE = 30.0
 # The sky about a star is near the frame's background, counts.
 _SKY = 3.0
 PRIOR = np.array([_LOOSE**-2, _LOOSE**-2, 0.0, _SKY**-2])
-"""The information (ALONE,) that keeps what the pixels do not tell of a star finite."""
+"""The information (ALONE,) that keeps finite the numbers that the pixels do not determine."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -224,7 +224,7 @@ def apply_information(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the information of all stars together times (shared (SHARED,), alone (n, ALONE)).
 
-    To the blocks of `Evaluation.information` comes what stars that share pixels know of each other.
+    To the blocks of `Evaluation.information` the coupling of stars that share pixels is added.
     """
     n = len(alone)
     vector = np.concatenate([np.broadcast_to(shared, (n, SHARED)), alone], axis=1)
@@ -236,7 +236,7 @@ def apply_information(
         lights.append(np.einsum("ie,ie->e", mixture.take(crowd.block, axis=1), crowd.images))
         change += np.bincount(crowd.slot, lights[-1], evaluation.shared)
     for crowd, light in zip(evaluation.crowds, lights, strict=True):
-        felt = crowd.weight * (change[crowd.slot] - light).astype(np.float32)
-        slope = np.add.reduceat(crowd.images * felt, crowd.first, axis=1).T.astype(np.float64)
+        weighted = crowd.weight * (change[crowd.slot] - light).astype(np.float32)
+        slope = np.add.reduceat(crowd.images * weighted, crowd.first, axis=1).T.astype(np.float64)
         np.add.at(out, crowd.star, (slope[:, None] @ crowd.matrix)[:, 0])
     return out[:, :SHARED].sum(axis=0), out[:, SHARED:] + PRIOR * alone

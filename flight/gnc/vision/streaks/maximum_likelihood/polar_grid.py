@@ -20,7 +20,7 @@ _ALONG = 4.0
 # Circles worked on at a time, so that they stay in the processor's cache.
 _CHUNK = 64
 _NEAREST = 0.003
-# The detector's border is looked at every so many pixels.
+# The detector's border is looked at in steps of this many pixels.
 _BORDER_STEP = 8.0
 
 
@@ -58,7 +58,7 @@ class PolarGrid:
 
 
 def polar_grid(pinhole: Pinhole, motion: Motion, every: int = 1) -> PolarGrid:
-    """Return the circles that cross the detector, `every` so many of them."""
+    """Return the circles that cross the detector, one in `every`."""
     angle = float(np.linalg.norm(motion.turn))
     axis = motion.turn / angle
     middle = np.array([0.0, 0.0, 1.0])

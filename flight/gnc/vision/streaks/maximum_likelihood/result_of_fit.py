@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from flight.gnc.math.arrays import BoolArray, FloatArray, IntArray
-from flight.gnc.vision.streaks.maximum_likelihood.agreement import disagreement, opinions
+from flight.gnc.vision.streaks.maximum_likelihood.agreement import disagreement, own_estimates
 from flight.gnc.vision.streaks.maximum_likelihood.equation_solver import shared_covariance
 from flight.gnc.vision.streaks.maximum_likelihood.iteration import ExposedCamera, Fit
 from flight.gnc.vision.streaks.maximum_likelihood.matched_filter import FaintStars
@@ -20,7 +20,7 @@ from flight.gnc.vision.streaks.streak_result import StreakStatus
 
 # Rounds of conjugate gradients for the covariance.
 _CONJUGATE = 12
-# Turn, growth, x and y among what is shared and a star's own.
+# Turn, growth, x and y among the shared parameters and a star's own.
 _GEOMETRY = np.array([0, 1, 2, 3, 4, 5, 7, 8])
 _LIGHT = 9
 # The last step, in standard deviations, from which a fit has not settled.
@@ -65,42 +65,42 @@ def with_stars(seen: MotionResult, camera: ExposedCamera, last: Fit) -> MotionRe
     )
 
 
-def with_rate(told: MotionResult, camera: ExposedCamera, last: Fit, whole: Wholeness) -> MotionResult:
-    """Return `told` with the rate, or with why there is none."""
+def with_rate(result: MotionResult, camera: ExposedCamera, last: Fit, whole: Wholeness) -> MotionResult:
+    """Return `result` with the rate, or with why there is none."""
     settings, scene = camera.settings, last.scene
-    if told.used_count < settings.least_stars:
-        return replace(told, status=StreakStatus.TOO_FEW)
+    if result.used_count < settings.least_stars:
+        return replace(result, status=StreakStatus.TOO_FEW)
     exact = shared_covariance(last.evaluation, last.free, _CONJUGATE)
     covariance = (last.solution.covariance if exact is None else exact)[:3, :3]
     turn = scene.motion.turn
     size = float(np.linalg.norm(turn))
     deviation = float(np.sqrt(turn @ covariance @ turn)) / size
-    if told.length < settings.least_length or not size > settings.least_significance * deviation:
-        return replace(told, status=StreakStatus.TOO_SHORT)
-    if last.restless > _RESTLESS or not told.misfit < settings.worst_misfit or whole is Wholeness.BROKEN:
-        return replace(told, status=StreakStatus.FAILED)
-    said = opinions(last.evaluation, scene, last.free)
-    spread = 1.0 if said is None else disagreement(said, scene.trusted)
+    if result.length < settings.least_length or not size > settings.least_significance * deviation:
+        return replace(result, status=StreakStatus.TOO_SHORT)
+    if last.restless > _RESTLESS or not result.misfit < settings.worst_misfit or whole is Wholeness.BROKEN:
+        return replace(result, status=StreakStatus.FAILED)
+    estimates = own_estimates(last.evaluation, scene, last.free)
+    spread = 1.0 if estimates is None else disagreement(estimates, scene.trusted)
     # What made others disagree is as likely to hide, less of it, in the light of those that agree.
     asked = min(settings.most_stars, len(scene.trusted))
-    spread = max(told.misfit, spread, 1.0) * asked / max(int(np.count_nonzero(scene.trusted)), 1)
+    spread = max(result.misfit, spread, 1.0) * asked / max(int(np.count_nonzero(scene.trusted)), 1)
     return replace(
-        told,
+        result,
         status=StreakStatus.AMBIGUOUS,
-        rate=turn / told.exposure,
+        rate=turn / result.exposure,
         # What the model does not explain makes it less certain; what fits too well, no more. A fit that goes
         # to and fro, as pixels are left out and taken in, is known no better than that.
-        covariance=covariance * spread * (1.0 + last.restless**2) / told.exposure**2,
-        acceleration=scene.motion.growth / told.exposure**2 if last.free[3] else None,
+        covariance=covariance * spread * (1.0 + last.restless**2) / result.exposure**2,
+        acceleration=scene.motion.growth / result.exposure**2 if last.free[3] else None,
     )
 
 
-def with_faint(told: MotionResult, camera: ExposedCamera, scene: Scene, faint: FaintStars) -> MotionResult:
-    """Return `told` with the streaks that were only found along the motion."""
+def with_faint(result: MotionResult, camera: ExposedCamera, scene: Scene, faint: FaintStars) -> MotionResult:
+    """Return `result` with the streaks that were only found along the motion."""
     times = _times(camera, scene, faint.stars)
     ends = [positions(camera.pinhole, scene.motion, faint.stars, time) for time in times.T]
     return replace(
-        told,
+        result,
         faint_endpoints=np.stack(ends, axis=1),
         faint_flux=faint.light,
         faint_significance=faint.significance,
@@ -112,7 +112,7 @@ def _times(camera: ExposedCamera, scene: Scene, stars: FloatArray) -> FloatArray
 
 
 def _distinct(stars: FloatArray, light: FloatArray) -> BoolArray:
-    """Tell which stars (n, 2) have no brighter one in the same place: a fit may move one into another."""
+    """Return which stars (n, 2) have no brighter one in the same place: a fit may move one into another."""
     near = np.linalg.norm(stars[:, None] - stars, axis=2) < _SAME
     return np.asarray(~(near & (light > light[:, None])).any(axis=1))
 

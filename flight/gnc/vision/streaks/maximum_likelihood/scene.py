@@ -1,4 +1,4 @@
-"""What is fitted to a frame: a motion, a point spread, stars."""
+"""The unknowns of the fit: a motion, a point spread, stars."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _PIXEL_VARIANCE = 1.0 / 12.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """What is fitted.
+    """The unknowns of the fit.
 
     Attributes:
         motion: of the camera.
@@ -25,7 +25,8 @@ class Scene:
         stars: (n, 2) px at mid-exposure.
         light: (n,) counts over the exposure.
         sky: (n,) counts a pixel about the star, beside the frame's background.
-        trusted: (n,) whether the star has a say in what is shared; others only take their light.
+        trusted: (n,) whether the star helps to determine the shared parameters; of others only light and
+            place are fitted.
     """
 
     motion: Motion
@@ -45,7 +46,7 @@ class Scene:
         return select(self, chosen, "motion", "width")
 
     def with_stars(self, stars: FloatArray, light: FloatArray) -> Scene:
-        """Return the scene with more stars (m, 2) of `light` (m,), which have no say in what is shared."""
+        """Return the scene with more stars (m, 2) of `light` (m,), untrusted."""
         return replace(
             self,
             stars=np.concatenate([self.stars, stars]),

@@ -24,7 +24,8 @@ class LikelihoodSettings:
         threshold_sigmas: of the 3 x 3 sum, for the first guess.
         most_stars: the brightest are fitted, no more: they hold most of the information.
         most_neighbours: faint stars on the bright ones' pixels that are fitted with them.
-        most_faint: so many more are found along the known motion and taken out of the others' windows.
+        most_faint: at most this many more are found along the known motion and taken out of the others'
+            windows.
         faint_sigmas: significance from which a streak along the known motion is believed.
         reach: widths of the point spread to either side of a path that are fitted.
         clip: sigmas of a residual that is no noise.
@@ -32,7 +33,7 @@ class LikelihoodSettings:
         least_length: px, median path below which no rate is given.
         least_significance: of the rate in its standard deviations, below which no rate is given.
         worst_misfit: chi-square per degree of freedom above which the motion is not believed.
-        sign_sigmas: the prior's projection on the axis must exceed so many of its sigmas to decide the
+        sign_sigmas: the prior's projection on the axis must exceed this many of its sigmas to decide the
             direction of time.
     """
 

@@ -33,7 +33,7 @@ from flight.gnc.vision.streaks.maximum_likelihood.strips import LINES, Strips, b
 IMAGES = 7
 """m, (n/w^2) m, its first moment along the path, e0, e1, dm/dw, 1."""
 
-# Blocks are worked on so many at a time, that their pixels stay in the processor's cache.
+# Blocks are drawn in groups of this many, so that their pixels stay in the processor's cache.
 _AT_ONCE = 256
 _ENDS = 5.5
 """Widths from an end beyond which its profile is 0 or 1."""
@@ -56,7 +56,7 @@ def images(
 ) -> Float32Array:
     """Return the images (b, IMAGES + more, LINES, k) of stars (n, 2), each of light 1, on their strips.
 
-    `width` is w in px; so many `more` images are left for others to fill in.
+    `width` is w in px; this many `more` images are left for others to fill in.
     """
     shape = strips.time.shape
     path = paths(pinhole, motion, np.repeat(stars[strips.star], LINES, axis=0), strips.time.reshape(-1))

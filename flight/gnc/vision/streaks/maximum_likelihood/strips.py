@@ -25,12 +25,12 @@ LINES = 10
 STEEPEST = 0.68
 """No path crosses its lines more obliquely: cosine to their normal, a little below that of both diagonals."""
 
-# A part of a path turns by no more than this, rad, so that it stays monotonic along its major axis.
+# A part of a path turns by this angle, rad, at most, so that it stays monotonic along its major axis.
 _LONGEST_TURN = 1.1
 _SAMPLES = 17
 # Where a path is divided it runs by so much more along the rows than across them.
 _DIAGONAL = 1.03
-# Instants of a part at which it is asked how its path runs.
+# Instants of a part at which its path's direction is taken.
 _INSTANTS = 7
 _SLOWEST = 1e-3
 # A line within reach of a part, beyond its end, may be crossed as obliquely as this.
@@ -119,7 +119,7 @@ def _parts(
     turned = float(np.linalg.norm(motion.turn)) + float(np.linalg.norm(motion.growth))
     pieces = max(1, math.ceil(turned * float(np.max(times[:, 1] - times[:, 0], initial=0.0)) / _LONGEST_TURN))
     edges = times[:, :1] + (times[:, 1:] - times[:, :1]) * np.linspace(0.0, 1.0, pieces + 1)
-    edges[:, -1] = times[:, 1]  # to the last bit: it is told by that
+    edges[:, -1] = times[:, 1]  # exactly: a later test compares it
     part = np.repeat(np.arange(len(times)), pieces)
     low, high = edges[:, :-1].reshape(-1), edges[:, 1:].reshape(-1)
     owner, diagonal = _diagonals(pinhole, motion, stars[part], low, high)
@@ -155,7 +155,7 @@ def _diagonals(
 
 
 def _crossings(major: FloatArray, sampled: FloatArray, line: IntArray, owner: IntArray) -> FloatArray:
-    """Return roughly when the paths cross `line` (b, LINES); the model takes care of what is left."""
+    """Return roughly when the paths cross `line` (b, LINES); the model corrects the rest."""
     time = np.empty(line.shape)
     bounds = np.searchsorted(owner, np.arange(len(major) + 1))
     for part in range(len(major)):
@@ -206,9 +206,9 @@ def _pixels(
     within &= offset[:, None, None] >= np.where(lines.real, -minor, 2 * half + 1)
     within &= offset[:, None, None] < limit - minor
     # No longer lines than there is something on, and no blocks without.
-    told = np.flatnonzero(within.any(axis=(1, 2)))
+    used = np.flatnonzero(within.any(axis=(1, 2)))
     used = np.flatnonzero(within.any(axis=(0, 2)))
-    begin, end = (int(told[0]), int(told[-1]) + 1) if len(told) else (0, 0)
+    begin, end = (int(used[0]), int(used[-1]) + 1) if len(used) else (0, 0)
     inside = np.ascontiguousarray(within[begin:end, used].transpose(1, 2, 0))
     corner, step = corner[used] + begin * step[used, None], step[used]
     first = corner[..., 1] * pinhole.columns + corner[..., 0]

@@ -1,10 +1,10 @@
 """By what angle all stars turn about a known axis, from the light of the whole frame.
 
-For frames of which no few regions tell the angle: faint streaks that come in pieces, bright ones that all
-are cut by the border. A box along a circle about the axis is held against what lies before and behind it, as
-long together as the box: a streak stands out whole when the box is as long as it is, and hardly as a piece of
-itself, with more light beside it, or with darkness in the box. The squared significance of all that stand out
-is largest for the true length.
+For frames in which a few regions do not give the angle: faint streaks that come in pieces, bright ones that
+all are cut by the border. A box along a circle about the axis is compared with the pixels before and behind
+it, as long together as the box: a streak stands out whole when the box is as long as it is, and hardly as a
+piece of itself, with more light beside it, or with darkness in the box. The squared significance of all that
+stand out is largest for the true length.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion
 from flight.gnc.vision.streaks.maximum_likelihood.polar_grid import polar_grid
 from flight.gnc.vision.streaks.maximum_likelihood.running_sums import totals
 
-# Lengths tried differ by this factor, from so many samples on.
+# Lengths tried differ by this factor, from this many samples on.
 _FACTOR = 1.1
 _SHORTEST = 5
-# Every so many circles do.
+# One circle in this many suffices.
 _SPARSE = 2
 # Noise of a sum of samples over a pixel's and the root of their number: nine pixels each, which overlap.
 _SAMPLE_NOISE = 3.1
 _LEAST_SIGMAS = 5.0
-# No streak counts more than so many sigmas.
+# No streak counts more than this many sigmas.
 _ENOUGH = 40.0
 
 

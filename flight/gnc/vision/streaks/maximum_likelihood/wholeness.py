@@ -24,7 +24,7 @@ _WHOLE_LIGHT = 0.5
 
 
 class Wholeness(Enum):
-    """What the streaks' ends and the light between them say of a motion."""
+    """Whether the streaks' ends and the light between them support a motion."""
 
     WHOLE = "whole"
     DOUBTED = "doubted"
@@ -36,7 +36,7 @@ def wholeness(camera: ExposedCamera, scene: Scene, faint: FaintStars) -> Wholene
 
     In a crowded frame what passes for a star may be several: a few that are dark here or there do not speak
     against the motion, but ask for another witness. So does a motion that most of the streaks disown which
-    show both ends, the only ones that tell by what angle the stars turned, and one that no such streak
+    show both ends, which alone give the angle turned, and one that no such streak
     vouches for; where the ends of those that decide are not where they should be, it is not the motion.
     """
     stars = np.concatenate([scene.stars, faint.stars])
@@ -48,9 +48,9 @@ def wholeness(camera: ExposedCamera, scene: Scene, faint: FaintStars) -> Wholene
     times = window_times(camera.pinhole, deciding.motion, camera.shutter, deciding.stars)
     seen = camera.frame, camera.pinhole, scene.motion, deciding.stars, deciding.light, times
     ends, lit = true_ends(*seen), unbroken(*seen)
-    told = np.isfinite(ends)
-    both = told.all(axis=1)
-    right = float(np.mean(ends[told])) if told.any() else 1.0
+    known = np.isfinite(ends)
+    both = known.all(axis=1)
+    right = float(np.mean(ends[known])) if known.any() else 1.0
     if both.any() and float(np.mean(ends[both])) < _TRUE_ENDS[1]:
         return Wholeness.BROKEN
     dark = np.count_nonzero(lit == 0.0)
@@ -59,12 +59,12 @@ def wholeness(camera: ExposedCamera, scene: Scene, faint: FaintStars) -> Wholene
     ):
         if right < least_ends or dark > max(1.0, most_broken * len(lit)):
             return worst
-    unvouched = bool(told.any()) and not both.any()
+    unvouched = bool(known.any()) and not both.any()
     return Wholeness.DOUBTED if unvouched or _disowned(camera, scene) else Wholeness.WHOLE
 
 
 def _disowned(camera: ExposedCamera, scene: Scene) -> bool:
-    """Tell whether most light of the bright streaks that show both ends is not of stars that agree."""
+    """Return whether most light of the bright streaks that show both ends is not of stars that agree."""
     times = window_times(camera.pinhole, scene.motion, camera.shutter, scene.stars)
     inside = np.ones(len(scene.stars), dtype=np.bool_)
     for time in times.T:

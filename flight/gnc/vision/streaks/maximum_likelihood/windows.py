@@ -17,21 +17,21 @@ from flight.gnc.vision.streaks.maximum_likelihood.strips import STEEPEST, Strips
 
 # Paths shorter than this many widths are summed instant by instant.
 _SPOT_WIDTHS = 8.0
-# Predicted light within so many sigmas of saturation is left out: chosen by the model, not by the noise.
+# Predicted light within this many sigmas of saturation is left out: chosen by the model, not by the noise.
 _MARGIN = 3.0
-# Instants at which it is asked what of a path the frame sees.
+# Instants at which a path is tested for being in the frame.
 _INSTANTS = 9
 _UNRESOLVED = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sight:
-    """What the frame shows on some blocks of pixels, all arrays (b, ...) alike.
+    """The frame on some blocks of pixels, all arrays (b, ...) alike.
 
     Attributes:
         slot: number of the pixel among those in use, the same for every star that shares it; one past the
             last where the pixel does not exist.
-        inside: whether the pixel exists, tells something, and is meant.
+        inside: whether the pixel exists, is usable and wanted.
         signal, floor, ceiling: of the frame.
         gain: electrons a count.
         crowded: (e,) flat positions of the pixels that other stars share; common: (e,) their numbers among
@@ -77,7 +77,7 @@ class Windows:
         long, spot: stars (a,), (b,) of each kind, indices into the scene.
         strips, patches: their pixels; star i of the strips is `long[i]`.
         pixels: (m,) flat indices of the pixels in use, by slot; slot: of all blocks' pixels, one after other.
-        on_strips, on_patches: what the frame shows there.
+        on_strips, on_patches: the frame there.
         shared: how many pixels are of several stars.
     """
 
@@ -94,7 +94,7 @@ class Windows:
     def total(self, on_strips: Float32Array, on_patches: FloatArray) -> Float32Array:
         """Return the light (m + 1,) of all stars on the pixels in use, from that on each star's own.
 
-        What comes last is of pixels that do not exist.
+        The last one is for pixels that do not exist.
         """
         light = np.concatenate([on_strips.reshape(-1), on_patches.reshape(-1).astype(np.float32)])
         return np.bincount(self.slot, light, len(self.pixels) + 1).astype(np.float32)
@@ -141,7 +141,7 @@ def cut_windows(
     index = np.concatenate([strips.index.reshape(-1), patches.index.reshape(-1)])
     inside = np.concatenate([strips.inside.reshape(-1), patches.inside.reshape(-1)])
     named = index[inside]
-    # Each pixel is told by the last place that names it; only memory of pixels in use is touched.
+    # Each pixel belongs to the last place that names it; only memory of pixels in use is touched.
     turn = np.arange(len(named), dtype=np.int32)
     number = np.empty(frame.signal.size, dtype=np.int32)
     number[named] = turn
