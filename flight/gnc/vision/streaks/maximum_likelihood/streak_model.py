@@ -80,11 +80,41 @@ def _draw(
     width: float,
 ) -> None:
     """Fill in the images of some blocks; `path`: position, tangent, speed and acceleration on their lines."""
+    speed, time = path[2], strips.time[part]
+    light, aside, s = _endless(strips, part, path, out.shape[3], width)
+    centre = time[:, LINES // 2 - 1 : LINES // 2 + 1].mean(axis=1, keepdims=True)
+    s += ((time - centre) * speed).astype(np.float32)
+    out[:, 0] = light.transpose(1, 2, 0)
+    across, along = (np.ascontiguousarray(each.transpose(1, 2, 0)) for each in (aside, s))
+    _ends(out, along, (time, centre, speed), shutter, strips, part, width)
+    light = out[:, 0]
+    u = across * across
+    u *= np.float32(1.0 / width**3)
+    u -= np.float32(1.0 / width)
+    u *= light
+    out[:, 5] += u
+    across *= np.float32(1.0 / width**2)
+    np.multiply(across, light, out=out[:, 1])
+    # The first moment of the light along the path, and the part that its ends cut off.
+    along *= out[:, 1]
+    across *= np.float32(width**2)
+    across *= out[:, 3] - out[:, 4]
+    np.add(along, across, out=out[:, 2])
+    out[:, 6] = 1.0
+
+
+def _endless(
+    strips: Strips, part: slice, path: tuple[FloatArray, ...], count: int, width: float
+) -> tuple[Float32Array, Float32Array, Float32Array]:
+    """Return light of a path without ends, px beside it and px ahead on it, of some blocks' pixels.
+
+    All are (count, b, LINES), `count` pixels a line.
+    """
     position, tangent, speed, acceleration = path
     tx, ty = tangent[..., 0], tangent[..., 1]
     gained = acceleration[..., 0] * tx + acceleration[..., 1] * ty
     bend = (acceleration[..., 1] * tx - acceleration[..., 0] * ty) / speed**2
-    aside, ahead = beside(strips.corner[part], strips.step[part], position, tangent, out.shape[3])
+    aside, ahead = beside(strips.corner[part], strips.step[part], position, tangent, count)
     squeeze = bend.astype(np.float32) * aside
     np.clip(squeeze, np.float32(-0.5), np.float32(0.5), out=squeeze)
     s = ahead / (np.float32(1.0) - squeeze)
@@ -105,26 +135,7 @@ def _draw(
     u *= square.astype(np.float32)
     u += (scale + 3.0 * square).astype(np.float32)
     light *= u
-    time = strips.time[part]
-    centre = time[:, LINES // 2 - 1 : LINES // 2 + 1].mean(axis=1, keepdims=True)
-    s += ((time - centre) * speed).astype(np.float32)
-    out[:, 0] = light.transpose(1, 2, 0)
-    across, along = (np.ascontiguousarray(each.transpose(1, 2, 0)) for each in (aside, s))
-    _ends(out, along, (time, centre, speed), shutter, strips, part, width)
-    light = out[:, 0]
-    u = across * across
-    u *= np.float32(1.0 / width**3)
-    u -= np.float32(1.0 / width)
-    u *= light
-    out[:, 5] += u
-    across *= np.float32(1.0 / width**2)
-    np.multiply(across, light, out=out[:, 1])
-    # The first moment of the light along the path, and what its ends cut off.
-    along *= out[:, 1]
-    across *= np.float32(width**2)
-    across *= out[:, 3] - out[:, 4]
-    np.add(along, across, out=out[:, 2])
-    out[:, 6] = 1.0
+    return light, aside, s
 
 
 def _ends(
@@ -164,8 +175,7 @@ def _ends(
         before = out[near, 0]
         bell *= before
         out[near, image] = bell
-        before *= ndtr(u)
-        out[near, 0] = before
+        out[near, 0] = before * ndtr(u)
         bell *= u
         out[near, 5] -= bell
 

@@ -205,14 +205,20 @@ def _pixels(
     within &= foot < stop.astype(np.float32)
     within &= offset[:, None, None] >= np.where(lines.real, -minor, 2 * half + 1)
     within &= offset[:, None, None] < limit - minor
-    # No longer lines than there is something on, and no blocks without.
-    used = np.flatnonzero(within.any(axis=(1, 2)))
+    return _cropped(lines, count, pinhole.columns, within, corner, step)
+
+
+def _cropped(
+    lines: _Lines, count: int, columns: int, within: BoolArray, corner: IntArray, step: IntArray
+) -> Strips:
+    """Return the strips with the blocks and pixels that `within` (k, b, LINES) needs."""
+    crossed = np.flatnonzero(within.any(axis=(1, 2)))
     used = np.flatnonzero(within.any(axis=(0, 2)))
-    begin, end = (int(used[0]), int(used[-1]) + 1) if len(used) else (0, 0)
+    begin, end = (int(crossed[0]), int(crossed[-1]) + 1) if len(crossed) else (0, 0)
     inside = np.ascontiguousarray(within[begin:end, used].transpose(1, 2, 0))
     corner, step = corner[used] + begin * step[used, None], step[used]
-    first = corner[..., 1] * pinhole.columns + corner[..., 0]
-    next_pixel = (step[:, 1] * pinhole.columns + step[:, 0])[:, None, None]
+    first = corner[..., 1] * columns + corner[..., 0]
+    next_pixel = (step[:, 1] * columns + step[:, 0])[:, None, None]
     index = first[..., None] + np.arange(end - begin) * next_pixel
     index *= inside
     return Strips(count, lines.star[used], lines.time[used], corner, step, index, inside)
@@ -224,7 +230,7 @@ def beside(
     """Return how far the pixels of each line (b, l) lie beside their path and ahead on it, (count, b, l) px.
 
     `corner` and `step` as of `Strips`; `position`, `tangent` (b, l, 2) of the path on the line. Pixels come
-    first: what is of lines goes with all of them at the speed of long arrays.
+    first: values of lines combine with all of them at the speed of long arrays.
     """
     offset = np.arange(count, dtype=np.float32)[:, None, None]
     dx, dy = corner[..., 0] - position[..., 0], corner[..., 1] - position[..., 1]
