@@ -109,11 +109,13 @@ def solve(observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> Att
         found = rotation_between(reference * signs, observed, seen.weight)
     except np.linalg.LinAlgError as error:
         raise AttitudeError(f"no attitude: {error}") from error
-    inverse = np.linalg.inv(found.normal)
+    inverse: FloatArray = np.linalg.inv(found.normal)
     # Forming the normal equations costs digits; one step from the equations' own residuals restores them.
     gibbs = found.rodrigues - inverse @ (seen.weight @ np.cross(found.residuals, found.sums))
     quaternion = upright(multiply(normalise(np.append(gibbs, 1.0)), turn))
-    return AttitudeFix(quaternion, _covariance(seen, found, gibbs, inverse), seen.loss(quaternion))
+    return AttitudeFix(
+        quaternion, _covariance(seen, found, np.asarray(gibbs), inverse), seen.loss(quaternion)
+    )
 
 
 def _covariance(seen: Sightings, found: OlaeSolution, gibbs: FloatArray, inverse: FloatArray) -> FloatArray:

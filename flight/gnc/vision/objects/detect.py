@@ -85,7 +85,9 @@ def examine(
 def _judged(judge: Judge, indicators: Indicators, labels: IntArray, streaks: Streaks) -> ObjectReport:
     """Return the verdict on each streak of `indicators`, of regions `labels`, and on the crowded regions."""
     found: list[SpaceObject] = []
-    verdicts, crowded, settled, strange = [], [], [], []
+    settled: list[int] = []
+    strange: list[int] = []
+    verdicts, crowded = [], []
     each = zip(labels, indicators.endpoints, indicators.deviations, indicators.fired, strict=True)
     for label, streak, deviation, fired in each:
         names = tuple(name for name, fires in zip(INDICATORS, fired, strict=True) if fires)
@@ -93,12 +95,12 @@ def _judged(judge: Judge, indicators: Indicators, labels: IntArray, streaks: Str
         verdicts.append(verdict)
         found += [candidate] if candidate is not None else []
         calm = verdict is Verdict.OBJECT or np.abs(deviation).max() <= _STRANGE
-        (settled if calm else strange).append(label)
+        (settled if calm else strange).append(int(label))
     for index, corners in streaks.crowded:
         verdict, candidate = judge.crowd(corners)
         crowded.append(verdict)
         found += [candidate] if candidate is not None else []
-        settled += [judge.segmented.candidates.label[index]] if verdict is Verdict.OBJECT else []
+        settled += [int(judge.segmented.candidates.label[index])] if verdict is Verdict.OBJECT else []
     found += judge.merged(np.array(settled, dtype=np.int64), np.array(strange, dtype=np.int64))
     found.sort(key=lambda candidate: -candidate.flux)
     return ObjectReport(indicators, tuple(verdicts), tuple(crowded), tuple(found), judge.rotation)
