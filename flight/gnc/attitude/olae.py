@@ -109,12 +109,12 @@ def solve(observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> Att
         found = rotation_between(reference * signs, observed, seen.weight)
     except np.linalg.LinAlgError as error:
         raise AttitudeError(f"no attitude: {error}") from error
-    inverse: FloatArray = np.linalg.inv(found.normal)
+    inverse = np.asarray(np.linalg.inv(found.normal), dtype=np.float64)
     # Forming the normal equations costs digits; one step from the equations' own residuals restores them.
     gibbs = found.rodrigues - inverse @ (seen.weight @ np.cross(found.residuals, found.sums))
     quaternion = upright(multiply(normalise(np.append(gibbs, 1.0)), turn))
     return AttitudeFix(
-        quaternion, _covariance(seen, found, np.asarray(gibbs), inverse), seen.loss(quaternion)
+        quaternion, _covariance(seen, found, gibbs, inverse), seen.loss(quaternion)
     )
 
 
