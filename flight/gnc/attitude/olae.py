@@ -113,9 +113,7 @@ def solve(observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> Att
     # Forming the normal equations costs digits; one step from the equations' own residuals restores them.
     gibbs = found.rodrigues - inverse @ (seen.weight @ np.cross(found.residuals, found.sums))
     quaternion = upright(multiply(normalise(np.append(gibbs, 1.0)), turn))
-    return AttitudeFix(
-        quaternion, _covariance(seen, found, gibbs, inverse), seen.loss(quaternion)
-    )
+    return AttitudeFix(quaternion, _covariance(seen, found, gibbs, inverse), seen.loss(quaternion))
 
 
 def _covariance(seen: Sightings, found: OlaeSolution, gibbs: FloatArray, inverse: FloatArray) -> FloatArray:
