@@ -15,9 +15,9 @@ from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.errors import FlightError
 from flight.gnc.math.arrays import FloatArray, Image
 from flight.gnc.vision.frame.saturation import FrameState, frame_state
-from flight.gnc.vision.streaks.streak_result import StreakResult, StreakStatus
+from flight.gnc.vision.streaks.streak_result import FrameMotion, StreakStatus
 
-Result = TypeVar("Result", bound=StreakResult)
+Result = TypeVar("Result", bound=FrameMotion)
 
 
 def validate(

@@ -32,8 +32,8 @@ def no_rows(*shape: int) -> Callable[[], FloatArray]:
 
 
 @dataclass(frozen=True, slots=True)
-class StreakResult:
-    """The motion in one frame and the streaks it is from.
+class FrameMotion:
+    """The motion in one frame and the streaks it is from: common to both estimators.
 
     Attributes:
         status: `rate`: all is known; `ambiguous`: `rate` is right up to its sign, no prior could decide; any
@@ -43,7 +43,6 @@ class StreakResult:
         length: px, median of the streaks used, else of those found, else of the regions; NaN when none.
         endpoints: (found, 2, 2) px, compensated when there is a rate; first ends are then simultaneous and,
             when the status is `rate`, earlier.
-        sigma: (found,) px, expected error of an endpoint, small for the bright; of corner detectors.
         used: (found,) which streaks the rate is from.
         rate: (3,) rad/s, camera frame, mean over the exposure, of the camera with respect to the stars; None
             when none.
@@ -57,7 +56,6 @@ class StreakResult:
     exposure: float
     length: float = float("nan")
     endpoints: FloatArray = field(default_factory=no_rows(2, 2))
-    sigma: FloatArray = field(default_factory=no_rows())
     used: BoolArray = field(default_factory=lambda: np.empty(0, dtype=np.bool_))
     rate: FloatArray | None = None
     covariance: FloatArray | None = None
@@ -78,3 +76,14 @@ class StreakResult:
         """Return the same motion in the other direction of time."""
         assert self.rate is not None
         return replace(self, rate=-self.rate, endpoints=self.endpoints[:, ::-1])
+
+
+@dataclass(frozen=True, slots=True)
+class StreakResult(FrameMotion):
+    """The motion by corner detectors.
+
+    Attributes:
+        sigma: (found,) px, expected error of an endpoint, small for the bright.
+    """
+
+    sigma: FloatArray = field(default_factory=no_rows())

@@ -8,16 +8,15 @@ from typing import Self
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import from_rotation_vector
 from flight.gnc.vision.streaks.maximum_likelihood.settings import RateModel
-from flight.gnc.vision.streaks.streak_result import StreakResult, no_rows
+from flight.gnc.vision.streaks.streak_result import FrameMotion, no_rows
 
 
 @dataclass(frozen=True, slots=True)
-class MotionResult(StreakResult):
+class MotionResult(FrameMotion):
     """The motion of one exposure and the stars; the rate is that at mid-exposure.
 
     Every star found has two ends: `endpoints` (n, 2, 2). `used` (n,) are those that were fitted to their
-    pixels with a say in the motion; `length` and `residual` (expected, not left over) are theirs. `sigma`
-    is empty: the ends have covariances.
+    pixels with a say in the motion; `length` and `residual` (expected, not left over) are theirs.
 
     Attributes:
         stars: (n, 2) px at mid-exposure; `star_covariance` (n, 2, 2) px^2.
@@ -57,7 +56,7 @@ class MotionResult(StreakResult):
     def reversed(self) -> Self:
         """Return the same motion in the other direction of time; the change of the rate keeps its sign."""
         return replace(
-            StreakResult.reversed(self),
+            FrameMotion.reversed(self),
             endpoint_covariance=self.endpoint_covariance[:, ::-1],
             directions=self.directions[:, ::-1],
             faint_endpoints=self.faint_endpoints[:, ::-1],
