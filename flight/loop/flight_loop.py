@@ -12,24 +12,24 @@ from dataclasses import dataclass, field
 from flight.link import events
 from flight.link.events import EventKind
 from flight.loop.body import Body
-from flight.loop.commanding import Commanding
-from flight.loop.control_cycle import ControlCycle
 from flight.loop.control_output import ControlOutput, SteeringState
 from flight.loop.executive.executive import Executive
 from flight.loop.executive.rate_group import Cycle, RateGroup
 from flight.loop.fdir.resources import ResourceReader
-from flight.loop.health_watch import HealthWatch
-from flight.loop.housekeeping import Housekeeping
-from flight.loop.imaging import Imaging
-from flight.loop.modes.mode_control import ModeControl
-from flight.loop.navigation import Navigation
-from flight.loop.performance import PerformanceObserver
 from flight.loop.progress import Progress
 from flight.loop.rate_groups import GroupTasks, Periods, rate_groups
 from flight.loop.run_label import RunLabel, record_run
 from flight.loop.services import Services
 from flight.loop.state.keeper import StateKeeper
 from flight.loop.state.learning import learned_of
+from flight.loop.tasks.commanding import Commanding
+from flight.loop.tasks.control_cycle import ControlCycle
+from flight.loop.tasks.health_watch import HealthWatch
+from flight.loop.tasks.housekeeping import Housekeeping
+from flight.loop.tasks.imaging import Imaging
+from flight.loop.tasks.mode_control import ModeControl
+from flight.loop.tasks.navigation import Navigation
+from flight.loop.tasks.performance import PerformanceObserver
 from flight.schema.sections import Config
 from hal.interfaces.wires import SECOND_NS
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from flight.loop.executive.rate_group import RateGroup, Task
-from flight.loop.performance import CONTROL
+from flight.loop.tasks.performance import CONTROL
 from hal.interfaces.wires import SECOND_NS
 
 HEALTH_PERIOD_NS = SECOND_NS // 4

@@ -12,8 +12,8 @@ from flight.gnc.vision.startracker.detection import DetectionSettings
 from flight.gnc.vision.startracker.solve import SolveSettings
 from flight.gnc.vision.streaks.corners.settings import StreakSettings
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
-from flight.loop.frame_measurements import ImagingSettings
-from flight.loop.navigation import NavigationSettings
+from flight.loop.tasks.frame_measurements import ImagingSettings
+from flight.loop.tasks.navigation import NavigationSettings
 from flight.schema.camera_model import camera_model
 from flight.schema.sections import Camera, Config
 from hal.interfaces.wires import SECOND_NS

@@ -13,23 +13,23 @@ from flight.app.composition.workers import worker_watches
 from flight.link.commands.channel import Channel
 from flight.link.telemetry.recorder import Recorder
 from flight.loop.body import Body
-from flight.loop.coil_drive import CoilDrive, CoilDriveSettings
-from flight.loop.commanding import Commanding
-from flight.loop.control_cycle import ControlCycle, CycleTasks
 from flight.loop.executive.jobs import JobRunner
 from flight.loop.fdir.event_log import EventLog
 from flight.loop.fdir.facts import Facts
 from flight.loop.fdir.streams import Streams, streams_of
 from flight.loop.flight_loop import FlightLoop, LoopTasks, Supervisors, nothing
-from flight.loop.health_watch import HealthInputs, HealthWatch
-from flight.loop.housekeeping import Housekeeping, Watched
-from flight.loop.imaging import Imaging
-from flight.loop.modes.mode_control import ModeControl, ModeSettings
-from flight.loop.navigation import Navigation
-from flight.loop.performance import PerformanceObserver
 from flight.loop.services import Devices, Services
 from flight.loop.state.content import Learned
-from flight.loop.steering import Steering
+from flight.loop.tasks.coil_drive import CoilDrive, CoilDriveSettings
+from flight.loop.tasks.commanding import Commanding
+from flight.loop.tasks.control_cycle import ControlCycle, CycleTasks
+from flight.loop.tasks.health_watch import HealthInputs, HealthWatch
+from flight.loop.tasks.housekeeping import Housekeeping, Watched
+from flight.loop.tasks.imaging import Imaging
+from flight.loop.tasks.mode_control import ModeControl, ModeSettings
+from flight.loop.tasks.navigation import Navigation
+from flight.loop.tasks.performance import PerformanceObserver
+from flight.loop.tasks.steering import Steering
 from flight.schema.sections import Config
 from hal.interfaces.wires import Clock
 

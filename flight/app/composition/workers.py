@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from flight.app.composition.bodies import body_kind
 from flight.gnc.vision import frame_job
-from flight.loop import imaging as imaging_task
 from flight.loop.body import PLANNER, Planner
 from flight.loop.executive.jobs import Worker
 from flight.loop.fdir.progress import WorkerWatch
-from flight.loop.imaging import Imaging
+from flight.loop.tasks import imaging as imaging_task
+from flight.loop.tasks.imaging import Imaging
 from flight.schema.sections import Config, Executive
 from hal.interfaces.wires import SECOND_NS
 

@@ -12,7 +12,7 @@ from flight.app.composition.bodies import body_kind
 from flight.gnc.guidance.one_axis.limits import Q2_LIMIT
 from flight.gnc.math.quaternion import about_axis_y, angle_about_axis_y
 from flight.link.telemetry.reader import Run
-from flight.loop.control_cycle import ATTITUDE_EVERY
+from flight.loop.tasks.control_cycle import ATTITUDE_EVERY
 from flight.schema import reader
 from flight.schema.errors import ConfigError
 from tests.scenario.flights import CONFIG, demo_config, fly

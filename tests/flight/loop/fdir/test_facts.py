@@ -13,8 +13,8 @@ from flight.link.modes import Mode
 from flight.loop.fdir import facts
 from flight.loop.fdir.event_log import EventLog
 from flight.loop.fdir.facts import FACTS, Facts, check
-from flight.loop.modes.mode_control import SAFING_REACTIONS, modes_moved_by
 from flight.loop.modes.triggers import Trigger
+from flight.loop.tasks.mode_control import SAFING_REACTIONS, modes_moved_by
 
 
 class Told:

@@ -6,8 +6,8 @@ import pytest
 
 from flight.link.modes import Mode
 from flight.loop.fdir.facts import FACTS
-from flight.loop.modes.mode_control import SAFING_REACTIONS
 from flight.loop.modes.table import TRANSITIONS
+from flight.loop.tasks.mode_control import SAFING_REACTIONS
 
 
 @pytest.mark.parametrize("mode", list(Mode))

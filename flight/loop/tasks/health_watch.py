@@ -8,14 +8,14 @@ from dataclasses import dataclass
 
 from flight.link import events
 from flight.link.telemetry.definitions import HEALTH
-from flight.loop.coil_drive import CoilDrive
 from flight.loop.executive.rate_group import Cycle, RateGroup
 from flight.loop.fdir import facts
 from flight.loop.fdir.facts import FACTS
 from flight.loop.fdir.progress import GroupsAndWorkers, WorkerWatch, failing
 from flight.loop.fdir.resources import ClockWatch, ResourceMonitor, ResourceReader, ResourceSample
-from flight.loop.modes.mode_control import ModeControl
 from flight.loop.services import Services
+from flight.loop.tasks.coil_drive import CoilDrive
+from flight.loop.tasks.mode_control import ModeControl
 from flight.schema.sections import Health
 from hal.interfaces.devices import PowerMonitor
 from hal.interfaces.wires import Ticker

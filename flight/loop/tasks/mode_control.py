@@ -20,11 +20,11 @@ from flight.loop.control_output import Target
 from flight.loop.fdir import facts
 from flight.loop.fdir.hold_timer import HoldTimer
 from flight.loop.modes.machine import Change, ModeMachine
-from flight.loop.modes.pointing_watch import PointingWatch
 from flight.loop.modes.table import TRANSITIONS, Answer
 from flight.loop.modes.triggers import COMMANDS, STARTS, Trigger
 from flight.loop.services import Services
-from flight.loop.steering import Steering
+from flight.loop.tasks.pointing_watch import PointingWatch
+from flight.loop.tasks.steering import Steering
 from flight.schema.sections import Modes
 
 SAFING_REACTIONS = {

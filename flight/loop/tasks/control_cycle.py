@@ -11,19 +11,19 @@ import numpy as np
 from flight.gnc.estimation.estimate import RATE, TURN, Estimate
 from flight.link.modes import STEERING, Mode
 from flight.link.telemetry.definitions import ATTITUDE
-from flight.loop import imaging as imaging_task
 from flight.loop.body import PLANNER, Body
-from flight.loop.coil_drive import CoilDrive
 from flight.loop.control_output import ControlOutput, Steered, Target
 from flight.loop.executive.jobs import JobResult
 from flight.loop.executive.rate_group import Cycle
 from flight.loop.fdir.coils.knowledge import CoilKnowledge
-from flight.loop.imaging import Imaging
-from flight.loop.modes.mode_control import ModeControl
-from flight.loop.navigation import Navigation
-from flight.loop.performance import PerformanceObserver
 from flight.loop.services import Services
-from flight.loop.steering import Steering
+from flight.loop.tasks import imaging as imaging_task
+from flight.loop.tasks.coil_drive import CoilDrive
+from flight.loop.tasks.imaging import Imaging
+from flight.loop.tasks.mode_control import ModeControl
+from flight.loop.tasks.navigation import Navigation
+from flight.loop.tasks.performance import PerformanceObserver
+from flight.loop.tasks.steering import Steering
 from hal.interfaces.readings import ImuReading
 
 ATTITUDE_EVERY = 4

@@ -18,7 +18,7 @@ from flight.gnc.vision.startracker.solve import AttitudePrior, RatePrior
 from flight.gnc.vision.streaks.corners.settings import StreakSettings
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from flight.gnc.vision.streaks.streak_result import StreakStatus
-from flight.loop.navigation import Navigation
+from flight.loop.tasks.navigation import Navigation
 from hal.interfaces.readings import Frame
 
 # rad, of the mounting between the camera and the inertial unit that the estimate is of.

@@ -13,8 +13,8 @@ from flight.gnc.vision.startracker.solution import FrameSolution, SolveStatus
 from flight.link import events
 from flight.link.telemetry.definitions import STARS, STREAK
 from flight.loop.body import BodyView
-from flight.loop.frame_measurements import FrameMeasurer, middle_ns
 from flight.loop.services import Services
+from flight.loop.tasks.frame_measurements import FrameMeasurer, middle_ns
 from hal.interfaces.readings import Frame
 
 _MANY_STARS = 12

@@ -10,10 +10,10 @@ import numpy as np
 from flight.gnc.estimation.estimate import Estimate
 from flight.gnc.math.arrays import FloatArray
 from flight.loop.body import Body
-from flight.loop.coil_drive import CoilDrive
 from flight.loop.control_output import CoilCommand, Steered, SteeringState
 from flight.loop.fdir import facts
 from flight.loop.services import Services
+from flight.loop.tasks.coil_drive import CoilDrive
 from hal.interfaces.readings import ImuReading
 
 _NO_DIPOLE: FloatArray = np.zeros(3)

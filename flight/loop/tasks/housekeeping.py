@@ -11,9 +11,9 @@ from flight.loop.body import Planner
 from flight.loop.control_output import SteeringState
 from flight.loop.executive.rate_group import Cycle
 from flight.loop.fdir import facts
-from flight.loop.imaging import Imaging
-from flight.loop.navigation import Navigation
 from flight.loop.services import Services
+from flight.loop.tasks.imaging import Imaging
+from flight.loop.tasks.navigation import Navigation
 from hal.interfaces.devices import PowerMonitor, TorqueCoils
 
 

@@ -15,10 +15,10 @@ from flight.loop.executive.jobs import JobResult
 from flight.loop.executive.rate_group import Cycle
 from flight.loop.fdir import facts
 from flight.loop.fdir.repeated_rows import RepeatedRows
-from flight.loop.frame_measurements import FrameMeasurer, ImagingSettings, middle_ns
-from flight.loop.frame_report import FrameReport, is_strange
-from flight.loop.navigation import Navigation
 from flight.loop.services import Services
+from flight.loop.tasks.frame_measurements import FrameMeasurer, ImagingSettings, middle_ns
+from flight.loop.tasks.frame_report import FrameReport, is_strange
+from flight.loop.tasks.navigation import Navigation
 from hal.interfaces.devices import FrameSource
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.readings import Frame

@@ -25,10 +25,10 @@ from flight.link.commands.codec import (
 from flight.link.modes import Mode
 from flight.link.telemetry.definitions import COMMAND
 from flight.link.telemetry.packets import Packer
-from flight.loop.coil_drive import CoilDrive
 from flight.loop.executive.rate_group import Cycle
-from flight.loop.modes.mode_control import ModeControl
 from flight.loop.services import Services
+from flight.loop.tasks.coil_drive import CoilDrive
+from flight.loop.tasks.mode_control import ModeControl
 from flight.schema.sections import CommandStep
 
 _REMEMBERED = 64

@@ -1,0 +1,1 @@
+"""The tasks of the loop, named as their domain: each owns one concern and returns its results."""
