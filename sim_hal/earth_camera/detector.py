@@ -39,7 +39,7 @@ def counts(model: EarthCameraModel, radiance: Float32Array, generator: np.random
 
 
 def spill(charge: Float32Array, full_well: float) -> None:
-    """Spread what is beyond the full well along each column of `charge` (rows, columns), half up, half down.
+    """Spread charge beyond the full well along each column of `charge` (rows, columns), half up, half down.
 
     Each pixel on the way fills to the brim before the next one gets any; what reaches an edge is lost.
     """

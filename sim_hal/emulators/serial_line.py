@@ -67,7 +67,7 @@ class Wire:
     """One direction of a line.
 
     Attributes:
-        faults: what is wrong with it; may be exchanged at any time.
+        faults: its faults; may be replaced at any time.
         lost_bytes: bytes that found the buffers full.
     """
 

@@ -56,7 +56,7 @@ def source_tracks(
 
     `epoch` is the Julian date TT of the orbits' time 0. The tracks' own times count from `zero` s, on the
     clock of the attitude history they go with. An object in the umbra or behind the Earth throughout is left
-    out; one that is partly lit, or for part of the time, is fainter by as much, evenly over the track. Give
+    out; an object partly lit, or lit for part of the time, is fainter by as much, evenly over the track. Give
     a rolling shutter's tracks its last row's end. Raises OutOfRange beyond the orbits' ends, or within 1 m.
     """
     if not start < end:
