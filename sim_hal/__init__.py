@@ -1,1 +1,1 @@
-"""What the devices would feel, and devices that answer on the wire."""
+"""Simulated worlds, and emulated devices that answer at the wire."""

@@ -1,7 +1,7 @@
-"""Simulated hardware for a configuration: the world and the emulated devices in it.
+"""Builds the simulated hardware of a configuration: the world and the emulated devices in it.
 
-What leads out of it ends in the same Protocols as Linux's, so the drivers that fly are those simulated.
-Before the release the body is held still at its first attitude, as a hand would hold it.
+The devices offer the same Protocols as Linux's, so simulated flights exercise the drivers that fly. Until its
+release the body is held still at its initial attitude.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from sim_hal.emulators.vn100 import Vn100Emulator, Vn100EmulatorSettings
 from sim_hal.emulators.vn100_sensors import NoiseProfile
 from sim_hal.faults.timeline import FaultTimeline
 from sim_hal.settings import Simulation, Sky
-from sim_hal.truth import TruthRecorder
 from sim_hal.worlds.coil_circuit import CoilCircuit
 from sim_hal.worlds.simulation import TimedSimulation
+from sim_hal.worlds.truth import TruthRecorder
 from sim_hal.worlds.world import World, WorldInputs, make_world
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ BUS_VOLTAGE = 5.0
 
 @dataclass(frozen=True, slots=True)
 class Hardware:
-    """All of it; drivers are plugged into `bus` and `camera`, the rest is for faults and for looking."""
+    """All simulated parts. Drivers use `bus` and `camera`; faults and tests use the rest."""
 
     simulation: TimedSimulation
     world: World
@@ -58,7 +58,7 @@ class Hardware:
     faults: FaultTimeline
 
     def release(self, epoch_ns: int) -> None:
-        """Let the body go at `epoch_ns`: mission time zero."""
+        """Release the body at `epoch_ns`, mission time zero."""
         self.world.release_at(epoch_ns)
         if self.truth is not None:
             self.truth.begin(epoch_ns)
@@ -75,8 +75,9 @@ def assemble(
 ) -> Hardware:
     """Build the hardware of `config` in the world of its simulation `section`.
 
-    `now_ns` tells the simulation's time; `line` is the serial line's device end; `expose` replaces the
-    camera's renderer (in real time it works beside the devices); `wait` lets time pass while the bus hangs.
+    `now_ns` returns the simulation's time; `line` is the device end of the serial line; `expose` replaces
+    the camera's renderer (in real time a process of its own); `wait` advances time while the bus hangs.
+    Raises ConfigError for a world that cannot be made.
     """
     unit_seed, circuit_seed = np.random.SeedSequence(section.seed).spawn(2)
     resistance = section.truth.resistance or config.coils.resistance
@@ -92,20 +93,7 @@ def assemble(
         bus_voltage=BUS_VOLTAGE,
     )
     world = make_world(WorldInputs(config, section, circuit.currents, now_ns()))
-    unit = Vn100Emulator(
-        world.motion,
-        line,
-        np.random.default_rng(unit_seed),
-        Vn100EmulatorSettings(
-            noise=NoiseProfile(
-                attitude_bound=section.imu.quaternion_noise, rate_bound=section.imu.rate_noise
-            ),
-            mounting=np.array(config.inertial_unit.mounting),
-            gyro_bias=np.array(section.imu.gyro_bias),
-            clock_ppm=section.imu.clock_ppm,
-        ),
-        now_ns=now_ns(),
-    )
+    unit = _unit(config, section, world, line, np.random.default_rng(unit_seed), now_ns())
     monitor = None
     parts: list[EmulatedPca9685 | EmulatedIna219] = [pwm]
     if config.power_monitor is not None:
@@ -114,13 +102,7 @@ def assemble(
         )
         parts.append(monitor)
     bus = EmulatedI2cBus(parts, wait=wait)
-    camera = None
-    if config.camera is not None:
-        make = expose or inline_exposure(StarRenderer(config.camera, section.sky, section.seed))
-        readout_ns = round(section.sky.readout * 1e9)
-        mounting = np.array(config.camera.mounting)
-        scan_ns = round(section.sky.line_time * config.camera.rows * 1e9)
-        camera = EmulatedStarCamera(world.motion, make, now_ns, readout_ns, mounting, scan_ns)
+    camera = _camera(config.camera, section, world, expose, now_ns)
     devices: list[EmulatedDevice] = [unit]
     if camera is not None:
         devices.append(camera)
@@ -133,19 +115,52 @@ def assemble(
     return Hardware(simulation, world, unit, bus, pwm, monitor, circuit, camera, truth, faults)
 
 
+def _unit(
+    config: Config,
+    section: Simulation,
+    world: World,
+    line: SerialEnd,
+    generator: np.random.Generator,
+    now_ns: int,
+) -> Vn100Emulator:
+    imu = section.imu
+    settings = Vn100EmulatorSettings(
+        noise=NoiseProfile(attitude_bound=imu.quaternion_noise, rate_bound=imu.rate_noise),
+        mounting=np.array(config.inertial_unit.mounting),
+        gyro_bias=np.array(imu.gyro_bias),
+        clock_ppm=imu.clock_ppm,
+    )
+    return Vn100Emulator(world.motion, line, generator, settings, now_ns=now_ns)
+
+
+def _camera(
+    camera: Camera | None,
+    section: Simulation,
+    world: World,
+    expose: Expose | None,
+    now_ns: Callable[[], int],
+) -> EmulatedStarCamera | None:
+    if camera is None:
+        return None
+    make = expose or inline_exposure(StarRenderer(camera, section.sky, section.seed))
+    readout_ns = round(section.sky.readout * 1e9)
+    scan_ns = round(section.sky.line_time * camera.rows * 1e9)
+    return EmulatedStarCamera(world.motion, make, now_ns, readout_ns, np.array(camera.mounting), scan_ns)
+
+
 def line_generator(seed: int) -> np.random.Generator:
-    """Return the draws of the serial line's faults, apart from all others of the same seed."""
+    """Return the generator of the serial line's faults, independent of all others of the same seed."""
     return np.random.default_rng([seed, _LINE_STREAM])
 
 
 def fault_generator(seed: int) -> np.random.Generator:
-    """Return the draws of the faults of devices, likewise."""
+    """Return the generator of device faults, independent of all others of the same seed."""
     return np.random.default_rng([seed, _FAULT_STREAM])
 
 
 def camera_model(camera: Camera, sky: Sky) -> StarCameraModel:
     """Return the optics and detector of an emulated camera."""
-    # Of no use to a server, whose frames another process renders: half of its start.
+    # Imported late: half of a server's start-up time, and another process renders its frames.
     from sim_hal.star_camera import StarCameraModel  # noqa: PLC0415
 
     return StarCameraModel(
@@ -165,7 +180,7 @@ def camera_model(camera: Camera, sky: Sky) -> StarCameraModel:
 
 
 class StarRenderer:
-    """Makes the frames of one camera; frame k is the same whoever makes it, and whenever."""
+    """Renders the frames of one camera; the noise of frame k depends on the seed and k only."""
 
     def __init__(self, camera: Camera, sky: Sky, seed: int) -> None:
         self._model = camera_model(camera, sky)
@@ -183,7 +198,7 @@ class StarRenderer:
 
 
 def inline_exposure(renderer: StarRenderer) -> Expose:
-    """Have frames made on the spot: right for lock-step."""
+    """Return an exposure that renders at once, for lock-step."""
 
     def expose(sequence: int, times: FloatArray, attitudes: FloatArray) -> Future[Image]:
         future: Future[Image] = Future()
@@ -194,7 +209,7 @@ def inline_exposure(renderer: StarRenderer) -> Expose:
 
 
 def _coil_settings(config: Config, resistance: tuple[float, float, float], supply: float) -> CoilSettings:
-    """Return the coils as they truly are."""
+    """Return the true coil settings."""
     wiring = partial(_wiring, config, resistance)
     return CoilSettings(
         (wiring(0), wiring(1), wiring(2)),

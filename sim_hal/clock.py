@@ -1,8 +1,7 @@
 """Simulated time: sleeping advances the world to the deadline and returns at once.
 
-Tickers run in turn as simulated time passes them, in the order in which they were made, so a flight is the
-same bit for bit each time. A job that itself sleeps (a driver waiting for its chip) lets time pass for the
-world, but no other ticker runs meanwhile.
+Due tickers run one after the other, in the order in which they were made, so a flight repeats bit for bit. A
+job that itself sleeps (a driver waiting for its chip) advances the world, but no other ticker runs meanwhile.
 """
 
 from __future__ import annotations
@@ -15,17 +14,17 @@ from hal.interfaces.wires import Ticker
 
 
 class TimedWorld(Protocol):
-    """What a SimClock carries along."""
+    """A world that a SimClock advances."""
 
     def next_event_ns(self) -> int:
-        """Return when something next happens by itself."""
+        """Return the time of the next event."""
 
     def advance_to(self, time_ns: int) -> None:
-        """Let everything happen that is due at or before `time_ns`."""
+        """Process all events due at or before `time_ns`."""
 
 
 class SimClock:
-    """A Clock that jumps. Time begins at `start_ns`; `utc_start_ns` is the label of time 0.
+    """A Clock that jumps to each deadline. Time begins at `start_ns`; `utc_start_ns` is the label of time 0.
 
     Attributes:
         tickers: those that run, in the order in which they were made.
@@ -39,7 +38,7 @@ class SimClock:
         self._running_jobs = False
 
     def attach(self, world: TimedWorld) -> None:
-        """Carry this world along from now on."""
+        """Advance this world from now on."""
         self._world = world
 
     def now_ns(self) -> int:
@@ -64,7 +63,7 @@ class SimClock:
         return made
 
     def utc_ns(self) -> int:
-        """Return the label of now."""
+        """Return UTC in ns, a label for telemetry."""
         return self._utc_start_ns + self._now_ns
 
     def _advance_world(self, time_ns: int) -> None:
@@ -88,7 +87,7 @@ class SimClock:
 
 
 class SimTicker(ContainedJob):
-    """A job on simulated time; a kick runs it on the spot."""
+    """A job on simulated time; a kick runs it at once."""
 
     def __init__(self, clock: SimClock, name: str, period_ns: int, job: Callable[[], None]) -> None:
         super().__init__(name, job, clock.now_ns)
@@ -103,7 +102,7 @@ class SimTicker(ContainedJob):
         self.run()
 
     def run(self) -> None:
-        """Run the job, unless it is this job that asks."""
+        """Run the job, unless it is already running."""
         if self._busy:
             return
         self._busy = True
@@ -113,6 +112,6 @@ class SimTicker(ContainedJob):
             self._busy = False
 
     def stop(self) -> None:
-        """Run no more."""
+        """Stop running the job."""
         if self in self._clock.tickers:
             self._clock.tickers.remove(self)

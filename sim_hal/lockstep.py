@@ -17,12 +17,12 @@ from sim_hal.emulators.serial_line import SerialLine
 from sim_hal.faults.bench import Bench
 from sim_hal.faults.schedule import put, scheduled
 from sim_hal.settings import Simulation
-from sim_hal.truth import TruthRecorder
+from sim_hal.worlds.truth import TruthRecorder
 
 
 @dataclass(frozen=True, slots=True)
 class LockStep:
-    """What the flight application needs, and the hardware for whoever injects faults."""
+    """Clock, wires and release for the flight; hardware and line for fault injection and tests."""
 
     clock: SimClock
     wires: Wires

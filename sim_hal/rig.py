@@ -12,10 +12,10 @@ from pathlib import Path
 
 from flight.gnc.errors import UsageError
 from flight.schema import reader as configuration
+from flight.schema.errors import ConfigError
 from flight.schema.sections import Config
 from hal.guardian.client import CoilReach
 from hal.interfaces.devices import FrameSource
-from hal.interfaces.errors import DeviceError
 from hal.interfaces.rig import Rig
 from hal.interfaces.wires import SECOND_NS, Clock
 from sim_hal import lockstep
@@ -54,7 +54,7 @@ class SimulationRequest:
         name = str(self.config_path)
         section = configuration.simulation_section(self.text, name, Simulation)
         if section is None:
-            raise DeviceError("simulation", f"{name} has no `simulation` section")
+            raise ConfigError(name, "has no `simulation` section")
         return section
 
 

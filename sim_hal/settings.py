@@ -1,7 +1,7 @@
-"""The shape of a configuration's `simulation` section: what the simulated world really does.
+"""The shape of a configuration's `simulation` section: the true properties of the world.
 
-A value that is left out is what the flight application believes; one that stands here makes the world differ
-from that belief. SI units unless the name says otherwise.
+A value that is left out is taken from the flight configuration; a value given here makes the world differ
+from the flight's model. SI units unless the name says otherwise.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ class Section(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
 
 
 class Release(Section, frozen=True, kw_only=True):
-    """How the body is let go: q2 and rate about the thread at mission time zero."""
+    """The release of the body: q2 and rate about the thread at mission time zero."""
 
     q2: Annotated[float, Meta(ge=-0.7, le=0.7)]
     rate: Annotated[float, Meta(ge=-10.0, le=10.0)] = 0.0
@@ -43,14 +43,14 @@ class ImuNoise(Section, frozen=True, kw_only=True):
 
 
 class Latency(Section, frozen=True, kw_only=True):
-    """How long results of the workers take to arrive in lock-step, s."""
+    """Latency of the workers' results in lock-step, s."""
 
     planner: NotNegative = 0.05
     vision: NotNegative = 0.25
 
 
 class Truth(Section, frozen=True, kw_only=True):
-    """Constants of the world that differ from the flight application's belief."""
+    """True constants where they differ from the flight configuration's."""
 
     inertia: Positive | None = None
     field: Positive | None = None
@@ -59,7 +59,7 @@ class Truth(Section, frozen=True, kw_only=True):
 
 
 class Sky(Section, frozen=True, kw_only=True):
-    """What the emulated star camera sees and how it sees it (Sease ch. 2)."""
+    """Sky and optics of the emulated star camera (Sease ch. 2)."""
 
     magnitude_limit: Annotated[float, Meta(ge=0.0, le=8.5)] = 8.5
     year: Annotated[float, Meta(ge=1900.0, le=2100.0)] = 2026.5
@@ -72,7 +72,7 @@ class Sky(Section, frozen=True, kw_only=True):
 
 
 class FaultEntry(Section, frozen=True, kw_only=True):
-    """A fault on the time line: what, from which second of mission time on, for how many seconds.
+    """A fault and when: `at` in s of mission time, `for` in s.
 
     Without `at` it begins at 0, without `for` it lasts to the end. `sim_hal.faults.grammar` reads `fault`.
     """

@@ -37,25 +37,14 @@ def injected_faults(request: RunRequest, text: str) -> tuple[str, ...]:
     """Return the faults of a flight as they are written, the configuration's first."""
     from sim_hal import rig  # noqa: PLC0415
 
-    return rig.injected_faults(
-        rig.SimulationRequest(request.config_path, text, request.out, faults=request.faults)
-    )
+    return rig.injected_faults(_simulation_request(request, text))
 
 
 def simulated_rig(request: RunRequest, text: str, config: Config, stack: ExitStack) -> Rig:
     """Open the emulated devices of a configuration, with the request's faults. Raises UsageError."""
     from sim_hal import rig  # noqa: PLC0415
 
-    asked = rig.SimulationRequest(
-        request.config_path,
-        text,
-        request.out,
-        request.realtime,
-        request.seed,
-        request.devices,
-        request.faults,
-    )
-    return rig.open_rig(asked, config, stack)
+    return rig.open_rig(_simulation_request(request, text), config, stack)
 
 
 def simulated_camera(config_path: Path, text: str, config: Config) -> tuple[Clock, FrameSource]:
@@ -65,7 +54,7 @@ def simulated_camera(config_path: Path, text: str, config: Config) -> tuple[Cloc
     return rig.open_camera(rig.SimulationRequest(config_path, text, Path()), config)
 
 
-def _asked(request: RunRequest, text: str) -> SimulationRequest:
+def _simulation_request(request: RunRequest, text: str) -> SimulationRequest:
     from sim_hal.rig import SimulationRequest  # noqa: PLC0415
 
     return SimulationRequest(

@@ -57,7 +57,7 @@ class EarthCameraModel:
         read_noise: e-, standard deviation; linear only.
         blooming: whether charge beyond the full well spills along its column; linear only.
         pedestal: counts of darkness.
-        noise: counts, standard deviation, of each pixel anew in each frame; logarithmic only.
+        noise: counts, standard deviation, of each pixel, independent in each frame; logarithmic only.
         fixed_pattern: counts, standard deviation, of each pixel's own offset, as calibration left it.
         response_spread: relative standard deviation of each pixel's sensitivity; linear only.
         dead_pixels: how many read zero, whatever falls on them.

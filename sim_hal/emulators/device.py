@@ -1,4 +1,4 @@
-"""What every emulated device has in common: it acts at instants of its own, and on time only."""
+"""The interface of emulated devices: each acts at its own event times."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ class EmulatedDevice(Protocol):
     """A device on the simulation's time line."""
 
     def next_event_ns(self) -> int:
-        """Return when it next does something by itself; NEVER if nothing is to come."""
+        """Return the time of its next event; NEVER without one."""
 
     def advance(self, now_ns: int) -> None:
-        """Do all that is due at or before `now_ns`, in order, each thing at its own time."""
+        """Process all events due at or before `now_ns`, in order, each at its own time."""
 
 
 class SerialEnd(Protocol):
@@ -24,10 +24,10 @@ class SerialEnd(Protocol):
     baud_rate: int
 
     def write(self, data: bytes, now_ns: int) -> None:
-        """Start to send bytes at `now_ns`, or when those before them have gone."""
+        """Send bytes from `now_ns` on, after any that wait."""
 
     def read(self, now_ns: int) -> bytes:
-        """Return what has crossed from the host by `now_ns` and was not read yet."""
+        """Return unread bytes from the host that have arrived by `now_ns`."""
 
     def next_arrival_ns(self) -> int:
-        """Return when bytes from the host will next be there; NEVER if none are on their way."""
+        """Return when bytes from the host next arrive; NEVER if none are under way."""

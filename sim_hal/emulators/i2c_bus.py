@@ -17,7 +17,7 @@ class I2cPart(Protocol):
     """A part on the bus."""
 
     def answers(self, address: int) -> bool:
-        """Tell whether the part acknowledges this address (0 is the general call)."""
+        """Return whether the part acknowledges this address (0 is the general call)."""
 
     def write(self, address: int, data: bytes) -> None:
         """Take the bytes of a write, from the address to the STOP or repeated START."""

@@ -1,7 +1,7 @@
 """An INA219 that holds registers and converts in its own time (TI SBOS448G).
 
-What it converts is the mean over its conversion window of what the circuit says it carried; a conversion is
-worked out when the bus asks for its result. Not modelled: noise, gain error, the input filter.
+Each conversion is the mean of the circuit's supply over the conversion window, computed when the bus asks for
+its result. Not modelled: noise, gain error, the input filter.
 """
 
 from __future__ import annotations
@@ -61,11 +61,11 @@ class EmulatedIna219:
         self._power_on()
 
     def brown_out(self) -> None:
-        """Let the supply fail for an instant: every register is back at its power-on value."""
+        """Interrupt the supply: every register returns to its power-on value."""
         self._power_on()
 
     def upset(self, register: int, bit: int) -> None:
-        """Let radiation flip a bit of Config or Calibration; one that does not exist stays zero."""
+        """Flip a bit of Config or Calibration, as radiation does; unused bits stay zero."""
         if register == CONFIG:
             self._convert()
             self._configure((self._config ^ 1 << bit) & 0xFFFF)
@@ -84,7 +84,7 @@ class EmulatedIna219:
         return words[register] & 0xFFFF if register < len(words) else 0
 
     def answers(self, address: int) -> bool:
-        """Tell whether the chip acknowledges this address."""
+        """Return whether the chip acknowledges this address."""
         return address == self.address
 
     def write(self, address: int, data: bytes) -> None:

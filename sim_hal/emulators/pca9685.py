@@ -95,7 +95,7 @@ class EmulatedPca9685:
         self._stop(_ALL_CHANNELS)
 
     def flip(self, register: int, bit: int) -> None:
-        """Let radiation flip a bit of a register; one that does not exist stays zero."""
+        """Flip a bit of a register, as radiation does; unused bits stay zero."""
         self.upset(register, self._registers[register] ^ 1 << bit & _WRITABLE[register])
 
     def register(self, register: int) -> int:
@@ -125,7 +125,7 @@ class EmulatedPca9685:
         return self.high(channel)[1] / COUNTS
 
     def answers(self, address: int) -> bool:
-        """Tell whether the chip acknowledges: its own, the general call, enabled ALLCALL and SUBADRs."""
+        """Return whether the chip acknowledges: its own, the general call, enabled ALLCALL and SUBADRs."""
         return address in self._addresses
 
     def write(self, address: int, data: bytes) -> None:

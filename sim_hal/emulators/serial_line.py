@@ -21,7 +21,7 @@ _SECOND_NS = 1_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class LineFaults:
-    """What is wrong with a wire, from the next byte on.
+    """The faults of a wire, from the next byte on.
 
     Attributes:
         silent: nothing crosses.
@@ -29,7 +29,7 @@ class LineFaults:
         cut_probability: of a message to lose a random run of its bytes.
         flip_probability: of each bit to arrive inverted.
         delay_ns: added to the time of each byte.
-        thinned: of so many messages one crosses.
+        thinned: one message of this many crosses.
     """
 
     silent: bool = False

@@ -46,7 +46,7 @@ class EmulatedStarCamera:
     Attributes:
         fault: "off", "black", "frozen", "saturated", "torn", "garbage", "wrong" (upside down), or none.
         late_ns: how much later than its read-out a frame comes.
-        one_of: it answers every so many triggers with one exposure; those between are lost.
+        one_of: it exposes on one trigger of this many and ignores the others.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class EmulatedStarCamera:
         self._unanswered = 0
 
     def trigger(self, exposure_ns: int) -> None:
-        """Start an exposure; one that is under way is abandoned, as a camera's reset does."""
+        """Start an exposure and abandon any that is under way, as a camera's reset does."""
         if self.fault == "off":
             raise NotResponding("camera", "does not answer the trigger")
         self._unanswered += 1
@@ -103,7 +103,7 @@ class EmulatedStarCamera:
         frame = Frame(
             exposure.sequence, exposure.start_ns, exposure.length_ns, now_ns, exposure.image.result()
         )
-        shown = self._spoil(frame)
+        shown = self._alter(frame)
         self._last = shown if self.fault == "frozen" else frame
         return shown
 
@@ -128,10 +128,10 @@ class EmulatedStarCamera:
                 exposure.image = self._expose(exposure.sequence, times, np.array(exposure.attitudes))
 
     def close(self) -> None:
-        """Drop what is under way."""
+        """Abandon the exposure under way."""
         self._exposure = None
 
-    def _spoil(self, frame: Frame) -> Frame:
+    def _alter(self, frame: Frame) -> Frame:
         """Apply the fault that is set."""
         if self.fault == "frozen" and self._last is not None:
             return Frame(

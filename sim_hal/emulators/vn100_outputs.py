@@ -1,4 +1,4 @@
-"""How the VN-100 says what it measures: the values of its binary fields, the text of its ASCII sentences.
+"""The VN-100's messages: values of binary fields, text of ASCII sentences.
 
 Layout and number formats: VectorNav UM001 v2.43 ch. 4 and 5.
 """
@@ -19,7 +19,7 @@ GRAVITY_NED: FloatArray = np.array([0.0, 0.0, STANDARD_GRAVITY])
 
 @dataclass(frozen=True, slots=True)
 class Instant:
-    """All that the unit can say at one time.
+    """The data of all messages at one time.
 
     Attributes:
         device_ns: since start.

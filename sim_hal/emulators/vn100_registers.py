@@ -1,4 +1,4 @@
-"""The registers of the VN-100: what each holds, what it takes, and the errors that the unit answers with.
+"""The registers of the VN-100: contents, accepted values, and the unit's error codes.
 
 Values are kept as the text that the unit prints. Contents and defaults: VectorNav UM001 v2.43 ch. 5.
 """

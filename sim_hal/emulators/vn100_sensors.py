@@ -1,4 +1,4 @@
-"""What the VN-100 measures of a motion: its frames, its units, its noise.
+"""The VN-100's measurement of a motion: frames, units, noise.
 
 Two profiles. THESIS: uniform bounds on attitude and rate as Sease 2013 ch. 5 takes them from the unit's data
 sheet. DATASHEET: white noise of the published densities at the filter windows of register 85, an error of the
@@ -99,7 +99,7 @@ class Measured:
 
 
 class Sensors:
-    """The sensing part of the unit: from a motion of the body to what the unit says."""
+    """The unit's sensors: from a motion of the body to a sample."""
 
     def __init__(
         self,

@@ -1,6 +1,6 @@
-"""Faults as data: what can break, how it is written down, when it breaks, and how it is mended again.
+"""Fault injection at device level: 88 fault types; faults that would have no effect are rejected.
 
-`catalogue` lists every fault, `grammar` reads them, `timeline` does things at instants of the simulation.
-`bench` is what they are done to: `serial`, `parts`, `circuit`, `imaging` and `machine` know how. What breaks
-in the flight process itself (workers, wall clock, disk) is `host`'s.
+`catalogue` lists them, `grammar` parses them, `schedule` checks them and puts them on the `timeline`. `bench`
+holds the hardware that they act on; `serial`, `parts`, `circuit`, `imaging` and `machine` implement them.
+`host` injects faults into the flight process itself (workers, wall clock, disk).
 """

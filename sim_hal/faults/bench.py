@@ -1,4 +1,4 @@
-"""What faults are done to: the emulated hardware, the line, and how to do things again and again."""
+"""The hardware that faults act on, and the ways to apply, combine and repeat faults."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import numpy as np
 
 from sim_hal.emulators.serial_line import SOUND, HostEnd, LineFaults, Wire
 
-if TYPE_CHECKING:  # a flight process that only reads what faults there are need not hold the whole world
+if TYPE_CHECKING:  # parsing faults needs no hardware
     from sim_hal.assembly import Hardware
 
 Lift = Callable[[], None]
-"""Takes a fault away again."""
+"""Removes a fault."""
 
 
 class Line(Protocol):
@@ -26,18 +26,18 @@ class Line(Protocol):
 
 
 def no_lift() -> None:
-    """Take nothing away: what was broken stays so until somebody mends it."""
+    """Remove nothing: the effect stays until something repairs it."""
 
 
 @dataclass(slots=True)
 class Bench:
-    """Everything that can be broken from outside the flight process.
+    """The parts that faults act on from outside the flight process.
 
     Attributes:
         now_ns: the simulation's time.
-        generator: the draws of faults that draw.
+        generator: for random faults.
         host: the line's host end, where it is in memory.
-        flight_process: its number, where it is another one than this.
+        flight_process: its process identifier, where it is not this process.
     """
 
     hardware: Hardware
@@ -48,8 +48,8 @@ class Bench:
     flight_process: int | None = None
     _on_wires: dict[int, list[LineFaults]] = field(default_factory=dict)
 
-    def spoil(self, wire: Wire, faults: LineFaults) -> Lift:
-        """Put one more fault on a wire; those that are there already stay."""
+    def disturb(self, wire: Wire, faults: LineFaults) -> Lift:
+        """Add a fault to those of a wire."""
         present = self._on_wires.setdefault(id(wire), [])
         present.append(faults)
         wire.faults = _together(present)
@@ -61,11 +61,11 @@ class Bench:
         return lift
 
     def after(self, seconds: float, action: Callable[[], None]) -> None:
-        """Do `action` in so many seconds of the simulation."""
+        """Run `action` after `seconds` of simulated time."""
         self.hardware.faults.at(self.now_ns() + round(seconds * 1e9), action)
 
     def toggle(self, begin: Callable[[], Lift], period: float, share: float) -> Lift:
-        """Have a fault come and go: there for `share` of each `period` s."""
+        """Apply a fault intermittently: for `share` of each `period` s."""
         state: dict[str, Lift | None] = {"lift": None}
         stopped = False
 

@@ -10,9 +10,9 @@ from sim_hal.worlds.coil_circuit import Condition
 
 _OHM = Parameter(5.0, 0.1, 1000.0, "ohm")
 _COIL = (
-    (Condition.OPEN, "open", "its wire is broken: no current"),
-    (Condition.SHORTED, "shorted", "the bridge drives this many ohm, the coil carries nothing"),
-    (Condition.REVERSED, "reversed", "its ends are exchanged"),
+    (Condition.OPEN, "open", "broken wire: no current"),
+    (Condition.SHORTED, "shorted", "the bridge drives `ohm`, the coil carries no current"),
+    (Condition.REVERSED, "reversed", "reversed polarity"),
 )
 _BRIDGE = (
     (Condition.A_HIGH, "a-high", "the output of input A stays high"),

@@ -20,7 +20,7 @@ from sim_hal.settings import FaultEntry
 GRAMMAR = "DEVICE: KIND [(NAME=VALUE, ...)] [@ SECONDS] [for SECONDS]"
 
 LONGEST = 1e9
-"""s, thirty years: what is beyond is a slip of the pen, and soon does not fit into 64 bits of ns."""
+"""s, thirty years; more would not fit into 64 bits of ns."""
 
 _FAULT = re.compile(
     r"\s*(?P<name>[\w-]+\s*:\s*[\w-]+)\s*(\((?P<given>[^()]*)\))?"
@@ -39,7 +39,7 @@ class ScheduledFault:
 
     @property
     def end(self) -> float:
-        """When it is over, s: at once where there is nothing to lift, infinity where it lasts."""
+        """The end, s: the beginning for a momentary fault, infinity for a lasting one."""
         if self.kind.momentary:
             return self.at
         return math.inf if self.span is None else self.at + self.span
@@ -52,7 +52,7 @@ class ScheduledFault:
 
 
 def parse(text: str) -> ScheduledFault:
-    """Read one fault. Raises UsageError that says what is wrong and what would be right."""
+    """Parse one fault. Raises UsageError with the correct form."""
     found = _FAULT.fullmatch(text)
     if found is None:
         raise UsageError(f"fault {text!r}: write it as {GRAMMAR}")
@@ -89,7 +89,7 @@ def schedule(entries: Sequence[FaultEntry]) -> tuple[ScheduledFault, ...]:
 def entries(texts: Sequence[str]) -> tuple[FaultEntry, ...]:
     """Return faults of the command line as those of a section. Raises UsageError for a bad one.
 
-    Those of the command line only are left out: they have happened already.
+    Leaves out faults that only the command line can inject: they were applied to the text already.
     """
     faults = map(parse, texts)
     return tuple(

@@ -1,7 +1,7 @@
 """Faults inside the flight process: its workers, its wall clock, its disk, the file it reads at the start.
 
-The composing root hands its parts through here when a simulation asks for such faults, and only then. What is
-handed back follows the faults' windows of mission time on the same clock, in lock-step and in real time.
+The app passes clock, workers and log files through here only when a simulation asks for such faults. The
+wrappers apply each fault in its window of mission time, in lock-step and in real time.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class HostFaults:
         return None
 
     def concerns(self, *devices: str) -> bool:
-        """Tell whether any of these devices has a fault in this flight."""
+        """Return whether any of these devices has a fault in this flight."""
         return any(fault.kind.device in devices for fault in self._faults)
 
     def clock(self) -> Clock:
@@ -55,17 +55,17 @@ class HostFaults:
         return _SteppedClock(self._clock, self) if self.concerns("clock") else self._clock
 
     def opener(self, opener: Callable[[Path], Any]) -> Callable[[Path], Any]:
-        """Return what opens files on a disk that may fail."""
+        """Return an opener of files on a disk that may fail."""
         return (lambda path: _FailingFile(opener, path, self)) if self.concerns("disk") else opener
 
     def workers(self, specs: Sequence[Any]) -> list[Any]:
-        """Return workers whose function may be sabotaged."""
+        """Return workers whose function may fail."""
         if not self.concerns("planner", "vision"):
             return list(specs)
         return [replace(spec, function=perform) for spec in specs]
 
     def jobs(self, runner: Any, specs: Sequence[Any], result: Callable[..., Any]) -> Any:
-        """Return a runner that tells the sabotaged workers what to do; `result` makes a job's result."""
+        """Return a runner that passes the faults on to the workers; `result` makes a job's result."""
         return _FaultyRunner(runner, specs, result, self) if self.concerns("planner", "vision") else runner
 
     @property
@@ -79,13 +79,13 @@ class HostFaults:
 
 
 def host_faults(section: Simulation, clock: Clock, realtime: bool) -> HostFaults | None:
-    """Return what is to break in the flight process, None when nothing is."""
+    """Return the faults inside the flight process, None without any."""
     faults = schedule(section.faults)
     return HostFaults(faults, clock, realtime) if any(f.kind.device in DEVICES for f in faults) else None
 
 
 def corrupted_by(faults: Sequence[str], text: str, seed: int | None) -> str:
-    """Return a configuration's text as `config: corrupted` among the faults leaves it, or as it is."""
+    """Return a configuration's text after any `config: corrupted` among the faults."""
     for fault in map(parse, faults):
         if fault.kind.name == "config: corrupted":
             text = corrupted(text, round(fault.parameters["bytes"]), seed or 1)
@@ -102,7 +102,7 @@ def corrupted(text: str, count: int, seed: int) -> str:
 
 
 class _SteppedClock:
-    """A clock whose label of UTC may be set; nothing else of it changes."""
+    """A clock whose UTC label may step; its monotonic time is unchanged."""
 
     def __init__(self, clock: Clock, faults: HostFaults) -> None:
         self._clock = clock
@@ -154,7 +154,7 @@ class _FailingFile:
 
 @dataclass(slots=True)
 class _Held:
-    """A job that no worker will ever answer, and what its runner says of it when."""
+    """A job that no worker will answer, and the outcome that its runner reports at `due_ns`."""
 
     due_ns: int
     outcome: str
@@ -163,7 +163,7 @@ class _Held:
 
 
 class _FaultyRunner:
-    """A JobRunner before another one."""
+    """A JobRunner that wraps another and adds faults."""
 
     def __init__(
         self, runner: Any, specs: Sequence[Any], result: Callable[..., Any], faults: HostFaults
@@ -184,7 +184,7 @@ class _FaultyRunner:
         spec = self._specs[worker]
         if not self._faults.realtime:
             now_ns = self._faults.now_ns()
-            # In lock-step jobs are done on the spot, by this very process: the outcome is modelled.
+            # In lock-step this process runs the jobs itself, so the outcome is modelled.
             if kind == "endless":
                 text = f"no result within {spec.timeout_ns * 1e-9:g} s"
                 self._held[worker] = _Held(now_ns + spec.timeout_ns, "timed-out", text, now_ns)

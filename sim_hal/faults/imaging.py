@@ -41,19 +41,17 @@ def _delayed(bench: Bench, given: Parameters) -> Lift:
     return lambda: setattr(camera, "late_ns", 0)
 
 
-def _by_turns(bench: Bench, given: Parameters) -> Lift:
+def _intermittently(bench: Bench, given: Parameters) -> Lift:
     begin = _showing("off")
     return bench.toggle(lambda: begin(bench, given), given["period"], given["share"])
 
 
 CAMERA = (
-    FaultKind("camera", "off", "it answers no trigger and gives no frame", _showing("off")),
+    FaultKind("camera", "off", "ignores triggers, delivers no frame", _showing("off")),
     FaultKind("camera", "black", "frames without light", _showing("black")),
-    FaultKind("camera", "saturated", "frames of light only", _showing("saturated")),
-    FaultKind("camera", "frozen", "the same frame again and again", _showing("frozen")),
-    FaultKind(
-        "camera", "torn", "the upper part of the frame before, the lower of this one", _showing("torn")
-    ),
+    FaultKind("camera", "saturated", "saturated frames", _showing("saturated")),
+    FaultKind("camera", "frozen", "the same frame repeatedly", _showing("frozen")),
+    FaultKind("camera", "torn", "upper part of the previous frame, lower part of this one", _showing("torn")),
     FaultKind("camera", "garbage", "random pixels", _showing("garbage")),
     FaultKind("camera", "wrong", "rows in the opposite order", _showing("wrong")),
     FaultKind(
@@ -63,12 +61,12 @@ CAMERA = (
         _slow,
         {"n": Parameter(3.0, 2.0, 1000.0, whole=True)},
     ),
-    FaultKind("camera", "delayed", "frames come so many seconds later", _delayed, {"delay": delay(3.0)}),
+    FaultKind("camera", "delayed", "frames arrive later, s", _delayed, {"delay": delay(3.0)}),
     FaultKind(
         "camera",
         "intermittent",
-        "off and on, by turns",
-        _by_turns,
+        "off intermittently",
+        _intermittently,
         {"period": replace(PERIOD, default=6.0), "share": SHARE},
     ),
 )

@@ -1,4 +1,4 @@
-"""What a sabotaged worker does: stands between a worker's function and its jobs, in simulation only."""
+"""Applies faults inside a worker, in simulation only."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """A job: its function as MODULE:NAME, its argument, and what is wrong with it, empty when nothing."""
+    """A job: its function as MODULE:NAME, its argument, and its fault, empty for none."""
 
     function: str
     argument: Any
@@ -24,7 +24,7 @@ class Task:
 
 
 def perform(task: Task) -> Any:
-    """Do a job, or what its fault makes of it."""
+    """Run a job with its fault."""
     module, _, name = task.function.partition(":")
     if task.fault == "endless":
         while True:

@@ -1,4 +1,4 @@
-"""What a kind of fault is: a row of the catalogue."""
+"""The type of a row of the fault catalogue."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Parameters = Mapping[str, float]
 
 
 class Where(Enum):
-    """In which kind of simulation a fault makes sense."""
+    """The kind of simulation in which a fault can occur."""
 
     BOTH = "in lock-step and in real time"
     REALTIME = "in real time only"
@@ -21,14 +21,14 @@ class Where(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """A number that a fault is given.
+    """A numeric parameter of a fault.
 
     Attributes:
-        default: what it is when it is not given; None where it is drawn then.
-        low, high: the least and the most that it may be.
+        default: where it is not given; None where it is then drawn.
+        low, high: its bounds.
         unit: of all three, empty for a mere number.
-        whole: whether it counts something.
-        choices: the only values that it may have, where not all between the bounds make sense.
+        whole: whether it must be a whole number.
+        choices: the allowed values, where not all between the bounds are.
     """
 
     default: float | None
@@ -39,13 +39,13 @@ class Parameter:
     choices: tuple[float, ...] = ()
 
     def accepts(self, value: float) -> bool:
-        """Tell whether a value is within the bounds; NaN is not."""
+        """Return whether a value is allowed; NaN is not."""
         if self.choices:
             return value in self.choices
         return self.low <= value <= self.high and not (self.whole and value % 1.0)
 
     def bounds(self) -> str:
-        """Return in words what it may be."""
+        """Return the allowed values in words."""
         unit = f" {self.unit}" if self.unit else ""
         if self.choices:
             return f"one of {', '.join(_runs(self.choices))}{unit}"
@@ -67,14 +67,14 @@ def _runs(values: Sequence[float]) -> list[str]:
 
 
 CHANCE = Parameter(0.5, 1e-6, 1.0)
-"""That something happens; at 0 nothing would."""
+"""Probability; at 0 a fault would have no effect."""
 PERIOD = Parameter(0.5, 0.05, 3600.0, "s")
 SHARE = Parameter(0.5, 0.01, 0.99)
-"""How long a fault that comes and goes is there, of its period."""
+"""Fraction of its period for which an intermittent fault is present."""
 
 
 def delay(default: float) -> Parameter:
-    """Return how much later something comes."""
+    """Return the parameter of a delay."""
     return Parameter(default, 1e-3, 60.0, "s")
 
 
@@ -85,11 +85,11 @@ class FaultKind:
     Attributes:
         device, kind: its name is "device: kind".
         meaning: what happens, in words.
-        begin: breaks the bench and returns what mends it; None for what breaks in the flight process.
-        parameters: what it is given, by name.
-        momentary: there is nothing to lift: it happens, and what it leaves is for others to mend.
+        begin: applies it to the bench and returns its removal; None for faults in the flight process.
+        parameters: by name.
+        momentary: it has no duration; its effect stays until something repairs it.
         where: in which kind of simulation.
-        adds: it may be there beside another fault of its device: neither takes the other's place.
+        adds: it may be present together with other faults of its device.
     """
 
     device: str
@@ -108,5 +108,5 @@ class FaultKind:
 
     @property
     def thing(self) -> str:
-        """What breaks: a coil and the bridge that drives it are one, for the circuit has one condition."""
+        """What it acts on: a coil and its bridge count as one, since they share one condition."""
         return self.device.replace("bridge-", "coil-")

@@ -28,11 +28,11 @@ def _stopped(bench: Bench, _: Parameters) -> Lift:
 
 def _worker(device: str) -> tuple[FaultKind, ...]:
     return (
-        FaultKind(device, "nan", "every number of its result is NaN", None),
-        FaultKind(device, "exception", "it raises one", None),
+        FaultKind(device, "nan", "all numbers of its result are NaN", None),
+        FaultKind(device, "exception", "it raises an exception", None),
         FaultKind(device, "endless", "it never returns", None),
-        FaultKind(device, "killed", "its process is killed at its work", None),
-        FaultKind(device, "slow", "results come so many seconds later", None, {"delay": delay(1.5)}),
+        FaultKind(device, "killed", "its process is killed during a job", None),
+        FaultKind(device, "slow", "results arrive later, s", None, {"delay": delay(1.5)}),
     )
 
 
@@ -43,13 +43,13 @@ MACHINE = (
         "process", "killed", "kill -9 of the flight process", _killed, momentary=True, where=Where.REALTIME
     ),
     FaultKind("process", "stopped", "SIGSTOP of the flight process", _stopped, where=Where.REALTIME),
-    FaultKind("clock", "stepped", "the wall clock is set forward by so many s", None, {"by": _STEP}),
-    FaultKind("disk", "full", "no byte more of the log can be written", None),
+    FaultKind("clock", "stepped", "the wall clock steps forward, s", None, {"by": _STEP}),
+    FaultKind("disk", "full", "the log cannot grow", None),
     FaultKind("disk", "failing", "every write of the log fails", None),
     FaultKind(
         "config",
         "corrupted",
-        "a bit flips in so many bytes of the file before it is read",
+        "one bit flips in each of `bytes` bytes of the file before it is read",
         None,
         {"bytes": Parameter(3.0, 1.0, 10000.0, whole=True)},
         momentary=True,

@@ -15,8 +15,8 @@ from sim_hal.faults.kinds import CHANCE, PERIOD, SHARE, FaultKind, Parameter, Pa
 _MOST_BYTES = 32
 
 
-class SpoiledPart:
-    """A part with something wrong between it and the bus; it acknowledges as before."""
+class DisturbedPart:
+    """A part whose data are altered between it and the bus; it acknowledges as before."""
 
     def __init__(
         self,
@@ -24,17 +24,17 @@ class SpoiledPart:
         written: Callable[[int, bytes], None] | None = None,
         read: Callable[[bytes], bytes] | None = None,
     ) -> None:
-        """Let `written` take what is written in the part's place, and `read` change what is read."""
+        """Pass writes to `written` in place of the part, and reads through `read`."""
         self._part = part
         self._written = written or part.write
         self._read = read or (lambda data: data)
 
     def answers(self, address: int) -> bool:
-        """Tell what the part tells."""
+        """Return the part's answer."""
         return self._part.answers(address)
 
     def write(self, address: int, data: bytes) -> None:
-        """Take a write; a register pointer alone is never spoiled."""
+        """Take a write; a register pointer alone is never altered."""
         if len(data) == 1:
             self._part.write(address, data)
         else:
@@ -50,14 +50,16 @@ def part_of(bench: Bench, device: str) -> I2cPart | None:
     return bench.hardware.pwm if device == "pwm" else bench.hardware.monitor
 
 
-def _spoiled(
+def _disturbed(
     bench: Bench,
     device: str,
     written: Callable[[int, bytes], None] | None = None,
     read: Callable[[bytes], bytes] | None = None,
 ) -> Lift:
     part = part_of(bench, device)
-    return no_lift if part is None else bench.hardware.bus.put_before(part, SpoiledPart(part, written, read))
+    return (
+        no_lift if part is None else bench.hardware.bus.put_before(part, DisturbedPart(part, written, read))
+    )
 
 
 def _off(device: str) -> Callable[[Bench, Parameters], Lift]:
@@ -83,7 +85,7 @@ def _brown_out(device: str) -> Callable[[Bench, Parameters], Lift]:
 
 
 def _stuck_pwm(bench: Bench, _: Parameters) -> Lift:
-    return _spoiled(bench, "pwm", written=lambda address, data: None)
+    return _disturbed(bench, "pwm", written=lambda address, data: None)
 
 
 def _stuck_monitor(bench: Bench, _: Parameters) -> Lift:
@@ -91,13 +93,13 @@ def _stuck_monitor(bench: Bench, _: Parameters) -> Lift:
     if monitor is None:
         return no_lift
     monitor.frozen = {number: monitor.register(number) for number in range(6)}
-    monitor.frozen[2] |= 0b10  # a converter that believes itself at work
+    monitor.frozen[2] |= 0b10  # keep the conversion-ready flag set
     return monitor.frozen.clear
 
 
 def _garbage(device: str) -> Callable[[Bench, Parameters], Lift]:
     def begin(bench: Bench, _: Parameters) -> Lift:
-        return _spoiled(bench, device, read=lambda data: bench.generator.bytes(len(data)))
+        return _disturbed(bench, device, read=lambda data: bench.generator.bytes(len(data)))
 
     return begin
 
@@ -114,7 +116,7 @@ def _bits(device: str) -> Callable[[Bench, Parameters], Lift]:
             assert part is not None
             part.write(address, data[:1] + flipped(data[1:]))
 
-        return _spoiled(bench, device, write, flipped)
+        return _disturbed(bench, device, write, flipped)
 
     return begin
 
@@ -138,7 +140,7 @@ def _delayed_pwm(bench: Bench, given: Parameters) -> Lift:
     def later(address: int, data: bytes) -> None:
         bench.after(given["delay"], lambda: part.write(address, data))
 
-    return _spoiled(bench, "pwm", later)
+    return _disturbed(bench, "pwm", later)
 
 
 def _delayed_monitor(bench: Bench, given: Parameters) -> Lift:
@@ -166,7 +168,7 @@ def _slow(device: str) -> Callable[[Bench, Parameters], Lift]:
     return begin
 
 
-def _by_turns(
+def _intermittently(
     begin: Callable[[Bench, Parameters], Lift],
 ) -> Callable[[Bench, Parameters], Lift]:
     return lambda bench, given: bench.toggle(lambda: begin(bench, given), given["period"], given["share"])
@@ -180,18 +182,18 @@ def _part(device: str) -> tuple[FaultKind, ...]:
     return (
         FaultKind(device, "off", "no power: nothing acknowledges, the registers are lost", _off(device)),
         FaultKind(device, "nack", "it acknowledges nothing", _nack(device), adds=True),
-        FaultKind(device, "garbage", "random bytes for what it is asked", _garbage(device)),
+        FaultKind(device, "garbage", "reads return random bytes", _garbage(device)),
         FaultKind(
             device,
             "bits",
-            "each bit read or written flips with this chance",
+            "each bit read or written flips with this probability",
             _bits(device),
             {"chance": replace(CHANCE, default=5e-3)},
         ),
         FaultKind(
             device,
             "slow",
-            "it stretches the clock beyond the bus's time-out, with this chance",
+            "it stretches the clock beyond the bus's time-out, with this probability",
             _slow(device),
             {"chance": CHANCE},
             adds=True,
@@ -199,15 +201,15 @@ def _part(device: str) -> tuple[FaultKind, ...]:
         FaultKind(
             device,
             "intermittent",
-            "it acknowledges or not, by turns",
-            _by_turns(_nack(device)),
+            "it acknowledges intermittently",
+            _intermittently(_nack(device)),
             _TURNS,
             adds=True,
         ),
         FaultKind(
             device,
             "brown-out",
-            "its registers are back at their power-on values",
+            "its registers return to their power-on values",
             _brown_out(device),
             momentary=True,
             adds=True,
@@ -217,22 +219,20 @@ def _part(device: str) -> tuple[FaultKind, ...]:
 
 PWM = (
     *_part("pwm"),
-    FaultKind("pwm", "stuck", "it acknowledges and changes nothing", _stuck_pwm),
-    FaultKind("pwm", "delayed", "what is written counts later, s", _delayed_pwm, {"delay": delay(0.2)}),
-    FaultKind(
-        "pwm", "wrong", "an upset register: the frequency is false", _wrong_pwm, momentary=True, adds=True
-    ),
+    FaultKind("pwm", "stuck", "it acknowledges, but its outputs do not change", _stuck_pwm),
+    FaultKind("pwm", "delayed", "writes take effect later, s", _delayed_pwm, {"delay": delay(0.2)}),
+    FaultKind("pwm", "wrong", "a register upset: wrong PWM frequency", _wrong_pwm, momentary=True, adds=True),
 )
 MONITOR = (
     *_part("monitor"),
     FaultKind("monitor", "stuck", "always the same conversion", _stuck_monitor),
     FaultKind(
-        "monitor", "delayed", "it tells what it measured s ago", _delayed_monitor, {"delay": delay(2.0)}
+        "monitor", "delayed", "it reports old measurements, s", _delayed_monitor, {"delay": delay(2.0)}
     ),
     FaultKind(
         "monitor",
         "wrong",
-        "it measures so many times too much",
+        "measured values are multiplied by gain",
         _wrong_monitor,
         {"gain": Parameter(2.0, 0.0, 10.0)},
     ),
@@ -248,7 +248,7 @@ BUS = (
     FaultKind(
         "bus",
         "nack",
-        "no acknowledge, with this chance",
+        "no acknowledge, with this probability",
         lambda bench, given: bench.hardware.bus.nack(
             None, times=None, chance=lambda: bench.generator.random() < given["chance"]
         ),
@@ -258,7 +258,7 @@ BUS = (
     FaultKind(
         "bus",
         "arbitration",
-        "another master wins, always",
+        "another master always wins",
         lambda bench, _: bench.hardware.bus.lose_arbitration(times=None),
         adds=True,
     ),
@@ -272,8 +272,8 @@ BUS = (
     FaultKind(
         "bus",
         "intermittent",
-        "the clock line is held low, by turns",
-        _by_turns(lambda bench, _: bench.hardware.bus.hang(times=None)),
+        "the clock line is held low intermittently",
+        _intermittently(lambda bench, _: bench.hardware.bus.hang(times=None)),
         _TURNS,
         adds=True,
     ),

@@ -16,7 +16,7 @@ _SECTIONS = {"camera": "camera", "vision": "camera", "monitor": "power_monitor"}
 
 
 def scheduled(entries: Sequence[FaultEntry], realtime: bool) -> tuple[ScheduledFault, ...]:
-    """Read the faults of a section for this kind of simulation. Raises UsageError for what makes no sense."""
+    """Read a section's faults for this kind of simulation. Raises UsageError for one that cannot occur."""
     faults = schedule(entries)
     for fault in faults:
         if fault.kind.where is Where.REALTIME and not realtime:
@@ -28,7 +28,7 @@ def scheduled(entries: Sequence[FaultEntry], realtime: bool) -> tuple[ScheduledF
 
 
 def check(entries: Sequence[FaultEntry], config: Config, realtime: bool) -> tuple[ScheduledFault, ...]:
-    """Read the faults of a flight of `config`. Raises UsageError for one that could not do anything in it."""
+    """Read the faults of a flight of `config`. Raises UsageError for one that would have no effect in it."""
     faults = scheduled(entries, realtime)
     for fault in faults:
         if fault.at >= config.duration:
@@ -48,7 +48,7 @@ def check(entries: Sequence[FaultEntry], config: Config, realtime: bool) -> tupl
 
 
 def _check_apart(faults: Sequence[ScheduledFault]) -> None:
-    """Raise UsageError for two that would take each other's place."""
+    """Raise UsageError for two faults that would replace each other."""
     alone = [fault for fault in faults if not fault.kind.adds]
     for number, fault in enumerate(alone):
         for other in alone[:number]:
@@ -65,7 +65,7 @@ def _meet(fault: ScheduledFault, other: ScheduledFault) -> bool:
 
 
 def put(faults: Sequence[ScheduledFault], bench: Bench, epoch_ns: int) -> None:
-    """Have each fault begin and end at its time after `epoch_ns`."""
+    """Schedule the beginning and end of each fault, relative to `epoch_ns`."""
     for fault in faults:
         _put(fault, bench, epoch_ns)
 
@@ -79,5 +79,5 @@ def _put(fault: ScheduledFault, bench: Bench, epoch_ns: int) -> None:
     begin_ns = epoch_ns + round(fault.at * 1e9)
     timeline.at(begin_ns, lambda: lifts.append(begin(bench, fault.parameters)))
     if fault.span is not None and not fault.kind.momentary:
-        # What mends it is known only once it has begun.
+        # The lift exists only once the fault has begun.
         timeline.at(begin_ns + round(fault.span * 1e9), lambda: lifts.pop()())  # noqa: PLW0108 - see above

@@ -18,7 +18,7 @@ from sim_hal.faults.kinds import CHANCE, PERIOD, SHARE, FaultKind, Parameter, Pa
 
 
 def _line(faults: Callable[[Parameters], LineFaults]) -> Callable[[Bench, Parameters], Lift]:
-    return lambda bench, given: bench.spoil(bench.line.to_host, faults(given))
+    return lambda bench, given: bench.disturb(bench.line.to_host, faults(given))
 
 
 def _off(bench: Bench, _: Parameters) -> Lift:
@@ -33,9 +33,9 @@ def _reset(bench: Bench, _: Parameters) -> Lift:
 
 def _unplugged(bench: Bench, _: Parameters) -> Lift:
     host = bench.host
-    if host is None:  # a pseudo-terminal cannot be pulled: nothing crosses, either way
-        ours = bench.spoil(bench.line.to_host, LineFaults(silent=True))
-        theirs = bench.spoil(bench.line.to_device, LineFaults(silent=True))
+    if host is None:  # a pseudo-terminal cannot be unplugged: silence it both ways
+        ours = bench.disturb(bench.line.to_host, LineFaults(silent=True))
+        theirs = bench.disturb(bench.line.to_device, LineFaults(silent=True))
 
         def plug_in() -> None:
             ours()
@@ -47,19 +47,19 @@ def _unplugged(bench: Bench, _: Parameters) -> Lift:
 
 
 def _baud(bench: Bench, given: Parameters) -> Lift:
-    # A speed that its stream does not fit into is one all the same: nobody asked the unit.
+    # The speed changes even where the stream does not fit: no command was given.
     with suppress(UnitError):
         bench.hardware.unit.change_baud_rate(round(given["rate"]), bench.now_ns())
     return no_lift
 
 
-def _measuring(bench: Bench, spoil: Callable[[Measured], Measured]) -> Lift:
+def _measuring(bench: Bench, alter: Callable[[Measured], Measured]) -> Lift:
     unit = bench.hardware.unit
-    unit.spoil = spoil
+    unit.alter = alter
 
     def lift() -> None:
-        if unit.spoil is spoil:
-            unit.spoil = None
+        if unit.alter is alter:
+            unit.alter = None
 
     return lift
 
@@ -85,7 +85,7 @@ def _wrong(bench: Bench, given: Parameters) -> Lift:
 
 def _intermittent(bench: Bench, given: Parameters) -> Lift:
     def begin() -> Lift:
-        return bench.spoil(bench.line.to_host, LineFaults(silent=True))
+        return bench.disturb(bench.line.to_host, LineFaults(silent=True))
 
     return bench.toggle(begin, given["period"], given["share"])
 
@@ -95,18 +95,18 @@ _ONE_OF = Parameter(8.0, 2.0, 1000.0, whole=True)
 _RATE = Parameter(230400.0, min(BAUD_RATES), max(BAUD_RATES), "baud", choices=BAUD_RATES)
 
 IMU = (
-    FaultKind("imu", "off", "no power; it starts anew, on its saved settings, when it is back", _off),
-    FaultKind("imu", "silent", "not one byte crosses", _line(lambda _: LineFaults(silent=True)), adds=True),
-    FaultKind("imu", "unplugged", "the serial port is gone", _unplugged),
-    FaultKind("imu", "stuck", "good packets, always the same values", _stuck),
+    FaultKind("imu", "off", "no power; restarts from its saved settings afterwards", _off),
+    FaultKind("imu", "silent", "no byte arrives", _line(lambda _: LineFaults(silent=True)), adds=True),
+    FaultKind("imu", "unplugged", "the serial port disappears", _unplugged),
+    FaultKind("imu", "stuck", "valid packets, constant values", _stuck),
     FaultKind(
-        "imu", "garbage", "random bytes for its own", _line(lambda _: LineFaults(garbage=True)), adds=True
+        "imu", "garbage", "random bytes replace its own", _line(lambda _: LineFaults(garbage=True)), adds=True
     ),
-    FaultKind("imu", "wrong", "good packets, false values", _wrong, _WRONG),
+    FaultKind("imu", "wrong", "valid packets, wrong values", _wrong, _WRONG),
     FaultKind(
         "imu",
         "slow",
-        "one packet of n comes",
+        "one packet of n arrives",
         _line(lambda p: LineFaults(thinned=round(p["n"]))),
         {"n": _ONE_OF},
         adds=True,
@@ -114,7 +114,7 @@ IMU = (
     FaultKind(
         "imu",
         "delayed",
-        "every byte comes later, s",
+        "every byte arrives later, s",
         _line(lambda p: LineFaults(delay_ns=round(p["delay"] * 1e9))),
         {"delay": delay(0.2)},
         adds=True,
@@ -122,7 +122,7 @@ IMU = (
     FaultKind(
         "imu",
         "intermittent",
-        "silent and not, by turns",
+        "silent intermittently",
         _intermittent,
         {"period": PERIOD, "share": SHARE},
         adds=True,
@@ -130,7 +130,7 @@ IMU = (
     FaultKind(
         "imu",
         "bits",
-        "each bit flips with this chance",
+        "each bit flips with this probability",
         _line(lambda p: LineFaults(flip_probability=p["chance"])),
         {"chance": replace(CHANCE, default=1e-3)},
         adds=True,
@@ -138,11 +138,11 @@ IMU = (
     FaultKind(
         "imu",
         "cut",
-        "packets lose bytes with this chance",
+        "packets lose bytes with this probability",
         _line(lambda p: LineFaults(cut_probability=p["chance"])),
         {"chance": replace(CHANCE, default=0.3)},
         adds=True,
     ),
-    FaultKind("imu", "reset", "it starts anew, on its saved settings", _reset, momentary=True),
-    FaultKind("imu", "baud", "it speaks at another speed", _baud, {"rate": _RATE}, momentary=True),
+    FaultKind("imu", "reset", "restarts from its saved settings", _reset, momentary=True),
+    FaultKind("imu", "baud", "its baud rate changes", _baud, {"rate": _RATE}, momentary=True),
 )

@@ -1,4 +1,4 @@
-"""A time line of faults: actions on the emulated devices at instants of the simulation."""
+"""Runs actions on the emulated devices at given times of the simulation."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ Action = Callable[[], None]
 
 
 class FaultTimeline:
-    """An emulated device that breaks others and mends them again."""
+    """The queue of such actions, as an emulated device."""
 
     def __init__(self) -> None:
         self._order = itertools.count()
         self._actions: list[tuple[int, int, Action]] = []
 
     def at(self, time_ns: int, action: Action) -> None:
-        """Do `action` at `time_ns` of the simulation."""
+        """Run `action` at `time_ns` of the simulation."""
         heapq.heappush(self._actions, (time_ns, next(self._order), action))
 
     def next_event_ns(self) -> int:
@@ -27,6 +27,6 @@ class FaultTimeline:
         return self._actions[0][0] if self._actions else NEVER
 
     def advance(self, now_ns: int) -> None:
-        """Do what is due."""
+        """Run the actions that are due."""
         while self._actions and self._actions[0][0] <= now_ns:
             heapq.heappop(self._actions)[2]()

@@ -1,4 +1,4 @@
-"""Bits of registers that radiation flips, once: what they leave is for the driver to find and to mend."""
+"""Single register bits that radiation flips; the driver has to find and repair the effect."""
 
 from __future__ import annotations
 

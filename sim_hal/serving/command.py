@@ -1,4 +1,4 @@
-"""`sim_hal serve`: a configuration's simulated hardware in real time, for a flight process or anybody."""
+"""`sim_hal serve`: a configuration's simulated hardware in real time, for any client."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def serve(options: argparse.Namespace) -> int:
         text = options.config.read_text(encoding="utf-8")
         section = configuration.simulation_section(text, str(options.config), Simulation)
         if section is None:
-            raise UsageError(f"{options.config} has no simulation section: there is nothing to serve")
+            raise UsageError(f"{options.config} has no simulation section: nothing to serve")
         if options.seed is not None:
             section = msgspec.structs.replace(section, seed=options.seed)
         server = DeviceServer(config, section, options.folder)

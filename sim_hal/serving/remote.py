@@ -41,7 +41,7 @@ class RemoteFrameSource:
         self._clock = clock
 
     def trigger(self, exposure_ns: int) -> None:
-        """Start an exposure; the answer is not waited for."""
+        """Start an exposure without waiting for the answer."""
         try:
             self._link.send("trigger", exposure_ns)
         except OSError as error:
@@ -73,7 +73,7 @@ class RemoteFrameSource:
 
 @dataclass(frozen=True, slots=True)
 class Served:
-    """What the flight application needs of devices in another process."""
+    """Clock, wires and release of devices in another process."""
 
     clock: SystemClock
     wires: Wires
@@ -106,7 +106,7 @@ def served(config_path: Path, seed: int, folder: Path) -> Iterator[Served]:
         env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
     )
     try:
-        with _plugged_into(_first_words(process)) as plugged:
+        with _connected(_server_facts(process)) as plugged:
             yield plugged
     finally:
         process.terminate()
@@ -123,20 +123,20 @@ def served(config_path: Path, seed: int, folder: Path) -> Iterator[Served]:
 def running(facts_path: Path) -> Iterator[Served]:
     """Connect to a server that runs already, and leave it running. Raises NotResponding.
 
-    `facts_path` is what it was told to write: `python -m sim_hal serve CONFIG --facts FILE`.
+    `facts_path` is the file that `python -m sim_hal serve CONFIG --facts FILE` wrote.
     """
     try:
         facts = json.loads(facts_path.read_text(encoding="utf-8"))
         facts = {name: facts[name] for name in ("serial", "baud_rate", "socket", "camera")}
     except (OSError, ValueError, LookupError, TypeError) as error:
-        raise NotResponding("emulated devices", f"{facts_path} tells of no server: {error!r}") from error
-    with _plugged_into(facts) as devices:
+        raise NotResponding("emulated devices", f"{facts_path} names no server: {error!r}") from error
+    with _connected(facts) as devices:
         yield devices
 
 
 @contextmanager
-def _plugged_into(facts: dict[str, Any]) -> Iterator[Served]:
-    """Connect to the server that said these words of itself."""
+def _connected(facts: dict[str, Any]) -> Iterator[Served]:
+    """Connect to the server with these facts."""
     clock = SystemClock()
     path = Path(facts["socket"])
     with ExitStack() as stack:
@@ -147,7 +147,7 @@ def _plugged_into(facts: dict[str, Any]) -> Iterator[Served]:
             stack.callback(bus.close)
             camera = RemoteFrameSource(path, clock) if facts["camera"] else None
         except OSError as error:
-            raise NotResponding("emulated devices", f"nobody answers on {path} ({error})") from error
+            raise NotResponding("emulated devices", f"no server answers on {path} ({error})") from error
         if camera is not None:
             stack.callback(camera.close)
         wires = Wires(serial, bus, camera)
@@ -158,8 +158,8 @@ def _plugged_into(facts: dict[str, Any]) -> Iterator[Served]:
         yield Served(clock, wires, release, (OPENER, str(path)))
 
 
-def _first_words(process: subprocess.Popen[bytes]) -> dict[str, Any]:
-    """Return what the server says of itself once its devices answer."""
+def _server_facts(process: subprocess.Popen[bytes]) -> dict[str, Any]:
+    """Return the facts that the server prints once its devices answer."""
     assert process.stdout is not None
     ready, _, _ = select.select([process.stdout], [], [], _START_S)
     line = process.stdout.readline() if ready else b""

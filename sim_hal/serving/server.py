@@ -1,4 +1,4 @@
-"""Simulated hardware in real time, in a process of its own: devices that go on when the flight process dies.
+"""Simulated hardware in real time, in a process of its own, which survives the flight process.
 
 The VN-100 is served on a pseudo-terminal. The I2C bus and the camera answer on a Unix socket, one request
 after the other on each connection (`sim_hal.serving.remote` is the other end); a frame's pixels pass through
@@ -33,7 +33,7 @@ from sim_hal.faults.grammar import parse
 from sim_hal.faults.schedule import put
 from sim_hal.serving.device_link import Inbox, pack
 from sim_hal.settings import Simulation, Sky
-from sim_hal.truth import TruthRecorder
+from sim_hal.worlds.truth import TruthRecorder
 
 SOCKET_NAME = "devices.sock"
 _LONGEST_WAIT_NS = 20_000_000
@@ -44,7 +44,7 @@ _renderer: list[StarRenderer] = []
 
 
 def _prepare_renderer(camera: Camera, sky: Sky, seed: int) -> None:
-    """Load the sky once in the rendering process, which ends with the server whatever becomes of that."""
+    """Load the sky once in the rendering process, which ends whenever the server does."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _renderer.append(StarRenderer(camera, sky, seed))
@@ -63,7 +63,7 @@ class _Connection:
         self._inbox = Inbox()
 
     def requests(self) -> list[Any] | None:
-        """Return the complete requests that have come; None when the client has gone."""
+        """Return the complete requests received; None when the client has disconnected."""
         try:
             chunk = self.line.recv(65536)
         except ConnectionError:
@@ -73,7 +73,7 @@ class _Connection:
         return self._inbox.take(chunk)
 
     def answer(self, message: Any) -> None:
-        """Send a message; a client that is gone, or does not read, is not waited for."""
+        """Send a message without waiting for a client that is gone or does not read."""
         try:
             self.line.sendall(pack(message))
         except OSError:
@@ -112,7 +112,7 @@ class DeviceServer:
         self._stopped = True
 
     def serve(self, patience_ns: int | None = None) -> None:
-        """Keep the devices' time and answer, until stopped or `patience_ns` after the last client left."""
+        """Advance the devices and answer requests, until stopped or `patience_ns` without clients."""
         left_ns: int | None = None
         while not self._stopped:
             now_ns = self._clock.now_ns()
@@ -149,7 +149,7 @@ class DeviceServer:
 
     def _expose(self, sequence: int, times: FloatArray, attitudes: FloatArray) -> Future[Image]:
         assert self._pool is not None
-        # The exposure before has its frame by now, or is abandoned: to make that first would delay this one.
+        # The previous exposure has its frame or is abandoned; rendering it first would delay this one.
         if self._rendering is not None:
             self._rendering.cancel()
         self._rendering = self._pool.submit(_render, sequence, times, attitudes)
@@ -198,7 +198,7 @@ class DeviceServer:
         }
 
     def _release(self, epoch_ns: int, faults: Sequence[str] = (), flight_process: int | None = None) -> None:
-        """Let the body go, and have the faults of a flight process come at their times after that."""
+        """Release the body and schedule the faults of a flight process."""
         self.hardware.release(epoch_ns)
         generator = self._faults_drawn
         bench = Bench(self.hardware, self._pty, self._clock.now_ns, generator, None, flight_process)
@@ -228,7 +228,7 @@ def _describe(frame: Frame) -> list[Any]:
 
 
 def _renderer_pool(config: Config, section: Simulation) -> ProcessPoolExecutor | None:
-    """Start the rendering process, which loads the sky at once. Nobody waits: no frame is exposed yet."""
+    """Start the rendering process, which loads the sky at once, without waiting for it."""
     if config.camera is None:
         return None
     pool = ProcessPoolExecutor(

@@ -13,7 +13,7 @@ from sim_hal.star_camera.model import StarCameraModel
 from sim_hal.star_camera.point_spread import Float32Array
 
 FAINT_SHARE = 0.25
-"""A pixel is faint while its light adds no more than this share to the variance of the background."""
+"""A pixel is faint while its light adds at most this share to the variance of the background."""
 GREATEST_SKEWNESS = 0.05
 """Below it noise may be drawn as Gaussian: its distribution function is then off by 0.004 (Edgeworth)."""
 

@@ -115,7 +115,7 @@ def path_lengths(camera: Pinhole, spread: PointSpread, vectors: FloatArray) -> F
 
 
 def touches(low: FloatArray, high: FloatArray, columns: int, rows: int, margin: float) -> BoolArray:
-    """Tell which boxes, corners (..., 2), come within `margin` px of the detector; one at NaN does not."""
+    """Return which boxes, corners (..., 2), come within `margin` px of the detector; one at NaN does not."""
     x = (high[..., 0] >= -margin) & (low[..., 0] <= columns - 1 + margin)
     y = (high[..., 1] >= -margin) & (low[..., 1] <= rows - 1 + margin)
     return np.asarray(x & y)

@@ -24,10 +24,10 @@ class PointSpread:
     """A separable point spread function.
 
     Attributes:
-        profile: fraction of the light on a pixel whose centre lies so many pixels from the point.
+        profile: fraction of the light on a pixel by the distance of its centre from the point, px.
         reach: whole pixels from the pixel the point is on, beyond which no light falls.
         patch: px of a path that are gathered at once.
-        quadrature: how many times a path of so many pixels must be sampled.
+        quadrature: number of samples for a path by its length in px.
     """
 
     profile: Callable[[FloatArray], FloatArray]
@@ -61,7 +61,7 @@ def integrated_gaussian(sigma: float) -> PointSpread:
         return np.asarray(ndtr((offset + 0.5) / sigma) - ndtr((offset - 0.5) / sigma))
 
     def quadrature(length: float) -> int:
-        # Gauss-Legendre converges at about one sample a sigma; so many leave 1e-4 of the streak's peak.
+        # Gauss-Legendre converges at about one sample a sigma; this many leave 1e-4 of the streak's peak.
         return 1 if length < 0.02 * sigma else math.ceil(1.5 + 0.95 * length / sigma)
 
     return PointSpread(profile, math.ceil(4.0 * sigma), max(4.0, 8.0 * sigma), quadrature)

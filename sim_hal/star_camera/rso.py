@@ -82,7 +82,7 @@ def directions(observer: FloatArray, position: FloatArray) -> FloatArray:
 
 
 def _track_times(camera: Orbit, orbit: Orbit, start: float, end: float) -> FloatArray:
-    """Return so many times that an even motion between them stays within `TRACK_ERROR` of the track.
+    """Return times close enough that an even motion between them stays within `TRACK_ERROR` of the track.
 
     The direction of an object that passes at speed v and distance d accelerates by 0.65 (v/d)^2 at most; the
     error of a step h is an eighth of that times h^2.

@@ -1,4 +1,4 @@
-"""From the PWM chip's outputs through the SN754410s to the coils' currents (Sease 2013 ch. 5, Table 5.2).
+"""Coil currents from the PWM chip's outputs through SN754410 bridges (Sease 2013 ch. 5, Table 5.2).
 
 The mean of a period counts: coil L/R is 0.1 ms, the period 20 ms. While the two inputs differ, V/R is driven
 in one direction; equal inputs brake, an enable input that is low lets the coil coast; neither makes current.
@@ -18,14 +18,14 @@ from hal.drivers.pca9685 import COUNTS
 from sim_hal.emulators.pca9685 import EmulatedPca9685
 
 CURRENT_UNCERTAINTY = 3.5e-3
-"""A; the thesis's bound on what a coil carries beside what it was told to."""
+"""A; the thesis's bound on the error of a coil's current."""
 
 _HISTORY_NS = 500_000_000
 _LOW, _HIGH = (0, 0), (0, COUNTS)
 
 
 class Condition(Enum):
-    """What is wrong with a coil or its bridge; of a leg stuck the other one still follows its input."""
+    """The condition of a coil or its bridge; beside a stuck leg the other leg still follows its input."""
 
     SOUND = "sound"
     OPEN = "open"
@@ -38,7 +38,7 @@ class Condition(Enum):
 
 
 class CoilCircuit:
-    """Three coils on one chip; follows the chip by itself, at every STOP that may have changed outputs."""
+    """Three coils on one chip; updates at every I2C STOP that may have changed outputs."""
 
     def __init__(
         self,
@@ -49,10 +49,10 @@ class CoilCircuit:
         uncertainty: float = CURRENT_UNCERTAINTY,
         bus_voltage: float | None = None,
     ) -> None:
-        """Wire the coils as they truly are, which need not be what the driver believes.
+        """Connect the coils by their true wiring, which may differ from the driver's.
 
-        `uncertainty` bounds a uniform error in A, drawn anew each time a coil's channels are written, none at
-        zero; `bus_voltage` is what a monitor in the supply sees, V, by default the coils' supply voltage.
+        `uncertainty` bounds a uniform error in A, drawn at each write of a coil's channels, none at zero;
+        `bus_voltage` is the voltage at a monitor in the supply, V, by default the coils' supply voltage.
         """
         self._chip = chip
         self._coils = tuple(
@@ -85,13 +85,13 @@ class CoilCircuit:
         return self._currents
 
     def become(self, axis: int, condition: Condition, short_ohm: float = 5.0) -> None:
-        """Let a coil break, or be mended; a shorted one leaves `short_ohm` to its bridge."""
+        """Set the condition of a coil; a shorted coil loads its bridge with `short_ohm`."""
         self._conditions[axis] = condition
         self._short_ohm[axis] = short_ohm
         self.update(self._coils[axis][1])
 
     def update(self, written: int) -> None:
-        """Follow the chip after a STOP; `written` is the mask of the channels that were written."""
+        """Update the currents after a STOP; `written` is the mask of the channels that were written."""
         draws = self._generator.random(3).tolist() if written else (0.5, 0.5, 0.5)
         for axis, (coil, channels, step, limit) in enumerate(self._coils):
             condition = self._conditions[axis]
@@ -114,7 +114,7 @@ class CoilCircuit:
     def mean_supply(self, start_ns: int, end_ns: int) -> tuple[float, float]:
         """Return the mean bus voltage (V) and mean current of all coils together (A) over a recent window.
 
-        A bridge takes |I| from the supply whichever way its coil is driven. Reaches half a second back.
+        A bridge takes |I| from the supply whichever way its coil is driven. The history spans 0.5 s.
         """
         charge = self._charge(end_ns) - self._charge(start_ns)
         return self._bus_voltage, charge / (end_ns - start_ns)

@@ -1,4 +1,4 @@
-"""What spoils a frame or hides an object: the Sun or the Earth in the camera's field, the Earth in between.
+"""Exclusion: the Sun or the Earth in the camera's field, or the Earth between camera and object.
 
 Sease 2.16-2.19 corrected: the boresight is the camera's +z. The field is taken as a cone about it; with half
 the field of view (the thesis's) a corner of the frame may still see the Sun or the limb, with the pinhole's
@@ -24,7 +24,7 @@ def boresights(attitudes: FloatArray, mounting: FloatArray = quaternion.IDENTITY
 def sun_in_field(
     boresight: FloatArray, position: FloatArray, sun: FloatArray, half_angle: float, buffer: float = 0.0
 ) -> BoolArray:
-    """Tell at which `boresight` (m, 3) the Sun's disc is within `half_angle` + `buffer` rad (2.16, 2.17).
+    """Return at which `boresight` (m, 3) the Sun's disc is within `half_angle` + `buffer` rad (2.16, 2.17).
 
     `position` (m, 3) is the camera's, `sun` (m, 3) the Sun's; `buffer` is for stray light past the baffle.
     """
@@ -35,12 +35,12 @@ def sun_in_field(
 def earth_in_field(
     boresight: FloatArray, position: FloatArray, half_angle: float, buffer: float = 0.0
 ) -> BoolArray:
-    """Tell at which `boresight` (m, 3) the Earth is within `half_angle` + `buffer` rad (2.18, 2.19)."""
+    """Return at which `boresight` (m, 3) the Earth is within `half_angle` + `buffer` rad (2.18, 2.19)."""
     return _within(boresight, -np.asarray(position), EARTH_RADIUS, half_angle + buffer)
 
 
 def hidden_by_earth(position: FloatArray, target: FloatArray) -> BoolArray:
-    """Tell for which pairs the Earth stands between `position` and `target`, (m, 3) each."""
+    """Return for which pairs the Earth stands between `position` and `target`, (m, 3) each."""
     way = target - position
     length = np.sum(way * way, axis=-1)
     nearest = np.clip(-np.sum(position * way, axis=-1) / np.where(length > 0.0, length, 1.0), 0.0, 1.0)
@@ -51,7 +51,7 @@ def hidden_by_earth(position: FloatArray, target: FloatArray) -> BoolArray:
 def in_field(
     camera: Pinhole, attitudes: FloatArray, directions: FloatArray, margin: float = 0.0
 ) -> BoolArray:
-    """Tell which `directions` (m, 3) ICRS are on the detector, or `margin` px off, at camera `attitudes`."""
+    """Return which `directions` (m, 3) ICRS are within `margin` px of the detector at camera `attitudes`."""
     seen = (quaternion.attitude_matrix(attitudes) @ directions[..., None])[..., 0]
     return camera.contains(camera.project(seen), margin)
 

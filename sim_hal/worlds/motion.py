@@ -1,4 +1,4 @@
-"""What an ideal inertial unit in the body would feel at an instant."""
+"""The true motion of the body: attitude, rate, field and specific force at one time."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ STANDARD_GRAVITY = 9.80665
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """The truth at one time.
+    """The measurements of an ideal inertial unit at one time.
 
     Attributes:
         time_ns: simulation time.
@@ -38,7 +38,7 @@ def about_thread(time_ns: int, angle: float, rate: float, field: float) -> Motio
         time_ns=time_ns,
         quaternion=about_axis_y(angle),
         rate=np.array([0.0, rate, 0.0]),
-        # (0, 0, -field) and the pull of the thread (0, -g, 0), turned into body axes.
+        # (0, 0, -field) and the specific force of the thread (0, -g, 0), turned into body axes.
         field_body=np.array([field * math.sin(angle), 0.0, -field * math.cos(angle)]),
         specific_force_body=np.array([0.0, -STANDARD_GRAVITY, 0.0]),
     )

@@ -1,4 +1,4 @@
-"""The world and the emulated devices together, advanced event by event on one time line."""
+"""Advances the world and the emulated devices together, event by event."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from sim_hal.emulators.device import NEVER, EmulatedDevice
 
 
 class TimedSimulation:
-    """Carries the world to each device's next event, then lets that device act."""
+    """Advances the world to each device's next event, then runs that device."""
 
     def __init__(self, advance_world: Callable[[int], None], devices: Sequence[EmulatedDevice]) -> None:
         self._advance_world = advance_world
         self._devices = tuple(devices)
 
     def next_event_ns(self) -> int:
-        """Return when the first device next does something by itself."""
+        """Return the time of the next event of any device."""
         return min((device.next_event_ns() for device in self._devices), default=NEVER)
 
     def advance_to(self, time_ns: int) -> None:
-        """Let everything happen that is due at or before `time_ns`, in order."""
+        """Process all events due at or before `time_ns`, in order."""
         while (event_ns := self.next_event_ns()) <= time_ns:
             self._advance_world(event_ns)
             for device in self._devices:

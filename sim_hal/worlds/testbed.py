@@ -1,6 +1,6 @@
-"""The testbed: a rigid body on a thread in a Helmholtz coil's field, turned by its torque coils.
+"""The testbed: a rigid body on a thread in a Helmholtz coil's field, controlled by its torque coils.
 
-Sease 2013 ch. 5: the thread leaves one freedom, the turn theta about it; J theta'' = m x B about the thread
+Sease 2013 ch. 5: one degree of freedom, the angle theta about the thread; J theta'' = m x B about the thread
 - k theta - c theta'. The testbed frame T has y down along the thread and the field along -z; at theta = 0 the
 body axes are those of T, so the coil on body x gives n A B I cos(theta) (5.4), the one on body z
 n A B I sin(theta), and the one on body y, which lies along the thread, none.
@@ -47,7 +47,7 @@ class TestbedModel:
 
 
 class Testbed:
-    """The state of the world, advanced in time under the currents that the coils carry."""
+    """The state of the testbed, advanced in time under the coil currents."""
 
     __test__ = False
 
@@ -70,14 +70,14 @@ class Testbed:
         self.rate = 0.0
         self.energy = 0.0
         self.supply_energy = 0.0
-        self.felt_current: FloatArray = np.zeros(3)
+        self.mean_current: FloatArray = np.zeros(3)
 
     def release_at(self, time_ns: int) -> None:
-        """Let the body go at `time_ns`, now or later."""
+        """Release the body at `time_ns`, now or later."""
         self._release_ns = time_ns
 
     def advance_to(self, time_ns: int) -> None:
-        """Carry the state to `time_ns` with the currents of now, by classical Runge-Kutta."""
+        """Advance the state to `time_ns` under the present currents, by classical Runge-Kutta."""
         if self._held:
             if self._release_ns is None or time_ns < self._release_ns:
                 self.time_ns = max(self.time_ns, time_ns)
@@ -88,8 +88,8 @@ class Testbed:
         span = (time_ns - self.time_ns) * 1e-9
         if span <= 0.0:
             return
-        self.felt_current = self._currents()
-        ix, iy, iz = (float(i) for i in self.felt_current)
+        self.mean_current = self._currents()
+        ix, iy, iz = (float(i) for i in self.mean_current)
         steps = max(1, math.ceil(span / _LONGEST_STEP))
         for _ in range(steps):
             self._step(span / steps, ix, iz)
@@ -99,13 +99,13 @@ class Testbed:
         self.time_ns = time_ns
 
     def motion(self, time_ns: int) -> Motion:
-        """Return what an ideal sensor in the body would feel; the world must stand at `time_ns`."""
+        """Advance to `time_ns` and return the motion there; `time_ns` is never before the state."""
         self.advance_to(time_ns)
         return about_thread(self.time_ns, self.angle, self.rate, self._model.field)
 
     def truth(self) -> WorldTruth:
         """Return currents and energies of the state as it is."""
-        return WorldTruth(self.felt_current, self.energy, self.supply_energy)
+        return WorldTruth(self.mean_current, self.energy, self.supply_energy)
 
     def _acceleration(self, angle: float, rate: float, ix: float, iz: float) -> float:
         m = self._model
@@ -126,13 +126,13 @@ class Testbed:
 
 
 def make(inputs: WorldInputs) -> Testbed:
-    """Return the testbed of a configuration, as far as its `simulation` section does not say otherwise."""
+    """Return the testbed of a configuration; values of its `simulation` section take precedence."""
     config, section = inputs.config, inputs.section
-    believed, truth = config.plant, section.truth
+    plant, truth = config.plant, section.truth
     model = TestbedModel(
-        inertia=truth.inertia or believed.inertia,
-        dipole_per_ampere=believed.coil_turns * believed.coil_area,
-        field=truth.field or believed.field,
+        inertia=truth.inertia or plant.inertia,
+        dipole_per_ampere=plant.coil_turns * plant.coil_area,
+        field=truth.field or plant.field,
         stiffness=section.thread.stiffness,
         damping=section.thread.damping,
         resistance=truth.resistance or config.coils.resistance,

@@ -1,4 +1,4 @@
-"""The world seam: what the emulated devices ask of the simulated world, whichever that is.
+"""The world seam: what the emulated devices need of any simulated world.
 
 A configuration names its world in `simulation.world`: one of `WORLDS`, or a third party's factory as
 `module:factory`, which takes `WorldInputs` and returns a `World`.
@@ -27,7 +27,7 @@ class WorldTruth:
     Attributes:
         current: (3,) A, mean currents that acted on the body.
         energy: J, integral of R I^2 over all coils since the release.
-        supply_energy: J, integral of V |I| likewise.
+        supply_energy: J, integral of V |I| over all coils since the release.
     """
 
     current: FloatArray
@@ -57,7 +57,7 @@ class WorldInputs:
     """What a world is made from.
 
     Attributes:
-        config: what the flight believes, for what `section` does not say.
+        config: the flight configuration, for values that `section` leaves out.
         section: the `simulation` section.
         currents: returns (3,) A that the coils carry now.
         start_ns: the simulation's time at the start.
@@ -80,8 +80,10 @@ def make_world(inputs: WorldInputs) -> World:
     try:
         factory = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError) as error:
-        raise ConfigError("simulation.world", f"is {named!r}, which cannot be had: {error}") from error
+        raise ConfigError("simulation.world", f"is {named!r}, which cannot be imported: {error}") from error
     world = factory(inputs) if callable(factory) else None
     if not isinstance(world, World):
-        raise ConfigError("simulation.world", f"is {named!r}: it makes no World of sim_hal.worlds.world")
+        raise ConfigError(
+            "simulation.world", f"is {named!r}: its factory returns no World (sim_hal.worlds.world)"
+        )
     return world

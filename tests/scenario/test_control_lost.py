@@ -48,8 +48,8 @@ def on_the_line(faults: LineFaults) -> Break:
     return lambda rigged: setattr(rigged.lock.line.to_host, "faults", faults)
 
 
-def in_the_unit(spoil: Callable[[Measured], Measured] | None) -> Break:
-    return lambda rigged: setattr(rigged.lock.hardware.unit, "spoil", spoil)
+def in_the_unit(alter: Callable[[Measured], Measured] | None) -> Break:
+    return lambda rigged: setattr(rigged.lock.hardware.unit, "alter", alter)
 
 
 def elsewhere(seen: Measured) -> Measured:

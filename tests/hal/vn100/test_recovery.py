@@ -166,12 +166,12 @@ def test_values_that_never_change_are_no_readings(bench: BenchLine) -> None:
         kept.append(measured)
         return kept[0]
 
-    bench.unit.spoil = same
+    bench.unit.alter = same
     before = bench.driver.link().out_of_range
     bench.run(2.0)
     assert bench.run(1.0) == []
     assert bench.driver.link().out_of_range - before > 80
-    bench.unit.spoil = None
+    bench.unit.alter = None
     assert seconds_until_readings(bench) <= 2.0
 
 

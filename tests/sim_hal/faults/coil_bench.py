@@ -48,7 +48,7 @@ def hold(target: float, noise: float = 0.0, others: float = 0.0, seed: int = 0) 
 
 
 def watch_settings(config: Config, monitor_only: bool = False) -> CoilWatchSettings:
-    """Return what the flight loop would tell a watch of the demonstration's hardware."""
+    """Return what the flight loop gives a watch of the demonstration's hardware."""
     coils, plant = config.coils, config.plant
     full = [coils.supply_voltage / ohm for ohm in coils.resistance]
     response = ResponseSettings(
@@ -81,7 +81,7 @@ def observe(
     monitor_only: bool = False,
     gain: tuple[float, float, float] = (1.0, 1.0, 1.0),
 ) -> Watched:
-    """Command the coils for a while and return what a watch says; `gain` spoils the believed resistance."""
+    """Command the coils for a while and return what a watch says; `gain` scales the configured resistance."""
     config = demo_config(duration, camera=False)
     entries = tuple(FaultEntry(fault=fault) for fault in faults)
     ohms = config.coils.resistance

@@ -36,7 +36,7 @@ def bench_of(lock: LockStep) -> Bench:
 
 
 def is_sound(lock: LockStep) -> bool:
-    """Tell whether nothing is left of any fault."""
+    """Return whether no effect of any fault remains."""
     hardware, line = lock.hardware, lock.line
     assert hardware.monitor is not None
     assert hardware.camera is not None
@@ -44,7 +44,7 @@ def is_sound(lock: LockStep) -> bool:
         line.to_host.faults == SOUND
         and line.to_device.faults == SOUND
         and not line.host.unplugged
-        and hardware.unit.spoil is None
+        and hardware.unit.alter is None
         and not hardware.bus._faults
         and set(hardware.bus._parts) == {hardware.pwm, hardware.monitor}
         and not hardware.monitor.frozen

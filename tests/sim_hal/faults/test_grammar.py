@@ -54,7 +54,7 @@ def test_a_fault_is_read_with_its_time_and_parameters(
 ) -> None:
     fault = parse(text)
     assert (fault.kind.name, fault.at, fault.span, dict(fault.parameters)) == (name, at, span, parameters)
-    assert parse(str(fault)) == fault, "what is written down is read as the same"
+    assert parse(str(fault)) == fault, "the text of a fault parses to the same fault"
 
 
 @pytest.mark.parametrize(

@@ -31,7 +31,7 @@ UPSETS = ("pwm: upset", "monitor: upset", "imu: upset")
 
 
 def driven_rig() -> Rig:
-    """Return coils that are told something each cycle, for a second by now."""
+    """Return coils that have been commanded each cycle for a second."""
     rig = Rig()
     rig.coils.start()
     for _ in range(40):
@@ -50,7 +50,9 @@ def drive(rig: Rig) -> None:
     + [(MODE2, bit) for bit in range(5)]
     + [(PRE_SCALE, bit) for bit in range(8)],
 )
-def test_a_bit_of_the_chips_set_up_is_told_and_mended_within_half_a_second(register: int, bit: int) -> None:
+def test_a_bit_of_the_chips_set_up_is_measured_and_mended_within_half_a_second(
+    register: int, bit: int
+) -> None:
     rig = driven_rig()
     sound = rig.wire.chip.register(register)
     rig.wire.chip.flip(register, bit)
@@ -84,7 +86,7 @@ def test_a_bit_that_does_not_exist_stays_zero() -> None:
 
 
 @pytest.mark.parametrize("bit", [bit for bit in range(16) if bit != 14])
-def test_a_bit_of_the_monitors_set_up_is_told_and_mended(bit: int) -> None:
+def test_a_bit_of_the_monitors_set_up_is_measured_and_mended(bit: int) -> None:
     rig = Rig()
     monitor = Ina219(rig.bus, INA, rig.clock)
     rig.clock.sleep_until_ns(3000 * MS)
@@ -187,15 +189,15 @@ def test_a_monitor_that_is_behind_tells_what_was_two_seconds_ago() -> None:
     monitor = Ina219(rig.bus, INA, rig.clock, averaged=1)
     rig.coils.start()
     rig.wire.monitor.lag_ns = 2000 * MS
-    told = []
+    measured = []
     for cycle in range(240):
         rig.clock.sleep_until_ns(cycle * CYCLE_NS)
         rig.command(0.06 if cycle >= 80 else 0.0, 0.0, 0.0)
         reading = monitor.latest()
-        told.append(0.0 if reading is None else reading.current)
+        measured.append(0.0 if reading is None else reading.current)
         assert not monitor.error()
-    assert max(told[:160]) < 5e-3, "nothing was driven two seconds ago"
-    assert min(told[180:]) > 0.04
+    assert max(measured[:160]) < 5e-3, "nothing was driven two seconds ago"
+    assert min(measured[180:]) > 0.04
     rig.wire.monitor.lag_ns = 0
     rig.command(0.0, 0.0, 0.0)
     rig.clock.sleep_until_ns(rig.clock.now_ns() + 1000 * MS)

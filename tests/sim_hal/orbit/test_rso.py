@@ -14,7 +14,10 @@ from flight.gnc.earth.sun import DAY
 from flight.gnc.math import quaternion
 from flight.gnc.math.arrays import FloatArray
 from hal.interfaces.errors import OutOfRange
-from sim_hal.faults.opportunities import (
+from sim_hal.star_camera import StarCameraModel, expected_electrons
+from sim_hal.star_camera.rso import TRACK_ERROR, ResidentSpaceObject, directions, source_tracks
+from sim_hal.worlds import sun
+from sim_hal.worlds.opportunities import (
     Scenario,
     constant_slew,
     exposure_attitudes,
@@ -23,9 +26,6 @@ from sim_hal.faults.opportunities import (
     table_4_3,
     windows,
 )
-from sim_hal.star_camera import StarCameraModel, expected_electrons
-from sim_hal.star_camera.rso import TRACK_ERROR, ResidentSpaceObject, directions, source_tracks
-from sim_hal.worlds import sun
 from sim_hal.worlds.orbit import KeplerianElements, propagate
 
 EPOCH = 2_461_041.5

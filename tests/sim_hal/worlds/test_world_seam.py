@@ -29,10 +29,10 @@ def test_a_third_partys_world_is_flown_and_its_motion_reaches_estimate_and_truth
     ("name", "complaint"),
     [
         ("moon", "name one of testbed"),
-        ("no_such_module:make", "cannot be had"),
-        (f"{HERE}:missing", "cannot be had"),
-        (f"{HERE}:NO_FACTORY", "makes no World"),
-        (f"{HERE}:make_nothing", "makes no World"),
+        ("no_such_module:make", "cannot be imported"),
+        (f"{HERE}:missing", "cannot be imported"),
+        (f"{HERE}:NO_FACTORY", "returns no World"),
+        (f"{HERE}:make_nothing", "returns no World"),
     ],
 )
 def test_a_world_that_is_not_there_is_one_clear_line(name: str, complaint: str, tmp_path: Path) -> None:

@@ -21,7 +21,9 @@ import numpy as np
 from flight.gnc.math.arrays import BoolArray, FloatArray, Image
 from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector
 from flight.gnc.vision.objects.report import ObjectReport
-from sim_hal.faults.opportunities import (
+from sim_hal.star_camera import StarCameraModel, render
+from sim_hal.star_camera.rso import source_tracks
+from sim_hal.worlds.opportunities import (
     Opportunity,
     Scenario,
     constant_slew,
@@ -29,8 +31,6 @@ from sim_hal.faults.opportunities import (
     opportunities,
     table_4_3,
 )
-from sim_hal.star_camera import StarCameraModel, render
-from sim_hal.star_camera.rso import source_tracks
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.rso import (
     EXPOSURE,

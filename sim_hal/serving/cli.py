@@ -31,7 +31,7 @@ examples:
   python -m sim_hal emulate vn100 --rate-deg-s 3 --link /tmp/vn100
       a steady turn, under a name that stays the same
   python -m sim_hal emulate vn100 --json --duration 60
-      one JSON object that says what is served, for a minute
+      prints one JSON object with the device's name, serves for a minute
 """
 
 
@@ -144,9 +144,9 @@ def serve(
     announce: Callable[[], None],
     duration: float | None = None,
 ) -> None:
-    """Let the emulator live on the line in real time, for `duration` s or until SIGINT or SIGTERM.
+    """Serve the emulator on the line in real time, for `duration` s or until SIGINT or SIGTERM.
 
-    `announce` is called once it can be stopped politely: whoever is told may stop it at once.
+    `announce` is called once the signal handlers are in place.
     """
     stopped = False
 

@@ -1,4 +1,4 @@
-"""What really happened: the world's state at 40 Hz, as packets in a log of its own."""
+"""Records the true state of the world at 40 Hz, as packets in a log of its own."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ PERIOD_NS = 25_000_000
 
 
 class PacketLog(Protocol):
-    """Where packets go."""
+    """A log of packets."""
 
     def write(self, packet: bytes) -> None:
-        """Keep a packet."""
+        """Append a packet."""
 
 
 class TruthRecorder:
-    """An emulated device that only looks."""
+    """Writes the truth log; takes part in the simulation as an emulated device."""
 
     def __init__(self, log: PacketLog) -> None:
         self._log = log
@@ -30,7 +30,7 @@ class TruthRecorder:
         self._due_ns = NEVER
 
     def watch(self, world: World) -> None:
-        """Look at this world."""
+        """Record this world."""
         self._world = world
 
     def begin(self, epoch_ns: int) -> None:

@@ -36,7 +36,7 @@ Attitude = Callable[[FloatArray], FloatArray]
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Scenario:
-    """A camera, the objects it may see, and what spoils its frames.
+    """A camera, the objects it may see, and its exclusion angles.
 
     Attributes:
         epoch: the Julian date TT of time 0.
@@ -45,7 +45,7 @@ class Scenario:
         attitude: its attitude at any times.
         pinhole: its geometry.
         objects: what there is to see.
-        half_angle: rad, of the cone about the boresight in which Sun and Earth spoil a frame.
+        half_angle: rad, of the cone about the boresight in which Sun and Earth exclude a frame.
         buffer: rad more, for stray light past the baffle.
         shadow: conical or cylindrical.
     """
@@ -135,13 +135,13 @@ def table_4_3(
 def exposure_attitudes(
     scenario: Scenario, start: float, exposure: float, step: float = 0.01
 ) -> tuple[FloatArray, FloatArray]:
-    """Return times (k,) s and attitudes (k, 4) of an exposure, no more than `step` s apart."""
+    """Return times (k,) s and attitudes (k, 4) of an exposure, at most `step` s apart."""
     times = np.linspace(start, start + exposure, max(2, math.ceil(exposure / step) + 1))
     return times, scenario.attitude(times)
 
 
 def observable(scenario: Scenario, index: int, times: FloatArray) -> BoolArray:
-    """Tell at which `times` (m,) s object number `index` is observable; half the Sun's disc must light it."""
+    """Return at which `times` (m,) s object `index` is observable; half the Sun's disc must light it."""
     camera = scenario.camera.positions_at(times)
     position = scenario.objects[index].orbit.positions_at(times)
     attitudes = scenario.attitude(times)
@@ -150,11 +150,11 @@ def observable(scenario: Scenario, index: int, times: FloatArray) -> BoolArray:
     left = np.flatnonzero(good)
     camera, position, boresight = camera[left], position[left], boresights(attitudes[left])
     sun_position = sun.position(scenario.epoch + np.asarray(times)[left] / DAY)
-    spoilt = sun_in_field(boresight, camera, sun_position, scenario.half_angle, scenario.buffer)
-    spoilt |= earth_in_field(boresight, camera, scenario.half_angle, scenario.buffer)
-    spoilt |= hidden_by_earth(camera, position)
-    spoilt |= sunlit_share(position, sun_position, scenario.shadow) < 0.5
-    good[left] = ~spoilt
+    excluded = sun_in_field(boresight, camera, sun_position, scenario.half_angle, scenario.buffer)
+    excluded |= earth_in_field(boresight, camera, scenario.half_angle, scenario.buffer)
+    excluded |= hidden_by_earth(camera, position)
+    excluded |= sunlit_share(position, sun_position, scenario.shadow) < 0.5
+    good[left] = ~excluded
     return good
 
 
