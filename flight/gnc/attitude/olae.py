@@ -9,6 +9,7 @@ v' = -omega x v (4.8-4.10 corrected).
 less, |g| below 1.74. An error e of b enters the equation as (1 + [g x]) e, larger than e by up to the root of
 1 + g^2 and different in each direction, so the weights 1/sigma^2 are not the best ones. The result therefore
 differs from Wahba's by an amount of the order of the noise, and the covariance is that of this estimator.
+Because Wahba's is efficient, the difference of the two attitudes has the difference of the two covariances.
 
 Reference: Mortari, Markley and Singla, Optimal linear attitude estimator, J. Guidance, Control, and Dynamics
 30 (2007).

@@ -16,7 +16,7 @@ class MotionResult(FrameMotion):
     """The motion of one exposure and the stars; the rate is that at mid-exposure.
 
     Every star found has two ends: `endpoints` (n, 2, 2). `used` (n,) are those that were fitted to their
-    pixels with a say in the motion; `length` and `residual` (expected, not left over) are theirs.
+    pixels and determine the motion; `length` and `residual` (expected, not left over) are theirs.
 
     Attributes:
         stars: (n, 2) px at mid-exposure; `star_covariance` (n, 2, 2) px^2.
