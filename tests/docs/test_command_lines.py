@@ -15,14 +15,14 @@ from flight.app.cli import COMMANDS as FLIGHT_COMMANDS
 from ground.commands import COMMANDS as GROUND_COMMANDS
 from tests.docs.blocks import ROOT, blocks, blocks_of, pages
 
-SHORT = "--duration 3"
+SHORT = "--duration 1"
 RUNNABLE = {block.page for block in blocks() if block.commands and not block.mark}
 
 
 def shortened(line: str) -> str:
     """Return the command to run for a line: a short flight with early faults, a report without pictures."""
     if line.startswith("python -m flight run ") and "--help" not in line:
-        early = re.sub(r"@ \d+", "@ 1", re.sub(r" for \d+", " for 1", line))
+        early = re.sub(r"@ \d+", "@ 0.3", re.sub(r" for \d+", " for 0.3", line))
         return re.sub(r" --duration \d+", "", early) + f" {SHORT}"
     if line.startswith("python -m flight report") and "--json" not in line:
         return f"{line} --no-figures"
