@@ -80,39 +80,46 @@ def assemble(
     Raises ConfigError for a world that cannot be made.
     """
     unit_seed, circuit_seed = np.random.SeedSequence(section.seed).spawn(2)
+    pwm = EmulatedPca9685(config.coils.address, now_ns)
+    circuit = _circuit(config, section, pwm, np.random.default_rng(circuit_seed), now_ns)
+    world = make_world(WorldInputs(config, section, circuit.currents, now_ns()))
+    unit = _unit(config, section, world, line, np.random.default_rng(unit_seed), now_ns())
+    monitor = _monitor(config, circuit, now_ns)
+    bus = EmulatedI2cBus([pwm] if monitor is None else [pwm, monitor], wait=wait)
+    camera = _camera(config.camera, section, world, expose, now_ns)
+    faults = FaultTimeline()
+    if truth is not None:
+        truth.watch(world)
+    # At equal times devices run in this order.
+    devices: list[EmulatedDevice | None] = [unit, camera, faults, truth]
+    simulation = TimedSimulation(world.advance_to, [device for device in devices if device is not None])
+    return Hardware(simulation, world, unit, bus, pwm, monitor, circuit, camera, truth, faults)
+
+
+def _circuit(
+    config: Config,
+    section: Simulation,
+    pwm: EmulatedPca9685,
+    generator: np.random.Generator,
+    now_ns: Callable[[], int],
+) -> CoilCircuit:
     resistance = section.truth.resistance or config.coils.resistance
     supply = section.truth.supply_voltage or config.coils.supply_voltage
-
-    pwm = EmulatedPca9685(config.coils.address, now_ns)
-    circuit = CoilCircuit(
+    return CoilCircuit(
         pwm,
         _coil_settings(config, resistance, supply),
-        np.random.default_rng(circuit_seed),
+        generator,
         now_ns,
         uncertainty=section.current_noise,
         bus_voltage=BUS_VOLTAGE,
     )
-    world = make_world(WorldInputs(config, section, circuit.currents, now_ns()))
-    unit = _unit(config, section, world, line, np.random.default_rng(unit_seed), now_ns())
-    monitor = None
-    parts: list[EmulatedPca9685 | EmulatedIna219] = [pwm]
-    if config.power_monitor is not None:
-        monitor = EmulatedIna219(
-            config.power_monitor.address, now_ns, circuit.mean_supply, config.power_monitor.shunt
-        )
-        parts.append(monitor)
-    bus = EmulatedI2cBus(parts, wait=wait)
-    camera = _camera(config.camera, section, world, expose, now_ns)
-    devices: list[EmulatedDevice] = [unit]
-    if camera is not None:
-        devices.append(camera)
-    faults = FaultTimeline()
-    devices.append(faults)
-    if truth is not None:
-        truth.watch(world)
-        devices.append(truth)
-    simulation = TimedSimulation(world.advance_to, devices)
-    return Hardware(simulation, world, unit, bus, pwm, monitor, circuit, camera, truth, faults)
+
+
+def _monitor(config: Config, circuit: CoilCircuit, now_ns: Callable[[], int]) -> EmulatedIna219 | None:
+    settings = config.power_monitor
+    if settings is None:
+        return None
+    return EmulatedIna219(settings.address, now_ns, circuit.mean_supply, settings.shunt)
 
 
 def _unit(

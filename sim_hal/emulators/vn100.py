@@ -1,7 +1,7 @@
 """An emulated VN-100 on the device end of a serial line.
 
-It answers every command and register of `vn100_registers` and sends the measurements of `vn100_sensors` in
-the formats of `vn100_outputs`, on the 800 Hz grid of its own clock. Registers that tune its estimation (21 to
+It executes commands through `vn100_commands` and sends the measurements of `vn100_sensors` in the formats of
+`vn100_outputs`, on the 800 Hz grid of its own clock. Registers that tune its estimation (21 to
 26, 32 to 47, 82 to 84) are stored and echoed without effect; of register 85 the windows of magnetometer,
 accelerometer and gyro have an effect. Not emulated: tare, SYNC lines, the second serial port. The 500 ms of a
 flash write are VectorNav's; the second of start-up is assumed.
@@ -17,31 +17,16 @@ import numpy as np
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.frames import NED_TO_TESTBED
 from flight.gnc.math.quaternion import IDENTITY
-from hal.drivers.vn100.ascii import Checksum, Sentence, build, parse
 from sim_hal.emulators.device import NEVER, SerialEnd
-from sim_hal.emulators.vn100_outputs import REPORT_BY_REGISTER, REPORT_BY_TYPE, Instant, report_length
-from sim_hal.emulators.vn100_registers import (
-    ASYNC_RATES_HZ,
-    BINARY_OUTPUTS,
-    INVALID_CHECKSUM,
-    INVALID_COMMAND,
-    INVALID_PARAMETER,
-    INVALID_REGISTER,
-    RECEIVE_OVERFLOW,
-    UNAUTHORIZED,
-    RegisterFile,
-    UnitError,
-    binary_output,
-    expect_count,
-)
+from sim_hal.emulators.vn100_commands import CommandInterface, UnitActions
+from sim_hal.emulators.vn100_outputs import REPORT_BY_TYPE, Instant, report_length
+from sim_hal.emulators.vn100_registers import ASYNC_RATES_HZ, RegisterFile, UnitError
 from sim_hal.emulators.vn100_sensors import IMU_RATE_HZ, PROFILES, Measured, NoiseProfile, Sensors
-from sim_hal.emulators.vn100_streams import OutputStreams, packer
+from sim_hal.emulators.vn100_streams import OutputStreams
 from sim_hal.worlds.motion import Motion
 
 TICK_NS = 1_000_000_000 // IMU_RATE_HZ
 _BILLION = 1_000_000_000
-_RECEIVE_BUFFER = 256
-_KNOWN_MAGNETIC, _KNOWN_ACCELERATION = 1 << 11, 1 << 12
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,8 +59,6 @@ class Vn100EmulatorSettings:
 class Vn100Emulator:
     """The unit; a `sim_hal.emulators.device.EmulatedDevice`.
 
-    Over 200 lines: power, commands and output share one state, which a reset replaces.
-
     Attributes:
         alter: changes each measurement before it is sent, for faults.
     """
@@ -97,11 +80,10 @@ class Vn100Emulator:
         bias = settings.gyro_bias
         self._sensors = Sensors(rng, settings.noise, settings.mounting, settings.reference, bias)
         self._clock_rate = _BILLION + round(settings.clock_ppm * 1000)
-        self._received = bytearray()
         self._then: tuple[int, Callable[[int], None]] | None = None
         self._streams = OutputStreams(self.registers)
-        self._paused = False
-        self._status = 0
+        actions = UnitActions(self._instant_now, self._build_streams, self._write_flash, self._restart)
+        self._commands = CommandInterface(line, self.registers, self._streams, actions, bias)
         self._origin_ns = now_ns
         self._uptime_ns = settings.uptime_ns
         self._tick = -1
@@ -119,7 +101,9 @@ class Vn100Emulator:
             if self._due_ns <= event_ns:
                 self._act(event_ns)
             else:
-                self._hear(self._line.read(event_ns), event_ns)
+                data = self._line.read(event_ns)
+                if self._then is None:  # A unit that starts, or writes its flash, receives nothing.
+                    self._commands.receive(data, event_ns)
             self._schedule(event_ns)
 
     def set_baud_rate(self, baud_rate: int) -> None:
@@ -139,7 +123,7 @@ class Vn100Emulator:
 
     def switch_on(self, now_ns: int) -> None:
         """Apply power, or reset: the unit restarts from its flash."""
-        self._then = now_ns + self._settings.boot_ns, lambda end_ns: self._start(end_ns, 0)
+        self._restart(now_ns)
         self._schedule(now_ns)
 
     def change_baud_rate(self, baud_rate: int, now_ns: int) -> None:
@@ -175,7 +159,7 @@ class Vn100Emulator:
             self._due_ns = self._then[0]
             return
         tick = self._streams.next_tick(max(self._tick, self._device_ns(now_ns) // TICK_NS))
-        if self._paused or tick is None:
+        if self._commands.paused or tick is None:
             self._due_ns = NEVER
         else:
             self._tick_due = tick
@@ -204,7 +188,9 @@ class Vn100Emulator:
     def _instant(self, device_ns: int, measured: Measured, since_ns: int) -> Instant:
         interval = (device_ns - since_ns) * 1e-9
         settings = self._settings
-        return Instant(device_ns, measured, self._status, interval, settings.temperature, settings.pressure)
+        return Instant(
+            device_ns, measured, self._commands.status, interval, settings.temperature, settings.pressure
+        )
 
     def _instant_now(self, now_ns: int) -> Instant:
         device_ns = self._device_ns(now_ns)
@@ -213,135 +199,24 @@ class Vn100Emulator:
     def _build_streams(self, now_ns: int) -> None:
         self._streams.build(self._device_ns(now_ns))
 
-    # Input.
+    # Power.
 
-    def _hear(self, data: bytes, now_ns: int) -> None:
-        if self._then is not None:
-            return  # starting, or writing its flash
-        self._received += data
-        while (end := self._received.find(b"\n")) >= 0:
-            line = bytes(self._received[: end + 1])
-            del self._received[: end + 1]
-            start = line.rfind(b"$")
-            if start >= 0:
-                self._obey(line[start:], now_ns)
-        if len(self._received) > _RECEIVE_BUFFER:
-            self._received.clear()
-            self._complain(RECEIVE_OVERFLOW, self._streams.checksum(), now_ns)
+    def _write_flash(self, now_ns: int, done: Callable[[int], None]) -> None:
+        self.registers.save()
+        self._then = now_ns + self._settings.flash_ns, done
 
-    def _obey(self, line: bytes, now_ns: int) -> None:
-        sentence = parse(line, allow_none=True)
-        if sentence is None:
-            wide = len(line.rstrip(b"\r\n").rpartition(b"*")[2]) == 4
-            self._complain(INVALID_CHECKSUM, "crc16" if wide else "xor8", now_ns)
-            return
-        checksum = self._streams.checksum() if sentence.checksum == "none" else sentence.checksum
-        try:
-            self._execute(sentence, checksum, now_ns)
-        except UnitError as error:
-            self._complain(error.code, checksum, now_ns)
-
-    def _complain(self, code: int, checksum: Checksum, now_ns: int) -> None:
-        mode = self.registers.integer(30, 6)
-        if mode:
-            self._line.write(build("ERR", f"{code:02X}", checksum=checksum), now_ns)
-        if mode == 2:
-            self.registers.write(6, ("0",))
-            self._build_streams(now_ns)
-
-    def _execute(self, sentence: Sentence, checksum: Checksum, now_ns: int) -> None:
-        """Execute a command and answer it. Raises UnitError."""
-
-        def answer(*fields: str, at_ns: int = now_ns) -> None:
-            self._line.write(build(sentence.command, *fields, checksum=checksum), at_ns)
-
-        fields = sentence.fields
-        match sentence.command:
-            case "RRG":
-                expect_count(fields, 1, 2)
-                answer(fields[0], *self._read(_number_of(fields[0]), now_ns))
-            case "WRG":
-                expect_count(fields, 2, 16)
-                self._write(_number_of(fields[0]), fields, answer, now_ns)
-            case "ASY":
-                self._paused = not _flag(fields)
-                answer(*fields)
-            case "KMD" | "KAD":
-                bit = _KNOWN_MAGNETIC if sentence.command == "KMD" else _KNOWN_ACCELERATION
-                self._status = self._status | bit if _flag(fields) else self._status & ~bit
-                answer(*fields)
-            case "BOM":
-                expect_count(fields, 1, 1)
-                self._poll_binary(BINARY_OUTPUTS[0] - 1 + _number_of(fields[0]), now_ns)
-            case "WNV":
-                self.registers.save()
-                self._then = now_ns + self._settings.flash_ns, lambda end_ns: answer(at_ns=end_ns)
-            case "SGB":
-                bias = self._settings.gyro_bias.tolist()
-                self.registers.write(43, tuple(f"{value:+010.6f}" for value in bias))
-                answer()
-            case "RFS" | "RST":
-                answer()
-                if sentence.command == "RFS":
-                    self.registers.restore()
-                self._then = now_ns + self._settings.boot_ns, lambda end_ns: self._start(end_ns, 0)
-            case _:
-                raise UnitError(INVALID_COMMAND)
-
-    def _read(self, number: int, now_ns: int) -> tuple[str, ...]:
-        report = REPORT_BY_REGISTER.get(number)
-        if report is not None:
-            return tuple(report.text(self._instant_now(now_ns)))
-        return self.registers.read(number)
-
-    def _write(self, number: int, fields: tuple[str, ...], answer: Callable[..., None], now_ns: int) -> None:
-        if number in REPORT_BY_REGISTER:
-            raise UnitError(UNAUTHORIZED)
-        before = self.registers.read(number)
-        echo = self.registers.write(number, fields[1:])
-        self._streams.muted.discard(number)
-        try:
-            self._build_streams(now_ns)
-        except UnitError:
-            self.registers.set_back(number, before)
-            raise
-        # The answer is sent at the old speed.
-        answer(fields[0], *echo)
-        self._line.baud_rate = self.registers.integer(5)
-
-    def _poll_binary(self, number: int, now_ns: int) -> None:
-        if number not in BINARY_OUTPUTS:
-            raise UnitError(INVALID_PARAMETER)
-        output = binary_output(self.registers.read(number))
-        if output is None:
-            raise UnitError(INVALID_PARAMETER)
-        self._line.write(packer(output)(self._instant_now(now_ns)), now_ns)
+    def _restart(self, now_ns: int) -> None:
+        self._then = now_ns + self._settings.boot_ns, lambda end_ns: self._start(end_ns, 0)
 
     def _start(self, now_ns: int, uptime_ns: int) -> None:
         """Start from the flash, with the unit's clock at `uptime_ns`."""
         self.registers.load()
         self._line.baud_rate = self.registers.integer(5)
         self._sensors.restart()
-        self._received.clear()
+        self._commands.reset()
         self._streams.reset()
-        self._paused = False
-        self._status = 0
         self._origin_ns = now_ns
         self._uptime_ns = uptime_ns
         self._tick = uptime_ns // TICK_NS
         self._build_streams(now_ns)
         self._schedule(now_ns)
-
-
-def _number_of(text: str) -> int:
-    try:
-        return int(text)
-    except ValueError as error:
-        raise UnitError(INVALID_REGISTER) from error
-
-
-def _flag(fields: tuple[str, ...]) -> bool:
-    expect_count(fields, 1, 1)
-    if fields[0] not in {"0", "1"}:
-        raise UnitError(INVALID_PARAMETER)
-    return fields[0] == "1"

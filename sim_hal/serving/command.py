@@ -12,6 +12,7 @@ import msgspec
 
 from flight.gnc.errors import UsageError
 from flight.schema import reader as configuration
+from flight.schema.carried import config_path, names
 from sim_hal.serving.server import DeviceServer
 from sim_hal.settings import Simulation
 
@@ -25,7 +26,13 @@ def add_to(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> Non
         "pseudo-terminal, the I2C bus and the camera on a Unix socket. Prints a JSON object with their names "
         "once they answer. `python -m flight run CONFIG --realtime` starts this by itself.",
     )
-    parser.add_argument("config", type=Path, metavar="CONFIG", help="YAML file with a simulation section")
+    carried = ", ".join(names())
+    parser.add_argument(
+        "config",
+        type=config_path,
+        metavar="CONFIG",
+        help=f"YAML file with a simulation section, or one of {carried}",
+    )
     parser.add_argument("--folder", type=Path, required=True, metavar="DIR", help="where the truth is logged")
     parser.add_argument("--seed", type=int, metavar="N", help="seed of the simulation instead")
     parser.add_argument(
