@@ -1,1 +1,1 @@
-"""Simulated worlds, and emulated devices that answer at the wire."""
+"""Simulated worlds, and devices emulated at the wire."""

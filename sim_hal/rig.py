@@ -1,4 +1,4 @@
-"""The simulator's one door for the flight application: rigs of emulated devices, and the faults in them.
+"""The simulator's only interface to the flight application: rigs of emulated devices, and the faults in them.
 
 In lock-step the devices live beside the loop and advance as it sleeps; in real time they live in a process of
 their own.
@@ -30,7 +30,7 @@ from sim_hal.settings import Simulation
 
 @dataclass(frozen=True, slots=True)
 class SimulationRequest:
-    """What a run asks of the simulator, beside its configuration.
+    """The requests of a run to the simulator, besides its configuration.
 
     Attributes:
         config_path: the configuration's file; `text` its content as it is flown.

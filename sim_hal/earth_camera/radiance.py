@@ -20,7 +20,7 @@ from sim_hal.earth_camera.scene import EarthScene
 Float32Array = npt.NDArray[np.float32]
 
 TOP = 120e3
-"""m: no air is seen above (a millionth of the limb's brightness)."""
+"""m: height above which air is invisible (a millionth of the limb's brightness)."""
 _DARKEST = -0.2
 """Cosine from the zenith of a Sun, 11.5 deg below the horizon, that lights only the air above `TOP`."""
 
@@ -80,7 +80,7 @@ def radiance(scene: EarthScene, rays: FloatArray, sight: Sight) -> Float32Array:
     solar = sunward[lit].astype(np.float32)
     directions = rays[seen]
     upward = np.maximum(-np.einsum("ij,ij->i", directions, normals @ to_earth), 0.0).astype(np.float32)
-    # Light goes on along the Sun's rays when it is scattered by no angle: then it comes from the Sun.
+    # Cosine of the scattering angle: 1, forward, for a line of sight towards the Sun.
     turned = (directions @ (to_earth.T @ sun)).astype(np.float32)
     air, hits = scene.atmosphere, sight.hits[seen]
     bottom = np.exp(-sight.heights[seen] / air.scale_height)

@@ -55,7 +55,7 @@ def add_disc(scene: EarthScene, model: EarthCameraModel, image: Float32Array) ->
     # Squares of chords: the angle's cosine is flat where the disc is.
     share = np.sum((rays - axis) ** 2, axis=1) / (2.0 * math.sin(0.5 * radius)) ** 2
     fine = np.zeros(len(rays))
-    # Where the lens sees nothing the ray is NaN, and no comparison holds.
+    # Outside the lens's field the ray is NaN, and every comparison is false.
     inside = np.flatnonzero(share < 1.0)
     fine[inside] = _darkening(share[inside]) * _transmission(scene, rays[inside])
     fine *= (1.0 - model.scatter) / math.sin(radius) ** 2

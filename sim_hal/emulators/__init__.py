@@ -1,1 +1,1 @@
-"""Devices that answer on the wire: they hold registers and speak packets as the real parts do."""
+"""Emulated devices with the registers and packets of the real parts."""

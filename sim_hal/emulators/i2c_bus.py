@@ -1,4 +1,4 @@
-"""An I2C bus in memory: parts that hold registers, and the faults that a wire can have.
+"""An I2C bus in memory, with emulated parts and the faults of its wires.
 
 A transaction is what smbus2 makes of a call: address, register byte and data, or a repeated start and a read.
 Its duration on the wire (0.6 ms for 24 bytes at 400 kHz) is not modelled; a hang lasts the bus's time-out.
@@ -20,15 +20,15 @@ class I2cPart(Protocol):
         """Return whether the part acknowledges this address (0 is the general call)."""
 
     def write(self, address: int, data: bytes) -> None:
-        """Take the bytes of a write, from the address to the STOP or repeated START."""
+        """Accept the bytes of a write, from the address to the STOP or repeated START."""
 
     def read(self, count: int) -> bytes:
-        """Give bytes from where the register pointer stands."""
+        """Return bytes from the register pointer on."""
 
 
 @dataclass(slots=True)
 class _Fault:
-    """One fault in waiting; `code` 0 is a bit flip, `left` None lasts until `clear_faults`."""
+    """One pending fault; `code` 0 is a bit flip, `left` None lasts until `clear_faults`."""
 
     code: int
     text: str
@@ -49,7 +49,7 @@ class EmulatedI2cBus:
         timeout_ns: int = 20_000_000,
         wait: Callable[[int], None] | None = None,
     ) -> None:
-        """Put parts on a bus; `wait` lets the nanoseconds of a time-out pass, without it none do."""
+        """Connect the parts; `wait` advances time by a time-out's ns, without it no time passes."""
         self._parts = list(parts)
         self._timeout_ns = timeout_ns
         self._wait = wait
@@ -60,17 +60,17 @@ class EmulatedI2cBus:
         self.transactions = 0
 
     def attach(self, part: I2cPart) -> None:
-        """Put one more part on the bus."""
+        """Add a part to the bus."""
         with self._lock:
             self._parts.append(part)
 
     def detach(self, part: I2cPart) -> None:
-        """Take a part off the bus; its address is acknowledged no more."""
+        """Remove a part from the bus; its address is no longer acknowledged."""
         with self._lock:
             self._parts.remove(part)
 
     def put_before(self, part: I2cPart, cover: I2cPart) -> Callable[[], None]:
-        """Let `cover` take the place of a part that is on the bus; return what puts the part back."""
+        """Replace a part on the bus by `cover`; return the function that restores the part."""
         with self._lock:
             self._parts[self._parts.index(part)] = cover
 
@@ -141,7 +141,7 @@ class EmulatedI2cBus:
         )
 
     def lose_arbitration(self, times: int | None = 1) -> Callable[[], None]:
-        """Let another master win."""
+        """Lose the arbitration to another master."""
         return self._add(_Fault(errno.EAGAIN, "arbitration lost", None, times))
 
     def flip_bits(self, address: int, index: int, mask: int, times: int | None = 1) -> Callable[[], None]:
@@ -149,7 +149,7 @@ class EmulatedI2cBus:
         return self._add(_Fault(0, "bits flipped", address, times, index=index, mask=mask))
 
     def clear_faults(self) -> None:
-        """Let the bus be in order again."""
+        """Remove all faults."""
         with self._lock:
             self._faults.clear()
 
@@ -160,7 +160,7 @@ class EmulatedI2cBus:
 
     def _lift(self, fault: _Fault) -> None:
         with self._lock:
-            # By identity: two faults alike are two faults.
+            # By identity: equal faults are distinct.
             self._faults = [other for other in self._faults if other is not fault]
 
     def _read(self, address: int, register: int, count: int) -> bytes:

@@ -1,4 +1,4 @@
-"""An INA219 that holds registers and converts in its own time (TI SBOS448G).
+"""An emulated INA219: registers, and conversions at its own pace (TI SBOS448G).
 
 Each conversion is the mean of the circuit's supply over the conversion window, computed when the bus asks for
 its result. Not modelled: noise, gain error, the input filter.
@@ -73,7 +73,7 @@ class EmulatedIna219:
             self._calibration = (self._calibration ^ 1 << bit) & _CALIBRATION_BITS
 
     def register(self, register: int) -> int:
-        """Return a register's word without any effect of reading it."""
+        """Return a register's word without the side effects of a bus read."""
         if register in self.frozen:
             return self.frozen[register]
         self._convert()
@@ -88,7 +88,7 @@ class EmulatedIna219:
         return address == self.address
 
     def write(self, address: int, data: bytes) -> None:
-        """Take a register pointer, and a word (big-endian) for Config or Calibration."""
+        """Accept a register pointer, and a word (big-endian) for Config or Calibration."""
         self._pointer = data[0]
         if len(data) < 3:
             return
@@ -100,7 +100,7 @@ class EmulatedIna219:
             self._calibration = word & _CALIBRATION_BITS
 
     def read(self, count: int) -> bytes:
-        """Give the pointed-at word, big-endian; beyond it the line floats high."""
+        """Return the word at the register pointer, big-endian; bytes beyond it read 0xFF."""
         word = self.register(self._pointer)
         if self._pointer == POWER:
             self._ready = False
@@ -132,7 +132,7 @@ class EmulatedIna219:
             self._ready = False
 
     def _convert(self) -> None:
-        """Take over the newest conversion that has ended by now: first the shunt, then the bus."""
+        """Accept the newest finished conversion: first the shunt, then the bus."""
         cycle_ns = self._shunt_ns + self._bus_ns
         if cycle_ns == 0:
             return

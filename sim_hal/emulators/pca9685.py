@@ -1,4 +1,4 @@
-"""A PCA9685 that holds registers (NXP data sheet): what the outputs do follows from them alone.
+"""An emulated PCA9685: its registers alone determine its outputs (NXP data sheet).
 
 What the data sheet forbids or leaves open is done in the way that does least, and noted in `violations`.
 Not modelled: oscillator tolerance and the phase of the counter; a change takes effect at the STOP.
@@ -33,12 +33,12 @@ _INVERT = 0x10
 _UPDATE_ON_ACK = 0x08
 _SOFTWARE_RESET = b"\x06"
 _ALL_CHANNELS = (1 << CHANNELS) - 1
-# Where SUBADR1..3 and ALLCALLADR stand, and the MODE1 bit that makes the chip answer there.
+# Registers SUBADR1..3 and ALLCALLADR, and the MODE1 bit that enables each address.
 _EXTRA_ADDRESSES = ((0x02, 0x08), (0x03, 0x04), (0x04, 0x02), (0x05, _ALL_CALL))
 
 
 def _writable_bits() -> bytes:
-    """Return the bits of each register that a write reaches; reserved ones read zero."""
+    """Return the writable bits of each register; reserved bits read zero."""
     bits = bytearray(256)
     bits[MODE1] = 0x7F
     bits[MODE2] = 0x1F
@@ -84,12 +84,12 @@ class EmulatedPca9685:
         self._power_on()
 
     def brown_out(self) -> None:
-        """Let the supply fail for an instant: every register is back at its power-on value."""
+        """Interrupt the supply: every register returns to its power-on value."""
         self._power_on()
         self._stop(_ALL_CHANNELS)
 
     def upset(self, register: int, value: int) -> None:
-        """Let radiation write a register, awake or asleep."""
+        """Overwrite a register, awake or asleep, as radiation does."""
         self._registers[register] = value
         self._find_addresses()
         self._stop(_ALL_CHANNELS)
@@ -99,7 +99,7 @@ class EmulatedPca9685:
         self.upset(register, self._registers[register] ^ 1 << bit & _WRITABLE[register])
 
     def register(self, register: int) -> int:
-        """Return a register's content, as a read of it gives."""
+        """Return a register's content as a bus read returns it."""
         restart = RESTART if register == MODE1 and self._restart else 0
         return self._registers[register] | restart
 
@@ -129,7 +129,7 @@ class EmulatedPca9685:
         return address in self._addresses
 
     def write(self, address: int, data: bytes) -> None:
-        """Take the bytes of one write."""
+        """Accept the bytes of one write."""
         if address == 0:
             if data == _SOFTWARE_RESET:
                 self._power_on()
@@ -153,7 +153,7 @@ class EmulatedPca9685:
         self._stop(written)
 
     def read(self, count: int) -> bytes:
-        """Give bytes from the register pointer on."""
+        """Return bytes from the register pointer on."""
         given = bytearray()
         for _ in range(count):
             given.append(self.register(self._pointer))
@@ -215,7 +215,7 @@ class EmulatedPca9685:
 
     def _store_mode1(self, value: int) -> None:
         before = self._registers[MODE1]
-        # EXTCLK can be set only while asleep, and nothing but a reset clears it.
+        # EXTCLK can be set only while asleep, and only a reset clears it.
         external = before & _EXTERNAL_CLOCK or value & before << 2 & _EXTERNAL_CLOCK
         self._registers[MODE1] = value & ~(RESTART | _EXTERNAL_CLOCK) | external
         if value & SLEEP and not before & SLEEP:

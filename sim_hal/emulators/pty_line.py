@@ -1,4 +1,4 @@
-"""A serial line to anybody: the device end served on a pseudo-terminal, paced in real time at its speed.
+"""A serial line for any client: the device end of a pseudo-terminal, paced in real time at the line's speed.
 
 The other side's speed is read from the terminal, so that the wrong one garbles here as it does on a cable.
 """
@@ -61,7 +61,7 @@ class PtyLine:
         self.to_host.push(data, now_ns, self.baud_rate, self._host_speed())
 
     def read(self, now_ns: int) -> bytes:
-        """Return what has crossed from the host by `now_ns`."""
+        """Return the host's bytes that have crossed by `now_ns`."""
         return b"".join(data for _, data in self.to_device.pull(now_ns))
 
     def next_arrival_ns(self) -> int:
@@ -69,7 +69,7 @@ class PtyLine:
         return self.to_device.next_arrival_ns()
 
     def exchange(self, now_ns: int) -> None:
-        """Take what the host has written, and hand it what has crossed by `now_ns`."""
+        """Accept the host's bytes; deliver the device's that have crossed by `now_ns`."""
         try:
             data = os.read(self._near, 4096)
         except BlockingIOError:
@@ -81,7 +81,7 @@ class PtyLine:
             try:
                 os.write(self._near, crossed)
             except OSError as error:
-                # Nobody reads: the bytes are lost, as on a cable with nothing at its end.
+                # Without a reader the bytes are lost, as on an unconnected cable.
                 if error.errno != errno.EAGAIN:
                     raise
 
@@ -95,7 +95,7 @@ class PtyLine:
         select.select([self._near], [], [], max(0, due_ns - now_ns) * 1e-9)
 
     def close(self) -> None:
-        """Close the terminal and take the link away. Safe to call twice."""
+        """Close the terminal and remove the link. Safe to call twice."""
         if self._near < 0:
             return
         if self._link is not None:
@@ -105,7 +105,7 @@ class PtyLine:
         self._near = self._far = -1
 
     def _host_speed(self) -> int:
-        # A speed without a name (128000) cannot be read back this way: it is taken to be right.
+        # A speed without a name (128000) cannot be read back this way: assume that it is right.
         return _SPEEDS.get(termios.tcgetattr(self._far)[5], self.baud_rate)
 
     def _set_speed(self, baud_rate: int) -> None:

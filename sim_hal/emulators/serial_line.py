@@ -1,4 +1,4 @@
-"""A serial line in memory: bytes take their time to cross, and the wire can be made to fail.
+"""A serial line in memory, with transmission times and wire faults.
 
 Each direction is a `Wire`. The host's end is a `hal.interfaces.wires.SerialPort`, the device's end a
 `sim_hal.emulators.device.SerialEnd`. Deterministic for a given generator.
@@ -84,14 +84,14 @@ class Wire:
         self._messages_sent = 0
 
     def push(self, data: bytes, now_ns: int, sender_baud: int, receiver_baud: int) -> None:
-        """Send bytes, from `now_ns` on or when the wire is free; unlike speeds make noise of them."""
+        """Send bytes, from `now_ns` on or when the wire is free; with unequal speeds they arrive as noise."""
         faults = self.faults
         start_ns = max(now_ns, self._free_ns)
         self._free_ns = start_ns + len(data) * _BITS * _SECOND_NS // sender_baud
         if faults is not SOUND:
             data = self._disturb(data, faults)
             start_ns += faults.delay_ns
-        # A delay that is taken away again lets no byte overtake another.
+        # Bytes keep their order when a delay is removed.
         start_ns = max(start_ns, self._last_ns)
         if data and sender_baud != receiver_baud:
             # A slower receiver sees fewer characters; none of them is what was sent.
@@ -106,11 +106,11 @@ class Wire:
             self._last_ns = message.crossed_ns(len(data))
 
     def noise(self, count: int, now_ns: int, baud_rate: int) -> None:
-        """Put `count` random bytes on the wire that nobody sent."""
+        """Insert `count` random bytes that neither end sent."""
         self.push(self._rng.bytes(count), now_ns, baud_rate, baud_rate)
 
     def pull(self, now_ns: int) -> list[tuple[int, bytes]]:
-        """Return what has crossed by `now_ns`, oldest first: (time of its last byte, bytes) by message."""
+        """Return crossed messages by `now_ns`, oldest first: (time of its last byte, bytes)."""
         chunks: list[tuple[int, bytes]] = []
         while self._messages:
             message = self._messages[0]
@@ -175,7 +175,7 @@ class HostEnd:
         self._now_ns = now_ns
 
     def receive(self) -> list[tuple[int, bytes]]:
-        """Return what has crossed since the last call. Raises NotResponding when the port is gone."""
+        """Return the bytes crossed since the last call. Raises NotResponding when the port is gone."""
         self._check()
         return self._line.to_host.pull(self._now_ns())
 
@@ -189,7 +189,7 @@ class HostEnd:
         self.baud_rate = baud_rate
 
     def close(self) -> None:
-        """Close the port: as good as unplugged."""
+        """Close the port, as unplugging does."""
         self.unplugged = True
 
     def _check(self) -> None:
@@ -209,7 +209,7 @@ class DeviceEnd:
         self._line.to_host.push(data, now_ns, self.baud_rate, self._line.host.baud_rate)
 
     def read(self, now_ns: int) -> bytes:
-        """Return what has crossed from the host by `now_ns`."""
+        """Return the host's bytes that have crossed by `now_ns`."""
         return b"".join(data for _, data in self._line.to_device.pull(now_ns))
 
     def next_arrival_ns(self) -> int:

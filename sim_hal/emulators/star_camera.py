@@ -1,4 +1,4 @@
-"""A star camera that exposes while the body really moves, and delivers its frame after a read-out.
+"""A star camera that exposes along the body's true motion and delivers its frame after the read-out.
 
 While an exposure lasts the attitude is sampled every 10 ms; the renderer then integrates the stars' light
 along it. `expose` gives a future, so that in real time a frame is made beside the devices that keep time.
@@ -22,7 +22,7 @@ from sim_hal.worlds.motion import Motion
 SAMPLE_NS = 10_000_000
 
 Expose = Callable[[int, FloatArray, FloatArray], "Future[Image]"]
-"""Takes the frame's number, times (k,) s from the start and camera attitudes (k, 4); promises an image."""
+"""Renders frame number, times (k,) s from the start and camera attitudes (k, 4) into a future image."""
 
 
 @dataclass(slots=True)

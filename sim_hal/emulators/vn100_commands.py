@@ -1,7 +1,4 @@
-"""The commands of an emulated VN-100: reads sentences from the line, executes and answers them.
-
-Commands, answers and error codes: VectorNav UM001 v2.43 ch. 4 and 5.
-"""
+"""The commands of an emulated VN-100: reads sentences from the line, executes and answers them."""
 
 from __future__ import annotations
 

@@ -197,7 +197,7 @@ REPORT_BY_REGISTER = {report.register: report for report in REPORTS if report.re
 
 _LEVEL = Measured(np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), np.zeros(3), -GRAVITY_NED)
 STILL = Instant(0, _LEVEL, 0, 0.025, 20.0, 101.325)
-"""A unit level and at rest: says how long each sentence is."""
+"""A level unit at rest, from which sentence lengths are computed."""
 
 SENTENCE_FRAME = len("$VN") + len("*XX\r\n")
 

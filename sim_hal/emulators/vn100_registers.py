@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from hal.drivers.vn100.codec import Layout, layout_of
 
 Rule = Callable[[str], str]
-"""Returns the text as the unit keeps it; raises ValueError when it does not take it."""
+"""Returns the text as the unit stores it; raises ValueError for an invalid text."""
 
 BAUD_RATES = (9600, 19200, 38400, 57600, 115200, 128000, 230400, 460800, 921600)
 ASYNC_RATES_HZ = (1, 2, 4, 5, 10, 20, 25, 40, 50, 100, 200)
@@ -49,7 +49,7 @@ class Register:
     port_option: bool = False
 
     def checked(self, fields: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the fields as the unit keeps them. Raises UnitError."""
+        """Return the fields as the unit stores them. Raises UnitError."""
         if not self.writable:
             raise UnitError(UNAUTHORIZED)
         expect_count(fields, len(self.rules), len(self.rules) + self.port_option)
@@ -62,7 +62,7 @@ class Register:
 
 
 def expect_count(fields: tuple[str, ...], least: int, most: int) -> None:
-    """Raise UnitError when there are fewer or more fields than that."""
+    """Raise UnitError when the number of fields is out of range."""
     if len(fields) < least:
         raise UnitError(TOO_FEW)
     if len(fields) > most:
@@ -148,13 +148,13 @@ REGISTERS: Mapping[int, Register] = {
 _OFF = ("0", "0", "00")
 
 FIELD_BITS = 16
-"""Of each field of a register that bits are flipped in."""
+"""Width of each field of the registers in which bits are flipped."""
 _BASE_10 = 2  # fields of a binary output; the others are hexadecimal
 
 
 @dataclass(frozen=True, slots=True)
 class BinaryOutput:
-    """An output set of registers 75 to 77: which serial ports, every how many 800 Hz ticks, which packet."""
+    """An output set of registers 75 to 77: serial ports, period in 800 Hz ticks, and packet."""
 
     ports: int
     divisor: int
@@ -205,7 +205,7 @@ class RegisterFile:
         return int(self._values[number][index])
 
     def write(self, number: int, fields: tuple[str, ...]) -> tuple[str, ...]:
-        """Keep a register's new fields; return what the unit echoes. Raises UnitError."""
+        """Store a register's new fields; return the unit's echo. Raises UnitError."""
         if number in BINARY_OUTPUTS:
             binary_output(fields)
             words = (f"{int(text, 16):04X}" for text in fields[3:])
@@ -241,7 +241,7 @@ class RegisterFile:
             REGISTERS[number].checked(self._values[number])
 
     def set_back(self, number: int, fields: tuple[str, ...]) -> None:
-        """Put a register back to fields that it had."""
+        """Restore a register's earlier fields."""
         self._values[number] = fields
 
     def save(self) -> None:
@@ -249,9 +249,9 @@ class RegisterFile:
         self._flash = dict(self._values)
 
     def restore(self) -> None:
-        """Write the factory's settings to flash."""
+        """Write the factory settings to flash."""
         self._flash = dict(self._defaults)
 
     def load(self) -> None:
-        """Take all from flash, as a start does."""
+        """Load all from flash, as at power-on."""
         self._values = dict(self._flash)

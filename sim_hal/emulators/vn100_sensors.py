@@ -28,7 +28,7 @@ ProfileName = Literal["thesis", "datasheet", "none"]
 
 @dataclass(frozen=True, slots=True)
 class NoiseProfile:
-    """Bounds of uniform noise, densities of white noise, and errors that stay from start to start.
+    """Bounds of uniform noise, densities of white noise, and errors constant until the next start.
 
     Attributes:
         attitude_bound: of each component of the vector part of a small rotation in body axes.
@@ -121,7 +121,7 @@ class Sensors:
         self._bias = gyro_bias
 
     def restart(self) -> None:
-        """Draw the errors that stay from one start to the next."""
+        """Draw the errors that are constant until the next start."""
         draws = self._rng.standard_normal(6)
         self._bias = self._fixed_bias + self._profile.gyro_bias * draws[:3]
         static = np.array(self._profile.static_attitude)

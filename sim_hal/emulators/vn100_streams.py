@@ -43,12 +43,12 @@ class OutputStreams:
         self.muted: set[int] = set()
 
     def reset(self) -> None:
-        """Forget all streams."""
+        """Remove all streams."""
         self._streams = {}
         self.muted.clear()
 
     def build(self, device_ns: int) -> None:
-        """Follow the registers. Raises UnitError, and changes nothing, where the line is too slow."""
+        """Rebuild the streams from the registers. Raises UnitError, unchanged, when the line is too slow."""
         registers = self._registers
         streams: dict[int, Stream] = {}
         report = REPORT_BY_TYPE.get(registers.integer(6))
@@ -78,7 +78,7 @@ class OutputStreams:
         return [stream for stream in self._streams.values() if tick % stream.divisor == 0]
 
     def checksum(self) -> Checksum:
-        """Return the checksum that register 30 asks for."""
+        """Return the checksum that register 30 selects."""
         return "crc16" if self._registers.integer(30, 4) == 3 else "xor8"
 
     def _suffix(self, status: int) -> str:

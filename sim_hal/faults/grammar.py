@@ -1,4 +1,4 @@
-"""How faults are written: `DEVICE: KIND [(NAME=VALUE, ...)] [@ SECONDS] [for SECONDS]`.
+"""The grammar of faults: `DEVICE: KIND [(NAME=VALUE, ...)] [@ SECONDS] [for SECONDS]`.
 
 Seconds are of mission time. Without `@` a fault begins at 0, without `for` it lasts to the end. In the
 `simulation` section of a configuration the same stands as `{fault: 'imu: silent', at: 120, for: 5}`.
@@ -30,7 +30,7 @@ _FAULT = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class ScheduledFault:
-    """A fault and when: from `at` s of mission time for `span` s, None to the end."""
+    """A fault and its time: from `at` s of mission time for `span` s, None to the end."""
 
     kind: FaultKind
     at: float
@@ -45,7 +45,7 @@ class ScheduledFault:
         return math.inf if self.span is None else self.at + self.span
 
     def __str__(self) -> str:
-        """Return it as it is written."""
+        """Return the fault as a user writes it."""
         given = ", ".join(f"{name}={value:g}" for name, value in self.parameters.items())
         lasts = "" if self.span is None else f" for {self.span:g}"
         return f"{self.kind.name}{f' ({given})' if given else ''} @ {self.at:g}{lasts}"

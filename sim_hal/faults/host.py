@@ -33,7 +33,7 @@ class HostFaults:
         self._epoch_ns: int | None = None
 
     def begin(self, epoch_ns: int) -> None:
-        """Take this as mission time zero."""
+        """Set mission time zero."""
         self._epoch_ns = epoch_ns
 
     def active(self, device: str) -> ScheduledFault | None:

@@ -40,7 +40,7 @@ def perform(task: Task) -> Any:
 
 
 def without_numbers(value: Any) -> Any:
-    """Return a value with every float in it NaN."""
+    """Return a value with every float replaced by NaN."""
     if isinstance(value, float):
         return float("nan")
     if isinstance(value, np.ndarray) and value.dtype.kind == "f":

@@ -53,7 +53,7 @@ class Parameter:
 
 
 def _runs(values: Sequence[float]) -> list[str]:
-    """Return values in words, three and more in a row by their ends."""
+    """Return values in words; three or more consecutive values as a range."""
     runs: list[list[float]] = []
     for value in values:
         if runs and value == runs[-1][-1] + 1.0:
@@ -103,10 +103,10 @@ class FaultKind:
 
     @property
     def name(self) -> str:
-        """How it is written."""
+        """The fault as a user writes it."""
         return f"{self.device}: {self.kind}"
 
     @property
     def thing(self) -> str:
-        """What it acts on: a coil and its bridge count as one, since they share one condition."""
+        """The affected part; a coil and its bridge count as one, since they share one condition."""
         return self.device.replace("bridge-", "coil-")

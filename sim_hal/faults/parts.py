@@ -34,14 +34,14 @@ class DisturbedPart:
         return self._part.answers(address)
 
     def write(self, address: int, data: bytes) -> None:
-        """Take a write; a register pointer alone is never altered."""
+        """Accept a write; a register pointer alone is never altered."""
         if len(data) == 1:
             self._part.write(address, data)
         else:
             self._written(address, data)
 
     def read(self, count: int) -> bytes:
-        """Give bytes."""
+        """Return altered bytes."""
         return self._read(self._part.read(count))
 
 

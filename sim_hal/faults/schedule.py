@@ -12,11 +12,11 @@ from sim_hal.faults.kinds import Where
 from sim_hal.settings import FaultEntry
 
 _SECTIONS = {"camera": "camera", "vision": "camera", "monitor": "power_monitor"}
-"""Which section of a configuration a device flies by, where it can be left out."""
+"""The optional configuration section of each device that can be absent."""
 
 
 def scheduled(entries: Sequence[FaultEntry], realtime: bool) -> tuple[ScheduledFault, ...]:
-    """Read a section's faults for this kind of simulation. Raises UsageError for one that cannot occur."""
+    """Read a section's faults for this kind of simulation. Raises UsageError for an impossible fault."""
     faults = schedule(entries)
     for fault in faults:
         if fault.kind.where is Where.REALTIME and not realtime:
@@ -28,7 +28,7 @@ def scheduled(entries: Sequence[FaultEntry], realtime: bool) -> tuple[ScheduledF
 
 
 def check(entries: Sequence[FaultEntry], config: Config, realtime: bool) -> tuple[ScheduledFault, ...]:
-    """Read the faults of a flight of `config`. Raises UsageError for one that would have no effect in it."""
+    """Read the faults of a flight of `config`. Raises UsageError for a fault without effect."""
     faults = scheduled(entries, realtime)
     for fault in faults:
         if fault.at >= config.duration:
@@ -79,5 +79,5 @@ def _put(fault: ScheduledFault, bench: Bench, epoch_ns: int) -> None:
     begin_ns = epoch_ns + round(fault.at * 1e9)
     timeline.at(begin_ns, lambda: lifts.append(begin(bench, fault.parameters)))
     if fault.span is not None and not fault.kind.momentary:
-        # The lift exists only once the fault has begun.
+        # The function that removes the fault exists only after the fault has begun.
         timeline.at(begin_ns + round(fault.span * 1e9), lambda: lifts.pop()())  # noqa: PLW0108 - see above

@@ -14,7 +14,7 @@ _SET_UP = (MODE1, MODE2, PRE_SCALE)
 _OUTPUTS = tuple(range(LED0_ON_L, LED0_ON_L + 4 * CHANNELS))
 _MONITOR = (CONFIG, CALIBRATION)
 _UNIT = (6, 7, 75)
-"""Which sentence, how often, and which packet: of these the unit's stream is made."""
+"""The registers of the unit's stream: sentence, its rate, and packet."""
 _MOST_FIELDS = 11  # of register 75: ports, divisor, groups and a word for each of eight groups
 
 
@@ -23,7 +23,7 @@ def _one_of(bench: Bench, given: Parameters, name: str, values: Sequence[int]) -
 
 
 def _pwm(bench: Bench, given: Parameters) -> Lift:
-    # Even draws of all registers would seldom meet the three that the set-up is made of.
+    # Uniform draws over all registers would seldom reach the three that configure the stream.
     among = _SET_UP if bench.generator.random() < 0.5 else _OUTPUTS
     register = _one_of(bench, given, "register", among)
     bench.hardware.pwm.flip(register, _one_of(bench, given, "bit", range(8)))

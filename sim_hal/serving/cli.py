@@ -43,7 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m sim_hal", description="Devices that answer on the wire.")
+    parser = argparse.ArgumentParser(prog="python -m sim_hal", description="Emulated devices for any client.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     emulate = commands.add_parser("emulate", help="serve one emulated device", description="Serve a device.")
     devices = emulate.add_subparsers(required=True, metavar="DEVICE")
@@ -99,7 +99,9 @@ def _emulate_vn100(options: argparse.Namespace) -> int:
     clock = SystemClock()
     rng = np.random.default_rng(options.seed)
     if options.link is not None and options.link.exists() and not options.link.is_symlink():
-        sys.stderr.write(f"sim_hal: --link {options.link} is there and no symbolic link: name another\n")
+        sys.stderr.write(
+            f"sim_hal: --link {options.link} exists and is not a symbolic link: choose another path\n"
+        )
         return 2
     try:
         line = PtyLine(options.baud, rng, options.link)

@@ -66,7 +66,7 @@ class Link:
         return number
 
     def pending(self) -> bool:
-        """Return whether a message waits, so that `receive` returns at once."""
+        """Return whether `receive` would return at once."""
         return bool(self._messages)
 
     def receive(self) -> list[Any]:

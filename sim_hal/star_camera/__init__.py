@@ -1,4 +1,4 @@
-"""The star camera's image model: chapter 2 of Sease 2013, corrected, with the attitude that was really had.
+"""The star camera's image model: chapter 2 of Sease 2013, corrected, along the true attitude.
 
     model = StarCameraModel(field_of_view=np.radians(20.0))
     stars = catalogue.load()

@@ -16,7 +16,7 @@ from hal.interfaces.errors import OutOfRange
 
 DEVICE = "star camera model"
 GREATEST_TURN = 0.5 * np.pi
-"""Between two samples, rad. Beyond pi the shorter way round would be the wrong way."""
+"""Between two samples, rad. Beyond pi the shorter rotation would be the wrong one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,7 +54,7 @@ class AttitudeHistory:
         return float(self.times[-1] - self.times[0])
 
     def at(self, times: FloatArray) -> FloatArray:
-        """Return the attitudes (m, 4) at `times` (m,); beyond an end the turn there goes on."""
+        """Return the attitudes (m, 4) at `times` (m,); extrapolated beyond the ends."""
         return _interpolate(self.times, self.quaternions, times)
 
     def matrices_at(self, times: FloatArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""What the detector makes of the light: noise, saturation, counts (Sease 2.10, 2.11, text after them)."""
+"""The detector's response to light: noise, saturation, counts (Sease 2.10, 2.11, text after them)."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ class Span:
 
     @property
     def durations(self) -> FloatArray:
-        """How long each sample (m,) stands for, s."""
+        """The time that each sample (m,) represents, s."""
         return self.weights * (self.ends - self.starts)
 
 
@@ -163,7 +163,7 @@ def _add_whole(image: Float32Array, patches: Float32Array, origin: IntArray) -> 
 
 
 def _add_cut(image: Float32Array, patches: Float32Array, origin: IntArray) -> None:
-    """Add what of `patches` lies on `image`; arguments as for `_add_whole`."""
+    """Add the part of `patches` on `image`; arguments as for `_add_whole`."""
     rows, columns = image.shape
     size = patches.shape[1]
     for patch, (left, top) in zip(patches, origin.tolist(), strict=True):

@@ -51,7 +51,7 @@ class SourceTrack:
         object.__setattr__(self, "directions", directions)
 
     def directions_at(self, times: FloatArray) -> FloatArray:
-        """Return unit vectors (m, 3) at `times` (m,); beyond an end the motion there goes on."""
+        """Return unit vectors (m, 3) at `times` (m,); extrapolated beyond the ends."""
         before = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 2)
         share = (times - self.times[before]) / (self.times[before + 1] - self.times[before])
         start, end = self.directions[before], self.directions[before + 1]
@@ -88,7 +88,7 @@ def render(
     rng: np.random.Generator,
     extra: Sequence[SourceTrack] = (),
 ) -> Image:
-    """Return the frame (rows, columns) that the camera gives: uint8 to 8 bits, uint16 above.
+    """Return the camera's frame (rows, columns): uint8 to 8 bits, uint16 above.
 
     Arguments as for `expected_electrons`; all noise is drawn from `rng`.
     """

@@ -1,4 +1,4 @@
-"""The numbers of a star camera, and what follows from them alone."""
+"""The parameters of a star camera, and the quantities derived from them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ DEVICE = "star camera model"
 HotPixel = tuple[int, int, float]
 """Column, row, and its dark current above its neighbours', e-/s."""
 
-# Each number's least and greatest value and its unit.
+# Minimum, maximum and unit of each parameter.
 _LIMITS: dict[str, tuple[float, float, str]] = {
     "columns": (1, 16_384, "px"),
     "rows": (1, 16_384, "px"),

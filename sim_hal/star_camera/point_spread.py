@@ -1,4 +1,4 @@
-"""How the light of a point falls on the pixels around it: a product of one profile across and one down."""
+"""Separable point spread functions: a horizontal profile times a vertical one."""
 
 from __future__ import annotations
 
@@ -96,5 +96,5 @@ def _table(spread: PointSpread, size: int) -> Float32Array:
     """Return the shares (size * STEPS + 2, size) of points at 0, 1/STEPS, ... along the line of pixels."""
     positions = np.arange(size * STEPS + 2) / STEPS
     table = spread.profile(np.arange(size) - positions[:, None])
-    # What falls beyond the reach goes back to the pixels, so that no light is lost.
+    # Normalised, so that the light beyond the reach is not lost.
     return np.asarray(table / table.sum(axis=1, keepdims=True), dtype=np.float32)

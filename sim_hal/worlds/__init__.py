@@ -1,1 +1,1 @@
-"""The physical world that the devices act on and feel."""
+"""The physical world that the devices measure and act on."""

@@ -131,7 +131,7 @@ class CoilCircuit:
             case _:
                 pass
         if enable is None:
-            # The part that both have in common drops out of the difference: it brakes.
+            # While both legs are high the coil is shorted, which brakes and does not drive.
             return a[1] - b[1]
         gate = high(enable)
         return common_counts(a, gate) - common_counts(b, gate)

@@ -146,7 +146,7 @@ def observable(scenario: Scenario, index: int, times: FloatArray) -> BoolArray:
     position = scenario.objects[index].orbit.positions_at(times)
     attitudes = scenario.attitude(times)
     good = in_field(scenario.pinhole, attitudes, directions(camera, position))
-    # Few of the times pass; the rest is asked of those alone.
+    # Few times pass; only those are tested further.
     left = np.flatnonzero(good)
     camera, position, boresight = camera[left], position[left], boresights(attitudes[left])
     sun_position = sun.position(scenario.epoch + np.asarray(times)[left] / DAY)

@@ -22,7 +22,7 @@ WORLDS = {"testbed": "sim_hal.worlds.testbed:make"}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WorldTruth:
-    """What the truth log records beside the motion.
+    """The quantities in the truth log besides the motion.
 
     Attributes:
         current: (3,) A, mean currents that acted on the body.
@@ -43,18 +43,18 @@ class World(Protocol):
         """Release the body at `time_ns`, now or later; until then it is held still."""
 
     def advance_to(self, time_ns: int) -> None:
-        """Carry the state to `time_ns` under the present currents."""
+        """Advance the state to `time_ns` under the present currents."""
 
     def motion(self, time_ns: int) -> Motion:
         """Return attitude, rate, field and specific force at `time_ns`, which is never before the state."""
 
     def truth(self) -> WorldTruth:
-        """Return currents and energies of the state as it is."""
+        """Return currents and energies of the present state."""
 
 
 @dataclass(frozen=True, slots=True)
 class WorldInputs:
-    """What a world is made from.
+    """The inputs of a world.
 
     Attributes:
         config: the flight configuration, for values that `section` leaves out.

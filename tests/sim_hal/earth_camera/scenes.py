@@ -23,7 +23,7 @@ DAY, NIGHT = 0.1, -0.1
 """Solar cosines beyond which a limb point is plainly lit, and plainly not."""
 _MOST_DRAWS = 20_000
 _LEAST_POINTS = 60
-"""Of 720 all round the Earth: so many must be on the detector for the horizon to count as in view."""
+"""Points, of 720 around the Earth, that must be on the detector for the horizon to be in view."""
 
 
 def random_direction(generator: np.random.Generator) -> FloatArray:

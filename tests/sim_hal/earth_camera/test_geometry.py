@@ -45,7 +45,7 @@ def test_over_the_equator_the_limb_is_nearer_to_nadir_towards_the_poles() -> Non
     assert angles[2:] == pytest.approx(np.arcsin(SEMI_MAJOR_AXIS / distance), abs=1e-12)
     towards_poles = np.arctan(SEMI_MINOR_AXIS / np.sqrt(distance**2 - SEMI_MAJOR_AXIS**2))
     assert angles[:2] == pytest.approx(towards_poles, abs=1e-12)
-    # A sphere would be wrong by three times what is asked of a nadir sensor.
+    # The error of a sphere is three times a nadir sensor's required accuracy.
     assert np.degrees(angles[3] - angles[0]) > 0.06
 
 

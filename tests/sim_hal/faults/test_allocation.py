@@ -17,7 +17,7 @@ vectors = st.tuples(*[st.floats(-1.0, 1.0)] * 3).map(np.array).filter(lambda v: 
 
 
 def torque_of(currents: FloatArray, field: FloatArray) -> FloatArray:
-    """Return m x B, independently of what is tested."""
+    """Return m x B, independently of the code under test."""
     made: FloatArray = np.cross(DIPOLE * currents, field)
     return made
 

@@ -54,14 +54,14 @@ def errors_under(fault: str) -> tuple[list[tuple[float, str]], float]:
 )
 def test_a_chip_that_fails_is_told_within_half_a_second_and_obeys_again_after(fault: str, word: str) -> None:
     seen, miss = errors_under(fault)
-    told = [(time, error) for time, error in seen if error]
-    assert 2.0 <= told[0][0] <= 2.6
-    assert any(word in error for _, error in told)
-    assert all(time < 4.5 for time, _ in told), "good again within half a second of the fault's end"
+    reports = [(time, error) for time, error in seen if error]
+    assert 2.0 <= reports[0][0] <= 2.6
+    assert any(word in error for _, error in reports)
+    assert all(time < 4.5 for time, _ in reports), "good again within half a second of the fault's end"
     assert miss < 4e-3
     if "for" in fault and "garbage" not in fault:
         lasting = [bool(error) for time, error in seen if 2.6 < time < 3.9]
-        assert all(lasting), "told as long as it lasts"
+        assert all(lasting), "reported while the fault lasts"
 
 
 def test_a_sound_chip_is_never_complained_of() -> None:

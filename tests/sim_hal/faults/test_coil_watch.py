@@ -229,7 +229,7 @@ def test_a_gap_in_the_readings_begins_the_watch_anew() -> None:
     watch.interrupted(0)
     assert not is_suspicious()
     feed(4.0, 4.5, 0.0)
-    assert not is_suspicious(), "these may tell of the time before"
+    assert not is_suspicious(), "readings from before the interruption do not count"
     feed(4.5, 9.0, 0.0)
     assert [verdict.axis for verdict in watch.verdicts] == [0]
     watch.forget(0)

@@ -82,7 +82,7 @@ def test_a_bit_that_does_not_exist_stays_zero() -> None:
     chip.flip(MODE2, 7)
     assert chip.register(MODE2) == 0x04
     chip.flip(MODE1, 0)
-    assert not chip.answers(0x70), "ALLCALL is one that does"
+    assert not chip.answers(0x70), "the ALLCALL bit exists"
 
 
 @pytest.mark.parametrize("bit", [bit for bit in range(16) if bit != 14])

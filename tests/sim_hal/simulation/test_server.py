@@ -13,7 +13,7 @@ from sim_hal.serving.server import DeviceServer
 
 
 class IdlePool:
-    """A pool whose process is busy: what is submitted waits."""
+    """A pool whose process is busy: submitted jobs wait."""
 
     def submit(self, *_: Any) -> Future[Any]:
         return Future()
