@@ -1,6 +1,7 @@
 """Which lines of `flight/` outside `gnc` the flights reach, measured by coverage.py in every process.
 
-The flights: the step demonstration's first 110 s in lock-step (two targets); 12 s of it in real time with
+The flights: the step demonstration's first 110 s in lock-step (two targets); the first 30 s as
+the thesis flies it; 12 s of the demonstration in real time with
 workers, guardian and devices in processes of their own; two runs into one archive, as the service flies
 them, with a kept state and a time line of commands; and the five fault flights of
 `tests.studies.same_bytes`. A line is a statement as coverage.py counts them.
@@ -20,6 +21,7 @@ from tests.studies.same_bytes.flights import FLIGHTS, Flight
 
 FLOWN: tuple[tuple[Flight, tuple[str, ...]], ...] = (
     (Flight("demo", "config/step_demo.yaml", 110), ()),
+    (Flight("thesis", "config/step_thesis.yaml", 30), ()),
     (Flight("realtime", "config/step_demo.yaml", 12), ("--realtime",)),
     *((flight, ()) for flight in FLIGHTS if flight.faults),
 )
