@@ -48,7 +48,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Take the frames; exit status 1 when the camera is frozen."""
-    from flight.app.lone_camera import opened_camera  # noqa: PLC0415 - no other command needs devices
+    from ground.lone_camera import opened_camera  # noqa: PLC0415 - no other command needs devices
 
     if options.count < 1:
         raise UsageError(f"--count {options.count}: give a number of frames, 1 or more")

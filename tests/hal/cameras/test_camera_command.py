@@ -36,7 +36,7 @@ def camera(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> IoctlCamera:
     clock = ManualClock()
     kernel = kernel_in(tmp_path, clock, monkeypatch)
     kernel.sizes = {"GREY": (64, 64), "Y10": (64, 64)}
-    monkeypatch.setattr("flight.app.lone_camera.SystemClock", lambda: clock)
+    monkeypatch.setattr("ground.lone_camera.SystemClock", lambda: clock)
     return kernel
 
 
