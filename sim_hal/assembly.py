@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,7 +16,7 @@ import numpy as np
 from flight.gnc.catalogue import load
 from flight.gnc.math.arrays import FloatArray, Image
 from flight.schema.sections import Camera, Config
-from hal.drivers.coil_settings import CoilSettings, CoilWiring
+from hal.drivers.coil_settings import CoilSettings, wirings
 from sim_hal.emulators.device import EmulatedDevice, SerialEnd
 from sim_hal.emulators.i2c_bus import EmulatedI2cBus
 from sim_hal.emulators.ina219 import EmulatedIna219
@@ -217,15 +216,6 @@ def inline_exposure(renderer: StarRenderer) -> Expose:
 
 def _coil_settings(config: Config, resistance: tuple[float, float, float], supply: float) -> CoilSettings:
     """Return the true coil settings."""
-    wiring = partial(_wiring, config, resistance)
-    return CoilSettings(
-        (wiring(0), wiring(1), wiring(2)),
-        supply_voltage=supply,
-        current_limit=config.coils.current_limit,
-    )
-
-
-def _wiring(config: Config, resistance: tuple[float, float, float], axis: int) -> CoilWiring:
-    a, b = config.coils.channels[axis]
-    enable = config.coils.enable_channels[axis] if config.coils.enable_channels else None
-    return CoilWiring(a, b, resistance[axis], config.coils.signs[axis], enable)
+    coils = config.coils
+    wired = wirings(coils.channels, resistance, coils.signs, coils.enable_channels)
+    return CoilSettings(wired, supply, coils.current_limit, coils.stale_after)

@@ -11,12 +11,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-Positive = Annotated[float, Meta(gt=0.0)]
-NotNegative = Annotated[float, Meta(ge=0.0)]
-
-
-class Section(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
-    """One section; unknown keys are refused."""
+from flight.schema.sections import NotNegative, Positive, Section
 
 
 class Release(Section, frozen=True, kw_only=True):

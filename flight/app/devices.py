@@ -10,7 +10,7 @@ from flight.gnc.math.frames import NED_TO_TESTBED, attitude_map
 from flight.gnc.math.quaternion import attitude_matrix
 from flight.loop.services import Devices
 from flight.schema.sections import Config
-from hal.drivers.coil_settings import CoilSettings, CoilWiring
+from hal.drivers.coil_settings import CoilSettings, wirings
 from hal.drivers.coils import PwmTorqueCoils
 from hal.drivers.ina219 import Ina219
 from hal.drivers.pca9685 import Pca9685
@@ -47,14 +47,8 @@ def open_devices(config: Config, rig: Rig, stack: ExitStack, patient: bool) -> D
 def coil_settings(config: Config) -> CoilSettings:
     """Return the settings of the coil driver."""
     coils = config.coils
-    enables = coils.enable_channels or (None, None, None)
-    x, y, z = (
-        CoilWiring(pair[0], pair[1], resistance, sign, enable)
-        for pair, resistance, sign, enable in zip(
-            coils.channels, coils.resistance, coils.signs, enables, strict=True
-        )
-    )
-    return CoilSettings((x, y, z), coils.supply_voltage, coils.current_limit, coils.stale_after)
+    wired = wirings(coils.channels, coils.resistance, coils.signs, coils.enable_channels)
+    return CoilSettings(wired, coils.supply_voltage, coils.current_limit, coils.stale_after)
 
 
 def unit_settings(config: Config) -> Vn100Settings:

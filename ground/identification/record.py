@@ -67,7 +67,7 @@ class Record:
     field: FieldMeasurement | None
 
 
-def read_record(run: Run, stale_after: float = 0.25) -> Record:
+def read_record(run: Run, stale_after: float) -> Record:
     """Return the record of a run.
 
     Without commands for `stale_after` s the driver lets the coils fall to zero. Raises UsageError for a run

@@ -61,7 +61,7 @@ class AravisSettings:
     rows: int
     pixel_format: str
     exposure_ns: int
-    gain: float | None = None
+    gain: float | None
     buffers: int = 4
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from hal.drivers.pca9685 import BLOCK_CHANNELS, CHANNELS
@@ -42,9 +43,27 @@ class CoilWiring:
         return (self.channel_a, self.channel_b, *enable)
 
 
+Wirings = tuple[CoilWiring, CoilWiring, CoilWiring]
+
+
+def wirings(
+    channels: Sequence[tuple[int, int]],
+    resistance: Sequence[float],
+    signs: Sequence[int],
+    enable_channels: Sequence[int] | None,
+) -> Wirings:
+    """Return the wiring of the three coils from three values of each kind. Raises OutOfRange."""
+    enables = enable_channels or (None, None, None)
+    x, y, z = (
+        CoilWiring(a, b, ohm, sign, enable)
+        for (a, b), ohm, sign, enable in zip(channels, resistance, signs, enables, strict=True)
+    )
+    return x, y, z
+
+
 @dataclass(frozen=True, slots=True)
 class CoilSettings:
-    """Wiring and drive of the three coils; the defaults are those of the thesis (Sease 2013 ch. 5).
+    """Wiring and drive of the three coils.
 
     Attributes:
         coils: wiring of the coils on body x, y, z.
@@ -56,10 +75,10 @@ class CoilSettings:
         retry_wait: s between them.
     """
 
-    coils: tuple[CoilWiring, CoilWiring, CoilWiring]
-    supply_voltage: float = 3.4
-    current_limit: float = 0.148
-    stale_after: float = 0.25
+    coils: Wirings
+    supply_voltage: float
+    current_limit: float
+    stale_after: float
     tries: int = 3
     retry_wait: float = 0.002
 

@@ -46,9 +46,9 @@ class V4l2Settings:
     rows: int
     pixel_format: str
     exposure_ns: int
-    gain: int | None = None
-    stamp: Stamp = Stamp.TOLD
-    stamp_delay_ns: int = 0
+    gain: int | None
+    stamp: Stamp
+    stamp_delay_ns: int
     settling: int = 2
     buffers: int = 4
 

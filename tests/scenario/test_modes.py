@@ -291,7 +291,9 @@ def keeper_of(folder: Path) -> StateKeeper:
     """Return the state of a boot in `folder`, begun."""
     folder.mkdir(exist_ok=True)
     notices = Notices()
-    return StateKeeper(StateStore(folder, notices.report), notices, SimClock(), window=600.0)
+    return StateKeeper(
+        StateStore(folder, notices.report), notices, SimClock(), window=600.0, period_ns=10_000_000_000
+    )
 
 
 def test_every_mode_is_reached_by_command_and_the_demonstration_goes_on_where_it_is_due(

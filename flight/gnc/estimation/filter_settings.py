@@ -17,7 +17,7 @@ _UNKNOWN_FOR = 1.0
 """s: an unknown current is modelled as white noise with the same effect over this time."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FilterSettings:
     """Noise and limits of the filter.
 
@@ -47,18 +47,18 @@ class FilterSettings:
     disturbance_walk: float
     disturbance_start: float = 0.02
     bias_walk: float = 1e-7
-    bias_start: float = 1e-3
-    torsion_start: float = 0.0
-    damping_start: float = 0.0
-    gain_start: float = 0.0
-    latency_start: float = 0.0
-    latency_walk: float = 0.0
+    bias_start: float
+    torsion_start: float
+    damping_start: float
+    gain_start: float
+    latency_start: float
+    latency_walk: float
     field_bias_start: float = 0.0
     field_bias_walk: float = 0.0
     rate_walk: float = 0.0
     unknown_current: float = 0.0
-    gate_sigma: float = 5.0
-    history_ns: int = 6_000_000_000
+    gate_sigma: float
+    history_ns: int
     longest_step: float = LONGEST_STEP
 
     def gates(self) -> dict[int, float]:

@@ -19,7 +19,6 @@ from flight.loop.state.history import BootRecord
 from flight.loop.state.store import StateStore
 from hal.interfaces.wires import Clock
 
-PERIOD_NS = 10_000_000_000
 _HUNG_DISK_S = 5.0
 _NOTICES = 64
 
@@ -55,7 +54,7 @@ class StateKeeper:
         *,
         window: float,
         devices: str = "",
-        period_ns: int = PERIOD_NS,
+        period_ns: int,
     ) -> None:
         """Load the state, count this boot and store it as running.
 

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
-
-import numpy as np
 
 from hal.drivers.vn100.codec import layout_of
 from hal.interfaces.errors import OutOfRange, Refused
@@ -23,7 +21,7 @@ _QMR_LENGTH = 137  # with a CRC16
 _LINE_LOAD_LIMIT = 0.8  # the rest is left for answers
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Vn100Settings:
     """Mounting and output of the unit.
 
@@ -34,7 +32,7 @@ class Vn100Settings:
         output: binary packets, or ASCII VNQMR lines (which carry no device time).
         unit_port: the unit's own serial port that the cable is on, 1 or 2.
         rate_range, field_range, acceleration_range: rad/s, T, m/s^2, per axis; samples beyond are
-            rejected. The field's default is the 6 G of the testbed's unit; present-day units state 2.5 G.
+            rejected. The testbed's unit states 6 G, present-day units 2.5 G.
         configure: False leaves the unit unchanged; any output with a complete reading is then accepted.
         response_timeout_ns: the wait for an answer, each try.
         tries: how often a command is sent before the unit counts as silent.
@@ -42,13 +40,13 @@ class Vn100Settings:
             every sensor has noise. 0: never.
     """
 
-    attitude_map: FloatArray = field(default_factory=lambda: np.eye(4))
-    mounting: FloatArray = field(default_factory=lambda: np.eye(3))
-    rate_hz: int = 40
-    output: Literal["binary", "ascii"] = "binary"
+    attitude_map: FloatArray
+    mounting: FloatArray
+    rate_hz: int
+    output: Literal["binary", "ascii"]
     unit_port: int = 1
     rate_range: float = math.radians(2000.0)
-    field_range: float = 6e-4
+    field_range: float
     acceleration_range: float = 16.0 * STANDARD_GRAVITY
     configure: bool = True
     response_timeout_ns: int = 100_000_000

@@ -16,11 +16,16 @@ from flight.link.telemetry.reader import Run
 from flight.link.telemetry.scanner import ScanResult
 from ground.identification.fit import fit
 from ground.identification.preparation import excitation_config, noise_of
-from ground.identification.record import IdentificationError, read_record
+from ground.identification.record import IdentificationError, Record, read_record
 from tests.ground.identification.worlds import World, believed, fly_stack, motion_error
 from tests.scenario import flights
 
 WORLD = World(inertia=1.15e-3, dipole=0.62, field=4.2e-4, stiffness=1.6e-5, damping=3.0e-6, bias=1e-4, seed=9)
+
+
+def recorded(run: Run) -> Record:
+    """Return the record of a run whose coils go to zero 0.25 s after the last command."""
+    return read_record(run, 0.25)
 
 
 @pytest.fixture(scope="module")
@@ -54,35 +59,35 @@ def altered(
 
 def test_the_truth_is_not_looked_at(short: Run) -> None:
     empty: ScanResult = replace(short.truth, packets={n: a[:0] for n, a in short.truth.packets.items()})
-    with_truth, without = read_record(short), read_record(replace(short, truth=empty))
+    with_truth, without = recorded(short), recorded(replace(short, truth=empty))
     assert len(short["truth"])
     for name in ("time", "angle", "rate", "switch_time", "current"):
         assert np.array_equal(getattr(with_truth, name), getattr(without, name))
 
 
 def test_samples_that_the_host_noted_late_stand_at_the_time_of_the_unit(short: Run) -> None:
-    exact = read_record(short).time
+    exact = recorded(short).time
     rng = np.random.default_rng(6)
     noted = short["imu"]["sample_time_ns"] + (20e6 * rng.uniform(size=len(exact)) ** 3).astype(int)
-    late = read_record(altered(short, "imu", sample_time_ns=noted)).time
+    late = recorded(altered(short, "imu", sample_time_ns=noted)).time
     assert np.max(np.abs(late - exact)) < 1e-3
     restarted = short["imu"]["device_time_ns"].copy()
     restarted[500:] -= restarted[500]
-    assert read_record(altered(short, "imu", device_time_ns=restarted)).time == pytest.approx(exact)
+    assert recorded(altered(short, "imu", device_time_ns=restarted)).time == pytest.approx(exact)
 
 
 def test_a_current_that_shows_a_cycle_later_counts_from_the_cycle_that_asked(short: Run) -> None:
     control = short["control"]
     written = control["current_written"]
     late = np.concatenate([np.zeros((1, 3)), written[:-1]])
-    found, exact = read_record(altered(short, "control", current_written=late)).current, written[:, 0]
+    found, exact = recorded(altered(short, "control", current_written=late)).current, written[:, 0]
     assert np.mean(np.abs(found[:-1] - exact[:-1]) > 1e-3) < 0.02
     assert np.mean(np.abs(late[:-1, 0] - exact[:-1]) > 1e-3) > 0.05, "as written it would be wrong"
 
 
 def test_without_commands_the_coil_falls_to_zero_as_the_driver_lets_it(short: Run) -> None:
     time = short["control"]["time_ns"] * 1e-9
-    record = read_record(altered(short, "control", keep=(time < 12.0) | (time > 13.0)), stale_after=0.25)
+    record = recorded(altered(short, "control", keep=(time < 12.0) | (time > 13.0)))
     at = int(np.searchsorted(record.switch_time, 12.5)) - 1
     assert record.current[at] == 0.0
     assert record.switch_time[at] == pytest.approx(11.975 + 0.25)
@@ -98,21 +103,21 @@ def test_the_field_is_taken_only_while_the_coils_are_off(short: Run) -> None:
     stilled = altered(short, "control", current_written=quiet, current_command=asked)
     field = imu["field"].copy()
     field[:805] *= 1.1
-    record = read_record(altered(stilled, "imu", field=field))
+    record = recorded(altered(stilled, "imu", field=field))
     assert record.field is not None
     assert record.field.magnitude == pytest.approx(4.5e-4, rel=1e-3)
     always_on = control["current_written"].copy()
     always_on[:, 0] = 0.05
-    assert read_record(altered(short, "control", current_written=always_on)).field is None
+    assert recorded(altered(short, "control", current_written=always_on)).field is None
 
 
 def test_another_coil_and_a_flight_too_short_are_refused(short: Run) -> None:
     driven = short["control"]["current_written"].copy()
     driven[5, 2] = 0.01
     with pytest.raises(UsageError, match="y or z"):
-        read_record(altered(short, "control", current_written=driven))
+        recorded(altered(short, "control", current_written=driven))
     with pytest.raises(IdentificationError, match="too short"):
-        read_record(altered(short, "imu", keep=slice(0, 50)))
+        recorded(altered(short, "imu", keep=slice(0, 50)))
 
 
 @pytest.mark.parametrize(
@@ -136,4 +141,4 @@ def test_values_that_no_flight_writes_are_told_as_damage(
     if field == "sample_time_ns":  # of no consequence while the unit's clock runs on
         damaged = altered(damaged, "imu", device_time_ns=values)
     with pytest.raises(IdentificationError, match=r"the log is damaged|in order of time"):
-        read_record(damaged)
+        recorded(damaged)

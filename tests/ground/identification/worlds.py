@@ -87,7 +87,7 @@ def fly_stack(world: World, folder: Path, duration: float = 200.0) -> Record:
         truth=Truth(inertia=world.inertia, field=world.field, resistance=(resistance, 23.0, 23.0)),
         imu=ImuNoise(quaternion_noise=1.75e-3, rate_noise=1.75e-4, gyro_bias=(0.0, world.bias, 0.0)),
     )
-    record = read_record(flights.fly(config, folder, section=section))
+    record = read_record(flights.fly(config, folder, section=section), config.coils.stale_after)
     if record.field is None:
         return record
     # The emulated magnetometer has no error of scale.

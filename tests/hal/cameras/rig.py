@@ -17,7 +17,7 @@ from hal.drivers import aravis_camera
 from hal.drivers.aravis_camera import AravisCamera, AravisSettings
 from hal.drivers.camera import ServedCamera
 from hal.drivers.v4l2_camera import V4l2Camera
-from hal.drivers.v4l2_settings import V4l2Settings
+from hal.drivers.v4l2_settings import Stamp, V4l2Settings
 from hal.interfaces.devices import FrameSource
 from hal.interfaces.errors import Refused
 from hal.interfaces.readings import Frame
@@ -114,6 +114,9 @@ def video_rig(kernel: IoctlCamera, clock: ManualClock, **changes: object) -> Vid
         "rows": 48,
         "pixel_format": "GREY",
         "exposure_ns": EXPOSURE_NS,
+        "gain": None,
+        "stamp": Stamp.TOLD,
+        "stamp_delay_ns": 0,
     }
     settings = V4l2Settings(**(wanted | changes))  # type: ignore[arg-type]  # the values are the tests' own
     camera = ServedCamera(V4l2Camera(settings, clock), clock)
@@ -139,6 +142,7 @@ def aravis_rig(**changes: object) -> Rig:
         "rows": 256,
         "pixel_format": "Mono8",
         "exposure_ns": EXPOSURE_NS,
+        "gain": None,
     }
     settings = AravisSettings(**(wanted | changes))  # type: ignore[arg-type]  # the values are the tests' own
     return Rig(ServedCamera(AravisCamera(settings, clock), clock), clock, (256, 512), None)

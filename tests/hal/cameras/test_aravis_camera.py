@@ -22,7 +22,7 @@ MILLISECOND_NS = 1_000_000
 def fake() -> Iterator[AravisCamera]:
     """Open Aravis' Fake camera, with nothing that serves it."""
     require_aravis()
-    camera = AravisCamera(AravisSettings("Fake_1", 512, 256, "Mono16", EXPOSURE_NS), SystemClock())
+    camera = AravisCamera(AravisSettings("Fake_1", 512, 256, "Mono16", EXPOSURE_NS, None), SystemClock())
     camera.open()
     yield camera
     camera.close()
@@ -76,7 +76,7 @@ def test_what_the_camera_cannot_do_is_said(changes: dict[str, object], message: 
 def test_a_camera_whose_control_is_lost_is_told_of_and_opened_again() -> None:
     require_aravis()
     clock = SystemClock()
-    device = AravisCamera(AravisSettings("Fake_1", 512, 256, "Mono8", EXPOSURE_NS), clock)
+    device = AravisCamera(AravisSettings("Fake_1", 512, 256, "Mono8", EXPOSURE_NS, None), clock)
     source = ServedCamera(device, clock)
     rig = Rig(source, clock, (256, 512), None)
     before = rig.next_frame().sequence
@@ -104,7 +104,7 @@ def test_frames_that_nobody_triggered_are_given_back(fake: AravisCamera) -> None
 def test_a_python_without_aravis_is_told_the_cure(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
     monkeypatch.setitem(sys.modules, "gi", None)  # as where it is not installed
-    camera = AravisCamera(AravisSettings("Fake_1", 512, 256, "Mono8", EXPOSURE_NS), SystemClock())
+    camera = AravisCamera(AravisSettings("Fake_1", 512, 256, "Mono8", EXPOSURE_NS, None), SystemClock())
     with pytest.raises(
         Refused, match=r"apt install gir1.2-aravis-0.8.*pip install 'knightcube-flight\[genicam\]'"
     ):

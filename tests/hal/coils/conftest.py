@@ -7,16 +7,15 @@ from collections.abc import Iterator
 import pytest
 
 from hal.buses.i2c_bus import LinuxI2cBus
-from hal.drivers.coil_settings import CoilSettings
 from tests.hal.coils.ioctl_wire import IoctlWire
-from tests.hal.coils.rig import THESIS_COILS, Rig, Wire
+from tests.hal.coils.rig import THESIS, Rig, Wire
 from tests.manual_clock import ManualClock
 
 
 @pytest.fixture
 def kernel(monkeypatch: pytest.MonkeyPatch) -> IoctlWire:
     """Replace the kernel's I2C by an emulated bus; any file that opens is then an adapter."""
-    wire = Wire(ManualClock(), CoilSettings(coils=THESIS_COILS), uncertainty=0.0)
+    wire = Wire(ManualClock(), THESIS, uncertainty=0.0)
     return _replace_ioctl(monkeypatch, wire)
 
 
@@ -27,7 +26,7 @@ def rig(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iter
         yield Rig()
         return
     clock = ManualClock()
-    wire = Wire(clock, CoilSettings(coils=THESIS_COILS), uncertainty=0.0)
+    wire = Wire(clock, THESIS, uncertainty=0.0)
     _replace_ioctl(monkeypatch, wire)
     bus = LinuxI2cBus("/dev/null")
     yield Rig(wire=wire, clock=clock, bus=bus)

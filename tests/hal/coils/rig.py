@@ -19,8 +19,15 @@ from tests.manual_clock import ManualClock
 
 PCA, INA = 0x40, 0x45
 THESIS_COILS = (CoilWiring(0, 1, 23.0), CoilWiring(2, 3, 23.0), CoilWiring(4, 5, 23.0))
-UNEQUAL = CoilSettings(
-    coils=(CoilWiring(0, 1, 23.0), CoilWiring(3, 2, 17.0, sign=-1), CoilWiring(8, 9, 25.0, enable_channel=10))
+THESIS = CoilSettings(THESIS_COILS, supply_voltage=3.4, current_limit=0.148, stale_after=0.25)
+"""Sease 2013, ch. 5."""
+UNEQUAL = dataclasses.replace(
+    THESIS,
+    coils=(
+        CoilWiring(0, 1, 23.0),
+        CoilWiring(3, 2, 17.0, sign=-1),
+        CoilWiring(8, 9, 25.0, enable_channel=10),
+    ),
 )
 
 
@@ -44,13 +51,13 @@ class Rig:
 
     def __init__(
         self,
-        settings: CoilSettings | None = None,
+        settings: CoilSettings = THESIS,
         uncertainty: float = 0.0,
         wire: Wire | None = None,
         clock: ManualClock | None = None,
         bus: I2cBus | None = None,
     ) -> None:
-        self.settings = CoilSettings(coils=THESIS_COILS) if settings is None else settings
+        self.settings = settings
         self.clock = ManualClock() if clock is None else clock
         self.wire = Wire(self.clock, self.settings, uncertainty) if wire is None else wire
         self.bus: I2cBus = self.wire.bus if bus is None else bus

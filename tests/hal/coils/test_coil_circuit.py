@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hal.drivers.coil_settings import CoilSettings, CoilWiring
+from hal.drivers.coil_settings import CoilWiring
 from hal.drivers.pca9685 import FULL_OFF, FULL_ON, PwmCounts
 from sim_hal.worlds.coil_circuit import CoilCircuit, common_counts
-from tests.hal.coils.rig import THESIS_COILS, Rig
+from tests.hal.coils.rig import THESIS, THESIS_COILS, Rig
 
 FULL = 3.4 / 23.0
-WITH_ENABLE = CoilSettings(
-    coils=(CoilWiring(0, 1, 23.0, enable_channel=2), CoilWiring(3, 4, 23.0), CoilWiring(5, 6, 23.0))
+WITH_ENABLE = replace(
+    THESIS, coils=(CoilWiring(0, 1, 23.0, enable_channel=2), CoilWiring(3, 4, 23.0), CoilWiring(5, 6, 23.0))
 )
 PULSE = st.tuples(st.integers(0, 4095), st.integers(0, 4096))
 
@@ -103,7 +103,7 @@ def test_the_true_current_never_passes_the_limit() -> None:
         for _ in range(50):
             rig.command(sign, sign, sign)
             assert max(map(abs, rig.currents())) <= FULL
-    limited = Rig(dataclasses.replace(rig.settings, current_limit=0.1), uncertainty=3.5e-3)
+    limited = Rig(replace(rig.settings, current_limit=0.1), uncertainty=3.5e-3)
     limited.coils.start()
     for _ in range(50):
         limited.command(1.0, 1.0, 1.0)
@@ -127,7 +127,7 @@ def test_the_same_seed_gives_the_same_currents() -> None:
 def test_a_coil_whose_resistance_is_not_what_the_driver_believes() -> None:
     """The driver's 0.1 A through 20 ohm instead of 23 is 0.115 A."""
     rig = Rig()
-    truth = CoilSettings(coils=(CoilWiring(0, 1, 20.0), *THESIS_COILS[1:]))
+    truth = replace(THESIS, coils=(CoilWiring(0, 1, 20.0), *THESIS_COILS[1:]))
     circuit = CoilCircuit(rig.wire.chip, truth, np.random.default_rng(1), rig.clock.now_ns, uncertainty=0.0)
     rig.coils.start()
     rig.command(0.1, 0.0, 0.0)

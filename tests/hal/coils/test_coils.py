@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hal.drivers.coil_settings import CoilSettings, CoilWiring
+from hal.drivers.coil_settings import CoilWiring
 from hal.drivers.h_bridge import current_step
 from hal.interfaces.errors import DeviceError, NotResponding, OutOfRange, Refused
-from tests.hal.coils.rig import PCA, THESIS_COILS, UNEQUAL, Rig, limited_to
+from tests.hal.coils.rig import PCA, THESIS, UNEQUAL, Rig, limited_to
 
 MS = 1_000_000
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
@@ -80,7 +81,7 @@ def test_a_wired_enable_coasts_at_zero_and_drives_otherwise() -> None:
 
 def test_three_coils_with_enable_take_nine_channels_in_two_blocks() -> None:
     wiring = tuple(CoilWiring(3 * axis, 3 * axis + 1, 23.0, enable_channel=3 * axis + 2) for axis in range(3))
-    rig = Rig(CoilSettings(coils=(wiring[0], wiring[1], wiring[2])))
+    rig = Rig(replace(THESIS, coils=(wiring[0], wiring[1], wiring[2])))
     assert [(first, len(pins)) for first, pins in rig.settings.blocks()] == [(0, 8), (8, 1)]
     rig.coils.start()
     rig.command(0.1, -0.1, 0.03)
@@ -138,13 +139,13 @@ def test_a_stale_command_is_at_zero_within_half_a_second(rig: Rig) -> None:
 
 
 def test_the_longest_allowed_staleness_still_ends_within_half_a_second() -> None:
-    rig = Rig(CoilSettings(coils=THESIS_COILS, stale_after=0.4))
+    rig = Rig(replace(THESIS, stale_after=0.4))
     rig.coils.start()
     rig.command(0.1, 0.0, 0.0)
     rig.clock.advance(499 * MS)
     assert rig.currents() == [0.0, 0.0, 0.0]
     with pytest.raises(OutOfRange, match="stale_after"):
-        CoilSettings(coils=THESIS_COILS, stale_after=0.45)
+        replace(THESIS, stale_after=0.45)
 
 
 def test_commands_that_keep_coming_keep_the_coils_driven(rig: Rig) -> None:
@@ -212,11 +213,15 @@ def test_before_the_first_command_the_state_is_all_zero(rig: Rig) -> None:
         lambda: CoilWiring(0, 1, 0.0),
         lambda: CoilWiring(0, 1, math.nan),
         lambda: CoilWiring(0, 1, 23.0, sign=2),
-        lambda: CoilSettings(coils=(CoilWiring(0, 1, 23.0), CoilWiring(1, 2, 23.0), CoilWiring(4, 5, 23.0))),
-        lambda: CoilSettings(coils=(CoilWiring(0, 16, 23.0), CoilWiring(1, 2, 23.0), CoilWiring(4, 5, 23.0))),
-        lambda: CoilSettings(coils=THESIS_COILS, supply_voltage=math.nan),
-        lambda: CoilSettings(coils=THESIS_COILS, current_limit=0.0),
-        lambda: CoilSettings(coils=THESIS_COILS, tries=0),
+        lambda: replace(
+            THESIS, coils=(CoilWiring(0, 1, 23.0), CoilWiring(1, 2, 23.0), CoilWiring(4, 5, 23.0))
+        ),
+        lambda: replace(
+            THESIS, coils=(CoilWiring(0, 16, 23.0), CoilWiring(1, 2, 23.0), CoilWiring(4, 5, 23.0))
+        ),
+        lambda: replace(THESIS, supply_voltage=math.nan),
+        lambda: replace(THESIS, current_limit=0.0),
+        lambda: replace(THESIS, tries=0),
     ],
 )
 def test_settings_that_cannot_be_are_refused(make: Callable[[], object]) -> None:

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 
 from hal.buses.clock import SystemClock
-from hal.drivers.coil_settings import CoilSettings
 from hal.drivers.coils import PwmTorqueCoils
 from hal.drivers.ina219 import Ina219
 from hal.drivers.pca9685 import Pca9685
-from tests.hal.coils.rig import INA, PCA, THESIS_COILS, Wire
+from tests.hal.coils.rig import INA, PCA, THESIS, Wire
 
 
 def eventually(condition: Callable[[], bool], within: float = 5.0) -> bool:
@@ -30,8 +29,8 @@ def eventually(condition: Callable[[], bool], within: float = 5.0) -> bool:
 def started() -> tuple[PwmTorqueCoils, Wire]:
     """Build and start the coils on the real clock."""
     clock = SystemClock()
-    wire = Wire(clock, CoilSettings(coils=THESIS_COILS), uncertainty=0.0)
-    coils = PwmTorqueCoils(Pca9685(wire.bus, PCA, clock), clock, CoilSettings(coils=THESIS_COILS))
+    wire = Wire(clock, THESIS, uncertainty=0.0)
+    coils = PwmTorqueCoils(Pca9685(wire.bus, PCA, clock), clock, THESIS)
     coils.start()
     return coils, wire
 

@@ -16,7 +16,13 @@ from sim_hal.emulators.serial_line import SerialLine
 from sim_hal.emulators.vn100 import Vn100Emulator, Vn100EmulatorSettings
 from sim_hal.worlds.motion import Motion, about_thread
 
-MISSION = Vn100Settings(attitude_map=attitude_map(IDENTITY, NED_TO_TESTBED))
+MISSION = Vn100Settings(
+    attitude_map=attitude_map(IDENTITY, NED_TO_TESTBED),
+    mounting=np.eye(3),
+    rate_hz=40,
+    output="binary",
+    field_range=6e-4,
+)
 
 
 def at_rest(time_ns: int) -> Motion:

@@ -64,8 +64,8 @@ def test_any_mounting_and_attitude_come_back_in_body_axes() -> None:
     def sense(time_ns: int) -> Motion:
         return Motion(time_ns, attitude, rate, field, force)
 
-    settings = Vn100Settings(
-        attitude_map=attitude_map(mounting, NED_TO_TESTBED), mounting=attitude_matrix(mounting)
+    settings = replace(
+        MISSION, attitude_map=attitude_map(mounting, NED_TO_TESTBED), mounting=attitude_matrix(mounting)
     )
     bench = bench_line(sense, settings, replace(QUIET, mounting=mounting))
     bench.driver.configure()

@@ -14,16 +14,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.gnc.math.frames import NED_TO_TESTBED, attitude_map
-from flight.gnc.math.quaternion import IDENTITY, angle_about_axis_y
+from flight.gnc.math.quaternion import angle_about_axis_y
 from hal.buses.clock import SystemClock
 from hal.buses.serial_port import PySerialPort
-from hal.drivers.vn100.driver import Vn100, Vn100Settings
+from hal.drivers.vn100.driver import Vn100
 from hal.interfaces.errors import CorruptData, NotResponding
 from hal.interfaces.readings import ImuReading
+from tests.hal.vn100.bench_line import MISSION
 
 COMMAND = [sys.executable, "-m", "sim_hal", "emulate", "vn100"]
-SETTINGS = Vn100Settings(attitude_map=attitude_map(IDENTITY, NED_TO_TESTBED))
 
 
 @pytest.fixture
@@ -58,7 +57,7 @@ def test_the_driver_sets_it_up_and_reads_at_40_hz(served: tuple[str, subprocess.
     name, process = served
     clock = SystemClock()
     port = PySerialPort(name, 115200, clock)
-    driver = Vn100(port, clock, SETTINGS)
+    driver = Vn100(port, clock, MISSION)
     driver.configure()
     readings = readings_for(1.5, driver, clock)
     driver.close()
@@ -79,7 +78,7 @@ def test_the_driver_sets_it_up_and_reads_at_40_hz(served: tuple[str, subprocess.
 
 def test_the_wrong_speed_is_known_for_what_it_is(served: tuple[str, subprocess.Popen[str]]) -> None:
     clock = SystemClock()
-    driver = Vn100(PySerialPort(served[0], 57600, clock), clock, SETTINGS)
+    driver = Vn100(PySerialPort(served[0], 57600, clock), clock, MISSION)
     with pytest.raises(CorruptData, match="check the baud rate"):
         driver.configure()
     driver.close()

@@ -21,7 +21,7 @@ import numpy as np
 from hal.buses.clock import SystemClock
 from hal.drivers.camera import ServedCamera
 from hal.drivers.v4l2_camera import V4l2Camera
-from hal.drivers.v4l2_settings import V4l2Settings
+from hal.drivers.v4l2_settings import Stamp, V4l2Settings
 from tests.hal.cameras.ioctl_camera import IoctlCamera
 
 COLUMNS, ROWS = 1280, 800
@@ -62,7 +62,7 @@ def measure(seconds: float) -> dict[str, float]:
         kernel.draws = False
         empty = _busy(clock, None, seconds / 4, 0)[0]
         with mock.patch("hal.buses.v4l2.ioctl", kernel):
-            settings = V4l2Settings(str(kernel.path), COLUMNS, ROWS, "GREY", EXPOSURE_NS)
+            settings = V4l2Settings(str(kernel.path), COLUMNS, ROWS, "GREY", EXPOSURE_NS, None, Stamp.TOLD, 0)
             camera = ServedCamera(V4l2Camera(settings, clock), clock)
             idle = _busy(clock, camera, seconds / 4, 0)[0]
             asked, latencies, triggers, polls = _busy(clock, camera, seconds / 2, CYCLES_A_TRIGGER)

@@ -14,7 +14,7 @@ runs. NIS likewise, over all measurements that were taken in.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,6 @@ from scipy.stats import chi2
 
 from flight.gnc.estimation.attitude_filter import AttitudeFilter
 from flight.gnc.estimation.estimate import Estimate
-from flight.gnc.estimation.filter_settings import FilterSettings
 from flight.gnc.estimation.measurements import Measurement
 from flight.gnc.estimation.rigid_body import RigidBody
 from flight.gnc.math.arrays import FloatArray, IntArray
@@ -37,6 +36,7 @@ from tests.studies.campaigns.consistency_worlds import (
     DRAUGHT,
     GAIN_SIGMA,
     INERTIA,
+    KNOWN_PLANT,
     MOST_DAMPING,
     MOST_STIFFNESS,
     TESTBED_FIELD,
@@ -83,11 +83,11 @@ def cases(runs: int, seed: int) -> list[Case]:
 def filter_of(world: World) -> AttitudeFilter:
     """Return the filter that is to follow a world: its noise, none of its surprises."""
     push = DRAUGHT if world.suspended else DRAG
-    settings = FilterSettings(
-        CURRENT_SIGMA,
-        CYCLE_NS * 1e-9,
-        push.walk,
-        push.start,
+    settings = replace(
+        KNOWN_PLANT,
+        current_noise=CURRENT_SIGMA,
+        disturbance_walk=push.walk,
+        disturbance_start=push.start,
         bias_start=BIAS_SIGMA,
         torsion_start=MOST_STIFFNESS / np.sqrt(3.0) / INERTIA[1, 1],
         gain_start=GAIN_SIGMA,

@@ -12,6 +12,7 @@ from typing import Protocol
 
 import numpy as np
 
+from flight.gnc.estimation.filter_settings import FilterSettings
 from flight.gnc.estimation.rigid_body import Parameters
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import about_axis_y, normalise
@@ -38,6 +39,21 @@ class Push:
     start: float
     walk: float
 
+
+KNOWN_PLANT = FilterSettings(
+    current_noise=0.0,
+    control_period=CYCLE_NS * 1e-9,
+    disturbance_walk=0.0,
+    bias_start=1e-3,
+    torsion_start=0.0,
+    damping_start=0.0,
+    gain_start=0.0,
+    latency_start=0.0,
+    latency_walk=0.0,
+    gate_sigma=5.0,
+    history_ns=6_000_000_000,
+)
+"""The filter's settings where nothing of the plant is estimated."""
 
 DRAUGHT = Push(1e-3, 5e-5)
 """Of the air about the testbed: 1e-6 N m."""

@@ -11,15 +11,16 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from hal.drivers.vn100.ascii import AsciiLine, build
 from hal.drivers.vn100.codec import FIELDS, HEADER_LENGTHS, BinaryPacket, Layout, layout_of, layout_of_header
-from hal.drivers.vn100.driver import OUTPUT_SET, Vn100, Vn100Settings
+from hal.drivers.vn100.driver import OUTPUT_SET, Vn100
 from hal.drivers.vn100.stream import StreamParser
+from tests.hal.vn100.bench_line import MISSION
 from tests.manual_clock import ManualClock
 from tests.studies.fuzz.harness import Finding
 from tests.studies.fuzz.mutation import Draw, chance, damage, integer
@@ -122,7 +123,7 @@ class Vn100Bytes:
         self._packets = _real_packets() + [_packet(draw) for _ in range(_POOL)]
         self._lines = [_line(draw) for _ in range(_POOL)]
         self._stream = b""
-        self._settings = Vn100Settings(configure=False)
+        self._settings = replace(MISSION, configure=False)
 
     def last(self) -> str:
         """Return the last stream in hexadecimal."""

@@ -32,6 +32,7 @@ from flight.gnc.math.arrays import FloatArray
 
 FIELD = "field"
 _UNIT_TOLERANCE = 1e-6
+_HISTORY_NS = 6_000_000_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -231,9 +232,15 @@ class AttitudeDetermination:
                 disturbance_start=settings.disturbance_start,
                 bias_walk=settings.bias_walk,
                 bias_start=settings.bias_start,
+                torsion_start=0.0,
+                damping_start=0.0,
+                gain_start=0.0,
+                latency_start=0.0,
+                latency_walk=0.0,
                 field_bias_start=settings.field_bias_start,
                 field_bias_walk=settings.field_bias_walk,
                 gate_sigma=settings.gate_sigma,
+                history_ns=_HISTORY_NS,
                 longest_step=settings.longest_step,
             ),
         )

@@ -39,7 +39,7 @@ class AdaptiveSettings:
 
     bandwidth: float
     adaptation: float
-    reference_bandwidth: float | None = None
+    reference_bandwidth: float | None
     dead_zone: float = 1e-3
 
     def __post_init__(self) -> None:

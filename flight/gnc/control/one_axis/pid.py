@@ -20,9 +20,7 @@ from flight.gnc.guidance.one_axis.plant import SingleAxisPlant
 class PidController:
     """Owns the integral of the error, rad s."""
 
-    def __init__(
-        self, plant: SingleAxisPlant, period: float, bandwidth: float, target_weight: float = 0.0
-    ) -> None:
+    def __init__(self, plant: SingleAxisPlant, period: float, bandwidth: float, target_weight: float) -> None:
         """Place three poles at -`bandwidth` rad/s; `period` in s between commands.
 
         Raises UsageError when a value is outside its range.

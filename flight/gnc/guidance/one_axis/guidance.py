@@ -42,7 +42,7 @@ class AcceptanceRules:
         current_excess: largest relative excess over the plant's current limit anywhere on the path.
     """
 
-    late_after: float = 1.0
+    late_after: float
     angle_tolerance: float = 0.05
     rate_tolerance: float = 0.02
     q2_limit: float = Q2_LIMIT
@@ -67,15 +67,13 @@ class Verdict:
 class Guidance:
     """Owns the path being followed and the current target."""
 
-    def __init__(
-        self, plant: SingleAxisPlant, rules: AcceptanceRules | None = None, arrives: bool = True
-    ) -> None:
+    def __init__(self, plant: SingleAxisPlant, rules: AcceptanceRules, arrives: bool = True) -> None:
         """Plan for `plant` and its limits; `arrives` says that paths end at the target and hold it.
 
         On a receding horizon (`arrives` false) a path that ends means that later plans are missing.
         """
         self._plant = plant
-        self._rules = rules or AcceptanceRules()
+        self._rules = rules
         self._arrives = arrives
         self._path: PolynomialPath | None = None
         self._planned_ns: int | None = None

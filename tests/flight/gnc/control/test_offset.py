@@ -42,7 +42,7 @@ def test_the_tracker_holds_without_offset_where_the_thesis_keeps_one(true: Singl
     "controller",
     [
         LqTracker(BELIEVED, *WEIGHTS),
-        PidController(BELIEVED, PERIOD, 0.76),
+        PidController(BELIEVED, PERIOD, 0.76, 0.0),
         AdaptiveController(BELIEVED, PERIOD, AdaptiveSettings(1.0, 10.0, 0.55)),
     ],
     ids=["lq", "pid", "adaptive"],

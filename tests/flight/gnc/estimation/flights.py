@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from tests.studies.campaigns.consistency_worlds import (
     CYCLE_NS,
     DIPOLE,
     INERTIA,
+    KNOWN_PLANT,
     TESTBED_FIELD,
     FreeWorld,
     SuspendedWorld,
@@ -25,8 +26,14 @@ from tests.studies.campaigns.consistency_worlds import (
 
 SUSPENDED = RigidBody(INERTIA, DIPOLE, TESTBED_FIELD, suspended=True)
 FREE = RigidBody(INERTIA, DIPOLE, TESTBED_FIELD)
-SETTINGS = FilterSettings(
-    2.02e-3, 0.025, 1e-4, disturbance_start=1e-2, torsion_start=0.02, damping_start=3e-3, gain_start=0.1
+SETTINGS = replace(
+    KNOWN_PLANT,
+    current_noise=2.02e-3,
+    disturbance_walk=1e-4,
+    disturbance_start=1e-2,
+    torsion_start=0.02,
+    damping_start=3e-3,
+    gain_start=0.1,
 )
 TURN_SIGMA, RATE_SIGMA = 2.02e-3, 1.01e-4
 TURN_COVARIANCE: FloatArray = np.eye(3) * TURN_SIGMA**2

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from flight.gnc.estimation.attitude_filter import AttitudeFilter
-from flight.gnc.estimation.filter_settings import FilterSettings
 from flight.gnc.estimation.measurements import (
     AttitudeMeasurement,
     MeanRateMeasurement,
@@ -15,10 +16,11 @@ from flight.gnc.estimation.measurements import (
 )
 from flight.gnc.estimation.rigid_body import RigidBody
 from flight.gnc.math.quaternion import about_axis_y
+from tests.studies.campaigns.consistency_worlds import KNOWN_PLANT
 
 PERIOD_NS = 25_000_000
 BODY = RigidBody(np.diag([1.1e-3, 1.05e-3, 0.99e-3]), 0.648, np.array([0.0, 0.0, -4.5e-4]), suspended=True)
-SETTINGS = FilterSettings(current_noise=2e-3, control_period=0.025, disturbance_walk=5e-5, gain_start=0.15)
+SETTINGS = replace(KNOWN_PLANT, current_noise=2e-3, disturbance_walk=5e-5, gain_start=0.15)
 RATE = 0.02
 
 

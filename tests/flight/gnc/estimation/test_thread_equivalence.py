@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from flight.bodies.testbed.thread_estimate import about_thread
 from flight.gnc.estimation.attitude_filter import AttitudeFilter
-from flight.gnc.estimation.filter_settings import FilterSettings
 from flight.gnc.estimation.measurements import (
     AttitudeMeasurement,
     MeanRateMeasurement,
@@ -21,6 +21,7 @@ from flight.gnc.math.quaternion import about_axis_y
 from tests.flight.gnc.estimation import single_axis
 from tests.flight.gnc.estimation.flights import SUSPENDED
 from tests.flight.gnc.estimation.test_single_axis import PERIOD, PLANT, SETTINGS, simulate
+from tests.studies.campaigns.consistency_worlds import KNOWN_PLANT
 
 ODD: FloatArray = np.array([3e-3, 0.0, -1e-2])
 """rad/s about the other axes: no business of the thread's."""
@@ -41,8 +42,8 @@ def largest_difference(driven: bool) -> tuple[float, float]:
     """Return how far estimates (in sigma) and covariances (relative) of both filters are ever apart."""
     truth, commands, measurements = simulate(np.random.default_rng(3), 300)
     gain = PLANT.torque_constant / PLANT.inertia
-    settings = FilterSettings(
-        current_noise=0.0,
+    settings = replace(
+        KNOWN_PLANT,
         control_period=SETTINGS.control_period,
         disturbance_walk=SETTINGS.disturbance_walk,
         disturbance_start=SETTINGS.disturbance_start,

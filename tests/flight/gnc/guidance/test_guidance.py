@@ -16,6 +16,7 @@ from flight.gnc.guidance.one_axis.vmc import Plan, plan
 from tests.flight.gnc.guidance.problems import KNIGHTCUBE
 
 SECOND = 1_000_000_000
+RULES = AcceptanceRules(late_after=1.0)
 START, TARGET = angle_of(0.1), 0.2
 
 
@@ -32,14 +33,14 @@ def newer() -> Plan:
 @pytest.fixture
 def guidance(good: Plan) -> Guidance:
     """Return guidance that flies `good` since 100 s."""
-    guidance = Guidance(KNIGHTCUBE)
+    guidance = Guidance(KNIGHTCUBE, RULES)
     guidance.aim(TARGET)
     assert guidance.offer(good, 100 * SECOND, 100 * SECOND, START, 0.0).accepted
     return guidance
 
 
 def test_before_any_plan_there_is_nothing_to_fly(good: Plan) -> None:
-    guidance = Guidance(KNIGHTCUBE)
+    guidance = Guidance(KNIGHTCUBE, RULES)
     assert guidance.sample(0) is None
     assert guidance.state(0) == GuidanceState.NONE
     assert "no target" in guidance.offer(good, 0, 0, START, 0.0).reason
@@ -105,7 +106,7 @@ def test_current_is_watched_between_the_nodes_too(guidance: Guidance, newer: Pla
 
 
 def test_a_path_beyond_the_attitude_limit_is_never_flown(newer: Plan) -> None:
-    narrow = Guidance(KNIGHTCUBE, AcceptanceRules(q2_limit=0.2))
+    narrow = Guidance(KNIGHTCUBE, replace(RULES, q2_limit=0.2))
     narrow.aim(TARGET)
     swing = plan(KNIGHTCUBE, 0.19, 0.03, TARGET, 0.0, 12.0)
     assert "|q2|" in narrow.offer(swing, 0, 0, angle_of(0.19), 0.03).reason
@@ -168,7 +169,7 @@ def test_an_impossible_hold_or_rule_is_refused(guidance: Guidance) -> None:
 
 def test_an_end_that_is_the_target_is_held_without_alarm_unless_paths_should_not_end(good: Plan) -> None:
     for arrives in (True, False):
-        guidance = Guidance(KNIGHTCUBE, arrives=arrives)
+        guidance = Guidance(KNIGHTCUBE, RULES, arrives=arrives)
         guidance.aim(TARGET)
         assert guidance.offer(good, 0, 0, START, 0.0).accepted
         assert not guidance.is_adrift(9 * SECOND)
@@ -203,9 +204,9 @@ def test_the_limit_is_judged_under_the_disturbance_that_the_plan_allowed_for() -
     """A push of 0.03 rad/s^2 takes 108 mA to hold against: with it this path is within the limit."""
     pushed = replace(KNIGHTCUBE, disturbance=0.03)
     helped = plan(pushed, 0.1, 0.0, 0.2, 0.0, 5.5)
-    guidance = Guidance(KNIGHTCUBE)
+    guidance = Guidance(KNIGHTCUBE, RULES)
     guidance.aim(0.2)
     assert guidance.offer(helped, 0, 0, START, 0.0, disturbance=0.03).accepted
-    other = Guidance(KNIGHTCUBE)
+    other = Guidance(KNIGHTCUBE, RULES)
     other.aim(0.2)
     assert "limit is" in other.offer(helped, 0, 0, START, 0.0, disturbance=-0.03).reason

@@ -26,7 +26,9 @@ FOLDER = Path("/state")
 def keeper_on(disk: Disk | None, clock: Clock, folder: Path = FOLDER) -> StateKeeper:
     """Return the keeper of a new boot."""
     notices = Notices()
-    return StateKeeper(StateStore(folder, notices.report, disk), notices, clock, window=600.0)
+    return StateKeeper(
+        StateStore(folder, notices.report, disk), notices, clock, window=600.0, period_ns=10 * SECOND
+    )
 
 
 def on_disk(disk: Disk) -> StoredState:

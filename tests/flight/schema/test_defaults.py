@@ -1,0 +1,127 @@
+"""Each default is written once: no settings class disagrees with the configuration section that it serves."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import inspect
+import pkgutil
+from collections.abc import Iterator
+from enum import Enum
+from types import ModuleType
+
+import msgspec
+import numpy as np
+
+import flight
+import hal
+import sim_hal
+from flight.schema import sections
+from hal.interfaces.wires import SECOND_NS
+
+OF_CAMERA = (sections.Camera, sections.StarTracker)
+SERVES: dict[str, tuple[type[msgspec.Struct], ...]] = {
+    "AdaptiveSettings": (sections.Control,),
+    "AravisSettings": (sections.AravisDevice, sections.Camera),
+    "CoilDriveSettings": (sections.Coils,),
+    "CoilSettings": (sections.Coils,),
+    "CoilWatchSettings": (sections.Coils, sections.PowerMonitor),
+    "ExcitationSettings": (sections.Identification,),
+    "FilterSettings": (sections.Estimation,),
+    "ImagingSettings": OF_CAMERA,
+    "LikelihoodSettings": OF_CAMERA,
+    "ModeSettings": (sections.Modes, sections.Detumble),
+    "NavigationSettings": (sections.InertialUnit, sections.Estimation),
+    "PlanningSettings": (sections.Guidance,),
+    "ResponseSettings": (sections.Plant, sections.InertialUnit),
+    "SolveSettings": OF_CAMERA,
+    "StreakSettings": OF_CAMERA,
+    "TrackerSettings": OF_CAMERA,
+    "V4l2Settings": (sections.V4l2Device, sections.Camera),
+    "Vn100Settings": (sections.InertialUnit,),
+}
+"""The sections that a flight fills each settings class from."""
+
+FILLED = {"DetectionSettings"}
+"""None stands for a value that is measured from the frame; a flight fills in the camera's."""
+
+OTHERS = {
+    "ClassicalSettings": "the thesis's star tracker, for comparison",
+    "DeterminationSettings": "a satellite's attitude determination, which the testbed does not fly",
+    "EdgeSettings": "horizon cameras",
+    "HorizonSettings": "horizon cameras",
+    "IdentificationSettings": "limits of the method",
+    "IndexSettings": "an index is built on the ground",
+    "ObjectSettings": "objects in frames of a run on the ground",
+    "SunSettings": "Sun cameras",
+    "VerificationSettings": "limits of the method",
+    "Vn100EmulatorSettings": "the emulated unit: truth, not belief",
+}
+"""Settings classes that no section fills, and why."""
+
+
+def _modules(package: ModuleType) -> Iterator[ModuleType]:
+    for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+        if not found.name.endswith("__main__"):
+            yield importlib.import_module(found.name)
+
+
+def _settings() -> dict[str, type]:
+    """Return every settings class of what flies and what it flies against, by name."""
+    return {
+        name: kind
+        for package in (flight, hal, sim_hal)
+        for module in _modules(package)
+        for name, kind in inspect.getmembers(module, inspect.isclass)
+        if name.endswith("Settings") and dataclasses.is_dataclass(kind)
+    }
+
+
+def _default(field: dataclasses.Field[object]) -> object:
+    if field.default_factory is not dataclasses.MISSING:
+        return field.default_factory()
+    return field.default
+
+
+def _disagreements(kind: type, section: type[msgspec.Struct]) -> list[str]:
+    """Return the values that both give a default, and not the same; times in ns count as those in s.
+
+    A section without a value of its own (None) leaves it to the settings class.
+    """
+    of_section = {field.name: field.default for field in msgspec.structs.fields(section)}
+    found = []
+    for field in dataclasses.fields(kind):
+        key = field.name.removesuffix("_ns")
+        own, configured = _default(field), of_section.get(key, msgspec.NODEFAULT)
+        if own is dataclasses.MISSING or configured in {None, msgspec.NODEFAULT}:
+            continue
+        own = own.value if isinstance(own, Enum) else own
+        if key != field.name and isinstance(configured, float):
+            configured = round(configured * SECOND_NS)
+        if not np.array_equal(np.asarray(own), np.asarray(configured)):
+            found.append(f"{kind.__name__}.{field.name} = {own}, {section.__name__}.{key} = {configured}")
+    return found
+
+
+def test_no_default_stands_twice_with_different_values() -> None:
+    kinds = _settings()
+    found = [
+        line
+        for name, filled_from in SERVES.items()
+        for section in filled_from
+        for line in _disagreements(kinds[name], section)
+    ]
+    assert found == []
+
+
+def test_every_settings_class_is_compared_or_has_a_reason() -> None:
+    assert sorted(_settings()) == sorted({*SERVES, *FILLED, *OTHERS})
+
+
+def test_a_default_that_differs_is_found() -> None:
+    @dataclasses.dataclass
+    class Other:
+        stale_after: float = 0.3
+        resistance: float = 1.0
+
+    assert _disagreements(Other, sections.Coils) == ["Other.stale_after = 0.3, Coils.stale_after = 0.25"]
