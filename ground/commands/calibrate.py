@@ -24,7 +24,7 @@ from flight.gnc.vision.startracker.solution import FrameSolution
 from flight.gnc.vision.startracker.solve import SolveSettings
 from ground.calibration.calibration import PARAMETERS, Calibration, calibrate
 from ground.calibration.lens_fit import MatchedFrame
-from ground.commands.options import positive
+from ground.commands.options import positive, write_new
 from ground.commands.solve import lens_of_field
 
 _ROUNDS = 3
@@ -186,8 +186,4 @@ def _write(path: Path, lens: Lens) -> None:
         f"    k1: {lens.k1:.8f}\n"
         f"    k2: {lens.k2:.8f}\n"
     )
-    try:
-        with path.open("x", encoding="utf-8") as file:
-            file.write(text)
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be written: {error.strerror or error}") from error
+    write_new(path, text)

@@ -17,7 +17,7 @@ from flight.link.telemetry.reader import read_run
 from flight.schema import reader as configuration
 from flight.schema.carried import config_path
 from flight.schema.sections import Config
-from ground.commands.options import positive
+from ground.commands.options import positive, write_new
 from ground.identification.constants import NAMES, UNITS, Constants
 from ground.identification.fit import Fit, fit
 from ground.identification.fragment import fragment
@@ -98,7 +98,7 @@ def run(options: argparse.Namespace) -> int:
     folder = _flown(options) if options.source.is_dir() else _fly(options)
     made = _identify(folder)
     if options.out is not None:
-        _write(options.out, made.fragment)
+        write_new(options.out, made.fragment)
     if options.json:
         sys.stdout.write(json.dumps(_facts(made), allow_nan=False) + "\n")
     else:
@@ -232,11 +232,3 @@ def _noise_line(found: Fit) -> str:
         f"noise:  current {1e3 * noise.current:.2f} mA, angle {1e3 * noise.angle:.2f} mrad, "
         f"rate {1e6 * noise.rate:.0f} urad/s; {verdict}"
     )
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        with path.open("x", encoding="utf-8") as file:
-            file.write(text)
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be written: {error.strerror or error}") from error

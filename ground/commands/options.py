@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from flight.gnc.camera.images import read_image, read_raw
+from flight.gnc.errors import UsageError
 from flight.gnc.math.arrays import Image
 from flight.schema.carried import config_path
 
@@ -68,3 +69,12 @@ def positive(text: str) -> float:
     if not (math.isfinite(value) and value > 0.0):
         raise argparse.ArgumentTypeError(f"{text} is not a positive number")
     return value
+
+
+def write_new(path: Path, text: str) -> None:
+    """Write a file that does not exist yet. Raises UsageError."""
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be written: {error.strerror or error}") from error

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 
 class DeviceError(Exception):
     """A device failed to do what was requested."""
@@ -34,3 +36,11 @@ class OutOfRange(DeviceError):
         self.low = low
         self.high = high
         self.unit = unit
+
+
+def check_limits(device: str, holder: object, limits: Mapping[str, tuple[float, float, str]]) -> None:
+    """Raise OutOfRange for an attribute of `holder` that is not within its (low, high, unit); NaN is not."""
+    for name, (low, high, unit) in limits.items():
+        value = getattr(holder, name)
+        if not low <= value <= high:
+            raise OutOfRange(device, name, value, low, high, unit)

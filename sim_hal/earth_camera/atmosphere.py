@@ -17,7 +17,7 @@ import numpy.typing as npt
 from scipy.special import erfcx
 
 from flight.gnc.earth.figure import SEMI_MAJOR_AXIS
-from hal.interfaces.errors import OutOfRange
+from hal.interfaces.errors import check_limits
 
 Float32Array = npt.NDArray[np.float32]
 
@@ -46,10 +46,7 @@ class Atmosphere:
             "optical_depth": (0.011, 10.0, ""),
             "multiple": (0.0, 4.0, ""),
         }
-        for name, (low, high, unit) in limits.items():
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise OutOfRange(DEVICE, name, value, low, high, unit)
+        check_limits(DEVICE, self, limits)
 
     @property
     def _ratio(self) -> float:

@@ -78,10 +78,3 @@ def _pattern(
     bright = rng.uniform(0.3, 1.0, size=model.hot_pixels) * model.highest_count
     dead, hot = blemished[: model.dead_pixels], blemished[model.dead_pixels :]
     return offsets, spread, dead, hot, bright.astype(np.float32)
-
-
-def blemished_pixels(model: EarthCameraModel) -> tuple[IntArray, IntArray]:
-    """Return the (x, y) places (n, 2) of dead and of hot pixels."""
-    _, _, dead, hot, _ = _pattern(model)
-    places = [np.stack([flat % model.columns, flat // model.columns], axis=1) for flat in (dead, hot)]
-    return places[0], places[1]

@@ -12,7 +12,7 @@ import numpy as np
 from flight.gnc.camera.lens import CameraModel, Lens
 from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.math.arrays import FloatArray
-from hal.interfaces.errors import OutOfRange
+from hal.interfaces.errors import OutOfRange, check_limits
 
 DEVICE = "Earth camera model"
 
@@ -94,10 +94,7 @@ class EarthCameraModel:
     scatter_angle: float = math.radians(0.5)
 
     def __post_init__(self) -> None:
-        for name, (low, high, unit) in _LIMITS.items():
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise OutOfRange(DEVICE, name, value, low, high, unit)
+        check_limits(DEVICE, self, _LIMITS)
         if self.response not in ("logarithmic", "linear"):
             raise ValueError(f"{DEVICE}: response = {self.response!r}: use logarithmic or linear")
         if (self.lens.rows, self.lens.columns) != (self.rows, self.columns):
@@ -153,13 +150,6 @@ class EarthCameraModel:
         else:
             counts = self.pedestal + np.minimum(light * self.sensitivity, self.full_well) / self.gain
         return np.asarray(np.clip(counts, 0.0, self.highest_count))
-
-    def radiance_of(self, counts: FloatArray) -> FloatArray:
-        """Return the radiance (...) that gives `counts` (...) in a pixel without noise or blemish."""
-        above = np.asarray(counts, dtype=float) - self.pedestal
-        if self.response == "logarithmic":
-            return np.asarray(self.darkest * (10.0 ** (above / self.counts_per_decade) - 1.0))
-        return np.asarray(above * self.gain / self.sensitivity)
 
 
 def pixel_rays(lens: CameraModel) -> FloatArray:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.math.arrays import FloatArray
-from hal.interfaces.errors import OutOfRange
+from hal.interfaces.errors import OutOfRange, check_limits
 
 DEVICE = "star camera model"
 
@@ -80,10 +80,7 @@ class StarCameraModel:
     background_gradient: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        for name, (low, high, unit) in _LIMITS.items():
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise OutOfRange(DEVICE, name, value, low, high, unit)
+        check_limits(DEVICE, self, _LIMITS)
         for name, choices in (("psf", ("integrated", "bilinear")), ("noise", ("poisson", "uniform"))):
             if getattr(self, name) not in choices:
                 raise ValueError(f"{DEVICE}: {name} = {getattr(self, name)!r}: use {' or '.join(choices)}")

@@ -16,7 +16,7 @@ from flight.gnc.earth.shadow import sunlit_share
 from flight.gnc.earth.sun import ASTRONOMICAL_UNIT
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.directions import tangent_basis
-from hal.interfaces.errors import OutOfRange
+from hal.interfaces.errors import check_limits
 
 DEVICE = "solar strings"
 _RINGS, _SPOKES = 16, 32
@@ -49,10 +49,7 @@ class SolarStringsModel:
         if np.shape(self.gain_errors) != (count,):
             raise ValueError(f"{DEVICE}: give one gain error a string")
         limits = {"grazing": (0.0, 0.5, "rad"), "noise": (0.0, 10.0, "A"), "albedo": (0.0, 1.0, "")}
-        for name, (low, high, unit) in limits.items():
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise OutOfRange(DEVICE, name, value, low, high, unit)
+        check_limits(DEVICE, self, limits)
 
     def currents(
         self, position: FloatArray, sun: FloatArray, body: FloatArray, generator: np.random.Generator

@@ -9,19 +9,14 @@ from __future__ import annotations
 import numpy as np
 
 from flight.gnc.attitude.profile import davenport_matrix
-from flight.gnc.attitude.wahba import AttitudeFix, fix, sightings
+from flight.gnc.attitude.wahba import optimal_solver
 from flight.gnc.math.arrays import FloatArray
-
-
-def solve(observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> AttitudeFix:
-    """Return the attitude that best turns `reference` into `observed` (n, 3), errors `sigma` (n,) rad.
-
-    Raises AttitudeError when the directions fix no attitude.
-    """
-    seen = sightings(observed, reference, sigma)
-    return fix(seen, optimal_quaternion(seen.profile))
 
 
 def optimal_quaternion(profile: FloatArray) -> FloatArray:
     """Return the optimal quaternion (4,) of an attitude profile matrix (3, 3)."""
     return np.asarray(np.linalg.eigh(davenport_matrix(profile))[1][:, 3])
+
+
+solve = optimal_solver(optimal_quaternion)
+"""Return the attitude by this method: a `flight.gnc.attitude.wahba.Solver`."""

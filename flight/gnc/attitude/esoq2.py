@@ -15,24 +15,19 @@ import numpy as np
 
 from flight.gnc.attitude.adjugate import adjugate
 from flight.gnc.attitude.profile import by_eigenvalue, in_turned_frame, skew_part, traces
-from flight.gnc.attitude.wahba import AttitudeFix, fix, sightings
+from flight.gnc.attitude.wahba import optimal_solver
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import normalise
-
-
-def solve(observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> AttitudeFix:
-    """Return the attitude that best turns `reference` into `observed` (n, 3), errors `sigma` (n,) rad.
-
-    Raises AttitudeError when the directions fix no attitude.
-    """
-    seen = sightings(observed, reference, sigma)
-    return fix(seen, optimal_quaternion(seen.profile))
 
 
 def optimal_quaternion(profile: FloatArray) -> FloatArray:
     """Return the optimal quaternion (4,) of an attitude profile matrix (3, 3) whose weights sum to one."""
     widest = int(traces(profile).argmin())
     return in_turned_frame(profile, lambda turned: by_eigenvalue(turned, _from_axis), widest)
+
+
+solve = optimal_solver(optimal_quaternion)
+"""Return the attitude by this method: a `flight.gnc.attitude.wahba.Solver`."""
 
 
 def _from_axis(profile: FloatArray, eigenvalue: float) -> FloatArray:

@@ -13,23 +13,18 @@ import numpy as np
 
 from flight.gnc.attitude.adjugate import adjugate, determinant
 from flight.gnc.attitude.profile import by_eigenvalue
-from flight.gnc.attitude.wahba import AttitudeFix, fix, sightings
+from flight.gnc.attitude.wahba import optimal_solver
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import from_matrix
-
-
-def solve(observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> AttitudeFix:
-    """Return the attitude that best turns `reference` into `observed` (n, 3), errors `sigma` (n,) rad.
-
-    Raises AttitudeError when the directions fix no attitude.
-    """
-    seen = sightings(observed, reference, sigma)
-    return fix(seen, optimal_quaternion(seen.profile))
 
 
 def optimal_quaternion(profile: FloatArray) -> FloatArray:
     """Return the optimal quaternion (4,) of an attitude profile matrix (3, 3) whose weights sum to one."""
     return by_eigenvalue(profile, _from_attitude_matrix)
+
+
+solve = optimal_solver(optimal_quaternion)
+"""Return the attitude by this method: a `flight.gnc.attitude.wahba.Solver`."""
 
 
 def _from_attitude_matrix(profile: FloatArray, eigenvalue: float) -> FloatArray:

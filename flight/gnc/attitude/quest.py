@@ -22,24 +22,19 @@ from flight.gnc.attitude.profile import (
     largest_eigenvalue,
     skew_part,
 )
-from flight.gnc.attitude.wahba import AttitudeFix, fix, sightings
+from flight.gnc.attitude.wahba import optimal_solver
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import normalise
-
-
-def solve(observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> AttitudeFix:
-    """Return the attitude that best turns `reference` into `observed` (n, 3), errors `sigma` (n,) rad.
-
-    Raises AttitudeError when the directions fix no attitude.
-    """
-    seen = sightings(observed, reference, sigma)
-    return fix(seen, optimal_quaternion(seen.profile))
 
 
 def optimal_quaternion(profile: FloatArray) -> FloatArray:
     """Return the optimal quaternion (4,) of an attitude profile matrix (3, 3) whose weights sum to one."""
     largest = _largest_component(profile, largest_eigenvalue(profile))
     return in_turned_frame(profile, lambda turned: by_eigenvalue(turned, _from_gibbs), largest)
+
+
+solve = optimal_solver(optimal_quaternion)
+"""Return the attitude by this method: a `flight.gnc.attitude.wahba.Solver`."""
 
 
 def _largest_component(profile: FloatArray, eigenvalue: float) -> int:

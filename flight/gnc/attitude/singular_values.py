@@ -10,18 +10,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from flight.gnc.attitude.wahba import AttitudeFix, fix, sightings
+from flight.gnc.attitude.wahba import optimal_solver
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import from_matrix
-
-
-def solve(observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> AttitudeFix:
-    """Return the attitude that best turns `reference` into `observed` (n, 3), errors `sigma` (n,) rad.
-
-    Raises AttitudeError when the directions fix no attitude.
-    """
-    seen = sightings(observed, reference, sigma)
-    return fix(seen, optimal_quaternion(seen.profile))
 
 
 def optimal_quaternion(profile: FloatArray) -> FloatArray:
@@ -29,3 +20,7 @@ def optimal_quaternion(profile: FloatArray) -> FloatArray:
     u, _, vt = np.linalg.svd(profile)
     u[:, 2] *= np.linalg.det(u) * np.linalg.det(vt)
     return from_matrix(u @ vt)
+
+
+solve = optimal_solver(optimal_quaternion)
+"""Return the attitude by this method: a `flight.gnc.attitude.wahba.Solver`."""

@@ -2,23 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 from flight.gnc.attitude import davenport, esoq2, foam, olae, predictive, quest, singular_values, triad
-from flight.gnc.attitude.wahba import AttitudeFix
+from flight.gnc.attitude.wahba import AttitudeFix, Solver
 from flight.gnc.math.arrays import FloatArray
-
-
-class Solver(Protocol):
-    """Computes an attitude from directions."""
-
-    def __call__(self, observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> AttitudeFix:
-        """Return the attitude that turns `reference` into `observed` (n, 3), errors `sigma` (n,) rad.
-
-        Raises AttitudeError when the directions fix no attitude.
-        """
-        ...
-
 
 SOLVERS: dict[str, Solver] = {
     "davenport": davenport.solve,

@@ -11,7 +11,9 @@ where the same two differ by d.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -114,6 +116,27 @@ def fix(seen: Sightings, quaternion: FloatArray) -> AttitudeFix:
     """Return the optimal attitude from a solver's `quaternion` (4,), with its covariance and loss (3.23)."""
     optimum, loss = refine(seen, quaternion)
     return AttitudeFix(upright(optimum), seen.covariance, loss)
+
+
+class Solver(Protocol):
+    """Computes an attitude from directions."""
+
+    def __call__(self, observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> AttitudeFix:
+        """Return the attitude that turns `reference` into `observed` (n, 3), errors `sigma` (n,) rad.
+
+        Raises AttitudeError when the directions fix no attitude.
+        """
+        ...
+
+
+def optimal_solver(optimal_quaternion: Callable[[FloatArray], FloatArray]) -> Solver:
+    """Return the solver that takes its quaternion (4,) from the profile matrix (3, 3)."""
+
+    def solve(observed: FloatArray, reference: FloatArray, sigma: FloatArray) -> AttitudeFix:
+        seen = sightings(observed, reference, sigma)
+        return fix(seen, optimal_quaternion(seen.profile))
+
+    return solve
 
 
 def upright(quaternion: FloatArray) -> FloatArray:

@@ -8,14 +8,13 @@ folds within its own detector is rejected.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Protocol, Self
 
 import numpy as np
 
 from flight.gnc.camera.pinhole import Pinhole
-from flight.gnc.errors import FlightError, InputError
+from flight.gnc.errors import FlightError
 from flight.gnc.math.arrays import BoolArray, FloatArray
 
 _MOST_STEPS = 60
@@ -113,32 +112,6 @@ class Lens:
             return camera
         return cls(camera.columns, camera.rows, camera.focal_length, camera.centre)
 
-    @classmethod
-    def from_mapping(cls, mapping: Mapping[str, object], where: str = "lens") -> Lens:
-        """Return the lens of a mapping with the keys of `to_mapping`; k1 and k2 are optional.
-
-        Raises InputError, with the place `where`, for a key or value that is wrong.
-        """
-        unknown = set(mapping) - set(_KEYS)
-        if unknown:
-            raise InputError(f"{where}.{min(unknown)}", f"no such key; a lens has {', '.join(_KEYS)}")
-        numbers = {key: _number(mapping, key, where) for key in _KEYS if key != "centre"}
-        for key in ("columns", "rows"):
-            if numbers[key] != int(numbers[key]):
-                raise InputError(f"{where}.{key}", f"{numbers[key]}: must be a whole number of pixels")
-        x, y = _centre(mapping, where)
-        try:
-            return cls(
-                int(numbers["columns"]),
-                int(numbers["rows"]),
-                numbers["focal_length"],
-                (x, y),
-                numbers["k1"],
-                numbers["k2"],
-            )
-        except LensError as error:
-            raise InputError(where, str(error)) from error
-
     def to_mapping(self) -> dict[str, int | float | list[float]]:
         """Return the lens as plain numbers for a YAML file: pixels, and k1, k2 of tangents."""
         return {
@@ -223,10 +196,6 @@ class Lens:
         return np.where(seen, radius, np.nan)
 
 
-_KEYS = ("columns", "rows", "focal_length", "centre", "k1", "k2")
-_OPTIONAL = {"k1": 0.0, "k2": 0.0}
-
-
 def _reach(k1: float, k2: float) -> float:
     """Return the least tangent where r (1 + k1 r^2 + k2 r^4) stops growing: 1 + 3 k1 r^2 + 5 k2 r^4 = 0."""
     discriminant = 9.0 * k1 * k1 - 20.0 * k2
@@ -235,18 +204,3 @@ def _reach(k1: float, k2: float) -> float:
     # The smaller positive root, without cancellation: for k2 = 0 it is -1/(3 k1).
     denominator = -3.0 * k1 + np.sqrt(discriminant)
     return float(np.sqrt(2.0 / denominator)) if denominator > _NO_FOLD else np.inf
-
-
-def _number(mapping: Mapping[str, object], key: str, where: str) -> float:
-    value = mapping.get(key, _OPTIONAL.get(key))
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InputError(f"{where}.{key}", f"{value!r}: must be a number")
-    return float(value)
-
-
-def _centre(mapping: Mapping[str, object], where: str) -> tuple[float, float]:
-    value = mapping.get("centre")
-    if not isinstance(value, list | tuple) or len(value) != 2:
-        raise InputError(f"{where}.centre", f"{value!r}: must be two numbers, [x, y] in pixels")
-    pair = {"x": value[0], "y": value[1]}
-    return _number(pair, "x", f"{where}.centre"), _number(pair, "y", f"{where}.centre")

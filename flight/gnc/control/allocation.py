@@ -65,10 +65,3 @@ def allocate(
     length = float(wanted @ wanted)
     share = float(made @ wanted) / length if length > 0.0 else 1.0
     return Allocation(currents, made, min(max(share, 0.0), 1.0))
-
-
-def keep_direction(currents: FloatArray, limits: FloatArray, available: FloatArray) -> FloatArray:
-    """Return currents (3,) A with unavailable axes zero, the vector scaled into the limits (3,) A."""
-    kept: FloatArray = np.where(available, currents, 0.0)
-    excess = float(np.max(np.abs(kept) / limits))
-    return kept / excess if excess > 1.0 else kept

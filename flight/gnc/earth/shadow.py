@@ -40,11 +40,6 @@ def sunlit_share(position: FloatArray, sun: FloatArray, shadow: Shadow = "conica
     return 1.0 - _covered(sun_disc, earth_disc, apart)
 
 
-def eclipsed(position: FloatArray, sun: FloatArray, shadow: Shadow = "conical") -> BoolArray:
-    """Return which of `position` (..., 3) m are in the umbra; arguments as above."""
-    return np.asarray(sunlit_share(position, sun, shadow) <= 0.0)
-
-
 def _in_cylinder(position: FloatArray, sun: FloatArray) -> BoolArray:
     towards = sun / np.linalg.norm(sun, axis=-1, keepdims=True)
     distance = np.linalg.norm(position, axis=-1)

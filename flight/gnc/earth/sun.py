@@ -11,6 +11,8 @@ import numpy as np
 
 from flight.gnc.math.arrays import FloatArray
 
+SPEED_OF_LIGHT = 299_792_458.0
+"""m/s."""
 ASTRONOMICAL_UNIT = 149_597_870_700.0
 """m (IAU 2012)."""
 SUN_RADIUS = 695_700_000.0

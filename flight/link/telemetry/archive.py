@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from flight.gnc.errors import UsageError
+from flight.link.telemetry.segments import make_lasting
 
 MOST_RUNS = 1000
 """A board that crashes at every start makes many runs of a few kilobytes: they are bounded by number too."""
@@ -62,7 +63,7 @@ def begin_run(archive: Path, budget_bytes: int, coming_bytes: int) -> NewRun:
         dropped += 1
     try:
         folder.mkdir(parents=True)
-        _make_lasting(archive)
+        make_lasting(archive)
     except OSError as error:
         if error.errno not in DISK_TROUBLE:
             raise UsageError(f"{archive}: no run can be begun there: {error.strerror or error}") from error
@@ -76,15 +77,6 @@ def _free(archive: Path) -> float:
     except OSError:
         return math.inf
     return float(disk.f_bavail * disk.f_frsize)
-
-
-def _make_lasting(folder: Path) -> None:
-    """Have the names in a folder outlive a loss of power."""
-    names = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        os.fsync(names)
-    finally:
-        os.close(names)
 
 
 def _drop(run: Path) -> None:

@@ -32,6 +32,15 @@ class SegmentFile(Protocol):
         """Close the file. Raises OSError."""
 
 
+def make_lasting(folder: Path) -> None:
+    """Have the names in a folder outlive a loss of power."""
+    names = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(names)
+    finally:
+        os.close(names)
+
+
 def open_segment(path: Path) -> SegmentFile:
     """Create a segment, never over an existing file, and make its name durable.
 
@@ -41,11 +50,7 @@ def open_segment(path: Path) -> SegmentFile:
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC
     file = os.fdopen(os.open(path, flags, 0o644), "wb", buffering=0)
     try:
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+        make_lasting(path.parent)
     except OSError:  # nothing is left in the way of another try
         file.close()
         path.unlink(missing_ok=True)

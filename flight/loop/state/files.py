@@ -12,6 +12,8 @@ import os
 from pathlib import Path
 from typing import Protocol
 
+from flight.link.telemetry.segments import make_lasting
+
 
 class Files(Protocol):
     """The file system calls that are used; each raises OSError."""
@@ -70,11 +72,7 @@ class LinuxFiles:
 
     def sync_folder(self, folder: Path) -> None:
         """Make the names in a folder durable."""
-        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+        make_lasting(folder)
 
 
 def replace_file(files: Files, path: Path, data: bytes) -> None:

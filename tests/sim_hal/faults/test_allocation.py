@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flight.gnc.control.allocation import allocate, keep_direction
+from flight.gnc.control.allocation import allocate
 from flight.gnc.errors import FlightError
 from flight.gnc.math.arrays import FloatArray
 
@@ -95,8 +95,3 @@ def test_no_torque_and_no_coil_ask_for_no_current() -> None:
 def test_what_is_not_finite_is_refused() -> None:
     with pytest.raises(FlightError, match="not finite"):
         allocate(np.array([np.nan, 0, 0]), np.ones(3), DIPOLE, LIMITS)
-
-
-def test_currents_keep_their_direction_in_the_limits() -> None:
-    kept = keep_direction(np.array([0.3, -0.1, 0.05]), LIMITS, np.array([True, True, False]))
-    assert kept == pytest.approx([0.148, -0.148 / 3.0, 0.0])

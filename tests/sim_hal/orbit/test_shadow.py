@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from flight.gnc.earth.figure import EARTH_RADIUS
-from flight.gnc.earth.shadow import eclipsed, sunlit_share
+from flight.gnc.earth.shadow import sunlit_share
 from flight.gnc.earth.sun import ASTRONOMICAL_UNIT, SUN_RADIUS
 from flight.gnc.math.arrays import FloatArray
 
@@ -28,8 +28,8 @@ def test_umbra_and_penumbra_end_at_the_common_tangents(depth: float) -> None:
     for edge, inside, outside in ((umbra, 0.0, 1e-9), (penumbra, 1.0 - 1e-9, 1.0)):
         assert sunlit_share(_behind(depth, edge - 200.0), SUN) == pytest.approx(inside, abs=2e-3)
         assert sunlit_share(_behind(depth, edge + 200.0), SUN) == pytest.approx(outside, abs=2e-3)
-    assert eclipsed(_behind(depth, umbra - 200.0), SUN)
-    assert not eclipsed(_behind(depth, umbra + 200.0), SUN)
+    assert sunlit_share(_behind(depth, umbra - 200.0), SUN) == 0.0
+    assert sunlit_share(_behind(depth, umbra + 200.0), SUN) > 0.0
     assert sunlit_share(_behind(depth, penumbra - 200.0), SUN) < 1.0
     assert sunlit_share(_behind(depth, penumbra + 200.0), SUN) == 1.0
 
@@ -38,7 +38,7 @@ def test_the_umbra_ends_where_hipparchus_had_it() -> None:
     """1.38 million km behind the Earth: beyond it the Sun is a ring, of the discs' areas."""
     tip = EARTH_RADIUS * ASTRONOMICAL_UNIT / (SUN_RADIUS - EARTH_RADIUS)
     assert tip == pytest.approx(1.384e9, rel=2e-3)
-    assert eclipsed(_behind(0.999 * tip, 0.0), SUN)
+    assert sunlit_share(_behind(0.999 * tip, 0.0), SUN) == 0.0
     share = sunlit_share(_behind(2.0 * tip, 0.0), SUN)
     earth, whole = EARTH_RADIUS / (2.0 * tip), SUN_RADIUS / (ASTRONOMICAL_UNIT + 2.0 * tip)
     assert share == pytest.approx(1.0 - (earth / whole) ** 2, rel=1e-4)
@@ -74,8 +74,8 @@ def test_between_earth_and_sun_it_is_day_everywhere() -> None:
 def test_the_cylinder_is_as_wide_as_the_earth() -> None:
     """Errata to 2.15: of the object's own position; at any depth the edge is one radius off the axis."""
     for depth in (1000e3, 42_164e3):
-        assert eclipsed(_behind(depth, EARTH_RADIUS - 10.0), SUN, "cylindrical")
-        assert not eclipsed(_behind(depth, EARTH_RADIUS + 10.0), SUN, "cylindrical")
+        assert sunlit_share(_behind(depth, EARTH_RADIUS - 10.0), SUN, "cylindrical") == 0.0
+        assert sunlit_share(_behind(depth, EARTH_RADIUS + 10.0), SUN, "cylindrical") > 0.0
 
 
 def test_cone_and_cylinder_agree_but_for_the_penumbra() -> None:

@@ -21,7 +21,6 @@ from flight.gnc.earth.shadow import sunlit_share
 from flight.gnc.earth.sun import ASTRONOMICAL_UNIT
 from flight.gnc.math.arrays import BoolArray, FloatArray
 from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector, normalise
-from flight.schema.sensor_suite import SensorSuite
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.orbit_geometry import (
     SUITES,
@@ -35,6 +34,7 @@ from tests.studies.campaigns.orbit_geometry import (
     suite,
 )
 from tests.studies.campaigns.orbit_world import FIRST_DATE
+from tests.studies.campaigns.sensor_suite import SensorSuite
 
 STEP = 20.0
 MOST_TILT = np.radians(15.0)

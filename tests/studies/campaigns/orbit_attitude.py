@@ -21,12 +21,12 @@ from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import conjugate, multiply
 from flight.gnc.math.quaternion import to_rotation_vector as rotation_vector
 from flight.schema.reader import replace
-from flight.schema.sensor_suite import SensorSuite
 from tests.studies.campaigns import orbit_world
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.consistency import band
 from tests.studies.campaigns.orbit_geometry import suite as suite_of
 from tests.studies.campaigns.orbit_world import OPTICAL_SIGMA, PUSH_WALK, STEP, Readings, World
+from tests.studies.campaigns.sensor_suite import SensorSuite
 
 SUITE = "uw"
 LOST_AT = 600.0

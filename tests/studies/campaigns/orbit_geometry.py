@@ -14,9 +14,9 @@ import numpy as np
 
 from flight.gnc.earth.figure import EARTH_RADIUS
 from flight.gnc.math.arrays import BoolArray, FloatArray
-from flight.schema import sensor_suite
-from flight.schema.sensor_suite import SensorSuite, WideCamera
 from sim_hal.worlds.orbit import KeplerianElements, propagate
+from tests.studies.campaigns import sensor_suite
+from tests.studies.campaigns.sensor_suite import SensorSuite, WideCamera
 
 ALTITUDE = 380e3
 INCLINATION = np.radians(51.6)

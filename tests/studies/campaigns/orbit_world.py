@@ -20,7 +20,6 @@ from flight.gnc.earth.sun import ASTRONOMICAL_UNIT
 from flight.gnc.math.arrays import BoolArray, FloatArray
 from flight.gnc.math.quaternion import attitude_matrix, conjugate, from_matrix, from_rotation_vector, multiply
 from flight.gnc.math.quaternion import to_rotation_vector as rotation_vector
-from flight.schema.sensor_suite import SensorSuite
 from sim_hal.worlds import geomagnetism
 from tests.studies.campaigns.orbit_geometry import (
     Pass,
@@ -30,6 +29,7 @@ from tests.studies.campaigns.orbit_geometry import (
     local_frame,
     revolution,
 )
+from tests.studies.campaigns.sensor_suite import SensorSuite
 
 STEP = 0.5
 """s, of the truth and of the gyros."""

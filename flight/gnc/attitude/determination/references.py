@@ -14,10 +14,8 @@ import numpy as np
 from flight.gnc.earth import geomagnetism
 from flight.gnc.earth.orbit_knowledge import OrbitState
 from flight.gnc.earth.orientation import terrestrial_time
-from flight.gnc.earth.sun import SUN_RADIUS, earth_from_sun
+from flight.gnc.earth.sun import SPEED_OF_LIGHT, SUN_RADIUS, earth_from_sun
 from flight.gnc.math.arrays import FloatArray
-
-SPEED_OF_LIGHT = 299_792_458.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

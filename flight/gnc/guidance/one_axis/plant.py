@@ -76,11 +76,6 @@ class SingleAxisPlant:
         )
         return np.asarray(torque / (self.torque_constant * np.cos(angle)))
 
-    def accelerations(self, angle: FloatArray, rate: FloatArray, current: FloatArray) -> FloatArray:
-        """Return `acceleration` for arrays (n,)."""
-        torque = self.torque_constant * current * np.cos(angle) - self.stiffness * angle
-        return np.asarray((torque - self.damping * rate) / self.inertia + self.disturbance)
-
 
 def angle_of(q2: float) -> float:
     """Return theta = 2 asin(q2) in rad."""

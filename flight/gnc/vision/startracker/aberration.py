@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from flight.gnc.earth.sun import SPEED_OF_LIGHT
 from flight.gnc.math.arrays import FloatArray
-
-SPEED_OF_LIGHT = 299_792_458.0
-"""m/s."""
 
 
 def apparent(direction: FloatArray, velocity: FloatArray) -> FloatArray:

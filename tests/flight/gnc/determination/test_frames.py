@@ -18,11 +18,11 @@ from flight.gnc.vision.horizon.knowledge import HorizonKnowledge
 from flight.gnc.vision.horizon.nadir import find_nadir
 from flight.gnc.vision.sun_sensor.direction import find_sun
 from flight.gnc.vision.sun_sensor.settings import SunSettings
-from flight.schema.sensor_suite import WideCamera
 from sim_hal.earth_camera import EarthCameraModel, EarthScene, render
 from tests.studies.campaigns.nadir import camera_model, finder_settings
 from tests.studies.campaigns.orbit_attitude import settings_of
 from tests.studies.campaigns.orbit_geometry import local_frame, suite
+from tests.studies.campaigns.sensor_suite import WideCamera
 
 UW = suite("uw")
 POSITION: FloatArray = (EARTH_RADIUS + 380e3) * np.array([[0.6, -0.64, 0.48]])

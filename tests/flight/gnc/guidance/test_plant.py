@@ -32,9 +32,6 @@ def test_current_and_acceleration_are_inverse(angle: float, rate: float, acceler
     assert THREAD.acceleration(angle, rate, current) == pytest.approx(acceleration, abs=1e-14)
     arrays = [np.array([value]) for value in (angle, rate, acceleration)]
     assert THREAD.currents(*arrays)[0] == pytest.approx(current, rel=1e-12, abs=1e-15)
-    assert THREAD.accelerations(arrays[0], arrays[1], np.array([current]))[0] == pytest.approx(
-        acceleration, abs=1e-14
-    )
 
 
 def test_full_current_turns_the_knightcube_as_the_torque_says() -> None:

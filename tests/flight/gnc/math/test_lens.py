@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import yaml
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from flight.gnc.camera.lens import CameraModel, Lens, LensError
 from flight.gnc.camera.pinhole import Pinhole
-from flight.gnc.errors import InputError
 from flight.gnc.math.arrays import FloatArray
 
 _PINHOLE = Pinhole.from_field_of_view(1024, 768, np.radians(20.0))
@@ -97,29 +95,3 @@ def test_a_pixel_that_is_none_leaves_the_others_alone() -> None:
 def test_the_farthest_corner_counts_when_the_axis_is_off_the_middle() -> None:
     lens = Lens(1000, 1000, 1000.0, (399.5, 499.5))
     assert lens.half_diagonal == pytest.approx(np.arctan(np.hypot(0.6, 0.5)), abs=1e-12)
-
-
-def test_it_survives_a_yaml_file() -> None:
-    lens = Lens(1024, 768, 2903.25, (509.125, 390.5), -0.0625, 0.5)
-    assert Lens.from_mapping(yaml.safe_load(yaml.safe_dump(lens.to_mapping()))) == lens
-
-
-@pytest.mark.parametrize(
-    ("change", "where"),
-    [
-        ({"focal_length": "long"}, "camera.lens.focal_length"),
-        ({"columns": 10.5}, "camera.lens.columns"),
-        ({"rows": True}, "camera.lens.rows"),
-        ({"centre": 5.0}, "camera.lens.centre"),
-        ({"centre": [1.0, None]}, "camera.lens.centre.y"),
-        ({"k3": 1.0}, "camera.lens.k3"),
-        ({"focal_length": -1.0}, "camera.lens"),
-        ({"k1": float("nan")}, "camera.lens"),
-        ({"k1": -1000.0}, "camera.lens"),
-    ],
-)
-def test_a_wrong_value_is_named_by_its_place(change: dict[str, object], where: str) -> None:
-    good = Lens.of(_PINHOLE).to_mapping()
-    with pytest.raises(InputError) as caught:
-        Lens.from_mapping({**good, **change}, "camera.lens")
-    assert caught.value.where == where

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flight.gnc.earth.sun import ASTRONOMICAL_UNIT, DAY, earth_from_sun, earth_velocity
-from flight.gnc.vision.startracker.aberration import SPEED_OF_LIGHT, apparent
+from flight.gnc.earth.sun import ASTRONOMICAL_UNIT, DAY, SPEED_OF_LIGHT, earth_from_sun, earth_velocity
+from flight.gnc.vision.startracker.aberration import apparent
 from sim_hal.worlds import sun
 
 _ARCSECOND = np.radians(1.0 / 3600.0)

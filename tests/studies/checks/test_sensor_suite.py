@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from flight.gnc.math.arrays import FloatArray
-from flight.schema import sensor_suite
 from flight.schema.errors import ConfigError
+from tests.studies.campaigns import sensor_suite
 from tests.studies.campaigns.orbit_geometry import SUITES, suite
 
 DOWN = np.array([0.0, 0.0, 1.0])
