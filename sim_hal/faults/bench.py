@@ -29,6 +29,14 @@ def no_lift() -> None:
     """Remove nothing: the effect stays until something repairs it."""
 
 
+def held(part: object | None, attribute: str, value: object, sound: object) -> Lift:
+    """Give an attribute of a part a value until the fault is removed; a part that is not fitted has none."""
+    if part is None:
+        return no_lift
+    setattr(part, attribute, value)
+    return lambda: setattr(part, attribute, sound)
+
+
 @dataclass(slots=True)
 class Bench:
     """The parts that faults act on from outside the flight process.

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from sim_hal.faults.bench import Bench, Lift
-from sim_hal.faults.kinds import FaultKind, Parameter, Parameters
+from sim_hal.faults.kinds import Begin, FaultKind, Parameter, Parameters
 from sim_hal.worlds.coil_circuit import Condition
 
 _OHM = Parameter(5.0, 0.1, 1000.0, "ohm")
@@ -22,7 +20,7 @@ _BRIDGE = (
 )
 
 
-def _broken(axis: int, condition: Condition) -> Callable[[Bench, Parameters], Lift]:
+def _broken(axis: int, condition: Condition) -> Begin:
     def begin(bench: Bench, given: Parameters) -> Lift:
         circuit = bench.hardware.circuit
         circuit.become(axis, condition, given.get("ohm", 0.0))

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
-from sim_hal.faults.bench import Bench, Lift, no_lift
-from sim_hal.faults.kinds import PERIOD, SHARE, FaultKind, Parameter, Parameters, delay
+from sim_hal.faults.bench import Bench, Lift, held, no_lift
+from sim_hal.faults.kinds import PERIOD, TURNS, Begin, FaultKind, Parameter, Parameters, delay, intermittently
 
 
-def _showing(fault: str) -> Callable[[Bench, Parameters], Lift]:
+def _showing(fault: str) -> Begin:
     def begin(bench: Bench, _: Parameters) -> Lift:
         camera = bench.hardware.camera
         if camera is None:
@@ -26,24 +25,11 @@ def _showing(fault: str) -> Callable[[Bench, Parameters], Lift]:
 
 
 def _slow(bench: Bench, given: Parameters) -> Lift:
-    camera = bench.hardware.camera
-    if camera is None:
-        return no_lift
-    camera.one_of = round(given["n"])
-    return lambda: setattr(camera, "one_of", 1)
+    return held(bench.hardware.camera, "one_of", round(given["n"]), 1)
 
 
 def _delayed(bench: Bench, given: Parameters) -> Lift:
-    camera = bench.hardware.camera
-    if camera is None:
-        return no_lift
-    camera.late_ns = round(given["delay"] * 1e9)
-    return lambda: setattr(camera, "late_ns", 0)
-
-
-def _intermittently(bench: Bench, given: Parameters) -> Lift:
-    begin = _showing("off")
-    return bench.toggle(lambda: begin(bench, given), given["period"], given["share"])
+    return held(bench.hardware.camera, "late_ns", round(given["delay"] * 1e9), 0)
 
 
 CAMERA = (
@@ -66,7 +52,7 @@ CAMERA = (
         "camera",
         "intermittent",
         "off intermittently",
-        _intermittently,
-        {"period": replace(PERIOD, default=6.0), "share": SHARE},
+        intermittently(_showing("off")),
+        TURNS | {"period": replace(PERIOD, default=6.0)},
     ),
 )

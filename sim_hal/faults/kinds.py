@@ -10,6 +10,9 @@ from sim_hal.faults.bench import Bench, Lift
 
 Parameters = Mapping[str, float]
 
+Begin = Callable[[Bench, Parameters], Lift]
+"""Applies a fault to the bench and returns its removal."""
+
 
 class Where(Enum):
     """The kind of simulation in which a fault can occur."""
@@ -71,6 +74,12 @@ CHANCE = Parameter(0.5, 1e-6, 1.0)
 PERIOD = Parameter(0.5, 0.05, 3600.0, "s")
 SHARE = Parameter(0.5, 0.01, 0.99)
 """Fraction of its period for which an intermittent fault is present."""
+TURNS = {"period": PERIOD, "share": SHARE}
+
+
+def intermittently(begin: Begin) -> Begin:
+    """Return the fault that comes and goes, with the parameters TURNS."""
+    return lambda bench, given: bench.toggle(lambda: begin(bench, given), given["period"], given["share"])
 
 
 def delay(default: float) -> Parameter:
@@ -95,7 +104,7 @@ class FaultKind:
     device: str
     kind: str
     meaning: str
-    begin: Callable[[Bench, Parameters], Lift] | None
+    begin: Begin | None
     parameters: Mapping[str, Parameter] = field(default_factory=dict)
     momentary: bool = False
     where: Where = Where.BOTH

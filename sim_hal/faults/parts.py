@@ -9,8 +9,8 @@ import numpy as np
 
 from hal.drivers.pca9685 import PRE_SCALE
 from sim_hal.emulators.i2c_bus import I2cPart
-from sim_hal.faults.bench import Bench, Lift, no_lift
-from sim_hal.faults.kinds import CHANCE, PERIOD, SHARE, FaultKind, Parameter, Parameters, delay
+from sim_hal.faults.bench import Bench, Lift, held, no_lift
+from sim_hal.faults.kinds import CHANCE, TURNS, Begin, FaultKind, Parameter, Parameters, delay, intermittently
 
 _MOST_BYTES = 32
 
@@ -62,7 +62,7 @@ def _disturbed(
     )
 
 
-def _off(device: str) -> Callable[[Bench, Parameters], Lift]:
+def _off(device: str) -> Begin:
     def begin(bench: Bench, _: Parameters) -> Lift:
         part = part_of(bench, device)
         if part is None:
@@ -74,7 +74,7 @@ def _off(device: str) -> Callable[[Bench, Parameters], Lift]:
     return begin
 
 
-def _brown_out(device: str) -> Callable[[Bench, Parameters], Lift]:
+def _brown_out(device: str) -> Begin:
     def begin(bench: Bench, _: Parameters) -> Lift:
         part = part_of(bench, device)
         if part is not None:
@@ -97,14 +97,14 @@ def _stuck_monitor(bench: Bench, _: Parameters) -> Lift:
     return monitor.frozen.clear
 
 
-def _garbage(device: str) -> Callable[[Bench, Parameters], Lift]:
+def _garbage(device: str) -> Begin:
     def begin(bench: Bench, _: Parameters) -> Lift:
         return _disturbed(bench, device, read=lambda data: bench.generator.bytes(len(data)))
 
     return begin
 
 
-def _bits(device: str) -> Callable[[Bench, Parameters], Lift]:
+def _bits(device: str) -> Begin:
     def begin(bench: Bench, given: Parameters) -> Lift:
         part = part_of(bench, device)
 
@@ -127,11 +127,7 @@ def _wrong_pwm(bench: Bench, _: Parameters) -> Lift:
 
 
 def _wrong_monitor(bench: Bench, given: Parameters) -> Lift:
-    monitor = bench.hardware.monitor
-    if monitor is None:
-        return no_lift
-    monitor.gain = given["gain"]
-    return lambda: setattr(monitor, "gain", 1.0)
+    return held(bench.hardware.monitor, "gain", given["gain"], 1.0)
 
 
 def _delayed_pwm(bench: Bench, given: Parameters) -> Lift:
@@ -144,11 +140,7 @@ def _delayed_pwm(bench: Bench, given: Parameters) -> Lift:
 
 
 def _delayed_monitor(bench: Bench, given: Parameters) -> Lift:
-    monitor = bench.hardware.monitor
-    if monitor is None:
-        return no_lift
-    monitor.lag_ns = round(given["delay"] * 1e9)
-    return lambda: setattr(monitor, "lag_ns", 0)
+    return held(bench.hardware.monitor, "lag_ns", round(given["delay"] * 1e9), 0)
 
 
 def _address(bench: Bench, device: str) -> int:
@@ -156,25 +148,16 @@ def _address(bench: Bench, device: str) -> int:
     return getattr(part, "address", 0)
 
 
-def _nack(device: str) -> Callable[[Bench, Parameters], Lift]:
+def _nack(device: str) -> Begin:
     return lambda bench, _: bench.hardware.bus.nack(_address(bench, device), times=None)
 
 
-def _slow(device: str) -> Callable[[Bench, Parameters], Lift]:
+def _slow(device: str) -> Begin:
     def begin(bench: Bench, given: Parameters) -> Lift:
         chance = given["chance"]
         return bench.hardware.bus.time_out(_address(bench, device), lambda: bench.generator.random() < chance)
 
     return begin
-
-
-def _intermittently(
-    begin: Callable[[Bench, Parameters], Lift],
-) -> Callable[[Bench, Parameters], Lift]:
-    return lambda bench, given: bench.toggle(lambda: begin(bench, given), given["period"], given["share"])
-
-
-_TURNS = {"period": PERIOD, "share": SHARE}
 
 
 def _part(device: str) -> tuple[FaultKind, ...]:
@@ -202,8 +185,8 @@ def _part(device: str) -> tuple[FaultKind, ...]:
             device,
             "intermittent",
             "it acknowledges intermittently",
-            _intermittently(_nack(device)),
-            _TURNS,
+            intermittently(_nack(device)),
+            TURNS,
             adds=True,
         ),
         FaultKind(
@@ -273,8 +256,8 @@ BUS = (
         "bus",
         "intermittent",
         "the clock line is held low intermittently",
-        _intermittently(lambda bench, _: bench.hardware.bus.hang(times=None)),
-        _TURNS,
+        intermittently(lambda bench, _: bench.hardware.bus.hang(times=None)),
+        TURNS,
         adds=True,
     ),
 )

@@ -13,12 +13,15 @@ from flight.gnc.math.quaternion import from_rotation_vector, multiply
 from sim_hal.emulators.serial_line import LineFaults
 from sim_hal.emulators.vn100_registers import BAUD_RATES, UnitError
 from sim_hal.emulators.vn100_sensors import Measured
-from sim_hal.faults.bench import Bench, Lift, no_lift
-from sim_hal.faults.kinds import CHANCE, PERIOD, SHARE, FaultKind, Parameter, Parameters, delay
+from sim_hal.faults.bench import Bench, Lift, held, no_lift
+from sim_hal.faults.kinds import CHANCE, TURNS, Begin, FaultKind, Parameter, Parameters, delay, intermittently
 
 
-def _line(faults: Callable[[Parameters], LineFaults]) -> Callable[[Bench, Parameters], Lift]:
+def _line(faults: Callable[[Parameters], LineFaults]) -> Begin:
     return lambda bench, given: bench.disturb(bench.line.to_host, faults(given))
+
+
+_SILENT = _line(lambda _: LineFaults(silent=True))
 
 
 def _off(bench: Bench, _: Parameters) -> Lift:
@@ -42,8 +45,7 @@ def _unplugged(bench: Bench, _: Parameters) -> Lift:
             theirs()
 
         return plug_in
-    host.unplugged = True
-    return lambda: setattr(host, "unplugged", False)
+    return held(host, "unplugged", True, False)
 
 
 def _baud(bench: Bench, given: Parameters) -> Lift:
@@ -83,20 +85,13 @@ def _wrong(bench: Bench, given: Parameters) -> Lift:
     )
 
 
-def _intermittent(bench: Bench, given: Parameters) -> Lift:
-    def begin() -> Lift:
-        return bench.disturb(bench.line.to_host, LineFaults(silent=True))
-
-    return bench.toggle(begin, given["period"], given["share"])
-
-
 _WRONG = {"angle": Parameter(0.2, -math.pi, math.pi, "rad"), "rate": Parameter(0.05, -10.0, 10.0, "rad/s")}
 _ONE_OF = Parameter(8.0, 2.0, 1000.0, whole=True)
 _RATE = Parameter(230400.0, min(BAUD_RATES), max(BAUD_RATES), "baud", choices=BAUD_RATES)
 
 IMU = (
     FaultKind("imu", "off", "no power; restarts from its saved settings afterwards", _off),
-    FaultKind("imu", "silent", "no byte arrives", _line(lambda _: LineFaults(silent=True)), adds=True),
+    FaultKind("imu", "silent", "no byte arrives", _SILENT, adds=True),
     FaultKind("imu", "unplugged", "the serial port disappears", _unplugged),
     FaultKind("imu", "stuck", "valid packets, constant values", _stuck),
     FaultKind(
@@ -123,8 +118,8 @@ IMU = (
         "imu",
         "intermittent",
         "silent intermittently",
-        _intermittent,
-        {"period": PERIOD, "share": SHARE},
+        intermittently(_SILENT),
+        TURNS,
         adds=True,
     ),
     FaultKind(

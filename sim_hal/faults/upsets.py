@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from hal.drivers.pca9685 import CHANNELS, LED0_ON_L, MODE1, MODE2, PRE_SCALE
 from sim_hal.emulators.ina219 import CALIBRATION, CONFIG
 from sim_hal.emulators.vn100_registers import FIELD_BITS
 from sim_hal.faults.bench import Bench, Lift, no_lift
-from sim_hal.faults.kinds import FaultKind, Parameter, Parameters
+from sim_hal.faults.kinds import Begin, FaultKind, Parameter, Parameters
 
 _SET_UP = (MODE1, MODE2, PRE_SCALE)
 _OUTPUTS = tuple(range(LED0_ON_L, LED0_ON_L + 4 * CHANNELS))
@@ -48,7 +48,7 @@ def _imu(bench: Bench, given: Parameters) -> Lift:
 
 def _upset(
     device: str,
-    begin: Callable[[Bench, Parameters], Lift],
+    begin: Begin,
     registers: tuple[int, ...],
     bits: int,
     meaning: str,
