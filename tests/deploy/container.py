@@ -27,7 +27,7 @@ COMMANDS = "/run/knightcube/commands"
 
 _OPENED = f"""[Service]
 ProtectHome=no
-ReadWritePaths={_SHARE}/told.txt
+ReadWritePaths={_SHARE}/result.txt
 Environment=PATH={_SHARE}/bin:/usr/bin PYTHONPATH={ROOT}"""
 """What the sandbox must let through here: an interpreter in a home, and the stand-in for i2cset."""
 
@@ -85,8 +85,8 @@ def boot(folder: Path) -> dict[str, Any]:
     result = folder / "seen.json"
     if not result.exists():
         journal = folder / "journal.txt"
-        told = journal.read_text(encoding="utf-8") if journal.exists() else ""
-        raise AssertionError(f"the scenario did not come to its end:\n{done.stdout}{done.stderr}{told}")
+        printed = journal.read_text(encoding="utf-8") if journal.exists() else ""
+        raise AssertionError(f"the scenario did not come to its end:\n{done.stdout}{done.stderr}{printed}")
     seen: dict[str, Any] = json.loads(result.read_text(encoding="utf-8"))
     return seen
 
@@ -136,7 +136,7 @@ def main(folder: Path) -> None:
 
 
 def _overlay() -> Path:
-    """Mount this machine's files with a layer of memory above, which takes what is written."""
+    """Mount this machine's files with a layer of memory above that takes all writes."""
     _do("mount", "-t", "tmpfs", "tmpfs", "/mnt")
     for name in ("upper", "work", "root"):
         Path("/mnt", name).mkdir()
@@ -204,9 +204,9 @@ ExecStopPost=/bin/sh -c 'journalctl --no-pager > /share/journal.txt; systemctl -
 def _write_i2cset(folder: Path) -> None:
     """Put an i2cset first in the services' path that reaches the emulated chip, and notes why it was run."""
     (folder / "bin").mkdir()
-    told = folder / "told.txt"
-    told.touch()
-    told.chmod(0o666)
+    printed = folder / "result.txt"
+    printed.touch()
+    printed.chmod(0o666)
     tool = folder / "bin/i2cset"
     tool.write_text(
         f"""#!{sys.base_prefix}/bin/python3 -ISE
@@ -217,8 +217,8 @@ _, yes, bus, address, register, value, mode = sys.argv
 assert (yes, bus, mode) == ("-y", "1", "b"), sys.argv
 chip = open_bus(json.load(open({_FACTS!r}))["socket"])
 chip.write_byte_data(int(address, 0), int(register, 0), int(value, 0))
-with open("/share/told.txt", "a") as told:
-    told.write(os.environ.get("SERVICE_RESULT", "before") + "\\n")
+with open("/share/result.txt", "a") as result:
+    result.write(os.environ.get("SERVICE_RESULT", "before") + "\\n")
 """,
         encoding="utf-8",
     )

@@ -1,4 +1,4 @@
-"""What is done to the service in the container, and what is seen; `tests.deploy.container` runs it."""
+"""The steps and observations of the service's test in the container; `tests.deploy.container` runs it."""
 
 from __future__ import annotations
 
@@ -81,8 +81,10 @@ def wait(condition: Callable[[], bool], patience: float) -> float:
 
 def _last_words() -> str:
     """Return why systemd ran the last ExecStopPost, as the stand-in for i2cset has noted."""
-    told = [word for word in Path("/share/told.txt").read_text(encoding="ascii").split() if word != "before"]
-    return told[-1] if told else ""
+    results = [
+        word for word in Path("/share/result.txt").read_text(encoding="ascii").split() if word != "before"
+    ]
+    return results[-1] if results else ""
 
 
 def play(facts: Path) -> dict[str, Any]:
@@ -106,7 +108,7 @@ def play(facts: Path) -> dict[str, Any]:
     seen["restarts"] = int(service.show("NRestarts"))
     wait(service.driven, 20.0)
     systemctl("stop", SERVICE)
-    seen["end"] = {"driven": service.driven(), "result": service.show("Result"), "told": _last_words()}
+    seen["end"] = {"driven": service.driven(), "result": service.show("Result"), "reported": _last_words()}
     seen["damaged"] = _damaged(service)
     seen["broken"] = _broken(service)
     return seen

@@ -68,10 +68,10 @@ def test_where_i2cset_fails_any_python_does_it(tools: Tools) -> None:
 def test_it_tries_again_and_says_so_when_all_is_in_vain(tools: Tools) -> None:
     tools.put("i2cset", 1)
     tools.put("python3", 1)
-    status, calls, told = tools.run()
+    status, calls, output = tools.run()
     assert status == 1
     assert len(calls) == 10, "five times each"
-    assert "the coils may be driven" in told
+    assert "the coils may be driven" in output
 
 
 def test_the_bus_and_address_last_flown_count_more_than_the_units(tools: Tools) -> None:

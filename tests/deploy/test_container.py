@@ -65,7 +65,7 @@ def test_devices_that_were_not_named_are_closed_to_it(seen: dict[str, Any]) -> N
 
 
 def test_a_polite_stop_is_a_success(seen: dict[str, Any]) -> None:
-    assert seen["end"] == {"driven": False, "result": "success", "told": "success"}
+    assert seen["end"] == {"driven": False, "result": "success", "reported": "success"}
 
 
 def test_without_its_python_it_is_given_up_in_the_safe_state(seen: dict[str, Any]) -> None:

@@ -56,8 +56,8 @@ class Image:
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Image:
     image = Image(tmp_path_factory.mktemp("installed"))
-    status, told = image.install("--config", str(TESTBED))
-    assert status == 0, told
+    status, output = image.install("--config", str(TESTBED))
+    assert status == 0, output
     return image
 
 
@@ -94,12 +94,12 @@ def test_the_checksum_is_one_that_sha256sum_checks(image: Image) -> None:
 
 def test_an_update_accepts_no_changed_configuration_but_accept_does(image: Image, tmp_path: Path) -> None:
     image.config.write_text(corrupted(TESTBED.read_text(encoding="utf-8"), 1, 7), encoding="utf-8")
-    status, told = image.install()
+    status, output = image.install()
     assert status == 2
-    assert "is not what was accepted: was it edited? Then: install.sh --accept" in told
+    assert "is not what was accepted: was it edited? Then: install.sh --accept" in output
     shutil.copy(changed_testbed(tmp_path, coils_bus="/dev/knightcube-i2c"), image.config)
-    status, told = image.call("--accept")
-    assert (status, told.startswith("accepted")) == (0, True), told
+    status, output = image.call("--accept")
+    assert (status, output.startswith("accepted")) == (0, True), output
     assert hashlib.sha256(image.config.read_bytes()).hexdigest() in image.sum.read_text(encoding="ascii")
     assert "/dev/knightcube-i2c" in image.text("etc/systemd/system/knightcube.service.d/board.conf")
     assert image.install()[0] == 0
@@ -108,16 +108,16 @@ def test_an_update_accepts_no_changed_configuration_but_accept_does(image: Image
 def test_what_cannot_be_flown_is_not_accepted(image: Image) -> None:
     accepted = image.sum.read_bytes()
     image.config.write_text("name: [", encoding="utf-8")
-    status, told = image.call("--accept")
+    status, output = image.call("--accept")
     assert status == 2
-    assert "Traceback" not in told
+    assert "Traceback" not in output
     assert image.sum.read_bytes() == accepted
 
 
 def test_another_configuration_than_the_installed_one_is_refused(image: Image) -> None:
-    status, told = image.install("--config", str(CONFIG))
+    status, output = image.install("--config", str(CONFIG))
     assert status == 2
-    assert f"another one is flown; put yours there first: rm {image.config}" in told
+    assert f"another one is flown; put yours there first: rm {image.config}" in output
     assert image.config.read_bytes() == TESTBED.read_bytes()
 
 
@@ -127,11 +127,11 @@ def test_device_names_that_were_edited_survive_an_update(image: Image) -> None:
     image.rules.write_text(mine, encoding="utf-8")
     assert image.install()[0] == 0
     assert image.rules.read_text(encoding="utf-8") == mine
-    # An update with other rules: those as they were shipped are replaced, the edited are kept and told of.
+    # An update with other rules: unedited ones are replaced, edited ones are kept and reported.
     copy = image.root / "opt/knightcube/share/99-knightcube.rules"
     copy.write_text(shipped + "# of yesterday\n", encoding="utf-8")
-    status, told = image.install()
-    assert (status, "was edited and is kept" in told) == (0, True)
+    status, output = image.install()
+    assert (status, "was edited and is kept" in output) == (0, True)
     assert image.rules.read_text(encoding="utf-8") == mine
     for path in (image.rules, copy):
         path.write_text(shipped + "# of yesterday\n", encoding="utf-8")
@@ -150,13 +150,13 @@ def test_the_sky_index_is_made_where_the_configuration_wants_one_however_it_is_w
     image: Image, tmp_path: Path, camera: str, wanted: bool
 ) -> None:
     shutil.copy(changed_testbed(tmp_path, camera=camera), image.config)
-    _, told = image.call("--accept", "--dry-run")
-    assert ("sky_index.py" in told) == wanted
+    _, output = image.call("--accept", "--dry-run")
+    assert ("sky_index.py" in output) == wanted
 
 
-def test_a_dry_run_tells_every_step_and_touches_nothing() -> None:
+def test_a_dry_run_prints_every_step_and_touches_nothing() -> None:
     before = sorted(Path("/etc/systemd/system").iterdir())
-    told = call("--dry-run", "--config", str(TESTBED)).stdout
+    output = call("--dry-run", "--config", str(TESTBED)).stdout
     for step in (
         "useradd",
         "venv",
@@ -167,13 +167,13 @@ def test_a_dry_run_tells_every_step_and_touches_nothing() -> None:
         "99-knight",
         "modules-load.d",
     ):
-        assert step in told
+        assert step in output
     assert sorted(Path("/etc/systemd/system").iterdir()) == before
     assert not Path("/opt/knightcube").exists()
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "output"),
     [
         (["--frobnicate"], "unknown option"),
         (["--config"], "wants a value"),
@@ -188,10 +188,10 @@ def test_a_dry_run_tells_every_step_and_touches_nothing() -> None:
         (["--dry-run", "--accept"], "there is no"),
     ],
 )
-def test_wrong_use_of_the_installer_is_told_before_the_first_step_with_status_2(
-    words: list[str], told: str
+def test_wrong_use_of_the_installer_is_refused_before_the_first_step_with_status_2(
+    words: list[str], output: str
 ) -> None:
     done = call(*words)
     assert done.returncode == 2
-    assert told in done.stderr
+    assert output in done.stderr
     assert not done.stdout, "nothing was done, or would have been"

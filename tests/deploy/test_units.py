@@ -63,8 +63,8 @@ def test_systemd_finds_nothing_to_complain_of(units: Path) -> None:
 def exposure(unit: Path) -> float:
     """Return what systemd makes of a unit's sandbox: 0 the tightest, 10 none."""
     words = ["systemd-analyze", "security", "--offline=true", "--no-pager", str(unit)]
-    told = subprocess.run(words, capture_output=True, text=True, check=True).stdout
-    found = re.search(r"Overall exposure level for \S+: ([0-9.]+)", told)
+    output = subprocess.run(words, capture_output=True, text=True, check=True).stdout
+    found = re.search(r"Overall exposure level for \S+: ([0-9.]+)", output)
     assert found is not None
     return float(found[1])
 

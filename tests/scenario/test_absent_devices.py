@@ -18,7 +18,7 @@ from sim_hal.lockstep import LockStep
 from tests.scenario.flights import Rigged, demo_config, demo_world, event_names, fly
 
 DEVICES = ("imu", "pwm")
-TOLD = {"imu": "imu-silent", "pwm": "coil-fault"}
+EVENTS = {"imu": "imu-silent", "pwm": "coil-fault"}
 
 
 def take_away(lock: LockStep, device: str) -> None:
@@ -42,7 +42,7 @@ def test_it_is_awaited_in_boot_and_flown_when_it_comes(tmp_path: Path, device: s
 
     config = demo_config(12.0, camera=False)
     run = fly(config, tmp_path, prepare, absent=lambda lock: take_away(lock, device))
-    assert TOLD[device] in event_names(run)
+    assert EVENTS[device] in event_names(run)
     modes, times = run["mode"]["mode"].tolist(), run["mode"]["time_ns"] * 1e-9
     assert modes == [Mode.BOOT, Mode.TESTBED_DEMO]
     assert 4.0 <= times[1] <= 6.0, "within two seconds"

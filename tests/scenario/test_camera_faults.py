@@ -1,4 +1,4 @@
-"""A camera whose frames are not the sky's or not in time, a worker that is slow: told, and not believed."""
+"""A camera whose frames are not the sky's or not in time, a slow worker: reported, and not believed."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def flown(folder: Path, mode: str, fault: str = "") -> Run:
     return fly(config, folder, section=replace(demo_world(), faults=faults))
 
 
-def first_told(run: Run, name: str) -> float:
+def first_event(run: Run, name: str) -> float:
     return float(run["event"]["time_ns"][event_names(run).index(name)]) * 1e-9
 
 
@@ -41,23 +41,23 @@ def test_a_sound_camera_raises_no_alarm(tmp_path: Path) -> None:
         ("vision: slow", "vision-slow", 2.5),
     ],
 )
-def test_what_is_late_is_told_with_the_next_frame(
+def test_what_is_late_is_reported_with_the_next_frame(
     fault: str, event: str, within: float, tmp_path: Path
 ) -> None:
     """A frame is exposed each 2 s."""
     run = flown(tmp_path, "hold", fault)
-    assert AT < first_told(run, event) < AT + within
+    assert AT < first_event(run, event) < AT + within
     assert "task-failed" not in event_names(run)
 
 
 @pytest.mark.parametrize(
     ("fault", "event"), [("camera: torn", "camera-torn"), ("camera: wrong", "camera-strange")]
 )
-def test_a_frame_that_is_not_in_order_is_told_and_not_believed(
+def test_a_frame_that_is_not_in_order_is_reported_and_not_believed(
     fault: str, event: str, tmp_path: Path
 ) -> None:
     run = flown(tmp_path, "safe", fault)
-    assert AT < first_told(run, event) < AT + 2.0
+    assert AT < first_event(run, event) < AT + 2.0
     streak = run["streak"]
     time = streak["time_ns"] * 1e-9
     spoiled = (time > AT) & (time < AT + 2.0)

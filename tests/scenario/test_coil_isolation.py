@@ -57,7 +57,7 @@ def torque(currents: FloatArray, quaternions: FloatArray) -> FloatArray:
     return made
 
 
-def told_at(run: Run, name: str) -> float:
+def event_time(run: Run, name: str) -> float:
     return float(run["event"]["time_ns"][event_names(run).index(name)]) * 1e-9
 
 
@@ -68,7 +68,7 @@ def test_an_axis_that_breaks_is_left_out_and_the_others_keep_the_direction_of_th
     fault: str, within: float, tmp_path: Path
 ) -> None:
     run, wishes = flown(fault, tmp_path, 16.0)
-    isolated = told_at(run, "coil-broken")
+    isolated = event_time(run, "coil-broken")
     assert AT < isolated < AT + within
     text = to_text(run["event"]["text"][event_names(run).index("coil-broken")])
     assert text.startswith("coil x")
@@ -81,15 +81,15 @@ def test_an_axis_that_breaks_is_left_out_and_the_others_keep_the_direction_of_th
     much = np.abs(wanted) > 0.1 * DIPOLE * 0.148 * 4.5e-4
     assert much.sum() > 40
     along = (np.sign(made) == np.sign(wanted))[much & (np.abs(made) > 1e-7)]
-    assert along.mean() > 0.99, "what is left turns the body the way that was wanted"
+    assert along.mean() > 0.99, "the remaining coils turn the body the commanded way"
     assert run["health"]["coils_in_use"][-1] == 0b110
 
 
-def test_a_coil_that_a_stuck_leg_drives_in_safe_is_told_braked_and_left_out(tmp_path: Path) -> None:
+def test_a_coil_that_a_stuck_leg_drives_in_safe_is_reported_braked_and_left_out(tmp_path: Path) -> None:
     run, _ = flown("bridge-z: b-high", tmp_path, 10.0, initial="safe")
     names = event_names(run)
     assert names.index("coil-suspect") < names.index("coil-broken")
-    assert told_at(run, "coil-suspect") < AT + 1.0
+    assert event_time(run, "coil-suspect") < AT + 1.0
     truth = run["truth"]
     time, carried = truth["time_ns"] * 1e-9, np.abs(truth["current"])
     assert carried[time > AT + 0.1, 2].max() == pytest.approx(3.4 / 23.0, rel=0.03)
@@ -114,8 +114,8 @@ def test_a_board_that_is_too_hot_leads_to_safe_with_the_coils_at_zero(tmp_path: 
 
     run = fly(demo_config(8.0, camera=False), tmp_path, prepare)
     assert modes_of(run)[-1] is Mode.SAFE
-    assert 3.0 < told_at(run, "too-hot") < 5.0
+    assert 3.0 < event_time(run, "too-hot") < 5.0
     truth = run["truth"]
     time, carried = truth["time_ns"] * 1e-9, np.abs(truth["current"]).max(axis=1)
     assert carried[time < 3.0].max() > 0.0
-    assert carried[time > told_at(run, "too-hot") + 0.1].max() == 0.0
+    assert carried[time > event_time(run, "too-hot") + 0.1].max() == 0.0

@@ -79,7 +79,7 @@ def test_each_command_is_obeyed_recorded_and_answered(tmp_path: Path) -> None:
     answers = np.concatenate([decode(answer)["command"] for answer in channel.answers])
     assert answers["count"].tolist() == [1, 2, 3, 4]
     assert answers["mode"].tolist() == [Mode.TESTBED_DEMO, Mode.HOLD, Mode.SLEW, Mode.SAFE]
-    assert event_names(run).count("commanded") == 2, "told at once, the others at the end: throttled"
+    assert event_names(run).count("commanded") == 2, "reported at once, the others at the end: throttled"
 
 
 def test_rubbish_and_repetitions_are_refused_with_the_reason_and_change_nothing(tmp_path: Path) -> None:

@@ -33,7 +33,7 @@ ZERO = 1e-3
 Break = Callable[[Rigged], None]
 
 
-def told(run: Run, name: str) -> float:
+def event_time(run: Run, name: str) -> float:
     """Return the mission time, s, of the first event of a name."""
     return float(run["event"]["time_ns"][event_names(run).index(name)]) * 1e-9
 
@@ -113,10 +113,10 @@ def test_whatever_takes_the_readings_away_no_coil_carries_current_a_tenth_of_a_s
 
 
 @pytest.mark.parametrize("initial", ["hold", "detumble"])
-def test_a_silent_unit_is_told_at_its_age_limit(tmp_path: Path, initial: str) -> None:
+def test_a_silent_unit_is_reported_at_its_age_limit(tmp_path: Path, initial: str) -> None:
     run = fly(commanded(4.0, initial=initial), tmp_path, silence)
-    assert told(run, "imu-silent") - SILENT_AT == pytest.approx(0.1, abs=2 * CYCLE)
-    assert told(run, "control-lost") - SILENT_AT < 0.1 + CYCLE
+    assert event_time(run, "imu-silent") - SILENT_AT == pytest.approx(0.1, abs=2 * CYCLE)
+    assert event_time(run, "control-lost") - SILENT_AT < 0.1 + CYCLE
 
 
 def test_the_model_carries_the_estimate_on_and_its_error_stays_within_what_the_covariance_says(
@@ -137,7 +137,7 @@ def test_the_model_carries_the_estimate_on_and_its_error_stays_within_what_the_c
 def test_a_hold_that_is_declared_impossible_ends_at_once(tmp_path: Path) -> None:
     config = commanded(5.0, initial="hold", hold_error=1e-4, hold_patience=1.0)
     run = fly(config, tmp_path, section=released(0.2, -0.1))
-    lost = told(run, "hold-impossible")
+    lost = event_time(run, "hold-impossible")
     assert currents(run, lost - 0.5, lost).max() > ZERO
     assert currents(run, lost + WITHIN, 5.0).max() == 0.0
 
@@ -168,7 +168,7 @@ def test_the_demonstration_is_completed_within_its_limits_after_five_seconds_wit
     run = fly(configuration.replace(config, steps=steps), tmp_path, lambda rigged: silence(rigged, 5.0))
     names = event_names(run)
     assert names.index("control-lost") < names.index("control-regained")
-    regained = told(run, "control-regained")
+    regained = event_time(run, "control-regained")
     assert regained - (SILENT_AT + 5.0) < 0.2
     assert currents(run, regained + WITHIN, regained + 5.0).max() > 0.0
     first, second = report.summarise(run)["steps"]

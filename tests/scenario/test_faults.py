@@ -1,4 +1,4 @@
-"""Whatever comes over the wires, control is kept or the coils are at zero, told and logged."""
+"""Whatever comes over the wires, control is kept or the coils are at zero, with an event in the log."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def test_after_a_silence_of_a_second_the_estimate_goes_on_as_the_model_carried_i
     [LineFaults(cut_probability=0.3), LineFaults(flip_probability=3e-4)],
     ids=["cut packets", "flipped bits"],
 )
-def test_some_bad_packets_are_told_and_flown_through(tmp_path: Path, faults: LineFaults) -> None:
+def test_some_bad_packets_are_reported_and_flown_through(tmp_path: Path, faults: LineFaults) -> None:
     run = fly(demo_config(DURATION, camera=False), tmp_path, line(faults))
     names = event_names(run)
     assert "imu-corrupt" in names
@@ -142,7 +142,7 @@ def test_noise_on_an_idle_line_is_corruption_not_silence(tmp_path: Path) -> None
     assert true_current(run, BEGIN + WITHIN, END).max() == 0.0
 
 
-def test_a_unit_that_starts_anew_is_told_apart_from_noise_and_silence(tmp_path: Path) -> None:
+def test_a_unit_that_restarts_is_distinguished_from_noise_and_silence(tmp_path: Path) -> None:
     """After its reset the unit sends the ASCII lines it was born with: packets, but no readings."""
 
     def prepare(rigged: Rigged) -> None:
@@ -160,7 +160,7 @@ def test_a_unit_that_starts_anew_is_told_apart_from_noise_and_silence(tmp_path: 
     assert abs(final) < np.radians(4.5)
 
 
-def test_an_unplugged_port_is_told_and_the_coils_go_to_zero(tmp_path: Path) -> None:
+def test_an_unplugged_port_is_reported_and_the_coils_go_to_zero(tmp_path: Path) -> None:
     def prepare(rigged: Rigged) -> None:
         host = rigged.lock.line.host
         rigged.at(BEGIN, lambda: setattr(host, "unplugged", True))
@@ -174,7 +174,7 @@ def test_an_unplugged_port_is_told_and_the_coils_go_to_zero(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("fault", ["nack", "hang", "lose_arbitration"])
-def test_a_bus_that_fails_is_told_and_flown_again_when_it_is_back(tmp_path: Path, fault: str) -> None:
+def test_a_bus_that_fails_is_reported_and_flown_again_when_it_is_back(tmp_path: Path, fault: str) -> None:
     def prepare(rigged: Rigged) -> None:
         bus = rigged.lock.hardware.bus
 
@@ -228,7 +228,7 @@ def test_a_brown_out_of_the_pwm_chip_is_mended(tmp_path: Path) -> None:
     ("fault", "event"),
     [("black", "camera-black"), ("saturated", "camera-black"), ("frozen", "camera-frozen")],
 )
-def test_a_camera_that_shows_nothing_true_is_told_and_gives_no_rate(
+def test_a_camera_that_shows_nothing_true_is_reported_and_gives_no_rate(
     tmp_path: Path, fault: str, event: str
 ) -> None:
     def prepare(rigged: Rigged) -> None:
@@ -243,7 +243,7 @@ def test_a_camera_that_shows_nothing_true_is_told_and_gives_no_rate(
     assert np.isnan(streaks["rate"][1:]).all()
 
 
-def test_a_camera_that_is_off_is_told_and_the_flight_goes_on(tmp_path: Path) -> None:
+def test_a_camera_that_is_off_is_reported_and_the_flight_goes_on(tmp_path: Path) -> None:
     def prepare(rigged: Rigged) -> None:
         camera = rigged.lock.hardware.camera
         rigged.at(2.0, lambda: setattr(camera, "fault", "off"))

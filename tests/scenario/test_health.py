@@ -124,7 +124,7 @@ def reading(memory: Callable[[float], float], rigged: Rigged) -> None:
     rigged.loop._tasks.health.read_resources(look, SECOND // 2)
 
 
-def test_too_much_memory_ends_the_flight_politely_and_wants_a_restart(tmp_path: Path) -> None:
+def test_too_much_memory_ends_the_flight_in_order_and_requests_a_restart(tmp_path: Path) -> None:
     loops = []
 
     def prepare(rigged: Rigged) -> None:
@@ -140,7 +140,7 @@ def test_too_much_memory_ends_the_flight_politely_and_wants_a_restart(tmp_path: 
         assert log.intact
 
 
-def test_a_wall_clock_that_is_set_is_told_and_moves_nothing(tmp_path: Path) -> None:
+def test_a_wall_clock_that_is_set_is_reported_and_moves_nothing(tmp_path: Path) -> None:
     def prepare(rigged: Rigged) -> None:
         clock = rigged.lock.clock
         rigged.at(2.0, lambda: setattr(clock, "_utc_start_ns", clock._utc_start_ns - 3600 * SECOND))

@@ -274,7 +274,7 @@ def test_a_unit_that_stays_silent_leads_to_safe_from_every_mode_that_drives(
 def test_too_many_crashes_of_late_lead_to_safe_and_one_fewer_does_not(
     tmp_path: Path, crashes: int, mode: Mode
 ) -> None:
-    """Killed so many times: the kept state of each boot is left as one that runs."""
+    """The stored state of each killed boot still says that it runs."""
     config = commanded(1.0)
     state = tmp_path / "state"
     for _ in range(crashes):

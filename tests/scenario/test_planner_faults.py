@@ -90,7 +90,7 @@ def test_after_two_good_plans_only_bad_ones_come(
 def test_on_a_goal_horizon_one_good_plan_is_enough_to_arrive(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spoil: Spoil
 ) -> None:
-    """The first path leads to the target; to hold its end is what is wanted then, and no alarm."""
+    """The first path leads to the target; holding its end is right then, and no alarm."""
     use_planner(
         monkeypatch, lambda job: plan_job.run(job) if job.number == 1 else spoil(job, plan_job.run(job))
     )
@@ -101,7 +101,7 @@ def test_on_a_goal_horizon_one_good_plan_is_enough_to_arrive(
     assert abs(final) < np.radians(0.1)
 
 
-def test_a_new_target_without_a_plan_for_it_is_told_while_the_old_attitude_is_held(
+def test_a_new_target_without_a_plan_for_it_is_reported_while_the_old_attitude_is_held(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     use_planner(
@@ -135,7 +135,7 @@ def test_a_planner_that_is_just_in_time_is_flown(tmp_path: Path) -> None:
     assert run["plan"]["accepted"].all()
 
 
-def test_an_infeasible_step_is_stretched_told_and_flown(tmp_path: Path) -> None:
+def test_an_infeasible_step_is_stretched_reported_and_flown(tmp_path: Path) -> None:
     """From +0.3 back to -0.3 at rest needs more than 10 s under 0.148 A."""
     steps = (Step(at=0.0, q2=0.3), Step(at=25.0, q2=-0.3))
     run = fly(configuration.replace(demo_config(60.0, camera=False), steps=steps), tmp_path)

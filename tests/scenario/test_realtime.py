@@ -53,7 +53,7 @@ def test_planner_and_vision_worked_beside_the_loop(flown: Run) -> None:
     assert outcomes == {("planner", "done"), ("vision", "done")}
     plans = flown["plan"]
     assert plans["accepted"][-1]
-    # A busy machine may be late with one, which is told and not flown.
+    # A busy machine may be late with a plan, which is reported and not flown.
     assert all(status.startswith(b"late") for status in plans["status"][plans["accepted"] == 0])
     assert to_text(flown["streak"]["status"][0]) == "rate"
 

@@ -23,7 +23,7 @@ def errors(run: Run) -> tuple[FloatArray, FloatArray]:
     """Return the error (n, 3) of each star attitude against the truth, and its covariance (n, 3, 3)."""
     stars, truth = run["stars"], run["truth"]
     at = np.searchsorted(truth["time_ns"], stars["middle_ns"])
-    # The truth is told every 25 ms, on which the middle of the exposure falls.
+    # The truth is logged every 25 ms, on which the middle of the exposure falls.
     np.testing.assert_array_equal(truth["time_ns"][at], stars["middle_ns"])
     error = to_rotation_vector(multiply(stars["quaternion"], conjugate(truth["quaternion"][at])))
     xx, yy, zz, xy, xz, yz = stars["covariance"].T
@@ -91,7 +91,7 @@ def test_the_attitudes_of_the_demonstration_are_as_good_as_they_say(demonstratio
 
 
 def test_a_flight_that_begins_blind_is_lost_in_space_and_finds_itself(tmp_path: Path) -> None:
-    """Without the unit there is no estimate to tell where to look, nor one that could take the attitude."""
+    """Without the unit there is no estimate to predict an attitude or to take one."""
     run = fly(demo_config(8.0), tmp_path, lambda rigged: unit_silent(rigged, 0.0, 4.0))
     assert_solved(run)
     assert run["stars"]["tracked"].tolist() == [_LOST, _TRACKED]
@@ -123,7 +123,7 @@ def test_after_a_blackout_the_first_frame_is_found_anywhere_and_the_next_is_trac
 
 
 def test_a_camera_knocked_out_of_place_is_found_out_and_misleads_nobody(tmp_path: Path) -> None:
-    """Its stars are identified, in another place than expected, and their attitude is refused and told."""
+    """Its stars are identified in an unexpected place, and their attitude is refused and reported."""
 
     def knock(rigged: Rigged) -> None:
         camera = rigged.lock.hardware.camera

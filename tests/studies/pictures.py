@@ -1,4 +1,4 @@
-"""`python -m tests.studies.pictures`: makes the README's pictures anew, from a flight of the demonstration.
+"""`python -m tests.studies.pictures`: makes the README's pictures from a flight of the demonstration.
 
 The flight is simulated in lock-step with a fixed seed, so the pictures change only when the software does.
 """
@@ -108,7 +108,7 @@ def _draw_frame(path: Path) -> None:
 
 
 def _draw_solved(path: Path) -> None:
-    """Draw Orion, drawn out to streaks, with the stars that were told from it and their names."""
+    """Draw Orion as streaks, with the identified stars and their names."""
     rng = np.random.default_rng(2026)
     camera = StarCameraModel()
     attitude = Pointing(*np.radians(ORION_DEG)).quaternion()

@@ -1,4 +1,4 @@
-"""The Cramer-Rao bound on what streaks can tell: no unbiased estimator has a smaller covariance.
+"""The Cramer-Rao bound of streaks: no unbiased estimator has a smaller covariance.
 
 A pixel's electrons are Poisson, the read noise Gaussian; the Fisher information of parameters p is the sum
 over pixels of (dm/dp)(dm/dp)^T / (floor + m), with m the mean light and `floor` the variance of everything
@@ -109,7 +109,7 @@ def star_information(
 ) -> FloatArray:
     """Return the Fisher information (8, 8) of turn (3) rad, PSF sigma px, x, y px, electrons, background.
 
-    `star` (2,) is the pixel at mid-exposure; light off the detector tells nothing.
+    `star` (2,) is the pixel at mid-exposure; light off the detector gives no information.
     """
     ends = paths(pinhole, motion, np.tile(star, (9, 1)), np.linspace(-0.5, 0.5, 9))
     length = float(np.sum(np.hypot(*np.diff(ends.position, axis=0).T)))
@@ -178,7 +178,7 @@ def _images(
 
 
 def _near_path(light: FloatArray) -> IntArray:
-    """Return the pixels that hold light worth counting: those that only tell of the background are not."""
+    """Return the pixels that hold light worth counting: those of background only are left out."""
     peak = light.max(initial=0.0)
     return np.flatnonzero(light > peak * math.exp(-0.5 * (_REACH_SIGMAS - 1.0) ** 2))
 

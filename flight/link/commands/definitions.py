@@ -22,9 +22,7 @@ MODE = _command("mode", 0x203, "Change the mode", Field("mode", "u1", "-", "as i
 SLEW = _command(
     "slew", 0x204, "Go to an attitude, then hold it", Field("q2", "f8", "-", "commanded final q2, +-0.68")
 )
-CLEAR = _command(
-    "clear", 0x205, "Let a latched event begin anew", Field("event", "S32", "-", "name of the event")
-)
+CLEAR = _command("clear", 0x205, "Clear a latched event", Field("event", "S32", "-", "name of the event"))
 
 COMMANDS: tuple[Packet, ...] = (PING, SAFE, MODE, SLEW, CLEAR)
 

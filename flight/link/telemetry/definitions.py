@@ -195,7 +195,7 @@ STARS = Packet(
         Field("sequence", "u4", "-", "the camera's count"),
         Field("middle_ns", "i8", "ns", "mission time of the exposure's middle"),
         Field("status", "S32", "-", "solved, no-stars, too-few-stars, no-match, ambiguous"),
-        Field("tracked", "u1", "-", "1 when the estimate told where to look, 0 lost in space"),
+        Field("tracked", "u1", "-", "1 when the search began at the estimate's attitude, 0 lost in space"),
         Field("found", "u2", "-", "what was taken for a star"),
         Field("matched", "u2", "-", "of them guide stars"),
         Field("quaternion", "f8", "-", "reference into body, scalar last; NaN when none", 4),
@@ -213,7 +213,7 @@ EVENT = Packet(
     (
         Field("code", "u2", "-", "number of the event (flight.link.events)"),
         Field("severity", "u1", "-", "0 information, 1 warning, 2 fault"),
-        Field("suppressed", "u4", "-", "how many of its kind the throttle held back since the last one told"),
+        Field("suppressed", "u4", "-", "how many of its kind the throttle held back since the last report"),
         Field("name", "S32", "-", "name of the event"),
         Field("text", "S160", "-", "what happened, with its values"),
     ),

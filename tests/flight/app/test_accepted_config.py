@@ -140,8 +140,8 @@ def test_a_disk_that_fails_is_tried_again(tmp_path: Path) -> None:
 def test_the_flight_of_a_kept_configuration_records_it_as_an_event(tmp_path: Path) -> None:
     request = RunRequest(CONFIG, tmp_path / "run", duration=2.0, config_problem="a bit has flipped")
     fly(request)
-    told = {to_text(row["name"]): to_text(row["text"]) for row in read_run(request.out)["event"]}
-    assert told["config-damaged"] == "a bit has flipped"
+    events = {to_text(row["name"]): to_text(row["text"]) for row in read_run(request.out)["event"]}
+    assert events["config-damaged"] == "a bit has flipped"
 
 
 def test_the_command_line_flies_the_kept_one_and_says_so(

@@ -75,7 +75,7 @@ def test_a_mistake_gets_one_line_with_its_place_and_its_cure(right: str, wrong: 
     assert "\n" not in str(caught.value)
 
 
-def test_mistakes_in_the_simulation_section_are_told_with_their_place_too() -> None:
+def test_mistakes_in_the_simulation_section_are_reported_with_their_place_too() -> None:
     text = DEMO.replace("current_noise: 3.5e-3", "curent_noise: 3.5e-3")
     with pytest.raises(ConfigError, match=r"`simulation.curent_noise` .* did you mean `current_noise`"):
         reader.simulation_section(text, "demo.yaml", Simulation)

@@ -105,7 +105,7 @@ def test_a_signal_ends_a_flight_with_its_log_whole(tmp_path: Path, number: signa
     assert all(part.intact for part in run.logs.values())
 
 
-def test_plan_tells_a_stretched_horizon_and_draws_it(tmp_path: Path) -> None:
+def test_plan_shows_a_stretched_horizon_and_draws_it(tmp_path: Path) -> None:
     picture = tmp_path / "path.png"
     words: list[str | Path] = [
         "plan",

@@ -34,13 +34,13 @@ def _response() -> tuple[str, ...]:
     return "--log-response", str(MODEL.pedestal), str(MODEL.counts_per_decade)
 
 
-def test_json_tells_nadir_with_its_covariance(folder: Path) -> None:
+def test_json_shows_nadir_with_its_covariance(folder: Path) -> None:
     done = command("horizon", folder / "limb.png", "--fov", "67", "--altitude", "600", *_response(), "--json")
     assert done.returncode == 0, done.stderr
     facts = json.loads(done.stdout)
     assert facts["status"] == "found"
     off = np.degrees(np.arccos(np.array(facts["nadir_camera"]) @ nadir(SCENE)))
-    # The lens's distortion, up to 20 px at the corners, is not told: nor is it in the answer's spread.
+    # The command does not know the lens's distortion, up to 20 px at the corners; nor does its covariance.
     assert off < 1.0
     assert np.all(np.linalg.eigvalsh(np.array(facts["covariance_rad2"])) > -1e-15)
     assert facts["sigma_deg"] > 0.05
@@ -77,7 +77,7 @@ def test_a_picture_without_a_horizon_says_so_with_exit_status_1(folder: Path) ->
         (["--fov", "67", "--camera", "config/step_demo.yaml"], "not allowed with"),
     ],
 )
-def test_a_mistake_is_told_with_exit_status_2(words: list[str], complaint: str, folder: Path) -> None:
+def test_a_mistake_is_reported_with_exit_status_2(words: list[str], complaint: str, folder: Path) -> None:
     done = command("horizon", folder / "limb.png", *words)
     assert done.returncode == 2
     assert complaint in done.stderr

@@ -80,7 +80,7 @@ def test_a_mistake_is_one_line_and_exit_status_2(flown: tuple[Path, dict[str, ob
         assert done.stderr.count("\n") == 1
 
 
-def test_a_flight_too_short_to_tell_is_one_line_and_exit_status_1(tmp_path: Path) -> None:
+def test_a_flight_too_short_to_fit_is_one_line_and_exit_status_1(tmp_path: Path) -> None:
     done = command("identify", DEMO, "--duration", "3", "--run", tmp_path / "run", "--out", tmp_path / "x")
     assert done.returncode == 1
     assert "too short a flight" in done.stderr

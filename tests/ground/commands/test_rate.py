@@ -48,7 +48,7 @@ def test_a_prior_that_says_about_which_way_gives_the_rate_with_its_sign(
     assert len(facts["streaks"]) >= 4
 
 
-def test_without_a_prior_the_direction_of_time_is_told_to_be_unknown(scene: Scene, picture: Path) -> None:
+def test_without_a_prior_the_direction_of_time_is_reported_as_unknown(scene: Scene, picture: Path) -> None:
     done = command("rate", picture, "--fov", FOV, "--exposure", "0.2")
     assert done.returncode == 0, done.stderr
     assert "ambiguous" in done.stdout

@@ -57,8 +57,8 @@ def test_streaks_give_the_rate_when_the_exposure_is_known(tmp_path: Path) -> Non
     motion = json.loads(done.stdout)["motion"]
     assert np.linalg.norm(motion["rate_rad_s"]) == pytest.approx(np.linalg.norm(frame.rate), rel=0.02)
     assert not motion["direction_of_time_known"]
-    told = command("solve", path, "--fov", "12")
-    assert "give --exposure for the rate" in told.stdout
+    result = command("solve", path, "--fov", "12")
+    assert "give --exposure for the rate" in result.stdout
 
 
 def test_the_date_takes_aberration_off(picture: Path) -> None:
@@ -88,7 +88,7 @@ def test_bare_pixels_behind_a_header_are_read(resting: SkyFrame, tmp_path: Path)
     assert json.loads(done.stdout)["status"] == "solved"
 
 
-def test_the_overlay_shows_the_stars_and_the_text_tells_them(picture: Path, tmp_path: Path) -> None:
+def test_the_overlay_shows_the_stars_and_the_text_lists_them(picture: Path, tmp_path: Path) -> None:
     overlay = tmp_path / "solved.png"
     done = command("solve", picture, "--fov", "12", "--overlay", overlay)
     assert done.returncode == 0, done.stderr

@@ -48,15 +48,15 @@ def main() -> int:
         reach = max(reach, float(np.max(np.abs(record.angle[record.time > 15.0]))))
         sys.stderr.write(f"\r{number + 1} of {options.runs}")
     sys.stderr.write("\n")
-    _tell("gain, torsion, damping", motion)
-    _tell("with the scale", scaled)
+    _progress("gain, torsion, damping", motion)
+    _progress("with the scale", scaled)
     errors = np.array(relative)
     print(f"relative error, median: {np.median(errors, axis=0)}, worst: {errors.max(axis=0)}")  # noqa: T201
     print(f"innovations not white: {coloured} of {options.runs}; largest |q2|: {np.sin(reach / 2):.3f}")  # noqa: T201
     return 0
 
 
-def _tell(name: str, pairs: list[tuple[np.ndarray, np.ndarray]]) -> None:
+def _progress(name: str, pairs: list[tuple[np.ndarray, np.ndarray]]) -> None:
     squares = np.array([error @ np.linalg.solve(covariance, error) for error, covariance in pairs])
     size = len(pairs[0][0])
     z = np.array([error / np.sqrt(np.diag(covariance)) for error, covariance in pairs])

@@ -59,7 +59,7 @@ def test_the_first_guess_is_near_enough_to_start_from(identified: list[Identifie
         assert first_guess(record).torsion == pytest.approx(world.constants.torsion, abs=1e-3)
 
 
-def test_a_delay_of_the_coils_is_told_from_the_torque() -> None:
+def test_a_delay_of_the_coils_is_distinguished_from_the_torque() -> None:
     record = fly_bare(USUAL, 40.0)
     late = replace(record, switch_time=record.switch_time - 0.012)
     made = fit(late, NOISE)
@@ -130,7 +130,7 @@ def test_rates_that_nothing_explains_are_refused_however_wild(value: float, time
         fit(replace(record, rate=rate), NOISE)
 
 
-def test_progress_is_told_until_the_steps_are_small() -> None:
+def test_progress_is_reported_until_the_steps_are_small() -> None:
     steps: list[float] = []
     fit(fly_bare(USUAL, 40.0), NOISE, lambda _, step: steps.append(step))
     assert steps[-1] < 0.01 < max(steps)

@@ -132,7 +132,7 @@ def test_another_coil_and_a_flight_too_short_are_refused(short: Run) -> None:
         ("run", "coil_resistance", np.nan),
     ],
 )
-def test_values_that_no_flight_writes_are_told_as_damage(
+def test_values_that_no_flight_writes_are_reported_as_damage(
     short: Run, packet: str, field: str, value: float
 ) -> None:
     values = short[packet][field].copy()

@@ -29,7 +29,7 @@ ANGLE_BOUND, RATE_BOUND, CURRENT_BOUND = 2.0 * 1.75e-3, 1.75e-4, 3.5e-3
 
 @dataclass(frozen=True)
 class World:
-    """What is true: `dipole` is n A per commanded ampere, `magnetometer` its scale."""
+    """The true constants: `dipole` is n A per commanded ampere, `magnetometer` its scale."""
 
     inertia: float
     dipole: float
@@ -108,14 +108,14 @@ def fly_bare(
     rng = np.random.default_rng(world.seed)
     plant = plant_of(believed())
     controller = ExcitationController(plant, PERIOD, settings or usual_excitation())
-    felt: list[FloatArray] = [np.zeros(3)]
+    flowing: list[FloatArray] = [np.zeros(3)]
     testbed = Testbed(
         TestbedModel(
             world.inertia, world.dipole, world.field, world.stiffness, world.damping, (23.0, 23.0, 23.0), 3.4
         ),
         angle=0.3,
         release_rate=-0.05,
-        currents=lambda: felt[0],
+        currents=lambda: flowing[0],
     )
     testbed.release_at(0)
     count = round(duration / PERIOD)
@@ -128,7 +128,7 @@ def fly_bare(
         time[k], angle[k], rate[k] = k * PERIOD, testbed.angle, testbed.rate
         current[k] = controller.command(rest, testbed.angle, testbed.rate).current
         on = current[k] != 0.0
-        felt[0] = np.array([current[k] + on * CURRENT_BOUND * uniform[k, 2], 0.0, 0.0])
+        flowing[0] = np.array([current[k] + on * CURRENT_BOUND * uniform[k, 2], 0.0, 0.0])
     return Record(
         time=time,
         angle=angle + ANGLE_BOUND * uniform[:, 0],

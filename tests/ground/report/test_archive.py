@@ -1,4 +1,4 @@
-"""The report of an archive has a row for every boot, and tells those that did not end by themselves."""
+"""The report of an archive has a row for every boot, and marks those that did not end by themselves."""
 
 from __future__ import annotations
 

@@ -95,7 +95,7 @@ def test_the_report_on_board_imports_no_matplotlib() -> None:
     assert printed.stdout == "False\n"
 
 
-def test_without_matplotlib_the_cure_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_matplotlib_the_cure_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = read_run(make_run(tmp_path, Recipe(duration=1.0, rate_hz=10.0)))
     for name in [name for name in sys.modules if name.startswith(("matplotlib", "ground.report."))]:
         monkeypatch.delitem(sys.modules, name)

@@ -1,4 +1,4 @@
-"""The summary tells of a run what is known of it, and says what is not."""
+"""The summary reports the facts of a run, and names the unknown ones."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def test_a_run_without_targets_has_no_steps_and_unknown_verdicts(tmp_path: Path)
     assert "no target packets: no steps to judge" in summary["notes"]
 
 
-def test_a_step_of_no_size_is_told_apart_from_one_never_made(tmp_path: Path) -> None:
+def test_a_step_of_no_size_is_distinguished_from_one_never_made(tmp_path: Path) -> None:
     summary = summarise(short(tmp_path, duration=300.0, planned=300.0, targets=(-0.3, -0.3, -0.2)))
     assert summary["steps"][1]["complete"]
     assert summary["steps"][1]["rise_s"] is None
@@ -240,7 +240,7 @@ def test_the_summary_is_strict_json(tmp_path: Path, changes: dict[str, object]) 
     assert json.loads(json.dumps(summary, allow_nan=False)) == summary
 
 
-def test_the_text_tells_the_table_of_the_thesis(full: Run) -> None:
+def test_the_text_shows_the_table_of_the_thesis(full: Run) -> None:
     text = format_report(summarise(full))
     assert "3  -0.100 -> +0.000" in text
     for row in ("steady-state error", "overshoot", "rise time", "settling time", "average power"):

@@ -1,7 +1,7 @@
 """The kernel's side of /dev/videoN, replaced: a free-running camera that answers the ioctls of V4L2.
 
 Its buffers lie in a memfd, which the binding really maps; the rules of the queue are those of the kernel
-(Linux Media userspace API, "Streaming I/O (Memory Mapping)"): what is out of order gets the errno of there.
+(Linux Media userspace API, "Streaming I/O (Memory Mapping)"): a call out of order gets the errno given there.
 """
 
 from __future__ import annotations
@@ -224,7 +224,7 @@ class IoctlCamera:
         knob.value = argument.value
 
     def _run(self) -> None:
-        """Finish every frame whose end has come; one that finds no free buffer is lost."""
+        """Finish every frame whose end has come; without a free buffer a frame is lost."""
         while self._streaming and not self.stopped:
             exposure_ns = self._exposure * v4l2.EXPOSURE_UNIT_NS
             start_ns = self._next_ns

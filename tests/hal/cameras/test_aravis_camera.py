@@ -20,7 +20,7 @@ MILLISECOND_NS = 1_000_000
 
 @pytest.fixture
 def fake() -> Iterator[AravisCamera]:
-    """Open Aravis' Fake camera, with nothing that serves it."""
+    """Open Aravis' Fake camera without a ServedCamera."""
     require_aravis()
     camera = AravisCamera(AravisSettings("Fake_1", 512, 256, "Mono16", EXPOSURE_NS, None), SystemClock())
     camera.open()
@@ -73,7 +73,7 @@ def test_what_the_camera_cannot_do_is_said(changes: dict[str, object], message: 
         aravis_rig(**changes)
 
 
-def test_a_camera_whose_control_is_lost_is_told_of_and_opened_again() -> None:
+def test_a_camera_whose_control_is_lost_is_reported_and_opened_again() -> None:
     require_aravis()
     clock = SystemClock()
     device = AravisCamera(AravisSettings("Fake_1", 512, 256, "Mono8", EXPOSURE_NS, None), clock)
@@ -101,7 +101,7 @@ def test_frames_that_nobody_triggered_are_given_back(fake: AravisCamera) -> None
     assert fake.counts.spoiled == 0
 
 
-def test_a_python_without_aravis_is_told_the_cure(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_python_without_aravis_gets_the_cure(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
     monkeypatch.setitem(sys.modules, "gi", None)  # as where it is not installed
     camera = AravisCamera(AravisSettings("Fake_1", 512, 256, "Mono8", EXPOSURE_NS, None), SystemClock())

@@ -40,17 +40,17 @@ def camera(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> IoctlCamera:
     return kernel
 
 
-def test_frames_of_a_real_camera_are_told_of_and_kept(
+def test_frames_of_a_real_camera_are_listed_and_kept(
     tmp_path: Path, camera: IoctlCamera, capsys: pytest.CaptureFixture[str]
 ) -> None:
     config = with_camera(tmp_path, f"{{kind: v4l2, path: {camera.path}, pixel_format: Y10, gain: 7}}", 10)
     out = tmp_path / "frame.png"
     assert main(["camera", "--config", str(config), "--out", str(out), "--count", "3", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert not told["frozen"]
-    numbers = [frame["sequence"] for frame in told["frames"]]
+    output = json.loads(capsys.readouterr().out)
+    assert not output["frozen"]
+    numbers = [frame["sequence"] for frame in output["frames"]]
     assert numbers == sorted(set(numbers))
-    for number, frame in zip(numbers, told["frames"], strict=True):
+    for number, frame in zip(numbers, output["frames"], strict=True):
         pixels = read_image(tmp_path / f"frame-{number}.png")
         y, x = np.mgrid[:64, :64]
         assert np.array_equal(pixels, (int(pixels[0, 0]) + x + 100 * y) % 1024)
@@ -75,9 +75,9 @@ def test_a_missing_camera_is_one_line_and_status_1(
 ) -> None:
     config = with_camera(tmp_path, f"{{kind: v4l2, path: {tmp_path}/none}}")
     assert main(["camera", "--config", str(config)]) == 1
-    told = capsys.readouterr().err
-    assert "no such camera" in told
-    assert told.count("\n") == 1
+    output = capsys.readouterr().err
+    assert "no such camera" in output
+    assert output.count("\n") == 1
 
 
 def test_frames_of_a_simulated_camera_are_taken_alike(
@@ -104,9 +104,9 @@ def test_a_mistake_is_one_line_and_status_2(
     words: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["camera", "--config", str(ROOT / "config" / "testbed.yaml"), *words]) == 2
-    told = capsys.readouterr().err
-    assert message in told
-    assert told.count("\n") == 1
+    output = capsys.readouterr().err
+    assert message in output
+    assert output.count("\n") == 1
 
 
 def test_real_devices_need_a_camera_that_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -115,12 +115,12 @@ def test_real_devices_need_a_camera_that_is_named(tmp_path: Path, capsys: pytest
 
 
 def test_each_kind_of_camera_has_its_own_keys(tmp_path: Path) -> None:
-    told = configuration.load(with_camera(tmp_path, "{kind: aravis, name: Fake_1, pixel_format: Mono8}"))
-    assert told.camera is not None
-    assert told.camera.device == AravisDevice(name="Fake_1", pixel_format="Mono8")
-    told = configuration.load(with_camera(tmp_path, "{kind: v4l2, stamp: end, stamp_delay: 0.01}"))
-    assert told.camera is not None
-    assert told.camera.device == V4l2Device(stamp="end", stamp_delay=0.01)
+    output = configuration.load(with_camera(tmp_path, "{kind: aravis, name: Fake_1, pixel_format: Mono8}"))
+    assert output.camera is not None
+    assert output.camera.device == AravisDevice(name="Fake_1", pixel_format="Mono8")
+    output = configuration.load(with_camera(tmp_path, "{kind: v4l2, stamp: end, stamp_delay: 0.01}"))
+    assert output.camera is not None
+    assert output.camera.device == V4l2Device(stamp="end", stamp_delay=0.01)
 
 
 @pytest.mark.parametrize(

@@ -68,13 +68,13 @@ def test_a_stamp_of_the_frames_end_is_traced_back_to_the_exposures_start(
     video.camera.close()
 
 
-@pytest.mark.parametrize(("told", "at_start"), [("1", True), ("0", False), (None, False)])
+@pytest.mark.parametrize(("stated", "at_start"), [("1", True), ("0", False), (None, False)])
 def test_uvc_stamps_are_of_the_start_only_when_the_kernel_uses_the_cameras_clock(
-    kernel: IoctlCamera, clock: ManualClock, told: str | None, at_start: bool
+    kernel: IoctlCamera, clock: ManualClock, stated: str | None, at_start: bool
 ) -> None:
     kernel.driver = b"uvcvideo"
-    if told is not None:
-        (kernel.path.parent / "hwtimestamps").write_text(told + "\n", encoding="ascii")
+    if stated is not None:
+        (kernel.path.parent / "hwtimestamps").write_text(stated + "\n", encoding="ascii")
     kernel.stamps_packets = not at_start
     video = settled(kernel, clock)
     frame = video.rig.next_frame()
@@ -212,7 +212,7 @@ def test_stamps_of_another_clock_are_refused(
     video.camera.close()
 
 
-def test_an_unplugged_camera_is_told_of_and_comes_back_by_itself(
+def test_an_unplugged_camera_is_reported_and_comes_back_by_itself(
     kernel: IoctlCamera, clock: ManualClock
 ) -> None:
     video = settled(kernel, clock)
@@ -233,7 +233,7 @@ def test_an_unplugged_camera_is_told_of_and_comes_back_by_itself(
     video.camera.close()
 
 
-def test_a_camera_that_stands_still_is_opened_anew(kernel: IoctlCamera, clock: ManualClock) -> None:
+def test_a_camera_that_stands_still_is_opened_again(kernel: IoctlCamera, clock: ManualClock) -> None:
     video = settled(kernel, clock)
     kernel.stopped = True
     video.camera.trigger(EXPOSURE_NS)

@@ -103,9 +103,9 @@ def test_all_agree_with_this_machines_own_header(tmp_path: Path) -> None:
     source, program = tmp_path / "sizes.c", tmp_path / "sizes"
     source.write_text(headers + "int main(void) {\n" + "\n".join(lines) + "\nreturn 0; }\n", encoding="ascii")
     subprocess.run([compiler, str(source), "-o", str(program)], check=True, timeout=60)
-    told = subprocess.run([str(program)], check=True, timeout=10, capture_output=True, text=True).stdout
+    output = subprocess.run([str(program)], check=True, timeout=10, capture_output=True, text=True).stdout
     ours = [ctypes.sizeof(kind) for kind in STRUCTURES.values()]
     ours += [getattr(kind, member).offset for _, kind, members in MEMBERS for member in members]
     ours += [getattr(videodev2, name) for name in CODES]
     ours += list(CONSTANTS.values())
-    assert [int(word) for word in told.split()] == ours
+    assert [int(word) for word in output.split()] == ours

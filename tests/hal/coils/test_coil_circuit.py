@@ -114,12 +114,12 @@ def test_the_same_seed_gives_the_same_currents() -> None:
     def fly() -> list[list[float]]:
         rig = Rig(uncertainty=3.5e-3)
         rig.coils.start()
-        felt = []
+        flowing = []
         for step in range(20):
             rig.command(0.01 * step, 0.0, -0.05)
             rig.clock.advance(25_000_000)
-            felt.append(rig.currents())
-        return felt
+            flowing.append(rig.currents())
+        return flowing
 
     assert fly() == fly()
 

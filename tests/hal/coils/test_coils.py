@@ -36,22 +36,22 @@ def test_the_world_feels_what_was_commanded_within_half_a_count(
     state = rig.coils.state()
     assert rig.currents() == pytest.approx(state.current.tolist(), abs=1e-15)
     any_limited = False
-    for coil, asked, felt in zip(UNEQUAL.coils, command, rig.currents(), strict=True):
+    for coil, asked, flowing in zip(UNEQUAL.coils, command, rig.currents(), strict=True):
         step = current_step(coil.resistance, 3.4)
         bound = min(limit, 3.4 / coil.resistance)
         any_limited = any_limited or abs(asked) > bound
-        assert abs(felt) <= bound * (1 + 1e-12)
-        assert felt * asked >= 0.0
+        assert abs(flowing) <= bound * (1 + 1e-12)
+        assert flowing * asked >= 0.0
         if abs(asked) <= bound - step:
-            assert abs(felt - asked) <= 0.5 * step * (1 + 1e-9)
+            assert abs(flowing - asked) <= 0.5 * step * (1 + 1e-9)
         else:
-            assert abs(felt) > bound - step
+            assert abs(flowing) > bound - step
     assert state.saturated or not any_limited
     assert state.command.tolist() == list(command)
     assert rig.wire.chip.violations == set()
 
 
-def test_saturation_is_told_and_only_when_it_happens(rig: Rig) -> None:
+def test_saturation_is_reported_and_only_when_it_happens(rig: Rig) -> None:
     rig.coils.start()
     rig.command(0.148, 0.0, 0.0)  # V/R is 0.14783 A
     assert rig.coils.state().saturated

@@ -75,7 +75,7 @@ def test_a_limit_of_whole_counts_loses_none() -> None:
         (-math.inf, -4096, True),
     ],
 )
-def test_counts_are_the_nearest_and_limits_are_told(current: float, counts: int, limited: bool) -> None:
+def test_counts_are_the_nearest_and_limits_are_reported(current: float, counts: int, limited: bool) -> None:
     assert counts_for(current, STEP, 4096) == (counts, limited)
 
 

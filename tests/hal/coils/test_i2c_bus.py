@@ -67,7 +67,7 @@ def test_a_closed_bus_says_so_and_closes_twice(rig: Rig) -> None:
         rig.bus.read_byte_data(PCA, 0x00)
 
 
-def test_the_adapter_is_told_its_time_out_and_to_repeat_nothing(kernel: IoctlWire) -> None:
+def test_the_adapter_gets_its_time_out_and_repeats_nothing(kernel: IoctlWire) -> None:
     LinuxI2cBus("/dev/null", timeout_ns=25_000_000).close()
     assert kernel.settings == [(I2C_TIMEOUT, 3), (I2C_RETRIES, 0)]
 
@@ -100,7 +100,7 @@ def test_no_descriptor_leaks_when_opening_fails() -> None:
     assert len(os.listdir("/proc/self/fd")) == before
 
 
-def test_an_address_held_by_a_kernel_driver_is_told(kernel: IoctlWire) -> None:
+def test_an_address_held_by_a_kernel_driver_is_reported(kernel: IoctlWire) -> None:
     bus = LinuxI2cBus("/dev/null")
     kernel.slave_error = errno.EBUSY
     with pytest.raises(OSError, match="held by a kernel driver, address 0x40 on /dev/null"):

@@ -323,13 +323,13 @@ def test_a_monitor_that_stops_converting_is_an_error() -> None:
     assert "no conversion" in monitor.error()
 
 
-def test_the_newest_conversion_is_told_with_the_time_that_it_may_tell_of(rig: Rig) -> None:
+def test_the_newest_conversion_is_returned_with_the_time_that_it_averages(rig: Rig) -> None:
     """A step of the current: no conversion that was begun before it counts as one of after."""
     rig.coils.start()
     monitor = Ina219(rig.bus, INA, rig.clock)
     rig.clock.advance(2000 * MS)
     step_ns = rig.clock.now_ns()
-    mixed = told = 0
+    mixed = returned = 0
     for _ in range(40):
         rig.command(0.1, 0.0, 0.0)
         rig.clock.advance(25 * MS)
@@ -338,13 +338,13 @@ def test_the_newest_conversion_is_told_with_the_time_that_it_may_tell_of(rig: Ri
         if reading.newest_since_ns >= step_ns:
             assert reading.newest == pytest.approx(0.1, abs=2e-4)
             mixed += reading.current < 0.099
-            told += 1
+            returned += 1
     assert mixed > 0, "the mean still holds the time before"
-    assert told > 20
+    assert returned > 20
 
 
 @pytest.mark.parametrize("amps", [0.0, 0.05])
-def test_a_monitor_that_always_gives_the_same_is_told_at_any_current(rig: Rig, amps: float) -> None:
+def test_a_monitor_that_always_gives_the_same_is_reported_at_any_current(rig: Rig, amps: float) -> None:
     """Its ready bit stays although the conversion was read; so even where the current is constant."""
     rig.coils.start()
     monitor = Ina219(rig.bus, INA, rig.clock)

@@ -18,7 +18,7 @@ from tests.manual_clock import ManualClock
 
 
 class Recorder(EmulatedI2cBus):
-    """An emulated bus that writes down what is written."""
+    """An emulated bus that logs all writes."""
 
     def __init__(self, chip: EmulatedPca9685, clock: ManualClock) -> None:
         super().__init__([chip])
@@ -169,6 +169,6 @@ def test_switch_off_tries_again_and_then_says_so(rig: Rig) -> None:
 
 
 def test_the_guardian_imports_no_numpy() -> None:
-    """The process that switches the coils off must start fast and need nothing that can break."""
+    """The process that switches the coils off must start fast, with few dependencies."""
     code = "import sys, hal.drivers.pca9685, hal.buses.i2c_bus; sys.exit('numpy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False, timeout=30).returncode == 0

@@ -1,4 +1,4 @@
-"""A bus that writes down what it is told, opened by a guardian as `tests.hal.guardian.byte_log:open_bus`.
+"""A bus that logs the bytes written to it, opened by a guardian as `tests.hal.guardian.byte_log:open_bus`.
 
 Light, for the guardian must stay so. While FILE.broken exists the bus fails as a silent part does.
 """

@@ -94,7 +94,7 @@ def _end_devices(children: list[int]) -> None:
 
 
 def lives(process: int) -> bool:
-    """Tell whether a process runs; one that has ended and was not reaped has no command line."""
+    """Return whether a process runs; a zombie has no command line."""
     try:
         return Path(f"/proc/{process}/cmdline").read_bytes() != b""
     except (FileNotFoundError, ProcessLookupError):

@@ -1,7 +1,7 @@
 """A flight in real time on emulated devices in a process of their own: to be stopped, hung and killed.
 
-The truth log of the devices tells what the coils carried; the service manager's end of the notification
-socket tells when the flight was ready.
+The truth log of the devices has the coils' currents; the service manager's end of the notification
+socket shows when the flight was ready.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class LiveFlight:
         )
 
     def wait_for(self, word: str, patience: float = 30.0) -> int:
-        """Wait until the service manager is told `word`; return the monotonic time in ns."""
+        """Wait until the service manager receives `word`; return the monotonic time in ns."""
         deadline = time.monotonic() + patience
         while (left := deadline - time.monotonic()) > 0.0 and self.process.poll() is None:
             if select.select([self._notifications], [], [], min(left, 0.2))[0]:
@@ -108,7 +108,7 @@ class LiveFlight:
         return [int(child) for task in tasks for child in task.read_text().split()]
 
     def end(self) -> str:
-        """Have the flight end politely; return what it wrote on standard error."""
+        """Stop the flight by SIGTERM; return what it wrote on standard error."""
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGCONT)
             self.process.terminate()
@@ -155,7 +155,7 @@ class CoilTruth:
             path.rename(folder / path.name)
         self.run: Run = read_run(folder)
         start = self.run["run"][0]
-        # Both clocks now: the run's label tells mission time zero in UTC only.
+        # Both clocks now: the run's label gives mission time zero in UTC only.
         epoch_ns = int(start["utc_ns"]) - (time.time_ns() - time.monotonic_ns())
         truth = self.run["truth"]
         self.time_ns: npt.NDArray[np.int64] = truth["time_ns"].astype(np.int64) + epoch_ns

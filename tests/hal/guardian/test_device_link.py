@@ -104,7 +104,7 @@ def test_real_devices_are_not_looked_for_in_a_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("facts", [None, "{", "[]", "{}"])
-def test_a_file_that_tells_of_no_server_is_said_so(tmp_path: Path, facts: str | None) -> None:
+def test_a_file_that_names_no_server_is_refused(tmp_path: Path, facts: str | None) -> None:
     path = tmp_path / "facts.json"
     if facts is not None:
         path.write_text(facts, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Whatever becomes of the flight process, the coils are at zero within half a second."""
+"""However the flight process ends, the coils are at zero within half a second."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ def test_control_comes_back_by_itself_within_two_seconds(campaign: Campaign, act
     assert recovered <= 2.0
 
 
-def test_a_guardian_that_is_killed_or_hangs_is_replaced_and_told(campaign: Campaign) -> None:
+def test_a_guardian_that_is_killed_or_hangs_is_replaced_and_reported(campaign: Campaign) -> None:
     assert len(set(campaign.guardians)) == 3
     names = event_names(campaign.truth.run)
     assert names.count("guardian-lost") == 2
     assert names.count("guardian-ready") >= 2
     events = campaign.truth.run["event"]
-    told = events["time_ns"][events["name"] == b"guardian-lost"] + campaign.truth.epoch_ns
-    delays = (told - np.array(campaign.guardian_lost_ns)) * 1e-9
+    reported = events["time_ns"][events["name"] == b"guardian-lost"] + campaign.truth.epoch_ns
+    delays = (reported - np.array(campaign.guardian_lost_ns)) * 1e-9
     assert 0.0 < delays[0] < 0.5, "a death is seen at once"
     assert 0.0 < delays[1] < 2.0, "a line that is not read fills up"
 

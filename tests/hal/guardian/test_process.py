@@ -1,4 +1,4 @@
-"""The guardian as a process: what it does to its bus, what it tells, what it weighs."""
+"""The guardian as a process: its writes to the bus, its reports, its memory."""
 
 from __future__ import annotations
 
@@ -100,10 +100,10 @@ def test_signals_that_end_a_flight_do_not_end_its_guardian(guardian: GuardianLin
         os.kill(guardian.process_id, number)
     beat_for(guardian, 0.1)
     assert guardian.tend(time.monotonic_ns()) == []
-    assert os.getsid(guardian.process_id) == guardian.process_id, "nor what is sent to the flight's group"
+    assert os.getsid(guardian.process_id) == guardian.process_id, "nor signals to the flight's group"
 
 
-def test_a_killed_guardian_is_replaced_and_told(guardian: GuardianLine) -> None:
+def test_a_killed_guardian_is_replaced_and_reported(guardian: GuardianLine) -> None:
     first = guardian.process_id
     os.kill(first, signal.SIGKILL)
     assert news_until(guardian, GuardianNews.READY) == [GuardianNews.LOST, GuardianNews.READY]
@@ -126,7 +126,7 @@ def test_a_guardian_that_cannot_be_replaced_now_is_replaced_later(
     assert news_until(guardian, GuardianNews.READY) == [GuardianNews.LOST, GuardianNews.READY]
 
 
-def test_a_guardian_that_hangs_is_replaced_and_told(guardian: GuardianLine) -> None:
+def test_a_guardian_that_hangs_is_replaced_and_reported(guardian: GuardianLine) -> None:
     first = guardian.process_id
     os.kill(first, signal.SIGSTOP)
     for _ in range(400):  # ten seconds of heartbeats, more than its line takes
@@ -135,7 +135,7 @@ def test_a_guardian_that_hangs_is_replaced_and_told(guardian: GuardianLine) -> N
     assert guardian.process_id != first
 
 
-def test_a_silent_chip_is_told_once_and_tried_again(guardian: GuardianLine, log: Path) -> None:
+def test_a_silent_chip_is_reported_once_and_tried_again(guardian: GuardianLine, log: Path) -> None:
     beat_for(guardian, 0.05)
     broken = Path(f"{log}.broken")
     broken.touch()

@@ -14,7 +14,7 @@ from hal.buses import real_time
 from hal.drivers.coil_settings import DEVICE as COILS
 
 
-def test_a_refusal_is_told_with_its_cure(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_refusal_is_reported_with_its_cure(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise PermissionError(1, "Operation not permitted")
 

@@ -12,34 +12,34 @@ from tests.manual_clock import ManualClock
 
 
 class Watchers:
-    """Guardian and service manager in one; note what they are told."""
+    """Guardian and service manager in one; note the calls."""
 
     def __init__(self) -> None:
-        self.told: list[str] = []
+        self.calls: list[str] = []
         self.news: list[GuardianNews] = []
 
     def beat(self) -> None:
-        self.told.append("beat")
+        self.calls.append("beat")
 
     def tend(self, _: int) -> list[GuardianNews]:
         news, self.news = self.news, []
         return news
 
     def ready(self, status: str) -> None:
-        self.told.append(f"ready: {status}")
+        self.calls.append(f"ready: {status}")
 
     def feed_watchdog(self) -> None:
-        self.told.append("feed")
+        self.calls.append("feed")
 
 
 class Events(Recorder):
     """Keeps the events in place of writing them."""
 
     def __init__(self) -> None:
-        self.told: list[tuple[str, str]] = []
+        self.calls: list[tuple[str, str]] = []
 
     def event(self, kind: EventKind, time_ns: int, suppressed: int, text: str) -> None:
-        self.told.append((kind.name, text))
+        self.calls.append((kind.name, text))
 
 
 class CoilJob:
@@ -81,19 +81,19 @@ def supervision(watchers: Watchers, events: Events, clock: ManualClock, coils: C
 
 def test_ready_is_said_once_after_the_first_good_cycle(supervision: Supervision, watchers: Watchers) -> None:
     supervision.feed()
-    assert watchers.told == ["feed"], "progress alone is no readiness"
+    assert watchers.calls == ["feed"], "progress alone is no readiness"
     supervision.beat()
     supervision.beat()
-    assert watchers.told == ["feed", "beat", "ready: flying", "beat"]
+    assert watchers.calls == ["feed", "beat", "ready: flying", "beat"]
 
 
-def test_what_becomes_of_the_guardian_is_told_as_events(
+def test_what_becomes_of_the_guardian_is_reported_as_events(
     supervision: Supervision, watchers: Watchers, events: Events
 ) -> None:
     watchers.news = list(GuardianNews)
     supervision.feed()
     supervision.feed()
-    assert events.told == [
+    assert events.calls == [
         ("guardian-lost", GuardianNews.LOST.value),
         ("guardian-ready", GuardianNews.READY.value),
         ("guardian-acted", GuardianNews.ACTED.value),
@@ -101,14 +101,14 @@ def test_what_becomes_of_the_guardian_is_told_as_events(
     ]
 
 
-def test_a_guardian_that_acts_again_and_again_is_told_once_in_a_while(
+def test_a_guardian_that_acts_again_and_again_is_reported_once_in_a_while(
     supervision: Supervision, watchers: Watchers, events: Events, clock: ManualClock
 ) -> None:
     for _ in range(40):
         watchers.news = [GuardianNews.ACTED]
         supervision.feed()
         clock.advance(250_000_000)
-    assert events.told == [("guardian-acted", GuardianNews.ACTED.value)] * 10, "ten seconds, one in each"
+    assert events.calls == [("guardian-acted", GuardianNews.ACTED.value)] * 10, "ten seconds, one in each"
 
 
 def test_a_loop_whose_commands_do_not_reach_the_coils_sends_no_heartbeat(
@@ -117,24 +117,24 @@ def test_a_loop_whose_commands_do_not_reach_the_coils_sends_no_heartbeat(
     for _ in range(4):
         clock.advance(25_000_000)
         supervision.beat()
-    assert watchers.told.count("beat") == 4
+    assert watchers.calls.count("beat") == 4
     coils.broken = True
     clock.advance(200_000_000)
     supervision.beat()
-    assert watchers.told.count("beat") == 4
+    assert watchers.calls.count("beat") == 4
     coils.broken = False
     clock.advance(50_000_000)
     supervision.beat()
-    assert watchers.told.count("beat") == 5
+    assert watchers.calls.count("beat") == 5
 
 
 def test_the_process_settles_once_before_it_is_called_ready(
     watchers: Watchers, events: Events, clock: ManualClock, coils: CoilJob
 ) -> None:
-    told = watchers.told
+    calls = watchers.calls
     settling = Supervision(
-        watchers, watchers, clock, events, "flying", coils.ticker, lambda: told.append("settled")
+        watchers, watchers, clock, events, "flying", coils.ticker, lambda: calls.append("settled")
     )
     settling.beat()
     settling.beat()
-    assert told == ["beat", "settled", "ready: flying", "beat"]
+    assert calls == ["beat", "settled", "ready: flying", "beat"]

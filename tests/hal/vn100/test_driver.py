@@ -104,7 +104,7 @@ def test_the_data_sheets_noise_has_its_density_at_the_drivers_windows() -> None:
     bench = bench_line(at_rest, MISSION, Vn100EmulatorSettings(noise=PROFILES["datasheet"]))
     bench.driver.configure()
     readings = bench.run(50.0)
-    # Window 20 gives 0.016 deg/s and 0.63 mG; 2000 samples tell a deviation to 1.6 %, five times that is 8 %.
+    # Window 20 gives 0.016 deg/s and 0.63 mG; 2000 samples give a deviation to 1.6 %, five times that is 8 %.
     rate = np.array([r.rate for r in readings])
     field = np.array([r.field for r in readings])
     assert rate.std(axis=0) == pytest.approx(np.full(3, np.radians(0.0035) * 20 / np.sqrt(20)), rel=0.08)
@@ -145,7 +145,7 @@ def test_a_unit_set_up_beforehand_is_taken_as_it_is() -> None:
     readings = bench.run(1.0)
     assert bench.unit.registers.read(6) == ("14",)
     assert len(readings) > 45
-    # Packets wait behind the VNYMR lines: here the unit's own time tells when the sample was taken.
+    # Packets wait behind the VNYMR lines: here the sample's time is the unit's own.
     sampled_ns = readings[-1].device_time_ns - QUIET.uptime_ns
     assert readings[-1].quaternion == pytest.approx(turning(sampled_ns).quaternion, abs=2 * FLOAT32)
 
@@ -167,7 +167,7 @@ def test_a_wrong_baud_rate_is_corrupt_data() -> None:
     assert bench.driver.link().packets == 0
 
 
-def test_a_unit_that_talks_but_does_not_hear_is_told_from_a_silent_one() -> None:
+def test_a_unit_that_talks_but_does_not_hear_is_distinguished_from_a_silent_one() -> None:
     bench = bench_line()
     bench.line.to_device.faults = LineFaults(silent=True)
     with pytest.raises(NotResponding, match="though its output arrives"):

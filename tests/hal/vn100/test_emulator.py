@@ -41,14 +41,14 @@ class Bench:
         self.unit.advance(self.now_ns)
         return [item for at, data in self.line.host.receive() for item in self.parser.feed(at, data)]
 
-    def tell(self, line: bytes, seconds: float = 0.02) -> list[Sentence]:
+    def exchange(self, line: bytes, seconds: float = 0.02) -> list[Sentence]:
         """Return the sentences that come after a command."""
         self.line.host.send(line)
         return [item.sentence for item in self.run(seconds) if isinstance(item, AsciiLine)]
 
     def quiet(self) -> Bench:
         """Pause its asynchronous output."""
-        self.tell(build("ASY", 0), 0.05)
+        self.exchange(build("ASY", 0), 0.05)
         return self
 
 
@@ -90,10 +90,10 @@ def test_out_of_the_box_it_speaks_vnymr_at_40_hz() -> None:
 )
 def test_mistakes_get_their_error_codes_and_change_nothing(line: bytes, code: str) -> None:
     bench = Bench()
-    bench.tell(build("WRG", 7, 20), 0.1)
+    bench.exchange(build("WRG", 7, 20), 0.1)
     bench.quiet()
     before = [bench.unit.registers.read(n) for n in (1, 5, 6, 7, 21, 44, 75)]
-    (answer,) = bench.tell(line)
+    (answer,) = bench.exchange(line)
     assert (answer.command, answer.fields) == ("ERR", (code,))
     assert [bench.unit.registers.read(n) for n in (1, 5, 6, 7, 21, 44, 75)] == before
 
@@ -101,14 +101,14 @@ def test_mistakes_get_their_error_codes_and_change_nothing(line: bytes, code: st
 def test_an_answer_is_checked_the_way_the_question_was() -> None:
     bench = Bench().quiet()
     for question in ("xor8", "crc16"):
-        (answer,) = bench.tell(build("RRG", 1, checksum=question))
+        (answer,) = bench.exchange(build("RRG", 1, checksum=question))
         assert (answer.checksum, answer.fields) == (question, ("1", "VN-100T-CR"))
-    assert bench.tell(b"$VNRRG,1*XX\r\n")[0].checksum == "xor8"
+    assert bench.exchange(b"$VNRRG,1*XX\r\n")[0].checksum == "xor8"
 
 
 def test_register_30_sets_checksum_and_trailing_fields_of_its_lines() -> None:
     bench = Bench()
-    bench.tell(build("WRG", 30, 1, 1, 0, 0, 3, 0, 1))
+    bench.exchange(build("WRG", 30, 1, 1, 0, 0, 3, 0, 1))
     line = bench.run(0.1)[-1]
     assert isinstance(line, AsciiLine)
     assert line.sentence.checksum == "crc16"
@@ -118,38 +118,38 @@ def test_register_30_sets_checksum_and_trailing_fields_of_its_lines() -> None:
 
 def test_the_error_mode_may_silence_errors() -> None:
     bench = Bench().quiet()
-    bench.tell(build("WRG", 30, 0, 0, 0, 0, 1, 0, 0))
-    assert bench.tell(build("FOO")) == []
+    bench.exchange(build("WRG", 30, 0, 0, 0, 0, 1, 0, 0))
+    assert bench.exchange(build("FOO")) == []
 
 
 def test_the_baud_rate_changes_after_the_answer() -> None:
     bench = Bench().quiet()
-    (answer,) = bench.tell(build("WRG", 5, 230400))
+    (answer,) = bench.exchange(build("WRG", 5, 230400))
     assert answer.fields == ("5", "230400")
-    assert bench.tell(build("RRG", 1)) == []
+    assert bench.exchange(build("RRG", 1)) == []
     bench.line.host.set_baud_rate(230400)
-    assert bench.tell(b"\r\n" + build("RRG", 1))[-1].fields == ("1", "VN-100T-CR")
+    assert bench.exchange(b"\r\n" + build("RRG", 1))[-1].fields == ("1", "VN-100T-CR")
 
 
 def test_settings_outlive_a_reset_only_when_saved() -> None:
     bench = Bench()
-    bench.tell(build("WRG", 6, 2))
-    bench.tell(build("RST"), 2.0)
+    bench.exchange(build("WRG", 6, 2))
+    bench.exchange(build("RST"), 2.0)
     assert bench.unit.registers.read(6) == ("14",)
-    bench.tell(build("WRG", 6, 2))
-    saved = bench.tell(build("WNV"), 0.6)
+    bench.exchange(build("WRG", 6, 2))
+    saved = bench.exchange(build("WNV"), 0.6)
     assert "WNV" in {sentence.command for sentence in saved}
-    bench.tell(build("RST"), 2.0)
+    bench.exchange(build("RST"), 2.0)
     assert {i.sentence.command for i in bench.run(0.5) if isinstance(i, AsciiLine)} == {"QTN"}
-    bench.tell(build("RFS"), 2.0)
+    bench.exchange(build("RFS"), 2.0)
     assert {i.sentence.command for i in bench.run(0.5) if isinstance(i, AsciiLine)} == {"YMR"}
 
 
 def test_after_a_reset_it_is_silent_while_it_starts_and_its_clock_begins_at_zero() -> None:
     bench = Bench()
-    bench.tell(build("WRG", 75, 1, 20, "01", "0001"))
-    bench.tell(build("WNV"), 0.6)
-    assert [s.command for s in bench.tell(build("RST"), 0.02)][-1] == "RST"
+    bench.exchange(build("WRG", 75, 1, 20, "01", "0001"))
+    bench.exchange(build("WNV"), 0.6)
+    assert [s.command for s in bench.exchange(build("RST"), 0.02)][-1] == "RST"
     assert bench.run(0.9) == []
     packets = [item for item in bench.run(1.0) if isinstance(item, BinaryPacket)]
     assert packets[0].values == (25_000_000,)
@@ -158,8 +158,8 @@ def test_after_a_reset_it_is_silent_while_it_starts_and_its_clock_begins_at_zero
 def test_its_clock_may_run_fast_and_out_of_step() -> None:
     fast = Vn100EmulatorSettings(noise=PROFILES["none"], clock_ppm=20.0, uptime_ns=7_310_000_000)
     bench = Bench(fast).quiet()
-    bench.tell(build("WRG", 75, 1, 20, "01", "0001"))
-    bench.tell(build("ASY", 1))
+    bench.exchange(build("WRG", 75, 1, 20, "01", "0001"))
+    bench.exchange(build("ASY", 1))
     packets = [item for item in bench.run(100.0) if isinstance(item, BinaryPacket)]
     bench.run(1.0)
     last, first = packets[-1], packets[0]
@@ -172,12 +172,12 @@ def test_its_clock_may_run_fast_and_out_of_step() -> None:
 def test_every_ascii_type_says_what_its_register_says() -> None:
     bench = Bench()
     for report in REPORTS:
-        bench.tell(build("WRG", 6, report.async_type), 0.05)
+        bench.exchange(build("WRG", 6, report.async_type), 0.05)
         line = bench.run(0.1)[-1]
         assert isinstance(line, AsciiLine)
         assert line.sentence.command == report.header
         if report.register is not None and report.header != "DTV":
-            answers = bench.tell(build("RRG", report.register))
+            answers = bench.exchange(build("RRG", report.register))
             (answer,) = [s for s in answers if s.command == "RRG"]
             assert answer.fields[1:] == line.sentence.fields
 
@@ -188,7 +188,7 @@ def test_every_binary_field_of_a_vn100_can_be_had_and_agrees_with_the_others() -
     for group, word in SUPPORTED_FIELDS.items():
         for bit, (_name, _) in enumerate(FIELDS[group]):
             if word >> bit & 1:
-                echo = bench.tell(build("WRG", 75, 0, 20, f"{1 << group:02X}", f"{1 << bit:04X}"))
+                echo = bench.exchange(build("WRG", 75, 0, 20, f"{1 << group:02X}", f"{1 << bit:04X}"))
                 assert echo[-1].command == "WRG"
                 bench.line.host.send(build("BOM", 1))
                 (packet,) = bench.run(0.05)
@@ -213,10 +213,10 @@ def test_every_binary_field_of_a_vn100_can_be_had_and_agrees_with_the_others() -
 
 def test_known_disturbances_show_in_the_status() -> None:
     bench = Bench().quiet()
-    bench.tell(build("WRG", 75, 0, 20, "10", "0001"))
+    bench.exchange(build("WRG", 75, 0, 20, "10", "0001"))
     for command, bit in (("KMD", 11), ("KAD", 12)):
         for flag in (1, 0):
-            bench.tell(build(command, flag))
+            bench.exchange(build(command, flag))
             bench.line.host.send(build("BOM", 1))
             (packet,) = bench.run(0.02)
             assert isinstance(packet, BinaryPacket)
@@ -225,10 +225,10 @@ def test_known_disturbances_show_in_the_status() -> None:
 
 def test_a_flood_without_a_line_end_overflows_its_buffer() -> None:
     bench = Bench().quiet()
-    answers = bench.tell(b"A" * 300, 0.1)
+    answers = bench.exchange(b"A" * 300, 0.1)
     assert [s.fields for s in answers] == [("02",)]
-    assert bench.tell(b"A" * 10) == []
-    assert bench.tell(b"\r\n" + build("RRG", 1))[0].command == "RRG"
+    assert bench.exchange(b"A" * 10) == []
+    assert bench.exchange(b"\r\n" + build("RRG", 1))[0].command == "RRG"
 
 
 numbers = map(str, range(0, 101, 5))
@@ -248,13 +248,13 @@ command = st.sampled_from(["RRG", "WRG", "ASY", "KMD", "BOM", "WNV", "RST", "RFS
     )
 )
 @settings(max_examples=150, deadline=None)
-def test_whatever_it_is_told_it_goes_on_and_can_be_restored(lines: list[bytes]) -> None:
+def test_whatever_it_receives_it_goes_on_and_can_be_restored(lines: list[bytes]) -> None:
     bench = Bench()
     for line in lines:
-        bench.tell(line, 0.03)
+        bench.exchange(line, 0.03)
     bench.run(1.6)
     bench.line.host.set_baud_rate(bench.line.device.baud_rate)
-    bench.tell(b"\r\n" + build("RFS"), 1.6)
+    bench.exchange(b"\r\n" + build("RFS"), 1.6)
     bench.line.host.set_baud_rate(115200)
     bench.run(0.1)
     assert {i.sentence.command for i in bench.run(0.2) if isinstance(i, AsciiLine)} == {"YMR"}

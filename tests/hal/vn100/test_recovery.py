@@ -1,4 +1,4 @@
-"""A unit that is lost in flight is found and set up anew within two seconds, and no poll ever waits."""
+"""A unit lost in flight is found and set up again within two seconds, and no poll ever waits."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ def test_readings_come_again_within_two_seconds_after_the_fault(
 
 
 def test_a_unit_that_was_reset_on_saved_binary_output_is_set_up_too(bench: BenchLine) -> None:
-    """Its packets come again by themselves, unfiltered: only its clock tells of the start."""
+    """Its packets come again by themselves, unfiltered: only its clock shows the restart."""
     bench.unit.registers.save()
     bench.unit.registers.write(85, ("0", "4", "4", "4", "0", "0", "3", "3", "3", "0"))
     bench.unit.registers.save()

@@ -52,7 +52,9 @@ def errors_under(fault: str) -> tuple[list[tuple[float, str]], float]:
         ("bus: arbitration @ 2 for 2", "arbitration lost"),
     ],
 )
-def test_a_chip_that_fails_is_told_within_half_a_second_and_obeys_again_after(fault: str, word: str) -> None:
+def test_a_chip_that_fails_is_reported_within_half_a_second_and_obeys_again_after(
+    fault: str, word: str
+) -> None:
     seen, miss = errors_under(fault)
     reports = [(time, error) for time, error in seen if error]
     assert 2.0 <= reports[0][0] <= 2.6

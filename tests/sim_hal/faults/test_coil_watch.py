@@ -110,7 +110,7 @@ def reading(time: float, current: float) -> PowerReading:
     return PowerReading(now_ns, 5.0, current, 5.0 * current, current, now_ns - 300_000_000)
 
 
-def test_a_stuck_leg_of_an_axis_that_is_driven_is_told_from_one_that_carries_nothing() -> None:
+def test_a_stuck_leg_of_an_axis_that_is_driven_is_distinguished_from_one_that_carries_nothing() -> None:
     """Under an opposing command a stuck leg draws no supply current, like an open coil: rest decides."""
     command = np.array([-FULL])
     assert supply_current(command, CoilFault.A_HIGH, FULL) == pytest.approx(0.0)
@@ -209,7 +209,7 @@ def test_in_eight_minutes_of_wild_commands_there_is_no_false_alarm() -> None:
     assert suspected == 0
 
 
-def test_a_gap_in_the_readings_begins_the_watch_anew() -> None:
+def test_a_gap_in_the_readings_restarts_the_watch() -> None:
     watch = CoilWatch(CoilWatchSettings((FULL, FULL, FULL)))
     currents = np.array([0.05, 0.0, 0.0])
 

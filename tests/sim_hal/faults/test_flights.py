@@ -39,11 +39,11 @@ def flown(fault: str, mode: str = "testbed-demo", span: float | None = 3.0) -> d
         ("monitor: delayed", ["coil-suspect"], 3.0, 2.0),
     ],
 )
-def test_a_device_that_fails_is_told_and_good_again_within_two_seconds(
+def test_a_device_that_fails_is_reported_and_good_again_within_two_seconds(
     fault: str, events: list[str], detected_in: float, recovered_in: float
 ) -> None:
     result = flown(fault)
-    assert result["told"][: len(events)] == events
+    assert result["reported"][: len(events)] == events
     assert result["reaction_right"] is not False
     assert result["detected_s"] <= detected_in
     assert result["recovered_s"] <= recovered_in
@@ -59,7 +59,7 @@ def test_a_coil_that_breaks_is_taken_out_of_use() -> None:
     assert result["recovered_s"] <= 6.0
 
 
-def test_what_is_told_by_another_name_is_not_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_report_by_another_name_does_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(fault_table.OWN_OF_KIND, "imu: silent", frozenset({"clock-step"}))
     result = flown("imu: silent")
     assert result["detected_s"] is None
@@ -104,7 +104,7 @@ def test_each_fault_has_events_of_its_own_that_exist(kind: FaultKind) -> None:
 
 
 @pytest.mark.parametrize("mode", [mode for mode in faults.MODES if mode not in {"detumble", "slew"}])
-def test_the_twin_without_a_fault_tells_none_of_their_events(mode: str, tmp_path: Any) -> None:
+def test_the_twin_without_a_fault_reports_none_of_their_events(mode: str, tmp_path: Any) -> None:
     """The same seed and mode as the flights with faults above; the two other modes are below."""
     section = configuration.replace(demo_world(), seed=3)
     run = fly(faults.config_for(mode, camera=False), tmp_path, section=section)
@@ -114,8 +114,8 @@ def test_the_twin_without_a_fault_tells_none_of_their_events(mode: str, tmp_path
 @pytest.mark.parametrize("mode", ["detumble", "slew"])
 def test_a_sound_flight_is_quiet_in_its_mode(mode: str, tmp_path: Any) -> None:
     run = fly(faults.config_for(mode, camera=False), tmp_path)
-    told = set(event_names(run)) - {"started", "stopped", "target", "mode", "commanded", "plan-stretched"}
-    assert told == set()
+    reported = set(event_names(run)) - {"started", "stopped", "target", "mode", "commanded", "plan-stretched"}
+    assert reported == set()
 
 
 def test_the_campaign_meets_every_fault_in_every_mode() -> None:
@@ -125,7 +125,7 @@ def test_the_campaign_meets_every_fault_in_every_mode() -> None:
     assert len(met) == len(drawn)
 
 
-def test_its_table_tells_the_worst_of_each_fault() -> None:
+def test_its_table_shows_the_worst_of_each_fault() -> None:
     base = {
         "exercised": True,
         "detected_s": 0.5,
@@ -154,8 +154,8 @@ def test_its_table_tells_the_worst_of_each_fault() -> None:
     assert row["blind_current_a"] == 0.02
     assert (row["reactions_right"], row["reactions_asked"]) == (1, 2)
     assert summary.facts["service_failing"] == 2
-    named = "imu: off, hold, 5.00 to 8.00 s, number 71; told: tumbling"
-    assert summary.facts["not_told"] == summary.facts["wrong_reaction"] == [named]
+    named = "imu: off, hold, 5.00 to 8.00 s, number 71; reported: tumbling"
+    assert summary.facts["not_reported"] == summary.facts["wrong_reaction"] == [named]
     assert summary.text.count(named) == 2
 
 

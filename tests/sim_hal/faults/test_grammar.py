@@ -244,7 +244,7 @@ def test_faults_that_follow_or_add_to_each_other_are_flown() -> None:
     checked("coil-x: open @ 2", "coil-y: open @ 2", "bus: hang @ 1", "pwm: nack @ 1", "pwm: off @ 1")
 
 
-def test_the_closing_text_tells_what_was_broken(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_closing_text_names_the_faults(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["run", str(CONFIG), "--duration", "0.5", "--fault"]
     assert main([*words, "imu: silent @ 0.2 for 0.1", "--out", str(tmp_path / "one")]) == 0
     assert "\nfaults: imu: silent @ 0.2 for 0.1\n" in capsys.readouterr().out

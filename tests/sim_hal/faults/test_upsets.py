@@ -130,7 +130,7 @@ def test_the_monitors_calibration_is_used_by_nobody() -> None:
         (75, 62),  # fields that the unit does not have
     ],
 )
-def test_a_unit_whose_output_is_upset_is_set_up_anew_within_two_seconds(register: int, bit: int) -> None:
+def test_a_unit_whose_output_is_upset_is_set_up_again_within_two_seconds(register: int, bit: int) -> None:
     bench = bench_line()
     bench.driver.configure()
     bench.run(0.5)
@@ -145,7 +145,7 @@ def test_a_unit_whose_output_is_upset_is_set_up_anew_within_two_seconds(register
     ("register", "bit"),
     [*((75, bit) for bit in (16, 17, 18, 19, 21, 22, 23)), (6, 3)],  # another rate; lines beside packets
 )
-def test_a_unit_that_says_more_or_less_than_it_was_asked_is_set_up_anew(register: int, bit: int) -> None:
+def test_a_unit_that_says_more_or_less_than_it_was_asked_is_set_up_again(register: int, bit: int) -> None:
     bench = bench_line()
     bench.driver.configure()
     bench.run(0.5)
@@ -184,7 +184,7 @@ def test_what_is_not_said_is_drawn(name: str) -> None:
     assert len(seen) > 10
 
 
-def test_a_monitor_that_is_behind_tells_what_was_two_seconds_ago() -> None:
+def test_a_monitor_that_is_behind_shows_what_was_two_seconds_ago() -> None:
     rig = Rig()
     monitor = Ina219(rig.bus, INA, rig.clock, averaged=1)
     rig.coils.start()
@@ -234,7 +234,7 @@ def test_an_upset_of_the_unit_is_met_where_its_samples_come_otherwise() -> None:
     assert fault_judgement._is_exercised(gap, kind, 4.0, 4.0)
 
 
-def test_an_upset_of_the_monitor_is_met_where_it_tells_nothing_for_a_while() -> None:
+def test_an_upset_of_the_monitor_is_met_where_it_shows_nothing_for_a_while() -> None:
     kind = CATALOGUE["monitor: upset"]
     house = np.zeros(10, dtype=[("time_ns", "i8"), ("coil_current", "f8")])
     house["time_ns"] = np.arange(10) * 1_000 * MS

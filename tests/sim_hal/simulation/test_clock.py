@@ -1,4 +1,4 @@
-"""Simulated time jumps, but nothing that is due on the way is missed or out of order."""
+"""Simulated time jumps, but every event due on the way comes, in order."""
 
 from __future__ import annotations
 

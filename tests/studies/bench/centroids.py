@@ -69,7 +69,7 @@ def frame_of(
 def point_bound(camera: StarCameraModel, place: FloatArray, electrons: float) -> FloatArray:
     """Return the least covariance (2, 2) px^2 of a star's place, its light, sky and point spread unknown.
 
-    Poisson and read noise, rounding; pixels whose mean is saturated tell nothing.
+    Poisson and read noise, rounding; pixels whose mean is saturated give no information.
     """
     reach = int(np.ceil(6.0 * camera.psf_sigma)) + 1
     middle = np.rint(place)

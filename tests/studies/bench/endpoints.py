@@ -1,7 +1,7 @@
 """Single endpoints, faint streaks and mid-exposure attitude of the likelihood fit, beside their bounds.
 
-`python -m tests.studies.bench endpoints`: three tables, seeds of their own. What each measures, and against
-what, is told where it is measured: `single_endpoints`, `faint_streaks`, `mid_exposure`.
+`python -m tests.studies.bench endpoints`: three tables, seeds of their own. The quantities and their
+references are described in `single_endpoints`, `faint_streaks`, `mid_exposure`.
 """
 
 from __future__ import annotations

@@ -2,11 +2,10 @@
 
 The step demonstration flies in real time on emulated devices in processes of their own, as a board flies on
 its devices: planner and vision have work without pause, the guardian watches. Beside it a bare absolute-sleep
-loop at the same rate (`tests.studies.bench.bare_loop`) tells what the machine stalls by itself, and the
-kernel what a virtual machine's host takes, which a loop that works meets more often than one that sleeps.
-Where SCHED_FIFO
-is allowed the flight is flown twice, with it and without. Run it alone on two cores. The slope of memory is
-told by flights of 16 minutes and more.
+loop at the same rate (`tests.studies.bench.bare_loop`) measures the machine's own stalls, and the
+kernel the time that a virtual machine's host takes; a working loop meets such stalls more often than a
+sleeping loop. Where SCHED_FIFO is allowed the flight is flown twice, with it and without. Run it alone on two
+cores. The slope of memory needs flights of 16 minutes or longer.
 """
 
 from __future__ import annotations
@@ -198,8 +197,8 @@ def fly(folder: Path, load: Load, fifo: bool) -> Flown:
             )
         )
         # Devices as a board has its own: there before the flight.
-        told = "--folder", str(devices), "--facts", str(facts)
-        stack.enter_context(answering("sim_hal", "serve", str(config), *told))
+        outputs = "--folder", str(devices), "--facts", str(facts)
+        stack.enter_context(answering("sim_hal", "serve", str(config), *outputs))
         notifications = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
         notifications.bind(str(folder / "notify"))
         flight = _started(folder, config, notifications, load.duration, facts, fifo)

@@ -19,7 +19,7 @@ PERIOD_NS = 25_000_000
 """Of the control group at 40 Hz; mission time zero is a multiple of it (`flight.app.mission_time`)."""
 
 SLOPE_FROM, SLOPE_SPAN = 720.0, 240.0
-"""s of flight from which on, and over which at least, the slope of memory is told.
+"""s of flight: the slope of memory is fitted from the first on, over the second at least.
 
 Until then windows of minutes fill, and pages of libraries and of the sky's index are touched the first time.
 """
@@ -167,7 +167,7 @@ def _of_processes(watched: Watched, warm_s: float, settled_s: float) -> Figures:
 
 
 def judged_slope(seconds: list[float], levels: list[float]) -> tuple[float, float, float]:
-    """Return the slope per hour and its interval; NaN where the span is too short to tell one that is asked.
+    """Return the slope per hour and its interval; NaN where the span is too short to judge it.
 
     Pages come and go by tenths of a MiB: over a minute that alone is tens of MiB/h.
     """
@@ -177,13 +177,13 @@ def judged_slope(seconds: list[float], levels: list[float]) -> tuple[float, floa
 
 
 def _share(looks: list[Look], name: str) -> float:
-    """Return the part of a core that a process took; of one that was replaced meanwhile, of all together."""
+    """Return the share of a core that a process took; a replaced process counts with its successors."""
     spent = np.diff([look.processor[name] for look in looks])
     return float(spent[spent > 0.0].sum()) / (looks[-1].time - looks[0].time)
 
 
 def misses(figures: Figures) -> list[str]:
-    """Return the names of the figures that exceed what is asked.
+    """Return the names of the figures that exceed their limits.
 
     Of the slope its interval decides: it misses when all of that lies above. A slope that is not known in so
     short a flight is not judged.
@@ -212,7 +212,7 @@ def table(figures: Figures, name: str) -> str:
     lines = [f"{name}: {figures['scheduling']}", f"{'':42}{'asked <=':>10}{'measured':>12}"]
     for text, key, asked, form in rows:
         known = not math.isnan(figures[key])
-        measured = form.format(figures[key]).rstrip("%") if known else "not told"
+        measured = form.format(figures[key]).rstrip("%") if known else "unknown"
         lines.append(f"{text:42}{asked:>10}{measured:>12}{'  MISSED' if key in wrong else ''}")
     lines += [
         f"slots {figures['slots']}: lost {figures['lost']} (slips counted {figures['slips']}), of these "
@@ -242,11 +242,11 @@ def table(figures: Figures, name: str) -> str:
 
 
 def _of_slope(figures: Figures) -> list[str]:
-    """Return what is told of the slope of memory: in a flight that is long enough its interval."""
+    """Return the lines on the slope of memory: its interval where the flight is long enough."""
     low, high = figures["memory_slope_interval"]
     if math.isnan(low):
         return [
-            f"slope of memory: told by flights of {(SLOPE_FROM + SLOPE_SPAN) / 60.0:.0f} minutes and more"
+            f"slope of memory: known from flights of {(SLOPE_FROM + SLOPE_SPAN) / 60.0:.0f} minutes and more"
         ]
     own = "{:+.2f} ({:+.2f} to {:+.2f})".format(
         figures["control_slope_mib_per_hour"], *figures["control_slope_interval"]

@@ -72,7 +72,7 @@ def largest_ratio(problem: Problem, found: Plan) -> float:
 
 
 def warm_gain(problems: list[tuple[Problem, float]]) -> dict[str, float]:
-    """Return evaluations of the second plan of a slew, a third on its way, begun anew and from the last."""
+    """Return evaluations of the second plan of a slew, a third on its way, from scratch and from the last."""
     cold, warm = [], []
     for problem, _ in problems:
         first = problem.planned()
@@ -92,7 +92,7 @@ def warm_gain(problems: list[tuple[Problem, float]]) -> dict[str, float]:
 
 
 def draw(problem: Problem, path: Path) -> None:
-    """Draw one solution: nodes, what is flown between them, and the oracle."""
+    """Draw one solution: nodes, the path between them, and the oracle."""
     from matplotlib.figure import Figure  # noqa: PLC0415 - an extra
 
     found = problem.planned()

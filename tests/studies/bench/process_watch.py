@@ -39,7 +39,7 @@ class ProcessWatch:
     """Looks at processes by name from a thread of its own, until closed."""
 
     def __init__(self, processes: Callable[[], Mapping[str, int]], period: float) -> None:
-        """Take what tells the process identifiers anew at each look, and the period in s."""
+        """Take the function that returns the process identifiers at each look, and the period in s."""
         self.looks: list[Look] = []
         self._processes = processes
         self._period = period

@@ -2,7 +2,7 @@
 
 The first part measures the lower bounds of `ObjectSettings.bounds` (Sease, text at Table 4.4: "characterize
 the performance with no RSOs"): percentiles of the three indicators over the single stars of random fields
-(truth tells them from overlaps and pieces), and the false alarms left. The second puts one object a frame,
+(by the truth: not overlaps or pieces), and the false alarms left. The second puts one object a frame,
 moving or tracked, at each magnitude and counts what is found. Seeds of its own.
 """
 

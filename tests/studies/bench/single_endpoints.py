@@ -52,17 +52,17 @@ def endpoint_cell(magnitude: float, length: float, frames: int, seed: int) -> di
         found = estimated(pixels, turn / EXPOSURE, EXPOSURE, camera)
         if found.rate is not None:
             rows.append(_end_errors(found, places, turn, electrons, floor, camera))
-    told = {"magnitude": magnitude, "length": length, "ends": sum(map(len, rows)), "of": 2 * STARS * frames}
+    facts = {"magnitude": magnitude, "length": length, "ends": sum(map(len, rows)), "of": 2 * STARS * frames}
     # The ends of a frame share one motion: only frames are independent.
     means = np.array([row[:, 0].mean() for row in rows if len(row)])
     if len(means) < 2:
-        return told
+        return facts
     errors = np.concatenate(rows)
     alone = np.mean(
         [endpoint_bound(length, electrons, camera.psf_sigma, floor, angle) for angle in (0.3, 0.7)], axis=0
     )
     return {
-        **told,
+        **facts,
         "bound_along": float(np.sqrt(np.mean(errors[:, 2] ** 2))),
         "over_joint": [float(np.sqrt(np.mean((errors[:, k] / errors[:, 2 + k]) ** 2))) for k in (0, 1)],
         "over_lone": [float(np.sqrt(np.mean(errors[:, k] ** 2)) / alone[k]) for k in (0, 1)],

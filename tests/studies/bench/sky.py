@@ -5,7 +5,7 @@ the horizontal field, degrees), with the field known to 5 % and, where it is of 
 Simulated frames: the simulator's camera of 12 deg and 0.1 s, with the field known to 0.1 deg, the axis of
 the turn 30 to 90 deg off the boresight, and across it. The bounds are Cramer-Rao's: `over bound`, the rms
 error across the boresight over that of the stars' places, and `bound`, that of the rate's magnitude. The
-names of the stars lower the latter by 2 % at most: a streak's length tells the rate, its middle the place.
+names of the stars lower the latter by 2 % at most: a streak's length gives the rate, its middle the place.
 Times are of one core's CPU; peers extract the stars themselves, as they come and with their filters off.
 """
 
@@ -52,7 +52,7 @@ ARCSECONDS = math.degrees(1.0) * 3600.0
 
 @dataclass(frozen=True)
 class Photograph:
-    """What became of one photograph; arcsec and ms are NaN where it was not solved."""
+    """The result of one photograph; arcsec and ms are NaN where it was not solved."""
 
     name: str
     known: bool

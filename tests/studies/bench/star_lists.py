@@ -94,7 +94,7 @@ def _tangent(field_deg: float) -> float:
 
 
 def draw(kind: ListKind, stars: GuideStars, rng: np.random.Generator) -> StarList:
-    """Return a list of the sky; the camera's true field of view differs evenly within what is known."""
+    """Return a list of the sky; the camera's true field of view is uniform within its tolerance."""
     off = 0.0 if kind.known_deg is None else rng.uniform(-kind.known_deg, kind.known_deg)
     camera = Pinhole.from_field_of_view(PIXELS, PIXELS, float(np.deg2rad(kind.field_deg + off)))
     attitude = normalise(rng.standard_normal(4))

@@ -71,7 +71,7 @@ def fly(
     dask: str | None = None,
     progress: bool = False,
 ) -> Summary:
-    """Run what is missing of a campaign in `out`, then summarise.
+    """Run the missing cases of a campaign in `out`, then summarise.
 
     Raises UsageError when the folder holds another campaign.
     """

@@ -1,7 +1,7 @@
 """Campaign `consistency`: is the filter as good as its covariance says? NEES and NIS with everything on.
 
-Each run is 100 s of sim_hal's testbed (suspended; a thread of 0..2e-5 N m/rad and 0..4e-6 N m s/rad that the
-filter is not told, and a draught; steps of q2 flown by the estimate itself) or of a body free in orbit (three
+Each run is 100 s of sim_hal's testbed (suspended; a thread of 0..2e-5 N m/rad and 0..4e-6 N m s/rad unknown
+to the filter, and a draught; steps of q2 flown by the estimate itself) or of a body free in orbit (three
 axes, random attitude, a torque that walks at random, a field that turns). The coils' gain is off by 10 %
 (1 sigma). The VN-100 gives attitude and rate at 40 Hz with uniform noise and a constant gyro bias, loses 2 %
 of its packets and falls silent twice for 0.5..1 s. Every 5 s the star camera gives, 0.2..0.6 s late, the mean
@@ -118,7 +118,7 @@ def run(case: Case) -> Result:
             tally.measured(filter_, "gyro", rate)
         for kind, measurement in camera.due(cycle, world):
             tally.measured(filter_, kind, measurement)
-        if not filter_.started:  # it gave up: told as a restart
+        if not filter_.started:  # it gave up: counted as a restart
             filter_.start(attitude, rate)
         estimate = filter_.at(now_ns)
         if cycle and cycle % 40 == 0:
@@ -233,7 +233,7 @@ def scene_facts(results: Sequence[Result]) -> dict[str, Any]:
 
 
 def band(degrees: int, share: float = 0.95) -> tuple[float, float]:
-    """Return where `share` of a chi-square of so many degrees lies, over them."""
+    """Return the quantile `share` of a chi-square over its degrees of freedom."""
     tail = 0.5 * (1.0 - share)
     return float(chi2.ppf(tail, degrees)) / degrees, float(chi2.isf(tail, degrees)) / degrees
 

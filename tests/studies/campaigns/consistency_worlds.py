@@ -27,7 +27,7 @@ FIELD_TURN = 2.2e-3
 """rad/s: the field along a low polar orbit turns twice in a revolution."""
 CURRENT_BOUND = 3.5e-3
 GAIN_SIGMA = 0.1
-"""Of the coils' torque over what is believed of it: field, area and inertia are not better known."""
+"""Of the coils' torque over its nominal value: field, area and inertia are not better known."""
 MOST_STIFFNESS, MOST_DAMPING = 2e-5, 4e-6
 """N m/rad and N m s/rad of the thread."""
 
@@ -117,7 +117,7 @@ class SuspendedWorld:
 
     def command(self, currents: FloatArray) -> None:
         """Drive the coils."""
-        self._currents = _felt(currents, self._rng)
+        self._currents = _actual(currents, self._rng)
 
     def advance(self, span_ns: int) -> None:
         """Let time pass."""
@@ -160,7 +160,7 @@ class FreeWorld:
 
     def command(self, currents: FloatArray) -> None:
         """Drive the coils."""
-        self._currents = _felt(currents, self._rng)
+        self._currents = _actual(currents, self._rng)
 
     def advance(self, span_ns: int) -> None:
         """Let time pass, in one step of Runge-Kutta; the torque walks afterwards."""
@@ -191,7 +191,7 @@ class FreeWorld:
         return np.concatenate([q_dot, np.linalg.solve(INERTIA, torque) + self.disturbance])
 
 
-def _felt(currents: FloatArray, rng: np.random.Generator) -> FloatArray:
+def _actual(currents: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Return what the coils carry: off by a uniform draw where they are driven at all."""
     noise = rng.uniform(-CURRENT_BOUND, CURRENT_BOUND, 3)
     return np.asarray(np.where(currents != 0.0, currents + noise, 0.0))

@@ -3,7 +3,7 @@
 Each run is one revolution of the paper's orbit from a random date and node, for each suite and way to fly:
 level; rolled and pitched by up to 15 deg (4.1); tipped back and forth by 90 deg in pitch (4.3); any
 attitude at all. It gives the share of time with the horizon, lit or not, in 0, 1, 2, ... cameras, and that
-of the sunlit time with the Sun in a camera. For UW, level, the Sun's share is told against the Sun's height
+of the sunlit time with the Sun in a camera. For UW, level, the Sun's share is given over the Sun's height
 over the orbit's plane (beta) and three headings of the hexagon, for the square detector and for the cone in
 it: the paper names none of them.
 """

@@ -40,7 +40,7 @@ SIGNIFICANCE = 8.0
 WRONG_SIGMAS = 6.0
 WRONG_SHARE = 0.01
 RIGHT, WRONG, AT_REST = "right", "wrong", "at rest"
-# Turns in percent of the field, upper edges: time and errors are told for each.
+# Turns in percent of the field, upper edges: time and errors are given for each.
 TURNS = (5, 20, 35, 50)
 _MOST_SKIES = 1000
 _FREEDOM = 3
@@ -103,7 +103,7 @@ def _path_lengths(scene: Scene) -> FloatArray:
 
 
 def _judge(found: MotionResult, scene: Scene, still: bool) -> Result:
-    """Return the verdict, the errors of an answer, and what is known of why it is none or wrong."""
+    """Return the verdict, the errors of an answer, and the known reasons where it is missing or wrong."""
     size = float(np.linalg.norm(scene.rate))
     if found.status is not StreakStatus.RATE or found.rate is None or found.covariance is None:
         verdict = AT_REST if still else found.status.value
@@ -123,7 +123,7 @@ def _judge(found: MotionResult, scene: Scene, still: bool) -> Result:
 
 
 def _why_refused(found: MotionResult) -> str:
-    """Return as much of the reason for a refusal as the result tells."""
+    """Return the reason for a refusal as far as the result gives it."""
     if not found.found:
         return "no motion that the regions agree on"
     return f"{found.used_count} of {found.found} stars used, {found.length:.0f} px, misfit {found.misfit:.2f}"

@@ -1,4 +1,4 @@
-"""What became of a flight of campaign `faults`, told from its log and from the truth beside it.
+"""Judges a flight of campaign `faults` by its log and by the truth beside it.
 
 Times are of the log and the truth, not of the events alone, which a throttle holds back.
 """
@@ -22,8 +22,8 @@ from tests.studies.campaigns.fault_table import REACTION, own_events, part_of
 DURATION = 26.0
 """s, of each flight."""
 CYCLE = 0.025
-TOLD_WITHIN = 20.0
-"""s after the end of a fault: what is told later is of something else."""
+REPORTED_WITHIN = 20.0
+"""s after the end of a fault: later events have another cause."""
 BLIND_GRACE = 0.1
 """s: within this the coils are at zero after the last measurement."""
 ZERO = 1e-3
@@ -31,7 +31,7 @@ ZERO = 1e-3
 FRAME_PERIOD, FRAME_EXPOSURE, FRAME_READOUT, FRAME_LATE = 2.0, 0.2, 0.05, 1.0
 """s, of the campaign's camera."""
 DRIVEN = 6.0e-3
-"""A, of a coil that is driven enough for the monitor to tell."""
+"""A, from which on the monitor can judge a driven coil."""
 
 OFF_SURELY, GAIN_ERROR = 0.015, 0.2
 """A and relative: readings that differ by more are of different currents."""
@@ -50,11 +50,11 @@ def judge(flown: Run, kind: FaultKind, entry: FaultEntry) -> Result:
     at = entry.at or 0.0
     span = DURATION - at if entry.span is None else entry.span
     end = at if kind.momentary else min(at + span, DURATION)
-    told = [(float(event["time_ns"]) * 1e-9, to_text(event["name"])) for event in flown["event"]]
+    reported = [(float(event["time_ns"]) * 1e-9, to_text(event["name"])) for event in flown["event"]]
     warned = [
         (time, name)
-        for time, name in told
-        if at - 1e-6 <= time < min(end + TOLD_WITHIN, DURATION - CYCLE)
+        for time, name in reported
+        if at - 1e-6 <= time < min(end + REPORTED_WITHIN, DURATION - CYCLE)
         and _KINDS[name].severity is not Severity.INFORMATION
     ]
     own = [(time, name) for time, name in warned if name in own_events(kind)]
@@ -68,13 +68,13 @@ def judge(flown: Run, kind: FaultKind, entry: FaultEntry) -> Result:
         "event": own[0][1] if own else None,
         "others": sorted({name for _, name in warned} - own_events(kind)),
         "reaction_right": _reaction_right(flown, kind, at, end, warned),
-        "told": list(dict.fromkeys(name for _, name in warned)),
+        "reported": list(dict.fromkeys(name for _, name in warned)),
         "reactions": sorted(reaction.name.lower().replace("_", " ") for reaction in reactions),
-        "recovered_s": _recovered(flown, kind, at, end, told),
+        "recovered_s": _recovered(flown, kind, at, end, reported),
         "blind_current_a": _blind_current(flown, part_of(kind) == "imu"),
         "largest_current_a": float(np.abs(flown["truth"]["current"]).max()),
-        "task_failed": any(name == "task-failed" for _, name in told),
-        "service_failing": any(name == "service-failing" for _, name in told),
+        "task_failed": any(name == "task-failed" for _, name in reported),
+        "service_failing": any(name == "service-failing" for _, name in reported),
         "log_intact": all(log.intact for log in flown.logs.values())
         and len(control) == round(DURATION / CYCLE),
     }
@@ -117,13 +117,13 @@ def _is_worker_met(flown: Run, kind: FaultKind, at: float, end: float) -> bool:
     mine = np.array([to_text(name) == kind.device for name in jobs["name"]], dtype=bool)
     if kind.kind == "endless":  # a job that was under way ran into its time limit
         return bool((mine & (when >= at) & (jobs["outcome"] == b"timed-out")).any())
-    # A result is told when the latency that the world models for it has passed.
+    # A result is reported when the latency that the world models for it has passed.
     begun = when - getattr(demo_world().latency, kind.device)
     return bool((mine & (begun >= at - 1e-6) & (begun < end)).any())
 
 
 def _is_behind(flown: Run, kind: FaultKind, inside: BoolArray) -> bool:
-    """Tell whether the coils were told something else than what an old answer tells, for a second."""
+    """Return whether the commands differed from those of an old answer for a second."""
     asked = np.abs(flown["control"]["current_written"]).sum(axis=1)
     behind = round((kind.parameters["delay"].default or 0.0) / CYCLE)
     before = np.concatenate([np.full(behind, asked[0]), asked[:-behind]])
@@ -131,12 +131,12 @@ def _is_behind(flown: Run, kind: FaultKind, inside: BoolArray) -> bool:
 
 
 def _differs(one: FloatArray, other: FloatArray) -> BoolArray:
-    """Tell which supply currents (n,) A are further apart than the same one may be read twice."""
+    """Return which supply currents (n,) A differ by more than two readings of one current may."""
     return np.asarray(np.abs(one - other) > OFF_SURELY + GAIN_ERROR * np.maximum(one, other))
 
 
 def _is_upset(flown: Run, device: str, at: float) -> bool:
-    """Tell whether a bit that flipped did anything: what nobody reads, or is soon written anew, does not."""
+    """Return whether a flipped bit had an effect: not in a register that is unused or soon rewritten."""
     match device:
         case "pwm":
             obeyed = _obeyed(flown, at)
@@ -168,7 +168,7 @@ def _is_frame_spoiled(kind: str, at: float, end: float) -> bool:
 
 
 def _recovered(
-    flown: Run, kind: FaultKind, at: float, end: float, told: Sequence[tuple[float, str]]
+    flown: Run, kind: FaultKind, at: float, end: float, reported: Sequence[tuple[float, str]]
 ) -> float | None:
     """Return how long after the fault's end the device's data are good again; None for never."""
     house = flown["housekeeping"]
@@ -186,8 +186,8 @@ def _recovered(
             if kind.momentary and len(lost):
                 later = _first(time[finite], float(lost[-1]))
                 found = None if later is None else float(lost[-1]) + later - end
-            # Told four times a second, where housekeeping comes once.
-            known = [t for t, name in told if name == "power-recovered" and t < DURATION - CYCLE]
+            # Reported four times a second, where housekeeping comes once.
+            known = [t for t, name in reported if name == "power-recovered" and t < DURATION - CYCLE]
             back = _first(np.array(known), end)
             if back is not None:
                 found = back if found is None or kind.momentary else min(found, back)
@@ -195,9 +195,9 @@ def _recovered(
             grown = np.flatnonzero(np.diff(house["frames"].astype(int)) > 0) + 1
             found = _first(house["time_ns"][grown] * 1e-9, end)
         case "coil" | "bridge":
-            found = _first(np.array([time for time, name in told if name == "coil-broken"]), at)
+            found = _first(np.array([time for time, name in reported if name == "coil-broken"]), at)
         case "disk":
-            found = _first(np.array([time for time, name in told if name == "log-recovered"]), end)
+            found = _first(np.array([time for time, name in reported if name == "log-recovered"]), end)
         case _:
             pass
     return found
@@ -223,8 +223,8 @@ def _obeyed(flown: Run, end: float) -> float | None:
     control, truth = flown["control"], flown["truth"]
     count = min(len(control), len(truth) - 1)
     # The truth's sample at a cycle's start is of the current before its command.
-    told, real = control["current_written"][:count], truth["current"][1 : count + 1]
-    agrees = (np.abs(told - real) < 8e-3).all(axis=1)
+    reported, real = control["current_written"][:count], truth["current"][1 : count + 1]
+    agrees = (np.abs(reported - real) < 8e-3).all(axis=1)
     time = control["time_ns"][:count] * 1e-9
     for first in np.flatnonzero(time >= end - 1e-6):
         if agrees[first : first + 20].all():
@@ -284,11 +284,11 @@ def _reaction_right(
             if times and driven[(time >= times[0] - 1.0) & (time <= times[0])].any():
                 # A chip out of reach holds what it has: then it has to obey soon after it is back.
                 carried = _carried(flown)
-                told = (time >= times[0] - CYCLE) & (time <= end + BACK_WITHIN)
+                reported = (time >= times[0] - CYCLE) & (time <= end + BACK_WITHIN)
                 zero = np.abs(control["current_written"]).max(axis=1) < ZERO
                 zero[: len(carried)] |= carried[: len(zero)] < ZERO
                 obeyed = _obeyed(flown, end) if part == "bus" or kind.kind in _OUT_OF_REACH else None
-                right = bool(zero[told].any()) or (obeyed is not None and obeyed <= BACK_WITHIN)
+                right = bool(zero[reported].any()) or (obeyed is not None and obeyed <= BACK_WITHIN)
         case _:
             pass
     return right

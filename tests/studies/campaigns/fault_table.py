@@ -1,7 +1,7 @@
-"""What flight has to say and to do about each fault: the authority that campaign `faults` judges by.
+"""The event and the reaction that each fault must cause: campaign `faults` judges by this table.
 
-A fault is told only by an event of its own: that the body tumbles because a coil is stuck is true, and does
-not say what broke. Where the table of events asks for more than a note, what it asks for has to follow.
+A fault counts as reported only by an event of its own: an event that the body tumbles is true of a stuck
+coil, but does not say which part failed. Where the table of events has a reaction, the reaction must follow.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ OWN: Mapping[str, frozenset[str]] = {
     "clock": frozenset({"clock-step"}),
     "disk": frozenset({"log-fault"}),
 }
-"""Events by which a fault of a device is told."""
+"""Events that report a fault of a device."""
 
 OWN_OF_KIND: dict[str, frozenset[str]] = {
-    # Good packets, too few or too old to steer by: what is told of the stream is all that there is to tell.
+    # The packets are good, but too few or too old to steer by: only the stream's own event applies.
     "imu: slow": OWN["imu"] | {"stream-poor"},
     "imu: delayed": OWN["imu"] | {"stream-poor"},
     "imu: intermittent": OWN["imu"] | {"stream-poor"},
@@ -57,5 +57,5 @@ def part_of(kind: FaultKind) -> str:
 
 
 def own_events(kind: FaultKind) -> frozenset[str]:
-    """Return the names of the events by which a fault is told."""
+    """Return the names of the events that report a fault."""
     return OWN_OF_KIND.get(kind.name, OWN[part_of(kind)])

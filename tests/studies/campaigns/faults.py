@@ -1,12 +1,12 @@
 """Campaign `faults`: every fault of the catalogue in every mode, at random times, in lock-step.
 
 Each run flies the demonstration's loop for half a minute in one mode and breaks one thing at a random time
-for a random span (coils and bridges to the end), at the wire; then it tells from the log whether the fault
-was told by an event of its own (`fault_table`), whether the reaction that the table asks for came, how long
-after the fault's end all was well again, what the coils carried while nothing was measured, and whether the
-log is whole. A fault that meets nothing (a coil that is not driven, a planner that is not asked) is told
-apart as not exercised: it cannot be seen, and does no harm. Flights in which a fault met something and was
-not told are listed with their numbers; `refly(seed, number)` flies one of them again.
+for a random span (coils and bridges to the end), at the wire. The log then shows whether an event of its own
+reported the fault (`fault_table`), whether the table's reaction followed, how long after its end the flight
+recovered, which currents the coils carried without measurements, and whether the log is whole. A fault of an
+unused part (a coil that is not driven, a planner without a request) counts as not exercised: it has no effect
+and cannot be seen. Exercised faults that no event reported are listed with their flight's number;
+`refly(seed, number)` flies one again.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def cases(runs: int, seed: int) -> list[Case]:
 
 
 def run(case: Case) -> Result:
-    """Fly one case and tell what became of it."""
+    """Fly one case and return its judgement."""
     kind, mode = CATALOGUE[case.parameters["fault"]], case.parameters["mode"]
     rng = np.random.default_rng(case.seed)
     at = 0.0 if mode == "boot" else float(rng.uniform(4.0, 11.0))
@@ -102,7 +102,7 @@ def config_for(mode: str, camera: bool) -> Config:
 
 
 def summarise(results: Sequence[Result], folder: Path) -> Summary:
-    """Return a row for each fault, and what is wrong over all."""
+    """Return a row for each fault, and all defects found."""
     del folder
     by_fault: dict[str, list[Result]] = defaultdict(list)
     for result in results:
@@ -128,15 +128,15 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
     facts["logs_intact"] = sum(result["log_intact"] for result in results)
     facts["detected"] = sum(row["detected"] for row in facts["faults"].values())
     facts["exercised"] = sum(row["exercised"] for row in facts["faults"].values())
-    facts["not_told"] = [_named(one) for one in results if one["exercised"] and one["detected_s"] is None]
+    facts["not_reported"] = [_named(one) for one in results if one["exercised"] and one["detected_s"] is None]
     facts["wrong_reaction"] = [_named(one) for one in results if one["reaction_right"] is False]
     lines.append(
-        f"detected {facts['detected']} of {facts['exercised']} that met anything; unhandled exceptions in "
+        f"detected {facts['detected']} of {facts['exercised']} exercised faults; unhandled exceptions in "
         f"{facts['task_failed']} flights, beside the loop in {facts['service_failing']}; log whole in "
         f"{facts['logs_intact']} of {len(results)}"
     )
     for heading, found in (
-        ("met something and was not told", facts["not_told"]),
+        ("exercised and not reported", facts["not_reported"]),
         ("the table's reaction did not come", facts["wrong_reaction"]),
     ):
         lines += [f"{heading}: {len(found)} flights", *(f"  {text}" for text in found)]
@@ -145,7 +145,7 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
 
 def _named(result: Result) -> str:
     """Return a flight with all that is needed to fly it again."""
-    others = f"; told: {', '.join(result['others'])}" if result["others"] else ""
+    others = f"; reported: {', '.join(result['others'])}" if result["others"] else ""
     span = f"{result['at']:.2f} to {result['end']:.2f} s"
     return f"{result['fault']}, {result['mode']}, {span}, number {result.get('number', '-')}{others}"
 

@@ -3,8 +3,8 @@
 A case is a board: its emulated devices live in a process of their own all the time, and so does its kept
 state, while one flight after the other is killed, a quarter of them before they are ready. After each kill
 the devices are asked for the coils' currents every few milliseconds, the log and the kept state are read, and
-the next flight must start. The last one ends politely: it must know of all kills, and fly in safe mode where
-they are as many as its configuration bears.
+the next flight must start. The last flight is stopped by SIGTERM: it must know of all kills, and fly in safe
+mode where they reach its configuration's limit.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def cases(runs: int, seed: int) -> list[Case]:
 
 
 def run(case: Case) -> Result:
-    """Kill one flight of a board after the other; let the last one end politely."""
+    """Kill one flight of a board after the other; stop the last by SIGTERM."""
     rng = np.random.default_rng(case.seed)
     begun = time.monotonic()
     kills: list[Result] = []
@@ -119,7 +119,7 @@ def _current_until(board: Board, kill_ns: int) -> float:
 def _watch_coils(board: Board, killed_ns: int, before: float) -> tuple[float, float]:
     """Return when the coils came to zero for good, s after the kill, and the largest current after the limit.
 
-    The first answer of zero counts: what is told is late by the time between two questions, never early.
+    The first answer of zero counts: it is late by the time between two questions, never early.
     Coils that carried current are watched beyond the limit, others for long enough to see them stay at zero.
     """
     zero_after = beyond = 0.0
@@ -175,7 +175,7 @@ def _state_of(board: Board, counted: bool) -> Result:
 
 
 def _end(board: Board, number: int, rng: np.random.Generator) -> Result:
-    """Let a flight end politely; tell whether that, and the mode that it flew in, was right.
+    """Stop a flight by SIGTERM; return whether its end and its mode were right.
 
     The kills that were counted are as many as it may take, or one too few for safe mode.
     """

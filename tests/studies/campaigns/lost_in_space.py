@@ -119,7 +119,7 @@ def answer_of(name: str, field: StarField, sky: KnownSky, motion: Motion) -> Ide
 
 
 def moving(drawn: StarList, generator: np.random.Generator) -> Motion:
-    """Return the velocities of a list's points as the two ends of their streaks would tell them."""
+    """Return the velocities of a list's points as the two ends of their streaks would give them."""
     field = drawn.field()
     axis = generator.standard_normal(3)
     rate = BODY_RATE * axis / np.linalg.norm(axis)

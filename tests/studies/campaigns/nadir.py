@@ -39,7 +39,7 @@ AIRS = ("known", "unknown")
 KNOWN_LIMB = 1000.0
 """m: to which the limb's height is believed where the air is known."""
 SCALE_HEIGHTS, HAZE = (6_500.0, 9_500.0), (0.7, 1.3)
-"""m, and times the standard optical depth: what is drawn where the air is not known."""
+"""m, and times the standard optical depth: drawn where the air is not known."""
 SUN_SIGMA, FIELD_SIGMA = np.radians(5.0), np.radians(2.0)
 WRONG_DEG = 0.5
 K1, K2 = -0.05, 0.01
@@ -184,11 +184,11 @@ def row(results: Sequence[Result]) -> dict[str, Any]:
 
 def _line(one: dict[str, Any]) -> str:
     errors = [one[name] for name in ("rms_deg", "p99_deg", "worst_deg")]
-    told = "  ".join("    -" if error is None else f"{error:.4f}" for error in errors)
+    written = "  ".join("    -" if error is None else f"{error:.4f}" for error in errors)
     nees = "-" if one["nees"] is None else f"{0.5 * one['nees']:.2f}"
     return (
         f"{one['view']:11} {one['air']:7}  {one['frames']:6d}  {one['right']:5d}  {one['wrong']:5d}"
-        f"  {one['ambiguous']:9d}  {one['refused']:7d}  {one['no-horizon']:4d}   {told}  {nees:>6}"
+        f"  {one['ambiguous']:9d}  {one['refused']:7d}  {one['no-horizon']:4d}   {written}  {nees:>6}"
         f"   {one['median_ms']:9.1f}  {one['p95_ms']:4.1f}  {one['most_ms']:5.1f}  {one['pixels_read']:8.0f}"
     )
 

@@ -64,7 +64,7 @@ def cases(runs: int, seed: int) -> list[Case]:
 
 
 def settings_of(suite: SensorSuite) -> DeterminationSettings:
-    """Return what the filter is told: the suite's noise, and how the body is pushed."""
+    """Return the filter's settings: the suite's noise, and how the body is pushed."""
     assert suite.gyros is not None
     assert suite.magnetometer is not None
     return DeterminationSettings(
@@ -103,7 +103,7 @@ def _suite(case: Case) -> SensorSuite:
 
 
 class _Flight:
-    """One orbit through the filter, and what is noted of it every ten seconds."""
+    """One orbit through the filter, with notes every ten seconds."""
 
     def __init__(self, suite: SensorSuite, truth: World, said: Readings, case: Case) -> None:
         self._truth, self._said, self._case = truth, said, case
@@ -220,7 +220,7 @@ def variant_facts(results: Sequence[Result]) -> dict[str, Any]:
     # Instants that all runs have, counted from the end: eclipses end together.
     shortest = min(len(result["notes"]) for result in results)
     nees = np.array([np.array(result["notes"])[-shortest:, 8] for result in results])
-    # Only instants at which every run has an attitude: the band is that of so many.
+    # Only instants at which every run has an attitude: the band is for their number.
     whole = np.all(np.isfinite(nees), axis=0)
     whole[: round(SETTLED / 10.0)] = False
     settled = np.mean(nees[:, whole], axis=0) / 6.0

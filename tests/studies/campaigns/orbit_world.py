@@ -2,7 +2,7 @@
 
 One revolution that ends with an eclipse, from a random date and node. The body follows the local vertical,
 two side cameras towards the Sun's side of the orbit; torques that walk at random push it off (3 deg rms)
-and a control law draws it back; the filter is told of neither. Sensors are drawn from the suite's noise:
+and a control law draws it back; the filter knows neither. Sensors are drawn from the suite's noise:
 gyros with a bias that walks, a magnetometer with hard iron in a field that no model has whole (IGRF-14
 where the filter believes WMM2025, a ring current, and the ionosphere as a Gauss-Markov process of first
 order), Sun and nadir when a camera has them in its field.
@@ -48,7 +48,7 @@ OPTICAL_SIGMA = np.radians(0.02)
 LEAST_LIMB = 30
 """Of the limb's 720 points, lit and in one camera's field: 15 deg of it."""
 _COARSE = 20
-"""Steps between looks at what is in the fields: 10 s."""
+"""Steps between checks of the fields of view: 10 s."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,7 +59,7 @@ class World:
         pass_: where the satellite is.
         attitudes: (n, 4); `rates` (n, 3) rad/s is the mean over the step before.
         sun: (n, 3) apparent directions, ICRS; `field` (n, 3) T, ICRS.
-        sunlit: (n,); `sun_in_field`, `nadir_in_field` (n,) tell what a camera could measure.
+        sunlit: (n,); `sun_in_field`, `nadir_in_field` (n,) say whether a camera could measure them.
     """
 
     pass_: Pass

@@ -2,8 +2,8 @@
 
 The camera turns at a constant rate about its y axis and exposes for half a second. In `rso-slew` an object
 moves among the stars and leaves a streak of its own; in `rso-track` the camera follows it, a point among
-streaks. A scene is drawn once and shown with the object at each magnitude, and without one: what is then
-found is false. The rate is that of the thesis's pipeline and of the likelihood, with the object in the frame.
+streaks. A scene is drawn once and shown with the object at each magnitude, and without one: finds are
+then false. The rate is that of the thesis's pipeline and of the likelihood, with the object in the frame.
 """
 
 from __future__ import annotations
@@ -155,7 +155,7 @@ def match(report: ObjectReport | None, truth: FloatArray | None) -> Found:
 
 
 def ends_error(ends: FloatArray, truth: FloatArray) -> float:
-    """Return the larger error of two ends (2, 2) px; one frame does not tell which came first."""
+    """Return the larger error of two ends (2, 2) px; one frame does not show which came first."""
     return float(min(np.linalg.norm(ends - other, axis=1).max() for other in (truth, truth[::-1])))
 
 
@@ -251,7 +251,7 @@ def number(value: float | None, digits: int) -> str:
 def _pictures(
     name: str, results: Sequence[Result], rows: Sequence[dict[str, Any]], out: Path
 ) -> tuple[Path, ...]:
-    """Draw detection over magnitude, and the first scene's frames again with what is found in them."""
+    """Draw detection over magnitude, and the first scene's frames with the finds in them."""
     if not results:
         return ()
     camera = StarCameraModel(field_of_view=FIELD)

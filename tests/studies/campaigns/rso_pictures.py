@@ -45,9 +45,9 @@ def draw_detection_rate(curves: Mapping[str, Sequence[Mapping[str, Any]]], path:
     figure = Figure(figsize=(6.0, 4.0), layout="constrained")
     axes = figure.subplots()
     for name, rows in curves.items():
-        told = [row for row in rows if row["frames"]]
-        share = [100.0 * row["found"] / row["frames"] for row in told]
-        axes.plot([row["magnitude"] for row in told], share, "o-", label=name)
+        counted = [row for row in rows if row["frames"]]
+        share = [100.0 * row["found"] / row["frames"] for row in counted]
+        axes.plot([row["magnitude"] for row in counted], share, "o-", label=name)
     axes.axhline(95.0, color="gray", linestyle="--", label="95 %")
     axes.set(xlabel="magnitude of the object", ylabel="found, %", ylim=(-3.0, 103.0))
     axes.grid(alpha=0.3)

@@ -19,7 +19,7 @@ SAMPLES = 41
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """A frame and what is true of it.
+    """A frame and its truth.
 
     Attributes:
         pixels: (rows, columns).

@@ -38,7 +38,7 @@ _UNHEARD = ("camera", "vision", "disk")
 
 
 def cases(hours: int, seed: int) -> list[Case]:
-    """Return flights of six hours, the last of what is left."""
+    """Return flights of six hours, and a shorter last one."""
     begins = range(0, hours, FLIGHT_HOURS)
     return [
         Case(f"from-hour-{begin}", (seed, begin), {"seconds": HOUR_S * min(FLIGHT_HOURS, hours - begin)})

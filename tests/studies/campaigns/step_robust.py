@@ -1,7 +1,7 @@
 """Campaign `step-robust`: the step demonstration's loop in worlds that are not what it believes.
 
 Each run draws a world: inertia +-20 %, field and coil resistance +-10 %, the thread's stiffness 0 to 3 times
-that of the demonstration (the loop is told of none), a gyro bias, noise up to 3 times, readings one to three
+that of the demonstration (the loop knows of none), a gyro bias, noise up to 3 times, readings one to three
 cycles late, the inertial unit silent for up to a second in a slew and in a hold, and 5 % of its packets
 damaged. The whole loop is flown in lock-step on the emulated devices, PWM counts and all; two of the
 demonstration's steps, the slew from the release and the first tenth, 65 s each. All figures are of the truth.
@@ -111,7 +111,7 @@ def disturb(rigged: Rigged, drawn: dict[str, Any]) -> None:
     def become(faults: LineFaults) -> None:
         wire.faults = faults
 
-    # After the release: what a late line tells of the held body would be taken for the flight's beginning.
+    # After the release: late samples of the held body would be taken for the flight's beginning.
     rigged.at(0.5, lambda: become(usual))
     for begin, span in drawn["dropouts_s"]:
         rigged.at(begin, lambda: become(LineFaults(silent=True)))
@@ -188,13 +188,13 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
     for key in ("settling_s", "steady_state_deg"):
         for result in sorted(results, key=lambda r: -r[key])[:3]:
             world = result["world"]
-            told = " ".join(f"{name} {world[name]:.2f}" for name in _TOLD)
-            lines.append(f"  {key} {result[key]:.3f}: {told} delay {world['delay_cycles']}")
+            listed = " ".join(f"{name} {world[name]:.2f}" for name in _LISTED)
+            lines.append(f"  {key} {result[key]:.3f}: {listed} delay {world['delay_cycles']}")
     picture = _draw(results, folder / "step_robust.png")
     return Summary("\n".join(lines) + "\n", facts, (picture,))
 
 
-_TOLD = ("inertia", "field", "resistance", "stiffness", "noise")
+_LISTED = ("inertia", "field", "resistance", "stiffness", "noise")
 
 
 def _finite(value: float) -> float | None:

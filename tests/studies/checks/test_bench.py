@@ -38,7 +38,7 @@ def test_an_unknown_bench_is_wrong_use(capsys: pytest.CaptureFixture[str]) -> No
 
 @pytest.mark.parametrize("name", ["plan", "likelihood", "endpoints"])
 def test_a_bench_gets_its_own_arguments(name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """Of a main with a list of arguments, and of one that reads the command line."""
+    """Of a main with a list of arguments, and of a main that reads the command line."""
     with pytest.raises(SystemExit) as stopped:
         bench.main([name, "--help"])
     assert stopped.value.code == 0

@@ -59,7 +59,7 @@ def test_a_world_unlike_the_loops_belief_is_flown_to_its_targets() -> None:
     assert {"imu-silent", "imu-corrupt", "control-lost", "control-regained"} <= set(result["events"])
 
 
-def test_the_table_counts_the_lost_and_tells_the_percentile(tmp_path: Path) -> None:
+def test_the_table_counts_the_lost_and_shows_the_percentile(tmp_path: Path) -> None:
     world = step_robust.draw((1, 0))
     results = [
         {

@@ -52,7 +52,7 @@ def test_wrong_is_far_from_the_truth_and_far_beyond_its_own_sigma(
     assert found["vector"] == pytest.approx(error)
 
 
-def test_an_answer_beyond_its_sigma_is_told_though_it_is_near(scene: Scene) -> None:
+def test_an_answer_beyond_its_sigma_is_counted_though_it_is_near(scene: Scene) -> None:
     result = failures._judge(_answer(scene, 0.005, 0.0001), scene, still=False)
     assert "1.0050 of the rate" in result["reason"]
 

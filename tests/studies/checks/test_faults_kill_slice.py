@@ -1,4 +1,4 @@
-"""Flights killed on devices that live on; and proof that a coil left on, a torn log, a lost kill are told."""
+"""Flights killed while their devices live on; and proof that a coil left on and a torn log are found."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def board(folder: Path, bus: Any = None) -> Board:
     return made
 
 
-def test_a_coil_that_nobody_zeroes_is_told_and_one_that_is_zeroed_is_not(
+def test_a_coil_that_nobody_zeroes_is_reported_and_one_that_is_zeroed_is_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(faults_kill, "LIMIT_S", 0.1)
@@ -77,7 +77,7 @@ def test_a_log_with_a_torn_end_is_readable_and_one_with_a_hole_is_not(tmp_path: 
     assert not faults_kill._log_of(tmp_path, 2.0)["readable"]
 
 
-def test_a_kill_that_was_not_remembered_and_a_torn_state_are_told(tmp_path: Path) -> None:
+def test_a_kill_that_was_not_remembered_and_a_torn_state_are_reported(tmp_path: Path) -> None:
     kept = board(tmp_path)
     store = StateStore(kept.state, lambda *_: None)
     first = history.begin(StoredState(), "")

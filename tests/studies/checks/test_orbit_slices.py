@@ -92,7 +92,7 @@ def piece(variant: str, run: int, **parameters: float) -> Result:
 
 @pytest.mark.slow
 def test_into_the_eclipse_the_filter_errs_by_no_more_than_it_says() -> None:
-    """Two orbits, 15 minutes about sunset: NEES in its 99.9 % band, both lights within what is asked."""
+    """Two orbits, 15 minutes about sunset: NEES in its 99.9 % band, both lights within their limits."""
     results = [piece("all sensors", run) for run in range(2)]
     facts = orbit_attitude.variant_facts(results)
     # Errors last for minutes: taken as those of two independent instants an orbit.

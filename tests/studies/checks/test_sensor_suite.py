@@ -86,7 +86,7 @@ def written(tmp_path: Path, old: str, new: str) -> Path:
         ("noise: 5.0e-8", "noise: .nan", "finite"),
     ],
 )
-def test_what_is_wrong_is_told_with_its_place(tmp_path: Path, old: str, new: str, said: str) -> None:
+def test_a_mistake_is_named_with_its_place(tmp_path: Path, old: str, new: str, said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         sensor_suite.load(written(tmp_path, old, new))
 

@@ -66,7 +66,7 @@ def test_the_boresight_component_is_the_weak_one_across_the_boresight() -> None:
 
 
 def test_one_star_hardly_fixes_the_rate() -> None:
-    """Two numbers of three: only the streak's bend and change of speed tell the third, next to nothing."""
+    """Two numbers of three: the third follows only from the streak's bend and change of speed, and poorly."""
     pinhole = Pinhole.from_field_of_view(1024, 1024, np.radians(20.0))
     rate = np.array([0.0, 0.03, 0.0])
     one = rate_bound(pinhole, np.array([[500.0, 500.0]]), np.array([1e5]), rate, 1.0, 1.0, 100.0)

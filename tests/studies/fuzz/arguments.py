@@ -210,7 +210,7 @@ def _typed(words: list[str], folder: Path, *, drawn: bool) -> tuple[Any, str, st
 
 @contextlib.contextmanager
 def _in_folder(folder: Path, drawn: bool) -> Iterator[None]:
-    """Work in a folder, with nothing that lasts."""
+    """Work in a temporary folder."""
     before = Path.cwd()
     changes: dict[str, Any] = {
         "flight.app.cli._parser": _parser,

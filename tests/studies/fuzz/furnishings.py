@@ -85,7 +85,7 @@ def _take_pictures(folder: Path) -> None:
 def answer(obeyed: bool) -> bytes:
     """Return a flight's answer to a command."""
     fields = dict.fromkeys((field.name for field in COMMAND.fields), 0)
-    texts = {field.name: "as told" for field in COMMAND.fields if field.kind.startswith("S")}
+    texts = {field.name: "as commanded" for field in COMMAND.fields if field.kind.startswith("S")}
     return Packer().pack(COMMAND, 5, {**fields, **texts, "obeyed": int(obeyed), "mode": int(Mode.HOLD)})
 
 

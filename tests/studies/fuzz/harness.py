@@ -17,7 +17,7 @@ from typing import Protocol
 import numpy as np
 
 MEMORY = 4 << 30
-"""Bytes of address space that a campaign may take: one that wants more is a crash."""
+"""Bytes of address space that a campaign may take: more counts as a crash."""
 
 LIMIT_S = 10.0
 """CPU time of one input, and a sixth of the time on the wall in which it must do something."""
@@ -39,7 +39,7 @@ class Target(Protocol):
     """One door."""
 
     def attempt(self, draw: np.random.Generator) -> Counter[str]:
-        """Feed one input; returns tallies of what it was and what became of it. Raises Finding."""
+        """Feed one input; returns tallies of its kind and of its outcome. Raises Finding."""
 
     def last(self) -> str:
         """Return the last input, to be looked at."""
@@ -91,7 +91,7 @@ def run(
                 campaign.found(f"hang at {_place()}", number, f"{LIMIT_S} s of CPU", target.last())
             except Finding as finding:
                 campaign.found(f"accepted: {str(finding)[:60]}", number, str(finding), target.last())
-            except Exception as error:  # noqa: BLE001 - any crash is what is looked for
+            except Exception as error:  # noqa: BLE001 - the campaign looks for any crash
                 text = "".join(traceback.format_exception(error)[-4:])
                 campaign.found(f"{type(error).__name__} at {_place()}", number, text, target.last())
             took = time.process_time() - began

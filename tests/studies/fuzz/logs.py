@@ -1,7 +1,7 @@
 """Damaged segments of a flight log through scanner, reader and report.
 
 Accepted corruption is a packet that was never written. A CRC of 16 bits lets one in 65,536 of the packets
-through that are damaged beyond four bits: such a packet is told apart by a CRC of this module's own, counted,
+through that are damaged beyond four bits: such a packet is recognised by a CRC of this module's own, counted,
 and the campaign fails when there are more of them than chance allows. So that the report meets wrong values
 too, some packets carry random ones under a right CRC: those were written.
 """

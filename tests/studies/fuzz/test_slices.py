@@ -1,4 +1,4 @@
-"""A small fixed slice of each fuzzing campaign, and proof that a campaign does find what is wrong."""
+"""A small fixed slice of each fuzzing campaign, and proof that a campaign finds planted defects."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_accepted_corruption_a_crash_and_a_hang_are_each_found(monkeypatch: pyte
     assert [finding["input"] for finding in campaign.findings] == [1, 2, 3], "the first of each kind"
     kinds = [str(finding["kind"]).partition(" ")[0] for finding in campaign.findings]
     assert kinds == ["accepted:", "ZeroDivisionError", "hang"]
-    assert sorted(campaign.distinct.values()) == [1, 1, 2], "one that turns round and one that sleeps"
+    assert sorted(campaign.distinct.values()) == [1, 1, 2], "an endless loop and a sleep"
     assert campaign.tallies["fine"] == 2, "the campaign goes on after each"
 
 
@@ -84,7 +84,9 @@ def test_the_second_parsers_checksum_is_that_of_the_manual() -> None:
     assert (found.start, found.stop) == (2, 20)
 
 
-def test_the_command_tells_figures_as_json_and_by_its_status(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_prints_figures_as_json_and_its_status_says_whether_it_found_any(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     assert main(["vn100", "--inputs", "20", "--seed", "3", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert (told["inputs"], told["found"]) == (20, {})
+    output = json.loads(capsys.readouterr().out)
+    assert (output["inputs"], output["found"]) == (20, {})

@@ -77,7 +77,7 @@ def field_sight(
     """
     strength = float(np.linalg.norm(reference))
     if not float(np.sqrt(np.trace(covariance))) < longest_angle * strength:
-        raise AttitudeError(f"a field of {strength:.2e} T tells no direction within its errors")
+        raise AttitudeError(f"a field of {strength:.2e} T gives no direction within its errors")
     return Sight(field / np.linalg.norm(field), reference / strength, np.asarray(covariance / strength**2))
 
 

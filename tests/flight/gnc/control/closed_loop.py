@@ -52,12 +52,12 @@ def fly(
         assert abs(made.current) <= BELIEVED.current_limit
         current = made.current
         rows.append((cycle * PERIOD, angle, rate, current))
-        felt = current + noise * rng.uniform(-3.5e-3, 3.5e-3)
+        actual = current + noise * rng.uniform(-3.5e-3, 3.5e-3)
         for _ in range(5):
-            middle = rate + 0.5 * PERIOD / 5 * true.acceleration(angle, rate, felt)
+            middle = rate + 0.5 * PERIOD / 5 * true.acceleration(angle, rate, actual)
             angle_there = angle + 0.5 * PERIOD / 5 * rate
             angle += PERIOD / 5 * middle
-            rate += PERIOD / 5 * true.acceleration(angle_there, middle, felt)
+            rate += PERIOD / 5 * true.acceleration(angle_there, middle, actual)
     return np.array(rows)
 
 

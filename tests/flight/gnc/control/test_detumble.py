@@ -33,7 +33,7 @@ OWN_FIELD = 1e-3
 
 
 class FreeBody:
-    """A rigid body in a field that turns in space; the magnetometer feels the coils too."""
+    """A rigid body in a field that turns in space; the magnetometer measures the coils too."""
 
     def __init__(
         self, rate: FloatArray, field: float, turn: FloatArray, inertia: FloatArray, seed: int

@@ -83,12 +83,12 @@ def test_one_exposure_of_four_cameras_fixes_the_attitude(sights: dict[str, Sight
 
 
 def test_the_filter_begins_from_the_frames_and_takes_the_next_ones_in(sights: dict[str, Sight]) -> None:
-    told = AttitudeDetermination(settings_of(UW))
-    told.rate(0, np.zeros(3))
+    estimator = AttitudeDetermination(settings_of(UW))
+    estimator.rate(0, np.zeros(3))
     for name, sight in sights.items():
-        told.direction(name, 0, sight.observed, sight.reference, sight.covariance)
-    report = told.report(0)
-    assert (report.status, told.starts, told.refused) == (Status.OBSERVED, 1, {})
+        estimator.direction(name, 0, sight.observed, sight.reference, sight.covariance)
+    report = estimator.report(0)
+    assert (report.status, estimator.starts, estimator.refused) == (Status.OBSERVED, 1, {})
     assert report.estimate is not None
     error = rotation_vector(multiply(attitude(), conjugate(report.estimate.quaternion)))
     assert np.all(np.abs(error) < 4.0 * report.sigma)

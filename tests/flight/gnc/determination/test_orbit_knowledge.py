@@ -118,7 +118,7 @@ def test_lines_that_are_no_elements_are_refused() -> None:
         TwoLineElements(FIRST, FIRST)
 
 
-def test_a_decayed_orbit_is_told() -> None:
+def test_a_decayed_orbit_is_reported() -> None:
     """The verification set's 28872, which SGP4 lets fall within 50 minutes of its epoch."""
     first = "1 28872U 05037B   05333.02012661  .25992681  00000-0  24476-3 0  1534"
     second = "2 28872  96.4736 157.9986 0303955 244.0492 110.6523 16.46015938 10708"

@@ -113,7 +113,7 @@ def test_two_attitudes_combine_to_what_their_sights_give_together() -> None:
     assert low < agreement < high
 
 
-def test_attitudes_that_contradict_each_other_are_told_by_the_loss() -> None:
+def test_attitudes_that_contradict_each_other_are_shown_by_the_loss() -> None:
     _, sun, nadir, _ = scene(np.random.default_rng(1))
     fix = optimum([sun, nadir])
     turned = AttitudeFix(
@@ -133,8 +133,8 @@ def test_what_a_camera_measured_is_seen_from_the_body() -> None:
     assert np.trace(sight.covariance) == pytest.approx(1e-6 + 3e-8)
 
 
-def test_a_field_that_its_bias_drowns_tells_no_direction() -> None:
-    with pytest.raises(AttitudeError, match="tells no direction"):
+def test_a_field_that_its_bias_drowns_gives_no_direction() -> None:
+    with pytest.raises(AttitudeError, match="gives no direction"):
         field_sight(np.full(3, 1e-6), np.full(3, 1e-6), 1e-11 * np.eye(3))
 
 

@@ -62,7 +62,7 @@ def fly(
 ) -> Flight:
     """Return a flight with noise of the unit and of the coils, a gyro bias and a thread or a drag.
 
-    `amplitude` A is that of the currents; `driven` tells by cycle and command what the coils carry.
+    `amplitude` A is that of the currents; `driven` gives the coils' currents by cycle and command.
     """
     rng = np.random.default_rng(seed)
     world = SuspendedWorld(rng) if suspended else FreeWorld(rng)
@@ -72,11 +72,11 @@ def fly(
         flight.attitudes[cycle], flight.rates[cycle] = world.attitude, world.rate
         flight.fields.append(world.field())
         seen = multiply(from_rotation_vector(rng.normal(0.0, TURN_SIGMA, 3)), world.attitude)
-        felt = world.rate + bias + rng.normal(0.0, RATE_SIGMA, 3)
+        measured = world.rate + bias + rng.normal(0.0, RATE_SIGMA, 3)
         flight.samples.append(
             (
                 AttitudeMeasurement(cycle * CYCLE_NS, seen, TURN_COVARIANCE),
-                RateMeasurement(cycle * CYCLE_NS, felt, RATE_COVARIANCE),
+                RateMeasurement(cycle * CYCLE_NS, measured, RATE_COVARIANCE),
             )
         )
         swing = amplitude * math.sin(0.015 * cycle)

@@ -4,7 +4,7 @@ Its states are angle, rate and disturbance.
 The angle theta = 2 asin q2 is used rather than q2 because its kinematics are linear (Sease 5.9 is not):
 theta' = omega, omega' = u + d, with u the acceleration that the plant model gives for the known current and d
 what the model does not know (the thread's torque), a random walk. Each measurement is applied at its own
-time: one that arrives late is put where it belongs and those after it are applied again. A rate from a
+time: a late measurement is put where it belongs and those after it are applied again. A rate from a
 streaked image is the mean over its exposure: the angle at the exposure's start is kept as one more state
 until its end (stochastic cloning, Roumeliotis and Burdick 2002): acceleration is no contradiction.
 """
@@ -78,7 +78,7 @@ class SingleAxisFilter:
     """Holds the estimate, its recent measurements and the recent commands."""
 
     REJECTIONS_TO_RESTART = 40
-    """After so many refused measurements in a row it is the filter that is wrong, and it starts anew."""
+    """After this number of refused measurements in a row the filter is wrong, and restarts."""
 
     def __init__(self, plant: SingleAxisPlant, settings: FilterSettings) -> None:
         self._plant = plant
@@ -116,7 +116,7 @@ class SingleAxisFilter:
         return bool(self._history)
 
     def measure(self, measurement: Measurement) -> bool:
-        """Apply a measurement at its own time; tell whether it passed the gate (or was too late)."""
+        """Apply a measurement at its own time; return whether it passed the gate (or was too late)."""
         if self._history and measurement.begin_ns >= self._history[-1].measurement.time_ns:
             used = self._apply([measurement], measurement)
         else:
@@ -165,7 +165,7 @@ class SingleAxisFilter:
             begin_ns = earliest
 
     def _apply(self, measurements: list[Measurement], asked: Measurement) -> bool:
-        """Apply measurements in order of time from the last checkpoint on; tell whether `asked` was used."""
+        """Apply measurements in order of time from the last checkpoint; return whether `asked` was used."""
         last = self._history[-1]
         state, covariance, time_ns = last.state, last.covariance, last.measurement.time_ns
         begins = sorted({m.since_ns for m in measurements if m.since_ns is not None})
@@ -246,7 +246,7 @@ class SingleAxisFilter:
             self.restarts += 1
 
     def _forget(self, now_ns: int) -> None:
-        """Drop what is too old to be of use, now and then."""
+        """Drop checkpoints and commands that are too old, now and then."""
         horizon_ns = now_ns - self._settings.history_ns
         if len(self._history) > 2 and self._history[0].measurement.time_ns < horizon_ns - 1_000_000_000:
             keep = bisect.bisect_left(self._history, horizon_ns, key=lambda c: c.measurement.time_ns)

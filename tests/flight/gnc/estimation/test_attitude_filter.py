@@ -100,7 +100,7 @@ def test_the_gyros_bias_is_found_within_three_sigma(suspended: bool) -> None:
     assert np.all(np.abs(last.bias - flight.bias)[axes] < 3.0 * sigma)
 
 
-def test_thread_and_coil_are_found_and_told_from_a_steady_torque() -> None:
+def test_thread_and_coil_are_found_and_distinguished_from_a_steady_torque() -> None:
     """All within three sigma after 30 s; torsion and gain ten times better known than before."""
     flight = fly(4, 1200, True)
     filter_ = begin(flight, True)
@@ -114,7 +114,7 @@ def test_thread_and_coil_are_found_and_told_from_a_steady_torque() -> None:
 
 
 def test_about_the_thread_the_disturbance_is_what_the_believed_plant_leaves_out() -> None:
-    """The current by which each belief would hold the body against it is the one that does."""
+    """The current by which each belief would hold the body is the true one."""
     flight = fly(5, 400, True)
     filter_ = begin(flight, True)
     follow(filter_, flight)
@@ -195,7 +195,7 @@ def test_the_gate_knows_its_degrees_of_freedom() -> None:
         assert filter_.restarts == 0
 
 
-def test_when_attitudes_disagree_for_a_second_it_is_the_filter_that_starts_anew() -> None:
+def test_when_attitudes_disagree_for_a_second_the_filter_restarts() -> None:
     """Even while the gyro agrees: attitudes and rates are counted apart."""
     flight = fly(10, 100, False)
     filter_ = begin(flight, False)
@@ -216,7 +216,7 @@ def test_when_attitudes_disagree_for_a_second_it_is_the_filter_that_starts_anew(
 
 
 def test_a_start_on_a_sample_from_before_the_release_is_given_up_at_once() -> None:
-    """A late line tells of the held body first; three rates that all disagree outweigh the one begun with."""
+    """A late line sends samples of the held body first; three rates that all disagree outweigh the first."""
     flight = fly(16, 40, True)
     thrown = RateMeasurement(0, np.array([0.0, 0.3, 0.0]), RATE_COVARIANCE)
     filter_ = AttitudeFilter(SUSPENDED, SETTINGS)

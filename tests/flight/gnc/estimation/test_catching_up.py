@@ -66,13 +66,13 @@ def test_the_estimate_is_that_of_measurements_put_in_at_once(at_a_time: int) -> 
     at_once, in_turn = _begun(), _begun()
     for measurement in _frame():
         assert at_once.measure(measurement)
-    told: list[list[bool]] = []
-    in_turn.measure_late(_frame(), told.append)
+    reported: list[list[bool]] = []
+    in_turn.measure_late(_frame(), reported.append)
     for measurement in _samples(80, 120):
         at_once.measure(measurement)
         in_turn.measure(measurement)
         in_turn.catch_up(at_a_time + 1)
-    assert told == [[True, True]]
+    assert reported == [[True, True]]
     end_ns = 200 * PERIOD_NS
     one, other = at_once.at(end_ns), in_turn.at(end_ns)
     assert np.allclose(one.quaternion, other.quaternion, rtol=0.0, atol=1e-12)
@@ -82,7 +82,7 @@ def test_the_estimate_is_that_of_measurements_put_in_at_once(at_a_time: int) -> 
 
 def test_until_it_is_done_the_estimate_is_that_without_the_late_ones() -> None:
     plain, in_turn = _begun(), _begun()
-    in_turn.measure_late(_frame(), lambda used: pytest.fail(f"told {used} too early"))
+    in_turn.measure_late(_frame(), lambda used: pytest.fail(f"reported {used} too early"))
     in_turn.catch_up(10)
     now_ns = 80 * PERIOD_NS
     assert np.array_equal(plain.at(now_ns).covariance, in_turn.at(now_ns).covariance)
@@ -90,11 +90,11 @@ def test_until_it_is_done_the_estimate_is_that_without_the_late_ones() -> None:
 
 def test_a_late_one_that_cannot_be_is_refused_and_costs_nothing() -> None:
     plain, in_turn = _begun(), _begun()
-    told: list[list[bool]] = []
+    reported: list[list[bool]] = []
     mean_rate, _ = _frame(rate=5.0 * RATE)
-    in_turn.measure_late([mean_rate], told.append)
+    in_turn.measure_late([mean_rate], reported.append)
     in_turn.catch_up()
-    assert told == [[False]]
+    assert reported == [[False]]
     assert in_turn.refused == 1
     now_ns = 80 * PERIOD_NS
     assert np.allclose(plain.at(now_ns).rate, in_turn.at(now_ns).rate, rtol=0.0, atol=1e-12)
@@ -102,18 +102,18 @@ def test_a_late_one_that_cannot_be_is_refused_and_costs_nothing() -> None:
 
 def test_one_from_before_all_that_is_remembered_is_refused_at_once() -> None:
     in_turn = AttitudeFilter(BODY, SETTINGS)
-    told: list[list[bool]] = []
-    in_turn.measure_late(_frame(), told.append)
-    assert told == [[False, False]]
+    reported: list[list[bool]] = []
+    in_turn.measure_late(_frame(), reported.append)
+    assert reported == [[False, False]]
 
 
-def test_a_filter_that_starts_anew_tells_that_the_late_ones_were_not_used() -> None:
+def test_a_filter_that_restarts_reports_that_the_late_ones_were_not_used() -> None:
     in_turn = _begun()
-    told: list[list[bool]] = []
-    in_turn.measure_late(_frame(), told.append)
+    reported: list[list[bool]] = []
+    in_turn.measure_late(_frame(), reported.append)
     for number in range(80, 200):
         turned = AttitudeMeasurement(number * PERIOD_NS, about_axis_y(1.5), np.eye(3) * 4e-6)
         if in_turn.started:
             in_turn.measure(turned)
     assert in_turn.restarts == 1
-    assert told == [[False, False]]
+    assert reported == [[False, False]]

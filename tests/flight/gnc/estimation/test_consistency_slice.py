@@ -61,7 +61,7 @@ def test_variances_that_are_claimed_too_large_are_found_out() -> None:
     assert facts["nis"]["gyro"]["mean"] < 0.5
 
 
-def test_the_summary_tells_both_scenes(flown: dict[str, list[Result]], tmp_path: Path) -> None:
+def test_the_summary_shows_both_scenes(flown: dict[str, list[Result]], tmp_path: Path) -> None:
     summary = consistency.summarise([*flown["testbed"], *flown["free"]], tmp_path)
     assert set(summary.facts) == {"testbed", "free"}
     assert "NIS gyro" in summary.text

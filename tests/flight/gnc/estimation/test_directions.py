@@ -1,4 +1,4 @@
-"""Directions and fields in the filter: each tells what it can and nothing else, late or in time."""
+"""Directions and fields in the filter: each gives its own information only, late or in time."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_what_a_covariance_holds_along_the_direction_does_not_count() -> None:
         for measurement in (seen, wide)
     ]
     assert squares[0] > 0.01
-    # The plane is across what is expected, 2 mrad off: its square is what is left.
+    # The plane is across the expected direction, 2 mrad off: its square remains.
     assert squares[1] == pytest.approx(squares[0], rel=0.05)
 
 
@@ -121,16 +121,16 @@ def test_late_directions_and_fields_give_what_they_would_have_given_in_time(susp
     settings = replace(SETTINGS, field_bias_start=1e-7, field_bias_walk=1e-9)
     seen = direction(flight.attitudes[40], time_ns=40 * CYCLE_NS, off=0.0)
     there = attitude_matrix(flight.attitudes[50]) @ FIELD
-    felt = FieldMeasurement(50 * CYCLE_NS, there, FIELD, 1e-14 * np.eye(3))
+    measured = FieldMeasurement(50 * CYCLE_NS, there, FIELD, 1e-14 * np.eye(3))
     in_time = begin(flight, suspended, settings)
     follow(in_time, flight, 1, 41)
     assert in_time.measure(seen)
     follow(in_time, flight, 41, 51)
-    assert in_time.measure(felt)
+    assert in_time.measure(measured)
     follow(in_time, flight, 51)
     late = begin(flight, suspended, settings)
     follow(late, flight)
-    assert late.measure(felt)
+    assert late.measure(measured)
     assert late.measure(seen)
     one, other = (filter_.at(80 * CYCLE_NS) for filter_ in (in_time, late))
     assert float(angle_between(one.quaternion, other.quaternion)) < 1e-11
@@ -166,8 +166,8 @@ def test_the_bias_of_the_magnetometer_is_found_while_the_attitude_is_known() -> 
             filter_.measure(sample)
         if cycle % 4 == 0:
             noise = 2e-8 * rng.standard_normal(3)
-            felt = attitude_matrix(flight.attitudes[cycle]) @ FIELD + bias + noise
-            filter_.measure(FieldMeasurement(cycle * CYCLE_NS, felt, FIELD, 4e-16 * np.eye(3)))
+            measured = attitude_matrix(flight.attitudes[cycle]) @ FIELD + bias + noise
+            filter_.measure(FieldMeasurement(cycle * CYCLE_NS, measured, FIELD, 4e-16 * np.eye(3)))
         filter_.command(cycle * CYCLE_NS, flight.commands[cycle], flight.fields[cycle])
     estimate = filter_.at(399 * CYCLE_NS)
     sigma = np.sqrt(np.diag(estimate.covariance)[FIELD_BIAS])
@@ -180,8 +180,8 @@ def test_without_a_bias_of_the_magnetometer_none_is_estimated() -> None:
     flight = fly(5, 20, True)
     filter_ = AttitudeFilter(SUSPENDED, SETTINGS)
     filter_.start(*flight.samples[0])
-    felt = attitude_matrix(flight.attitudes[0]) @ FIELD + 1e-9
-    assert filter_.measure(FieldMeasurement(0, felt, FIELD, 1e-16 * np.eye(3)))
+    measured = attitude_matrix(flight.attitudes[0]) @ FIELD + 1e-9
+    assert filter_.measure(FieldMeasurement(0, measured, FIELD, 1e-16 * np.eye(3)))
     estimate = filter_.at(CYCLE_NS)
     np.testing.assert_array_equal(estimate.field_bias, np.zeros(3))
     assert not np.any(estimate.covariance[FIELD_BIAS])

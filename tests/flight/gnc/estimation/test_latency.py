@@ -17,7 +17,7 @@ from tests.flight.gnc.estimation.flights import RATE_COVARIANCE, SETTINGS, SUSPE
 from tests.studies.campaigns.consistency_worlds import CYCLE_NS
 
 SWING = 0.14
-"""A, about what the coils can give: a slew tells the age, a hold does not."""
+"""A, about the coils' limit: a slew shows the age, a hold does not."""
 ESTIMATING = replace(SETTINGS, latency_start=0.05)
 
 
@@ -68,7 +68,7 @@ def test_the_error_of_the_age_is_as_large_as_the_filter_says() -> None:
     assert 1.265 < sum(squares) < 31.42
 
 
-def test_a_rate_alone_does_not_tell_the_age() -> None:
+def test_a_rate_alone_does_not_show_the_age() -> None:
     flight = fly(12, 400, True, SWING)
     filter_, _ = follow_late(flight, 1, ESTIMATING)
     now_ns, age = 400 * CYCLE_NS, filter_.latency

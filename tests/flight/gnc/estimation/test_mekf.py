@@ -55,7 +55,7 @@ def difference(a: State, b: State) -> FloatArray:
 
 
 def test_the_transition_is_how_errors_grow() -> None:
-    """Columns by central differences over one cycle; what is left is the third order of the step."""
+    """Columns by central differences over one cycle; the remainder is of the third order of the step."""
     for body, state, free in ((FREE, STATE, [*range(12), 14]), (SUSPENDED, HUNG, ABOUT_THREAD)):
         step = 1e-5
         for column in free:
@@ -151,8 +151,8 @@ def test_the_covariance_stays_symmetric_and_positive(seed: int) -> None:
             seen = AttitudeMeasurement(0, np.array(state.quaternion), size * np.eye(3))
             found = innovation(state, seen, False)
         else:
-            felt = np.array(state.rate) + np.array(state.bias)
-            found = innovation(state, RateMeasurement(0, felt, size * np.eye(3)), False)
+            measured = np.array(state.rate) + np.array(state.bias)
+            found = innovation(state, RateMeasurement(0, measured, size * np.eye(3)), False)
         state, covariance = correct(state, covariance, found, normalised_square(found, covariance)[1])
         state, covariance = propagate(FREE, noise, state, covariance, TORQUING, 0.025)
         np.testing.assert_allclose(covariance, covariance.T, rtol=1e-9, atol=1e-12 * covariance.max())

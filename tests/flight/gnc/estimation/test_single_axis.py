@@ -31,9 +31,9 @@ def simulate(
         measurements.append(Measurement(time_ns, RATE, rate + rate_error, RATE_SIGMA**2))
         command = 0.05 * math.sin(0.01 * cycle)
         commands.append(command)
-        felt = command + rng.uniform(-3.5e-3, 3.5e-3)
+        actual = command + rng.uniform(-3.5e-3, 3.5e-3)
         for _ in range(10):
-            torque = PLANT.torque_constant * felt * math.cos(angle) - stiffness * angle
+            torque = PLANT.torque_constant * actual * math.cos(angle) - stiffness * angle
             rate += torque / PLANT.inertia * 0.0025
             angle += rate * 0.0025
     return truth, commands, measurements
@@ -150,7 +150,7 @@ def test_an_outlier_is_refused_and_the_next_good_one_is_not() -> None:
     assert (filter_.refused, filter_.restarts) == (1, 0)
 
 
-def test_when_everything_disagrees_it_is_the_filter_that_starts_anew() -> None:
+def test_when_everything_disagrees_the_filter_restarts() -> None:
     filter_ = SingleAxisFilter(PLANT, SETTINGS)
     filter_.start(Measurement(0, ANGLE, 0.1, 1e-6), Measurement(0, RATE, 0.0, 1e-8))
     for cycle in range(1, 21):
@@ -160,7 +160,7 @@ def test_when_everything_disagrees_it_is_the_filter_that_starts_anew() -> None:
     assert filter_.restarts == 1
 
 
-def test_without_measurements_the_covariance_grows_and_the_age_is_told() -> None:
+def test_without_measurements_the_covariance_grows_and_the_age_is_reported() -> None:
     filter_ = SingleAxisFilter(PLANT, SETTINGS)
     filter_.start(Measurement(0, ANGLE, 0.1, 1e-6), Measurement(0, RATE, 0.0, 1e-8))
     near, far = filter_.at(PERIOD), filter_.at(40 * PERIOD)

@@ -29,8 +29,8 @@ def flown() -> Flight:
     return fly(5, END, suspended=True, driven=keep)
 
 
-def told(flown: Flight, doubted: bool) -> tuple[AttitudeFilter, int]:
-    """Return the filter after the flight, told of the chip or not, and how much it refused after that."""
+def flown_after(flown: Flight, doubted: bool) -> tuple[AttitudeFilter, int]:
+    """Return the filter after a flight, and its refusals; `doubted`: it knows that the chip does not obey."""
     filter_ = begin(flown, True, dataclasses.replace(SETTINGS, unknown_current=LIMIT, gate_sigma=15.0))
     follow(filter_, flown, 1, FOUND)
     refused = filter_.refused
@@ -55,14 +55,16 @@ def errors(filter_: AttitudeFilter, flown: Flight) -> FloatArray:
     return np.asarray(np.abs(found - true) / sigma[[1, 4, 14]])
 
 
-def test_told_that_the_chip_does_not_obey_it_refuses_nothing_and_stays_consistent(flown: Flight) -> None:
-    filter_, refused = told(flown, doubted=True)
+def test_a_filter_that_knows_the_chip_does_not_obey_refuses_nothing_and_stays_consistent(
+    flown: Flight,
+) -> None:
+    filter_, refused = flown_after(flown, doubted=True)
     assert (refused, filter_.restarts) == (0, 0)
     assert errors(filter_, flown).max() < 4.0
 
 
-def test_not_told_it_refuses_what_it_measures_and_begins_anew(flown: Flight) -> None:
-    filter_, refused = told(flown, doubted=False)
+def test_a_filter_that_does_not_know_refuses_measurements_and_restarts(flown: Flight) -> None:
+    filter_, refused = flown_after(flown, doubted=False)
     assert refused > 0
     assert filter_.restarts > 0
 

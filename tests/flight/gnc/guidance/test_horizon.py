@@ -89,7 +89,7 @@ def test_an_impossible_price_is_refused(price: float) -> None:
 
 
 def rest_of(problem: Problem, found: Plan, share: float) -> tuple[Problem, int]:
-    """Return what is left after `share` of a path, from a little off it, and the time elapsed in ns."""
+    """Return the remaining path after `share` of it, from a little off it, and the time elapsed in ns."""
     elapsed_ns = round(share * found.horizon * 1e9)
     at = found.path.sample(elapsed_ns)
     left = Problem(

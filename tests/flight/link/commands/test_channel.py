@@ -40,7 +40,7 @@ def answer_once(
             for data, sender in channel.poll():
                 taken.append(unpack(data))
                 fields = {"obeyed": int(obeyed), "name": "x", "source": channel.name, "count": 1}
-                fields |= {"mode": int(mode), "text": "as told"}
+                fields |= {"mode": int(mode), "text": "as commanded"}
                 channel.answer(Packer().pack(COMMAND, 0, fields), sender)
                 return
             time.sleep(0.01)
@@ -69,7 +69,7 @@ def test_the_command_line_sends_what_was_typed_and_prints_the_answer(
     channel.close()
     assert status == 0
     assert taken == [command]
-    assert capsys.readouterr().out == "obeyed: as told; mode hold\n"
+    assert capsys.readouterr().out == "obeyed: as commanded; mode hold\n"
 
 
 def test_over_udp_a_refusal_is_exit_status_1_and_one_json_object(capsys: pytest.CaptureFixture[str]) -> None:
@@ -81,7 +81,7 @@ def test_over_udp_a_refusal_is_exit_status_1_and_one_json_object(capsys: pytest.
     channel.close()
     assert status == 1
     answer = json.loads(capsys.readouterr().out)
-    assert answer == {"obeyed": False, "mode": "hold", "text": "as told", "count": 1}
+    assert answer == {"obeyed": False, "mode": "hold", "text": "as commanded", "count": 1}
 
 
 @pytest.mark.parametrize(
@@ -101,7 +101,7 @@ def test_what_cannot_be_sent_is_one_line(
     assert line.count("\n") == 1
 
 
-def test_a_flight_that_does_not_answer_is_told(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_flight_that_does_not_answer_is_reported(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     channel = open_unix(place)
     assert main(["command", "--to", str(place), "--timeout", "0.05", "ping"]) == 1
     channel.close()
@@ -200,7 +200,7 @@ def test_the_socket_of_a_flight_that_is_gone_is_replaced_but_nothing_else_is(pla
         (lambda: open_udp("203.0.113.7:9"), "commands.udp"),
     ],
 )
-def test_where_nobody_can_listen_is_a_mistake_of_the_users(
+def test_an_address_that_cannot_be_opened_is_a_mistake_of_the_users(
     listen: Callable[[], DatagramChannel], problem: str
 ) -> None:
     with pytest.raises(UsageError, match=problem):

@@ -1,4 +1,4 @@
-"""UDP commands come from the configured peers alone; who they are without a word is told or refused."""
+"""UDP commands come from the configured peers alone; the defaults without `peers` are reported or refused."""
 
 from __future__ import annotations
 

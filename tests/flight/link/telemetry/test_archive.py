@@ -14,7 +14,7 @@ from flight.link.telemetry.archive import LEAST_FREE_BYTES, MOST_RUNS, begin_run
 
 
 def fill(folder: Path, size: int) -> None:
-    """Put so many bytes into a run, in two files."""
+    """Put `size` bytes into a run, in two files."""
     (folder / "flight-0001.ccsds").write_bytes(bytes(size - size // 3))
     (folder / "figures").mkdir()
     (folder / "figures" / "a.png").write_bytes(bytes(size // 3))

@@ -22,8 +22,8 @@ SECOND = 1_000_000_000
 
 
 @pytest.mark.parametrize("room", [0, 1, 500, 777])
-def test_a_full_disk_stops_the_log_politely(tmp_path: Path, room: int) -> None:
-    """What fits is kept as whole packets; the rest is counted and told."""
+def test_a_full_disk_stops_the_log_in_order(tmp_path: Path, room: int) -> None:
+    """Packets that fit are kept whole; the rest is counted and reported."""
     clock, disk = ManualClock(0), SmallDisk(room)
     packets = timing_packets(50)
     log = FlightLog(tmp_path, clock=clock, segment_bytes=10 * len(packets[0]), opener=disk.open)
@@ -82,7 +82,7 @@ def test_what_did_not_fit_while_the_disk_was_full_is_counted_to_the_end(tmp_path
     assert log.error() == f"log flight: writing stopped: {os.strerror(errno.ENOSPC)}; 10 packets lost"
     result = scan(content(tmp_path))
     assert result.packets["cycle_timing"]["cycle"].tolist() == [*range(10), *range(20, 30)]
-    assert result.missing["cycle_timing"] == 10, "the sequence counts tell the gap"
+    assert result.missing["cycle_timing"] == 10, "the sequence counts show the gap"
 
 
 def test_a_full_disk_is_asked_once_a_second_not_at_every_drain(tmp_path: Path) -> None:
@@ -146,7 +146,7 @@ def test_a_disk_that_takes_little_at_a_time_loses_nothing(tmp_path: Path) -> Non
     assert content(tmp_path) == b"".join(packets)
 
 
-def test_a_segment_that_cannot_be_opened_later_stops_the_log_politely(tmp_path: Path) -> None:
+def test_a_segment_that_cannot_be_opened_later_stops_the_log_in_order(tmp_path: Path) -> None:
     def once(path: Path) -> SegmentFile:
         if path.name != "flight-0001.ccsds":
             raise OSError(errno.EROFS, os.strerror(errno.EROFS))

@@ -1,4 +1,4 @@
-"""A run's folder is read back as arrays, and what is wrong with it is said."""
+"""A run's folder is read back as arrays, with an account of its damage."""
 
 from __future__ import annotations
 

@@ -125,7 +125,7 @@ def test_decode_takes_whole_packets_only() -> None:
         decode(b"".join(packets) + b"x")
 
 
-def test_kinds_of_packets_are_told_apart_in_order() -> None:
+def test_kinds_of_packets_are_distinguished_in_order() -> None:
     packer = Packer()
     kinds = [IMU, CONTROL, TARGET, IMU, EVENT, IMU]
     data = b"".join(packer.pack(kind, i, plain_contents(kind)) for i, kind in enumerate(kinds))

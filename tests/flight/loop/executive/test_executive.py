@@ -55,7 +55,7 @@ def test_a_task_that_stalls_makes_slips_and_then_the_grid_goes_on() -> None:
     assert min(b - a for a, b in pairwise(starts)) == 25 * MS
 
 
-def test_an_exception_in_a_task_is_told_and_the_loop_goes_on() -> None:
+def test_an_exception_in_a_task_is_reported_and_the_loop_goes_on() -> None:
     notes = Notes()
 
     def fail(cycle: Cycle) -> None:

@@ -144,7 +144,7 @@ def test_memory_that_a_process_touches_is_seen_and_its_processor_time_too() -> N
     assert alone >= before.memory["me"] - (1 << 20)
 
 
-def test_a_slope_is_told_from_minutes_on_and_not_before() -> None:
+def test_a_slope_is_given_from_minutes_on_and_not_before() -> None:
     seconds = np.arange(0.0, SLOPE_SPAN + 1.0, 0.5)
     levels = 100.0 + 12.0 * seconds / 3600.0
     assert judged_slope(seconds.tolist(), levels.tolist()) == pytest.approx((12.0, 12.0, 12.0))

@@ -125,7 +125,7 @@ def test_a_hung_worker_is_killed_and_replaced(processes: ProcessRunner) -> None:
         os.kill(old, 0)
 
 
-def test_a_worker_that_dies_is_told_and_replaced(processes: ProcessRunner) -> None:
+def test_a_worker_that_dies_is_reported_and_replaced(processes: ProcessRunner) -> None:
     processes.submit("die", None)
     (result,) = wait(processes)
     assert (result.worker, result.outcome) == ("die", "died")

@@ -18,11 +18,11 @@ STALE = 12
 """Cycles after which the coil driver, or the guardian, zeroes a command."""
 
 
-def _fly(driver_lets_go: bool, told: bool, cycles: int = 1200) -> tuple[list[float], int]:
+def _fly(driver_lets_go: bool, informed: bool, cycles: int = 1200) -> tuple[list[float], int]:
     """Drive coil x with a loop that stalls now and then; its samples arrive in a burst after each stall.
 
     Meanwhile the driver zeroes the coils, and reports when; or a guardian does without a report, unless the
-    loop is `told` that the currents of that time are unknown.
+    loop is `informed` that the currents of that time are unknown.
     Returns the trusted gains of coil x, and how often an axis was found reversed.
     """
     settings = ResponseSettings(np.eye(3) * INERTIA, DIPOLE, 1e-4, free=(False, True, False))
@@ -40,7 +40,7 @@ def _fly(driver_lets_go: bool, told: bool, cycles: int = 1200) -> tuple[list[flo
             continue
         if stood == STANDS and driver_lets_go:
             response.commanded(now_ns - (STANDS - STALE) * TICK_NS, (0.0, 0.0, 0.0))
-        elif stood == STANDS and told:
+        elif stood == STANDS and informed:
             response.interrupted(now_ns)
         for time_ns, seen in waiting:
             if response.observe_motion(time_ns, np.array([0.0, seen, 0.0]), FIELD):
@@ -54,16 +54,16 @@ def _fly(driver_lets_go: bool, told: bool, cycles: int = 1200) -> tuple[list[flo
 
 
 def test_a_sound_coil_is_not_taken_for_a_broken_one_where_a_guardian_held_it_at_zero() -> None:
-    gains, wrong = _fly(driver_lets_go=False, told=True)
+    gains, wrong = _fly(driver_lets_go=False, informed=True)
     assert wrong == 0
     assert len(gains) > 20
     assert np.abs(np.array(gains) - 1.0).max() < 0.2
-    misled, _ = _fly(driver_lets_go=False, told=False)
+    misled, _ = _fly(driver_lets_go=False, informed=False)
     assert np.abs(np.array(misled) - 1.0).max() > 0.3, "samples of a time in which others held it do mislead"
 
 
 def test_samples_that_come_in_a_burst_are_those_of_the_commands_of_their_time() -> None:
-    gains, wrong = _fly(driver_lets_go=True, told=False)
+    gains, wrong = _fly(driver_lets_go=True, informed=False)
     assert wrong == 0
     assert len(gains) > 100
     assert np.abs(np.array(gains) - 1.0).max() < 0.1

@@ -17,7 +17,7 @@ from flight.loop.modes.triggers import Trigger
 from flight.loop.tasks.mode_control import SAFING_REACTIONS, modes_moved_by
 
 
-class Told:
+class EventRecord:
     """A sink that records events."""
 
     def __init__(self) -> None:
@@ -26,9 +26,9 @@ class Told:
         self.facts = Facts(self.log)
 
 
-def state(told: Told, fact: facts.Fact, *statements: bool | None) -> None:
+def state(record: EventRecord, fact: facts.Fact, *statements: bool | None) -> None:
     for holds in statements:
-        told.facts.update(fact, holds, 0, "text")
+        record.facts.update(fact, holds, 0, "text")
 
 
 def test_the_table_that_flies_is_sound() -> None:
@@ -36,71 +36,71 @@ def test_the_table_that_flies_is_sound() -> None:
 
 
 def test_a_fact_counts_after_its_number_of_statements_in_a_row_and_not_before() -> None:
-    told = Told()
-    told.facts.enter(Mode.HOLD)
-    state(told, facts.TUMBLING, *[True] * 7, False, *[True] * 7)
-    assert not told.facts.holds(facts.TUMBLING)
-    state(told, facts.TUMBLING, True)
-    assert told.facts.holds(facts.TUMBLING)
-    assert told.names == ["tumbling"]
+    record = EventRecord()
+    record.facts.enter(Mode.HOLD)
+    state(record, facts.TUMBLING, *[True] * 7, False, *[True] * 7)
+    assert not record.facts.holds(facts.TUMBLING)
+    state(record, facts.TUMBLING, True)
+    assert record.facts.holds(facts.TUMBLING)
+    assert record.names == ["tumbling"]
 
 
-def test_it_is_over_after_its_number_of_statements_and_told_once_each_way() -> None:
-    told = Told()
-    state(told, facts.IMU_POOR, *[True] * 9)
-    state(told, facts.IMU_POOR, *[False] * 7, True, *[False] * 7)
-    assert told.facts.holds(facts.IMU_POOR)
-    state(told, facts.IMU_POOR, False)
-    assert told.names == ["stream-poor", "stream-good"]
+def test_a_fact_ends_after_its_number_of_statements_with_one_event_each_way() -> None:
+    record = EventRecord()
+    state(record, facts.IMU_POOR, *[True] * 9)
+    state(record, facts.IMU_POOR, *[False] * 7, True, *[False] * 7)
+    assert record.facts.holds(facts.IMU_POOR)
+    state(record, facts.IMU_POOR, False)
+    assert record.names == ["stream-poor", "stream-good"]
 
 
 def test_what_cannot_be_known_neither_counts_nor_mends() -> None:
-    told = Told()
-    state(told, facts.DISK_LOW, True, None, True)
-    assert told.facts.holds(facts.DISK_LOW)
-    state(told, facts.DISK_LOW, False, None, None, False)
-    assert not told.facts.holds(facts.DISK_LOW)
+    record = EventRecord()
+    state(record, facts.DISK_LOW, True, None, True)
+    assert record.facts.holds(facts.DISK_LOW)
+    state(record, facts.DISK_LOW, False, None, None, False)
+    assert not record.facts.holds(facts.DISK_LOW)
 
 
 def test_a_latched_fact_stays_until_it_is_cleared_by_the_name_of_its_event() -> None:
-    told = Told()
-    state(told, facts.TOO_HOT, True, True, *[False] * 20)
-    assert told.facts.held() == (facts.TOO_HOT,)
-    assert not told.facts.clear("hot")
-    assert told.facts.clear("too-hot")
-    assert told.facts.held() == ()
-    assert not told.facts.clear("too-hot"), "there is nothing left to clear"
+    record = EventRecord()
+    state(record, facts.TOO_HOT, True, True, *[False] * 20)
+    assert record.facts.held() == (facts.TOO_HOT,)
+    assert not record.facts.clear("hot")
+    assert record.facts.clear("too-hot")
+    assert record.facts.held() == ()
+    assert not record.facts.clear("too-hot"), "there is nothing left to clear"
 
 
 def test_a_fact_that_is_not_latched_is_not_to_be_cleared_away() -> None:
-    told = Told()
-    state(told, facts.IMU_SILENT, True)
-    assert not told.facts.clear("imu-silent")
-    assert told.facts.holds(facts.IMU_SILENT)
+    record = EventRecord()
+    state(record, facts.IMU_SILENT, True)
+    assert not record.facts.clear("imu-silent")
+    assert record.facts.holds(facts.IMU_SILENT)
 
 
-def test_in_a_mode_that_does_not_watch_it_a_fact_does_not_count_and_begins_anew_after() -> None:
-    told = Told()
-    told.facts.enter(Mode.HOLD)
-    state(told, facts.TUMBLING, *[True] * 7)
-    told.facts.enter(Mode.SAFE)
-    state(told, facts.TUMBLING, *[True] * 50)
-    told.facts.enter(Mode.HOLD)
-    state(told, facts.TUMBLING, *[True] * 7)
-    assert told.names == []
-    state(told, facts.TUMBLING, True)
-    assert told.names == ["tumbling"]
+def test_in_a_mode_that_does_not_watch_it_a_fact_does_not_count_and_restarts_after() -> None:
+    record = EventRecord()
+    record.facts.enter(Mode.HOLD)
+    state(record, facts.TUMBLING, *[True] * 7)
+    record.facts.enter(Mode.SAFE)
+    state(record, facts.TUMBLING, *[True] * 50)
+    record.facts.enter(Mode.HOLD)
+    state(record, facts.TUMBLING, *[True] * 7)
+    assert record.names == []
+    state(record, facts.TUMBLING, True)
+    assert record.names == ["tumbling"]
 
 
 def test_every_event_beyond_a_note_is_reacted_to_even_while_the_throttle_holds_it_back() -> None:
     reacted: list[tuple[EventKind, str]] = []
-    told: list[str] = []
-    log = EventLog(lambda kind, *_: told.append(kind.name))
+    record: list[str] = []
+    log = EventLog(lambda kind, *_: record.append(kind.name))
     log.react_by(lambda kind, _, text: reacted.append((kind, text)))
     for text in ("a", "b"):
         log.report(events.CONTROL_LOST, 0, text)
         log.report(events.CYCLE_SLIP, 0, text)
-    assert told == ["control-lost", "cycle-slip"]
+    assert record == ["control-lost", "cycle-slip"]
     assert reacted == [(events.CONTROL_LOST, "a"), (events.CONTROL_LOST, "b")]
 
 

@@ -48,7 +48,7 @@ def test_a_worker_gets_on_while_idle_and_until_its_patience_is_over() -> None:
     assert watch.stalled(200 * SECOND) == []
 
 
-def test_a_job_beside_the_loop_that_raises_is_told_and_runs_again() -> None:
+def test_a_job_beside_the_loop_that_raises_is_reported_and_runs_again() -> None:
     clock, runs = ManualClock(), 0
 
     def job() -> None:
@@ -64,7 +64,7 @@ def test_a_job_beside_the_loop_that_raises_is_told_and_runs_again() -> None:
     assert (runs, failing(clock.tickers, clock.now_ns())) == (3, [])
 
 
-def test_a_job_that_does_not_come_to_its_end_is_told_after_three_periods() -> None:
+def test_a_job_that_does_not_end_is_reported_after_three_periods() -> None:
     clock = ManualClock()
     ticker = clock.ticker("log", 4 * SECOND, lambda: None)
     clock.advance(4 * SECOND)

@@ -13,7 +13,7 @@ from flight.loop.fdir import facts
 from flight.loop.fdir.board import Board
 from flight.loop.fdir.resources import ClockWatch, ResourceMonitor, ResourceSample
 from flight.schema.sections import Health
-from tests.flight.loop.fdir.test_facts import Told
+from tests.flight.loop.fdir.test_facts import EventRecord
 
 MIB = 1024.0 * 1024.0
 SETTINGS = Health(look_period=5.0, warm_up=20.0, slope_window=100.0)
@@ -24,34 +24,34 @@ def sample(seconds: float, **changes: float) -> ResourceSample:
     return replace(sound, **changes)  # type: ignore[arg-type]  # never the time
 
 
-def watched(samples: list[ResourceSample]) -> tuple[ResourceMonitor, Told]:
-    monitor, told = ResourceMonitor(SETTINGS), Told()
+def watched(samples: list[ResourceSample]) -> tuple[ResourceMonitor, EventRecord]:
+    monitor, record = ResourceMonitor(SETTINGS), EventRecord()
     for one in samples:
         monitor.ingest(one)
-        monitor.report(told.facts, one.time_ns)
-    return monitor, told
+        monitor.report(record.facts, one.time_ns)
+    return monitor, record
 
 
-def test_a_sound_board_raises_no_alarm_and_its_share_of_the_processor_is_told() -> None:
-    monitor, told = watched([sample(5.0 * k) for k in range(60)])
-    assert told.names == []
+def test_a_sound_board_raises_no_alarm_and_its_share_of_the_processor_is_reported() -> None:
+    monitor, record = watched([sample(5.0 * k) for k in range(60)])
+    assert record.names == []
     assert monitor.state.cpu_share == pytest.approx(0.2)
     assert monitor.state.memory_slope == pytest.approx(0.0, abs=1e-6)
 
 
-def test_memory_that_grows_is_told_with_its_slope_and_the_warm_up_is_left_out() -> None:
+def test_memory_that_grows_is_reported_with_its_slope_and_the_warm_up_is_left_out() -> None:
     def memory(seconds: float) -> float:
         return 150 * MIB + 5e3 * seconds + (0.0 if seconds >= 20.0 else -50 * MIB)
 
-    monitor, told = watched([sample(5.0 * k, proportional=memory(5.0 * k)) for k in range(60)])
+    monitor, record = watched([sample(5.0 * k, proportional=memory(5.0 * k)) for k in range(60)])
     assert monitor.state.memory_slope == pytest.approx(5e3, rel=1e-6)
-    assert told.names == ["memory-grows"]
+    assert record.names == ["memory-grows"]
 
 
 def test_a_slope_is_not_claimed_before_its_window_is_full() -> None:
-    monitor, told = watched([sample(5.0 * k, proportional=150 * MIB + 1e5 * k) for k in range(23)])
+    monitor, record = watched([sample(5.0 * k, proportional=150 * MIB + 1e5 * k) for k in range(23)])
     assert math.isnan(monitor.state.memory_slope)
-    assert told.names == []
+    assert record.names == []
 
 
 @pytest.mark.parametrize(
@@ -62,26 +62,26 @@ def test_a_slope_is_not_claimed_before_its_window_is_full() -> None:
         ({"proportional": 2e9}, "memory-high"),
     ],
 )
-def test_a_bound_that_is_passed_is_told_after_some_looks_and_never_for_one(
+def test_a_bound_that_is_passed_is_reported_after_some_looks_and_never_for_one(
     change: dict[str, float], event: str
 ) -> None:
     for count, names in ((1, []), (4, [event])):
-        _, told = watched([sample(5.0 * k, **change) for k in range(count)])
-        assert [name for name in told.names if name == event] == names
+        _, record = watched([sample(5.0 * k, **change) for k in range(count)])
+        assert [name for name in record.names if name == event] == names
 
 
 def test_a_board_that_is_too_hot_is_latched() -> None:
     samples = [sample(5.0 * k, temperature=100.0 if k < 4 else 40.0) for k in range(20)]
-    _, told = watched(samples)
-    assert "too-hot" in told.names
-    assert told.facts.holds(facts.TOO_HOT)
-    assert not told.facts.holds(facts.HOT)
+    _, record = watched(samples)
+    assert "too-hot" in record.names
+    assert record.facts.holds(facts.TOO_HOT)
+    assert not record.facts.holds(facts.HOT)
 
 
 def test_what_the_board_does_not_have_is_neither_good_nor_bad() -> None:
     samples = [sample(5.0 * k, temperature=math.nan, disk_free=math.nan) for k in range(10)]
-    _, told = watched(samples)
-    assert told.names == []
+    _, record = watched(samples)
+    assert record.names == []
 
 
 class TwoClocks:
@@ -115,7 +115,7 @@ def test_a_step_of_the_wall_clock_is_seen_either_way_and_slow_drift_is_not() -> 
     assert watch.steps == 2
 
 
-def test_the_board_tells_of_this_very_process(tmp_path: Path) -> None:
+def test_the_board_shows_of_this_very_process(tmp_path: Path) -> None:
     read = Board(tmp_path)(123)
     assert read.time_ns == 123
     assert 0.0 < read.cpu <= sum(os.times()[:2]) + 0.05

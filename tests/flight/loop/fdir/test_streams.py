@@ -49,7 +49,7 @@ def test_half_its_rate_is_slow_once_a_whole_window_has_been_seen() -> None:
     assert late.state(now) is StreamState.SLOW
 
 
-def test_after_a_silence_the_rate_is_counted_anew() -> None:
+def test_after_a_silence_the_rate_is_counted_again() -> None:
     watch, now = fed(4.0)
     for k in range(40):
         watch.note(now + 5_000_000_000 + k * PERIOD, 0.5)
@@ -63,7 +63,7 @@ def test_what_is_not_fitted_takes_no_notes() -> None:
     assert streams.state("imu", 2) is StreamState.NEVER
 
 
-def test_silence_that_another_alarm_tells_is_not_told_twice_and_any_other_is() -> None:
+def test_silence_that_another_alarm_reports_is_not_reported_twice_and_any_other_is() -> None:
     quiet = Stream("power", 4.0, 3.0, POWER_POOR, has_silence_alarm=False)
     streams = Streams((ROW, quiet))
     for name in ("imu", "power"):

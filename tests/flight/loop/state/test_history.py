@@ -62,7 +62,7 @@ def test_only_the_newest_crashes_are_kept() -> None:
     assert crashes[-1].boot == state.boot_count
 
 
-def test_what_is_learned_anew_replaces_the_old_and_the_rest_stays() -> None:
+def test_what_is_learned_again_replaces_the_old_and_the_rest_stays() -> None:
     first, second = Learned((1.0,), ((0.1,),)), Learned((2.0,), ((0.1,),))
     state = go_on(begin(StoredState(learned={"a": first, "b": first}), LABEL), 1.0, "", {"a": second}, LABEL)
     assert state.learned == {"a": second, "b": first}

@@ -47,7 +47,7 @@ def test_running_is_on_disk_before_anything_flies_and_gone_after_a_clean_end() -
 
 
 @pytest.mark.parametrize("closed", [True, False])
-def test_an_end_that_was_not_clean_is_told_at_the_next_start(closed: bool) -> None:
+def test_an_end_that_was_not_clean_is_reported_at_the_next_start(closed: bool) -> None:
     """Whether the process was killed, or closed the keeper on its way out of an exception."""
     disk, clock = Disk(), ManualClock()
     first = keeper_on(disk, clock)
@@ -61,7 +61,7 @@ def test_an_end_that_was_not_clean_is_told_at_the_next_start(closed: bool) -> No
     ((kind, text),) = second.notices()
     assert kind is events.UNCLEAN_SHUTDOWN
     assert text == "boot 1, last heard of 1970-01-01T00:00:21Z: 1 of late"
-    assert not second.notices(), "told once"
+    assert not second.notices(), "reported once"
 
 
 def test_what_is_noted_is_on_disk_after_a_period_with_the_operating_time() -> None:
@@ -80,7 +80,7 @@ def test_what_is_noted_is_on_disk_after_a_period_with_the_operating_time() -> No
     assert keeper_on(disk, clock).learned == {"gyro-bias": learned}
 
 
-def test_learned_values_that_are_unfit_are_left_out_and_told() -> None:
+def test_learned_values_that_are_unfit_are_left_out_and_reported() -> None:
     disk, clock = Disk(), ManualClock()
     keeper = keeper_on(disk, clock)
     keeper.note("hold" * 20, {"gyro-bias": Learned((float("nan"),), ((1.0,),))})
@@ -93,7 +93,7 @@ def test_learned_values_that_are_unfit_are_left_out_and_told() -> None:
     assert not keeper.notices()
 
 
-def test_a_full_disk_is_told_and_the_flight_goes_on() -> None:
+def test_a_full_disk_is_reported_and_the_flight_goes_on() -> None:
     disk, clock = Disk(), ManualClock()
     keeper_on(disk, clock).close(clean=True)
     disk.start(0, NO_SPACE)
@@ -104,7 +104,7 @@ def test_a_full_disk_is_told_and_the_flight_goes_on() -> None:
     assert on_disk(disk).boot_count == 2
 
 
-def test_damaged_files_are_told_through_the_notices(tmp_path: Path) -> None:
+def test_damaged_files_are_reported_through_the_notices(tmp_path: Path) -> None:
     for name in COPIES:
         (tmp_path / name).write_bytes(b"no state")
     keeper = keeper_on(None, ManualClock(), tmp_path)

@@ -83,7 +83,7 @@ def test_what_may_have_changed_widens_the_start_and_what_is_known_stays_known() 
         (GYRO_BIAS, [0.0], "3 values are wanted"),
     ],
 )
-def test_what_cannot_be_true_is_not_taken_and_told(name: str, values: list[float], why: str) -> None:
+def test_what_cannot_be_true_is_not_taken_and_reported(name: str, values: list[float], why: str) -> None:
     believed = slow_prior(SUSPENDED, SETTINGS)
     learned = {name: Learned.of(np.array(values), np.eye(len(values)) * 1e-12)}
     prior, (problem,) = start_from(learned, believed, CHANGED)
@@ -104,7 +104,7 @@ def keeper_on(disk: Disk, devices: str) -> StateKeeper:
     return StateKeeper(store, notices, ManualClock(), window=600.0, period_ns=10_000_000_000, devices=devices)
 
 
-def test_what_was_learned_of_other_devices_is_forgotten_and_told() -> None:
+def test_what_was_learned_of_other_devices_is_forgotten_and_reported() -> None:
     disk = Disk()
     learned = {PLANT: Learned.of(np.array([0.01, 1e-3, 1.1]), np.eye(3) * 1e-8)}
     first = keeper_on(disk, "a")
@@ -119,7 +119,7 @@ def test_what_was_learned_of_other_devices_is_forgotten_and_told() -> None:
     ((kind, _),) = other.notices()
     assert kind is events.LEARNED_REFUSED
     other.close(clean=True)
-    assert not keeper_on(disk, "b").notices(), "told once"
+    assert not keeper_on(disk, "b").notices(), "reported once"
 
 
 def test_a_plant_that_is_configured_otherwise_is_another_one() -> None:
@@ -130,7 +130,7 @@ def test_a_plant_that_is_configured_otherwise_is_another_one() -> None:
     assert digest_of(config) != digest_of(heavier)
 
 
-def test_a_flight_begins_where_the_last_one_ended_and_with_a_lost_state_anew(tmp_path: Path) -> None:
+def test_a_flight_begins_where_the_last_one_ended_and_from_nothing_with_a_lost_state(tmp_path: Path) -> None:
     def torsion_after(seconds: float, folder: Path, run: str) -> tuple[float, float, list[str]]:
         """Fly; return the stored torsion of the thread, its sigma, and the events."""
         config = flights.demo_config(seconds, camera=False)

@@ -23,7 +23,7 @@ CONFIG = Path(__file__).resolve().parents[4] / "config" / "step_demo.yaml"
 
 
 def stored(folder: Path) -> StoredState:
-    """Return what is on disk."""
+    """Return the state on disk."""
     return StateStore(folder, lambda *_: None).load()
 
 
@@ -87,11 +87,11 @@ def test_a_folder_that_cannot_be_made_is_no_reason_not_to_fly(tmp_path: Path) ->
     with ExitStack() as stack:
         keeper = open_state(simulated(tmp_path / "file" / "state"), {}, ManualClock(), stack)
         assert keeper is not None
-        told = [kind.name for kind, _ in keeper.notices()]
-        assert told == ["state-lost", "unclean-shutdown", "state-unwritten"]
+        events = [kind.name for kind, _ in keeper.notices()]
+        assert events == ["state-lost", "unclean-shutdown", "state-unwritten"]
 
 
-def test_a_service_flies_run_after_run_into_its_archive_and_tells_a_crash_before(tmp_path: Path) -> None:
+def test_a_service_flies_run_after_run_into_its_archive_and_shows_a_crash_before(tmp_path: Path) -> None:
     """Two short flights; the process of the second finds that the one before was killed."""
     text = CONFIG.read_text(encoding="utf-8") + f"\nstate: {{folder: {tmp_path / 'state'}}}\n"
     path = tmp_path / "flight.yaml"

@@ -106,7 +106,7 @@ def test_power_loss_before_every_call_leaves_the_old_state_or_the_new(bite: int)
 
 
 @pytest.mark.parametrize("forgotten", ["sync", "sync_folder"])
-def test_the_model_of_power_loss_tells_a_write_that_forgets_to_sync(forgotten: str) -> None:
+def test_the_model_of_power_loss_finds_a_write_that_forgets_to_sync(forgotten: str) -> None:
     """The test above can fail: without either sync the disk may hold an old state, or none."""
     disk = Disk(forget=forgotten)
     _stored(disk, Reports()).store(state_of(3))
@@ -131,7 +131,7 @@ def test_a_disk_that_fails_at_any_call_keeps_a_whole_state_and_says_so(error: in
 
 
 @pytest.mark.parametrize("copy", COPIES)
-def test_damage_to_one_copy_at_any_byte_loses_nothing_and_is_told(tmp_path: Path, copy: str) -> None:
+def test_damage_to_one_copy_at_any_byte_loses_nothing_and_is_reported(tmp_path: Path, copy: str) -> None:
     StateStore(tmp_path, Reports()).store(state_of(1))
     path = tmp_path / copy
     whole = path.read_bytes()
@@ -178,7 +178,7 @@ def test_two_damaged_copies_give_defaults_that_count_as_an_unclean_shutdown(tmp_
     assert reports.kinds == [events.STATE_LOST]
 
 
-def test_a_copy_that_cannot_be_read_is_told_with_the_systems_words(tmp_path: Path) -> None:
+def test_a_copy_that_cannot_be_read_is_reported_with_the_systems_words(tmp_path: Path) -> None:
     StateStore(tmp_path, Reports()).store(state_of(1))
     (tmp_path / COPIES[1]).unlink()
     (tmp_path / COPIES[1]).mkdir()
