@@ -17,7 +17,7 @@ from flight.schema.reader import replace
 from flight.schema.sections import Modes
 from sim_hal.settings import FaultEntry
 from tests.scenario.flights import Rigged, demo_config, demo_world, event_names, fly
-from tests.scenario.test_modes import modes_of
+from tests.scenario.mode_flights import modes_of
 
 AT = 4.0
 SECOND = 1_000_000_000

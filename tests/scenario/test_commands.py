@@ -15,7 +15,7 @@ from flight.link.telemetry.packets import to_text
 from flight.link.telemetry.reader import Run
 from flight.link.telemetry.scanner import decode
 from tests.scenario.flights import Rigged, demo_config, event_names, fly
-from tests.scenario.test_modes import commanded, modes_of
+from tests.scenario.mode_flights import commanded, modes_of
 
 
 class Script:

@@ -22,7 +22,7 @@ from ground import report
 from sim_hal.emulators.serial_line import SOUND, LineFaults
 from sim_hal.emulators.vn100_sensors import Measured
 from tests.scenario.flights import Rigged, demo_config, event_names, fly, thesis_config
-from tests.scenario.test_modes import commanded, currents, released
+from tests.scenario.mode_flights import commanded, currents, released
 
 SILENT_AT = 3.0
 WITHIN = 0.1

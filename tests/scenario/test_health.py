@@ -17,7 +17,7 @@ from flight.loop.fdir.resources import ResourceSample
 from flight.loop.fdir.streams import StreamState
 from sim_hal.emulators.serial_line import SOUND, LineFaults
 from tests.scenario.flights import Rigged, demo_config, event_names, fly
-from tests.scenario.test_modes import commanded, modes_of
+from tests.scenario.mode_flights import commanded, modes_of
 
 SECOND = 1_000_000_000
 

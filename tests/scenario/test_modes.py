@@ -9,59 +9,26 @@ import numpy as np
 import pytest
 
 from flight.gnc.estimation.attitude_filter import AttitudeFilter
-from flight.gnc.math.arrays import FloatArray
 from flight.link.modes import Mode
 from flight.link.telemetry.packets import to_text
-from flight.link.telemetry.reader import Run
 from flight.loop.state.keeper import Notices, StateKeeper
 from flight.loop.state.store import StateStore
 from flight.schema import reader as configuration
-from flight.schema.sections import Commands, CommandStep, Config, Step
+from flight.schema.sections import Step
 from sim_hal.clock import SimClock
 from sim_hal.emulators.serial_line import SOUND, LineFaults
-from sim_hal.settings import Release
-from tests.scenario.flights import Rigged, demo_config, demo_world, event_names, fly
-
-CYCLE = 0.025
-BRIEF = {"arrived_for": 0.3, "boot_patience": 1.0, "hold_patience": 2.0, "blind_limit": 3.0}
-"""Modes' settings with little patience, s."""
-
-
-def commanded(duration: float, *steps: dict[str, Any], initial: str = "testbed-demo", **modes: Any) -> Config:
-    """Return the demonstration without a camera, with a time line of commands, and little patience."""
-    config = demo_config(duration, camera=False)
-    timeline = tuple(CommandStep(**step) for step in steps)
-    section = configuration.replace(config.modes, initial=initial, **{**BRIEF, **modes})
-    return configuration.replace(config, modes=section, commands=Commands(timeline=timeline))
-
-
-def path_of_modes(run: Run) -> list[tuple[Mode, str]]:
-    """Return the modes entered, each with its trigger."""
-    return [(Mode(int(row["mode"])), to_text(row["trigger"])) for row in run["mode"]]
-
-
-def modes_of(run: Run) -> list[Mode]:
-    return [mode for mode, _ in path_of_modes(run)]
-
-
-def entered(run: Run, mode: Mode) -> float:
-    """Return the mission time, s, at which a mode was entered last."""
-    return float(run["mode"]["time_ns"][run["mode"]["mode"] == mode][-1]) * 1e-9
-
-
-def currents(run: Run, since: float, until: float) -> FloatArray:
-    """Return |I| of the coil that carried most at each sample of the truth in an interval."""
-    time = run["truth"]["time_ns"] * 1e-9
-    largest: FloatArray = np.abs(run["truth"]["current"]).max(axis=1)
-    return largest[(time >= since) & (time < until)]
-
-
-def true_angle(run: Run) -> FloatArray:
-    return np.asarray(2.0 * np.arcsin(run["truth"]["quaternion"][:, 1]))
-
-
-def released(q2: float, rate: float) -> Any:
-    return configuration.replace(demo_world(), release=Release(q2=q2, rate=rate))
+from tests.scenario.flights import Rigged, demo_config, event_names, fly
+from tests.scenario.mode_flights import (
+    BRIEF,
+    CYCLE,
+    commanded,
+    currents,
+    entered,
+    modes_of,
+    path_of_modes,
+    released,
+    true_angle,
+)
 
 
 def test_the_demonstration_is_what_flies_by_default_after_one_cycle_of_boot(tmp_path: Path) -> None:
@@ -271,7 +238,7 @@ def test_a_unit_that_stays_silent_leads_to_safe_from_every_mode_that_drives(
 
 
 @pytest.mark.parametrize(("crashes", "mode"), [(2, Mode.TESTBED_DEMO), (3, Mode.SAFE)])
-def test_too_many_crashes_of_late_lead_to_safe_and_one_fewer_does_not(
+def test_too_many_recent_crashes_lead_to_safe_and_one_fewer_does_not(
     tmp_path: Path, crashes: int, mode: Mode
 ) -> None:
     """The stored state of each killed boot still says that it runs."""

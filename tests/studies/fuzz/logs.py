@@ -26,7 +26,7 @@ from ground import report as reporting
 from tests.ground.report.synthetic import Recipe, make_run
 from tests.studies.fuzz.harness import Finding
 from tests.studies.fuzz.mutation import Draw, chance, damage, integer
-from tests.studies.fuzz.vn100 import checksum
+from tests.studies.fuzz.vn100_packets import checksum
 
 _DRAWN, _SAVED = 0.004, 0.05
 

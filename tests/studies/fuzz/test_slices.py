@@ -13,7 +13,8 @@ from tests.studies.fuzz import harness
 from tests.studies.fuzz.__main__ import TARGETS, main, target_of
 from tests.studies.fuzz.harness import Finding, run
 from tests.studies.fuzz.logs import collisions_allowed
-from tests.studies.fuzz.vn100 import candidates, checksum
+from tests.studies.fuzz.vn100 import candidates
+from tests.studies.fuzz.vn100_packets import checksum
 
 SLICES = {"vn100": 250, "config": 40, "commands": 1500, "logs": 80, "cli": 60}
 

@@ -1,0 +1,60 @@
+"""Flights through the modes: configurations with a time line of commands, and the modes entered."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from flight.gnc.math.arrays import FloatArray
+from flight.link.modes import Mode
+from flight.link.telemetry.packets import to_text
+from flight.link.telemetry.reader import Run
+from flight.schema import reader as configuration
+from flight.schema.sections import Commands, CommandStep, Config
+from sim_hal.settings import Release, Simulation
+from tests.scenario.flights import demo_config, demo_world
+
+CYCLE = 0.025
+BRIEF = {"arrived_for": 0.3, "boot_patience": 1.0, "hold_patience": 2.0, "blind_limit": 3.0}
+"""Modes' settings with little patience, s."""
+
+
+def commanded(duration: float, *steps: dict[str, Any], initial: str = "testbed-demo", **modes: Any) -> Config:
+    """Return the demonstration without a camera, with a time line of commands, and little patience."""
+    config = demo_config(duration, camera=False)
+    timeline = tuple(CommandStep(**step) for step in steps)
+    section = configuration.replace(config.modes, initial=initial, **{**BRIEF, **modes})
+    return configuration.replace(config, modes=section, commands=Commands(timeline=timeline))
+
+
+def path_of_modes(run: Run) -> list[tuple[Mode, str]]:
+    """Return the modes entered, each with its trigger."""
+    return [(Mode(int(row["mode"])), to_text(row["trigger"])) for row in run["mode"]]
+
+
+def modes_of(run: Run) -> list[Mode]:
+    """Return the modes entered."""
+    return [mode for mode, _ in path_of_modes(run)]
+
+
+def entered(run: Run, mode: Mode) -> float:
+    """Return the mission time, s, at which a mode was entered last."""
+    return float(run["mode"]["time_ns"][run["mode"]["mode"] == mode][-1]) * 1e-9
+
+
+def currents(run: Run, since: float, until: float) -> FloatArray:
+    """Return |I| of the coil that carried most at each sample of the truth in an interval."""
+    time = run["truth"]["time_ns"] * 1e-9
+    largest: FloatArray = np.abs(run["truth"]["current"]).max(axis=1)
+    return largest[(time >= since) & (time < until)]
+
+
+def true_angle(run: Run) -> FloatArray:
+    """Return theta of the truth (n,), rad."""
+    return np.asarray(2.0 * np.arcsin(run["truth"]["quaternion"][:, 1]))
+
+
+def released(q2: float, rate: float) -> Simulation:
+    """Return the demonstration's world with another release: q2 and rate, rad/s."""
+    return configuration.replace(demo_world(), release=Release(q2=q2, rate=rate))
