@@ -38,7 +38,7 @@ class Service:
         return int(self.show("MainPID"))
 
     def driven(self) -> bool:
-        """Tell whether a coil carries current; the devices of a busy machine may take a moment to say."""
+        """Return whether a coil carries current; the devices of a busy machine may take a moment to say."""
         for _ in range(50):
             with contextlib.suppress(TimeoutError):
                 return any(self._bus.call("currents"))
@@ -143,7 +143,7 @@ def _damaged(service: Service) -> dict[str, Any]:
 
 
 def _devices_closed() -> bool:
-    """Tell whether a unit with the service's device policy is kept from a device that any other may open."""
+    """Return whether the service's device policy keeps a unit from a device that others may open."""
 
     def opens(policy: str) -> bool:
         Path("/run/systemd/system/probe.service").write_text(_PROBE.format(policy), encoding="ascii")

@@ -26,7 +26,7 @@ ROOT = Path(__file__).resolve().parents[3]
 
 
 def is_drawn(path: Path) -> bool:
-    """Tell whether a picture is more than its white paper."""
+    """Return whether a picture is more than its white paper."""
     return bool(imread(path)[..., :3].std() > 0.01)
 
 

@@ -152,7 +152,7 @@ def _write(folder: Path, load: Load, flights: dict[str, Figures], grids: dict[st
 
 
 def fifo_allowed() -> bool:
-    """Tell whether a process started from here may have SCHED_FIFO."""
+    """Return whether a process started from here may have SCHED_FIFO."""
     able = ctypes.CDLL(None).prctl(_PR_CAPBSET_READ, _CAP_SYS_NICE, 0, 0, 0) == 1 and os.geteuid() == 0
     return able or resource.getrlimit(resource.RLIMIT_RTPRIO)[0] >= PRIORITY
 

@@ -64,7 +64,7 @@ def faint_frame(frame: int, seed: int) -> dict[str, Any]:
 
 
 def _on_a_path(points: FloatArray, scene: Scene) -> BoolArray:
-    """Tell which points (n, 2) px lie on the path of any star."""
+    """Return which points (n, 2) px lie on the path of any star."""
     on = np.zeros(len(points), dtype=np.bool_)
     for first, last in ((scene.start, scene.middle), (scene.middle, scene.end)):
         chord = last - first

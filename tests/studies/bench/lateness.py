@@ -44,7 +44,7 @@ def on_grid(starts_ns: Times, period_ns: int, first: int, count: int) -> Grid:
 
 
 def stalled(machine: Grid) -> npt.NDArray[np.bool_]:
-    """Tell which slots the bare loop lost, itself or one of their neighbours.
+    """Return which slots the bare loop lost, itself or one of their neighbours.
 
     Neighbours count because a stall need not begin and end for both loops within the same slot: one of them
     may still be at work, the other asleep.
@@ -53,7 +53,7 @@ def stalled(machine: Grid) -> npt.NDArray[np.bool_]:
 
 
 def robbed(loop: Grid, noted_ns: Times, stolen_ns: Times) -> npt.NDArray[np.bool_]:
-    """Tell during which slots the host gave others what makes a slot lost, and half of how late it was.
+    """Return which slots lost to the host's other guests the time of a lost slot, and half of their lateness.
 
     A slot lasts from its predecessor's time to the look after it was served: `stolen_ns`, of all cores since
     boot, was looked at when `noted_ns`.

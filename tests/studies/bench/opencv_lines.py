@@ -93,7 +93,7 @@ def merge(segments: FloatArray, frame: Prepared) -> FloatArray:
 
 
 def _touching(segments: FloatArray) -> BoolArray:
-    """Tell which segments (n, n) are parallel and have an end at the other."""
+    """Return which segments (n, n) are parallel and have an end at the other."""
     chord = segments[:, 1] - segments[:, 0]
     angle = np.arctan2(chord[:, 1], chord[:, 0])
     apart = np.abs((angle[:, None] - angle + 0.5 * np.pi) % np.pi - 0.5 * np.pi)

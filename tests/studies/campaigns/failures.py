@@ -157,7 +157,7 @@ def summarise(results: Sequence[Result], out: Path) -> Summary:
 
 
 def _worth_a_line(result: Result) -> bool:
-    """Tell whether a frame is to be looked at: wrong, overconfident, refused though stars move, or warned."""
+    """Return whether a frame needs a look: wrong, overconfident, refused though stars move, or warned."""
     if result["verdict"] == AT_REST:
         return bool(result["warnings"])
     return bool(result["reason"] or result["warnings"])

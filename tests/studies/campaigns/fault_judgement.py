@@ -38,15 +38,15 @@ OFF_SURELY, GAIN_ERROR = 0.015, 0.2
 LOOKED_FROM, LOOKED = 2.0, 3.0
 """s: from when in a flight the monitor's mean is whole, and how long an upset's trace is looked for."""
 FEW = 3
-"""Samples of the unit, more or less, that are nothing."""
+"""Samples of the unit: a difference up to this is no effect."""
 BACK_WITHIN = 2.0
-"""s, of a part that can be reached again."""
+"""s: limit for a part's recovery once it answers again."""
 _OUT_OF_REACH = {"nack", "slow", "intermittent"}
 _KINDS: dict[str, EventKind] = {kind.name: kind for kind in EVENTS}
 
 
 def judge(flown: Run, kind: FaultKind, entry: FaultEntry) -> Result:
-    """Tell from a flight's logs what a fault did."""
+    """Return the judgement of a fault from its flight's logs."""
     at = entry.at or 0.0
     span = DURATION - at if entry.span is None else entry.span
     end = at if kind.momentary else min(at + span, DURATION)
@@ -81,14 +81,14 @@ def judge(flown: Run, kind: FaultKind, entry: FaultEntry) -> Result:
 
 
 def _is_exercised(flown: Run, kind: FaultKind, at: float, end: float) -> bool:
-    """Tell whether the broken thing was asked for anything while it was broken."""
+    """Return whether the part was in use while its fault lasted."""
     control = flown["control"]
     time = control["time_ns"] * 1e-9
     inside = (time >= at) & (time < max(end, at + 1.0))
     written = np.abs(control["current_written"][inside])
     device, _, axis = kind.device.partition("-")
     if device in {"coil", "bridge"}:
-        return _is_missed(control["current_written"][inside][:, "xyz".index(axis)], kind.kind)
+        return _is_driven(control["current_written"][inside][:, "xyz".index(axis)], kind.kind)
     if kind.name in {"pwm: stuck", "pwm: delayed", "pwm: bits"}:
         return bool((written > DRIVEN).any(axis=1).sum() * CYCLE > 1.0)
     if kind.name == "monitor: wrong":
@@ -98,20 +98,20 @@ def _is_exercised(flown: Run, kind: FaultKind, at: float, end: float) -> bool:
         return _is_behind(flown, kind, inside)
     if kind.kind == "upset" or device == "camera":
         return _is_upset(flown, device, at) if kind.kind == "upset" else _is_frame_spoiled(kind.kind, at, end)
-    return device not in {"planner", "vision"} or _is_worker_met(flown, kind, at, end)
+    return device not in {"planner", "vision"} or _is_worker_busy(flown, kind, at, end)
 
 
-def _is_missed(own: FloatArray, kind: str) -> bool:
-    """Tell whether a broken coil or bridge was driven for long; A of the currents (n,) that were written.
+def _is_driven(own: FloatArray, kind: str) -> bool:
+    """Return whether a broken coil or bridge was driven for long, from the commanded currents (n,) A.
 
-    A leg that is stuck low is missed only where it should be high: input A drives forwards, B backwards.
+    A leg stuck low has an effect only where it should be high: input A drives forwards, B backwards.
     """
     driven = {"a-low": own > DRIVEN, "b-low": own < -DRIVEN}.get(kind, np.abs(own) > DRIVEN)
     return kind.endswith("high") or bool(driven.sum() * CYCLE > 2.5)
 
 
-def _is_worker_met(flown: Run, kind: FaultKind, at: float, end: float) -> bool:
-    """Tell whether a worker that was broken had a job."""
+def _is_worker_busy(flown: Run, kind: FaultKind, at: float, end: float) -> bool:
+    """Return whether a worker had a job during its fault."""
     jobs = flown["job_timing"]
     when = jobs["time_ns"] * 1e-9
     mine = np.array([to_text(name) == kind.device for name in jobs["name"]], dtype=bool)
@@ -153,13 +153,13 @@ def _is_upset(flown: Run, device: str, at: float) -> bool:
 
 
 def _is_frame_spoiled(kind: str, at: float, end: float) -> bool:
-    """Tell whether a frame should have come while the camera was broken, and was the worse for it."""
+    """Return whether the fault spoilt a frame that was due."""
     due = np.arange(0.0, DURATION, FRAME_PERIOD) + FRAME_EXPOSURE + FRAME_READOUT
     spoiled = due[(due >= at) & (due < end)]
     if kind == "torn":
-        spoiled = spoiled[spoiled > FRAME_PERIOD]  # the first one has none before it
+        spoiled = spoiled[spoiled > FRAME_PERIOD]  # the first frame has no previous one
     if kind == "slow":
-        # It is the triggers that are lost, and of a frame that is read out already nothing is.
+        # Triggers are lost, not frames that are already read out.
         triggers = np.arange(0.0, DURATION, FRAME_PERIOD)
         spoiled = triggers[(triggers >= at) & (triggers < end)]
     if kind == "delayed":
@@ -181,7 +181,7 @@ def _recovered(
         case "monitor":
             finite, time = np.isfinite(house["coil_current"]), house["time_ns"] * 1e-9
             lost = time[~finite & (time >= end) & (time < end + LOOKED)]
-            # What happens at once is noticed only after it.
+            # A momentary fault shows only after it.
             found = _first(time[finite], end)
             if kind.momentary and len(lost):
                 later = _first(time[finite], float(lost[-1]))
@@ -209,7 +209,7 @@ def _first(times: FloatArray, end: float) -> float | None:
 
 
 def _steady(times: FloatArray, end: float, gap: float, count: int = 8) -> float | None:
-    """Return when after `end` samples come without a gap again."""
+    """Return how long after `end` samples come without a gap again, s."""
     later = times[times >= end - 1e-6]
     short = np.diff(later) < gap
     for first in range(len(short) - count):
@@ -219,7 +219,7 @@ def _steady(times: FloatArray, end: float, gap: float, count: int = 8) -> float 
 
 
 def _obeyed(flown: Run, end: float) -> float | None:
-    """Return when after `end` the coils carry what the log says is written to them, half a second long."""
+    """Return how long after `end` the coils carry the logged commands for half a second, s."""
     control, truth = flown["control"], flown["truth"]
     count = min(len(control), len(truth) - 1)
     # The truth's sample at a cycle's start is of the current before its command.
@@ -244,8 +244,8 @@ def _is_unmeasured(flown: Run) -> BoolArray:
 def _blind_current(flown: Run, also_unsteered: bool) -> float:
     """Return the largest current in A while nothing was measured for longer than the grace.
 
-    The estimate may be carried on meanwhile; no coil may be driven by it. `also_unsteered` looks at cycles
-    in which the loop steered no more for that long as well: what came was refused.
+    The estimate may be propagated meanwhile, but may drive no coil. `also_unsteered` adds cycles in which the
+    loop has not steered for that long because it refused the measurements.
     """
     off = flown["control"]["state"] == 0
     cycles = round(BLIND_GRACE / CYCLE)
@@ -264,7 +264,7 @@ def _carried(flown: Run) -> FloatArray:
 def _reaction_right(
     flown: Run, kind: FaultKind, at: float, end: float, warned: Sequence[tuple[float, str]]
 ) -> bool | None:
-    """Tell whether the reaction that the table asks for came; None where it asks for none."""
+    """Return whether the table's reaction followed; None where the table has none."""
     part = part_of(kind)
     times = [time for time, name in warned if name == REACTION.get(part)]
     control = flown["control"]
@@ -277,12 +277,12 @@ def _reaction_right(
             if lost.any() and driven[(time >= at - 0.5) & (time <= at + 0.5)].any():
                 right = bool(times) and not control["state"][lost].any()
         case "coil" | "bridge":
-            # One that is soon taken out of use is driven for less than it takes to be sure that it could be.
+            # A coil that is soon isolated is driven too briefly to count as exercised.
             if times or _is_exercised(flown, kind, at, end):
                 right = bool(times)
         case "pwm" | "bus":
             if times and driven[(time >= times[0] - 1.0) & (time <= times[0])].any():
-                # A chip out of reach holds what it has: then it has to obey soon after it is back.
+                # An unreachable chip keeps its outputs: it must obey soon after it is back.
                 carried = _carried(flown)
                 reported = (time >= times[0] - CYCLE) & (time <= end + BACK_WITHIN)
                 zero = np.abs(control["current_written"]).max(axis=1) < ZERO

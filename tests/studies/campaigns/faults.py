@@ -108,7 +108,7 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
     for result in results:
         by_fault[result["fault"]].append(result)
     lines = [
-        f"{len(results)} flights of {DURATION:g} s; detected: of those in which it met anything",
+        f"{len(results)} flights of {DURATION:g} s; detected: of the exercised faults",
         f"{'fault':22}{'detected':>10}{'in, s (worst)':>16}  {'first event':18}{'reaction':28}"
         f"{'right':>7}{'recovered in, s':>16}{'blind mA':>10}{'log':>8}",
     ]

@@ -31,7 +31,7 @@ from tests.studies.campaigns.kill_board import Board
 
 LIMIT_S = 0.5
 KILLS = 16
-"""Of a board: as many as the most crashes after which a configuration may lead to safe mode."""
+"""Of a board: the highest `crash_limit` of a configuration."""
 
 EARLY = 0.25
 """Share of the kills that come before the flight is ready."""
@@ -76,7 +76,7 @@ def run(case: Case) -> Result:
 
 
 def _kill(board: Board, number: int, rng: np.random.Generator) -> Result:
-    """Start a flight, kill it, look at coils, log and state."""
+    """Start a flight, kill it, check coils, log and state."""
     early = bool(rng.random() < EARLY)
     share, target = float(rng.random()), float(rng.uniform(-_TARGET, _TARGET))
     with board.flight(number, target, KILLS) as flight:
@@ -104,9 +104,9 @@ def _kill(board: Board, number: int, rng: np.random.Generator) -> Result:
 
 
 def _current_until(board: Board, kill_ns: int) -> float:
-    """Wait for a moment; return the largest current of the last tenth of a second, or of the last question.
+    """Wait for a moment; return the largest current of the last tenth of a second, or of the last sample.
 
-    A flight takes its coils' current off now and then, to hear the magnetometer: one question is not enough.
+    A flight switches its coils off now and then to read the magnetometer: one sample is not enough.
     """
     time.sleep(max(0.0, (kill_ns - time.monotonic_ns()) * 1e-9 - _BEFORE_S))
     current = board.current()
@@ -119,7 +119,7 @@ def _current_until(board: Board, kill_ns: int) -> float:
 def _watch_coils(board: Board, killed_ns: int, before: float) -> tuple[float, float]:
     """Return when the coils came to zero for good, s after the kill, and the largest current after the limit.
 
-    The first answer of zero counts: it is late by the time between two questions, never early.
+    The first answer of zero counts: it is late by at most the time between two samples, never early.
     Coils that carried current are watched beyond the limit, others for long enough to see them stay at zero.
     """
     zero_after = beyond = 0.0
@@ -141,7 +141,7 @@ def _watch_coils(board: Board, killed_ns: int, before: float) -> tuple[float, fl
 
 
 def _log_of(folder: Path, ready_for: float | None) -> Result:
-    """Tell whether the log reads to its last whole packet, and how much of the flight is in it."""
+    """Return whether the log reads to its last whole packet, and how much of the flight is in it."""
     try:
         flown = read_run(folder)
     except UsageError as error:
@@ -152,7 +152,7 @@ def _log_of(folder: Path, ready_for: float | None) -> Result:
 
 
 def _whole(flown: Run) -> bool:
-    """Tell whether nothing is amiss in a run's logs but for one packet cut short at the end of each."""
+    """Return whether a run's logs are whole, except for one truncated packet at the end of each."""
     return all(
         log.skipped_bytes + log.other_versions + sum(log.missing.values()) == 0
         and log.truncated_bytes < LONGEST_PACKET
@@ -161,10 +161,10 @@ def _whole(flown: Run) -> bool:
 
 
 def _state_of(board: Board, counted: bool) -> Result:
-    """Tell whether the kept state is whole and knows of all kills but perhaps an early one.
+    """Return whether the stored state is whole and lists all kills, except perhaps an early one.
 
-    Of every boot so far it must know that it did not end cleanly: the last one by `running`, the others by
-    name. A flight that was ready must have counted itself.
+    It must list every boot so far as unclean, the last by `running`, the others by name. A flight that was
+    ready must have counted itself.
     """
     state, problems = board.kept()
     new = state.boot_count - board.boots
@@ -203,7 +203,7 @@ def _end(board: Board, number: int, rng: np.random.Generator) -> Result:
 
 
 def summarise(results: Sequence[Result], folder: Path) -> Summary:
-    """Return how long the coils stayed on, over those kills in which they were, and all that was judged."""
+    """Return how long the coils stayed on after kills with current, and the other judgements."""
     del folder
     kills = [kill for result in results for kill in result["kills"]]
     ends = [result["end"] for result in results if result["end"] is not None]
@@ -225,7 +225,7 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
         "logs_readable": sum(kill["log"]["readable"] for kill in kills),
         "states_whole": sum(kill["state"]["whole"] for kill in kills),
         "kills_counted": sum(kill["state"]["counted"] for kill in kills),
-        "polite_ends": sum(end["status"] == 0 and end["clean"] and end["remembered"] for end in ends),
+        "clean_ends": sum(end["status"] == 0 and end["clean"] and end["remembered"] for end in ends),
         "modes_right": sum(end["mode_right"] for end in ends),
         "safe_wanted": sum(end["safe_wanted"] for end in ends),
         "left_behind": sum(end["left_behind"] for end in ends),
@@ -237,11 +237,11 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
         f"ready, {facts['driven']} with current in the coils\n"
         f"coils at zero after: median {spread['median']:.3f} s, 99 % {spread['p99']:.3f} s, "
         f"worst {spread['worst']:.3f} s (limit {LIMIT_S:g} s, beyond it {facts['beyond_limit']})\n"
-        f"largest current later than that: {1e3 * facts['current_after_a']:.1f} mA\n"
-        f"flight log readable: {facts['logs_readable']}, kept state whole: {facts['states_whole']}, "
+        f"largest current beyond the limit: {1e3 * facts['current_after_a']:.1f} mA\n"
+        f"flight log readable: {facts['logs_readable']}, stored state whole: {facts['states_whole']}, "
         f"kill remembered: {facts['kills_counted']} of {facts['kills']}\n"
         f"flights that did not start: {facts['starts_failed']}\n"
-        f"last flight of a board ended cleanly: {facts['polite_ends']}, in the right mode: "
+        f"last flight of a board ended cleanly: {facts['clean_ends']}, in the right mode: "
         f"{facts['modes_right']} of {facts['boards']} (safe: {facts['safe_wanted']}), "
         f"processes left behind: {facts['left_behind']}\n"
         f"{facts['wall_s_per_kill']:.2f} s a kill\n"

@@ -17,7 +17,7 @@ from sim_hal.serving.device_link import RemoteI2cBus
 from tests.hal.guardian.live_flight import LiveFlight, write_config
 
 START_S = 1.5
-"""Taken for the time from exec to READY until one was seen."""
+"""s, assumed from exec to READY until the first start was measured."""
 
 AT_MOST_S = 60.0
 

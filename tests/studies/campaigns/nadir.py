@@ -194,7 +194,7 @@ def _line(one: dict[str, Any]) -> str:
 
 
 def _worth_a_line(result: Result) -> bool:
-    """Tell whether a frame is to be looked at: wrong, none, far beyond its covariance, or warned."""
+    """Return whether a frame is to be looked at: wrong, none, far beyond its covariance, or warned."""
     return bool(result["verdict"] != RIGHT or result["nees"] > 20.0 or result["warnings"])
 
 

@@ -30,7 +30,7 @@ def test_after_each_kill_coils_log_and_state_are_sound_and_the_next_flight_start
     assert (facts["kills"], facts["early"]) == (2, 1)
     assert (facts["beyond_limit"], facts["current_after_a"]) == (0, 0.0)
     assert facts["logs_readable"] == facts["states_whole"] == facts["kills_counted"] == 2
-    assert facts["polite_ends"] == facts["modes_right"] == 1
+    assert facts["clean_ends"] == facts["modes_right"] == 1
     assert facts["starts_failed"] == facts["left_behind"] == 0
 
 

@@ -293,5 +293,5 @@ def _anything(draw: Draw) -> str:
 
 
 def _asks_for_help(word: str) -> bool:
-    """Tell whether a word is answered with text whatever else is asked: argparse takes beginnings, too."""
+    """Return whether a word is answered with text whatever else is asked: argparse takes beginnings, too."""
     return word == "-h" or (len(word) > 2 and any(name.startswith(word) for name in ("--help", "--version")))
