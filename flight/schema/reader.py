@@ -51,11 +51,6 @@ def load_camera(path: Path) -> Camera:
     return camera
 
 
-def load_whole(path: Path, shape: type[T]) -> T:
-    """Read a file that is one `shape` and nothing else. Raises ConfigError."""
-    return convert(read_document(read_text(path), str(path)), shape)
-
-
 def simulation_section(text: str, name: str, shape: type[T]) -> T | None:
     """Return the `simulation` section of configuration text as `shape`, None when there is none.
 

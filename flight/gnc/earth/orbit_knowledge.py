@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from sgp4.api import SGP4_ERRORS, Satrec
@@ -40,14 +39,6 @@ class OrbitState:
     def nadir(self) -> FloatArray:
         """The direction (3,) of the Earth's centre."""
         return np.asarray(-self.position / np.linalg.norm(self.position))
-
-
-class OrbitKnowledge(Protocol):
-    """A source of the satellite's position and velocity."""
-
-    def at(self, julian_date: float) -> OrbitState:
-        """Return the state at a Julian date UTC. Raises OrbitError."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)

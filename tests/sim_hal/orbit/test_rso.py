@@ -17,7 +17,8 @@ from hal.interfaces.errors import OutOfRange
 from sim_hal.star_camera import StarCameraModel, expected_electrons
 from sim_hal.star_camera.rso import TRACK_ERROR, ResidentSpaceObject, directions, source_tracks
 from sim_hal.worlds import sun
-from sim_hal.worlds.opportunities import (
+from sim_hal.worlds.orbit import KeplerianElements, propagate
+from tests.studies.campaigns.opportunities import (
     Scenario,
     constant_slew,
     exposure_attitudes,
@@ -26,7 +27,6 @@ from sim_hal.worlds.opportunities import (
     table_4_3,
     windows,
 )
-from sim_hal.worlds.orbit import KeplerianElements, propagate
 
 EPOCH = 2_461_041.5
 """2026 January 1.0."""

@@ -23,7 +23,8 @@ from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector
 from flight.gnc.vision.objects.report import ObjectReport
 from sim_hal.star_camera import StarCameraModel, render
 from sim_hal.star_camera.rso import source_tracks
-from sim_hal.worlds.opportunities import (
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.opportunities import (
     Opportunity,
     Scenario,
     constant_slew,
@@ -31,7 +32,6 @@ from sim_hal.worlds.opportunities import (
     opportunities,
     table_4_3,
 )
-from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.rso import (
     EXPOSURE,
     MATCH_PX,

@@ -15,7 +15,8 @@ from msgspec import Meta
 
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import attitude_matrix
-from flight.schema import reader
+from flight.schema.conversion import convert
+from flight.schema.document import read_document, read_text
 from flight.schema.errors import ConfigError
 from flight.schema.sections import NotNegative, Positive, Quaternion, Section
 
@@ -95,7 +96,7 @@ class SensorSuite(Section, frozen=True, kw_only=True):
 
 def load(path: Path) -> SensorSuite:
     """Read and check a sensor suite. Raises ConfigError."""
-    suite = reader.load_whole(path, SensorSuite)
+    suite = convert(read_document(read_text(path), str(path)), SensorSuite)
     for kind, named in (("cameras", suite.cameras), ("solar_strings", suite.solar_strings)):
         names = [entry.name for entry in named]
         for index, name in enumerate(names):
