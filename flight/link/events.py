@@ -96,6 +96,13 @@ POWER_DOUBTED = EventKind(
 )
 POWER_FAULT = EventKind(32, "power-fault", _WARNED, "the current monitor does not answer")
 POWER_RECOVERED = EventKind(33, "power-recovered", _TOLD, "the current monitor answers again")
+COMMANDS_DOUBTED = EventKind(
+    38,
+    "commands-doubted",
+    _WARNED,
+    "the body does not move as commanded: the filter follows the gyro alone",
+)
+COMMANDS_TRUSTED = EventKind(39, "commands-trusted", _TOLD, "the body follows the commands again")
 TARGET = EventKind(40, "target", _TOLD, "a new attitude is commanded")
 PLAN_STRETCHED = EventKind(41, "plan-stretched", _TOLD, "no path within the horizon: stretched")
 PLAN_REFUSED = EventKind(42, "plan-refused", _WARNED, "a plan was not flown, with the reason")

@@ -17,9 +17,8 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from flight.gnc.estimation.checkpoints import CheckpointHistory
+from flight.gnc.estimation.command_doubt import CommandDoubt
 from flight.gnc.estimation.commands import CommandHistory
 from flight.gnc.estimation.estimate import Estimate
 from flight.gnc.estimation.filter_settings import FilterSettings, process_noise, slow_prior
@@ -72,6 +71,7 @@ class AttitudeFilter:
         self._commands = CommandHistory(body, settings.history_ns)
         noise = process_noise(body, settings)
         self._model = Model(body, noise, self._commands, settings.longest_step, settings.gates())
+        self._doubt = CommandDoubt(self._model)
         self._history = CheckpointHistory(settings.history_ns)
         self._branch: _Branch | None = None
         self._refused_in_a_row: dict[type[Measurement], int] = {}
@@ -89,7 +89,8 @@ class AttitudeFilter:
         Commands come in order of time, each before the measurements under it. Without `field` the body's own
         is used. Currents that are not `known` are only a guess.
         """
-        self._commands.record(time_ns, currents, field, known)
+        doubt = self._doubt
+        self._commands.record(max(time_ns, doubt.ended_ns), currents, field, known and not doubt.active)
 
     def mark_unknown(self, since_ns: int) -> None:
         """Treat the currents recorded since then as unknown: they may not have flown.
@@ -140,6 +141,8 @@ class AttitudeFilter:
             self.late += 1
             return False
         self._count(type(measurement), used)
+        if self._history and (since_ns := self._doubt.judge(self._history.newest)) is not None:
+            self.mark_unknown(since_ns)
         if self._branch is None:  # a branch needs its base
             self._history.forget(measurement.time_ns)
         return used
@@ -178,6 +181,11 @@ class AttitudeFilter:
         branch.applied(used)
 
     @property
+    def doubts_commands(self) -> bool:
+        """Whether the body does not move as commanded, so that the coil currents are unknown."""
+        return self._doubt.active
+
+    @property
     def latency(self) -> float:
         """The estimated age of the inertial unit's samples at their stamp, s, limited to plausible values."""
         found = self._history.newest.state.latency if self._history else self._prior.latency
@@ -185,30 +193,15 @@ class AttitudeFilter:
 
     def at(self, time_ns: int) -> Estimate:
         """Return the estimate propagated to `time_ns`; the filter itself does not change."""
-        return self._estimate(self._history.newest, time_ns, self.measured_ns)
+        return self._model.estimate(self._history.newest, time_ns, self.measured_ns)
 
     def past(self, time_ns: int) -> Estimate | None:
         """Return the estimate at a past time, None before the first checkpoint kept."""
         then = self._history.at(time_ns)
-        return None if then is None else self._estimate(then, time_ns, then.time_ns)
+        return None if then is None else self._model.estimate(then, time_ns, then.time_ns)
 
     def _is_newest(self, measurement: Measurement) -> bool:
         return bool(self._history) and measurement.begin_ns >= self._history.newest.time_ns
-
-    def _estimate(self, then: Checkpoint, time_ns: int, measured_ns: int) -> Estimate:
-        state, covariance = self._model.propagate(then.state, then.covariance, then.time_ns, time_ns)
-        return Estimate(
-            time_ns,
-            np.array(state.quaternion),
-            np.array(state.rate),
-            np.array(state.bias),
-            np.array(state.disturbance),
-            state.parameters,
-            covariance,
-            measured_ns,
-            state.latency,
-            np.array(state.field_bias),
-        )
 
     def _insert(self, index: int, measurement: Measurement) -> bool:
         """Return to the first `index` checkpoints; apply the later measurements again with `measurement`."""

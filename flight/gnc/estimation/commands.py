@@ -13,11 +13,15 @@ from flight.gnc.math.arrays import FloatArray
 
 
 class CommandHistory:
-    """The recent commands in order of time; before the first no coil is driven."""
+    """The recent commands in order of time; before the first no coil is driven.
+
+    Attributes:
+        idle: the torquing of coils that are not driven.
+    """
 
     def __init__(self, body: RigidBody, history_ns: int) -> None:
         self._body = body
-        self._idle = body.torquing(np.zeros(3))
+        self.idle = body.torquing(np.zeros(3))
         self._history_ns = history_ns
         self._times: list[int] = []
         self._torquings: list[Torquing] = []
@@ -49,14 +53,14 @@ class CommandHistory:
     def at(self, time_ns: int) -> Torquing:
         """Return the torquing in force at a time."""
         index = max(bisect.bisect_right(self._times, time_ns) - 1, 0)
-        return self._torquings[index] if self._torquings else self._idle
+        return self._torquings[index] if self._torquings else self.idle
 
     def spans(self, from_ns: int, to_ns: int) -> Iterator[tuple[Torquing, int]]:
         """Yield each torquing in force between two times and its duration in ns, in order of time."""
         time_ns = from_ns
         index = max(bisect.bisect_right(self._times, from_ns) - 1, 0)
         while time_ns < to_ns:
-            torquing = self._torquings[index] if self._torquings else self._idle
+            torquing = self._torquings[index] if self._torquings else self.idle
             more = index + 1 < len(self._torquings)
             until_ns = min(to_ns, self._times[index + 1]) if more else to_ns
             if until_ns > time_ns:

@@ -13,9 +13,6 @@ from flight.gnc.estimation.slow_prior import SlowPrior
 from flight.gnc.math import chi_square
 from flight.gnc.math.arrays import FloatArray
 
-_UNKNOWN_FOR = 1.0
-"""s: an unknown current is modelled as white noise with the same effect over this time."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FilterSettings:
@@ -80,7 +77,7 @@ def process_noise(body: RigidBody, settings: FilterSettings) -> ProcessNoise:
         np.array([*settings.bias_walk**2 * free, *settings.disturbance_walk**2 * free]),
         settings.latency_walk**2,
         settings.field_bias_walk**2,
-        settings.unknown_current**2 * _UNKNOWN_FOR,
+        settings.unknown_current,
     )
 
 

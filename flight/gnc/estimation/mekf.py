@@ -20,12 +20,13 @@ from flight.gnc.estimation.turn import Vector, compose, exponential
 from flight.gnc.math.arrays import FloatArray
 
 
-def normalised_square(found: Innovation, covariance: FloatArray) -> tuple[float, FloatArray]:
-    """Return y^T S^-1 y, a chi-square with the degrees of freedom of y, and the gain P H^T S^-1."""
+def normalised_square(found: Innovation, covariance: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+    """Return y^T S^-1 y, a chi-square with the degrees of freedom of y; the gain P H^T S^-1; and S."""
     cross = covariance @ found.rows.T
-    weight = _inverted(found.rows @ cross + found.noise)
+    spread = found.rows @ cross + found.noise
+    weight = _inverted(spread)
     y = np.array(found.value)
-    return float(y @ weight @ y), cross @ weight
+    return float(y @ weight @ y), cross @ weight, spread
 
 
 def correct(

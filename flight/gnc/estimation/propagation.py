@@ -20,12 +20,17 @@ LONGEST_STEP = 0.025
 """s: the default limit of a step, the period of the testbed's loop."""
 
 
+_UNKNOWN_FOR = 0.3
+"""s: an unknown current is modelled as white noise with the same effect over this time, in which the guardian
+has zeroed the coils of a loop that stands."""
+
+
 class ProcessNoise(NamedTuple):
-    """Spectral densities of the process noise.
+    """Spectral densities of the process noise, and the largest current of a coil.
 
     `current` of one driven coil, A^2 s; `rate` (3, 3) rad^2/s^3; `walks` (6,) of bias (rad^2/s^3) and
-    disturbance (rad^2/s^5); `latency` s; `field_bias` T^2/s; `unknown_current` of each coil while its current
-    is not known, A^2 s.
+    disturbance (rad^2/s^5); `latency` s; `field_bias` T^2/s; `unknown_current` A of each coil while its
+    current is not known.
     """
 
     current: float
@@ -107,7 +112,7 @@ def _add_noise(
     if noise.current and any(torquing.driven):
         density = density + noise.current * ((by_current * torquing.driven) @ by_current.T)
     if not torquing.known:
-        density = density + noise.unknown_current * (by_current @ by_current.T)
+        density = density + noise.unknown_current**2 * _UNKNOWN_FOR * (by_current @ by_current.T)
     cross = (0.5 * dt * dt) * density
     covariance[TURN, TURN] += (dt**3 / 3.0) * density
     covariance[TURN, RATE] += cross

@@ -9,10 +9,12 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+import numpy as np
 
 from flight.gnc.estimation.commands import CommandHistory
-from flight.gnc.estimation.estimate import LATENCY
+from flight.gnc.estimation.estimate import LATENCY, Estimate
 from flight.gnc.estimation.innovation import innovation
 from flight.gnc.estimation.latency import Motion, considered, motion
 from flight.gnc.estimation.measurements import MeanRateMeasurement, Measurement, RateMeasurement
@@ -23,15 +25,26 @@ from flight.gnc.estimation.state import SIZE, State
 from flight.gnc.math.arrays import FloatArray
 
 
+def _nothing() -> FloatArray:
+    return np.zeros(0)
+
+
 @dataclass(slots=True, eq=False)
 class Checkpoint:
-    """A measurement, whether it passed the gate, and the state just after it."""
+    """A measurement, whether it passed the gate, and the state just after it.
+
+    Attributes:
+        departure: the innovation's components, and
+        spread: their standard deviations, of the measurement's unit; empty at the start.
+    """
 
     measurement: Measurement
     used: bool
     state: State
     covariance: FloatArray
     nis: float = math.nan
+    departure: FloatArray = field(default_factory=_nothing)
+    spread: FloatArray = field(default_factory=_nothing)
 
     @property
     def time_ns(self) -> int:
@@ -58,6 +71,22 @@ class Model:
                 self.body, self.noise, state, covariance, torquing, span_ns * 1e-9, self.longest_step
             )
         return state, covariance
+
+    def estimate(self, then: Checkpoint, time_ns: int, measured_ns: int) -> Estimate:
+        """Return the estimate of `time_ns` propagated from a checkpoint; measured at `measured_ns` last."""
+        state, covariance = self.propagate(then.state, then.covariance, then.time_ns, time_ns)
+        return Estimate(
+            time_ns,
+            np.array(state.quaternion),
+            np.array(state.rate),
+            np.array(state.bias),
+            np.array(state.disturbance),
+            state.parameters,
+            covariance,
+            measured_ns,
+            state.latency,
+            np.array(state.field_bias),
+        )
 
     def motion(self, state: State, covariance: FloatArray, time_ns: int) -> Motion:
         """Return how the rate changes around the time of a sample whose age is estimated."""
@@ -109,7 +138,7 @@ class Replay:
         if isinstance(measurement, RateMeasurement) and measurement.latency is not None:
             aging = model.motion(state, covariance, measurement.time_ns)
         found = innovation(state, measurement, model.body.suspended, aging)
-        nis, gain = normalised_square(found, covariance)
+        nis, gain, variance = normalised_square(found, covariance)
         used = 0.0 <= nis <= model.gate[len(found.value)]  # a NaN does not pass
         if aging is not None:
             gain = considered(gain)
@@ -119,7 +148,10 @@ class Replay:
             state, covariance = release_attitude(state, covariance, measurement)
         self._state, self._covariance = state, covariance
         alone = state._replace(kept=()) if state.kept else state
-        self.checkpoints.append(Checkpoint(measurement, used, alone, covariance[:SIZE, :SIZE], nis))
+        departure, spread = np.array(found.value), np.sqrt(variance.diagonal())
+        self.checkpoints.append(
+            Checkpoint(measurement, used, alone, covariance[:SIZE, :SIZE], nis, departure, spread)
+        )
 
     def _propagate_to(self, time_ns: int) -> None:
         self._state, self._covariance = self._model.propagate(

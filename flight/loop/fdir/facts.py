@@ -61,6 +61,7 @@ COIL_X_BROKEN, COIL_Y_BROKEN, COIL_Z_BROKEN = (
     Fact(f"coil-{axis}-broken", events.COIL_BROKEN, latching=True) for axis in "xyz"
 )
 COIL_SUSPECT = Fact("coil-suspect", events.COIL_SUSPECT)
+COMMANDS_DOUBTED = Fact("commands-doubted", events.COMMANDS_DOUBTED, events.COMMANDS_TRUSTED)
 POWER_DOUBTED = Fact("power-doubted", events.POWER_DOUBTED)
 POWER_FAULT = Fact("power-fault", events.POWER_FAULT, events.POWER_RECOVERED)
 CAMERA_LOST = Fact("camera-lost", events.CAMERA_LOST, events.CAMERA_RECOVERED)

@@ -102,6 +102,9 @@ class Navigation:
             self._streams.note("field", reading.time_ns, float(np.linalg.norm(reading.field)))
             self._heard_ns = reading.time_ns
         self._watch_line(now_ns)
+        doubted = self._filter.doubts_commands
+        text = "the rate departs from the commanded" if doubted else "the rate follows the commands"
+        self._facts.update(facts.COMMANDS_DOUBTED, doubted, now_ns, text)
         return readings
 
     def is_heard(self, now_ns: int) -> bool:

@@ -15,7 +15,7 @@ from tests.studies.campaigns.registry import CAMPAIGNS
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a campaign; return the exit status: 0 done, 2 wrong use, 130 broken off."""
-    listed = "\n".join(f"  {c.name:14} {c.purpose}" for c in CAMPAIGNS.values())
+    listed = "\n".join(f"  {c.name:15} {c.purpose}" for c in CAMPAIGNS.values())
     parser = argparse.ArgumentParser(
         prog="python -m tests.studies.campaigns",
         description="Run a Monte Carlo campaign on all cores. Broken off, it goes on where it was.",

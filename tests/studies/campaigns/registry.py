@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from tests.studies.campaigns.campaign import Campaign
+from tests.studies.campaigns.coil_faults import COIL_FAULTS
 from tests.studies.campaigns.consistency import CONSISTENCY
 from tests.studies.campaigns.controllers import CONTROLLERS_CAMPAIGN
 from tests.studies.campaigns.coverage import COVERAGE
@@ -33,6 +34,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         STEP_ROBUST,
         FAULTS,
         FAULTS_KILL,
+        COIL_FAULTS,
         SOAK,
         COVERAGE,
         ORBIT_ATTITUDE,

@@ -1,4 +1,4 @@
-"""While nobody knows what the coils carry the filter goes by its measurements, and learns nothing false."""
+"""While the coil currents are unknown the filter follows its measurements, and learns nothing false."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import pytest
 
 from flight.gnc.estimation.attitude_filter import AttitudeFilter
 from flight.gnc.estimation.commands import CommandHistory
+from flight.gnc.estimation.measurements import RateMeasurement
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import angle_about_axis_y
 from tests.flight.gnc.estimation.flights import SETTINGS, SUSPENDED, Flight, begin, fly, follow
@@ -29,21 +30,19 @@ def flown() -> Flight:
     return fly(5, END, suspended=True, driven=keep)
 
 
-def flown_after(flown: Flight, doubted: bool) -> tuple[AttitudeFilter, int]:
-    """Return the filter after a flight, and its refusals; `doubted`: it knows that the chip does not obey."""
+def filtered(flown: Flight, reported: bool, until: int = END) -> AttitudeFilter:
+    """Return the filter after the flight; the loop may report from `FOUND` on that the chip does not obey."""
     filter_ = begin(flown, True, dataclasses.replace(SETTINGS, unknown_current=LIMIT, gate_sigma=15.0))
-    follow(filter_, flown, 1, FOUND)
-    refused = filter_.refused
-    assert refused > 0, "half a second of it was enough to disagree"
-    if doubted:
+    follow(filter_, flown, 1, min(FOUND, until))
+    if reported:
         filter_.mark_unknown((STUCK - 4) * CYCLE_NS)
-    for cycle in range(FOUND, END):
+    for cycle in range(FOUND, until):
         filter_.catch_up(16)
         for sample in flown.samples[cycle]:
             filter_.measure(sample)
-        known = not doubted or cycle >= FREE_AGAIN
+        known = not reported or cycle >= FREE_AGAIN
         filter_.command(cycle * CYCLE_NS, flown.commands[cycle], flown.fields[cycle], known=known)
-    return filter_, filter_.refused - refused
+    return filter_
 
 
 def errors(filter_: AttitudeFilter, flown: Flight) -> FloatArray:
@@ -55,18 +54,34 @@ def errors(filter_: AttitudeFilter, flown: Flight) -> FloatArray:
     return np.asarray(np.abs(found - true) / sigma[[1, 4, 14]])
 
 
-def test_a_filter_that_knows_the_chip_does_not_obey_refuses_nothing_and_stays_consistent(
-    flown: Flight,
+@pytest.mark.parametrize("reported", [True, False])
+def test_reported_or_not_the_filter_refuses_nothing_and_stays_consistent(
+    flown: Flight, reported: bool
 ) -> None:
-    filter_, refused = flown_after(flown, doubted=True)
-    assert (refused, filter_.restarts) == (0, 0)
+    filter_ = filtered(flown, reported)
+    assert (filter_.refused, filter_.restarts) == (0, 0)
     assert errors(filter_, flown).max() < 4.0
 
 
-def test_a_filter_that_does_not_know_refuses_measurements_and_restarts(flown: Flight) -> None:
-    filter_, refused = flown_after(flown, doubted=False)
-    assert refused > 0
-    assert filter_.restarts > 0
+def test_a_chip_that_does_not_obey_is_noticed_within_a_quarter_of_a_second(flown: Flight) -> None:
+    assert not filtered(flown, reported=False, until=STUCK).doubts_commands
+    assert filtered(flown, reported=False, until=STUCK + 10).doubts_commands
+
+
+def test_the_commands_are_trusted_again_once_the_body_follows_them(flown: Flight) -> None:
+    assert filtered(flown, reported=False, until=FREE_AGAIN).doubts_commands
+    assert not filtered(flown, reported=False).doubts_commands
+
+
+def test_a_gyro_that_jumps_further_than_any_current_pushes_raises_no_doubt(flown: Flight) -> None:
+    filter_ = filtered(flown, reported=False, until=STUCK)
+    for cycle in range(STUCK, STUCK + 20):
+        for sample in flown.samples[cycle]:
+            wrong = isinstance(sample, RateMeasurement)
+            filter_.measure(dataclasses.replace(sample, rate=sample.rate + 0.1) if wrong else sample)
+        filter_.command(cycle * CYCLE_NS, flown.commands[cycle], flown.fields[cycle])
+    assert filter_.refused > 0
+    assert not filter_.doubts_commands
 
 
 def test_a_doubt_reaches_back_to_its_time_and_no_further() -> None:

@@ -1,0 +1,147 @@
+"""Decides from the gyro whether the coils carry the commanded currents.
+
+A command is an assumption, a measured rate is not. While a coil is broken the model predicts an acceleration
+that does not happen: the gyro's innovations, as large as their covariance in every healthy flight, leave it
+within one to a few samples. The currents are then unknown, from a little before, and the filter follows the
+gyro. A change of the rate that no coil current can cause is no reason: then the gyro itself is in doubt.
+
+The commands are trusted again when the rate follows them: over the last second a share g of the commanded
+change c of the rate is fitted to the gyro's samples, z = b + g c. The commands must have moved the body
+enough to fix g, g must be 1, and the residuals must be noise. A body that is not driven proves nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+
+from flight.gnc.estimation.measurements import RateMeasurement
+from flight.gnc.estimation.replay import Checkpoint, Model
+from flight.gnc.estimation.state import State
+from flight.gnc.math.arrays import FloatArray
+
+_WINDOWS = (1, 4, 16)
+"""Samples in a row whose mean departure is tested: strong faults show in one, weak ones in their mean."""
+_SURPRISE = 5.5
+"""Standard deviations of such a mean that begin a doubt; healthy flights reach 4."""
+_BEFORE_NS = 100_000_000
+"""The currents are unknown from this long before the first sample of the departure."""
+_MOST = 3.0
+"""Of the largest change: a reversed coil departs by two, and a sample's age is uncertain."""
+_SHORTEST_GAP, _LONGEST_GAP = 0.025, 0.25
+"""s between samples, over which currents may have acted: a longer silence would explain any departure."""
+_PROOF = 1.0
+"""s: the samples of this time prove the commands again."""
+_KNOWN_SHARE = 0.2
+"""Standard deviation of the fitted share below which the share proves something."""
+_SHARE_ERROR = 0.15
+"""Error of the share that the model's own error of the coils' gain explains."""
+
+
+class CommandDoubt:
+    """Judges the commands by the gyro's samples.
+
+    Attributes:
+        active: whether the commanded currents may not flow.
+        ended_ns: when they were trusted again last.
+    """
+
+    def __init__(self, model: Model) -> None:
+        self.active = False
+        self.ended_ns = 0
+        self._model = model
+        self._axes = slice(1, 2) if model.body.suspended else slice(3)
+        self._departures: deque[tuple[int, FloatArray]] = deque(maxlen=max(_WINDOWS))
+        self._samples: deque[tuple[int, FloatArray, FloatArray]] = deque()
+        self._forget()
+
+    def judge(self, newest: Checkpoint) -> int | None:
+        """Judge by the newest checkpoint, if it is of a rate and the body has coils.
+
+        Returns the time from which on the currents are unknown when a doubt begins, else None.
+        """
+        rate = newest.measurement
+        if not isinstance(rate, RateMeasurement) or not self._model.noise.unknown_current:
+            return None
+        if self.active:
+            self._weigh(newest.state, rate)
+            return None
+        return self._compare(newest)
+
+    def _compare(self, newest: Checkpoint) -> int | None:
+        """Test the departures from the model."""
+        time_ns = newest.time_ns
+        gap = (time_ns - self._departures[-1][0]) * 1e-9 if self._departures else _SHORTEST_GAP
+        most = self._most_change(newest.state, min(max(gap, _SHORTEST_GAP), _LONGEST_GAP))
+        departure, spread = newest.departure, newest.spread
+        if not (np.abs(departure) <= _SURPRISE * spread + _MOST * most).all():
+            return None
+        self._departures.append((time_ns, departure / spread))
+        sums = np.cumsum([value for _, value in reversed(self._departures)], axis=0)
+        for count in _WINDOWS:
+            if count <= len(sums) and np.abs(sums[count - 1]).max() > _SURPRISE * math.sqrt(count):
+                since_ns = self._departures[-count][0] - _BEFORE_NS
+                self.active = True
+                self._forget()
+                return since_ns
+        return None
+
+    def _weigh(self, state: State, rate: RateMeasurement) -> None:
+        """Note a sample, and end the doubt when the rate follows the commands."""
+        before_ns = self._samples[-1][0] if self._samples else rate.time_ns
+        commanded, natural = self._changes(state, before_ns, rate.time_ns)
+        self._natural = self._natural + natural
+        self._commanded = self._commanded + commanded
+        self._samples.append((rate.time_ns, rate.rate[self._axes] - self._natural, self._commanded))
+        while rate.time_ns - self._samples[0][0] > _PROOF * 1e9:
+            self._samples.popleft()
+            if self._follows(self._variance(state, rate)):
+                self.active, self.ended_ns = False, rate.time_ns
+                self._forget()
+                return
+
+    def _follows(self, variance: FloatArray) -> bool:
+        """Return whether the noted rates are b + c, with c the commanded changes."""
+        _, rates, commanded = zip(*self._samples, strict=True)
+        weight = 1.0 / np.sqrt(variance)
+        z, c = ((np.array(values) - np.mean(values, axis=0)) * weight for values in (rates, commanded))
+        information = float((c * c).sum())
+        if information * _KNOWN_SHARE**2 < 1.0:
+            return False
+        share = float((c * z).sum()) / information
+        residual = z - share * c
+        noise = math.sqrt(float((residual * residual).sum()) / residual.size)
+        tolerance = _SHARE_ERROR + 3.0 / math.sqrt(information)
+        return abs(share - 1.0) <= tolerance and noise <= 1.0 + 3.0 / math.sqrt(2.0 * residual.size)
+
+    def _forget(self) -> None:
+        self._departures.clear()
+        self._samples.clear()
+        self._natural: FloatArray = np.zeros(1)
+        self._commanded: FloatArray = np.zeros(1)
+
+    def _most_change(self, state: State, duration: float) -> FloatArray:
+        """Return the largest change of the rate, rad/s, that unknown currents can cause in `duration` s."""
+        model = self._model
+        idle = model.body.linearise(state.quaternion, state.rate, state.parameters, model.commands.idle, 0.0)
+        change = model.noise.unknown_current * np.abs(idle.by_current).sum(axis=1) * duration
+        return np.asarray(change[self._axes])
+
+    def _changes(self, state: State, from_ns: int, to_ns: int) -> tuple[FloatArray, FloatArray]:
+        """Return the model's change of the rate, rad/s, by the coils as commanded and by all else."""
+        commanded, natural = np.zeros(3), np.zeros(3)
+        for torquing, span_ns in self._model.commands.spans(from_ns, to_ns):
+            found = self._model.body.linearise(state.quaternion, state.rate, state.parameters, torquing, 0.0)
+            by_coils = state.parameters.gain * np.array(found.by_parameters)[:, 2]
+            commanded += span_ns * 1e-9 * by_coils
+            natural += span_ns * 1e-9 * (np.array(found.acceleration) + state.disturbance - by_coils)
+        return commanded[self._axes], natural[self._axes]
+
+    def _variance(self, state: State, rate: RateMeasurement) -> FloatArray:
+        """Return the variance of a sample, with that of the coils' noise in the middle of a proof."""
+        model = self._model
+        idle = model.body.linearise(state.quaternion, state.rate, state.parameters, model.commands.idle, 0.0)
+        by_coils = 0.5 * _PROOF * model.noise.current * (idle.by_current**2).sum(axis=1)
+        return np.asarray((rate.covariance.diagonal() + by_coils)[self._axes])

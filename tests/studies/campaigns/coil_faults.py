@@ -1,0 +1,165 @@
+"""Campaign `coil-faults`: the estimate while a coil does not carry the commanded current.
+
+Each run flies 20 s of the demonstration's loop in lock-step, without a camera, through two slews, and breaks
+one coil or one leg of a bridge at a random time, for 3 s or to the end. The inertial unit stays healthy. From
+log and truth: for how long after the fault's onset and end the estimated rate or angle is more than 5 of its
+own standard deviations off; how long after the onset measurements of the healthy unit are still refused; how
+often control was lost.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flight.gnc.math.arrays import FloatArray
+from flight.link import events
+from flight.link.telemetry.packets import to_text
+from flight.link.telemetry.reader import Run
+from flight.schema import reader as configuration
+from flight.schema.sections import Commands, CommandStep, Config, Modes
+from hal.interfaces.wires import SECOND_NS
+from sim_hal.faults.catalogue import CATALOGUE
+from sim_hal.settings import FaultEntry
+from tests.scenario.flights import demo_config, demo_world, fly
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+
+DURATION = 20.0
+SPAN = 3.0
+SIGMAS = 5.0
+LONGEST_BEYOND = 0.25
+"""s: the limit of the time that the estimate may be beyond `SIGMAS` after an onset or an end."""
+LONGEST_REFUSAL = 0.5
+"""s after the onset, from which on no measurement of the healthy unit may be refused."""
+
+
+def faults() -> list[str]:
+    """Return the faults of coils and bridges, by name."""
+    return [kind.name for kind in CATALOGUE.values() if kind.device.startswith(("coil", "bridge"))]
+
+
+def cases(runs: int, seed: int) -> list[Case]:
+    """Return `runs` flights of each fault, for 3 s and to the end."""
+    return [
+        Case(
+            f"{name} {span or 'lasting'} {k}", (seed, number, span is None, k), {"fault": name, "span": span}
+        )
+        for k in range(runs)
+        for number, name in enumerate(faults())
+        for span in (SPAN, None)
+    ]
+
+
+def run(case: Case) -> Result:
+    """Fly one case and judge its estimate."""
+    rng = np.random.default_rng(case.seed)
+    fault, span = case.parameters["fault"], case.parameters["span"]
+    entry = FaultEntry(fault=fault, at=float(rng.uniform(4.0, 11.0)), span=span)
+    section = configuration.replace(demo_world(), seed=int(rng.integers(1, 2**31)), faults=(entry,))
+    slews = (-0.3, 0.1) if rng.random() < 0.5 else (0.25, -0.2)
+    with tempfile.TemporaryDirectory() as place:
+        flown = fly(config_for(slews), Path(place) / "run", section=section)
+        return {"fault": fault, "span": span, "at": entry.at, **judge(flown, entry)}
+
+
+def config_for(slews: tuple[float, float]) -> Config:
+    """Return 20 s of the demonstration without its camera, with slews at 3.5 and 12 s."""
+    first, second = (CommandStep(at=at, slew=slew) for at, slew in zip((3.5, 12.0), slews, strict=True))
+    return configuration.replace(
+        demo_config(DURATION, camera=False),
+        modes=configuration.replace(Modes(), initial="hold"),
+        commands=configuration.replace(Commands(), timeline=(first, second)),
+    )
+
+
+def judge(flown: Run, entry: FaultEntry) -> Result:
+    """Return how long the estimate was dishonest, and when healthy measurements were refused."""
+    beyond, times = estimate_beyond(flown)
+    period = float(np.median(np.diff(times)))
+    end = entry.at + entry.span if entry.span is not None else DURATION
+    event = flown["event"]
+    names = [to_text(name) for name in event["name"]]
+    refused = event["time_ns"][np.array([name == events.IMU_REFUSED.name for name in names], bool)]
+    refused_s = refused / SECOND_NS - entry.at
+    return {
+        "beyond_s": period * int(beyond[(times >= entry.at) & (times < end)].sum()),
+        "beyond_after_end_s": period * int(beyond[times >= end].sum()),
+        "beyond_before_s": period * int(beyond[times < entry.at].sum()),
+        "refusals": len(refused_s),
+        "last_refusal_s": max(refused_s.tolist(), default=None),
+        "control_lost": names.count(events.CONTROL_LOST.name),
+        "found_s": _first(event, names, events.COIL_BROKEN.name, entry.at),
+    }
+
+
+def estimate_beyond(flown: Run) -> tuple[np.ndarray[Any, np.dtype[np.bool_]], FloatArray]:
+    """Return for each control cycle with an estimate whether it is beyond, and the mission times, s."""
+    control, truth = flown["control"], flown["truth"]
+    known = np.isfinite(control["rate"])
+    control = control[known]
+    times = control["time_ns"] / SECOND_NS
+    real = truth["time_ns"] / SECOND_NS
+    angle = 2.0 * np.arctan2(truth["quaternion"][:, 1], truth["quaternion"][:, 3])
+    off_rate = np.abs(control["rate"] - np.interp(times, real, truth["rate"][:, 1])) / control["rate_sigma"]
+    off_angle = np.abs(control["angle"] - np.interp(times, real, angle)) / control["angle_sigma"]
+    return (off_rate > SIGMAS) | (off_angle > SIGMAS), times
+
+
+def summarise(results: Sequence[Result], folder: Path) -> Summary:
+    """Return a row for each fault."""
+    del folder
+    by_fault: dict[str, list[Result]] = defaultdict(list)
+    for result in results:
+        by_fault[f"{result['fault']}{'' if result['span'] is None else ' for 3'}"].append(result)
+    lines = [
+        f"{'fault':24}{'flights':>8}{'beyond 5 sigma, s':>19}{'after its end, s':>18}{'refusals':>10}"
+        f"{'last, s':>9}{'control lost':>14}{'found, s':>10}"
+    ]
+    facts: dict[str, Any] = {"faults": {}}
+    for name, own in by_fault.items():
+        row = {
+            "flights": len(own),
+            "beyond_s": max(one["beyond_s"] for one in own),
+            "beyond_after_end_s": max(one["beyond_after_end_s"] for one in own),
+            "refusals": sum(one["refusals"] for one in own),
+            "last_refusal_s": max((one["last_refusal_s"] or 0.0 for one in own), default=0.0),
+            "control_lost": sum(one["control_lost"] for one in own),
+            "found_s": max((one["found_s"] for one in own if one["found_s"] is not None), default=None),
+        }
+        facts["faults"][name] = row
+        found = "-" if row["found_s"] is None else f"{row['found_s']:.2f}"
+        lines.append(
+            f"{name:24}{row['flights']:8}{row['beyond_s']:19.3f}{row['beyond_after_end_s']:18.3f}"
+            f"{row['refusals']:10}{row['last_refusal_s']:9.2f}{row['control_lost']:14}{found:>10}"
+        )
+    facts["flights"] = len(results)
+    facts["beyond"] = sum(
+        max(one["beyond_s"], one["beyond_after_end_s"]) >= LONGEST_BEYOND for one in results
+    )
+    facts["refused_late"] = sum((one["last_refusal_s"] or 0.0) > LONGEST_REFUSAL for one in results)
+    lines.append(
+        f"{len(results)} flights: beyond 5 sigma for {LONGEST_BEYOND} s or more in {facts['beyond']}; "
+        f"refusals later than {LONGEST_REFUSAL} s after the onset in {facts['refused_late']}"
+    )
+    return Summary("\n".join(lines) + "\n", facts)
+
+
+def _first(event: Any, names: Sequence[str], name: str, after: float) -> float | None:
+    """Return when an event came first, s after a time, None if never."""
+    at = event["time_ns"][np.array([one == name for one in names], bool)] / SECOND_NS - after
+    return min(at[at >= 0.0].tolist(), default=None)
+
+
+COIL_FAULTS = Campaign(
+    "coil-faults",
+    "the estimate while a coil does not carry its command",
+    cases,
+    run,
+    summarise,
+    20,
+)
