@@ -13,6 +13,7 @@ from tests.studies.campaigns.faults_kill import FAULTS_KILL
 from tests.studies.campaigns.lost_in_space import LOST_IN_SPACE
 from tests.studies.campaigns.nadir import NADIR
 from tests.studies.campaigns.orbit_attitude import ORBIT_ATTITUDE
+from tests.studies.campaigns.planner_edge import PLANNER_EDGE
 from tests.studies.campaigns.rso import RSO_SLEW, RSO_TRACK
 from tests.studies.campaigns.rso_orbits import RSO_ORBITS
 from tests.studies.campaigns.soak import SOAK
@@ -32,6 +33,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         NADIR,
         CONTROLLERS_CAMPAIGN,
         STEP_ROBUST,
+        PLANNER_EDGE,
         FAULTS,
         FAULTS_KILL,
         COIL_FAULTS,

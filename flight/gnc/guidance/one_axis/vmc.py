@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 
 import numpy as np
 
@@ -30,6 +31,11 @@ from flight.gnc.math.arrays import FloatArray
 NODES = 24
 """At 24 nodes the cost is within 1e-4 of the true optimum from 1.1 of the shortest horizon on, a stretched
 horizon within 1.5 % of the shortest; 16 nodes take half the time and leave 2.5 %."""
+FINE_NODES = 40
+"""For paths that run along the current's limit about the asked horizon: on 24 nodes they cost up to 0.3 %
+more than the optimum, on 40 up to 0.07 %."""
+_NEARLY = 1.03
+"""Of the asked horizon: up to here, finer nodes may still find a path over the asked horizon."""
 
 REFERENCE = 2.0
 MAX_STRETCH = 6.0
@@ -37,6 +43,7 @@ NODES_RANGE = (8, 40)
 HORIZON_RANGE = (1e-3, 1e5)
 FASTEST = 100.0
 LEAST_PRICED = 1.0
+_ALONG_LIMIT = 0.99
 
 
 class PlanStatus(StrEnum):
@@ -111,8 +118,8 @@ def plan(
         raise PlanningError(f"time_price is {time_price} W: it must be finite and positive")
     boundary = Boundary(start_q2, q2_rate_of(start_q2, start_rate), end_q2, q2_rate_of(end_q2, end_rate))
 
-    def program_at(time: float) -> Program:
-        return Program(plant, Family.around(boundary, time, reference, nodes), q2_limit, time)
+    def program_at(time: float, count: int = nodes) -> Program:
+        return Program(plant, Family.around(boundary, time, reference, count), q2_limit, time)
 
     search = Search(program_at, _remains(last, nodes))
     longest = max_stretch * horizon
@@ -122,11 +129,23 @@ def plan(
         program, trial = search.priced(horizon, min(LEAST_PRICED, longest), longest, time_price)
     if trial is None:
         raise PlanningError(
-            f"no path from q2 {start_q2:.4f} at {start_rate:.4f} rad/s to {end_q2:.4f} at {end_rate:.4f} "
-            f"rad/s keeps |I| <= {plant.current_limit} A and |q2| <= {q2_limit} within {longest:.1f} s"
+            f"no path was found from q2 {start_q2:.4f} at {start_rate:.4f} rad/s to {end_q2:.4f} at "
+            f"{end_rate:.4f} rad/s with |I| <= {plant.current_limit} A and |q2| <= {q2_limit} over "
+            f"{horizon:g} to {longest:.1f} s"
         )
     asked = horizon if time_price is None else trial.horizon
-    return _assemble(program, trial, boundary, reference, asked, search.evaluations, end_rate)
+    found = _assemble(program, trial, boundary, reference, asked, search.evaluations, end_rate)
+    along_limit = found.peak_current >= _ALONG_LIMIT * plant.current_limit
+    if time_price is not None or nodes >= FINE_NODES or not along_limit or trial.horizon > _NEARLY * asked:
+        return found
+    search = Search(
+        partial(program_at, count=FINE_NODES), _remains(found.path, FINE_NODES), search.evaluations
+    )
+    program, trial = search.within(asked, trial.horizon)
+    if trial is None:
+        return found
+    finer = _assemble(program, trial, boundary, reference, asked, search.evaluations, end_rate)
+    return min(finer, found, key=lambda one: (one.horizon, one.energy))
 
 
 def _remains(last: PolynomialPath | None, nodes: int) -> FloatArray | None:

@@ -122,6 +122,11 @@ class Family:
         """The number of free path control parameters, N - 4."""
         return int(self.basis.shape[1])
 
+    @property
+    def farthest_end(self) -> float:
+        """The larger |q2| of the two ends."""
+        return float(np.abs(self.still[[0, -1]]).max())
+
     def remixed(self, mixing: FloatArray) -> Family:
         """Return the same paths under new parameters: y_old = mixing @ y_new, mixing (N - 4, N - 4)."""
         return Family(self.grid, self.still, self.drift, self.basis @ mixing)

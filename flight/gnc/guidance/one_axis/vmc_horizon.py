@@ -30,6 +30,9 @@ _RETRY = 1.4
 _ALONG_LIMIT = 0.99
 _ATTEMPTS = 10
 _AT_BOUND = 1e-9
+_ANCHORS = (0.85, 0.7, 0.5, 0.35, 1.2, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0)
+_STEP, _LEAST_STEP = 1.15, 1.01
+_MOST_EVALUATIONS = 3000
 _PRICED_STEPS = 12
 _PRICED_CHANGE = 0.03
 
@@ -78,7 +81,7 @@ class Search:
             if trial is not None or time == longest:
                 break
             time = min(longest, time * growth)
-        return program, trial
+        return (program, trial) if trial is not None else self._continued(program, asked, longest)
 
     def priced(
         self, guess: float, least: float, longest: float, price: float
@@ -115,6 +118,46 @@ class Search:
                 break
             time = following
         return self.within(time, longest)
+
+    def _continued(self, failed: Program, asked: float, longest: float) -> tuple[Program, Trial | None]:
+        """Return a path over `asked` s, or longer, by continuation from horizons that can be solved.
+
+        Where a thread pulls harder than the coil, only some horizons have paths: those of the body's swings.
+        From a solved horizon, shorter ones first, the horizon changes in steps, each started from the last
+        path.
+        """
+        stretched: tuple[Program, Trial] | None = None
+        for factor in _ANCHORS:
+            if asked * factor > longest or self.evaluations > _MOST_EVALUATIONS:
+                break
+            program, trial = self.over(asked * factor, None)
+            step = _STEP
+            while trial is not None and trial.horizon != asked and step > _LEAST_STEP:
+                ratio = min(max(asked / trial.horizon, 1.0 / step), step)
+                wanted = asked if 1.0 / step < ratio < step else trial.horizon * ratio
+                further, found = self.over(wanted, program.from_prey(trial))
+                if found is None:
+                    step = math.sqrt(step)
+                else:
+                    program, trial = further, found
+                    step = min(step * step, _STEP)
+            if trial is not None and trial.horizon == asked:
+                return program, trial
+            if trial is not None and trial.horizon > asked and stretched is None:
+                stretched = program, trial
+        return stretched or (failed, None)
+
+    def over(self, time: float, apart: FloatArray | None) -> tuple[Program, Trial | None]:
+        """Return the program at `time` s and its path within the limits, from `apart` (N,) beside the prey."""
+        program = self.program_at(time)
+        trial = None if apart is None else program.limited(program.beside_prey(apart, time))
+        if trial is None:
+            start = program.prey(time) if apart is None else program.beside_prey(apart, time)
+            trial = program.unlimited(start)
+            if trial is None or float(np.abs(program.ratios(trial)).max()) > 1.0 + LIMIT_TOLERANCE:
+                trial = program.limited(start if trial is None else trial)
+        self.evaluations += program.evaluations
+        return program, trial
 
     def _resumed(self, program: Program, warm: FloatArray, asked: float, longest: float) -> Trial | None:
         """Return the path found when starting from an earlier one; None when that fails.

@@ -33,7 +33,7 @@ too; without the margin the exchanges converge slowly."""
 _SOLVER_STOPS = (nlopt.RoundoffLimited, RuntimeError, getattr(nlopt, "runtime_error", RuntimeError))
 _CONVERGED = (nlopt.SUCCESS, nlopt.FTOL_REACHED, nlopt.XTOL_REACHED)
 _EXCHANGES = 10
-_EVALUATIONS = 60
+_EVALUATIONS = 300
 _FREE_TOLERANCE = 1e-5
 _IMPOSE_ABOVE = 0.5
 _IMPOSE_EVERY = 16
@@ -81,7 +81,8 @@ class Program:
 
     def __init__(self, plant: SingleAxisPlant, family: Family, q2_limit: float, horizon: float) -> None:
         self._plant = plant
-        self._q2_limit = q2_limit
+        # The ends are given: one at the limit itself leaves no room for the margin.
+        self._q2_limit = max(q2_limit, (1.0 + IMPOSED_MARGIN) * family.farthest_end)
         # An iterate may pass the singularity; q2 is clamped beyond its limit so that the current stays
         # finite.
         self._q2_cap = 0.5 * (q2_limit + math.sqrt(SQUARE_Q2_WITHOUT_AUTHORITY))
@@ -162,6 +163,10 @@ class Program:
     def beside_prey(self, apart: FloatArray, horizon: float) -> Trial:
         """Return the path that differs by `apart` (N,) from the prey on the nodes; its ends stay the same."""
         return Trial(np.asarray(np.linalg.solve(self.family.basis[2:-2], apart[2:-2]), dtype=float), horizon)
+
+    def from_prey(self, trial: Trial) -> FloatArray:
+        """Return the difference (N,) of a path from its prey on the nodes, as `beside_prey` takes it."""
+        return np.asarray(self.family.basis @ trial.parameters)
 
     def unlimited(self, start: Trial) -> Trial | None:
         """Return the least-energy path over the horizon of `start` without limits; None if none is found."""

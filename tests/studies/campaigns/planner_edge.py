@@ -1,0 +1,133 @@
+"""Campaign `planner-edge`: slews between the ends of the range of q2, where the coil hardly turns the body.
+
+Start and target lie at |q2| of 0.60 to 0.68; a known thread of 0 to 2e-5 N m/rad pulls up to ten times harder
+than the coil can; the horizon is 5 to 60 s. Each slew is planned, and solved by the tests' own collocation
+(`tests.flight.gnc.guidance.oracle`), which shares nothing with the planner. A slew counts as failed when the
+collocation finds a path within |q2| <= 0.68 over the asked horizon and the planner none, as dear when the
+planner's path costs more than 1.001 times the collocation's, and as late when it is stretched although the
+collocation keeps the horizon.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from flight.gnc.errors import PlanningError
+from flight.gnc.guidance.one_axis.limits import Q2_LIMIT
+from flight.gnc.guidance.one_axis.plant import SingleAxisPlant
+from flight.gnc.guidance.one_axis.vmc import plan
+from tests.flight.gnc.guidance.oracle import Slew, solve
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+
+INTERVALS = 1200
+DEAR = 1.001
+INERTIA, TORQUE_CONSTANT, RESISTANCE, CURRENT_LIMIT, DAMPING = (
+    1.05e-3,
+    80 * 0.0081 * 4.5e-4,
+    23.0,
+    0.148,
+    2e-6,
+)
+"""The plant of `config/step_demo.yaml`."""
+
+
+def cases(runs: int, seed: int) -> list[Case]:
+    """Return `runs` slews."""
+    return [Case(f"{k}", (seed, k), {}) for k in range(runs)]
+
+
+def run(case: Case) -> Result:
+    """Plan one slew and solve it by collocation."""
+    rng = np.random.default_rng(case.seed)
+    start, end = (rng.uniform(0.60, Q2_LIMIT, 2) * rng.choice([-1.0, 1.0], 2)).tolist()
+    stiffness, horizon = float(rng.uniform(0.0, 2e-5)), float(rng.uniform(5.0, 60.0))
+    plant = SingleAxisPlant(INERTIA, TORQUE_CONSTANT, RESISTANCE, CURRENT_LIMIT, stiffness, DAMPING)
+    result: Result = {"start": start, "end": end, "stiffness": stiffness, "asked": horizon}
+    begun = time.process_time()
+    try:
+        found = plan(plant, start, 0.0, end, 0.0, horizon)
+        result |= {"horizon": found.horizon, "energy": found.energy}
+    except PlanningError:
+        result |= {"horizon": None, "energy": None}
+    result["cpu_s"] = time.process_time() - begun
+    angles = 2.0 * math.asin(start), 2.0 * math.asin(end)
+    optimum = solve(
+        Slew(
+            angles[0],
+            0.0,
+            angles[1],
+            0.0,
+            horizon,
+            INERTIA,
+            TORQUE_CONSTANT,
+            RESISTANCE,
+            CURRENT_LIMIT,
+            stiffness,
+            DAMPING,
+        ),
+        INTERVALS,
+    )
+    # The collocation does not know of the limit of q2: a path beyond it is none.
+    within = optimum is not None and np.abs(np.sin(0.5 * optimum.angle)).max() <= Q2_LIMIT * (1.0 + 1e-9)
+    result["optimum"] = optimum.energy if optimum is not None and within else None
+    return result
+
+
+def verdict(result: Result) -> str:
+    """Return failed, late, dear, solved, or unknown where the collocation has no path."""
+    if result["optimum"] is None:
+        return "unknown"
+    if result["horizon"] is None:
+        return "failed"
+    if result["horizon"] > result["asked"] * (1.0 + 1e-9):
+        return "late"
+    return "dear" if result["energy"] > DEAR * result["optimum"] else "solved"
+
+
+def summarise(results: Sequence[Result], folder: Path) -> Summary:
+    """Count the verdicts and list what was not solved."""
+    del folder
+    verdicts = [verdict(result) for result in results]
+    counts = {name: verdicts.count(name) for name in ("solved", "dear", "late", "failed", "unknown")}
+    refused = sum(result["horizon"] is None for result in results)
+    ratios = [
+        r["energy"] / r["optimum"] for r, v in zip(results, verdicts, strict=True) if v in ("solved", "dear")
+    ]
+    times = [result["cpu_s"] for result in results]
+    facts = {
+        **counts,
+        "refused": refused,
+        "largest_cost_ratio": max(ratios, default=None),
+        "cpu_s_median": float(np.median(times)),
+        "cpu_s_most": max(times),
+    }
+    lines = [
+        f"{len(results)} slews between |q2| of 0.60 and {Q2_LIMIT}: "
+        + ", ".join(f"{name} {count}" for name, count in counts.items())
+        + f"; refused {refused}",
+        f"cost over the collocation's at most {max(ratios, default=math.nan):.5f}; processor time "
+        f"{1e3 * facts['cpu_s_median']:.0f} ms (median), {1e3 * max(times):.0f} ms (most)",
+    ]
+    for number, (result, name) in enumerate(zip(results, verdicts, strict=True)):
+        if name in ("failed", "late", "dear"):
+            ends = f"{result['start']:+.4f} to {result['end']:+.4f} in {result['asked']:.2f} s"
+            lines.append(
+                f"  {number}: {name}: {ends}, thread {result['stiffness']:.2e}: {result['horizon']} s, "
+                f"{result['energy']} J, optimum {result['optimum']:.4f} J"
+            )
+    return Summary("\n".join(lines) + "\n", facts)
+
+
+PLANNER_EDGE = Campaign(
+    "planner-edge",
+    "slews near the ends of q2 under a known thread, beside a collocation",
+    cases,
+    run,
+    summarise,
+    200,
+)

@@ -1,0 +1,35 @@
+"""A slice of campaign `planner-edge` at a fixed seed, and slews that an earlier planner refused."""
+
+from __future__ import annotations
+
+import pytest
+
+from flight.gnc.guidance.one_axis.plant import SingleAxisPlant
+from flight.gnc.guidance.one_axis.vmc import PlanStatus, plan
+from tests.studies.campaigns.planner_edge import (
+    CURRENT_LIMIT,
+    DAMPING,
+    INERTIA,
+    RESISTANCE,
+    TORQUE_CONSTANT,
+    cases,
+    run,
+    verdict,
+)
+
+
+def test_no_slew_with_a_path_is_refused_or_dear() -> None:
+    verdicts = [verdict(run(case)) for case in cases(12, 1)]
+    assert set(verdicts) <= {"solved", "unknown"}
+    assert verdicts.count("solved") >= 6
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "stiffness", "horizon"),
+    [(0.6731, 0.6642, 1.05e-5, 55.36), (0.6443, 0.6796, 1.24e-5, 59.39), (0.68, 0.675, 1.55e-5, 26.7)],
+)
+def test_against_a_strong_thread_the_body_is_swung(
+    start: float, end: float, stiffness: float, horizon: float
+) -> None:
+    plant = SingleAxisPlant(INERTIA, TORQUE_CONSTANT, RESISTANCE, CURRENT_LIMIT, stiffness, DAMPING)
+    assert plan(plant, start, 0.0, end, 0.0, horizon).status is PlanStatus.OPTIMAL
