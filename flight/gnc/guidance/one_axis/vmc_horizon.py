@@ -148,7 +148,7 @@ class Search:
         return stretched or (failed, None)
 
     def over(self, time: float, apart: FloatArray | None) -> tuple[Program, Trial | None]:
-        """Return the program at `time` s and its path within the limits, from `apart` (N,) beside the prey."""
+        """Return the program at `time` s and a path within the limits, from `apart` (N,) beside the prey."""
         program = self.program_at(time)
         trial = None if apart is None else program.limited(program.beside_prey(apart, time))
         if trial is None:
