@@ -187,10 +187,14 @@ class Estimation(Section, frozen=True, kw_only=True):
 
 
 class Guidance(Section, frozen=True, kw_only=True):
-    """Virtual motion camouflage (Sease 5.8-5.15); `bodies.testbed.planning` explains the strategies."""
+    """Virtual motion camouflage (Sease 5.8-5.15); `bodies.testbed.planning` explains the strategies.
+
+    `cost` is the energy that paths save: the coil's heat R I^2, or V |I| taken from the supply.
+    """
 
     strategy: Literal["goal", "receding", "step"] = "goal"
     horizon: Positive = 10.0
+    cost: Literal["heat", "supply"] = "heat"
     time_price: Positive | None = None
     current_share: Annotated[float, Meta(ge=0.5, le=1.0)] = 0.95
     replan_period: Positive = 5.0

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from flight.bodies.testbed.plant_model import plant_of
+from flight.gnc.guidance.one_axis.path_cost import PathCost
 from flight.gnc.guidance.one_axis.plant import SingleAxisPlant
 from flight.gnc.guidance.one_axis.vmc import NODES, Plan, plan
 from flight.schema import reader as configuration
@@ -39,6 +40,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
         type=_number,
         metavar="W",
         help="price of time: choose the horizon of least energy plus price times time",
+    )
+    parser.add_argument(
+        "--cost",
+        choices=[cost.value for cost in PathCost],
+        help="energy to save: heat R I^2, or supply V |I|",
     )
     parser.add_argument("--nodes", type=int, metavar="N", help=f"nodes of the path (default {NODES})")
     parser.add_argument(
@@ -68,6 +74,7 @@ def run(options: argparse.Namespace) -> int:
         horizon,
         nodes=options.nodes or config.guidance.nodes or NODES,
         time_price=options.time_price,
+        cost=PathCost(options.cost or config.guidance.cost),
     )
     solved_s = time.perf_counter() - begun
     if options.json:
@@ -90,6 +97,7 @@ def _facts(made: Plan, plant: SingleAxisPlant, solved_s: float) -> dict[str, obj
         "horizon_asked_s": made.horizon_asked,
         "horizon_s": made.horizon,
         "energy_J": made.energy,
+        "supply_energy_J": made.supplied,
         "mean_power_W": made.energy / made.horizon,
         "peak_current_A": made.peak_current,
         "current_limit_A": plant.current_limit,
@@ -109,6 +117,7 @@ def _text(made: Plan, plant: SingleAxisPlant, solved_s: float) -> str:
         f"status:        {made.status.value}\n"
         f"horizon:       {made.horizon:.3f} s{stretched}\n"
         f"energy:        {made.energy:.5f} J, integral of R I^2\n"
+        f"supply:        {made.supplied:.5f} J, integral of V |I|\n"
         f"mean power:    {1e3 * made.energy / made.horizon:.2f} mW\n"
         f"peak current:  {made.peak_current:.4f} A of {plant.current_limit:.4f} A\n"
         f"solved in:     {1e3 * solved_s:.1f} ms, {made.evaluations} evaluations\n"

@@ -22,6 +22,7 @@ from flight.gnc.estimation.filter_settings import FilterSettings, slow_prior
 from flight.gnc.estimation.rigid_body import Parameters, RigidBody
 from flight.gnc.guidance.one_axis import job as plan_job
 from flight.gnc.guidance.one_axis.guidance import AcceptanceRules, Guidance
+from flight.gnc.guidance.one_axis.path_cost import PathCost
 from flight.gnc.guidance.one_axis.plant import SingleAxisPlant
 from flight.gnc.guidance.one_axis.vmc import NODES
 from flight.gnc.math.arrays import FloatArray
@@ -153,4 +154,5 @@ def planning_settings(config: Config) -> PlanningSettings:
         strategy=Strategy(section.strategy),
         time_price=section.time_price,
         current_share=section.current_share,
+        cost=PathCost(section.cost),
     )

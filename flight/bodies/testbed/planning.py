@@ -19,6 +19,7 @@ from flight.gnc.estimation.estimate import Estimate
 from flight.gnc.guidance.one_axis.guidance import Guidance
 from flight.gnc.guidance.one_axis.job import PlanJob
 from flight.gnc.guidance.one_axis.path import FARTHEST
+from flight.gnc.guidance.one_axis.path_cost import PathCost
 from flight.gnc.guidance.one_axis.plant import SingleAxisPlant, angle_of, q2_of
 from flight.gnc.guidance.one_axis.vmc import Plan, PlanStatus
 from flight.link import events
@@ -52,6 +53,7 @@ class PlanningSettings:
         strategy: see the module.
         time_price: W, cost of a second of a slew; None for a fixed horizon.
         current_share: fraction of the coil's limit that a plan may use; the rest is the controller's.
+        cost: the power whose integral a path minimises.
         least_horizon: s, time to the goal below which there is no new plan.
         displaced: rad, distance from the path above which there is a new plan.
     """
@@ -63,6 +65,7 @@ class PlanningSettings:
     strategy: Strategy
     time_price: float | None
     current_share: float
+    cost: PathCost
     least_horizon: float = 2.0
     displaced: float = 0.05
 
@@ -183,6 +186,7 @@ class Planning:
             settings.nodes,
             None if begun else settings.time_price,
             self._guidance.remains(now_ns) if begun else None,
+            settings.cost,
         )
 
     def _due_q2(self, law: ThreadLaw, now_ns: int, horizon: float) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from flight.gnc.guidance.one_axis.path import PolynomialPath
+from flight.gnc.guidance.one_axis.path_cost import PathCost
 from flight.gnc.guidance.one_axis.plant import SingleAxisPlant
 from flight.gnc.guidance.one_axis.vmc import NODES, Plan, plan
 
@@ -29,6 +30,7 @@ class PlanJob:
     nodes: int = NODES
     time_price: float | None = None
     last: PolynomialPath | None = None
+    cost: PathCost = PathCost.HEAT
 
 
 def run(job: PlanJob) -> Plan:
@@ -44,4 +46,5 @@ def run(job: PlanJob) -> Plan:
         max_stretch=max(job.max_horizon / job.horizon, 1.0),
         time_price=job.time_price,
         last=job.last,
+        cost=job.cost,
     )

@@ -21,6 +21,7 @@ from flight.gnc.errors import PlanningError
 from flight.gnc.guidance.lgl import lgl_rule
 from flight.gnc.guidance.one_axis.limits import Q2_LIMIT
 from flight.gnc.guidance.one_axis.path import PolynomialPath
+from flight.gnc.guidance.one_axis.path_cost import PathCost
 from flight.gnc.guidance.one_axis.plant import SQUARE_Q2_WITHOUT_AUTHORITY, SingleAxisPlant, q2_rate_of
 from flight.gnc.guidance.one_axis.prey import CubicPrey
 from flight.gnc.guidance.one_axis.vmc_family import Boundary, Family
@@ -62,6 +63,7 @@ class Plan:
         status: optimal at the asked horizon, or stretched to the shortest feasible one.
         horizon_asked, horizon: s; equal with a price of time.
         energy: integral of R I^2, J.
+        supplied: integral of V |I|, J.
         peak_current: largest |I| on a dense grid, A.
         evaluations: number of evaluations of the cost.
         target_q2: q2 at the end.
@@ -75,6 +77,7 @@ class Plan:
     horizon_asked: float
     horizon: float
     energy: float
+    supplied: float
     peak_current: float
     evaluations: int
     target_q2: float
@@ -97,6 +100,7 @@ def plan(
     max_stretch: float = MAX_STRETCH,
     time_price: float | None = None,
     last: PolynomialPath | None = None,
+    cost: PathCost = PathCost.HEAT,
 ) -> Plan:
     """Return the least-energy path between two states in `horizon` s, or in the shortest feasible time.
 
@@ -107,7 +111,7 @@ def plan(
     With `time_price` in W the path minimises energy plus price times horizon, over horizons from LEAST_PRICED
     s to `max_stretch` times `horizon`; `horizon` is then the initial guess. `last` is the path followed until
     now, its origin relative to the new start (so not positive); its remainder is the initial guess of the
-    path.
+    path. `cost` says which energy is the least.
 
     Raises PlanningError when an argument is not finite or outside its limits, or when no allowed horizon is
     feasible.
@@ -119,7 +123,7 @@ def plan(
     boundary = Boundary(start_q2, q2_rate_of(start_q2, start_rate), end_q2, q2_rate_of(end_q2, end_rate))
 
     def program_at(time: float, count: int = nodes) -> Program:
-        return Program(plant, Family.around(boundary, time, reference, count), q2_limit, time)
+        return Program(plant, Family.around(boundary, time, reference, count), q2_limit, time, cost)
 
     search = Search(program_at, _remains(last, nodes))
     longest = max_stretch * horizon
@@ -145,7 +149,9 @@ def plan(
     if trial is None:
         return found
     finer = _assemble(program, trial, boundary, reference, asked, search.evaluations, end_rate)
-    return min(finer, found, key=lambda one: (one.horizon, one.energy))
+    return min(
+        finer, found, key=lambda one: (one.horizon, one.energy if cost is PathCost.HEAT else one.supplied)
+    )
 
 
 def _remains(last: PolynomialPath | None, nodes: int) -> FloatArray | None:
@@ -180,7 +186,7 @@ def _assemble(
     end_rate: float,
 ) -> Plan:
     """Return the plan that flies `trial`; raises PlanningError when it is not finite."""
-    energy, _, _ = program.energy(trial)
+    energy, supplied = (program.spent(trial, cost) for cost in PathCost)
     peak = float(np.abs(program.ratios(trial)[0]).max()) * program.current_limit
     node_q2 = program.family.nodes(trial.parameters, trial.horizon)
     if not (math.isfinite(energy) and math.isfinite(peak) and np.isfinite(node_q2).all()):
@@ -194,6 +200,7 @@ def _assemble(
         horizon_asked=asked,
         horizon=trial.horizon,
         energy=energy,
+        supplied=supplied,
         peak_current=peak,
         evaluations=evaluations,
         target_q2=boundary.end,

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import nlopt
 import numpy as np
 
+from flight.gnc.guidance.one_axis.path_cost import PathCost
 from flight.gnc.guidance.one_axis.plant import (
     SQUARE_Q2_WITHOUT_AUTHORITY,
     SingleAxisPlant,
@@ -79,14 +80,22 @@ class Program:
         evaluations: of the cost, over all solutions.
     """
 
-    def __init__(self, plant: SingleAxisPlant, family: Family, q2_limit: float, horizon: float) -> None:
+    def __init__(
+        self,
+        plant: SingleAxisPlant,
+        family: Family,
+        q2_limit: float,
+        horizon: float,
+        cost: PathCost = PathCost.HEAT,
+    ) -> None:
         self._plant = plant
+        self._cost = cost
         # The ends are given: one at the limit itself leaves no room for the margin.
         self._q2_limit = max(q2_limit, (1.0 + IMPOSED_MARGIN) * family.farthest_end)
         # An iterate may pass the singularity; q2 is clamped beyond its limit so that the current stays
         # finite.
         self._q2_cap = 0.5 * (q2_limit + math.sqrt(SQUARE_Q2_WITHOUT_AUTHORITY))
-        self._weights = 0.5 * plant.resistance * family.grid.cost_weights
+        self._weights = 0.5 * family.grid.cost_weights
         self._bang = plant.resistance * plant.current_limit**2
         self.family = self._whitened(family, horizon)
         self._cost_points = self.family.observed(family.grid.cost)
@@ -114,7 +123,7 @@ class Program:
         observed = family.observed(family.grid.cost)
         prey = observed.trajectory(np.zeros(family.size), horizon)
         _, slopes = self._current(prey, horizon)
-        root_weights = np.sqrt(2.0 * horizon * self._weights)
+        root_weights = np.sqrt(2.0 * self._plant.resistance * horizon * self._weights)
         jacobian = root_weights[:, None] * _contract(slopes, observed.basis)
         return family.remixed(np.linalg.inv(np.linalg.qr(jacobian, mode="r")))
 
@@ -129,16 +138,25 @@ class Program:
         return current, stacked
 
     def energy(self, trial: Trial) -> tuple[float, FloatArray, float]:
-        """Return the integral of R I^2 in J (5.8 without the 1/2 of 5.1), its gradient (N - 4,), and d/dT."""
+        """Return the integral of the cost's power in J, its gradient (N - 4,), and d/dT.
+
+        For heat that is 5.8 without the 1/2 of 5.1.
+        """
         points, horizon = self._cost_points, trial.horizon
         trajectory = points.trajectory(trial.parameters, horizon)
         current, slopes = self._current(trajectory, horizon)
-        weighted = self._weights * current
-        energy = horizon * float(weighted @ current)
-        pull = (2.0 * horizon) * weighted * slopes
+        power, by_current = self._cost.smooth(self._plant, current)
+        energy = horizon * float(self._weights @ power)
+        pull = (horizon * self._weights * by_current) * slopes
         gradient = pull.ravel() @ points.basis.reshape(-1, points.basis.shape[2])
         by_horizon = energy / horizon + float(np.sum(pull * points.aging(trajectory, horizon)))
         return energy, gradient, by_horizon
+
+    def spent(self, trial: Trial, cost: PathCost) -> float:
+        """Return the integral of a power along a path, J."""
+        trajectory = self._cost_points.trajectory(trial.parameters, trial.horizon)
+        power = cost.power(self._plant, self._current(trajectory, trial.horizon)[0])
+        return trial.horizon * float(self._weights @ power)
 
     def excess(
         self, limits: Limits, points: Observed, trial: Trial
