@@ -203,17 +203,27 @@ class Guidance(Section, frozen=True, kw_only=True):
     nodes: Annotated[int, Meta(ge=8, le=40)] | None = None
 
 
+class PidGains(Section, frozen=True, kw_only=True):
+    """Free gains of the PID controller on angle (1/s^2), its integral (1/s^3) and the rate (1/s)."""
+
+    proportional: Positive
+    integral: Positive
+    derivative: Positive
+
+
 class Control(Section, frozen=True, kw_only=True):
     """The controller.
 
     `lq` and `thesis` take the weights of Sease 5.30-5.32, Q = state_weight I and R = control_weight; `pid`
-    and `adaptive` the bandwidth and what follows it. `excitation` is flown by `python -m flight identify`.
+    and `adaptive` the bandwidth and what follows it; `gains` replace the bandwidth of `pid`. `excitation` is
+    flown by `python -m flight identify`.
     """
 
     tracker: Literal["lq", "thesis", "pid", "adaptive", "excitation"] = "lq"
     state_weight: Positive = 2.0
     control_weight: Positive = 1.0
     bandwidth: Positive = 1.0
+    gains: PidGains | None = None
     target_weight: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
     adaptation: Positive = 1.0
     reference_bandwidth: Positive | None = None

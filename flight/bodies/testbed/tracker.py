@@ -9,7 +9,7 @@ from flight.gnc.control.one_axis.adaptive import AdaptiveController, AdaptiveSet
 from flight.gnc.control.one_axis.controller import Controller
 from flight.gnc.control.one_axis.excitation import ExcitationController, ExcitationSettings
 from flight.gnc.control.one_axis.lq_tracker import LqTracker
-from flight.gnc.control.one_axis.pid import PidController
+from flight.gnc.control.one_axis.pid import PidController, PidGains
 from flight.gnc.estimation.estimate import Estimate
 from flight.gnc.guidance.one_axis.path import Sample
 from flight.gnc.guidance.one_axis.plant import SingleAxisPlant
@@ -30,7 +30,13 @@ def controller_of(
             plant, period, ExcitationSettings(move.current_share, move.largest_q2, move.swing)
         )
     if section.tracker == "pid":
-        return PidController(plant, period, section.bandwidth, section.target_weight)
+        free = section.gains
+        gains = (
+            PidGains.placed(section.bandwidth)
+            if free is None
+            else PidGains(free.proportional, free.integral, free.derivative)
+        )
+        return PidController(plant, period, gains, section.target_weight)
     if section.tracker == "adaptive":
         settings = AdaptiveSettings(section.bandwidth, section.adaptation, section.reference_bandwidth)
         return AdaptiveController(plant, period, settings)

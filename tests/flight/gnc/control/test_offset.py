@@ -10,7 +10,7 @@ import pytest
 from flight.gnc.control.one_axis.adaptive import AdaptiveController, AdaptiveSettings
 from flight.gnc.control.one_axis.controller import Controller
 from flight.gnc.control.one_axis.lq_tracker import LqTracker
-from flight.gnc.control.one_axis.pid import PidController
+from flight.gnc.control.one_axis.pid import PidController, PidGains
 from flight.gnc.guidance.one_axis.plant import SingleAxisPlant
 from tests.flight.gnc.control.closed_loop import BELIEVED, PERIOD, fly, held, largest_error
 
@@ -42,7 +42,7 @@ def test_the_tracker_holds_without_offset_where_the_thesis_keeps_one(true: Singl
     "controller",
     [
         LqTracker(BELIEVED, *WEIGHTS),
-        PidController(BELIEVED, PERIOD, 0.76, 0.0),
+        PidController(BELIEVED, PERIOD, PidGains.placed(0.76), 0.0),
         AdaptiveController(BELIEVED, PERIOD, AdaptiveSettings(1.0, 10.0, 0.55)),
     ],
     ids=["lq", "pid", "adaptive"],

@@ -1,0 +1,18 @@
+"""The tuning study: its criterion is met by the gains that the campaign flies, and it finds better ones."""
+
+from __future__ import annotations
+
+from flight.gnc.control.one_axis.pid import PidController, PidGains
+from tests.studies.campaigns import controllers
+from tests.studies.tune_controllers import BELIEVED, OVERSHOOT, PERIOD, SETTLED_S, fly
+
+
+def test_the_flown_pid_keeps_the_criterion_with_less_power_than_three_poles() -> None:
+    control = controllers.pid().control
+    assert control.gains is not None
+    gains = PidGains(control.gains.proportional, control.gains.integral, control.gains.derivative)
+    tuned = fly(PidController(BELIEVED, PERIOD, gains, control.target_weight))
+    placed = fly(PidController(BELIEVED, PERIOD, PidGains.placed(0.76), 0.0))
+    assert tuned.settling <= SETTLED_S + 0.1
+    assert tuned.overshoot <= OVERSHOOT + 0.001
+    assert tuned.power < 0.8 * placed.power
