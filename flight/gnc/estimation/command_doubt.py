@@ -7,7 +7,8 @@ gyro. A change of the rate that no coil current can cause is no reason: then the
 
 The commands are trusted again when the rate follows them: over the last second a share g of the commanded
 change c of the rate is fitted to the gyro's samples, z = b + g c. The commands must have moved the body
-enough to fix g, g must be 1, and the residuals must be noise. A body that is not driven proves nothing.
+enough to fix g, g must be 1, and the residuals must be white. A body that is not driven proves nothing. A
+gyro with more noise than assumed raises the scale of its departures, not a doubt.
 """
 
 from __future__ import annotations
@@ -36,6 +37,11 @@ _PROOF = 1.0
 """s: the samples of this time prove the commands again."""
 _KNOWN_SHARE = 0.2
 """Standard deviation of the fitted share below which the share proves something."""
+_WHITE = 0.5
+"""Least half mean square of the residuals' differences over their mean square: one for white noise (von
+Neumann 1941), near zero for a drift."""
+_SCALE_OVER = 64.0
+"""Samples over which the scale of the departures is averaged."""
 _SHARE_ERROR = 0.15
 """Error of the share that the model's own error of the coils' gain explains."""
 
@@ -52,6 +58,7 @@ class CommandDoubt:
         self.active = False
         self.ended_ns = 0
         self._model = model
+        self._scale = 1.0
         self._axes = slice(1, 2) if model.body.suspended else slice(3)
         self._departures: deque[tuple[int, FloatArray]] = deque(maxlen=max(_WINDOWS))
         self._samples: deque[tuple[int, FloatArray, FloatArray]] = deque()
@@ -75,10 +82,12 @@ class CommandDoubt:
         time_ns = newest.time_ns
         gap = (time_ns - self._departures[-1][0]) * 1e-9 if self._departures else _SHORTEST_GAP
         most = self._most_change(newest.state, min(max(gap, _SHORTEST_GAP), _LONGEST_GAP))
-        departure, spread = newest.departure, newest.spread
+        departure, spread = newest.departure, newest.spread * self._scale
         if not (np.abs(departure) <= _SURPRISE * spread + _MOST * most).all():
             return None
         self._departures.append((time_ns, departure / spread))
+        size = min(float((departure * departure / (newest.spread * newest.spread)).mean()), _SURPRISE**2)
+        self._scale = math.sqrt(max(1.0, self._scale**2 + (size - self._scale**2) / _SCALE_OVER))
         sums = np.cumsum([value for _, value in reversed(self._departures)], axis=0)
         for count in _WINDOWS:
             if count <= len(sums) and np.abs(sums[count - 1]).max() > _SURPRISE * math.sqrt(count):
@@ -103,7 +112,7 @@ class CommandDoubt:
                 return
 
     def _follows(self, variance: FloatArray) -> bool:
-        """Return whether the noted rates are b + c, with c the commanded changes."""
+        """Return whether the noted rates are b + c, with c the commanded changes; set the noise's scale."""
         _, rates, commanded = zip(*self._samples, strict=True)
         weight = 1.0 / np.sqrt(variance)
         z, c = ((np.array(values) - np.mean(values, axis=0)) * weight for values in (rates, commanded))
@@ -112,9 +121,12 @@ class CommandDoubt:
             return False
         share = float((c * z).sum()) / information
         residual = z - share * c
-        noise = math.sqrt(float((residual * residual).sum()) / residual.size)
-        tolerance = _SHARE_ERROR + 3.0 / math.sqrt(information)
-        return abs(share - 1.0) <= tolerance and noise <= 1.0 + 3.0 / math.sqrt(2.0 * residual.size)
+        noise, jumps = float((residual**2).mean()), 0.5 * float((np.diff(residual, axis=0) ** 2).mean())
+        scale = math.sqrt(max(1.0, noise))
+        if jumps < _WHITE * noise or abs(share - 1.0) > _SHARE_ERROR + 3.0 * scale / math.sqrt(information):
+            return False
+        self._scale = scale
+        return True
 
     def _forget(self) -> None:
         self._departures.clear()
