@@ -81,19 +81,20 @@ def judge(flown: Run, entry: FaultEntry) -> Result:
     """Return how long the estimate was dishonest, and when healthy measurements were refused."""
     beyond, times = estimate_beyond(flown)
     period = float(np.median(np.diff(times)))
-    end = entry.at + entry.span if entry.span is not None else DURATION
+    begin = entry.at or 0.0
+    end = begin + entry.span if entry.span is not None else DURATION
     event = flown["event"]
     names = [to_text(name) for name in event["name"]]
     refused = event["time_ns"][np.array([name == events.IMU_REFUSED.name for name in names], bool)]
-    refused_s = refused / SECOND_NS - entry.at
+    refused_s = refused / SECOND_NS - begin
     return {
-        "beyond_s": period * int(beyond[(times >= entry.at) & (times < end)].sum()),
+        "beyond_s": period * int(beyond[(times >= begin) & (times < end)].sum()),
         "beyond_after_end_s": period * int(beyond[times >= end].sum()),
-        "beyond_before_s": period * int(beyond[times < entry.at].sum()),
+        "beyond_before_s": period * int(beyond[times < begin].sum()),
         "refusals": len(refused_s),
         "last_refusal_s": max(refused_s.tolist(), default=None),
         "control_lost": names.count(events.CONTROL_LOST.name),
-        "found_s": _first(event, names, events.COIL_BROKEN.name, entry.at),
+        "found_s": _first(event, names, events.COIL_BROKEN.name, begin),
     }
 
 
