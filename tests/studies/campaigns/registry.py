@@ -11,6 +11,7 @@ from tests.studies.campaigns.failures import FAILURES
 from tests.studies.campaigns.faults import FAULTS
 from tests.studies.campaigns.faults_kill import FAULTS_KILL
 from tests.studies.campaigns.lost_in_space import LOST_IN_SPACE
+from tests.studies.campaigns.mismatch import MISMATCH, VIBRATION
 from tests.studies.campaigns.nadir import NADIR
 from tests.studies.campaigns.orbit_attitude import ORBIT_ATTITUDE
 from tests.studies.campaigns.planner_edge import PLANNER_EDGE
@@ -25,6 +26,8 @@ CAMPAIGNS: dict[str, Campaign] = {
     for campaign in (
         STREAKS,
         FAILURES,
+        MISMATCH,
+        VIBRATION,
         RSO_SLEW,
         RSO_TRACK,
         RSO_ORBITS,

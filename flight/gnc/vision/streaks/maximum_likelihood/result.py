@@ -29,6 +29,7 @@ class MotionResult(FrameMotion):
         misfit: chi-square per degree of freedom, median of the bright stars: 1 where the rate model holds.
         rate_model: which was fitted, `constant` or `accelerating`.
         acceleration: (3,) rad/s^2 if fitted, else None.
+        reason: why there is no rate, in a line; empty when there is one.
     """
 
     stars: FloatArray = field(default_factory=no_rows(2))
@@ -44,6 +45,7 @@ class MotionResult(FrameMotion):
     misfit: float = float("nan")
     rate_model: RateModel = "constant"
     acceleration: FloatArray | None = None
+    reason: str = ""
 
     @property
     def start_to_end(self) -> FloatArray | None:

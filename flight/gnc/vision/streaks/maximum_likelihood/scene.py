@@ -12,7 +12,7 @@ from flight.gnc.vision.records import select
 from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion, positions
 from flight.gnc.vision.streaks.maximum_likelihood.shutter import Shutter
 
-_PIXEL_VARIANCE = 1.0 / 12.0
+PIXEL_VARIANCE = 1.0 / 12.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,7 +39,7 @@ class Scene:
     @property
     def sigma(self) -> float:
         """The standard deviation of the point spread without the pixel's square, px."""
-        return float(np.sqrt(max(self.width**2 - _PIXEL_VARIANCE, 0.01)))
+        return float(np.sqrt(max(self.width**2 - PIXEL_VARIANCE, 0.01)))
 
     def select(self, chosen: BoolArray | IntArray) -> Scene:
         """Return the scene with the stars that `chosen` picks, by mask or index."""

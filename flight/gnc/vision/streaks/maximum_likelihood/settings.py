@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from flight.gnc.camera.knowledge import CameraKnowledge
+
 RateModel = Literal["auto", "constant", "accelerating"]
 
 
@@ -33,6 +35,10 @@ class LikelihoodSettings:
         least_length: px, median path below which no rate is given.
         least_significance: of the rate in its standard deviations, below which no rate is given.
         worst_misfit: chi-square per degree of freedom above which the motion is not believed.
+        worst_shaking: displacement common to all streaks, px, or common share of their brightness, above which
+            the motion is not believed to be smooth.
+        worst_doubt: share of the rate to which model errors may leave it uncertain.
+        knowledge: how well the camera is known.
         sign_sigmas: the prior's projection on the axis must exceed this many of its sigmas to decide the
             direction of time.
     """
@@ -54,4 +60,7 @@ class LikelihoodSettings:
     least_length: float = 3.0
     least_significance: float = 5.0
     worst_misfit: float = 4.0
+    worst_shaking: float = 0.05
+    worst_doubt: float = 0.05
     sign_sigmas: float = 3.0
+    knowledge: CameraKnowledge = CameraKnowledge()
