@@ -8,10 +8,12 @@ from __future__ import annotations
 import io
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
 
+from flight.gnc.camera.knowledge import CameraKnowledge
 from flight.gnc.math.arrays import FloatArray, Image
 from tests.studies.supersampled import Optics, coma, disc, gaussian, halo, moffat
 
@@ -64,7 +66,7 @@ class Imperfection:
     counts: Stage | None = None
     encode: Encoder = _twelve_bits
     line_time: float = 0.0
-    known: dict[str, float] = field(default_factory=dict)
+    known: dict[str, Any] = field(default_factory=dict)
     top: float | None = TOP
 
 
@@ -218,6 +220,6 @@ IMPERFECTIONS: dict[str, Imperfection] = {
     "distortion 0.2 %": Imperfection(Optics(distortion=0.002)),
     "distortion 1 %": Imperfection(Optics(distortion=0.01)),
     "axis 5 px off": Imperfection(Optics(offset=(4.0, -3.0))),
-    "rolling untold": Imperfection(line_time=20e-6),
+    "rolling untold": Imperfection(line_time=20e-6, known={"knowledge": CameraKnowledge(line_time=10e-6)}),
     "rolling told": Imperfection(line_time=20e-6, known={"line_time": 20e-6}),
 }

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,7 @@ from sim_hal.star_camera import StarCameraModel
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.imperfections import IMPERFECTIONS, Imperfection
 from tests.studies.campaigns.scenes import FIELD, catalogue, noise_floor
-from tests.studies.supersampled import Attitudes, Sky, light, through_lens
+from tests.studies.supersampled import Attitudes, Sky, light
 
 TURNS = (10, 30)
 EXPOSURES = (0.2, 1.0)

@@ -70,12 +70,13 @@ def claim(result: MotionResult, camera: ExposedCamera, last: Fit) -> Claim:
     end = np.hypot(
         _spread_doubt(scene.width, settings.psf_sigma), _END_SHAKING * max(shaking.across, shaking.along)
     )
-    doubt = float(np.sqrt(2.0) * end / result.length)
+    ends = float(np.sqrt(2.0) * end / result.length)
     # What the model does not explain makes it less certain; what fits too well, no more. A fit that goes
     # to and fro, as pixels are left out and taken in, is known no better than that.
-    covariance = noise * spread * (1.0 + last.restless**2) + added
-    covariance = covariance + doubt**2 * float(turn @ turn) * np.eye(3)
-    return Claim(turn, covariance, doubt, shaking)
+    covariance = noise * spread * (1.0 + last.restless**2)
+    common = added + ends**2 * float(turn @ turn) * np.eye(3)
+    doubt = float(np.sqrt(np.linalg.eigvalsh(common)[-1] / (turn @ turn)))
+    return Claim(turn, covariance + common, doubt, shaking)
 
 
 def _with_lens(

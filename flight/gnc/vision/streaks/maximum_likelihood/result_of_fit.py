@@ -22,6 +22,10 @@ _GEOMETRY = np.array([0, 1, 2, 3, 4, 5, 7, 8])
 _LIGHT = 9
 # The last step, in standard deviations, from which a fit has not settled.
 _RESTLESS = 2.0
+# Streaks so close, px, and as bright as this part of one run beside it; a sky has few such pairs.
+_BESIDE = 8.0
+_LIKE = 0.3
+_MOST_PAIRED = 0.4
 # Two streaks so close, px, are one.
 _SAME = 1.5
 
@@ -100,12 +104,25 @@ def _why_not(result: MotionResult, camera: ExposedCamera, last: Fit, whole: Whol
             f"the body shook: all streaks waver by {shaking.across:.2f} px across and "
             f"{100.0 * shaking.along:.0f} % in brightness"
         )
+    if _paired(result) > _MOST_PAIRED:
+        return "most streaks run beside another: the body shook, or the point spread is hollow"
     if known.doubt > settings.worst_doubt:
         return (
-            f"the point spread, {result.psf_sigma:.2f} px, is not that described, {settings.psf_sigma:g} px: "
-            f"the rate is uncertain by {100.0 * known.doubt:.0f} %"
+            f"the rate is uncertain by {100.0 * known.doubt:.1f} %: the point spread is {result.psf_sigma:.2f} px, "
+            f"{settings.psf_sigma:g} px as described; how well is the lens known?"
         )
     return ""
+
+
+def _paired(result: MotionResult) -> float:
+    """Return what part of the used stars has another, not much fainter, beside it.
+
+    The light of a body that shakes many times in an exposure gathers where the motion turns round, on either
+    side of each path.
+    """
+    apart = np.linalg.norm(result.stars[result.used, None] - result.stars, axis=2)
+    rival = result.flux > _LIKE * result.flux[result.used, None]
+    return float(np.mean((rival & (apart > 0.0) & (apart < _BESIDE)).any(axis=1)))
 
 
 def with_faint(result: MotionResult, camera: ExposedCamera, scene: Scene, faint: FaintStars) -> MotionResult:

@@ -61,6 +61,6 @@ class LikelihoodSettings:
     least_significance: float = 5.0
     worst_misfit: float = 4.0
     worst_shaking: float = 0.05
-    worst_doubt: float = 0.05
+    worst_doubt: float = 0.015
     sign_sigmas: float = 3.0
     knowledge: CameraKnowledge = CameraKnowledge()
