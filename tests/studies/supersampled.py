@@ -30,7 +30,7 @@ _STARS_AT_ONCE = 64
 
 
 def gaussian(sigma: float, ratio: float = 1.0, angle: float = 0.0) -> Spread:
-    """Return an elliptical Gaussian: axes sigma sqrt(ratio), sigma / sqrt(ratio) px, the long at `angle` rad."""
+    """Return an ellipse: axes sigma sqrt(ratio) and sigma / sqrt(ratio) px, the long at `angle` rad."""
     cosine, sine = np.cos(angle), np.sin(angle)
 
     def density(dx: FloatArray, dy: FloatArray) -> FloatArray:

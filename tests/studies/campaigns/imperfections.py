@@ -1,4 +1,4 @@
-"""The imperfections that the campaign `mismatch` flies: how each changes optics, light, counts, or what is known.
+"""The imperfections that the campaign `mismatch` flies: how each changes optics, light or counts.
 
 An imperfection is untold unless its name says `told`: the estimator is given the ideal camera.
 """

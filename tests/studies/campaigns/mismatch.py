@@ -1,12 +1,12 @@
-"""Campaigns `mismatch` and `vibration`: cameras and motions unlike the model, rendered by a renderer of its own.
+"""Campaigns `mismatch` and `vibration`: cameras and motions unlike the model, by a renderer of its own.
 
-`mismatch` flies each of `imperfections.IMPERFECTIONS` alone, at turns of 10 and 30 % of the field; `vibration`
-a body that shakes by 1 to 5 px at 5 to 50 Hz at exposures of 0.2 and 1 s. Pointings are uniform over the sky,
-the axis is 0 to 90 deg off the boresight, and five stars must be usable (`scenes.usable`).
+`mismatch` flies each of `imperfections.IMPERFECTIONS` at turns of 10 and 30 % of the field; `vibration` a
+body that shakes by 1 to 5 px at 5 to 50 Hz, with exposures of 0.2 and 1 s. Pointings are uniform over the sky, the
+axis is 0 to 90 deg off the boresight, and five stars must be usable (`scenes.usable`).
 
-An answer is judged by its error in its own standard deviations (the square root of its NEES) and as a part of
-the rate. More than 6 is confidently wrong: chance makes it so once in 13 million. What a body turns by that
-shakes is its mean rate, from attitude to attitude at the exposure's ends.
+An answer is judged by its error in its own standard deviations (the square root of its NEES) and as a part
+of the rate. More than 6 is confidently wrong: chance makes it so once in 13 million. The true rate of a body
+that shakes is its mean rate, from attitude to attitude at the exposure's ends.
 """
 
 from __future__ import annotations
@@ -215,15 +215,17 @@ def summarise(results: Sequence[Result], out: Path) -> Summary:
     ]
     total = _figures(results)
     lines = [
-        f"{'imperfection':20} {'turn':>5} {'answers':>9} {'worst sigma':>11} {'NEES':>8} {'worst error':>11} {'claimed':>8}"
+        f"{'imperfection':20} {'turn':>5} {'answers':>9} {'worst sigma':>11} {'NEES':>8} "
+        f"{'worst error':>11} {'claimed':>8}"
     ]
     lines += [
         _line(row["row"], f"{row['percent']:.0f} %", row)
         for row in [*table, {"row": "all", "percent": 0.0, **total}]
     ]
     lines.append(
-        f"beyond {WRONG_SIGMAS:.0f} sigma: {total['beyond_sigmas']}; more than {100 * WRONG_SHARE:.0f} % wrong: "
-        f"{total['beyond_share']}; of {total['answers']} answers from {total['frames']} frames"
+        f"beyond {WRONG_SIGMAS:.0f} sigma: {total['beyond_sigmas']}; "
+        f"more than {100 * WRONG_SHARE:.0f} % wrong: {total['beyond_share']}; "
+        f"of {total['answers']} from {total['frames']} frames"
     )
     worst = sorted((r for r in results if r["nees"] is not None), key=lambda r: -r["nees"])[:10]
     return Summary("\n".join(lines) + "\n", {"rows": table, "all": total, "worst": worst})

@@ -1,9 +1,9 @@
 """What a fit may claim of its turn: its covariance with all that the model does not describe.
 
-Noise gives the least covariance. Stars that disagree beyond their noise widen it. So do the errors of the
-camera's description, as far as the stars do not show them, and what is common to all stars and therefore shows
-in no disagreement: a point spread other than the one described, and a body that shakes. Both leave the ends of
-the streaks uncertain by some px, alike for all.
+Noise gives the least covariance. Stars that disagree beyond their noise widen it. So do errors of the
+camera's description, as far as the stars do not show them, and what is common to all stars and shows in no
+disagreement: a point spread other than the one described, and a body that shakes. Both leave the ends of the
+streaks uncertain by some px, alike for all.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from flight.gnc.vision.streaks.maximum_likelihood.shaking import Shaking, find_s
 
 # Rounds of conjugate gradients for the covariance.
 _CONJUGATE = 12
-# The described point spread may differ from the fitted by this part of its variance for the renderer's reasons.
+# Fitted and described point spread are the same when their variances differ by this part.
 _SAME_SPREAD = 0.05
 # Ends are uncertain by this part of the square root of the difference of the variances.
 _END_SHARE = 0.6
-# Px by which the ends are uncertain for each px, or each unit of brightness, that the streaks shake in common.
+# Px by which ends are uncertain for each px, or unit of brightness, that all streaks waver in common.
 _END_SHAKING = 25.0
 
 
@@ -82,7 +82,7 @@ def claim(result: MotionResult, camera: ExposedCamera, last: Fit) -> Claim:
 def _with_lens(
     camera: ExposedCamera, last: Fit, equations: OwnEquations, exposure: float
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Return the turn's correction (3,), its covariance (3, 3) for the camera's errors, and the stars' spread."""
+    """Return the turn's correction (3,), covariance (3, 3) for the camera's errors, and the stars' spread."""
     trusted = np.flatnonzero(last.scene.trusted)
     scene = last.scene.select(trusted)
     equations = OwnEquations(equations.kept, equations.information[trusted], equations.score[trusted])
@@ -106,7 +106,7 @@ def _with_lens(
 
 
 def _spread_doubt(width: float, sigma: float) -> float:
-    """Return by how many px the ends of streaks of a fitted `width` are uncertain, `sigma` being described."""
+    """Return by how many px the ends of streaks of a fitted `width` are uncertain; `sigma` is described."""
     described = sigma**2 + PIXEL_VARIANCE
     beyond = abs(width**2 - described) - _SAME_SPREAD * described
     return _END_SHARE * float(np.sqrt(max(beyond, 0.0)))

@@ -43,9 +43,9 @@ def correct(
 ) -> Correction | None:
     """Return the joint solution of the shared parameters and of the camera's errors; None without one.
 
-    `information` (n, k, k) and `score` (n, k) are each star's, its own numbers eliminated; `seeming` (n, k, m)
-    the change of the parameters that m errors, each of one standard deviation, seem to be; `spread` the
-    variance of what is left over, in that of the noise.
+    `information` (n, k, k) and `score` (n, k) are each star's, its own numbers eliminated; `seeming`
+    (n, k, m) the change of the parameters that m errors, each of one standard deviation, seem to be;
+    `spread` the variance of what is left over, in that of the noise.
     """
     m = seeming.shape[2]
     known = information / spread

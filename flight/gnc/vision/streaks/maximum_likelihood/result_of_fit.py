@@ -89,29 +89,31 @@ def with_rate(result: MotionResult, camera: ExposedCamera, last: Fit, whole: Who
 
 
 def _why_not(result: MotionResult, camera: ExposedCamera, last: Fit, whole: Wholeness, known: Claim) -> str:
-    """Return why a motion that was fitted is not believed; empty when it is."""
+    """Return why a motion that was fitted is not believed, in a line; empty when it is."""
     settings, shaking = camera.settings, known.shaking
-    if last.restless > _RESTLESS:
-        return "the fit does not settle"
-    if not result.misfit < settings.worst_misfit:
-        return (
-            f"the streaks are unlike the model: misfit {result.misfit:.1f}, {settings.worst_misfit} at most"
-        )
-    if whole is Wholeness.BROKEN:
-        return "the motion makes pieces of longer streaks, or joins several, or ends where the light goes on"
-    if max(shaking.across, shaking.along) > settings.worst_shaking:
-        return (
+    checks = (
+        (last.restless > _RESTLESS, "the fit does not settle"),
+        (
+            not result.misfit < settings.worst_misfit,
+            f"the streaks are unlike the model: misfit {result.misfit:.1f}",
+        ),
+        (whole is Wholeness.BROKEN, "the motion makes pieces of streaks, or joins several"),
+        (
+            max(shaking.across, shaking.along) > settings.worst_shaking,
             f"the body shook: all streaks waver by {shaking.across:.2f} px across and "
-            f"{100.0 * shaking.along:.0f} % in brightness"
-        )
-    if _paired(result) > _MOST_PAIRED:
-        return "most streaks run beside another: the body shook, or the point spread is hollow"
-    if known.doubt > settings.worst_doubt:
-        return (
-            f"the rate is uncertain by {100.0 * known.doubt:.1f} %: the point spread is {result.psf_sigma:.2f} px, "
-            f"{settings.psf_sigma:g} px as described; how well is the lens known?"
-        )
-    return ""
+            f"{100.0 * shaking.along:.0f} % in brightness",
+        ),
+        (
+            _paired(result) > _MOST_PAIRED,
+            "most streaks run beside another: the body shook, or the point spread is hollow",
+        ),
+        (
+            known.doubt > settings.worst_doubt,
+            f"the rate is uncertain by {100.0 * known.doubt:.1f} %: the point spread is {result.psf_sigma:.2f}"
+            f" px, {settings.psf_sigma:g} px as described, or the lens is not known well enough",
+        ),
+    )
+    return next((reason for failed, reason in checks if failed), "")
 
 
 def _paired(result: MotionResult) -> float:

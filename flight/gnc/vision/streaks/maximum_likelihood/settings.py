@@ -7,6 +7,8 @@ from typing import Literal
 
 from flight.gnc.camera.knowledge import CameraKnowledge
 
+_UNCALIBRATED = CameraKnowledge()
+
 RateModel = Literal["auto", "constant", "accelerating"]
 
 
@@ -35,8 +37,8 @@ class LikelihoodSettings:
         least_length: px, median path below which no rate is given.
         least_significance: of the rate in its standard deviations, below which no rate is given.
         worst_misfit: chi-square per degree of freedom above which the motion is not believed.
-        worst_shaking: displacement common to all streaks, px, or common share of their brightness, above which
-            the motion is not believed to be smooth.
+        worst_shaking: px of displacement, or share of brightness, that all streaks waver in common, above
+            which the motion is not smooth.
         worst_doubt: share of the rate to which model errors may leave it uncertain.
         knowledge: how well the camera is known.
         sign_sigmas: the prior's projection on the axis must exceed this many of its sigmas to decide the
@@ -63,4 +65,4 @@ class LikelihoodSettings:
     worst_shaking: float = 0.05
     worst_doubt: float = 0.015
     sign_sigmas: float = 3.0
-    knowledge: CameraKnowledge = CameraKnowledge()
+    knowledge: CameraKnowledge = _UNCALIBRATED

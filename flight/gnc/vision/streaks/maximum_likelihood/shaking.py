@@ -1,6 +1,6 @@
 """Whether the body shook during the exposure: what all streaks have in common that a smooth motion has not.
 
-A jitter moves all stars alike. Across their paths it shows as a displacement common to all streaks at the same
+A jitter moves all stars alike. Across their paths it shows as a displacement common to all streaks at one
 time, along them as a common change of brightness, where the motion lingers or hurries. Residuals are stacked
 over the stars by the time of the exposure; only products of different stars are summed, so that what one star
 has of its own, a neighbour hidden in its light, adds nothing.
@@ -29,7 +29,7 @@ _SIGNIFICANT = 4.0
 
 @dataclass(frozen=True, slots=True)
 class Shaking:
-    """What the streaks have in common beyond a smooth motion, rms over the exposure; 0 where chance explains it.
+    """What the streaks have in common beyond a smooth motion, rms; 0 where chance explains it.
 
     Attributes:
         across: px, displacement across the paths.
@@ -86,7 +86,7 @@ def _left_over(camera: ExposedCamera, fit: Fit) -> tuple[Float32Array, Float32Ar
 def _common(cell: FloatArray, score: FloatArray, information: FloatArray) -> float:
     """Return the rms of what all stars ask for in common, 0 when it may be chance.
 
-    `cell` (m,) numbers star and time, star by star; `score` (m, 2) and `information` (m,) of lines are summed.
+    `cell` (m,) numbers star and time; `score` (m, 2) and `information` (m,) of lines are summed.
     """
     size = (int(cell.max()) // _BINS + 1) * _BINS if len(cell) else 0
     if size < 2 * _BINS:
