@@ -1,8 +1,8 @@
 """Campaigns `mismatch` and `vibration`: cameras and motions unlike the model, by a renderer of its own.
 
 `mismatch` flies each of `imperfections.IMPERFECTIONS` at turns of 10 and 30 % of the field; `vibration` a
-body that shakes by 1 to 5 px at 5 to 50 Hz, with exposures of 0.2 and 1 s. Pointings are uniform over the sky, the
-axis is 0 to 90 deg off the boresight, and five stars must be usable (`scenes.usable`).
+body that shakes by 1 to 5 px at 5 to 50 Hz, with exposures of 0.2 and 1 s. Pointings are uniform over
+the sky, the axis is 0 to 90 deg off the boresight, and five stars must be usable (`scenes.usable`).
 
 An answer is judged by its error in its own standard deviations (the square root of its NEES) and as a part
 of the rate. More than 6 is confidently wrong: chance makes it so once in 13 million. The true rate of a body

@@ -109,8 +109,8 @@ def _why_not(result: MotionResult, camera: ExposedCamera, last: Fit, whole: Whol
         ),
         (
             known.doubt > settings.worst_doubt,
-            f"the rate is uncertain by {100.0 * known.doubt:.1f} %: the point spread is {result.psf_sigma:.2f}"
-            f" px, {settings.psf_sigma:g} px as described, or the lens is not known well enough",
+            f"uncertain by {100.0 * known.doubt:.1f} %: the point spread is {result.psf_sigma:.2f} px,"
+            f" {settings.psf_sigma:g} px as described, or the lens is not known well enough",
         ),
     )
     return next((reason for failed, reason in checks if failed), "")
