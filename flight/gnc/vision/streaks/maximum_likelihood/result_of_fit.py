@@ -70,13 +70,16 @@ def with_rate(result: MotionResult, camera: ExposedCamera, last: Fit, whole: Who
     """Return `result` with the rate, or with why there is none."""
     settings, scene = camera.settings, last.scene
     if result.used_count < settings.least_stars:
-        return replace(result, status=StreakStatus.TOO_FEW)
+        why = f"{result.used_count} streaks agree, {settings.least_stars} at least are needed"
+        return replace(result, status=StreakStatus.TOO_FEW, reason=why)
     known = claim(result, camera, last)
     size = float(np.linalg.norm(known.turn))
     deviation = float(np.sqrt(known.turn @ known.covariance @ known.turn)) / size
-    if result.length < settings.least_length or not size > settings.least_significance * deviation:
-        return replace(result, status=StreakStatus.TOO_SHORT)
+    still = not size > settings.least_significance * deviation
     reason = _why_not(result, camera, last, whole, known)
+    if result.length < settings.least_length or (still and not reason):
+        why = f"streaks of {result.length:.1f} px are too short for a rate"
+        return replace(result, status=StreakStatus.TOO_SHORT, reason=why)
     if reason:
         return replace(result, status=StreakStatus.FAILED, reason=reason)
     return replace(
