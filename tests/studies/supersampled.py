@@ -9,13 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from scipy import fft
 
 from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import attitude_matrix
+
+Cells = npt.NDArray[np.floating[Any]]
+"""Light (rows, columns) on a grid of cells."""
 
 CELLS = 3
 """Cells along a pixel's side."""
@@ -125,7 +130,7 @@ def light(
     `length` px bounds the length of paths; `delay` is from row to row, in exposures (a rolling shutter).
     """
     layers = len(optics.spreads)
-    grid = np.zeros((layers, CELLS * pinhole.rows, CELLS * pinhole.columns), dtype=np.float32)
+    grid: Cells = np.zeros((layers, CELLS * pinhole.rows, CELLS * pinhole.columns), dtype=np.float32)
     room = 0.5 + 0.5 * abs(delay) * pinhole.rows
     count = int(np.ceil(2.0 * room * length / _APART)) + 16
     times = (np.arange(count) + 0.5) / count * 2.0 * room - room
@@ -146,11 +151,11 @@ def light(
         seen = (weight > 0.0) & pinhole.contains(place, optics.radius)
         laid.append((place[seen], weight[seen]))
     _lay(grid, pinhole, np.concatenate([p for p, _ in laid]), np.concatenate([w for _, w in laid]))
-    cells = sum(
-        _spread(layer, spread, optics.radius) for layer, spread in zip(grid, optics.spreads, strict=True)
-    )
+    cells = np.zeros(grid.shape[1:])
+    for layer, spread in zip(grid, optics.spreads, strict=True):
+        cells += _spread(layer, spread, optics.radius)
     shape = pinhole.rows, CELLS, pinhole.columns, CELLS
-    return np.asarray(cells, dtype=float).reshape(shape).sum(axis=(1, 3)).clip(0.0)
+    return np.asarray(cells.reshape(shape).sum(axis=(1, 3)).clip(0.0))
 
 
 def through_lens(pinhole: Pinhole, optics: Optics, vectors: FloatArray) -> FloatArray:
@@ -163,7 +168,7 @@ def through_lens(pinhole: Pinhole, optics: Optics, vectors: FloatArray) -> Float
     return np.asarray(place + np.array(pinhole.centre) + np.array(optics.offset))
 
 
-def _lay(grid: FloatArray, pinhole: Pinhole, place: FloatArray, weight: FloatArray) -> None:
+def _lay(grid: Cells, pinhole: Pinhole, place: FloatArray, weight: FloatArray) -> None:
     """Add points of light, each shared by the four cells about it and by the layers about its radius."""
     cell = CELLS * (place + 0.5) - 0.5
     corner = np.floor(cell).astype(np.int64)
@@ -181,7 +186,7 @@ def _lay(grid: FloatArray, pinhole: Pinhole, place: FloatArray, weight: FloatArr
             grid[layer] += np.bincount(index, share * x * y, rows * columns).reshape(rows, columns)
 
 
-def _spread(layer: FloatArray, spread: Spread, radius: float) -> FloatArray:
+def _spread(layer: Cells, spread: Spread, radius: float) -> Cells:
     """Return a layer (rows, columns) of cells convolved with a point spread."""
     half = int(np.ceil(radius * CELLS))
     fine = (np.arange((2 * half + 1) * _FINER) + 0.5) / (_FINER * CELLS) - (half + 0.5) / CELLS

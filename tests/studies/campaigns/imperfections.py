@@ -78,11 +78,11 @@ def _grid(image: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _vignetting(image: FloatArray, rng: np.random.Generator) -> FloatArray:
     x, y = _grid(image)
-    return image * (1.0 - 0.25 * (x * x + y * y))
+    return np.asarray(image * (1.0 - 0.25 * (x * x + y * y)))
 
 
 def _response(rms: float) -> Stage:
-    return lambda image, rng: image * rng.normal(1.0, rms, image.shape).clip(0.0)
+    return lambda image, rng: np.asarray(image * rng.normal(1.0, rms, image.shape).clip(0.0))
 
 
 def _gradient(electrons: float) -> Stage:
@@ -90,7 +90,7 @@ def _gradient(electrons: float) -> Stage:
         x, y = _grid(image)
         angle = rng.uniform(0.0, 2.0 * np.pi)
         across = np.cos(angle) * x + np.sin(angle) * y
-        return image + electrons * (across - across.min()) / np.ptp(across)
+        return np.asarray(image + electrons * (across - across.min()) / np.ptp(across))
 
     return add
 
@@ -98,7 +98,7 @@ def _gradient(electrons: float) -> Stage:
 def _blob(image: FloatArray, rng: np.random.Generator) -> FloatArray:
     y, x = np.indices(image.shape)
     column, row = rng.uniform(100.0, 900.0, 2)
-    return image + 3000.0 * np.exp(-0.5 * ((x - column) ** 2 + (y - row) ** 2) / 30.0**2)
+    return np.asarray(image + 3000.0 * np.exp(-0.5 * ((x - column) ** 2 + (y - row) ** 2) / 30.0**2))
 
 
 def _limb(image: FloatArray, rng: np.random.Generator) -> FloatArray:
@@ -106,7 +106,7 @@ def _limb(image: FloatArray, rng: np.random.Generator) -> FloatArray:
     angle = rng.uniform(0.0, 2.0 * np.pi)
     middle = np.array([512.0, 512.0]) + 2900.0 * np.array([np.cos(angle), np.sin(angle)])
     depth = 2600.0 - np.hypot(x - middle[0], y - middle[1])
-    return image + 3000.0 / (1.0 + np.exp(-np.clip(depth / 4.0, -50.0, 50.0)))
+    return np.asarray(image + 3000.0 / (1.0 + np.exp(-np.clip(depth / 4.0, -50.0, 50.0))))
 
 
 def _bayer(image: FloatArray, rng: np.random.Generator) -> FloatArray:
@@ -119,7 +119,7 @@ def _bayer(image: FloatArray, rng: np.random.Generator) -> FloatArray:
 def _hot(share: float) -> Stage:
     def add(image: FloatArray, rng: np.random.Generator) -> FloatArray:
         hot = rng.random(image.shape) < share
-        return image + hot * rng.exponential(600.0, image.shape)
+        return np.asarray(image + hot * rng.exponential(600.0, image.shape))
 
     return add
 
@@ -160,7 +160,7 @@ def _nonlinear(image: FloatArray, rng: np.random.Generator) -> FloatArray:
 
 
 def _columns(image: FloatArray, rng: np.random.Generator) -> FloatArray:
-    return image + rng.normal(0.0, 6.0, image.shape[1])[None, :]
+    return np.asarray(image + np.asarray(rng.normal(0.0, 6.0, image.shape[1]))[None, :])
 
 
 def _bad_columns(image: FloatArray, rng: np.random.Generator) -> FloatArray:
@@ -168,10 +168,6 @@ def _bad_columns(image: FloatArray, rng: np.random.Generator) -> FloatArray:
     for column in rng.integers(0, image.shape[1], 6):
         out[:, column] = rng.choice([0.0, 1500.0])
     return out
-
-
-def _quantised(step: float, gain: float) -> Stage:
-    return lambda image, rng: np.asarray(np.rint(image / step) * gain)
 
 
 IMPERFECTIONS: dict[str, Imperfection] = {

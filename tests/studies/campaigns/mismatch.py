@@ -18,8 +18,14 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray, Image
-from flight.gnc.math.quaternion import from_rotation_vector, multiply, normalise, to_rotation_vector
+from flight.gnc.math.arrays import FloatArray, Image, IntArray
+from flight.gnc.math.quaternion import (
+    attitude_matrix,
+    from_rotation_vector,
+    multiply,
+    normalise,
+    to_rotation_vector,
+)
 from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from flight.gnc.vision.streaks.streak_result import StreakStatus
@@ -130,10 +136,8 @@ def expose(case: Case, imperfection: Imperfection) -> tuple[Image, FloatArray]:
     return _detected(electrons, imperfection, camera, exposure, rng), np.asarray(rate)
 
 
-def _seen(camera: StarCameraModel, sky: Sky, attitudes: Attitudes, exposure: float) -> tuple[FloatArray, int]:
+def _seen(camera: StarCameraModel, sky: Sky, attitudes: Attitudes, exposure: float) -> tuple[IntArray, int]:
     """Return the stars that may throw light on the frame, and how many are usable."""
-    from flight.gnc.math.quaternion import attitude_matrix  # noqa: PLC0415
-
     vectors = np.einsum("tij,nj->tni", attitude_matrix(attitudes(np.array([-0.5, 0.0, 0.5]))), sky.directions)
     reach = np.cos(camera.pinhole.half_diagonal + 0.4 * camera.field_of_view)
     near = np.flatnonzero(vectors[1, :, 2] > reach)

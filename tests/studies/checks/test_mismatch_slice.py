@@ -1,4 +1,4 @@
-"""The campaigns `mismatch` and `vibration`: their renderer, and a small slice of each with a seed of its own."""
+"""The campaigns `mismatch` and `vibration`: their renderer, and a small slice of each, with its own seed."""
 
 from __future__ import annotations
 

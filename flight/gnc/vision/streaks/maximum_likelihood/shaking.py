@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.arrays import FloatArray, IntArray
 from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import Float32Array
 from flight.gnc.vision.streaks.maximum_likelihood.iteration import ExposedCamera, Fit
 from flight.gnc.vision.streaks.maximum_likelihood.motion import paths
@@ -83,7 +83,7 @@ def _left_over(camera: ExposedCamera, fit: Fit) -> tuple[Float32Array, Float32Ar
     return images, weight, residual
 
 
-def _common(cell: FloatArray, score: FloatArray, information: FloatArray) -> float:
+def _common(cell: IntArray, score: FloatArray, information: FloatArray) -> float:
     """Return the rms of what all stars ask for in common, 0 when it may be chance.
 
     `cell` (m,) numbers star and time; `score` (m, 2) and `information` (m,) of lines are summed.
