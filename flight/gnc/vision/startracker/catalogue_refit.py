@@ -207,7 +207,7 @@ def _scenes(
     path = path_lengths(camera.pinhole, course, known.places) + 2.0 * np.sqrt(np.pi) * width
     light = known.light * known.inside
     floor = float(np.median(camera.frame.floor)) * 2.0 * np.sqrt(np.pi) * width * path * known.inside
-    seen = light > settings.faint_sigmas * np.sqrt(floor + light / settings.gain)
+    seen = light > settings.faint_sigmas * np.sqrt(floor + light / camera.frame.gain)
     fitted = np.flatnonzero(near & (leading | seen) & ~twin)[: settings.most_stars + settings.most_neighbours]
     hidden = near.copy()
     hidden[fitted] = False
