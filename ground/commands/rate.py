@@ -32,6 +32,14 @@ from ground.pictures.overlay import draw_marks
 
 LIKELIHOOD = "likelihood"
 
+_REASONS = {
+    StreakStatus.FAILED: "no motion that enough of the light vouches for",
+    StreakStatus.TOO_FEW: "too few streaks stand out of the noise",
+    StreakStatus.TOO_SHORT: "the stars hardly moved",
+    StreakStatus.BLACK: "the frame is of one value: it shows no scene",
+    StreakStatus.SATURATED: "the frame is overexposed",
+}
+
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of this command to the parser."""
@@ -187,7 +195,10 @@ def _facts(
 
 def _reason(found: StreakResult | MotionResult) -> str:
     """Return why there is no rate, in a line; empty when there is one."""
-    return found.reason if isinstance(found, MotionResult) else ""
+    if found.rate is not None:
+        return ""
+    detailed = found.reason if isinstance(found, MotionResult) else ""
+    return detailed or _REASONS.get(found.status, "")
 
 
 def _text(found: StreakResult | MotionResult, objects: tuple[SpaceObject, ...]) -> str:

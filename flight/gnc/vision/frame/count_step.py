@@ -1,4 +1,4 @@
-"""The step between the counts of a frame: 257 where eight bits were written as sixteen, 16 where twelve were."""
+"""The step between a frame's counts: 257 where eight bits were written as sixteen, 16 where twelve were."""
 
 from __future__ import annotations
 

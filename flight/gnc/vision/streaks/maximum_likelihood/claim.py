@@ -28,6 +28,8 @@ from flight.gnc.vision.streaks.maximum_likelihood.shaking import Shaking, find_s
 
 # Rounds of conjugate gradients for the covariance.
 _CONJUGATE = 12
+# So few stars hardly contradict each other: their variance counts by this factor.
+_UNCHECKED = (2, 4.0)
 # Fitted and described point spread are the same when their variances differ by this part.
 _SAME_SPREAD = 0.05
 # Ends are uncertain by this part of the square root of the difference of the variances.
@@ -66,6 +68,8 @@ def claim(result: MotionResult, camera: ExposedCamera, last: Fit) -> Claim:
     # What made others disagree is as likely to hide, less of it, in the light of those that agree.
     asked = min(settings.most_stars, len(scene.trusted))
     spread = max(result.misfit, spread, 1.0) * asked / max(int(np.count_nonzero(scene.trusted)), 1)
+    if np.count_nonzero(scene.trusted) <= _UNCHECKED[0]:
+        spread *= _UNCHECKED[1]
     shaking = find_shaking(camera, last)
     end = np.hypot(
         _spread_doubt(scene.width, settings.psf_sigma), _END_SHAKING * max(shaking.across, shaking.along)

@@ -33,7 +33,7 @@ class LikelihoodSettings:
         faint_sigmas: significance from which a streak along the known motion is believed.
         reach: widths of the point spread to either side of a path that are fitted.
         clip: sigmas of a residual that is no noise.
-        least_stars: fewer fix no rate.
+        least_stars: fewer fix no rate; two do, though none contradicts them.
         least_length: px, median path below which no rate is given.
         least_significance: of the rate in its standard deviations, below which no rate is given.
         worst_misfit: chi-square per degree of freedom above which the motion is not believed.
@@ -58,7 +58,7 @@ class LikelihoodSettings:
     faint_sigmas: float = 6.0
     reach: float = 3.6
     clip: float = 5.0
-    least_stars: int = 3
+    least_stars: int = 2
     least_length: float = 3.0
     least_significance: float = 5.0
     worst_misfit: float = 4.0

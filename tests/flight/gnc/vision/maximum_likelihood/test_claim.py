@@ -7,6 +7,7 @@ import pytest
 
 from flight.gnc.camera.knowledge import EXACT, CameraKnowledge
 from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import from_rotation_vector, multiply
 from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion
 from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import expose_frame
 from flight.gnc.vision.streaks.maximum_likelihood.iteration import ExposedCamera
@@ -15,7 +16,8 @@ from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion, sensitiv
 from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from flight.gnc.vision.streaks.maximum_likelihood.shutter import Shutter
-from tests.flight.gnc.vision.maximum_likelihood.scenes import CAMERA, SATURATION, real_sky
+from sim_hal.star_camera import render
+from tests.flight.gnc.vision.maximum_likelihood.scenes import CAMERA, SATURATION, real_sky, turn_of
 
 _TURN = np.array([0.02, 0.03, 0.0])
 
@@ -109,3 +111,21 @@ def test_a_point_spread_far_from_the_one_described_is_refused_with_a_reason() ->
     result = estimate_motion(scene.pixels, CAMERA.pinhole, 0.2, settings, scene.rate, 0.0)
     assert result.rate is None
     assert "point spread is 1.0" in result.reason
+
+
+def test_two_stars_fix_a_rate_with_a_covariance_that_says_so() -> None:
+    turn = turn_of(np.radians(60.0), 90.0, 0.3)
+    middle = np.array([0.0, 0.0, 0.0, 1.0])
+    stars = CAMERA.pinhole.unit_vectors(np.array([[300.0, 350.0], [700.0, 560.0]]))
+    times = np.array([-0.5, 0.0, 0.5])
+    attitudes = multiply(from_rotation_vector(times[:, None] * turn), middle)
+    rng = np.random.default_rng(4)
+    pixels = render(CAMERA, stars, np.array([2.0, 3.0]), 0.2 * (times + 0.5), attitudes, rng)
+    settings = LikelihoodSettings(saturation=SATURATION, knowledge=EXACT)
+    found = estimate_motion(pixels, CAMERA.pinhole, 0.2, settings, turn / 0.2, 0.0)
+    assert found.used_count == 2
+    assert found.rate is not None
+    assert found.covariance is not None
+    error = found.rate - turn / 0.2
+    assert error @ np.linalg.solve(found.covariance, error) < 16.3
+    assert np.linalg.norm(error) < 0.01 * np.linalg.norm(turn / 0.2)
