@@ -138,7 +138,8 @@ def solve_frame(
         rate_prior: gives the direction of time, which one frame does not show.
     """
     tracker = TrackerSettings(settings, scale)
-    estimator = settings.likelihood
+    # Of a picture the places of the stars are wanted: a rate that is hardly known serves as well.
+    estimator = replace(settings.likelihood, worst_doubt=math.inf, worst_shaking=math.inf)
     job = FrameJob(
         pixels, camera, exposure, estimator, tracker, rate_prior, attitude_prior, motion_first=False
     )
