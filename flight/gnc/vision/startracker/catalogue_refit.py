@@ -92,7 +92,9 @@ def refit_motion(
     likelihood: LikelihoodSettings,
 ) -> MotionResult | None:
     """Return `motion` refitted with all stars known; None if that fails or gives another rate."""
-    if motion.rate is None or motion.covariance is None:
+    # Under a rolling shutter an ambiguous rate lies between two motions: there is none to start from.
+    between = likelihood.line_time > 0.0 and motion.status is not StreakStatus.RATE
+    if motion.rate is None or motion.covariance is None or between:
         return None
     pinhole, exposure = solution.camera.ideal, motion.exposure
     growth = np.zeros(3) if motion.acceleration is None else motion.acceleration * exposure**2

@@ -30,7 +30,7 @@ from flight.gnc.vision.streaks.maximum_likelihood.iteration import (
 from flight.gnc.vision.streaks.maximum_likelihood.matched_filter import find_faint
 from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion
 from flight.gnc.vision.streaks.maximum_likelihood.polar_grid import polar_grid
-from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene, window_times
+from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene, mid_exposure, window_times
 
 _FIRST_STARS = 12
 # This many guesses are tried at most.
@@ -124,7 +124,9 @@ def _tried(camera: ExposedCamera, guess: Guess) -> tuple[float, bool, Fit] | Non
     count = len(guess.light)
     everyone = np.ones(count, dtype=np.bool_)
     width = float(np.hypot(camera.settings.psf_sigma, 0.29))
-    scene = Scene(Motion.steady(guess.turn), width, guess.stars, guess.light, np.zeros(count), everyone)
+    motion = Motion.steady(camera.directed(guess.turn))
+    stars = mid_exposure(camera.pinhole, motion, camera.shutter, guess.stars)
+    scene = Scene(motion, width, stars, guess.light, np.zeros(count), everyone)
     free = np.array([True] * 3 + [False] * 3 + [True])
     done = iterate(camera, scene, free, FIRST)
     if done is None:

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import fdtri
 
 from flight.gnc.camera.pinhole import Pinhole
-from flight.gnc.math.arrays import BoolArray
+from flight.gnc.math.arrays import BoolArray, FloatArray
 from flight.gnc.vision.streaks.maximum_likelihood.agreement import agreed_step
 from flight.gnc.vision.streaks.maximum_likelihood.equation_solver import Solution, moved, solve
 from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import ExposedFrame
@@ -71,13 +71,19 @@ LAST = Rounds(10, clipped=True, tolerance=0.003, settled=SETTLED, conjugate=12, 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExposedCamera:
-    """A frame with all that is known of how it was taken; `growing`: whether the rate may change."""
+    """A frame with all that is known of how it was taken.
+
+    Attributes:
+        growing: whether the rate may change.
+        sense: (3,) a vector along which the camera turns, not against it; None where either will do.
+    """
 
     frame: ExposedFrame
     pinhole: Pinhole
     shutter: Shutter
     settings: LikelihoodSettings
     growing: bool = False
+    sense: FloatArray | None = None
 
     @property
     def free(self) -> BoolArray:
@@ -88,6 +94,10 @@ class ExposedCamera:
     def undecided(self) -> bool:
         """Whether the pixels are yet to show that the rate changes."""
         return self.settings.rate_model == "auto" and not self.growing
+
+    def directed(self, turn: FloatArray) -> FloatArray:
+        """Return `turn` (3,) in the direction of `sense`."""
+        return -turn if self.sense is not None and turn @ self.sense < 0.0 else turn
 
     def windows(self, scene: Scene) -> Windows:
         """Return the pixels about the scene's streaks."""

@@ -22,7 +22,7 @@ from flight.gnc.vision.streaks.maximum_likelihood.length_correction import stret
 from flight.gnc.vision.streaks.maximum_likelihood.matched_filter import FaintStars, find_faint
 from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion
 from flight.gnc.vision.streaks.maximum_likelihood.normal_equations import light_of
-from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene, path_lengths
+from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene, mid_exposure, path_lengths
 from flight.gnc.vision.streaks.maximum_likelihood.windows import window_areas
 
 # A rate that changes by more than this part of itself is beyond the model.
@@ -95,6 +95,8 @@ def _fit_from(camera: ExposedCamera, first: Fit) -> tuple[Fit | None, FaintStars
         settings.faint_sigmas,
         settings.most_faint,
     )
+    stars = mid_exposure(camera.pinhole, before.motion, camera.shutter, faint.stars)
+    faint = replace(faint, stars=stars)
     whole = before.with_stars(faint.stars, faint.light)
     order = np.argsort(-whole.light, kind="stable")
     bright, rest = order[: settings.most_stars], order[settings.most_stars :]

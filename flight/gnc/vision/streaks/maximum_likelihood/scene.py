@@ -69,6 +69,13 @@ def window_times(pinhole: Pinhole, motion: Motion, shutter: Shutter, stars: Floa
     return times
 
 
+def mid_exposure(pinhole: Pinhole, motion: Motion, shutter: Shutter, middles: FloatArray) -> FloatArray:
+    """Return where stars whose streaks have their middles at `middles` (n, 2) px are at mid-exposure."""
+    if shutter.delay_per_row == 0.0 or not len(middles):
+        return middles
+    return positions(pinhole, motion, middles, -np.asarray(shutter.delay(middles[:, 1])))
+
+
 def path_lengths(pinhole: Pinhole, motion: Motion, stars: FloatArray) -> FloatArray:
     """Return the length (n,) px of the paths of `stars` (n, 2)."""
     samples = 9

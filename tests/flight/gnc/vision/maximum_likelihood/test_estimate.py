@@ -182,6 +182,29 @@ def test_a_rolling_shutter_is_part_of_the_model_and_spoils_the_rate_when_it_is_n
     assert abs(np.linalg.norm(blind.rate) / size - 1.0) > 0.005
 
 
+def test_a_rolling_shutter_makes_two_motions_of_a_turn_and_its_reverse() -> None:
+    """50 us a line in 0.2 s, across the boresight: 5 % apart. Without a prior the answer spans both."""
+    camera = replace(CAMERA, line_time=5e-5)
+    turn = turn_of(np.radians(90.0), 102.0, 0.2)
+    scene = taken(np.random.default_rng(22), turn, np.zeros(3), 0.2, camera)
+    settings = replace(_SETTINGS, line_time=5e-5)
+    forward = _estimated(scene, settings)
+    backward = estimate_motion(scene.pixels, camera.pinhole, 0.2, settings, -scene.rate, 0.0)
+    alone = estimate_motion(scene.pixels, camera.pinhole, 0.2, settings)
+    assert (forward.status, backward.status) == (StreakStatus.RATE, StreakStatus.RATE)
+    assert alone.status is StreakStatus.AMBIGUOUS
+    assert forward.rate is not None
+    assert forward.covariance is not None
+    assert backward.rate is not None
+    assert alone.rate is not None
+    assert alone.covariance is not None
+    assert _squared(forward.rate - scene.rate, forward.covariance) < 16.3
+    apart = abs(np.linalg.norm(backward.rate) / np.linalg.norm(forward.rate) - 1.0)
+    assert apart > 0.02
+    sign = np.sign(alone.rate @ scene.rate)
+    assert _squared(sign * alone.rate - scene.rate, alone.covariance) < 16.3
+
+
 def test_a_frame_of_noise_a_dead_and_a_frozen_one_are_told() -> None:
     noise = np.random.default_rng(19).normal(100.0, 10.0, (1024, 1024)).astype(np.uint16)
     found = estimate_motion(noise, CAMERA.pinhole, 1.0, _SETTINGS)
