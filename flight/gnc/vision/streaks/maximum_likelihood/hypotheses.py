@@ -16,6 +16,7 @@ from flight.gnc.vision.streaks.maximum_likelihood.first_guess import (
     Guess,
     find_turning,
     scanned_motions,
+    seen_growth,
     voted_motions,
 )
 from flight.gnc.vision.streaks.maximum_likelihood.iteration import (
@@ -35,6 +36,8 @@ from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene, mid_exposu
 _FIRST_STARS = 12
 # This many guesses are tried at most.
 _MOST_GUESSES = 5
+# Of them so many of a rate that changes.
+_MOST_GROWING = 2
 _STILL_ROUNDS = 12
 # A guess is made of this many whole streaks, or of a scan; regions longer than it speak against it.
 _WHOLE = 8
@@ -112,6 +115,9 @@ def _guesses(camera: ExposedCamera, blobs: Blobs, near: float | None) -> Iterato
     turning = find_turning(blobs, camera.pinhole)
     if turning is None:
         return
+    growth = 0.0 if camera.settings.rate_model == "constant" else seen_growth(turning, blobs)
+    if growth:
+        yield from voted_motions(turning, blobs, camera.pinhole, _FIRST_STARS, growth)[:_MOST_GROWING]
     voted = voted_motions(turning, blobs, camera.pinhole, _FIRST_STARS)
     if voted and len(voted[0].light) >= _WHOLE and voted[0].contradicted < _CONTRADICTED:
         yield voted.pop(0)
@@ -124,11 +130,11 @@ def _tried(camera: ExposedCamera, guess: Guess) -> tuple[float, bool, Fit] | Non
     count = len(guess.light)
     everyone = np.ones(count, dtype=np.bool_)
     width = float(np.hypot(camera.settings.psf_sigma, 0.29))
-    motion = Motion.steady(camera.directed(guess.turn))
+    motion = Motion(camera.directed(guess.turn), guess.growth)
     stars = mid_exposure(camera.pinhole, motion, camera.shutter, guess.stars)
     scene = Scene(motion, width, stars, guess.light, np.zeros(count), everyone)
-    free = np.array([True] * 3 + [False] * 3 + [True])
-    done = iterate(camera, scene, free, FIRST)
+    camera = replace(camera, growing=not motion.constant)
+    done = iterate(camera, scene, camera.free, FIRST)
     if done is None:
         return None
     evidence, share = _borne_out(done)

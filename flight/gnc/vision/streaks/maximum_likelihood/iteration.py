@@ -25,6 +25,8 @@ _DRIFT = 1.5
 # Ends of untrusted stars may be farther from it; after the first round by any distance: all windows are
 # not cut again for those whose light hardly fixes their place.
 _FAINT_DRIFT = 2.5
+# The growth may change by this part of the turn before that.
+_GROWN = 0.1
 # Converged: no shared parameter moves by more than this part of its standard deviation. The step is
 # taken, and what it leaves is of second order.
 SETTLED = 0.4
@@ -196,7 +198,13 @@ def _possible(scene: Scene) -> bool:
 
 
 def _drifted(camera: ExposedCamera, before: Scene, after: Scene, faint: float) -> bool:
-    """Return whether an end of a streak has left its window's middle; untrusted ones by `faint` px."""
+    """Return whether an end of a streak has left its window's middle; untrusted ones by `faint` px.
+
+    Windows are also cut for where a rate that changes makes the streaks slow.
+    """
+    grown = float(np.linalg.norm(after.motion.growth - before.motion.growth))
+    if grown > _GROWN * float(np.linalg.norm(after.motion.turn)):
+        return True
     n = len(before.stars)
     at = np.repeat([-0.5, 0.5], n)
     there = positions(camera.pinhole, after.motion, np.tile(after.stars, (2, 1)), at)

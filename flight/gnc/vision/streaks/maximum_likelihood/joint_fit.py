@@ -25,8 +25,8 @@ from flight.gnc.vision.streaks.maximum_likelihood.normal_equations import light_
 from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene, mid_exposure, path_lengths
 from flight.gnc.vision.streaks.maximum_likelihood.windows import window_areas
 
-# A rate that changes by more than this part of itself is beyond the model.
-_MOST_GROWTH = 0.5
+# A rate that changes by more than this part of itself is beyond the model: 2 is from rest, or to it.
+_MOST_GROWTH = 2.2
 # A star is trusted within this many deviations; ends (px) and width (px) are never modelled better than this.
 _TRUST_SIGMAS = 3.5
 _END_FLOOR = 0.01
@@ -86,6 +86,8 @@ def _fit_from(camera: ExposedCamera, first: Fit) -> tuple[Fit | None, FaintStars
     other.
     """
     settings, before = camera.settings, first.scene
+    if not before.motion.constant:
+        camera = replace(camera, growing=True)
     light = light_of(camera.pinhole, camera.shutter, before, first.windows)
     faint = find_faint(
         camera.frame,

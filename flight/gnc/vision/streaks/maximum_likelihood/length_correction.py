@@ -33,6 +33,8 @@ _LEAST_STREAKS = 3
 _LEAST_OFF = 4.0
 _ALIKE = 3.0
 _MORE = 2
+# Beyond this change of the rate, in parts of it, the light is too uneven.
+_MOST_GROWTH = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,8 +93,11 @@ def find_edges(camera: ExposedCamera, scene: Scene) -> Edges:
 def stretched(camera: ExposedCamera, scene: Scene) -> Scene | None:
     """Return `scene` with a motion by which its streaks end where their light does; None when they do.
 
+    Also None where the rate changes so much that the light along a streak is not alike.
     A star stays where its ends are, or the one that is on the detector.
     """
+    if abs(scene.motion.relative_growth) > _MOST_GROWTH:
+        return None
     edges = find_edges(camera, scene)
     stretch = edges.stretch
     if stretch == 0.0:

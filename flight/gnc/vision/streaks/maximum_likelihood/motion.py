@@ -40,6 +40,12 @@ class Motion:
         """Whether the rate does not change."""
         return not self.growth.any()
 
+    @property
+    def relative_growth(self) -> float:
+        """The change of the rate along its axis over the exposure, in rates of mid-exposure: 2 from rest."""
+        square = float(self.turn @ self.turn)
+        return float(self.turn @ self.growth) / square if square else 0.0
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Paths:

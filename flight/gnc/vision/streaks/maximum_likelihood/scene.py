@@ -70,8 +70,16 @@ def window_times(pinhole: Pinhole, motion: Motion, shutter: Shutter, stars: Floa
 
 
 def mid_exposure(pinhole: Pinhole, motion: Motion, shutter: Shutter, middles: FloatArray) -> FloatArray:
-    """Return where stars whose streaks have their middles at `middles` (n, 2) px are at mid-exposure."""
-    if shutter.delay_per_row == 0.0 or not len(middles):
+    """Return where stars are at mid-exposure whose streaks have the middles of their length at `middles`.
+
+    All are (n, 2) px.
+    """
+    if not len(middles):
+        return middles
+    if not motion.constant:
+        # A path has its middle an eighth of the growth ahead of mid-exposure.
+        middles = positions(pinhole, Motion.steady(motion.growth / 8.0), middles, np.full(len(middles), -1.0))
+    if shutter.delay_per_row == 0.0:
         return middles
     return positions(pinhole, motion, middles, -np.asarray(shutter.delay(middles[:, 1])))
 

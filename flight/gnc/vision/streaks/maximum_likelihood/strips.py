@@ -69,10 +69,21 @@ class Strips:
 
 
 def cut_strips(
-    pinhole: Pinhole, motion: Motion, stars: FloatArray, times: FloatArray, width: float
+    pinhole: Pinhole,
+    motion: Motion,
+    stars: FloatArray,
+    times: FloatArray,
+    width: float,
+    ending: BoolArray | None = None,
 ) -> Strips:
-    """Return the pixels within `width` px of the paths of stars (n, 2) between `times` (n, 2), exposures."""
+    """Return the pixels within `width` px of the paths of stars (n, 2) between `times` (n, 2), exposures.
+
+    `ending` (n, 2): which of the times are ends of the path, beyond which there are pixels too; by default
+    all.
+    """
     part, low, high, outer = _parts(pinhole, motion, stars, times)
+    if ending is not None:
+        outer &= ending[part]
     reach = 1.45 * width + 1.0
     begin = low - reach / _speed(paths(pinhole, motion, stars[part], low))
     end = high + reach / _speed(paths(pinhole, motion, stars[part], high))

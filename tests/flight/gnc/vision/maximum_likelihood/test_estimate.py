@@ -149,9 +149,23 @@ def test_the_pixels_decide_whether_the_rate_changes(growth: float) -> None:
     assert _squared(found.rate - scene.rate, found.covariance) < 16.3
 
 
-def test_a_rate_that_doubles_within_the_exposure_is_beyond_the_model_and_refused() -> None:
+@pytest.mark.parametrize(("growth", "length"), [(1.0, 50.0), (2.0, 16.0), (-2.0, 90.0)])
+def test_a_rate_that_grows_from_nothing_or_falls_to_it_is_fitted_from_the_start(
+    growth: float, length: float
+) -> None:
+    """To 200 % of the mean over the exposure: the slow ends are bright, the fast ones dim."""
+    turn = turn_of(np.radians(60.0), length, 0.4)
+    found = _estimated(taken(np.random.default_rng(25), turn, growth * turn, 0.2))
+    assert found.rate is not None
+    assert found.covariance is not None
+    assert found.acceleration is not None
+    assert _squared(found.rate - turn / 0.2, found.covariance) < 16.3
+    assert found.acceleration @ turn * 0.2**2 / (turn @ turn) == pytest.approx(growth, abs=0.05)
+
+
+def test_a_turn_that_reverses_within_the_exposure_is_beyond_the_model_and_refused() -> None:
     turn = turn_of(np.radians(60.0), 50.0, 0.4)
-    found = _estimated(taken(np.random.default_rng(25), turn, 1.0 * turn, 0.2))
+    found = _estimated(taken(np.random.default_rng(25), turn, 4.0 * turn, 0.2))
     assert found.rate is None
 
 
