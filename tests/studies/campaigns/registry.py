@@ -14,6 +14,7 @@ from tests.studies.campaigns.lost_in_space import LOST_IN_SPACE
 from tests.studies.campaigns.nadir import NADIR
 from tests.studies.campaigns.orbit_attitude import ORBIT_ATTITUDE
 from tests.studies.campaigns.planner_edge import PLANNER_EDGE
+from tests.studies.campaigns.rate_change import RATE_CHANGE
 from tests.studies.campaigns.rolling_shutter import ROLLING_SHUTTER
 from tests.studies.campaigns.rso import RSO_SLEW, RSO_TRACK
 from tests.studies.campaigns.rso_orbits import RSO_ORBITS
@@ -26,6 +27,7 @@ CAMPAIGNS: dict[str, Campaign] = {
     for campaign in (
         STREAKS,
         FAILURES,
+        RATE_CHANGE,
         ROLLING_SHUTTER,
         RSO_SLEW,
         RSO_TRACK,

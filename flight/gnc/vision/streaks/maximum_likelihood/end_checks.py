@@ -33,6 +33,8 @@ _LEAST_VALID = 0.7
 _TELLING = 4.0
 # Where a star is slower than this part of its rate, the point spread hides how much brighter its path is.
 _SLOW = 0.5
+# Light beyond an end is a trail from this part of the streak's mean brightness on.
+_TRAIL = 0.08
 # So much of a streak may be dark for reasons of its own.
 _DARK = 0.15
 
@@ -68,6 +70,31 @@ def true_ends(
         true = (within > _HALF * expected) & (beyond < _HALF * expected)
         out[long, end] = np.where(known, true, np.nan)
     return out
+
+
+def trailing(
+    frame: ExposedFrame,
+    pinhole: Pinhole,
+    motion: Motion,
+    stars: FloatArray,
+    light: FloatArray,
+    times: FloatArray,
+) -> float:
+    """Return the part of the stars that can be judged whose light goes on, faintly, beyond an end.
+
+    Arguments as of `true_ends`. A rate that changes otherwise than assumed leaves a short streak with a dim
+    tail.
+    """
+    faint = _TRAIL * expected_brightness(light, path_lengths(pinhole, motion, stars))
+    away = _FROM_END + np.linspace(0.0, 1.0, _SAMPLES) * _LEAST_STRETCH
+    judged, lit = np.zeros(len(stars), dtype=np.bool_), np.zeros(len(stars), dtype=np.bool_)
+    for end, sign in ((0, -1.0), (1, 1.0)):
+        steady, there, speed = ending(pinhole, motion, stars, times[:, end])
+        mean, deviation = brightness(frame, pinhole, steady, there, sign * away / speed[:, None])
+        known = np.isfinite(mean) & (faint > _TELLING * deviation)
+        judged |= known
+        lit |= known & (mean > faint)
+    return float(np.mean(lit[judged])) if judged.any() else 0.0
 
 
 def ending(
