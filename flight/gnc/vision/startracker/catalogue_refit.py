@@ -187,7 +187,7 @@ def _known_stars(
     magnitude = sky.stars.magnitude
     zero = np.median(np.log10(motion.flux[fitted[used]]) + 0.4 * magnitude[solution.star[matched[used]]])
     pinhole, matrix = solution.camera.ideal, attitude_matrix(solution.fix.quaternion)
-    reach = min(pinhole.half_diagonal + 0.5 * float(np.linalg.norm(course.turn)), 0.5 * np.pi)
+    reach = min(pinhole.half_diagonal + 0.5 * float(np.linalg.norm(course.whole)), 0.5 * np.pi)
     near = np.flatnonzero(matrix[2].astype(np.float32) @ sky.coarse > np.cos(reach))
     direction = sky.stars.direction[near]
     if settings.velocity is not None:

@@ -75,10 +75,15 @@ class AttitudePrior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RatePrior:
-    """Predicted rate (3,), rad/s in the camera's axes, and the standard deviation of each component."""
+    """Predicted rate (3,), rad/s in the camera's axes, and the standard deviation of each component.
+
+    `course` (k, 3) rad: the coefficients of t, t^2, ... of the rotation vector since mid-exposure, t in
+    exposures, where the change of the rate is known; else None.
+    """
 
     rate: FloatArray
     sigma: float
+    course: FloatArray | None = None
 
 
 def solve_points(

@@ -31,6 +31,8 @@ _HALF = 0.5
 _LEAST_VALID = 0.7
 # A stretch can be judged when the light expected exceeds this many deviations of its mean.
 _TELLING = 4.0
+# Instants at which the progress along a path is taken.
+_INSTANTS = 65
 # Where a star is slower than this part of its rate, the point spread hides how much brighter its path is.
 _SLOW = 0.5
 # Light beyond an end is a trail from this part of the streak's mean brightness on.
@@ -105,7 +107,7 @@ def ending(
     `times` (n,) are those of the ends. Where the rate changes the path itself may be at rest there.
     """
     there = positions(pinhole, motion, stars, times)
-    steady = Motion.steady(motion.turn)
+    steady = Motion.steady(motion.whole)
     velocity = paths(pinhole, steady, there, np.zeros(len(there))).velocity
     return steady, there, np.maximum(np.hypot(velocity[:, 0], velocity[:, 1]), 1e-3)
 
@@ -115,14 +117,13 @@ def relative_brightness(motion: Motion, sign: float, near: FloatArray, far: Floa
 
     Distances are in parts of the path; `sign` is 1 for the last end, -1 for the first.
     """
-    growth = -sign * motion.relative_growth
-    rate = max(1.0 - 0.5 * growth, 0.0)
-
-    def time(distance: FloatArray) -> FloatArray:
-        root = np.sqrt(np.maximum(rate**2 + 2.0 * growth * distance, 0.0))
-        return np.asarray(2.0 * distance / np.maximum(rate + root, 1e-6))
-
-    return (time(far) - time(near)) / np.maximum(far - near, 1e-9)
+    time = np.linspace(-0.5, 0.5, _INSTANTS)
+    progress = np.maximum.accumulate(motion.progress(time))
+    # A little more with time, so that a rest has its duration.
+    progress += 1e-9 * np.arange(_INSTANTS)
+    end = progress[-1 if sign > 0.0 else 0]
+    begin, stop = (np.interp(end - sign * distance, progress, time) for distance in (near, far))
+    return np.abs(stop - begin) / np.maximum(far - near, 1e-9)
 
 
 def unbroken(
@@ -146,7 +147,7 @@ def unbroken(
     time = times[:, :1] + (times[:, 1:] - times[:, :1]) * share
     each = np.repeat(stars, _WITHIN, axis=0)
     mean, deviation = brightness(frame, pinhole, motion, each, time.reshape(len(each), _WITHIN_SAMPLES))
-    rate = np.clip(1.0 + motion.relative_growth * time.reshape(len(each), _WITHIN_SAMPLES), _SLOW, None)
+    rate = np.clip(motion.pace(time.reshape(-1)), _SLOW, None).reshape(len(each), _WITHIN_SAMPLES)
     expected = np.repeat(expected_brightness(light, length), _WITHIN) * np.mean(1.0 / rate, axis=1)
     known = np.isfinite(mean) & (expected > _TELLING * deviation)
     dark = (known & (mean < _HALF * expected)).reshape(-1, _WITHIN).sum(axis=1)

@@ -27,7 +27,7 @@ from flight.gnc.vision.streaks.maximum_likelihood.hypotheses import (
 )
 from flight.gnc.vision.streaks.maximum_likelihood.iteration import ExposedCamera, Fit
 from flight.gnc.vision.streaks.maximum_likelihood.joint_fit import last_fit
-from flight.gnc.vision.streaks.maximum_likelihood.motion import positions
+from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion, positions
 from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
 from flight.gnc.vision.streaks.maximum_likelihood.result_of_fit import with_faint, with_rate, with_stars
 from flight.gnc.vision.streaks.maximum_likelihood.scene import window_times
@@ -53,6 +53,9 @@ _AT_REST = 4.0
 # The same of the brightest regions, below which no streak of the least length can be among them.
 _SPOT = 2.2
 _BRIGHTEST = 12
+# A known course that departs from a constant rate by less px is none; looked at at these instants.
+_UNEVEN = 0.05
+_INSTANTS = 65
 
 
 def estimate_motion(
@@ -63,6 +66,7 @@ def estimate_motion(
     prior_rate: FloatArray | None = None,
     prior_sigma: float = 0.0,
     previous_checksum: int | None = None,
+    prior_course: FloatArray | None = None,
 ) -> MotionResult:
     """Return the rate over one exposure, with its covariance, and the stars of the frame `pixels`.
 
@@ -74,6 +78,8 @@ def estimate_motion(
         prior_rate: (3,) rad/s, camera frame: decides the direction of rotation; None when unknown.
         prior_sigma: rad/s, standard deviation of each component of `prior_rate`.
         previous_checksum: of the frame before: the same pixels again are a frozen camera.
+        prior_course: (k, 3) rad, how the camera turned as it is known from elsewhere: the coefficients of t,
+            t^2, ... of the rotation vector since mid-exposure, t in exposures; None when unknown.
 
     Raises FlightError for a frame, exposure or prior that is impossible. Why a scene gives no rate is
     reported by the status.
@@ -86,6 +92,8 @@ def estimate_motion(
     frame = expose_frame(pixels, saturation, settings.gain)
     growing = settings.rate_model == "accelerating"
     camera = ExposedCamera(frame, pinhole, _shutter(pinhole, exposure, settings), settings, growing)
+    if prior_course is not None and settings.rate_model != "constant":
+        camera = replace(camera, course=_course(pinhole, prior_course))
     blobs = find_blobs(frame, settings.threshold_sigmas, _MOST_BLOBS)
     seen = MotionResult(StreakStatus.FAILED, checksum, exposure, hot_pixels=frame.hot_pixels)
     if len(blobs) < settings.least_stars:
@@ -115,6 +123,14 @@ def _in_time(
         return _answer(replace(camera, sense=sense), seen, blobs, near)
 
     return rolling_answer(along, axis[0], prior_rate, prior_sigma, sigmas)
+
+
+def _course(pinhole: Pinhole, terms: FloatArray) -> Motion | None:
+    """Return the motion of `terms` (k, 3), None where its rate is as good as constant."""
+    course = Motion(terms[0], 2.0 * terms[1], terms[2:])
+    time = np.linspace(-0.5, 0.5, _INSTANTS)
+    uneven = (course.progress(time) - time) * float(np.linalg.norm(course.whole)) * pinhole.focal_length
+    return course if np.ptp(uneven) > _UNEVEN else None
 
 
 def _answer(camera: ExposedCamera, seen: MotionResult, blobs: Blobs, near: float | None) -> Directed | None:
@@ -168,13 +184,13 @@ def _fitted(camera: ExposedCamera, seen: MotionResult, first: Fit) -> _Candidate
     """Return what the joint fit from `first` says; a fit that failed is broken."""
     last, faint = last_fit(camera, first)
     if last is None:
-        return _Candidate(Directed(seen, None), first.scene.motion.turn, Wholeness.BROKEN)
+        return _Candidate(Directed(seen, None), first.scene.motion.whole, Wholeness.BROKEN)
     whole = wholeness(camera, last.scene, faint)
     answer = with_faint(with_stars(seen, camera, last), camera, last.scene, faint)
     answer = with_rate(answer, camera, last, whole)
     failed = answer.status is StreakStatus.FAILED
     directed = Directed(answer, _misfits(camera, last) if camera.shutter.delay_per_row else None)
-    return _Candidate(directed, last.scene.motion.turn, Wholeness.BROKEN if failed else whole)
+    return _Candidate(directed, last.scene.motion.whole, Wholeness.BROKEN if failed else whole)
 
 
 def _misfits(camera: ExposedCamera, last: Fit) -> Misfits:

@@ -10,7 +10,7 @@ Fragments of one star lie on one circle about the axis, and vote joined.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -19,7 +19,8 @@ from flight.gnc.math.arrays import BoolArray, FloatArray, IntArray
 from flight.gnc.vision.streaks.maximum_likelihood.angle_scan import SCANNED_STARS, Circles, scan_angles
 from flight.gnc.vision.streaks.maximum_likelihood.blobs import Blobs
 from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import ExposedFrame
-from flight.gnc.vision.streaks.maximum_likelihood.motion import image_flow
+from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion, image_flow, positions
+from flight.gnc.vision.streaks.maximum_likelihood.scene import path_lengths
 
 _PROPOSERS = 16
 _PARALLEL = 1e-9
@@ -34,6 +35,9 @@ _LENGTH_SHARE = 0.015
 _MOST_HYPOTHESES = 3
 """Of each ranking."""
 _SAME_CIRCLE = 2.0
+# A region is of a star under a known motion if its length differs by this part of it, and the error above.
+_LIKELY_LENGTH = 0.2
+_INSTANTS = 65
 # So many whole regions must show it, and so much of itself must the rate change, to be fitted from the start.
 _LEAST_GROWING = 3
 _LEAST_GROWTH = 0.4
@@ -44,17 +48,15 @@ class Guess:
     """Where a fit may start.
 
     Attributes:
-        turn: (3,) rad.
+        motion: of the camera.
         stars: (n, 2) px, middles of the streaks; light: (n,) counts.
         contradicted: share of the regions' light that lies in regions longer than the turn allows.
-        growth: (3,) rad, of the turn.
     """
 
-    turn: FloatArray
+    motion: Motion
     stars: FloatArray
     light: FloatArray
     contradicted: float
-    growth: FloatArray = field(default_factory=lambda: np.zeros(3))
 
 
 def guess_axis(blobs: Blobs, pinhole: Pinhole) -> tuple[FloatArray, BoolArray] | None:
@@ -124,8 +126,22 @@ def voted_motions(
         stars, light = _stars(turning.arcs, blobs, turning.agree, pinhole, angle, most, growth)
         if len(light):
             turn = turning.axis * angle
-            guesses.append(Guess(turn, stars, light, contradicted, growth * turn))
+            guesses.append(Guess(Motion(turn, growth * turn), stars, light, contradicted))
     return guesses
+
+
+def course_motion(course: Motion, blobs: Blobs, pinhole: Pinhole, most: int) -> Guess:
+    """Return a guess of a known motion: the brightest whole regions that are as long as it draws streaks."""
+    time = np.linspace(-0.5, 0.5, _INSTANTS)
+    progress = course.progress(time)
+    # A region's centre is that of light, and its second moment that of time.
+    wide = np.sqrt(12.0 * np.var(progress))
+    length = path_lengths(pinhole, course, blobs.centre) * wide
+    likely = np.abs(blobs.length - length) < _LENGTH_ERROR + _LIKELY_LENGTH * length
+    chosen = np.flatnonzero(likely & ~blobs.cut)[:most]
+    lag = course.whole * float(np.mean(progress)) - course.middle
+    back = positions(pinhole, Motion.steady(lag), blobs.centre[chosen], np.full(len(chosen), -1.0))
+    return Guess(course, back, blobs.flux[chosen], 0.0)
 
 
 def seen_growth(turning: Turning, blobs: Blobs) -> float:
@@ -152,7 +168,8 @@ def scanned_motions(
     circles = Circles(arcs.frame, arcs.height[chosen], arcs.middle[chosen])
     for turned in scan_angles(frame, pinhole, circles, _MOST_HYPOTHESES, near):
         if len(turned.light):
-            yield Guess(turning.axis * turned.angle, turned.stars[:most], turned.light[:most], 0.0)
+            motion = Motion.steady(turning.axis * turned.angle)
+            yield Guess(motion, turned.stars[:most], turned.light[:most], 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

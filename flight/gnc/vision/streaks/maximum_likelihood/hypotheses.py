@@ -14,6 +14,7 @@ from flight.gnc.vision.streaks.maximum_likelihood.blobs import Blobs
 from flight.gnc.vision.streaks.maximum_likelihood.end_checks import true_ends, unbroken
 from flight.gnc.vision.streaks.maximum_likelihood.first_guess import (
     Guess,
+    course_motion,
     find_turning,
     scanned_motions,
     seen_growth,
@@ -70,17 +71,17 @@ def first_fits(camera: ExposedCamera, blobs: Blobs, near: float | None) -> Itera
         if tried is None:
             continue
         explained, convincing, done = tried
-        if any(alike(done.scene.motion.turn, other) for other in yielded):
+        if any(alike(done.scene.motion.whole, other) for other in yielded):
             continue
         if convincing and all(explained > rival for rival, _ in rivals):
-            yielded.append(done.scene.motion.turn)
+            yielded.append(done.scene.motion.whole)
             yield done
         elif misfit(done.evaluation) <= _WORST_FIRST:
             rivals.append((explained, done))
     rivals.sort(key=lambda rival: -rival[0])
     for _, done in rivals:
-        if not any(alike(done.scene.motion.turn, other) for other in yielded):
-            yielded.append(done.scene.motion.turn)
+        if not any(alike(done.scene.motion.whole, other) for other in yielded):
+            yielded.append(done.scene.motion.whole)
             yield done
 
 
@@ -99,7 +100,8 @@ def rescanned_fits(camera: ExposedCamera, turn: FloatArray, angles: list[float])
             stars, light = turned.stars[:_FIRST_STARS], turned.light[:_FIRST_STARS]
             if len(light) < settings.least_stars:
                 continue
-            tried = _tried(camera, Guess(frame[2] * turned.angle, stars, light, 0.0))
+            turn = Motion.steady(frame[2] * turned.angle)
+            tried = _tried(camera, Guess(turn, stars, light, 0.0))
             if tried is not None:
                 yield tried[2]
 
@@ -115,6 +117,10 @@ def _guesses(camera: ExposedCamera, blobs: Blobs, near: float | None) -> Iterato
     turning = find_turning(blobs, camera.pinhole)
     if turning is None:
         return
+    if camera.course is not None:
+        known = course_motion(camera.course, blobs, camera.pinhole, _FIRST_STARS)
+        if len(known.light) >= camera.settings.least_stars:
+            yield known
     growth = 0.0 if camera.settings.rate_model == "constant" else seen_growth(turning, blobs)
     if growth:
         yield from voted_motions(turning, blobs, camera.pinhole, _FIRST_STARS, growth)[:_MOST_GROWING]
@@ -130,7 +136,7 @@ def _tried(camera: ExposedCamera, guess: Guess) -> tuple[float, bool, Fit] | Non
     count = len(guess.light)
     everyone = np.ones(count, dtype=np.bool_)
     width = float(np.hypot(camera.settings.psf_sigma, 0.29))
-    motion = Motion(camera.directed(guess.turn), guess.growth)
+    motion = guess.motion if camera.sense is None else guess.motion.along(camera.sense)
     stars = mid_exposure(camera.pinhole, motion, camera.shutter, guess.stars)
     scene = Scene(motion, width, stars, guess.light, np.zeros(count), everyone)
     camera = replace(camera, growing=not motion.constant)

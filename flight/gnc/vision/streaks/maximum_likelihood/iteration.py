@@ -12,7 +12,7 @@ from flight.gnc.math.arrays import BoolArray, FloatArray
 from flight.gnc.vision.streaks.maximum_likelihood.agreement import agreed_step
 from flight.gnc.vision.streaks.maximum_likelihood.equation_solver import Solution, moved, solve
 from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import ExposedFrame
-from flight.gnc.vision.streaks.maximum_likelihood.motion import positions
+from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion, positions
 from flight.gnc.vision.streaks.maximum_likelihood.normal_equations import ALONE, SHARED, Evaluation, evaluate
 from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
@@ -77,6 +77,7 @@ class ExposedCamera:
 
     Attributes:
         growing: whether the rate may change.
+        course: the motion as it is known from elsewhere; None where unknown, or as good as constant.
         sense: (3,) a vector along which the camera turns, not against it; None where either will do.
     """
 
@@ -86,6 +87,7 @@ class ExposedCamera:
     settings: LikelihoodSettings
     growing: bool = False
     sense: FloatArray | None = None
+    course: Motion | None = None
 
     @property
     def free(self) -> BoolArray:
@@ -96,10 +98,6 @@ class ExposedCamera:
     def undecided(self) -> bool:
         """Whether the pixels are yet to show that the rate changes."""
         return self.settings.rate_model == "auto" and not self.growing
-
-    def directed(self, turn: FloatArray) -> FloatArray:
-        """Return `turn` (3,) in the direction of `sense`."""
-        return -turn if self.sense is not None and turn @ self.sense < 0.0 else turn
 
     def windows(self, scene: Scene) -> Windows:
         """Return the pixels about the scene's streaks."""
@@ -193,7 +191,7 @@ def _possible(scene: Scene) -> bool:
     return (
         0.3 < scene.width < _WIDEST
         and bool(np.all(np.isfinite(scene.stars)))
-        and float(np.linalg.norm(scene.motion.turn)) <= np.pi
+        and float(np.linalg.norm(scene.motion.whole)) <= np.pi
     )
 
 
@@ -203,7 +201,7 @@ def _drifted(camera: ExposedCamera, before: Scene, after: Scene, faint: float) -
     Windows are also cut for where a rate that changes makes the streaks slow.
     """
     grown = float(np.linalg.norm(after.motion.growth - before.motion.growth))
-    if grown > _GROWN * float(np.linalg.norm(after.motion.turn)):
+    if grown > _GROWN * float(np.linalg.norm(after.motion.whole)):
         return True
     n = len(before.stars)
     at = np.repeat([-0.5, 0.5], n)

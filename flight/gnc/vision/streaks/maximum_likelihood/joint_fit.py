@@ -73,8 +73,8 @@ def last_fit(camera: ExposedCamera, first: Fit) -> tuple[Fit | None, FaintStars]
 
 def _far(camera: ExposedCamera, before: Scene, after: Scene) -> bool:
     """Return whether the ends of the streaks have moved by more than the fit can follow."""
-    changed = float(np.linalg.norm(after.motion.turn - before.motion.turn))
-    turn = float(np.linalg.norm(after.motion.turn))
+    changed = float(np.linalg.norm(after.motion.whole - before.motion.whole))
+    turn = float(np.linalg.norm(after.motion.whole))
     length = float(np.median(path_lengths(camera.pinhole, after.motion, before.stars)))
     return length * changed / max(turn, 1e-12) > _FAR
 
@@ -141,7 +141,9 @@ def joint_fit(camera: ExposedCamera, scene: Scene) -> Fit | None:
 
 
 def _beyond(motion: Motion) -> bool:
-    """Return whether the rate changes by more than the model can describe."""
+    """Return whether the rate changes by more than the model can describe; known otherwise, it does not."""
+    if motion.shape.any():
+        return False
     return float(np.linalg.norm(motion.growth)) > _MOST_GROWTH * float(np.linalg.norm(motion.turn))
 
 
@@ -153,7 +155,7 @@ def _trusted(camera: ExposedCamera, rough: Fit) -> BoolArray:
         return before
     had = np.flatnonzero(before)
     moved = path_lengths(camera.pinhole, rough.scene.motion, rough.scene.stars[had])
-    turn = float(np.linalg.norm(rough.scene.motion.turn))
+    turn = float(np.linalg.norm(rough.scene.motion.whole))
     angle = _END_FLOOR * turn / max(float(np.median(moved)), 1.0)
     floors = np.array([angle, angle, angle, _WIDTH_FLOOR])
     agree = agreeing(OwnEstimates(estimates.change[had], estimates.deviation[had]), floors, _TRUST_SIGMAS)

@@ -15,7 +15,7 @@ import numpy as np
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.vision.streaks.maximum_likelihood.end_checks import brightness, expected_brightness
 from flight.gnc.vision.streaks.maximum_likelihood.iteration import ExposedCamera
-from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion, positions
+from flight.gnc.vision.streaks.maximum_likelihood.motion import positions
 from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene, path_lengths, window_times
 
 # Looked at is this part of a streak's length to either side of its end, between this many px, in this many
@@ -108,5 +108,5 @@ def stretched(camera: ExposedCamera, scene: Scene) -> Scene | None:
     known = np.isfinite(middle)
     time = np.where(known, middle, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
     moved = positions(camera.pinhole, scene.motion, scene.stars, time)
-    motion = Motion((1.0 + stretch) * scene.motion.turn, scene.motion.growth)
+    motion = replace(scene.motion, turn=scene.motion.turn + stretch * scene.motion.whole)
     return replace(scene, motion=motion, stars=moved)

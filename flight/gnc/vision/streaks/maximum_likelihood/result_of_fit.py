@@ -72,7 +72,7 @@ def with_rate(result: MotionResult, camera: ExposedCamera, last: Fit, whole: Who
         return replace(result, status=StreakStatus.TOO_FEW)
     exact = shared_covariance(last.evaluation, last.free, _CONJUGATE)
     covariance = (last.solution.covariance if exact is None else exact)[:3, :3]
-    turn = scene.motion.turn
+    turn = scene.motion.whole
     size = float(np.linalg.norm(turn))
     deviation = float(np.sqrt(turn @ covariance @ turn)) / size
     if result.length < settings.least_length or not size > settings.least_significance * deviation:

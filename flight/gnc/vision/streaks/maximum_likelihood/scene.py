@@ -77,8 +77,7 @@ def mid_exposure(pinhole: Pinhole, motion: Motion, shutter: Shutter, middles: Fl
     if not len(middles):
         return middles
     if not motion.constant:
-        # A path has its middle an eighth of the growth ahead of mid-exposure.
-        middles = positions(pinhole, Motion.steady(motion.growth / 8.0), middles, np.full(len(middles), -1.0))
+        middles = positions(pinhole, Motion.steady(motion.middle), middles, np.full(len(middles), -1.0))
     if shutter.delay_per_row == 0.0:
         return middles
     return positions(pinhole, motion, middles, -np.asarray(shutter.delay(middles[:, 1])))

@@ -127,7 +127,7 @@ def _parts(
     pinhole: Pinhole, motion: Motion, stars: FloatArray, times: FloatArray
 ) -> tuple[IntArray, FloatArray, FloatArray, BoolArray]:
     """Return the parts' stars, start and end times, and which of those two are ends of the path (.., 2)."""
-    turned = float(np.linalg.norm(motion.turn)) + float(np.linalg.norm(motion.growth))
+    turned = float(np.linalg.norm(motion.whole)) + float(np.linalg.norm(motion.growth))
     pieces = max(1, math.ceil(turned * float(np.max(times[:, 1] - times[:, 0], initial=0.0)) / _LONGEST_TURN))
     edges = times[:, :1] + (times[:, 1:] - times[:, :1]) * np.linspace(0.0, 1.0, pieces + 1)
     edges[:, -1] = times[:, 1]  # exactly: a later test compares it

@@ -13,7 +13,7 @@ import numpy as np
 from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.math.arrays import BoolArray, FloatArray, IntArray
 from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import ExposedFrame, Float32Array
-from flight.gnc.vision.streaks.maximum_likelihood.motion import paths, positions
+from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion, paths, positions
 from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene, path_lengths, window_times
 from flight.gnc.vision.streaks.maximum_likelihood.shutter import Shutter
 from flight.gnc.vision.streaks.maximum_likelihood.spot_model import Patches, cut_patches
@@ -31,6 +31,8 @@ _STEADY = 0.05
 # A fast part shorter than this many widths is left to the patch.
 _LEAST_FAST = 4.0
 _SLOWEST = 1e-3
+# Instants at which the rate is looked at for that.
+_SAMPLES = 129
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -187,20 +189,25 @@ def _divided(pinhole: Pinhole, scene: Scene, times: FloatArray) -> tuple[FloatAr
     The slow part is at the end towards which the rate falls; what there is none of has no duration.
     """
     motion = scene.motion
-    # The rate over that of mid-exposure is 1 + growth t.
-    growth = motion.relative_growth
-    if growth == 0.0:
+    if motion.constant or not motion.whole.any():
         return times, np.zeros_like(times)
-    velocity = paths(pinhole, motion, scene.stars, np.zeros(len(times))).velocity
+    time = np.linspace(times.min(), times.max(), _SAMPLES)
+    pace, change = motion.pace(time), np.abs(motion.pace(time, 1)).max()
+    steady = Motion.steady(motion.whole)
+    velocity = paths(pinhole, steady, scene.stars, np.zeros(len(times))).velocity
     speed = np.maximum(np.hypot(velocity[:, 0], velocity[:, 1]), _SLOWEST)
-    slowest = np.sqrt(abs(growth) * scene.width / (_STEADY * speed))
-    until = np.clip((slowest - 1.0) / growth, times[:, 0], times[:, 1])
-    fast, slow = times.copy(), times.copy()
-    fast[:, 0 if growth > 0.0 else 1] = until
-    slow[:, 1 if growth > 0.0 else 0] = until
-    way = speed * (np.diff(fast) + 0.5 * growth * np.diff(fast**2))[:, 0]
+    # Slow wherever the speed may change by too much of itself over a width.
+    slow = pace < np.sqrt(change * scene.width / (_STEADY * speed))[:, None]
+    fast, rest = times.copy(), times.copy()
+    if pace[0] < pace[-1]:
+        until = np.where(slow.any(axis=1), time[_SAMPLES - 1 - slow[:, ::-1].argmax(axis=1)], -np.inf)
+        fast[:, 0] = rest[:, 1] = np.clip(until, times[:, 0], times[:, 1])
+    else:
+        since = np.where(slow.any(axis=1), time[slow.argmax(axis=1)], np.inf)
+        fast[:, 1] = rest[:, 0] = np.clip(since, times[:, 0], times[:, 1])
+    way = speed * (motion.progress(fast[:, 1]) - motion.progress(fast[:, 0]))
     fast[way < _LEAST_FAST * scene.width] = 0.0
-    return fast, slow
+    return fast, rest
 
 
 def _patches_about(pinhole: Pinhole, scene: Scene, spot: IntArray, part: FloatArray, room: float) -> Patches:
