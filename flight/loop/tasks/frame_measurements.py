@@ -16,6 +16,7 @@ from flight.gnc.vision.frame_job import Found, FrameFound, FrameJob, TrackerSett
 from flight.gnc.vision.startracker.mid_exposure import NODES, middle_covariance, weighting_of
 from flight.gnc.vision.startracker.solve import AttitudePrior, RatePrior
 from flight.gnc.vision.streaks.corners.settings import StreakSettings
+from flight.gnc.vision.streaks.maximum_likelihood.course import Course
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from flight.gnc.vision.streaks.streak_result import StreakStatus
 from flight.loop.tasks.navigation import Navigation
@@ -23,9 +24,8 @@ from hal.interfaces.readings import Frame
 
 # rad, of the mounting between the camera and the inertial unit that the estimate is of.
 _LEAST_PRIOR_SIGMA = 5e-4
-# The rate over an exposure is taken at so many instants, and the turn described to this power of time.
+# The rate over an exposure is taken at so many instants.
 _COURSE_NODES = 17
-_COURSE_DEGREE = 7
 _NAN = np.full(3, np.nan), np.full((3, 3), np.nan)
 
 
@@ -83,20 +83,17 @@ class FrameMeasurer:
     def _rate_prior(self, frame: Frame, past: Estimate) -> RatePrior:
         widest = float(np.linalg.eigvalsh(past.covariance[RATE, RATE])[-1])
         rate, sigma = self._body_to_camera @ past.rate, math.sqrt(max(widest, 0.0))
-        return RatePrior(rate, sigma, self._course(frame))
+        return RatePrior(rate, sigma, self._course(frame, sigma))
 
-    def _course(self, frame: Frame) -> FloatArray | None:
-        """Return how the camera turned, as `RatePrior.course`; None beyond the estimate's history."""
+    def _course(self, frame: Frame, sigma: float) -> Course | None:
+        """Return how the camera turned, its rate known to `sigma` rad/s; None beyond the history."""
         parts = np.linspace(0.0, 1.0, _COURSE_NODES)
         times = [frame.exposure_start_ns + round(part * frame.exposure_ns) for part in parts]
         past = [self._navigation.past(time) for time in times]
-        rates = np.array([one.rate for one in past if one is not None])
+        rates = [self._body_to_camera @ one.rate for one in past if one is not None]
         if len(rates) < _COURSE_NODES:
             return None
-        powers = np.arange(_COURSE_DEGREE)
-        fitted = np.linalg.lstsq((parts[:, None] - 0.5) ** powers, rates, rcond=None)[0]
-        turns = fitted * (frame.exposure_ns * 1e-9) / (powers[:, None] + 1.0)
-        return np.asarray(turns @ self._body_to_camera.T)
+        return Course.of_rates(np.array(rates), frame.exposure_ns * 1e-9, sigma)
 
     def _attitude_prior(self, past: Estimate) -> AttitudePrior:
         widest = float(np.linalg.eigvalsh(past.covariance[TURN, TURN])[-1])

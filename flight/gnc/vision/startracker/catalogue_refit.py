@@ -98,7 +98,8 @@ def refit_motion(
         return None
     pinhole, exposure = solution.camera.ideal, motion.exposure
     growth = np.zeros(3) if motion.acceleration is None else motion.acceleration * exposure**2
-    course = Motion(motion.rate * exposure, growth)
+    shape = np.zeros((0, 3)) if motion.course is None else motion.course.terms[2:]
+    course = Motion.between(motion.rate * exposure, growth, shape)
     most = likelihood.most_stars + likelihood.most_neighbours + likelihood.most_faint
     known = _known_stars(motion, solution, sky, settings, course, most)
     if known is None:
@@ -118,6 +119,8 @@ def refit_motion(
     refit = with_rate(with_stars(motion, camera, done), camera, done, Wholeness.WHOLE)
     if refit.status is not StreakStatus.AMBIGUOUS or refit.rate is None or refit.covariance is None:
         return None
+    if motion.course is not None:
+        refit = replace(refit, covariance=refit.covariance + motion.course.covariance(exposure))
     apart = refit.rate - motion.rate
     if not apart @ np.linalg.solve(motion.covariance + refit.covariance, apart) < _ONE_MOTION:
         return None

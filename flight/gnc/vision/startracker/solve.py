@@ -32,6 +32,7 @@ from flight.gnc.vision.startracker.image_fit import fit_in_image
 from flight.gnc.vision.startracker.index.sky_index import SkyIndex
 from flight.gnc.vision.startracker.mid_exposure import timing_covariance
 from flight.gnc.vision.startracker.solution import FrameSolution, SolveStatus
+from flight.gnc.vision.streaks.maximum_likelihood.course import Course
 from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 
@@ -77,13 +78,12 @@ class AttitudePrior:
 class RatePrior:
     """Predicted rate (3,), rad/s in the camera's axes, and the standard deviation of each component.
 
-    `course` (k, 3) rad: the coefficients of t, t^2, ... of the rotation vector since mid-exposure, t in
-    exposures, where the change of the rate is known; else None.
+    `course`: how the camera turned over the exposure, where that is known.
     """
 
     rate: FloatArray
     sigma: float
-    course: FloatArray | None = None
+    course: Course | None = None
 
 
 def solve_points(

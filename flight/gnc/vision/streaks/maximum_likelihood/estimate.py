@@ -17,6 +17,7 @@ from flight.gnc.math.arrays import FloatArray, Image
 from flight.gnc.vision.frame.saturation import saturation_count
 from flight.gnc.vision.streaks.admission import admit, in_time, validate
 from flight.gnc.vision.streaks.maximum_likelihood.blobs import Blobs, find_blobs
+from flight.gnc.vision.streaks.maximum_likelihood.course import Course
 from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import expose_frame
 from flight.gnc.vision.streaks.maximum_likelihood.first_guess import guess_axis
 from flight.gnc.vision.streaks.maximum_likelihood.hypotheses import (
@@ -27,7 +28,7 @@ from flight.gnc.vision.streaks.maximum_likelihood.hypotheses import (
 )
 from flight.gnc.vision.streaks.maximum_likelihood.iteration import ExposedCamera, Fit
 from flight.gnc.vision.streaks.maximum_likelihood.joint_fit import last_fit
-from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion, positions
+from flight.gnc.vision.streaks.maximum_likelihood.motion import positions
 from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
 from flight.gnc.vision.streaks.maximum_likelihood.result_of_fit import with_faint, with_rate, with_stars
 from flight.gnc.vision.streaks.maximum_likelihood.scene import window_times
@@ -53,9 +54,6 @@ _AT_REST = 4.0
 # The same of the brightest regions, below which no streak of the least length can be among them.
 _SPOT = 2.2
 _BRIGHTEST = 12
-# A known course that departs from a constant rate by less px is none; looked at at these instants.
-_UNEVEN = 0.05
-_INSTANTS = 65
 
 
 def estimate_motion(
@@ -66,7 +64,7 @@ def estimate_motion(
     prior_rate: FloatArray | None = None,
     prior_sigma: float = 0.0,
     previous_checksum: int | None = None,
-    prior_course: FloatArray | None = None,
+    prior_course: Course | None = None,
 ) -> MotionResult:
     """Return the rate over one exposure, with its covariance, and the stars of the frame `pixels`.
 
@@ -78,8 +76,7 @@ def estimate_motion(
         prior_rate: (3,) rad/s, camera frame: decides the direction of rotation; None when unknown.
         prior_sigma: rad/s, standard deviation of each component of `prior_rate`.
         previous_checksum: of the frame before: the same pixels again are a frozen camera.
-        prior_course: (k, 3) rad, how the camera turned as it is known from elsewhere: the coefficients of t,
-            t^2, ... of the rotation vector since mid-exposure, t in exposures; None when unknown.
+        prior_course: how the camera turned, where that is known from elsewhere.
 
     Raises FlightError for a frame, exposure or prior that is impossible. Why a scene gives no rate is
     reported by the status.
@@ -93,12 +90,12 @@ def estimate_motion(
     growing = settings.rate_model == "accelerating"
     camera = ExposedCamera(frame, pinhole, _shutter(pinhole, exposure, settings), settings, growing)
     if prior_course is not None and settings.rate_model != "constant":
-        camera = replace(camera, course=_course(pinhole, prior_course))
+        camera = replace(camera, course=prior_course.motion(pinhole.focal_length))
     blobs = find_blobs(frame, settings.threshold_sigmas, _MOST_BLOBS)
     seen = MotionResult(StreakStatus.FAILED, checksum, exposure, hot_pixels=frame.hot_pixels)
     if len(blobs) < settings.least_stars:
         return replace(seen, status=StreakStatus.TOO_FEW)
-    answer = None if _resting(blobs) else _in_time(camera, seen, blobs, prior_rate, prior_sigma)
+    answer = None if _resting(blobs) else _in_time(camera, seen, blobs, prior_rate, prior_sigma, prior_course)
     return _without_rate(seen, camera, blobs) if answer is None else answer
 
 
@@ -108,12 +105,15 @@ def _in_time(
     blobs: Blobs,
     prior_rate: FloatArray | None,
     prior_sigma: float,
+    course: Course | None,
 ) -> MotionResult | None:
     """Return the motion in the direction of the prior; None without a motion."""
     sigmas = camera.settings.sign_sigmas
     near = None if prior_rate is None else float(np.linalg.norm(prior_rate)) * seen.exposure
     if not camera.shutter.delay_per_row:
-        found = _answer(camera, seen, blobs, near)
+        found = None if course is None else _on_course(camera, seen, blobs, near, course)
+        if found is None:
+            found = _answer(replace(camera, course=None), seen, blobs, near)
         return None if found is None else in_time(found.result, prior_rate, prior_sigma, sigmas)
     axis = guess_axis(blobs, camera.pinhole)
     if axis is None:
@@ -125,12 +125,17 @@ def _in_time(
     return rolling_answer(along, axis[0], prior_rate, prior_sigma, sigmas)
 
 
-def _course(pinhole: Pinhole, terms: FloatArray) -> Motion | None:
-    """Return the motion of `terms` (k, 3), None where its rate is as good as constant."""
-    course = Motion(terms[0], 2.0 * terms[1], terms[2:])
-    time = np.linspace(-0.5, 0.5, _INSTANTS)
-    uneven = (course.progress(time) - time) * float(np.linalg.norm(course.whole)) * pinhole.focal_length
-    return course if np.ptp(uneven) > _UNEVEN else None
+def _on_course(
+    camera: ExposedCamera, seen: MotionResult, blobs: Blobs, near: float | None, course: Course
+) -> Directed | None:
+    """Return the answer by the known course; None where it is of no use, or the pixels deny it."""
+    found = None if camera.course is None else _answer(camera, seen, blobs, near)
+    if found is None or found.result.status is StreakStatus.FAILED:
+        return None
+    if found.result.covariance is None:
+        return found
+    covariance = found.result.covariance + course.covariance(seen.exposure)
+    return replace(found, result=replace(found.result, covariance=covariance, course=course))
 
 
 def _answer(camera: ExposedCamera, seen: MotionResult, blobs: Blobs, near: float | None) -> Directed | None:

@@ -9,7 +9,7 @@ A star is named by its pixel at mid-exposure.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -38,6 +38,12 @@ class Motion:
         """Return the motion at constant rate."""
         return cls(np.asarray(turn, dtype=float), np.zeros(3))
 
+    @classmethod
+    def between(cls, whole: FloatArray, growth: FloatArray, shape: FloatArray) -> Motion:
+        """Return the motion that turns by `whole` (3,) from start to end."""
+        unscaled = cls(np.zeros(3), growth, shape)
+        return replace(unscaled, turn=whole - unscaled.whole)
+
     @property
     def constant(self) -> bool:
         """Whether the rate does not change."""
@@ -52,6 +58,11 @@ class Motion:
             return self
         odd = (-1.0) ** np.arange(3, 3 + len(self.shape))
         return Motion(-self.turn, self.growth, odd[:, None] * self.shape)
+
+    def scaled_to(self, whole: FloatArray) -> Motion:
+        """Return the motion with another rotation (3,) from start to end, or its opposite."""
+        sign = -1.0 if self.whole @ whole < 0.0 else 1.0
+        return replace(self, turn=self.turn + sign * whole - self.whole)
 
     @property
     def whole(self) -> FloatArray:
