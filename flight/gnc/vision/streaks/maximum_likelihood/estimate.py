@@ -41,6 +41,7 @@ from flight.gnc.vision.streaks.maximum_likelihood.shutter_direction import (
 )
 from flight.gnc.vision.streaks.maximum_likelihood.whole_frame_scan import frame_angles
 from flight.gnc.vision.streaks.maximum_likelihood.wholeness import Wholeness, wholeness
+from flight.gnc.vision.streaks.maximum_likelihood.work import Work
 from flight.gnc.vision.streaks.streak_result import StreakStatus
 
 _MOST_BLOBS = 48
@@ -113,14 +114,14 @@ def _in_time(
     if not camera.shutter.delay_per_row:
         found = None if course is None else _on_course(camera, seen, blobs, near, course)
         if found is None:
-            found = _answer(replace(camera, course=None), seen, blobs, near)
+            found = _answer(replace(camera, course=None, work=Work()), seen, blobs, near)
         return None if found is None else in_time(found.result, prior_rate, prior_sigma, sigmas)
     axis = guess_axis(blobs, camera.pinhole)
     if axis is None:
         return None
 
     def along(sense: FloatArray) -> Directed | None:
-        return _answer(replace(camera, sense=sense), seen, blobs, near)
+        return _answer(replace(camera, sense=sense, work=Work()), seen, blobs, near)
 
     return rolling_answer(along, axis[0], prior_rate, prior_sigma, sigmas)
 
@@ -150,11 +151,14 @@ def _answer(camera: ExposedCamera, seen: MotionResult, blobs: Blobs, near: float
     # A doubted motion to which the light of the whole frame leads again has two witnesses. To ask it costs
     # less than to fit a rival, and the axis is often right, known well from pieces of streaks, where the
     # angle is not.
+    camera.work.passed(camera.frame.signal.size)
     angles = frame_angles(camera.frame, camera.pinhole, leading.turn, _MOST_ANGLES)
     if leading.stands and _witnessed(leading.turn, angles):
         return leading.answer
     candidates = [leading]
     for fit in chain(rescanned_fits(camera, leading.turn, angles), rivals):
+        if camera.work.exhausted:
+            break
         candidate = _fitted(camera, seen, fit)
         again = any(other.stands and alike(candidate.turn, other.turn) for other in candidates)
         if candidate.whole is Wholeness.WHOLE or (

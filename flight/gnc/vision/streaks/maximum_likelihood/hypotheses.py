@@ -67,6 +67,8 @@ def first_fits(camera: ExposedCamera, blobs: Blobs, near: float | None) -> Itera
     rivals: list[tuple[float, Fit]] = []
     yielded: list[FloatArray] = []
     for guess in islice(_guesses(camera, blobs, near), _MOST_GUESSES):
+        if camera.work.exhausted:
+            break
         tried = _tried(camera, guess)
         if tried is None:
             continue
@@ -91,6 +93,9 @@ def rescanned_fits(camera: ExposedCamera, turn: FloatArray, angles: list[float])
     nothing = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.float32)
     frame = polar_grid(pinhole, Motion.steady(turn)).frame
     for angle in angles:
+        if camera.work.exhausted:
+            return
+        camera.work.passed(camera.frame.signal.size)
         motion = Motion.steady(frame[2] * angle)
         found = find_faint(camera.frame, nothing, pinhole, motion, settings.faint_sigmas, settings.most_faint)
         bright = np.argsort(-found.light, kind="stable")[:SCANNED_STARS]

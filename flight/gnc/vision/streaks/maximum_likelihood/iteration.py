@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.special import fdtri
@@ -18,6 +18,7 @@ from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from flight.gnc.vision.streaks.maximum_likelihood.shutter import Shutter
 from flight.gnc.vision.streaks.maximum_likelihood.windows import Windows, cut_windows
+from flight.gnc.vision.streaks.maximum_likelihood.work import Work
 
 _LONGEST_STEP = 3.0
 # An end so far, px, from where its window was cut has left the window's middle.
@@ -78,6 +79,7 @@ class ExposedCamera:
     Attributes:
         growing: whether the rate may change.
         course: the motion as it is known from elsewhere; None where unknown, or as good as constant.
+        work: that was done on the frame.
         sense: (3,) a vector along which the camera turns, not against it; None where either will do.
     """
 
@@ -88,6 +90,7 @@ class ExposedCamera:
     growing: bool = False
     sense: FloatArray | None = None
     course: Motion | None = None
+    work: Work = field(default_factory=Work)
 
     @property
     def free(self) -> BoolArray:
@@ -105,6 +108,7 @@ class ExposedCamera:
 
     def evaluate(self, scene: Scene, windows: Windows, clip: float) -> Evaluation:
         """Return the normal equations."""
+        self.work.evaluated(len(windows.slot))
         growth = self.growing or (self.undecided and clip > 0.0)
         return evaluate(self.pinhole, self.shutter, scene, windows, clip, growth)
 

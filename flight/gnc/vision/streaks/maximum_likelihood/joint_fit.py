@@ -63,6 +63,8 @@ def last_fit(camera: ExposedCamera, first: Fit) -> tuple[Fit | None, FaintStars]
         other = stretched(camera, scene)
         if other is None and not _far(camera, first.scene, scene):
             break
+        if camera.work.exhausted:
+            return None, faint
         scene = scene if other is None else other
         scene = scene.select(np.argsort(-scene.light, kind="stable")[: len(first.scene.light)])
         first = replace(done, scene=scene, windows=camera.windows(scene))
@@ -88,6 +90,7 @@ def _fit_from(camera: ExposedCamera, first: Fit) -> tuple[Fit | None, FaintStars
     settings, before = camera.settings, first.scene
     if not before.motion.constant:
         camera = replace(camera, growing=True)
+    camera.work.passed(camera.frame.signal.size)
     light = light_of(camera.pinhole, camera.shutter, before, first.windows)
     faint = find_faint(
         camera.frame,
