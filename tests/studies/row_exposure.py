@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtr
 
-from flight.gnc.math.arrays import BoolArray, FloatArray, Image
+from flight.gnc.math.arrays import BoolArray, FloatArray, Image, IntArray
 from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
 from sim_hal.star_camera import StarCameraModel, detector
 from tests.studies.campaigns.scenes import catalogue
@@ -111,7 +111,7 @@ def _add(
     light += np.bincount(index[within], patches[within], light.size).reshape(light.shape)
 
 
-def _shares(pixels: FloatArray, place: FloatArray, sigma: float) -> FloatArray:
+def _shares(pixels: IntArray, place: FloatArray, sigma: float) -> FloatArray:
     """Return the share (m, p) of points at `place` (m,) that falls on `pixels` (m, p)."""
     away = (pixels - place[:, None]) / sigma
     return np.asarray(ndtr(away + 0.5 / sigma) - ndtr(away - 0.5 / sigma))

@@ -58,7 +58,7 @@ def run(case: Case) -> Result:
     rate = turn_of(np.deg2rad(given["theta"]), given["length"], roll, camera) / exposure
 
     def turns(times: FloatArray) -> FloatArray:
-        return (times + 0.5 * given["change"] * times**2 / exposure)[:, None] * rate
+        return np.asarray((times + 0.5 * given["change"] * times**2 / exposure)[:, None] * rate)
 
     scene = row_scene(camera, turns, exposure, generator)
     settings = LikelihoodSettings(saturation=float(camera.highest_count), gain=camera.gain)

@@ -119,15 +119,16 @@ def refit_motion(
     refit = with_rate(with_stars(motion, camera, done), camera, done, Wholeness.WHOLE)
     if refit.status is not StreakStatus.AMBIGUOUS or refit.rate is None or refit.covariance is None:
         return None
-    if motion.course is not None:
-        refit = replace(refit, covariance=refit.covariance + motion.course.covariance(exposure))
+    assumed = np.zeros((3, 3)) if motion.course is None else motion.course.covariance(exposure)
+    covariance = refit.covariance + assumed
     apart = refit.rate - motion.rate
-    if not apart @ np.linalg.solve(motion.covariance + refit.covariance, apart) < _ONE_MOTION:
+    if not apart @ np.linalg.solve(motion.covariance + covariance, apart) < _ONE_MOTION:
         return None
     left = _elsewhere(motion.faint_endpoints, refit.endpoints)
     return replace(
         refit,
         status=motion.status,
+        covariance=covariance,
         faint_endpoints=motion.faint_endpoints[left],
         faint_flux=motion.faint_flux[left],
         faint_significance=motion.faint_significance[left],

@@ -123,7 +123,7 @@ def relative_brightness(motion: Motion, sign: float, near: FloatArray, far: Floa
     progress += 1e-9 * np.arange(_INSTANTS)
     end = progress[-1 if sign > 0.0 else 0]
     begin, stop = (np.interp(end - sign * distance, progress, time) for distance in (near, far))
-    return np.abs(stop - begin) / np.maximum(far - near, 1e-9)
+    return np.asarray(np.abs(stop - begin) / np.maximum(far - near, 1e-9))
 
 
 def unbroken(

@@ -105,8 +105,8 @@ def rescanned_fits(camera: ExposedCamera, turn: FloatArray, angles: list[float])
             stars, light = turned.stars[:_FIRST_STARS], turned.light[:_FIRST_STARS]
             if len(light) < settings.least_stars:
                 continue
-            turn = Motion.steady(frame[2] * turned.angle)
-            tried = _tried(camera, Guess(turn, stars, light, 0.0))
+            guess = Guess(Motion.steady(frame[2] * turned.angle), stars, light, 0.0)
+            tried = _tried(camera, guess)
             if tried is not None:
                 yield tried[2]
 

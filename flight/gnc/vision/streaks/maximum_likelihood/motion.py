@@ -67,12 +67,12 @@ class Motion:
     @property
     def whole(self) -> FloatArray:
         """The rotation (3,) from start to end, rad: the mean rate times the exposure."""
-        return self.turn + self.known(np.array([-0.5, 0.5])) @ np.array([-1.0, 1.0])
+        return np.asarray(self.turn + self.known(np.array([-0.5, 0.5])) @ np.array([-1.0, 1.0]))
 
     @property
     def middle(self) -> FloatArray:
         """The rotation (3,) rad from mid-exposure to halfway between start and end."""
-        return self.growth / 8.0 + self.known(np.array([-0.5, 0.5])) @ np.array([0.5, 0.5])
+        return np.asarray(self.growth / 8.0 + self.known(np.array([-0.5, 0.5])) @ np.array([0.5, 0.5]))
 
     @property
     def relative_growth(self) -> float:

@@ -57,10 +57,12 @@ def rolling_answer(
     if prior_rate is not None:
         sign = direction_of_time(axis, prior_rate, prior_sigma, sigmas)
         found = answer(sign * axis) if sign else None
-        if found is not None and found.result.rate is None:
-            return found.result
-        if found is not None and direction_of_time(found.result.rate, prior_rate, prior_sigma, sigmas) > 0:
-            return replace(found.result, status=StreakStatus.RATE)
+        if found is not None:
+            rate = found.result.rate
+            if rate is None:
+                return found.result
+            if direction_of_time(rate, prior_rate, prior_sigma, sigmas) > 0:
+                return replace(found.result, status=StreakStatus.RATE)
     seen = [found for found in (answer(axis), answer(-axis)) if found is not None]
     if not seen:
         return None
