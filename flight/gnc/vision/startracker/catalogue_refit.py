@@ -97,9 +97,7 @@ def refit_motion(
     if motion.rate is None or motion.covariance is None or between:
         return None
     pinhole, exposure = solution.camera.ideal, motion.exposure
-    growth = np.zeros(3) if motion.acceleration is None else motion.acceleration * exposure**2
-    shape = np.zeros((0, 3)) if motion.course is None else motion.course.terms[2:]
-    course = Motion.between(motion.rate * exposure, growth, shape)
+    course = _course_of(motion, motion.rate)
     most = likelihood.most_stars + likelihood.most_neighbours + likelihood.most_faint
     known = _known_stars(motion, solution, sky, settings, course, most)
     if known is None:
@@ -133,6 +131,14 @@ def refit_motion(
         faint_flux=motion.faint_flux[left],
         faint_significance=motion.faint_significance[left],
     )
+
+
+def _course_of(motion: MotionResult, rate: FloatArray) -> Motion:
+    """Return the course over the exposure by the mean `rate` (3,) rad/s and what else `motion` has found."""
+    exposure = motion.exposure
+    growth = np.zeros(3) if motion.acceleration is None else motion.acceleration * exposure**2
+    shape = np.zeros((0, 3)) if motion.course is None else motion.course.terms[2:]
+    return Motion.between(rate * exposure, growth, shape)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -84,12 +84,7 @@ def cut_strips(
     part, low, high, outer = _parts(pinhole, motion, stars, times)
     if ending is not None:
         outer &= ending[part]
-    reach = 1.45 * width + 1.0
-    begin = low - reach / _speed(paths(pinhole, motion, stars[part], low))
-    end = high + reach / _speed(paths(pinhole, motion, stars[part], high))
-    sampled = begin[:, None] + (end - begin)[:, None] * np.linspace(0.0, 1.0, _SAMPLES)
-    there = positions(pinhole, motion, np.repeat(stars[part], _SAMPLES, axis=0), sampled.reshape(-1))
-    place = there.reshape(-1, _SAMPLES, 2)
+    sampled, place = _extended(pinhole, motion, stars[part], (low, high), 1.45 * width + 1.0)
     span = np.abs(place[:, -1] - place[:, 0])
     along_rows = span[:, 0] >= span[:, 1]
     major = np.where(along_rows[:, None], place[:, :, 0], place[:, :, 1])
@@ -111,6 +106,18 @@ def cut_strips(
         width,
         (low, high, outer, len(stars)),
     )
+
+
+def _extended(
+    pinhole: Pinhole, motion: Motion, stars: FloatArray, times: tuple[FloatArray, FloatArray], reach: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return times (n, s) from `reach` px before the paths to as far beyond, and places (n, s, 2)."""
+    low, high = times
+    begin = low - reach / _speed(paths(pinhole, motion, stars, low))
+    end = high + reach / _speed(paths(pinhole, motion, stars, high))
+    sampled = begin[:, None] + (end - begin)[:, None] * np.linspace(0.0, 1.0, _SAMPLES)
+    there = positions(pinhole, motion, np.repeat(stars, _SAMPLES, axis=0), sampled.reshape(-1))
+    return sampled, there.reshape(-1, _SAMPLES, 2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -142,17 +142,7 @@ def cut_windows(
     frame: ExposedFrame, pinhole: Pinhole, shutter: Shutter, scene: Scene, reach: float
 ) -> Windows:
     """Return the pixels of `frame` within `reach` widths of the stars' paths."""
-    room = reach * scene.width
-    times = window_times(pinhole, scene.motion, shutter, scene.stars)
-    fast, slow = _divided(pinhole, scene, times)
-    whole = path_lengths(pinhole, scene.motion, scene.stars) >= _SPOT_WIDTHS * scene.width
-    long = np.flatnonzero(whole & (fast[:, 1] > fast[:, 0]))
-    spot = np.flatnonzero(~(whole & (fast[:, 1] > fast[:, 0])) | (slow[:, 1] > slow[:, 0]))
-    strips = cut_strips(pinhole, scene.motion, scene.stars[long], fast[long], room, fast[long] == times[long])
-    # The part of a path that a patch serves: the slow one of a streak, all of a spot.
-    part = np.where(np.isin(spot, long)[:, None], slow[spot], times[spot])
-    patches = _patches_about(pinhole, scene, spot, part, room)
-    strips = _beside_patches(strips, long, patches, spot)
+    long, spot, strips, patches = _placed(pinhole, shutter, scene, reach * scene.width)
     index = np.concatenate([strips.index.reshape(-1), patches.index.reshape(-1)])
     inside = np.concatenate([strips.inside.reshape(-1), patches.inside.reshape(-1)])
     named = index[inside]
@@ -181,6 +171,23 @@ def cut_windows(
         _sight(frame, patches.index, patches.inside, slot[cut:], crowded[crowded >= cut] - cut, common),
         int(np.count_nonzero(shared)),
     )
+
+
+def _placed(
+    pinhole: Pinhole, shutter: Shutter, scene: Scene, room: float
+) -> tuple[IntArray, IntArray, Strips, Patches]:
+    """Return which stars have strips (a,), and patches (b,), within `room` px of their paths, and those."""
+    times = window_times(pinhole, scene.motion, shutter, scene.stars)
+    fast, slow = _divided(pinhole, scene, times)
+    whole = path_lengths(pinhole, scene.motion, scene.stars) >= _SPOT_WIDTHS * scene.width
+    long = np.flatnonzero(whole & (fast[:, 1] > fast[:, 0]))
+    spot = np.flatnonzero(~(whole & (fast[:, 1] > fast[:, 0])) | (slow[:, 1] > slow[:, 0]))
+    strips = cut_strips(pinhole, scene.motion, scene.stars[long], fast[long], room, fast[long] == times[long])
+    # The part of a path that a patch serves: the slow one of a streak, all of a spot.
+    part = np.where(np.isin(spot, long)[:, None], slow[spot], times[spot])
+    patches = _patches_about(pinhole, scene, spot, part, room)
+    strips = _beside_patches(strips, long, patches, spot)
+    return long, spot, strips, patches
 
 
 def _divided(pinhole: Pinhole, scene: Scene, times: FloatArray) -> tuple[FloatArray, FloatArray]:
