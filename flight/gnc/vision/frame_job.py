@@ -199,7 +199,8 @@ def _motion(job: FrameJob) -> Found:
     rate, sigma = (prior.rate, prior.sigma) if prior is not None else (None, math.inf)
     lens, estimator, previous = job.camera.ideal, job.estimator, job.previous_checksum
     if isinstance(estimator, LikelihoodSettings):
-        return estimate_motion(job.pixels, lens, job.exposure, estimator, rate, sigma, previous)
+        course = prior.course if prior is not None else None
+        return estimate_motion(job.pixels, lens, job.exposure, estimator, rate, sigma, previous, course)
     return estimate_rate(job.pixels, lens, job.exposure, estimator, rate, sigma, previous)
 
 

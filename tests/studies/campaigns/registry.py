@@ -15,6 +15,8 @@ from tests.studies.campaigns.mismatch import MISMATCH, VIBRATION
 from tests.studies.campaigns.nadir import NADIR
 from tests.studies.campaigns.orbit_attitude import ORBIT_ATTITUDE
 from tests.studies.campaigns.planner_edge import PLANNER_EDGE
+from tests.studies.campaigns.rate_change import RATE_CHANGE
+from tests.studies.campaigns.rolling_shutter import ROLLING_SHUTTER
 from tests.studies.campaigns.rso import RSO_SLEW, RSO_TRACK
 from tests.studies.campaigns.rso_orbits import RSO_ORBITS
 from tests.studies.campaigns.soak import SOAK
@@ -28,6 +30,8 @@ CAMPAIGNS: dict[str, Campaign] = {
         FAILURES,
         MISMATCH,
         VIBRATION,
+        RATE_CHANGE,
+        ROLLING_SHUTTER,
         RSO_SLEW,
         RSO_TRACK,
         RSO_ORBITS,

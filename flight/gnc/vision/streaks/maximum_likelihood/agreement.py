@@ -59,7 +59,7 @@ def estimates_of(alone: OwnEquations, scene: Scene) -> OwnEstimates:
 
     All are steps from the scene's; the units are rad, and px for the width.
     """
-    axis = scene.motion.turn / max(float(np.linalg.norm(scene.motion.turn)), 1e-12)
+    axis = scene.motion.whole / max(float(np.linalg.norm(scene.motion.whole)), 1e-12)
     across = np.linalg.svd(axis[None])[2][1:]
     directions = np.zeros((4, SHARED))
     directions[0, :3], directions[1:3, :3], directions[3, 6] = axis, across, 1.0

@@ -60,7 +60,7 @@ def claim(result: MotionResult, camera: ExposedCamera, last: Fit) -> Claim:
     scene, settings = last.scene, camera.settings
     exact = shared_covariance(last.evaluation, last.free, _CONJUGATE)
     noise = (last.solution.covariance if exact is None else exact)[:3, :3]
-    turn, added, spread = scene.motion.turn, np.zeros((3, 3)), 1.0
+    turn, added, spread = scene.motion.whole, np.zeros((3, 3)), 1.0
     equations = own_equations(last.evaluation, last.free)
     if equations is not None:
         step, added, spread = _with_lens(camera, last, equations, result.exposure)

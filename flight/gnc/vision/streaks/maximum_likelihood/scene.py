@@ -69,6 +69,20 @@ def window_times(pinhole: Pinhole, motion: Motion, shutter: Shutter, stars: Floa
     return times
 
 
+def mid_exposure(pinhole: Pinhole, motion: Motion, shutter: Shutter, middles: FloatArray) -> FloatArray:
+    """Return where stars are at mid-exposure whose streaks have the middles of their length at `middles`.
+
+    All are (n, 2) px.
+    """
+    if not len(middles):
+        return middles
+    if not motion.constant:
+        middles = positions(pinhole, Motion.steady(motion.middle), middles, np.full(len(middles), -1.0))
+    if shutter.delay_per_row == 0.0:
+        return middles
+    return positions(pinhole, motion, middles, -np.asarray(shutter.delay(middles[:, 1])))
+
+
 def path_lengths(pinhole: Pinhole, motion: Motion, stars: FloatArray) -> FloatArray:
     """Return the length (n,) px of the paths of `stars` (n, 2)."""
     samples = 9
