@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
+from flight.gnc.camera.knowledge import CameraKnowledge
 from flight.gnc.guidance.one_axis.limits import Q2_LIMIT
 
 Positive = Annotated[float, Meta(gt=0.0)]
@@ -93,6 +94,22 @@ class CameraLens(Section, frozen=True, kw_only=True):
     k2: float = 0.0
 
 
+_KNOWN = CameraKnowledge()
+
+
+class CameraAccuracy(Section, frozen=True, kw_only=True):
+    """How well the camera is known, standard deviations: what streaks may claim of a rate depends on it.
+
+    `focal_length` as a share of itself, `centre` of the axis along x and y in px, `distortion` as the share
+    of its radius by which a corner may be displaced, `line_time` in s. Zero is exact, as an emulated camera.
+    """
+
+    focal_length: NotNegative = _KNOWN.focal_length
+    centre: NotNegative = _KNOWN.centre
+    distortion: NotNegative = _KNOWN.distortion
+    line_time: NotNegative = _KNOWN.line_time
+
+
 class StarTracker(Section, frozen=True, kw_only=True):
     """The star tracker: its sky index (default: the one in the cache folder), and its trust in the lens.
 
@@ -136,6 +153,7 @@ class Camera(Section, frozen=True, kw_only=True):
     rows: Annotated[int, Meta(ge=64, le=8192)] = 1024
     field_of_view_deg: Annotated[float, Meta(gt=1.0, lt=120.0)] = 20.0
     lens: CameraLens | None = None
+    accuracy: CameraAccuracy = CameraAccuracy()
     exposure: Annotated[float, Meta(gt=0.0, le=10.0)] = 1.0
     period: Positive = 5.0
     bits: Annotated[int, Meta(ge=8, le=16)] = 16

@@ -6,6 +6,7 @@ import argparse
 import json
 import math
 import sys
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -24,11 +25,20 @@ from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from flight.gnc.vision.streaks.streak_result import StreakResult, StreakStatus
 from flight.schema import reader as configuration
+from flight.schema.camera_model import camera_knowledge, camera_model
 from flight.schema.sections import Camera
 from ground.commands.options import add_field, add_output, add_picture, positive, read_picture
 from ground.pictures.overlay import draw_marks
 
 LIKELIHOOD = "likelihood"
+
+_REASONS = {
+    StreakStatus.FAILED: "no motion that enough of the light vouches for",
+    StreakStatus.TOO_FEW: "too few streaks stand out of the noise",
+    StreakStatus.TOO_SHORT: "the stars hardly moved",
+    StreakStatus.BLACK: "the frame is of one value: it shows no scene",
+    StreakStatus.SATURATED: "the frame is overexposed",
+}
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -43,6 +53,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_picture(parser)
     add_field(parser)
     parser.add_argument("--exposure", type=positive, metavar="S", help="exposure time")
+    parser.add_argument("--gain", type=positive, metavar="E", help="electrons a count (default 1)")
+    parser.add_argument("--saturation", type=positive, metavar="COUNTS", help="count at which pixels clip")
+    parser.add_argument("--psf", type=positive, metavar="PX", help="point spread, standard deviation (1)")
+    parser.add_argument(
+        "--line-time",
+        type=float,
+        metavar="S",
+        help="from one row's exposure to the next's (0: global shutter)",
+    )
     parser.add_argument("--prior", type=float, nargs=3, metavar=("X", "Y", "Z"), help="rough rate, rad/s")
     parser.add_argument(
         "--method",
@@ -61,8 +80,9 @@ def run(options: argparse.Namespace) -> int:
     camera = configuration.load_camera(options.camera) if options.camera else None
     pinhole, exposure = _geometry(options, camera, pixels)
     prior = None if options.prior is None else np.array(options.prior)
-    found = _estimate(options.method, pixels, pinhole, exposure, camera, prior)
-    objects = _objects(pixels, pinhole, exposure, camera, prior)
+    likelihood = _likelihood(options, camera)
+    found = _estimate(options.method, pixels, pinhole, exposure, likelihood, prior)
+    objects = _objects(pixels, pinhole, exposure, likelihood, prior)
     if options.json:
         sys.stdout.write(json.dumps(_facts(found, objects, options.method), allow_nan=False) + "\n")
     else:
@@ -82,9 +102,37 @@ def _geometry(options: argparse.Namespace, camera: Camera | None, pixels: Image)
     exposure = options.exposure or (camera.exposure if camera else None)
     if fov_deg is None or exposure is None:
         raise UsageError("give --fov and --exposure, or --camera with a configuration that has them")
+    if options.fov is None and camera is not None and camera.lens is not None:
+        if (camera.rows, camera.columns) != pixels.shape:
+            raise UsageError(
+                f"{options.image} has {columns} x {rows} pixels, its camera {camera.columns} x {camera.rows}"
+            )
+        return camera_model(camera).ideal, exposure
     if not 0.1 <= fov_deg <= 120.0:
         raise UsageError(f"--fov {fov_deg}: a pinhole camera sees 0.1 to 120 degrees")
     return Pinhole.from_field_of_view(columns, rows, math.radians(fov_deg)), exposure
+
+
+def _likelihood(options: argparse.Namespace, camera: Camera | None) -> LikelihoodSettings:
+    """Return the settings of the fit: the options, else the configuration's, else the defaults."""
+    settings = LikelihoodSettings()
+    if camera is not None:
+        settings = LikelihoodSettings(
+            gain=camera.gain,
+            saturation=camera.saturation,
+            psf_sigma=camera.psf_sigma,
+            line_time=camera.line_time,
+            knowledge=camera_knowledge(camera),
+        )
+    if options.line_time is not None and not math.isfinite(options.line_time):
+        raise UsageError(f"--line-time {options.line_time}: must be finite")
+    given = {
+        "gain": options.gain,
+        "saturation": options.saturation,
+        "psf_sigma": options.psf,
+        "line_time": options.line_time,
+    }
+    return replace(settings, **{name: value for name, value in given.items() if value is not None})
 
 
 def _estimate(
@@ -92,23 +140,24 @@ def _estimate(
     pixels: Image,
     pinhole: Pinhole,
     exposure: float,
-    camera: Camera | None,
+    likelihood: LikelihoodSettings,
     prior: FloatArray | None,
 ) -> StreakResult | MotionResult:
-    gain = camera.gain if camera else 1.0
-    saturation = camera.saturation if camera else None
     if method == LIKELIHOOD:
-        likelihood = LikelihoodSettings(gain=gain, saturation=saturation)
         return estimate_motion(pixels, pinhole, exposure, likelihood, prior, 0.0)
+    gain, saturation = likelihood.gain, likelihood.saturation
     settings = StreakSettings.of(method, gain=gain, saturation=saturation)  # type: ignore[arg-type]  # a choice
     return estimate_rate(pixels, pinhole, exposure, settings, prior, 0.0)
 
 
 def _objects(
-    pixels: Image, pinhole: Pinhole, exposure: float, camera: Camera | None, prior: FloatArray | None
+    pixels: Image,
+    pinhole: Pinhole,
+    exposure: float,
+    likelihood: LikelihoodSettings,
+    prior: FloatArray | None,
 ) -> tuple[SpaceObject, ...]:
-    gain = camera.gain if camera else 1.0
-    settings = StreakSettings(gain=gain, saturation=camera.saturation if camera else None)
+    settings = StreakSettings(gain=likelihood.gain, saturation=likelihood.saturation)
     report = detect(pixels, pinhole, exposure, settings, ObjectSettings(), prior)
     return report.objects if report is not None else ()
 
@@ -120,6 +169,7 @@ def _facts(
     return {
         "method": method,
         "status": found.status.value,
+        "reason": _reason(found),
         "rate_rad_s": found.rate.tolist() if found.rate is not None else None,
         "covariance_rad2_s2": found.covariance.tolist() if known and found.covariance is not None else None,
         "direction_of_time_known": found.status is StreakStatus.RATE,
@@ -143,8 +193,18 @@ def _facts(
     }
 
 
+def _reason(found: StreakResult | MotionResult) -> str:
+    """Return why there is no rate, in a line; empty when there is one."""
+    if found.rate is not None:
+        return ""
+    detailed = found.reason if isinstance(found, MotionResult) else ""
+    return detailed or _REASONS.get(found.status, "")
+
+
 def _text(found: StreakResult | MotionResult, objects: tuple[SpaceObject, ...]) -> str:
     lines = [f"status:        {found.status.value}"]
+    if _reason(found):
+        lines.append(f"why:           {_reason(found)}")
     if found.rate is not None and found.covariance is not None:
         sigma = np.sqrt(np.diag(found.covariance))
         size = float(np.linalg.norm(found.rate))

@@ -14,7 +14,7 @@ from flight.gnc.vision.streaks.corners.settings import StreakSettings
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from flight.loop.tasks.frame_measurements import ImagingSettings
 from flight.loop.tasks.navigation import NavigationSettings
-from flight.schema.camera_model import camera_model
+from flight.schema.camera_model import camera_knowledge, camera_model
 from flight.schema.sections import Camera, Config
 from hal.interfaces.wires import SECOND_NS
 
@@ -70,7 +70,11 @@ def _estimator(camera: Camera) -> StreakSettings | LikelihoodSettings:
     saturation = _saturation(camera)
     if camera.estimator == "likelihood":
         return LikelihoodSettings(
-            gain=camera.gain, saturation=saturation, psf_sigma=camera.psf_sigma, line_time=camera.line_time
+            gain=camera.gain,
+            saturation=saturation,
+            psf_sigma=camera.psf_sigma,
+            line_time=camera.line_time,
+            knowledge=camera_knowledge(camera),
         )
     settings = StreakSettings.of(camera.estimator, saturation=saturation, gain=camera.gain)
     return settings if camera.endpoint_bias is None else replace(settings, endpoint_bias=camera.endpoint_bias)

@@ -138,7 +138,8 @@ def solve_frame(
         rate_prior: gives the direction of time, which one frame does not show.
     """
     tracker = TrackerSettings(settings, scale)
-    estimator = settings.likelihood
+    # Of a picture the places of the stars are wanted: a rate that is hardly known serves as well.
+    estimator = replace(settings.likelihood, worst_doubt=math.inf, worst_shaking=math.inf)
     job = FrameJob(
         pixels, camera, exposure, estimator, tracker, rate_prior, attitude_prior, motion_first=False
     )
@@ -198,7 +199,8 @@ def _motion(job: FrameJob) -> Found:
     rate, sigma = (prior.rate, prior.sigma) if prior is not None else (None, math.inf)
     lens, estimator, previous = job.camera.ideal, job.estimator, job.previous_checksum
     if isinstance(estimator, LikelihoodSettings):
-        return estimate_motion(job.pixels, lens, job.exposure, estimator, rate, sigma, previous)
+        course = prior.course if prior is not None else None
+        return estimate_motion(job.pixels, lens, job.exposure, estimator, rate, sigma, previous, course)
     return estimate_rate(job.pixels, lens, job.exposure, estimator, rate, sigma, previous)
 
 

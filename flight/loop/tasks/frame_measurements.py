@@ -16,6 +16,7 @@ from flight.gnc.vision.frame_job import Found, FrameFound, FrameJob, TrackerSett
 from flight.gnc.vision.startracker.mid_exposure import NODES, middle_covariance, weighting_of
 from flight.gnc.vision.startracker.solve import AttitudePrior, RatePrior
 from flight.gnc.vision.streaks.corners.settings import StreakSettings
+from flight.gnc.vision.streaks.maximum_likelihood.course import Course
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from flight.gnc.vision.streaks.streak_result import StreakStatus
 from flight.loop.tasks.navigation import Navigation
@@ -23,6 +24,8 @@ from hal.interfaces.readings import Frame
 
 # rad, of the mounting between the camera and the inertial unit that the estimate is of.
 _LEAST_PRIOR_SIGMA = 5e-4
+# The rate over an exposure is taken at so many instants.
+_COURSE_NODES = 17
 _NAN = np.full(3, np.nan), np.full((3, 3), np.nan)
 
 
@@ -65,7 +68,7 @@ class FrameMeasurer:
             frame.exposure_ns * 1e-9,
             self._estimator(past),
             self._settings.tracker,
-            self._rate_prior(past) if past is not None else None,
+            self._rate_prior(frame, past) if past is not None else None,
             self._attitude_prior(past) if past is not None else None,
             last_checksum,
         )
@@ -77,9 +80,20 @@ class FrameMeasurer:
             return replace(estimator, rate_model="accelerating")
         return estimator
 
-    def _rate_prior(self, past: Estimate) -> RatePrior:
+    def _rate_prior(self, frame: Frame, past: Estimate) -> RatePrior:
         widest = float(np.linalg.eigvalsh(past.covariance[RATE, RATE])[-1])
-        return RatePrior(self._body_to_camera @ past.rate, math.sqrt(max(widest, 0.0)))
+        rate, sigma = self._body_to_camera @ past.rate, math.sqrt(max(widest, 0.0))
+        return RatePrior(rate, sigma, self._course(frame, sigma))
+
+    def _course(self, frame: Frame, sigma: float) -> Course | None:
+        """Return how the camera turned, its rate known to `sigma` rad/s; None beyond the history."""
+        parts = np.linspace(0.0, 1.0, _COURSE_NODES)
+        times = [frame.exposure_start_ns + round(part * frame.exposure_ns) for part in parts]
+        past = [self._navigation.past(time) for time in times]
+        rates = [self._body_to_camera @ one.rate for one in past if one is not None]
+        if len(rates) < _COURSE_NODES:
+            return None
+        return Course.of_rates(np.array(rates), frame.exposure_ns * 1e-9, sigma)
 
     def _attitude_prior(self, past: Estimate) -> AttitudePrior:
         widest = float(np.linalg.eigvalsh(past.covariance[TURN, TURN])[-1])

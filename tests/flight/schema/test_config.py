@@ -9,7 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from flight.gnc.camera.knowledge import EXACT
 from flight.schema import reader
+from flight.schema.camera_model import camera_knowledge
 from flight.schema.document import read_document, to_yaml
 from flight.schema.errors import ConfigError
 from sim_hal.settings import Simulation
@@ -141,3 +143,18 @@ def test_a_configuration_is_written_in_its_order_and_read_back_the_same() -> Non
     text = to_yaml(values)
     assert list(read_document(text, "written").values) == list(values)
     assert read_document(text, "written").values == values | {"pair": [1, -0.0]}
+
+
+def test_what_a_lens_differs_by_from_a_pinhole_counts_as_unknown_to_the_streaks() -> None:
+    """An axis 3 and 4 px off, and distortion that moves the corner by 1 % of its radius."""
+    demo = reader.load(FOLDER / "step_demo.yaml").camera
+    assert demo is not None
+    assert camera_knowledge(demo) == EXACT
+    accuracy = "accuracy: {centre: 0.0, distortion: 0.0}"
+    focal, corner = 2900.0, 511.5 * 2.0**0.5
+    lens = f"lens: {{focal_length: {focal}, centre: [514.5, 507.5], k1: {0.01 * (focal / corner) ** 2}}}"
+    camera = reader.parse(DEMO.replace(accuracy, f"{accuracy}\n  {lens}"), "text").camera
+    assert camera is not None
+    known = camera_knowledge(camera)
+    assert known.centre == pytest.approx(5.0)
+    assert known.distortion == pytest.approx(0.01)

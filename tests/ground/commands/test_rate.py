@@ -89,3 +89,40 @@ def test_a_mistake_is_one_line(words: list[str], complaint: str, picture: Path) 
     assert done.returncode == 2
     assert complaint in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+def test_options_describe_the_camera_and_a_refusal_says_why(scene: Scene, picture: Path) -> None:
+    """The picture's point spread is 1 px; called 2 px, its streaks' ends are not where they seem."""
+    told = [
+        "--fov",
+        FOV,
+        "--exposure",
+        "0.2",
+        "--gain",
+        "1",
+        "--saturation",
+        "4095",
+        "--line-time",
+        "0",
+        "--json",
+    ]
+    right = json.loads(command("rate", picture, *told, "--psf", "1").stdout)
+    assert right["status"] == "ambiguous"
+    assert right["reason"] == ""
+    wrong = command("rate", picture, *told, "--psf", "2")
+    assert wrong.returncode == 1
+    assert "2 px as described" in json.loads(wrong.stdout)["reason"]
+
+
+def test_a_cameras_configuration_says_how_well_it_is_known(picture: Path, tmp_path: Path) -> None:
+    def sigma(accuracy: str) -> float:
+        path = tmp_path / "camera.yaml"
+        lens = f"{{focal_length: {CAMERA.pinhole.focal_length}, centre: [319.5, 319.5]}}"
+        size = "columns: 640, rows: 640, bits: 12, exposure: 0.2"
+        path.write_text(f"camera: {{{size}, lens: {lens}, accuracy: {accuracy}}}\n")
+        done = command("rate", picture, "--camera", path, "--json")
+        assert done.returncode == 0, done.stderr
+        return float(np.sqrt(np.trace(json.loads(done.stdout)["covariance_rad2_s2"])))
+
+    exact, usual = sigma("{centre: 0.0, distortion: 0.0}"), sigma("{}")
+    assert exact < 0.8 * usual

@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from flight.gnc.camera.knowledge import EXACT
 from flight.gnc.math.arrays import FloatArray, Image
 from flight.gnc.vision.streaks.corners import streak_rate
 from flight.gnc.vision.streaks.corners.endpoints import chord_outward, extend
@@ -73,7 +74,7 @@ Estimator = Callable[[Scene, StarCameraModel], Sighting]
 
 def estimated(pixels: Image, rate: FloatArray, exposure: float, camera: StarCameraModel) -> MotionResult:
     """Return what the likelihood estimator says of a frame; the true `rate` (3,) only gives the sign."""
-    settings = LikelihoodSettings(saturation=float(camera.highest_count), gain=camera.gain)
+    settings = LikelihoodSettings(saturation=float(camera.highest_count), gain=camera.gain, knowledge=EXACT)
     return estimate_motion(pixels, camera.pinhole, exposure, settings, rate, 0.0)
 
 

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
+from flight.gnc.camera.knowledge import EXACT
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion
 from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
@@ -75,7 +76,7 @@ def run(case: Case) -> Result:
     """Estimate one frame's motion and judge the answer."""
     camera = StarCameraModel(field_of_view=FIELD)
     scene, drawn = expose(case, camera)
-    settings = LikelihoodSettings(saturation=float(camera.highest_count), gain=camera.gain)
+    settings = LikelihoodSettings(saturation=float(camera.highest_count), gain=camera.gain, knowledge=EXACT)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         begun = time.process_time()

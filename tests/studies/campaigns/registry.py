@@ -11,9 +11,12 @@ from tests.studies.campaigns.failures import FAILURES
 from tests.studies.campaigns.faults import FAULTS
 from tests.studies.campaigns.faults_kill import FAULTS_KILL
 from tests.studies.campaigns.lost_in_space import LOST_IN_SPACE
+from tests.studies.campaigns.mismatch import MISMATCH, VIBRATION
 from tests.studies.campaigns.nadir import NADIR
 from tests.studies.campaigns.orbit_attitude import ORBIT_ATTITUDE
 from tests.studies.campaigns.planner_edge import PLANNER_EDGE
+from tests.studies.campaigns.rate_change import RATE_CHANGE
+from tests.studies.campaigns.rolling_shutter import ROLLING_SHUTTER
 from tests.studies.campaigns.rso import RSO_SLEW, RSO_TRACK
 from tests.studies.campaigns.rso_orbits import RSO_ORBITS
 from tests.studies.campaigns.soak import SOAK
@@ -25,6 +28,10 @@ CAMPAIGNS: dict[str, Campaign] = {
     for campaign in (
         STREAKS,
         FAILURES,
+        MISMATCH,
+        VIBRATION,
+        RATE_CHANGE,
+        ROLLING_SHUTTER,
         RSO_SLEW,
         RSO_TRACK,
         RSO_ORBITS,

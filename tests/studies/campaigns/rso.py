@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from flight.gnc.camera.knowledge import EXACT
 from flight.gnc.math.arrays import FloatArray, Image
 from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
 from flight.gnc.vision.objects.detect import detect
@@ -163,7 +164,7 @@ def _rates(pixels: Image, camera: StarCameraModel, rate: FloatArray) -> Result:
     """Return the two estimators' errors: magnitude in parts of it, axis in rad; None without a rate."""
     saturation = float(camera.highest_count)
     streaks = StreakSettings(saturation=saturation, gain=camera.gain)
-    likelihood = LikelihoodSettings(saturation=saturation, gain=camera.gain)
+    likelihood = LikelihoodSettings(saturation=saturation, gain=camera.gain, knowledge=EXACT)
     found = {
         "harris": estimate_rate(pixels, camera.pinhole, EXPOSURE, streaks, rate, 0.0),
         "likelihood": estimate_motion(pixels, camera.pinhole, EXPOSURE, likelihood, rate, 0.0),

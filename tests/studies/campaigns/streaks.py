@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from flight.gnc.camera.knowledge import EXACT
 from flight.gnc.errors import FlightError
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.vision.startracker.two_ends import attitudes_of_ends
@@ -67,7 +68,7 @@ def run(case: Case) -> Result:
         settings = StreakSettings.of(name, saturation=saturation)
         found = estimate_rate(scene.pixels, camera.pinhole, EXPOSURE, settings, scene.rate, 0.0)
         result[name] = _errors(found, scene, camera)
-    likelihood = LikelihoodSettings(saturation=saturation, gain=camera.gain)
+    likelihood = LikelihoodSettings(saturation=saturation, gain=camera.gain, knowledge=EXACT)
     motion = estimate_motion(scene.pixels, camera.pinhole, EXPOSURE, likelihood, scene.rate, 0.0)
     result[LIKELIHOOD] = _errors(motion, scene, camera)
     return result

@@ -92,11 +92,12 @@ def refit_motion(
     likelihood: LikelihoodSettings,
 ) -> MotionResult | None:
     """Return `motion` refitted with all stars known; None if that fails or gives another rate."""
-    if motion.rate is None or motion.covariance is None:
+    # Under a rolling shutter an ambiguous rate lies between two motions: there is none to start from.
+    between = likelihood.line_time > 0.0 and motion.status is not StreakStatus.RATE
+    if motion.rate is None or motion.covariance is None or between:
         return None
     pinhole, exposure = solution.camera.ideal, motion.exposure
-    growth = np.zeros(3) if motion.acceleration is None else motion.acceleration * exposure**2
-    course = Motion(motion.rate * exposure, growth)
+    course = _course_of(motion, motion.rate)
     most = likelihood.most_stars + likelihood.most_neighbours + likelihood.most_faint
     known = _known_stars(motion, solution, sky, settings, course, most)
     if known is None:
@@ -116,17 +117,28 @@ def refit_motion(
     refit = with_rate(with_stars(motion, camera, done), camera, done, Wholeness.WHOLE)
     if refit.status is not StreakStatus.AMBIGUOUS or refit.rate is None or refit.covariance is None:
         return None
+    assumed = np.zeros((3, 3)) if motion.course is None else motion.course.covariance(exposure)
+    covariance = refit.covariance + assumed
     apart = refit.rate - motion.rate
-    if not apart @ np.linalg.solve(motion.covariance + refit.covariance, apart) < _ONE_MOTION:
+    if not apart @ np.linalg.solve(motion.covariance + covariance, apart) < _ONE_MOTION:
         return None
     left = _elsewhere(motion.faint_endpoints, refit.endpoints)
     return replace(
         refit,
         status=motion.status,
+        covariance=covariance,
         faint_endpoints=motion.faint_endpoints[left],
         faint_flux=motion.faint_flux[left],
         faint_significance=motion.faint_significance[left],
     )
+
+
+def _course_of(motion: MotionResult, rate: FloatArray) -> Motion:
+    """Return the course over the exposure by the mean `rate` (3,) rad/s and what else `motion` has found."""
+    exposure = motion.exposure
+    growth = np.zeros(3) if motion.acceleration is None else motion.acceleration * exposure**2
+    shape = np.zeros((0, 3)) if motion.course is None else motion.course.terms[2:]
+    return Motion.between(rate * exposure, growth, shape)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -185,7 +197,7 @@ def _known_stars(
     magnitude = sky.stars.magnitude
     zero = np.median(np.log10(motion.flux[fitted[used]]) + 0.4 * magnitude[solution.star[matched[used]]])
     pinhole, matrix = solution.camera.ideal, attitude_matrix(solution.fix.quaternion)
-    reach = min(pinhole.half_diagonal + 0.5 * float(np.linalg.norm(course.turn)), 0.5 * np.pi)
+    reach = min(pinhole.half_diagonal + 0.5 * float(np.linalg.norm(course.whole)), 0.5 * np.pi)
     near = np.flatnonzero(matrix[2].astype(np.float32) @ sky.coarse > np.cos(reach))
     direction = sky.stars.direction[near]
     if settings.velocity is not None:
@@ -207,7 +219,7 @@ def _scenes(
     path = path_lengths(camera.pinhole, course, known.places) + 2.0 * np.sqrt(np.pi) * width
     light = known.light * known.inside
     floor = float(np.median(camera.frame.floor)) * 2.0 * np.sqrt(np.pi) * width * path * known.inside
-    seen = light > settings.faint_sigmas * np.sqrt(floor + light / settings.gain)
+    seen = light > settings.faint_sigmas * np.sqrt(floor + light / camera.frame.gain)
     fitted = np.flatnonzero(near & (leading | seen) & ~twin)[: settings.most_stars + settings.most_neighbours]
     hidden = near.copy()
     hidden[fitted] = False

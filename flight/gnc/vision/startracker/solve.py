@@ -32,6 +32,7 @@ from flight.gnc.vision.startracker.image_fit import fit_in_image
 from flight.gnc.vision.startracker.index.sky_index import SkyIndex
 from flight.gnc.vision.startracker.mid_exposure import timing_covariance
 from flight.gnc.vision.startracker.solution import FrameSolution, SolveStatus
+from flight.gnc.vision.streaks.maximum_likelihood.course import Course
 from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 
@@ -75,10 +76,14 @@ class AttitudePrior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RatePrior:
-    """Predicted rate (3,), rad/s in the camera's axes, and the standard deviation of each component."""
+    """Predicted rate (3,), rad/s in the camera's axes, and the standard deviation of each component.
+
+    `course`: how the camera turned over the exposure, where that is known.
+    """
 
     rate: FloatArray
     sigma: float
+    course: Course | None = None
 
 
 def solve_points(

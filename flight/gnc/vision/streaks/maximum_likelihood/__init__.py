@@ -29,7 +29,11 @@ The modules in the order of the computation (`estimate` runs it; `settings` and 
       |  end_checks           light from end to end of a streak and none beyond
       |  chains               streaks that are pieces of longer ones
       |  wholeness            whole, doubtful or broken
+      |  shutter_direction    either direction of the turn, where a rolling shutter distinguishes them
       |  result_of_fit        the stars and the rate, or why there is none
+
+Throughout, `work` counts what was done: beyond its limit no rival motion is begun. `course` is how the camera
+turned as navigation knows it.
 
 What is fitted is a `scene` (motion, point spread, stars) on `windows` of pixels: `strips` about long streaks,
 patches about spots. The model of the light: `motion` (where a star is when), `shutter` (when a row is

@@ -34,25 +34,41 @@ class OwnEstimates:
     deviation: FloatArray
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class OwnEquations:
+    """What each star by itself says of the free shared parameters, its own numbers eliminated.
+
+    Attributes:
+        kept: (k,) which shared parameters are free.
+        information: (n, k, k); score: (n, k).
+    """
+
+    kept: IntArray
+    information: FloatArray
+    score: FloatArray
+
+
 def own_estimates(evaluation: Evaluation, scene: Scene, free: BoolArray) -> OwnEstimates | None:
+    """Return each star's own estimate of the turn and the width; None when they are not determined."""
+    alone = own_equations(evaluation, free)
+    return None if alone is None else estimates_of(alone, scene)
+
+
+def estimates_of(alone: OwnEquations, scene: Scene) -> OwnEstimates:
     """Return each star's own estimate of the turn, along it and across it twice, and of the width.
 
     All are steps from the scene's; the units are rad, and px for the width.
     """
-    alone = _alone(evaluation, free)
-    if alone is None:
-        return None
-    kept, schur, score = alone
-    axis = scene.motion.turn / max(float(np.linalg.norm(scene.motion.turn)), 1e-12)
+    axis = scene.motion.whole / max(float(np.linalg.norm(scene.motion.whole)), 1e-12)
     across = np.linalg.svd(axis[None])[2][1:]
     directions = np.zeros((4, SHARED))
     directions[0, :3], directions[1:3, :3], directions[3, 6] = axis, across, 1.0
-    directions = directions[:, kept]
-    information = np.einsum("ai,nij,aj->na", directions, schur, directions)
+    directions = directions[:, alone.kept]
+    information = np.einsum("ai,nij,aj->na", directions, alone.information, directions)
     informed = information > _NOTHING * information.max(axis=0)
     information = np.where(informed, information, _NOTHING * information.max(axis=0) + 1e-300)
     return OwnEstimates(
-        np.where(informed, score @ directions.T / information, 0.0), 1.0 / np.sqrt(information)
+        np.where(informed, alone.score @ directions.T / information, 0.0), 1.0 / np.sqrt(information)
     )
 
 
@@ -62,22 +78,19 @@ def agreed_step(evaluation: Evaluation, step: FloatArray) -> tuple[float, int]:
     Each star asks for its own part of the step. The spread of what they ask is the measure, where it is more
     than the noise: one star in whose light another's is hidden moves no agreement.
     """
-    alone = _alone(evaluation, step != 0.0)
+    alone = own_equations(evaluation, step != 0.0)
     if alone is None:
         return 0.0, 0
-    kept, schur, score = alone
-    asked, due = score @ step[kept], np.einsum("i,nij,j->n", step[kept], schur, step[kept])
+    part = step[alone.kept]
+    asked, due = alone.score @ part, np.einsum("i,nij,j->n", part, alone.information, part)
     count = int(np.count_nonzero(due > 0.0))
     spread = float(np.sum((asked - due) ** 2)) * count / max(count - 1, 1)
     total = float(due.sum())
     return total**2 / max(total, spread, 1e-300), count
 
 
-def _alone(evaluation: Evaluation, free: BoolArray) -> tuple[IntArray, FloatArray, FloatArray] | None:
-    """Return the free shared parameters (k,), each star's information (n, k, k) and score (n, k) of them.
-
-    Its own numbers are eliminated; None when the shared parameters are not determined.
-    """
+def own_equations(evaluation: Evaluation, free: BoolArray) -> OwnEquations | None:
+    """Return what each star says of the `free` shared parameters; None when they are not determined."""
     eliminated = eliminate(evaluation, free)
     if eliminated is None:
         return None
@@ -85,7 +98,7 @@ def _alone(evaluation: Evaluation, free: BoolArray) -> tuple[IntArray, FloatArra
     cross = evaluation.information[:, SHARED:][:, :, kept]
     schur = evaluation.information[:, kept[:, None], kept] - gain @ cross
     score = evaluation.gradient[:, kept] - np.einsum("nij,nj->ni", gain, evaluation.gradient[:, SHARED:])
-    return kept, schur, score
+    return OwnEquations(kept, schur, score)
 
 
 def agreeing(estimates: OwnEstimates, floors: FloatArray, sigmas: float) -> BoolArray:

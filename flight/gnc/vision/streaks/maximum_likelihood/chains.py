@@ -20,7 +20,7 @@ _ALIKE = 2.5
 
 def circles(pinhole: Pinhole, motion: Motion, stars: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the angles (n,) rad of stars at pixels (n, 2) from the axis of rotation, and about it."""
-    axis = motion.turn / max(float(np.linalg.norm(motion.turn)), 1e-12)
+    axis = motion.whole / max(float(np.linalg.norm(motion.whole)), 1e-12)
     first = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
     first = first / np.linalg.norm(first)
     local = pinhole.unit_vectors(stars) @ np.stack([first, np.cross(axis, first), axis]).T
@@ -40,7 +40,7 @@ def in_chains(
     Only the first `asked` of them are judged, when that is given.
     """
     polar, azimuth = circles(pinhole, motion, stars)
-    turns = apart(azimuth[:asked], azimuth) / max(float(np.linalg.norm(motion.turn)), 1e-12)
+    turns = apart(azimuth[:asked], azimuth) / max(float(np.linalg.norm(motion.whole)), 1e-12)
     aside = np.abs(polar[:asked, None] - polar) * pinhole.focal_length
     ratio = light[:asked, None] / np.maximum(light, 1e-9)
     joined = (aside < _ASIDE) & (turns > _NEXT[0]) & (turns < _NEXT[1])
@@ -55,5 +55,5 @@ def close_by(
     other_polar, other_azimuth = circles(pinhole, motion, others)
     beside = np.abs(polar[:, None] - other_polar) * pinhole.focal_length < distance
     room = distance / (pinhole.focal_length * np.maximum(np.sin(other_polar), 1e-3))
-    angle = float(np.linalg.norm(motion.turn))
+    angle = float(np.linalg.norm(motion.whole))
     return np.asarray((beside & (apart(azimuth, other_azimuth) < angle + room)).any(axis=1))

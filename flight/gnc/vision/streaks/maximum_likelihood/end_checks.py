@@ -13,7 +13,7 @@ import numpy as np
 from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import ExposedFrame
-from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion, paths
+from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion, paths, positions
 from flight.gnc.vision.streaks.maximum_likelihood.scene import path_lengths
 
 # Looked at is a stretch of this part of the path, at least so long, from so far before or beyond the end, px.
@@ -31,6 +31,12 @@ _HALF = 0.5
 _LEAST_VALID = 0.7
 # A stretch can be judged when the light expected exceeds this many deviations of its mean.
 _TELLING = 4.0
+# Instants at which the progress along a path is taken.
+_INSTANTS = 65
+# Where a star is slower than this part of its rate, the point spread hides how much brighter its path is.
+_SLOW = 0.5
+# Light beyond an end is a trail from this part of the streak's mean brightness on.
+_TRAIL = 0.08
 # So much of a streak may be dark for reasons of its own.
 _DARK = 0.15
 
@@ -55,19 +61,69 @@ def true_ends(
         return out
     stars, light, times, length = stars[long], light[long], times[long], length[long]
     stretch = np.maximum(_STRETCH * length, _LEAST_STRETCH)
-    expected = expected_brightness(light, length)
     away = _FROM_END + np.linspace(0.0, 1.0, _SAMPLES) * stretch[:, None]
-    end = times.T.reshape(-1)
-    velocity = paths(pinhole, motion, np.tile(stars, (2, 1)), end).velocity
-    outward = np.repeat([-1.0, 1.0], len(stars)) / np.maximum(np.hypot(velocity[:, 0], velocity[:, 1]), 1e-3)
-    delay = outward[:, None] * np.tile(away, (2, 1))
-    time = np.concatenate([end[:, None] - delay, end[:, None] + delay])
-    mean, _ = brightness(frame, pinhole, motion, np.tile(stars, (4, 1)), time)
-    within, beyond = mean.reshape(2, 2, -1)
-    known = np.isfinite(within) & np.isfinite(beyond)
-    true = (within > _HALF * expected) & (beyond < _HALF * expected)
-    out[long] = np.where(known, true, np.nan).T
+    for end, sign in ((0, -1.0), (1, 1.0)):
+        steady, there, speed = ending(pinhole, motion, stars, times[:, end])
+        part = relative_brightness(motion, sign, _FROM_END / speed, (_FROM_END + stretch) / speed)
+        expected = expected_brightness(light, length) * part
+        time = sign * away / speed[:, None]
+        within, beyond = (brightness(frame, pinhole, steady, there, t)[0] for t in (-time, time))
+        known = np.isfinite(within) & np.isfinite(beyond)
+        true = (within > _HALF * expected) & (beyond < _HALF * expected)
+        out[long, end] = np.where(known, true, np.nan)
     return out
+
+
+def trailing(
+    frame: ExposedFrame,
+    pinhole: Pinhole,
+    motion: Motion,
+    stars: FloatArray,
+    light: FloatArray,
+    times: FloatArray,
+) -> float:
+    """Return the part of the stars that can be judged whose light goes on, faintly, beyond an end.
+
+    Arguments as of `true_ends`. A rate that changes otherwise than assumed leaves a short streak with a dim
+    tail.
+    """
+    faint = _TRAIL * expected_brightness(light, path_lengths(pinhole, motion, stars))
+    away = _FROM_END + np.linspace(0.0, 1.0, _SAMPLES) * _LEAST_STRETCH
+    judged, lit = np.zeros(len(stars), dtype=np.bool_), np.zeros(len(stars), dtype=np.bool_)
+    for end, sign in ((0, -1.0), (1, 1.0)):
+        steady, there, speed = ending(pinhole, motion, stars, times[:, end])
+        mean, deviation = brightness(frame, pinhole, steady, there, sign * away / speed[:, None])
+        known = np.isfinite(mean) & (faint > _TELLING * deviation)
+        judged |= known
+        lit |= known & (mean > faint)
+    return float(np.mean(lit[judged])) if judged.any() else 0.0
+
+
+def ending(
+    pinhole: Pinhole, motion: Motion, stars: FloatArray, times: FloatArray
+) -> tuple[Motion, FloatArray, FloatArray]:
+    """Return a steady motion through ends of paths, where those are (n, 2) px, and its speed (n,) there.
+
+    `times` (n,) are those of the ends. Where the rate changes the path itself may be at rest there.
+    """
+    there = positions(pinhole, motion, stars, times)
+    steady = Motion.steady(motion.whole)
+    velocity = paths(pinhole, steady, there, np.zeros(len(there))).velocity
+    return steady, there, np.maximum(np.hypot(velocity[:, 0], velocity[:, 1]), 1e-3)
+
+
+def relative_brightness(motion: Motion, sign: float, near: FloatArray, far: FloatArray) -> FloatArray:
+    """Return how bright (n,) the path is from `near` to `far` (n,) of its end, over its mean.
+
+    Distances are in parts of the path; `sign` is 1 for the last end, -1 for the first.
+    """
+    time = np.linspace(-0.5, 0.5, _INSTANTS)
+    progress = np.maximum.accumulate(motion.progress(time))
+    # A little more with time, so that a rest has its duration.
+    progress += 1e-9 * np.arange(_INSTANTS)
+    end = progress[-1 if sign > 0.0 else 0]
+    begin, stop = (np.interp(end - sign * distance, progress, time) for distance in (near, far))
+    return np.asarray(np.abs(stop - begin) / np.maximum(far - near, 1e-9))
 
 
 def unbroken(
@@ -91,7 +147,8 @@ def unbroken(
     time = times[:, :1] + (times[:, 1:] - times[:, :1]) * share
     each = np.repeat(stars, _WITHIN, axis=0)
     mean, deviation = brightness(frame, pinhole, motion, each, time.reshape(len(each), _WITHIN_SAMPLES))
-    expected = np.repeat(expected_brightness(light, length), _WITHIN)
+    rate = np.clip(motion.pace(time.reshape(-1)), _SLOW, None).reshape(len(each), _WITHIN_SAMPLES)
+    expected = np.repeat(expected_brightness(light, length), _WITHIN) * np.mean(1.0 / rate, axis=1)
     known = np.isfinite(mean) & (expected > _TELLING * deviation)
     dark = (known & (mean < _HALF * expected)).reshape(-1, _WITHIN).sum(axis=1)
     known_of = known.reshape(-1, _WITHIN).sum(axis=1)

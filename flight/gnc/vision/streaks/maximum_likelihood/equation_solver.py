@@ -13,7 +13,7 @@ import numpy as np
 
 from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.math.arrays import BoolArray, FloatArray, IntArray
-from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion, sensitivities
+from flight.gnc.vision.streaks.maximum_likelihood.motion import sensitivities
 from flight.gnc.vision.streaks.maximum_likelihood.normal_equations import (
     ALONE,
     PRIOR,
@@ -209,10 +209,10 @@ def moved(scene: Scene, solution: Solution, pinhole: Pinhole, longest: float) ->
     far = np.hypot(step[:, 0], step[:, 1])
     step[:, :2] *= np.minimum(1.0, longest / np.maximum(far, 1e-9))[:, None]
     shared = share * solution.shared
-    motion = Motion(scene.motion.turn + shared[:3], scene.motion.growth + shared[3:6])
+    turn, growth = scene.motion.turn + shared[:3], scene.motion.growth + shared[3:6]
     after = replace(
         scene,
-        motion=motion,
+        motion=replace(scene.motion, turn=turn, growth=growth),
         width=scene.width + float(shared[6]),
         stars=scene.stars + step[:, :2],
         light=np.maximum(scene.light + step[:, 2], 0.3 * scene.light),

@@ -17,7 +17,9 @@ from flight.gnc.math.arrays import FloatArray, Image
 from flight.gnc.vision.frame.saturation import saturation_count
 from flight.gnc.vision.streaks.admission import admit, in_time, validate
 from flight.gnc.vision.streaks.maximum_likelihood.blobs import Blobs, find_blobs
+from flight.gnc.vision.streaks.maximum_likelihood.course import Course
 from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import expose_frame
+from flight.gnc.vision.streaks.maximum_likelihood.first_guess import guess_axis
 from flight.gnc.vision.streaks.maximum_likelihood.hypotheses import (
     alike,
     first_fits,
@@ -26,12 +28,20 @@ from flight.gnc.vision.streaks.maximum_likelihood.hypotheses import (
 )
 from flight.gnc.vision.streaks.maximum_likelihood.iteration import ExposedCamera, Fit
 from flight.gnc.vision.streaks.maximum_likelihood.joint_fit import last_fit
+from flight.gnc.vision.streaks.maximum_likelihood.motion import positions
 from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
 from flight.gnc.vision.streaks.maximum_likelihood.result_of_fit import with_faint, with_rate, with_stars
+from flight.gnc.vision.streaks.maximum_likelihood.scene import window_times
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from flight.gnc.vision.streaks.maximum_likelihood.shutter import Shutter
+from flight.gnc.vision.streaks.maximum_likelihood.shutter_direction import (
+    Directed,
+    Misfits,
+    rolling_answer,
+)
 from flight.gnc.vision.streaks.maximum_likelihood.whole_frame_scan import frame_angles
 from flight.gnc.vision.streaks.maximum_likelihood.wholeness import Wholeness, wholeness
+from flight.gnc.vision.streaks.maximum_likelihood.work import Work
 from flight.gnc.vision.streaks.streak_result import StreakStatus
 
 _MOST_BLOBS = 48
@@ -55,6 +65,7 @@ def estimate_motion(
     prior_rate: FloatArray | None = None,
     prior_sigma: float = 0.0,
     previous_checksum: int | None = None,
+    prior_course: Course | None = None,
 ) -> MotionResult:
     """Return the rate over one exposure, with its covariance, and the stars of the frame `pixels`.
 
@@ -66,6 +77,7 @@ def estimate_motion(
         prior_rate: (3,) rad/s, camera frame: decides the direction of rotation; None when unknown.
         prior_sigma: rad/s, standard deviation of each component of `prior_rate`.
         previous_checksum: of the frame before: the same pixels again are a frozen camera.
+        prior_course: how the camera turned, where that is known from elsewhere.
 
     Raises FlightError for a frame, exposure or prior that is impossible. Why a scene gives no rate is
     reported by the status.
@@ -78,20 +90,56 @@ def estimate_motion(
     frame = expose_frame(pixels, saturation, settings.gain)
     growing = settings.rate_model == "accelerating"
     camera = ExposedCamera(frame, pinhole, _shutter(pinhole, exposure, settings), settings, growing)
+    if prior_course is not None and settings.rate_model != "constant":
+        camera = replace(camera, course=prior_course.motion(pinhole.focal_length))
     blobs = find_blobs(frame, settings.threshold_sigmas, _MOST_BLOBS)
-    near = None if prior_rate is None else float(np.linalg.norm(prior_rate)) * exposure
     seen = MotionResult(StreakStatus.FAILED, checksum, exposure, hot_pixels=frame.hot_pixels)
     if len(blobs) < settings.least_stars:
         return replace(seen, status=StreakStatus.TOO_FEW)
-    answer = None if _resting(blobs) else _answer(camera, seen, blobs, near)
-    if answer is None:
-        return _without_rate(seen, camera, blobs)
-    return in_time(answer, prior_rate, prior_sigma, settings.sign_sigmas)
+    answer = None if _resting(blobs) else _in_time(camera, seen, blobs, prior_rate, prior_sigma, prior_course)
+    return _without_rate(seen, camera, blobs) if answer is None else answer
 
 
-def _answer(
-    camera: ExposedCamera, seen: MotionResult, blobs: Blobs, near: float | None
+def _in_time(
+    camera: ExposedCamera,
+    seen: MotionResult,
+    blobs: Blobs,
+    prior_rate: FloatArray | None,
+    prior_sigma: float,
+    course: Course | None,
 ) -> MotionResult | None:
+    """Return the motion in the direction of the prior; None without a motion."""
+    sigmas = camera.settings.sign_sigmas
+    near = None if prior_rate is None else float(np.linalg.norm(prior_rate)) * seen.exposure
+    if not camera.shutter.delay_per_row:
+        found = None if course is None else _on_course(camera, seen, blobs, near, course)
+        if found is None:
+            found = _answer(replace(camera, course=None, work=Work()), seen, blobs, near)
+        return None if found is None else in_time(found.result, prior_rate, prior_sigma, sigmas)
+    axis = guess_axis(blobs, camera.pinhole)
+    if axis is None:
+        return None
+
+    def along(sense: FloatArray) -> Directed | None:
+        return _answer(replace(camera, sense=sense, work=Work()), seen, blobs, near)
+
+    return rolling_answer(along, axis[0], prior_rate, prior_sigma, sigmas)
+
+
+def _on_course(
+    camera: ExposedCamera, seen: MotionResult, blobs: Blobs, near: float | None, course: Course
+) -> Directed | None:
+    """Return the answer by the known course; None where it is of no use, or the pixels deny it."""
+    found = None if camera.course is None else _answer(camera, seen, blobs, near)
+    if found is None or found.result.status is StreakStatus.FAILED:
+        return None
+    if found.result.covariance is None:
+        return found
+    covariance = found.result.covariance + course.covariance(seen.exposure)
+    return replace(found, result=replace(found.result, covariance=covariance, course=course))
+
+
+def _answer(camera: ExposedCamera, seen: MotionResult, blobs: Blobs, near: float | None) -> Directed | None:
     """Return the first motion that passes every test, else the likeliest; None without one."""
     rivals = islice(first_fits(camera, blobs, near), _MOST_MOTIONS)
     first = next(rivals, None)
@@ -99,23 +147,27 @@ def _answer(
         return None
     leading = _fitted(camera, seen, first)
     if leading.whole is Wholeness.WHOLE:
-        return leading.result
+        return leading.answer
     # A doubted motion to which the light of the whole frame leads again has two witnesses. To ask it costs
     # less than to fit a rival, and the axis is often right, known well from pieces of streaks, where the
     # angle is not.
+    camera.work.passed(camera.frame.signal.size)
     angles = frame_angles(camera.frame, camera.pinhole, leading.turn, _MOST_ANGLES)
     if leading.stands and _witnessed(leading.turn, angles):
-        return leading.result
+        return leading.answer
     candidates = [leading]
     for fit in chain(rescanned_fits(camera, leading.turn, angles), rivals):
+        if camera.work.exhausted:
+            break
         candidate = _fitted(camera, seen, fit)
         again = any(other.stands and alike(candidate.turn, other.turn) for other in candidates)
         if candidate.whole is Wholeness.WHOLE or (
             candidate.stands and (again or _witnessed(candidate.turn, angles))
         ):
-            return candidate.result
+            return candidate.answer
         candidates.append(candidate)
-    return replace(leading.result, status=StreakStatus.FAILED, rate=None, covariance=None)
+    refused = replace(leading.answer.result, status=StreakStatus.FAILED, rate=None, covariance=None)
+    return replace(leading.answer, result=refused)
 
 
 def _witnessed(turn: FloatArray, angles: list[float]) -> bool:
@@ -126,9 +178,9 @@ def _witnessed(turn: FloatArray, angles: list[float]) -> bool:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Candidate:
-    """A motion that was fitted: the result, its turn (3,), and whether its streaks are whole."""
+    """A motion that was fitted: the answer it gives, its turn (3,), and whether its streaks are whole."""
 
-    result: MotionResult
+    answer: Directed
     turn: FloatArray
     whole: Wholeness
 
@@ -141,12 +193,23 @@ def _fitted(camera: ExposedCamera, seen: MotionResult, first: Fit) -> _Candidate
     """Return what the joint fit from `first` says; a fit that failed is broken."""
     last, faint = last_fit(camera, first)
     if last is None:
-        return _Candidate(seen, first.scene.motion.turn, Wholeness.BROKEN)
+        return _Candidate(Directed(seen, None), first.scene.motion.whole, Wholeness.BROKEN)
     whole = wholeness(camera, last.scene, faint)
     answer = with_faint(with_stars(seen, camera, last), camera, last.scene, faint)
     answer = with_rate(answer, camera, last, whole)
     failed = answer.status is StreakStatus.FAILED
-    return _Candidate(answer, last.scene.motion.turn, Wholeness.BROKEN if failed else whole)
+    directed = Directed(answer, _misfits(camera, last) if camera.shutter.delay_per_row else None)
+    return _Candidate(directed, last.scene.motion.whole, Wholeness.BROKEN if failed else whole)
+
+
+def _misfits(camera: ExposedCamera, last: Fit) -> Misfits:
+    """Return what the model leaves over of the brightest streaks, no pixel left out."""
+    whole = camera.evaluate(last.scene, last.windows, clip=0.0)
+    bright = slice(camera.settings.most_stars)
+    motion, stars = last.scene.motion, last.scene.stars[bright]
+    time = window_times(camera.pinhole, motion, camera.shutter, stars).mean(axis=1)
+    middles = positions(camera.pinhole, motion, stars, time)
+    return Misfits(middles, whole.chi2[bright] - whole.pixels[bright])
 
 
 def _shutter(pinhole: Pinhole, exposure: float, settings: LikelihoodSettings) -> Shutter:

@@ -10,6 +10,7 @@ import numpy.typing as npt
 from flight.gnc.math.arrays import BoolArray, Image
 from flight.gnc.vision.frame.background import estimate_background
 from flight.gnc.vision.frame.box_sums import box_sum
+from flight.gnc.vision.frame.count_step import in_steps
 from flight.gnc.vision.frame.hot_pixels import find_hot_pixels
 from flight.gnc.vision.frame.saturation import at_least, saturation_count
 
@@ -18,7 +19,7 @@ Float32Array = npt.NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExposedFrame:
-    """A frame of (rows, columns), its arrays flat.
+    """A frame of (rows, columns), its arrays flat; a count is a step of the converter's.
 
     Attributes:
         shape: rows, columns.
@@ -42,17 +43,19 @@ class ExposedFrame:
 
 
 def expose_frame(pixels: Image, saturation: float | None, gain: float) -> ExposedFrame:
-    """Return `pixels` (rows, columns) ready for the fit.
+    """Return `pixels` (rows, columns) ready for the fit, in steps of their counts.
 
-    `saturation` in counts; None takes the highest count of the frame when many pixels share it, else the
-    top of the integer type.
+    `saturation` in counts and `gain` in e- a count of `pixels`; a saturation of None takes the highest count
+    of the frame when many pixels share it, else the top of the integer type.
     """
+    top = saturation_count(pixels) if saturation is None else saturation
+    pixels, step, offset = in_steps(pixels)
+    top, gain = (top - offset) / step, gain * step
     background = estimate_background(pixels)
     # Written over itself: fresh megabytes cost more than the arithmetic.
     signal = background.map(background.level)
     np.subtract(pixels, signal, out=signal)
     floor = background.map(np.square(background.noise))
-    top = saturation_count(pixels) if saturation is None else saturation
     bad = at_least(pixels, top)
     hot = find_hot_pixels(signal, floor)
     signal[hot] = 0.0

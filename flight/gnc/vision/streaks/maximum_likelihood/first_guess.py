@@ -19,7 +19,8 @@ from flight.gnc.math.arrays import BoolArray, FloatArray, IntArray
 from flight.gnc.vision.streaks.maximum_likelihood.angle_scan import SCANNED_STARS, Circles, scan_angles
 from flight.gnc.vision.streaks.maximum_likelihood.blobs import Blobs
 from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import ExposedFrame
-from flight.gnc.vision.streaks.maximum_likelihood.motion import image_flow
+from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion, image_flow, positions
+from flight.gnc.vision.streaks.maximum_likelihood.scene import path_lengths
 
 _PROPOSERS = 16
 _PARALLEL = 1e-9
@@ -34,6 +35,12 @@ _LENGTH_SHARE = 0.015
 _MOST_HYPOTHESES = 3
 """Of each ranking."""
 _SAME_CIRCLE = 2.0
+# A region is of a star under a known motion if its length differs by this part of it, and the error above.
+_LIKELY_LENGTH = 0.2
+_INSTANTS = 65
+# So many whole regions must show it, and so much of itself must the rate change, to be fitted from the start.
+_LEAST_GROWING = 3
+_LEAST_GROWTH = 0.4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,12 +48,12 @@ class Guess:
     """Where a fit may start.
 
     Attributes:
-        turn: (3,) rad.
-        stars: (n, 2) px at mid-exposure; light: (n,) counts.
+        motion: of the camera.
+        stars: (n, 2) px, middles of the streaks; light: (n,) counts.
         contradicted: share of the regions' light that lies in regions longer than the turn allows.
     """
 
-    turn: FloatArray
+    motion: Motion
     stars: FloatArray
     light: FloatArray
     contradicted: float
@@ -105,14 +112,51 @@ def find_turning(blobs: Blobs, pinhole: Pinhole) -> Turning | None:
     return None if found is None else Turning(*found, _arcs(blobs, pinhole, found[0]))
 
 
-def voted_motions(turning: Turning, blobs: Blobs, pinhole: Pinhole, most: int) -> list[Guess]:
-    """Return guesses by the regions' lengths, the likeliest first, each of at most `most` stars."""
+def voted_motions(
+    turning: Turning, blobs: Blobs, pinhole: Pinhole, most: int, growth: float = 0.0
+) -> list[Guess]:
+    """Return guesses by the regions' lengths, the likeliest first, each of at most `most` stars.
+
+    `growth` as by `seen_growth`.
+    """
     guesses = []
-    for angle, contradicted in _angles(turning.arcs, blobs, turning.agree):
-        stars, light = _stars(turning.arcs, blobs, turning.agree, pinhole, angle, most)
+    for wide, contradicted in _angles(turning.arcs, blobs, turning.agree):
+        # The second moment of a path that is slow at one end is a little larger.
+        angle = wide / np.sqrt(1.0 + growth**2 / 60.0)
+        stars, light = _stars(turning.arcs, blobs, turning.agree, pinhole, angle, most, growth)
         if len(light):
-            guesses.append(Guess(turning.axis * angle, stars, light, contradicted))
+            turn = turning.axis * angle
+            guesses.append(Guess(Motion(turn, growth * turn), stars, light, contradicted))
     return guesses
+
+
+def course_motion(course: Motion, blobs: Blobs, pinhole: Pinhole, most: int) -> Guess:
+    """Return a guess of a known motion: the brightest whole regions that are as long as it draws streaks."""
+    time = np.linspace(-0.5, 0.5, _INSTANTS)
+    progress = course.progress(time)
+    # A region's centre is that of light, and its second moment that of time.
+    wide = np.sqrt(12.0 * np.var(progress))
+    length = path_lengths(pinhole, course, blobs.centre) * wide
+    likely = np.abs(blobs.length - length) < _LENGTH_ERROR + _LIKELY_LENGTH * length
+    chosen = np.flatnonzero(likely & ~blobs.cut)[:most]
+    lag = course.whole * float(np.mean(progress)) - course.middle
+    back = positions(pinhole, Motion.steady(lag), blobs.centre[chosen], np.full(len(chosen), -1.0))
+    return Guess(course, back, blobs.flux[chosen], 0.0)
+
+
+def seen_growth(turning: Turning, blobs: Blobs) -> float:
+    """Return the change of the rate in parts of it, by how the light lies within the regions; 0 if unseen.
+
+    Where the rate doubles from nothing, the centre of the light is a sixth of the length behind the middle.
+    Positive is a growth along the axis for a turn along the axis, or against both.
+    """
+    arcs = turning.arcs
+    whole = turning.agree & ~blobs.cut & (arcs.width * arcs.speed > _LEAST_LENGTH)
+    if np.count_nonzero(whole) < _LEAST_GROWING:
+        return 0.0
+    off = (arcs.middle - 0.5 * (arcs.first + arcs.last))[whole] / arcs.width[whole]
+    growth = 12.0 * float(np.median(off))
+    return float(np.clip(growth, -2.0, 2.0)) if abs(growth) > _LEAST_GROWTH else 0.0
 
 
 def scanned_motions(
@@ -124,7 +168,8 @@ def scanned_motions(
     circles = Circles(arcs.frame, arcs.height[chosen], arcs.middle[chosen])
     for turned in scan_angles(frame, pinhole, circles, _MOST_HYPOTHESES, near):
         if len(turned.light):
-            yield Guess(turning.axis * turned.angle, turned.stars[:most], turned.light[:most], 0.0)
+            motion = Motion.steady(turning.axis * turned.angle)
+            yield Guess(motion, turned.stars[:most], turned.light[:most], 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -254,9 +299,15 @@ def _joined(arcs: _Arcs, blobs: Blobs, agree: BoolArray) -> FloatArray:
 
 
 def _stars(
-    arcs: _Arcs, blobs: Blobs, agree: BoolArray, pinhole: Pinhole, angle: float, most: int
+    arcs: _Arcs,
+    blobs: Blobs,
+    agree: BoolArray,
+    pinhole: Pinhole,
+    angle: float,
+    most: int,
+    growth: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return mid-exposure pixels and light of the brightest regions that fit the angle."""
+    """Return the streaks' middles, px, and the light of the brightest regions that fit the angle."""
     spread = _LENGTH_ERROR / arcs.speed + _LENGTH_SHARE * angle
     whole = agree & ~blobs.cut & (np.abs(arcs.width - angle) < 4.0 * spread)
     reach = np.abs(arcs.last - arcs.first)
@@ -265,7 +316,7 @@ def _stars(
     # Where the border cuts, the other end decides; a region reaches about 2 px beyond it.
     past = 2.0 / arcs.speed
     middle = np.where(arcs.cut_first, arcs.last - past - 0.5 * angle, arcs.first + past + 0.5 * angle)
-    middle = np.where(whole, arcs.middle, middle)
+    middle = np.where(whole, arcs.middle - growth / 12.0 * angle, middle)
     part = np.where(whole, 1.0, np.clip(reach / angle, 0.1, 1.0))
     chosen = np.flatnonzero(whole | cut)[:most]
     sine = np.sqrt(np.maximum(1.0 - arcs.height[chosen] ** 2, 0.0))

@@ -14,8 +14,10 @@ from flight.gnc.vision.streaks.maximum_likelihood.blobs import Blobs
 from flight.gnc.vision.streaks.maximum_likelihood.end_checks import true_ends, unbroken
 from flight.gnc.vision.streaks.maximum_likelihood.first_guess import (
     Guess,
+    course_motion,
     find_turning,
     scanned_motions,
+    seen_growth,
     voted_motions,
 )
 from flight.gnc.vision.streaks.maximum_likelihood.iteration import (
@@ -30,11 +32,13 @@ from flight.gnc.vision.streaks.maximum_likelihood.iteration import (
 from flight.gnc.vision.streaks.maximum_likelihood.matched_filter import find_faint
 from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion
 from flight.gnc.vision.streaks.maximum_likelihood.polar_grid import polar_grid
-from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene, window_times
+from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene, mid_exposure, window_times
 
 _FIRST_STARS = 12
 # This many guesses are tried at most.
 _MOST_GUESSES = 5
+# Of them so many of a rate that changes.
+_MOST_GROWING = 2
 _STILL_ROUNDS = 12
 # A guess is made of this many whole streaks, or of a scan; regions longer than it speak against it.
 _WHOLE = 8
@@ -63,21 +67,23 @@ def first_fits(camera: ExposedCamera, blobs: Blobs, near: float | None) -> Itera
     rivals: list[tuple[float, Fit]] = []
     yielded: list[FloatArray] = []
     for guess in islice(_guesses(camera, blobs, near), _MOST_GUESSES):
+        if camera.work.exhausted:
+            break
         tried = _tried(camera, guess)
         if tried is None:
             continue
         explained, convincing, done = tried
-        if any(alike(done.scene.motion.turn, other) for other in yielded):
+        if any(alike(done.scene.motion.whole, other) for other in yielded):
             continue
         if convincing and all(explained > rival for rival, _ in rivals):
-            yielded.append(done.scene.motion.turn)
+            yielded.append(done.scene.motion.whole)
             yield done
         elif misfit(done.evaluation) <= _WORST_FIRST:
             rivals.append((explained, done))
     rivals.sort(key=lambda rival: -rival[0])
     for _, done in rivals:
-        if not any(alike(done.scene.motion.turn, other) for other in yielded):
-            yielded.append(done.scene.motion.turn)
+        if not any(alike(done.scene.motion.whole, other) for other in yielded):
+            yielded.append(done.scene.motion.whole)
             yield done
 
 
@@ -87,6 +93,9 @@ def rescanned_fits(camera: ExposedCamera, turn: FloatArray, angles: list[float])
     nothing = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.float32)
     frame = polar_grid(pinhole, Motion.steady(turn)).frame
     for angle in angles:
+        if camera.work.exhausted:
+            return
+        camera.work.passed(camera.frame.signal.size)
         motion = Motion.steady(frame[2] * angle)
         found = find_faint(camera.frame, nothing, pinhole, motion, settings.faint_sigmas, settings.most_faint)
         bright = np.argsort(-found.light, kind="stable")[:SCANNED_STARS]
@@ -96,7 +105,8 @@ def rescanned_fits(camera: ExposedCamera, turn: FloatArray, angles: list[float])
             stars, light = turned.stars[:_FIRST_STARS], turned.light[:_FIRST_STARS]
             if len(light) < settings.least_stars:
                 continue
-            tried = _tried(camera, Guess(frame[2] * turned.angle, stars, light, 0.0))
+            guess = Guess(Motion.steady(frame[2] * turned.angle), stars, light, 0.0)
+            tried = _tried(camera, guess)
             if tried is not None:
                 yield tried[2]
 
@@ -112,6 +122,13 @@ def _guesses(camera: ExposedCamera, blobs: Blobs, near: float | None) -> Iterato
     turning = find_turning(blobs, camera.pinhole)
     if turning is None:
         return
+    if camera.course is not None:
+        known = course_motion(camera.course, blobs, camera.pinhole, _FIRST_STARS)
+        if len(known.light) >= camera.settings.least_stars:
+            yield known
+    growth = 0.0 if camera.settings.rate_model == "constant" else seen_growth(turning, blobs)
+    if growth:
+        yield from voted_motions(turning, blobs, camera.pinhole, _FIRST_STARS, growth)[:_MOST_GROWING]
     voted = voted_motions(turning, blobs, camera.pinhole, _FIRST_STARS)
     if voted and len(voted[0].light) >= _WHOLE and voted[0].contradicted < _CONTRADICTED:
         yield voted.pop(0)
@@ -124,9 +141,12 @@ def _tried(camera: ExposedCamera, guess: Guess) -> tuple[float, bool, Fit] | Non
     count = len(guess.light)
     everyone = np.ones(count, dtype=np.bool_)
     width = float(np.hypot(camera.settings.psf_sigma, 0.29))
-    scene = Scene(Motion.steady(guess.turn), width, guess.stars, guess.light, np.zeros(count), everyone)
-    free = np.array([True] * 3 + [False] * 3 + [True])
-    done = iterate(camera, scene, free, FIRST)
+    motion = guess.motion if camera.course is None else camera.course.scaled_to(guess.motion.whole)
+    motion = motion if camera.sense is None else motion.along(camera.sense)
+    stars = mid_exposure(camera.pinhole, motion, camera.shutter, guess.stars)
+    scene = Scene(motion, width, stars, guess.light, np.zeros(count), everyone)
+    camera = replace(camera, growing=not motion.constant)
+    done = iterate(camera, scene, camera.free, FIRST)
     if done is None:
         return None
     evidence, share = _borne_out(done)

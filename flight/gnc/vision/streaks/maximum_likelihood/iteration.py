@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.special import fdtri
 
 from flight.gnc.camera.pinhole import Pinhole
-from flight.gnc.math.arrays import BoolArray
+from flight.gnc.math.arrays import BoolArray, FloatArray
 from flight.gnc.vision.streaks.maximum_likelihood.agreement import agreed_step
 from flight.gnc.vision.streaks.maximum_likelihood.equation_solver import Solution, moved, solve
 from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import ExposedFrame
-from flight.gnc.vision.streaks.maximum_likelihood.motion import positions
+from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion, positions
 from flight.gnc.vision.streaks.maximum_likelihood.normal_equations import ALONE, SHARED, Evaluation, evaluate
 from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from flight.gnc.vision.streaks.maximum_likelihood.shutter import Shutter
 from flight.gnc.vision.streaks.maximum_likelihood.windows import Windows, cut_windows
+from flight.gnc.vision.streaks.maximum_likelihood.work import Work
 
 _LONGEST_STEP = 3.0
 # An end so far, px, from where its window was cut has left the window's middle.
@@ -25,6 +26,8 @@ _DRIFT = 1.5
 # Ends of untrusted stars may be farther from it; after the first round by any distance: all windows are
 # not cut again for those whose light hardly fixes their place.
 _FAINT_DRIFT = 2.5
+# The growth may change by this part of the turn before that.
+_GROWN = 0.1
 # Converged: no shared parameter moves by more than this part of its standard deviation. The step is
 # taken, and what it leaves is of second order.
 SETTLED = 0.4
@@ -71,13 +74,23 @@ LAST = Rounds(10, clipped=True, tolerance=0.003, settled=SETTLED, conjugate=12, 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExposedCamera:
-    """A frame with all that is known of how it was taken; `growing`: whether the rate may change."""
+    """A frame with all that is known of how it was taken.
+
+    Attributes:
+        growing: whether the rate may change.
+        course: the motion as it is known from elsewhere; None where unknown, or as good as constant.
+        work: that was done on the frame.
+        sense: (3,) a vector along which the camera turns, not against it; None where either will do.
+    """
 
     frame: ExposedFrame
     pinhole: Pinhole
     shutter: Shutter
     settings: LikelihoodSettings
     growing: bool = False
+    sense: FloatArray | None = None
+    course: Motion | None = None
+    work: Work = field(default_factory=Work)
 
     @property
     def free(self) -> BoolArray:
@@ -95,6 +108,7 @@ class ExposedCamera:
 
     def evaluate(self, scene: Scene, windows: Windows, clip: float) -> Evaluation:
         """Return the normal equations."""
+        self.work.evaluated(len(windows.slot))
         growth = self.growing or (self.undecided and clip > 0.0)
         return evaluate(self.pinhole, self.shutter, scene, windows, clip, growth)
 
@@ -181,12 +195,18 @@ def _possible(scene: Scene) -> bool:
     return (
         0.3 < scene.width < _WIDEST
         and bool(np.all(np.isfinite(scene.stars)))
-        and float(np.linalg.norm(scene.motion.turn)) <= np.pi
+        and float(np.linalg.norm(scene.motion.whole)) <= np.pi
     )
 
 
 def _drifted(camera: ExposedCamera, before: Scene, after: Scene, faint: float) -> bool:
-    """Return whether an end of a streak has left its window's middle; untrusted ones by `faint` px."""
+    """Return whether an end of a streak has left its window's middle; untrusted ones by `faint` px.
+
+    Windows are also cut for where a rate that changes makes the streaks slow.
+    """
+    grown = float(np.linalg.norm(after.motion.growth - before.motion.growth))
+    if grown > _GROWN * float(np.linalg.norm(after.motion.whole)):
+        return True
     n = len(before.stars)
     at = np.repeat([-0.5, 0.5], n)
     there = positions(camera.pinhole, after.motion, np.tile(after.stars, (2, 1)), at)

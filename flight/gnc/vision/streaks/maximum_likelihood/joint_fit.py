@@ -22,11 +22,11 @@ from flight.gnc.vision.streaks.maximum_likelihood.length_correction import stret
 from flight.gnc.vision.streaks.maximum_likelihood.matched_filter import FaintStars, find_faint
 from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion
 from flight.gnc.vision.streaks.maximum_likelihood.normal_equations import light_of
-from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene, path_lengths
+from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene, mid_exposure, path_lengths
 from flight.gnc.vision.streaks.maximum_likelihood.windows import window_areas
 
-# A rate that changes by more than this part of itself is beyond the model.
-_MOST_GROWTH = 0.5
+# A rate that changes by more than this part of itself is beyond the model: 2 is from rest, or to it.
+_MOST_GROWTH = 2.2
 # A star is trusted within this many deviations; ends (px) and width (px) are never modelled better than this.
 _TRUST_SIGMAS = 3.5
 _END_FLOOR = 0.01
@@ -63,6 +63,8 @@ def last_fit(camera: ExposedCamera, first: Fit) -> tuple[Fit | None, FaintStars]
         other = stretched(camera, scene)
         if other is None and not _far(camera, first.scene, scene):
             break
+        if camera.work.exhausted:
+            return None, faint
         scene = scene if other is None else other
         scene = scene.select(np.argsort(-scene.light, kind="stable")[: len(first.scene.light)])
         first = replace(done, scene=scene, windows=camera.windows(scene))
@@ -73,8 +75,8 @@ def last_fit(camera: ExposedCamera, first: Fit) -> tuple[Fit | None, FaintStars]
 
 def _far(camera: ExposedCamera, before: Scene, after: Scene) -> bool:
     """Return whether the ends of the streaks have moved by more than the fit can follow."""
-    changed = float(np.linalg.norm(after.motion.turn - before.motion.turn))
-    turn = float(np.linalg.norm(after.motion.turn))
+    changed = float(np.linalg.norm(after.motion.whole - before.motion.whole))
+    turn = float(np.linalg.norm(after.motion.whole))
     length = float(np.median(path_lengths(camera.pinhole, after.motion, before.stars)))
     return length * changed / max(turn, 1e-12) > _FAR
 
@@ -86,6 +88,9 @@ def _fit_from(camera: ExposedCamera, first: Fit) -> tuple[Fit | None, FaintStars
     other.
     """
     settings, before = camera.settings, first.scene
+    if not before.motion.constant:
+        camera = replace(camera, growing=True)
+    camera.work.passed(camera.frame.signal.size)
     light = light_of(camera.pinhole, camera.shutter, before, first.windows)
     faint = find_faint(
         camera.frame,
@@ -95,6 +100,8 @@ def _fit_from(camera: ExposedCamera, first: Fit) -> tuple[Fit | None, FaintStars
         settings.faint_sigmas,
         settings.most_faint,
     )
+    stars = mid_exposure(camera.pinhole, before.motion, camera.shutter, faint.stars)
+    faint = replace(faint, stars=stars)
     whole = before.with_stars(faint.stars, faint.light)
     order = np.argsort(-whole.light, kind="stable")
     bright, rest = order[: settings.most_stars], order[settings.most_stars :]
@@ -137,7 +144,9 @@ def joint_fit(camera: ExposedCamera, scene: Scene) -> Fit | None:
 
 
 def _beyond(motion: Motion) -> bool:
-    """Return whether the rate changes by more than the model can describe."""
+    """Return whether the rate changes by more than the model can describe; known otherwise, it does not."""
+    if motion.shape.any():
+        return False
     return float(np.linalg.norm(motion.growth)) > _MOST_GROWTH * float(np.linalg.norm(motion.turn))
 
 
@@ -149,7 +158,7 @@ def _trusted(camera: ExposedCamera, rough: Fit) -> BoolArray:
         return before
     had = np.flatnonzero(before)
     moved = path_lengths(camera.pinhole, rough.scene.motion, rough.scene.stars[had])
-    turn = float(np.linalg.norm(rough.scene.motion.turn))
+    turn = float(np.linalg.norm(rough.scene.motion.whole))
     angle = _END_FLOOR * turn / max(float(np.median(moved)), 1.0)
     floors = np.array([angle, angle, angle, _WIDTH_FLOOR])
     agree = agreeing(OwnEstimates(estimates.change[had], estimates.deviation[had]), floors, _TRUST_SIGMAS)

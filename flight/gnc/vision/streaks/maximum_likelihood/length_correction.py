@@ -15,7 +15,7 @@ import numpy as np
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.vision.streaks.maximum_likelihood.end_checks import brightness, expected_brightness
 from flight.gnc.vision.streaks.maximum_likelihood.iteration import ExposedCamera
-from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion, positions
+from flight.gnc.vision.streaks.maximum_likelihood.motion import positions
 from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene, path_lengths, window_times
 
 # Looked at is this part of a streak's length to either side of its end, between this many px, in this many
@@ -33,6 +33,8 @@ _LEAST_STREAKS = 3
 _LEAST_OFF = 4.0
 _ALIKE = 3.0
 _MORE = 2
+# Beyond this change of the rate, in parts of it, the light is too uneven.
+_MOST_GROWTH = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,8 +93,11 @@ def find_edges(camera: ExposedCamera, scene: Scene) -> Edges:
 def stretched(camera: ExposedCamera, scene: Scene) -> Scene | None:
     """Return `scene` with a motion by which its streaks end where their light does; None when they do.
 
+    Also None where the rate changes so much that the light along a streak is not alike.
     A star stays where its ends are, or the one that is on the detector.
     """
+    if abs(scene.motion.relative_growth) > _MOST_GROWTH:
+        return None
     edges = find_edges(camera, scene)
     stretch = edges.stretch
     if stretch == 0.0:
@@ -103,5 +108,5 @@ def stretched(camera: ExposedCamera, scene: Scene) -> Scene | None:
     known = np.isfinite(middle)
     time = np.where(known, middle, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
     moved = positions(camera.pinhole, scene.motion, scene.stars, time)
-    motion = Motion((1.0 + stretch) * scene.motion.turn, scene.motion.growth)
+    motion = replace(scene.motion, turn=scene.motion.turn + stretch * scene.motion.whole)
     return replace(scene, motion=motion, stars=moved)

@@ -66,7 +66,7 @@ def find_faint(
 ) -> FaintStars:
     """Return the `most` strongest streaks along `motion` in the frame less `modelled`: pixels (m,), light."""
     middle = paths(pinhole, motion, np.array([pinhole.centre]), np.zeros(1)).velocity
-    reach = float(np.linalg.norm(motion.turn)) * float(np.sin(pinhole.half_diagonal)) * pinhole.focal_length
+    reach = float(np.linalg.norm(motion.whole)) * float(np.sin(pinhole.half_diagonal)) * pinhole.focal_length
     if max(float(np.hypot(*middle[0])), reach) < _LEAST_LENGTH:
         return FaintStars(np.empty((0, 2)), np.empty(0), np.empty(0))
     grid = polar_grid(pinhole, motion)

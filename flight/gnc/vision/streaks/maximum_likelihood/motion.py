@@ -3,12 +3,13 @@
 Time is in exposures, zero at mid-exposure. With turn u = omega T and growth g = (d omega/dt) T^2, both in the
 camera's axes, the rate is u + g t and the stars move as v' = -(u + g t) x v. The rotation since mid-exposure
 is the vector u t + g t^2/2 + (u x g) t^3/12, exact without growth and to the fourth order with it (Magnus).
+How else the rate changes may be known from elsewhere: terms of t^3 and on are then added to the vector.
 A star is named by its pixel at mid-exposure.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -25,20 +26,80 @@ class Motion:
     Attributes:
         turn: (3,) rad, rate at mid-exposure times the exposure.
         growth: (3,) rad, change of the rate over the exposure times the exposure.
+        shape: (k, 3) rad, known terms of t^3, t^4, ... of the rotation vector.
     """
 
     turn: FloatArray
     growth: FloatArray
+    shape: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
 
     @classmethod
     def steady(cls, turn: FloatArray) -> Motion:
         """Return the motion at constant rate."""
         return cls(np.asarray(turn, dtype=float), np.zeros(3))
 
+    @classmethod
+    def between(cls, whole: FloatArray, growth: FloatArray, shape: FloatArray) -> Motion:
+        """Return the motion that turns by `whole` (3,) from start to end."""
+        unscaled = cls(np.zeros(3), growth, shape)
+        return replace(unscaled, turn=whole - unscaled.whole)
+
     @property
     def constant(self) -> bool:
         """Whether the rate does not change."""
-        return not self.growth.any()
+        return not (self.growth.any() or self.shape.any())
+
+    def along(self, sense: FloatArray) -> Motion:
+        """Return the motion in that direction of time in which it turns along `sense` (3,), not against it.
+
+        The change of the rate keeps its sign.
+        """
+        if self.whole @ sense >= 0.0:
+            return self
+        odd = (-1.0) ** np.arange(3, 3 + len(self.shape))
+        return Motion(-self.turn, self.growth, odd[:, None] * self.shape)
+
+    def scaled_to(self, whole: FloatArray) -> Motion:
+        """Return the motion with another rotation (3,) from start to end, or its opposite."""
+        sign = -1.0 if self.whole @ whole < 0.0 else 1.0
+        return replace(self, turn=self.turn + sign * whole - self.whole)
+
+    @property
+    def whole(self) -> FloatArray:
+        """The rotation (3,) from start to end, rad: the mean rate times the exposure."""
+        return np.asarray(self.turn + self.known(np.array([-0.5, 0.5])) @ np.array([-1.0, 1.0]))
+
+    @property
+    def middle(self) -> FloatArray:
+        """The rotation (3,) rad from mid-exposure to halfway between start and end."""
+        return np.asarray(self.growth / 8.0 + self.known(np.array([-0.5, 0.5])) @ np.array([0.5, 0.5]))
+
+    @property
+    def relative_growth(self) -> float:
+        """The change of the rate along its axis over the exposure, in mean rates: 2 from rest."""
+        square = float(self.whole @ self.whole)
+        rate = self.known(np.array([-0.5, 0.5]), 1)
+        change = self.growth + rate[:, 1] - rate[:, 0]
+        return float(self.whole @ change) / square if square else 0.0
+
+    def progress(self, time: FloatArray) -> FloatArray:
+        """Return what part of `whole` has been turned along its axis between mid-exposure and `time` (m,)."""
+        vector = self.turn[:, None] * time + 0.5 * self.growth[:, None] * time**2 + self.known(time)
+        return np.asarray(self.whole @ vector / max(float(self.whole @ self.whole), _TINY))
+
+    def pace(self, time: FloatArray, derivative: int = 0) -> FloatArray:
+        """Return the rate along its axis over the mean rate at `time` (m,), or its change per exposure."""
+        vector = _rate(self, time) if derivative == 0 else self.growth[:, None] + self.known(time, 2)
+        pace = self.whole @ vector / max(float(self.whole @ self.whole), _TINY)
+        return np.asarray(np.broadcast_to(pace, time.shape))
+
+    def known(self, time: FloatArray, derivative: int = 0) -> FloatArray:
+        """Return the terms of `shape` (3, m), or their first or second derivative, at `time` (m,)."""
+        out = np.zeros((3, len(time)))
+        for power, term in enumerate(self.shape, start=3):
+            factor = (1, power, power * (power - 1))[derivative]
+            out += factor * term[:, None] * time ** (power - derivative)
+        return out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,7 +122,7 @@ def paths(pinhole: Pinhole, motion: Motion, stars: FloatArray, time: FloatArray)
     velocity = _cross(v, w)  # -omega x v
     acceleration = _cross(velocity, w)
     if not motion.constant:
-        acceleration += _cross(v, motion.growth[:, None])
+        acceleration += _cross(v, motion.growth[:, None] + motion.known(time, 2))
     focal = pinhole.focal_length
     inverse = 1.0 / v[2]
     there = v[:2] * inverse
@@ -105,6 +166,8 @@ def moving(
     flow = _flow(pinhole, there)
     # The mean rate since mid-exposure: what changes beyond it is of higher order.
     mean = motion.turn[:, None] + 0.5 * time * motion.growth[:, None]
+    if motion.shape.any():
+        mean += motion.known(time) / np.where(np.abs(time) < _TINY, 1.0, time)
     angle = np.sqrt(np.sum(mean * mean, axis=0))
     axis = mean / np.maximum(angle, _TINY)
     phi = angle * time
@@ -157,7 +220,7 @@ def _rate(motion: Motion, time: FloatArray) -> FloatArray:
     """Return the turn's rate (3, 1), or (3, m) where it changes with `time`."""
     if motion.constant:
         return motion.turn[:, None]
-    return motion.turn[:, None] + motion.growth[:, None] * time
+    return motion.turn[:, None] + motion.growth[:, None] * time + motion.known(time, 1)
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -179,7 +242,7 @@ def _turning(motion: Motion, time: FloatArray) -> tuple[FloatArray, FloatArray, 
         twist = np.cross(motion.turn, motion.growth) / 12.0
         parts = np.stack([motion.turn, 0.5 * motion.growth, twist], axis=1)
         square = time * time
-        vector = parts @ np.stack([time, square, square * time])
+        vector = parts @ np.stack([time, square, square * time]) + motion.known(time)
         phi = np.sqrt(np.sum(vector**2, axis=0))
         a = vector / np.maximum(phi, _TINY)
     return a, np.sin(phi), np.cos(phi)

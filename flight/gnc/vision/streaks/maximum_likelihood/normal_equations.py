@@ -81,7 +81,7 @@ def evaluate(
     Pixels whose residual exceeds `clip` sigma (and a tenth of the model) are left out; 0 leaves none.
     """
     strips = windows.strips
-    images, spots, change = _shapes(pinhole, shutter, scene, windows)
+    images, spots, change = shapes(pinhole, shutter, scene, windows)
     of_block = windows.long[strips.star]
     streak_light = images[:, 0] * scene.light[of_block, None, None].astype(np.float32)
     streak_light += scene.sky[of_block, None, None].astype(np.float32)
@@ -116,12 +116,12 @@ def evaluate(
 
 def light_of(pinhole: Pinhole, shutter: Shutter, scene: Scene, windows: Windows) -> Float32Array:
     """Return the light of all stars of `scene` on the pixels in use of its windows, sky left out."""
-    images, spots, _ = _shapes(pinhole, shutter, scene, windows)
+    images, spots, _ = shapes(pinhole, shutter, scene, windows)
     streaks = images[:, 0] * scene.light[windows.long[windows.strips.star], None, None].astype(np.float32)
     return windows.total(streaks, spots * scene.light[windows.spot, None, None])[:-1]
 
 
-def _shapes(
+def shapes(
     pinhole: Pinhole, shutter: Shutter, scene: Scene, windows: Windows
 ) -> tuple[Float32Array, FloatArray, FloatArray]:
     """Return the images of the strips, the spots' light and its derivatives, all of stars of light 1.

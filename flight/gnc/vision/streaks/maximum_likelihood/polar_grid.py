@@ -59,8 +59,8 @@ class PolarGrid:
 
 def polar_grid(pinhole: Pinhole, motion: Motion, every: int = 1) -> PolarGrid:
     """Return the circles that cross the detector, one in `every`."""
-    angle = float(np.linalg.norm(motion.turn))
-    axis = motion.turn / angle
+    angle = float(np.linalg.norm(motion.whole))
+    axis = motion.whole / angle
     middle = np.array([0.0, 0.0, 1.0])
     if axis @ middle < 0.0:
         axis = -axis

@@ -7,6 +7,7 @@ from typing import Self
 
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import from_rotation_vector
+from flight.gnc.vision.streaks.maximum_likelihood.course import Course
 from flight.gnc.vision.streaks.maximum_likelihood.settings import RateModel
 from flight.gnc.vision.streaks.streak_result import FrameMotion, no_rows
 
@@ -29,6 +30,8 @@ class MotionResult(FrameMotion):
         misfit: chi-square per degree of freedom, median of the bright stars: 1 where the rate model holds.
         rate_model: which was fitted, `constant` or `accelerating`.
         acceleration: (3,) rad/s^2 if fitted, else None.
+        reason: why there is no rate, in a line; empty when there is one.
+        course: the known course that the fit took for the rest of the motion; None without one.
     """
 
     stars: FloatArray = field(default_factory=no_rows(2))
@@ -44,6 +47,8 @@ class MotionResult(FrameMotion):
     misfit: float = float("nan")
     rate_model: RateModel = "constant"
     acceleration: FloatArray | None = None
+    reason: str = ""
+    course: Course | None = None
 
     @property
     def start_to_end(self) -> FloatArray | None:
@@ -60,4 +65,5 @@ class MotionResult(FrameMotion):
             endpoint_covariance=self.endpoint_covariance[:, ::-1],
             directions=self.directions[:, ::-1],
             faint_endpoints=self.faint_endpoints[:, ::-1],
+            course=None,
         )

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from flight.gnc.math.arrays import BoolArray, FloatArray, IntArray
-from flight.gnc.vision.streaks.maximum_likelihood.agreement import disagreement, own_estimates
-from flight.gnc.vision.streaks.maximum_likelihood.equation_solver import shared_covariance
+from flight.gnc.vision.streaks.maximum_likelihood.claim import Claim, claim
 from flight.gnc.vision.streaks.maximum_likelihood.iteration import ExposedCamera, Fit
 from flight.gnc.vision.streaks.maximum_likelihood.matched_filter import FaintStars
 from flight.gnc.vision.streaks.maximum_likelihood.motion import positions, sensitivities
@@ -18,13 +17,15 @@ from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene, path_lengt
 from flight.gnc.vision.streaks.maximum_likelihood.wholeness import Wholeness
 from flight.gnc.vision.streaks.streak_result import StreakStatus
 
-# Rounds of conjugate gradients for the covariance.
-_CONJUGATE = 12
 # Turn, growth, x and y among the shared parameters and a star's own.
 _GEOMETRY = np.array([0, 1, 2, 3, 4, 5, 7, 8])
 _LIGHT = 9
 # The last step, in standard deviations, from which a fit has not settled.
 _RESTLESS = 2.0
+# Streaks so close, px, and as bright as this part of one run beside it; a sky has few such pairs.
+_BESIDE = 8.0
+_LIKE = 0.3
+_MOST_PAIRED = 0.4
 # Two streaks so close, px, are one.
 _SAME = 1.5
 
@@ -69,30 +70,64 @@ def with_rate(result: MotionResult, camera: ExposedCamera, last: Fit, whole: Who
     """Return `result` with the rate, or with why there is none."""
     settings, scene = camera.settings, last.scene
     if result.used_count < settings.least_stars:
-        return replace(result, status=StreakStatus.TOO_FEW)
-    exact = shared_covariance(last.evaluation, last.free, _CONJUGATE)
-    covariance = (last.solution.covariance if exact is None else exact)[:3, :3]
-    turn = scene.motion.turn
-    size = float(np.linalg.norm(turn))
-    deviation = float(np.sqrt(turn @ covariance @ turn)) / size
-    if result.length < settings.least_length or not size > settings.least_significance * deviation:
-        return replace(result, status=StreakStatus.TOO_SHORT)
-    if last.restless > _RESTLESS or not result.misfit < settings.worst_misfit or whole is Wholeness.BROKEN:
-        return replace(result, status=StreakStatus.FAILED)
-    estimates = own_estimates(last.evaluation, scene, last.free)
-    spread = 1.0 if estimates is None else disagreement(estimates, scene.trusted)
-    # What made others disagree is as likely to hide, less of it, in the light of those that agree.
-    asked = min(settings.most_stars, len(scene.trusted))
-    spread = max(result.misfit, spread, 1.0) * asked / max(int(np.count_nonzero(scene.trusted)), 1)
+        why = f"{result.used_count} streaks agree, {settings.least_stars} at least are needed"
+        return replace(result, status=StreakStatus.TOO_FEW, reason=why)
+    known = claim(result, camera, last)
+    size = float(np.linalg.norm(known.turn))
+    deviation = float(np.sqrt(known.turn @ known.covariance @ known.turn)) / size
+    still = not size > settings.least_significance * deviation
+    reason = _why_not(result, camera, last, whole, known)
+    if result.length < settings.least_length or (still and not reason):
+        why = f"streaks of {result.length:.1f} px are too short for a rate"
+        return replace(result, status=StreakStatus.TOO_SHORT, reason=why)
+    if reason:
+        return replace(result, status=StreakStatus.FAILED, reason=reason)
     return replace(
         result,
         status=StreakStatus.AMBIGUOUS,
-        rate=turn / result.exposure,
-        # What the model does not explain makes it less certain; what fits too well, no more. A fit that goes
-        # to and fro, as pixels are left out and taken in, is known no better than that.
-        covariance=covariance * spread * (1.0 + last.restless**2) / result.exposure**2,
+        rate=known.turn / result.exposure,
+        covariance=known.covariance / result.exposure**2,
         acceleration=scene.motion.growth / result.exposure**2 if last.free[3] else None,
     )
+
+
+def _why_not(result: MotionResult, camera: ExposedCamera, last: Fit, whole: Wholeness, known: Claim) -> str:
+    """Return why a motion that was fitted is not believed, in a line; empty when it is."""
+    settings, shaking = camera.settings, known.shaking
+    checks = (
+        (last.restless > _RESTLESS, "the fit does not settle"),
+        (
+            not result.misfit < settings.worst_misfit,
+            f"the streaks are unlike the model: misfit {result.misfit:.1f}",
+        ),
+        (whole is Wholeness.BROKEN, "the motion makes pieces of streaks, or joins several"),
+        (
+            max(shaking.across, shaking.along) > settings.worst_shaking,
+            f"the body shook: all streaks waver by {shaking.across:.2f} px across and "
+            f"{100.0 * shaking.along:.0f} % in brightness",
+        ),
+        (
+            _paired(result) > _MOST_PAIRED,
+            "most streaks run beside another: the body shook, or the point spread is hollow",
+        ),
+        (
+            known.doubt > settings.worst_doubt,
+            f"uncertain by {100.0 * known.doubt:.1f} %: the point spread is {result.psf_sigma:.2f} px,"
+            f" {settings.psf_sigma:g} px as described, or the lens is not known well enough",
+        ),
+    )
+    return next((reason for failed, reason in checks if failed), "")
+
+
+def _paired(result: MotionResult) -> float:
+    """Return what part of the used stars has another, not much fainter, beside it.
+
+    The light of a body that shakes many times in an exposure gathers where the motion turns round, on either
+    side of each path.
+    """
+    apart = np.linalg.norm(result.stars[result.used, None] - result.stars, axis=2)
+    rival = result.flux > _LIKE * result.flux[result.used, None]
+    return float(np.mean((rival & (apart > 0.0) & (apart < _BESIDE)).any(axis=1)))
 
 
 def with_faint(result: MotionResult, camera: ExposedCamera, scene: Scene, faint: FaintStars) -> MotionResult:

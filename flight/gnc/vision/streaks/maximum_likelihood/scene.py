@@ -12,7 +12,7 @@ from flight.gnc.vision.records import select
 from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion, positions
 from flight.gnc.vision.streaks.maximum_likelihood.shutter import Shutter
 
-_PIXEL_VARIANCE = 1.0 / 12.0
+PIXEL_VARIANCE = 1.0 / 12.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,7 +39,7 @@ class Scene:
     @property
     def sigma(self) -> float:
         """The standard deviation of the point spread without the pixel's square, px."""
-        return float(np.sqrt(max(self.width**2 - _PIXEL_VARIANCE, 0.01)))
+        return float(np.sqrt(max(self.width**2 - PIXEL_VARIANCE, 0.01)))
 
     def select(self, chosen: BoolArray | IntArray) -> Scene:
         """Return the scene with the stars that `chosen` picks, by mask or index."""
@@ -67,6 +67,20 @@ def window_times(pinhole: Pinhole, motion: Motion, shutter: Shutter, stars: Floa
             row = positions(pinhole, motion, stars, times[:, end])[:, 1]
             times[:, end] = nominal + shutter.delay(np.clip(row, 0.0, pinhole.rows - 1.0))
     return times
+
+
+def mid_exposure(pinhole: Pinhole, motion: Motion, shutter: Shutter, middles: FloatArray) -> FloatArray:
+    """Return where stars are at mid-exposure whose streaks have the middles of their length at `middles`.
+
+    All are (n, 2) px.
+    """
+    if not len(middles):
+        return middles
+    if not motion.constant:
+        middles = positions(pinhole, Motion.steady(motion.middle), middles, np.full(len(middles), -1.0))
+    if shutter.delay_per_row == 0.0:
+        return middles
+    return positions(pinhole, motion, middles, -np.asarray(shutter.delay(middles[:, 1])))
 
 
 def path_lengths(pinhole: Pinhole, motion: Motion, stars: FloatArray) -> FloatArray:

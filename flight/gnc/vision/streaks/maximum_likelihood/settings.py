@@ -5,6 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from flight.gnc.camera.knowledge import CameraKnowledge
+
+_UNCALIBRATED = CameraKnowledge()
+
 RateModel = Literal["auto", "constant", "accelerating"]
 
 
@@ -29,10 +33,14 @@ class LikelihoodSettings:
         faint_sigmas: significance from which a streak along the known motion is believed.
         reach: widths of the point spread to either side of a path that are fitted.
         clip: sigmas of a residual that is no noise.
-        least_stars: fewer fix no rate.
+        least_stars: fewer fix no rate; two do, though none contradicts them.
         least_length: px, median path below which no rate is given.
         least_significance: of the rate in its standard deviations, below which no rate is given.
         worst_misfit: chi-square per degree of freedom above which the motion is not believed.
+        worst_shaking: px of displacement, or share of brightness, that all streaks waver in common, above
+            which the motion is not smooth.
+        worst_doubt: share of the rate to which model errors may leave it uncertain.
+        knowledge: how well the camera is known.
         sign_sigmas: the prior's projection on the axis must exceed this many of its sigmas to decide the
             direction of time.
     """
@@ -50,8 +58,11 @@ class LikelihoodSettings:
     faint_sigmas: float = 6.0
     reach: float = 3.6
     clip: float = 5.0
-    least_stars: int = 3
+    least_stars: int = 2
     least_length: float = 3.0
     least_significance: float = 5.0
     worst_misfit: float = 4.0
+    worst_shaking: float = 0.05
+    worst_doubt: float = 0.015
     sign_sigmas: float = 3.0
+    knowledge: CameraKnowledge = _UNCALIBRATED

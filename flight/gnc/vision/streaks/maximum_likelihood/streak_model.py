@@ -81,12 +81,14 @@ def _draw(
 ) -> None:
     """Fill in the images of some blocks; `path`: position, tangent, speed and acceleration on their lines."""
     speed, time = path[2], strips.time[part]
-    light, aside, s = _endless(strips, part, path, out.shape[3], width)
+    # By how much the speed along the path grows, px per exposure squared.
+    gained = np.sum(path[3] * path[1], axis=-1)
+    light, aside, s = _endless(strips, part, (*path, gained), out.shape[3], width)
     centre = time[:, LINES // 2 - 1 : LINES // 2 + 1].mean(axis=1, keepdims=True)
     s += ((time - centre) * speed).astype(np.float32)
     out[:, 0] = light.transpose(1, 2, 0)
     across, along = (np.ascontiguousarray(each.transpose(1, 2, 0)) for each in (aside, s))
-    _ends(out, along, (time, centre, speed), shutter, strips, part, width)
+    _ends(out, along, (time, centre, speed, gained), shutter, strips, part, width)
     light = out[:, 0]
     u = across * across
     u *= np.float32(1.0 / width**3)
@@ -110,9 +112,8 @@ def _endless(
 
     All are (count, b, LINES), `count` pixels a line.
     """
-    position, tangent, speed, acceleration = path
+    position, tangent, speed, acceleration, gained = path
     tx, ty = tangent[..., 0], tangent[..., 1]
-    gained = acceleration[..., 0] * tx + acceleration[..., 1] * ty
     bend = (acceleration[..., 1] * tx - acceleration[..., 0] * ty) / speed**2
     aside, ahead = beside(strips.corner[part], strips.step[part], position, tangent, count)
     squeeze = bend.astype(np.float32) * aside
@@ -141,7 +142,7 @@ def _endless(
 def _ends(
     out: Float32Array,
     along: Float32Array,
-    lines: tuple[FloatArray, FloatArray, FloatArray],
+    lines: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
     shutter: Shutter,
     strips: Strips,
     part: slice,
@@ -150,10 +151,10 @@ def _ends(
     """Cut the light in `out[:, 0]` at both ends of the exposure, and fill in what changes with them.
 
     `along` (b, LINES, k) px from where the path is at the blocks' middle; `lines`: when it crosses each line
-    (b, LINES), when at the middle (b, 1), and its speed on each.
+    (b, LINES), when at the middle (b, 1), its speed on each, and by how much that grows.
     """
     out[:, 3:6] = 0.0
-    crossing, centre, speed = lines
+    crossing, centre, speed, gained = lines
     rolling = shutter.delay_per_row != 0.0
     delay = shutter.delay(strips.rows(part)[..., [0, -1]]) if rolling else np.zeros(2)
     for end, image in ((-0.5, 3), (0.5, 4)):
@@ -163,7 +164,8 @@ def _ends(
         if not near.size:
             continue
         u = along[near]
-        u += _wide((centre[near] - end) * speed[near])
+        before_end = crossing[near] - end
+        u += _wide((centre[near] - end) * speed[near] - 0.5 * gained[near] * before_end**2)
         if rolling:
             # A row-dependent end is a slanted cut of the path: the pixel's window is exact, row by row.
             u -= shutter.delay(strips.rows(near + part.start)) * _wide(speed[near])
@@ -176,6 +178,9 @@ def _ends(
         bell *= before
         out[near, image] = bell
         out[near, 0] = before * ndtr(u)
+        # Light is denser where the star is slower: the end cuts off more of it, or less.
+        thinning = gained[near] / speed[near] ** 2
+        out[near, 0] -= _wide(sign * width**2 * thinning) * bell
         bell *= u
         out[near, 5] -= bell
 

@@ -69,16 +69,22 @@ class Strips:
 
 
 def cut_strips(
-    pinhole: Pinhole, motion: Motion, stars: FloatArray, times: FloatArray, width: float
+    pinhole: Pinhole,
+    motion: Motion,
+    stars: FloatArray,
+    times: FloatArray,
+    width: float,
+    ending: BoolArray | None = None,
 ) -> Strips:
-    """Return the pixels within `width` px of the paths of stars (n, 2) between `times` (n, 2), exposures."""
+    """Return the pixels within `width` px of the paths of stars (n, 2) between `times` (n, 2), exposures.
+
+    `ending` (n, 2): which of the times are ends of the path, beyond which there are pixels too; by default
+    all.
+    """
     part, low, high, outer = _parts(pinhole, motion, stars, times)
-    reach = 1.45 * width + 1.0
-    begin = low - reach / _speed(paths(pinhole, motion, stars[part], low))
-    end = high + reach / _speed(paths(pinhole, motion, stars[part], high))
-    sampled = begin[:, None] + (end - begin)[:, None] * np.linspace(0.0, 1.0, _SAMPLES)
-    there = positions(pinhole, motion, np.repeat(stars[part], _SAMPLES, axis=0), sampled.reshape(-1))
-    place = there.reshape(-1, _SAMPLES, 2)
+    if ending is not None:
+        outer &= ending[part]
+    sampled, place = _extended(pinhole, motion, stars[part], (low, high), 1.45 * width + 1.0)
     span = np.abs(place[:, -1] - place[:, 0])
     along_rows = span[:, 0] >= span[:, 1]
     major = np.where(along_rows[:, None], place[:, :, 0], place[:, :, 1])
@@ -102,6 +108,18 @@ def cut_strips(
     )
 
 
+def _extended(
+    pinhole: Pinhole, motion: Motion, stars: FloatArray, times: tuple[FloatArray, FloatArray], reach: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return times (n, s) from `reach` px before the paths to as far beyond, and places (n, s, 2)."""
+    low, high = times
+    begin = low - reach / _speed(paths(pinhole, motion, stars, low))
+    end = high + reach / _speed(paths(pinhole, motion, stars, high))
+    sampled = begin[:, None] + (end - begin)[:, None] * np.linspace(0.0, 1.0, _SAMPLES)
+    there = positions(pinhole, motion, np.repeat(stars, _SAMPLES, axis=0), sampled.reshape(-1))
+    return sampled, there.reshape(-1, _SAMPLES, 2)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Lines:
     star: IntArray
@@ -116,7 +134,7 @@ def _parts(
     pinhole: Pinhole, motion: Motion, stars: FloatArray, times: FloatArray
 ) -> tuple[IntArray, FloatArray, FloatArray, BoolArray]:
     """Return the parts' stars, start and end times, and which of those two are ends of the path (.., 2)."""
-    turned = float(np.linalg.norm(motion.turn)) + float(np.linalg.norm(motion.growth))
+    turned = float(np.linalg.norm(motion.whole)) + float(np.linalg.norm(motion.growth))
     pieces = max(1, math.ceil(turned * float(np.max(times[:, 1] - times[:, 0], initial=0.0)) / _LONGEST_TURN))
     edges = times[:, :1] + (times[:, 1:] - times[:, :1]) * np.linspace(0.0, 1.0, pieces + 1)
     edges[:, -1] = times[:, 1]  # exactly: a later test compares it

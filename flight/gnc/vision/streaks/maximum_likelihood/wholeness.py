@@ -7,7 +7,7 @@ from enum import Enum
 import numpy as np
 
 from flight.gnc.vision.streaks.maximum_likelihood.chains import in_chains
-from flight.gnc.vision.streaks.maximum_likelihood.end_checks import true_ends, unbroken
+from flight.gnc.vision.streaks.maximum_likelihood.end_checks import trailing, true_ends, unbroken
 from flight.gnc.vision.streaks.maximum_likelihood.iteration import ExposedCamera
 from flight.gnc.vision.streaks.maximum_likelihood.matched_filter import FaintStars
 from flight.gnc.vision.streaks.maximum_likelihood.motion import positions
@@ -21,6 +21,9 @@ _TRUE_ENDS = (0.75, 0.6)
 _BROKEN = (0.12, 0.35)
 # Share of the light of streaks that lie in the frame from end to end which the motion must have on its side.
 _WHOLE_LIGHT = 0.5
+# Where the rate changes by more than this part of itself, so many stars may have light beyond an end.
+_UNEVEN = 0.4
+_MOST_TRAILING = 0.5
 
 
 class Wholeness(Enum):
@@ -47,6 +50,8 @@ def wholeness(camera: ExposedCamera, scene: Scene, faint: FaintStars) -> Wholene
     deciding = scene.select(scene.trusted)
     times = window_times(camera.pinhole, deciding.motion, camera.shutter, deciding.stars)
     seen = camera.frame, camera.pinhole, scene.motion, deciding.stars, deciding.light, times
+    if abs(scene.motion.relative_growth) > _UNEVEN and trailing(*seen) > _MOST_TRAILING:
+        return Wholeness.BROKEN
     ends, lit = true_ends(*seen), unbroken(*seen)
     known = np.isfinite(ends)
     both = known.all(axis=1)

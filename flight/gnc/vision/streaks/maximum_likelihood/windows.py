@@ -1,4 +1,8 @@
-"""The pixels that are fitted: strips about long streaks, patches about spots."""
+"""The pixels that are fitted: strips about long streaks, patches about spots and the slow parts of streaks.
+
+The light of a streak is 1/speed of the star, which the strips' model expands about each point. About a rest
+that fails: where the rate grows from nothing, or falls to it, a patch serves the slow part of each streak.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +13,7 @@ import numpy as np
 from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.math.arrays import BoolArray, FloatArray, IntArray
 from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import ExposedFrame, Float32Array
-from flight.gnc.vision.streaks.maximum_likelihood.motion import positions
+from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion, paths, positions
 from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene, path_lengths, window_times
 from flight.gnc.vision.streaks.maximum_likelihood.shutter import Shutter
 from flight.gnc.vision.streaks.maximum_likelihood.spot_model import Patches, cut_patches
@@ -22,6 +26,13 @@ _MARGIN = 3.0
 # Instants at which a path is tested for being in the frame.
 _INSTANTS = 9
 _UNRESOLVED = 0.1
+# The speed along a strip may change by this part of itself over a width of the point spread.
+_STEADY = 0.05
+# A fast part shorter than this many widths is left to the patch.
+_LEAST_FAST = 4.0
+_SLOWEST = 1e-3
+# Instants at which the rate is looked at for that.
+_SAMPLES = 129
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,7 +85,8 @@ class Windows:
     """The pixels that are fitted: strips about long streaks, patches about spots.
 
     Attributes:
-        long, spot: stars (a,), (b,) of each kind, indices into the scene.
+        long, spot: stars (a,), (b,) with a strip and with a patch, indices into the scene; a streak that is
+            slow in part has both.
         strips, patches: their pixels; star i of the strips is `long[i]`.
         pixels: (m,) flat indices of the pixels in use, by slot; slot: of all blocks' pixels, one after other.
         on_strips, on_patches: the frame there.
@@ -130,14 +142,7 @@ def cut_windows(
     frame: ExposedFrame, pinhole: Pinhole, shutter: Shutter, scene: Scene, reach: float
 ) -> Windows:
     """Return the pixels of `frame` within `reach` widths of the stars' paths."""
-    length = path_lengths(pinhole, scene.motion, scene.stars)
-    limit = _SPOT_WIDTHS * scene.width
-    long, spot = np.flatnonzero(length >= limit), np.flatnonzero(length < limit)
-    room = reach * scene.width
-    times = window_times(pinhole, scene.motion, shutter, scene.stars[long])
-    strips = cut_strips(pinhole, scene.motion, scene.stars[long], times, room)
-    longest = float(length[spot].max(initial=0.0))
-    patches = cut_patches(pinhole, scene.stars[spot], int(np.ceil(room + 0.5 * longest)))
+    long, spot, strips, patches = _placed(pinhole, shutter, scene, reach * scene.width)
     index = np.concatenate([strips.index.reshape(-1), patches.index.reshape(-1)])
     inside = np.concatenate([strips.inside.reshape(-1), patches.inside.reshape(-1)])
     named = index[inside]
@@ -166,6 +171,77 @@ def cut_windows(
         _sight(frame, patches.index, patches.inside, slot[cut:], crowded[crowded >= cut] - cut, common),
         int(np.count_nonzero(shared)),
     )
+
+
+def _placed(
+    pinhole: Pinhole, shutter: Shutter, scene: Scene, room: float
+) -> tuple[IntArray, IntArray, Strips, Patches]:
+    """Return which stars have strips (a,), and patches (b,), within `room` px of their paths, and those."""
+    times = window_times(pinhole, scene.motion, shutter, scene.stars)
+    fast, slow = _divided(pinhole, scene, times)
+    whole = path_lengths(pinhole, scene.motion, scene.stars) >= _SPOT_WIDTHS * scene.width
+    long = np.flatnonzero(whole & (fast[:, 1] > fast[:, 0]))
+    spot = np.flatnonzero(~(whole & (fast[:, 1] > fast[:, 0])) | (slow[:, 1] > slow[:, 0]))
+    strips = cut_strips(pinhole, scene.motion, scene.stars[long], fast[long], room, fast[long] == times[long])
+    # The part of a path that a patch serves: the slow one of a streak, all of a spot.
+    part = np.where(np.isin(spot, long)[:, None], slow[spot], times[spot])
+    patches = _patches_about(pinhole, scene, spot, part, room)
+    strips = _beside_patches(strips, long, patches, spot)
+    return long, spot, strips, patches
+
+
+def _divided(pinhole: Pinhole, scene: Scene, times: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return when (n, 2) each star is fast enough for strips within `times` (n, 2), and when it is slow.
+
+    The slow part is at the end towards which the rate falls; what there is none of has no duration.
+    """
+    motion = scene.motion
+    if motion.constant or not motion.whole.any():
+        return times, np.zeros_like(times)
+    time = np.linspace(times.min(), times.max(), _SAMPLES)
+    pace, change = motion.pace(time), np.abs(motion.pace(time, 1)).max()
+    steady = Motion.steady(motion.whole)
+    velocity = paths(pinhole, steady, scene.stars, np.zeros(len(times))).velocity
+    speed = np.maximum(np.hypot(velocity[:, 0], velocity[:, 1]), _SLOWEST)
+    # Slow wherever the speed may change by too much of itself over a width.
+    slow = pace < np.sqrt(change * scene.width / (_STEADY * speed))[:, None]
+    fast, rest = times.copy(), times.copy()
+    if pace[0] < pace[-1]:
+        until = np.where(slow.any(axis=1), time[_SAMPLES - 1 - slow[:, ::-1].argmax(axis=1)], -np.inf)
+        fast[:, 0] = rest[:, 1] = np.clip(until, times[:, 0], times[:, 1])
+    else:
+        since = np.where(slow.any(axis=1), time[slow.argmax(axis=1)], np.inf)
+        fast[:, 1] = rest[:, 0] = np.clip(since, times[:, 0], times[:, 1])
+    way = speed * (motion.progress(fast[:, 1]) - motion.progress(fast[:, 0]))
+    fast[way < _LEAST_FAST * scene.width] = 0.0
+    return fast, rest
+
+
+def _patches_about(pinhole: Pinhole, scene: Scene, spot: IntArray, part: FloatArray, room: float) -> Patches:
+    """Return patches with all pixels within `room` px of stars `spot` (n,) at times `part` (n, 2)."""
+    sampled = part[:, :1] + np.diff(part) * np.linspace(0.0, 1.0, _INSTANTS)
+    stars = np.repeat(scene.stars[spot], _INSTANTS, axis=0)
+    there = positions(pinhole, scene.motion, stars, sampled.reshape(-1)).reshape(-1, _INSTANTS, 2)
+    low, high = there.min(axis=1), there.max(axis=1)
+    half = int(np.ceil(room + 0.5 * float(np.max(high - low, initial=0.0))))
+    return cut_patches(pinhole, 0.5 * (low + high), half)
+
+
+def _beside_patches(strips: Strips, long: IntArray, patches: Patches, spot: IntArray) -> Strips:
+    """Return the strips without the pixels that a patch of the same star has."""
+    both = np.isin(long, spot)
+    if not both.any():
+        return strips
+    patch = np.searchsorted(spot, long)[strips.star]
+    split = np.flatnonzero(both[strips.star])
+    patch = patch[split]
+    along = np.arange(strips.index.shape[2])[:, None] * strips.step[split, None, None]
+    pixel = strips.corner[split, :, None] + along
+    theirs = np.stack([patches.column[patch], patches.row[patch]], axis=-1)
+    low, high = theirs[:, None, None, 0], theirs[:, None, None, -1]
+    inside = strips.inside.copy()
+    inside[split] &= ~np.all((pixel >= low) & (pixel <= high), axis=-1)
+    return replace(strips, inside=inside)
 
 
 def _sight(

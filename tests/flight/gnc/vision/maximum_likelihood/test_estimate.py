@@ -11,6 +11,7 @@ import pytest
 from flight.gnc.errors import FlightError
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import attitude_matrix
+from flight.gnc.vision.streaks.maximum_likelihood.course import Course
 from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion
 from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
@@ -24,6 +25,7 @@ from tests.flight.gnc.vision.maximum_likelihood.scenes import (
     taken,
     turn_of,
 )
+from tests.studies.row_exposure import row_scene
 
 _SETTINGS = LikelihoodSettings(saturation=SATURATION)
 
@@ -149,9 +151,56 @@ def test_the_pixels_decide_whether_the_rate_changes(growth: float) -> None:
     assert _squared(found.rate - scene.rate, found.covariance) < 16.3
 
 
-def test_a_rate_that_doubles_within_the_exposure_is_beyond_the_model_and_refused() -> None:
+@pytest.mark.parametrize(("growth", "length"), [(1.0, 50.0), (2.0, 16.0), (-2.0, 90.0)])
+def test_a_rate_that_grows_from_nothing_or_falls_to_it_is_fitted_from_the_start(
+    growth: float, length: float
+) -> None:
+    """To 200 % of the mean over the exposure: the slow ends are bright, the fast ones dim."""
+    turn = turn_of(np.radians(60.0), length, 0.4)
+    found = _estimated(taken(np.random.default_rng(25), turn, growth * turn, 0.2))
+    assert found.rate is not None
+    assert found.covariance is not None
+    assert found.acceleration is not None
+    assert _squared(found.rate - turn / 0.2, found.covariance) < 16.3
+    assert found.acceleration @ turn * 0.2**2 / (turn @ turn) == pytest.approx(growth, abs=0.05)
+
+
+def test_a_step_within_the_exposure_is_fitted_where_navigation_knows_the_course() -> None:
+    """At rest for a third of the exposure, then faster and faster: no growth describes that."""
+    turn = turn_of(np.radians(70.0), 40.0, 0.9)
+    share = 1.0 / 3.0
+
+    def progress(times: FloatArray) -> FloatArray:
+        return np.maximum(times + 0.5 - share, 0.0) ** 2 / (1.0 - share) ** 2
+
+    def turns(times: FloatArray) -> FloatArray:
+        return (progress(times) - progress(np.zeros(1)))[:, None] * turn
+
+    scene = row_scene(CAMERA, turns, 1.0, np.random.default_rng(27))
+    times = np.linspace(-0.5, 0.5, 17)[:, None]
+    rates = 2.0 * np.maximum(times + 0.5 - share, 0.0) / (1.0 - share) ** 2 * turn
+    course = Course.of_rates(rates, 1.0, 0.1 / CAMERA.pinhole.focal_length)
+    found = estimate_motion(scene.pixels, CAMERA.pinhole, 1.0, _SETTINGS, turn, 1e-5, None, course)
+    assert found.status is StreakStatus.RATE
+    assert found.rate is not None
+    assert found.covariance is not None
+    assert found.misfit < 1.3
+    assert _squared(found.rate - turn, found.covariance) < 16.3
+
+
+def test_a_course_that_is_wrong_is_dropped() -> None:
+    turn = turn_of(np.radians(60.0), 80.0, 0.4)
+    scene = taken(np.random.default_rng(28), turn, np.zeros(3), 0.2)
+    course = Course(np.stack([turn, turn, 0.0 * turn]), 1e-5)
+    found = estimate_motion(scene.pixels, CAMERA.pinhole, 0.2, _SETTINGS, scene.rate, 1e-5, None, course)
+    assert found.rate is not None
+    assert found.covariance is not None
+    assert _squared(found.rate - scene.rate, found.covariance) < 16.3
+
+
+def test_a_turn_that_reverses_within_the_exposure_is_beyond_the_model_and_refused() -> None:
     turn = turn_of(np.radians(60.0), 50.0, 0.4)
-    found = _estimated(taken(np.random.default_rng(25), turn, 1.0 * turn, 0.2))
+    found = _estimated(taken(np.random.default_rng(25), turn, 4.0 * turn, 0.2))
     assert found.rate is None
 
 
@@ -180,6 +229,29 @@ def test_a_rolling_shutter_is_part_of_the_model_and_spoils_the_rate_when_it_is_n
     size = np.linalg.norm(scene.rate)
     assert abs(np.linalg.norm(rolling.rate) / size - 1.0) < 0.002
     assert abs(np.linalg.norm(blind.rate) / size - 1.0) > 0.005
+
+
+def test_a_rolling_shutter_makes_two_motions_of_a_turn_and_its_reverse() -> None:
+    """50 us a line in 0.2 s, across the boresight: 5 % apart. Without a prior the answer spans both."""
+    camera = replace(CAMERA, line_time=5e-5)
+    turn = turn_of(np.radians(90.0), 102.0, 0.2)
+    scene = taken(np.random.default_rng(22), turn, np.zeros(3), 0.2, camera)
+    settings = replace(_SETTINGS, line_time=5e-5)
+    forward = _estimated(scene, settings)
+    backward = estimate_motion(scene.pixels, camera.pinhole, 0.2, settings, -scene.rate, 0.0)
+    alone = estimate_motion(scene.pixels, camera.pinhole, 0.2, settings)
+    assert (forward.status, backward.status) == (StreakStatus.RATE, StreakStatus.RATE)
+    assert alone.status is StreakStatus.AMBIGUOUS
+    assert forward.rate is not None
+    assert forward.covariance is not None
+    assert backward.rate is not None
+    assert alone.rate is not None
+    assert alone.covariance is not None
+    assert _squared(forward.rate - scene.rate, forward.covariance) < 16.3
+    apart = abs(np.linalg.norm(backward.rate) / np.linalg.norm(forward.rate) - 1.0)
+    assert apart > 0.02
+    sign = np.sign(alone.rate @ scene.rate)
+    assert _squared(sign * alone.rate - scene.rate, alone.covariance) < 16.3
 
 
 def test_a_frame_of_noise_a_dead_and_a_frozen_one_are_told() -> None:

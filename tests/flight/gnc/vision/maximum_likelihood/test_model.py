@@ -8,9 +8,13 @@ import pytest
 from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.math.arrays import BoolArray, FloatArray
 from flight.gnc.vision.streaks.maximum_likelihood import spot_model, streak_model
+from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import expose_frame
 from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion, moving, paths, sensitivities
+from flight.gnc.vision.streaks.maximum_likelihood.normal_equations import light_of
+from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene
 from flight.gnc.vision.streaks.maximum_likelihood.shutter import Shutter
 from flight.gnc.vision.streaks.maximum_likelihood.strips import cut_strips
+from flight.gnc.vision.streaks.maximum_likelihood.windows import cut_windows
 from tests.sim_hal.star_camera.scenes import integrated_by_brute_force
 
 _PINHOLE = Pinhole(320, 320, 2903.6)
@@ -55,6 +59,25 @@ def test_the_light_is_that_of_brute_force(
     covered, light, _ = _modelled(motion, np.array(star), sigma)
     assert truth[~covered].sum() < 1e-2 * truth.sum()
     assert np.abs(light - truth)[covered].max() < allowed * truth.max()
+
+
+@pytest.mark.parametrize("growth", [0.3, 1.0, 2.0, -2.0])
+@pytest.mark.parametrize("length", [16.0, 30.0, 90.0])
+def test_the_light_of_a_rate_that_changes_is_that_of_brute_force(growth: float, length: float) -> None:
+    """From rest the light piles up where the star is slow: a patch serves there, strips beyond."""
+    turn = np.array([0.4, 0.9, 0.1]) * length / _PINHOLE.focal_length
+    motion, star = Motion(turn, growth * turn), np.array([160.3, 155.2])
+    truth = _brute(motion, star, 1.0).reshape(-1)
+    noise = np.random.default_rng(1).normal(100.0, 3.0, (320, 320)).astype(np.uint16)
+    scene = Scene(
+        motion, float(np.sqrt(13.0 / 12.0)), star[None], np.ones(1), np.zeros(1), np.ones(1, dtype=np.bool_)
+    )
+    windows = cut_windows(expose_frame(noise, 65535.0, 1.0), _PINHOLE, Shutter(), scene, 5.0)
+    light = np.zeros(320 * 320)
+    light[windows.pixels] = light_of(_PINHOLE, Shutter(), scene, windows)
+    covered = np.bincount(windows.pixels, minlength=320 * 320) > 0
+    assert truth[~covered].sum() < 1e-3
+    assert np.abs(light - truth)[covered].max() < 2.5e-3 * truth.max()
 
 
 @pytest.mark.parametrize(("turn", "star"), _CASES)

@@ -1,0 +1,116 @@
+"""What a fit may claim of its turn: its covariance with all that the model does not describe.
+
+Noise gives the least covariance. Stars that disagree beyond their noise widen it. So do errors of the
+camera's description, as far as the stars do not show them, and what is common to all stars and shows in no
+disagreement: a point spread other than the one described, and a body that shakes. Both leave the ends of the
+streaks uncertain by some px, alike for all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flight.gnc.math.arrays import BoolArray, FloatArray
+from flight.gnc.vision.streaks.maximum_likelihood.agreement import (
+    OwnEquations,
+    disagreement,
+    estimates_of,
+    own_equations,
+)
+from flight.gnc.vision.streaks.maximum_likelihood.equation_solver import shared_covariance
+from flight.gnc.vision.streaks.maximum_likelihood.iteration import ExposedCamera, Fit
+from flight.gnc.vision.streaks.maximum_likelihood.lens_errors import correct, seeming_turns
+from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
+from flight.gnc.vision.streaks.maximum_likelihood.scene import PIXEL_VARIANCE
+from flight.gnc.vision.streaks.maximum_likelihood.shaking import Shaking, find_shaking
+
+# Rounds of conjugate gradients for the covariance.
+_CONJUGATE = 12
+# So few stars hardly contradict each other: their variance counts by this factor.
+_UNCHECKED = (2, 4.0)
+# Fitted and described point spread are the same when their variances differ by this part.
+_SAME_SPREAD = 0.05
+# Ends are uncertain by this part of the square root of the difference of the variances.
+_END_SHARE = 0.6
+# Px by which ends are uncertain for each px, or unit of brightness, that all streaks waver in common.
+_END_SHAKING = 25.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Claim:
+    """What is known of the turn.
+
+    Attributes:
+        turn: (3,) rad, corrected for the camera's errors where the stars show them.
+        covariance: (3, 3) rad^2.
+        doubt: share of the turn to which model errors common to all stars leave it uncertain.
+        shaking: of the body.
+    """
+
+    turn: FloatArray
+    covariance: FloatArray
+    doubt: float
+    shaking: Shaking
+
+
+def claim(result: MotionResult, camera: ExposedCamera, last: Fit) -> Claim:
+    """Return what a fit may claim of its turn; `result` has its stars."""
+    scene, settings = last.scene, camera.settings
+    exact = shared_covariance(last.evaluation, last.free, _CONJUGATE)
+    noise = (last.solution.covariance if exact is None else exact)[:3, :3]
+    turn, added, spread = scene.motion.whole, np.zeros((3, 3)), 1.0
+    equations = own_equations(last.evaluation, last.free)
+    if equations is not None:
+        step, added, spread = _with_lens(camera, last, equations, result.exposure)
+        turn = turn + step
+    # What made others disagree is as likely to hide, less of it, in the light of those that agree.
+    asked = min(settings.most_stars, len(scene.trusted))
+    spread = max(result.misfit, spread, 1.0) * asked / max(int(np.count_nonzero(scene.trusted)), 1)
+    if np.count_nonzero(scene.trusted) <= _UNCHECKED[0]:
+        spread *= _UNCHECKED[1]
+    shaking = find_shaking(camera, last)
+    end = np.hypot(
+        _spread_doubt(scene.width, settings.psf_sigma), _END_SHAKING * max(shaking.across, shaking.along)
+    )
+    ends = float(np.sqrt(2.0) * end / result.length)
+    # What the model does not explain makes it less certain; what fits too well, no more. A fit that goes
+    # to and fro, as pixels are left out and taken in, is known no better than that.
+    covariance = noise * spread * (1.0 + last.restless**2)
+    common = added + ends**2 * float(turn @ turn) * np.eye(3)
+    doubt = float(np.sqrt(np.linalg.eigvalsh(common)[-1] / (turn @ turn)))
+    return Claim(turn, covariance + common, doubt, shaking)
+
+
+def _with_lens(
+    camera: ExposedCamera, last: Fit, equations: OwnEquations, exposure: float
+) -> tuple[FloatArray, FloatArray, float]:
+    """Return the turn's correction (3,), covariance (3, 3) for the camera's errors, and the stars' spread."""
+    trusted = np.flatnonzero(last.scene.trusted)
+    scene = last.scene.select(trusted)
+    equations = OwnEquations(equations.kept, equations.information[trusted], equations.score[trusted])
+    seeming = seeming_turns(camera, scene, exposure)
+    everyone: BoolArray = np.ones(len(trusted), dtype=np.bool_)
+    spread = disagreement(estimates_of(equations, scene), everyone)
+    if not seeming.shape[2]:
+        return np.zeros(3), np.zeros((3, 3)), spread
+    shared = np.zeros((len(trusted), len(equations.kept), seeming.shape[2]))
+    shared[:, :3] = seeming
+    corrected, before = None, 1.0
+    # What the camera's errors explain of the disagreement is no noise.
+    for _ in range(2):
+        corrected = correct(equations.information, equations.score, shared, before)
+        if corrected is None:
+            return np.zeros(3), np.zeros((3, 3)), spread
+        left = replace(equations, score=corrected.score)
+        before = max(1.0, min(spread, disagreement(estimates_of(left, scene), everyone)))
+    assert corrected is not None
+    return corrected.step[:3], corrected.added[:3, :3], before if corrected.step.any() else spread
+
+
+def _spread_doubt(width: float, sigma: float) -> float:
+    """Return by how many px the ends of streaks of a fitted `width` are uncertain; `sigma` is described."""
+    described = sigma**2 + PIXEL_VARIANCE
+    beyond = abs(width**2 - described) - _SAME_SPREAD * described
+    return _END_SHARE * float(np.sqrt(max(beyond, 0.0)))

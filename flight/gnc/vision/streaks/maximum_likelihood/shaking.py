@@ -1,0 +1,107 @@
+"""Whether the body shook during the exposure: what all streaks have in common that a smooth motion has not.
+
+A jitter moves all stars alike. Across their paths it shows as a displacement common to all streaks at one
+time, along them as a common change of brightness, where the motion lingers or hurries. Residuals are stacked
+over the stars by the time of the exposure; only products of different stars are summed, so that what one star
+has of its own, a neighbour hidden in its light, adds nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flight.gnc.math.arrays import FloatArray, IntArray
+from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import Float32Array
+from flight.gnc.vision.streaks.maximum_likelihood.iteration import ExposedCamera, Fit
+from flight.gnc.vision.streaks.maximum_likelihood.motion import paths
+from flight.gnc.vision.streaks.maximum_likelihood.normal_equations import shapes
+from flight.gnc.vision.streaks.maximum_likelihood.strips import LINES
+
+_BINS = 48
+# Residuals beyond this many sigmas and this part of their line's brightest pixel are another's light.
+_FOREIGN_SIGMAS = 5.0
+_FOREIGN_SHARE = 0.6
+# What is common must exceed chance by this many deviations to be believed.
+_SIGNIFICANT = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class Shaking:
+    """What the streaks have in common beyond a smooth motion, rms; 0 where chance explains it.
+
+    Attributes:
+        across: px, displacement across the paths.
+        along: relative change of brightness along them.
+    """
+
+    across: float = 0.0
+    along: float = 0.0
+
+
+def find_shaking(camera: ExposedCamera, fit: Fit) -> Shaking:
+    """Return what the trusted streaks of a fit have in common; nothing where none is long."""
+    windows, scene = fit.windows, fit.scene
+    strips = windows.strips
+    chosen = np.flatnonzero(scene.trusted[windows.long[strips.star]])
+    if not len(chosen):
+        return Shaking()
+    images, weight, residual = _left_over(camera, fit)
+    images, weight, residual = images[chosen], weight[chosen], residual[chosen]
+    time, star = strips.time[chosen], strips.star[chosen]
+    stars = scene.stars[windows.long[star]]
+    velocity = paths(camera.pinhole, scene.motion, np.repeat(stars, LINES, axis=0), time.reshape(-1)).velocity
+    tangent = velocity / np.maximum(np.linalg.norm(velocity, axis=1, keepdims=True), 1e-9)
+    normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+    light = scene.light[windows.long[star], None]
+    place = np.clip(((time + 0.5) * _BINS).astype(np.int64), 0, _BINS - 1).reshape(-1)
+    within = (np.abs(time) < 0.5).reshape(-1)
+    owner = np.repeat(star, LINES)
+    found = []
+    for image, way in ((images[:, 1], normal), (images[:, 0], tangent)):
+        score = (light * np.sum(weight * residual * image, axis=2)).reshape(-1)
+        information = (light**2 * np.sum(weight * image * image, axis=2)).reshape(-1)
+        cell = (owner * _BINS + place)[within]
+        found.append(_common(cell, score[within, None] * way[within], information[within]))
+    return Shaking(*found)
+
+
+def _left_over(camera: ExposedCamera, fit: Fit) -> tuple[Float32Array, Float32Array, Float32Array]:
+    """Return the strips' images, and weights and residuals (b, LINES, k) of their pixels."""
+    scene, windows = fit.scene, fit.windows
+    images, spots, _ = shapes(camera.pinhole, camera.shutter, scene, windows)
+    of_block = windows.long[windows.strips.star]
+    light = images[:, 0] * scene.light[of_block, None, None].astype(np.float32)
+    peak = light.max(axis=2, keepdims=True)
+    light += scene.sky[of_block, None, None].astype(np.float32)
+    spot_light = spots * scene.light[windows.spot, None, None] + scene.sky[windows.spot, None, None]
+    weight, residual = windows.on_strips.residual(windows.total(light, spot_light), 0.0)
+    with np.errstate(divide="ignore"):
+        foreign = np.abs(residual) > _FOREIGN_SIGMAS / np.sqrt(weight) + _FOREIGN_SHARE * peak
+    weight[foreign] = 0.0
+    return images, weight, residual
+
+
+def _common(cell: IntArray, score: FloatArray, information: FloatArray) -> float:
+    """Return the rms of what all stars ask for in common, 0 when it may be chance.
+
+    `cell` (m,) numbers star and time; `score` (m, 2) and `information` (m,) of lines are summed.
+    """
+    size = (int(cell.max()) // _BINS + 1) * _BINS if len(cell) else 0
+    if size < 2 * _BINS:
+        return 0.0
+    own = np.stack([np.bincount(cell, score[:, axis], size) for axis in (0, 1)], axis=-1)
+    own = own.reshape(-1, _BINS, 2)
+    known = np.bincount(cell, information, size).reshape(-1, _BINS)
+    # A star by itself says as much as its own scatter allows: its model errors are not noise.
+    scatter = np.sum(own**2, axis=(1, 2)) / np.maximum(known.sum(axis=1), 1e-30)
+    trust = 1.0 / np.maximum(scatter, 1.0)
+    own, known = own * trust[:, None, None], known * trust[:, None]
+    square = np.sum(own**2, axis=2)
+    common = float(np.sum(np.sum(own, axis=0) ** 2) - square.sum())
+    chance = float(np.sqrt(2.0 * np.sum(square.sum(axis=0) ** 2 - np.sum(square**2, axis=0))))
+    weight = float(np.sum(known.sum(axis=0) ** 2 - np.sum(known**2, axis=0)))
+    if weight <= 0.0 or common <= _SIGNIFICANT * chance:
+        return 0.0
+    return float(np.sqrt(common / weight))

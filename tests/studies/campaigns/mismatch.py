@@ -1,0 +1,280 @@
+"""Campaigns `mismatch` and `vibration`: cameras and motions unlike the model, by a renderer of its own.
+
+`mismatch` flies each of `imperfections.IMPERFECTIONS` at turns of 10 and 30 % of the field; `vibration` a
+body that shakes by 1 to 5 px at 5 to 50 Hz, with exposures of 0.2 and 1 s. Pointings are uniform over
+the sky, the axis is 0 to 90 deg off the boresight, and five stars must be usable (`scenes.usable`).
+
+An answer is judged by its error in its own standard deviations (the square root of its NEES) and as a part
+of the rate. More than 6 is confidently wrong: chance makes it so once in 13 million. The true rate of a body
+that shakes is its mean rate, from attitude to attitude at the exposure's ends.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flight.gnc.math.arrays import FloatArray, Image, IntArray
+from flight.gnc.math.quaternion import (
+    attitude_matrix,
+    from_rotation_vector,
+    multiply,
+    normalise,
+    to_rotation_vector,
+)
+from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion
+from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from flight.gnc.vision.streaks.streak_result import StreakStatus
+from sim_hal.star_camera import StarCameraModel
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.imperfections import IMPERFECTIONS, Imperfection
+from tests.studies.campaigns.scenes import FIELD, catalogue, noise_floor
+from tests.studies.supersampled import Attitudes, Sky, light
+
+TURNS = (10, 30)
+EXPOSURES = (0.2, 1.0)
+WRONG_SIGMAS = 6.0
+WRONG_SHARE = 0.01
+LEAST_USABLE = 5
+_SIGNIFICANCE = 8.0
+_MARGIN = 4.0
+_MOST_SKIES = 1000
+_VIBRATION_TURN = 10.0
+
+
+def mismatch_cases(runs: int, seed: int) -> list[Case]:
+    """Return `runs` random motions of each imperfection and turn."""
+    cells = [(name, percent) for name in IMPERFECTIONS for percent in TURNS]
+    found = []
+    for cell, (name, percent) in enumerate(cells):
+        for run in range(runs):
+            draw = np.random.default_rng((seed, cell, run, 0))
+            parameters = {
+                "row": name,
+                "percent": float(percent),
+                "exposure": float(draw.choice(EXPOSURES)),
+                "theta": float(np.rad2deg(draw.uniform(0.0, 0.5 * np.pi))),
+            }
+            found.append(Case(f"{name} {percent} {run}", (seed, cell, run, 1), parameters))
+    return found
+
+
+def vibration_cases(runs: int, seed: int) -> list[Case]:
+    """Return `runs` shaking motions, half of them of each exposure."""
+    found = []
+    for run in range(runs):
+        draw = np.random.default_rng((seed, run, 0))
+        exposure = EXPOSURES[run % len(EXPOSURES)]
+        parameters = {
+            "row": f"{exposure:g} s",
+            "percent": _VIBRATION_TURN,
+            "exposure": exposure,
+            "theta": float(np.rad2deg(draw.uniform(0.0, 0.5 * np.pi))),
+            "frequency": float(draw.uniform(5.0, 50.0)),
+            "amplitude": float(draw.uniform(1.0, 5.0)),
+        }
+        found.append(Case(str(run), (seed, run, 1), parameters))
+    return found
+
+
+def attitudes_of(parameters: dict[str, Any], camera: StarCameraModel, rng: np.random.Generator) -> Attitudes:
+    """Return a case's attitude as a function of time: a random pointing, a steady turn, what it shakes."""
+    theta, azimuth = np.deg2rad(parameters["theta"]), rng.uniform(0.0, 2.0 * np.pi)
+    axis = np.array([np.sin(theta) * np.cos(azimuth), np.sin(theta) * np.sin(azimuth), np.cos(theta)])
+    turn = axis * parameters["percent"] / 100.0 * camera.field_of_view
+    middle = normalise(rng.normal(size=4))
+    way, phase = rng.uniform(0.0, 2.0 * np.pi, 2)
+    shake = (
+        parameters.get("amplitude", 0.0)
+        / camera.pinhole.focal_length
+        * np.array([np.cos(way), np.sin(way), 0.0])
+    )
+    cycles = parameters.get("frequency", 0.0) * parameters["exposure"]
+
+    def at(times: FloatArray) -> FloatArray:
+        steady = from_rotation_vector(times[:, None] * turn)
+        shaking = from_rotation_vector(np.sin(2.0 * np.pi * cycles * times + phase)[:, None] * shake)
+        return multiply(shaking, multiply(steady, middle))
+
+    return at
+
+
+def expose(case: Case, imperfection: Imperfection) -> tuple[Image, FloatArray]:
+    """Return a case's frame and the true mean rate (3,) rad/s in the camera's frame."""
+    camera, rng, exposure = (
+        StarCameraModel(field_of_view=FIELD),
+        np.random.default_rng(case.seed),
+        case.parameters["exposure"],
+    )
+    stars, directions = catalogue(8.5)
+    for _ in range(_MOST_SKIES):
+        attitudes = attitudes_of(case.parameters, camera, rng)
+        sky = Sky(directions, camera.electrons(stars.magnitude, exposure))
+        near, good = _seen(camera, sky, attitudes, exposure)
+        if good >= LEAST_USABLE:
+            break
+    else:
+        raise ValueError(f"no sky in {_MOST_SKIES} with {LEAST_USABLE} usable stars for {case.parameters}")
+    begin, end = attitudes(np.array([-0.5, 0.5]))
+    rate = to_rotation_vector(multiply(end, np.array([-1.0, -1.0, -1.0, 1.0]) * begin)) / exposure
+    length = 1.3 * case.parameters["percent"] / 100.0 * camera.columns + 60.0 * case.parameters.get(
+        "amplitude", 0.0
+    )
+    electrons = light(
+        camera.pinhole,
+        imperfection.optics,
+        Sky(directions[near], sky.electrons[near]),
+        attitudes,
+        length,
+        imperfection.line_time / exposure,
+        rng,
+    )
+    return _detected(electrons, imperfection, camera, exposure, rng), np.asarray(rate)
+
+
+def _seen(camera: StarCameraModel, sky: Sky, attitudes: Attitudes, exposure: float) -> tuple[IntArray, int]:
+    """Return the stars that may throw light on the frame, and how many are usable."""
+    vectors = np.einsum("tij,nj->tni", attitude_matrix(attitudes(np.array([-0.5, 0.0, 0.5]))), sky.directions)
+    reach = np.cos(camera.pinhole.half_diagonal + 0.4 * camera.field_of_view)
+    near = np.flatnonzero(vectors[1, :, 2] > reach)
+    place = camera.pinhole.project(vectors[:, near])
+    inside = np.logical_and.reduce([camera.pinhole.contains(ends, -_MARGIN) for ends in place])
+    length = np.linalg.norm(place[2] - place[0], axis=1)
+    pixels = 4.0 * camera.psf_sigma * (length + 4.0 * camera.psf_sigma)
+    noise = np.sqrt(noise_floor(camera, exposure) * pixels)
+    return near, int(np.count_nonzero(inside & (sky.electrons[near] > _SIGNIFICANCE * noise)))
+
+
+def _detected(
+    electrons: FloatArray,
+    imperfection: Imperfection,
+    camera: StarCameraModel,
+    exposure: float,
+    rng: np.random.Generator,
+) -> Image:
+    """Return the frame of counts of light: photons, detector, conversion."""
+    if imperfection.electrons is not None:
+        electrons = imperfection.electrons(electrons, rng)
+    collected = rng.poisson(electrons + camera.dark_current * exposure).astype(float)
+    if imperfection.collected is not None:
+        collected = imperfection.collected(collected, rng)
+    collected = np.minimum(collected, camera.full_well) + rng.normal(0.0, camera.read_noise, collected.shape)
+    counts = collected / imperfection.gain + camera.pedestal
+    if imperfection.counts is not None:
+        counts = imperfection.counts(counts, rng)
+    return imperfection.encode(counts)
+
+
+def run_mismatch(case: Case) -> Result:
+    """Estimate one frame of an imperfect camera and judge the answer."""
+    imperfection = IMPERFECTIONS[case.parameters["row"]]
+    return judge(case, *expose(case, imperfection), imperfection)
+
+
+def run_vibration(case: Case) -> Result:
+    """Estimate one frame of a body that shakes and judge the answer."""
+    imperfection = IMPERFECTIONS["none"]
+    return judge(case, *expose(case, imperfection), imperfection)
+
+
+def judge(case: Case, pixels: Image, rate: FloatArray, imperfection: Imperfection) -> Result:
+    """Return status, errors and time of the estimator on a frame; `rate` (3,) is true and the prior."""
+    camera = StarCameraModel(field_of_view=FIELD)
+    settings = LikelihoodSettings(
+        **{"gain": camera.gain, "saturation": imperfection.top, **imperfection.known}
+    )
+    begun = time.process_time()
+    found = estimate_motion(pixels, camera.pinhole, case.parameters["exposure"], settings, rate, 0.0)
+    result = {
+        **case.parameters,
+        "seed": list(case.seed),
+        "status": found.status.value,
+        "nees": None,
+        "share": None,
+    }
+    result["milliseconds"] = 1e3 * (time.process_time() - begun)
+    result["misfit"] = found.misfit if np.isfinite(found.misfit) else None
+    if found.status is StreakStatus.RATE and found.rate is not None and found.covariance is not None:
+        error = found.rate - rate
+        result["nees"] = float(error @ np.linalg.solve(found.covariance, error))
+        result["share"] = float(np.linalg.norm(error) / np.linalg.norm(rate))
+        result["claimed"] = float(np.sqrt(np.trace(found.covariance)) / np.linalg.norm(rate))
+    return result
+
+
+def summarise(results: Sequence[Result], out: Path) -> Summary:
+    """Return availability and errors of each row, and of all."""
+    rows = list(dict.fromkeys((result["row"], result["percent"]) for result in results))
+    table = [
+        {
+            "row": row,
+            "percent": percent,
+            **_figures([r for r in results if (r["row"], r["percent"]) == (row, percent)]),
+        }
+        for row, percent in rows
+    ]
+    total = _figures(results)
+    lines = [
+        f"{'imperfection':20} {'turn':>5} {'answers':>9} {'worst sigma':>11} {'NEES':>8} "
+        f"{'worst error':>11} {'claimed':>8}"
+    ]
+    lines += [
+        _line(row["row"], f"{row['percent']:.0f} %", row)
+        for row in [*table, {"row": "all", "percent": 0.0, **total}]
+    ]
+    lines.append(
+        f"beyond {WRONG_SIGMAS:.0f} sigma: {total['beyond_sigmas']}; "
+        f"more than {100 * WRONG_SHARE:.0f} % wrong: {total['beyond_share']}; "
+        f"of {total['answers']} from {total['frames']} frames"
+    )
+    worst = sorted((r for r in results if r["nees"] is not None), key=lambda r: -r["nees"])[:10]
+    return Summary("\n".join(lines) + "\n", {"rows": table, "all": total, "worst": worst})
+
+
+def _figures(results: Sequence[Result]) -> dict[str, Any]:
+    answers = [r for r in results if r["nees"] is not None]
+    nees, share = np.array([r["nees"] for r in answers]), np.array([r["share"] for r in answers])
+    some = len(answers) > 0
+    return {
+        "frames": len(results),
+        "answers": len(answers),
+        "worst_sigmas": float(np.sqrt(nees.max())) if some else None,
+        "nees": float(nees.mean()) if some else None,
+        "worst_share": float(share.max()) if some else None,
+        "claimed": float(np.median([r["claimed"] for r in answers])) if some else None,
+        "beyond_sigmas": int(np.count_nonzero(nees > WRONG_SIGMAS**2)),
+        "beyond_share": int(np.count_nonzero(share > WRONG_SHARE)),
+        "milliseconds": float(np.median([r["milliseconds"] for r in results])),
+    }
+
+
+def _line(name: str, turn: str, row: dict[str, Any]) -> str:
+    start = f"{name:20} {turn:>5} {row['answers']:4} /{row['frames']:3}"
+    if not row["answers"]:
+        return start
+    return (
+        f"{start} {row['worst_sigmas']:11.1f} {row['nees']:8.1f} {100 * row['worst_share']:9.3f} % "
+        f"{100 * row['claimed']:6.3f} %"
+    )
+
+
+MISMATCH = Campaign(
+    "mismatch",
+    "cameras unlike the model: availability and honesty of the rate, by imperfection",
+    mismatch_cases,
+    run_mismatch,
+    summarise,
+    20,
+)
+VIBRATION = Campaign(
+    "vibration",
+    "a body that shakes during the exposure: availability and honesty of the rate",
+    vibration_cases,
+    run_vibration,
+    summarise,
+    200,
+)

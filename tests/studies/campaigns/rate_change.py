@@ -1,0 +1,113 @@
+"""Campaign `rate-change`: frames over which the rate changes, up to 200 % of its mean.
+
+Random fields, theta over 0..90 deg, streaks of 16 to 90 px, exposures of 0.2 and 1 s; the rate changes evenly
+along its axis by 0 to 200 % of its mean, up or down, a third of the frames by 200 %: from rest, or to it.
+The frames are summed instant by instant (`row_exposure`), not by the estimator's model. Right is an answer
+within 6 of its own standard deviations, or within 1 % of the rate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion
+from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from sim_hal.star_camera import StarCameraModel
+from tests.flight.gnc.vision.maximum_likelihood.scenes import turn_of
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.scenes import FIELD
+from tests.studies.row_exposure import row_scene
+
+EXPOSURES = (0.2, 1.0)
+LENGTHS = (16.0, 90.0)
+FROM_REST = 2.0
+FROM_REST_SHARE = 1 / 3
+WRONG_SIGMAS = 6.0
+WRONG_SHARE = 0.01
+# Changes of the rate in percent of its mean, upper edges.
+CHANGES = (50, 100, 150, 199, 200)
+
+
+def cases(runs: int, seed: int) -> list[Case]:
+    """Return `runs` random motions; the sky is drawn when one is run."""
+    found = []
+    for run in range(runs):
+        draw = np.random.default_rng((seed, run, 0))
+        change = FROM_REST if draw.uniform() < FROM_REST_SHARE else draw.uniform(0.0, FROM_REST)
+        parameters = {
+            "theta": float(np.rad2deg(draw.uniform(0.0, 0.5 * np.pi))),
+            "length": float(np.exp(draw.uniform(*np.log(LENGTHS)))),
+            "exposure": float(draw.choice(EXPOSURES)),
+            "change": float(change * draw.choice([-1.0, 1.0])),
+        }
+        found.append(Case(str(run), (seed, run, 1), parameters))
+    return found
+
+
+def run(case: Case) -> Result:
+    """Estimate one frame's motion."""
+    given, generator = case.parameters, np.random.default_rng(case.seed)
+    camera = StarCameraModel(field_of_view=FIELD)
+    roll, exposure = generator.uniform(0.0, 2.0 * np.pi), given["exposure"]
+    rate = turn_of(np.deg2rad(given["theta"]), given["length"], roll, camera) / exposure
+
+    def turns(times: FloatArray) -> FloatArray:
+        return np.asarray((times + 0.5 * given["change"] * times**2 / exposure)[:, None] * rate)
+
+    scene = row_scene(camera, turns, exposure, generator)
+    settings = LikelihoodSettings(saturation=float(camera.highest_count), gain=camera.gain)
+    found = estimate_motion(scene.pixels, camera.pinhole, exposure, settings, rate, 0.0)
+    result: Result = {**given, "status": found.status.value, "nees": None}
+    if found.rate is not None and found.covariance is not None:
+        error = found.rate - rate
+        result["nees"] = float(error @ np.linalg.solve(found.covariance, error))
+        result["vector"] = float(np.linalg.norm(error) / np.linalg.norm(rate))
+    return result
+
+
+def summarise(results: Sequence[Result], out: Path) -> Summary:
+    """Return a row for each range of the change, and one for all."""
+    del out
+    rows = []
+    for low, high in pairwise((0, *CHANGES)):
+        here = [one for one in results if low <= 100.0 * abs(one["change"]) - 1e-6 < high]
+        if here:
+            rows.append({"change": f"to {high} %", **_row(here)})
+    rows.append({"change": "all", **_row(results)})
+    lines = ["change    frames  answers  right  beyond 6 sigma   NEES  worst error %"]
+    for row in rows:
+        lines.append(
+            f"{row['change']:8}  {row['frames']:6d}  {row['answers']:7d}  {row['right']:5d}"
+            f"  {row['beyond_sigmas']:14d}  {row['nees'] or 0.0:5.2f}  {100.0 * row['worst']:13.3f}"
+        )
+    return Summary("\n".join(lines) + "\n", {"rows": rows})
+
+
+def _row(results: Sequence[Result]) -> dict[str, Any]:
+    answers = [one for one in results if one["nees"] is not None]
+    beyond = [one["nees"] > WRONG_SIGMAS**2 for one in answers]
+    wrong = [far and one["vector"] > WRONG_SHARE for far, one in zip(beyond, answers, strict=True)]
+    return {
+        "frames": len(results),
+        "answers": len(answers),
+        "right": len(answers) - sum(wrong),
+        "beyond_sigmas": sum(beyond),
+        "nees": float(np.mean([one["nees"] for one in answers])) if answers else None,
+        "worst": max((one["vector"] for one in answers), default=0.0),
+    }
+
+
+RATE_CHANGE = Campaign(
+    "rate-change",
+    "frames over which the rate changes by up to 200 % of its mean: right, refused, beyond 6 sigma",
+    cases,
+    run,
+    summarise,
+    200,
+)

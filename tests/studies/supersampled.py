@@ -1,0 +1,198 @@
+"""Frames of streaks by a renderer of its own: any point spread, any lens, any motion.
+
+The estimator's model and `sim_hal.star_camera` use one Gaussian point spread and analytic streaks. This one
+knows neither: points of light are laid along each star's path on a grid of three by three cells a pixel, the
+grid is convolved with a sampled point spread, and cells are added up to pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy import fft
+
+from flight.gnc.camera.pinhole import Pinhole
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import attitude_matrix
+
+Cells = npt.NDArray[np.floating[Any]]
+"""Light (rows, columns) on a grid of cells."""
+
+CELLS = 3
+"""Cells along a pixel's side."""
+
+Spread = Callable[[FloatArray, FloatArray], FloatArray]
+"""Density of a point's light at (dx, dy) px from it; need not be normalised."""
+
+_FINER = 5
+_APART = 0.15
+"""Points on a path are at most so far apart, px."""
+_STARS_AT_ONCE = 64
+
+
+def gaussian(sigma: float, ratio: float = 1.0, angle: float = 0.0) -> Spread:
+    """Return an ellipse: axes sigma sqrt(ratio) and sigma / sqrt(ratio) px, the long at `angle` rad."""
+    cosine, sine = np.cos(angle), np.sin(angle)
+
+    def density(dx: FloatArray, dy: FloatArray) -> FloatArray:
+        a, b = cosine * dx + sine * dy, cosine * dy - sine * dx
+        return np.asarray(np.exp(-0.5 * (a * a / ratio + b * b * ratio) / sigma**2))
+
+    return density
+
+
+def moffat(sigma: float, beta: float) -> Spread:
+    """Return a Moffat profile whose half-width is that of a Gaussian of `sigma` px."""
+    alpha = np.sqrt(2.0 * np.log(2.0)) * sigma / np.sqrt(2.0 ** (1.0 / beta) - 1.0)
+    return lambda dx, dy: np.asarray((1.0 + (dx * dx + dy * dy) / alpha**2) ** -beta)
+
+
+def disc(diameter: float) -> Spread:
+    """Return a defocused point: a uniform disc, px, with a blur of 0.4 px."""
+
+    def density(dx: FloatArray, dy: FloatArray) -> FloatArray:
+        return np.asarray(1.0 / (1.0 + np.exp((np.hypot(dx, dy) - 0.5 * diameter) / 0.15)))
+
+    return density
+
+
+def halo(sigma: float, share: float, width: float) -> Spread:
+    """Return a Gaussian core with `share` of the light in a Gaussian of `width` px."""
+
+    def density(dx: FloatArray, dy: FloatArray) -> FloatArray:
+        square = dx * dx + dy * dy
+        core = (1.0 - share) / sigma**2 * np.exp(-0.5 * square / sigma**2)
+        return np.asarray(core + share / width**2 * np.exp(-0.5 * square / width**2))
+
+    return density
+
+
+def coma(sigma: float, length: float, angle: float) -> Spread:
+    """Return a point with a tail: fainter and wider Gaussians along `angle` rad, up to `length` px away."""
+
+    def density(dx: FloatArray, dy: FloatArray) -> FloatArray:
+        total = np.zeros(np.broadcast_shapes(dx.shape, dy.shape))
+        for step in np.linspace(0.0, 1.0, 7):
+            x, y = dx - length * step * np.cos(angle), dy - length * step * np.sin(angle)
+            width = sigma * (1.0 + 0.6 * step)
+            total += (1.0 - 0.8 * step) / width**2 * np.exp(-0.5 * (x * x + y * y) / width**2)
+        return total
+
+    return density
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Optics:
+    """What lies between the sky and the pixels.
+
+    Attributes:
+        spreads: point spreads from the field's middle to its corner; between them light is mixed.
+        radius: px, beyond which a point has no light.
+        distortion: share of the radius by which the corner is moved outwards, with the radius' cube.
+        offset: px, of the optical axis from the detector's middle.
+        scintillation: rms of each star's brightness from stretch to stretch of its path.
+    """
+
+    spreads: tuple[Spread, ...] = (gaussian(1.0),)
+    radius: float = 7.0
+    distortion: float = 0.0
+    offset: tuple[float, float] = (0.0, 0.0)
+    scintillation: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sky:
+    """Stars: directions (n, 3) and the electrons (n,) that each gives over the exposure."""
+
+    directions: FloatArray
+    electrons: FloatArray
+
+
+Attitudes = Callable[[FloatArray], FloatArray]
+"""Attitude (m, 4), sky into camera, at times (m,) in exposures from mid-exposure."""
+
+
+def light(
+    pinhole: Pinhole,
+    optics: Optics,
+    sky: Sky,
+    attitudes: Attitudes,
+    length: float,
+    delay: float,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """Return the electrons (rows, columns) expected of a sky.
+
+    `length` px bounds the length of paths; `delay` is from row to row, in exposures (a rolling shutter).
+    """
+    layers = len(optics.spreads)
+    grid: Cells = np.zeros((layers, CELLS * pinhole.rows, CELLS * pinhole.columns), dtype=np.float32)
+    room = 0.5 + 0.5 * abs(delay) * pinhole.rows
+    count = int(np.ceil(2.0 * room * length / _APART)) + 16
+    times = (np.arange(count) + 0.5) / count * 2.0 * room - room
+    matrices = attitude_matrix(attitudes(times))
+    laid: list[tuple[FloatArray, FloatArray]] = []
+    for first in range(0, len(sky.electrons), _STARS_AT_ONCE):
+        some = slice(first, first + _STARS_AT_ONCE)
+        camera = np.einsum("tij,nj->nti", matrices, sky.directions[some])
+        place = through_lens(pinhole, optics, camera)
+        weight = np.full(place.shape[:2], 1.0) * sky.electrons[some, None] * (2.0 * room / count)
+        if delay:
+            late = times - delay * (place[..., 1] - 0.5 * (pinhole.rows - 1))
+            weight *= np.abs(late) <= 0.5
+        if optics.scintillation:
+            knots = rng.normal(1.0, optics.scintillation, (len(place), 24)).clip(0.0)
+            share = np.linspace(0.0, 23.0, count)
+            weight *= np.array([np.interp(share, np.arange(24.0), knot) for knot in knots])
+        seen = (weight > 0.0) & pinhole.contains(place, optics.radius)
+        laid.append((place[seen], weight[seen]))
+    _lay(grid, pinhole, np.concatenate([p for p, _ in laid]), np.concatenate([w for _, w in laid]))
+    cells = np.zeros(grid.shape[1:])
+    for layer, spread in zip(grid, optics.spreads, strict=True):
+        cells += _spread(layer, spread, optics.radius)
+    shape = pinhole.rows, CELLS, pinhole.columns, CELLS
+    return np.asarray(cells.reshape(shape).sum(axis=(1, 3)).clip(0.0))
+
+
+def through_lens(pinhole: Pinhole, optics: Optics, vectors: FloatArray) -> FloatArray:
+    """Return the pixels (..., 2) of `vectors` (..., 3), NaN behind the camera."""
+    z = np.where(vectors[..., 2] > 0.2, vectors[..., 2], np.nan)
+    tangent = vectors[..., :2] / z[..., None]
+    corner = np.tan(pinhole.half_diagonal)
+    square = np.sum(tangent**2, axis=-1, keepdims=True) / corner**2
+    place = pinhole.focal_length * tangent * (1.0 + optics.distortion * square)
+    return np.asarray(place + np.array(pinhole.centre) + np.array(optics.offset))
+
+
+def _lay(grid: Cells, pinhole: Pinhole, place: FloatArray, weight: FloatArray) -> None:
+    """Add points of light, each shared by the four cells about it and by the layers about its radius."""
+    cell = CELLS * (place + 0.5) - 0.5
+    corner = np.floor(cell).astype(np.int64)
+    inside = ((corner >= 0) & (corner < np.array(grid.shape[:0:-1]) - 1)).all(axis=1)
+    place, weight, cell, corner = place[inside], weight[inside], cell[inside], corner[inside]
+    part = cell - corner
+    layers, rows, columns = grid.shape
+    radius = np.hypot(*(place - np.array(pinhole.centre)).T) / np.hypot(*pinhole.centre)
+    at = np.clip(radius * (layers - 1), 0.0, max(layers - 1 - 1e-9, 0.0))
+    for layer in range(layers):
+        share = weight * np.clip(1.0 - np.abs(at - layer), 0.0, 1.0)
+        for right, down in ((0, 0), (1, 0), (0, 1), (1, 1)):
+            x, y = (part[:, 0] if right else 1.0 - part[:, 0]), (part[:, 1] if down else 1.0 - part[:, 1])
+            index = (corner[:, 1] + down) * columns + corner[:, 0] + right
+            grid[layer] += np.bincount(index, share * x * y, rows * columns).reshape(rows, columns)
+
+
+def _spread(layer: Cells, spread: Spread, radius: float) -> Cells:
+    """Return a layer (rows, columns) of cells convolved with a point spread."""
+    half = int(np.ceil(radius * CELLS))
+    fine = (np.arange((2 * half + 1) * _FINER) + 0.5) / (_FINER * CELLS) - (half + 0.5) / CELLS
+    density = spread(fine[None, :], fine[:, None])
+    kernel = density.reshape(2 * half + 1, _FINER, 2 * half + 1, _FINER).sum(axis=(1, 3))
+    shape = [fft.next_fast_len(size + 2 * half, real=True) for size in layer.shape]
+    product = fft.rfft2(layer, shape) * fft.rfft2((kernel / kernel.sum()).astype(np.float32), shape)
+    whole = fft.irfft2(product, shape)
+    return np.asarray(whole[half : half + layer.shape[0], half : half + layer.shape[1]])
