@@ -132,7 +132,8 @@ def _assert_streaks_right(run: Run, moving: int) -> None:
     assert np.mean(deviations**2) < (2.1 if moving >= 14 else 2.7)
 
 
-@pytest.mark.timeout(120)
+@pytest.mark.slow
+@pytest.mark.timeout(300)
 def test_a_step_within_an_exposure_spoils_no_frame(tmp_path: Path) -> None:
     """Off the grid of frames: at rest for a part of the exposure, then faster and faster."""
     config = demo_config(66.0)
