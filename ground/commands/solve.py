@@ -201,6 +201,7 @@ def facts(solution: FrameSolution, sky: SkyIndex, exposure: float | None, second
         "quaternion": solution.fix.quaternion.tolist(),
         "covariance_rad2": solution.fix.covariance.tolist(),
         "field_of_view_deg": math.degrees(fov),
+        "mirrored": solution.mirrored,
         "field_of_view_sigma_deg": math.degrees(math.sin(fov) * solution.scale_sigma),
         "focal_length_px": camera.focal_length,
         "log10_false_alarm": chance if math.isfinite(chance) else None,
@@ -258,6 +259,10 @@ def _text(solution: FrameSolution, sky: SkyIndex, exposure: float | None, second
         f" residual {rms:.2f} px rms an axis",
         f"by chance:        10^{solution.log10_false_alarm:.0f}",
     ]
+    if solution.mirrored:
+        lines.append(
+            "mirrored:         yes; the attitude is that of the picture mirrored back"
+        )
     named = [PROPER_NAMES.get(star["hip"]) or f"HIP {star['hip']}" for star in values["stars"][:8]]
     lines.append(f"brightest:        {', '.join(named)}")
     lines += _motion_text(solution, exposure)

@@ -134,6 +134,8 @@ def solve_motion(
     if not len(chosen):
         return seen
     seen = replace(seen, points=motion.stars[chosen], covariance=motion.star_covariance[chosen])
+    # A mirrored turn is another turn: the rate of a mirrored picture would be wrong.
+    settings = replace(settings, identification=replace(settings.identification, mirror=False))
     solution = _identify(seen, motion.flux[chosen], scale, sky, settings, prior)
     if solution.fix is None:
         return solution
@@ -190,7 +192,23 @@ def _identify(
             return _with_attitude(replace(seen, tracked=True), near, sky, settings)
     if settings.method is not None:
         return _with_attitude(seen, settings.method(stars, sky), sky, settings)
-    return _with_attitude(seen, identify(stars, sky, settings.identification), sky, settings)
+    found = identify(stars, sky, settings.identification)
+    if found.mirrored:
+        # Fitted as it should be, reported as it came.
+        return _mirrored(replace(_with_attitude(_mirrored(seen), found, sky, settings), mirrored=True))
+    return _with_attitude(seen, found, sky, settings)
+
+
+def _mirrored(seen: FrameSolution) -> FrameSolution:
+    """Return `seen` with left and right of its places exchanged about the optical axis."""
+    axis = np.array([2.0 * seen.camera.centre[0], 0.0])
+    turned = np.array([-1.0, 1.0])
+    return replace(
+        seen,
+        points=axis + turned * seen.points,
+        expected=axis + turned * seen.expected if len(seen.expected) else seen.expected,
+        covariance=seen.covariance * np.outer(turned, turned),
+    )
 
 
 def star_field(seen: FrameSolution, flux: FloatArray | None, scale: tuple[float, float]) -> StarField:

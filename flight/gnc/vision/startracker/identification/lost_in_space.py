@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -42,6 +42,7 @@ class IdentificationSettings:
         batches: numbers of triangles looked up, batch after batch, at each step of scale.
         work: entries of the index that may be read in total.
         verified: candidates of each batch that are verified at most.
+        mirror: whether the field is searched for as a mirror shows it too.
         verification: when a candidate is accepted.
     """
 
@@ -50,9 +51,12 @@ class IdentificationSettings:
     batches: tuple[int, ...] = (60, 250, 800)
     work: int = 50_000
     verified: int = 12
+    mirror: bool = True
     verification: VerificationSettings = field(default_factory=VerificationSettings)
 
 
+# A mirrored match must be ten times less likely by chance: most pictures are not mirrored.
+_MIRROR_IS_RARE = 10.0
 DEFAULT = IdentificationSettings()
 
 
@@ -62,6 +66,17 @@ def identify(
     """Return which stars the frame shows and their attitude, or why it cannot be identified."""
     if len(observed) < settings.verification.least_matches:
         return nothing(observed, Status.TOO_FEW_STARS)
+    answer = _search(observed, sky, settings, 1.0)
+    if answer.status is Status.IDENTIFIED or not settings.mirror:
+        return answer
+    answer = _search(observed.mirrored(), sky, settings, _MIRROR_IS_RARE)
+    return replace(answer, mirrored=answer.status is Status.IDENTIFIED)
+
+
+def _search(
+    observed: StarField, sky: SkyIndex, settings: IdentificationSettings, searched: float
+) -> Identification:
+    """Return the identification of the field as it is."""
     steps = ScaleSteps.of(observed, settings.distortion)
     found: list[TriangleMatches] = []
     tried: set[tuple[int, int]] = set()
@@ -72,7 +87,7 @@ def identify(
         )
         found.append(finds)
         for matrix, scale in _candidates(observed, sky, TriangleMatches.of(found), tried, settings.verified):
-            answer = verify_matrix(observed, sky, matrix, scale, 1.0, settings.verification)
+            answer = verify_matrix(observed, sky, matrix, scale, searched, settings.verification)
             if answer.status is Status.IDENTIFIED:
                 return answer
         work += read

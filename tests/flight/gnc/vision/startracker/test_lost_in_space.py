@@ -10,7 +10,7 @@ import pytest
 from flight.gnc.math.quaternion import angle_between, attitude_matrix
 from flight.gnc.vision.startracker.identification.field import StarField
 from flight.gnc.vision.startracker.identification.identification import Identification, Status
-from flight.gnc.vision.startracker.identification.lost_in_space import identify
+from flight.gnc.vision.startracker.identification.lost_in_space import IdentificationSettings, identify
 from flight.gnc.vision.startracker.index.build import default_index
 from tests.pace import ordinary_seconds
 from tests.studies.bench.star_lists import ListKind, StarList, configurations, draw, draw_random
@@ -106,11 +106,20 @@ def test_fewer_than_four_stars_are_said_to_be_too_few(count: int) -> None:
     assert identify(drawn.field(), SKY).status is Status.TOO_FEW_STARS
 
 
-def test_a_mirror_image_of_the_sky_is_refused() -> None:
+@pytest.mark.parametrize("known_deg", [0.1, None])
+def test_a_mirror_image_of_the_sky_is_named_and_said_to_be_mirrored(known_deg: float | None) -> None:
     for seed in range(10):
-        field = _drawn(ListKind(), seed).field()
-        mirrored = replace(field, direction=field.direction * np.array([-1.0, 1.0, 1.0]))
-        assert identify(mirrored, SKY).status is Status.NO_MATCH, seed
+        drawn = _drawn(ListKind(known_deg=known_deg, noise_px=0.3), seed)
+        assert not identify(drawn.field(), SKY).mirrored
+        found = identify(drawn.field().mirrored(), SKY)
+        assert found.mirrored
+        assert _right(found, drawn), seed
+
+
+def test_a_camera_that_has_no_mirror_takes_none_for_the_sky() -> None:
+    for seed in range(5):
+        field = _drawn(ListKind(), seed).field().mirrored()
+        assert identify(field, SKY, IdentificationSettings(mirror=False)).status is Status.NO_MATCH, seed
 
 
 def test_four_true_stars_and_nothing_else_are_enough_when_sharp() -> None:
