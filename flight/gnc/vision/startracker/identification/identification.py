@@ -30,8 +30,8 @@ class Identification:
         scale_sigma: its standard deviation; 0 when the scale was given.
         log10_false_alarm: of the probability that random stars would match as well anywhere in the sky; 0 if
             unknown.
-        mirrored: whether the sky was found in the mirrored field (`StarField.mirrored`); `fix` is the attitude
-            of that field.
+        mirrored: whether the sky was found in the mirrored field (`StarField.mirrored`); `fix` is the
+            attitude of that field.
     """
 
     status: Status
