@@ -35,6 +35,7 @@ class IndexSettings:
         smallest, largest: rad, longest sides of the triangles.
         density: number of stars that count as bright within 2.5 deg of a triangle of that size; larger for
             larger ones, so that every octave of size has about as many triangles.
+        few: brightest stars of any circle whose triangles are in the index.
     """
 
     faintest: float = 8.5
@@ -43,6 +44,7 @@ class IndexSettings:
     smallest: float = float(np.deg2rad(2.0))
     largest: float = float(np.deg2rad(25.0))
     density: float = 7.5
+    few: int = 5
 
 
 DEFAULT = IndexSettings()
@@ -58,7 +60,7 @@ def build(settings: IndexSettings = DEFAULT) -> SkyIndex:
     sizes = np.geomspace(settings.smallest, settings.largest, count + 1)
     middle = np.sqrt(sizes[1:] * sizes[:-1])
     ranks = np.round(settings.density * (middle / _REFERENCE_SIZE) ** (2.0 / 3.0)).astype(np.int64)
-    triangles = build_triangles(guide_stars.direction, 2.0 * np.sin(0.5 * sizes), ranks)
+    triangles = build_triangles(guide_stars.direction, 2.0 * np.sin(0.5 * sizes), ranks, settings.few)
     return SkyIndex(guide_stars, proper_motion(guide_stars), triangles)
 
 

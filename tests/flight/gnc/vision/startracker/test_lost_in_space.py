@@ -83,6 +83,37 @@ def test_other_cameras_and_worse_detectors_are_served_too(kind: ListKind) -> Non
         assert _right(identify(drawn.field(), SKY), drawn), seed
 
 
+@pytest.mark.parametrize(("false_stars", "least"), [(3, 6), (10, 6), (20, 5)])
+def test_false_stars_brighter_than_all_true_ones_do_not_hide_the_sky(false_stars: int, least: int) -> None:
+    """A slice of `python -m tests.studies.bench starid --hard`; the field of view is unknown."""
+    right = 0
+    for seed in range(6):
+        drawn = _drawn(
+            ListKind(field_deg=15.0, noise_px=0.3, false_stars=false_stars, bright=True, known_deg=None), seed
+        )
+        found = identify(drawn.field(), SKY)
+        assert found.status is not Status.IDENTIFIED or _right(found, drawn), seed
+        right += found.status is Status.IDENTIFIED
+    assert right >= least
+
+
+@pytest.mark.parametrize(
+    ("field_deg", "faintest"), [(4.5, 8.0), (7.0, 7.0), (15.0, 6.0), (40.0, 5.5), (58.0, 5.0)]
+)
+def test_a_field_of_view_between_4_and_60_deg_is_found(field_deg: float, faintest: float) -> None:
+    kind = ListKind(
+        field_deg=field_deg,
+        noise_px=0.3,
+        false_stars=2,
+        faintest=faintest,
+        known_deg=None,
+        searched_deg=(4.0, 60.0),
+    )
+    for seed in range(5):
+        drawn = _drawn(kind, seed)
+        assert _right(identify(drawn.field(), SKY), drawn), seed
+
+
 @pytest.mark.parametrize("known_deg", [0.1, None])
 def test_points_strewn_at_random_are_refused(known_deg: float | None) -> None:
     kind = ListKind(known_deg=known_deg, noise_px=0.3)
