@@ -39,7 +39,7 @@ from ground.commands.options import add_field, add_output, add_picture, positive
 from ground.pictures.sky_picture import draw_solution
 
 ARCSECONDS = math.degrees(1.0) * 3600.0
-UNKNOWN_DEG = 10.0, 30.0
+UNKNOWN_DEG = 4.0, 60.0
 """Fields of view that are searched when none is given."""
 _FOV_TOLERANCE = 0.05
 

@@ -59,8 +59,8 @@ def _tracker(camera: Camera) -> TrackerSettings | None:
     scale = (1.0 / spread, spread)
     index = Path(section.index) if section.index is not None else None
     velocity = None if section.velocity is None else np.array(section.velocity)
-    # The camera is known on board: no mirror is in its path that the configuration does not name.
-    identification = IdentificationSettings(mirror=False)
+    # The camera is known on board: no mirror is in its path, and its focal length is as good as configured.
+    identification = IdentificationSettings(mirror=False, hint_error=1.0)
     solve = SolveSettings(detection=detection, identification=identification, velocity=velocity)
     return TrackerSettings(solve, scale, index)
 

@@ -5,7 +5,7 @@ guide stars, all at once. Each match votes for its three pairs of an observed an
 occur in many triangles, chance pairs in one. The matches with the most votes are verified against the whole
 field until one holds. If none does, triangles spread over all stars are looked up: of a thousand enough are
 of true stars to win the vote, though most stars and the brightest be false. Last the field is tried as a
-mirror shows it.
+mirror shows it, and with a scale outside of a narrow range that was given as a hint.
 
 The shape on the sphere depends on the scale of the image, though little: a wide range of scales is tried in
 steps, each narrow enough for the ratios of the sides to stay within the tolerance.
@@ -44,6 +44,8 @@ class IdentificationSettings:
         work: entries of the index that may be read in total.
         verified: candidates of each batch that are verified at most.
         mirror: whether the field is searched for as a mirror shows it too.
+        hint_error: factor by which a scale within a narrow range, a hint, may lie outside of that range after
+            all; 1 where the range is certain. A calibrated scale, (1, 1), is always believed.
         verification: when a candidate is accepted.
     """
 
@@ -53,14 +55,15 @@ class IdentificationSettings:
     work: int = 600_000
     verified: int = 12
     mirror: bool = True
+    hint_error: float = 1.25
     verification: VerificationSettings = field(default_factory=VerificationSettings)
 
 
 # Tolerance and verified candidates of triangles spread over many stars: of these there are enough that some
 # may be missed, and the true ones have many votes.
 _OF_SPREAD = 0.6
-# A mirrored match must be ten times less likely by chance: most pictures are not mirrored.
-_MIRROR_IS_RARE = 10.0
+# A match in a mirror, or against a hint, must be ten times less likely by chance: most pictures need neither.
+_RARE = 10.0
 DEFAULT = IdentificationSettings()
 
 
@@ -71,10 +74,14 @@ def identify(
     if len(observed) < settings.verification.least_matches:
         return nothing(observed, Status.TOO_FEW_STARS)
     answer = _search(observed, sky, settings, 1.0)
-    if answer.status is Status.IDENTIFIED or not settings.mirror:
-        return answer
-    answer = _search(observed.mirrored(), sky, settings, _MIRROR_IS_RARE)
-    return replace(answer, mirrored=answer.status is Status.IDENTIFIED)
+    if answer.status is not Status.IDENTIFIED and settings.mirror:
+        answer = _search(observed.mirrored(), sky, settings, _RARE)
+        answer = replace(answer, mirrored=answer.status is Status.IDENTIFIED)
+    lowest, highest = observed.scale
+    if answer.status is not Status.IDENTIFIED and 1.0 < highest / lowest < settings.hint_error**2:
+        wider = lowest / settings.hint_error, highest * settings.hint_error
+        answer = _search(replace(observed, scale=wider), sky, settings, _RARE)
+    return answer
 
 
 def _search(

@@ -41,7 +41,7 @@ class IndexSettings:
     faintest: float = 8.5
     epoch: float = 2026.5
     resolution: float = float(np.deg2rad(40.0 / 3600.0))
-    smallest: float = float(np.deg2rad(2.0))
+    smallest: float = float(np.deg2rad(1.5))
     largest: float = float(np.deg2rad(25.0))
     density: float = 7.5
     few: int = 5

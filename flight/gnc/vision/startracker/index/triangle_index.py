@@ -121,9 +121,10 @@ def _of_circles(direction: FloatArray, smallest: float, radius: float, few: int)
 
     centres = evenly_spread(math.ceil(4.0 * math.pi / (_CIRCLES_APART * radius) ** 2))
     # Most circles find enough among the brightest stars of the sky, the others among all.
-    brightest = math.ceil(_ENOUGH * few * 4.0 / radius**2)
+    brightest = min(math.ceil(_ENOUGH * few * 4.0 / radius**2), len(direction))
     chosen = np.full((len(centres), few), len(direction))
-    for stars in (direction[:brightest], direction):
+    for count in sorted({brightest, len(direction)}):
+        stars = direction[:count]
         poor = np.flatnonzero(chosen[:, -1] == len(direction))
         for circle, inside in zip(poor, cKDTree(stars).query_ball_point(centres[poor], radius), strict=True):
             first = np.sort(inside)[:few]
