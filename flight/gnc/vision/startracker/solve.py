@@ -136,8 +136,6 @@ def solve_motion(
     if not len(chosen):
         return seen
     seen = replace(seen, points=motion.stars[chosen], covariance=motion.star_covariance[chosen])
-    # A mirrored turn is another turn: the rate of a mirrored picture would be wrong.
-    settings = replace(settings, identification=replace(settings.identification, mirror=False))
     solution = _identify(seen, motion.flux[chosen], scale, sky, settings, prior)
     if solution.fix is None:
         return solution
@@ -194,7 +192,11 @@ def _identify(
             return _with_attitude(replace(seen, tracked=True), near, sky, settings)
     if settings.method is not None:
         return _with_attitude(seen, settings.method(stars, sky), sky, settings)
-    found = identify(stars, sky, settings.identification)
+    options = settings.identification
+    if seen.kind is FrameKind.STREAKS:
+        # A mirrored turn is another turn: the rate of a mirrored picture would be wrong.
+        options = replace(options, mirror=False)
+    found = identify(stars, sky, options)
     if found.mirrored:
         # Fitted as it should be, reported as it came.
         return _mirrored(replace(_with_attitude(_mirrored(seen), found, sky, settings), mirrored=True))
