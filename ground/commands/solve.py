@@ -260,9 +260,7 @@ def _text(solution: FrameSolution, sky: SkyIndex, exposure: float | None, second
         f"by chance:        10^{solution.log10_false_alarm:.0f}",
     ]
     if solution.mirrored:
-        lines.append(
-            "mirrored:         yes; the attitude is that of the picture mirrored back"
-        )
+        lines.append("mirrored:         yes; the attitude is that of the picture mirrored back")
     named = [PROPER_NAMES.get(star["hip"]) or f"HIP {star['hip']}" for star in values["stars"][:8]]
     lines.append(f"brightest:        {', '.join(named)}")
     lines += _motion_text(solution, exposure)
