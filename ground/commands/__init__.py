@@ -8,6 +8,7 @@ COMMANDS = {
     "identify": "identify the body's constants from a short flight",
     "rate": "estimate the body rate from a picture of star streaks",
     "solve": "determine where a picture of the sky points, and identify its stars",
+    "index": "make the sky index of a mission's camera",
     "camera": "take frames from the configured camera and check them",
     "horizon": "find the nadir in a picture of the Earth's limb",
     "calibrate": "calibrate a camera's lens from pictures of the sky",

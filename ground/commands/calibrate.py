@@ -18,6 +18,7 @@ from flight.gnc.camera.lens import CameraModel, Lens
 from flight.gnc.errors import UsageError
 from flight.gnc.math.arrays import Image
 from flight.gnc.vision.frame_job import solve_frame
+from flight.gnc.vision.startracker.identification.lost_in_space import IdentificationSettings
 from flight.gnc.vision.startracker.index.build import default_index
 from flight.gnc.vision.startracker.index.sky_index import SkyIndex
 from flight.gnc.vision.startracker.solution import FrameSolution
@@ -29,6 +30,8 @@ from ground.commands.solve import lens_of_field
 
 _ROUNDS = 3
 _LEAST_SIGMA_PX = 0.02
+# A lens is not fitted to pictures that show the sky as a mirror does.
+_SETTINGS = SolveSettings(identification=IdentificationSettings(mirror=False))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,7 +113,7 @@ def _solve(
         if sys.stderr.isatty():
             sys.stderr.write(f"\rround {round_number + 1} of {_ROUNDS}: picture {number} of {len(frames)} ")
             sys.stderr.flush()
-        pictures.append(Picture(path, pixels, solve_frame(pixels, camera, scale, 1.0, sky, SolveSettings())))
+        pictures.append(Picture(path, pixels, solve_frame(pixels, camera, scale, 1.0, sky, _SETTINGS)))
     if sys.stderr.isatty():
         sys.stderr.write("\n")
     return pictures

@@ -39,7 +39,7 @@ from ground.commands.options import add_field, add_output, add_picture, positive
 from ground.pictures.sky_picture import draw_solution
 
 ARCSECONDS = math.degrees(1.0) * 3600.0
-UNKNOWN_DEG = 10.0, 30.0
+UNKNOWN_DEG = 4.0, 60.0
 """Fields of view that are searched when none is given."""
 _FOV_TOLERANCE = 0.05
 
@@ -201,6 +201,7 @@ def facts(solution: FrameSolution, sky: SkyIndex, exposure: float | None, second
         "quaternion": solution.fix.quaternion.tolist(),
         "covariance_rad2": solution.fix.covariance.tolist(),
         "field_of_view_deg": math.degrees(fov),
+        "mirrored": solution.mirrored,
         "field_of_view_sigma_deg": math.degrees(math.sin(fov) * solution.scale_sigma),
         "focal_length_px": camera.focal_length,
         "log10_false_alarm": chance if math.isfinite(chance) else None,
@@ -258,6 +259,8 @@ def _text(solution: FrameSolution, sky: SkyIndex, exposure: float | None, second
         f" residual {rms:.2f} px rms an axis",
         f"by chance:        10^{solution.log10_false_alarm:.0f}",
     ]
+    if solution.mirrored:
+        lines.append("mirrored:         yes; the attitude is that of the picture mirrored back")
     named = [PROPER_NAMES.get(star["hip"]) or f"HIP {star['hip']}" for star in values["stars"][:8]]
     lines.append(f"brightest:        {', '.join(named)}")
     lines += _motion_text(solution, exposure)

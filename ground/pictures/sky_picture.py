@@ -54,6 +54,8 @@ def draw_solution(picture: Picture, solution: FrameSolution, sky: SkyIndex) -> P
     faintest = float(sky.stars.magnitude[solution.star[solution.matched]].max())
     bright = sky.stars.brighter_than(faintest)
     places = solution.camera.project(bright.direction @ matrix.T)
+    if solution.mirrored:
+        places[:, 0] = 2.0 * solution.camera.centre[0] - places[:, 0]
     inside = np.flatnonzero(solution.camera.contains(places))
     for place in places[inside]:
         draw_ring(drawn, place, 9.0 * scale, _EXPECTED)
@@ -88,19 +90,23 @@ def _with_text(
         place, anchor = (x + 11.0 * scale, "lm") if right else (x - 11.0 * scale, "rm")
         draw.text((place, y), text, fill=_NAME, font=font, anchor=anchor)
     if solution.fix is not None:
-        _draw_compass(draw, picture.shape, Pointing.of(solution.fix.quaternion), font, scale)
+        _draw_compass(draw, picture.shape, solution, font, scale)
     return np.asarray(image)
 
 
 def _draw_compass(
-    draw: ImageDraw.ImageDraw, shape: tuple[int, ...], pointing: Pointing, font: Any, scale: float
+    draw: ImageDraw.ImageDraw, shape: tuple[int, ...], solution: FrameSolution, font: Any, scale: float
 ) -> None:
     """Draw north and east as seen at the boresight, in the picture's lower left corner."""
     size = _ARROW_PART * max(shape[:2])
     origin = np.array([1.6 * size, shape[0] - 1.6 * size])
+    assert solution.fix is not None  # there is a compass to draw
+    roll = Pointing.of(solution.fix.quaternion).roll
     # Up stands `roll` from north towards east, and east is to the left of north.
-    north = np.array([np.sin(pointing.roll), -np.cos(pointing.roll)])
+    north = np.array([np.sin(roll), -np.cos(roll)])
     east = np.array([north[1], -north[0]])
+    if solution.mirrored:
+        north, east = north * [-1.0, 1.0], east * [-1.0, 1.0]
     for direction, length, letter in ((north, size, "N"), (east, 0.6 * size, "E")):
         tip = origin + length * direction
         draw.line([tuple(origin), tuple(tip)], fill=_COMPASS, width=max(2, round(2.0 * scale)))

@@ -9,6 +9,7 @@ import numpy as np
 
 from flight.gnc.vision.frame_job import TrackerSettings
 from flight.gnc.vision.startracker.detection import DetectionSettings
+from flight.gnc.vision.startracker.identification.lost_in_space import IdentificationSettings
 from flight.gnc.vision.startracker.solve import SolveSettings
 from flight.gnc.vision.streaks.corners.settings import StreakSettings
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
@@ -58,7 +59,10 @@ def _tracker(camera: Camera) -> TrackerSettings | None:
     scale = (1.0 / spread, spread)
     index = Path(section.index) if section.index is not None else None
     velocity = None if section.velocity is None else np.array(section.velocity)
-    return TrackerSettings(SolveSettings(detection=detection, velocity=velocity), scale, index)
+    # The camera is known on board: no mirror is in its path, and its focal length is as good as configured.
+    identification = IdentificationSettings(mirror=False, hint_error=1.0)
+    solve = SolveSettings(detection=detection, identification=identification, velocity=velocity)
+    return TrackerSettings(solve, scale, index)
 
 
 def _saturation(camera: Camera) -> float:

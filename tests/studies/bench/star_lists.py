@@ -33,8 +33,11 @@ class ListKind:
         magnitude_error: of the instrumental magnitudes, one sigma.
         lost: part of the stars that is missing.
         order: "brightness", or "none" for a shuffled list without magnitudes.
-        known_deg: by which the field of view may differ from the believed one; None: 10 to 30 deg.
+        known_deg: by which the field of view may differ from the believed one; None: see `searched_deg`.
         distortion_px: radial distortion at the corner.
+        searched_deg: lowest and highest field of view believed possible where `known_deg` is None.
+        bright: whether the false stars are all brighter than the true ones.
+        mirrored: whether the image is left-right mirrored.
     """
 
     field_deg: float = 12.0
@@ -46,6 +49,9 @@ class ListKind:
     order: str = "brightness"
     known_deg: float | None = 0.1
     distortion_px: float = 0.0
+    searched_deg: tuple[float, float] = (10.0, 30.0)
+    bright: bool = False
+    mirrored: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,13 +81,14 @@ class StarList:
         half = 0.5 * PIXELS / camera.focal_length
         sigma = np.full(len(self.pixels), self.kind.noise_px / camera.focal_length)
         magnitude = None if self.kind.order == "none" else self.magnitude
-        return StarField(camera.unit_vectors(self.pixels), sigma, (half, half), scale, magnitude)
+        seen = StarField(camera.unit_vectors(self.pixels), sigma, (half, half), scale, magnitude)
+        return seen.mirrored() if self.kind.mirrored else seen
 
 
 def believed_field(kind: ListKind) -> tuple[float, tuple[float, float]]:
     """Return the believed field of view in deg and the range of scale that goes with it."""
     if kind.known_deg is None:
-        low, high = 10.0, 30.0
+        low, high = kind.searched_deg
         believed = float(np.rad2deg(2.0 * np.arctan(np.sqrt(_tangent(low) * _tangent(high)))))
     else:
         low, high = kind.field_deg - kind.known_deg, kind.field_deg + kind.known_deg
@@ -116,6 +123,8 @@ def draw(kind: ListKind, stars: GuideStars, rng: np.random.Generator) -> StarLis
         if len(near)
         else np.full(kind.false_stars, kind.faintest)
     )
+    if kind.bright:
+        false_magnitude = seen_magnitude.min(initial=kind.faintest) - rng.random(kind.false_stars)
     pixels = np.concatenate([pixels, false])
     magnitude = np.concatenate([seen_magnitude, false_magnitude])
     star = np.concatenate([near, np.full(kind.false_stars, -1)])

@@ -40,7 +40,7 @@ _RIGHT_DEG = 0.05
 _SHARE = 0.8
 _PEERS_RANDOM = 20
 _RAYLEIGH = 1.1774
-_ARCSECONDS = 3600.0 * 180.0 / np.pi
+ARCSECONDS = 3600.0 * 180.0 / np.pi
 _INSTALL = (
     "give --peer-python the Python of an environment with them: pip install cedar-solve tetra3rs"
     " (cedar-solve wants numpy below 2, so an environment of their own)"
@@ -156,7 +156,7 @@ def row_of(
         "median_ms": float(np.median(ms)),
         "p95_ms": float(np.percentile(ms, 95)),
         "max_ms": float(ms.max()),
-        "error_arcsec": float(np.median(errors[right]) * _ARCSECONDS) if right.any() else None,
+        "error_arcsec": float(np.median(errors[right]) * ARCSECONDS) if right.any() else None,
         "over_bound": float(np.median(ratio)) if right.any() else None,
         "ratios": ratio.tolist(),
     }

@@ -42,6 +42,8 @@ class FrameSolution:
         log10_false_alarm: of the probability that a frame of random points would have been solved.
         tracked: whether the stars were found near the prior attitude.
         motion: from the streaks, camera frame; None for points.
+        mirrored: whether the picture shows the sky as a mirror does; `fix` is then of the picture with left
+            and right exchanged about the optical axis, `points` and `expected` are of the picture as it came.
     """
 
     status: SolveStatus
@@ -57,6 +59,7 @@ class FrameSolution:
     log10_false_alarm: float = 0.0
     tracked: bool = False
     motion: MotionResult | None = None
+    mirrored: bool = False
 
     @property
     def matched(self) -> IntArray:

@@ -7,13 +7,15 @@ that of mid-exposure.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from flight.gnc.attitude.wahba import AttitudeError
-from flight.gnc.camera.lens import CameraModel
+from flight.gnc.camera.lens import CameraModel, Lens, LensError
+from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.math.arrays import FloatArray, Image
 from flight.gnc.math.quaternion import attitude_matrix
 from flight.gnc.vision.startracker.aberration import apparent
@@ -195,7 +197,27 @@ def _identify(
             return _with_attitude(replace(seen, tracked=True), near, sky, settings)
     if settings.method is not None:
         return _with_attitude(seen, settings.method(stars, sky), sky, settings)
-    return _with_attitude(seen, identify(stars, sky, settings.identification), sky, settings)
+    options = settings.identification
+    if seen.kind is FrameKind.STREAKS:
+        # A mirrored turn is another turn: the rate of a mirrored picture would be wrong.
+        options = replace(options, mirror=False)
+    found = identify(stars, sky, options)
+    if found.mirrored:
+        # Fitted as it should be, reported as it came.
+        return _mirrored(replace(_with_attitude(_mirrored(seen), found, sky, settings), mirrored=True))
+    return _with_attitude(seen, found, sky, settings)
+
+
+def _mirrored(seen: FrameSolution) -> FrameSolution:
+    """Return `seen` with left and right of its places exchanged about the optical axis."""
+    axis = np.array([2.0 * seen.camera.centre[0], 0.0])
+    turned = np.array([-1.0, 1.0])
+    return replace(
+        seen,
+        points=axis + turned * seen.points,
+        expected=axis + turned * seen.expected if len(seen.expected) else seen.expected,
+        covariance=seen.covariance * np.outer(turned, turned),
+    )
 
 
 def star_field(seen: FrameSolution, flux: FloatArray | None, scale: tuple[float, float]) -> StarField:
@@ -217,7 +239,7 @@ def _with_attitude(
     if found.status is not Status.IDENTIFIED or found.fix is None:
         return replace(seen, status=SolveStatus(found.status.value), reason=_reason(found.status, seen))
     free_scale = found.scale_sigma > 0.0
-    camera = seen.camera.rescaled(1.0 / found.scale)
+    camera = _camera_found(seen.camera, found)
     chosen = np.flatnonzero(found.star >= 0)
     reference = sky.stars.direction[found.star[chosen]]
     if settings.velocity is not None:
@@ -230,8 +252,11 @@ def _with_attitude(
     except AttitudeError as error:
         return replace(seen, status=SolveStatus.AMBIGUOUS, reason=str(error))
     camera = camera.rescaled(1.0 / fit.scale)
+    fix = fit.fix
+    if found.from_lens is not None:
+        fix = replace(fix, covariance=fix.covariance + found.from_lens)
     expected = np.full_like(seen.points, np.nan)
-    expected[chosen] = camera.project(reference @ attitude_matrix(fit.fix.quaternion).T)
+    expected[chosen] = camera.project(reference @ attitude_matrix(fix.quaternion).T)
     return replace(
         seen,
         status=SolveStatus.SOLVED,
@@ -239,10 +264,23 @@ def _with_attitude(
         camera=camera,
         star=found.star,
         expected=expected,
-        fix=fit.fix,
+        fix=fix,
         scale_sigma=fit.scale_sigma,
         log10_false_alarm=found.log10_false_alarm,
     )
+
+
+def _camera_found(camera: CameraModel, found: Identification) -> CameraModel:
+    """Return the camera with the focal length, and the distortion of a pinhole, that were found."""
+    camera = camera.rescaled(1.0 / found.scale)
+    if found.distortion == 0.0 or not isinstance(camera, Pinhole):
+        return camera
+    # Of the tangent's square, where `distortion` is of the corner's.
+    corner = 0.5 * math.hypot(camera.columns, camera.rows) / camera.focal_length
+    try:
+        return replace(Lens.of(camera), k1=found.distortion / corner**2)
+    except LensError:
+        return camera
 
 
 def _reason(status: Status, seen: FrameSolution) -> str:

@@ -42,6 +42,10 @@ class StarField:
             scale=(self.scale[0] / factor, self.scale[1] / factor),
         )
 
+    def mirrored(self) -> StarField:
+        """Return the field as a mirror shows it: left and right exchanged about the boresight."""
+        return replace(self, direction=self.direction * np.array([-1.0, 1.0, 1.0]))
+
     def subset(self, chosen: IntArray) -> StarField:
         """Return the field of the stars `chosen` (k,) by number, in that order."""
         magnitude = None if self.magnitude is None else self.magnitude[chosen]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from flight.gnc.attitude.wahba import AttitudeFix
-from flight.gnc.math.arrays import IntArray
+from flight.gnc.math.arrays import FloatArray, IntArray
 
 
 class Status(Enum):
@@ -30,6 +30,11 @@ class Identification:
         scale_sigma: its standard deviation; 0 when the scale was given.
         log10_false_alarm: of the probability that random stars would match as well anywhere in the sky; 0 if
             unknown.
+        distortion: relative shift of a star in the corner that the lens was found to have (see the module
+            `distortion`); 0 where the stars matched without.
+        from_lens: (3, 3) rad^2, the part of the covariance of `fix` that is the uncertainty of `distortion`.
+        mirrored: whether the sky was found in the mirrored field (`StarField.mirrored`); `fix` is the
+            attitude of that field.
     """
 
     status: Status
@@ -38,3 +43,6 @@ class Identification:
     scale: float = 1.0
     scale_sigma: float = 0.0
     log10_false_alarm: float = 0.0
+    distortion: float = 0.0
+    from_lens: FloatArray | None = None
+    mirrored: bool = False

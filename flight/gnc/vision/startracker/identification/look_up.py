@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from flight.gnc.math.arrays import BoolArray, FloatArray, IntArray
 from flight.gnc.vision.startracker.identification.field import StarField
@@ -16,6 +17,7 @@ from flight.gnc.vision.startracker.index.triangle_index import (
     CELLS,
     FINE,
     LEAST_RATIO,
+    RUN_BITS,
     SIZE_BITS,
     SIZE_UNIT,
 )
@@ -58,13 +60,13 @@ class TriangleMatches:
     """Observed triangles that look like triangles of guide stars, corner by corner.
 
     Attributes:
-        observed: (k, 3) numbers of observed stars.
-        star: (k, 3) numbers of guide stars.
+        observed: (k, 3) uint32, numbers of observed stars.
+        star: (k, 3) uint32, numbers of guide stars.
         scale: (k,) factor of the tangents that makes the longest sides equal.
     """
 
-    observed: IntArray
-    star: IntArray
+    observed: npt.NDArray[np.uint32]
+    star: npt.NDArray[np.uint32]
     scale: FloatArray
 
     def __len__(self) -> int:
@@ -82,25 +84,18 @@ class TriangleMatches:
         )
 
     def votes(self) -> IntArray:
-        """Return for each pair of each match (k, 3) how many matches of about the same scale have it.
-
-        Scales are counted in two sets of bins, half a bin apart, and the larger count is used: no scale is
-        at the edge of both.
-        """
+        """Return for each pair of each match (k, 3) how many matches of about the same scale have it."""
         bins = np.log(self.scale) * _BINS_PER_LN_SCALE
-        if bins.max() - bins.min() < 1.0:
-            return self._votes_in(np.zeros_like(bins))
-        return np.asarray(np.maximum(self._votes_in(np.floor(bins)), self._votes_in(np.floor(bins + 0.5))))
-
-    def _votes_in(self, scale_bin: FloatArray) -> IntArray:
-        slots = 1 << max(13, (3 * self.star.size).bit_length())
+        bins -= bins.min()
+        bits = max(13, self.star.size.bit_length())
         # A multiplicative hash: two pairs rarely share a slot, and if they do it is harmless.
-        code = (self.star * 1021 + self.observed) * 257 + scale_bin.astype(np.int64)[:, None]
-        slot = ((code * 2654435761) >> 11) & (slots - 1)
-        return np.asarray(np.bincount(slot.ravel(), minlength=slots)[slot])
+        code = (self.star * np.uint32(1021) + self.observed) * np.uint32(257)
+        code += bins.astype(np.uint32)[:, None]
+        slot = (code * np.uint32(2654435761)) >> np.uint32(32 - bits)
+        return np.asarray(np.bincount(slot.ravel(), minlength=1 << bits)[slot])
 
 
-_BINS_PER_LN_SCALE = 25.0
+_BINS_PER_LN_SCALE = 15.0
 
 
 def look_up(
@@ -136,30 +131,47 @@ def look_up(
     lowest = size * (steps.lowest / steps.middle)[step] * (1.0 - slack)
     highest = size * (steps.highest / steps.middle)[step] * (1.0 + slack)
     query, short, middle, begin, end = _runs(sky, ratio, slack, left, lowest, highest)
-    entry, run = _entries(begin, end, most)
+    begin, count = _affordable(begin, end, most)
+    query, short, middle = query[: len(count)], short[: len(count)], middle[: len(count)]
+    # int32: the entries are the bulk of the work.
+    first = (begin - (np.cumsum(count) - count)).astype(np.int32)
+    entry = np.arange(int(count.sum()), dtype=np.int32) + np.repeat(first, count)
+    near = np.ones(len(entry), dtype=np.bool_)
+    for column, cells in enumerate((short, middle)):
+        lowest_place, width = _places(ratio[query, column], slack[query], cells)
+        place = sky.triangles.shape[:, column][entry]
+        # Below the lowest place the difference of the bytes wraps round to a large one.
+        near &= place - np.repeat(lowest_place, count) <= np.repeat(width, count)
+    chosen = np.flatnonzero(near)
     total = len(entry)
-    # In units of the finest division of a ratio, from its middle.
-    wanted = ratio * (CELLS * FINE) - 0.5
-    off_short = (short * FINE - wanted[query, 0])[run] + sky.triangles.shape[entry, 0]
-    off_middle = (middle * FINE - wanted[query, 1])[run] + sky.triangles.shape[entry, 1]
-    reach = (slack[query] * (CELLS * FINE) + 0.5)[run]
-    near = np.flatnonzero((np.abs(off_short) <= reach) & (np.abs(off_middle) <= reach))
-    entry, query = entry[near], query[run[near]]
+    entry = entry[chosen]
+    query = query[np.searchsorted(np.cumsum(count), chosen, side="right")]
     longest = (sky.triangles.key[entry] & np.uint32(_LARGEST_SIZE)) * SIZE_UNIT
+    # The runs hold some triangles too small or too large for the step.
+    fits = np.flatnonzero((longest >= lowest[query]) & (longest <= highest[query]))
+    entry, query, longest = entry[fits], query[fits], longest[fits]
     scale = longest / size[query] * steps.middle[step[query]]
-    star = sky.triangles.corners[entry].astype(np.int64)
-    return TriangleMatches(corners[query], star, scale), total
+    star = sky.triangles.corners[entry].astype(np.uint32)
+    return TriangleMatches(corners[query].astype(np.uint32), star, scale), total
 
 
-def _entries(begin: IntArray, end: IntArray, most: int) -> tuple[IntArray, IntArray]:
-    """Return the entries (k,) of the first runs, `most` at most, and the run of each."""
+def _affordable(begin: IntArray, end: IntArray, most: int) -> tuple[IntArray, IntArray]:
+    """Return begin and length of the first runs, which hold `most` entries at most."""
     count = end - begin
-    read = np.cumsum(count)
-    if len(read) and read[-1] > most:
-        kept = int(np.searchsorted(read, most))
-        count, read, begin = count[:kept], read[:kept], begin[:kept]
-    run = np.repeat(np.arange(len(count)), count)
-    return np.arange(len(run)) + (begin - read + count)[run], run
+    kept = int(np.searchsorted(np.cumsum(count), most, side="right"))
+    return begin[:kept], count[:kept]
+
+
+def _places(
+    ratio: FloatArray, slack: FloatArray, cells: IntArray
+) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
+    """Return the lowest place in its cell that is within `slack` of each ratio, and how many follow it."""
+    # In units of the finest division of a ratio, from its middle.
+    wanted = ratio * (CELLS * FINE) - 0.5 - cells * FINE
+    reach = slack * (CELLS * FINE) + 0.5
+    lowest = np.clip(np.ceil(wanted - reach), 0, FINE - 1)
+    highest = np.clip(np.floor(wanted + reach), lowest, FINE - 1)
+    return lowest.astype(np.uint8), (highest - lowest).astype(np.uint8)
 
 
 def _forms(
@@ -211,7 +223,6 @@ def _runs(
     form = ((left[query] * CELLS + short) * CELLS + middle) << SIZE_BITS
     first = np.minimum(lowest / SIZE_UNIT, _LARGEST_SIZE).astype(np.int64)[query]
     last = np.minimum(highest / SIZE_UNIT, _LARGEST_SIZE).astype(np.int64)[query]
-    # The keys' own type: searchsorted would convert all keys to another.
-    begin = np.searchsorted(sky.triangles.key, (form | first).astype(np.uint32))
-    end = np.searchsorted(sky.triangles.key, (form | last).astype(np.uint32), side="right")
+    below = sky.triangles.below
+    begin, end = below[(form | first) >> RUN_BITS], below[((form | last) >> RUN_BITS) + 1]
     return query, short, middle, begin, end

@@ -3,8 +3,9 @@
 Every triangle of the brightest observed stars is looked up by shape, turning and size among those of the
 guide stars, all at once. Each match votes for its three pairs of an observed and a guide star: true pairs
 occur in many triangles, chance pairs in one. The matches with the most votes are verified against the whole
-field until one holds. If none does, fainter stars are added until the budget is spent; last come triangles of
-neighbours, for a list that is not in order of brightness.
+field until one holds. If none does, triangles spread over all stars are looked up: of a thousand enough are
+of true stars to win the vote, though most stars and the brightest be false. Last the field is tried as a
+mirror shows it, and with a scale outside of a narrow range that was given as a hint.
 
 The shape on the sphere depends on the scale of the image, though little: a wide range of scales is tried in
 steps, each narrow enough for the ratios of the sides to stay within the tolerance.
@@ -14,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -22,7 +23,7 @@ from flight.gnc.math.arrays import FloatArray
 from flight.gnc.vision.startracker.identification.field import StarField
 from flight.gnc.vision.startracker.identification.identification import Identification, Status
 from flight.gnc.vision.startracker.identification.look_up import ScaleSteps, TriangleMatches, look_up
-from flight.gnc.vision.startracker.identification.observed_triangles import batches_of
+from flight.gnc.vision.startracker.identification.observed_triangles import BatchSizes, batches_of
 from flight.gnc.vision.startracker.identification.refinement import stretched
 from flight.gnc.vision.startracker.identification.verification import (
     VerificationSettings,
@@ -39,20 +40,30 @@ class IdentificationSettings:
     Attributes:
         tolerance: of the ratios of sides, in their sigmas.
         distortion: additional error of a ratio of sides, for a lens that is no pinhole.
-        batches: numbers of triangles looked up, batch after batch, at each step of scale.
+        batches: numbers of triangles looked up.
         work: entries of the index that may be read in total.
         verified: candidates of each batch that are verified at most.
+        mirror: whether the field is searched for as a mirror shows it too.
+        hint_error: factor by which a scale within a narrow range, a hint, may lie outside of that range after
+            all; 1 where the range is certain. A calibrated scale, (1, 1), is always believed.
         verification: when a candidate is accepted.
     """
 
     tolerance: float = 3.0
     distortion: float = 0.0015
-    batches: tuple[int, ...] = (60, 250, 800)
-    work: int = 50_000
+    batches: BatchSizes = field(default_factory=BatchSizes)
+    work: int = 600_000
     verified: int = 12
+    mirror: bool = True
+    hint_error: float = 1.25
     verification: VerificationSettings = field(default_factory=VerificationSettings)
 
 
+# Tolerance and verified candidates of triangles spread over many stars: of these there are enough that some
+# may be missed, and the true ones have many votes.
+_OF_SPREAD = 0.6
+# A match in a mirror, or against a hint, must be ten times less likely by chance: most pictures need neither.
+_RARE = 10.0
 DEFAULT = IdentificationSettings()
 
 
@@ -62,17 +73,40 @@ def identify(
     """Return which stars the frame shows and their attitude, or why it cannot be identified."""
     if len(observed) < settings.verification.least_matches:
         return nothing(observed, Status.TOO_FEW_STARS)
+    answer = _search(observed, sky, settings, 1.0)
+    if answer.status is not Status.IDENTIFIED and settings.mirror:
+        answer = _search(observed.mirrored(), sky, settings, _RARE)
+        answer = replace(answer, mirrored=answer.status is Status.IDENTIFIED)
+    lowest, highest = observed.scale
+    if answer.status is not Status.IDENTIFIED and 1.0 < highest / lowest < settings.hint_error**2:
+        wider = lowest / settings.hint_error, highest * settings.hint_error
+        answer = _search(replace(observed, scale=wider), sky, settings, _RARE)
+    return answer
+
+
+def _search(
+    observed: StarField, sky: SkyIndex, settings: IdentificationSettings, searched: float
+) -> Identification:
+    """Return the identification of the field as it is."""
     steps = ScaleSteps.of(observed, settings.distortion)
     found: list[TriangleMatches] = []
     tried: set[tuple[int, int]] = set()
     work = 0
-    for triangles in batches_of(observed, settings.batches, len(steps)):
+    for triangles, spread in batches_of(observed, settings.batches, len(steps)):
+        share = _OF_SPREAD if spread else 1.0
         finds, read = look_up(
-            observed, sky, steps, triangles, settings.tolerance, settings.distortion, settings.work - work
+            observed,
+            sky,
+            steps,
+            triangles,
+            share * settings.tolerance,
+            settings.distortion,
+            settings.work - work,
         )
         found.append(finds)
-        for matrix, scale in _candidates(observed, sky, TriangleMatches.of(found), tried, settings.verified):
-            answer = verify_matrix(observed, sky, matrix, scale, 1.0, settings.verification)
+        most = round(share * settings.verified)
+        for matrix, scale in _candidates(observed, sky, TriangleMatches.of(found), tried, most):
+            answer = verify_matrix(observed, sky, matrix, scale, searched, settings.verification)
             if answer.status is Status.IDENTIFIED:
                 return answer
         work += read
@@ -88,9 +122,11 @@ def _candidates(
     if not len(finds):
         return
     votes = finds.votes().sum(axis=1)
-    order = np.argsort(-votes, kind="stable")
+    # Of all matches, which may be a hundred thousand, only the first in order are sorted.
+    first = np.argpartition(-votes, min(8 * most, len(votes) - 1))[: 8 * most]
+    order = first[np.lexsort((first, -votes[first]))]
     yielded = 0
-    for find in order[: 8 * most].tolist():
+    for find in order.tolist():
         pairs = list(zip(finds.observed[find].tolist(), finds.star[find].tolist(), strict=True))
         if sum(pair in tried for pair in pairs) >= 2:
             continue

@@ -61,9 +61,9 @@ class Refinement:
         return replace(self, covariance=self.covariance * factor)
 
 
-def stretched(direction: FloatArray, scale: float) -> FloatArray:
-    """Return unit vectors (n, 3) whose tangents x/z, y/z are `scale` times those of `direction` (n, 3)."""
-    if scale == 1.0:
+def stretched(direction: FloatArray, scale: float | FloatArray) -> FloatArray:
+    """Return unit vectors (n, 3) whose tangents x/z, y/z are `scale`, one or (n,), times `direction`'s."""
+    if isinstance(scale, float) and scale == 1.0:
         return direction
     x, y, z = direction.T
     longer = np.empty_like(direction)

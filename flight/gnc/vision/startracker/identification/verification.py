@@ -9,7 +9,8 @@ random (`chance`).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,9 +18,15 @@ import numpy.typing as npt
 from flight.gnc.math.arrays import FloatArray, IntArray
 from flight.gnc.math.quaternion import attitude_matrix
 from flight.gnc.vision.startracker.identification.chance import Chance
+from flight.gnc.vision.startracker.identification.distortion import fit_with_distortion
 from flight.gnc.vision.startracker.identification.field import StarField
 from flight.gnc.vision.startracker.identification.identification import Identification, Status
-from flight.gnc.vision.startracker.identification.refinement import Refinement, refine, stretched
+from flight.gnc.vision.startracker.identification.refinement import (
+    Refinement,
+    inflation,
+    refine,
+    stretched,
+)
 from flight.gnc.vision.startracker.index.sky_index import SkyIndex
 
 
@@ -52,6 +59,8 @@ class _Matching:
     log10_chance: float
 
 
+# Shares of the bright expected stars that match: with less a distorted lens is supposed, or nothing found.
+_FEW_MISSED, _MOST_MISSED = 0.8, 0.5
 # A candidate that begins more than this, in powers of ten, above the limit is given up.
 _HOPELESS = 7.0
 
@@ -103,7 +112,32 @@ def verify_matrix(
         if decided is None:
             return nothing(field)
         matching, refined = decided
+    # A calibrated lens has no distortion left; another has it where stars are missed or scatter.
+    if field.scale[1] > field.scale[0] and (
+        _share_of_bright(expected, matching.star) < _FEW_MISSED
+        or inflation(refined.squares, len(refined.covariance)) > 1.0
+    ):
+        return _distorted(field, sky, matching, refined)
     return _identified(field, matching, refined.widened())
+
+
+def _distorted(field: StarField, sky: SkyIndex, matching: _Matching, refined: Refinement) -> Identification:
+    """Return the identification with distortion fitted; NO_MATCH if most bright stars stay missed."""
+    width = _half_width(field, refined.scale)
+    expected = expected_stars(sky, refined.matrix, width, int(1.3 * len(field)) + 8)
+    found = fit_with_distortion(field, sky, expected, matching.observed, matching.star, refined)
+    if found is None or _share_of_bright(expected, found.star) < _MOST_MISSED:
+        return nothing(field)
+    grown = _Matching(found.observed, found.star, matching.log10_chance)
+    answer = _identified(field, grown, found.refined)
+    return replace(answer, distortion=found.distortion, from_lens=found.from_lens)
+
+
+def _share_of_bright(expected: npt.NDArray[np.intp], star: npt.NDArray[np.integer[Any]]) -> float:
+    """Return how many of the expected stars match, among those as bright as the brighter half of `star`."""
+    matched = np.isin(expected, star)
+    places = np.flatnonzero(matched)
+    return float(np.mean(matched[: places[(len(places) - 1) // 2] + 1])) if len(places) else 0.0
 
 
 def nothing(field: StarField, status: Status = Status.NO_MATCH) -> Identification:

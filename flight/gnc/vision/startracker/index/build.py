@@ -2,6 +2,7 @@
 
 The default index is made on first use, in some seconds, and kept in the cache folder: $XDG_CACHE_HOME, or
 ~/.cache, /knightcube. On board the installer makes it, and the configuration names its path.
+`python -m flight index --camera CONFIG` makes one for a mission's camera.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import argparse
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -35,30 +36,53 @@ class IndexSettings:
         smallest, largest: rad, longest sides of the triangles.
         density: number of stars that count as bright within 2.5 deg of a triangle of that size; larger for
             larger ones, so that every octave of size has about as many triangles.
+        few: brightest stars of any circle whose triangles are in the index.
     """
 
     faintest: float = 8.5
     epoch: float = 2026.5
     resolution: float = float(np.deg2rad(40.0 / 3600.0))
-    smallest: float = float(np.deg2rad(2.0))
+    smallest: float = float(np.deg2rad(1.5))
     largest: float = float(np.deg2rad(25.0))
     density: float = 7.5
+    few: int = 5
+
+    @classmethod
+    def of_field(cls, fov: float, pixel: float | None = None) -> IndexSettings:
+        """Return the settings for a camera of `fov` rad across, its pixels `pixel` rad wide if given.
+
+        Raises UsageError for a field below 2 or above 120 deg.
+        """
+        if not _NARROWEST <= fov <= _WIDEST:
+            raise UsageError(f"a field of {np.rad2deg(fov):g} deg: an index serves 2 to 120 deg")
+        longest = min(fov, DEFAULT.largest)
+        resolution = DEFAULT.resolution if pixel is None else _RESOLVED_PIXELS * pixel
+        return cls(smallest=_SMALLEST_SHARE * longest, largest=longest, resolution=resolution)
 
 
+_NARROWEST, _WIDEST = float(np.deg2rad(2.0)), float(np.deg2rad(120.0))
+# Of the largest triangle of a field: the smallest; and pixels between two stars that are seen as two.
+_SMALLEST_SHARE = 0.2
+_RESOLVED_PIXELS = 2.5
+_MOST_STARS = 1 << 16
 DEFAULT = IndexSettings()
 _BANDS_PER_OCTAVE = 2.5
 _REFERENCE_SIZE = float(np.deg2rad(2.5))
 
 
 def build(settings: IndexSettings = DEFAULT) -> SkyIndex:
-    """Return the index of the catalogue's stars."""
+    """Return the index of the catalogue's stars. Raises UsageError for too many or too few of them."""
     stars = catalogue.load()
     guide_stars = choose_guide_stars(stars, settings.faintest, settings.epoch, settings.resolution)
+    if not 3 <= len(guide_stars) <= _MOST_STARS:
+        raise UsageError(
+            f"{len(guide_stars)} stars to V {settings.faintest:g}: an index holds 3 to {_MOST_STARS}"
+        )
     count = round(_BANDS_PER_OCTAVE * np.log2(settings.largest / settings.smallest))
     sizes = np.geomspace(settings.smallest, settings.largest, count + 1)
     middle = np.sqrt(sizes[1:] * sizes[:-1])
     ranks = np.round(settings.density * (middle / _REFERENCE_SIZE) ** (2.0 / 3.0)).astype(np.int64)
-    triangles = build_triangles(guide_stars.direction, 2.0 * np.sin(0.5 * sizes), ranks)
+    triangles = build_triangles(guide_stars.direction, 2.0 * np.sin(0.5 * sizes), ranks, settings.few)
     return SkyIndex(guide_stars, proper_motion(guide_stars), triangles)
 
 
@@ -103,10 +127,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--epoch", type=float, default=DEFAULT.epoch, help="Julian year (default %(default)s)"
     )
     parser.add_argument("--faintest", type=float, default=DEFAULT.faintest, help="V (default %(default)s)")
+    parser.add_argument("--fov", type=float, metavar="DEG", help="of a mission's camera (default: 4 to 60)")
     options = parser.parse_args(arguments)
     begin = time.monotonic()
     try:
-        sky = build(IndexSettings(faintest=options.faintest, epoch=options.epoch))
+        settings = DEFAULT if options.fov is None else IndexSettings.of_field(np.deg2rad(options.fov))
+        sky = build(replace(settings, faintest=options.faintest, epoch=options.epoch))
         options.output.parent.mkdir(parents=True, exist_ok=True)
         save(sky, options.output)
     except (UsageError, ValueError) as error:

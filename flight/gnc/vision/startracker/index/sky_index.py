@@ -19,7 +19,7 @@ from flight.gnc.vision.startracker.index import table_file
 from flight.gnc.vision.startracker.index.guide_stars import GuideStars
 from flight.gnc.vision.startracker.index.triangle_index import TriangleIndex
 
-_VERSION = 2
+_VERSION = 3
 KIND = table_file.Kind(
     b"KCSKYIDX",
     _VERSION,

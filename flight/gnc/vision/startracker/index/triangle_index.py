@@ -6,6 +6,9 @@ it that is smaller than r. A triangle is kept if its longest side is at most r o
 of view enters: every size of field finds as many triangles, of stars that a frame of that size shows among
 its brightest. In any part of the sky there are as many stars, and a dense field adds no triangles.
 
+Beside a cluster of bright stars no star is among the brightest of its circle. So circles that cover the sky,
+of every radius, have the triangles of their `few` brightest stars as well.
+
 Keys: the ratios of the shortest and of the middle side to the longest, in cells of `CELL`; whether the
 corners opposite the shortest, the middle and the longest side turn left or right; the longest side itself.
 Of cells in that order the triangles of one cell within limits of size are one run of the sorted keys. Sides
@@ -14,7 +17,10 @@ are chords.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations
 
 import numpy as np
 import numpy.typing as npt
@@ -28,13 +34,20 @@ FINE = 256
 SIZE_BITS = 18
 SIZE_UNIT = 2.0**-SIZE_BITS
 """Of the longest side's chord, which is below 1."""
+RUN_BITS = 12
+"""Keys are counted in steps of 2^12 units of size: about one key each."""
 TIE = 1e-9
 """Relative tolerance of a side against a limit: the limits are sides themselves."""
 LEAST_RATIO = 0.1
 """Of the shortest to the longest side: flatter triangles discriminate little better than a pair."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+# Of the radius, between the centres of circles; and how many stars more than needed are looked through first.
+_CIRCLES_APART = 0.7
+_ENOUGH = 4.0
+
+
+@dataclass(frozen=True, eq=False)
 class TriangleIndex:
     """Triangles in order of their keys.
 
@@ -50,6 +63,13 @@ class TriangleIndex:
 
     def __len__(self) -> int:
         return len(self.key)
+
+    @cached_property
+    def below(self) -> npt.NDArray[np.int32]:
+        """How many keys are below each multiple of 2^RUN_BITS (f,), so that runs need no search."""
+        run = self.key >> np.uint32(RUN_BITS)
+        count = np.bincount(run, minlength=2 * CELLS * CELLS << (SIZE_BITS - RUN_BITS))
+        return np.concatenate([[0], np.cumsum(count)]).astype(np.int32)
 
 
 def reach(direction: FloatArray, rank: int, farthest: float) -> FloatArray:
@@ -79,13 +99,52 @@ def reach(direction: FloatArray, rank: int, farthest: float) -> FloatArray:
     return result
 
 
-def build(direction: FloatArray, sizes: FloatArray, ranks: IntArray) -> TriangleIndex:
+def build(direction: FloatArray, sizes: FloatArray, ranks: IntArray, few: int) -> TriangleIndex:
     """Return the triangles of stars (n, 3), the brightest first.
 
-    Between sizes[i] and sizes[i + 1] (b + 1,), chords of the longest side, are those of ranks[i] (b,).
+    Between sizes[i] and sizes[i + 1] (b + 1,), chords of the longest side, are those of ranks[i] (b,);
+    besides those of the `few` brightest stars of circles of these radii.
     """
     bands = zip(sizes[:-1], sizes[1:], ranks, strict=True)
-    return _indexed(direction, np.concatenate([_band(direction, *band) for band in bands]))
+    found = [np.sort(_band(direction, *band), axis=1) for band in bands]
+    if few >= 3:
+        found += [_of_circles(direction, sizes[0], radius, few) for radius in sizes[:-1]]
+    return _indexed(direction, np.unique(np.concatenate(found), axis=0))
+
+
+def _of_circles(direction: FloatArray, smallest: float, radius: float, few: int) -> IntArray:
+    """Return the triangles (m, 3) of the `few` brightest stars of each of many circles over the whole sky.
+
+    Their longest sides are chords from `smallest` to the diameter.
+    """
+    from scipy.spatial import cKDTree  # noqa: PLC0415 - to make a table, not to read one
+
+    centres = evenly_spread(math.ceil(4.0 * math.pi / (_CIRCLES_APART * radius) ** 2))
+    # Most circles find enough among the brightest stars of the sky, the others among all.
+    brightest = min(math.ceil(_ENOUGH * few * 4.0 / radius**2), len(direction))
+    chosen = np.full((len(centres), few), len(direction))
+    for count in sorted({brightest, len(direction)}):
+        stars = direction[:count]
+        poor = np.flatnonzero(chosen[:, -1] == len(direction))
+        for circle, inside in zip(poor, cKDTree(stars).query_ball_point(centres[poor], radius), strict=True):
+            first = np.sort(inside)[:few]
+            chosen[circle, : len(first)] = first
+    one, two, three = np.array(list(combinations(range(few), 3))).T
+    corners = np.stack([chosen[:, one], chosen[:, two], chosen[:, three]], axis=-1).reshape(-1, 3)
+    corners = np.unique(corners[corners[:, 2] < len(direction)], axis=0)
+    place = direction[corners]
+    side = np.linalg.norm(place - np.roll(place, 1, axis=1), axis=-1)
+    longest = side.max(axis=1)
+    return np.asarray(corners[(longest >= smallest) & (side.min(axis=1) >= LEAST_RATIO * longest)])
+
+
+def evenly_spread(count: int) -> FloatArray:
+    """Return unit vectors (count, 3) spread evenly over the sphere: a spiral by the golden angle."""
+    place = np.arange(count) + 0.5
+    z = 1.0 - 2.0 * place / count
+    turn = place * math.pi * (3.0 - math.sqrt(5.0))
+    across = np.sqrt(1.0 - z * z)
+    return np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=-1)
 
 
 def _band(direction: FloatArray, smallest: float, largest: float, rank: int) -> IntArray:

@@ -10,7 +10,13 @@ import pytest
 
 from flight.gnc.camera.images import read_image
 from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import conjugate, from_rotation_vector, multiply, to_rotation_vector
+from flight.gnc.math.quaternion import (
+    angle_between,
+    conjugate,
+    from_rotation_vector,
+    multiply,
+    to_rotation_vector,
+)
 from flight.gnc.vision.frame_job import solve_frame
 from flight.gnc.vision.startracker.solution import FrameSolution, SolveStatus
 from flight.gnc.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings
@@ -129,9 +135,20 @@ def test_a_photograph_is_solved_to_a_minute_of_arc(name: str) -> None:
 
 
 @pytest.mark.skipif(not _PHOTOGRAPHS.is_dir(), reason="the photographs of ../shared/data/sky are not here")
-def test_a_mirrored_photograph_is_refused() -> None:
-    """The sky in a mirror is no sky: an answer to it would be a false one."""
-    pixels = np.ascontiguousarray(read_image(_PHOTOGRAPHS / "esa_alt40_azi45.tiff")[:, ::-1])
-    camera = type(NARROW.pinhole)(pixels.shape[1], pixels.shape[0], 5110.0)
-    found = solve_frame(pixels, camera, (0.9, 1.1), 1.0, sky(), SolveSettings())
-    assert found.status is SolveStatus.NO_MATCH
+def test_a_mirrored_photograph_is_solved_and_said_to_be_mirrored() -> None:
+    """The attitude is that of the picture as it should be; the places are those of the picture as it came."""
+    upright = read_image(_PHOTOGRAPHS / "esa_alt40_azi45.tiff")
+    camera = type(NARROW.pinhole)(upright.shape[1], upright.shape[0], 5110.0)
+    good, mirrored = (
+        solve_frame(np.ascontiguousarray(pixels), camera, (0.9, 1.1), 1.0, sky(), SolveSettings())
+        for pixels in (upright, upright[:, ::-1])
+    )
+    assert good.fix is not None
+    assert mirrored.fix is not None
+    assert (good.mirrored, mirrored.mirrored) == (False, True)
+    assert angle_between(good.fix.quaternion, mirrored.fix.quaternion) < 1e-4
+    matched = mirrored.matched
+    assert np.abs(mirrored.points[matched] - mirrored.expected[matched]).max() < 5.0
+    first = np.flatnonzero(good.star == mirrored.star[matched[0]])[0]
+    across = upright.shape[1] - 1.0 - good.points[first, 0]
+    assert mirrored.points[matched[0], 0] == pytest.approx(across, abs=0.5)

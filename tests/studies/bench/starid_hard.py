@@ -1,0 +1,204 @@
+"""Star identification where lists are hard: `python -m tests.studies.bench starid_hard`.
+
+Fields of view unknown, false stars that are all brighter than the true ones, mirrored images, hints of the
+field that are 10 % wrong, lenses with 2 to 8 % of distortion that nobody calibrated, and points that show no
+part of the sky, with the times of their refusals. Lists as in the bench `starid`; `wrong` is an answer that
+is not right. Of distorted lenses an answer is misleading that is off by more than five of its own sigmas and
+120 arcseconds. The status is 1 when an answer is wrong or misleading. `--peer` runs tetra3rs or cedar-solve
+on the same lists.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from flight.gnc.math.quaternion import attitude_matrix
+from flight.gnc.vision.startracker.identification.identification import Identification
+from flight.gnc.vision.startracker.identification.lost_in_space import identify
+from flight.gnc.vision.startracker.index.build import default_index
+from flight.gnc.vision.startracker.index.guide_stars import GuideStars
+from flight.gnc.vision.startracker.index.sky_index import SkyIndex
+from tests.studies.bench.star_lists import PIXELS, ListKind, StarList, believed_field, draw, draw_random
+from tests.studies.bench.star_peers import PEERS
+from tests.studies.bench.starid import ARCSECONDS, Answer, peer_answers, pointing_error
+
+_SEED = 314_159
+_RIGHT_DEG = 0.05
+_SHARE = 0.8
+_MISLEADING_SIGMAS, _MISLEADING_ARCSEC = 5.0, 120.0
+_DISTORTION = 0.02, 0.08
+_HINT = 0.1
+_UNKNOWN = ListKind(noise_px=0.3, known_deg=None)
+_WIDE = replace(_UNKNOWN, searched_deg=(4.0, 60.0), false_stars=2)
+_EVEN = 10.0, 30.0
+
+
+@dataclass(frozen=True, slots=True)
+class Hardship:
+    """One row: a kind of list, the fields of view (lowest, highest) deg it is drawn from, and what is wrong.
+
+    Attributes:
+        kind: the field of view of it is drawn.
+        fields: deg.
+        distorted: whether the lens is, by _DISTORTION at the corner, and the false stars 0 to 5.
+        hint: relative error of the field of view given.
+        strewn: whether the points show no part of the sky.
+    """
+
+    kind: ListKind
+    fields: tuple[float, float] = _EVEN
+    distorted: bool = False
+    hint: float = 0.0
+    strewn: bool = False
+
+
+def hardships() -> dict[str, Hardship]:
+    """Return the rows by name."""
+    rows = {
+        f"unknown 10-30 deg, {noise} px, 5 false": Hardship(
+            replace(_UNKNOWN, noise_px=noise, false_stars=5), fields
+        )
+        for noise, fields in ((0.3, _EVEN), (0.5, (12.0, 12.0)))
+    }
+    for count in (3, 5, 10, 20, 40):
+        kind = replace(_UNKNOWN, false_stars=count, bright=True)
+        rows[f"unknown 10-30 deg, {count} bright false"] = Hardship(kind)
+    rows["unknown 4-60 deg, of 4-10 deg to V 8"] = Hardship(replace(_WIDE, faintest=8.0), (4.0, 10.0))
+    rows["unknown 4-60 deg, of 10-30 deg"] = Hardship(_WIDE)
+    rows["unknown 4-60 deg, of 30-60 deg to V 5"] = Hardship(replace(_WIDE, faintest=5.0), (30.0, 60.0))
+    for name, known in (("known", 0.1), ("unknown 10-30 deg", None)):
+        rows[f"{name}, mirrored"] = Hardship(replace(_UNKNOWN, known_deg=known, false_stars=2, mirrored=True))
+    rows["known to 5 %, hint 10 % wrong"] = Hardship(
+        replace(_UNKNOWN, known_deg=0.6, false_stars=2), (12.0, 12.0), hint=_HINT
+    )
+    for name, known in (("known", 0.1), ("known to 1 deg", 1.0), ("unknown 10-30 deg", None)):
+        rows[f"{name}, distorted 2-8 %"] = Hardship(replace(_UNKNOWN, known_deg=known), distorted=True)
+    for name, kind in (("known", replace(_UNKNOWN, known_deg=0.1)), ("unknown", _UNKNOWN), ("4-60", _WIDE)):
+        rows[f"random, {name}"] = Hardship(kind, strewn=True)
+    return rows
+
+
+def drawn_list(row: Hardship, stars: GuideStars, rng: np.random.Generator) -> StarList:
+    """Return one list of a row."""
+    kind = replace(row.kind, field_deg=float(rng.uniform(*row.fields)))
+    if row.strewn:
+        return draw_random(row.kind, int(rng.integers(4, 41)), rng)
+    if row.distorted:
+        shift = float(rng.uniform(*_DISTORTION) * rng.choice([-1.0, 1.0]))
+        kind = replace(kind, distortion_px=shift * PIXELS / np.sqrt(2.0), false_stars=int(rng.integers(0, 6)))
+    return draw(kind, stars, rng)
+
+
+def answered(row: Hardship, drawn: StarList, sky: SkyIndex) -> tuple[Identification, float]:
+    """Return our answer and its milliseconds."""
+    field = drawn.field()
+    if row.hint:
+        field = replace(field.rescaled(1.0 + row.hint), scale=field.scale)
+    begin = time.process_time()
+    found = identify(field, sky)
+    return found, 1000.0 * (time.process_time() - begin)
+
+
+def verdict(row: Hardship, drawn: StarList, found: Identification) -> str:
+    """Return right, wrong or refused; of a distorted lens right, misleading or refused."""
+    if found.fix is None:
+        return "refused"
+    matched = found.star >= 0
+    named = float(np.mean(found.star[matched] == drawn.star[matched]))
+    if row.strewn or named < _SHARE or found.mirrored != drawn.kind.mirrored:
+        return "wrong"
+    turn = attitude_matrix(found.fix.quaternion) @ attitude_matrix(drawn.attitude).T
+    error = 0.5 * np.array([turn[1, 2] - turn[2, 1], turn[2, 0] - turn[0, 2]])
+    off = float(np.linalg.norm(error))
+    if not row.distorted:
+        return "right" if off < np.deg2rad(_RIGHT_DEG) else "wrong"
+    sigmas = float(np.sqrt(error @ np.linalg.solve(found.fix.covariance[:2, :2], error)))
+    misleads = sigmas > _MISLEADING_SIGMAS and off * ARCSECONDS > _MISLEADING_ARCSEC
+    return "wrong" if misleads else "right"
+
+
+def measured(
+    name: str, lists: int, sky: SkyIndex, seed: int, peer: str | None = None, python: str = sys.executable
+) -> dict[str, Any]:
+    """Return the figures of one row."""
+    row, number = hardships()[name], list(hardships()).index(name)
+    drawn = [
+        drawn_list(row, sky.stars, np.random.default_rng([seed, number, place])) for place in range(lists)
+    ]
+    answered(row, drawn[0], sky)
+    answers = [answered(row, one, sky) for one in drawn]
+    verdicts = [verdict(row, one, found) for one, (found, _) in zip(drawn, answers, strict=True)]
+    ms = [spent for _, spent in answers]
+    figures = {
+        "row": name,
+        "lists": lists,
+        **{kind: verdicts.count(kind) for kind in ("right", "wrong", "refused")},
+        "median_ms": float(np.median(ms)),
+        "p95_ms": float(np.percentile(ms, 95)),
+        "max_ms": max(ms),
+    }
+    # A list of no sky may take a peer the whole of its time limit.
+    if peer is None or row.strewn:
+        return figures
+    jobs = [_job(row, one) for one in drawn]
+    theirs = peer_answers(peer, python, jobs)
+    return figures | ({} if theirs is None else {"peer_right": _right(theirs[0], drawn)})
+
+
+def _job(row: Hardship, drawn: StarList) -> dict[str, Any]:
+    believed, _ = believed_field(drawn.kind)
+    if drawn.kind.known_deg is None:
+        low, high = drawn.kind.searched_deg
+        believed, error = 0.5 * (low + high), 0.5 * (high - low)
+    else:
+        believed, error = believed * (1.0 + row.hint), drawn.kind.known_deg
+    pixels = drawn.pixels.copy()
+    if drawn.kind.mirrored:
+        pixels[:, 0] = PIXELS - 1.0 - pixels[:, 0]
+    return {"pixels": pixels.tolist(), "size": PIXELS, "field_deg": believed, "known_deg": error}
+
+
+def _right(answers: Sequence[Answer], drawn: Sequence[StarList]) -> int:
+    limit = np.deg2rad(_RIGHT_DEG)
+    return sum(
+        answer.boresight is not None and bool(np.any(one.star >= 0)) and pointing_error(answer, one) < limit
+        for answer, one in zip(answers, drawn, strict=True)
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print the table; 1 when an answer is wrong."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--lists", type=int, default=100, help="of each row (default %(default)s)")
+    parser.add_argument("--only", default="", metavar="WORD", help="rows whose names contain it")
+    parser.add_argument("--seed", type=int, default=_SEED, help="default %(default)s")
+    parser.add_argument("--peer", choices=tuple(PEERS), help="another program on the same lists")
+    parser.add_argument("--peer-python", default=sys.executable, metavar="PYTHON", help="that it is in")
+    parser.add_argument("--json", action="store_true", help="one JSON object a row instead of the table")
+    options = parser.parse_args(arguments)
+    sky = default_index()
+    wrong = 0
+    if not options.json:
+        sys.stdout.write(f"{'':42} right wrong refused   median    p95    max ms   peer right\n")
+    for name in (name for name in hardships() if options.only in name):
+        row = measured(name, options.lists, sky, options.seed, options.peer, options.peer_python)
+        wrong += row["wrong"]
+        text = (
+            f"{name:42} {row['right']:5d} {row['wrong']:5d} {row['refused']:7d} {row['median_ms']:8.1f}"
+            f" {row['p95_ms']:6.1f} {row['max_ms']:6.1f}   {row.get('peer_right', '')}"
+        )
+        sys.stdout.write((json.dumps(row) if options.json else text) + "\n")
+        sys.stdout.flush()
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

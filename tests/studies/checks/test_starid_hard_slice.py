@@ -1,0 +1,57 @@
+"""A small slice of the bench `starid_hard`: few lists of some rows, with another seed."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from flight.gnc.vision.startracker.identification.identification import Identification, Status
+from flight.gnc.vision.startracker.identification.verification import nothing
+from flight.gnc.vision.startracker.index.build import default_index
+from tests.studies.bench import starid_hard
+from tests.studies.bench.starid_hard import drawn_list, hardships, measured
+
+_SEED = 20_261_123
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("row", "least"),
+    [
+        ("unknown 10-30 deg, 20 bright false", 6),
+        ("unknown 4-60 deg, of 4-10 deg to V 8", 7),
+        ("unknown 10-30 deg, mirrored", 8),
+        ("known to 5 %, hint 10 % wrong", 8),
+        ("known to 1 deg, distorted 2-8 %", 7),
+        ("unknown 10-30 deg, distorted 2-8 %", 7),
+    ],
+)
+def test_hard_lists_are_named_and_none_is_wrong(row: str, least: int) -> None:
+    figures = measured(row, 8, default_index(), _SEED)
+    assert figures["wrong"] == 0
+    assert figures["right"] >= least
+
+
+def test_an_answer_to_strewn_points_is_wrong_and_none_is_refused() -> None:
+    row, rng = hardships()["random, unknown"], np.random.default_rng(1)
+    drawn = drawn_list(row, default_index().stars, rng)
+    found, _ = starid_hard.answered(
+        hardships()["unknown 10-30 deg, mirrored"],
+        drawn_list(hardships()["unknown 10-30 deg, mirrored"], default_index().stars, rng),
+        default_index(),
+    )
+    assert found.status is Status.IDENTIFIED
+    assert starid_hard.verdict(row, drawn, nothing(drawn.field())) == "refused"
+    assert (
+        starid_hard.verdict(row, drawn, Identification(found.status, np.arange(len(drawn.star)), found.fix))
+        == "wrong"
+    )
+
+
+def test_the_command_prints_a_row_as_json(capsys: pytest.CaptureFixture[str]) -> None:
+    assert starid_hard.main(["--lists", "2", "--only", "known, mirrored", "--json"]) == 0
+    row = json.loads(capsys.readouterr().out.splitlines()[0])
+    assert row["lists"] == 2
+    assert row["right"] + row["wrong"] + row["refused"] == 2
