@@ -5,6 +5,11 @@ directions across the star and whitened by the place's covariance; Gauss-Newton 
 the maximum likelihood for Gaussian errors. Light of another star in a streak shifts its place: stars that
 disagree by more than chance allows, given the scatter of the majority, are found under Huber's weights, which
 bound the pull of any star, and are excluded.
+
+A lens that is not calibrated is wrong in more than its focal length: its axis is not in the middle of the
+picture, and it distorts. Seen from the middle, tangents u are then off by (u . a) u + |u|^2 b + k |u|^2 u + l |u|^4 u
+(Brown 1966). The tilt a, the decentring b and the distortion k, l are fitted too, held by what is usual of lenses: what the stars leave open of them is in the
+attitude's covariance.
 """
 
 from __future__ import annotations
@@ -30,6 +35,12 @@ _MEDIAN = 2.0 * float(np.log(2.0))
 # Deviations beyond which a star's pull is bounded while outliers are searched for.
 _PULL = 1.5
 _HUBER_ROUNDS = 10
+# Standard deviations of the tilt along x and y, as a part of the tangent of the corner, and of the distortion
+# there by its two terms: 20 px of 1024, 3 and 1 %. Their product is the decentring's.
+_USUAL_TILT, _USUAL_DISTORTION = 0.03, (0.03, 0.01)
+_BENDS = 6
+# Their places among the parameters: after the turn and ln scale.
+_LENS = np.arange(4, 4 + _BENDS)
 _LEAST_AGREEING = 4
 
 
@@ -59,6 +70,7 @@ def fit_in_image(
     camera: CameraModel,
     start: FloatArray,
     free_scale: bool = False,
+    free_lens: bool = False,
 ) -> ImageFit:
     """Return the attitude that puts stars at `reference` (n, 3) to `points` (n, 2) px.
 
@@ -69,11 +81,13 @@ def fit_in_image(
         camera: with its lens.
         start: (4,) an attitude near the answer, reference into camera.
         free_scale: whether the focal length may be wrong.
+        free_lens: whether tilt, decentring and distortion are free as well, as of a lens not calibrated.
 
     Raises AttitudeError when the stars do not determine the parameters.
     """
     observed = camera.unit_vectors(points)
-    seen = _Seen(observed, _whitener(points, observed, covariance, camera), reference, free_scale)
+    usual = _usual(camera) if free_scale and free_lens else np.zeros(0)
+    seen = _Seen(observed, _whitener(points, observed, covariance, camera), reference, free_scale, usual)
     pose = seen.fitted(_Pose(attitude_matrix(start), 1.0), np.ones(len(points)))
     squares, agree = seen.squares(pose), np.ones(len(points), dtype=np.bool_)
     # One outlier shifts all residuals: their spread is meaningless before its pull is bounded.
@@ -93,46 +107,73 @@ def fit_in_image(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Pose:
-    """Attitude (3, 3) and scale, and the covariance of the turn and ln scale that weights of stars give."""
+    """Attitude (3, 3), scale, bend (6,), and the covariance that weights of stars give them."""
 
     matrix: FloatArray
     scale: float
+    bend: FloatArray = field(default_factory=lambda: np.zeros(_BENDS))
     covariance: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Seen:
-    """Stars seen at `observed` (n, 3) with `whitener` (n, 2, 3), at `reference` (n, 3) in the sky."""
+    """Stars seen at `observed` (n, 3) with `whitener` (n, 2, 3), at `reference` (n, 3) in the sky.
+
+    `usual` (6,): information about tilt, decentring and distortion before any star is seen; (0,): there are none.
+    """
 
     observed: FloatArray
     whitener: FloatArray
     reference: FloatArray
     free_scale: bool
+    usual: FloatArray
 
     def fitted(self, start: _Pose, weight: FloatArray) -> _Pose:
         """Return the least of the squares times `weight` (n,)."""
         whitener = self.whitener * np.sqrt(weight)[:, None, None]
-        matrix, scale = start.matrix, start.scale
+        matrix, scale, bend = start.matrix, start.scale, start.bend
         for _ in range(_MOST_STEPS):
-            seen, predicted = stretched(self.observed, scale), self.reference @ matrix.T
+            seen, predicted = self.directions(scale, bend), self.reference @ matrix.T
             residual = np.einsum("nij,nj->ni", whitener, seen - predicted).ravel()
-            flat = _slope(whitener, seen, predicted, self.free_scale)
+            flat = self._slope(whitener, seen, predicted)
+            normal, gradient = flat.T @ flat, flat.T @ residual
+            if len(self.usual):
+                normal[_LENS, _LENS] += self.usual
+                gradient[4:] += self.usual * bend
             try:
-                inverse = np.linalg.inv(flat.T @ flat)
+                inverse = np.linalg.inv(normal)
             except np.linalg.LinAlgError as error:
                 raise AttitudeError(f"{len(weight)} stars in one place fix no attitude") from error
-            step = -inverse @ (flat.T @ residual)
-            if not np.all(np.abs(step) < 1.0):
+            step = -inverse @ gradient
+            if not np.all(np.abs(step[:4]) < 1.0):
                 raise AttitudeError(f"{len(weight)} stars do not agree on an attitude")
             matrix = turned(matrix, step[:3])
             scale *= float(np.exp(step[3])) if self.free_scale else 1.0
+            bend = bend + step[4:] if len(self.usual) else bend
             if np.abs(step).max() < _SETTLED:
                 break
-        return _Pose(matrix, scale, np.asarray(inverse, dtype=np.float64))
+        return _Pose(matrix, scale, bend, np.asarray(inverse, dtype=np.float64))
+
+    def _slope(self, whitener: FloatArray, seen: FloatArray, predicted: FloatArray) -> FloatArray:
+        """Return d(whitened residuals)/d(turn, ln scale, bend), (2n, 3, 4 or 10)."""
+        slopes = [-whitener @ cross_matrices(predicted)]
+        if self.free_scale:
+            slopes.append(whitener @ scale_slope(seen)[:, :, None])
+        if len(self.usual):
+            slopes.append(whitener @ _bend_slope(seen))
+        return np.concatenate(slopes, axis=2).reshape(2 * len(seen), -1)
+
+    def directions(self, scale: float, bend: FloatArray) -> FloatArray:
+        """Return the unit vectors (n, 3) seen through a lens of this scale and bend (6,)."""
+        seen = stretched(self.observed, scale)
+        if not bend.any():
+            return seen
+        out = seen + np.einsum("nij,j->ni", _bend_slope(seen), bend)
+        return np.asarray(out / np.linalg.norm(out, axis=1, keepdims=True))
 
     def squares(self, pose: _Pose) -> FloatArray:
         """Return each star's squared error over its covariance (n,)."""
-        missed = stretched(self.observed, pose.scale) - self.reference @ pose.matrix.T
+        missed = self.directions(pose.scale, pose.bend) - self.reference @ pose.matrix.T
         return np.asarray(np.sum(np.einsum("nij,nj->ni", self.whitener, missed) ** 2, axis=1))
 
 
@@ -143,13 +184,24 @@ def _agreeing(squares: FloatArray) -> BoolArray:
     return agree if enough else np.ones(len(squares), dtype=np.bool_)
 
 
-def _slope(whitener: FloatArray, seen: FloatArray, predicted: FloatArray, free_scale: bool) -> FloatArray:
-    """Return d(whitened residuals)/d(turn, ln scale), (2n, 3 or 4)."""
-    turn = -whitener @ cross_matrices(predicted)
-    if not free_scale:
-        return np.asarray(turn.reshape(-1, 3))
-    scale = np.einsum("nij,nj->ni", whitener, scale_slope(seen))
-    return np.concatenate([turn, scale[:, :, None]], axis=2).reshape(-1, 4)
+def _usual(camera: CameraModel) -> FloatArray:
+    """Return the information (6,) about tilt, decentring and distortion that is usual of lenses."""
+    corner = float(np.tan(camera.half_diagonal))
+    first, second = _USUAL_DISTORTION
+    off = [_USUAL_TILT * corner] * 2 + [_USUAL_TILT * first / corner] * 2
+    return np.array([*off, first / corner**2, second / corner**4]) ** -2.0
+
+
+def _bend_slope(seen: FloatArray) -> FloatArray:
+    """Return by how much directions (n, 3) move per unit of tilt, decentring and distortion, (n, 3, 6)."""
+    tangent = seen[:, :2] / seen[:, 2:]
+    square = np.sum(tangent**2, axis=1, keepdims=True)
+    # Tilt and distortion stretch a tangent u along itself, by u_x, u_y, |u|^2 and |u|^4.
+    along = np.concatenate([tangent, square, square**2], axis=1)
+    stretch = scale_slope(seen)[:, :, None] * along[:, None, :]
+    across = np.eye(3)[:, :2] - seen[:, :, None] * seen[:, None, :2]
+    shift = across * (seen[:, 2:] * square)[:, :, None]
+    return np.asarray(np.concatenate([stretch[:, :, :2], shift, stretch[:, :, 2:]], axis=2))
 
 
 def _whitener(

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from flight.gnc.attitude.wahba import AttitudeError
+from flight.gnc.attitude.wahba import AttitudeError, AttitudeFix
 from flight.gnc.camera.lens import CameraModel
 from flight.gnc.math.arrays import FloatArray, Image
 from flight.gnc.math.quaternion import attitude_matrix
@@ -37,6 +37,12 @@ from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSett
 
 # px: error of a place from unknown distortion of the lens or the star's colour.
 _LEAST_SIGMA_PX = 0.005
+# px: the same of a lens that is not calibrated, for identification. Tried second: most pictures need no more
+# room than their places' errors, in which fewer stars agree by chance.
+_UNTOLD_SIGMA_PX = 0.3
+# px, across the boresight and at the edge about it: what such a lens and the air leave beyond the fit of the
+# lens. Photographs differ from other solvers' attitudes by this (bench `untold_lens`).
+_UNTOLD_LENS_PX = 0.25
 # Standard deviations of light; fainter stars of a motion are not identified.
 _LEAST_SIGNIFICANCE = 5.0
 # Tracking looks for this number of stars, within PRIOR_SIGMAS of the prior.
@@ -56,6 +62,8 @@ class SolveSettings:
         identification: settings of the default method.
         method: another method of identification.
         velocity: (3,) m/s of the camera about the Sun, for aberration; None: no correction.
+        untold_lens: whether a lens of uncertain focal length may have its axis off the middle and distort; else
+            the focal length is all that is uncertain.
     """
 
     detection: DetectionSettings = field(default_factory=DetectionSettings)
@@ -63,6 +71,7 @@ class SolveSettings:
     identification: IdentificationSettings = field(default_factory=IdentificationSettings)
     method: Callable[[StarField, SkyIndex], Identification] | None = None
     velocity: FloatArray | None = None
+    untold_lens: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -190,14 +199,19 @@ def _identify(
             return _with_attitude(replace(seen, tracked=True), near, sky, settings)
     if settings.method is not None:
         return _with_attitude(seen, settings.method(stars, sky), sky, settings)
-    return _with_attitude(seen, identify(stars, sky, settings.identification), sky, settings)
+    found = identify(stars, sky, settings.identification)
+    if found.status is Status.NO_MATCH and settings.untold_lens and scale[0] != scale[1]:
+        found = identify(star_field(seen, flux, scale, _UNTOLD_SIGMA_PX), sky, settings.identification)
+    return _with_attitude(seen, found, sky, settings)
 
 
-def star_field(seen: FrameSolution, flux: FloatArray | None, scale: tuple[float, float]) -> StarField:
-    """Return the directions of the points of `seen`, with their errors, for identification."""
+def star_field(
+    seen: FrameSolution, flux: FloatArray | None, scale: tuple[float, float], least: float = _LEAST_SIGMA_PX
+) -> StarField:
+    """Return the directions of the points of `seen`, with their errors of `least` px or more, to identify."""
     camera = seen.camera
     direction = camera.unit_vectors(seen.points)
-    pixels = np.sqrt(0.5 * np.trace(seen.covariance, axis1=1, axis2=2) + _LEAST_SIGMA_PX**2)
+    pixels = np.sqrt(0.5 * np.trace(seen.covariance, axis1=1, axis2=2) + least**2)
     # A pixel off the boresight is seen shorter: by cos^2 along the radius and cos across it.
     sigma = pixels / camera.focal_length * direction[:, 2] ** 1.5
     half_width = 0.5 * camera.columns / camera.focal_length, 0.5 * camera.rows / camera.focal_length
@@ -212,6 +226,7 @@ def _with_attitude(
     if found.status is not Status.IDENTIFIED or found.fix is None:
         return replace(seen, status=SolveStatus(found.status.value), reason=_reason(found.status, seen))
     free_scale = found.scale_sigma > 0.0
+    free_lens = free_scale and settings.untold_lens
     camera = seen.camera.rescaled(1.0 / found.scale)
     chosen = np.flatnonzero(found.star >= 0)
     reference = sky.stars.direction[found.star[chosen]]
@@ -220,11 +235,18 @@ def _with_attitude(
     covariance = seen.covariance[chosen] + _LEAST_SIGMA_PX**2 * np.eye(2)
     try:
         fit = fit_in_image(
-            seen.points[chosen], covariance, reference, camera, found.fix.quaternion, free_scale
+            seen.points[chosen],
+            covariance,
+            reference,
+            camera,
+            found.fix.quaternion,
+            free_scale,
+            free_lens,
         )
     except AttitudeError as error:
         return replace(seen, status=SolveStatus.AMBIGUOUS, reason=str(error))
     camera = camera.rescaled(1.0 / fit.scale)
+    fix = _widened(fit.fix, camera) if free_lens else fit.fix
     expected = np.full_like(seen.points, np.nan)
     expected[chosen] = camera.project(reference @ attitude_matrix(fit.fix.quaternion).T)
     return replace(
@@ -234,10 +256,17 @@ def _with_attitude(
         camera=camera,
         star=found.star,
         expected=expected,
-        fix=fit.fix,
+        fix=fix,
         scale_sigma=fit.scale_sigma,
         log10_false_alarm=found.log10_false_alarm,
     )
+
+
+def _widened(fix: AttitudeFix, camera: CameraModel) -> AttitudeFix:
+    """Return `fix` with the error of a lens that is not calibrated."""
+    across, about = 1.0 / camera.focal_length, 2.0 / max(camera.columns, camera.rows)
+    error = _UNTOLD_LENS_PX * np.array([across, across, about])
+    return replace(fix, covariance=fix.covariance + np.diag(error**2))
 
 
 def _reason(status: Status, seen: FrameSolution) -> str:

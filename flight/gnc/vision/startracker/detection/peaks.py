@@ -59,7 +59,9 @@ def worth_measuring(peaks: Peaks, open_sky: BoolArray, shape: tuple[int, ...], m
     that a cloud that is brighter than all stars leaves room for the stars beside it. As many of the others show
     what the sources of the foreground look like, and take no star's place.
     """
-    compared = np.sort(np.concatenate([np.flatnonzero(part)[:_MOST_COMPARED] for part in (open_sky, ~open_sky)]))
+    compared = np.sort(
+        np.concatenate([np.flatnonzero(part)[:_MOST_COMPARED] for part in (open_sky, ~open_sky)])
+    )
     compared = compared[~on_wings(peaks.select(compared))]
     parts = (compared[open_sky[compared]], compared[~open_sky[compared]])
     return np.sort(np.concatenate([part[_spread(peaks.select(part), shape, most)] for part in parts]))
