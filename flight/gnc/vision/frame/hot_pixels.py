@@ -16,13 +16,13 @@ from flight.gnc.vision.frame.regions import positions
 # Part of a pixel's light that its neighbours would get from a star, and sigmas of their noise on top; never
 # more than another part, which a faint star's neighbours reach.
 _SHARPNESS, _NOISE, _MOST = 0.15, 3.0, 0.3
-# Of two hot pixels side by side only the third brightest is dark: asked of bright ones, with less noise on top.
+# Of two hot pixels side by side only the third brightest is dark: asked of bright ones, with less noise.
 _PAIR, _PAIR_NOISE = 20.0, 1.0
 _AROUND = tuple((dr, dc) for dr in (-1, 0, 1) for dc in (-1, 0, 1) if (dr, dc) != (0, 0))
 
 
 def repair_hot_pixels(signal: Image, noise: Image, sigmas: float = 10.0) -> int:
-    """Replace the hot pixels of `signal` (rows, columns) in place by their neighbours' median; return how many.
+    """Replace the hot pixels of `signal` (rows, columns) by their neighbours' median; return how many.
 
     `noise` (rows, columns) is of one pixel; only pixels above `sigmas` times it are examined.
     """

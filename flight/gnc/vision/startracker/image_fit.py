@@ -6,10 +6,8 @@ the maximum likelihood for Gaussian errors. Light of another star in a streak sh
 disagree by more than chance allows, given the scatter of the majority, are found under Huber's weights, which
 bound the pull of any star, and are excluded.
 
-A lens that is not calibrated is wrong in more than its focal length: its axis is not in the middle of the
-picture, and it distorts. Seen from the middle, tangents u are then off by (u . a) u + |u|^2 b + k |u|^2 u + l |u|^4 u
-(Brown 1966). The tilt a, the decentring b and the distortion k, l are fitted too, held by what is usual of lenses: what the stars leave open of them is in the
-attitude's covariance.
+The tilt, decentring and distortion of a lens that is not calibrated are fitted too, held by what is usual of
+lenses (`lens_bend`): what the stars leave open of them is in the attitude's covariance.
 """
 
 from __future__ import annotations
@@ -24,6 +22,7 @@ from flight.gnc.math.arrays import BoolArray, FloatArray
 from flight.gnc.math.directions import cross_matrices
 from flight.gnc.math.quaternion import attitude_matrix, from_matrix
 from flight.gnc.vision.startracker.identification.refinement import inflation, scale_slope, stretched, turned
+from flight.gnc.vision.startracker.lens_bend import BENDS, bend_slope, bent, usual_bend
 
 _MOST_STEPS = 8
 _SETTLED = 1e-11
@@ -35,12 +34,8 @@ _MEDIAN = 2.0 * float(np.log(2.0))
 # Deviations beyond which a star's pull is bounded while outliers are searched for.
 _PULL = 1.5
 _HUBER_ROUNDS = 10
-# Standard deviations of the tilt along x and y, as a part of the tangent of the corner, and of the distortion
-# there by its two terms: 20 px of 1024, 3 and 1 %. Their product is the decentring's.
-_USUAL_TILT, _USUAL_DISTORTION = 0.03, (0.03, 0.01)
-_BENDS = 6
 # Their places among the parameters: after the turn and ln scale.
-_LENS = np.arange(4, 4 + _BENDS)
+_LENS = np.arange(4, 4 + BENDS)
 _LEAST_AGREEING = 4
 
 
@@ -52,6 +47,7 @@ class ImageFit:
         fix: the attitude by the stars that agree; its covariance is widened if they scatter beyond theirs.
         scale: factor of the tangents x/z, y/z; 1 when it was held.
         scale_sigma: relative standard deviation of the scale; 0 when it was held.
+        bend: (6,) of the lens (`lens_bend`); zeros when it was held.
         squares: (n,) squared error of each star over its covariance, of two degrees of freedom.
         agree: (n,) whether the star was used.
     """
@@ -59,6 +55,7 @@ class ImageFit:
     fix: AttitudeFix
     scale: float
     scale_sigma: float
+    bend: FloatArray
     squares: FloatArray
     agree: BoolArray
 
@@ -86,7 +83,7 @@ def fit_in_image(
     Raises AttitudeError when the stars do not determine the parameters.
     """
     observed = camera.unit_vectors(points)
-    usual = _usual(camera) if free_scale and free_lens else np.zeros(0)
+    usual = usual_bend(camera) if free_scale and free_lens else np.zeros(0)
     seen = _Seen(observed, _whitener(points, observed, covariance, camera), reference, free_scale, usual)
     pose = seen.fitted(_Pose(attitude_matrix(start), 1.0), np.ones(len(points)))
     squares, agree = seen.squares(pose), np.ones(len(points), dtype=np.bool_)
@@ -102,7 +99,7 @@ def fit_in_image(
     inverse = pose.covariance * inflation(squares[agree], len(pose.covariance))
     turn = np.ascontiguousarray(inverse[:3, :3], dtype=np.float64)
     fix = AttitudeFix(from_matrix(pose.matrix), turn, 0.5 * float(squares[agree].sum()))
-    return ImageFit(fix, pose.scale, float(np.sqrt(inverse[3, 3])) if free_scale else 0.0, squares, agree)
+    return ImageFit(fix, pose.scale, float(np.sqrt(inverse[3, 3])) if free_scale else 0.0, pose.bend, squares, agree)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,7 +108,7 @@ class _Pose:
 
     matrix: FloatArray
     scale: float
-    bend: FloatArray = field(default_factory=lambda: np.zeros(_BENDS))
+    bend: FloatArray = field(default_factory=lambda: np.zeros(BENDS))
     covariance: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
 
 
@@ -119,7 +116,7 @@ class _Pose:
 class _Seen:
     """Stars seen at `observed` (n, 3) with `whitener` (n, 2, 3), at `reference` (n, 3) in the sky.
 
-    `usual` (6,): information about tilt, decentring and distortion before any star is seen; (0,): there are none.
+    `usual` (6,): information about the lens's bend before any star is seen; (0,): the lens has none.
     """
 
     observed: FloatArray
@@ -160,16 +157,12 @@ class _Seen:
         if self.free_scale:
             slopes.append(whitener @ scale_slope(seen)[:, :, None])
         if len(self.usual):
-            slopes.append(whitener @ _bend_slope(seen))
+            slopes.append(whitener @ bend_slope(seen))
         return np.concatenate(slopes, axis=2).reshape(2 * len(seen), -1)
 
     def directions(self, scale: float, bend: FloatArray) -> FloatArray:
         """Return the unit vectors (n, 3) seen through a lens of this scale and bend (6,)."""
-        seen = stretched(self.observed, scale)
-        if not bend.any():
-            return seen
-        out = seen + np.einsum("nij,j->ni", _bend_slope(seen), bend)
-        return np.asarray(out / np.linalg.norm(out, axis=1, keepdims=True))
+        return bent(stretched(self.observed, scale), bend)
 
     def squares(self, pose: _Pose) -> FloatArray:
         """Return each star's squared error over its covariance (n,)."""
@@ -182,26 +175,6 @@ def _agreeing(squares: FloatArray) -> BoolArray:
     agree = squares <= _FARTHEST * max(1.0, float(np.median(squares)) / _MEDIAN)
     enough = np.count_nonzero(agree) >= max(_LEAST_AGREEING, len(squares) // 2)
     return agree if enough else np.ones(len(squares), dtype=np.bool_)
-
-
-def _usual(camera: CameraModel) -> FloatArray:
-    """Return the information (6,) about tilt, decentring and distortion that is usual of lenses."""
-    corner = float(np.tan(camera.half_diagonal))
-    first, second = _USUAL_DISTORTION
-    off = [_USUAL_TILT * corner] * 2 + [_USUAL_TILT * first / corner] * 2
-    return np.array([*off, first / corner**2, second / corner**4]) ** -2.0
-
-
-def _bend_slope(seen: FloatArray) -> FloatArray:
-    """Return by how much directions (n, 3) move per unit of tilt, decentring and distortion, (n, 3, 6)."""
-    tangent = seen[:, :2] / seen[:, 2:]
-    square = np.sum(tangent**2, axis=1, keepdims=True)
-    # Tilt and distortion stretch a tangent u along itself, by u_x, u_y, |u|^2 and |u|^4.
-    along = np.concatenate([tangent, square, square**2], axis=1)
-    stretch = scale_slope(seen)[:, :, None] * along[:, None, :]
-    across = np.eye(3)[:, :2] - seen[:, :, None] * seen[:, None, :2]
-    shift = across * (seen[:, 2:] * square)[:, :, None]
-    return np.asarray(np.concatenate([stretch[:, :, :2], shift, stretch[:, :, 2:]], axis=2))
 
 
 def _whitener(

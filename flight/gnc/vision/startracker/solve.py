@@ -31,14 +31,15 @@ from flight.gnc.vision.startracker.identification.verification import expected_s
 from flight.gnc.vision.startracker.image_fit import fit_in_image
 from flight.gnc.vision.startracker.index.sky_index import SkyIndex
 from flight.gnc.vision.startracker.mid_exposure import timing_covariance
+from flight.gnc.vision.startracker.sky_map import SkyMap
 from flight.gnc.vision.startracker.solution import FrameSolution, SolveStatus
 from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 
 # px: error of a place from unknown distortion of the lens or the star's colour.
 _LEAST_SIGMA_PX = 0.005
-# px: the same of a lens that is not calibrated, for identification. Tried second: most pictures need no more
-# room than their places' errors, in which fewer stars agree by chance.
+# px: the same of a lens that is not calibrated, for identification. Tried second: most pictures need only
+# the room of their places' errors, in which fewer stars agree by chance.
 _UNTOLD_SIGMA_PX = 0.3
 # px, across the boresight and at the edge about it: what such a lens and the air leave beyond the fit of the
 # lens. Photographs differ from other solvers' attitudes by this (bench `untold_lens`).
@@ -248,7 +249,7 @@ def _with_attitude(
     camera = camera.rescaled(1.0 / fit.scale)
     fix = _widened(fit.fix, camera) if free_lens else fit.fix
     expected = np.full_like(seen.points, np.nan)
-    expected[chosen] = camera.project(reference @ attitude_matrix(fit.fix.quaternion).T)
+    expected[chosen] = SkyMap(camera, fix.quaternion, fit.bend).pixels(reference)
     return replace(
         seen,
         status=SolveStatus.SOLVED,
@@ -258,6 +259,7 @@ def _with_attitude(
         expected=expected,
         fix=fix,
         scale_sigma=fit.scale_sigma,
+        bend=fit.bend,
         log10_false_alarm=found.log10_false_alarm,
     )
 

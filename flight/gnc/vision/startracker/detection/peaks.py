@@ -55,9 +55,9 @@ def find_peaks(areas: Areas) -> Peaks:
 def worth_measuring(peaks: Peaks, open_sky: BoolArray, shape: tuple[int, ...], most: int) -> IntArray:
     """Return which peaks (p,) to measure, highest first, without bumps on brighter stars' wings.
 
-    Of those in the `open_sky` (p,) `most`, and of a cell of a sixteenth of `shape` a quarter of them at most, so
-    that a cloud that is brighter than all stars leaves room for the stars beside it. As many of the others show
-    what the sources of the foreground look like, and take no star's place.
+    Of those in the `open_sky` (p,) `most`, and of a cell of a sixteenth of `shape` a quarter of them at most,
+    so that a cloud that is brighter than all stars leaves room for the stars beside it. As many of the others
+    show what the sources of the foreground look like, and take no star's place.
     """
     compared = np.sort(
         np.concatenate([np.flatnonzero(part)[:_MOST_COMPARED] for part in (open_sky, ~open_sky)])
