@@ -99,7 +99,9 @@ def fit_in_image(
     inverse = pose.covariance * inflation(squares[agree], len(pose.covariance))
     turn = np.ascontiguousarray(inverse[:3, :3], dtype=np.float64)
     fix = AttitudeFix(from_matrix(pose.matrix), turn, 0.5 * float(squares[agree].sum()))
-    return ImageFit(fix, pose.scale, float(np.sqrt(inverse[3, 3])) if free_scale else 0.0, pose.bend, squares, agree)
+    return ImageFit(
+        fix, pose.scale, float(np.sqrt(inverse[3, 3])) if free_scale else 0.0, pose.bend, squares, agree
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
