@@ -1,7 +1,7 @@
 """Which frames a calibration may use: those of one lens.
 
-A picture of another focus or zoom, or one that was solved wrongly, pulls the lens of all. Such a frame disagrees
-with the majority about the focal length, or has most of its matches left out by the fit.
+A picture of another focus or zoom, or a wrongly solved one, pulls the lens of all. Such a frame disagrees with
+the majority about the focal length, or has most of its matches left out by the fit.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _BELIEVED_PART = 0.5
 # Sigmas, and a part of the focal length, by which a frame's own may differ from the median.
 _SIGMAS, _PART = 5.0, 0.01
 LEAST_STARS = 24
-"""Believed matches that a lens must rest on: three of each of its five parameters, and a frame's three turns."""
+"""Believed matches that a lens must rest on: three for each of its parameters and of a frame's turns."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,9 +52,7 @@ def calibrate_one_lens(
     for number in np.flatnonzero(
         np.abs(focal_lengths - usual) > np.maximum(_SIGMAS * sigmas, _PART * usual)
     ).tolist():
-        left_out[number] = (
-            f"its focal length of {focal_lengths[number]:.1f} px is not the others' {usual:.1f}"
-        )
+        left_out[number] = f"its focal length of {focal_lengths[number]:.1f} px is not {usual:.1f}"
     while True:
         kept = [number for number in range(len(frames)) if number not in left_out]
         found = calibrate([frames[number] for number in kept], initial)

@@ -56,8 +56,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of this command to the parser."""
     parser.description = (
         "Calibrate a camera from pictures of the night sky: focal length, optical axis, radial distortion, "
-        "with their errors. All pictures must be of one camera at one focus; those that are not are left out; ten that put stars into the "
-        "corners are worth more than a hundred that do not. Undetermined parameters are named."
+        "with their errors. All pictures must be of one camera at one focus; those that do not fit are left "
+        "out and named. Ten that put stars into the corners are worth more than a hundred that do not. "
+        "Undetermined parameters are named; fewer than "
+        f"{LEAST_STARS} stars make no camera file."
     )
     parser.epilog = "example: python -m flight calibrate night*.tiff --fov 11.4 --out camera.yaml"
     parser.add_argument("images", type=Path, nargs="+", metavar="IMAGE")

@@ -18,7 +18,7 @@ _SAME_PX = 0.1
 
 
 def sky_facts(sky: SkyMap | None, bodies: Sequence[Body]) -> dict[str, Any]:
-    """Return where middle and axis of the picture point, its bodies and its world coordinates, for `--json`."""
+    """Return where middle and axis point, the bodies and the world coordinates, for `--json`."""
     if sky is None:
         return {}
     camera = sky.camera

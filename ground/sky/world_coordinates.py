@@ -82,7 +82,7 @@ def world_coordinates(sky: SkyMap) -> dict[str, str | int | float | bool]:
 def _polynomials(
     names: tuple[str, str], places: FloatArray, shift: FloatArray, least: int
 ) -> dict[str, str | int | float | bool]:
-    """Return the coefficients that make `shift` (n, 2) px of `places` (n, 2) px, terms of `least` order on."""
+    """Return the coefficients that make `shift` (n, 2) of `places` (n, 2), px, terms of `least` order on."""
     powers = [(i, j) for i in range(_ORDER + 1) for j in range(_ORDER + 1 - i) if least <= i + j]
     size = float(np.abs(places).max())
     x, y = (places / size).T

@@ -1,7 +1,7 @@
 """What a lens that nobody calibrated does beyond a wrong focal length, seen from the picture's middle.
 
-Its axis is not in the middle, and it distorts: tangents u are off by (u . a) u + |u|^2 b + k |u|^2 u + l |u|^4 u,
-with tilt a, decentring b and distortion k, l (Brown 1966): the bend (6,) is (a, b, k, l).
+Its axis is not in the middle, and it distorts: tangents u are off by
+(u . a) u + |u|^2 b + k |u|^2 u + l |u|^4 u, with tilt a, decentring b and distortion k, l (Brown 1966): the bend (6,) is (a, b, k, l).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from flight.gnc.math.arrays import FloatArray
 from flight.gnc.vision.startracker.identification.refinement import scale_slope
 
 BENDS = 6
-# Standard deviations of the tilt along x and y, as a part of the tangent of the corner, and of the distortion
+# Standard deviations of the tilt along x and y, as a part of the corner's tangent, and of the distortion
 # there by its two terms: 20 px of 1024, 3 and 1 %. The decentring is the product of tilt and distortion.
 _TILT, _DISTORTION = 0.03, (0.03, 0.01)
 
@@ -27,7 +27,7 @@ def usual_bend(camera: CameraModel) -> FloatArray:
 
 
 def bent(direction: FloatArray, bend: FloatArray) -> FloatArray:
-    """Return the unit vectors (n, 3) of the sky that a lens of this `bend` (6,) puts at `direction` (n, 3)."""
+    """Return the unit vectors (n, 3) of what a lens of this `bend` (6,) shows at `direction` (n, 3)."""
     if not bend.any():
         return direction
     out = direction + bend_slope(direction) @ bend

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from flight.gnc.attitude.wahba import AttitudeError, AttitudeFix
+from flight.gnc.attitude.wahba import AttitudeError
 from flight.gnc.camera.lens import CameraModel
 from flight.gnc.math.arrays import FloatArray, Image
 from flight.gnc.math.quaternion import attitude_matrix
@@ -63,8 +63,8 @@ class SolveSettings:
         identification: settings of the default method.
         method: another method of identification.
         velocity: (3,) m/s of the camera about the Sun, for aberration; None: no correction.
-        untold_lens: whether a lens of uncertain focal length may have its axis off the middle and distort; else
-            the focal length is all that is uncertain.
+        untold_lens: whether a lens of uncertain focal length may have its axis off the middle and distort;
+            else the focal length is all that is uncertain.
     """
 
     detection: DetectionSettings = field(default_factory=DetectionSettings)
@@ -247,7 +247,9 @@ def _with_attitude(
     except AttitudeError as error:
         return replace(seen, status=SolveStatus.AMBIGUOUS, reason=str(error))
     camera = camera.rescaled(1.0 / fit.scale)
-    fix = _widened(fit.fix, camera) if free_lens else fit.fix
+    fix = fit.fix
+    if free_lens:
+        fix = replace(fix, covariance=fix.covariance + lens_floor(camera))
     expected = np.full_like(seen.points, np.nan)
     expected[chosen] = SkyMap(camera, fix.quaternion, fit.bend).pixels(reference)
     return replace(
@@ -264,11 +266,10 @@ def _with_attitude(
     )
 
 
-def _widened(fix: AttitudeFix, camera: CameraModel) -> AttitudeFix:
-    """Return `fix` with the error of a lens that is not calibrated."""
+def lens_floor(camera: CameraModel) -> FloatArray:
+    """Return the covariance (3, 3) rad^2 that a lens which is not calibrated adds to an attitude."""
     across, about = 1.0 / camera.focal_length, 2.0 / max(camera.columns, camera.rows)
-    error = _UNTOLD_LENS_PX * np.array([across, across, about])
-    return replace(fix, covariance=fix.covariance + np.diag(error**2))
+    return np.diag((_UNTOLD_LENS_PX * np.array([across, across, about])) ** 2)
 
 
 def _reason(status: Status, seen: FrameSolution) -> str:
