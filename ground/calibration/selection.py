@@ -1,7 +1,7 @@
 """Which frames a calibration may use: those of one lens.
 
-A picture of another focus or zoom, or a wrongly solved one, pulls the lens of all. Such a frame disagrees with
-the majority about the focal length, or has most of its matches left out by the fit.
+A picture of another focus or zoom, or a wrongly solved one, pulls the lens of all. Such a frame disagrees
+with the majority about the focal length, or has most of its matches left out by the fit.
 """
 
 from __future__ import annotations
@@ -52,7 +52,8 @@ def calibrate_one_lens(
     for number in np.flatnonzero(
         np.abs(focal_lengths - usual) > np.maximum(_SIGMAS * sigmas, _PART * usual)
     ).tolist():
-        left_out[number] = f"its focal length of {focal_lengths[number]:.1f} px is not {usual:.1f}"
+        own = focal_lengths[number]
+        left_out[number] = f"its focal length of {own:.1f} px is not {usual:.1f}"
     while True:
         kept = [number for number in range(len(frames)) if number not in left_out]
         found = calibrate([frames[number] for number in kept], initial)

@@ -35,11 +35,11 @@ from flight.gnc.vision.streaks.streak_result import StreakStatus
 from flight.schema import reader as configuration
 from flight.schema.camera_model import camera_model
 from flight.schema.sections import Camera
-from ground.commands.options import add_field, add_output, add_picture, positive, read_picture
+from ground.commands.options import add_field, add_output, add_picture, positive, read_picture, write_new
 from ground.pictures.sky_picture import draw_solution
 from ground.sky.bodies import bodies_in
 from ground.sky.facts import sky_facts, sky_text
-from ground.sky.world_coordinates import write_header
+from ground.sky.world_coordinates import header_text
 
 ARCSECONDS = math.degrees(1.0) * 3600.0
 UNKNOWN_DEG = 10.0, 30.0
@@ -109,7 +109,7 @@ def run(options: argparse.Namespace) -> int:
     else:
         sys.stdout.write(_text(solution, sky, exposure, seconds) + sky_text(sky_map, bodies))
     if options.wcs is not None and sky_map is not None:
-        write_header(options.wcs, sky_map)
+        write_new(options.wcs, header_text(sky_map))
     if options.overlay is not None:
         write_picture(options.overlay, draw_solution(grey_stretch(pixels), solution, sky))
         if not options.json:

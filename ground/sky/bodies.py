@@ -1,8 +1,8 @@
 """Sun, Moon and planets in a picture, seen from the Earth's centre.
 
-ERFA's series: plan94 (Simon et al. 1994: a few arcseconds, Jupiter and Saturn 80", 1800 to 2050), moon98 (Meeus
-1998: 10"), epv00 for the Earth. ERFA is a dependency already, and needs no file of ephemerides. An observer on
-the ground sees the Moon up to 1 deg elsewhere.
+ERFA's series: plan94 (Simon et al. 1994: a few arcseconds, Jupiter and Saturn 80", 1800 to 2050), moon98
+(Meeus 1998: 10"), epv00 for the Earth. ERFA is a dependency already, and needs no file of ephemerides. An
+observer on the ground sees the Moon up to 1 deg elsewhere.
 """
 
 from __future__ import annotations

@@ -7,11 +7,9 @@ stand in the file. Written by hand: sixty lines against a library of the size of
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
-from flight.gnc.errors import UsageError
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.vision.startracker.sky_map import SkyMap
 
@@ -95,16 +93,11 @@ def _polynomials(
     return found
 
 
-def write_header(path: Path, sky: SkyMap) -> None:
-    """Write a FITS file of a header alone. Raises UsageError when it cannot be written or exists."""
+def header_text(sky: SkyMap) -> str:
+    """Return a FITS file of a header alone, ASCII."""
     cards: list[Card] = [("SIMPLE", True), ("BITPIX", 8), ("NAXIS", 0), *world_coordinates(sky).items()]
     text = "".join(_card(key, value) for key, value in cards) + "END".ljust(_CARD)
-    content = text.ljust(-(-len(text) // _BLOCK) * _BLOCK).encode("ascii")
-    try:
-        with path.open("xb") as file:
-            file.write(content)
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be written: {error.strerror or error}") from error
+    return text.ljust(-(-len(text) // _BLOCK) * _BLOCK)
 
 
 def _card(key: str, value: str | int | float | bool) -> str:

@@ -1,9 +1,9 @@
 """Frames of stars with foregrounds and defects, solved of each: `python -m tests.studies.bench foregrounds`.
 
 Photographs: those of a folder with a `truth.json`, as the bench `sky` takes them. Rendered frames: the
-simulator's camera of 12 deg, at rest, or with streaks (`--streaks`). The field is known to 5 %. A frame is right
-within 60" of its truth, or 3 px: no lens is given, and a foreground leaves stars on one side of it. Peers, where
-they are installed, get the same frames.
+simulator's camera of 12 deg, at rest, or with streaks (`--streaks`). The field is known to 5 %. A frame is
+right within 60" of its truth, or 3 px: no lens is given, and a foreground leaves stars on one side of it.
+Peers, where they are installed, get the same frames.
 """
 
 from __future__ import annotations

@@ -1,11 +1,12 @@
 """Claimed errors of pictures whose lens nobody gave: `python -m tests.studies.bench untold_lens`.
 
-Drawn pictures: stars of the real sky through a lens with its axis off the middle and with distortion, of which
-the star tracker is given the field to 5 %; places are off by 0.1 px. The truth is the attitude of the middle of
-the picture. Photographs: those of a folder with a `truth.json`, whose values other solvers made without a lens:
-some of the difference is theirs. `NEES`: squared error over its covariance, per degree of freedom; 1 is honest.
-`median ratio`: error across the boresight over its claimed sigma, 1.18 where honest. The floor that photographs
-ask for makes drawn pictures, which have no air and no colours, claim too much error: `fit alone` is without it.
+Drawn pictures: stars of the real sky through a lens with its axis off the middle and with distortion, of
+which the star tracker is given the field to 5 %; places are off by 0.1 px. The truth is the attitude of the
+middle of the picture. Photographs: those of a folder with a `truth.json`, whose values other solvers made
+without a lens: some of the difference is theirs. `NEES`: squared error over its covariance, per degree of
+freedom; 1 is honest. `median ratio`: error across the boresight over its claimed sigma, 1.18 where honest.
+The floor that photographs ask for makes drawn pictures, which have no air and no colours, claim too much
+error: `fit alone` is without it.
 """
 
 from __future__ import annotations
@@ -166,13 +167,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.write(json.dumps({"rows": shown}) + "\n")
         return 0
     sys.stdout.write(
-        f"{'pictures':12s} {'solved':>10s} {'NEES':>7s} {'fit alone':>10s} {'median ratio':>13s} {'beyond 5':>9s}"
-        f" {'rms px':>7s}\n"
+        f"{'pictures':12s} {'solved':>10s} {'NEES':>7s} {'fit alone':>10s} {'median ratio':>13s}"
+        f" {'beyond 5':>9s} {'rms px':>7s}\n"
     )
     for row in rows:
         solved = f"{row['solved']} of {row['tried']}"
         sys.stdout.write(
-            f"{row['pictures']:12s} {solved:>10s} {row['nees']:7.2f} {row['nees_of_the_fit_alone']:10.2f} {row['median_ratio']:13.2f}"
+            f"{row['pictures']:12s} {solved:>10s} {row['nees']:7.2f} {row['nees_of_the_fit_alone']:10.2f}"
+            f" {row['median_ratio']:13.2f}"
             f" {row['beyond_5_sigma']:9d} {row['rms_px']:7.3f}\n"
         )
     return 0
