@@ -45,7 +45,7 @@ def calibrate_one_lens(
 ) -> Selected:
     """Return the lens of the frames that agree on one, begun from `initial`.
 
-    `focal_lengths` (m,) px of each frame alone, with `sigmas` (m,) px. Raises CalibrationError as `calibrate`.
+    `focal_lengths` (m,) px of each frame alone, with `sigmas` (m,) px. Raises as `calibrate`.
     """
     left_out: dict[int, str] = {}
     usual = float(np.median(focal_lengths))

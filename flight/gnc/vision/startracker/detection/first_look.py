@@ -119,7 +119,7 @@ def single_pixels(windows: Windows) -> BoolArray:
     """Return which windows (n,) hold one or two bright pixels with dark neighbours, which no optics make."""
     h = windows.half
     core = windows.light[:, h - 1 : h + 2, h - 1 : h + 2].reshape(len(windows), 9)
-    return are_hot(core.T, windows.noise) & (core.max(axis=1) > _LEAST_HOT * windows.noise)
+    return np.asarray(are_hot(core.T, windows.noise) & (core.max(axis=1) > _LEAST_HOT * windows.noise))
 
 
 def crowded(middle: IntArray) -> BoolArray:

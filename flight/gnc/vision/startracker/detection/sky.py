@@ -216,8 +216,8 @@ def _tail(sample: Float32Array, level: FloatArray, noise: FloatArray) -> FloatAr
     block = np.ix_(np.arange(rows) * down // rows, np.arange(columns) * across // columns)
     relative = (sample - level[block]) / noise[block]
     height, width = rows // down, columns // across
-    values = relative[: down * height, : across * width].reshape(down, height, across, width)
-    values = values.transpose(0, 2, 1, 3).reshape(down, across, -1)
+    blocks = relative[: down * height, : across * width].reshape(down, height, across, width)
+    values = blocks.transpose(0, 2, 1, 3).reshape(down, across, -1)
     place = min(values.shape[-1] - 1, int(_TAIL_PART * values.shape[-1]))
     tail = np.maximum(1.0, 0.5 * np.partition(values, place, axis=-1)[..., place])
     return np.asarray(ndimage.median_filter(tail, size=3, mode="nearest"))

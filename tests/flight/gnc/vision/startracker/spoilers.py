@@ -69,7 +69,7 @@ def _roof(frame: FloatArray, span: float, rng: np.random.Generator) -> FloatArra
 
 def _leaves(frame: FloatArray, span: float, rng: np.random.Generator) -> FloatArray:
     rows, columns = frame.shape
-    light = np.zeros(frame.shape)
+    light: FloatArray = np.zeros(frame.shape)
     for _ in range(rows * columns // 900):
         x, y = rng.uniform(0.55 * columns, columns), rng.uniform(0.0, 0.55 * rows)
         width, height, turn = rng.uniform(2.0, 7.0), rng.uniform(1.5, 3.5), rng.uniform(0.0, np.pi)
@@ -84,7 +84,7 @@ def _leaves(frame: FloatArray, span: float, rng: np.random.Generator) -> FloatAr
 
 def _discs(frame: FloatArray, span: float, rng: np.random.Generator) -> FloatArray:
     rows, columns = frame.shape
-    light = np.zeros(frame.shape)
+    light: FloatArray = np.zeros(frame.shape)
     for _ in range(4):
         x, y, radius = rng.uniform(0, columns), rng.uniform(0, rows), rng.uniform(8.0, 25.0)
         apart = np.hypot(np.arange(columns)[None] - x, np.arange(rows)[:, None] - y)
@@ -112,7 +112,8 @@ def _limb(frame: FloatArray, span: float, rng: np.random.Generator) -> FloatArra
 
 def _gradient(frame: FloatArray, span: float, rng: np.random.Generator) -> FloatArray:
     y, x = _grid(frame)
-    return _lit(frame, 3.0 * span * (0.6 * x + 0.4 * y) ** 2, rng)
+    light = np.asarray(3.0 * span * (0.6 * x + 0.4 * y) ** 2, dtype=np.float64)
+    return _lit(frame, light, rng)
 
 
 def _hot(share: float) -> Spoiler:
@@ -124,13 +125,13 @@ def _hot(share: float) -> Spoiler:
 
 
 def _columns(frame: FloatArray, span: float, rng: np.random.Generator) -> FloatArray:
-    bad = rng.random(frame.shape[1]) < 0.01
+    bad = np.asarray(rng.random(frame.shape[1]) < 0.01)
     return np.where(bad[None], frame + 2.0 * span, frame)
 
 
 def _column_pattern(frame: FloatArray, span: float, rng: np.random.Generator) -> FloatArray:
-    noise = 1.4826 * np.median(np.abs(frame - np.median(frame))) + 0.3
-    return frame + 2.0 * noise * rng.standard_normal(frame.shape[1])[None]
+    noise = 1.4826 * float(np.median(np.abs(frame - np.median(frame)))) + 0.3
+    return np.asarray(frame + 2.0 * noise * rng.standard_normal((1, frame.shape[1])))
 
 
 def _cosmic(frame: FloatArray, span: float, rng: np.random.Generator) -> FloatArray:
