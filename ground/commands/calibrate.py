@@ -7,7 +7,7 @@ import json
 import math
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +23,9 @@ from flight.gnc.vision.startracker.index.build import default_index
 from flight.gnc.vision.startracker.index.sky_index import SkyIndex
 from flight.gnc.vision.startracker.solution import FrameSolution
 from flight.gnc.vision.startracker.solve import SolveSettings
-from ground.calibration.calibration import PARAMETERS, Calibration, calibrate
+from ground.calibration.calibration import PARAMETERS, Calibration
 from ground.calibration.lens_fit import MatchedFrame
+from ground.calibration.selection import LEAST_STARS, Selected, calibrate_one_lens
 from ground.commands.options import positive, write_new
 from ground.commands.solve import lens_of_field
 
@@ -36,19 +37,32 @@ _SETTINGS = SolveSettings(identification=IdentificationSettings(mirror=False))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Picture:
-    """A picture and its solution."""
+    """A picture, its solution, and why it was left out; empty if it was not."""
 
     path: Path
     pixels: Image
     solution: FrameSolution
+    left_out: str = ""
+
+    @property
+    def used(self) -> bool:
+        """Whether the lens rests on it."""
+        return self.solution.fix is not None and not self.left_out
+
+    @property
+    def reason(self) -> str:
+        """Why the lens does not rest on it."""
+        return self.left_out or self.solution.reason
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of this command to the parser."""
     parser.description = (
         "Calibrate a camera from pictures of the night sky: focal length, optical axis, radial distortion, "
-        "with their errors. All pictures must be of one camera at one focus; ten that put stars into the "
-        "corners are worth more than a hundred that do not. Undetermined parameters are named."
+        "with their errors. All pictures must be of one camera at one focus; those that do not fit are left "
+        "out and named. Ten that put stars into the corners are worth more than a hundred that do not. "
+        "Undetermined parameters are named; fewer than "
+        f"{LEAST_STARS} stars make no camera file."
     )
     parser.epilog = "example: python -m flight calibrate night*.tiff --fov 11.4 --out camera.yaml"
     parser.add_argument("images", type=Path, nargs="+", metavar="IMAGE")
@@ -59,36 +73,57 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Solve, fit, print, write; exit status 1 when no picture could be solved."""
+    """Solve, fit, print, write; exit status 1 when no picture is solved or too few stars for a camera."""
     if options.out is not None and options.out.exists():
         raise UsageError(f"{options.out}: exists already: name another file")
     frames = _read(options.images)
     shape = frames[0][1].shape
-    camera, scale = lens_of_field(options.fov, None, shape)
     sky = default_index()
-    model: CameraModel = camera
-    pictures: list[Picture] = []
-    found: Calibration | None = None
+    pictures, selected = _calibrated(frames, *lens_of_field(options.fov, None, shape), sky)
+    if selected is None:
+        for picture in pictures:
+            sys.stderr.write(f"{picture.path}: {picture.reason}\n")
+        return 1
+    found = selected.calibration
+    facts = _facts(found, pictures)
+    sys.stdout.write(json.dumps(facts, allow_nan=False) + "\n" if options.json else _text(found, pictures))
+    if options.out is None:
+        return 0
+    if selected.stars < LEAST_STARS:
+        sys.stderr.write(
+            f"{options.out}: not written: {selected.stars} stars are too few for a camera, {LEAST_STARS} are"
+            " needed: give more pictures\n"
+        )
+        return 1
+    _write(options.out, found.lens)
+    if not options.json:
+        sys.stdout.write(f"\nwritten: {options.out}, for --camera of `flight solve` and `flight rate`\n")
+    return 0
+
+
+def _calibrated(
+    frames: Sequence[tuple[Path, Image]], camera: CameraModel, scale: tuple[float, float], sky: SkyIndex
+) -> tuple[list[Picture], Selected | None]:
+    """Return the pictures, each with its solution or why it was left out, and the lens; None without one."""
+    model, selected, pictures = camera, None, []
     for round_number in range(_ROUNDS):
         # The better the lens, the more stars in the corners match.
         pictures = _solve(frames, model, scale, sky, round_number)
-        solved = [picture for picture in pictures if picture.solution.fix is not None]
+        solved = [number for number, picture in enumerate(pictures) if picture.solution.fix is not None]
         if not solved:
-            break
-        begun = solved[0].solution.camera if found is None else model
-        found = calibrate([_matches(picture.solution, sky) for picture in solved], begun)
-        model, scale = found.lens, (0.999, 1.001)
-    if found is None:
-        for picture in pictures:
-            sys.stderr.write(f"{picture.path}: {picture.solution.reason}\n")
-        return 1
-    if options.out is not None:
-        _write(options.out, found.lens)
-    facts = _facts(found, pictures)
-    sys.stdout.write(json.dumps(facts, allow_nan=False) + "\n" if options.json else _text(found, pictures))
-    if options.out is not None and not options.json:
-        sys.stdout.write(f"\nwritten: {options.out}, for --camera of `flight solve` and `flight rate`\n")
-    return 0
+            return pictures, None
+        solutions = [pictures[number].solution for number in solved]
+        focal_lengths = np.array([solution.camera.focal_length for solution in solutions])
+        sigmas = focal_lengths * np.array([solution.scale_sigma for solution in solutions])
+        middle = int(np.argsort(focal_lengths)[len(solved) // 2])
+        begun = solutions[middle].camera if selected is None else model
+        selected = calibrate_one_lens(
+            [_matches(solution, sky) for solution in solutions], begun, focal_lengths, sigmas
+        )
+        for number, reason in selected.left_out.items():
+            pictures[solved[number]] = replace(pictures[solved[number]], left_out=reason)
+        model, scale = selected.calibration.lens, (0.999, 1.001)
+    return pictures, selected
 
 
 def _read(paths: Sequence[Path]) -> list[tuple[Path, Image]]:
@@ -141,6 +176,7 @@ def _facts(found: Calibration, pictures: Sequence[Picture]) -> dict[str, Any]:
             {
                 "path": str(picture.path),
                 "status": picture.solution.status.value,
+                "left_out": picture.reason or None,
                 "stars": len(picture.solution.matched),
             }
             for picture in pictures
@@ -150,16 +186,16 @@ def _facts(found: Calibration, pictures: Sequence[Picture]) -> dict[str, Any]:
 
 def _text(found: Calibration, pictures: Sequence[Picture]) -> str:
     lens, sigma = found.lens, found.sigma
-    solved = [picture for picture in pictures if picture.solution.fix is not None]
+    solved = [picture for picture in pictures if picture.used]
     stars = sum(len(picture.solution.matched) for picture in solved)
     values = dict(zip(PARAMETERS, (lens.focal_length, *lens.centre, lens.k1, lens.k2), strict=True))
     places = {"k1": 5, "k2": 5}
     lines = [
-        f"{picture.path}: not solved: {picture.solution.reason}"
+        f"{picture.path}: {'left out' if picture.left_out else 'not solved'}: {picture.reason}"
         for picture in pictures
-        if picture.solution.fix is None
+        if not picture.used
     ]
-    lines.append(f"pictures:     {len(solved)} of {len(pictures)} solved, {stars} stars")
+    lines.append(f"pictures:     {len(solved)} of {len(pictures)} used, {stars} stars")
     for name, value in values.items():
         digits = places.get(name, 2)
         note = "   not determined by the stars: the assumed value" if name in found.undetermined else ""

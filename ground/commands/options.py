@@ -18,7 +18,7 @@ _RAW = re.compile(r"([0-9]+)x([0-9]+)x(8|16)")
 
 def add_picture(parser: argparse.ArgumentParser) -> None:
     """Add the arguments that name a picture."""
-    parser.add_argument("image", type=Path, metavar="IMAGE", help="PNG, TIFF, JPEG, FITS, or see --raw")
+    parser.add_argument("image", type=Path, metavar="IMAGE", help="PNG, TIFF, JPEG, BMP, FITS, or see --raw")
     parser.add_argument(
         "--raw",
         type=raw_shape,

@@ -35,8 +35,11 @@ from flight.gnc.vision.streaks.streak_result import StreakStatus
 from flight.schema import reader as configuration
 from flight.schema.camera_model import camera_model
 from flight.schema.sections import Camera
-from ground.commands.options import add_field, add_output, add_picture, positive, read_picture
+from ground.commands.options import add_field, add_output, add_picture, positive, read_picture, write_new
 from ground.pictures.sky_picture import draw_solution
+from ground.sky.bodies import bodies_in
+from ground.sky.facts import sky_facts, sky_text
+from ground.sky.world_coordinates import header_text
 
 ARCSECONDS = math.degrees(1.0) * 3600.0
 UNKNOWN_DEG = 4.0, 60.0
@@ -49,7 +52,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Determine where a picture of the sky points: right ascension, declination and roll (the position "
         "angle of up, from north through east), ICRS; which stars it shows; and, from star streaks, "
-        "how the camera turned. PNG, TIFF, JPEG or FITS. Without --fov or --camera all fields from "
+        "how the camera turned. PNG, TIFF, JPEG, BMP or FITS. Without --fov or --camera all fields from "
         f"{UNKNOWN_DEG[0]:g} to {UNKNOWN_DEG[1]:g} deg are searched."
     )
     parser.epilog = "example: python -m flight solve night.jpg --fov 11.4 --overlay solved.png"
@@ -63,7 +66,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--prior", type=float, nargs=3, metavar=("X", "Y", "Z"), help="rough rate, rad/s")
     parser.add_argument(
-        "--date", type=_date, metavar="UTC", help="when, such as 2026-11-21: proper motion, aberration"
+        "--date",
+        type=_date,
+        metavar="UTC",
+        help="when, such as 2026-11-21: proper motion, aberration, planets",
+    )
+    parser.add_argument(
+        "--wcs", type=Path, metavar="FITS", help="write a header of world coordinates (TAN-SIP) here"
     )
     parser.add_argument("--index", type=Path, metavar="FILE", help="another sky index")
     parser.add_argument(
@@ -77,6 +86,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Solve, print, draw; exit status 1 when the picture is not solved."""
+    if options.wcs is not None and options.wcs.exists():
+        raise UsageError(f"{options.wcs}: exists already: name another file")
     pixels = read_picture(options)
     camera, scale, exposure, settings = _belief(options, pixels)
     sky = sky_index.load(options.index) if options.index else default_index()
@@ -89,10 +100,16 @@ def run(options: argparse.Namespace) -> int:
     begin = time.perf_counter()
     solution = solve_frame(pixels, camera, scale, exposure or 1.0, sky, settings, rate_prior=prior)
     seconds = time.perf_counter() - begin
+    sky_map, bodies = solution.sky_map(settings.velocity), []
+    if sky_map is not None and options.date is not None:
+        bodies = bodies_in(sky_map, options.date.julian_date)
     if options.json:
-        sys.stdout.write(json.dumps(facts(solution, sky, exposure, seconds), allow_nan=False) + "\n")
+        values = facts(solution, sky, exposure, seconds) | sky_facts(sky_map, bodies)
+        sys.stdout.write(json.dumps(values, allow_nan=False) + "\n")
     else:
-        sys.stdout.write(_text(solution, sky, exposure, seconds))
+        sys.stdout.write(_text(solution, sky, exposure, seconds) + sky_text(sky_map, bodies))
+    if options.wcs is not None and sky_map is not None:
+        write_new(options.wcs, header_text(sky_map))
     if options.overlay is not None:
         write_picture(options.overlay, draw_solution(grey_stretch(pixels), solution, sky))
         if not options.json:

@@ -1,4 +1,4 @@
-"""Reads image files as arrays (PNG, TIFF and JPEG through Pillow, FITS by `fits`); writes pictures.
+"""Reads image files as arrays (PNG, TIFF, JPEG and BMP through Pillow, FITS by `fits`); writes pictures.
 
     pixels = read_image(Path("night.fits"))      # (rows, columns), the counts as they stand in the file
     pixels = read_raw(Path("night.raw"), columns=1280, rows=960, bits=16)      # bare pixels
@@ -11,6 +11,7 @@ the sky. The orientation in a photograph's EXIF data is ignored.
 from __future__ import annotations
 
 import struct
+import sys
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,7 +26,7 @@ from flight.gnc.math.arrays import Image
 if TYPE_CHECKING:
     from PIL.Image import Image as Picture
 
-FORMATS = ("PNG", "TIFF", "JPEG")
+FORMATS = ("PNG", "TIFF", "JPEG", "BMP")
 EXTRA = "pip install 'knightcube-flight[images]'"
 
 PHOTOMETRIC_INTERPRETATION, WHITE_IS_ZERO = 262, 0
@@ -33,6 +34,16 @@ PHOTOMETRIC_INTERPRETATION, WHITE_IS_ZERO = 262, 0
 GREY_MODES = {"L": np.uint8, "1": np.uint8, "I;16": np.uint16, "I;16L": np.uint16, "I;16B": np.uint16}
 """Pillow's names of grey pixels that are whole numbers of 8 or 16 bits."""
 COLOUR_MODES = ("LA", "La", "P", "PA", "RGB", "RGBA", "RGBa", "RGBX", "CMYK", "YCbCr", "LAB", "HSV")
+
+_LUMINANCE = np.array([0.299, 0.587, 0.114])
+"""Of red, green and blue: ITU-R BT.601."""
+_NATIVE_SWAPPED = "B" if sys.byteorder == "little" else "L"
+# Pillow keeps the high byte of 16-bit colour. Given the other order of bytes, it keeps the low one.
+_OTHER_BYTES = {
+    f"{colour};16{order}": f"{colour};16{other}"
+    for colour in ("RGB", "RGBA", "RGBX")
+    for order, other in (("B", "L"), ("L", "B"), ("N", _NATIVE_SWAPPED))
+}
 
 
 def read_image(path: Path) -> Image:
@@ -110,6 +121,11 @@ def _through_pillow(path: Path) -> Image:
         # Its warnings concern metadata, which is not used here; damaged pixels raise.
         with warnings.catch_warnings(action="ignore"), pillow.open(path, formats=FORMATS) as picture:
             _check_kept(path, picture)
+            if _is_deep(picture):
+                high = _colours(picture)
+                with pillow.open(path, formats=FORMATS) as again:
+                    again.tile = [tile._replace(args=_low_bytes(tile.args)) for tile in again.tile]
+                    return _luminance(256.0 * high + _colours(again))
             picture.load()
             return _grey(path, picture)
     except UnidentifiedImageError as error:
@@ -123,11 +139,38 @@ def _through_pillow(path: Path) -> Image:
 
 def _check_kept(path: Path, picture: Picture) -> None:
     """Raise UsageError for images that Pillow would misread: 16-bit colour cut to 8, inverted grey."""
-    if picture.mode in COLOUR_MODES and any(";16" in str(tile[3]) for tile in getattr(picture, "tile", ())):
-        raise UsageError(f"{path}: 16-bit colour is not read: convert it to 16-bit grey")
+    deep = any(";16" in _raw_mode(tile[3]) for tile in getattr(picture, "tile", ()))
+    if picture.mode in COLOUR_MODES and deep and not _is_deep(picture):
+        raise UsageError(f"{path}: its 16-bit colour is not read: convert it to 16-bit grey")
     interpretation = getattr(picture, "tag_v2", {}).get(PHOTOMETRIC_INTERPRETATION)
     if picture.mode.startswith("I") and interpretation == WHITE_IS_ZERO:
         raise UsageError(f"{path}: its zero is white: convert it to a TIFF whose zero is black")
+
+
+def _raw_mode(args: object) -> str:
+    """Return how Pillow unpacks a tile: the first of its decoder's arguments."""
+    return str(args[0]) if isinstance(args, tuple) and args else str(args)
+
+
+def _is_deep(picture: Picture) -> bool:
+    """Return whether it holds red, green and blue of 16 bits, of which Pillow keeps the high ones."""
+    modes = {_raw_mode(tile[3]) for tile in getattr(picture, "tile", ())}
+    return len(modes) == 1 and modes <= _OTHER_BYTES.keys()
+
+
+def _low_bytes(args: object) -> object:
+    """Return the decoder's arguments that take the other byte of each pair."""
+    other = _OTHER_BYTES[_raw_mode(args)]
+    return (other, *args[1:]) if isinstance(args, tuple) else other
+
+
+def _colours(picture: Picture) -> npt.NDArray[np.float64]:
+    return np.asarray(picture.convert("RGB"), dtype=np.float64)
+
+
+def _luminance(colours: npt.NDArray[np.float64]) -> npt.NDArray[np.uint16]:
+    """Return the luminance (rows, columns) of colours (rows, columns, 3) of 16 bits."""
+    return np.rint(colours @ _LUMINANCE).astype(np.uint16)
 
 
 def _grey(path: Path, picture: Picture) -> Image:

@@ -1,7 +1,8 @@
 """From one frame to attitude and rate: the only decision tree, of the vision worker and of `flight solve`.
 
 1. The motion over the exposure is estimated: of every frame in flight, which reports it; of any other
-   picture only where a survey of its bright areas shows streaks, for the survey is cheaper.
+   picture only where a survey of its bright areas shows streaks, for the survey is cheaper. If these give no
+   attitude (a fence or a striped wall looks like streaks too), the picture's points are tried.
 2. Stars at rest are looked for near their predicted places if there is a prior attitude, else, or if that
    fails, in the whole frame.
 3. Streaks give their stars' places at mid-exposure, which are identified like points. A focal length that
@@ -22,7 +23,7 @@ import numpy as np
 
 from flight.gnc.camera.lens import CameraModel
 from flight.gnc.math.arrays import Image
-from flight.gnc.vision.startracker.detection import FrameKind, measure_areas, survey
+from flight.gnc.vision.startracker.detection import FrameKind, Survey, measure_areas, survey
 from flight.gnc.vision.startracker.index import sky_index
 from flight.gnc.vision.startracker.index.build import default_index
 from flight.gnc.vision.startracker.index.sky_index import SkyIndex
@@ -156,20 +157,42 @@ def attitude_and_rate(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) ->
         near = solve_near(job.pixels, job.camera, tracker.scale, sky, tracker.solve, job.attitude_prior)
         if near is not None:
             return FrameFound(motion or _no_motion(job), near)
-    if rests or motion is None:
-        seen = survey(job.pixels, tracker.solve.detection)
-        if motion is not None or seen.shape.kind is not FrameKind.STREAKS:
-            stars = measure_areas(seen).stars()
-            points = solve_points(stars, job.camera, tracker.scale, sky, tracker.solve, job.attitude_prior)
-            return FrameFound(motion or _no_motion(job), points)
     if motion is None:
-        motion = _motion(job)
-    elif motion.status not in MOVED:
+        return _of_picture(job, tracker, sky)
+    if rests:
+        seen = survey(job.pixels, tracker.solve.detection)
+        return FrameFound(motion, _from_points(job, tracker, sky, seen))
+    if motion.status not in MOVED:
         return FrameFound(motion, None)
+    return _from_motion(job, tracker, sky, motion)
+
+
+def _from_motion(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, motion: Found) -> FrameFound:
+    """Return the attitude of a frame of streaks by the way of the estimator that found their motion."""
     if isinstance(motion, StreakResult):
         ends, rate = solve_ends(motion, job.camera, tracker.scale, sky, tracker.solve, job.attitude_prior)
         return FrameFound(rate, ends)
     return _from_streaks(job, tracker, sky, motion)
+
+
+def _of_picture(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) -> FrameFound:
+    """Return attitude and rate of a picture, of which a survey says whether it shows points or streaks."""
+    seen = survey(job.pixels, tracker.solve.detection)
+    found: FrameFound | None = None
+    if seen.shape.kind is FrameKind.STREAKS:
+        found = _from_motion(job, tracker, sky, _motion(job))
+        if found.solution is None or found.solution.status is SolveStatus.SOLVED:
+            return found
+    # A fence or a striped wall looks like streaks; the sky beside it shows points.
+    points = _from_points(job, tracker, sky, seen)
+    if found is not None and points.status is not SolveStatus.SOLVED:
+        return found
+    return FrameFound(_no_motion(job), points)
+
+
+def _from_points(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, seen: Survey) -> FrameSolution:
+    stars = measure_areas(seen).stars()
+    return solve_points(stars, job.camera, tracker.scale, sky, tracker.solve, job.attitude_prior)
 
 
 def _from_streaks(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, motion: MotionResult) -> FrameFound:

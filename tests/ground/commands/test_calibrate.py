@@ -46,6 +46,33 @@ def test_what_the_stars_leave_open_is_named(pictures: list[Path], tmp_path: Path
     assert "not determined by the stars" in done.stdout
 
 
+def test_a_picture_of_another_focus_is_left_out_and_named(pictures: list[Path], tmp_path: Path) -> None:
+    other = tmp_path / "other.png"
+    picture = pillow.open(pictures[0])
+    picture.resize((1055, 1055)).crop((15, 15, 1039, 1039)).save(other)
+    done = command("calibrate", *pictures, other, "--fov", "12", "--json")
+    assert done.returncode == 0, done.stderr
+    facts = json.loads(done.stdout)
+    assert [picture["left_out"] is None for picture in facts["pictures"]] == [True, True, True, False]
+    assert facts["focal_length"] == pytest.approx(NARROW.pinhole.focal_length, rel=2e-4)
+
+
+def test_few_stars_make_no_camera_file(pictures: list[Path], tmp_path: Path) -> None:
+    corner, out = tmp_path / "corner.png", tmp_path / "camera.yaml"
+    pixels = np.asarray(pillow.open(pictures[0])).copy()
+    shown = json.loads(command("solve", pictures[0], "--fov", "12", "--json").stdout)["stars"][:8]
+    mask = np.zeros(pixels.shape, dtype=bool)
+    for star in shown:
+        x, y = np.rint(star["point_px"]).astype(int)
+        mask[max(0, y - 8) : y + 9, max(0, x - 8) : x + 9] = True
+    dark = np.random.default_rng(3).normal(np.median(pixels), 11.0, pixels.shape)
+    pillow.fromarray(np.where(mask, pixels, np.clip(dark, 0, 4000)).astype(np.uint16)).save(corner)
+    done = command("calibrate", corner, "--fov", "12", "--out", out)
+    assert done.returncode == 1
+    assert "too few for a camera" in done.stderr
+    assert not out.exists()
+
+
 def test_pictures_without_stars_are_named_with_the_reason_and_exit_status_1(tmp_path: Path) -> None:
     path = tmp_path / "cloud.png"
     pillow.fromarray(np.random.default_rng(1).normal(90.0, 9.0, (256, 256)).astype(np.uint8)).save(path)

@@ -127,3 +127,55 @@ def test_a_mistake_is_one_line_and_exit_status_2(
     assert done.returncode == 2
     assert complaint in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_the_world_coordinates_put_the_stars_where_the_picture_has_them(
+    picture: Path, tmp_path: Path
+) -> None:
+    """The tangent plane is computed here by its definition (Calabretta & Greisen 2002), SIP by Shupe 2005."""
+    out = tmp_path / "frame.wcs"
+    done = command("solve", picture, "--fov", "12", "--wcs", out, "--json")
+    assert done.returncode == 0, done.stderr
+    facts = json.loads(done.stdout)
+    wcs = facts["wcs"]
+    text = out.read_bytes().decode("ascii")
+    assert len(text) % 2880 == 0
+    cards = {text[k : k + 8].strip(): text[k + 10 : k + 80].strip() for k in range(0, len(text), 80)}
+    assert {key: float(cards[key]) for key in wcs if isinstance(wcs[key], float)} == pytest.approx(
+        wcs_numbers(wcs)
+    )
+    crval = np.radians([wcs["CRVAL1"], wcs["CRVAL2"]])
+    for name in ("image_centre", "axis"):
+        place = facts[name]
+        x, y = np.array(place["point_px"]) + 1.0 - (wcs["CRPIX1"], wcs["CRPIX2"])
+        assert _sky_of(wcs, x, y, crval) == pytest.approx(
+            (place["right_ascension_deg"], place["declination_deg"]), abs=1e-6
+        )
+    # Out to the corner and back by the other two polynomials.
+    x, y = 400.0, -350.0
+    u, v = x + _polynomial(wcs, "A", x, y), y + _polynomial(wcs, "B", x, y)
+    assert (u + _polynomial(wcs, "AP", u, v), v + _polynomial(wcs, "BP", u, v)) == pytest.approx(
+        (x, y), abs=0.01
+    )
+
+
+def wcs_numbers(wcs: dict[str, object]) -> dict[str, float]:
+    return {key: value for key, value in wcs.items() if isinstance(value, float)}
+
+
+def _polynomial(wcs: dict[str, float], name: str, x: float, y: float) -> float:
+    order = int(wcs[f"{name}_ORDER"])
+    return sum(
+        wcs.get(f"{name}_{i}_{j}", 0.0) * x**i * y**j for i in range(order + 1) for j in range(order + 1 - i)
+    )
+
+
+def _sky_of(wcs: dict[str, float], x: float, y: float, crval: np.ndarray) -> tuple[float, float]:
+    u, v = x + _polynomial(wcs, "A", x, y), y + _polynomial(wcs, "B", x, y)
+    xi = math.radians(wcs["CD1_1"] * u + wcs["CD1_2"] * v)
+    eta = math.radians(wcs["CD2_1"] * u + wcs["CD2_2"] * v)
+    ra0, dec0 = crval
+    below = math.cos(dec0) - eta * math.sin(dec0)
+    ra = ra0 + math.atan2(xi, below)
+    dec = math.atan2(math.sin(dec0) + eta * math.cos(dec0), math.hypot(xi, below))
+    return math.degrees(ra) % 360.0, math.degrees(dec)

@@ -37,16 +37,16 @@ from tests.studies.bench.star_peers import PEERS
 from tests.studies.bench.starid import Answer, peer_answers
 
 _SEED = 16_018
-_PHOTOGRAPHS = Path(__file__).parents[4] / "shared" / "data" / "sky"
+PHOTOGRAPHS = Path(__file__).parents[4] / "shared" / "data" / "sky"
 _STREAKS_PX = (0.0, 10.0, 20.0, 40.0, 80.0)
 _OBLIQUE, _ACROSS = (30.0, 90.0), (90.0, 90.0)
 _EXPOSURE = 0.1
 # rad, of the prior for tracking: 1.5 px.
 _PRIOR_SIGMA = 3e-4
-_FIELD_SHARE = 0.05
+FIELD_SHARE = 0.05
 _LOWEST_DEG, _HIGHEST_DEG = 10.0, 30.0
-_NARROW_DEG, _NARROW_KNOWN_DEG = 12.0, 0.1
-_RIGHT_ARCSEC = 60.0
+NARROW_DEG, _NARROW_KNOWN_DEG = 12.0, 0.1
+RIGHT_ARCSEC = 60.0
 ARCSECONDS = math.degrees(1.0) * 3600.0
 
 
@@ -75,7 +75,7 @@ def photograph(folder: Path, name: str, truth: dict[str, float], known: bool) ->
     pixels = read_image(folder / name)
     fov = truth["fov"]
     low, high = (
-        (fov * (1.0 - _FIELD_SHARE), fov * (1.0 + _FIELD_SHARE)) if known else (_LOWEST_DEG, _HIGHEST_DEG)
+        (fov * (1.0 - FIELD_SHARE), fov * (1.0 + FIELD_SHARE)) if known else (_LOWEST_DEG, _HIGHEST_DEG)
     )
     camera, scale = believed(pixels, fov if known else 17.0, low, high)
     begin = time.process_time()
@@ -148,9 +148,9 @@ def scene_of(length: float, theta_deg: tuple[float, float], frame: int) -> SkyFr
 
 def solved(scene: SkyFrame, length: float) -> Solved:
     """Return what the star tracker makes of a simulated frame, lost in space and with a prior."""
-    low, high = _NARROW_DEG - _NARROW_KNOWN_DEG, _NARROW_DEG + _NARROW_KNOWN_DEG
-    camera, scale = believed(scene.pixels, _NARROW_DEG, low, high)
-    rate_prior, settings = RatePrior(scene.rate, 1e-6), SolveSettings()
+    low, high = NARROW_DEG - _NARROW_KNOWN_DEG, NARROW_DEG + _NARROW_KNOWN_DEG
+    camera, scale = believed(scene.pixels, NARROW_DEG, low, high)
+    rate_prior, settings = RatePrior(scene.rate, 1e-6), SolveSettings(untold_lens=False)
     prior = AttitudePrior(scene.attitude, _PRIOR_SIGMA)
     exposure = scene.exposure
     begin = time.process_time()
@@ -187,8 +187,8 @@ def row_of(length: float, theta_deg: tuple[float, float], frames: int) -> dict[s
         "length_px": length,
         "across": theta_deg == _ACROSS,
         "frames": frames,
-        "right": int(np.sum(across <= _RIGHT_ARCSEC)),
-        "wrong": int(np.sum(across > _RIGHT_ARCSEC)),
+        "right": int(np.sum(across <= RIGHT_ARCSEC)),
+        "wrong": int(np.sum(across > RIGHT_ARCSEC)),
         "median_arcsec": _or_nan(np.median, across),
         "worst_arcsec": _or_nan(np.max, across),
         "over_bound": _or_nan(_rms, across) / _or_nan(_rms, columns["across_bound"][told]),
@@ -233,7 +233,7 @@ def peer_cases(options: argparse.Namespace, folder: Path) -> list[Case]:
     if (options.photographs / "truth.json").is_file():
         for name, values, known in _shown(options.photographs):
             pixels, fov = read_image(options.photographs / name), values["fov"]
-            field, error = (fov, _FIELD_SHARE * fov) if known else (20.0, 10.0)
+            field, error = (fov, FIELD_SHARE * fov) if known else (20.0, 10.0)
             add(
                 f"photographs, field {'known' if known else 'unknown'}",
                 centre_of(values),
@@ -245,7 +245,7 @@ def peer_cases(options: argparse.Namespace, folder: Path) -> list[Case]:
         for frame in range(options.frames):
             scene = scene_of(length, _OBLIQUE, frame)
             boresight = attitude_matrix(scene.attitude)[2]
-            add(f"{length:.0f} px, field known", boresight, scene.pixels, _NARROW_DEG, _NARROW_KNOWN_DEG)
+            add(f"{length:.0f} px, field known", boresight, scene.pixels, NARROW_DEG, _NARROW_KNOWN_DEG)
     return cases
 
 
@@ -275,8 +275,8 @@ def _peer_row(chosen: Sequence[tuple[Answer, Case]]) -> dict[str, Any]:
     ms = [answer.ms for answer, _ in chosen]
     return {
         "frames": len(chosen),
-        "right": int(np.sum(off <= _RIGHT_ARCSEC)),
-        "wrong": int(np.sum(off > _RIGHT_ARCSEC)),
+        "right": int(np.sum(off <= RIGHT_ARCSEC)),
+        "wrong": int(np.sum(off > RIGHT_ARCSEC)),
         "refused": len(chosen) - len(off),
         "median_arcsec": _or_nan(np.median, off),
         "median_ms": float(np.median(ms)),
@@ -288,7 +288,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Measure and print; exit status 0."""
     parser = argparse.ArgumentParser(prog="python -m tests.studies.bench sky", description=__doc__)
     parser.add_argument("--frames", type=int, default=20, help="of each length (default %(default)s)")
-    parser.add_argument("--photographs", type=Path, default=_PHOTOGRAPHS, metavar="FOLDER")
+    parser.add_argument("--photographs", type=Path, default=PHOTOGRAPHS, metavar="FOLDER")
     parser.add_argument("--peers", action="store_true", help="cedar-solve and tetra3rs on the same frames")
     parser.add_argument(
         "--peer-python", default=sys.executable, metavar="PYTHON", help="that the peers are in"
@@ -318,8 +318,8 @@ def _table(pictures: list[Photograph], rows: list[dict[str, Any]]) -> str:
         known = "known" if one.known else "unknown"
         lines.append(f"{one.name:26s} {known:8s} {off} {one.stars:6d} {one.ms:6.1f}")
     told = [one for one in pictures if one.solved]
-    right = sum(one.arcsec <= _RIGHT_ARCSEC for one in told)
-    lines.append(f'right to {_RIGHT_ARCSEC:.0f}": {right} of {len(pictures)}, wrong {len(told) - right}')
+    right = sum(one.arcsec <= RIGHT_ARCSEC for one in told)
+    lines.append(f'right to {RIGHT_ARCSEC:.0f}": {right} of {len(pictures)}, wrong {len(told) - right}')
     for across in (False, True):
         lines.append(
             f"\naxis {'across the boresight' if across else '30 to 90 deg off the boresight'}\n"

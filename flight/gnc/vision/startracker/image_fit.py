@@ -5,6 +5,9 @@ directions across the star and whitened by the place's covariance; Gauss-Newton 
 the maximum likelihood for Gaussian errors. Light of another star in a streak shifts its place: stars that
 disagree by more than chance allows, given the scatter of the majority, are found under Huber's weights, which
 bound the pull of any star, and are excluded.
+
+The tilt, decentring and distortion of a lens that is not calibrated are fitted too, held by what is usual of
+lenses (`lens_bend`): what the stars leave open of them is in the attitude's covariance.
 """
 
 from __future__ import annotations
@@ -19,6 +22,7 @@ from flight.gnc.math.arrays import BoolArray, FloatArray
 from flight.gnc.math.directions import cross_matrices
 from flight.gnc.math.quaternion import attitude_matrix, from_matrix
 from flight.gnc.vision.startracker.identification.refinement import inflation, scale_slope, stretched, turned
+from flight.gnc.vision.startracker.lens_bend import BENDS, bend_slope, bent, usual_bend
 
 _MOST_STEPS = 8
 _SETTLED = 1e-11
@@ -30,6 +34,8 @@ _MEDIAN = 2.0 * float(np.log(2.0))
 # Deviations beyond which a star's pull is bounded while outliers are searched for.
 _PULL = 1.5
 _HUBER_ROUNDS = 10
+# Their places among the parameters: after the turn and ln scale.
+_LENS = np.arange(4, 4 + BENDS)
 _LEAST_AGREEING = 4
 
 
@@ -41,6 +47,7 @@ class ImageFit:
         fix: the attitude by the stars that agree; its covariance is widened if they scatter beyond theirs.
         scale: factor of the tangents x/z, y/z; 1 when it was held.
         scale_sigma: relative standard deviation of the scale; 0 when it was held.
+        bend: (6,) of the lens (`lens_bend`); zeros when it was held.
         squares: (n,) squared error of each star over its covariance, of two degrees of freedom.
         agree: (n,) whether the star was used.
     """
@@ -48,6 +55,7 @@ class ImageFit:
     fix: AttitudeFix
     scale: float
     scale_sigma: float
+    bend: FloatArray
     squares: FloatArray
     agree: BoolArray
 
@@ -59,6 +67,7 @@ def fit_in_image(
     camera: CameraModel,
     start: FloatArray,
     free_scale: bool = False,
+    free_lens: bool = False,
 ) -> ImageFit:
     """Return the attitude that puts stars at `reference` (n, 3) to `points` (n, 2) px.
 
@@ -69,11 +78,13 @@ def fit_in_image(
         camera: with its lens.
         start: (4,) an attitude near the answer, reference into camera.
         free_scale: whether the focal length may be wrong.
+        free_lens: whether tilt, decentring and distortion are free as well, as of a lens not calibrated.
 
     Raises AttitudeError when the stars do not determine the parameters.
     """
     observed = camera.unit_vectors(points)
-    seen = _Seen(observed, _whitener(points, observed, covariance, camera), reference, free_scale)
+    usual = usual_bend(camera) if free_scale and free_lens else np.zeros(0)
+    seen = _Seen(observed, _whitener(points, observed, covariance, camera), reference, free_scale, usual)
     pose = seen.fitted(_Pose(attitude_matrix(start), 1.0), np.ones(len(points)))
     squares, agree = seen.squares(pose), np.ones(len(points), dtype=np.bool_)
     # One outlier shifts all residuals: their spread is meaningless before its pull is bounded.
@@ -88,51 +99,76 @@ def fit_in_image(
     inverse = pose.covariance * inflation(squares[agree], len(pose.covariance))
     turn = np.ascontiguousarray(inverse[:3, :3], dtype=np.float64)
     fix = AttitudeFix(from_matrix(pose.matrix), turn, 0.5 * float(squares[agree].sum()))
-    return ImageFit(fix, pose.scale, float(np.sqrt(inverse[3, 3])) if free_scale else 0.0, squares, agree)
+    return ImageFit(
+        fix, pose.scale, float(np.sqrt(inverse[3, 3])) if free_scale else 0.0, pose.bend, squares, agree
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Pose:
-    """Attitude (3, 3) and scale, and the covariance of the turn and ln scale that weights of stars give."""
+    """Attitude (3, 3), scale, bend (6,), and the covariance that weights of stars give them."""
 
     matrix: FloatArray
     scale: float
+    bend: FloatArray = field(default_factory=lambda: np.zeros(BENDS))
     covariance: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Seen:
-    """Stars seen at `observed` (n, 3) with `whitener` (n, 2, 3), at `reference` (n, 3) in the sky."""
+    """Stars seen at `observed` (n, 3) with `whitener` (n, 2, 3), at `reference` (n, 3) in the sky.
+
+    `usual` (6,): information about the lens's bend before any star is seen; (0,): the lens has none.
+    """
 
     observed: FloatArray
     whitener: FloatArray
     reference: FloatArray
     free_scale: bool
+    usual: FloatArray
 
     def fitted(self, start: _Pose, weight: FloatArray) -> _Pose:
         """Return the least of the squares times `weight` (n,)."""
         whitener = self.whitener * np.sqrt(weight)[:, None, None]
-        matrix, scale = start.matrix, start.scale
+        matrix, scale, bend = start.matrix, start.scale, start.bend
         for _ in range(_MOST_STEPS):
-            seen, predicted = stretched(self.observed, scale), self.reference @ matrix.T
+            seen, predicted = self.directions(scale, bend), self.reference @ matrix.T
             residual = np.einsum("nij,nj->ni", whitener, seen - predicted).ravel()
-            flat = _slope(whitener, seen, predicted, self.free_scale)
+            flat = self._slope(whitener, seen, predicted)
+            normal, gradient = flat.T @ flat, flat.T @ residual
+            if len(self.usual):
+                normal[_LENS, _LENS] += self.usual
+                gradient[4:] += self.usual * bend
             try:
-                inverse = np.linalg.inv(flat.T @ flat)
+                inverse = np.linalg.inv(normal)
             except np.linalg.LinAlgError as error:
                 raise AttitudeError(f"{len(weight)} stars in one place fix no attitude") from error
-            step = -inverse @ (flat.T @ residual)
-            if not np.all(np.abs(step) < 1.0):
+            step = -inverse @ gradient
+            if not np.all(np.abs(step[:4]) < 1.0):
                 raise AttitudeError(f"{len(weight)} stars do not agree on an attitude")
             matrix = turned(matrix, step[:3])
             scale *= float(np.exp(step[3])) if self.free_scale else 1.0
+            bend = bend + step[4:] if len(self.usual) else bend
             if np.abs(step).max() < _SETTLED:
                 break
-        return _Pose(matrix, scale, np.asarray(inverse, dtype=np.float64))
+        return _Pose(matrix, scale, bend, np.asarray(inverse, dtype=np.float64))
+
+    def _slope(self, whitener: FloatArray, seen: FloatArray, predicted: FloatArray) -> FloatArray:
+        """Return d(whitened residuals)/d(turn, ln scale, bend), (2n, 3, 4 or 10)."""
+        slopes = [-whitener @ cross_matrices(predicted)]
+        if self.free_scale:
+            slopes.append(whitener @ scale_slope(seen)[:, :, None])
+        if len(self.usual):
+            slopes.append(whitener @ bend_slope(seen))
+        return np.concatenate(slopes, axis=2).reshape(2 * len(seen), -1)
+
+    def directions(self, scale: float, bend: FloatArray) -> FloatArray:
+        """Return the unit vectors (n, 3) seen through a lens of this scale and bend (6,)."""
+        return bent(stretched(self.observed, scale), bend)
 
     def squares(self, pose: _Pose) -> FloatArray:
         """Return each star's squared error over its covariance (n,)."""
-        missed = stretched(self.observed, pose.scale) - self.reference @ pose.matrix.T
+        missed = self.directions(pose.scale, pose.bend) - self.reference @ pose.matrix.T
         return np.asarray(np.sum(np.einsum("nij,nj->ni", self.whitener, missed) ** 2, axis=1))
 
 
@@ -141,15 +177,6 @@ def _agreeing(squares: FloatArray) -> BoolArray:
     agree = squares <= _FARTHEST * max(1.0, float(np.median(squares)) / _MEDIAN)
     enough = np.count_nonzero(agree) >= max(_LEAST_AGREEING, len(squares) // 2)
     return agree if enough else np.ones(len(squares), dtype=np.bool_)
-
-
-def _slope(whitener: FloatArray, seen: FloatArray, predicted: FloatArray, free_scale: bool) -> FloatArray:
-    """Return d(whitened residuals)/d(turn, ln scale), (2n, 3 or 4)."""
-    turn = -whitener @ cross_matrices(predicted)
-    if not free_scale:
-        return np.asarray(turn.reshape(-1, 3))
-    scale = np.einsum("nij,nj->ni", whitener, scale_slope(seen))
-    return np.concatenate([turn, scale[:, :, None]], axis=2).reshape(-1, 4)
 
 
 def _whitener(

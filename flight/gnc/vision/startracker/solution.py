@@ -11,6 +11,8 @@ from flight.gnc.attitude.wahba import AttitudeFix
 from flight.gnc.camera.lens import CameraModel
 from flight.gnc.math.arrays import FloatArray, IntArray
 from flight.gnc.vision.startracker.detection import FrameKind
+from flight.gnc.vision.startracker.lens_bend import BENDS
+from flight.gnc.vision.startracker.sky_map import SkyMap
 from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
 
 
@@ -39,6 +41,7 @@ class FrameSolution:
         expected: (n, 2) px, where the attitude puts the guide star; NaN for none.
         fix: attitude, ICRS to camera, and its covariance; the smaller scalar part is not negative.
         scale_sigma: relative standard deviation of the focal length; 0 where it was given.
+        bend: (6,) of a lens that was not given (`lens_bend`), else zeros.
         log10_false_alarm: of the probability that a frame of random points would have been solved.
         tracked: whether the stars were found near the prior attitude.
         motion: from the streaks, camera frame; None for points.
@@ -56,6 +59,7 @@ class FrameSolution:
     expected: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
     fix: AttitudeFix | None = None
     scale_sigma: float = 0.0
+    bend: FloatArray = field(default_factory=lambda: np.zeros(BENDS))
     log10_false_alarm: float = 0.0
     tracked: bool = False
     motion: MotionResult | None = None
@@ -65,3 +69,10 @@ class FrameSolution:
     def matched(self) -> IntArray:
         """Which of the points (m,) are guide stars."""
         return np.flatnonzero(self.star >= 0)
+
+    def sky_map(self, velocity: FloatArray | None = None) -> SkyMap | None:
+        """Return the way from pixels to the sky and back; None when not solved.
+
+        `velocity` (3,) m/s is that which the frame was solved with.
+        """
+        return None if self.fix is None else SkyMap(self.camera, self.fix.quaternion, self.bend, velocity)

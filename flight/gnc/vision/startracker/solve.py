@@ -33,6 +33,7 @@ from flight.gnc.vision.startracker.identification.verification import expected_s
 from flight.gnc.vision.startracker.image_fit import fit_in_image
 from flight.gnc.vision.startracker.index.sky_index import SkyIndex
 from flight.gnc.vision.startracker.mid_exposure import timing_covariance
+from flight.gnc.vision.startracker.sky_map import SkyMap
 from flight.gnc.vision.startracker.solution import FrameSolution, SolveStatus
 from flight.gnc.vision.streaks.maximum_likelihood.course import Course
 from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
@@ -40,6 +41,12 @@ from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSett
 
 # px: error of a place from unknown distortion of the lens or the star's colour.
 _LEAST_SIGMA_PX = 0.005
+# px: the same of a lens that is not calibrated, for identification. Tried second: most pictures need only
+# the room of their places' errors, in which fewer stars agree by chance.
+_UNTOLD_SIGMA_PX = 0.3
+# px, across the boresight and at the edge about it: what such a lens and the air leave beyond the fit of the
+# lens. Photographs differ from other solvers' attitudes by this (bench `untold_lens`).
+_UNTOLD_LENS_PX = 0.25
 # Standard deviations of light; fainter stars of a motion are not identified.
 _LEAST_SIGNIFICANCE = 5.0
 # Tracking looks for this number of stars, within PRIOR_SIGMAS of the prior.
@@ -59,6 +66,8 @@ class SolveSettings:
         identification: settings of the default method.
         method: another method of identification.
         velocity: (3,) m/s of the camera about the Sun, for aberration; None: no correction.
+        untold_lens: whether a lens of uncertain focal length may have its axis off the middle and distort;
+            else the focal length is all that is uncertain.
     """
 
     detection: DetectionSettings = field(default_factory=DetectionSettings)
@@ -66,6 +75,7 @@ class SolveSettings:
     identification: IdentificationSettings = field(default_factory=IdentificationSettings)
     method: Callable[[StarField, SkyIndex], Identification] | None = None
     velocity: FloatArray | None = None
+    untold_lens: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -202,6 +212,8 @@ def _identify(
         # A mirrored turn is another turn: the rate of a mirrored picture would be wrong.
         options = replace(options, mirror=False)
     found = identify(stars, sky, options)
+    if found.status is Status.NO_MATCH and settings.untold_lens and scale[0] != scale[1]:
+        found = identify(star_field(seen, flux, scale, _UNTOLD_SIGMA_PX), sky, options)
     if found.mirrored:
         # Fitted as it should be, reported as it came.
         return _mirrored(replace(_with_attitude(_mirrored(seen), found, sky, settings), mirrored=True))
@@ -220,11 +232,13 @@ def _mirrored(seen: FrameSolution) -> FrameSolution:
     )
 
 
-def star_field(seen: FrameSolution, flux: FloatArray | None, scale: tuple[float, float]) -> StarField:
-    """Return the directions of the points of `seen`, with their errors, for identification."""
+def star_field(
+    seen: FrameSolution, flux: FloatArray | None, scale: tuple[float, float], least: float = _LEAST_SIGMA_PX
+) -> StarField:
+    """Return the directions of the points of `seen`, with their errors of `least` px or more, to identify."""
     camera = seen.camera
     direction = camera.unit_vectors(seen.points)
-    pixels = np.sqrt(0.5 * np.trace(seen.covariance, axis1=1, axis2=2) + _LEAST_SIGMA_PX**2)
+    pixels = np.sqrt(0.5 * np.trace(seen.covariance, axis1=1, axis2=2) + least**2)
     # A pixel off the boresight is seen shorter: by cos^2 along the radius and cos across it.
     sigma = pixels / camera.focal_length * direction[:, 2] ** 1.5
     half_width = 0.5 * camera.columns / camera.focal_length, 0.5 * camera.rows / camera.focal_length
@@ -239,6 +253,7 @@ def _with_attitude(
     if found.status is not Status.IDENTIFIED or found.fix is None:
         return replace(seen, status=SolveStatus(found.status.value), reason=_reason(found.status, seen))
     free_scale = found.scale_sigma > 0.0
+    free_lens = free_scale and settings.untold_lens
     camera = _camera_found(seen.camera, found)
     chosen = np.flatnonzero(found.star >= 0)
     reference = sky.stars.direction[found.star[chosen]]
@@ -247,7 +262,13 @@ def _with_attitude(
     covariance = seen.covariance[chosen] + _LEAST_SIGMA_PX**2 * np.eye(2)
     try:
         fit = fit_in_image(
-            seen.points[chosen], covariance, reference, camera, found.fix.quaternion, free_scale
+            seen.points[chosen],
+            covariance,
+            reference,
+            camera,
+            found.fix.quaternion,
+            free_scale,
+            free_lens,
         )
     except AttitudeError as error:
         return replace(seen, status=SolveStatus.AMBIGUOUS, reason=str(error))
@@ -255,8 +276,10 @@ def _with_attitude(
     fix = fit.fix
     if found.from_lens is not None:
         fix = replace(fix, covariance=fix.covariance + found.from_lens)
+    if free_lens:
+        fix = replace(fix, covariance=fix.covariance + lens_floor(camera))
     expected = np.full_like(seen.points, np.nan)
-    expected[chosen] = camera.project(reference @ attitude_matrix(fix.quaternion).T)
+    expected[chosen] = SkyMap(camera, fix.quaternion, fit.bend).pixels(reference)
     return replace(
         seen,
         status=SolveStatus.SOLVED,
@@ -266,6 +289,7 @@ def _with_attitude(
         expected=expected,
         fix=fix,
         scale_sigma=fit.scale_sigma,
+        bend=fit.bend,
         log10_false_alarm=found.log10_false_alarm,
     )
 
@@ -281,6 +305,12 @@ def _camera_found(camera: CameraModel, found: Identification) -> CameraModel:
         return replace(Lens.of(camera), k1=found.distortion / corner**2)
     except LensError:
         return camera
+
+
+def lens_floor(camera: CameraModel) -> FloatArray:
+    """Return the covariance (3, 3) rad^2 that a lens which is not calibrated adds to an attitude."""
+    across, about = 1.0 / camera.focal_length, 2.0 / max(camera.columns, camera.rows)
+    return np.diag((_UNTOLD_LENS_PX * np.array([across, across, about])) ** 2)
 
 
 def _reason(status: Status, seen: FrameSolution) -> str:

@@ -124,12 +124,26 @@ def test_one_bit_becomes_black_and_white(tmp_path: Path) -> None:
     assert np.array_equal(read_image(tmp_path / "a.png"), np.where(EIGHT > 127, 255, 0))
 
 
-@pytest.mark.parametrize(("colour_type", "channels"), [(2, 3), (4, 2), (6, 4)])
-def test_16_bit_colour_is_refused_rather_than_halved(tmp_path: Path, colour_type: int, channels: int) -> None:
+@pytest.mark.parametrize(("colour_type", "channels"), [(2, 3), (6, 4)])
+def test_16_bit_colour_becomes_luminance_of_16_bits(tmp_path: Path, colour_type: int, channels: int) -> None:
+    """All channels the same: the luminance is each pixel's own count, its low byte too."""
     path = tmp_path / "a.png"
     path.write_bytes(_png(SIXTEEN, colour_type, channels))
+    found = read_image(path)
+    assert found.dtype == np.uint16
+    assert np.array_equal(found, SIXTEEN)
+
+
+def test_16_bit_grey_with_transparency_is_refused_rather_than_halved(tmp_path: Path) -> None:
+    path = tmp_path / "a.png"
+    path.write_bytes(_png(SIXTEEN, 4, 2))
     with pytest.raises(UsageError, match="16-bit colour"):
         read_image(path)
+
+
+def test_a_bitmap_is_read(tmp_path: Path) -> None:
+    pillow.fromarray(EIGHT).save(tmp_path / "a.bmp")
+    assert np.array_equal(read_image(tmp_path / "a.bmp"), EIGHT)
 
 
 def test_a_negative_is_refused_rather_than_taken_for_a_picture(tmp_path: Path) -> None:
@@ -149,14 +163,14 @@ def test_pixels_of_another_kind_are_refused(tmp_path: Path) -> None:
 def test_a_file_that_is_no_image_is_refused_in_one_line(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "a.png"
     path.write_bytes(content)
-    with pytest.raises(UsageError, match="PNG, TIFF, JPEG or FITS") as caught:
+    with pytest.raises(UsageError, match="PNG, TIFF, JPEG, BMP or FITS") as caught:
         read_image(path)
     assert "\n" not in str(caught.value)
 
 
 def test_a_gif_is_refused(tmp_path: Path) -> None:
     pillow.fromarray(EIGHT).save(tmp_path / "a.gif")
-    with pytest.raises(UsageError, match="PNG, TIFF, JPEG or FITS"):
+    with pytest.raises(UsageError, match="PNG, TIFF, JPEG, BMP or FITS"):
         read_image(tmp_path / "a.gif")
 
 

@@ -45,11 +45,14 @@ def detect(pixels: Image, settings: DetectionSettings | None = None) -> Detectio
 def measure_areas(seen: Survey) -> Detections:
     """Return the sources of a survey's areas, brightest first."""
     pixels, settings, areas = seen.pixels, seen.settings, seen.areas
-    peaks = worth_measuring(find_peaks(areas), pixels.shape, int(_MEASURED_FOR_ONE * settings.most_stars))
+    peaks = find_peaks(areas)
     if not len(peaks):
         return Detections.none(settings.psf_sigma or np.nan)
-    targets = _targets(pixels, seen.sky, areas, peaks)
     flags = _flags_of_areas(seen.sky, areas, peaks)
+    open_sky = (flags & Quality.CLUTTER) == 0
+    chosen = worth_measuring(peaks, open_sky, pixels.shape, int(_MEASURED_FOR_ONE * settings.most_stars))
+    peaks, flags = peaks.select(chosen), flags[chosen]
+    targets = _targets(pixels, seen.sky, areas, peaks)
     shapes = first_look(targets)
     spread = frame_spread(shapes, plain_ones(flags == 0, targets), settings)
     found = measure(targets, shapes, spread, settings)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flight.gnc.math.arrays import BoolArray, FloatArray, IntArray
+from flight.gnc.vision.frame.hot_pixels import are_hot
 from flight.gnc.vision.startracker.detection.noise_model import NoiseModel, measure_noise
 from flight.gnc.vision.startracker.detection.psf_fit import FLUX, WIDTH, PsfFit, fit
 from flight.gnc.vision.startracker.detection.settings import DetectionSettings
@@ -23,6 +24,8 @@ _FIRST_NOISE = NoiseModel(0.0, 0.1)
 _UNKNOWN_MISMATCH = 0.02
 _MOST_OF_CELL = 4
 _LEAST_LONE = 3
+# Of a pixel's noise: fainter ones are not called hot.
+_LEAST_HOT = 10.0
 # Two windows of the first look that do not touch.
 _APART = 2 * _HALF_OF_FIRST + 1
 
@@ -113,16 +116,10 @@ def start(windows: Windows) -> tuple[FloatArray, FloatArray]:
 
 
 def single_pixels(windows: Windows) -> BoolArray:
-    """Return which windows (n,) hold one bright pixel with dark neighbours, which no optics make.
-
-    A star's image of sigma 0.5 px gives its brightest pixel's neighbours 15 % of it and more.
-    """
+    """Return which windows (n,) hold one or two bright pixels with dark neighbours, which no optics make."""
     h = windows.half
     core = windows.light[:, h - 1 : h + 2, h - 1 : h + 2].reshape(len(windows), 9)
-    highest = core.max(axis=1)
-    second = np.sort(core, axis=1)[:, -2]
-    dark = (second < 0.15 * highest + 3.0 * windows.noise) & (second < 0.3 * highest)
-    return np.asarray(dark & (highest > 10.0 * windows.noise))
+    return np.asarray(are_hot(core.T, windows.noise) & (core.max(axis=1) > _LEAST_HOT * windows.noise))
 
 
 def crowded(middle: IntArray) -> BoolArray:

@@ -52,20 +52,29 @@ def find_peaks(areas: Areas) -> Peaks:
     return peaks.select(np.argsort(-peaks.height, kind="stable"))
 
 
-def worth_measuring(peaks: Peaks, shape: tuple[int, ...], most: int) -> Peaks:
-    """Return the brightest peaks, `most` of them, highest first, without bumps on brighter stars' wings.
+def worth_measuring(peaks: Peaks, open_sky: BoolArray, shape: tuple[int, ...], most: int) -> IntArray:
+    """Return which peaks (p,) to measure, highest first, without bumps on brighter stars' wings.
 
-    No cell of a sixteenth of `shape` gives more than a quarter of them, so that a tree or a cloud that is
-    brighter than all stars leaves room for the stars beside it.
+    Of those in the `open_sky` (p,) `most`, and of a cell of a sixteenth of `shape` a quarter of them at most,
+    so that a cloud that is brighter than all stars leaves room for the stars beside it. As many of the others
+    show what the sources of the foreground look like, and take no star's place.
     """
-    peaks = peaks.select(np.arange(min(len(peaks), _MOST_COMPARED)))
-    peaks = peaks.select(~on_wings(peaks))
+    compared = np.sort(
+        np.concatenate([np.flatnonzero(part)[:_MOST_COMPARED] for part in (open_sky, ~open_sky)])
+    )
+    compared = compared[~on_wings(peaks.select(compared))]
+    parts = (compared[open_sky[compared]], compared[~open_sky[compared]])
+    return np.sort(np.concatenate([part[_spread(peaks.select(part), shape, most)] for part in parts]))
+
+
+def _spread(peaks: Peaks, shape: tuple[int, ...], most: int) -> IntArray:
+    """Return the first `most` of the peaks, of a cell of a sixteenth of `shape` a quarter of them at most."""
     row, column = (peaks.place[:, k] * _CELLS // shape[1 - k] for k in (1, 0))
     cell = row * _CELLS + column
     order = np.argsort(cell, kind="stable")
     rank = np.empty(len(peaks), dtype=np.int64)
     rank[order] = np.arange(len(peaks)) - np.searchsorted(cell[order], cell[order])
-    return peaks.select(np.flatnonzero(rank < max(4, most // 4))[:most])
+    return np.flatnonzero(rank < max(4, most // 4))[:most]
 
 
 def on_wings(peaks: Peaks) -> BoolArray:

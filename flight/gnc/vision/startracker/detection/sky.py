@@ -20,6 +20,7 @@ from flight.gnc.vision.frame.background import (
     interpolation_weights,
     place_among_blocks,
 )
+from flight.gnc.vision.frame.hot_pixels import find_hot_pixels
 
 Float32Array = npt.NDArray[np.float32]
 
@@ -128,13 +129,32 @@ def measure_sky(pixels: Image) -> Sky:
     smooth = estimate_background(sample, _BLOCK // _STRIDE, 1)
     # Rounding to whole counts is noise, even of a sky that is zero everywhere.
     smooth_noise = np.maximum(smooth.noise, KERNEL_NORM * _ROUNDING)
-    lone = pixels[2::_SINGLE_STRIDE, 2::_SINGLE_STRIDE].astype(np.float32)
+    lone = pixels[2::_STRIDE, 2::_STRIDE].astype(np.float32)
     return Sky(
         level,
         Surface(single.noise * _tail(lone, single.level, single.noise), shape),
         Surface(smooth.level, shape),
         Surface(smooth_noise * _tail(sample, smooth.level, smooth_noise), shape),
     )
+
+
+def without_hot_pixels(pixels: Image, most: int) -> Image:
+    """Return `pixels` (rows, columns) with the hot ones replaced, if there are more of them than `most`.
+
+    A few are left, to be measured and refused by name; a worn sensor's thousands would take the places of all
+    stars, and widen the noise.
+    """
+    single = estimate_background(pixels, _BLOCK, _SINGLE_STRIDE)
+    signal = pixels - single.map(single.level)
+    noise = single.map(single.noise)
+    row, column = find_hot_pixels(signal, noise * noise)
+    if len(row) <= most:
+        return pixels
+    repaired = pixels.copy()
+    around = [(dr, dc) for dr in (-1, 0, 1) for dc in (-1, 0, 1) if (dr, dc) != (0, 0)]
+    beside = np.stack([pixels[row + dr, column + dc] for dr, dc in around])
+    repaired[row, column] = np.median(beside, axis=0).astype(pixels.dtype)
+    return repaired
 
 
 def find_bright(pixels: Image, sky: Sky, sigmas: float) -> BrightPixels:
@@ -183,14 +203,21 @@ def _smoothed_at(pixels: Image, row: IntArray, column: IntArray) -> Float32Array
     return total
 
 
-def _tail(sample: Float32Array, level: FloatArray, noise: FloatArray) -> float:
-    """Return how much farther the noise reaches upwards than a normal one; 1 or more.
+def _tail(sample: Float32Array, level: FloatArray, noise: FloatArray) -> FloatArray:
+    """Return how much farther the noise of each block reaches upwards than a normal one; 1 or more.
 
-    2.3 % of a frame should stand above twice its noise. A sky cut off at zero counts has noise on one side
-    only, whose clipped moments underestimate it.
+    2.3 % of a block should stand above twice its noise. A sky cut off at zero counts has noise on one side
+    only, whose clipped moments underestimate it. A foreground's texture reaches far, its neighbours' sky does
+    not: each block takes the median of the 3 x 3 about it, which a few stars hardly move.
     """
+    from scipy import ndimage  # noqa: PLC0415 - a process that only names the estimators need not hold it
+
     (rows, columns), (down, across) = sample.shape, level.shape
     block = np.ix_(np.arange(rows) * down // rows, np.arange(columns) * across // columns)
     relative = (sample - level[block]) / noise[block]
-    place = min(relative.size - 1, int(_TAIL_PART * relative.size))
-    return max(1.0, 0.5 * float(np.partition(relative, place, axis=None)[place]))
+    height, width = rows // down, columns // across
+    blocks = relative[: down * height, : across * width].reshape(down, height, across, width)
+    values = blocks.transpose(0, 2, 1, 3).reshape(down, across, -1)
+    place = min(values.shape[-1] - 1, int(_TAIL_PART * values.shape[-1]))
+    tail = np.maximum(1.0, 0.5 * np.partition(values, place, axis=-1)[..., place])
+    return np.asarray(ndimage.median_filter(tail, size=3, mode="nearest"))

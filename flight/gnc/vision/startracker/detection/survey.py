@@ -9,7 +9,13 @@ from flight.gnc.vision.startracker.detection.areas import Areas, find_areas
 from flight.gnc.vision.startracker.detection.detections import FrameShape
 from flight.gnc.vision.startracker.detection.frame_kind import frame_shape
 from flight.gnc.vision.startracker.detection.settings import DetectionSettings
-from flight.gnc.vision.startracker.detection.sky import Sky, find_bright, in_counts, measure_sky
+from flight.gnc.vision.startracker.detection.sky import (
+    Sky,
+    find_bright,
+    in_counts,
+    measure_sky,
+    without_hot_pixels,
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -17,7 +23,7 @@ class Survey:
     """One pass over a frame: its sky, and the areas that stand above the noise.
 
     Attributes:
-        pixels: (rows, columns) in counts, `unit` of the frame's own numbers each.
+        pixels: (rows, columns) in counts, `unit` of the frame's own numbers each; many hot ones are replaced.
         settings: in these counts.
     """
 
@@ -37,6 +43,7 @@ def survey(pixels: Image, settings: DetectionSettings | None = None) -> Survey:
     """Return what stands above the noise of a frame (rows, columns). Raises ValueError as `detect`."""
     pixels, unit = in_counts(pixels)
     settings = (settings or DetectionSettings()).in_units_of(unit)
+    pixels = without_hot_pixels(pixels, settings.most_stars)
     sky = measure_sky(pixels)
     bright = find_bright(pixels, sky, settings.threshold_sigmas)
     return Survey(pixels, unit, settings, sky, find_areas(pixels, sky, bright, settings.saturation))

@@ -33,8 +33,9 @@ def _solve(
     frame: SkyFrame, prior: AttitudePrior | None = None, scale: tuple[float, float] = (1.0, 1.0)
 ) -> FrameSolution:
     rate = RatePrior(frame.rate, 1e-6)
-    camera = NARROW.pinhole
-    return solve_frame(frame.pixels, camera, scale, frame.exposure, sky(), SolveSettings(), prior, rate)
+    # The simulated lens is perfect but for its focal length.
+    camera, settings = NARROW.pinhole, SolveSettings(untold_lens=False)
+    return solve_frame(frame.pixels, camera, scale, frame.exposure, sky(), settings, prior, rate)
 
 
 def _mismatch(found: FrameSolution, truth: FloatArray) -> float:
