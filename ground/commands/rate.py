@@ -62,7 +62,7 @@ def run(options: argparse.Namespace) -> int:
     pinhole, exposure = _geometry(options, camera, pixels)
     prior = None if options.prior is None else np.array(options.prior)
     found = _estimate(options.method, pixels, pinhole, exposure, camera, prior)
-    objects = _objects(pixels, pinhole, exposure, camera, prior)
+    objects = _objects(pixels, pinhole, found, camera)
     if options.json:
         sys.stdout.write(json.dumps(_facts(found, objects, options.method), allow_nan=False) + "\n")
     else:
@@ -105,11 +105,14 @@ def _estimate(
 
 
 def _objects(
-    pixels: Image, pinhole: Pinhole, exposure: float, camera: Camera | None, prior: FloatArray | None
+    pixels: Image, pinhole: Pinhole, found: StreakResult | MotionResult, camera: Camera | None
 ) -> tuple[SpaceObject, ...]:
+    if found.rate is None:
+        return ()
     gain = camera.gain if camera else 1.0
     settings = StreakSettings(gain=gain, saturation=camera.saturation if camera else None)
-    report = detect(pixels, pinhole, exposure, settings, ObjectSettings(), prior)
+    rotation, exposure = found.rate * found.exposure, found.exposure
+    report = detect(pixels, pinhole, rotation, exposure, settings, ObjectSettings())
     return report.objects if report is not None else ()
 
 
