@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -135,8 +136,8 @@ def _chance(
     residuals = (fit.residuals / limb.pixel)[fit.used]
     in_view = limb_in_view(points, inside, due, (columns, rows))
     unknowns = 3 if guess.place.altitude_sigma >= UNKNOWN else 2
-    left = float(np.log10(guess.orientation.share))
-    return left + log10_chance(in_view, residuals, others, camera, unknowns)
+    chance = log10_chance(in_view, residuals, others, camera, unknowns)
+    return chance + math.log10(guess.orientation.share)
 
 
 def _breadth(view: View, seen: Observation, used: BoolArray, settings: HorizonSettings) -> float:
