@@ -130,14 +130,14 @@ def _chance(
     rays = limb_rays(fit.view, _FINE_RAYS)
     points = camera.project(rays)
     inside = camera.contains(points, -_BORDER)
-    due = inside if sun is None else sun_elevation(fit.view, rays, sun) > LOWEST_SUN
+    due: BoolArray = inside if sun is None else sun_elevation(fit.view, rays, sun) > LOWEST_SUN
     columns, rows = (max(1.0, size / settings.edges.lines) for size in (camera.columns, camera.rows))
     others = (limb_residuals(fit.view, seen.rays.rays) / seen.rays.pixel)[~used]
     residuals = (fit.residuals / limb.pixel)[fit.used]
     in_view = limb_in_view(points, inside, due, (columns, rows))
     unknowns = 3 if guess.place.altitude_sigma >= UNKNOWN else 2
     chance = log10_chance(in_view, residuals, others, camera, unknowns)
-    return chance + math.log10(guess.orientation.share)
+    return float(chance + math.log10(guess.orientation.share))
 
 
 def _breadth(view: View, seen: Observation, used: BoolArray, settings: HorizonSettings) -> float:
