@@ -137,12 +137,12 @@ def _chance(
     in_view = limb_in_view(points, inside, due, (columns, rows))
     unknowns = 3 if guess.place.altitude_sigma >= UNKNOWN else 2
     chance = log10_chance(in_view, residuals, others, camera, unknowns)
-    return float(chance + math.log10(guess.orientation.share))
+    return chance + math.log10(guess.orientation.share)
 
 
 def _breadth(view: View, seen: Observation, used: BoolArray, settings: HorizonSettings) -> float:
     """Return the breadth of the used edges over that of the air and the blur."""
-    reach = np.sqrt(max(float(view.position @ view.position) - view.surface.equatorial**2, 1.0))
+    reach = math.sqrt(max(float(view.position @ view.position) - view.surface.equatorial**2, 1.0))
     air = UNIT_DEPTH_HEIGHT / (reach * float(np.median(seen.rays.pixel[used])))
     return float(np.median(seen.edges.scale[used])) / (air + 1.0 + settings.edges.psf_sigma)
 
