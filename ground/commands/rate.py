@@ -82,7 +82,7 @@ def run(options: argparse.Namespace) -> int:
     prior = None if options.prior is None else np.array(options.prior)
     likelihood = _likelihood(options, camera)
     found = _estimate(options.method, pixels, pinhole, exposure, likelihood, prior)
-    objects = _objects(pixels, pinhole, exposure, likelihood, prior)
+    objects = _objects(pixels, pinhole, found, likelihood)
     if options.json:
         sys.stdout.write(json.dumps(_facts(found, objects, options.method), allow_nan=False) + "\n")
     else:
@@ -151,14 +151,13 @@ def _estimate(
 
 
 def _objects(
-    pixels: Image,
-    pinhole: Pinhole,
-    exposure: float,
-    likelihood: LikelihoodSettings,
-    prior: FloatArray | None,
+    pixels: Image, pinhole: Pinhole, found: StreakResult | MotionResult, likelihood: LikelihoodSettings
 ) -> tuple[SpaceObject, ...]:
+    if found.rate is None:
+        return ()
     settings = StreakSettings(gain=likelihood.gain, saturation=likelihood.saturation)
-    report = detect(pixels, pinhole, exposure, settings, ObjectSettings(), prior)
+    rotation, exposure = found.rate * found.exposure, found.exposure
+    report = detect(pixels, pinhole, rotation, exposure, settings, ObjectSettings())
     return report.objects if report is not None else ()
 
 

@@ -17,12 +17,14 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.math.arrays import BoolArray, FloatArray
+from flight.gnc.math.arrays import BoolArray, FloatArray, Image
 from flight.gnc.vision.objects.detect import detect
 from flight.gnc.vision.objects.report import ObjectReport
 from flight.gnc.vision.objects.rso_indicators import INDICATORS
 from flight.gnc.vision.objects.settings import ObjectSettings
 from flight.gnc.vision.streaks.corners.settings import DETECTOR_NAMES, StreakSettings
+from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion
+from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from tests.flight.gnc.vision.streaks.frames import rate_at, star_camera, true_endpoints
 from tests.flight.gnc.vision.streaks.space_objects import frame_with, motion_across, object_path, star_field
 
@@ -48,7 +50,7 @@ def without(frames: int, seed: int, settings: StreakSettings) -> dict[str, Any]:
     for frame in range(frames):
         rotation = random_rotation(np.random.default_rng([seed, frame]), frame)
         pixels = frame_with(_CAMERA, rotation, _EXPOSURE, seed + frame, [], _FAINTEST_STAR)
-        report = detect(pixels, _CAMERA.pinhole, _EXPOSURE, settings, ObjectSettings(), rotation)
+        report = _detect(pixels, rotation, settings)
         if report is None:
             failed += 1
             continue
@@ -90,7 +92,7 @@ def with_one(
         motion = rotation if tracked else motion_across(place, angle, rng.uniform(0.0, 2.0 * np.pi))
         path = object_path(_CAMERA, place, motion, rotation)
         pixels = frame_with(_CAMERA, rotation, _EXPOSURE, seed + frame, [(path, magnitude)], _FAINTEST_STAR)
-        report = detect(pixels, _CAMERA.pinhole, _EXPOSURE, settings, ObjectSettings(), rotation)
+        report = _detect(pixels, rotation, settings)
         if report is None:
             continue
         hits, missed = _match(report, path[[0, -1]])
@@ -108,6 +110,16 @@ def with_one(
         "fired": dict(fired),
         "endpoint_error": float(np.median(errors)) if errors else float("nan"),
     }
+
+
+def _detect(pixels: Image, rotation: FloatArray, settings: StreakSettings) -> ObjectReport | None:
+    """Return the report by the rotation that the likelihood finds, the true one deciding its sign."""
+    likelihood = LikelihoodSettings(saturation=settings.saturation, gain=settings.gain)
+    motion = estimate_motion(pixels, _CAMERA.pinhole, _EXPOSURE, likelihood, rotation, 0.0)
+    if motion.rate is None:
+        return None
+    turn = motion.rate * _EXPOSURE
+    return detect(pixels, _CAMERA.pinhole, turn, _EXPOSURE, settings, ObjectSettings())
 
 
 def _match(report: ObjectReport, truth: FloatArray) -> tuple[list[tuple[float, tuple[str, ...]]], int]:

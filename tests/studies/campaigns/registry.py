@@ -8,6 +8,7 @@ from tests.studies.campaigns.consistency import CONSISTENCY
 from tests.studies.campaigns.controllers import CONTROLLERS_CAMPAIGN
 from tests.studies.campaigns.coverage import COVERAGE
 from tests.studies.campaigns.failures import FAILURES
+from tests.studies.campaigns.false_horizons import FALSE_HORIZONS
 from tests.studies.campaigns.faults import FAULTS
 from tests.studies.campaigns.faults_kill import FAULTS_KILL
 from tests.studies.campaigns.lost_in_space import LOST_IN_SPACE
@@ -38,6 +39,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         CONSISTENCY,
         LOST_IN_SPACE,
         NADIR,
+        FALSE_HORIZONS,
         CONTROLLERS_CAMPAIGN,
         STEP_ROBUST,
         PLANNER_EDGE,

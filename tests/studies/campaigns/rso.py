@@ -136,10 +136,15 @@ def run(case: Case) -> Result:
 
 
 def look(pixels: Image, camera: StarCameraModel, rate: FloatArray) -> tuple[ObjectReport | None, float]:
-    """Return the report on a frame and the processor seconds that it took."""
+    """Return the report on a frame, by the likelihood's rotation, and the processor seconds of both."""
     settings = StreakSettings(saturation=float(camera.highest_count), gain=camera.gain)
     begun = time.process_time()
-    report = detect(pixels, camera.pinhole, EXPOSURE, settings, ObjectSettings(), rate)
+    likelihood = LikelihoodSettings(saturation=settings.saturation, gain=settings.gain)
+    motion = estimate_motion(pixels, camera.pinhole, EXPOSURE, likelihood, rate, 0.0)
+    if motion.rate is None:
+        return None, time.process_time() - begun
+    turn = motion.rate * EXPOSURE
+    report = detect(pixels, camera.pinhole, turn, EXPOSURE, settings, ObjectSettings())
     return report, time.process_time() - begun
 
 

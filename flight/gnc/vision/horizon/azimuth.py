@@ -19,6 +19,9 @@ from flight.gnc.vision.horizon.knowledge import HorizonKnowledge
 from flight.gnc.vision.horizon.limb_equation import turn
 from flight.gnc.vision.horizon.vector_method import shortest_turn
 
+MOST_MISMATCH = 4.0
+"""Standard deviations by which a coarse sensor may disagree."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Orientation:
@@ -28,11 +31,13 @@ class Orientation:
         rotation: (3, 3), inertial into camera axes; nadir exactly as assumed.
         sigma: rad, of the turn about nadir; infinite if unknown.
         mismatch: the worst disagreement of a known direction with this nadir, in its own standard deviations.
+        share: of all nadirs, those that the known directions leave.
     """
 
     rotation: FloatArray
     sigma: float
     mismatch: float
+    share: float = 1.0
 
 
 def orientation(nadir: FloatArray, inertial_nadir: FloatArray, knowledge: HorizonKnowledge) -> Orientation:
@@ -40,7 +45,11 @@ def orientation(nadir: FloatArray, inertial_nadir: FloatArray, knowledge: Horizo
     base = shortest_turn(inertial_nadir, nadir)
     down = _unit(nadir)
     vote, weight, mismatch = 0.0 + 0.0j, 0.0, 0.0
-    for camera, inertial, sigma in _known(knowledge, inertial_nadir):
+    known = _known(knowledge, inertial_nadir)
+    # Each leaves a ring of the sphere; two rings cross, a third adds little.
+    narrowest = sorted(sigma for _, _, sigma in known)[:2]
+    share = math.prod(min(1.0, MOST_MISMATCH * sigma) for sigma in narrowest)
+    for camera, inertial, sigma in known:
         seen, expected = _unit(camera), _unit(base @ inertial)
         below, assumed = _dot(down, seen), _dot(down, expected)
         across = _length(_cross(down, expected))
@@ -52,8 +61,8 @@ def orientation(nadir: FloatArray, inertial_nadir: FloatArray, knowledge: Horizo
             vote += precision * cmath.exp(1j * angle)
             weight += precision
     if weight == 0.0:
-        return Orientation(base, math.inf, mismatch)
-    return Orientation(turn(cmath.phase(vote) * nadir) @ base, weight**-0.5, mismatch)
+        return Orientation(base, math.inf, mismatch, share)
+    return Orientation(turn(cmath.phase(vote) * nadir) @ base, weight**-0.5, mismatch, share)
 
 
 def turned(rotation: FloatArray, nadir: FloatArray, angle: float) -> FloatArray:

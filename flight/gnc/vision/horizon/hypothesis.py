@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from flight.gnc.camera.lens import CameraModel
 from flight.gnc.math.arrays import BoolArray, FloatArray
+from flight.gnc.vision.horizon.chance import limb_in_view, log10_chance
 from flight.gnc.vision.horizon.illumination import (
     DAYLIGHT,
     GLARE,
@@ -18,9 +20,16 @@ from flight.gnc.vision.horizon.illumination import (
 )
 from flight.gnc.vision.horizon.initial_guess import InitialGuess, sun_from
 from flight.gnc.vision.horizon.knowledge import HorizonKnowledge
-from flight.gnc.vision.horizon.limb_equation import View
-from flight.gnc.vision.horizon.limb_fit import FittedLimb, Prior, fit_limb, stepped
-from flight.gnc.vision.horizon.limb_points import LimbPoints, limb_points, near_limb, placed_by_profile
+from flight.gnc.vision.horizon.limb_equation import View, limb_residuals
+from flight.gnc.vision.horizon.limb_fit import UNKNOWN, FittedLimb, Prior, fit_limb, stepped
+from flight.gnc.vision.horizon.limb_points import (
+    LOWEST_SUN,
+    LimbPoints,
+    limb_points,
+    near_limb,
+    placed_by_profile,
+)
+from flight.gnc.vision.horizon.limb_profile import UNIT_DEPTH_HEIGHT
 from flight.gnc.vision.horizon.observation import Observation
 from flight.gnc.vision.horizon.settings import HorizonSettings
 
@@ -28,7 +37,7 @@ _UNKNOWN_TURN = 1.0
 """rad: the prior on an unknown turn about nadir; on a sphere it has no effect."""
 _NIGHT = np.radians(-8.0)
 """Elevation of the Sun: an edge there is not the limb."""
-_LIMB_RAYS = 120
+_LIMB_RAYS, _FINE_RAYS = 120, 720
 _BORDER = 8.0
 """px."""
 _NEAR = 0.0375
@@ -49,6 +58,8 @@ class Hypothesis:
             none.
         night: the share of members where the Sun is well below the horizon.
         allowance: rad an axis, added to the covariance for unmodelled effects.
+        chance: log10 of the expected number of cones as good among chance edges, see `log10_chance`.
+        breadth: of the members' edges over the air's, medians.
     """
 
     fit: FittedLimb
@@ -59,6 +70,8 @@ class Hypothesis:
     coverage: float
     night: float
     allowance: float
+    chance: float
+    breadth: float
 
     @property
     def covariance(self) -> FloatArray:
@@ -98,7 +111,40 @@ def examine(
         _coverage(fit.view, seen, used, sun, camera),
         night,
         settings.sphere_sigma if np.isinf(stand.sigma) else 0.0,
+        _chance(guess, fit, limb, seen, used, sun, camera, settings),
+        _breadth(fit.view, seen, used, settings),
     )
+
+
+def _chance(
+    guess: InitialGuess,
+    fit: FittedLimb,
+    limb: LimbPoints,
+    seen: Observation,
+    used: BoolArray,
+    sun: FloatArray | None,
+    camera: CameraModel,
+    settings: HorizonSettings,
+) -> float:
+    """Return log10 of the number of chance cones; limb that is known to lie in the night needs no edges."""
+    rays = limb_rays(fit.view, _FINE_RAYS)
+    points = camera.project(rays)
+    inside = camera.contains(points, -_BORDER)
+    due: BoolArray = inside if sun is None else sun_elevation(fit.view, rays, sun) > LOWEST_SUN
+    columns, rows = (max(1.0, size / settings.edges.lines) for size in (camera.columns, camera.rows))
+    others = (limb_residuals(fit.view, seen.rays.rays) / seen.rays.pixel)[~used]
+    residuals = (fit.residuals / limb.pixel)[fit.used]
+    in_view = limb_in_view(points, inside, due, (columns, rows))
+    unknowns = 3 if guess.place.altitude_sigma >= UNKNOWN else 2
+    chance = log10_chance(in_view, residuals, others, camera, unknowns)
+    return chance + math.log10(guess.orientation.share)
+
+
+def _breadth(view: View, seen: Observation, used: BoolArray, settings: HorizonSettings) -> float:
+    """Return the breadth of the used edges over that of the air and the blur."""
+    reach = math.sqrt(max(float(view.position @ view.position) - view.surface.equatorial**2, 1.0))
+    air = UNIT_DEPTH_HEIGHT / (reach * float(np.median(seen.rays.pixel[used])))
+    return float(np.median(seen.edges.scale[used])) / (air + 1.0 + settings.edges.psf_sigma)
 
 
 def _fitted(

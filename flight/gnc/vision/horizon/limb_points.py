@@ -16,7 +16,7 @@ from flight.gnc.vision.horizon.settings import HorizonSettings
 
 _GRAZING = 0.3
 """Cosine: a scan line more oblique to the limb places it badly."""
-_LOWEST_SUN = np.radians(1.0)
+LOWEST_SUN = np.radians(1.0)
 """Of a limb point's Sun: lower, the light reaches high air only, and the limb appears higher."""
 _FINE = SCALE_HEIGHT / 6.0
 """m a pixel: with finer pixels the steepest place is used; the profile is longer than the samples kept."""
@@ -67,7 +67,7 @@ def limb_points(view: View, seen: Observation, members: BoolArray, sun: FloatArr
     chosen = np.flatnonzero(members)
     rays = seen.rays.rays[chosen]
     if sun is not None:
-        day = sun_elevation(view, rays, sun) > _LOWEST_SUN
+        day = sun_elevation(view, rays, sun) > LOWEST_SUN
         chosen, rays = chosen[day], rays[day]
     residuals, gradients = limb_gradients(view, rays)
     slopes = _slopes(seen, chosen, rays, gradients)

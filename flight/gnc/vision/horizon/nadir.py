@@ -5,8 +5,9 @@
         filter.update(solution.nadir.direction, solution.nadir.covariance, -position)
 
 Finds edges on scan lines and cones on which many of them agree, fits the ellipsoid's limb to each, and tests
-each fit against the light of the whole picture, the coarse sensors and the rough attitude. A single
-consistent fit is the result; several are ambiguous; without one the picture is refused with the reason.
+each fit against chance, the air's breadth, the light of the whole picture, the coarse sensors and the rough
+attitude. A single consistent fit is the result; several are ambiguous; without one the picture is refused
+with the reason.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import numpy as np
 from flight.gnc.camera.lens import CameraModel
 from flight.gnc.camera.pixel_access import ArrayPixels, PixelAccess
 from flight.gnc.math.arrays import Image
+from flight.gnc.vision.horizon.azimuth import MOST_MISMATCH
 from flight.gnc.vision.horizon.consensus import best_cone, left_free
 from flight.gnc.vision.horizon.edges import Nearby, find_edges
 from flight.gnc.vision.horizon.hypothesis import Hypothesis, examine
@@ -37,12 +39,14 @@ from flight.gnc.vision.horizon.solution import HorizonSolution, HorizonStatus, N
 
 _ALTITUDES = 100e3, 40_000e3
 """m: range of an unknown altitude."""
-_MOST_MISMATCH = 4.0
-"""Standard deviations by which a coarse sensor may disagree."""
 _STRAY, _COVERED, _NIGHT = 0.05, 0.6, 0.1
 _RIVAL = 0.3
 """Of the best horizon's edges: a second horizon with this share of its own is a rival."""
 _SAME = np.radians(1.0)
+_MOST_CHANCE = -6.0
+"""log10 of the number of cones that chance edges would fit as well: a horizon has fewer."""
+_BREADTH = 0.125, 2.0
+"""Of an edge over the air's: a sharper one is no limb, nor a broader one."""
 _GAIN = 1.5
 """Three times the lines must give this factor of the edges on a horizon, or it is rejected."""
 
@@ -100,7 +104,7 @@ class _Look:
         if not hypotheses:
             return HorizonSolution(
                 HorizonStatus.NO_HORIZON,
-                f"{len(points)} edges lie on no common horizon",
+                f"{len(points)} edges lie on no horizon better than chance edges would",
                 points=points,
                 on_horizon=np.zeros(len(points), dtype=bool),
                 pixels_read=self.read,
@@ -145,7 +149,7 @@ def _closer(
     members = near_limb(best.fit.view, seen, 2.0 * settings.tolerance)
     again = replace(best.guess, view=best.fit.view, members=members)
     found = examine(again, seen, knowledge, settings, camera)
-    return _Look(seen, look.levels, [] if found is None else [found], lines.pixels)
+    return _Look(seen, look.levels, [] if found is None or not _is_limb(found) else [found], lines.pixels)
 
 
 def _hypotheses(
@@ -173,18 +177,18 @@ def _hypotheses(
             break
         free = left_free(seen.rays, free, cone, settings.tolerance)
         guess = initial_guess(cone, seen, place, knowledge, settings)
-        if guess.orientation.mismatch > _MOST_MISMATCH:
+        if guess.orientation.mismatch > MOST_MISMATCH:
             contradicted.append(guess)
             continue
         found = examine(guess, seen, knowledge, settings, camera)
-        if found is not None:
+        if found is not None and _is_limb(found):
             sound.append(found)
             if not _flaw(found):
                 enough = max(enough, _RIVAL * np.count_nonzero(found.members))
     if all(_flaw(each) for each in sound):
         # Contradicted guesses are fitted only for the reason of the refusal.
         fitted = (examine(each, seen, knowledge, settings, camera) for each in contradicted)
-        sound += [each for each in fitted if each is not None]
+        sound += [each for each in fitted if each is not None and _is_limb(each)]
     return sorted(sound, key=lambda each: (_flaw(each) != "", -np.count_nonzero(each.members)))
 
 
@@ -203,10 +207,15 @@ def _judged(hypotheses: list[Hypothesis]) -> tuple[HorizonStatus, str]:
     return HorizonStatus.FOUND, ""
 
 
+def _is_limb(one: Hypothesis) -> bool:
+    """Return whether chance edges do not explain a hypothesis, and its edges are as broad as the air."""
+    return one.chance < _MOST_CHANCE and _BREADTH[0] < one.breadth < _BREADTH[1]
+
+
 def _flaw(one: Hypothesis) -> str:
     """Return the reason against a hypothesis; empty without one."""
     light = one.lighting
-    if one.guess.orientation.mismatch > _MOST_MISMATCH:
+    if one.guess.orientation.mismatch > MOST_MISMATCH:
         return f"a coarse direction is {one.guess.orientation.mismatch:.1f} sigma off"
     if light.stray > _STRAY:
         return f"{100.0 * light.stray:.0f} % of sky and night are bright"

@@ -13,6 +13,8 @@ from flight.gnc.vision.objects.detect import detect
 from flight.gnc.vision.objects.report import ObjectReport, SpaceObject, Verdict
 from flight.gnc.vision.objects.settings import ObjectSettings
 from flight.gnc.vision.streaks.corners.settings import StreakSettings
+from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion
+from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from tests.flight.gnc.vision.streaks.frames import expose, rate_at, read_out, star_camera
 from tests.flight.gnc.vision.streaks.space_objects import (
     add_object,
@@ -31,9 +33,18 @@ _FAINTEST = 6.0
 
 
 def _detect(pixels: FloatArray, rotation: FloatArray, exposure: float = 1.0) -> ObjectReport:
-    report = detect(pixels, _CAMERA.pinhole, exposure, _SETTINGS, ObjectSettings(), rotation)
+    found = _turn(pixels, rotation, exposure)
+    report = detect(pixels, _CAMERA.pinhole, found, exposure, _SETTINGS, ObjectSettings())
     assert report is not None
     return report
+
+
+def _turn(pixels: FloatArray, rotation: FloatArray, exposure: float) -> FloatArray:
+    """Return the rotation that the likelihood finds; the true one decides its sign."""
+    settings = LikelihoodSettings(saturation=_SETTINGS.saturation, gain=_SETTINGS.gain)
+    found = estimate_motion(pixels, _CAMERA.pinhole, exposure, settings, rotation / exposure, 0.0)
+    assert found.rate is not None
+    return np.asarray(found.rate * exposure)
 
 
 def _see(
@@ -185,16 +196,16 @@ def test_a_piece_of_a_faint_star_is_no_object() -> None:
         assert _detect(pixels, _ROTATION).objects == ()
 
 
-def test_a_frame_without_a_rotation_has_no_report() -> None:
+def test_a_frame_without_streaks_has_no_report() -> None:
     noise = np.rint(np.random.default_rng(9).normal(150.0, 12.0, (512, 512))).astype(np.uint16)
-    assert detect(noise, _CAMERA.pinhole, 1.0, _SETTINGS, ObjectSettings()) is None
+    assert detect(noise, _CAMERA.pinhole, _ROTATION, 1.0, _SETTINGS, ObjectSettings()) is None
 
 
 def test_an_object_weaker_than_asked_is_not_called_one() -> None:
     path = object_path(_CAMERA, _PLACE, motion_across(_PLACE, 60.0 / _FOCAL, 2.4), _ROTATION)
     pixels = frame_with(_CAMERA, _ROTATION, 1.0, 5, [(path, 4.0)], _FAINTEST)
     deaf = dataclasses.replace(ObjectSettings(), improvement=1e9, crossing_improvement=1e9)
-    report = detect(pixels, _CAMERA.pinhole, 1.0, _SETTINGS, deaf, _ROTATION)
+    report = detect(pixels, _CAMERA.pinhole, _ROTATION, 1.0, _SETTINGS, deaf)
     assert report is not None
     assert report.objects == ()
     assert Verdict.UNCLEAR in report.verdicts + report.crowded

@@ -1,0 +1,30 @@
+"""A small slice of the campaign `false-horizons`, always the same."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.studies.campaigns.false_horizons import FALSE_HORIZONS, HARD, run
+from tests.studies.campaigns.limbless import MAKERS
+
+SEED = 3
+# Each gave a horizon, with the altitude known or without, before chance was counted.
+FALSE_ONCE = ("clouds-15", "coast-16", "terminator-12", "gradient-6", "stars-4", "flares-11")
+
+
+@pytest.mark.slow
+def test_pictures_that_once_gave_a_horizon_give_none_and_a_crescent_is_found(tmp_path: Path) -> None:
+    cases = {case.key: case for case in FALSE_HORIZONS.cases(20, SEED)}
+    assert len(cases) == 20 * len(MAKERS) + 4 * len(HARD)
+    results = [run(cases[key]) for key in (*FALSE_ONCE, "limb-crescent-0")]
+    verdicts = [[answer["verdict"] for answer in result["answers"]] for result in results]
+    assert not any({"right", "wrong"} & set(each) for each in verdicts[:-1])
+    # With a flight's knowledge.
+    assert verdicts[-1][-1] == "right"
+    summary = FALSE_HORIZONS.summarise(results, tmp_path)
+    json.dumps(summary.facts, allow_nan=False)
+    assert (summary.facts["false"], summary.facts["empty"]) == (0, len(FALSE_ONCE))
+    assert "0 of 6 pictures" in summary.text
