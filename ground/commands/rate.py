@@ -155,7 +155,8 @@ def _text(found: StreakResult | MotionResult, objects: tuple[SpaceObject, ...]) 
         lines.append(f"magnitude:     {1e3 * size:.4f} mrad/s +- {100.0 * spread / size:.3f} %")
     if found.status is StreakStatus.AMBIGUOUS:
         lines.append("direction:     unknown, the rate may be its opposite: give --prior")
-    lines.append(f"streaks:       {found.found} found, {found.used_count} used, {found.length:.1f} px long")
+    length = f", {found.length:.1f} px long" if math.isfinite(found.length) else ""
+    lines.append(f"streaks:       {found.found} found, {found.used_count} used{length}")
     for item in objects:
         x, y = item.endpoints.mean(axis=0)
         rate = 1e3 * item.relative_rate

@@ -88,7 +88,7 @@ def test_a_device_that_is_not_there_is_one_line_and_exit_status_1(tmp_path: Path
     assert "/dev/i2c" in done.stderr
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_a_flight_with_its_log_whole(tmp_path: Path, number: signal.Signals) -> None:
     words = [sys.executable, "-m", "flight", "run", str(DEMO), "--out", str(tmp_path / "run")]
     flight = subprocess.Popen(words, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
