@@ -1,4 +1,4 @@
-"""The signals that end a flight: Ctrl-C, a service manager's SIGTERM, the SIGHUP of a terminal that closes."""
+"""The signals that end a flight: SIGINT of Ctrl-C, SIGTERM, and the SIGHUP of a terminal that closes."""
 
 from __future__ import annotations
 

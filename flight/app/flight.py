@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 
 from flight.app.accepted_config import FlownConfig
+from flight.app.devices import check_settings
 from flight.app.ending_signals import EndingSignals
 from flight.app.linux import linux_rig
 from flight.app.mission_time import mission_zero, next_whole_second
@@ -20,6 +21,7 @@ from flight.link import events
 from flight.loop.progress import Progress
 from flight.loop.run_label import RunLabel
 from flight.loop.state.opening import service_folder
+from flight.schema import reader as configuration
 from flight.schema.sections import Config
 from hal.interfaces.rig import Rig
 
@@ -28,6 +30,8 @@ def fly(request: RunRequest, progress: Callable[[Progress], None] | None = None)
     """Fly a configuration to its end. Raises UsageError for a user mistake, DeviceError for a device."""
     with EndingSignals() as signals, ExitStack() as stack:
         text, config = requested_config(request)
+        stack.enter_context(_placing(text, str(request.config_path)))
+        check_settings(config)
         request = begin_folder(request, text, config)
         rig = _open_rig(request, text, config, stack)
         loop, flight_log = open_flight(config, rig, request.out, stack, patient=_is_patient(request))
@@ -44,6 +48,15 @@ def fly(request: RunRequest, progress: Callable[[Progress], None] | None = None)
         reason = loop.run(epoch_ns, label)
     faults = () if config.simulation is None else injected_faults(request, text)
     return RunResult(request.out, reason, signals.received, flight_log.error(), loop.restart, faults)
+
+
+@contextmanager
+def _placing(text: str, name: str) -> Iterator[None]:
+    """Have a complaint about a value of the configuration say in which line of which file the value is."""
+    try:
+        yield
+    except UsageError as error:
+        raise configuration.placed(error, text, name) from error
 
 
 def _open_rig(request: RunRequest, text: str, config: Config, stack: ExitStack) -> Rig:

@@ -72,12 +72,20 @@ def raw_shape(text: str) -> tuple[int, int, int]:
 
 def positive(text: str) -> float:
     """Return the number that an argument gives. Raises ArgumentTypeError unless it is finite and positive."""
+    value = finite(text)
+    if value <= 0.0:
+        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
+    return value
+
+
+def finite(text: str) -> float:
+    """Return the number that an argument gives. Raises ArgumentTypeError unless it is finite."""
     try:
         value = float(text)
     except ValueError as error:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number") from error
-    if not (math.isfinite(value) and value > 0.0):
-        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"{text} is not a finite number")
     return value
 
 

@@ -25,7 +25,7 @@ from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSett
 from flight.gnc.vision.streaks.streak_result import StreakResult, StreakStatus
 from flight.schema import reader as configuration
 from flight.schema.sections import Camera
-from ground.commands.options import add_field, add_output, add_picture, positive, read_picture
+from ground.commands.options import add_field, add_output, add_picture, finite, positive, read_picture
 from ground.pictures.overlay import draw_marks
 
 LIKELIHOOD = "likelihood"
@@ -43,7 +43,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_picture(parser)
     add_field(parser)
     parser.add_argument("--exposure", type=positive, metavar="S", help="exposure time")
-    parser.add_argument("--prior", type=float, nargs=3, metavar=("X", "Y", "Z"), help="rough rate, rad/s")
+    parser.add_argument("--prior", type=finite, nargs=3, metavar=("X", "Y", "Z"), help="rough rate, rad/s")
     parser.add_argument(
         "--method",
         choices=(LIKELIHOOD, *DETECTOR_NAMES),

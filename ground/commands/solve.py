@@ -35,7 +35,7 @@ from flight.gnc.vision.streaks.streak_result import StreakStatus
 from flight.schema import reader as configuration
 from flight.schema.camera_model import camera_model
 from flight.schema.sections import Camera
-from ground.commands.options import add_field, add_output, add_picture, positive, read_picture
+from ground.commands.options import add_field, add_output, add_picture, finite, positive, read_picture
 from ground.pictures.sky_picture import draw_solution
 
 ARCSECONDS = math.degrees(1.0) * 3600.0
@@ -61,7 +61,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--exposure", type=positive, metavar="S", help="exposure time, for the rate of streaks"
     )
-    parser.add_argument("--prior", type=float, nargs=3, metavar=("X", "Y", "Z"), help="rough rate, rad/s")
+    parser.add_argument("--prior", type=finite, nargs=3, metavar=("X", "Y", "Z"), help="rough rate, rad/s")
     parser.add_argument(
         "--date", type=_date, metavar="UTC", help="when, such as 2026-11-21: proper motion, aberration"
     )
@@ -84,6 +84,8 @@ def run(options: argparse.Namespace) -> int:
         sky = sky.at(options.date.year)
         settings = replace(settings, velocity=earth_velocity(options.date.julian_date))
     if options.method != DEFAULT_METHOD:
+        if options.fov is None and options.camera is None:
+            raise UsageError(f"--method {options.method}: it needs the field of view: give --fov or --camera")
         settings = replace(settings, method=method_of(options.method))
     prior = None if options.prior is None else RatePrior(np.array(options.prior), 0.0)
     begin = time.perf_counter()

@@ -154,8 +154,11 @@ def progress_line(stream: TextIO) -> Callable[[Progress], None]:
 
 
 def seed_number(text: str) -> int:
-    """Return the seed that an argument gives. Raises ArgumentTypeError below zero."""
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"{text} is below zero")
+    """Return the seed that an argument gives. Raises ArgumentTypeError unless the log can hold it."""
+    try:
+        value = int(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is no whole number") from error
+    if not 0 <= value < 2**64:
+        raise argparse.ArgumentTypeError(f"{text}: give a whole number from 0 to 2^64 - 1")
     return value

@@ -72,9 +72,10 @@ def test_a_signal_while_a_flight_opens_ends_the_flight_at_its_first_cycle() -> N
 
 def test_a_second_signal_interrupts_the_opening_and_the_handlers_are_put_back() -> None:
     before = signal.getsignal(signal.SIGTERM)
-    with pytest.raises(KeyboardInterrupt), EndingSignals():
+    with EndingSignals():
         signal.raise_signal(signal.SIGTERM)
-        signal.raise_signal(signal.SIGTERM)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGTERM)
     assert signal.getsignal(signal.SIGTERM) == before
 
 

@@ -2,8 +2,9 @@
 
 A part of them are right ones with a word or two changed, or with a damaged file behind a name: they lead far
 into the commands. A flight lasts three control cycles, a camera takes two frames, few pictures are really
-drawn. A part is typed in a process that a signal or a closed pipe disturbs. Broken promises are: a status other than 0, 1, 2; wrong use without a word on standard error; with
---json and status 0 anything but one JSON object on standard output.
+drawn. A part is typed in a process that a signal or a closed pipe disturbs (`interrupted`). Broken promises
+are: a status other than 0, 1, 2; wrong use without a word on standard error; with --json and status 0
+anything but one JSON object on standard output.
 """
 
 from __future__ import annotations
