@@ -46,8 +46,9 @@ def fly(request: RunRequest, progress: Callable[[Progress], None] | None = None)
         rig.release(epoch_ns)
         signals.end(loop)
         reason = loop.run(epoch_ns, label)
+        ending = loop.ending()
     faults = () if config.simulation is None else injected_faults(request, text)
-    return RunResult(request.out, reason, signals.received, flight_log.error(), loop.restart, faults)
+    return RunResult(request.out, reason, signals.received, flight_log.error(), ending, loop.restart, faults)
 
 
 @contextmanager
