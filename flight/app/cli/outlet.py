@@ -20,7 +20,7 @@ class _Outlet(io.FileIO):
 
     _lost = False
 
-    def write(self, data: Any) -> int | None:
+    def write(self, data: Any, /) -> int:
         """Write bytes; return how many are done with. Raises OSError once, such as for a full disk."""
         try:
             if not self._lost:

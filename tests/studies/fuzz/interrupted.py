@@ -90,7 +90,7 @@ def _live(type_line: Callable[[], int], output: str, complaint: IO[bytes]) -> No
 def _put_output(output: str) -> None:
     if output == "closed":
         os.close(1)
-        sys.stdout = sys.__stdout__ = None  # type: ignore[assignment,misc]
+        sys.stdout = sys.__stdout__ = None  # type: ignore[misc]
         return
     if output == "pipe":
         reader, writer = os.pipe()
