@@ -140,15 +140,9 @@ class FlightLoop:
 
     def ending(self) -> Ending:
         """Return how the flight stands; once `run` has returned, how it ended."""
-        services = self._services
-        return ending(
-            self._requests.ended_ns * 1e-9,
-            self._groups[0].completed,
-            self._tasks.modes.mode.label,
-            services.facts,
-            services.events.counts,
-            self._tasks.housekeeping.coils(),
-        )
+        tasks, requests, services = self._tasks, self._requests, self._services
+        cycles, coils, mode = self._groups[0].completed, tasks.housekeeping.coils(), tasks.modes.mode.label
+        return ending(requests.ended_ns * 1e-9, cycles, mode, services.facts, services.events.counts, coils)
 
     def _begin(self, epoch_ns: int, label: RunLabel) -> None:
         """Start every task at mission time zero, and record the run."""

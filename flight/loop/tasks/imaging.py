@@ -24,12 +24,6 @@ from hal.interfaces.errors import DeviceError
 from hal.interfaces.readings import Frame
 
 WORKER = "vision"
-_NAMED_ELSEWHERE = {
-    StreakStatus.TOO_SHORT,  # no motion
-    StreakStatus.BLACK,
-    StreakStatus.SATURATED,
-    StreakStatus.FROZEN,
-}
 
 
 class Imaging:
@@ -150,10 +144,8 @@ class Imaging:
         rate, attitude = self._measurer.mean_rate(frame, motion), self._measurer.attitude(frame, found)
         if is_strange(found.solution):
             rate = None  # its pixels are invalid
-        if rate is None and attitude is None and motion.status not in _NAMED_ELSEWHERE:
-            text = f"frame {frame.sequence}: streaks {motion.status.value}"
-            text += f", stars {found.solution.status.value}" if found.solution is not None else ""
-            self._events.report(events.FRAME_UNUSED, now_ns, text)
+        if rate is None and attitude is None:
+            self._report.unused(frame, found, now_ns)
         known = self._navigation.past(middle_ns(frame)) is not None
         late = [m for m in (rate, attitude if known else None) if m is not None]
 
