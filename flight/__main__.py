@@ -1,6 +1,11 @@
 """`python -m flight`, and the console script `knightcube`, which is the same."""
 
 import os
+import signal
+
+if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    # Ctrl-C ends a command at once, imports too, without a traceback. A flight takes the signal over.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 # Matrices here are small: multithreaded BLAS would slow them down.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -9,13 +9,14 @@ import numpy as np
 from flight.gnc.math.frames import NED_TO_TESTBED, attitude_map
 from flight.gnc.math.quaternion import attitude_matrix
 from flight.loop.services import Devices
+from flight.schema.errors import ConfigError
 from flight.schema.sections import Config
 from hal.drivers.coil_settings import CoilSettings, wirings
 from hal.drivers.coils import PwmTorqueCoils
 from hal.drivers.ina219 import Ina219
 from hal.drivers.pca9685 import Pca9685
 from hal.drivers.vn100.driver import Vn100, Vn100Settings
-from hal.interfaces.errors import DeviceError
+from hal.interfaces.errors import DeviceError, OutOfRange
 from hal.interfaces.rig import Rig
 
 
@@ -42,6 +43,20 @@ def open_devices(config: Config, rig: Rig, stack: ExitStack, patient: bool) -> D
     if camera is not None:
         stack.callback(camera.close)
     return Devices(unit, coils, power, camera)
+
+
+def check_settings(config: Config) -> None:
+    """Refuse a value that a driver does not take. Raises ConfigError with the driver's range."""
+    for section, settings in (("coils", coil_settings), ("inertial_unit", unit_settings)):
+        try:
+            settings(config)
+        except OutOfRange as error:
+            key = error.quantity.removeprefix("coil ").replace(" ", "_")
+            known = hasattr(getattr(config, section), key)
+            problem = f"{error.value!r}: must be {error.low:g} to {error.high:g} {error.unit}".rstrip()
+            raise ConfigError(
+                f"{section}.{key}" if known else section, f"is {problem}" if known else f"{key} is {problem}"
+            ) from error
 
 
 def coil_settings(config: Config) -> CoilSettings:

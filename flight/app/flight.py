@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-import signal
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from types import FrameType
 
 from flight.app.accepted_config import FlownConfig
+from flight.app.devices import check_settings
+from flight.app.ending_signals import EndingSignals
 from flight.app.linux import linux_rig
 from flight.app.mission_time import mission_zero, next_whole_second
 from flight.app.opening import open_flight
@@ -18,19 +18,21 @@ from flight.app.run_folder import begin_folder
 from flight.app.simulated import injected_faults, simulated_rig
 from flight.gnc.errors import UsageError
 from flight.link import events
-from flight.loop.flight_loop import FlightLoop
 from flight.loop.progress import Progress
 from flight.loop.run_label import RunLabel
 from flight.loop.state.opening import service_folder
+from flight.schema import reader as configuration
 from flight.schema.sections import Config
 from hal.interfaces.rig import Rig
 
 
 def fly(request: RunRequest, progress: Callable[[Progress], None] | None = None) -> RunResult:
     """Fly a configuration to its end. Raises UsageError for a user mistake, DeviceError for a device."""
-    text, config = requested_config(request)
-    request = begin_folder(request, text, config)
-    with ExitStack() as stack:
+    with EndingSignals() as signals, ExitStack() as stack:
+        text, config = requested_config(request)
+        stack.enter_context(_placing(text, str(request.config_path)))
+        check_settings(config)
+        request = begin_folder(request, text, config)
         rig = _open_rig(request, text, config, stack)
         loop, flight_log = open_flight(config, rig, request.out, stack, patient=_is_patient(request))
         if progress is not None:
@@ -40,12 +42,22 @@ def fly(request: RunRequest, progress: Callable[[Progress], None] | None = None)
         elif rig.realtime and (folder := service_folder(os.environ)) is not None:
             stack.callback(FlownConfig(text, folder).serve(rig.clock).stop)
         label = RunLabel(text, rig.seed, config.simulation is not None, rig.realtime)
-        with _signals_stop(loop) as received:
-            epoch_ns = mission_zero(rig.clock) if rig.realtime else next_whole_second(rig.clock)
-            rig.release(epoch_ns)
-            reason = loop.run(epoch_ns, label)
+        epoch_ns = mission_zero(rig.clock) if rig.realtime else next_whole_second(rig.clock)
+        rig.release(epoch_ns)
+        signals.end(loop)
+        reason = loop.run(epoch_ns, label)
+        ending = loop.ending()
     faults = () if config.simulation is None else injected_faults(request, text)
-    return RunResult(request.out, reason, bool(received), flight_log.error(), loop.restart, faults)
+    return RunResult(request.out, reason, signals.received, flight_log.error(), ending, loop.restart, faults)
+
+
+@contextmanager
+def _placing(text: str, name: str) -> Iterator[None]:
+    """Have a complaint about a value of the configuration say in which line of which file the value is."""
+    try:
+        yield
+    except UsageError as error:
+        raise configuration.placed(error, text, name) from error
 
 
 def _open_rig(request: RunRequest, text: str, config: Config, stack: ExitStack) -> Rig:
@@ -62,20 +74,3 @@ def _open_rig(request: RunRequest, text: str, config: Config, stack: ExitStack) 
 def _is_patient(request: RunRequest) -> bool:
     """Return whether the flight waits for missing devices: on a board, where nobody can reconnect them."""
     return request.archive is not None
-
-
-@contextmanager
-def _signals_stop(loop: FlightLoop) -> Iterator[list[int]]:
-    """End the flight after the running cycle on SIGINT or SIGTERM; the list holds the signals received."""
-    received: list[int] = []
-
-    def stop(number: int, _: FrameType | None) -> None:
-        received.append(number)
-        loop.stop(f"stopped by {signal.Signals(number).name}")
-
-    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield received
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

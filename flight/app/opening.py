@@ -21,6 +21,7 @@ from flight.loop.executive.processes import ProcessRunner
 from flight.loop.fdir.board import Board
 from flight.loop.flight_loop import FlightLoop, Supervisors, nothing
 from flight.loop.state.opening import open_state
+from flight.schema.errors import ConfigError
 from flight.schema.peers import peer_networks
 from flight.schema.sections import Config
 from hal.interfaces.rig import Rig
@@ -42,6 +43,8 @@ def open_flight(
     tracker = config.camera.star_tracker if config.camera is not None else None
     if tracker is not None and tracker.index is None:
         ensure_default_index()
+    elif tracker is not None and not patient and not Path(tracker.index or "").is_file():
+        raise ConfigError("camera.star_tracker.index", f"is {tracker.index!r}: there is no such file")
     jobs = _open_jobs(config, rig, stack)
     recorder = Recorder(flight_log, performance_log)
     feed, beat = nothing, nothing

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from flight.loop.ending import Ending
+
 
 @dataclass(frozen=True, slots=True)
 class RunRequest:
@@ -31,12 +33,14 @@ class RunRequest:
 class RunResult:
     """How a flight ended; `interrupted` when by a signal.
 
-    `restart` says why the process should be restarted, empty when it should not. `faults` were injected.
+    `ending` is how the loop stood. `restart` says why the process should be restarted, empty when it should
+    not. `faults` were injected.
     """
 
     folder: Path
     reason: str
     interrupted: bool
     log_error: str
+    ending: Ending
     restart: str = ""
     faults: tuple[str, ...] = ()

@@ -34,7 +34,7 @@ def begin_folder(request: RunRequest, text: str, config: Config) -> RunRequest:
         request = replace(request, out=run.folder)
     out = request.out
     if any(out.glob("*.ccsds")):
-        raise UsageError(f"{out} holds a run already: give another folder with --out, or remove it")
+        raise UsageError(f"{out} holds a run already: give another folder, or remove this one")
     try:
         out.mkdir(parents=True, exist_ok=True)
         (out / "config.yaml").write_text(text, encoding="utf-8")

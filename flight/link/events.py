@@ -122,6 +122,12 @@ CAMERA_STRANGE = EventKind(
     58, "camera-strange", _WARNED, "many stars in a frame, and no sky that has them: are its pixels in order?"
 )
 VISION_SLOW = EventKind(59, "vision-slow", _WARNED, "vision takes long over a frame")
+FRAME_UNUSED = EventKind(
+    69,
+    "frame-unused",
+    _TOLD,
+    "a frame of a body in motion gave no rate and no attitude",
+)
 CAMERA_LATE = EventKind(
     66, "camera-late", _WARNED, "a frame comes long after its exposure, or has not come yet"
 )

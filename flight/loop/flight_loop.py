@@ -13,6 +13,7 @@ from flight.link import events
 from flight.link.events import EventKind
 from flight.loop.body import Body
 from flight.loop.control_output import ControlOutput, SteeringState
+from flight.loop.ending import Ending, ending
 from flight.loop.executive.executive import Executive
 from flight.loop.executive.rate_group import Cycle, RateGroup
 from flight.loop.fdir.resources import ResourceReader
@@ -72,9 +73,10 @@ class LoopTasks:
 
 @dataclass(slots=True)
 class _Requests:
-    """Requests of the application to the flight."""
+    """Requests of the application to the flight, and the mission time at which the flight ended."""
 
     stop_reason: str = ""
+    ended_ns: int = 0
     progress: Callable[[Progress], None] | None = None
     notes: list[tuple[EventKind, str]] = field(default_factory=list)
 
@@ -129,11 +131,18 @@ class FlightLoop:
             self._tasks.control.coils_off()
             self._tasks.health.close()
             now_ns = services.clock.now_ns()
+            self._requests.ended_ns = max(now_ns - epoch_ns, 0)
             reason = self._requests.stop_reason or "the configured duration is over"
             services.events.flush(now_ns)
             services.events.report(events.STOPPED, now_ns, reason)
             self._record_performance(now_ns)
         return reason
+
+    def ending(self) -> Ending:
+        """Return how the flight stands; once `run` has returned, how it ended."""
+        tasks, requests, services = self._tasks, self._requests, self._services
+        cycles, coils, mode = self._groups[0].completed, tasks.housekeeping.coils(), tasks.modes.mode.label
+        return ending(requests.ended_ns * 1e-9, cycles, mode, services.facts, services.events.counts, coils)
 
     def _begin(self, epoch_ns: int, label: RunLabel) -> None:
         """Start every task at mission time zero, and record the run."""

@@ -35,6 +35,9 @@ def check_consistency(config: Config, document: Document) -> None:
     _check_commands(config.commands, refuse)
     _check_coils(config, refuse)
     _check_times(config, refuse)
+    telemetry = config.telemetry
+    if telemetry.budget_bytes < 2 * telemetry.segment_bytes:
+        refuse("telemetry.budget_bytes", f"is {telemetry.budget_bytes}: must hold two segments")
     if config.camera is not None:
         _check_camera(config.camera, refuse)
         _check_length("camera.mounting", config.camera.mounting, refuse)

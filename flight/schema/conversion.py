@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from flight.schema.document import Document, join
+from flight.schema.expectation import expectation, steps_of
 
 T = TypeVar("T")
 
@@ -29,9 +30,13 @@ def convert(document: Document, shape: type[T], section: str = "") -> T:
             key = unknown.group(1)
             problem = "is an unknown key" + _nearest(key, shape, tree, path)
             raise document.error(join(dotted, key), problem) from error
+        missing = re.match(r"Object missing required field `(.+)`", message)
+        if missing:
+            raise document.error(join(dotted, missing.group(1)), "is missing") from error
         value = _lookup(tree, path)
+        message = expectation(message, shape, path)
         if value is not _ABSENT:
-            message = f"is {_shown(value)}: {message[0].lower()}{message[1:]}"
+            message = f"is {_shown(value)}: {message}"
         raise document.error(dotted, message) from error
 
 
@@ -43,7 +48,7 @@ def _shown(value: Any) -> str:
 
 def _lookup(tree: Any, path: str) -> Any:
     """Return the value at a msgspec path such as `.coils.channels[1]`; _ABSENT for a section."""
-    for key, index in re.findall(r"\.([^.\[]+)|\[(\d+|\.\.\.)\]", path):
+    for key, index in steps_of(path):
         try:
             tree = tree[key] if key else tree[int(index)]
         except (KeyError, IndexError, TypeError, ValueError):

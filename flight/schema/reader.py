@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
+from flight.gnc.errors import UsageError
 from flight.schema.consistency import check_consistency
 from flight.schema.conversion import convert
 from flight.schema.document import read_document, read_text
@@ -49,6 +50,14 @@ def load_camera(path: Path) -> Camera:
     if camera is None:
         raise ConfigError(str(path), "`camera` is none: give a configuration with a camera")
     return camera
+
+
+def placed(error: UsageError, text: str, name: str) -> UsageError:
+    """Return a complaint that begins with a value's dotted name with file and line; others as they are."""
+    where, _, problem = str(error).partition(": ")
+    if where.partition(".")[0].partition("[")[0] not in Config.__struct_fields__:
+        return error
+    return read_document(text, name).error(where, problem)
 
 
 def simulation_section(text: str, name: str, shape: type[T]) -> T | None:

@@ -19,8 +19,19 @@ Positive = Annotated[float, Meta(gt=0.0)]
 NotNegative = Annotated[float, Meta(ge=0.0)]
 Q2 = Annotated[float, Meta(ge=-Q2_LIMIT, le=Q2_LIMIT)]
 Address = Annotated[int, Meta(ge=0x08, le=0x77)]
-Bus = Annotated[int, Meta(ge=0, le=0xFFFFF)] | Annotated[str, Meta(pattern=r"^/[A-Za-z0-9_./:+-]+$")]
-Peer = Annotated[str, Meta(pattern=r"^[0-9]{1,3}(\.[0-9]{1,3}){3}(/[0-9]{1,2})?$")]
+Bus = (
+    Annotated[int, Meta(ge=0, le=0xFFFFF)]
+    | Annotated[
+        str, Meta(pattern=r"^/[A-Za-z0-9_./:+-]+$", description="the number of a bus, or its device file")
+    ]
+)
+Peer = Annotated[
+    str,
+    Meta(
+        pattern=r"^[0-9]{1,3}(\.[0-9]{1,3}){3}(/[0-9]{1,2})?$",
+        description="an IPv4 address or subnet, such as 192.168.7.0/24",
+    ),
+]
 Sign = Literal[-1, 1]
 Channel = Annotated[int, Meta(ge=0, le=15)]
 Estimator = Literal["likelihood", "harris", "minimum-eigenvalue", "trajkovic-4", "trajkovic-8"]
@@ -349,7 +360,10 @@ class Commands(Section, frozen=True, kw_only=True):
     """
 
     socket: Annotated[str, Meta(min_length=1, max_length=100)] | None = None
-    udp: Annotated[str, Meta(pattern=r"^[^:\s]+:[0-9]{1,5}$")] | None = None
+    udp: (
+        Annotated[str, Meta(pattern=r"^[^:\s]+:[0-9]{1,5}$", description="HOST:PORT, such as 127.0.0.1:5005")]
+        | None
+    ) = None
     peers: Annotated[tuple[Peer, ...], Meta(min_length=1)] | None = None
     timeline: tuple[CommandStep, ...] = ()
 

@@ -26,7 +26,7 @@ from flight.gnc.vision.startracker.solve import SolveSettings
 from ground.calibration.calibration import PARAMETERS, Calibration
 from ground.calibration.lens_fit import MatchedFrame
 from ground.calibration.selection import LEAST_STARS, Selected, calibrate_one_lens
-from ground.commands.options import positive, write_new
+from ground.commands.options import check_size, positive, write_new
 from ground.commands.solve import lens_of_field
 
 _ROUNDS = 3
@@ -130,6 +130,7 @@ def _read(paths: Sequence[Path]) -> list[tuple[Path, Image]]:
     frames = [(path, read_image(path)) for path in paths]
     first = frames[0]
     for path, pixels in frames:
+        check_size(path, pixels)
         if pixels.shape != first[1].shape:
             sizes = [f"{image.shape[1]} x {image.shape[0]}" for image in (pixels, first[1])]
             raise UsageError(f"{path}: {sizes[0]} pixels, but {first[0]} has {sizes[1]}: give one camera's")

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from flight.app.utc_label import utc_ns
 from flight.gnc.errors import FlightError, UsageError
-from flight.link.commands.codec import ChangeMode, Clear, Command, CommandPacker, Ping, Slew
+from flight.link.commands.codec import ChangeMode, Clear, Command, CommandError, CommandPacker, Ping, Slew
 from flight.link.modes import COMMANDABLE, Mode
 from flight.link.telemetry.definitions import COMMAND
 from flight.link.telemetry.packets import LONGEST_PACKET, TelemetryError, to_text
@@ -49,7 +49,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def command(options: argparse.Namespace) -> int:
     """Send, wait, print."""
-    data = CommandPacker().pack(_command_of(options), utc_ns())  # the time makes it unique
+    try:
+        data = CommandPacker().pack(_command_of(options), utc_ns())  # the time makes it unique
+    except CommandError as error:
+        raise UsageError(str(error)) from error
     raw = exchange(options.to, data, options.timeout)
     try:
         (row,) = decode(raw)[COMMAND.name]
@@ -66,7 +69,7 @@ def command(options: argparse.Namespace) -> int:
 
 
 def exchange(to: str, data: bytes, timeout: float) -> bytes:
-    """Send a datagram and return the answer. Raises UsageError for a place where nobody can listen."""
+    """Send a datagram and return the answer. Raises FlightError without one, UsageError."""
     if not 0.0 < timeout < float("inf"):
         raise UsageError(f"--timeout {timeout}: must be a positive number of seconds")
     host, _, port = to.rpartition(":")
@@ -98,7 +101,7 @@ def _ask(line: socket.socket, address: str | tuple[str, int], data: bytes, timeo
     try:
         line.sendto(data, address)
     except OSError as error:
-        raise UsageError(f"{to}: no flight listens there: {error.strerror or error}") from error
+        raise FlightError(f"{to}: no flight listens there: {error.strerror or error}") from error
     except OverflowError as error:
         raise UsageError(f"{to}: {error}") from error
     try:

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from flight.app.cli.run import progress_line, seed_number
+from flight.app.cli.run import progress_on, seed_number
 from flight.app.request import RunRequest
 from flight.gnc.errors import UsageError
 from flight.link.telemetry.reader import read_run
@@ -133,7 +133,7 @@ def _fly(options: argparse.Namespace) -> Path:
         path = Path(place) / options.source.name
         path.write_text(config_text(config), encoding="utf-8")
         request = RunRequest(path, out, options.realtime, seed=options.seed)
-        result = fly(request, progress_line(sys.stderr) if with_line else None)
+        result = fly(request, progress_on(sys.stderr))
     if with_line:
         sys.stderr.write("\r\x1b[K")
     if result.interrupted:

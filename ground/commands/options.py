@@ -11,6 +11,7 @@ from pathlib import Path
 from flight.gnc.camera.images import read_image, read_raw
 from flight.gnc.errors import UsageError
 from flight.gnc.math.arrays import Image
+from flight.gnc.vision.startracker.detection.sky import LEAST_SIDE
 from flight.schema.carried import config_path
 
 _RAW = re.compile(r"([0-9]+)x([0-9]+)x(8|16)")
@@ -48,7 +49,16 @@ def add_output(parser: argparse.ArgumentParser, run: Callable[[argparse.Namespac
 
 def read_picture(options: argparse.Namespace) -> Image:
     """Return the pixels (rows, columns) of the picture that the arguments name. Raises UsageError."""
-    return read_raw(options.image, *options.raw) if options.raw else read_image(options.image)
+    pixels = read_raw(options.image, *options.raw) if options.raw else read_image(options.image)
+    check_size(options.image, pixels)
+    return pixels
+
+
+def check_size(path: Path, pixels: Image) -> None:
+    """Raise UsageError for a picture that is too small to show anything."""
+    rows, columns = pixels.shape
+    if min(rows, columns) < LEAST_SIDE:
+        raise UsageError(f"{path}: {columns} x {rows} pixels: give {LEAST_SIDE} or more each way")
 
 
 def raw_shape(text: str) -> tuple[int, int, int]:
@@ -62,12 +72,20 @@ def raw_shape(text: str) -> tuple[int, int, int]:
 
 def positive(text: str) -> float:
     """Return the number that an argument gives. Raises ArgumentTypeError unless it is finite and positive."""
+    value = finite(text)
+    if value <= 0.0:
+        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
+    return value
+
+
+def finite(text: str) -> float:
+    """Return the number that an argument gives. Raises ArgumentTypeError unless it is finite."""
     try:
         value = float(text)
     except ValueError as error:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number") from error
-    if not (math.isfinite(value) and value > 0.0):
-        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"{text} is not a finite number")
     return value
 
 

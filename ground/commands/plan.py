@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import sys
 import time
 from pathlib import Path
@@ -12,11 +11,14 @@ from pathlib import Path
 import numpy as np
 
 from flight.bodies.testbed.plant_model import plant_of
+from flight.gnc.errors import UsageError
+from flight.gnc.guidance.one_axis.limits import Q2_LIMIT
 from flight.gnc.guidance.one_axis.path_cost import PathCost
 from flight.gnc.guidance.one_axis.plant import SingleAxisPlant
-from flight.gnc.guidance.one_axis.vmc import NODES, Plan, plan
+from flight.gnc.guidance.one_axis.vmc import FASTEST, HORIZON_RANGE, NODES, NODES_RANGE, Plan, plan
 from flight.schema import reader as configuration
 from flight.schema.carried import config_path
+from ground.commands.options import finite, positive
 
 _DEFAULT_CONFIG = "step_demo"
 
@@ -29,15 +31,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.epilog = "example: python -m flight plan --from 0.4 --from-rate 0.015 --to -0.3 --picture path.png"
     parser.add_argument(
-        "--from", dest="start", type=_number, required=True, metavar="Q2", help="q2 at the start"
+        "--from", dest="start", type=finite, required=True, metavar="Q2", help="q2 at the start"
     )
-    parser.add_argument("--to", dest="end", type=_number, required=True, metavar="Q2", help="q2 at the end")
-    parser.add_argument("--from-rate", type=_number, default=0.0, metavar="W", help="rad/s at the start")
-    parser.add_argument("--to-rate", type=_number, default=0.0, metavar="W", help="rad/s at the end")
-    parser.add_argument("--horizon", type=_number, metavar="S", help="seconds (default: the configuration's)")
+    parser.add_argument("--to", dest="end", type=finite, required=True, metavar="Q2", help="q2 at the end")
+    parser.add_argument("--from-rate", type=finite, default=0.0, metavar="W", help="rad/s at the start")
+    parser.add_argument("--to-rate", type=finite, default=0.0, metavar="W", help="rad/s at the end")
+    parser.add_argument("--horizon", type=finite, metavar="S", help="seconds (default: the configuration's)")
     parser.add_argument(
         "--time-price",
-        type=_number,
+        type=positive,
         metavar="W",
         help="price of time: choose the horizon of least energy plus price times time",
     )
@@ -61,6 +63,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Plan, print, draw."""
+    _check(options)
     config = configuration.load(options.config)
     plant = plant_of(config)
     horizon = config.guidance.horizon if options.horizon is None else options.horizon
@@ -124,8 +127,15 @@ def _text(made: Plan, plant: SingleAxisPlant, solved_s: float) -> str:
     )
 
 
-def _number(text: str) -> float:
-    value = float(text)
-    if not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f"{text} is not a finite number")
-    return value
+def _check(options: argparse.Namespace) -> None:
+    """Raise UsageError for an option that no plan can follow."""
+    for option, value, (low, high) in (
+        ("--from", options.start, (-Q2_LIMIT, Q2_LIMIT)),
+        ("--to", options.end, (-Q2_LIMIT, Q2_LIMIT)),
+        ("--from-rate", options.from_rate, (-FASTEST, FASTEST)),
+        ("--to-rate", options.to_rate, (-FASTEST, FASTEST)),
+        ("--horizon", options.horizon, HORIZON_RANGE),
+        ("--nodes", options.nodes, NODES_RANGE),
+    ):
+        if value is not None and not low <= value <= high:
+            raise UsageError(f"{option} {value:g}: must be {low:g} to {high:g}")

@@ -27,7 +27,7 @@ from flight.gnc.vision.streaks.streak_result import StreakResult, StreakStatus
 from flight.schema import reader as configuration
 from flight.schema.camera_model import camera_knowledge, camera_model
 from flight.schema.sections import Camera
-from ground.commands.options import add_field, add_output, add_picture, positive, read_picture
+from ground.commands.options import add_field, add_output, add_picture, finite, positive, read_picture
 from ground.pictures.overlay import draw_marks
 
 LIKELIHOOD = "likelihood"
@@ -58,11 +58,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--psf", type=positive, metavar="PX", help="point spread, standard deviation (1)")
     parser.add_argument(
         "--line-time",
-        type=float,
+        type=finite,
         metavar="S",
         help="from one row's exposure to the next's (0: global shutter)",
     )
-    parser.add_argument("--prior", type=float, nargs=3, metavar=("X", "Y", "Z"), help="rough rate, rad/s")
+    parser.add_argument("--prior", type=finite, nargs=3, metavar=("X", "Y", "Z"), help="rough rate, rad/s")
     parser.add_argument(
         "--method",
         choices=(LIKELIHOOD, *DETECTOR_NAMES),
@@ -214,7 +214,8 @@ def _text(found: StreakResult | MotionResult, objects: tuple[SpaceObject, ...]) 
         lines.append(f"magnitude:     {1e3 * size:.4f} mrad/s +- {100.0 * spread / size:.3f} %")
     if found.status is StreakStatus.AMBIGUOUS:
         lines.append("direction:     unknown, the rate may be its opposite: give --prior")
-    lines.append(f"streaks:       {found.found} found, {found.used_count} used, {found.length:.1f} px long")
+    length = f", {found.length:.1f} px long" if math.isfinite(found.length) else ""
+    lines.append(f"streaks:       {found.found} found, {found.used_count} used{length}")
     for item in objects:
         x, y = item.endpoints.mean(axis=0)
         rate = 1e3 * item.relative_rate

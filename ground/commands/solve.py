@@ -35,7 +35,15 @@ from flight.gnc.vision.streaks.streak_result import StreakStatus
 from flight.schema import reader as configuration
 from flight.schema.camera_model import camera_model
 from flight.schema.sections import Camera
-from ground.commands.options import add_field, add_output, add_picture, positive, read_picture, write_new
+from ground.commands.options import (
+    add_field,
+    add_output,
+    add_picture,
+    finite,
+    positive,
+    read_picture,
+    write_new,
+)
 from ground.pictures.sky_picture import draw_solution
 from ground.sky.bodies import bodies_in
 from ground.sky.facts import sky_facts, sky_text
@@ -64,7 +72,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--exposure", type=positive, metavar="S", help="exposure time, for the rate of streaks"
     )
-    parser.add_argument("--prior", type=float, nargs=3, metavar=("X", "Y", "Z"), help="rough rate, rad/s")
+    parser.add_argument("--prior", type=finite, nargs=3, metavar=("X", "Y", "Z"), help="rough rate, rad/s")
     parser.add_argument(
         "--date",
         type=_date,
@@ -95,6 +103,8 @@ def run(options: argparse.Namespace) -> int:
         sky = sky.at(options.date.year)
         settings = replace(settings, velocity=earth_velocity(options.date.julian_date))
     if options.method != DEFAULT_METHOD:
+        if options.fov is None and options.camera is None:
+            raise UsageError(f"--method {options.method}: it needs the field of view: give --fov or --camera")
         settings = replace(settings, method=method_of(options.method))
     prior = None if options.prior is None else RatePrior(np.array(options.prior), 0.0)
     begin = time.perf_counter()

@@ -38,5 +38,4 @@ def fit_figure(record: Record, found: Fit) -> Figure:
 
 def save_fit(record: Record, found: Fit, file: Path) -> None:
     """Draw a fit into a file. Raises OSError."""
-    file.parent.mkdir(parents=True, exist_ok=True)
     fit_figure(record, found).savefig(file, dpi=DPI, facecolor="white", format="png")

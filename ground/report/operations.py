@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from flight.gnc.math.arrays import FloatArray
-from flight.link.modes import Mode
+from flight.link.modes import STEERING, Mode
 from flight.link.telemetry.packets import PacketArray, to_text
 from flight.link.telemetry.reader import Run
 from flight.loop.fdir.facts import FACTS
@@ -111,6 +111,13 @@ def modes(packets: PacketArray) -> list[Object]:
         }
         for row, time in zip(packets, seconds(packets), strict=True)
     ]
+
+
+def step_ends(packets: PacketArray) -> FloatArray:
+    """Return the times, s, at which a mode ended any step: by command, or because nothing is steered."""
+    by_command = np.array([to_text(row["trigger"]).startswith("commanded") for row in packets], dtype=bool)
+    steering = np.isin(packets["mode"], [int(mode) for mode in STEERING])
+    return seconds(packets)[by_command | ~steering]
 
 
 def health(packets: PacketArray) -> Object | None:

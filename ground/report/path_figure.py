@@ -47,5 +47,4 @@ def path_figure(plan: Plan, plant: SingleAxisPlant) -> Figure:
 
 def save_path(plan: Plan, plant: SingleAxisPlant, file: Path) -> None:
     """Draw a plan into a file. Raises OSError."""
-    file.parent.mkdir(parents=True, exist_ok=True)
     path_figure(plan, plant).savefig(file, dpi=DPI, facecolor="white", format="png")

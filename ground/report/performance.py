@@ -1,17 +1,18 @@
 """The figures of Sease 2013, Table 5.3: how well each attitude step was made.
 
-Definitions: sample 0 is the step's command. The step runs from the target before (the first from where the
-body was) to its own target. Rise: from 10 to 90 % of the step. Overshoot: beyond the target, in % of the
-step. Settling: the last entry into +-5 % of the step about the target. Steady state: the largest error over
-the last 30 s, in degrees of theta = 2 asin q2, of a target that stands for a minute at least. Crossings are
-interpolated between samples.
+Definitions: sample 0 is the step's command. The step runs from the target before, where the body held that
+target, else from where the body was, to its own target. Rise: from 10 to 90 % of the step. Overshoot: beyond
+the target, in % of the step. Settling: the last entry into +-5 % of the step about the target. Steady state:
+the largest error over the last 30 s, in degrees of theta = 2 asin q2, of a target that stands for a minute at
+least. Crossings are interpolated between samples. A step that ends within 30 s, not settled, is interrupted:
+nothing of it is judged.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -31,13 +32,18 @@ CURRENT_LIMIT_A = 0.148
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """One commanded step: when, s; from which q2 to which; how long it stands, s."""
+    """One commanded step: when, s; from which q2 to which; how long it stands, s.
+
+    `from_target`: it begins at a target that the body held. `again`: a step of this index came before.
+    """
 
     index: int
     time: float
     start: float
     target: float
     duration: float
+    from_target: bool = True
+    again: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +74,38 @@ def commands(
         Command(int(i), float(t), float(start), float(target), float(stop - t))
         for i, t, start, target, stop in zip(indices, times, starts, targets, ends, strict=True)
     ]
+
+
+def placed(listed: Sequence[Command], time: FloatArray, q2: FloatArray, stops: FloatArray) -> list[Command]:
+    """Return the commands as they were met: from where the body was, and until something ended them.
+
+    Args:
+        listed: commands from target to target.
+        time: (n,) s of the samples.
+        q2: (n,).
+        stops: s, ascending, when a mode ended whatever step there was.
+    """
+    met: list[Command] = []
+    for command in listed:
+        was = float(np.interp(command.time, time, q2))
+        held = abs(was - command.start) <= SETTLING_BAND * abs(command.target - command.start)
+        later = stops[stops > command.time]
+        duration = min(command.duration, float(later[0]) - command.time if len(later) else math.inf)
+        met.append(
+            replace(
+                command,
+                start=command.start if held else was,
+                duration=duration,
+                from_target=held and bool(met),
+                again=any(before.index == command.index for before in met),
+            )
+        )
+    return met
+
+
+def interrupted(command: Command, found: Response) -> bool:
+    """Return whether a step was ended before it could be judged."""
+    return command.duration < SETTLING_LIMIT_S and math.isinf(found.settling_s)
 
 
 def response(time: FloatArray, q2: FloatArray, command: Command) -> Response:

@@ -70,6 +70,23 @@ def streaks(run: Run) -> Object:
     return found
 
 
+def failed_frames(run: Run) -> list[Object]:
+    """Return the frames that gave neither a rate nor an attitude: which, when, and why."""
+    solved = set(run["stars"]["sequence"][np.all(np.isfinite(run["stars"]["quaternion"]), axis=1)].tolist())
+    starry = {int(row["sequence"]): to_text(row["status"]) for row in run["stars"]}
+    rated = np.all(np.isfinite(run["streak"]["rate"]), axis=1)
+    return [
+        {
+            "sequence": int(row["sequence"]),
+            "exposed_s": float(row["exposure_start_ns"]) / 1e9,
+            "streaks": to_text(row["status"]),
+            "stars": starry.get(int(row["sequence"])),
+        }
+        for row in run["streak"][~rated]
+        if int(row["sequence"]) not in solved
+    ]
+
+
 def star_attitudes(run: Run) -> Object:
     """Return what the star tracker made of the frames, and how far its attitudes were from the truth.
 

@@ -11,12 +11,22 @@ from typing import Any
 import numpy as np
 
 from flight.gnc.math.arrays import FloatArray
-from flight.link.telemetry.packets import PacketArray, to_text
+from flight.link.telemetry.packets import to_text
 from flight.link.telemetry.reader import Run
 from ground.report import performance as limits
-from ground.report.operations import cycles, events, health, jobs, logs, modes, planner, rate_groups
-from ground.report.performance import Command, Response, commands, response
-from ground.report.sensing import estimate_errors, star_attitudes, streaks
+from ground.report.operations import (
+    cycles,
+    events,
+    health,
+    jobs,
+    logs,
+    modes,
+    planner,
+    rate_groups,
+    step_ends,
+)
+from ground.report.performance import Command, Response, commands, interrupted, placed, response
+from ground.report.sensing import estimate_errors, failed_frames, star_attitudes, streaks
 from ground.report.signals import Attitude, coil_power, estimated_attitude, seconds, true_attitude
 
 Object = dict[str, Any]
@@ -28,7 +38,7 @@ def summarise(run: Run) -> Object:
     attitude = true_attitude(run) or estimated_attitude(run)
     notes: list[str] = []
     identity = _identity(run, attitude, notes)
-    steps = _steps(run["target"], attitude, identity["duration_planned_s"], notes)
+    steps = _steps(run, attitude, identity["duration_planned_s"], notes)
     power = _power(run, notes)
     summary: Object = {
         "run": identity,
@@ -43,6 +53,7 @@ def summarise(run: Run) -> Object:
         "estimate": estimate_errors(run),
         "streaks": streaks(run),
         "stars": star_attitudes(run),
+        "failed_frames": failed_frames(run),
         "modes": modes(run["mode"]),
         "health": health(run["health"]),
         "events": events(run["event"]),
@@ -95,9 +106,10 @@ def _identity(run: Run, attitude: Attitude, notes: list[str]) -> Object:
 
 
 def _steps(
-    targets: PacketArray, attitude: Attitude, planned_end: float, notes: list[str]
+    run: Run, attitude: Attitude, planned_end: float, notes: list[str]
 ) -> list[tuple[Command, Response | None]]:
-    """Return each commanded step with its response, None where the step was cut short or not observed."""
+    """Return each commanded step with its response, None where it was interrupted or not observed."""
+    targets = run["target"]
     if not len(targets):
         notes.append("no target packets: no steps to judge")
         return []
@@ -109,14 +121,19 @@ def _steps(
     release = float(np.interp(times[0], attitude.time, attitude.q2))
     end = _end_of_last_step(times, planned_end, seen_until)
     listed = commands(targets["index"].tolist(), times, targets["q2"].astype(float), release, end)
+    listed = placed(listed, attitude.time, attitude.q2, step_ends(run["mode"]))
     sample = 3.0 * float(np.median(np.diff(attitude.time)))
     steps: list[tuple[Command, Response | None]] = []
     for command in listed:
         seen = attitude.time[0] - sample <= command.time
         complete = seen and command.time + command.duration <= seen_until + sample
         found = response(attitude.time, attitude.q2, command) if complete else None
+        if found is not None and interrupted(command, found):
+            found = None
+            notes.append(f"step {command.index}: interrupted after {command.duration:.1f} s, not judged")
+        else:
+            notes += _remarks(command, found)
         steps.append((command, found))
-        notes += _remarks(command, found)
     return steps
 
 
@@ -144,8 +161,8 @@ def _end_of_last_step(times: FloatArray, planned_end: float, seen_until: float) 
 
 
 def _rise_is_judged(command: Command) -> bool:
-    """Return whether the thesis bounds this rise: a step between targets, not the slew from the release."""
-    return command.index > 0
+    """Return whether the thesis bounds this rise: a step between targets, not a slew from elsewhere."""
+    return command.index > 0 and command.from_target
 
 
 def _step_row(command: Command, found: Response | None) -> Object:
@@ -153,10 +170,12 @@ def _step_row(command: Command, found: Response | None) -> Object:
     answer = found or none
     return {
         "index": command.index,
+        "again": command.again,
         "start_s": command.time,
         "duration_s": command.duration,
         "complete": found is not None,
         "from_q2": command.start,
+        "from_target": command.from_target,
         "target_q2": command.target,
         "steady_state_deg": answer.steady_state_deg,
         "overshoot_percent": answer.overshoot_percent,

@@ -6,9 +6,12 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from ground.report.performance import SETTLING_BAND, SETTLING_LIMIT_S, STEADY_STATE_S
+
 Object = dict[str, Any]
 
 ARCSECONDS = 648_000.0 / math.pi
+_LISTED = 20
 _SEVERITIES = ("information", "warning", "fault")
 
 
@@ -70,7 +73,8 @@ def _steps(summary: Object) -> list[str]:
         rise = number(step["rise_s"]) + ("" if step["rise_judged"] or step["rise_s"] is None else " *")
         rows.append(
             [
-                f"{step['index']}  {_signed(step['from_q2'])} -> {_signed(step['target_q2'])}",
+                f"{step['index']}{' again' if step['again'] else ''}  "
+                f"{_signed(step['from_q2'])} -> {_signed(step['target_q2'])}",
                 number(step["start_s"], 1),
                 number(step["steady_state_deg"]),
                 number(step["overshoot_percent"], 1),
@@ -81,8 +85,15 @@ def _steps(summary: Object) -> list[str]:
     head = ["step, q2", "at s", "steady state deg", "overshoot %", "rise s", "settling s"]
     lines = [f"Attitude steps, judged on the {summary['attitude_source']}", *table(head, rows)]
     if any(not step["rise_judged"] for step in summary["steps"]):
-        lines.append("  * the slew from the release: its rise is not judged")
-    return lines
+        lines.append("  * from the release, or from a body on its way: its rise is not judged")
+    return [
+        *lines,
+        "  rise: from 10 to 90 % of the step; overshoot: beyond the target, in % of the step;",
+        f"  settling: the last entry into +-{100 * SETTLING_BAND:g} % of the step about the target;",
+        f"  steady state: the largest error in the last {STEADY_STATE_S:g} s of a target that stands for "
+        f"{2 * STEADY_STATE_S:g} s or more;",
+        f"  a step that ended within {SETTLING_LIMIT_S:g} s, not settled, is interrupted and not judged",
+    ]
 
 
 def _thesis(summary: Object) -> list[str]:
@@ -189,7 +200,19 @@ def _sensing(summary: Object) -> list[str]:
             f"  rms error x, y, z {errors} mrad/s of {streaks['compared']} rates; "
             f"mean e' P^-1 e / 3 = {number(streaks['normalised'])}"
         )
-    return lines + _stars(summary["stars"])
+    return lines + _stars(summary["stars"]) + _failed_frames(summary["failed_frames"])
+
+
+def _failed_frames(frames: list[Object]) -> list[str]:
+    if not frames:
+        return []
+    rows = [
+        [str(frame["sequence"]), number(frame["exposed_s"], 3), frame["streaks"], frame["stars"] or "-"]
+        for frame in frames[:_LISTED]
+    ]
+    more = [f"  and {len(frames) - _LISTED} more: --json lists all"] if len(frames) > _LISTED else []
+    head = ["frame", "exposed at s", "streaks", "stars"]
+    return [f"Frames without rate or attitude: {len(frames)}", *table(head, rows), *more]
 
 
 def _stars(stars: Object) -> list[str]:

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from flight.gnc.errors import UsageError
 from hal.buses.clock import SystemClock
 from hal.buses.serial_port import PySerialPort
 from hal.interfaces.errors import NotResponding
@@ -121,7 +122,7 @@ def served(config_path: Path, seed: int, folder: Path) -> Iterator[Served]:
 
 @contextmanager
 def running(facts_path: Path) -> Iterator[Served]:
-    """Connect to a server that runs already, and leave it running. Raises NotResponding.
+    """Connect to a server that runs already, and leave it running. Raises UsageError, NotResponding.
 
     `facts_path` is the file that `python -m sim_hal serve CONFIG --facts FILE` wrote.
     """
@@ -129,7 +130,7 @@ def running(facts_path: Path) -> Iterator[Served]:
         facts = json.loads(facts_path.read_text(encoding="utf-8"))
         facts = {name: facts[name] for name in ("serial", "baud_rate", "socket", "camera")}
     except (OSError, ValueError, LookupError, TypeError) as error:
-        raise NotResponding("emulated devices", f"{facts_path} names no server: {error!r}") from error
+        raise UsageError(f"{facts_path} names no server: give what `sim_hal serve --facts` wrote") from error
     with _connected(facts) as devices:
         yield devices
 

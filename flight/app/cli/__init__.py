@@ -15,6 +15,7 @@ from importlib import metadata
 from pathlib import Path
 
 from flight import __version__
+from flight.app.cli.outlet import outlast_readers
 from flight.gnc.errors import FlightError, UsageError
 from hal.interfaces.errors import DeviceError
 
@@ -40,22 +41,30 @@ examples:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; return the exit status: 0 done, 1 ran and failed, 2 wrong use."""
+    outlast_readers()
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # a file's name need not be a text
     words = list(sys.argv[1:] if arguments is None else arguments)
-    options = _parser(words).parse_args(words)
     try:
-        status: int = options.command(options)
+        return _obey(words)
     except UsageError as error:
         return _complain(str(error), 2)
     except (FlightError, DeviceError) as error:
         return _complain(str(error), 1)
-    except BrokenPipeError:
-        return 1  # whoever read our output has read enough
+    except KeyboardInterrupt:
+        return _complain("interrupted", 130)  # as a shell counts what SIGINT ended
     except OSError as error:  # a name that no file can have, a folder that may not be entered
         if error.filename is None:
             return _complain(error.strerror or str(error), 1)
         return _complain(f"{error.filename}: {error.strerror}", 2)
+
+
+def _obey(words: Sequence[str]) -> int:
+    try:
+        options = _parser(words).parse_args(words)
+        status: int = options.command(options)
+    finally:
+        sys.stdout.flush()
     return status
 
 

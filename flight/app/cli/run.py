@@ -8,13 +8,12 @@ import os
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import TextIO
 
-from flight.app.cli import PROGRAM
-from flight.app.request import RunRequest, RunResult
-from flight.link.telemetry.packets import PacketArray
-from flight.link.telemetry.reader import read_run
+from flight.app.cli.summary import summary_facts, summary_text
+from flight.app.request import RunRequest
 from flight.loop.progress import Progress
 from flight.schema.carried import config_path, names
 
@@ -70,7 +69,7 @@ def _faults_help() -> str:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Fly, showing progress on standard error when it is a terminal."""
+    """Fly, showing progress on standard error; print the summary."""
     from flight.app.accepted_config import accepted_config  # noqa: PLC0415
     from flight.app.flight import fly  # noqa: PLC0415 - no other command needs devices
     from flight.app.run_folder import default_folder  # noqa: PLC0415
@@ -91,71 +90,53 @@ def run(options: argparse.Namespace) -> int:
         problem,
     )
     begun = time.perf_counter()
-    with_line = sys.stderr.isatty()
-    result = fly(request, progress_line(sys.stderr) if with_line else None)
-    if with_line:
+    # A service writes no lines into the journal for days: its log has all of it.
+    progress = None if options.archive and not sys.stderr.isatty() else progress_on(sys.stderr)
+    result = fly(request, progress)
+    if sys.stderr.isatty():
         sys.stderr.write("\r\x1b[K")
-    # A service that is asked to stop does not read days of packets first.
-    control = None if options.archive else read_run(result.folder)["control"]
-    _print_result(result, control, time.perf_counter() - begun, options.json)
+    elapsed = time.perf_counter() - begun
+    if options.json:
+        sys.stdout.write(json.dumps(summary_facts(result, elapsed)) + "\n")
+    else:
+        sys.stdout.write(summary_text(result, elapsed))
     for problem in filter(None, (result.log_error, result.restart)):
         sys.stderr.write(f"flight: {problem}\n")
     # A service manager restarts a service that failed.
     return 1 if result.log_error or result.restart else 0
 
 
-def _print_result(result: RunResult, control: PacketArray | None, elapsed: float, as_json: bool) -> None:
-    """Print how the flight went; `control` are its control packets, `elapsed` the seconds it took."""
-    seconds = elapsed
-    if control is not None:
-        seconds = float(control["time_ns"][-1]) * 1e-9 if len(control) else 0.0
-    if as_json:
-        facts = {
-            "folder": str(result.folder),
-            "reason": result.reason,
-            "interrupted": result.interrupted,
-            "mission_time_s": seconds,
-            "elapsed_s": elapsed,
-            "packets": None if control is None else len(control),
-            "log_error": result.log_error or None,
-            "faults": result.faults,
-        }
-        sys.stdout.write(json.dumps(facts) + "\n")
-        return
-    faults = f"faults: {'; '.join(result.faults)}\n" if result.faults else ""
-    sys.stdout.write(
-        f"flown: {seconds:.0f} s in {elapsed:.1f} s, {result.reason}\n"
-        f"{faults}"
-        f"log:   {result.folder}\n"
-        f"next:  {PROGRAM} report {result.folder}\n"
-    )
-
-
-def progress_line(stream: TextIO) -> Callable[[Progress], None]:
-    """Return a function that rewrites one line of progress, at most five times a second."""
-    last = 0.0
+def progress_on(stream: TextIO) -> Callable[[Progress], None]:
+    """Return a function that shows progress: on a terminal in one line, elsewhere in a line every 10 s."""
+    terminal = stream.isatty()
+    period, before, after = (0.2, "\r\x1b[K", "") if terminal else (10.0, "", "\n")
+    last = time.perf_counter()
 
     def show(progress: Progress) -> None:
         nonlocal last
         now = time.perf_counter()
-        if now - last < 0.2:
+        if now - last < period:
             return
         last = now
         of = f"/{progress.duration:.0f}"
         currents = " ".join(f"{1e3 * current:+.1f}" for current in progress.currents)
-        stream.write(
-            f"\r\x1b[K{progress.mission_time:6.0f}{of} s  {progress.attitude}  "
-            f"coils {currents} mA  {progress.state}  "
-            f"slips {progress.slips}  events {progress.events}"
-        )
-        stream.flush()
+        with suppress(OSError):  # such as a full disk: no flight suffers from that
+            stream.write(
+                f"{before}{progress.mission_time:6.0f}{of} s  {progress.attitude}  "
+                f"coils {currents} mA  {progress.state}  "
+                f"slips {progress.slips}  events {progress.events}{after}"
+            )
+            stream.flush()
 
     return show
 
 
 def seed_number(text: str) -> int:
-    """Return the seed that an argument gives. Raises ArgumentTypeError below zero."""
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"{text} is below zero")
+    """Return the seed that an argument gives. Raises ArgumentTypeError unless the log can hold it."""
+    try:
+        value = int(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is no whole number") from error
+    if not 0 <= value < 2**64:
+        raise argparse.ArgumentTypeError(f"{text}: give a whole number from 0 to 2^64 - 1")
     return value

@@ -6,6 +6,7 @@ a fault at 40 Hz writes one event every few seconds, not forty a second.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 
 from flight.link.events import EVENTS, EventKind, Reaction
@@ -20,7 +21,7 @@ Reactor = Callable[[EventKind, int, str], None]
 
 
 class EventLog:
-    """Passes events to a sink, throttled by kind; `count` includes those held back."""
+    """Passes events to a sink, throttled by kind; `count` and `counts`, by kind, include those held back."""
 
     def __init__(self, sink: Sink, throttle_ns: int = THROTTLE_NS) -> None:
         self._sink = sink
@@ -29,6 +30,7 @@ class EventLog:
         self._last_written: dict[int, int] = {}
         self._held_back: dict[int, int] = {}
         self.count = 0
+        self.counts: Counter[EventKind] = Counter()
 
     def react_by(self, react: Reactor) -> None:
         """Call `react` for every event whose reaction is more than a note, throttled or not."""
@@ -42,6 +44,7 @@ class EventLog:
 
     def _write(self, kind: EventKind, time_ns: int, text: str) -> None:
         self.count += 1
+        self.counts[kind] += 1
         last_ns = self._last_written.get(kind.code)
         if last_ns is not None and time_ns - last_ns < self._throttle_ns:
             self._held_back[kind.code] = self._held_back.get(kind.code, 0) + 1

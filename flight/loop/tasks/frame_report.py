@@ -8,8 +8,9 @@ import numpy as np
 
 from flight.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement
 from flight.gnc.math.arrays import FloatArray
-from flight.gnc.vision.frame_job import Found
+from flight.gnc.vision.frame_job import Found, FrameFound
 from flight.gnc.vision.startracker.solution import FrameSolution, SolveStatus
+from flight.gnc.vision.streaks.streak_result import StreakStatus
 from flight.link import events
 from flight.link.telemetry.definitions import STARS, STREAK
 from flight.loop.body import BodyView
@@ -19,6 +20,13 @@ from hal.interfaces.readings import Frame
 
 _MANY_STARS = 12
 """A frame with at least this many unmatched detections does not show the sky: its pixels are invalid."""
+_NAMED_ELSEWHERE = {
+    StreakStatus.TOO_SHORT,  # no motion
+    StreakStatus.BLACK,
+    StreakStatus.SATURATED,
+    StreakStatus.FROZEN,
+}
+"""States of a frame without motion, or with an event of their own."""
 _NAN4, _NAN33 = np.full(4, np.nan), np.full((3, 3), np.nan)
 
 
@@ -41,6 +49,14 @@ class FrameReport:
             text = f"frame {frame.sequence}: {self._view.rate_text(rate)}"
             self._events.report(events.STREAK_REFUSED, now_ns, text)
         self.record(frame, motion.status.value, motion, now_ns, accepted)
+
+    def unused(self, frame: Frame, found: FrameFound, now_ns: int) -> None:
+        """Report a frame of a body in motion that gave no rate and no attitude."""
+        if found.motion.status in _NAMED_ELSEWHERE:
+            return
+        stars = f", stars {found.solution.status.value}" if found.solution is not None else ""
+        text = f"frame {frame.sequence}: streaks {found.motion.status.value}{stars}"
+        self._events.report(events.FRAME_UNUSED, now_ns, text)
 
     def stars(
         self,

@@ -15,6 +15,7 @@ from flight.loop.services import Services
 from flight.loop.tasks.imaging import Imaging
 from flight.loop.tasks.navigation import Navigation
 from hal.interfaces.devices import PowerMonitor, TorqueCoils
+from hal.interfaces.readings import CoilState
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +38,10 @@ class Housekeeping:
         self._recorder = services.recorder
         self._events = services.events
         self._facts = services.facts
+
+    def coils(self) -> CoilState:
+        """Return the state of the coils."""
+        return self._watched.coils.state()
 
     def run(self, cycle: Cycle, state: SteeringState) -> None:
         """Write the packet; `state` is that of the newest control cycle."""

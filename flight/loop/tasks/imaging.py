@@ -144,6 +144,8 @@ class Imaging:
         rate, attitude = self._measurer.mean_rate(frame, motion), self._measurer.attitude(frame, found)
         if is_strange(found.solution):
             rate = None  # its pixels are invalid
+        if rate is None and attitude is None:
+            self._report.unused(frame, found, now_ns)
         known = self._navigation.past(middle_ns(frame)) is not None
         late = [m for m in (rate, attitude if known else None) if m is not None]
 

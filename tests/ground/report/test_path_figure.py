@@ -35,7 +35,7 @@ def test_a_path_is_drawn_from_its_start_to_its_target_within_the_limit(tmp_path:
     drawn = np.abs(np.asarray(current.get_lines()[0].get_ydata()))
     assert drawn.max() == pytest.approx(made.peak_current, rel=0.02)
     assert drawn.max() <= 1.001 * plant.current_limit
-    file = tmp_path / "new" / "path.png"
+    file = tmp_path / "path.png"
     draw_path(made, plant, file)
     assert imread(file).std() > 0.01
     with pytest.raises(UsageError, match="no pictures can be written there"):

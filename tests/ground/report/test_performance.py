@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.optimize import brentq
 
 from flight.gnc.math.arrays import FloatArray
-from ground.report.performance import Command, commands, response
+from ground.report.performance import Command, commands, interrupted, placed, response
 from tests.ground.report.synthetic import second_order
 
 STEP = Command(index=1, time=100.0, start=-0.3, target=-0.2, duration=100.0)
@@ -103,3 +104,17 @@ def test_a_step_of_no_size_has_only_a_steady_state() -> None:
 def test_steps_run_from_target_to_target_and_the_first_from_the_release() -> None:
     listed = commands([3, 4], np.array([0.0, 100.0]), np.array([-0.3, -0.2]), 0.2, 180.0)
     assert listed == [Command(3, 0.0, 0.2, -0.3, 100.0), Command(4, 100.0, -0.3, -0.2, 80.0)]
+
+
+def test_a_step_begins_where_the_body_was_unless_the_body_held_the_target_before() -> None:
+    """The second command comes while the body is half way to the first; a mode ends the third."""
+    listed = commands([0, 1, 1], np.array([0.0, 2.0, 60.0]), np.array([0.2, 0.4, -0.2]), 0.0, 100.0)
+    time = np.arange(0.0, 100.0, 0.1)
+    q2 = np.where(time < 2.0, 0.05 * time, 0.4)
+    met = placed(listed, time, q2, np.array([70.0]))
+    assert [step.start for step in met] == pytest.approx([0.0, 0.4, 0.4], abs=1e-9)
+    assert [step.duration for step in met] == [2.0, 58.0, 10.0]
+    assert [step.again for step in met] == [False, False, True]
+    assert [step.from_target for step in met] == [False, False, True], "0.2 was never held, 0.4 was"
+    assert interrupted(met[0], response(time, q2, met[0]))
+    assert not interrupted(replace(met[0], duration=60.0), response(time, q2, met[0])), "it had its time"

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.link.telemetry.definitions import TRUTH
+from flight.link.telemetry.definitions import STREAK, TRUTH
 from flight.link.telemetry.log import FlightLog
 from flight.link.telemetry.packets import Packer
 from flight.link.telemetry.reader import Run, read_run
@@ -134,9 +134,37 @@ def test_a_step_of_no_size_is_distinguished_from_one_never_made(tmp_path: Path) 
     assert verdicts["rise time"] == "pass"
 
 
-def test_a_step_never_settled_is_a_miss(tmp_path: Path) -> None:
-    """Six seconds are too few for this response to reach 90 % of its step."""
+def test_an_interrupted_step_is_not_judged(tmp_path: Path) -> None:
+    """Three seconds are too few for this response to reach 90 % of its step."""
     summary = summarise(short(tmp_path, duration=6.0, planned=6.0, hold=3.0))
+    assert not any(step["complete"] for step in summary["steps"])
+    assert "step 1: interrupted after 3.0 s, not judged" in summary["notes"]
+    verdicts = {row["quantity"]: row["verdict"] for row in summary["thesis"]}
+    assert {verdicts[name] for name in ("overshoot", "rise time", "settling time")} == {"unknown"}
+
+
+def test_frames_without_rate_and_attitude_are_listed_with_the_reason(full: Run, tmp_path: Path) -> None:
+    log, packer = FlightLog(tmp_path, "flight", clock=ManualClock()), Packer()
+    nothing = {"rate": (math.nan,) * 3, "covariance": (math.nan,) * 6, "exposure": 0.2, "residual": math.nan}
+    counts = {"streaks": 0, "used": 0, "length": math.nan, "accepted": False}
+    log.write(
+        packer.pack(
+            STREAK, 5, sequence=7, exposure_start_ns=4_500_000_000, status="too-few", **nothing, **counts
+        )
+    )
+    log.close()
+    summary = summarise(read_run(tmp_path))
+    assert summary["failed_frames"] == [
+        {"sequence": 7, "exposed_s": 4.5, "streaks": "too-few", "stars": None}
+    ]
+    assert "Frames without rate or attitude: 1" in format_report(summary)
+    assert summarise(full)["failed_frames"] == []
+
+
+def test_a_step_never_settled_is_a_miss(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Forty seconds are too few for a response this slow to reach 90 % of its step."""
+    monkeypatch.setattr("tests.ground.report.synthetic.FREQUENCY", 0.02)
+    summary = summarise(short(tmp_path, duration=80.0, planned=80.0, hold=40.0))
     assert summary["steps"][1]["settling_s"] is None
     assert "step 1: never settled" in summary["notes"]
     verdicts = {row["quantity"]: row["verdict"] for row in summary["thesis"]}

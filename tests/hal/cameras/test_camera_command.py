@@ -132,7 +132,7 @@ def test_each_kind_of_camera_has_its_own_keys(tmp_path: Path) -> None:
         ("{kind: webcam}", 8, "webcam"),
         ("{kind: v4l2, pixel_format: GREY}", 12, "pixels of GREY have 8"),
         ("{kind: v4l2, pixel_format: Y16}", 8, "pixels of Y16 have 9 to 16"),
-        ("{kind: aravis}", 8, "missing required field `name`"),
+        ("{kind: aravis}", 8, "`camera.device.name` is missing"),
     ],
 )
 def test_a_camera_that_makes_no_sense_is_refused(

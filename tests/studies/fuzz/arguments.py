@@ -2,8 +2,9 @@
 
 A part of them are right ones with a word or two changed, or with a damaged file behind a name: they lead far
 into the commands. A flight lasts three control cycles, a camera takes two frames, few pictures are really
-drawn. Broken promises are: a status other than 0, 1, 2; wrong use without a word on standard error; with
---json and status 0 anything but one JSON object on standard output.
+drawn. A part is typed in a process that a signal or a closed pipe disturbs (`interrupted`). Broken promises
+are: a status other than 0, 1, 2; wrong use without a word on standard error; with --json and status 0
+anything but one JSON object on standard output.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from ground.commands import camera as camera_command
 from sim_hal.faults.catalogue import CATALOGUE
 from tests.studies.fuzz.furnishings import Listener, answer, furnish
 from tests.studies.fuzz.harness import Finding
+from tests.studies.fuzz.interrupted import Disturbance, disturbed
 from tests.studies.fuzz.logs import hostile, split
 from tests.studies.fuzz.mutation import Draw, chance, damage, integer
 from tests.studies.fuzz.vocabulary import FLIGHT, NUMBERS, PATHS, RIGHT, WORDS
@@ -43,6 +45,7 @@ _COMMANDS = cli.COMMANDS | GROUND_COMMANDS
 _DRAWN_EVERY = 200
 _FLOWN_S = 0.075
 _FRAMES = 2
+_DISTURBED = 0.3
 
 
 class Arguments:
@@ -79,6 +82,13 @@ class Arguments:
             shutil.copytree(self._made, self._folder)
         if chance(draw, 0.25):
             self._spoil(draw, words)
+        name = words[0] if words and words[0] in _COMMANDS else "no command"
+        if chance(draw, _DISTURBED):
+            disturbance = Disturbance.drawn(draw)
+            self._words = [*words, repr(disturbance)]
+            status = disturbed(lambda: _typed_here(words, self._folder), disturbance)
+            kind = disturbance.number.name if disturbance.number is not None else disturbance.output
+            return Counter(["disturbed", kind, f"{kind}, status {status}"])
         status, output, complaint = _typed(words, self._folder, drawn=integer(draw, 1, _DRAWN_EVERY) == 1)
         if status not in {0, 1, 2}:
             raise Finding(f"status {status}")
@@ -89,7 +99,6 @@ class Arguments:
                 json.loads(output)
             except ValueError as error:
                 raise Finding(f"--json gave {output[:100]!r}") from error
-        name = words[0] if words and words[0] in _COMMANDS else "no command"
         return Counter([f"status {status}", name, f"{name}, status {status}"])
 
     def _command_line(self, draw: Draw) -> list[str]:
@@ -206,6 +215,12 @@ def _typed(words: list[str], folder: Path, *, drawn: bool) -> tuple[Any, str, st
         except SystemExit as end:
             status = 0 if end.code is None else end.code
     return status, raw.getvalue().decode(), complaint.getvalue()
+
+
+def _typed_here(words: list[str], folder: Path) -> int:
+    """Type a command line with this process's own streams; return its status."""
+    with _in_folder(folder, drawn=False):
+        return cli.main(words)
 
 
 @contextlib.contextmanager

@@ -52,7 +52,8 @@ def saturation_count(pixels: Image) -> float:
     Serves frames of streaks, whose bright stars spread over many pixels.
     """
     highest = pixels.max()
-    if np.count_nonzero(pixels == highest) >= _PLATEAU:
+    # One value everywhere is a dead frame's; a converter's top it is at the type's top only.
+    if pixels.min() < highest and np.count_nonzero(pixels == highest) >= _PLATEAU:
         return float(highest)
     return saturation_level(pixels, None)
 

@@ -1,0 +1,101 @@
+"""Wrong use and bad configurations: status 2 and a line with the place and what is permitted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.ground.commands.in_process import command
+from tests.ground.commands.test_commands import DEMO
+
+PLAN = "plan --from 0.1 --to 0"
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        ("plan --from 2 --to 0", "--from 2: must be -0.68 to 0.68"),
+        (f"{PLAN} --horizon -1", "--horizon -1: must be 0.001 to 100000"),
+        (f"{PLAN} --nodes 2", "--nodes 2: must be 8 to 40"),
+        (f"{PLAN} --time-price -1", "-1 is not a positive number"),
+        (f"{PLAN} --picture TMP/no/where.png", "where.png: no pictures can be written there"),
+        ("command --to TMP/none slew 5", "q2 = 5.0 must lie within +-0.68"),
+        ("solve TMP/sky.png --prior nan 0 0", "nan is not a finite number"),
+        ("rate TMP/sky.png --prior nan 0 0", "nan is not a finite number"),
+        ("run step_demo --out TMP/a --seed 1e22", "'1e22' is no whole number"),
+        ("run step_demo --out TMP/a --seed 99999999999999999999", "from 0 to 2^64 - 1"),
+        ("run step_demo --out TMP/a --realtime --devices /etc/passwd", "/etc/passwd names no server"),
+        ("identify step_demo --run TMP/held --duration 5", "holds a run already: give another folder, or"),
+    ],
+)
+def test_wrong_use_is_status_2(words: str, complaint: str, tmp_path: Path) -> None:
+    (tmp_path / "held").mkdir()
+    (tmp_path / "held" / "flight-0001.ccsds").touch()
+    done = command(*words.replace("TMP", str(tmp_path)).split())
+    assert (done.returncode, complaint in done.stderr) == (2, True), done.stderr
+    assert not (tmp_path / "no").exists(), "no folder is made for a picture"
+
+
+def test_a_method_that_needs_the_field_of_view_asks_for_it(tmp_path: Path) -> None:
+    (tmp_path / "sky.pgm").write_bytes(bytes(64 * 64))
+    done = command("solve", tmp_path / "sky.pgm", "--raw", "64x64x8", "--method", "pyramid")
+    assert done.returncode == 2
+    assert "give --fov or --camera" in done.stderr
+
+
+def test_a_command_to_nobody_ran_and_failed(tmp_path: Path) -> None:
+    done = command("command", "--to", tmp_path / "none", "ping")
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    assert "no flight listens there" in done.stderr
+
+
+def test_the_plan_s_configuration_is_found_in_any_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("tests.ground.commands.in_process.ROOT", tmp_path)
+    assert command(*PLAN.split()).returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "complaint"),
+    [
+        (
+            "current_limit: 0.148",
+            "current_limit: 148",
+            ":29: `coils.current_limit` is 148.0: must be 0.001 to 1 A",
+        ),
+        (
+            "strategy: goal",
+            "strategy: gaol",
+            "`guidance.strategy` is 'gaol': expected one of goal, receding, step",
+        ),
+        ("name: step-demo", "body: nobody\nname: x", ":5: `body` is 'nobody': name one of testbed"),
+        ("inertia:", "coil_tuns: 1\n  #", "`plant.coil_tuns` is an unknown key, did you mean"),
+        ("steps:", "telemetry: {segment_bytes: 9000, budget_bytes: 17000}\nsteps:", "must hold two segments"),
+        ("steps:", "commands: {udp: nowhere}\nsteps:", "expected HOST:PORT, such as"),
+        (
+            "steps:",
+            "commands: {socket: /nowhere/x}\nsteps:",
+            "`commands.socket` /nowhere/x cannot be listened to",
+        ),
+        ("steps:", "modes: {initial: slew}\nsteps:", "expected one of detumble, hold, safe, testbed-demo"),
+        (
+            "star_tracker: {}",
+            "star_tracker: {index: /nowhere/x}",
+            "`camera.star_tracker.index` is '/nowhere/x'",
+        ),
+    ],
+)
+def test_a_bad_configuration_is_one_line_with_its_place_and_what_is_permitted(
+    right: str, wrong: str, complaint: str, tmp_path: Path
+) -> None:
+    text = DEMO.read_text(encoding="utf-8")
+    assert right in text
+    path = tmp_path / "c.yaml"
+    path.write_text(text.replace(right, wrong, 1), encoding="utf-8")
+    done = command("run", path, "--duration", "0.1", "--out", tmp_path / "run")
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+    assert done.stderr.startswith(f"flight: {path}"), done.stderr
+    assert complaint in done.stderr
