@@ -84,7 +84,7 @@ def found_boresight(scene: Scene) -> FloatArray | None:
 
 def _is_right(scene: Scene, boresight: FloatArray) -> bool:
     pixel = 3600.0 * scene.field_deg / scene.pixels.shape[1]
-    return angle_arcsec(boresight, scene.boresight) <= max(RIGHT_ARCSEC, _RIGHT_PX * pixel)
+    return bool(angle_arcsec(boresight, scene.boresight) <= max(RIGHT_ARCSEC, _RIGHT_PX * pixel))
 
 
 def _of_peer(peer: str, python: str, scenes: Sequence[Scene]) -> list[FloatArray | None] | None:

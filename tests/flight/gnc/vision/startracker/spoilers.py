@@ -50,13 +50,15 @@ def _dark_third(frame: FloatArray, span: float, rng: np.random.Generator) -> Flo
 def _stripes(frame: FloatArray, span: float, rng: np.random.Generator) -> FloatArray:
     row = np.arange(frame.shape[0])[:, None]
     lit = (row > 0.6 * frame.shape[0]) & (row % 24 < 10)
-    return _lit(frame, 1.5 * span * lit * np.ones((1, frame.shape[1])), rng)
+    light = np.asarray(1.5 * span * lit * np.ones((1, frame.shape[1])), dtype=np.float64)
+    return _lit(frame, light, rng)
 
 
 def _bars(frame: FloatArray, span: float, rng: np.random.Generator) -> FloatArray:
     y, _ = _grid(frame)
     column = np.arange(frame.shape[1])[None]
-    return _lit(frame, 1.5 * span * ((y > 0.5) & (column % 40 < 14)), rng)
+    light = np.asarray(1.5 * span * ((y > 0.5) & (column % 40 < 14)), dtype=np.float64)
+    return _lit(frame, light, rng)
 
 
 def _roof(frame: FloatArray, span: float, rng: np.random.Generator) -> FloatArray:
