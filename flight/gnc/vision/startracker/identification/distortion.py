@@ -78,6 +78,7 @@ def fit_with_distortion(
     pose = _Pose(start.matrix, start.scale, 0.0)
     reference = sky.stars.direction[expected]
     seen: set[bytes] = set()
+    fitted = None
     for _ in range(_ROUNDS):
         fitted = _fitted(field, sky, observed, star, pose, corner)
         if fitted is None:
@@ -95,6 +96,7 @@ def fit_with_distortion(
         if len(within) < len(observed):
             break
         observed, star = within, expected[nearest[within]]
+    assert fitted is not None  # there was a round
     squares = fitted[2]
     spread = max(1.0, math.sqrt(float(np.median(squares))) / _RAYLEIGH_MEDIAN)
     kept = squares <= (_OUTLIER * spread) ** 2
@@ -108,7 +110,7 @@ def fit_with_distortion(
     normal[4, 4] -= PRIOR**-2
     normal /= inflation(squares, 5)
     normal[4, 4] += PRIOR**-2
-    covariance = np.linalg.inv(normal)
+    covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
     from_lens = np.outer(covariance[:3, 4], covariance[:3, 4]) / covariance[4, 4]
     refined = Refinement(pose.matrix, pose.scale, covariance[:4, :4], squares)
     return DistortedFit(observed, star, refined, pose.distortion, from_lens)
@@ -169,7 +171,8 @@ def _fitted(
         distortion = pose.distortion + float(step[4])
         if not float(np.abs(step).max()) < 1.0 or abs(distortion) > _MOST:
             return None
-        pose = _Pose(turned(pose.matrix, step[:3]), pose.scale * math.exp(float(step[3])), distortion)
+        turn = np.asarray(step[:3], dtype=np.float64)
+        pose = _Pose(turned(pose.matrix, turn), pose.scale * math.exp(float(step[3])), distortion)
         if np.abs(step).max() < _SETTLED:
             break
     missed = weight[:, None] * (pose.true(direction, corner) - reference @ pose.matrix.T)

@@ -60,7 +60,7 @@ class _Matching:
 
 
 # Shares of the bright expected stars that match: with less a distorted lens is supposed, or nothing found.
-_FEW_MISSED, _MOST_MISSED = 0.8, 0.5
+_FEW_MISSED, _MOST_MISSED = 0.8, 0.7
 # A candidate that begins more than this, in powers of ten, above the limit is given up.
 _HOPELESS = 7.0
 
