@@ -13,9 +13,10 @@ import sys
 from pathlib import Path
 
 from flight.gnc.errors import UsageError
+from flight.schema.devices import V4l2Device
 from flight.schema.peers import peer_networks
 from flight.schema.reader import load
-from flight.schema.sections import Config, V4l2Device
+from flight.schema.sections import Config
 from hal.buses.i2c_bus import device_file
 
 SERIAL, VIDEO, I2C = ("ttyUSB", "ttyACM"), ("video4linux",), ()

@@ -10,8 +10,8 @@ from flight.app.linux import linux_camera
 from flight.app.request import RunRequest
 from flight.app.requested_config import requested_config
 from flight.app.simulated import simulated_camera
+from flight.schema.devices import Camera
 from flight.schema.errors import ConfigError
-from flight.schema.sections import Camera
 from hal.buses.clock import SystemClock
 from hal.interfaces.devices import FrameSource
 from hal.interfaces.wires import Clock

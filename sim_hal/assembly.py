@@ -15,7 +15,8 @@ import numpy as np
 
 from flight.gnc.catalogue import load
 from flight.gnc.math.arrays import FloatArray, Image
-from flight.schema.sections import Camera, Config
+from flight.schema.devices import Camera
+from flight.schema.sections import Config
 from hal.drivers.coil_settings import CoilSettings, wirings
 from sim_hal.emulators.device import EmulatedDevice, SerialEnd
 from sim_hal.emulators.i2c_bus import EmulatedI2cBus

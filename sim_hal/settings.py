@@ -11,7 +11,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from flight.schema.sections import NotNegative, Positive, Section
+from flight.schema.values import NotNegative, Positive, Section
 
 
 class Release(Section, frozen=True, kw_only=True):

@@ -6,8 +6,9 @@ import os
 from contextlib import ExitStack, nullcontext, suppress
 
 from flight.loop.state.opening import state_folder
+from flight.schema.devices import AravisDevice, Camera, V4l2Device
 from flight.schema.errors import ConfigError
-from flight.schema.sections import AravisDevice, Camera, Config, V4l2Device
+from flight.schema.sections import Config
 from hal.buses.clock import SystemClock
 from hal.buses.i2c_bus import LinuxI2cBus
 from hal.buses.serial_port import PySerialPort

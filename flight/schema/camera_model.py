@@ -7,7 +7,7 @@ import math
 from flight.gnc.camera.knowledge import CameraKnowledge
 from flight.gnc.camera.lens import CameraModel, Lens
 from flight.gnc.camera.pinhole import Pinhole
-from flight.schema.sections import Camera
+from flight.schema.devices import Camera
 
 
 def camera_model(camera: Camera) -> CameraModel:

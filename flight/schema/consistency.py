@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+from flight.schema.devices import Camera
 from flight.schema.document import Document
 from flight.schema.peers import peer_networks
-from flight.schema.sections import Camera, Commands, Config, Quaternion
+from flight.schema.sections import Commands, Config
+from flight.schema.values import Quaternion
 
 Refuse = Callable[[str, str], None]
 """Raises the complaint about the value of a dotted name."""

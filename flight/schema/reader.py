@@ -13,9 +13,10 @@ import msgspec
 from flight.gnc.errors import UsageError
 from flight.schema.consistency import check_consistency
 from flight.schema.conversion import convert
+from flight.schema.devices import Camera
 from flight.schema.document import read_document, read_text
 from flight.schema.errors import ConfigError
-from flight.schema.sections import Camera, Config
+from flight.schema.sections import Config
 
 T = TypeVar("T")
 S = TypeVar("S", bound=msgspec.Struct)

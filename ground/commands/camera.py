@@ -14,7 +14,7 @@ import numpy as np
 from flight.gnc.camera.images import write_picture
 from flight.gnc.errors import UsageError
 from flight.schema.carried import config_path
-from flight.schema.sections import Camera
+from flight.schema.devices import Camera
 from hal.interfaces.devices import FrameSource
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.readings import Frame

@@ -34,7 +34,7 @@ from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSett
 from flight.gnc.vision.streaks.streak_result import StreakStatus
 from flight.schema import reader as configuration
 from flight.schema.camera_model import camera_model
-from flight.schema.sections import Camera
+from flight.schema.devices import Camera
 from ground.commands.options import (
     add_field,
     add_output,

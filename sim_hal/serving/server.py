@@ -22,7 +22,8 @@ from typing import Any
 
 from flight.gnc.math.arrays import FloatArray, Image
 from flight.link.telemetry.log import FlightLog
-from flight.schema.sections import Camera, Config
+from flight.schema.devices import Camera
+from flight.schema.sections import Config
 from hal.buses.clock import SystemClock
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.readings import Frame

@@ -16,7 +16,8 @@ from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSett
 from flight.loop.tasks.frame_measurements import ImagingSettings
 from flight.loop.tasks.navigation import NavigationSettings
 from flight.schema.camera_model import camera_knowledge, camera_model
-from flight.schema.sections import Camera, Config
+from flight.schema.devices import Camera
+from flight.schema.sections import Config
 from hal.interfaces.wires import SECOND_NS
 
 

@@ -166,9 +166,8 @@ class Planning:
             self._asked_ns = now_ns
 
     def _job_from(self, estimate: ThreadEstimate, law: ThreadLaw, now_ns: int) -> PlanJob:
-        settings, goal_ns = self._settings, self._goal_ns
+        settings, goal_ns, begun = self._settings, self._goal_ns, self._goal_ns is not None
         towards_goal = settings.strategy is Strategy.GOAL
-        begun = goal_ns is not None
         horizon = (goal_ns - now_ns) * 1e-9 if goal_ns is not None else settings.horizon
         end_q2 = self._due_q2(law, now_ns, horizon) if towards_goal else law.q2
         if end_q2 != self._guidance.target_q2:

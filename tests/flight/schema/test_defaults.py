@@ -16,29 +16,29 @@ import numpy as np
 import flight
 import hal
 import sim_hal
-from flight.schema import sections
+from flight.schema import devices, sections
 from hal.interfaces.wires import SECOND_NS
 
-OF_CAMERA = (sections.Camera, sections.StarTracker)
+OF_CAMERA = (devices.Camera, devices.StarTracker)
 SERVES: dict[str, tuple[type[msgspec.Struct], ...]] = {
     "AdaptiveSettings": (sections.Control,),
-    "AravisSettings": (sections.AravisDevice, sections.Camera),
-    "CoilDriveSettings": (sections.Coils,),
-    "CoilSettings": (sections.Coils,),
-    "CoilWatchSettings": (sections.Coils, sections.PowerMonitor),
+    "AravisSettings": (devices.AravisDevice, devices.Camera),
+    "CoilDriveSettings": (devices.Coils,),
+    "CoilSettings": (devices.Coils,),
+    "CoilWatchSettings": (devices.Coils, devices.PowerMonitor),
     "ExcitationSettings": (sections.Identification,),
     "FilterSettings": (sections.Estimation,),
     "ImagingSettings": OF_CAMERA,
     "LikelihoodSettings": OF_CAMERA,
     "ModeSettings": (sections.Modes, sections.Detumble),
-    "NavigationSettings": (sections.InertialUnit, sections.Estimation),
+    "NavigationSettings": (devices.InertialUnit, sections.Estimation),
     "PlanningSettings": (sections.Guidance,),
-    "ResponseSettings": (sections.Plant, sections.InertialUnit),
+    "ResponseSettings": (sections.Plant, devices.InertialUnit),
     "SolveSettings": OF_CAMERA,
     "StreakSettings": OF_CAMERA,
     "TrackerSettings": OF_CAMERA,
-    "V4l2Settings": (sections.V4l2Device, sections.Camera),
-    "Vn100Settings": (sections.InertialUnit,),
+    "V4l2Settings": (devices.V4l2Device, devices.Camera),
+    "Vn100Settings": (devices.InertialUnit,),
 }
 """The sections that a flight fills each settings class from."""
 
@@ -124,4 +124,4 @@ def test_a_default_that_differs_is_found() -> None:
         stale_after: float = 0.3
         resistance: float = 1.0
 
-    assert _disagreements(Other, sections.Coils) == ["Other.stale_after = 0.3, Coils.stale_after = 0.25"]
+    assert _disagreements(Other, devices.Coils) == ["Other.stale_after = 0.3, Coils.stale_after = 0.25"]

@@ -18,7 +18,7 @@ from flight.gnc.math.quaternion import attitude_matrix
 from flight.schema.conversion import convert
 from flight.schema.document import read_document, read_text
 from flight.schema.errors import ConfigError
-from flight.schema.sections import NotNegative, Positive, Quaternion, Section
+from flight.schema.values import NotNegative, Positive, Quaternion, Section
 
 _UNIT_TOLERANCE = 1e-6
 

@@ -149,9 +149,8 @@ def plan(
     if trial is None:
         return found
     finer = _assemble(program, trial, boundary, reference, asked, search.evaluations, end_rate)
-    return min(
-        finer, found, key=lambda one: (one.horizon, one.energy if cost is PathCost.HEAT else one.supplied)
-    )
+    saved = (finer.energy, found.energy) if cost is PathCost.HEAT else (finer.supplied, found.supplied)
+    return finer if (finer.horizon, saved[0]) < (found.horizon, saved[1]) else found
 
 
 def _remains(last: PolynomialPath | None, nodes: int) -> FloatArray | None:

@@ -87,14 +87,8 @@ def fit_in_image(
     seen = _Seen(observed, _whitener(points, observed, covariance, camera), reference, free_scale, usual)
     pose = seen.fitted(_Pose(attitude_matrix(start), 1.0), np.ones(len(points)))
     squares, agree = seen.squares(pose), np.ones(len(points), dtype=np.bool_)
-    # One outlier shifts all residuals: their spread is meaningless before its pull is bounded.
     if squares.max() > _FARTHEST:
-        held = pose
-        for _ in range(_HUBER_ROUNDS):
-            held = seen.fitted(held, _PULL / np.maximum(np.sqrt(squares), _PULL))
-            squares = seen.squares(held)
-        agree = _agreeing(squares)
-        pose = seen.fitted(held, agree.astype(np.float64))
+        pose, agree = _without_outliers(seen, pose, squares)
         squares = seen.squares(pose)
     inverse = pose.covariance * inflation(squares[agree], len(pose.covariance))
     turn = np.ascontiguousarray(inverse[:3, :3], dtype=np.float64)
@@ -170,6 +164,18 @@ class _Seen:
         """Return each star's squared error over its covariance (n,)."""
         missed = self.directions(pose.scale, pose.bend) - self.reference @ pose.matrix.T
         return np.asarray(np.sum(np.einsum("nij,nj->ni", self.whitener, missed) ** 2, axis=1))
+
+
+def _without_outliers(seen: _Seen, pose: _Pose, squares: FloatArray) -> tuple[_Pose, BoolArray]:
+    """Return the fit to the stars that agree, and which (n,) do.
+
+    One outlier shifts all residuals: their spread is meaningless before its pull is bounded.
+    """
+    for _ in range(_HUBER_ROUNDS):
+        pose = seen.fitted(pose, _PULL / np.maximum(np.sqrt(squares), _PULL))
+        squares = seen.squares(pose)
+    agree = _agreeing(squares)
+    return seen.fitted(pose, agree.astype(np.float64)), agree
 
 
 def _agreeing(squares: FloatArray) -> BoolArray:

@@ -18,7 +18,7 @@ from flight.gnc.vision.frame.saturation import saturation_count
 from flight.gnc.vision.streaks.admission import admit, in_time, validate
 from flight.gnc.vision.streaks.maximum_likelihood.blobs import Blobs, find_blobs
 from flight.gnc.vision.streaks.maximum_likelihood.course import Course
-from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import expose_frame
+from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import ExposedFrame, expose_frame
 from flight.gnc.vision.streaks.maximum_likelihood.first_guess import guess_axis
 from flight.gnc.vision.streaks.maximum_likelihood.hypotheses import (
     alike,
@@ -88,16 +88,28 @@ def estimate_motion(
     if unusable is not None:
         return MotionResult(unusable, checksum, exposure)
     frame = expose_frame(pixels, saturation, settings.gain)
-    growing = settings.rate_model == "accelerating"
-    camera = ExposedCamera(frame, pinhole, _shutter(pinhole, exposure, settings), settings, growing)
-    if prior_course is not None and settings.rate_model != "constant":
-        camera = replace(camera, course=prior_course.motion(pinhole.focal_length))
+    camera = _exposed_camera(frame, pinhole, exposure, settings, prior_course)
     blobs = find_blobs(frame, settings.threshold_sigmas, _MOST_BLOBS)
     seen = MotionResult(StreakStatus.FAILED, checksum, exposure, hot_pixels=frame.hot_pixels)
     if len(blobs) < settings.least_stars:
         return replace(seen, status=StreakStatus.TOO_FEW)
     answer = None if _resting(blobs) else _in_time(camera, seen, blobs, prior_rate, prior_sigma, prior_course)
     return _without_rate(seen, camera, blobs) if answer is None else answer
+
+
+def _exposed_camera(
+    frame: ExposedFrame,
+    pinhole: Pinhole,
+    exposure: float,
+    settings: LikelihoodSettings,
+    course: Course | None,
+) -> ExposedCamera:
+    """Return the frame with its camera, its shutter and the known course, where the rate may change."""
+    growing = settings.rate_model == "accelerating"
+    camera = ExposedCamera(frame, pinhole, _shutter(pinhole, exposure, settings), settings, growing)
+    if course is None or settings.rate_model == "constant":
+        return camera
+    return replace(camera, course=course.motion(pinhole.focal_length))
 
 
 def _in_time(
