@@ -142,6 +142,22 @@ class EarthCameraModel:
         """How many counts ten times the light adds in the logarithmic camera."""
         return (self.highest_count - self.pedestal) / self.decades
 
+    def ideal_counts(self, radiance: FloatArray) -> FloatArray:
+        """Return the counts (...) of `radiance` (...), unrounded, of a pixel without noise or blemish."""
+        light = np.asarray(radiance, dtype=float)
+        if self.response == "logarithmic":
+            counts = self.pedestal + self.counts_per_decade * np.log10(1.0 + light / self.darkest)
+        else:
+            counts = self.pedestal + np.minimum(light * self.sensitivity, self.full_well) / self.gain
+        return np.asarray(np.clip(counts, 0.0, self.highest_count))
+
+    def radiance_of(self, counts: FloatArray) -> FloatArray:
+        """Return the radiance (...) that gives `counts` (...) in a pixel without noise or blemish."""
+        above = np.asarray(counts, dtype=float) - self.pedestal
+        if self.response == "logarithmic":
+            return np.asarray(self.darkest * (10.0 ** (above / self.counts_per_decade) - 1.0))
+        return np.asarray(above * self.gain / self.sensitivity)
+
 
 def pixel_rays(lens: CameraModel) -> FloatArray:
     """Return the unit vectors (rows x columns, 3) in camera axes along which the pixels look; read-only."""

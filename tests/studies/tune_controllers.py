@@ -92,7 +92,7 @@ STARTS: dict[str, tuple[Callable[[Sequence[float]], Controller], tuple[tuple[flo
 }
 
 
-def tune(name: str, progress: Callable[[str], None] = lambda _: None) -> tuple[tuple[float, ...], Flown]:
+def tune(name: str, progress: Callable[[str], object] = lambda _: None) -> tuple[tuple[float, ...], Flown]:
     """Return the best variables of a baseline, and the flight with them."""
     make, starts = STARTS[name]
     best: tuple[float, tuple[float, ...]] | None = None

@@ -14,7 +14,7 @@ import struct
 import sys
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -158,7 +158,7 @@ def _is_deep(picture: Picture) -> bool:
     return len(modes) == 1 and modes <= _OTHER_BYTES.keys()
 
 
-def _low_bytes(args: object) -> object:
+def _low_bytes(args: Any) -> Any:
     """Return the decoder's arguments that take the other byte of each pair."""
     other = _OTHER_BYTES[_raw_mode(args)]
     return (other, *args[1:]) if isinstance(args, tuple) else other
@@ -170,7 +170,7 @@ def _colours(picture: Picture) -> npt.NDArray[np.float64]:
 
 def _luminance(colours: npt.NDArray[np.float64]) -> npt.NDArray[np.uint16]:
     """Return the luminance (rows, columns) of colours (rows, columns, 3) of 16 bits."""
-    return np.rint(colours @ _LUMINANCE).astype(np.uint16)
+    return np.asarray(np.rint(colours @ _LUMINANCE), dtype=np.uint16)
 
 
 def _grey(path: Path, picture: Picture) -> Image:

@@ -62,7 +62,8 @@ class CommandDoubt:
         self._axes = slice(1, 2) if model.body.suspended else slice(3)
         self._departures: deque[tuple[int, FloatArray]] = deque(maxlen=max(_WINDOWS))
         self._samples: deque[tuple[int, FloatArray, FloatArray]] = deque()
-        self._forget()
+        self._natural: FloatArray = np.zeros(1)
+        self._commanded: FloatArray = np.zeros(1)
 
     def judge(self, newest: Checkpoint) -> int | None:
         """Judge by the newest checkpoint, if it is of a rate and the body has coils.
@@ -131,8 +132,7 @@ class CommandDoubt:
     def _forget(self) -> None:
         self._departures.clear()
         self._samples.clear()
-        self._natural: FloatArray = np.zeros(1)
-        self._commanded: FloatArray = np.zeros(1)
+        self._natural = self._commanded = np.zeros(1)
 
     def _most_change(self, state: State, duration: float) -> FloatArray:
         """Return the largest change of the rate, rad/s, that unknown currents can cause in `duration` s."""

@@ -77,8 +77,10 @@ def test_a_gyro_that_jumps_further_than_any_current_pushes_raises_no_doubt(flown
     filter_ = filtered(flown, reported=False, until=STUCK)
     for cycle in range(STUCK, STUCK + 20):
         for sample in flown.samples[cycle]:
-            wrong = isinstance(sample, RateMeasurement)
-            filter_.measure(dataclasses.replace(sample, rate=sample.rate + 0.1) if wrong else sample)
+            if isinstance(sample, RateMeasurement):
+                filter_.measure(dataclasses.replace(sample, rate=sample.rate + 0.1))
+            else:
+                filter_.measure(sample)
         filter_.command(cycle * CYCLE_NS, flown.commands[cycle], flown.fields[cycle])
     assert filter_.refused > 0
     assert not filter_.doubts_commands

@@ -60,7 +60,10 @@ class _Matching:
 
 
 # Shares of the bright expected stars that match: with less a distorted lens is supposed, or nothing found.
-_FEW_MISSED, _MOST_MISSED = 0.8, 0.7
+_FEW_MISSED, _MOST_MISSED = 0.8, 0.5
+# Below this share an answer is refused when the missed stars lie farther out than the matched ones, in this
+# share of pairs, as they do around a local group that fits by chance.
+_LOCAL_BELOW, _FARTHER_OUT = 0.7, 0.7
 # A candidate that begins more than this, in powers of ten, above the limit is given up.
 _HOPELESS = 7.0
 
@@ -126,7 +129,10 @@ def _distorted(field: StarField, sky: SkyIndex, matching: _Matching, refined: Re
     width = _half_width(field, refined.scale)
     expected = expected_stars(sky, refined.matrix, width, int(1.3 * len(field)) + 8)
     found = fit_with_distortion(field, sky, expected, matching.observed, matching.star, refined)
-    if found is None or _share_of_bright(expected, found.star) < _MOST_MISSED:
+    if found is None:
+        return nothing(field)
+    share = _share_of_bright(expected, found.star)
+    if share < _MOST_MISSED or (share < _LOCAL_BELOW and _is_local(sky, expected, found.star)):
         return nothing(field)
     grown = _Matching(found.observed, found.star, matching.log10_chance)
     answer = _identified(field, grown, found.refined)
@@ -134,10 +140,27 @@ def _distorted(field: StarField, sky: SkyIndex, matching: _Matching, refined: Re
 
 
 def _share_of_bright(expected: npt.NDArray[np.intp], star: npt.NDArray[np.integer[Any]]) -> float:
-    """Return how many of the expected stars match, among those as bright as the brighter half of `star`."""
+    """Return how many of the bright expected stars match."""
+    matched = _bright_matched(expected, star)
+    return float(np.mean(matched)) if len(matched) else 0.0
+
+
+def _bright_matched(
+    expected: npt.NDArray[np.intp], star: npt.NDArray[np.integer[Any]]
+) -> npt.NDArray[np.bool_]:
+    """Return which of the expected stars match, of those as bright as the brighter half of `star`."""
     matched = np.isin(expected, star)
     places = np.flatnonzero(matched)
-    return float(np.mean(matched[: places[(len(places) - 1) // 2] + 1])) if len(places) else 0.0
+    return matched[: places[(len(places) - 1) // 2] + 1] if len(places) else matched[:0]
+
+
+def _is_local(sky: SkyIndex, expected: npt.NDArray[np.intp], star: npt.NDArray[np.integer[Any]]) -> bool:
+    """Return whether the missed bright stars lie farther from the middle of the matched ones than these."""
+    matched = _bright_matched(expected, star)
+    direction = sky.stars.direction[expected[: len(matched)]]
+    nearness = direction @ direction[matched].mean(axis=0)
+    pairs = nearness[matched][:, None] > nearness[~matched]
+    return bool(pairs.mean() > _FARTHER_OUT) if pairs.size else False
 
 
 def nothing(field: StarField, status: Status = Status.NO_MATCH) -> Identification:
