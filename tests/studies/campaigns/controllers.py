@@ -58,7 +58,7 @@ def thesis_loop() -> Config:
 def raw_thesis_loop() -> Config:
     """Return the thesis's loop on each reading as it comes: to the filter readings are without noise."""
     config = thesis_config(DURATION)
-    unit = configuration.replace(config.inertial_unit, angle_noise=1e-5, rate_noise=1e-5)
+    unit = configuration.replace(config.inertial_unit, angle_noise=3e-4, rate_noise=3e-5)
     estimation = configuration.replace(
         config.estimation, current_noise=0.1, disturbance_walk=1.0, gate_sigma=1e9
     )
