@@ -23,10 +23,12 @@ from flight.gnc.estimation.replay import Checkpoint, Model
 from flight.gnc.estimation.state import State
 from flight.gnc.math.arrays import FloatArray
 
-_WINDOWS = (1, 4, 16)
-"""Samples in a row whose mean departure is tested: strong faults show in one, weak ones in their mean."""
-_SURPRISE = 5.5
-"""Standard deviations of such a mean that begin a doubt; healthy flights reach 4."""
+_SURPRISE = {1: 5.5, 4: 5.5, 16: 8.0}
+"""By the number of samples in a row, the standard deviations of their mean departure that begin a doubt: strong
+faults show in one sample, weak ones in the mean of many. Healthy flights reach 2.8, 4.0 and 7.0; over more
+samples the model's errors add up."""
+_LARGEST = 5.5
+"""Standard deviations of a single departure beside what currents can explain."""
 _BEFORE_NS = 100_000_000
 """The currents are unknown from this long before the first sample of the departure."""
 _MOST = 3.0
@@ -60,7 +62,7 @@ class CommandDoubt:
         self._model = model
         self._scale = 1.0
         self._axes = slice(1, 2) if model.body.suspended else slice(3)
-        self._departures: deque[tuple[int, FloatArray]] = deque(maxlen=max(_WINDOWS))
+        self._departures: deque[tuple[int, FloatArray]] = deque(maxlen=max(_SURPRISE))
         self._samples: deque[tuple[int, FloatArray, FloatArray]] = deque()
         self._natural: FloatArray = np.zeros(1)
         self._commanded: FloatArray = np.zeros(1)
@@ -84,14 +86,14 @@ class CommandDoubt:
         gap = (time_ns - self._departures[-1][0]) * 1e-9 if self._departures else _SHORTEST_GAP
         most = self._most_change(newest.state, min(max(gap, _SHORTEST_GAP), _LONGEST_GAP))
         departure, spread = newest.departure, newest.spread * self._scale
-        if not (np.abs(departure) <= _SURPRISE * spread + _MOST * most).all():
+        if not (np.abs(departure) <= _LARGEST * spread + _MOST * most).all():
             return None
         self._departures.append((time_ns, departure / spread))
-        size = min(float((departure * departure / (newest.spread * newest.spread)).mean()), _SURPRISE**2)
+        size = min(float((departure * departure / (newest.spread * newest.spread)).mean()), _LARGEST**2)
         self._scale = math.sqrt(max(1.0, self._scale**2 + (size - self._scale**2) / _SCALE_OVER))
         sums = np.cumsum([value for _, value in reversed(self._departures)], axis=0)
-        for count in _WINDOWS:
-            if count <= len(sums) and np.abs(sums[count - 1]).max() > _SURPRISE * math.sqrt(count):
+        for count, limit in _SURPRISE.items():
+            if count <= len(sums) and np.abs(sums[count - 1]).max() > limit * math.sqrt(count):
                 since_ns = self._departures[-count][0] - _BEFORE_NS
                 self.active = True
                 self._forget()

@@ -77,7 +77,7 @@ def test_the_installed_wheel_flies_the_demonstration_from_any_folder(
     for path in _type(environment, tmp_path, "python", "-c", script).split():
         assert Path(path).is_relative_to(environment)
     flown = _type(environment, tmp_path, "knightcube", "run", "step_demo", "--duration", "2", "--out", "demo")
-    assert "next:  knightcube report demo" in flown
+    assert "next:     knightcube report demo" in flown
     text = (ROOT / "config" / "step_demo.yaml").read_text(encoding="utf-8")
     assert (tmp_path / "demo" / "config.yaml").read_text(encoding="utf-8") == text
     assert "q2" in _type(environment, tmp_path, "knightcube", "report", "demo", "--no-figures")

@@ -247,6 +247,6 @@ def test_faults_that_follow_or_add_to_each_other_are_flown() -> None:
 def test_the_closing_text_names_the_faults(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["run", str(CONFIG), "--duration", "0.5", "--fault"]
     assert main([*words, "imu: silent @ 0.2 for 0.1", "--out", str(tmp_path / "one")]) == 0
-    assert "\nfaults: imu: silent @ 0.2 for 0.1\n" in capsys.readouterr().out
+    assert "\ninjected: imu: silent @ 0.2 for 0.1\n" in capsys.readouterr().out
     assert main([*words, "imu: silent @ 3", "--out", str(tmp_path / "two")]) == 2
     assert "over after 0.5 s" in capsys.readouterr().err

@@ -48,6 +48,7 @@ RIGHT: dict[str, tuple[float, tuple[str, ...]]] = {
                      "sky.png --camera camera.yaml --date 2026-11-21 --overlay new.png",
                      "sky.png --fov 12 --fov-error 0.1 --method pyramid", "flat.png --fov 12",
                      "streaks.png --fov 12 --exposure 0.2 --prior 0 -0.1 0")),
+    "index": (0.02, ("--camera camera.yaml --out new.npz",)),
     "camera": (0.14, ("--config camera.yaml --count 2 --out new.png", "--config camera.yaml --json",
                       "--config camera.yaml --exposure 0.1")),
     "horizon": (0.25, ("limb.png --fov 67 --altitude 515 --json", "limb.png --fov 67",

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from flight.gnc.errors import PlanningError
 from flight.gnc.guidance.one_axis.path import FARTHEST
 from flight.gnc.guidance.one_axis.plant import angle_of, q2_of
-from flight.gnc.guidance.one_axis.vmc import Plan, PlanStatus, plan
+from flight.gnc.guidance.one_axis.vmc import FINE_NODES, Plan, PlanStatus, plan
 from flight.gnc.math.arrays import FloatArray
 from tests.flight.gnc.guidance.oracle import solve
 from tests.flight.gnc.guidance.problems import KNIGHTCUBE, THESIS, Problem, feasible_problems, known_optima
@@ -108,14 +108,14 @@ def test_the_last_path_makes_the_next_plan_cheaper_and_changes_nothing_else() ->
     for problem, _ in feasible_problems(12, seed=3, share=(1.1, 1.25)):
         first = problem.planned()
         left, elapsed_ns = rest_of(problem, first, 0.3)
-        cold = left.planned()
-        warm = left.planned(last=first.path.starting_at(-elapsed_ns))
+        cold = left.planned(nodes=FINE_NODES)
+        warm = left.planned(nodes=FINE_NODES, last=first.path.starting_at(-elapsed_ns))
         assert warm.energy == pytest.approx(cold.energy, rel=1e-5)
         np.testing.assert_allclose(warm.node_q2, cold.node_q2, atol=1e-4)
         cold_total += cold.evaluations
         warm_total += warm.evaluations
     # How many it takes differs a little with the processor's rounding.
-    assert warm_total < 0.85 * cold_total
+    assert warm_total < 0.9 * cold_total
 
 
 def test_a_last_path_that_does_not_fit_does_no_harm() -> None:

@@ -87,9 +87,9 @@ def test_over_udp_a_refusal_is_exit_status_1_and_one_json_object(capsys: pytest.
 @pytest.mark.parametrize(
     ("words", "status", "problem"),
     [
-        (["slew", "0.9"], 1, "q2 = 0.9 must lie within"),
-        (["slew", "nan"], 1, "must lie within"),
-        (["ping"], 2, "no flight listens there"),
+        (["slew", "0.9"], 2, "q2 = 0.9 must lie within"),
+        (["slew", "nan"], 2, "must lie within"),
+        (["ping"], 1, "no flight listens there"),
     ],
 )
 def test_what_cannot_be_sent_is_one_line(

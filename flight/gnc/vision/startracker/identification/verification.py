@@ -60,10 +60,10 @@ class _Matching:
 
 
 # Shares of the bright expected stars that match: with less a distorted lens is supposed, or nothing found.
-_FEW_MISSED, _MOST_MISSED = 0.8, 0.5
-# Below this share an answer is refused when the missed stars lie farther out than the matched ones, in this
-# share of pairs, as they do around a local group that fits by chance.
-_LOCAL_BELOW, _FARTHER_OUT = 0.7, 0.7
+_FEW_MISSED, _MOST_MISSED = 0.8, 0.35
+# Below this share an answer is refused when the matched stars spread over less than this of the expected
+# ones' extent, as a local group does that fits by chance.
+_LOCAL_BELOW, _LOCAL_EXTENT = 0.7, 0.75
 # A candidate that begins more than this, in powers of ten, above the limit is given up.
 _HOPELESS = 7.0
 
@@ -155,12 +155,12 @@ def _bright_matched(
 
 
 def _is_local(sky: SkyIndex, expected: npt.NDArray[np.intp], star: npt.NDArray[np.integer[Any]]) -> bool:
-    """Return whether the missed bright stars lie farther from the middle of the matched ones than these."""
+    """Return whether the matched bright stars spread over a part of the bright expected ones' extent."""
     matched = _bright_matched(expected, star)
     direction = sky.stars.direction[expected[: len(matched)]]
-    nearness = direction @ direction[matched].mean(axis=0)
-    pairs = nearness[matched][:, None] > nearness[~matched]
-    return bool(pairs.mean() > _FARTHER_OUT) if pairs.size else False
+    # For unit vectors, the mean square distance from their mean is one less the mean's square.
+    part, whole = (1.0 - float((d.mean(axis=0) ** 2).sum()) for d in (direction[matched], direction))
+    return part < _LOCAL_EXTENT**2 * whole
 
 
 def nothing(field: StarField, status: Status = Status.NO_MATCH) -> Identification:
