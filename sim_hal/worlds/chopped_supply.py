@@ -1,7 +1,7 @@
 """The chopped current that three bridges draw from their supply, integrated exactly over any window.
 
 A bridge draws its coil's current while its inputs differ and its enable input is high, none otherwise.
-A coil's L/R of 0.1 ms is neglected beside the PWM's period of 20 ms (SN754410; PCA9685 data sheet, section 7.3.3).
+A coil's L/R of 0.1 ms is neglected beside the PWM's period of 20 ms (SN754410 and PCA9685 data sheets).
 """
 
 from __future__ import annotations
