@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,6 +28,7 @@ from sim_hal.emulators.vn100_sensors import NoiseProfile
 from sim_hal.faults.timeline import FaultTimeline
 from sim_hal.settings import Simulation, Sky
 from sim_hal.worlds.coil_circuit import CoilCircuit
+from sim_hal.worlds.motion import Motion
 from sim_hal.worlds.simulation import TimedSimulation
 from sim_hal.worlds.truth import TruthRecorder
 from sim_hal.worlds.world import World, WorldInputs, make_world
@@ -83,7 +84,8 @@ def assemble(
     pwm = EmulatedPca9685(config.coils.address, now_ns)
     circuit = _circuit(config, section, pwm, np.random.default_rng(circuit_seed), now_ns)
     world = make_world(WorldInputs(config, section, circuit.currents, now_ns()))
-    unit = _unit(config, section, world, line, np.random.default_rng(unit_seed), now_ns())
+    sense = _sense(world, circuit, np.array(section.coil_field))
+    unit = _unit(config, section, sense, line, np.random.default_rng(unit_seed), now_ns())
     monitor = _monitor(config, circuit, now_ns)
     bus = EmulatedI2cBus([pwm] if monitor is None else [pwm, monitor], wait=wait)
     camera = _camera(config.camera, section, world, expose, now_ns)
@@ -122,10 +124,25 @@ def _monitor(config: Config, circuit: CoilCircuit, now_ns: Callable[[], int]) ->
     return EmulatedIna219(settings.address, now_ns, circuit.mean_supply, settings.shunt)
 
 
+def _sense(world: World, circuit: CoilCircuit, coil_field: FloatArray) -> Callable[[int], Motion]:
+    """Return the motion that the inertial unit feels, with the coils' field; `coil_field` is (3, 3) T/A.
+
+    The mean currents count: the unit averages its magnetometer over one control period.
+    """
+    if not coil_field.any():
+        return world.motion
+
+    def sense(time_ns: int) -> Motion:
+        motion = world.motion(time_ns)
+        return replace(motion, field_body=motion.field_body + coil_field @ circuit.currents())
+
+    return sense
+
+
 def _unit(
     config: Config,
     section: Simulation,
-    world: World,
+    sense: Callable[[int], Motion],
     line: SerialEnd,
     generator: np.random.Generator,
     now_ns: int,
@@ -137,7 +154,7 @@ def _unit(
         gyro_bias=np.array(imu.gyro_bias),
         clock_ppm=imu.clock_ppm,
     )
-    return Vn100Emulator(world.motion, line, generator, settings, now_ns=now_ns)
+    return Vn100Emulator(sense, line, generator, settings, now_ns=now_ns)
 
 
 def _camera(

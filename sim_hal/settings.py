@@ -13,6 +13,8 @@ from msgspec import Meta
 
 from flight.schema.values import NotNegative, Positive, Section
 
+Row = tuple[float, float, float]
+
 
 class Release(Section, frozen=True, kw_only=True):
     """The release of the body: q2 and rate about the thread at mission time zero."""
@@ -78,7 +80,10 @@ class FaultEntry(Section, frozen=True, kw_only=True):
 
 
 class Simulation(Section, frozen=True, kw_only=True):
-    """The whole section; `world` is one of `sim_hal.worlds.world.WORLDS`, or `module:factory`."""
+    """The whole section; `world` is one of `sim_hal.worlds.world.WORLDS`, or `module:factory`.
+
+    `coil_field` is the field of the coils at the magnetometer, (3, 3) T/A, from currents to body axes.
+    """
 
     seed: Annotated[int, Meta(ge=0)] = 1
     utc: str = "2026-01-01T00:00:00Z"
@@ -86,6 +91,7 @@ class Simulation(Section, frozen=True, kw_only=True):
     release: Release
     thread: Thread = Thread()
     current_noise: NotNegative = 0.0
+    coil_field: tuple[Row, Row, Row] = ((0.0, 0.0, 0.0),) * 3
     imu: ImuNoise = ImuNoise()
     sky: Sky = Sky()
     truth: Truth = Truth()

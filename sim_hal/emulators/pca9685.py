@@ -111,6 +111,11 @@ class EmulatedPca9685:
             return 0.0
         return OSCILLATOR_HZ / (COUNTS * (self._registers[PRE_SCALE] + 1))
 
+    @property
+    def counter_start_ns(self) -> int:
+        """When the PWM counter last started from zero: at the wake-up."""
+        return self._awake_ns
+
     def high(self, channel: int) -> tuple[int, int]:
         """Return when in a period an output is high: (first count, how many counts, 0 .. 4096)."""
         if not self.output_enable:

@@ -1,12 +1,12 @@
 """Coil currents from the PWM chip's outputs through SN754410 bridges (Sease 2013 ch. 5, Table 5.2).
 
-The mean of a period counts: coil L/R is 0.1 ms, the period 20 ms. While the two inputs differ, V/R is driven
-in one direction; equal inputs brake, an enable input that is low lets the coil coast; neither makes current.
+The body moves by the mean of a period: coil L/R is 0.1 ms, the period 20 ms. While the two inputs differ, V/R
+is driven in one direction; equal inputs brake, an enable input that is low lets the coil coast; neither makes
+current. The supply's current is chopped (`sim_hal.worlds.chopped_supply`).
 """
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable
 from enum import Enum
 
@@ -16,12 +16,13 @@ from flight.gnc.math.arrays import FloatArray
 from hal.drivers.coil_settings import CoilSettings
 from hal.drivers.pca9685 import COUNTS
 from sim_hal.emulators.pca9685 import EmulatedPca9685
+from sim_hal.worlds.chopped_supply import Bridge, ChoppedSupply, Chopping
 
 CURRENT_UNCERTAINTY = 3.5e-3
 """A; the thesis's bound on the error of a coil's current."""
 
-_HISTORY_NS = 500_000_000
 _LOW, _HIGH = (0, 0), (0, COUNTS)
+_OFF = Bridge(_LOW, _LOW, _HIGH)
 
 
 class Condition(Enum):
@@ -71,12 +72,11 @@ class CoilCircuit:
         self._supply_voltage = truth.supply_voltage
         self._conditions = [Condition.SOUND] * 3
         self._short_ohm = [1.0, 1.0, 1.0]
-        self._counts = [0, 0, 0]
+        self._bridges = [_OFF] * 3
         self._values = [0.0, 0.0, 0.0]
-        self._drawn = [0.0, 0.0, 0.0]  # from the supply, by each bridge
+        self._drawn = [0.0, 0.0, 0.0]  # from the supply while driven, by each bridge
         self._currents: FloatArray = np.zeros(3)
-        # (time, charge in A ns that the supply has given by then, current since then), oldest first.
-        self._history: deque[tuple[int, float, float]] = deque([(now_ns(), 0.0, 0.0)])
+        self._supply = ChoppedSupply()
         chip.on_stop = self.update
         self.update(0)
 
@@ -95,18 +95,21 @@ class CoilCircuit:
         draws = self._generator.random(3).tolist() if written else (0.5, 0.5, 0.5)
         for axis, (coil, channels, step, limit) in enumerate(self._coils):
             condition = self._conditions[axis]
-            counts = self._driven(coil.channel_a, coil.channel_b, coil.enable_channel, condition)
-            if counts == self._counts[axis] and not written & channels:
+            bridge = self._bridge(coil.channel_a, coil.channel_b, coil.enable_channel, condition)
+            if bridge == self._bridges[axis] and not written & channels:
                 continue
-            self._counts[axis] = counts
-            current = 0.0
+            self._bridges[axis] = bridge
+            counts = bridge.net_counts()
+            current, drawn = 0.0, abs(step) * COUNTS
             if counts and condition is not Condition.OPEN:
                 current = counts * step + self._uncertainty * (2.0 * draws[axis] - 1.0)
                 current = min(limit, max(-limit, current))
-            self._drawn[axis] = abs(current)
-            if condition is Condition.SHORTED:
-                self._drawn[axis] = abs(counts) / COUNTS * self._supply_voltage / self._short_ohm[axis]
-                current = 0.0
+                drawn = abs(current) * COUNTS / abs(counts)
+            if condition is Condition.OPEN:
+                drawn = 0.0
+            elif condition is Condition.SHORTED:
+                current, drawn = 0.0, self._supply_voltage / self._short_ohm[axis]
+            self._drawn[axis] = drawn
             self._values[axis] = -current if condition is Condition.REVERSED else current
         self._currents = np.array(self._values)
         self._remember()
@@ -114,13 +117,12 @@ class CoilCircuit:
     def mean_supply(self, start_ns: int, end_ns: int) -> tuple[float, float]:
         """Return the mean bus voltage (V) and mean current of all coils together (A) over a recent window.
 
-        A bridge takes |I| from the supply whichever way its coil is driven. The history spans 0.5 s.
+        A bridge takes |I| from the supply while its coil is driven, whichever way. The history spans 0.5 s.
         """
-        charge = self._charge(end_ns) - self._charge(start_ns)
-        return self._bus_voltage, charge / (end_ns - start_ns)
+        return self._bus_voltage, self._supply.charge(start_ns, end_ns) / (end_ns - start_ns)
 
-    def _driven(self, channel_a: int, channel_b: int, enable: int | None, condition: Condition) -> int:
-        """Return for how many counts of a period, signed, the coil is driven."""
+    def _bridge(self, channel_a: int, channel_b: int, enable: int | None, condition: Condition) -> Bridge:
+        """Return the pulses that a bridge's legs follow."""
         high = self._chip.high
         a, b = high(channel_a), high(channel_b)
         match condition:
@@ -130,30 +132,10 @@ class CoilCircuit:
                 b = _HIGH if condition is Condition.B_HIGH else _LOW
             case _:
                 pass
-        if enable is None:
-            # While both legs are high the coil is shorted, which brakes and does not drive.
-            return a[1] - b[1]
-        gate = high(enable)
-        return common_counts(a, gate) - common_counts(b, gate)
+        return Bridge(a, b, _HIGH if enable is None else high(enable))
 
     def _remember(self) -> None:
-        now = self._now_ns()
-        last_ns, charge, current = self._history[-1]
-        self._history.append((now, charge + current * (now - last_ns), sum(self._drawn)))
-        while len(self._history) > 1 and self._history[1][0] < now - _HISTORY_NS:
-            self._history.popleft()
-
-    def _charge(self, time_ns: int) -> float:
-        for begin_ns, charge, current in reversed(self._history):
-            if begin_ns <= time_ns:
-                return charge + current * (time_ns - begin_ns)
-        return self._history[0][1]
-
-
-def common_counts(a: tuple[int, int], b: tuple[int, int]) -> int:
-    """Return for how many counts of a period two pulses, (first count, length) each, are high together."""
-    lag = (b[0] - a[0]) % COUNTS
-    # b's pulse as a sees it starts at lag, and what runs over the period's end comes back at its beginning.
-    first = min(a[1], lag + b[1]) - lag
-    wrapped = min(a[1], lag + b[1] - COUNTS)
-    return max(0, first) + max(0, wrapped)
+        # Without a clock the outputs are constant, and any frequency is right.
+        period_ns = 1e9 / (self._chip.frequency or 1.0)
+        pulses: tuple[tuple[Bridge, float], ...] = tuple(zip(self._bridges, self._drawn, strict=True))
+        self._supply.note(Chopping(self._now_ns(), self._chip.counter_start_ns, period_ns, pulses))
