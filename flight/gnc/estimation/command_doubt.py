@@ -24,9 +24,11 @@ from flight.gnc.estimation.state import State
 from flight.gnc.math.arrays import FloatArray
 
 _SURPRISE = {1: 5.5, 4: 5.5, 16: 8.0}
-"""By the number of samples in a row, the standard deviations of their mean departure that begin a doubt: strong
-faults show in one sample, weak ones in the mean of many. Healthy flights reach 2.8, 4.0 and 7.0; over more
-samples the model's errors add up."""
+"""By the number of samples in a row, the standard deviations of their mean departure that begin a doubt.
+
+Strong faults show in one sample, weak ones in the mean of many. Healthy flights reach 2.8, 4.0 and 7.0; over
+more samples the model's errors add up.
+"""
 _LARGEST = 5.5
 """Standard deviations of a single departure beside what currents can explain."""
 _BEFORE_NS = 100_000_000
