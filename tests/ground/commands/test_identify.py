@@ -29,7 +29,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, obj
     ]
     done = command("identify", DEMO, *words, "--json")
     assert done.returncode == 0, done.stderr
-    assert done.stderr == ""
+    assert all("events" in line for line in done.stderr.splitlines())  # progress on a busy machine
     facts: dict[str, object] = json.loads(done.stdout)
     return place, facts
 
