@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from flight.gnc.vision.startracker.identification.identification import Identification, Status
+from flight.gnc.vision.startracker.identification.lost_in_space import identify
 from flight.gnc.vision.startracker.identification.verification import nothing
 from flight.gnc.vision.startracker.index.build import default_index
 from tests.studies.bench import starid_hard
+from tests.studies.bench.star_lists import ListKind, draw
 from tests.studies.bench.starid_hard import drawn_list, hardships, measured
 
 _SEED = 20_261_123
@@ -55,3 +57,20 @@ def test_the_command_prints_a_row_as_json(capsys: pytest.CaptureFixture[str]) ->
     row = json.loads(capsys.readouterr().out.splitlines()[0])
     assert row["lists"] == 2
     assert row["right"] + row["wrong"] + row["refused"] == 2
+
+
+@pytest.mark.slow
+def test_a_lens_fitted_wrongly_is_refused_and_a_hidden_half_is_not() -> None:
+    """A list that was answered 175" off, at 5 sigmas; and good ones of which only the left part is seen."""
+    sky = default_index()
+    name = "known to 1 deg, distorted 2-8 %"
+    row, number = hardships()[name], list(hardships()).index(name)
+    wrong = drawn_list(row, sky.stars, np.random.default_rng([314_159, number, 510]))
+    assert starid_hard.verdict(row, wrong, identify(wrong.field(), sky)) != "wrong"
+    kind = ListKind(field_deg=20.0, noise_px=0.3, known_deg=1.0)
+    for seed in range(6):
+        drawn = draw(kind, sky.stars, np.random.default_rng([_SEED, seed]))
+        left = np.flatnonzero(drawn.pixels[:, 0] < 400.0)
+        found = identify(drawn.field().subset(left), sky)
+        assert found.status is Status.IDENTIFIED, seed
+        assert np.array_equal(found.star[found.star >= 0], drawn.star[left][found.star >= 0])

@@ -52,6 +52,7 @@ class DistortedFit:
         star: (k,) numbers of guide stars.
         refined: attitude, scale and their covariance, widened, with the distortion free.
         distortion: c of the module's text.
+        seen: (n, 3) true directions, camera frame, of all stars of the field by this lens.
         from_lens: (3, 3) rad^2, the part of the attitude's covariance that an uncertain c adds.
     """
 
@@ -59,6 +60,7 @@ class DistortedFit:
     star: IntArray
     refined: Refinement
     distortion: float
+    seen: FloatArray
     from_lens: FloatArray
 
 
@@ -113,7 +115,8 @@ def fit_with_distortion(
     covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
     from_lens = np.outer(covariance[:3, 4], covariance[:3, 4]) / covariance[4, 4]
     refined = Refinement(pose.matrix, pose.scale, covariance[:4, :4], squares)
-    return DistortedFit(observed, star, refined, pose.distortion, from_lens)
+    seen_by = pose.true(field.direction, corner)
+    return DistortedFit(observed, star, refined, pose.distortion, seen_by, from_lens)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

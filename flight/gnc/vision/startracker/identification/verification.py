@@ -18,7 +18,7 @@ import numpy.typing as npt
 from flight.gnc.math.arrays import FloatArray, IntArray
 from flight.gnc.math.quaternion import attitude_matrix
 from flight.gnc.vision.startracker.identification.chance import Chance
-from flight.gnc.vision.startracker.identification.distortion import fit_with_distortion
+from flight.gnc.vision.startracker.identification.distortion import DistortedFit, fit_with_distortion
 from flight.gnc.vision.startracker.identification.field import StarField
 from flight.gnc.vision.startracker.identification.identification import Identification, Status
 from flight.gnc.vision.startracker.identification.refinement import (
@@ -59,11 +59,12 @@ class _Matching:
     log10_chance: float
 
 
-# Shares of the bright expected stars that match: with less a distorted lens is supposed, or nothing found.
-_FEW_MISSED, _MOST_MISSED = 0.8, 0.35
-# Below this share an answer is refused when the matched stars spread over less than this of the expected
-# ones' extent, as a local group does that fits by chance.
-_LOCAL_BELOW, _LOCAL_EXTENT = 0.7, 0.75
+# Share of the bright expected stars that match: with less a distorted lens is supposed.
+_FEW_MISSED = 0.8
+# An answer is refused if more than this share of the bright expected stars is missed with an unmatched star
+# within this share of the corner's tangent, beyond chance: the lens is fitted wrongly there. A foreground
+# hides stars and puts none beside them.
+_MOST_DISPLACED, _DISPLACED_BY = 0.15, 0.04
 # A candidate that begins more than this, in powers of ten, above the limit is given up.
 _HOPELESS = 7.0
 
@@ -125,14 +126,11 @@ def verify_matrix(
 
 
 def _distorted(field: StarField, sky: SkyIndex, matching: _Matching, refined: Refinement) -> Identification:
-    """Return the identification with distortion fitted; NO_MATCH if most bright stars stay missed."""
+    """Return the identification with distortion fitted; NO_MATCH if bright stars are seen out of place."""
     width = _half_width(field, refined.scale)
     expected = expected_stars(sky, refined.matrix, width, int(1.3 * len(field)) + 8)
     found = fit_with_distortion(field, sky, expected, matching.observed, matching.star, refined)
-    if found is None:
-        return nothing(field)
-    share = _share_of_bright(expected, found.star)
-    if share < _MOST_MISSED or (share < _LOCAL_BELOW and _is_local(sky, expected, found.star)):
+    if found is None or _share_displaced(field, sky, expected, found) > _MOST_DISPLACED:
         return nothing(field)
     grown = _Matching(found.observed, found.star, matching.log10_chance)
     answer = _identified(field, grown, found.refined)
@@ -154,13 +152,21 @@ def _bright_matched(
     return matched[: places[(len(places) - 1) // 2] + 1] if len(places) else matched[:0]
 
 
-def _is_local(sky: SkyIndex, expected: npt.NDArray[np.intp], star: npt.NDArray[np.integer[Any]]) -> bool:
-    """Return whether the matched bright stars spread over a part of the bright expected ones' extent."""
-    matched = _bright_matched(expected, star)
-    direction = sky.stars.direction[expected[: len(matched)]]
-    # For unit vectors, the mean square distance from their mean is one less the mean's square.
-    part, whole = (1.0 - float((d.mean(axis=0) ** 2).sum()) for d in (direction[matched], direction))
-    return part < _LOCAL_EXTENT**2 * whole
+def _share_displaced(
+    field: StarField, sky: SkyIndex, expected: npt.NDArray[np.intp], found: DistortedFit
+) -> float:
+    """Return how many of the bright expected stars are missed with an unmatched star near, less chance."""
+    matched = _bright_matched(expected, found.star)
+    missed = sky.stars.direction[expected[: len(matched)][~matched]]
+    unmatched = np.delete(found.seen, found.observed, axis=0)
+    if not len(missed) or not len(unmatched):
+        return 0.0
+    across, down = _half_width(field, found.refined.scale)
+    radius = _DISPLACED_BY * math.hypot(across, down)
+    nearest = (unmatched @ (found.refined.matrix @ missed.T)).max(axis=0)
+    near = np.count_nonzero(2.0 - 2.0 * nearest < radius**2)
+    chance = len(missed) * min(1.0, len(unmatched) * math.pi * radius**2 / (4.0 * across * down))
+    return float(near - chance) / len(matched)
 
 
 def nothing(field: StarField, status: Status = Status.NO_MATCH) -> Identification:
