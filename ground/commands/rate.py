@@ -193,7 +193,7 @@ def _facts(
 
 
 def _reason(found: StreakResult | MotionResult) -> str:
-    """Return why there is no rate, in a line; empty when there is one."""
+    """Return in a line why there is no rate; empty with a rate."""
     if found.rate is not None:
         return ""
     detailed = found.reason if isinstance(found, MotionResult) else ""

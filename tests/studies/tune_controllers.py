@@ -15,7 +15,7 @@ import json
 import math
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import minimize
@@ -24,17 +24,18 @@ from flight.gnc.control.one_axis.adaptive import AdaptiveController, AdaptiveSet
 from flight.gnc.control.one_axis.controller import Controller
 from flight.gnc.control.one_axis.pid import PidController, PidGains
 from flight.gnc.guidance.one_axis.path import Sample
-from flight.gnc.guidance.one_axis.plant import SingleAxisPlant, angle_of
+from flight.gnc.guidance.one_axis.plant import angle_of
+from tests.flight.gnc.control.closed_loop import BELIEVED, PERIOD
 
-PERIOD = 0.025
-BELIEVED = SingleAxisPlant(1.05e-3, 80 * 0.0081 * 4.5e-4, 23.0, 0.148)
-TRUE = SingleAxisPlant(1.05e-3, 80 * 0.0081 * 4.5e-4, 23.0, 0.148, 1e-5, 2e-6)
+TRUE = replace(BELIEVED, stiffness=1e-5, damping=2e-6)
 RELEASE = (angle_of(0.2), -0.1)
 TARGETS = (-0.3, -0.2, -0.1, 0.0, 0.1, 0.2, 0.3)
+"""Of `config/step_demo.yaml`."""
 STEP = 20.0
 SETTLED_S, OVERSHOOT = 8.7, 0.008
 _BAND = 0.05
 _PENALTY = 20.0
+_SEARCH = {"maxfev": 800, "xatol": 1e-3, "fatol": 1e-3}
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +99,10 @@ def tune(name: str, progress: Callable[[str], object] = lambda _: None) -> tuple
     best: tuple[float, tuple[float, ...]] | None = None
     for start in starts:
         found = minimize(
-            lambda x: fly(make(x)).loss, start, method="Nelder-Mead", options={"maxfev": 250, "xatol": 1e-3}
+            lambda x: fly(make(x)).loss,
+            start,
+            method="Nelder-Mead",
+            options={"maxfev": 800, "xatol": 1e-3, "fatol": 1e-3},
         )
         progress(f"{name}: from {start}: loss {found.fun:.3f}\n")
         if best is None or found.fun < best[0]:

@@ -17,6 +17,8 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from flight.gnc.estimation.checkpoints import CheckpointHistory
 from flight.gnc.estimation.command_doubt import CommandDoubt
 from flight.gnc.estimation.commands import CommandHistory
@@ -33,7 +35,7 @@ from flight.gnc.estimation.measurements import (
 from flight.gnc.estimation.replay import Checkpoint, Model, Replay
 from flight.gnc.estimation.rigid_body import RigidBody
 from flight.gnc.estimation.slow_prior import SlowPrior
-from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.arrays import FloatArray, IntArray
 
 OnApplied = Callable[[list[bool]], None]
 """Called with which of the late measurements passed the gate."""
@@ -141,8 +143,11 @@ class AttitudeFilter:
             self.late += 1
             return False
         self._count(type(measurement), used)
-        if self._history and (since_ns := self._doubt.judge(self._history.newest)) is not None:
-            self.mark_unknown(since_ns)
+        newest = self._history.newest if self._history else None
+        if newest is not None and newest.measurement is measurement:
+            since_ns = self._doubt.judge(newest)
+            if since_ns is not None:
+                self.mark_unknown(since_ns)
         if self._branch is None:  # a branch needs its base
             self._history.forget(measurement.time_ns)
         return used
@@ -199,6 +204,16 @@ class AttitudeFilter:
         """Return the estimate at a past time, None before the first checkpoint kept."""
         then = self._history.at(time_ns)
         return None if then is None else self._model.estimate(then, time_ns, then.time_ns)
+
+    def rates(self, begin_ns: int, end_ns: int) -> tuple[IntArray, FloatArray] | None:
+        """Return the times (n,) ns and rates (n, 3) rad/s of the checkpoints that span an interval.
+
+        None where the history does not reach back to its beginning.
+        """
+        spanning = self._history.spanning(begin_ns, end_ns)
+        if not spanning:
+            return None
+        return np.array([c.time_ns for c in spanning]), np.array([c.state.rate for c in spanning])
 
     def _is_newest(self, measurement: Measurement) -> bool:
         return bool(self._history) and measurement.begin_ns >= self._history.newest.time_ns

@@ -42,6 +42,15 @@ class CheckpointHistory:
         index = bisect.bisect_right(self._checkpoints, time_ns, key=_TIME)
         return self._checkpoints[index - 1] if index else None
 
+    def spanning(self, begin_ns: int, end_ns: int) -> list[Checkpoint]:
+        """Return the checkpoints from the last up to `begin_ns` to the first from `end_ns` on, or the newest.
+
+        Empty where none is as old as `begin_ns`.
+        """
+        first = bisect.bisect_right(self._checkpoints, begin_ns, key=_TIME)
+        last = bisect.bisect_left(self._checkpoints, end_ns, key=_TIME)
+        return self._checkpoints[first - 1 : last + 1] if first else []
+
     def index_before(self, begin_ns: int) -> int:
         """Return how many checkpoints lie up to `begin_ns`, or up to the start of a mean that spans it."""
         while True:

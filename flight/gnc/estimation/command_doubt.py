@@ -29,8 +29,6 @@ _SURPRISE = {1: 5.5, 4: 5.5, 16: 8.0}
 Strong faults show in one sample, weak ones in the mean of many. Healthy flights reach 2.8, 4.0 and 7.0; over
 more samples the model's errors add up.
 """
-_LARGEST = 5.5
-"""Standard deviations of a single departure beside what currents can explain."""
 _BEFORE_NS = 100_000_000
 """The currents are unknown from this long before the first sample of the departure."""
 _MOST = 3.0
@@ -84,14 +82,12 @@ class CommandDoubt:
 
     def _compare(self, newest: Checkpoint) -> int | None:
         """Test the departures from the model."""
-        time_ns = newest.time_ns
-        gap = (time_ns - self._departures[-1][0]) * 1e-9 if self._departures else _SHORTEST_GAP
-        most = self._most_change(newest.state, min(max(gap, _SHORTEST_GAP), _LONGEST_GAP))
-        departure, spread = newest.departure, newest.spread * self._scale
-        if not (np.abs(departure) <= _LARGEST * spread + _MOST * most).all():
+        assert newest.variance is not None  # only the first checkpoint has none, and it is not judged
+        departure = np.array(newest.innovation) / np.sqrt(newest.variance.diagonal())
+        if not np.abs(departure).max() <= _SURPRISE[1] * self._scale and not self._explains(newest):
             return None
-        self._departures.append((time_ns, departure / spread))
-        size = min(float((departure * departure / (newest.spread * newest.spread)).mean()), _LARGEST**2)
+        self._departures.append((newest.time_ns, departure / self._scale))
+        size = min(float(departure @ departure) / len(departure), _SURPRISE[1] ** 2)
         self._scale = math.sqrt(max(1.0, self._scale**2 + (size - self._scale**2) / _SCALE_OVER))
         sums = np.cumsum([value for _, value in reversed(self._departures)], axis=0)
         for count, limit in _SURPRISE.items():
@@ -101,6 +97,14 @@ class CommandDoubt:
                 self._forget()
                 return since_ns
         return None
+
+    def _explains(self, newest: Checkpoint) -> bool:
+        """Return whether coil currents can have caused a departure, beside the noise."""
+        assert newest.variance is not None
+        gap = (newest.time_ns - self._departures[-1][0]) * 1e-9 if self._departures else _SHORTEST_GAP
+        most = self._most_change(newest.state, min(max(gap, _SHORTEST_GAP), _LONGEST_GAP))
+        noise = _SURPRISE[1] * self._scale * np.sqrt(newest.variance.diagonal())
+        return bool((np.abs(newest.innovation) <= noise + _MOST * most).all())
 
     def _weigh(self, state: State, rate: RateMeasurement) -> None:
         """Note a sample, and end the doubt when the rate follows the commands."""

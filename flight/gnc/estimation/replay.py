@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -25,17 +25,13 @@ from flight.gnc.estimation.state import SIZE, State
 from flight.gnc.math.arrays import FloatArray
 
 
-def _nothing() -> FloatArray:
-    return np.zeros(0)
-
-
 @dataclass(slots=True, eq=False)
 class Checkpoint:
     """A measurement, whether it passed the gate, and the state just after it.
 
     Attributes:
-        departure: the innovation's components, and
-        spread: their standard deviations, of the measurement's unit; empty at the start.
+        innovation: its components, of the measurement's unit; empty at the start.
+        variance: their covariance; None at the start.
     """
 
     measurement: Measurement
@@ -43,8 +39,8 @@ class Checkpoint:
     state: State
     covariance: FloatArray
     nis: float = math.nan
-    departure: FloatArray = field(default_factory=_nothing)
-    spread: FloatArray = field(default_factory=_nothing)
+    innovation: tuple[float, ...] = ()
+    variance: FloatArray | None = None
 
     @property
     def time_ns(self) -> int:
@@ -148,9 +144,8 @@ class Replay:
             state, covariance = release_attitude(state, covariance, measurement)
         self._state, self._covariance = state, covariance
         alone = state._replace(kept=()) if state.kept else state
-        departure, spread = np.array(found.value), np.sqrt(variance.diagonal())
         self.checkpoints.append(
-            Checkpoint(measurement, used, alone, covariance[:SIZE, :SIZE], nis, departure, spread)
+            Checkpoint(measurement, used, alone, covariance[:SIZE, :SIZE], nis, found.value, variance)
         )
 
     def _propagate_to(self, time_ns: int) -> None:

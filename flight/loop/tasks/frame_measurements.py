@@ -24,7 +24,7 @@ from hal.interfaces.readings import Frame
 
 # rad, of the mounting between the camera and the inertial unit that the estimate is of.
 _LEAST_PRIOR_SIGMA = 5e-4
-# The rate over an exposure is taken at so many instants.
+# Instants of an exposure at which the rate is taken.
 _COURSE_NODES = 17
 _NAN = np.full(3, np.nan), np.full((3, 3), np.nan)
 
@@ -87,13 +87,15 @@ class FrameMeasurer:
 
     def _course(self, frame: Frame, sigma: float) -> Course | None:
         """Return how the camera turned, its rate known to `sigma` rad/s; None beyond the history."""
-        parts = np.linspace(0.0, 1.0, _COURSE_NODES)
-        times = [frame.exposure_start_ns + round(part * frame.exposure_ns) for part in parts]
-        past = [self._navigation.past(time) for time in times]
-        rates = [self._body_to_camera @ one.rate for one in past if one is not None]
-        if len(rates) < _COURSE_NODES:
+        spanning = self._navigation.rates(
+            frame.exposure_start_ns, frame.exposure_start_ns + frame.exposure_ns
+        )
+        if spanning is None:
             return None
-        return Course.of_rates(np.array(rates), frame.exposure_ns * 1e-9, sigma)
+        times, rates = spanning
+        at = np.linspace(0.0, frame.exposure_ns, _COURSE_NODES) + (frame.exposure_start_ns - times[0])
+        even = np.stack([np.interp(at, times - times[0], rate) for rate in rates.T], axis=1)
+        return Course.of_rates(even @ self._body_to_camera.T, frame.exposure_ns * 1e-9, sigma)
 
     def _attitude_prior(self, past: Estimate) -> AttitudePrior:
         widest = float(np.linalg.eigvalsh(past.covariance[TURN, TURN])[-1])

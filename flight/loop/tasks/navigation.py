@@ -13,7 +13,7 @@ import numpy as np
 
 from flight.gnc.estimation.estimate import Estimate
 from flight.gnc.estimation.measurements import AttitudeMeasurement, Measurement, RateMeasurement
-from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.arrays import FloatArray, IntArray
 from flight.link import events
 from flight.link.telemetry.definitions import IMU
 from flight.loop.body import Body
@@ -132,6 +132,10 @@ class Navigation:
     def past(self, time_ns: int) -> Estimate | None:
         """Return the estimate of a past time, None beyond the filter's history."""
         return self._filter.past(time_ns) if self._filter.started else None
+
+    def rates(self, begin_ns: int, end_ns: int) -> tuple[IntArray, FloatArray] | None:
+        """Return times (n,) ns and rates (n, 3) rad/s that span a past interval; None beyond the history."""
+        return self._filter.rates(begin_ns, end_ns) if self._filter.started else None
 
     def ingest_late(self, late: Sequence[Measurement], report: Callable[[list[bool]], None]) -> None:
         """Apply measurements of a frame at their times, over the next cycles.

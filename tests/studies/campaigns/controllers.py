@@ -5,8 +5,8 @@ The thesis gives 0.10 W for its own loop, 0.15 W for PID and 0.66 W for adaptive
 that save supply energy, the thesis's, the thesis's on raw readings (its filter made transparent), and PID and
 adaptive control, which are shown the targets themselves. All gains of PID and adaptive are tuned by one
 criterion, `python -m tests.studies.tune_controllers`: the least power with every step settled in 9 s and
-overshoots of 1 % at most. The adaptive controller as the thesis may have flown it, tuned by its bandwidth
-alone, and a PID by three poles in one place stand beside them.
+overshoots of 1 % at most. An adaptive controller tuned by its bandwidth alone, and a PID by three poles in
+one place, stand beside them.
 
 Two powers are given: R I^2 of the mean current, the thesis's cost, and V |I|, which the chopped coils take
 from their supply of 3.4 V.

@@ -13,27 +13,20 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from flight.gnc.errors import PlanningError
 from flight.gnc.guidance.one_axis.limits import Q2_LIMIT
-from flight.gnc.guidance.one_axis.plant import SingleAxisPlant
-from flight.gnc.guidance.one_axis.vmc import plan
-from tests.flight.gnc.guidance.oracle import Slew, solve
+from tests.flight.gnc.guidance.oracle import solve
+from tests.flight.gnc.guidance.problems import KNIGHTCUBE, Problem
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 
 INTERVALS = 1200
 DEAR = 1.001
-INERTIA, TORQUE_CONSTANT, RESISTANCE, CURRENT_LIMIT, DAMPING = (
-    1.05e-3,
-    80 * 0.0081 * 4.5e-4,
-    23.0,
-    0.148,
-    2e-6,
-)
-"""The plant of `config/step_demo.yaml`."""
+PLANT = replace(KNIGHTCUBE, damping=2e-6)
 
 
 def cases(runs: int, seed: int) -> list[Case]:
@@ -41,37 +34,31 @@ def cases(runs: int, seed: int) -> list[Case]:
     return [Case(f"{k}", (seed, k), {}) for k in range(runs)]
 
 
-def run(case: Case) -> Result:
-    """Plan one slew and solve it by collocation."""
+def problem_of(case: Case) -> Problem:
+    """Return the slew of a case."""
     rng = np.random.default_rng(case.seed)
     start, end = (rng.uniform(0.60, Q2_LIMIT, 2) * rng.choice([-1.0, 1.0], 2)).tolist()
     stiffness, horizon = float(rng.uniform(0.0, 2e-5)), float(rng.uniform(5.0, 60.0))
-    plant = SingleAxisPlant(INERTIA, TORQUE_CONSTANT, RESISTANCE, CURRENT_LIMIT, stiffness, DAMPING)
-    result: Result = {"start": start, "end": end, "stiffness": stiffness, "asked": horizon}
+    return Problem(replace(PLANT, stiffness=stiffness), start, 0.0, end, 0.0, horizon)
+
+
+def run(case: Case) -> Result:
+    """Plan one slew and solve it by collocation."""
+    problem = problem_of(case)
+    result: Result = {
+        "start": problem.start_q2,
+        "end": problem.end_q2,
+        "stiffness": problem.plant.stiffness,
+        "asked": problem.horizon,
+    }
     begun = time.process_time()
     try:
-        found = plan(plant, start, 0.0, end, 0.0, horizon)
+        found = problem.planned()
         result |= {"horizon": found.horizon, "energy": found.energy}
     except PlanningError:
         result |= {"horizon": None, "energy": None}
     result["cpu_s"] = time.process_time() - begun
-    angles = 2.0 * math.asin(start), 2.0 * math.asin(end)
-    optimum = solve(
-        Slew(
-            angles[0],
-            0.0,
-            angles[1],
-            0.0,
-            horizon,
-            INERTIA,
-            TORQUE_CONSTANT,
-            RESISTANCE,
-            CURRENT_LIMIT,
-            stiffness,
-            DAMPING,
-        ),
-        INTERVALS,
-    )
+    optimum = solve(problem.slew(problem.horizon), INTERVALS)
     # The collocation does not know of the limit of q2: a path beyond it is none.
     within = optimum is not None and np.abs(np.sin(0.5 * optimum.angle)).max() <= Q2_LIMIT * (1.0 + 1e-9)
     result["optimum"] = optimum.energy if optimum is not None and within else None

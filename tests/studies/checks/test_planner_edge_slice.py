@@ -2,20 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
-from flight.gnc.guidance.one_axis.plant import SingleAxisPlant
-from flight.gnc.guidance.one_axis.vmc import PlanStatus, plan
-from tests.studies.campaigns.planner_edge import (
-    CURRENT_LIMIT,
-    DAMPING,
-    INERTIA,
-    RESISTANCE,
-    TORQUE_CONSTANT,
-    cases,
-    run,
-    verdict,
-)
+from flight.gnc.guidance.one_axis.vmc import PlanStatus
+from tests.flight.gnc.guidance.problems import Problem
+from tests.studies.campaigns.planner_edge import PLANT, cases, run, verdict
 
 
 def test_no_slew_with_a_path_is_refused_or_dear() -> None:
@@ -31,5 +24,5 @@ def test_no_slew_with_a_path_is_refused_or_dear() -> None:
 def test_against_a_strong_thread_the_body_is_swung(
     start: float, end: float, stiffness: float, horizon: float
 ) -> None:
-    plant = SingleAxisPlant(INERTIA, TORQUE_CONSTANT, RESISTANCE, CURRENT_LIMIT, stiffness, DAMPING)
-    assert plan(plant, start, 0.0, end, 0.0, horizon).status is PlanStatus.OPTIMAL
+    problem = Problem(replace(PLANT, stiffness=stiffness), start, 0.0, end, 0.0, horizon)
+    assert problem.planned().status is PlanStatus.OPTIMAL

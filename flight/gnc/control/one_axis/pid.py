@@ -1,11 +1,10 @@
 """A PID controller of the angle about the thread, for comparison (Sease 2013, ch. 5: 0.15 W on the testbed).
 
 The gains are free, or place three poles of a double integrator at -w: 3 w, 3 w^2 and w^3 on rate, angle and
-its integral.
-The reference enters the proportional part with a weight b (two degrees of freedom, Astrom and Hagglund 1995,
-3.4): with b = 0 a step of the target makes no step of the current and no overshoot. The integral stops while
-the limit is applied and the error would push it further (conditional integration). Of the plant the
-controller uses only the ratio of inertia to torque constant, which scales the gains.
+its integral. The reference enters the proportional part with a weight b (two degrees of freedom, Astrom and
+Hagglund 1995, 3.4): with b = 0 a step of the target makes no step of the current and no overshoot. The
+integral stops while the limit is applied and the error would push it further (conditional integration). Of
+the plant the controller uses only the ratio of inertia to torque constant, which scales the gains.
 """
 
 from __future__ import annotations

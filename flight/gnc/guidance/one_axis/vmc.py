@@ -25,7 +25,7 @@ from flight.gnc.guidance.one_axis.path_cost import PathCost
 from flight.gnc.guidance.one_axis.plant import SQUARE_Q2_WITHOUT_AUTHORITY, SingleAxisPlant, q2_rate_of
 from flight.gnc.guidance.one_axis.prey import CubicPrey
 from flight.gnc.guidance.one_axis.vmc_family import Boundary, Family
-from flight.gnc.guidance.one_axis.vmc_horizon import Search
+from flight.gnc.guidance.one_axis.vmc_horizon import ALONG_LIMIT, Search
 from flight.gnc.guidance.one_axis.vmc_program import Program, Trial
 from flight.gnc.math.arrays import FloatArray
 
@@ -44,7 +44,6 @@ NODES_RANGE = (8, 40)
 HORIZON_RANGE = (1e-3, 1e5)
 FASTEST = 100.0
 LEAST_PRICED = 1.0
-_ALONG_LIMIT = 0.99
 
 
 class PlanStatus(StrEnum):
@@ -84,6 +83,10 @@ class Plan:
     nu: FloatArray
     node_times: FloatArray
     node_q2: FloatArray
+
+    def spent(self, cost: PathCost) -> float:
+        """Return the energy of one kind, J."""
+        return self.energy if cost is PathCost.HEAT else self.supplied
 
 
 def plan(
@@ -139,7 +142,7 @@ def plan(
         )
     asked = horizon if time_price is None else trial.horizon
     found = _assemble(program, trial, boundary, reference, asked, search.evaluations, end_rate)
-    along_limit = found.peak_current >= _ALONG_LIMIT * plant.current_limit
+    along_limit = found.peak_current >= ALONG_LIMIT * plant.current_limit
     if time_price is not None or nodes >= FINE_NODES or not along_limit or trial.horizon > _NEARLY * asked:
         return found
     search = Search(
@@ -149,8 +152,7 @@ def plan(
     if trial is None:
         return found
     finer = _assemble(program, trial, boundary, reference, asked, search.evaluations, end_rate)
-    saved = (finer.energy, found.energy) if cost is PathCost.HEAT else (finer.supplied, found.supplied)
-    return finer if (finer.horizon, saved[0]) < (found.horizon, saved[1]) else found
+    return min(finer, found, key=lambda one: (one.horizon, one.spent(cost)))
 
 
 def _remains(last: PolynomialPath | None, nodes: int) -> FloatArray | None:

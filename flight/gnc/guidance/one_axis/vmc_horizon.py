@@ -27,7 +27,8 @@ about 0.3 % later, where the cost is within 0.25 %."""
 _START_BELOW = 1.7
 _GROW_TO = 1.4
 _RETRY = 1.4
-_ALONG_LIMIT = 0.99
+ALONG_LIMIT = 0.99
+"""Of a limit: from here on a path runs along it."""
 _ATTEMPTS = 10
 _AT_BOUND = 1e-9
 _ANCHORS = (0.85, 0.7, 0.5, 0.35, 1.2, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0)
@@ -168,7 +169,7 @@ class Search:
         worst = float(np.abs(program.ratios(start)).max())
         if not worst < _START_BELOW:
             return None
-        if worst > _ALONG_LIMIT:
+        if worst > ALONG_LIMIT:
             return self._hasty(program, start, asked, longest)
         trial = program.unlimited(start)
         if trial is None or float(np.abs(program.ratios(trial)).max()) > 1.0 + LIMIT_TOLERANCE:

@@ -86,7 +86,7 @@ class Program:
         family: Family,
         q2_limit: float,
         horizon: float,
-        cost: PathCost = PathCost.HEAT,
+        cost: PathCost,
     ) -> None:
         self._plant = plant
         self._cost = cost

@@ -46,7 +46,7 @@ _SAME = np.radians(1.0)
 _MOST_CHANCE = -6.0
 """log10 of the number of cones that chance edges would fit as well: a horizon has fewer."""
 _BREADTH = 0.125, 2.0
-"""Of an edge over the air's: a sharper one is no limb, nor a broader one."""
+"""Breadth of a limb's edge over that of the air, least and largest."""
 _GAIN = 1.5
 """Three times the lines must give this factor of the edges on a horizon, or it is rejected."""
 

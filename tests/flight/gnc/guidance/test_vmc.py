@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from flight.gnc.errors import PlanningError
+from flight.gnc.guidance.one_axis.path_cost import PathCost
 from flight.gnc.guidance.one_axis.plant import SingleAxisPlant, angle_of, q2_of
 from flight.gnc.guidance.one_axis.vmc import Plan, PlanStatus, plan
 from flight.gnc.guidance.one_axis.vmc_family import Boundary, Family
@@ -168,7 +169,7 @@ def test_the_reference_point_changes_the_parameters_and_not_the_path() -> None:
 def test_gradients_are_exact(horizon: float) -> None:
     """Energy and limits against central differences, by every parameter and by the horizon."""
     family = Family.around(Boundary(0.3, 0.01, -0.2, -0.004), horizon, 2.0, 12)
-    program = Program(THREAD, family, 0.68, horizon)
+    program = Program(THREAD, family, 0.68, horizon, PathCost.HEAT)
     rng = np.random.default_rng(0)
     y = 0.3 * rng.normal(size=program.family.size)
     chosen = np.zeros((2, family.grid.dense.points.size), dtype=bool)

@@ -28,7 +28,7 @@ from flight.gnc.vision.streaks.maximum_likelihood.shaking import Shaking, find_s
 
 # Rounds of conjugate gradients for the covariance.
 _CONJUGATE = 12
-# So few stars hardly contradict each other: their variance counts by this factor.
+# Up to this number, stars hardly contradict each other: their variance counts by the factor.
 _UNCHECKED = (2, 4.0)
 # Fitted and described point spread are the same when their variances differ by this part.
 _SAME_SPREAD = 0.05
@@ -98,7 +98,7 @@ def _with_lens(
     shared = np.zeros((len(trusted), len(equations.kept), seeming.shape[2]))
     shared[:, :3] = seeming
     corrected, before = None, 1.0
-    # What the camera's errors explain of the disagreement is no noise.
+    # The part of the disagreement that the camera's errors explain is not counted as noise.
     for _ in range(2):
         corrected = correct(equations.information, equations.score, shared, before)
         if corrected is None:

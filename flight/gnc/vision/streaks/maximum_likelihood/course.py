@@ -14,7 +14,7 @@ from flight.gnc.math.arrays import FloatArray
 from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion
 
 _DEGREE = 7
-# A course that departs from a constant rate by less px is none; looked at at so many instants.
+# A course within this many px of a constant rate counts as constant; it is sampled at _INSTANTS.
 _UNEVEN = 0.05
 _INSTANTS = 65
 # Its rate must be known to this many px an exposure.

@@ -16,7 +16,7 @@ from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import ExposedFr
 from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion, paths, positions
 from flight.gnc.vision.streaks.maximum_likelihood.scene import path_lengths
 
-# Looked at is a stretch of this part of the path, at least so long, from so far before or beyond the end, px.
+# The stretch judged: part of the path, its least length and its distance from the end, px.
 _STRETCH = 0.1
 _LEAST_STRETCH = 8.0
 _FROM_END = 4.0
@@ -37,7 +37,7 @@ _INSTANTS = 65
 _SLOW = 0.5
 # Light beyond an end is a trail from this part of the streak's mean brightness on.
 _TRAIL = 0.08
-# So much of a streak may be dark for reasons of its own.
+# Part of a streak that may be dark for reasons of its own.
 _DARK = 0.15
 
 

@@ -37,7 +37,7 @@ from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene, mid_exposu
 _FIRST_STARS = 12
 # This many guesses are tried at most.
 _MOST_GUESSES = 5
-# Of them so many of a rate that changes.
+# Of them, for a rate that changes.
 _MOST_GROWING = 2
 _STILL_ROUNDS = 12
 # A guess is made of this many whole streaks, or of a scan; regions longer than it speak against it.

@@ -30,7 +30,7 @@ class MotionResult(FrameMotion):
         misfit: chi-square per degree of freedom, median of the bright stars: 1 where the rate model holds.
         rate_model: which was fitted, `constant` or `accelerating`.
         acceleration: (3,) rad/s^2 if fitted, else None.
-        reason: why there is no rate, in a line; empty when there is one.
+        reason: of a missing rate, in a line; empty with a rate.
         course: the known course that the fit took for the rest of the motion; None without one.
     """
 

@@ -21,7 +21,7 @@ from flight.gnc.vision.streaks.maximum_likelihood.shutter import Shutter
 # Gauss-Legendre nodes of a piece of the path: with one a width of the point spread it is exact to 1e-4.
 _NODE, _WEIGHT = np.polynomial.legendre.leggauss(10)
 _PIECE_WIDTHS = 8.0
-# Light from so many widths beyond a patch still reaches its pixels.
+# Widths beyond a patch from which light still reaches its pixels.
 _BEYOND = 5.5
 # Instants at which a path that is slow in places is looked at to divide it.
 _SAMPLES = 33

@@ -21,7 +21,8 @@ _TRUE_ENDS = (0.75, 0.6)
 _BROKEN = (0.12, 0.35)
 # Share of the light of streaks that lie in the frame from end to end which the motion must have on its side.
 _WHOLE_LIGHT = 0.5
-# Where the rate changes by more than this part of itself, so many stars may have light beyond an end.
+# Where the rate changes by more than the first part of itself, the second part of the stars may have light
+# beyond an end.
 _UNEVEN = 0.4
 _MOST_TRAILING = 0.5
 
