@@ -52,11 +52,12 @@ class Board:
         return float(words[1]) * _PAGE if len(words) > 1 else math.nan
 
     def _proportional(self, process: int) -> float:
-        """Return the proportional set size in bytes; 0 for a process that has just ended."""
+        """Return the proportional set size in bytes; 0 for a process that has ended, waited for or not."""
         for line in _read(self._proc / str(process) / "smaps_rollup").splitlines():
             if line.startswith("Pss:"):
                 return float(line.split()[1]) * 1024.0
-        return math.nan if (self._proc / str(process)).exists() else 0.0
+        state = _read(self._proc / str(process) / "stat").rpartition(")")[2].split()[:1]
+        return 0.0 if state in ([], ["Z"], ["X"]) else math.nan
 
     def _disk_free(self) -> float:
         try:

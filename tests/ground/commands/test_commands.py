@@ -93,13 +93,21 @@ def test_a_device_that_is_not_there_is_one_line_and_exit_status_1(tmp_path: Path
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_a_flight_with_its_log_whole(tmp_path: Path, number: signal.Signals) -> None:
     words = [sys.executable, "-m", "flight", "run", str(DEMO), "--out", str(tmp_path / "run")]
-    flight = subprocess.Popen(words, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    # A SIGHUP that is ignored, as under nohup, stays ignored: the tests themselves may run so.
+    heed = f"import os, signal; signal.signal({int(number)}, signal.SIG_DFL); os.execv({sys.executable!r}, {words!r})"
+    flight = subprocess.Popen(
+        [sys.executable, "-c", heed], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
     log = tmp_path / "run" / "flight-0001.ccsds"
     deadline = time.monotonic() + 60.0
-    while time.monotonic() < deadline and not (log.exists() and log.stat().st_size > 100_000):
-        time.sleep(0.05)
-    os.kill(flight.pid, number)
-    out, err = flight.communicate(timeout=60)
+    try:
+        while time.monotonic() < deadline and not (log.exists() and log.stat().st_size > 100_000):
+            time.sleep(0.05)
+        os.kill(flight.pid, number)
+        out, err = flight.communicate(timeout=60)
+    finally:
+        flight.kill()
+        flight.communicate()
     assert flight.returncode == 0, err
     assert f"stopped by {number.name}" in out
     run = read_run(tmp_path / "run")

@@ -131,9 +131,12 @@ def test_the_board_reads_what_the_kernel_writes_and_nothing_where_it_writes_noth
     (process / "stat").write_text(f"{os.getpid()} (a ) b) S " + " ".join(["0"] * 10) + " 250 50 " + "0 " * 30)
     (process / "statm").write_text("1000 512 100 1 0 200 0")
     (process / "smaps_rollup").write_text("Rss: 9000 kB\nPss:   4096 kB\nPss_Dirty: 1 kB\n")
-    (process / "task" / "1" / "children").write_text("77 ")
+    (process / "task" / "1" / "children").write_text("77 78 ")
     (tmp_path / "proc" / "77").mkdir()
     (tmp_path / "proc" / "77" / "smaps_rollup").write_text("Pss: 1024 kB\n")
+    # A worker that has ended and was not waited for has no memory.
+    (tmp_path / "proc" / "78").mkdir()
+    (tmp_path / "proc" / "78" / "stat").write_text("78 (python) Z " + "0 " * 40)
     zone = tmp_path / "thermal" / "thermal_zone0"
     zone.mkdir(parents=True)
     (zone / "temp").write_text("51500\n")
