@@ -94,9 +94,10 @@ def test_a_device_that_is_not_there_is_one_line_and_exit_status_1(tmp_path: Path
 def test_a_signal_ends_a_flight_with_its_log_whole(tmp_path: Path, number: signal.Signals) -> None:
     words = [sys.executable, "-m", "flight", "run", str(DEMO), "--out", str(tmp_path / "run")]
     # A SIGHUP that is ignored, as under nohup, stays ignored: the tests themselves may run so.
-    heed = f"import os, signal; signal.signal({int(number)}, signal.SIG_DFL); os.execv({sys.executable!r}, {words!r})"
+    heed = f"signal.signal({int(number)}, signal.SIG_DFL)"
+    begin = f"import os, signal; {heed}; os.execv({words[0]!r}, {words!r})"
     flight = subprocess.Popen(
-        [sys.executable, "-c", heed], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-c", begin], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
     log = tmp_path / "run" / "flight-0001.ccsds"
     deadline = time.monotonic() + 60.0
