@@ -23,14 +23,15 @@ from flight.gnc.estimation.replay import Checkpoint, Model
 from flight.gnc.estimation.state import State
 from flight.gnc.math.arrays import FloatArray
 
-_SURPRISE = {1: 5.5, 4: 5.5, 16: 8.0}
+_SURPRISE = {1: 5.5, 4: 5.5, 16: 7.5}
 """By the number of samples in a row, the standard deviations of their mean departure that begin a doubt.
 
 Strong faults show in one sample, weak ones in the mean of many. Healthy flights reach 2.8, 4.0 and 7.0; over
 more samples the model's errors add up.
 """
-_BEFORE_NS = 100_000_000
-"""The currents are unknown from this long before the first sample of the departure."""
+_BEFORE_NS = 500_000_000
+"""The currents are unknown from this long before the first sample of a departure: what a weak fault did to the
+other states before it showed is undone."""
 _MOST = 3.0
 """Of the largest change: a reversed coil departs by two, and a sample's age is uncertain."""
 _SHORTEST_GAP, _LONGEST_GAP = 0.025, 0.25
