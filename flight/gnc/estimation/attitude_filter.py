@@ -17,8 +17,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from flight.gnc.estimation.checkpoints import CheckpointHistory
 from flight.gnc.estimation.command_doubt import CommandDoubt
 from flight.gnc.estimation.commands import CommandHistory
@@ -143,9 +141,8 @@ class AttitudeFilter:
             self.late += 1
             return False
         self._count(type(measurement), used)
-        newest = self._history.newest if self._history else None
-        if newest is not None and newest.measurement is measurement:
-            since_ns = self._doubt.judge(newest)
+        if self._history and self._history.newest.measurement is measurement:
+            since_ns = self._doubt.judge(self._history.newest)
             if since_ns is not None:
                 self.mark_unknown(since_ns)
         if self._branch is None:  # a branch needs its base
@@ -206,14 +203,8 @@ class AttitudeFilter:
         return None if then is None else self._model.estimate(then, time_ns, then.time_ns)
 
     def rates(self, begin_ns: int, end_ns: int) -> tuple[IntArray, FloatArray] | None:
-        """Return the times (n,) ns and rates (n, 3) rad/s of the checkpoints that span an interval.
-
-        None where the history does not reach back to its beginning.
-        """
-        spanning = self._history.spanning(begin_ns, end_ns)
-        if not spanning:
-            return None
-        return np.array([c.time_ns for c in spanning]), np.array([c.state.rate for c in spanning])
+        """Return times (n,) ns and rates (n, 3) rad/s that span an interval; None beyond the history."""
+        return self._history.rates(begin_ns, end_ns)
 
     def _is_newest(self, measurement: Measurement) -> bool:
         return bool(self._history) and measurement.begin_ns >= self._history.newest.time_ns

@@ -6,8 +6,11 @@ import bisect
 from collections.abc import Sequence
 from operator import attrgetter
 
+import numpy as np
+
 from flight.gnc.estimation.measurements import Measurement
 from flight.gnc.estimation.replay import Checkpoint
+from flight.gnc.math.arrays import FloatArray, IntArray
 
 _SPARE_NS = 1_000_000_000
 """Kept beyond the history, so that checkpoints are dropped in batches."""
@@ -42,14 +45,17 @@ class CheckpointHistory:
         index = bisect.bisect_right(self._checkpoints, time_ns, key=_TIME)
         return self._checkpoints[index - 1] if index else None
 
-    def spanning(self, begin_ns: int, end_ns: int) -> list[Checkpoint]:
-        """Return the checkpoints from the last up to `begin_ns` to the first from `end_ns` on, or the newest.
+    def rates(self, begin_ns: int, end_ns: int) -> tuple[IntArray, FloatArray] | None:
+        """Return times (n,) ns and rates (n, 3) rad/s from the last checkpoint up to `begin_ns` on.
 
-        Empty where none is as old as `begin_ns`.
+        They end with the first from `end_ns` on, or the newest. None where no checkpoint is as old as that.
         """
         first = bisect.bisect_right(self._checkpoints, begin_ns, key=_TIME)
         last = bisect.bisect_left(self._checkpoints, end_ns, key=_TIME)
-        return self._checkpoints[first - 1 : last + 1] if first else []
+        spanning = self._checkpoints[first - 1 : last + 1]
+        if not first:
+            return None
+        return np.array([c.time_ns for c in spanning]), np.array([c.state.rate for c in spanning])
 
     def index_before(self, begin_ns: int) -> int:
         """Return how many checkpoints lie up to `begin_ns`, or up to the start of a mean that spans it."""

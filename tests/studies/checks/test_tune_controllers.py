@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from flight.gnc.control.one_axis.pid import PidController, PidGains
+from tests.flight.gnc.control.closed_loop import BELIEVED, PERIOD
 from tests.studies.campaigns import controllers
-from tests.studies.tune_controllers import BELIEVED, OVERSHOOT, PERIOD, SETTLED_S, fly
+from tests.studies.tune_controllers import OVERSHOOT, SETTLED_S, fly
 
 
 def test_the_flown_pid_keeps_the_criterion_with_less_power_than_three_poles() -> None:
