@@ -30,8 +30,10 @@ Strong faults show in one sample, weak ones in the mean of many. Healthy flights
 more samples the model's errors add up.
 """
 _BEFORE_NS = 500_000_000
-"""The currents are unknown from this long before the first sample of a departure: what a weak fault did to the
-other states before it showed is undone."""
+"""The currents are unknown from this long before the first sample of a departure.
+
+What a weak fault did to the other states before it showed is undone.
+"""
 _MOST = 3.0
 """Of the largest change: a reversed coil departs by two, and a sample's age is uncertain."""
 _SHORTEST_GAP, _LONGEST_GAP = 0.025, 0.25
