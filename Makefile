@@ -4,6 +4,8 @@ VENV   ?= .venv
 RUN    := $(VENV)/bin/python
 READY  := $(VENV)/.ready
 TESTS  := $(RUN) -m pytest -n auto
+# The tests start hundreds of processes: without kept bytecode each would compile every module again.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo quick test test-container lint types arrows docs house unit fast slow-list pictures lock clean help
 

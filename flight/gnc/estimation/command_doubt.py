@@ -156,7 +156,7 @@ class CommandDoubt:
         """Return the model's change of the rate, rad/s, by the coils as commanded and by all else."""
         commanded, natural = np.zeros(3), np.zeros(3)
         for torquing, span_ns in self._model.commands.spans(from_ns, to_ns):
-            found = self._model.body.linearise(state.quaternion, state.rate, state.parameters, torquing, 0.0)
+            found = self._model.body.accelerate(state.quaternion, state.rate, state.parameters, torquing)
             by_coils = state.parameters.gain * np.array(found.by_parameters)[:, 2]
             commanded += span_ns * 1e-9 * by_coils
             natural += span_ns * 1e-9 * (np.array(found.acceleration) + state.disturbance - by_coils)

@@ -7,9 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flight.gnc.estimation.estimate import BIAS, DISTURBANCE, FIELD_BIAS, LATENCY
 from flight.gnc.estimation.propagation import LONGEST_STEP, ProcessNoise
 from flight.gnc.estimation.rigid_body import RigidBody
 from flight.gnc.estimation.slow_prior import SlowPrior
+from flight.gnc.estimation.state import SIZE
 from flight.gnc.math import chi_square
 from flight.gnc.math.arrays import FloatArray
 
@@ -71,12 +73,15 @@ def free_axes(body: RigidBody) -> FloatArray:
 def process_noise(body: RigidBody, settings: FilterSettings) -> ProcessNoise:
     """Return the process noise of a body."""
     free = free_axes(body)
+    walks = np.zeros(SIZE)
+    walks[BIAS] = settings.bias_walk**2 * free
+    walks[DISTURBANCE] = settings.disturbance_walk**2 * free
+    walks[LATENCY] = settings.latency_walk**2
+    walks[FIELD_BIAS] = settings.field_bias_walk**2
     return ProcessNoise(
         settings.current_noise**2 * settings.control_period,
         np.diag(settings.rate_walk**2 * free),
-        np.array([*settings.bias_walk**2 * free, *settings.disturbance_walk**2 * free]),
-        settings.latency_walk**2,
-        settings.field_bias_walk**2,
+        walks,
         settings.unknown_current,
     )
 

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flight.gnc.estimation.estimate import DISTURBANCE, LATENCY, PARAMETERS
-from flight.gnc.estimation.rigid_body import Linearised
+from flight.gnc.estimation.rigid_body import Accelerated
 from flight.gnc.estimation.turn import Vector
 from flight.gnc.math.arrays import FloatArray
 
@@ -25,6 +25,7 @@ LONGEST_LATENCY = 0.25
 """s: the largest plausible latency."""
 
 _PUSHES = slice(DISTURBANCE.start, PARAMETERS.stop)
+_BY_PUSHES: FloatArray = np.eye(3, 6)
 
 
 class Motion(NamedTuple):
@@ -37,7 +38,7 @@ class Motion(NamedTuple):
     uncertainty: FloatArray
 
 
-def motion(before: Linearised, after: Linearised, disturbance: Vector, covariance: FloatArray) -> Motion:
+def motion(before: Accelerated, after: Accelerated, disturbance: Vector, covariance: FloatArray) -> Motion:
     """Return how the rate changes with the age, from the model one sigma of the age to either side.
 
     A command that begins or ends between them makes a bend, half of whose difference is treated as noise; so
@@ -47,9 +48,10 @@ def motion(before: Linearised, after: Linearised, disturbance: Vector, covarianc
     x, y, z = (0.5 * (a + b) + d for a, b, d in pairs)
     bend = 0.5 * (np.array(after.acceleration) - before.acceleration)
     by_parameters = 0.5 * (np.array(before.by_parameters) + after.by_parameters)
-    rows = np.hstack([np.eye(3), by_parameters])
+    rows = _BY_PUSHES.copy()
+    rows[:, 3:] = by_parameters
     spread = rows @ covariance[_PUSHES, _PUSHES] @ rows.T
-    return Motion((x, y, z), covariance[LATENCY, LATENCY] * (spread + np.outer(bend, bend)))
+    return Motion((x, y, z), covariance[LATENCY, LATENCY] * (spread + bend[:, np.newaxis] * bend))
 
 
 def aged(more: float, change: Vector, value: Vector, rows: FloatArray) -> tuple[Vector, FloatArray]:

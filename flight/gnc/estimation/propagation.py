@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flight.gnc.estimation.estimate import DISTURBANCE, FIELD_BIAS, LATENCY, PARAMETERS, RATE, TURN
+from flight.gnc.estimation.estimate import DISTURBANCE, PARAMETERS, RATE, TURN
 from flight.gnc.estimation.rigid_body import Linearised, RigidBody, Torquing
 from flight.gnc.estimation.state import SIZE, State
 from flight.gnc.estimation.turn import Vector, compose, exponential
@@ -28,16 +28,13 @@ has zeroed the coils of a loop that stands."""
 class ProcessNoise(NamedTuple):
     """Spectral densities of the process noise, and the largest current of a coil.
 
-    `current` of one driven coil, A^2 s; `rate` (3, 3) rad^2/s^3; `walks` (6,) of bias (rad^2/s^3) and
-    disturbance (rad^2/s^5); `latency` s; `field_bias` T^2/s; `unknown_current` A of each coil while its
-    current is not known.
+    `current` of one driven coil, A^2 s; `rate` (3, 3) rad^2/s^3; `walks` (19,) of the parts of the error, of
+    the square of their unit per s; `unknown_current` A of each coil while its current is not known.
     """
 
     current: float
     rate: FloatArray
     walks: FloatArray
-    latency: float = 0.0
-    field_bias: float = 0.0
     unknown_current: float = 0.0
 
 
@@ -95,12 +92,13 @@ def _step(
 
 def _transition(rate: Vector, model: Linearised, dt: float) -> FloatArray:
     """Return I + F dt + (F dt)^2 / 2 of the error's dynamics: turn' = -w x turn + rate error, and so on."""
-    flow = _FLOW * dt
-    x, y, z = rate[0] * dt, rate[1] * dt, rate[2] * dt
+    x, y, z = rate
+    flow = _FLOW.copy()
     flow[TURN, TURN] = ((0.0, z, -y), (-z, 0.0, x), (y, -x, 0.0))
-    flow[RATE, TURN] = model.by_turn * dt
-    flow[RATE, RATE] = model.by_rate * dt
-    flow[RATE, PARAMETERS] = np.array(model.by_parameters) * dt
+    flow[RATE, TURN] = model.by_turn
+    flow[RATE, RATE] = model.by_rate
+    flow[RATE, PARAMETERS] = model.by_parameters
+    flow *= dt
     return np.asarray(_IDENTITY + flow + 0.5 * (flow @ flow))
 
 
@@ -113,19 +111,14 @@ def _add_noise(
         density = density + noise.current * ((by_current * torquing.driven) @ by_current.T)
     if not torquing.known:
         density = density + noise.unknown_current**2 * _UNKNOWN_FOR * (by_current @ by_current.T)
-    cross = (0.5 * dt * dt) * density
-    covariance[TURN, TURN] += (dt**3 / 3.0) * density
-    covariance[TURN, RATE] += cross
-    covariance[RATE, TURN] += cross
-    covariance[RATE, RATE] += dt * density
-    stride = len(covariance) + 1
-    covariance.reshape(-1)[6 * stride : 12 * stride : stride] += dt * noise.walks
-    covariance[LATENCY, LATENCY] += dt * noise.latency
-    if noise.field_bias:
-        covariance[FIELD_BIAS, FIELD_BIAS] += dt * noise.field_bias * _IDENTITY[FIELD_BIAS, FIELD_BIAS]
+    turn, cross = dt**3 / 3.0, 0.5 * dt * dt
+    over = np.array((turn, cross, cross, dt)).reshape(2, 1, 2, 1)
+    covariance[_MOTION, _MOTION] += (over * density[:, np.newaxis]).reshape(6, 6)
+    covariance.reshape(-1)[: SIZE * len(covariance) : len(covariance) + 1] += dt * noise.walks
 
 
 _IDENTITY: FloatArray = np.eye(SIZE)
+_MOTION = slice(TURN.start, RATE.stop)
 _FLOW: FloatArray = np.zeros((SIZE, SIZE))
 _FLOW[TURN, RATE] = np.eye(3)
 _FLOW[RATE, DISTURBANCE] = np.eye(3)

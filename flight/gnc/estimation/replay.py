@@ -87,12 +87,11 @@ class Model:
     def motion(self, state: State, covariance: FloatArray, time_ns: int) -> Motion:
         """Return how the rate changes around the time of a sample whose age is estimated."""
         half_ns = round(0.5e9 * math.sqrt(covariance[LATENCY, LATENCY]))
-        before, after = (
-            self.body.linearise(
-                state.quaternion, state.rate, state.parameters, self.commands.at(time_ns + shift), 0.0
-            )
-            for shift in (-half_ns, half_ns)
-        )
+        first, last = self.commands.at(time_ns - half_ns), self.commands.at(time_ns + half_ns)
+        before = self.body.accelerate(state.quaternion, state.rate, state.parameters, first)
+        after = before
+        if last is not first:
+            after = self.body.accelerate(state.quaternion, state.rate, state.parameters, last)
         return motion(before, after, state.disturbance, covariance)
 
 

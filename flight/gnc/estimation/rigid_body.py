@@ -39,15 +39,22 @@ NOMINAL = Parameters()
 
 @dataclass(frozen=True, slots=True)
 class Torquing:
-    """The action of the coils: dipole moment (body, A m^2) in a field (reference, T); which are driven.
+    """The action of the coils: dipole moment (body, A m^2) in a field (reference, T); 1 for each driven coil.
 
     Not `known` while the PWM chip does not respond to commands: any coil may then be driven.
     """
 
     dipole: Vector
     field: Vector
-    driven: tuple[bool, bool, bool]
+    driven: Vector
     known: bool = True
+
+
+class Accelerated(NamedTuple):
+    """Angular acceleration w' (rad/s^2), and its derivatives (3, 3) by torsion, damping and gain."""
+
+    acceleration: Vector
+    by_parameters: Matrix
 
 
 class Linearised(NamedTuple):
@@ -59,7 +66,7 @@ class Linearised(NamedTuple):
     """
 
     acceleration: Vector
-    by_parameters: tuple[Vector, Vector, Vector]
+    by_parameters: Matrix
     by_turn: FloatArray
     by_rate: FloatArray
     by_current: FloatArray
@@ -117,12 +124,18 @@ class RigidBody:
         x, y, z = (float(i) for i in currents)
         bx, by, bz = (float(b) for b in (self.field if reference_field is None else reference_field))
         n = self.dipole_per_ampere
-        return Torquing((n * x, n * y, n * z), (bx, by, bz), (x != 0.0, y != 0.0, z != 0.0), known)
+        return Torquing((n * x, n * y, n * z), (bx, by, bz), (float(x != 0.0), float(y != 0.0), float(z != 0.0)), known)
 
     @property
     def parameters(self) -> Parameters:
         """The nominal parameters."""
         return Parameters(self.stiffness * self._response[1][1], self.damping * self._response[1][1])
+
+    def accelerate(
+        self, q: Quaternion, rate: Vector, parameters: Parameters, torquing: Torquing
+    ) -> Accelerated:
+        """Return the acceleration under `torquing` at attitude q."""
+        return self._accelerate(q, rate, parameters, torquing, times(matrix(q), torquing.field))
 
     def linearise(
         self, q: Quaternion, rate: Vector, parameters: Parameters, torquing: Torquing, ahead: float
@@ -132,28 +145,29 @@ class RigidBody:
         The gyroscopic torque is taken at the rate `ahead` s later, which makes it second order for a body
         that tumbles.
         """
-        torque_free = times(self._response, self._gyroscopic(rate))
-        rate = (
-            rate[0] + ahead * torque_free[0],
-            rate[1] + ahead * torque_free[1],
-            rate[2] + ahead * torque_free[2],
-        )
+        x, y, z = times(self._response, self._gyroscopic(rate))
+        rate = (rate[0] + ahead * x, rate[1] + ahead * y, rate[2] + ahead * z)
+        field_body = times(matrix(q), torquing.field)
+        acceleration, by_parameters = self._accelerate(q, rate, parameters, torquing, field_body)
+        derivatives = np.array([*_by_turn(torquing.dipole, field_body), *self._by_rate(rate), *skew(field_body)])
+        by_turn, by_rate, by_field = self.response @ derivatives.reshape(3, 3, 3)
         torsion, damping, gain = parameters
-        dipole, field_body = torquing.dipole, times(matrix(q), torquing.field)
-        cx, cy, cz = times(self._response, cross(dipole, field_body))
-        fx, fy, fz = times(self._response, self._gyroscopic(rate))
-        angle = twist(q) if self.suspended else 0.0
-        thread = -torsion * angle - damping * rate[1]
-        acceleration = (gain * cx + fx, gain * cy + fy + thread, gain * cz + fz)
-        by_turn, by_rate, by_field = self.response @ np.array(
-            [*_by_turn(dipole, field_body), *self._by_rate(rate), *skew(field_body)]
-        ).reshape(3, 3, 3)
         by_turn *= gain
         by_turn[1, 1] -= torsion
         by_rate[1, 1] -= damping
         by_current = -gain * self.dipole_per_ampere * by_field
-        by_parameters = ((0.0, 0.0, cx), (-angle, -rate[1], cy), (0.0, 0.0, cz))
         return Linearised(acceleration, by_parameters, by_turn, by_rate, by_current)
+
+    def _accelerate(
+        self, q: Quaternion, rate: Vector, parameters: Parameters, torquing: Torquing, field_body: Vector
+    ) -> Accelerated:
+        torsion, damping, gain = parameters
+        cx, cy, cz = times(self._response, cross(torquing.dipole, field_body))
+        fx, fy, fz = times(self._response, self._gyroscopic(rate))
+        angle = twist(q) if self.suspended else 0.0
+        thread = -torsion * angle - damping * rate[1]
+        acceleration = (gain * cx + fx, gain * cy + fy + thread, gain * cz + fz)
+        return Accelerated(acceleration, ((0.0, 0.0, cx), (-angle, -rate[1], cy), (0.0, 0.0, cz)))
 
     def _gyroscopic(self, rate: Vector) -> Vector:
         return cross(times(self._inertia, rate), rate)

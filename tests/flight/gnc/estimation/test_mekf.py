@@ -19,7 +19,7 @@ from flight.gnc.estimation.turn import compose, exponential, inverse, logarithm
 from flight.gnc.math.arrays import FloatArray
 from tests.flight.gnc.estimation.flights import FREE, RATE_COVARIANCE, SUSPENDED, TURN_COVARIANCE
 
-STILL = ProcessNoise(0.0, np.zeros((3, 3)), np.zeros(6))
+STILL = ProcessNoise(0.0, np.zeros((3, 3)), np.zeros(SIZE))
 STATE = State(
     exponential(0.3, -0.5, 0.8), (0.2, -0.3, 0.1), (1e-3, 0.0, -2e-3), (0.01, 0.02, -0.03), Parameters()
 )
@@ -28,6 +28,11 @@ HUNG = State(
     exponential(0.0, 0.4, 0.0), (0.0, -0.3, 0.0), (0.0, 1e-3, 0.0), (0.0, 0.02, 0.0), Parameters(0.01, 2e-3)
 )
 ABOUT_THREAD = [1, 4, 7, 10, 12, 13, 14]
+
+
+def walks_of(bias: float, disturbance: float) -> FloatArray:
+    """Return the densities (19,) of the random walks."""
+    return np.repeat([0.0, bias, disturbance, 0.0], [6, 3, 3, SIZE - 12])
 
 
 def moved(state: State, error: FloatArray) -> State:
@@ -74,7 +79,7 @@ def test_the_process_noise_is_what_random_currents_and_walks_make() -> None:
     rng = np.random.default_rng(3)
     draws, cycles, dt = 4000, 20, 0.025
     sigma, walk, bias_walk = 2e-3, 5e-4, 1e-5
-    noise = ProcessNoise(sigma**2 * dt, np.zeros((3, 3)), np.repeat([bias_walk**2, walk**2], 3))
+    noise = ProcessNoise(sigma**2 * dt, np.zeros((3, 3)), walks_of(bias_walk**2, walk**2))
     still = State((0.0, 0.0, 0.0, 1.0), (0.0,) * 3, (0.0,) * 3, (0.0,) * 3, Parameters())
     torquing = FREE.torquing(np.full(3, 1e-9))
     _, covariance = propagate(FREE, noise, still, np.zeros((SIZE, SIZE)), torquing, cycles * dt)
@@ -142,7 +147,7 @@ def test_correcting_by_an_exact_attitude_gives_that_attitude() -> None:
 def test_the_covariance_stays_symmetric_and_positive(seed: int) -> None:
     """Exact and hopeless measurements in any order, from one rad to a microradian."""
     rng = np.random.default_rng(seed)
-    noise = ProcessNoise(1e-7, np.zeros((3, 3)), np.full(6, 1e-9))
+    noise = ProcessNoise(1e-7, np.zeros((3, 3)), walks_of(1e-9, 1e-9))
     state, covariance = STATE, np.diag(10.0 ** rng.uniform(-8.0, 0.0, SIZE))
     for _ in range(20):
         size = 10.0 ** rng.uniform(-12.0, 0.0)
