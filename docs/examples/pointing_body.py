@@ -42,6 +42,7 @@ from flight.loop.executive.rate_group import Cycle
 from flight.loop.services import Services
 from flight.loop.state.content import Learned
 from flight.schema.sections import Config
+from flight.schema.testbed import TestbedConfig, as_testbed
 from hal.interfaces.readings import ImuReading
 
 DUE_NS = 60_000_000_000
@@ -89,7 +90,7 @@ def error_of(estimate: Estimate, wanted: FloatArray) -> FloatArray:
 class CrossProductTracker:
     """Implements `Tracker`: quaternion feedback, limited so that the dipole keeps its direction."""
 
-    def __init__(self, config: Config, reference_field: FloatArray) -> None:
+    def __init__(self, config: TestbedConfig, reference_field: FloatArray) -> None:
         plant, bandwidth = plant_of(config), config.control.bandwidth
         self._stiffness = plant.inertia * bandwidth**2
         self._damping = 2.0 * 0.9 * plant.inertia * bandwidth
@@ -184,7 +185,7 @@ class Direct:
 class Attitudes:
     """Implements `Targets`: the configured steps as attitudes about the thread."""
 
-    def __init__(self, config: Config, direct: Direct) -> None:
+    def __init__(self, config: TestbedConfig, direct: Direct) -> None:
         self._times = [round(step.at * 1e9) for step in config.steps]
         self._steps = [Target(index, _about_thread(step.q2)) for index, step in enumerate(config.steps)]
         self._direct = direct
@@ -264,6 +265,7 @@ class View:
 # --8<-- [start:make]
 def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> Body:
     """Return the body of a configuration, with what an earlier boot learned."""
+    config = as_testbed(config)
     plant = plant_of(config)
     filter_, problems = attitude_filter(config, plant, learned)
     tracker = CrossProductTracker(config, surrounding_field(config))

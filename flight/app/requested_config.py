@@ -27,6 +27,5 @@ def requested_config(request: RunRequest) -> tuple[str, Config]:
     if request.duration is not None:
         if not (np.isfinite(request.duration) and request.duration > 0.0):
             raise UsageError(f"--duration {request.duration}: must be a positive number of seconds")
-        steps = tuple(step for step in config.steps if step.at < request.duration)
-        config = configuration.replace(config, duration=request.duration, steps=steps)
+        config = config.shortened(request.duration)
     return text, config

@@ -168,7 +168,7 @@ class FlightLoop:
         camera = config.camera
         periods = Periods(
             round(SECOND_NS / config.executive.control_rate_hz),
-            round(config.guidance.replan_period * SECOND_NS),
+            round(config.replan_period() * SECOND_NS),
             round(camera.period * SECOND_NS) if camera is not None else None,
         )
         return rate_groups(

@@ -9,6 +9,7 @@ from flight.schema.devices import Camera
 from flight.schema.document import Document
 from flight.schema.peers import peer_networks
 from flight.schema.sections import Commands, Config
+from flight.schema.testbed import TestbedConfig
 from flight.schema.values import Quaternion
 
 Refuse = Callable[[str, str], None]
@@ -33,7 +34,8 @@ def check_consistency(config: Config, document: Document) -> None:
     def refuse(dotted: str, problem: str) -> None:
         raise document.error(dotted, problem)
 
-    _check_steps(config, refuse)
+    if isinstance(config, TestbedConfig):
+        _check_testbed(config, refuse)
     _check_commands(config.commands, refuse)
     _check_coils(config, refuse)
     _check_times(config, refuse)
@@ -46,7 +48,9 @@ def check_consistency(config: Config, document: Document) -> None:
     _check_length("inertial_unit.mounting", config.inertial_unit.mounting, refuse)
 
 
-def _check_steps(config: Config, refuse: Refuse) -> None:
+def _check_testbed(config: TestbedConfig, refuse: Refuse) -> None:
+    if config.guidance.replan_period >= config.guidance.horizon:
+        refuse("guidance.replan_period", "must be shorter than `guidance.horizon`")
     times = [step.at for step in config.steps]
     if times[0] != 0.0:
         refuse("steps[0].at", f"is {times[0]!r}: the first target must be given at 0")
@@ -76,8 +80,6 @@ def _check_times(config: Config, refuse: Refuse) -> None:
     if unit.max_age < least:
         problem = f"is {unit.max_age!r}: at the rates of unit and control it must be {least:g} s at least"
         refuse("inertial_unit.max_age", problem)
-    if config.guidance.replan_period >= config.guidance.horizon:
-        refuse("guidance.replan_period", "must be shorter than `guidance.horizon`")
 
 
 def _check_length(dotted: str, quaternion: Quaternion, refuse: Refuse) -> None:

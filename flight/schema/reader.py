@@ -17,9 +17,13 @@ from flight.schema.devices import Camera
 from flight.schema.document import read_document, read_text
 from flight.schema.errors import ConfigError
 from flight.schema.sections import Config
+from flight.schema.testbed import TestbedConfig
 
 T = TypeVar("T")
 S = TypeVar("S", bound=msgspec.Struct)
+
+_SHAPES: dict[str, type[Config]] = {}
+"""The shape of a body's configuration; a body that is not here has the testbed's."""
 
 
 def load(path: Path) -> Config:
@@ -33,7 +37,8 @@ def parse(text: str, name: str = "configuration") -> Config:
     for optional in ("camera", "power_monitor"):
         if document.values.get(optional) == "none":
             document.values[optional] = None
-    config = convert(document, Config)
+    shape = _SHAPES.get(str(document.values.get("body")), TestbedConfig)
+    config = convert(document, shape)
     check_consistency(config, document)
     return config
 

@@ -1,4 +1,4 @@
-"""The shape of a flight configuration: every section, every value, its unit and its bounds.
+"""The shape of a flight configuration: the sections of every body, each value with unit and bounds.
 
 A configuration says what the flight application believes and how its devices are wired. What the simulated
 world really does stands in its `simulation` section, whose shape is sim_hal's own (`sim_hal.settings`).
@@ -7,23 +7,13 @@ SI units unless the name says otherwise.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Self
 
+import msgspec
 from msgspec import Meta
 
 from flight.schema.devices import Camera, Coils, InertialUnit, PowerMonitor
 from flight.schema.values import Q2, NotNegative, Peer, PlainMode, Positive, Section
-
-
-class Plant(Section, frozen=True, kw_only=True):
-    """What the flight application believes about the body and its actuator (Sease Table 5.1, 5.3, 5.4)."""
-
-    inertia: Annotated[float, Meta(gt=0.0, le=1e3)]
-    coil_turns: Annotated[int, Meta(gt=0, le=100_000)]
-    coil_area: Annotated[float, Meta(gt=0.0, le=100.0)]
-    field: Annotated[float, Meta(gt=0.0, le=1.0)]
-    thread_stiffness: NotNegative = 0.0
-    thread_damping: NotNegative = 0.0
 
 
 class Executive(Section, frozen=True, kw_only=True):
@@ -57,73 +47,6 @@ class Estimation(Section, frozen=True, kw_only=True):
     history: Positive = 6.0
     coast: Positive = 1.2
     changed: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.3
-
-
-class Guidance(Section, frozen=True, kw_only=True):
-    """Virtual motion camouflage (Sease 5.8-5.15); `bodies.testbed.planning` explains the strategies.
-
-    `cost` is the energy that paths save: the coil's heat R I^2, or V |I| taken from the supply.
-    """
-
-    strategy: Literal["goal", "receding", "step"] = "goal"
-    horizon: Positive = 10.0
-    cost: Literal["heat", "supply"] = "heat"
-    time_price: Positive | None = None
-    current_share: Annotated[float, Meta(ge=0.5, le=1.0)] = 0.95
-    replan_period: Positive = 5.0
-    late_after: Positive = 1.0
-    max_horizon: Positive = 60.0
-    nodes: Annotated[int, Meta(ge=8, le=40)] | None = None
-
-
-class PidGains(Section, frozen=True, kw_only=True):
-    """Free gains of the PID controller on angle (1/s^2), its integral (1/s^3) and the rate (1/s)."""
-
-    proportional: Positive
-    integral: Positive
-    derivative: Positive
-
-
-class Control(Section, frozen=True, kw_only=True):
-    """The controller.
-
-    `lq` and `thesis` take the weights of Sease 5.30-5.32, Q = state_weight I and R = control_weight; `pid`
-    and `adaptive` the bandwidth and what follows it; `gains` replace the bandwidth of `pid`. `excitation` is
-    flown by `python -m flight identify`.
-    """
-
-    tracker: Literal["lq", "thesis", "pid", "adaptive", "excitation"] = "lq"
-    state_weight: Positive = 2.0
-    control_weight: Positive = 1.0
-    bandwidth: Positive = 1.0
-    gains: PidGains | None = None
-    target_weight: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
-    adaptation: Positive = 1.0
-    reference_bandwidth: Positive | None = None
-
-
-class Identification(Section, frozen=True, kw_only=True):
-    """How `python -m flight identify` moves the body, and how well the plant is known beforehand.
-
-    `*_error` are relative standard deviations of what stands in `plant`: the inertia, the coils' dipole per
-    ampere (turns, area and what the resistance makes of it), the field; and of the magnetometer's scale.
-    """
-
-    current_share: Annotated[float, Meta(gt=0.0, le=0.9)] = 0.6
-    largest_q2: Annotated[float, Meta(ge=0.05, le=0.5)] = 0.4
-    swing: Positive = 45.0
-    inertia_error: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.1
-    dipole_error: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.05
-    field_error: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.1
-    magnetometer_error: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.02
-
-
-class Step(Section, frozen=True, kw_only=True):
-    """One commanded attitude: from `at` seconds of mission time reach q2 at `rate` rad/s; zero holds it."""
-
-    at: NotNegative
-    q2: Q2
-    rate: Annotated[float, Meta(ge=-0.1, le=0.1)] = 0.0
 
 
 class Modes(Section, frozen=True, kw_only=True):
@@ -231,26 +154,40 @@ class State(Section, frozen=True, kw_only=True):
 
 
 class Config(Section, frozen=True, kw_only=True):
-    """A whole configuration; `body` is the one that is flown, or a third party's as `module:object`."""
+    """The sections of every body's configuration; each body has a shape of its own with more of them.
+
+    `body` is the body that is flown, or a third party's as `module:object`.
+    """
 
     name: Annotated[str, Meta(min_length=1, max_length=64)]
     body: Annotated[str, Meta(min_length=1, max_length=200)] = "testbed"
-    plant: Plant
     inertial_unit: InertialUnit
     coils: Coils
     power_monitor: PowerMonitor | None = None
     camera: Camera | None
     executive: Executive = Executive()
     estimation: Estimation = Estimation()
-    guidance: Guidance = Guidance()
-    control: Control = Control()
-    identification: Identification = Identification()
     modes: Modes = Modes()
     detumble: Detumble = Detumble()
     health: Health = Health()
     commands: Commands = Commands()
-    steps: Annotated[tuple[Step, ...], Meta(min_length=1)]
     duration: Positive
     telemetry: Telemetry = Telemetry()
     state: State = State()
     simulation: dict[str, Any] | None = None
+
+    def field_range(self) -> tuple[float, float]:
+        """Return the smallest and the largest strength of a valid magnetometer reading, T."""
+        raise NotImplementedError
+
+    def replan_period(self) -> float:
+        """Return how often a path is planned from the newest estimate, s."""
+        raise NotImplementedError
+
+    def hardware(self) -> tuple[Section, ...]:
+        """Return the sections of body and devices for which learned parameters hold."""
+        return (self.coils, self.inertial_unit)
+
+    def shortened(self, duration: float) -> Self:
+        """Return the configuration of a flight of `duration` s."""
+        return msgspec.structs.replace(self, duration=duration)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from flight.schema.sections import Plant
+from flight.schema.testbed import Plant
 from ground.identification.scale import AbsolutePlant, Known
 
 

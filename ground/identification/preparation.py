@@ -6,7 +6,7 @@ import msgspec
 
 from flight.schema import reader as configuration
 from flight.schema.document import to_yaml
-from flight.schema.sections import Config, Step
+from flight.schema.testbed import Step, TestbedConfig
 from ground.identification.constants import Constants, Noise
 from ground.identification.scale import Belief, Beliefs
 
@@ -14,7 +14,7 @@ DURATION = 200.0
 """s: each manoeuvre once with either sign, and the time in between."""
 
 
-def excitation_config(config: Config, duration: float) -> Config:
+def excitation_config(config: TestbedConfig, duration: float) -> TestbedConfig:
     """Return `config` with `duration` s of the excitation in place of its steps, without camera or paths."""
     return configuration.replace(
         config,
@@ -27,12 +27,12 @@ def excitation_config(config: Config, duration: float) -> Config:
     )
 
 
-def config_text(config: Config) -> str:
+def config_text(config: TestbedConfig) -> str:
     """Return a configuration as text that `flight.schema.reader` reads back as the same."""
     return to_yaml(msgspec.to_builtins(config))
 
 
-def beliefs_of(config: Config) -> Beliefs:
+def beliefs_of(config: TestbedConfig) -> Beliefs:
     """Return what a configuration believes of the scale, and how firmly."""
     plant, known = config.plant, config.identification
     return Beliefs(
@@ -43,14 +43,14 @@ def beliefs_of(config: Config) -> Beliefs:
     )
 
 
-def believed_constants(config: Config) -> Constants:
+def believed_constants(config: TestbedConfig) -> Constants:
     """Return the constants per inertia that a configuration believes in."""
     plant = config.plant
     gain = plant.coil_turns * plant.coil_area * plant.field / plant.inertia
     return Constants(gain, plant.thread_stiffness / plant.inertia, plant.thread_damping / plant.inertia)
 
 
-def noise_of(config: Config) -> Noise:
+def noise_of(config: TestbedConfig) -> Noise:
     """Return the noise that a configuration believes in, where a fit begins."""
     unit = config.inertial_unit
     return Noise(max(config.estimation.current_noise, 1e-4), unit.angle_noise, unit.rate_noise)

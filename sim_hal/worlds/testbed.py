@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flight.gnc.math.arrays import FloatArray
+from flight.schema.testbed import as_testbed
 from sim_hal.worlds.motion import Motion, about_thread
 from sim_hal.worlds.world import WorldInputs, WorldTruth
 
@@ -127,7 +128,7 @@ class Testbed:
 
 def make(inputs: WorldInputs) -> Testbed:
     """Return the testbed of a configuration; values of its `simulation` section take precedence."""
-    config, section = inputs.config, inputs.section
+    config, section = as_testbed(inputs.config), inputs.section
     plant, truth = config.plant, section.truth
     model = TestbedModel(
         inertia=truth.inertia or plant.inertia,

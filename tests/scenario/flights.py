@@ -15,6 +15,7 @@ from flight.loop.flight_loop import FlightLoop
 from flight.loop.run_label import RunLabel
 from flight.schema import reader as configuration
 from flight.schema.sections import Config
+from flight.schema.testbed import TestbedConfig, as_testbed
 from hal.interfaces.rig import Rig
 from hal.interfaces.wires import SECOND_NS
 from sim_hal import lockstep
@@ -46,9 +47,9 @@ class Rigged:
         self.lock.hardware.faults.at(self.epoch_ns + round(seconds * SECOND_NS), action)
 
 
-def demo_config(duration: float, camera: bool = True) -> Config:
+def demo_config(duration: float, camera: bool = True) -> TestbedConfig:
     """Return the step demonstration, cut to `duration` s."""
-    config = configuration.parse(TEXT)
+    config = as_testbed(configuration.parse(TEXT))
     steps = tuple(step for step in config.steps if step.at < duration)
     changed = configuration.replace(config, duration=duration, steps=steps)
     return changed if camera else configuration.replace(changed, camera=None)
@@ -61,7 +62,7 @@ def demo_world() -> Simulation:
     return section
 
 
-def thesis_config(duration: float) -> Config:
+def thesis_config(duration: float) -> TestbedConfig:
     """Return the demonstration as the thesis flies it: receding horizon, its tracker; no camera."""
     config = demo_config(duration, camera=False)
     guidance = configuration.replace(config.guidance, strategy="receding", current_share=1.0)

@@ -11,7 +11,8 @@ from flight.link.modes import Mode
 from flight.link.telemetry.packets import to_text
 from flight.link.telemetry.reader import Run
 from flight.schema import reader as configuration
-from flight.schema.sections import Commands, CommandStep, Config
+from flight.schema.sections import Commands, CommandStep
+from flight.schema.testbed import TestbedConfig
 from sim_hal.settings import Release, Simulation
 from tests.scenario.flights import demo_config, demo_world
 
@@ -20,7 +21,9 @@ BRIEF = {"arrived_for": 0.3, "boot_patience": 1.0, "hold_patience": 2.0, "blind_
 """Modes' settings with little patience, s."""
 
 
-def commanded(duration: float, *steps: dict[str, Any], initial: str = "testbed-demo", **modes: Any) -> Config:
+def commanded(
+    duration: float, *steps: dict[str, Any], initial: str = "testbed-demo", **modes: Any
+) -> TestbedConfig:
     """Return the demonstration without a camera, with a time line of commands, and little patience."""
     config = demo_config(duration, camera=False)
     timeline = tuple(CommandStep(**step) for step in steps)

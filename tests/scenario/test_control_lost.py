@@ -17,7 +17,7 @@ import pytest
 from flight.gnc.math.quaternion import from_rotation_vector, multiply
 from flight.link.telemetry.reader import Run
 from flight.schema import reader as configuration
-from flight.schema.sections import Config, Step
+from flight.schema.testbed import Step, TestbedConfig
 from ground import report
 from sim_hal.emulators.serial_line import SOUND, LineFaults
 from sim_hal.emulators.vn100_sensors import Measured
@@ -69,7 +69,7 @@ LOSSES: dict[str, tuple[Break, Break]] = {
 """What begins, and what ends it."""
 
 
-def slewing(duration: float) -> Config:
+def slewing(duration: float) -> TestbedConfig:
     return commanded(duration, {"at": 1.0, "slew": -0.3}, initial="hold")
 
 
@@ -86,7 +86,7 @@ def slewing(duration: float) -> Config:
     ids=["demonstration", "thesis", "hold", "slew", "detumble"],
 )
 def test_whatever_takes_the_readings_away_no_coil_carries_current_a_tenth_of_a_second_later(
-    tmp_path: Path, configured: Callable[[float], Config], rate: float, losses: tuple[str, ...]
+    tmp_path: Path, configured: Callable[[float], TestbedConfig], rate: float, losses: tuple[str, ...]
 ) -> None:
     # Just after a reading, and just after the windows of detumble began to brake: what lasts longest.
     begins = {name: 3.126 + 1.5 * place for place, name in enumerate(losses)}

@@ -14,7 +14,7 @@ from flight.link.telemetry.packets import to_text
 from flight.loop.state.keeper import Notices, StateKeeper
 from flight.loop.state.store import StateStore
 from flight.schema import reader as configuration
-from flight.schema.sections import Step
+from flight.schema.testbed import Step
 from sim_hal.clock import SimClock
 from sim_hal.emulators.serial_line import SOUND, LineFaults
 from tests.scenario.flights import Rigged, demo_config, event_names, fly

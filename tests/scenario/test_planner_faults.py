@@ -19,7 +19,7 @@ from flight.gnc.guidance.one_axis.vmc import Plan
 from flight.gnc.guidance.one_axis.vmc import plan as make_plan
 from flight.link.telemetry.packets import to_text
 from flight.schema import reader as configuration
-from flight.schema.sections import Config, Step
+from flight.schema.testbed import Step, TestbedConfig
 from tests.scenario.flights import demo_config, event_names, fly, thesis_config
 
 DURATION = 24.0
@@ -116,7 +116,7 @@ def test_a_new_target_without_a_plan_for_it_is_reported_while_the_old_attitude_i
 
 @pytest.mark.parametrize("configured", [thesis_config, partial(demo_config, camera=False)])
 def test_with_a_good_planner_none_of_these_alarms_rings(
-    tmp_path: Path, configured: Callable[[float], Config]
+    tmp_path: Path, configured: Callable[[float], TestbedConfig]
 ) -> None:
     run = fly(configured(DURATION), tmp_path)
     assert event_names(run) == ["started", "target", "stopped"]

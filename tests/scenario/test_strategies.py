@@ -12,11 +12,11 @@ from flight.gnc.guidance.one_axis.plant import angle_of
 from flight.gnc.math.arrays import FloatArray
 from flight.link.telemetry.reader import Run
 from flight.schema import reader as configuration
-from flight.schema.sections import Config, Step
+from flight.schema.testbed import Step, TestbedConfig
 from tests.scenario.flights import Rigged, demo_config, event_names, fly, thesis_config
 
 
-def configured(duration: float, steps: tuple[Step, ...], **guidance: Any) -> Config:
+def configured(duration: float, steps: tuple[Step, ...], **guidance: Any) -> TestbedConfig:
     """Return the demonstration with other steps and other guidance, without a camera."""
     config = configuration.replace(demo_config(duration, camera=False), steps=steps)
     return configuration.replace(config, guidance=configuration.replace(config.guidance, **guidance))

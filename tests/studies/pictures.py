@@ -33,6 +33,7 @@ from flight.gnc.vision.streaks.streak_result import StreakStatus
 from flight.link.telemetry.reader import read_run
 from flight.schema import reader as configuration
 from flight.schema.camera_model import camera_model
+from flight.schema.testbed import as_testbed
 from ground.pictures.horizon import draw_horizon
 from ground.pictures.sky_picture import draw_solution
 from ground.report import draw, draw_path
@@ -64,7 +65,7 @@ def main() -> int:
         drawn = {path.name: path for path in draw(read_run(run_folder), Path(place) / "figures")}
         for name in ("overview.png", "paths.png"):
             (folder / name).write_bytes(drawn[name].read_bytes())
-    config = configuration.load(CONFIG)
+    config = as_testbed(configuration.load(CONFIG))
     plant = plant_of(config)
     draw_path(plan(plant, 0.4, 0.015, -0.3, 0.0, 10.0), plant, folder / "path.png")
     _draw_frame(folder / "frame.png")

@@ -34,6 +34,7 @@ from flight.loop.services import Services
 from flight.loop.state.content import Learned
 from flight.loop.state.learning import start_from
 from flight.schema.sections import Config
+from flight.schema.testbed import TestbedConfig, as_testbed
 from hal.interfaces.wires import SECOND_NS
 
 _THREAD_AXIS = np.array([0.0, 1.0, 0.0])
@@ -41,6 +42,7 @@ _THREAD_AXIS = np.array([0.0, 1.0, 0.0])
 
 def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> Body:
     """Return the testbed of a configuration, with the parameters that an earlier boot learned."""
+    config = as_testbed(config)
     plant = plant_of(config)
     filter_, problems = attitude_filter(config, plant, learned)
     reader = ThreadReader(Parameters(plant.stiffness / plant.inertia, plant.damping / plant.inertia))
@@ -78,18 +80,18 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
 TESTBED = BodyKind(plan_job.run, make)
 
 
-def surrounding_field(config: Config) -> FloatArray:
+def surrounding_field(config: TestbedConfig) -> FloatArray:
     """Return the surrounding field (3,) T, reference axes."""
     return np.array([0.0, 0.0, -config.plant.field])
 
 
-def dipole_per_ampere(config: Config) -> float:
+def dipole_per_ampere(config: TestbedConfig) -> float:
     """Return n A of each coil, m^2."""
     return config.plant.coil_turns * config.plant.coil_area
 
 
 def attitude_filter(
-    config: Config, plant: SingleAxisPlant, learned: Mapping[str, Learned]
+    config: TestbedConfig, plant: SingleAxisPlant, learned: Mapping[str, Learned]
 ) -> tuple[AttitudeFilter, list[str]]:
     """Return the filter of a body on the thread, and why `learned` parameters were rejected."""
     section = config.estimation
@@ -119,7 +121,7 @@ def attitude_filter(
     return AttitudeFilter(body, settings, prior), problems
 
 
-def detumbler(config: Config, plant: SingleAxisPlant) -> Detumbler:
+def detumbler(config: TestbedConfig, plant: SingleAxisPlant) -> Detumbler:
     """Return the law and the windows of detumbling."""
     section = config.detumble
     settle_ns, measure_ns, act_ns = (
@@ -131,7 +133,7 @@ def detumbler(config: Config, plant: SingleAxisPlant) -> Detumbler:
     return Detumbler(schedule, Braking(plant.inertia, dipole_per_ampere(config), plant.current_limit, share))
 
 
-def coil_watch(config: Config, plant: SingleAxisPlant) -> CoilWatch:
+def coil_watch(config: TestbedConfig, plant: SingleAxisPlant) -> CoilWatch:
     """Return the watch over the coils' circuit."""
     x, y, z = (config.coils.supply_voltage / resistance for resistance in config.coils.resistance)
     response = ResponseSettings(
@@ -143,7 +145,7 @@ def coil_watch(config: Config, plant: SingleAxisPlant) -> CoilWatch:
     return CoilWatch(CoilWatchSettings((x, y, z), response=response))
 
 
-def planning_settings(config: Config) -> PlanningSettings:
+def planning_settings(config: TestbedConfig) -> PlanningSettings:
     """Return the settings of planning."""
     section = config.guidance
     return PlanningSettings(

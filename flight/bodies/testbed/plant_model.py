@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from flight.gnc.guidance.one_axis.plant import SingleAxisPlant
-from flight.schema.sections import Config
+from flight.schema.testbed import TestbedConfig
 
 
-def plant_of(config: Config) -> SingleAxisPlant:
+def plant_of(config: TestbedConfig) -> SingleAxisPlant:
     """Return the plant model that planner, tracker and filter use."""
     section = config.plant
     return SingleAxisPlant(
@@ -21,7 +21,7 @@ def plant_of(config: Config) -> SingleAxisPlant:
     )
 
 
-def angular_acceleration_psd_of(config: Config, plant: SingleAxisPlant) -> float:
+def angular_acceleration_psd_of(config: TestbedConfig, plant: SingleAxisPlant) -> float:
     """Return the power spectral density of the angular acceleration due to current noise, rad^2/s^3."""
     noise = plant.torque_constant / plant.inertia * config.estimation.current_noise
     return noise**2 / config.executive.control_rate_hz

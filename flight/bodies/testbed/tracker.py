@@ -14,7 +14,7 @@ from flight.gnc.estimation.estimate import Estimate
 from flight.gnc.guidance.one_axis.path import Sample
 from flight.gnc.guidance.one_axis.plant import SingleAxisPlant
 from flight.loop.control_output import CoilCommand
-from flight.schema.sections import Control, Identification
+from flight.schema.testbed import Control, Identification
 
 
 def controller_of(

@@ -124,7 +124,9 @@ class RigidBody:
         x, y, z = (float(i) for i in currents)
         bx, by, bz = (float(b) for b in (self.field if reference_field is None else reference_field))
         n = self.dipole_per_ampere
-        return Torquing((n * x, n * y, n * z), (bx, by, bz), (float(x != 0.0), float(y != 0.0), float(z != 0.0)), known)
+        return Torquing(
+            (n * x, n * y, n * z), (bx, by, bz), (float(x != 0.0), float(y != 0.0), float(z != 0.0)), known
+        )
 
     @property
     def parameters(self) -> Parameters:
@@ -149,7 +151,9 @@ class RigidBody:
         rate = (rate[0] + ahead * x, rate[1] + ahead * y, rate[2] + ahead * z)
         field_body = times(matrix(q), torquing.field)
         acceleration, by_parameters = self._accelerate(q, rate, parameters, torquing, field_body)
-        derivatives = np.array([*_by_turn(torquing.dipole, field_body), *self._by_rate(rate), *skew(field_body)])
+        derivatives = np.array(
+            [*_by_turn(torquing.dipole, field_body), *self._by_rate(rate), *skew(field_body)]
+        )
         by_turn, by_rate, by_field = self.response @ derivatives.reshape(3, 3, 3)
         torsion, damping, gain = parameters
         by_turn *= gain

@@ -50,13 +50,11 @@ class Stream:
 
 def streams_of(config: Config) -> tuple[Stream, ...]:
     """Return the streams of the devices that a configuration has."""
-    unit, coils, plant = config.inertial_unit, config.coils, config.plant
+    unit, coils, field = config.inertial_unit, config.coils, config.field_range()
     control_hz = config.executive.control_rate_hz
     rows = [
         Stream("imu", float(unit.rate_hz), unit.max_age, facts.IMU_POOR),
-        Stream(
-            "field", float(unit.rate_hz), unit.max_age, facts.FIELD_POOR, 0.2 * plant.field, 3.0 * plant.field
-        ),
+        Stream("field", float(unit.rate_hz), unit.max_age, facts.FIELD_POOR, *field),
         Stream("coils", control_hz, coils.stale_after, facts.COILS_POOR),
     ]
     if config.power_monitor is not None:

@@ -45,8 +45,7 @@ def learned_of(estimate: Estimate) -> dict[str, Learned]:
 
 def digest_of(config: Config) -> str:
     """Return a digest of the devices of a configuration."""
-    devices = (config.plant, config.coils, config.inertial_unit)
-    return f"{zlib.crc32(msgspec.json.encode(devices)):08x}"
+    return f"{zlib.crc32(msgspec.json.encode(config.hardware())):08x}"
 
 
 def start_from(

@@ -15,6 +15,7 @@ from flight.link.telemetry.packets import to_text
 from flight.link.telemetry.reader import read_run
 from flight.schema import reader as configuration
 from flight.schema.errors import ConfigError
+from flight.schema.testbed import as_testbed
 from sim_hal.faults.host import corrupted
 from tests.manual_clock import ManualClock
 from tests.scenario.flights import CONFIG
@@ -60,8 +61,8 @@ def test_a_flip_that_reads_as_another_body_is_found_by_the_checksum_alone(
     """The characters 3 and 7 are one bit apart."""
     assert ord("3") ^ ord("7") == 4
     accepted.write_text(TEXT.replace("1.05e-3", "1.05e-7", 1), encoding="utf-8")
-    assert configuration.load(accepted).plant.inertia == 1.05e-7
-    assert configuration.load(accepted_config(accepted, service)[0]).plant.inertia == 1.05e-3
+    assert as_testbed(configuration.load(accepted)).plant.inertia == 1.05e-7
+    assert as_testbed(configuration.load(accepted_config(accepted, service)[0])).plant.inertia == 1.05e-3
 
 
 def test_what_was_accepted_is_flown(accepted: Path, service: dict[str, str]) -> None:

@@ -16,6 +16,7 @@ from flight.loop.control_output import CoilCommand, Reference
 from flight.loop.services import Services
 from flight.loop.state.content import Learned
 from flight.schema.sections import Config
+from flight.schema.testbed import as_testbed
 
 STIFFNESS, DAMPING = 4e-4, 1e-3
 """N m/rad and N m s/rad."""
@@ -41,7 +42,7 @@ class PlainTracker:
 
 def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> Body:
     testbed = TESTBED.make(config, services, learned)
-    field = np.array([0.0, 0.0, -config.plant.field])
+    field = np.array([0.0, 0.0, -as_testbed(config).plant.field])
     tracker = PlainTracker(field, config.coils.current_limit, testbed.dipole_per_ampere)
     return replace(testbed, tracker=tracker)
 

@@ -15,6 +15,7 @@ from flight.link.telemetry.reader import Run
 from flight.loop.tasks.control_cycle import ATTITUDE_EVERY
 from flight.schema import reader
 from flight.schema.errors import ConfigError
+from flight.schema.testbed import as_testbed
 from tests.scenario.flights import CONFIG, demo_config, fly
 
 DIPOLE_PER_AMPERE = 80 * 0.0081
@@ -72,7 +73,7 @@ def test_a_step_that_the_configuration_may_ask_for_is_one_that_the_loop_accepts(
 ) -> None:
     """A limit that stood twice once let 0.695 pass the configuration, and failed each control cycle."""
     text = CONFIG.read_text(encoding="utf-8")
-    config = reader.parse(text.replace("q2: -0.3", f"q2: {q2}", 1))
+    config = as_testbed(reader.parse(text.replace("q2: -0.3", f"q2: {q2}", 1)))
     config = structs.replace(demo_config(3.0, camera=False), steps=config.steps[:1])
     run = fly(config, tmp_path)
     assert b"task-failed" not in set(run["event"]["name"].tolist())

@@ -14,6 +14,7 @@ from flight.schema import reader
 from flight.schema.camera_model import camera_knowledge
 from flight.schema.document import read_document, to_yaml
 from flight.schema.errors import ConfigError
+from flight.schema.testbed import as_testbed
 from sim_hal.settings import Simulation
 
 FOLDER = Path(__file__).resolve().parents[3] / "config"
@@ -29,7 +30,7 @@ def test_every_configuration_in_the_repository_is_valid(path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["step_demo.yaml", "step_thesis.yaml"])
 def test_the_demonstration_is_the_thesis(name: str) -> None:
-    loaded = reader.load(FOLDER / name)
+    loaded = as_testbed(reader.load(FOLDER / name))
     assert [step.at for step in loaded.steps] == [100.0 * k for k in range(7)]
     assert [step.q2 for step in loaded.steps] == pytest.approx([-0.3 + 0.1 * k for k in range(7)])
     assert (loaded.duration, loaded.guidance.horizon, loaded.guidance.replan_period) == (700.0, 10.0, 5.0)
@@ -37,7 +38,7 @@ def test_the_demonstration_is_the_thesis(name: str) -> None:
 
 
 def test_the_thesis_loop_stays_as_it_was_in_the_same_world() -> None:
-    demo, thesis = (reader.load(FOLDER / name) for name in ("step_demo.yaml", "step_thesis.yaml"))
+    demo, thesis = (as_testbed(reader.load(FOLDER / name)) for name in ("step_demo.yaml", "step_thesis.yaml"))
     assert (thesis.control.tracker, thesis.guidance.strategy) == ("thesis", "receding")
     assert (thesis.control.state_weight, thesis.control.control_weight) == (20.0, 1.0)
     assert thesis.simulation == demo.simulation
@@ -85,7 +86,7 @@ def test_mistakes_in_the_simulation_section_are_reported_with_their_place_too() 
 
 def test_numbers_without_a_point_are_numbers() -> None:
     text = DEMO.replace("inertia: 1.05e-3", "inertia: 2e-3")
-    assert reader.parse(text).plant.inertia == 2e-3
+    assert as_testbed(reader.parse(text)).plant.inertia == 2e-3
 
 
 def test_a_testbed_without_a_camera_says_none() -> None:

@@ -16,24 +16,24 @@ import numpy as np
 import flight
 import hal
 import sim_hal
-from flight.schema import devices, sections
+from flight.schema import devices, sections, testbed
 from hal.interfaces.wires import SECOND_NS
 
 OF_CAMERA = (devices.Camera, devices.StarTracker)
 SERVES: dict[str, tuple[type[msgspec.Struct], ...]] = {
-    "AdaptiveSettings": (sections.Control,),
+    "AdaptiveSettings": (testbed.Control,),
     "AravisSettings": (devices.AravisDevice, devices.Camera),
     "CoilDriveSettings": (devices.Coils,),
     "CoilSettings": (devices.Coils,),
     "CoilWatchSettings": (devices.Coils, devices.PowerMonitor),
-    "ExcitationSettings": (sections.Identification,),
+    "ExcitationSettings": (testbed.Identification,),
     "FilterSettings": (sections.Estimation,),
     "ImagingSettings": OF_CAMERA,
     "LikelihoodSettings": OF_CAMERA,
     "ModeSettings": (sections.Modes, sections.Detumble),
     "NavigationSettings": (devices.InertialUnit, sections.Estimation),
-    "PlanningSettings": (sections.Guidance,),
-    "ResponseSettings": (sections.Plant, devices.InertialUnit),
+    "PlanningSettings": (testbed.Guidance,),
+    "ResponseSettings": (testbed.Plant, devices.InertialUnit),
     "SolveSettings": OF_CAMERA,
     "StreakSettings": OF_CAMERA,
     "TrackerSettings": OF_CAMERA,

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from flight.schema.reader import parse
+from flight.schema.testbed import as_testbed
 from tests.ground.commands.in_process import command
 from tests.ground.commands.test_commands import DEMO
 
@@ -50,7 +51,7 @@ def test_the_fragment_can_be_pasted_over_the_old_plant(flown: tuple[Path, dict[s
     assert text == facts["fragment"]
     old = DEMO.read_text()
     head, rest = old.split("plant:", 1)
-    config = parse(head + text + "inertial_unit:" + rest.split("inertial_unit:", 1)[1])
+    config = as_testbed(parse(head + text + "inertial_unit:" + rest.split("inertial_unit:", 1)[1]))
     assert config.plant.thread_stiffness == pytest.approx(1e-5, rel=0.3)
 
 

@@ -9,6 +9,7 @@ import pytest
 from scipy.stats import chi2
 
 from flight.schema.reader import parse
+from flight.schema.testbed import as_testbed
 from ground.identification.constants import Constants
 from ground.identification.fit import Fit
 from ground.identification.fragment import fragment, plant_section
@@ -92,7 +93,7 @@ def test_the_fragment_takes_the_place_of_the_plant_section(identified: list[Iden
     plant = scaled(made, BELIEFS, world.field)
     head, rest = flights.TEXT.split("plant:", 1)
     _, tail = rest.split("inertial_unit:", 1)
-    config = parse(head + fragment(plant, 80, "a test") + "\ninertial_unit:" + tail)
+    config = as_testbed(parse(head + fragment(plant, 80, "a test") + "\ninertial_unit:" + tail))
     section = config.plant
     gain = section.coil_turns * section.coil_area * section.field / section.inertia
     assert gain == pytest.approx(made.constants.gain, rel=1e-5)

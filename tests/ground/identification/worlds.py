@@ -13,7 +13,7 @@ from flight.gnc.control.one_axis.excitation import ExcitationController, Excitat
 from flight.gnc.guidance.one_axis.path import Sample
 from flight.gnc.math.arrays import FloatArray
 from flight.schema import reader as configuration
-from flight.schema.sections import Config, Identification
+from flight.schema.testbed import Identification, TestbedConfig
 from ground.identification.constants import Constants
 from ground.identification.preparation import excitation_config
 from ground.identification.record import FieldMeasurement, Record, read_record
@@ -51,7 +51,7 @@ class World:
         )
 
 
-def believed() -> Config:
+def believed() -> TestbedConfig:
     """Return the configuration that is believed in."""
     return flights.demo_config(200.0, camera=False)
 

@@ -11,6 +11,7 @@ from flight.bodies.testbed.plant_model import plant_of
 from flight.gnc.errors import UsageError
 from flight.gnc.guidance.one_axis.vmc import plan
 from flight.schema import reader as configuration
+from flight.schema.testbed import as_testbed
 from ground.report import draw_path
 
 pytest.importorskip("matplotlib", reason="pictures need the extra 'plots'")
@@ -22,7 +23,7 @@ CONFIG = Path(__file__).resolve().parents[3] / "config" / "step_demo.yaml"
 
 
 def test_a_path_is_drawn_from_its_start_to_its_target_within_the_limit(tmp_path: Path) -> None:
-    plant = plant_of(configuration.load(CONFIG))
+    plant = plant_of(as_testbed(configuration.load(CONFIG)))
     made = plan(plant, -0.3, 0.0, -0.2, 0.0, 10.0)
     attitude, rate, current = path_figure(made, plant).axes
     q2 = np.asarray(attitude.get_lines()[0].get_ydata())

@@ -15,7 +15,7 @@ from flight.gnc.math.quaternion import angle_about_axis_y
 from flight.loop.fdir.coils.response import ResponseSettings
 from flight.loop.fdir.coils.watch import CoilWatch, CoilWatchSettings
 from flight.schema import reader as configuration
-from flight.schema.sections import Config
+from flight.schema.testbed import TestbedConfig
 from hal.drivers.coils import PwmTorqueCoils
 from hal.drivers.ina219 import Ina219
 from hal.drivers.pca9685 import Pca9685
@@ -47,7 +47,7 @@ def hold(target: float, noise: float = 0.0, others: float = 0.0, seed: int = 0) 
     return command
 
 
-def watch_settings(config: Config, monitor_only: bool = False) -> CoilWatchSettings:
+def watch_settings(config: TestbedConfig, monitor_only: bool = False) -> CoilWatchSettings:
     """Return what the flight loop gives a watch of the demonstration's hardware."""
     coils, plant = config.coils, config.plant
     full = [coils.supply_voltage / ohm for ohm in coils.resistance]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from flight.schema.testbed import as_testbed
 from sim_hal.worlds.motion import Motion, about_thread
 from sim_hal.worlds.world import WorldInputs, WorldTruth
 
@@ -36,7 +37,7 @@ class SpinningWorld:
 
 
 def make(inputs: WorldInputs) -> SpinningWorld:
-    return SpinningWorld(inputs.config.plant.field)
+    return SpinningWorld(as_testbed(inputs.config).plant.field)
 
 
 def make_nothing(inputs: WorldInputs) -> None:

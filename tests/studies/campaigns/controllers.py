@@ -27,7 +27,7 @@ import numpy as np
 
 from flight.gnc.guidance.one_axis.plant import SingleAxisPlant, angle_of
 from flight.schema import reader as configuration
-from flight.schema.sections import Config, PidGains
+from flight.schema.testbed import PidGains, TestbedConfig
 from ground import report
 from sim_hal.settings import Simulation
 from tests.flight.gnc.guidance.oracle import Slew, solve
@@ -45,17 +45,17 @@ FIGURES = (
 THESIS_W = {"thesis": 0.10, "thesis, raw readings": 0.10, "pid": 0.15, "adaptive": 0.66}
 
 
-def this_loop() -> Config:
+def this_loop() -> TestbedConfig:
     """Return the demonstration as it is flown here, without its camera."""
     return demo_config(DURATION, camera=False)
 
 
-def thesis_loop() -> Config:
+def thesis_loop() -> TestbedConfig:
     """Return the thesis's guidance and tracker behind the filter."""
     return thesis_config(DURATION)
 
 
-def raw_thesis_loop() -> Config:
+def raw_thesis_loop() -> TestbedConfig:
     """Return the thesis's loop on each reading as it comes: to the filter readings are without noise."""
     config = thesis_config(DURATION)
     unit = configuration.replace(config.inertial_unit, angle_noise=3e-4, rate_noise=3e-5)
@@ -65,7 +65,7 @@ def raw_thesis_loop() -> Config:
     return configuration.replace(config, inertial_unit=unit, estimation=estimation)
 
 
-def towards_steps(**control: Any) -> Config:
+def towards_steps(**control: Any) -> TestbedConfig:
     """Return the demonstration with another controller, which is shown the targets themselves."""
     config = this_loop()
     return configuration.replace(
@@ -75,34 +75,34 @@ def towards_steps(**control: Any) -> Config:
     )
 
 
-def supply_saving() -> Config:
+def supply_saving() -> TestbedConfig:
     """Return the demonstration as flown here, with paths that save supply energy."""
     config = this_loop()
     return configuration.replace(config, guidance=configuration.replace(config.guidance, cost="supply"))
 
 
-def pid() -> Config:
+def pid() -> TestbedConfig:
     """Return the demonstration under PID control with tuned gains [tune_controllers, 2026-11-23]."""
     gains = PidGains(proportional=0.4851, integral=0.09534, derivative=1.0)
     return towards_steps(tracker="pid", gains=gains, target_weight=0.187)
 
 
-def placed_pid() -> Config:
+def placed_pid() -> TestbedConfig:
     """Return the demonstration under PID control with three poles in one place."""
     return towards_steps(tracker="pid", bandwidth=0.76)
 
 
-def adaptive() -> Config:
+def adaptive() -> TestbedConfig:
     """Return the demonstration under adaptive control with tuned gains [tune_controllers, 2026-11-23]."""
     return towards_steps(tracker="adaptive", bandwidth=0.319, adaptation=33.2, reference_bandwidth=0.584)
 
 
-def by_bandwidth() -> Config:
+def by_bandwidth() -> TestbedConfig:
     """Return the demonstration under adaptive control tuned by its bandwidth alone."""
     return towards_steps(tracker="adaptive", bandwidth=1.0, adaptation=10.0, reference_bandwidth=0.56)
 
 
-CONTROLLERS: dict[str, Callable[[], Config]] = {
+CONTROLLERS: dict[str, Callable[[], TestbedConfig]] = {
     "this loop": this_loop,
     "this loop, supply": supply_saving,
     "thesis": thesis_loop,
@@ -146,7 +146,7 @@ def _worst(rows: Sequence[dict[str, Any]], key: str) -> float:
     return max(np.inf if row[key] is None else row[key] for row in rows)
 
 
-def clairvoyant_power(config: Config, world: Simulation) -> float:
+def clairvoyant_power(config: TestbedConfig, world: Simulation) -> float:
     """Return the mean R I^2 in W of the clairvoyant optimum of a demonstration's steps in a world."""
     true = SingleAxisPlant(
         world.truth.inertia or config.plant.inertia,

@@ -20,7 +20,8 @@ import numpy as np
 
 from flight.link.telemetry.reader import Run
 from flight.schema import reader as configuration
-from flight.schema.sections import Commands, CommandStep, Config, Step, Telemetry
+from flight.schema.sections import Commands, CommandStep, Telemetry
+from flight.schema.testbed import Step, TestbedConfig
 from sim_hal.settings import FaultEntry
 from tests.scenario.flights import Rigged, demo_config, demo_world, event_names, fly
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
@@ -96,7 +97,7 @@ def break_things(
     return tuple(entries), tuple(cleared)
 
 
-def config_for(rng: np.random.Generator, seconds: float, cleared: tuple[CommandStep, ...]) -> Config:
+def config_for(rng: np.random.Generator, seconds: float, cleared: tuple[CommandStep, ...]) -> TestbedConfig:
     """Return the loop with an attitude to go to every now and then, and a small log."""
     base = demo_config(seconds, camera=False)
     times, time = [0.0], 0.0
@@ -125,7 +126,7 @@ def _slope(memory: Sequence[tuple[float, int]]) -> float:
     return float(np.polyfit(half[:, 0], half[:, 1], 1)[0]) * HOUR_S
 
 
-def _pointing(flown: Run, config: Config) -> float:
+def _pointing(flown: Run, config: TestbedConfig) -> float:
     """Return how far the body is from its last target in the last ten seconds, deg."""
     truth = flown["truth"]
     late = truth["time_ns"] * 1e-9 > config.duration - 10.0

@@ -23,7 +23,7 @@ import numpy as np
 
 from flight.link.telemetry.reader import Run
 from flight.schema import reader as configuration
-from flight.schema.sections import Config, Step
+from flight.schema.testbed import Step, TestbedConfig
 from ground import report
 from ground.report.performance import STEADY_STATE_S
 from sim_hal.emulators.serial_line import LineFaults
@@ -81,7 +81,7 @@ def draw(seed: tuple[int, ...]) -> dict[str, Any]:
     }
 
 
-def world_of(drawn: dict[str, Any], config: Config) -> Simulation:
+def world_of(drawn: dict[str, Any], config: TestbedConfig) -> Simulation:
     """Return the simulation of a drawn world."""
     base = demo_world()
     ohms = config.coils.resistance

@@ -113,8 +113,9 @@ def _set_up(config: Config) -> None:
     from flight.app.composition.workers import workers  # noqa: PLC0415
     from flight.app.devices import coil_settings, unit_settings  # noqa: PLC0415 - the whole flight hangs on it
     from flight.bodies.testbed.plant_model import plant_of  # noqa: PLC0415
+    from flight.schema.testbed import as_testbed  # noqa: PLC0415
 
-    plant = plant_of(config)
+    plant = plant_of(as_testbed(config))
     coils, unit = coil_settings(config), unit_settings(config)
     workers(config)
     numbers = (

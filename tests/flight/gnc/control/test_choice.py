@@ -13,7 +13,7 @@ from flight.gnc.control.one_axis.lq_tracker import LqTracker
 from flight.gnc.control.one_axis.pid import PidController
 from flight.gnc.errors import UsageError
 from flight.gnc.guidance.one_axis.path import Sample
-from flight.schema.sections import Control, Identification
+from flight.schema.testbed import Control, Identification
 from tests.flight.gnc.control.closed_loop import BELIEVED
 
 KINDS = {"lq": LqTracker, "thesis": LqTracker, "pid": PidController, "adaptive": AdaptiveController}

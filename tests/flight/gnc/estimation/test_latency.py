@@ -98,7 +98,7 @@ def test_a_command_that_begins_within_the_doubt_is_noise() -> None:
     now = state.at(0)
     quaternion = tuple(now.quaternion.tolist())
     off, on = (
-        SUSPENDED.linearise(quaternion, (0.0, 0.0, 0.0), now.parameters, SUSPENDED.torquing(currents), 0.0)
+        SUSPENDED.accelerate(quaternion, (0.0, 0.0, 0.0), now.parameters, SUSPENDED.torquing(currents))
         for currents in (np.zeros(3), np.array([0.1, 0.0, 0.0]))
     )
     covariance = np.zeros((16, 16))
