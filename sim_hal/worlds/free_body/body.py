@@ -19,10 +19,11 @@ from flight.gnc.earth.sun import DAY
 from flight.gnc.math import quaternion
 from flight.gnc.math.arrays import FloatArray
 from flight.schema.errors import ConfigError
+from hal.interfaces.wires import SECOND_NS
 from sim_hal.emulators.device import NEVER
 from sim_hal.worlds import sun
 from sim_hal.worlds.free_body.craft import CRAFTS, build
-from sim_hal.worlds.free_body.environment import Environment, Surroundings
+from sim_hal.worlds.free_body.environment import Environment
 from sim_hal.worlds.free_body.load_model import LoadModel
 from sim_hal.worlds.free_body.rotation import (
     Floats,
@@ -37,6 +38,7 @@ from sim_hal.worlds.free_body.rotation import (
 from sim_hal.worlds.free_body.section import FreeBodySection, OrbitSection, TipOff
 from sim_hal.worlds.motion import Motion
 from sim_hal.worlds.orbit import KeplerianElements
+from sim_hal.worlds.surroundings import Surroundings
 from sim_hal.worlds.world import WorldInputs, WorldTruth
 
 UNIX_EPOCH = 2_440_587.5
@@ -97,6 +99,7 @@ class FreeBody:
         craft = CRAFTS[section.craft] if isinstance(section.craft, str) else section.craft
         self.craft = build(craft, multiples, errors)
         self.utc_start = julian_date(utc)
+        self._utc_start_ns = round(datetime.fromisoformat(utc).timestamp()) * SECOND_NS - start_ns
         orbit = elements(section.orbit, self.utc_start)
         self.environment = Environment(orbit, self.utc_start, weather, multiples.ring_current)
         self._loads = LoadModel(self.craft, multiples)
@@ -148,6 +151,10 @@ class FreeBody:
     def surroundings(self) -> Surroundings:
         """Return what surrounds the craft now, ICRS."""
         return self.environment.at(self._seconds(self.time_ns))
+
+    def utc_ns(self) -> int:
+        """Return UTC of the present state, ns since 1970."""
+        return self._utc_start_ns + self.time_ns
 
     def truth(self) -> FreeBodyTruth:
         """Return the state as it is; torques by their causes."""

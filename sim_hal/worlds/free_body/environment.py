@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -22,6 +21,7 @@ from flight.gnc.math.arrays import FloatArray
 from sim_hal.worlds import geomagnetism, sun
 from sim_hal.worlds.free_body.atmosphere import log_density
 from sim_hal.worlds.orbit import KeplerianElements, Orbit, propagate
+from sim_hal.worlds.surroundings import Floats, Surroundings
 
 KNOT = 10.0
 _CHUNK = 100
@@ -34,29 +34,6 @@ _WALK_TIME = 3_000.0
 _STORM_TIMES = np.array([3.0, 7.0, 17.0]) * 3600.0
 
 Row = list[float]
-Floats = tuple[float, float, float]
-
-
-class Surroundings(NamedTuple):
-    """What surrounds the craft at an instant, ICRS.
-
-    Attributes:
-        position: (3,) m. velocity: (3,) m/s. field: (3,) T.
-        sun: (3,) its direction from the craft.
-        light: sunlight over that at one astronomical unit; 0 in the umbra.
-        sunlit: the share of the Sun's disc that is seen.
-        density: of the air, kg/m^3.
-        walk: (3,) of the walking dipole, of unit standard deviation, body axes.
-    """
-
-    position: Floats
-    velocity: Floats
-    field: Floats
-    sun: Floats
-    light: float
-    sunlit: float
-    density: float
-    walk: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,9 +10,10 @@ import math
 from flight.gnc.earth.figure import GRAVITATIONAL_PARAMETER
 from sim_hal.worlds.free_body import pressure
 from sim_hal.worlds.free_body.craft import TrueCraft
-from sim_hal.worlds.free_body.environment import Surroundings, air_flow
+from sim_hal.worlds.free_body.environment import air_flow
 from sim_hal.worlds.free_body.rotation import Floats, Matrix, turned
 from sim_hal.worlds.free_body.section import Disturbances
+from sim_hal.worlds.surroundings import Surroundings
 
 
 class LoadModel:
