@@ -12,12 +12,13 @@ import msgspec
 from msgspec import Meta
 
 from flight.schema.values import NotNegative, Positive, Section
+from sim_hal.worlds.free_body.section import FreeBodySection
 
 Row = tuple[float, float, float]
 
 
 class Release(Section, frozen=True, kw_only=True):
-    """The release of the body: q2 and rate about the thread at mission time zero."""
+    """The release of the testbed's body: q2 and rate about the thread at mission time zero."""
 
     q2: Annotated[float, Meta(ge=-0.7, le=0.7)]
     rate: Annotated[float, Meta(ge=-10.0, le=10.0)] = 0.0
@@ -88,12 +89,13 @@ class Simulation(Section, frozen=True, kw_only=True):
     seed: Annotated[int, Meta(ge=0)] = 1
     utc: str = "2026-01-01T00:00:00Z"
     world: Annotated[str, Meta(min_length=1, max_length=200)] = "testbed"
-    release: Release
+    release: Release | None = None
     thread: Thread = Thread()
     current_noise: NotNegative = 0.0
     coil_field: tuple[Row, Row, Row] = ((0.0, 0.0, 0.0),) * 3
     imu: ImuNoise = ImuNoise()
     sky: Sky = Sky()
     truth: Truth = Truth()
+    free_body: FreeBodySection | None = None
     latency: Latency = Latency()
     faults: tuple[FaultEntry, ...] = ()

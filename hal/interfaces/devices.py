@@ -4,7 +4,17 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from hal.interfaces.readings import CoilState, FloatArray, Frame, ImuLink, ImuReading, PowerReading
+from hal.interfaces.readings import (
+    CoilState,
+    FloatArray,
+    Frame,
+    GpsLink,
+    GpsReading,
+    ImuLink,
+    ImuReading,
+    PowerReading,
+    StringReading,
+)
 
 
 class InertialUnit(Protocol):
@@ -82,3 +92,32 @@ class FrameSource(Protocol):
 
     def close(self) -> None:
         """Release the camera."""
+
+
+class GpsReceiver(Protocol):
+    """Reports where the satellite is, and the time, about once a second."""
+
+    def poll(self) -> list[GpsReading]:
+        """Return the epochs since the last call, oldest first. Never blocks.
+
+        Raises NotResponding when the line itself is lost.
+        """
+
+    def link(self) -> GpsLink:
+        """Return the line's counters."""
+
+    def close(self) -> None:
+        """Release the line."""
+
+
+class SolarStrings(Protocol):
+    """Measures the currents of the solar strings."""
+
+    def latest(self) -> StringReading | None:
+        """Return the newest reading, None before the first."""
+
+    def error(self) -> str:
+        """Return the last failure while it lasts, empty when readings arrive."""
+
+    def close(self) -> None:
+        """Stop reading."""

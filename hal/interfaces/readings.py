@@ -57,6 +57,56 @@ class ImuLink:
 
 
 @dataclass(frozen=True, slots=True)
+class GpsReading:
+    """One epoch of a GPS receiver.
+
+    Attributes:
+        time_ns: host clock when the receiver began to send; the epoch itself is up to 0.2 s older.
+        arrival_ns: host clock when the last byte was received.
+        utc_ns: UTC of the epoch, ns since 1970; 0 where the receiver does not know the time.
+        position: (3,) m, ITRS. velocity: (3,) m/s with respect to the ground, ITRS.
+        sigma: m, of each axis, as the receiver claims. velocity_sigma: m/s.
+        satellites: in use.
+        valid: whether the receiver vouches for time and place.
+    """
+
+    time_ns: int
+    arrival_ns: int
+    utc_ns: int
+    position: FloatArray
+    velocity: FloatArray
+    sigma: float
+    velocity_sigma: float
+    satellites: int
+    valid: bool
+
+
+@dataclass(frozen=True, slots=True)
+class GpsLink:
+    """Counters of the receiver's line since start; they only grow. Times are -1 before the first.
+
+    `refused` counts commands that the receiver did not take, `out_of_range` impossible epochs.
+    """
+
+    bytes_received: int
+    frames: int
+    bad_checksum: int
+    discarded_bytes: int
+    out_of_range: int
+    refused: int
+    last_byte_ns: int
+    last_fix_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class StringReading:
+    """Currents (n,) A of the solar strings at `time_ns` of the host clock."""
+
+    time_ns: int
+    currents: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
 class Frame:
     """One image: `pixels` is (rows, columns), uint8 or uint16; times are of the host clock.
 

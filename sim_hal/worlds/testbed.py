@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flight.gnc.math.arrays import FloatArray
+from flight.schema.errors import ConfigError
 from flight.schema.testbed import as_testbed
 from sim_hal.worlds.motion import Motion, about_thread
 from sim_hal.worlds.world import WorldInputs, WorldTruth
@@ -127,8 +128,14 @@ class Testbed:
 
 
 def make(inputs: WorldInputs) -> Testbed:
-    """Return the testbed of a configuration; values of its `simulation` section take precedence."""
+    """Return the testbed of a configuration; values of its `simulation` section take precedence.
+
+    Raises ConfigError without a release.
+    """
     config, section = as_testbed(inputs.config), inputs.section
+    release = section.release
+    if release is None:
+        raise ConfigError("simulation.release", "is missing: the world testbed needs it")
     plant, truth = config.plant, section.truth
     model = TestbedModel(
         inertia=truth.inertia or plant.inertia,
@@ -139,5 +146,5 @@ def make(inputs: WorldInputs) -> Testbed:
         resistance=truth.resistance or config.coils.resistance,
         supply_voltage=truth.supply_voltage or config.coils.supply_voltage,
     )
-    angle = 2.0 * float(np.arcsin(section.release.q2))
-    return Testbed(model, angle, section.release.rate, inputs.currents, inputs.start_ns)
+    angle = 2.0 * float(np.arcsin(release.q2))
+    return Testbed(model, angle, release.rate, inputs.currents, inputs.start_ns)

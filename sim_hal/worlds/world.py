@@ -17,7 +17,10 @@ from flight.schema.sections import Config
 from sim_hal.settings import Simulation
 from sim_hal.worlds.motion import Motion
 
-WORLDS = {"testbed": "sim_hal.worlds.testbed:make"}
+WORLDS = {
+    "testbed": "sim_hal.worlds.testbed:make",
+    "free_body": "sim_hal.worlds.free_body.body:make",
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

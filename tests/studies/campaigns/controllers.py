@@ -156,6 +156,7 @@ def clairvoyant_power(config: TestbedConfig, world: Simulation) -> float:
         world.thread.stiffness,
         world.thread.damping,
     )
+    assert world.release is not None, "the testbed has one"
     angle, rate = angle_of(world.release.q2), world.release.rate
     ends = [step.at for step in config.steps[1:]] + [config.duration]
     energy = 0.0

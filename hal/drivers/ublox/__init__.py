@@ -1,0 +1,1 @@
+"""A u-blox GPS receiver and its UBX protocol on a serial line."""

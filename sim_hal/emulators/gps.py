@@ -1,0 +1,174 @@
+"""A u-blox GPS receiver: UBX in and out on a serial line, with the errors of a receiver in orbit.
+
+It begins with its set-up lost: sentences of NMEA, until it is asked for NAV-PVT. A fix is of a whole step of
+UTC, and its frame leaves `latency` later. Errors: a walk of the position (ionosphere, ephemerides) and white
+noise of position and velocity.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+import numpy as np
+
+from flight.gnc.earth.orientation import ROTATION_RATE, celestial_to_terrestrial, geodetic, north_east_down
+from flight.gnc.math.arrays import FloatArray
+from hal.drivers.ublox.codec import (
+    ACK_ACK,
+    ACK_NAK,
+    CFG_MSG,
+    CFG_PRT,
+    CFG_RATE,
+    DATE_AND_TIME,
+    FIX_OK,
+    NAV_PVT,
+    THREE_DIMENSIONS,
+    Kind,
+    Pvt,
+    StreamParser,
+    frame,
+)
+from hal.interfaces.wires import SECOND_NS
+from sim_hal.emulators.device import NEVER, SerialEnd
+from sim_hal.worlds.surroundings import OrbitingWorld
+
+UNIX_EPOCH = 2_440_587.5
+NMEA = b"$GNTXT,01,01,02,u-blox*12\r\n"
+_UNKNOWN = 0xFFFF_FFFF
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GpsErrors:
+    """The receiver's errors and delays.
+
+    Attributes:
+        walk: m, standard deviation of the slow error of each axis; `walk_time` s.
+        noise: m, of each axis. velocity_noise: m/s, of each axis.
+        latency: s from the epoch to the frame. start: s from power to the first fix.
+    """
+
+    walk: float = 2.0
+    walk_time: float = 600.0
+    noise: float = 1.0
+    velocity_noise: float = 0.03
+    latency: float = 0.06
+    start: float = 30.0
+
+
+class EmulatedGps:
+    """The receiver; an emulated device.
+
+    Attributes:
+        shift: (3,) m, ITRS, by which it reports a false place. clock_ns: by which its time is wrong.
+        blind: no satellite is received. frozen: the first frame is repeated.
+    """
+
+    def __init__(
+        self,
+        world: OrbitingWorld,
+        line: SerialEnd,
+        generator: np.random.Generator,
+        errors: GpsErrors,
+        now_ns: int = 0,
+    ) -> None:
+        """Take a receiver that has been on for long."""
+        self.shift: FloatArray = np.zeros(3)
+        self.clock_ns = 0
+        self.blind = False
+        self.frozen = False
+        self._world, self._line, self._generator, self._errors = world, line, generator, errors
+        self._period_ns = SECOND_NS
+        self._utc_offset_ns = world.utc_ns() - now_ns
+        self._walk = generator.standard_normal(3)
+        self._last: Pvt | None = None
+        self._power(now_ns, start=0.0)
+
+    def switch_off(self) -> None:
+        """Remove the power."""
+        self._epoch_ns = NEVER
+        self._sending.clear()
+
+    def switch_on(self, now_ns: int) -> None:
+        """Apply power: the set-up is lost, and satellites are searched."""
+        self._power(now_ns, self._errors.start)
+
+    def next_event_ns(self) -> int:
+        """Return when the receiver next takes an epoch, sends, or receives."""
+        sends_ns = self._sending[0][0] if self._sending else NEVER
+        return min(self._epoch_ns, sends_ns, self._line.next_arrival_ns())
+
+    def advance(self, now_ns: int) -> None:
+        """Receive, measure and send all that is due at or before `now_ns`."""
+        if self._line.next_arrival_ns() <= now_ns:
+            data = self._line.read(now_ns)
+            for kind, payload, _ in self._parser.feed(data) if self._epoch_ns != NEVER else ():
+                self._obey(kind, payload, now_ns)
+        while self._epoch_ns <= now_ns:
+            epoch_ns = self._epoch_ns
+            self._epoch_ns += self._period_ns
+            data = frame(NAV_PVT, self._measure(epoch_ns).packed()) if self._asked else NMEA
+            self._sending.append((epoch_ns + round(self._errors.latency * SECOND_NS), data))
+        while self._sending and self._sending[0][0] <= now_ns:
+            sent_ns, data = self._sending.pop(0)
+            self._line.write(data, sent_ns)
+
+    def _power(self, now_ns: int, start: float) -> None:
+        self._parser = StreamParser()
+        self._sending: list[tuple[int, bytes]] = []
+        self._asked = False
+        self._found_ns = now_ns + round(start * SECOND_NS)
+        utc_ns = now_ns + self._utc_offset_ns
+        self._epoch_ns = now_ns + (-utc_ns) % self._period_ns
+
+    def _obey(self, kind: Kind, payload: bytes, now_ns: int) -> None:
+        known = kind in {CFG_PRT, CFG_RATE, CFG_MSG}
+        if kind == CFG_MSG and payload[:2] == bytes(NAV_PVT):
+            self._asked = payload[-1] > 0
+        if kind == CFG_RATE:
+            self._period_ns = max(100, int.from_bytes(payload[:2], "little")) * 1_000_000
+        self._line.write(frame(ACK_ACK if known else ACK_NAK, bytes(kind)), now_ns)
+
+    def _measure(self, epoch_ns: int) -> Pvt:
+        if self.frozen and self._last is not None:
+            return self._last
+        errors = self._errors
+        utc_ns = epoch_ns + self._utc_offset_ns
+        keep = math.exp(-self._period_ns / SECOND_NS / errors.walk_time)
+        self._walk = keep * self._walk + math.sqrt(1.0 - keep * keep) * self._generator.standard_normal(3)
+        noise = self._generator.standard_normal(6)
+        date = UNIX_EPOCH + utc_ns * 1e-9 / 86_400.0
+        around = self._world.surroundings()
+        to_ground = celestial_to_terrestrial(date)
+        exact = to_ground @ np.array(around.position)
+        velocity = to_ground @ np.array(around.velocity) - np.cross([0.0, 0.0, ROTATION_RATE], exact)
+        position = exact + errors.walk * self._walk + errors.noise * noise[:3] + self.shift
+        velocity = velocity + errors.velocity_noise * noise[3:]
+        found = not self.blind and epoch_ns >= self._found_ns
+        self._last = self._report(utc_ns + self.clock_ns, position, velocity, found)
+        return self._last
+
+    def _report(self, utc_ns: int, position: FloatArray, velocity: FloatArray, found: bool) -> Pvt:
+        errors = self._errors
+        longitude, latitude, height = (float(part) for part in geodetic(position))
+        north, east, down = (1e3 * north_east_down(longitude, latitude) @ velocity).tolist()
+        if not found:
+            longitude = latitude = height = north = east = down = 0.0
+        when = datetime.fromtimestamp(utc_ns // SECOND_NS, UTC)
+        accuracy = round(1e3 * math.sqrt(2.0) * math.hypot(errors.walk, errors.noise))
+        return Pvt(
+            date=(when.year, when.month, when.day, when.hour, when.minute, when.second),
+            nano=utc_ns % SECOND_NS,
+            valid=DATE_AND_TIME | 0b100,
+            fix=THREE_DIMENSIONS if found else 0,
+            flags=FIX_OK if found else 0,
+            satellites=11 if found else 0,
+            longitude=round(math.degrees(longitude) * 1e7),
+            latitude=round(math.degrees(latitude) * 1e7),
+            height=round(1e3 * height),
+            horizontal=accuracy if found else _UNKNOWN,
+            vertical=accuracy if found else _UNKNOWN,
+            velocity=(round(north), round(east), round(down)),
+            speed_accuracy=round(1e3 * math.sqrt(3.0) * errors.velocity_noise) if found else 20_000,
+        )

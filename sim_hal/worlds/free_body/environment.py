@@ -1,0 +1,161 @@
+"""The surroundings along an orbit, evaluated at knots and read between them by cubic splines.
+
+Knots stand 10 s apart, which is a thousandth of a turn of position and field: position is then true to
+2 mm and the field to 1e-4 nT, far below the models' own errors. Sunlight changes within seconds in the
+penumbra, so it has knots each second, joined by straight lines. Knots are made 1,000 s at a time, and what is
+random follows the order of the knots, never the times that are asked for.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from flight.gnc.earth.orientation import ROTATION_RATE
+from flight.gnc.earth.shadow import sunlit_share
+from flight.gnc.earth.sun import ASTRONOMICAL_UNIT, DAY
+from flight.gnc.math.arrays import FloatArray
+from sim_hal.worlds import geomagnetism, sun
+from sim_hal.worlds.free_body.atmosphere import log_density
+from sim_hal.worlds.orbit import KeplerianElements, Orbit, propagate
+from sim_hal.worlds.surroundings import Floats, Surroundings
+
+KNOT = 10.0
+_CHUNK = 100
+_LIGHT_KNOTS = 1_000
+_SPAN = KNOT * _CHUNK
+_FIRST_ORBIT = 12_000.0
+RING_CURRENT = 20e-9
+_TURBULENCE, _TURBULENCE_TIME = 0.1, 600.0
+_WALK_TIME = 3_000.0
+_STORM_TIMES = np.array([3.0, 7.0, 17.0]) * 3600.0
+
+Row = list[float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chunk:
+    """The knots of one stretch: cubics (knots, 4, columns), highest power first, and light (seconds,)."""
+
+    start: float
+    cubics: list[list[Row]]
+    sunlit: Row
+
+
+class Environment:
+    """The surroundings from time 0, s, on; times are read in any order within a chunk, else forwards."""
+
+    def __init__(
+        self,
+        elements: KeplerianElements,
+        julian_date: float,
+        generator: np.random.Generator,
+        ring_current: float = 1.0,
+    ) -> None:
+        """Start at a Julian date UTC; `ring_current` is a multiple of 20 nT."""
+        self._elements = elements
+        self._julian_date = julian_date
+        self._generator = generator
+        self._storm = ring_current * RING_CURRENT
+        self._phases = generator.uniform(0.0, 2.0 * math.pi, 3)
+        self._noise: FloatArray = generator.standard_normal(4)
+        self._orbit: Orbit = propagate(elements, _FIRST_ORBIT)
+        self._chunk = self._make(0)
+        self._next = 1
+
+    def position_and_field(self, time: float) -> tuple[Floats, Floats]:
+        """Return position (3,) m and field (3,) T, ICRS: what every step of the motion needs."""
+        part, (a, b, c, d) = self._cubic(time)
+        return (
+            (
+                ((a[0] * part + b[0]) * part + c[0]) * part + d[0],
+                ((a[1] * part + b[1]) * part + c[1]) * part + d[1],
+                ((a[2] * part + b[2]) * part + c[2]) * part + d[2],
+            ),
+            (
+                ((a[3] * part + b[3]) * part + c[3]) * part + d[3],
+                ((a[4] * part + b[4]) * part + c[4]) * part + d[4],
+                ((a[5] * part + b[5]) * part + c[5]) * part + d[5],
+            ),
+        )
+
+    def at(self, time: float) -> Surroundings:
+        """Return everything at `time` s."""
+        part, (a, b, c, d) = self._cubic(time)
+        values = [((i * part + j) * part + k) * part + m for i, j, k, m in zip(a, b, c, d, strict=True)]
+        slope = [(3.0 * i * part + 2.0 * j) * part + k for i, j, k in zip(a[:3], b[:3], c[:3], strict=True)]
+        px, py, pz, bx, by, bz, sx, sy, sz, density, wx, wy, wz = values
+        sx, sy, sz = sx - px, sy - py, sz - pz
+        distance = math.sqrt(sx * sx + sy * sy + sz * sz)
+        seen = self._sunlit(time)
+        vx, vy, vz = slope
+        return Surroundings(
+            (px, py, pz),
+            (vx, vy, vz),
+            (bx, by, bz),
+            (sx / distance, sy / distance, sz / distance),
+            seen * (ASTRONOMICAL_UNIT / distance) ** 2,
+            seen,
+            math.exp(density),
+            (wx, wy, wz),
+        )
+
+    def _sunlit(self, time: float) -> float:
+        place = (time - self._chunk.start) * (_LIGHT_KNOTS / _SPAN)
+        index = min(max(int(place), 0), _LIGHT_KNOTS - 1)
+        before, after = self._chunk.sunlit[index], self._chunk.sunlit[index + 1]
+        return before + (place - index) * (after - before)
+
+    def _cubic(self, time: float) -> tuple[float, list[Row]]:
+        """Return the time since the knot before `time`, and its cubic."""
+        since = time - self._chunk.start
+        while since > _SPAN:
+            self._chunk = self._make(self._next)
+            self._next += 1
+            since = time - self._chunk.start
+        index = min(max(int(since / KNOT), 0), _CHUNK - 1)
+        return since - index * KNOT, self._chunk.cubics[index]
+
+    def _make(self, number: int) -> Chunk:
+        start = number * _SPAN
+        times: FloatArray = start + KNOT * np.arange(_CHUNK + 1.0)
+        if times[-1] > self._orbit.duration:
+            self._orbit = propagate(self._elements, 2.0 * self._orbit.duration)
+        date = self._julian_date + times / DAY
+        position = self._orbit.positions_at(times)
+        sun_there = sun.position(date)
+        noise = self._walks()
+        density = log_density(position, sun_there) + _TURBULENCE * noise[:, 0]
+        field = geomagnetism.field(date, position) + self._ring_current(times, date)
+        knots = np.column_stack([position, field, sun_there, density, noise[:, 1:]])
+        spline = CubicSpline(times, knots)
+        seconds = np.linspace(start, times[-1], _LIGHT_KNOTS + 1)
+        values = spline(seconds)
+        sunlit = sunlit_share(values[:, :3], values[:, 6:9])
+        return Chunk(start, np.moveaxis(spline.c, 1, 0).tolist(), sunlit.tolist())
+
+    def _ring_current(self, times: FloatArray, date: FloatArray) -> FloatArray:
+        """Return the ring current's field (n, 3) T: never below nothing, changing by hours."""
+        waves = np.sin(times[:, None] * (2.0 * math.pi / _STORM_TIMES) + self._phases)
+        return np.asarray(
+            geomagnetism.ring_current(date, self._storm) * (1.0 + np.mean(waves, axis=1))[:, None]
+        )
+
+    def _walks(self) -> FloatArray:
+        """Return four Gauss-Markov walks of unit deviation at the knots (101, 4), the air's first."""
+        keep = np.exp(-KNOT / np.array([_TURBULENCE_TIME, _WALK_TIME, _WALK_TIME, _WALK_TIME]))
+        kicks = np.sqrt(1.0 - keep**2) * self._generator.standard_normal((_CHUNK, 4))
+        rows = [self._noise]
+        for kick in kicks:
+            rows.append(keep * rows[-1] + kick)
+        self._noise = rows[-1]
+        return np.array(rows)
+
+
+def air_flow(surroundings: Surroundings) -> Floats:
+    """Return the craft's velocity (3,) m/s through air that turns with the Earth, ICRS."""
+    (x, y, _), (vx, vy, vz) = surroundings.position, surroundings.velocity
+    return vx + ROTATION_RATE * y, vy - ROTATION_RATE * x, vz

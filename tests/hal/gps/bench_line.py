@@ -1,0 +1,46 @@
+"""A GPS receiver in orbit on a serial line in memory, and the driver on its other end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hal.drivers.ublox.receiver import UbloxReceiver
+from hal.interfaces.readings import GpsReading
+from hal.interfaces.wires import SECOND_NS
+from sim_hal.clock import SimClock
+from sim_hal.emulators.gps import EmulatedGps, GpsErrors
+from sim_hal.emulators.serial_line import SerialLine
+from sim_hal.worlds.free_body.body import FreeBody
+from sim_hal.worlds.free_body.section import FreeBodySection
+from sim_hal.worlds.simulation import TimedSimulation
+
+UTC = "2026-03-20T12:00:00Z"
+EXACT = GpsErrors(walk=0.0, noise=0.0, velocity_noise=0.0)
+
+
+@dataclass
+class GpsBench:
+    clock: SimClock
+    body: FreeBody
+    line: SerialLine
+    gps: EmulatedGps
+    driver: UbloxReceiver
+
+    def fly(self, seconds: float) -> list[GpsReading]:
+        """Poll at 10 Hz for a while; return all readings."""
+        readings = []
+        for _ in range(round(10 * seconds)):
+            self.clock.sleep_until_ns(self.clock.now_ns() + SECOND_NS // 10)
+            readings += self.driver.poll()
+        return readings
+
+
+def bench(errors: GpsErrors = EXACT, baud_rate: int = 115200) -> GpsBench:
+    clock = SimClock()
+    body = FreeBody(FreeBodySection(), lambda: np.zeros(3), utc=UTC)
+    line = SerialLine(clock.now_ns, baud_rate, np.random.default_rng(1))
+    gps = EmulatedGps(body, line.device, np.random.default_rng(2), errors)
+    clock.attach(TimedSimulation(body.advance_to, [gps]))
+    return GpsBench(clock, body, line, gps, UbloxReceiver(line.host, clock))

@@ -1,0 +1,159 @@
+"""The free body as a world: its loads, its errors, and its place behind the seam."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flight.gnc.math import quaternion
+from flight.gnc.math.arrays import FloatArray
+from flight.schema import reader
+from flight.schema.errors import ConfigError
+from sim_hal.settings import Simulation
+from sim_hal.worlds.free_body import pressure
+from sim_hal.worlds.free_body.body import FreeBody
+from sim_hal.worlds.free_body.craft import CRAFTS, box, build
+from sim_hal.worlds.free_body.section import Disturbances, FreeBodySection, OrbitSection, TipOff
+from sim_hal.worlds.world import World, WorldInputs, make_world
+from tests.scenario.flights import demo_config, demo_world
+
+SECOND = 1_000_000_000
+MOVING = np.array([0.02, 0.0, -0.04])
+
+
+def released(section: FreeBodySection, seed: int = 1, currents: FloatArray = MOVING) -> FreeBody:
+    body = FreeBody(section, lambda: currents, seed=seed)
+    body.release_at(2 * SECOND)
+    return body
+
+
+def test_the_body_is_held_until_its_release_while_the_orbit_goes_on() -> None:
+    body = released(FreeBodySection(release=TipOff(speed=0.2)))
+    first = body.motion(0)
+    held = body.motion(2 * SECOND - 1)
+    np.testing.assert_array_equal(first.quaternion, held.quaternion)
+    assert not held.rate.any()
+    assert np.linalg.norm(body.truth().velocity) == pytest.approx(7612.6, abs=20.0)
+    assert np.abs(held.field_body - first.field_body).max() > 1e-9
+    later = body.motion(3 * SECOND)
+    assert np.linalg.norm(later.rate) == pytest.approx(0.2, abs=0.01)
+    assert body.energy == pytest.approx(23.0 * float(MOVING @ MOVING), rel=1e-6)
+    assert body.supply_energy == pytest.approx(3.4 * 0.06, rel=1e-6)
+
+
+def test_the_result_hardly_depends_on_how_often_time_is_advanced_and_looked_at() -> None:
+    seldom, often = released(FreeBodySection()), released(FreeBodySection())
+    for step in range(1, 4001):
+        often.advance_to(step * SECOND // 200)
+    seldom.advance_to(20 * SECOND)
+    np.testing.assert_array_equal(seldom.motion(20 * SECOND).quaternion, often.motion(20 * SECOND).quaternion)
+    looked_at = released(FreeBodySection())
+    for step in range(1, 1601):
+        looked_at.motion(step * SECOND // 80)
+    other = looked_at.motion(20 * SECOND).quaternion
+    assert quaternion.angle_between(seldom.motion(20 * SECOND).quaternion, other) < 1e-6
+
+
+def test_a_change_of_currents_acts_from_its_own_time_on() -> None:
+    currents = [np.zeros(3)]
+    body = FreeBody(FreeBodySection(release=TipOff(speed=0.0)), lambda: currents[0])
+    body.release_at(0)
+    body.advance_to(10 * SECOND)
+    currents[0] = np.array([0.1, 0.0, 0.0])
+    body.advance_to(11 * SECOND)
+    assert body.truth().energy == pytest.approx(23.0 * 0.01)
+    np.testing.assert_array_equal(body.truth().current, currents[0])
+
+
+def test_a_seed_draws_another_craft_and_the_multiples_only_scale_it() -> None:
+    def craft(seed: int, multiple: float) -> FloatArray:
+        settings = Disturbances(residual_dipole=multiple)
+        return build(CRAFTS["knightcube"], settings, np.random.default_rng(seed)).constant_dipole
+
+    np.testing.assert_allclose(craft(1, 0.1), 0.1 * craft(1, 1.0))
+    assert np.linalg.norm(craft(1, 1.0)) == pytest.approx(1e-3)
+    assert np.abs(craft(2, 1.0) - craft(1, 1.0)).max() > 1e-4
+
+
+def test_the_errors_of_craft_and_coils_are_as_large_as_asked_for() -> None:
+    crafts = [build(CRAFTS["cubesat_3u"], Disturbances(), np.random.default_rng(seed)) for seed in range(300)]
+    turns = np.degrees([np.linalg.norm(quaternion.to_rotation_vector(c.to_principal)) for c in crafts])
+    assert 1.0 <= turns.min() < 1.2
+    assert 2.8 < turns.max() <= 3.0
+    lengths = np.array([np.linalg.norm(c.coil_dipole, axis=0) for c in crafts]) / 3.4
+    assert np.std(lengths) == pytest.approx(0.03, rel=0.1)
+    cosines = np.array([np.diag(c.coil_dipole) / np.linalg.norm(c.coil_dipole, axis=0) for c in crafts])
+    assert np.degrees(np.sqrt(np.mean(np.arccos(cosines) ** 2))) == pytest.approx(np.sqrt(2.0), rel=0.1)
+
+
+def test_drag_on_a_box_is_its_arm_across_the_force_on_its_shadow() -> None:
+    """For a convex box the torque of the flow is that of the whole force at the middle of the box."""
+    arm, flow = np.array([0.01, -0.005, 0.015]), np.array([5000.0, 4000.0, -3000.0])
+    faces = box((0.3, 0.1, 0.2), arm, np.zeros(6))
+    shadow = np.array([0.02, 0.06, 0.03]) @ np.abs(flow)
+    expected = np.cross(arm, -0.5 * 2.2 * 1e-12 * shadow * flow)
+    x, y, z = flow.tolist()
+    np.testing.assert_allclose(pressure.drag(faces, (x, y, z), 1e-12), expected, rtol=1e-12)
+
+
+def test_sunlight_on_a_black_box_pushes_away_and_on_a_mirror_twice_as_hard() -> None:
+    arm = np.array([0.0, 0.02, 0.0])
+    black = pressure.sunlight(box((0.1, 0.1, 0.1), arm, np.zeros(6)), (1.0, 0.0, 0.0), 1.0)
+    np.testing.assert_allclose(black, [0.0, 0.0, 0.02 * 4.56e-6 * 0.01], atol=1e-20)
+    mirror = pressure.sunlight(box((0.1, 0.1, 0.1), arm, np.ones(6)), (1.0, 0.0, 0.0), 1.0)
+    np.testing.assert_allclose(mirror, 2.0 * np.array(black), atol=1e-20)
+    assert pressure.sunlight(box((0.1, 0.1, 0.1), arm, np.ones(6)), (1.0, 0.0, 0.0), 0.0) == (0.0, 0.0, 0.0)
+
+
+def test_the_disturbances_of_a_3u_have_the_sizes_that_the_design_names() -> None:
+    """At 500 km: gravity gradient 4.9e-8, dipole of 1e-3 A m^2 2 to 5e-8, drag 6e-9 N m end on."""
+    sizes: dict[str, list[float]] = {}
+    for seed in range(12):
+        body = FreeBody(FreeBodySection(craft="cubesat_3u"), lambda: np.zeros(3), seed=seed)
+        for time in range(0, 2000, 100):
+            body.advance_to(time * SECOND)
+            for cause, torque in body.truth().torques.items():
+                sizes.setdefault(cause, []).append(float(np.linalg.norm(torque)))
+    assert 4.4e-8 < max(sizes["gravity gradient"]) <= 5.0e-8
+    assert 1e-8 < np.median(sizes["residual dipole"]) < max(sizes["residual dipole"]) < 7e-8
+    assert 3e-9 < np.median(sizes["drag"]) < max(sizes["drag"]) < 6e-8
+    assert 1e-9 < max(sizes["sunlight"]) < 6e-9
+    assert max(sizes["coils"]) == 0.0
+
+
+def test_the_residual_dipole_has_a_part_that_goes_in_shadow() -> None:
+    body = FreeBody(FreeBodySection(orbit=OrbitSection(local_time=12.0)), lambda: np.zeros(3))
+    lit: list[FloatArray] = []
+    dark: list[FloatArray] = []
+    for time in range(0, 5600, 50):
+        body.advance_to(time * SECOND)
+        truth = body.truth()
+        (lit if truth.sunlit == 1.0 else dark if truth.sunlit == 0.0 else []).append(truth.residual_dipole)
+    difference = np.linalg.norm(np.mean(lit, axis=0) - np.mean(dark, axis=0))
+    assert difference == pytest.approx(3e-4, abs=1.2e-4)
+
+
+def test_a_configuration_names_the_free_body_and_must_describe_it() -> None:
+    config = demo_config(1.0, camera=False)
+    section = reader.replace(demo_world(), world="free_body")
+    with pytest.raises(ConfigError, match="free_body: is missing"):
+        make_world(WorldInputs(config, section, lambda: np.zeros(3), 0))
+    described = reader.replace(section, free_body=FreeBodySection(), release=None)
+    world = make_world(WorldInputs(config, described, lambda: np.zeros(3), 0))
+    assert isinstance(world, World)
+    unreleased = reader.replace(described, world="testbed")
+    with pytest.raises(ConfigError, match=r"simulation\.release"):
+        make_world(WorldInputs(config, unreleased, lambda: np.zeros(3), 0))
+
+
+def test_the_documents_section_is_read_and_flies() -> None:
+    """The example of docs/fly/simulation.md."""
+    page = Path("docs/fly/simulation.md").read_text(encoding="utf-8")
+    text = page.split("free_body/test_free_body.py -->\n```yaml\n")[1].split("```")[0]
+    section = reader.simulation_section(text, "simulation.md", Simulation)
+    assert section is not None
+    world = make_world(WorldInputs(demo_config(1.0, camera=False), section, lambda: np.zeros(3), 0))
+    assert isinstance(world, FreeBody)
+    assert world.craft.inertia == CRAFTS["cubesat_3u"].inertia
