@@ -37,9 +37,10 @@ examples:
   {PROGRAM} run step_demo --out runs/demo
   {PROGRAM} report runs/demo
   {PROGRAM} plan --from 0.4 --to -0.3 --picture path.png
-  {PROGRAM} rate frame.png --fov 20 --exposure 0.2 --overlay found.png
-  {PROGRAM} solve night.jpg --fov 11.4 --overlay solved.png
-  {PROGRAM} horizon limb.png --fov 67 --altitude 515 --overlay found.png
+  {PROGRAM} samples
+  {PROGRAM} rate samples/streaks.png --fov 15 --exposure 0.4 --overlay found.png
+  {PROGRAM} solve samples/stars.png --fov 15 --overlay solved.png
+  {PROGRAM} horizon samples/limb.png --fov 67 --altitude 515 --overlay limb.png
 """
 
 
