@@ -11,19 +11,20 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from flight.gnc.errors import UsageError
+from flight.gnc.math.arrays import FloatArray
 from flight.schema import reader as configuration
 from flight.schema.errors import ConfigError
 from flight.schema.sections import Config
 from hal.guardian.client import CoilReach
-from hal.interfaces.devices import FrameSource
 from hal.interfaces.rig import Rig
-from hal.interfaces.wires import SECOND_NS, Clock
+from hal.interfaces.wires import SECOND_NS
 from sim_hal import lockstep
 from sim_hal.clock import SimClock
 from sim_hal.faults import grammar
 from sim_hal.faults.catalogue import listing
 from sim_hal.faults.host import corrupted_by, host_faults
 from sim_hal.faults.schedule import check, scheduled
+from sim_hal.posed_camera import PosedCamera, posed_camera
 from sim_hal.serving import remote
 from sim_hal.settings import Simulation
 
@@ -72,13 +73,10 @@ def open_rig(request: SimulationRequest, config: Config, stack: ExitStack) -> Ri
     return with_host_faults(opener(request, config, section, stack), section)
 
 
-def open_camera(request: SimulationRequest, config: Config) -> tuple[Clock, FrameSource]:
-    """Return the emulated camera of a configuration in lock-step, with the clock that drives it."""
+def open_camera(request: SimulationRequest, config: Config, rate: FloatArray) -> PosedCamera:
+    """Return the emulated camera of a configuration, turning at `rate` (3,) rad/s in camera axes."""
     section = request.section()
-    clock = SimClock(lockstep.utc_ns(section.utc))
-    frames = lockstep.build(config, section, None, clock).wires.frames
-    assert frames is not None, "the caller has seen to a camera section"
-    return clock, frames
+    return posed_camera(config, section, SimClock(lockstep.utc_ns(section.utc)), rate)
 
 
 def fault_catalogue() -> tuple[str, str]:

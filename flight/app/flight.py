@@ -30,7 +30,7 @@ def fly(request: RunRequest, progress: Callable[[Progress], None] | None = None)
     """Fly a configuration to its end. Raises UsageError for a user mistake, DeviceError for a device."""
     with EndingSignals() as signals, ExitStack() as stack:
         text, config = requested_config(request)
-        stack.enter_context(_placing(text, str(request.config_path)))
+        stack.enter_context(placing(text, str(request.config_path)))
         check_settings(config)
         request = begin_folder(request, text, config)
         rig = _open_rig(request, text, config, stack)
@@ -52,7 +52,7 @@ def fly(request: RunRequest, progress: Callable[[Progress], None] | None = None)
 
 
 @contextmanager
-def _placing(text: str, name: str) -> Iterator[None]:
+def placing(text: str, name: str) -> Iterator[None]:
     """Have a complaint about a value of the configuration say in which line of which file the value is."""
     try:
         yield

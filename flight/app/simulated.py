@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flight.app.request import RunRequest
+from flight.gnc.math.arrays import FloatArray
 from flight.schema.sections import Config
-from hal.interfaces.devices import FrameSource
 from hal.interfaces.rig import Rig
-from hal.interfaces.wires import Clock
 
 if TYPE_CHECKING:
+    from sim_hal.posed_camera import PosedCamera
     from sim_hal.rig import SimulationRequest
 
 
@@ -47,11 +47,11 @@ def simulated_rig(request: RunRequest, text: str, config: Config, stack: ExitSta
     return rig.open_rig(_simulation_request(request, text), config, stack)
 
 
-def simulated_camera(config_path: Path, text: str, config: Config) -> tuple[Clock, FrameSource]:
-    """Return the emulated camera of a configuration in lock-step, with the clock that drives it."""
+def simulated_camera(config_path: Path, text: str, config: Config, rate: FloatArray) -> PosedCamera:
+    """Return the emulated camera of a configuration, turning at `rate` (3,) rad/s in camera axes."""
     from sim_hal import rig  # noqa: PLC0415
 
-    return rig.open_camera(rig.SimulationRequest(config_path, text, Path()), config)
+    return rig.open_camera(rig.SimulationRequest(config_path, text, Path()), config, rate)
 
 
 def _simulation_request(request: RunRequest, text: str) -> SimulationRequest:

@@ -4,9 +4,10 @@ Weighted least squares in pixels over all frames at once, each frame's attitude 
 first weighed down (Cauchy's weights, scaled by the residuals' own spread), then left out beyond five sigma.
 
 Some parameters may not be in the data: in a narrow field a shift of the axis is a turn of the camera, and a
-single frame hardly separates them. Each therefore has a prior about the initial lens, stated as a
-standard deviation; a parameter that is not known to half of that afterwards is named in `undetermined`.
-Without a prior, data that leave the lens open are refused.
+single frame hardly separates them. Each therefore has a prior, stated as a standard deviation about the lens
+assumed: of the initial focal length, the axis in the middle, no distortion. A parameter that is not known to
+half of that afterwards is named in `undetermined`. Without a prior, data that leave the lens open are
+refused.
 """
 
 from __future__ import annotations
@@ -44,14 +45,15 @@ _CUT = 5.0
 _CAUCHY = 2.385
 # The median of a residual's length in sigmas, of Rayleigh's distribution.
 _MEDIAN_LENGTH = np.sqrt(2.0 * np.log(2.0))
-_DETERMINED = 0.5
+DETERMINED = 0.5
+"""Of its prior's standard deviation: to this a parameter must be known."""
 # Standard deviations by which chi-square may exceed its degrees of freedom before the sigmas count as wrong.
 _DOUBT = 3.0
 
 
 @dataclass(frozen=True, slots=True)
 class LensPrior:
-    """Prior knowledge of a lens: standard deviations about the initial lens; inf for none.
+    """Prior knowledge of a lens: standard deviations about the lens assumed; inf for none.
 
     Attributes:
         focal_length: a part of it; the default allows any lens whose field is roughly known.
@@ -88,7 +90,7 @@ class Calibration:
         used: of each frame (n,), which matches were believed.
         chi_square, degrees: of the residuals and the prior, by the given sigmas.
         rms_before, rms_after: px, of the distances of used matches from their stars with each frame's best
-            attitude, by the lens begun with and by the one found.
+            attitude, by the lens assumed and by the one found.
     """
 
     lens: Lens
@@ -117,14 +119,15 @@ def calibrate(
 ) -> Calibration:
     """Return the lens that fits all frames best, begun from `initial`.
 
-    Raises CalibrationError for malformed frames, for matches that do not fix a lens and for a fit that does
+    The prior, by default `LensPrior()`, is about the pinhole of the initial focal length. Raises
+    CalibrationError for malformed frames, for matches that do not fix a lens and for a fit that does
     not converge or ends at no lens.
     """
     _refuse_malformed(frames)
     begun = Lens.of(initial)
     information = (prior or LensPrior()).information(begun)
-    expected = parameters_of(begun)
-    fit = Fit(expected, np.array([_attitude(frame, begun, n) for n, frame in enumerate(frames)]))
+    expected = parameters_of(Lens.of(begun.ideal))
+    fit = Fit(parameters_of(begun), np.array([_attitude(frame, begun, n) for n, frame in enumerate(frames)]))
     for _ in range(_ROBUST_STEPS):
         fit = step(frames, fit, _cauchy_weights(_lengths(frames, fit)), information, expected).fit
     used = _believed(_lengths(frames, fit))
@@ -133,7 +136,7 @@ def calibrate(
         fit, before = last.fit, used
         used = _believed(_lengths(frames, fit))
         if all(np.array_equal(a, b) for a, b in zip(before, used, strict=True)):
-            return _result(frames, begun, last, used, information)
+            return _result(frames, begun, last, used, information, expected)
     raise CalibrationError("which matches are right does not settle: too many may be wrong")
 
 
@@ -213,6 +216,7 @@ def _result(
     last: Step,
     used: tuple[BoolArray, ...],
     prior: FloatArray,
+    expected: FloatArray,
 ) -> Calibration:
     """Return the calibration that the last step ends with."""
     focal_length, x, y, k1, k2 = last.fit.parameters.tolist()
@@ -220,7 +224,7 @@ def _result(
         lens = Lens(begun.columns, begun.rows, focal_length, (x, y), k1, k2)
     except LensError as error:
         raise CalibrationError(f"the matches fit no lens: {error}") from error
-    offset = last.fit.parameters - parameters_of(begun)
+    offset = last.fit.parameters - expected
     squares = [length[chosen] ** 2 for length, chosen in zip(_lengths(frames, last.fit), used, strict=True)]
     chi_square = float(np.sum(np.concatenate(squares)) + np.sum(prior * offset**2))
     count = sum(map(len, squares))
@@ -240,7 +244,7 @@ def _result(
         used,
         chi_square,
         degrees,
-        _rms(frames, begun, used),
+        _rms(frames, Lens.of(begun.ideal), used),
         _rms(frames, lens, used),
     )
 
@@ -251,7 +255,7 @@ def _undetermined(covariance: FloatArray, prior: FloatArray, begun: Lens) -> tup
     Raises CalibrationError for one without a prior that is not known to half of what any prior would say.
     """
     usual = LensPrior().information(begun)
-    poor = np.diag(covariance) * np.where(prior > 0.0, prior, usual) > _DETERMINED**2
+    poor = np.diag(covariance) * np.where(prior > 0.0, prior, usual) > DETERMINED**2
     names = [name for name, is_poor in zip(PARAMETERS, poor, strict=True) if is_poor]
     if np.any(poor & (prior == 0.0)):
         raise CalibrationError(f"the matches leave {', '.join(names)} open: give a prior")

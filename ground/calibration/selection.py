@@ -15,6 +15,7 @@ from flight.gnc.camera.lens import CameraModel
 from flight.gnc.math.arrays import FloatArray
 from ground.calibration.calibration import Calibration, calibrate
 from ground.calibration.lens_fit import MatchedFrame
+from ground.calibration.terms import FixedTerms, fit_terms
 
 # Part of its matches that a frame of the lens has believed.
 _BELIEVED_PART = 0.5
@@ -26,10 +27,15 @@ LEAST_STARS = 24
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Selected:
-    """A calibration and why frames were left out: reason by number of the frame."""
+    """A lens of the terms that the stars fix, and why frames were left out: reason by number of the frame."""
 
-    calibration: Calibration
+    terms: FixedTerms
     left_out: dict[int, str]
+
+    @property
+    def calibration(self) -> Calibration:
+        """The lens and its errors."""
+        return self.terms.calibration
 
     @property
     def stars(self) -> int:
@@ -60,5 +66,5 @@ def calibrate_one_lens(
         parts = np.array([used.mean() for used in found.used])
         worst = int(parts.argmin())
         if parts[worst] >= _BELIEVED_PART or len(kept) == 1:
-            return Selected(found, left_out)
+            return Selected(fit_terms([frames[number] for number in kept], initial), left_out)
         left_out[kept[worst]] = f"the lens of the others fits {parts[worst]:.0%} of its stars"

@@ -10,6 +10,7 @@ COMMANDS = {
     "solve": "determine where a picture of the sky points, and identify its stars",
     "index": "make the sky index of a mission's camera",
     "camera": "take frames from the configured camera and check them",
+    "samples": "render pictures to try the other commands on, with their truth",
     "horizon": "find the nadir in a picture of the Earth's limb",
     "calibrate": "calibrate a camera's lens from pictures of the sky",
 }

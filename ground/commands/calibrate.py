@@ -7,14 +7,14 @@ import json
 import math
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from flight.gnc.camera.images import read_image
-from flight.gnc.camera.lens import CameraModel, Lens
+from flight.gnc.camera.lens import CameraModel
 from flight.gnc.errors import UsageError
 from flight.gnc.math.arrays import Image
 from flight.gnc.vision.frame_job import solve_frame
@@ -23,9 +23,10 @@ from flight.gnc.vision.startracker.index.build import default_index
 from flight.gnc.vision.startracker.index.sky_index import SkyIndex
 from flight.gnc.vision.startracker.solution import FrameSolution
 from flight.gnc.vision.startracker.solve import SolveSettings
-from ground.calibration.calibration import PARAMETERS, Calibration
+from ground.calibration.calibration import PARAMETERS
 from ground.calibration.lens_fit import MatchedFrame
 from ground.calibration.selection import LEAST_STARS, Selected, calibrate_one_lens
+from ground.calibration.terms import FixedTerms, LeftOut
 from ground.commands.options import check_size, positive, write_new
 from ground.commands.solve import lens_of_field
 
@@ -61,8 +62,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "Calibrate a camera from pictures of the night sky: focal length, optical axis, radial distortion, "
         "with their errors. All pictures must be of one camera at one focus; those that do not fit are left "
         "out and named. Ten that put stars into the corners are worth more than a hundred that do not. "
-        "Undetermined parameters are named; fewer than "
-        f"{LEAST_STARS} stars make no camera file."
+        "A term that the stars do not fix is left out of the lens and named. The camera file says how well "
+        f"the lens is known (`accuracy`); fewer than {LEAST_STARS} stars make none."
     )
     parser.epilog = "example: python -m flight calibrate night*.tiff --fov 11.4 --out camera.yaml"
     parser.add_argument("images", type=Path, nargs="+", metavar="IMAGE")
@@ -84,18 +85,15 @@ def run(options: argparse.Namespace) -> int:
         for picture in pictures:
             sys.stderr.write(f"{picture.path}: {picture.reason}\n")
         return 1
-    found = selected.calibration
-    facts = _facts(found, pictures)
-    sys.stdout.write(json.dumps(facts, allow_nan=False) + "\n" if options.json else _text(found, pictures))
+    facts = _facts(selected.terms, pictures)
+    text = json.dumps(facts, allow_nan=False) + "\n" if options.json else _text(selected.terms, pictures)
+    sys.stdout.write(text)
     if options.out is None:
         return 0
-    if selected.stars < LEAST_STARS:
-        sys.stderr.write(
-            f"{options.out}: not written: {selected.stars} stars are too few for a camera, {LEAST_STARS} are"
-            " needed: give more pictures\n"
-        )
+    if problem := _problem(selected):
+        sys.stderr.write(f"{options.out}: not written: {problem}\n")
         return 1
-    _write(options.out, found.lens)
+    _write(options.out, selected.terms)
     if not options.json:
         sys.stdout.write(f"\nwritten: {options.out}, for --camera of `flight solve` and `flight rate`\n")
     return 0
@@ -163,11 +161,24 @@ def _matches(solution: FrameSolution, sky: SkyIndex) -> MatchedFrame:
     )
 
 
-def _facts(found: Calibration, pictures: Sequence[Picture]) -> dict[str, Any]:
+def _problem(selected: Selected) -> str:
+    """Return why the lens is none to write down, empty where it is one."""
+    if selected.stars < LEAST_STARS:
+        few = f"{selected.stars} stars are too few for a camera, {LEAST_STARS} are needed"
+        return f"{few}: give more pictures"
+    if "focal_length" in selected.calibration.undetermined:
+        return "the stars do not fix the focal length: give more pictures"
+    return ""
+
+
+def _facts(terms: FixedTerms, pictures: Sequence[Picture]) -> dict[str, Any]:
+    found = terms.calibration
     return {
         **found.lens.to_mapping(),
         "sigma": found.sigma,
         "undetermined": list(found.undetermined),
+        "terms_left_out": {name: asdict(gone) for name, gone in terms.left_out.items()},
+        "accuracy": terms.accuracy,
         "rms_px_before": found.rms_before,
         "rms_px_after": found.rms_after,
         "chi_square": found.chi_square,
@@ -185,12 +196,12 @@ def _facts(found: Calibration, pictures: Sequence[Picture]) -> dict[str, Any]:
     }
 
 
-def _text(found: Calibration, pictures: Sequence[Picture]) -> str:
+def _text(terms: FixedTerms, pictures: Sequence[Picture]) -> str:
+    found = terms.calibration
     lens, sigma = found.lens, found.sigma
     solved = [picture for picture in pictures if picture.used]
     stars = sum(len(picture.solution.matched) for picture in solved)
     values = dict(zip(PARAMETERS, (lens.focal_length, *lens.centre, lens.k1, lens.k2), strict=True))
-    places = {"k1": 5, "k2": 5}
     lines = [
         f"{picture.path}: {'left out' if picture.left_out else 'not solved'}: {picture.reason}"
         for picture in pictures
@@ -198,12 +209,16 @@ def _text(found: Calibration, pictures: Sequence[Picture]) -> str:
     ]
     lines.append(f"pictures:     {len(solved)} of {len(pictures)} used, {stars} stars")
     for name, value in values.items():
-        digits = places.get(name, 2)
-        note = "   not determined by the stars: the assumed value" if name in found.undetermined else ""
-        lines.append(f"{name + ':':13s} {value:.{digits}f} +- {sigma[name]:.{digits}f}{note}")
+        digits = 5 if name in ("k1", "k2") else 2
+        if name.partition("_")[0] not in terms.left_out:
+            lines.append(f"{name + ':':13s} {value:.{digits}f} +- {sigma[name]:.{digits}f}")
+    lines += [_left_out(name, gone) for name, gone in terms.left_out.items()]
     fov = 2.0 * math.degrees(math.atan(0.5 * lens.columns / lens.focal_length))
     lines.append(f"field:        {fov:.4f} deg across, without the distortion")
-    lines.append(f"residual:     {found.rms_before:.3f} px rms before, {found.rms_after:.3f} px after")
+    lines.append(f"accuracy:     {_accuracy(terms)}")
+    lines.append(
+        f"residual:     {found.rms_before:.3f} px rms without these terms, {found.rms_after:.3f} with"
+    )
     lines.append(
         f"chi-square:   {found.chi_square:.0f} of {found.degrees} degrees of freedom,"
         f" {found.rejected_count} matches not believed"
@@ -211,19 +226,45 @@ def _text(found: Calibration, pictures: Sequence[Picture]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _write(path: Path, lens: Lens) -> None:
-    """Write the camera as a section that `--camera` reads and a configuration may take over."""
-    fov = 2.0 * math.degrees(math.atan(0.5 * lens.columns / lens.focal_length))
-    text = (
-        "# Made by `python -m flight calibrate`.\n"
-        "camera:\n"
-        f"  columns: {lens.columns}\n"
-        f"  rows: {lens.rows}\n"
-        f"  field_of_view_deg: {fov:.6f}\n"
-        "  lens:                       # px; the pixel (x, y) on the axis; radial distortion of tangents\n"
-        f"    focal_length: {lens.focal_length:.4f}\n"
-        f"    centre: [{lens.centre[0]:.4f}, {lens.centre[1]:.4f}]\n"
-        f"    k1: {lens.k1:.8f}\n"
-        f"    k2: {lens.k2:.8f}\n"
+def _left_out(name: str, gone: LeftOut) -> str:
+    digits = 2 if name == "centre" else 5
+    fitted = ", ".join(
+        f"{value:.{digits}f} +- {sigma:.{digits}f}"
+        for value, sigma in zip(gone.values, gone.sigmas, strict=True)
     )
-    write_new(path, text)
+    assumed = "the middle of the picture" if name == "centre" else "none"
+    return f"{name + ':':13s} left out, not determined by the stars ({fitted}): {assumed} is assumed"
+
+
+def _accuracy(terms: FixedTerms) -> str:
+    places = {"focal_length": ("focal length", 1e2, 4, " %"), "centre": ("centre", 1.0, 2, " px")}
+    places["distortion"] = ("distortion at a corner", 1e2, 4, " %")
+    return ", ".join(
+        f"{label} {terms.accuracy[key] * scale:.{digits}f}{unit}"
+        if key in terms.accuracy
+        else f"{label} not known"
+        for key, (label, scale, digits, unit) in places.items()
+    )
+
+
+def _write(path: Path, terms: FixedTerms) -> None:
+    """Write the camera as a section that `--camera` reads and a configuration may take over."""
+    lens, gone = terms.calibration.lens, terms.left_out
+    fov = 2.0 * math.degrees(math.atan(0.5 * lens.columns / lens.focal_length))
+    assumed = "      # the middle: the stars do not fix it" if "centre" in gone else ""
+    lines = [
+        "# Made by `python -m flight calibrate`.",
+        "camera:",
+        f"  columns: {lens.columns}",
+        f"  rows: {lens.rows}",
+        f"  field_of_view_deg: {fov:.6f}",
+        "  lens:                       # px; the pixel (x, y) on the axis; radial distortion of tangents",
+        f"    focal_length: {lens.focal_length:.4f}",
+        f"    centre: [{lens.centre[0]:.4f}, {lens.centre[1]:.4f}]{assumed}",
+        *(f"    {name}: {getattr(lens, name):.8f}" for name in ("k1", "k2") if name not in gone),
+        "  accuracy:                   # standard deviations: shares of themselves, px for the centre",
+        *(f"    {name}: {value:.3g}" for name, value in terms.accuracy.items()),
+    ]
+    if gone:
+        lines.append(f"  # The stars do not fix {', '.join(gone)}: left out.")
+    write_new(path, "\n".join(lines) + "\n")

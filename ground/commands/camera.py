@@ -5,23 +5,32 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import textwrap
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from flight.gnc.camera.images import write_picture
 from flight.gnc.errors import UsageError
+from flight.gnc.math.arrays import FloatArray
+from flight.schema.camera_model import camera_model
 from flight.schema.carried import config_path
 from flight.schema.devices import Camera
+from ground.commands.options import finite
+from ground.truth import sky_truth, write_truth
 from hal.interfaces.devices import FrameSource
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.readings import Frame
 from hal.interfaces.wires import Clock
 
+if TYPE_CHECKING:
+    from ground.lone_camera import LoneCamera
+
 _LOOK_NS = 5_000_000
 _PATIENCE_NS = 10_000_000_000
+_MOST_TURN = 0.5  # rad: beyond it streaks would leave any field
 _MOST_EXPOSURES = 8
 """That may pass until a frame comes: a free-running camera takes the next whole one, once it has settled."""
 
@@ -31,10 +40,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Take frames from the camera of a configuration, real or simulated, one trigger each. Print the "
         "number of each, its delay after the end of the exposure, and its counts. --out writes the counts "
-        "as PNG, for `flight solve` and `flight rate`. Coils and inertial unit are not opened."
+        "as PNG, for `flight solve` and `flight rate`. Coils and inertial unit are not opened. A simulated "
+        "camera may turn: --rate makes streaks, and the truth of each picture is written beside it as JSON."
     )
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.description = textwrap.fill(parser.description, 100)
     parser.epilog = (
-        "example: python -m flight camera --config /etc/knightcube/flight.yaml --out frame.png --count 5"
+        "examples:\n"
+        "  python -m flight camera --config /etc/knightcube/flight.yaml --out frame.png --count 5\n"
+        "  python -m flight camera --config step_demo --exposure 0.3 --rate 0.05 -0.02 0.01 --out turn.png\n"
+        "  python -m flight rate turn.png --camera step_demo --exposure 0.3 --prior 0.05 -0.02 0.01\n"
     )
     parser.add_argument(
         "--config", type=config_path, required=True, metavar="CONFIG", help="file, or a carried name"
@@ -42,6 +57,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, metavar="PNG", help="write the frame; several as name-NUMBER.png")
     parser.add_argument("--count", type=int, default=1, metavar="N", help="frames to take (default 1)")
     parser.add_argument("--exposure", type=float, metavar="S", help="exposure instead of the configuration's")
+    parser.add_argument(
+        "--rate",
+        type=finite,
+        nargs=3,
+        metavar=("X", "Y", "Z"),
+        help="turn a simulated camera, rad/s in its axes: boresight +z, x right, y down",
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.set_defaults(command=run)
 
@@ -57,14 +79,21 @@ def run(options: argparse.Namespace) -> int:
     if options.out is not None and options.out.suffix.lower() != ".png":
         raise UsageError(f"--out {options.out}: frames are kept as PNG: give a name that ends in .png")
     facts = []
-    with opened_camera(options.config) as (clock, source, camera):
-        exposure_ns = round((options.exposure or camera.exposure) * 1e9)
-        for frame in _frames(clock, source, exposure_ns, options.count):
-            facts.append(_facts(frame, camera))
+    rate = None if options.rate is None else np.array(options.rate)
+    with opened_camera(options.config, rate) as lone:
+        exposure = options.exposure or lone.section.exposure
+        if rate is not None and np.linalg.norm(rate) * exposure > _MOST_TURN:
+            raise UsageError(
+                f"--rate: {np.linalg.norm(rate) * exposure:.3g} rad in the exposure: at most 0.5"
+            )
+        for frame in _frames(lone.clock, lone.frames, round(exposure * 1e9), options.count):
+            facts.append(_facts(frame, lone.section))
             if not options.json:
                 sys.stdout.write(_line(facts[-1]))
             if options.out is not None:
-                _keep(options.out, frame, options.count)
+                path = _keep(options.out, frame, options.count)
+                if rate is not None:
+                    write_truth(path.with_suffix(".json"), _truth(frame, lone, rate))
     numbers = [fact["sequence"] for fact in facts]
     frozen = numbers != sorted(set(numbers))
     if options.json:
@@ -113,6 +142,15 @@ def _line(fact: dict[str, Any]) -> str:
     )
 
 
-def _keep(out: Path, frame: Frame, count: int) -> None:
+def _keep(out: Path, frame: Frame, count: int) -> Path:
+    """Write a frame; return where."""
     path = out if count == 1 else out.with_name(f"{out.stem}-{frame.sequence}{out.suffix}")
     write_picture(path, frame.pixels)
+    return path
+
+
+def _truth(frame: Frame, lone: LoneCamera, rate: FloatArray) -> dict[str, Any]:
+    assert lone.attitude is not None, "only a simulated camera turns"
+    middle_ns = frame.exposure_start_ns + frame.exposure_ns // 2
+    focal_length = camera_model(lone.section).focal_length
+    return sky_truth(rate, frame.exposure_ns * 1e-9, lone.attitude(middle_ns), focal_length)

@@ -88,9 +88,8 @@ def run(options: argparse.Namespace) -> int:
     else:
         sys.stdout.write(_text(found, objects))
     if options.overlay is not None:
-        picture = grey_stretch(pixels)
-        draw_marks(picture, found.endpoints, found.used, [item.endpoints for item in objects])
-        write_picture(options.overlay, picture)
+        ends = [item.endpoints for item in objects]
+        write_picture(options.overlay, draw_marks(grey_stretch(pixels), found.endpoints, found.used, ends))
         if not options.json:
             sys.stdout.write(f"picture:       {options.overlay}\n")
     return 0 if found.rate is not None else 1

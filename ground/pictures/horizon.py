@@ -10,7 +10,7 @@ from flight.gnc.math.arrays import FloatArray
 from flight.gnc.vision.horizon.illumination import limb_rays
 from flight.gnc.vision.horizon.limb_equation import View
 from flight.gnc.vision.horizon.solution import HorizonSolution
-from ground.pictures.overlay import STREAK, UNUSED, draw_ring
+from ground.pictures.overlay import STREAK, UNUSED, draw_ring, outlined
 
 _RADIUS = 5.0
 _DOT = 0.0
@@ -27,12 +27,13 @@ def limb_in_picture(view: View, camera: CameraModel) -> FloatArray:
 def draw_horizon(
     picture: npt.NDArray[np.uint8], solution: HorizonSolution, camera: CameraModel
 ) -> npt.NDArray[np.uint8]:
-    """Return `picture` (rows, columns, 3) with the horizon drawn on it, in place.
+    """Return `picture` (rows, columns, 3) with the horizon drawn on it.
 
     The fitted limb as a line, orange rings for the edges on it, blue ones for the others.
     """
+    drawn = picture.copy()
     for point in limb_in_picture(solution.view, camera) if solution.view is not None else ():
-        draw_ring(picture, point, _DOT, STREAK)
+        draw_ring(drawn, point, _DOT, STREAK)
     for point, used in zip(solution.points, solution.on_horizon, strict=True):
-        draw_ring(picture, point, _RADIUS, STREAK if used else UNUSED)
-    return picture
+        draw_ring(drawn, point, _RADIUS, STREAK if used else UNUSED)
+    return outlined(picture, drawn)

@@ -18,7 +18,7 @@ from flight.gnc.math.quaternion import attitude_matrix
 from flight.gnc.vision.startracker.index.sky_index import SkyIndex
 from flight.gnc.vision.startracker.pointing import Pointing
 from flight.gnc.vision.startracker.solution import FrameSolution
-from ground.pictures.overlay import OBJECT, STREAK, UNUSED, Colour, draw_ring
+from ground.pictures.overlay import OBJECT, STREAK, UNUSED, Colour, draw_ring, outlined
 
 if TYPE_CHECKING:
     from PIL import ImageDraw
@@ -49,7 +49,7 @@ def draw_solution(picture: Picture, solution: FrameSolution, sky: SkyIndex) -> P
     if solution.fix is None:
         for point in solution.points[len(solution.star) :]:
             draw_ring(drawn, point, 6.0 * scale, _UNMATCHED)
-        return drawn
+        return outlined(picture, drawn)
     matrix = attitude_matrix(solution.fix.quaternion)
     faintest = float(sky.stars.magnitude[solution.star[solution.matched]].max())
     bright = sky.stars.brighter_than(faintest)
@@ -69,7 +69,7 @@ def draw_solution(picture: Picture, solution: FrameSolution, sky: SkyIndex) -> P
         text = PROPER_NAMES.get(int(bright.hip[star]), f"HIP {bright.hip[star]}")
         if text not in named:
             labels.append((places[star], text))
-    return _with_text(drawn, labels[:_MOST_NAMES], solution, scale)
+    return outlined(picture, _with_text(drawn, labels[:_MOST_NAMES], solution, scale))
 
 
 def _with_text(
@@ -84,14 +84,23 @@ def _with_text(
     image = pillow.fromarray(picture)
     draw = pillow_draw.Draw(image)
     font = ImageFont.load_default(size=15.0 * scale)
+    taken: list[tuple[float, float, float, float]] = []
     for (x, y), text in labels:
-        # To the right of its star, or to the left where the picture ends.
-        right = x + 11.0 * scale + draw.textlength(text, font=font) < picture.shape[1]
-        place, anchor = (x + 11.0 * scale, "lm") if right else (x - 11.0 * scale, "rm")
-        draw.text((place, y), text, fill=_NAME, font=font, anchor=anchor)
+        # To the right of its star, else to the left; left out where both are taken by brighter stars' names.
+        for place, anchor in (((x + 11.0 * scale, y), "lm"), ((x - 11.0 * scale, y), "rm")):
+            box = draw.textbbox(place, text, font=font, anchor=anchor)
+            if box[0] >= 0 and box[2] < picture.shape[1] and not any(_overlap(box, other) for other in taken):
+                draw.text(place, text, fill=_NAME, font=font, anchor=anchor)
+                taken.append(box)
+                break
     if solution.fix is not None:
         _draw_compass(draw, picture.shape, solution, font, scale)
     return np.asarray(image)
+
+
+def _overlap(box: tuple[float, float, float, float], other: tuple[float, float, float, float]) -> bool:
+    """Return whether two boxes of left, top, right, bottom share a pixel."""
+    return box[0] <= other[2] and other[0] <= box[2] and box[1] <= other[3] and other[1] <= box[3]
 
 
 def _draw_compass(

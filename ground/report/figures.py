@@ -87,7 +87,9 @@ def _cycle_times(scene: Scene) -> Figure | None:
     figure = Figure(figsize=TALL, layout="constrained")
     axes = figure.subplots(2 if len(jobs) else 1, 1, squeeze=False)[:, 0]
     cycle = {name: timing[name].astype(float) for name in ("lateness", "execution")}
-    panels.exceedance(axes[0], cycle, "Control cycles")
+    identity = scene.run["run"]
+    period = float(identity["control_period_ns"][0]) * 1e-9 if len(identity) else None
+    panels.exceedance(axes[0], cycle, "Control cycles", period)
     if len(jobs):
         names = np.array([to_text(name) for name in jobs["name"]], dtype=object)
         work = {str(name): jobs["execution"][names == name].astype(float) for name in sorted(set(names))}

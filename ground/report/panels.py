@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.ticker import LogLocator
 
 from flight.gnc.math.arrays import FloatArray
 from flight.link.telemetry.definitions import MAX_NODES
@@ -218,20 +219,40 @@ def rate_error(ax: Axes, scene: Scene) -> None:
     legend(ax)
 
 
-def exceedance(ax: Axes, values: dict[str, FloatArray], title: str) -> None:
-    """Draw the share of values larger than x, of each named set of times in s."""
+def exceedance(ax: Axes, values: dict[str, FloatArray], title: str, bound: float | None = None) -> None:
+    """Draw the share of values larger than x, of each named set of times in s; a line at `bound` s.
+
+    On axes of decades: one late cycle of thousands is as plain as the median. Times of zero, as the lateness
+    in lock-step, have no place on them and are stated in the legend.
+    """
+    least = []
     for (name, times), colour in zip(values.items(), PATH_COLOURS, strict=False):
-        ordered = np.sort(1e3 * times)
-        share = 1.0 - np.arange(len(ordered)) / len(ordered)
-        ax.step(
-            ordered,
-            share,
-            where="pre",
-            color=colour,
-            linewidth=1.6,
-            label=f"{name}: median {np.median(ordered):.3g} ms, max {ordered[-1]:.3g} ms",
-        )
+        ordered = np.sort(times[np.isfinite(times)])
+        share = 1.0 - np.arange(len(ordered)) / max(1, len(ordered))
+        shown = ordered > 0.0
+        if not shown.any():
+            ax.plot([], [], color=colour, linewidth=1.6, label=f"{name}: none")
+            continue
+        ends = f"median {duration(float(np.median(ordered)))}, max {duration(float(ordered[-1]))}"
+        x, y = ordered[shown], share[shown]
+        ax.step(x, y, where="pre", color=colour, linewidth=1.6, label=f"{name}: {ends}")
+        ax.plot(x[-1:], y[-1:], "o", color=colour, markersize=5)
+        least.append(x[0])
+    if bound is not None:
+        label = f"period, {duration(bound)}"
+        ax.axvline(bound, color=VERMILLION, linewidth=1.2, linestyle=(0, (5, 2)), label=label)
+    style(ax, "share above", title, "time")
     ax.set_yscale("log")
-    style(ax, "share above", title, "time, ms")
-    ax.set_xlim(left=0.0)
+    ax.yaxis.set_major_formatter(lambda share, _: f"{100.0 * share:g} %")
+    if least or bound is not None:
+        ax.set_xscale("log")
+        ax.margins(x=0.05)
+        ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=20))
+        ax.xaxis.set_major_formatter(lambda time, _: duration(time))
     legend(ax)
+
+
+def duration(time: float) -> str:
+    """Return a time in s as text of three digits with its unit."""
+    scale, unit = next(((s, u) for s, u in ((1.0, "s"), (1e3, "ms")) if abs(time) * s >= 0.9995), (1e6, "µs"))
+    return f"{time * scale:.3g} {unit}"

@@ -19,7 +19,10 @@ from flight.app.cli.outlet import outlast_readers
 from flight.gnc.errors import FlightError, UsageError
 from hal.interfaces.errors import DeviceError
 
-COMMANDS = {"run": "fly a configuration"}
+COMMANDS = {
+    "run": "fly a configuration",
+    "check": "check a configuration and the devices that it names, before it is flown",
+}
 """What a board has; the packages of `GROUP` add theirs."""
 
 GROUP = "knightcube.commands"
@@ -30,12 +33,14 @@ PROGRAM = "knightcube" if Path(sys.argv[0]).name == "knightcube" else "python -m
 
 _EXAMPLES = f"""\
 examples:
+  {PROGRAM} check step_demo
   {PROGRAM} run step_demo --out runs/demo
   {PROGRAM} report runs/demo
   {PROGRAM} plan --from 0.4 --to -0.3 --picture path.png
-  {PROGRAM} rate frame.png --fov 20 --exposure 0.2 --overlay found.png
-  {PROGRAM} solve night.jpg --fov 11.4 --overlay solved.png
-  {PROGRAM} horizon limb.png --fov 67 --altitude 515 --overlay found.png
+  {PROGRAM} samples
+  {PROGRAM} rate samples/streaks.png --fov 15 --exposure 0.4 --overlay found.png
+  {PROGRAM} solve samples/stars.png --fov 15 --overlay solved.png
+  {PROGRAM} horizon samples/limb.png --fov 67 --altitude 515 --overlay limb.png
 """
 
 

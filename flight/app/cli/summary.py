@@ -17,7 +17,7 @@ def summary_text(result: RunResult, elapsed: float) -> str:
         ("flown", f"{ending.mission_time:.0f} s in {elapsed:.1f} s, {result.reason}"),
         ("mode", ending.mode),
         ("alarms", ", ".join(ending.alarms) or "none"),
-        ("noticed", _counts(ending.faults, "faults") + "; " + _counts(ending.warnings, "warnings")),
+        ("noticed", counts_text(ending.faults, "faults") + "; " + counts_text(ending.warnings, "warnings")),
         ("coils", _coils(ending)),
     ]
     if result.faults:
@@ -47,7 +47,8 @@ def summary_facts(result: RunResult, elapsed: float) -> dict[str, Any]:
     }
 
 
-def _counts(counts: Mapping[str, int], noun: str) -> str:
+def counts_text(counts: Mapping[str, int], noun: str) -> str:
+    """Return how often each event of a kind came, in a phrase."""
     if not counts:
         return f"no {noun}"
     return f"{noun} " + ", ".join(f"{name} ({count})" for name, count in sorted(counts.items()))

@@ -54,6 +54,10 @@ class Vn100:
             while True:
                 question = dialogue.send(self._ask(question))
 
+    def model(self) -> str:
+        """Return what the unit calls itself; nothing is changed in it. Raises as `configure`."""
+        return ",".join(self._ask(Question("RRG", (1,))))
+
     def poll(self) -> list[ImuReading]:
         """Return the samples since the last call, oldest first. Never blocks.
 

@@ -10,6 +10,7 @@ import pytest
 
 pillow = pytest.importorskip("PIL.Image", reason="needs the extra `images`")
 
+from flight.schema.reader import load_camera  # noqa: E402
 from tests.flight.gnc.vision.startracker.frames import NARROW, sky_frame  # noqa: E402
 from tests.ground.commands.in_process import command  # noqa: E402
 
@@ -37,13 +38,32 @@ def test_the_lens_found_is_the_one_that_took_the_pictures(pictures: list[Path], 
     assert json.loads(solved.stdout)["field_of_view_deg"] == pytest.approx(12.0, abs=0.005)
 
 
-def test_what_the_stars_leave_open_is_named(pictures: list[Path], tmp_path: Path) -> None:
+def test_what_the_stars_leave_open_is_named_and_not_written(pictures: list[Path], tmp_path: Path) -> None:
     """The middle of one picture, 7 deg across: a distortion shows at the edge, and there is none."""
-    middle = tmp_path / "middle.png"
+    middle, out = tmp_path / "middle.png", tmp_path / "camera.yaml"
     pillow.open(pictures[0]).crop((212, 212, 812, 812)).save(middle)
-    done = command("calibrate", middle, "--fov", "7.05")
+    done = command("calibrate", middle, "--fov", "7.05", "--out", out)
     assert done.returncode == 0, done.stderr
-    assert "not determined by the stars" in done.stdout
+    (line,) = [line for line in done.stdout.splitlines() if line.startswith("k2:")]
+    assert "left out, not determined by the stars" in line
+    text = out.read_text()
+    assert "k2:" not in text
+    assert "# The stars do not fix k2" in text
+    assert load_camera(out).lens.k2 == 0.0  # type: ignore[union-attr]  # it has just been written
+
+
+def test_a_camera_file_says_how_well_the_lens_is_known(pictures: list[Path], tmp_path: Path) -> None:
+    """What `rate` claims rests on it: the error of the focal length is that of the fit."""
+    out = tmp_path / "camera.yaml"
+    done = command("calibrate", *pictures, "--fov", "12", "--out", out, "--json")
+    facts = json.loads(done.stdout)
+    accuracy = load_camera(out).accuracy
+    assert accuracy.focal_length == pytest.approx(facts["accuracy"]["focal_length"], rel=1e-2)
+    least = facts["sigma"]["focal_length"] / facts["focal_length"]
+    assert 0.99 * least <= accuracy.focal_length < 1e-3
+    assert abs(facts["focal_length"] / NARROW.pinhole.focal_length - 1.0) < 5.0 * accuracy.focal_length
+    assert 0.0 < accuracy.distortion < 2e-3
+    assert accuracy.line_time == 0.0, "no picture of stars that stand still shows that"
 
 
 def test_a_picture_of_another_focus_is_left_out_and_named(pictures: list[Path], tmp_path: Path) -> None:

@@ -66,6 +66,38 @@ def test_the_panels_show_the_values_of_the_log(tmp_path: Path) -> None:
     assert drawn.max() == CURRENT
 
 
+def test_one_late_cycle_of_thousands_does_not_flatten_the_distribution() -> None:
+    times = 1e-4 * np.random.default_rng(1).gamma(3.0, size=4000)
+    times[7] = 3.0
+    ax = Figure().subplots()
+    panels.exceedance(ax, {"lateness": times}, "Control cycles", 0.025)
+    middle, top = np.percentile(times, [50.0, 99.0])
+    (low, _), (high, _) = ax.transAxes.inverted().transform(ax.transData.transform([(middle, 1), (top, 1)]))
+    assert high - low > 0.08, "share of the width from the median to 99 %"
+    assert ax.get_xlim()[1] > 3.0
+    line = ax.get_lines()[0]
+    np.testing.assert_array_equal(line.get_xdata(), np.sort(times))
+    np.testing.assert_allclose(line.get_ydata(), 1.0 - np.arange(4000) / 4000)
+
+
+def test_the_lateness_of_lock_step_is_none_and_said() -> None:
+    ax = Figure().subplots()
+    panels.exceedance(ax, {"lateness": np.zeros(9), "execution": np.full(9, 2.0e-3)}, "Control cycles")
+    labels = ax.get_legend_handles_labels()[1]
+    assert labels == ["lateness: none", "execution: median 2 ms, max 2 ms"]
+    only = Figure().subplots()
+    panels.exceedance(only, {"lateness": np.zeros(9)}, "Control cycles")
+    assert only.get_xscale() == "linear", "a logarithmic axis needs a number"
+
+
+@pytest.mark.parametrize(
+    ("time", "text"),
+    [(2.58, "2.58 s"), (0.9999, "1 s"), (0.0246, "24.6 ms"), (1.2e-5, "12 µs"), (0.0, "0 µs")],
+)
+def test_times_have_the_unit_that_fits_them(time: float, text: str) -> None:
+    assert panels.duration(time) == text
+
+
 def test_values_that_only_a_damaged_log_has_do_not_keep_a_panel_from_being_drawn(tmp_path: Path) -> None:
     run = read_run(make_run(tmp_path, Recipe(duration=20.0, rate_hz=10.0)))
     damaged = run.truth.packets["truth"].copy()

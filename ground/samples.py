@@ -1,0 +1,142 @@
+"""Pictures to try the commands on, rendered by the simulator, each with its truth.
+
+They are made on demand: noise of 12 bits does not compress, so a few pictures would be megabytes in the
+repository, and none would follow the simulator when it changes. The same seed gives the same pictures.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flight.gnc.camera.images import write_picture
+from flight.gnc.camera.pinhole import Pinhole
+from flight.gnc.catalogue import load
+from flight.gnc.earth.figure import SEMI_MAJOR_AXIS
+from flight.gnc.earth.sun import ASTRONOMICAL_UNIT
+from flight.gnc.math.arrays import FloatArray, Image
+from flight.gnc.math.quaternion import attitude_matrix, from_matrix, from_rotation_vector, multiply
+from flight.gnc.vision.startracker.pointing import Pointing
+from ground.truth import sky_truth
+from sim_hal import earth_camera, star_camera
+
+PIXELS, FIELD_DEG = 768, 15.0
+YEAR = 2026.5
+STILL_S, TURNING_S = 0.5, 0.4
+RATE = (0.035, -0.02, 0.015)
+"""rad/s, camera axes: streaks of 47 px."""
+ORION = Pointing(math.radians(83.8), math.radians(-1.2), math.radians(20.0))
+EARTH_PIXELS, EARTH_FIELD_DEG, ALTITUDE_KM = 512, 67.0, 515.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sample:
+    """A picture, its truth ready for JSON, and the words of the command to try on it; `{}` is its file."""
+
+    name: str
+    pixels: Image
+    truth: dict[str, Any]
+    words: str
+
+
+def write_samples(folder: Path, seed: int, progress: Callable[[str], None]) -> list[tuple[Path, Sample]]:
+    """Render every sample into a folder that exists; return the files. Raises UsageError."""
+    written = []
+    for number, (name, make) in enumerate(_MAKERS.items()):
+        progress(name)
+        sample = make(name, np.random.default_rng([seed, number]))
+        written.append((folder / f"{name}.png", sample))
+        write_picture(written[-1][0], sample.pixels)
+    return written
+
+
+def _stars(name: str, generator: np.random.Generator) -> Sample:
+    """Show Orion, the camera still."""
+    return _sky(name, generator, ORION.quaternion(), np.zeros(3), STILL_S)
+
+
+def _night(name: str, generator: np.random.Generator) -> Sample:
+    """Show stars anywhere, for a calibration."""
+    attitude = generator.standard_normal(4)
+    return _sky(name, generator, attitude / np.linalg.norm(attitude), np.zeros(3), STILL_S)
+
+
+def _streaks(name: str, generator: np.random.Generator) -> Sample:
+    """Show Orion while the camera turns, and a satellite that moves among the stars."""
+    satellite = _satellite(ORION.quaternion())
+    sample = _sky(name, generator, ORION.quaternion(), np.array(RATE), TURNING_S, [satellite])
+    prior = " ".join(f"{component:g}" for component in RATE)
+    words = f"rate {{}} --fov {FIELD_DEG:g} --exposure {TURNING_S:g} --prior {prior}"
+    return replace(sample, words=words)
+
+
+def _limb(name: str, generator: np.random.Generator) -> Sample:
+    """Show the Earth's limb by day from a low orbit, the boresight 8 deg below it."""
+    lens = Pinhole.from_field_of_view(EARTH_PIXELS, EARTH_PIXELS, math.radians(EARTH_FIELD_DEG))
+    model = earth_camera.EarthCameraModel(lens=lens, response="linear", seed=1)
+    radius = SEMI_MAJOR_AXIS + 1e3 * ALTITUDE_KM
+    zenith, ahead = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.8, 0.6])
+    angle = math.asin(SEMI_MAJOR_AXIS / radius) - math.radians(8.0)
+    boresight = -math.cos(angle) * zenith + math.sin(angle) * ahead
+    across = np.cross(-zenith, boresight)
+    across /= np.linalg.norm(across)
+    attitude = from_matrix(np.stack([across, np.cross(boresight, across), boresight]))
+    turned = multiply(from_rotation_vector(np.array([0.0, 0.0, 0.2])), attitude)
+    sun = ASTRONOMICAL_UNIT * np.array([0.8, -0.6, 0.0])
+    scene = earth_camera.EarthScene(radius * zenith, turned, sun, texture=3)
+    pixels = earth_camera.render(model, scene, generator)
+    truth = {"nadir_camera": earth_camera.nadir(scene).tolist(), "altitude_km": ALTITUDE_KM}
+    words = f"horizon {{}} --fov {EARTH_FIELD_DEG:g} --altitude {ALTITUDE_KM:g}"
+    return Sample(name, pixels, truth, words)
+
+
+_MAKERS: dict[str, Callable[[str, np.random.Generator], Sample]] = {
+    "stars": _stars,
+    "streaks": _streaks,
+    "limb": _limb,
+    **{f"night-{number}": _night for number in range(1, 5)},
+}
+
+
+@cache
+def _camera() -> star_camera.StarCameraModel:
+    return star_camera.StarCameraModel(columns=PIXELS, rows=PIXELS, field_of_view=math.radians(FIELD_DEG))
+
+
+def _sky(
+    name: str,
+    generator: np.random.Generator,
+    attitude: FloatArray,
+    rate: FloatArray,
+    exposure: float,
+    extra: list[star_camera.SourceTrack] | None = None,
+) -> Sample:
+    """Return the sky as exposed about `attitude` (4,) at its middle, turning at `rate` (3,)."""
+    times = np.linspace(0.0, exposure, 41)
+    turns = from_rotation_vector((times[:, None] - 0.5 * exposure) * rate)
+    stars, model = load(), _camera()
+    pixels = star_camera.render(
+        model,
+        stars.directions_at(YEAR),
+        stars.magnitude,
+        times,
+        multiply(turns, attitude),
+        generator,
+        extra or [],
+    )
+    truth = sky_truth(rate, exposure, attitude, model.pinhole.focal_length)
+    return Sample(name, pixels, truth, f"solve {{}} --fov {FIELD_DEG:g}")
+
+
+def _satellite(attitude: FloatArray) -> star_camera.SourceTrack:
+    """Return something of magnitude 3 that moves by 25 mrad/s among the stars, near the picture's middle."""
+    seen = np.array([[0.03, 0.02, 1.0], [0.03, 0.03, 1.0]])
+    directions = seen @ attitude_matrix(attitude)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return star_camera.SourceTrack(np.array([0.0, TURNING_S]), directions, 3.0)

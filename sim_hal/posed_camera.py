@@ -1,0 +1,61 @@
+"""A simulated star camera by itself: held as a configuration releases the body, or turning at a steady rate.
+
+Its frames have a truth: the attitude at any time, and the rate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector, multiply
+from flight.schema.sections import Config
+from hal.interfaces.devices import FrameSource
+from hal.interfaces.wires import Clock
+from sim_hal.assembly import StarRenderer, inline_exposure
+from sim_hal.clock import SimClock
+from sim_hal.emulators.star_camera import EmulatedStarCamera
+from sim_hal.settings import Simulation
+from sim_hal.worlds.motion import Motion
+from sim_hal.worlds.simulation import TimedSimulation
+from sim_hal.worlds.world import WorldInputs, make_world
+
+
+@dataclass(frozen=True, slots=True)
+class PosedCamera:
+    """A camera, its clock, and its attitude (4,), ICRS into camera, at a time of that clock."""
+
+    clock: Clock
+    frames: FrameSource
+    attitude: Callable[[int], FloatArray]
+
+
+def posed_camera(config: Config, section: Simulation, clock: SimClock, rate: FloatArray) -> PosedCamera:
+    """Return the camera of a configuration on a clock, turning at `rate` (3,) rad/s, camera axes.
+
+    It begins at the attitude at which the body is released. Raises ConfigError for a world that cannot be.
+    """
+    camera = config.camera
+    assert camera is not None, "the caller has seen to a camera section"
+    begun_ns, mounting = clock.now_ns(), np.array(camera.mounting)
+    world = make_world(WorldInputs(config, section, lambda: np.zeros(3), begun_ns))
+    held, body_rate = world.motion(begun_ns), attitude_matrix(mounting).T @ rate
+    nothing = np.zeros(3)
+
+    def motion(time_ns: int) -> Motion:
+        turned = from_rotation_vector(body_rate * ((time_ns - begun_ns) * 1e-9))
+        return Motion(time_ns, multiply(turned, held.quaternion), body_rate, nothing, nothing)
+
+    device = EmulatedStarCamera(
+        motion,
+        inline_exposure(StarRenderer(camera, section.sky, section.seed)),
+        clock.now_ns,
+        round(section.sky.readout * 1e9),
+        mounting,
+        round(section.sky.line_time * camera.rows * 1e9),
+    )
+    clock.attach(TimedSimulation(lambda _: None, [device]))
+    return PosedCamera(clock, device, lambda time_ns: multiply(mounting, motion(time_ns).quaternion))

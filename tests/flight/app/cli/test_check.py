@@ -1,0 +1,152 @@
+"""`flight check`: ready or not, with each missing device and its cure, before anything is flown."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import yaml
+
+from flight.app.cli.check import flight_problems
+from flight.app.request import RunResult
+from flight.loop.ending import Ending
+from tests.ground.commands.in_process import command
+from tests.ground.commands.test_commands import DEMO, ROOT
+
+TESTBED = ROOT / "config" / "testbed.yaml"
+WELL = Ending(10.0, 400, "testbed-demo", coils_at_zero=True, coil_error="")
+
+
+def write(folder: Path, source: Path, **changes: object) -> Path:
+    """Return a configuration with some sections changed."""
+    path = folder / "mine.yaml"
+    path.write_text(yaml.safe_dump({**yaml.safe_load(source.read_text()), **changes}), encoding="utf-8")
+    return path
+
+
+def test_a_sound_simulation_flies_ten_seconds_and_is_ready(tmp_path: Path) -> None:
+    done = command("check", write(tmp_path, DEMO, camera="none"), "--json")
+    assert (done.returncode, done.stderr) == (0, "")
+    facts = json.loads(done.stdout)
+    assert (facts["ready"], facts["problems"], facts["simulated"]) == (True, [], True)
+    assert facts["flight"]["mission_time_s"] == pytest.approx(10.0, abs=0.1)
+    assert not Path(facts["flight"]["folder"]).exists(), "nothing is left behind"
+
+
+def test_a_shorter_flight_is_flown_whole_and_the_text_says_ready(tmp_path: Path) -> None:
+    path = write(tmp_path, DEMO, camera="none", duration=0.5, steps=[{"at": 0.0, "q2": 0.0}])
+    done = command("check", path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith(f"configuration: {path}: step-demo, valid\n")
+    assert done.stdout.endswith("noticed:       no faults; no warnings\nverdict:       ready\n")
+
+
+def test_a_simulation_that_does_not_fly_well_is_not_ready(tmp_path: Path) -> None:
+    """The coils carry a hundredth of what the configuration says."""
+    world = {**yaml.safe_load(DEMO.read_text())["simulation"], "truth": {"resistance": [2300.0] * 3}}
+    steps = [{"at": 0.0, "q2": 0.0}]
+    done = command("check", write(tmp_path, DEMO, camera="none", duration=6.0, steps=steps, simulation=world))
+    assert done.returncode == 1, done.stdout
+    assert "problem:       fault noticed: coil-broken" in done.stdout
+    assert done.stdout.endswith("verdict:       not ready\n")
+
+
+@pytest.mark.parametrize(
+    ("ending", "changes", "problem"),
+    [
+        (WELL, {}, None),
+        (replace(WELL, warnings={"cycle-slip": 1}), {}, None),
+        (replace(WELL, alarms=("imu-silent",)), {}, "alarm: imu-silent"),
+        (replace(WELL, faults={"blind": 2}), {}, "fault noticed: blind (2)"),
+        (replace(WELL, alarms=("imu-silent",), faults={"blind": 2}), {"faults": ("imu: silent",)}, None),
+        (replace(WELL, coils_at_zero=False), {}, "the coils were not left at zero"),
+        (replace(WELL, coils_at_zero=False, coil_error="no answer"), {}, "no answer"),
+        (WELL, {"interrupted": True}, "the flight was stopped by SIGINT"),
+        (WELL, {"log_error": "the disk is full"}, "the disk is full"),
+        (WELL, {"restart": "the loop stood"}, "the loop stood"),
+    ],
+)
+def test_what_counts_as_a_problem_of_a_flight(
+    ending: Ending, changes: dict[str, object], problem: str | None
+) -> None:
+    result = replace(RunResult(Path(), "stopped by SIGINT", False, "", ending), **changes)  # type: ignore[arg-type]
+    assert flight_problems(result) == ([] if problem is None else [problem])
+
+
+@pytest.fixture(scope="module")
+def unit(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Yield the device file of an emulated unit in a process of its own."""
+    link = tmp_path_factory.mktemp("line") / "unit"
+    words = [sys.executable, "-m", "sim_hal", "emulate", "vn100", "--link", str(link), "--duration", "60"]
+    with subprocess.Popen(words, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as server:
+        deadline = time.monotonic() + 20.0
+        while not link.exists() and time.monotonic() < deadline:
+            time.sleep(0.02)
+        yield link
+        server.terminate()
+
+
+def test_devices_that_are_missing_are_named_with_the_cure_and_one_that_is_there_is_found(
+    unit: Path, tmp_path: Path
+) -> None:
+    tree = yaml.safe_load(TESTBED.read_text())
+    changes: dict[str, object] = {
+        "inertial_unit": {**tree["inertial_unit"], "device": str(unit)},
+        "coils": {**tree["coils"], "bus": str(tmp_path / "no-bus")},
+        "camera": {
+            "device": {"kind": "v4l2", "path": str(tmp_path / "no-camera")},
+            "bits": 8,
+            "star_tracker": {"index": "x"},
+        },
+        "commands": {"socket": str(tmp_path / "nowhere" / "socket")},
+    }
+    path = write(tmp_path, TESTBED, **changes)
+    done = command("check", path, "--json")
+    assert done.returncode == 1, done.stderr
+    facts = json.loads(done.stdout)
+    devices = {item["name"]: item for item in facts["devices"]}
+    assert {name for name, item in devices.items() if item["found"]} == {"inertial_unit"}
+    assert devices["inertial_unit"]["text"].startswith("answers: VN-100")
+    for name, cure in {
+        "coils": "no such bus",
+        "power_monitor": "no such bus",
+        "camera": "no-camera",
+        "camera.star_tracker.index": "flight index",
+        "commands.socket": "no such folder",
+    }.items():
+        assert cure in devices[name]["text"] + devices[name]["place"], name
+        assert f"{name}: missing" in facts["problems"]
+    assert facts["flight"] is None, "no real device is flown"
+    text = command("check", path).stdout
+    assert "MISSING  coils" in text
+    assert "found    inertial_unit" in text
+
+
+@pytest.mark.parametrize(
+    ("changes", "complaint"),
+    [
+        ({"body": "nobody"}, "`body` is 'nobody'"),
+        ({"duration": -1.0}, "duration"),
+        ({"surplus": 1}, "surplus"),
+    ],
+)
+def test_a_configuration_that_is_refused_is_one_line_and_status_2(
+    changes: dict[str, object], complaint: str, tmp_path: Path
+) -> None:
+    done = command("check", write(tmp_path, DEMO, **changes))
+    assert (done.returncode, done.stderr.count("\n"), done.stdout) == (2, 1, "")
+    assert complaint in done.stderr
+
+
+def test_a_file_that_is_not_what_was_accepted_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path, DEMO, camera="none")
+    (tmp_path / "mine.yaml.sha256").write_text("00  mine.yaml\n")
+    done = command("check", path)
+    assert done.returncode == 2
+    assert "is not what was accepted" in done.stderr

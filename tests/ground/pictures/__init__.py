@@ -1,0 +1,1 @@
+"""Drawings upon pictures."""

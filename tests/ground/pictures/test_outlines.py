@@ -1,0 +1,49 @@
+"""Marks and names are read on a bright sky as on a dark one: black stands between them and the sky."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.ndimage import binary_dilation
+
+from flight.gnc.vision.frame_job import solve_frame
+from flight.gnc.vision.startracker.index.build import default_index
+from flight.gnc.vision.startracker.solve import SolveSettings
+from ground.pictures.overlay import draw_marks
+from ground.pictures.sky_picture import draw_solution
+from tests.flight.gnc.vision.startracker.frames import NARROW, sky_frame
+
+pytest.importorskip("PIL.Image", reason="needs the extra `images`")
+Picture = npt.NDArray[np.uint8]
+
+
+def _sky(size: int, grey: int) -> Picture:
+    return np.full((size, size, 3), grey, dtype=np.uint8)
+
+
+def _stand_apart(plain: Picture, drawn: Picture) -> bool:
+    """Return whether no pixel of a colour touches one of the sky."""
+    coloured = np.ptp(drawn.astype(int), axis=2) > 40
+    around = binary_dilation(coloured, np.ones((3, 3), dtype=bool)) & ~coloured
+    return bool(coloured.any() and np.all(np.any(drawn[around] != plain[around], axis=1)))
+
+
+def test_streaks_and_objects_stand_apart_from_a_white_sky_and_the_picture_is_left_alone() -> None:
+    plain = _sky(200, 255)
+    ends = np.array([[[20.0, 30.0], [60.0, 50.0]], [[100.0, 5.0], [195.0, 150.0]]])
+    drawn = draw_marks(plain, ends, np.array([True, False]), [np.array([[150.0, 40.0], [160.0, 50.0]])])
+    assert np.all(plain == 255)
+    assert _stand_apart(plain, drawn)
+
+
+def test_a_solved_picture_can_be_read_on_any_sky() -> None:
+    frame = sky_frame(np.random.default_rng([41, 0]), 0.0, 0.5).pixels
+    sky = default_index()
+    found = solve_frame(frame, NARROW.pinhole, (0.98, 1.02), 1.0, sky, SolveSettings())
+    for grey in (0, 128, 255):
+        plain = _sky(len(frame), grey)
+        drawn = draw_solution(plain, found, sky)
+        yellow = np.all(np.abs(drawn.astype(int) - [240, 228, 66]) < 30, axis=2)
+        assert yellow.sum() > 300, "names"
+        assert grey == 0 or _stand_apart(plain, drawn)
