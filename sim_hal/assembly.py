@@ -17,7 +17,7 @@ from flight.gnc.catalogue import load
 from flight.gnc.math.arrays import FloatArray, Image
 from flight.schema.devices import Camera
 from flight.schema.sections import Config
-from hal.drivers.coil_settings import CoilSettings, wirings
+from sim_hal.coil_assembly import assemble_coils
 from sim_hal.emulators.device import EmulatedDevice, SerialEnd
 from sim_hal.emulators.i2c_bus import EmulatedI2cBus
 from sim_hal.emulators.ina219 import EmulatedIna219
@@ -38,9 +38,6 @@ if TYPE_CHECKING:
 
 _LINE_STREAM = 0x11E
 _FAULT_STREAM = 0xFA017
-
-BUS_VOLTAGE = 5.0
-"""V in the coils' supply, before the losses of the bridge [ch. 5: a 5 V power bus]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,13 +78,11 @@ def assemble(
     Raises ConfigError for a world that cannot be made.
     """
     unit_seed, circuit_seed = np.random.SeedSequence(section.seed).spawn(2)
-    pwm = EmulatedPca9685(config.coils.address, now_ns)
-    circuit = _circuit(config, section, pwm, np.random.default_rng(circuit_seed), now_ns)
+    coils = assemble_coils(config, section, np.random.default_rng(circuit_seed), now_ns, wait)
+    circuit = coils.circuit
     world = make_world(WorldInputs(config, section, circuit.currents, now_ns()))
     sense = _sense(world, circuit, np.array(section.coil_field))
     unit = _unit(config, section, sense, line, np.random.default_rng(unit_seed), now_ns())
-    monitor = _monitor(config, circuit, now_ns)
-    bus = EmulatedI2cBus([pwm] if monitor is None else [pwm, monitor], wait=wait)
     camera = _camera(config.camera, section, world, expose, now_ns)
     faults = FaultTimeline()
     if truth is not None:
@@ -95,33 +90,9 @@ def assemble(
     # At equal times devices run in this order.
     devices: list[EmulatedDevice | None] = [unit, camera, faults, truth]
     simulation = TimedSimulation(world.advance_to, [device for device in devices if device is not None])
-    return Hardware(simulation, world, unit, bus, pwm, monitor, circuit, camera, truth, faults)
-
-
-def _circuit(
-    config: Config,
-    section: Simulation,
-    pwm: EmulatedPca9685,
-    generator: np.random.Generator,
-    now_ns: Callable[[], int],
-) -> CoilCircuit:
-    resistance = section.truth.resistance or config.coils.resistance
-    supply = section.truth.supply_voltage or config.coils.supply_voltage
-    return CoilCircuit(
-        pwm,
-        _coil_settings(config, resistance, supply),
-        generator,
-        now_ns,
-        uncertainty=section.current_noise,
-        bus_voltage=BUS_VOLTAGE,
+    return Hardware(
+        simulation, world, unit, coils.bus, coils.pwm, coils.monitor, circuit, camera, truth, faults
     )
-
-
-def _monitor(config: Config, circuit: CoilCircuit, now_ns: Callable[[], int]) -> EmulatedIna219 | None:
-    settings = config.power_monitor
-    if settings is None:
-        return None
-    return EmulatedIna219(settings.address, now_ns, circuit.mean_supply, settings.shunt)
 
 
 def _sense(world: World, circuit: CoilCircuit, coil_field: FloatArray) -> Callable[[int], Motion]:
@@ -230,10 +201,3 @@ def inline_exposure(renderer: StarRenderer) -> Expose:
         return future
 
     return expose
-
-
-def _coil_settings(config: Config, resistance: tuple[float, float, float], supply: float) -> CoilSettings:
-    """Return the true coil settings."""
-    coils = config.coils
-    wired = wirings(coils.channels, resistance, coils.signs, coils.enable_channels)
-    return CoilSettings(wired, supply, coils.current_limit, coils.stale_after)

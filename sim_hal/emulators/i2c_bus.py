@@ -1,7 +1,8 @@
 """An I2C bus in memory, with emulated parts and the faults of its wires.
 
-A transaction is what smbus2 makes of a call: address, register byte and data, or a repeated start and a read.
-Its duration on the wire (0.6 ms for 24 bytes at 400 kHz) is not modelled; a hang lasts the bus's time-out.
+A transaction is one message, or several joined by repeated STARTs, as in Linux's ioctl I2C_RDWR;
+`sim_hal.emulators.i2c_adapter` makes SMBus transfers of them. The duration on the wire (0.6 ms for 24 bytes
+at 400 kHz) is not modelled; a hang lasts the bus's time-out.
 """
 
 from __future__ import annotations
@@ -24,6 +25,15 @@ class I2cPart(Protocol):
 
     def read(self, count: int) -> bytes:
         """Return bytes from the register pointer on."""
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """One message: a write of `data`, or with `count` a read of that many bytes; either may be empty."""
+
+    address: int
+    data: bytes = b""
+    count: int | None = None
 
 
 @dataclass(slots=True)
@@ -103,16 +113,36 @@ class EmulatedI2cBus:
         self._closed = True
 
     def send(self, address: int, data: bytes) -> None:
-        """Write bytes as they are, as i2c_rdwr would: 0x06 alone to address 0 is the software reset."""
+        """Write bytes as they are: 0x06 alone to address 0 is the software reset."""
+        self.transfer((Message(address, data),))
+
+    def transfer(self, messages: Sequence[Message]) -> list[bytes]:
+        """Send messages joined by repeated STARTs; return what each read gives.
+
+        At most one fault meets a part in a transaction. Its flipped bits are of the data read where something
+        is read, else of the data written after the register byte.
+        """
+        reads = any(message.count is not None for message in messages)
+        given: list[bytes] = []
+        parts: list[I2cPart] = []
+        fault: _Fault | None = None
+        address = -1
         with self._lock:
-            parts, fault = self._begin(address)
-            if fault is not None:
-                if fault.code:
-                    if fault.after:
-                        self._deliver(parts, address, data[: fault.after])
-                    self._fail(fault, address)
-                data = _flipped(data, 1 + fault.index, fault.mask)
-            self._deliver(parts, address, data)
+            for message in messages:
+                if message.address != address:
+                    address = message.address
+                    parts, fault = self._begin(address)
+                    if fault is not None and fault.code:
+                        self._deliver(parts, address, b"" if reads else message.data[: fault.after])
+                        self._fail(fault, address)
+                if message.count is None:
+                    written = message.data if reads else _flipped(message.data, fault, 1)
+                    self._deliver(parts, address, written)
+                else:
+                    # Outputs are open drain: of several parts that answer, the zeros win.
+                    answers = zip(*(part.read(message.count) for part in parts), strict=True)
+                    given.append(_flipped(bytes(map(_wired_and, answers)), fault, 0))
+        return given
 
     def nack(
         self,
@@ -164,14 +194,7 @@ class EmulatedI2cBus:
             self._faults = [other for other in self._faults if other is not fault]
 
     def _read(self, address: int, register: int, count: int) -> bytes:
-        with self._lock:
-            parts, fault = self._begin(address)
-            if fault is not None and fault.code:
-                self._fail(fault, address)
-            self._deliver(parts, address, bytes((register,)))
-            # Outputs are open drain: of several parts that answer, the zeros win.
-            data = bytes(map(_wired_and, zip(*(part.read(count) for part in parts), strict=True)))
-            return data if fault is None else _flipped(data, fault.index, fault.mask)
+        return self.transfer((Message(address, bytes((register,))), Message(address, count=count)))[0]
 
     def _begin(self, address: int) -> tuple[list[I2cPart], _Fault | None]:
         if self._closed:
@@ -200,8 +223,9 @@ class EmulatedI2cBus:
 
     @staticmethod
     def _deliver(parts: list[I2cPart], address: int, data: bytes) -> None:
-        for part in parts:
-            part.write(address, data)
+        if data:  # An empty write only asks for the acknowledge of the address.
+            for part in parts:
+                part.write(address, data)
 
 
 def _wired_and(column: tuple[int, ...]) -> int:
@@ -211,10 +235,12 @@ def _wired_and(column: tuple[int, ...]) -> int:
     return value
 
 
-def _flipped(data: bytes, index: int, mask: int) -> bytes:
-    if index >= len(data):
+def _flipped(data: bytes, fault: _Fault | None, first: int) -> bytes:
+    """Return the data with the bits that a fault flips, counted from byte `first` on."""
+    if fault is None or first + fault.index >= len(data):
         return data
-    return data[:index] + bytes((data[index] ^ mask,)) + data[index + 1 :]
+    index = first + fault.index
+    return data[:index] + bytes((data[index] ^ fault.mask,)) + data[index + 1 :]
 
 
 def _check_length(length: int) -> None:

@@ -1,10 +1,10 @@
 """An emulated VN-100 on the device end of a serial line.
 
 It executes commands through `vn100_commands` and sends the measurements of `vn100_sensors` in the formats of
-`vn100_outputs`, on the 800 Hz grid of its own clock. Registers that tune its estimation (21 to
-26, 32 to 47, 82 to 84) are stored and echoed without effect; of register 85 the windows of magnetometer,
-accelerometer and gyro have an effect. Not emulated: tare, SYNC lines, the second serial port. The 500 ms of a
-flash write are VectorNav's; the second of start-up is assumed.
+`vn100_outputs`, on the 800 Hz grid of its own clock. Registers that tune its estimation (21 to 26, 32 to 51,
+74, 82 to 84) are stored and echoed without effect, except the heading mode of 35; of register 85 the windows
+of magnetometer, accelerometer and gyro have an effect. Not emulated: SYNC lines, the second serial port. The
+500 ms of a flash write are VectorNav's; the second of start-up is assumed.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.frames import NED_TO_TESTBED
 from flight.gnc.math.quaternion import IDENTITY
 from sim_hal.emulators.device import NEVER, SerialEnd
+from sim_hal.emulators.vn100_attitude import AttitudeCommands
 from sim_hal.emulators.vn100_commands import CommandInterface, UnitActions
 from sim_hal.emulators.vn100_outputs import REPORT_BY_TYPE, Instant, report_length
 from sim_hal.emulators.vn100_registers import ASYNC_RATES_HZ, RegisterFile, UnitError
@@ -83,7 +84,8 @@ class Vn100Emulator:
         self._then: tuple[int, Callable[[int], None]] | None = None
         self._streams = OutputStreams(self.registers)
         actions = UnitActions(self._instant_now, self._build_streams, self._write_flash, self._restart)
-        self._commands = CommandInterface(line, self.registers, self._streams, actions, bias)
+        self._attitude = AttitudeCommands(self.registers, bias)
+        self._commands = CommandInterface(line, self.registers, self._streams, actions, self._attitude)
         self._origin_ns = now_ns
         self._uptime_ns = settings.uptime_ns
         self._tick = -1
@@ -182,14 +184,14 @@ class Vn100Emulator:
 
     def _measure(self, now_ns: int) -> Measured:
         windows = tuple(self.registers.integer(85, index) for index in range(3))
-        measured = self._sensors.measure(self._sense(now_ns), windows)
+        measured = self._attitude.turned(self._sensors.measure(self._sense(now_ns), windows))
         return measured if self.alter is None else self.alter(measured)
 
     def _instant(self, device_ns: int, measured: Measured, since_ns: int) -> Instant:
         interval = (device_ns - since_ns) * 1e-9
         settings = self._settings
         return Instant(
-            device_ns, measured, self._commands.status, interval, settings.temperature, settings.pressure
+            device_ns, measured, self._attitude.status, interval, settings.temperature, settings.pressure
         )
 
     def _instant_now(self, now_ns: int) -> Instant:

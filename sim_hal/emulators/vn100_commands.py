@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from flight.gnc.math.arrays import FloatArray
 from hal.drivers.vn100.ascii import Checksum, Sentence, build, parse
 from sim_hal.emulators.device import SerialEnd
+from sim_hal.emulators.vn100_attitude import ATTITUDE_COMMANDS, AttitudeCommands, flag
 from sim_hal.emulators.vn100_outputs import REPORT_BY_REGISTER, Instant
 from sim_hal.emulators.vn100_registers import (
     BINARY_OUTPUTS,
@@ -25,7 +25,6 @@ from sim_hal.emulators.vn100_registers import (
 from sim_hal.emulators.vn100_streams import OutputStreams, packer
 
 _RECEIVE_BUFFER = 256
-_KNOWN_MAGNETIC, _KNOWN_ACCELERATION = 1 << 11, 1 << 12
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +49,6 @@ class CommandInterface:
 
     Attributes:
         paused: whether asynchronous outputs are paused (ASY).
-        status: the VPE status word; KMD and KAD set its disturbance bits.
     """
 
     def __init__(
@@ -59,23 +57,21 @@ class CommandInterface:
         registers: RegisterFile,
         streams: OutputStreams,
         actions: UnitActions,
-        gyro_bias: FloatArray,
+        attitude: AttitudeCommands,
     ) -> None:
-        """`gyro_bias` (3,) rad/s, sensor axes, is stored by SGB as the estimate."""
         self._line = line
         self._registers = registers
         self._streams = streams
         self._actions = actions
-        self._gyro_bias = gyro_bias
+        self._attitude = attitude
         self._received = bytearray()
         self.paused = False
-        self.status = 0
 
     def reset(self) -> None:
         """Discard received bytes and the state that commands have set."""
         self._received.clear()
         self.paused = False
-        self.status = 0
+        self._attitude.reset()
 
     def receive(self, data: bytes, now_ns: int) -> None:
         """Execute and answer the commands that `data` completes."""
@@ -125,20 +121,16 @@ class CommandInterface:
                 expect_count(fields, 2, 16)
                 self._write(_number_of(fields[0]), fields, answer, now_ns)
             case "ASY":
-                self.paused = not _flag(fields)
+                self.paused = not flag(fields)
                 answer(*fields)
-            case "KMD" | "KAD":
-                bit = _KNOWN_MAGNETIC if sentence.command == "KMD" else _KNOWN_ACCELERATION
-                self.status = self.status | bit if _flag(fields) else self.status & ~bit
+            case command if command in ATTITUDE_COMMANDS:
+                self._attitude.execute(command, fields, lambda: self._actions.sample(now_ns).measured)
                 answer(*fields)
             case "BOM":
                 expect_count(fields, 1, 1)
                 self._poll_binary(BINARY_OUTPUTS[0] - 1 + _number_of(fields[0]), now_ns)
             case "WNV":
                 self._actions.write_flash(now_ns, lambda end_ns: answer(at_ns=end_ns))
-            case "SGB":
-                self._registers.write(43, tuple(f"{value:+010.6f}" for value in self._gyro_bias.tolist()))
-                answer()
             case "RFS" | "RST":
                 answer()
                 if sentence.command == "RFS":
@@ -182,10 +174,3 @@ def _number_of(text: str) -> int:
         return int(text)
     except ValueError as error:
         raise UnitError(INVALID_REGISTER) from error
-
-
-def _flag(fields: tuple[str, ...]) -> bool:
-    expect_count(fields, 1, 1)
-    if fields[0] not in {"0", "1"}:
-        raise UnitError(INVALID_PARAMETER)
-    return fields[0] == "1"

@@ -187,8 +187,8 @@ REPORTS = (
     Report("GYR", 12, 19, _rate_text),
     Report("MAR", 13, 20, _sensors_text),
     Report("YMR", 14, 27, lambda now: _angles_text(now) + _sensors_text(now)),
-    Report("YBA", 16, None, lambda now: _linear_text(now, (4, 6))),
-    Report("YIA", 17, None, lambda now: _linear_text(now, (4, 7))),
+    Report("YBA", 16, 239, lambda now: _linear_text(now, (4, 6))),
+    Report("YIA", 17, 240, lambda now: _linear_text(now, (4, 7))),
     Report("IMU", 19, 54, _imu_text),
     Report("DTV", 30, 80, _deltas_text),
 )

@@ -18,6 +18,7 @@ BAUD_RATES = (9600, 19200, 38400, 57600, 115200, 128000, 230400, 460800, 921600)
 ASYNC_RATES_HZ = (1, 2, 4, 5, 10, 20, 25, 40, 50, 100, 200)
 ASYNC_TYPES = (0, 1, 2, 8, 9, 10, 11, 12, 13, 14, 16, 17, 19, 30)
 BINARY_OUTPUTS = (75, 76, 77)
+GYRO_STARTUP_BIAS, FILTER_STARTUP_BIAS = 43, 74
 
 # The fields that a VN-100 has, by group bit; all others need satellite navigation or later units.
 SUPPORTED_FIELDS: Mapping[int, int] = {0: 0x3F3D, 1: 0x0191, 2: 0x0FFF, 4: 0x01FF}
@@ -93,6 +94,15 @@ def _number(text: str) -> str:
     return text
 
 
+def _between(low: float, high: float) -> Rule:
+    def rule(text: str) -> str:
+        if not low <= float(text) <= high:
+            raise ValueError(text)
+        return text
+
+    return rule
+
+
 def _tag(text: str) -> str:
     if len(text) > 20:
         raise ValueError(text)
@@ -136,9 +146,14 @@ REGISTERS: Mapping[int, Register] = {
     ),
     33: Register((_unsigned(4294967295),) * 3, ("0", "0", "0")),
     35: Register((_ON_OFF, _unsigned(2), _ON_OFF, _ON_OFF), ("1", "1", "1", "1")),
-    43: _numbers("+00.000000", "+00.000000", "+00.000000"),
+    36: Register((_between(0.0, 10.0),) * 9, ("4",) * 3 + ("5",) * 3 + ("5.5",) * 3),
+    38: Register((_between(0.0, 10.0),) * 9, ("5",) * 3 + ("3",) * 3 + ("4",) * 3),
+    GYRO_STARTUP_BIAS: _numbers(*("+00.000000",) * 3),
     44: Register((_unsigned(2), _choice(1, 3), _choice(1, 2, 3, 4, 5)), ("1", "3", "5")),
     47: Register((_number,) * 12, _CALIBRATION, writable=False),
+    50: _numbers("0", "0", "0"),
+    51: Register((_ON_OFF, _number, _number), ("1", "0.1", "0.01")),
+    FILTER_STARTUP_BIAS: _numbers(*("+00.000000",) * 7),
     82: Register((_ON_OFF, _unsigned(2), _ON_OFF, _ON_OFF, _ON_OFF), ("0", "0", "0", "0", "0")),
     83: _numbers("0", "0", "0", "0", "1000", "0.000", "+00.00000000", "+000.00000000", "+00000.000"),
     84: _numbers(*_CALIBRATION),

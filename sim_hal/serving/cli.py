@@ -19,7 +19,8 @@ from sim_hal.emulators.pty_line import PtyLine
 from sim_hal.emulators.vn100 import Vn100Emulator, Vn100EmulatorSettings
 from sim_hal.emulators.vn100_registers import BAUD_RATES
 from sim_hal.emulators.vn100_sensors import PROFILES
-from sim_hal.serving import command
+from sim_hal.serving import command, emulate_i2c
+from sim_hal.serving.options import number, positive, seed
 from sim_hal.worlds.motion import Motion, about_thread
 
 _LONGEST_WAIT_NS = 50_000_000
@@ -48,6 +49,7 @@ def _parser() -> argparse.ArgumentParser:
     emulate = commands.add_parser("emulate", help="serve one emulated device", description="Serve a device.")
     devices = emulate.add_subparsers(required=True, metavar="DEVICE")
     _add_vn100(devices)
+    emulate_i2c.add_to(devices)
     command.add_to(commands)
     return parser
 
@@ -61,38 +63,17 @@ def _add_vn100(devices: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = vn100.add_argument
-    add("--rate-deg-s", type=_number, metavar="R", help="turn steadily at R degrees a second")
-    add("--amplitude-deg", type=_number, default=20.0, metavar="A", help="else swing by A (default 20)")
-    add("--period-s", type=_positive, default=20.0, metavar="S", help="period of the swing (default 20)")
-    add("--field", type=_number, default=4.5e-4, metavar="T", help="tesla (default 4.5e-4)")
+    add("--rate-deg-s", type=number, metavar="R", help="turn steadily at R degrees a second")
+    add("--amplitude-deg", type=number, default=20.0, metavar="A", help="else swing by A (default 20)")
+    add("--period-s", type=positive, default=20.0, metavar="S", help="period of the swing (default 20)")
+    add("--field", type=number, default=4.5e-4, metavar="T", help="tesla (default 4.5e-4)")
     add("--baud", type=int, choices=BAUD_RATES, default=115200, help="the unit's speed (default 115200)")
     add("--noise", choices=sorted(PROFILES), default="thesis", help="noise profile (default thesis)")
-    add("--seed", type=_seed, default=1, help="of the noise (default 1)")
+    add("--seed", type=seed, default=1, help="of the noise (default 1)")
     add("--link", type=Path, metavar="PATH", help="make PATH a symbolic link to the device")
-    add("--duration", type=_positive, metavar="S", help="end after S seconds")
+    add("--duration", type=positive, metavar="S", help="end after S seconds")
     add("--json", action="store_true", help="print one JSON object instead of the device's name")
     vn100.set_defaults(command=_emulate_vn100)
-
-
-def _number(text: str) -> float:
-    value = float(text)
-    if not math.isfinite(value):
-        raise argparse.ArgumentTypeError(f"{text} is not a finite number")
-    return value
-
-
-def _positive(text: str) -> float:
-    value = _number(text)
-    if value <= 0.0:
-        raise argparse.ArgumentTypeError(f"{text} is not above zero")
-    return value
-
-
-def _seed(text: str) -> int:
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"{text} is below zero")
-    return value
 
 
 def _emulate_vn100(options: argparse.Namespace) -> int:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import ctypes
 import errno
 from typing import Any
 
 from smbus2 import smbus2
 
-from sim_hal.emulators.i2c_bus import EmulatedI2cBus
+from sim_hal.emulators import i2c_adapter
+from sim_hal.emulators.i2c_bus import EmulatedI2cBus, Message
 
 I2C_RETRIES = 0x0701
 I2C_TIMEOUT = 0x0702
@@ -27,7 +29,7 @@ class IoctlWire:
         self.wire = wire
         self._address = -1
         self.settings: list[tuple[int, int]] = []
-        self.functions = int(smbus2.I2cFunc.I2C | smbus2.I2cFunc.SMBUS_EMUL)
+        self.functions = i2c_adapter.FUNCTIONS
         self.slave_error = 0
 
     def __call__(self, descriptor: int, request: int, argument: Any = 0) -> int:
@@ -42,24 +44,30 @@ class IoctlWire:
             self.settings.append((request, argument))
         elif request == smbus2.I2C_SMBUS:
             self._transfer(argument)
+        elif request == smbus2.I2C_RDWR:
+            self._messages(argument)
         else:
             raise OSError(errno.ENOTTY, f"request 0x{request:04x}")
         return 0
 
     def _transfer(self, message: Any) -> None:
-        data = message.data.contents
-        reading = message.read_write == smbus2.I2C_SMBUS_READ
-        if message.size == smbus2.I2C_SMBUS_BYTE_DATA:
-            if reading:
-                data.byte = self.wire.read_byte_data(self._address, message.command)
-            else:
-                self.wire.write_byte_data(self._address, message.command, data.byte)
-        elif message.size == smbus2.I2C_SMBUS_I2C_BLOCK_DATA:
-            length = data.block[0]
-            if reading:
-                answer = self.wire.read_i2c_block_data(self._address, message.command, length)
-                data.block[1 : length + 1] = answer
-            else:
-                self.wire.write_i2c_block_data(self._address, message.command, data.block[1 : length + 1])
-        else:
-            raise OSError(errno.EOPNOTSUPP, f"SMBus size {message.size}")
+        union = message.data.contents if message.data else None
+        sent = b"" if union is None else bytes(union.block)
+        reading, command, size = message.read_write == 1, message.command, message.size
+        answer = i2c_adapter.smbus(self.wire, self._address, reading, command, size, sent)
+        if union is not None:
+            union.block[: len(answer)] = answer
+
+    def _messages(self, argument: Any) -> None:
+        messages = [argument.msgs[index] for index in range(argument.nmsgs)]
+        answers = iter(
+            self.wire.transfer(
+                [
+                    Message(m.addr, count=m.len) if m.flags & 1 else Message(m.addr, m.buf[: m.len])
+                    for m in messages
+                ]
+            )
+        )
+        for message in messages:
+            if message.flags & 1:
+                ctypes.memmove(message.buf, next(answers), message.len)

@@ -19,6 +19,8 @@ from sim_hal.emulators.vn100_registers import SUPPORTED_FIELDS
 from sim_hal.emulators.vn100_sensors import PROFILES
 from sim_hal.worlds.motion import about_thread
 
+WATCHED = (1, 5, 6, 7, 21, 36, 38, 43, 44, 50, 51, 74, 75)
+
 
 class Bench:
     """A unit on a line, and a host that only looks at bytes."""
@@ -67,7 +69,25 @@ def test_out_of_the_box_it_speaks_vnymr_at_40_hz() -> None:
         (b"$VNRRG,1*00\r\n", "03"),
         (b"$VNRRG,1*0000\r\n", "03"),
         (build("FOO"), "04"),
-        (build("TAR"), "04"),
+        (build("TAR", 1), "06"),
+        (build("SFB", 0), "06"),
+        (build("SIH"), "05"),
+        (build("SIH", 10, 0), "05"),
+        (build("SIH", 0, 0, 0, 1, 0), "06"),
+        (build("SIH", "north"), "07"),
+        (build("SIH", "inf"), "07"),
+        (build("SIH", 0, 0, 0, 0), "07"),
+        (build("WRG", 36, *(5,) * 8), "05"),
+        (build("WRG", 36, *(5,) * 10), "06"),
+        (build("WRG", 36, *(5,) * 8, 10.5), "07"),
+        (build("WRG", 38, -1, *(5,) * 8), "07"),
+        (build("WRG", 50, 1, 2), "05"),
+        (build("WRG", 50, 1, 2, 3, 4), "06"),
+        (build("WRG", 50, 1, 2, "nan"), "07"),
+        (build("WRG", 51, 2, 0.1, 0.01), "07"),
+        (build("WRG", 51, 1, 0.1), "05"),
+        (build("WRG", 239, *(0,) * 9), "09"),
+        (build("WRG", 240, *(0,) * 9), "09"),
         (build("RRG"), "05"),
         (build("WRG", 44, 1, 3), "05"),
         (build("WRG", 44, 1, 3, 5, 1), "06"),
@@ -92,10 +112,10 @@ def test_mistakes_get_their_error_codes_and_change_nothing(line: bytes, code: st
     bench = Bench()
     bench.exchange(build("WRG", 7, 20), 0.1)
     bench.quiet()
-    before = [bench.unit.registers.read(n) for n in (1, 5, 6, 7, 21, 44, 75)]
+    before = [bench.unit.registers.read(n) for n in WATCHED]
     (answer,) = bench.exchange(line)
     assert (answer.command, answer.fields) == ("ERR", (code,))
-    assert [bench.unit.registers.read(n) for n in (1, 5, 6, 7, 21, 44, 75)] == before
+    assert [bench.unit.registers.read(n) for n in WATCHED] == before
 
 
 def test_an_answer_is_checked_the_way_the_question_was() -> None:
@@ -233,7 +253,9 @@ def test_a_flood_without_a_line_end_overflows_its_buffer() -> None:
 
 numbers = map(str, range(0, 101, 5))
 field = st.sampled_from([*numbers, "8", "44", "75", "01", "FFFF", "-1", "1e9", "nan", "", "é"])
-command = st.sampled_from(["RRG", "WRG", "ASY", "KMD", "BOM", "WNV", "RST", "RFS", "SGB", "ERR", ""])
+command = st.sampled_from(
+    ["RRG", "WRG", "ASY", "KMD", "BOM", "WNV", "RST", "RFS", "SGB", "SIH", "TAR", "ERR", ""]
+)
 
 
 @given(
