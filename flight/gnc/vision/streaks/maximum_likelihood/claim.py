@@ -19,7 +19,7 @@ from flight.gnc.vision.streaks.maximum_likelihood.agreement import (
     estimates_of,
     own_equations,
 )
-from flight.gnc.vision.streaks.maximum_likelihood.equation_solver import shared_covariance
+from flight.gnc.vision.streaks.maximum_likelihood.equation_solver import turn_covariance
 from flight.gnc.vision.streaks.maximum_likelihood.iteration import ExposedCamera, Fit
 from flight.gnc.vision.streaks.maximum_likelihood.lens_errors import correct, seeming_turns
 from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
@@ -58,8 +58,8 @@ class Claim:
 def claim(result: MotionResult, camera: ExposedCamera, last: Fit) -> Claim:
     """Return what a fit may claim of its turn; `result` has its stars."""
     scene, settings = last.scene, camera.settings
-    exact = shared_covariance(last.evaluation, last.free, _CONJUGATE)
-    noise = (last.solution.covariance if exact is None else exact)[:3, :3]
+    exact = turn_covariance(last.evaluation, last.free, _CONJUGATE)
+    noise = last.solution.covariance[:3, :3] if exact is None else exact
     turn, added, spread = scene.motion.whole, np.zeros((3, 3)), 1.0
     equations = own_equations(last.evaluation, last.free)
     if equations is not None:

@@ -128,19 +128,19 @@ def _from_prior(scene: Scene) -> FloatArray:
     return np.stack([np.zeros_like(scene.sky)] * 3 + [scene.sky], axis=-1)
 
 
-def shared_covariance(evaluation: Evaluation, free: BoolArray, rounds: int) -> FloatArray | None:
-    """Return the covariance (SHARED, SHARED) of the shared parameters, shared pixels accounted for."""
+def turn_covariance(evaluation: Evaluation, free: BoolArray, rounds: int) -> FloatArray | None:
+    """Return the covariance (3, 3) of the turn, shared pixels accounted for; None without one."""
     eliminated = eliminate(evaluation, free)
     if eliminated is None:
         return None
-    n = len(evaluation.chi2)
-    out = np.zeros((SHARED, SHARED))
-    for k in eliminated.kept:
-        # Scaled to a unit of the solution, so that one tolerance serves radians and pixels.
+    alone = np.zeros((len(evaluation.chi2), ALONE))
+    out = np.empty((3, 3))
+    for k in range(3):
+        # Scaled to a unit of the solution, so that one tolerance serves all.
         unit = np.zeros(SHARED)
-        unit[k] = 1.0 / np.sqrt(eliminated.inner[np.searchsorted(eliminated.kept, k)].max())
-        solved, _ = _conjugate(evaluation, eliminated, free, (unit, np.zeros((n, ALONE))), rounds)
-        out[k] = solved / unit[k]
+        unit[k] = 1.0 / np.sqrt(eliminated.inner[k].max())
+        solved, _ = _conjugate(evaluation, eliminated, free, (unit, alone), rounds)
+        out[k] = solved[:3] / unit[k]
     return 0.5 * (out + out.T)
 
 

@@ -23,7 +23,6 @@ from flight.gnc.vision.streaks.maximum_likelihood.first_guess import (
 from flight.gnc.vision.streaks.maximum_likelihood.iteration import (
     FIRST,
     LAST,
-    SETTLED,
     ExposedCamera,
     Fit,
     iterate,
@@ -43,9 +42,11 @@ _STILL_ROUNDS = 12
 # A guess is made of this many whole streaks, or of a scan; regions longer than it speak against it.
 _WHOLE = 8
 _CONTRADICTED = 0.3
-# A hypothesis with this many stars, this part of which it explains, needs no rival.
+# A hypothesis with this many stars needs no rival where it explains this part of them, the rest being crowded
+# by others, and this part of their ends is in place.
 _MANY = 3
-_MOST = 0.6
+_EXPLAINED = 0.4
+_IN_PLACE = 0.6
 _WORST_FIRST = 12.0
 # A star is explained when at most this part of its light is left; none counts more than this many sigmas.
 _LEFT_OVER = 0.01
@@ -152,7 +153,7 @@ def _tried(camera: ExposedCamera, guess: Guess) -> tuple[float, bool, Fit] | Non
     evidence, share = _borne_out(done)
     ends = _ending(camera, done.scene)
     explained = evidence * (1.0 - _CONTRADICTION * guess.contradicted) * max(ends - _BY_CHANCE, 0.02)
-    convincing = done.restless <= SETTLED and min(share, ends) > _MOST and count >= _MANY
+    convincing = share > _EXPLAINED and ends > _IN_PLACE and count >= _MANY
     return explained, convincing, done
 
 

@@ -23,8 +23,8 @@ from flight.gnc.vision.streaks.maximum_likelihood.work import Work
 _LONGEST_STEP = 3.0
 # An end so far, px, from where its window was cut has left the window's middle.
 _DRIFT = 1.5
-# Ends of untrusted stars may be farther from it; after the first round by any distance: all windows are
-# not cut again for those whose light hardly fixes their place.
+# Ends of untrusted stars may be farther from it; after the first round in fresh windows by any distance: all
+# windows are not cut again for those whose light hardly fixes their place.
 _FAINT_DRIFT = 2.5
 # The growth may change by this part of the turn before that.
 _GROWN = 0.1
@@ -153,6 +153,7 @@ def iterate(
     camera: ExposedCamera, scene: Scene, free: BoolArray, how: Rounds, windows: Windows | None = None
 ) -> Fit | None:
     """Return the fit after some rounds, None when the stars do not fix the motion."""
+    fresh = windows is None
     whole, cut_at = windows or camera.windows(scene), scene
     windows = whole
     restless, asked, before = np.inf, np.inf, np.zeros(SHARED)
@@ -179,7 +180,7 @@ def iterate(
         if turn >= how.patience and wanted > _LEAST_PROGRESS * asked and not onward:
             break
         asked, before = wanted, solution.shared
-        if _drifted(camera, cut_at, scene, _FAINT_DRIFT if turn == 0 else np.inf):
+        if _drifted(camera, cut_at, scene, _FAINT_DRIFT if turn == 0 and fresh else np.inf):
             del windows, whole  # tens of MB, as are the new ones
             windows = whole = camera.windows(scene)
             cut_at = scene
