@@ -114,7 +114,7 @@ def _text(verdict: Verdict) -> str:
     config, result = verdict.config, verdict.result
     lines = [
         ("configuration", f"{verdict.path}: {config.name}, valid"),
-        ("to fly", f"body {config.body}, {len(config.steps)} steps in {config.duration:g} s"),
+        ("to fly", f"body {config.body}, {config.duration:g} s"),
         ("devices", "simulated" if config.simulation is not None else f"{len(verdict.devices)} looked for"),
     ]
     lines += [
