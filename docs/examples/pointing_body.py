@@ -2,7 +2,7 @@
 
 The configuration names this body as `body: pointing_body:POINTING`. The law is the cross product law of
 magnetic control: from the wanted torque T, the dipole is m = (B x T) / |B|^2, so that m x B is the part of T
-across the field B. Filter, detumbling and coil watch are those of the testbed, whose plant this body has.
+across the field B. Filter, feed, brake and coil watch are those of the testbed, whose plant this body has.
 
 Run with `python docs/examples/pointing_body.py`: it flies the demonstration's first step.
 """
@@ -23,11 +23,12 @@ import numpy as np
 
 from flight.bodies.testbed.body import (
     attitude_filter,
+    brake_of,
     coil_watch,
-    detumbler,
     dipole_per_ampere,
     surrounding_field,
 )
+from flight.bodies.testbed.feed import UnitFeed
 from flight.bodies.testbed.plant_model import angular_acceleration_psd_of, plant_of
 from flight.gnc.estimation.estimate import Estimate
 from flight.gnc.estimation.measurements import MeanRateMeasurement
@@ -43,7 +44,6 @@ from flight.loop.services import Services
 from flight.loop.state.content import Learned
 from flight.schema.sections import Config
 from flight.schema.testbed import TestbedConfig, as_testbed
-from hal.interfaces.readings import ImuReading
 
 DUE_NS = 60_000_000_000
 """After this time a target should have been reached."""
@@ -246,10 +246,6 @@ class View:
         """Return the body's field of the mode packet."""
         return {"target_q2": math.nan}
 
-    def reading_text(self, reading: ImuReading) -> str:
-        """Return a reading in words."""
-        return f"rate {reading.rate.round(5).tolist()} rad/s"
-
     def rate_text(self, rate: MeanRateMeasurement) -> str:
         """Return a rate from streaks in words."""
         return f"rate {rate.rate.round(5).tolist()} rad/s"
@@ -277,7 +273,8 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
         planner=direct,
         targets=Attitudes(config, direct),
         tracker=tracker,
-        detumbler=detumbler(config, plant),
+        feed=UnitFeed(filter_, config.inertial_unit),
+        brake=brake_of(config, plant),
         coil_watch=coil_watch(config, plant),
         view=View(services),
         field=tracker.field,

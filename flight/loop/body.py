@@ -11,7 +11,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from flight.gnc.control.detumble import Detumbler
 from flight.gnc.estimation.attitude_filter import AttitudeFilter
 from flight.gnc.estimation.estimate import Estimate
 from flight.gnc.estimation.measurements import MeanRateMeasurement
@@ -27,6 +26,42 @@ from hal.interfaces.readings import ImuReading
 
 PLANNER = "planner"
 """The planner worker's name."""
+
+
+@dataclass(frozen=True, slots=True)
+class Agreement:
+    """How a reading of the inertial unit agrees with the estimate.
+
+    Attributes:
+        holds: whether at least a part of it agrees, so that the estimate counts as measured.
+        objection: the part that does not agree, as text; empty when all does.
+    """
+
+    holds: bool
+    objection: str = ""
+
+
+class Feed(Protocol):
+    """Gives the filter the quantities of a reading that have a meaning for this body."""
+
+    def accept(self, reading: ImuReading) -> Agreement:
+        """Start the filter from a reading, or apply it."""
+
+
+class Brake(Protocol):
+    """Brakes a tumble by the magnetometer alone, in windows in which the coils pause."""
+
+    def begin(self, now_ns: int) -> None:
+        """Begin with no knowledge of the field."""
+
+    def sample(self, time_ns: int, field: FloatArray) -> None:
+        """Accept a field (3,) T measured at `time_ns`; ignored unless the coils were off and settled."""
+
+    def command(self, now_ns: int) -> CoilCommand:
+        """Return the command now: zero while the field is measured or the rate is not known."""
+
+    def field(self, now_ns: int) -> FloatArray | None:
+        """Return the field (3,) T in body axes now; None before it is known."""
 
 
 class Tracker(Protocol):
@@ -120,9 +155,6 @@ class BodyView(Protocol):
     def mode_fields(self, wanted: Target | None) -> Mapping[str, float]:
         """Return the body's fields of the mode packet."""
 
-    def reading_text(self, reading: ImuReading) -> str:
-        """Return a reading as text, for the event of its rejection."""
-
     def rate_text(self, rate: MeanRateMeasurement) -> str:
         """Return a rate from streaks as text, for the event of its rejection."""
 
@@ -140,7 +172,8 @@ class Body:
         field: returns the magnetic field (3,) T in body axes at an estimate, for reallocation of currents.
         free_axis: (3,) the only axis about which the body can turn; None for a free body.
         coil_watch: compares commanded currents with supply and motion.
-        detumbler: brakes a tumble by the magnetometer alone.
+        feed: gives the filter the readings of the inertial unit.
+        brake: brakes a tumble by the magnetometer alone.
         angular_acceleration_psd: rad^2/s^3, density of the body's white angular acceleration.
     """
 
@@ -150,7 +183,8 @@ class Body:
     planner: Planner
     targets: Targets
     tracker: Tracker
-    detumbler: Detumbler
+    feed: Feed
+    brake: Brake
     coil_watch: CoilWatch
     view: BodyView
     field: Callable[[Estimate], FloatArray]

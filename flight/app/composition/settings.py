@@ -22,11 +22,9 @@ from hal.interfaces.wires import SECOND_NS
 
 
 def navigation_settings(config: Config) -> NavigationSettings:
-    """Return noise and age limits of the inertial unit."""
+    """Return the age limits of the inertial unit's readings."""
     section = config.estimation
     return NavigationSettings(
-        config.inertial_unit.angle_noise,
-        config.inertial_unit.rate_noise,
         round(config.inertial_unit.max_age * SECOND_NS),
         round(section.coast * SECOND_NS),
         round(SECOND_NS / config.executive.control_rate_hz),

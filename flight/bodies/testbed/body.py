@@ -9,6 +9,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from flight.bodies.testbed.brake import BdotBrake
+from flight.bodies.testbed.feed import UnitFeed
 from flight.bodies.testbed.planning import Planning, PlanningSettings, Strategy
 from flight.bodies.testbed.plant_model import angular_acceleration_psd_of, plant_of
 from flight.bodies.testbed.targets import ThreadTargets, TimedStep
@@ -67,7 +69,8 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
         planner=planning,
         targets=ThreadTargets(steps, reader, guidance, planning),
         tracker=ThreadTracker(controller, reader, dipole),
-        detumbler=detumbler(config, plant),
+        feed=UnitFeed(filter_, config.inertial_unit),
+        brake=brake_of(config, plant),
         coil_watch=coil_watch(config, plant),
         view=ThreadView(reader, planning, services),
         field=field,
@@ -121,7 +124,7 @@ def attitude_filter(
     return AttitudeFilter(body, settings, prior), problems
 
 
-def detumbler(config: TestbedConfig, plant: SingleAxisPlant) -> Detumbler:
+def brake_of(config: TestbedConfig, plant: SingleAxisPlant) -> BdotBrake:
     """Return the law and the windows of detumbling."""
     section = config.detumble
     settle_ns, measure_ns, act_ns = (
@@ -130,7 +133,9 @@ def detumbler(config: TestbedConfig, plant: SingleAxisPlant) -> Detumbler:
     schedule = WindowSchedule(settle_ns, measure_ns, act_ns)
     turning = section.field_turn > 0.0
     share = share_in_turning_field(section.field_turn, schedule) if turning else section.share
-    return Detumbler(schedule, Braking(plant.inertia, dipole_per_ampere(config), plant.current_limit, share))
+    dipole = dipole_per_ampere(config)
+    braking = Braking(plant.inertia, dipole, plant.current_limit, share)
+    return BdotBrake(Detumbler(schedule, braking), dipole)
 
 
 def coil_watch(config: TestbedConfig, plant: SingleAxisPlant) -> CoilWatch:

@@ -9,12 +9,10 @@ from flight.bodies.testbed.planning import Planning
 from flight.bodies.testbed.thread_estimate import ThreadReader
 from flight.bodies.testbed.thread_law import law_of
 from flight.gnc.estimation.measurements import MeanRateMeasurement
-from flight.gnc.math.quaternion import angle_about_axis_y
 from flight.link import events
 from flight.link.telemetry.definitions import CONTROL, TARGET
 from flight.loop.control_output import KEPT, ControlOutput, Target
 from flight.loop.services import Services
-from hal.interfaces.readings import ImuReading
 
 
 class ThreadView:
@@ -63,11 +61,6 @@ class ThreadView:
     def mode_fields(self, wanted: Target | None) -> Mapping[str, float]:
         """Return the body's fields of the mode packet."""
         return {"target_q2": math.nan if wanted is None else law_of(wanted).q2}
-
-    def reading_text(self, reading: ImuReading) -> str:
-        """Return a reading as text."""
-        angle = angle_about_axis_y(reading.quaternion)
-        return f"angle {angle:.4f} rad, rate {reading.rate[1]:.5f} rad/s"
 
     def rate_text(self, rate: MeanRateMeasurement) -> str:
         """Return a rate from streaks as text."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flight.gnc.estimation.estimate import Estimate
-from flight.gnc.estimation.measurements import AttitudeMeasurement, Measurement, RateMeasurement
+from flight.gnc.estimation.measurements import Measurement
 from flight.gnc.math.arrays import FloatArray, IntArray
 from flight.link import events
 from flight.link.telemetry.definitions import IMU
@@ -30,18 +30,14 @@ _AT_A_TIME = 16
 
 @dataclass(frozen=True, slots=True)
 class NavigationSettings:
-    """Noise and age limits of the inertial unit.
+    """Age limits of the inertial unit's readings.
 
     Attributes:
-        angle_noise: rad, standard deviation of the unit's attitude about each axis.
-        rate_noise: rad/s, of its rate.
         max_age_ns: age limit of a reading by which the coils are driven.
         coast_ns: for how long the estimate is propagated without a measurement, for telemetry only.
         period_ns: of the control cycle: a commanded current flows at least until the next cycle.
     """
 
-    angle_noise: float
-    rate_noise: float
     max_age_ns: int
     coast_ns: int
     period_ns: int
@@ -55,10 +51,8 @@ class Navigation:
     ) -> None:
         self._unit = unit
         self._filter = body.filter
-        self._view = body.view
+        self._feed = body.feed
         self._settings = settings
-        self._angle_covariance: FloatArray = np.eye(3) * settings.angle_noise**2
-        self._rate_covariance: FloatArray = np.eye(3) * settings.rate_noise**2
         self._recorder = services.recorder
         self._events = services.events
         self._facts = services.facts
@@ -158,25 +152,12 @@ class Navigation:
             field=reading.field.tolist(),
             acceleration=reading.acceleration.tolist(),
         )
-        latency = self._filter.latency
-        time_ns = reading.time_ns - round(latency * 1e9)
-        attitude = AttitudeMeasurement(time_ns, reading.quaternion, self._angle_covariance, latency)
-        rate = RateMeasurement(time_ns, reading.rate, self._rate_covariance, latency)
-        if not self._filter.started:
-            self._filter.start(attitude, rate)
+        agreement = self._feed.accept(reading)
+        if agreement.holds:
             self._agreed_ns = reading.time_ns
-            return
-        # Gated separately: a correct gyro keeps the rate while the attitude is rejected.
-        turned = self._filter.measure(attitude)
-        moved = self._filter.started and self._filter.measure(rate)
-        if turned or moved:
-            self._agreed_ns = reading.time_ns
-        if not (turned and moved):
-            self._events.report(
-                events.IMU_REFUSED,
-                reading.arrival_ns,
-                f"{self._view.reading_text(reading)} disagree with the estimate",
-            )
+        if agreement.objection:
+            text = f"{agreement.objection} disagree with the estimate"
+            self._events.report(events.IMU_REFUSED, reading.arrival_ns, text)
 
     def _watch_line(self, now_ns: int) -> None:
         link, before = self._unit.link(), self._link

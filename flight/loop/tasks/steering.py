@@ -60,21 +60,21 @@ class Steering:
 
     def begin_braking(self, now_ns: int) -> None:
         """Begin the measuring and acting windows of detumbling."""
-        self._body.detumbler.begin(now_ns)
+        self._body.brake.begin(now_ns)
 
     def brake(self, readings: Sequence[ImuReading], heard: bool, now_ns: int) -> Steered:
         """Detumble in this cycle, by the magnetometer alone; `heard`: its newest reading is fresh enough."""
-        detumbler = self._body.detumbler
+        brake = self._body.brake
         for reading in readings:
-            detumbler.sample(reading.time_ns, reading.field)
+            brake.sample(reading.time_ns, reading.field)
         text = "braking again" if heard else "no reading fresh enough to brake by: coils to zero"
         self._facts.update(facts.CONTROL_LOST, not heard, now_ns, text)
         state, dipole = SteeringState.OFF, _NO_DIPOLE
         if heard:
             self._body.tracker.reset()
-            state, currents = SteeringState.BRAKING, detumbler.current(now_ns)
-            dipole = currents * self._body.dipole_per_ampere
-            self._drive.send(currents, lambda: detumbler.field(now_ns))
+            state, wanted = SteeringState.BRAKING, brake.command(now_ns)
+            dipole = wanted.dipole
+            self._drive.send(wanted.currents, lambda: brake.field(now_ns))
         else:
             self._release()
         return self._steered(state, now_ns, None, dipole)

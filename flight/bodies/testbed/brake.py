@@ -1,0 +1,33 @@
+"""The testbed's brake: B-dot on the magnetometer."""
+
+from __future__ import annotations
+
+from flight.gnc.control.detumble import Detumbler
+from flight.gnc.math.arrays import FloatArray
+from flight.loop.control_output import CoilCommand
+
+
+class BdotBrake:
+    """Commands the detumbler's currents; implements `flight.loop.body.Brake`."""
+
+    def __init__(self, detumbler: Detumbler, dipole_per_ampere: float) -> None:
+        """Take n A of each coil, m^2."""
+        self._detumbler = detumbler
+        self._dipole_per_ampere = dipole_per_ampere
+
+    def begin(self, now_ns: int) -> None:
+        """Begin with no knowledge of the field."""
+        self._detumbler.begin(now_ns)
+
+    def sample(self, time_ns: int, field: FloatArray) -> None:
+        """Accept a field (3,) T measured at `time_ns`."""
+        self._detumbler.sample(time_ns, field)
+
+    def command(self, now_ns: int) -> CoilCommand:
+        """Return the command now."""
+        currents = self._detumbler.current(now_ns)
+        return CoilCommand(currents * self._dipole_per_ampere, currents)
+
+    def field(self, now_ns: int) -> FloatArray | None:
+        """Return the field (3,) T in body axes now; None before it is known."""
+        return self._detumbler.field(now_ns)
