@@ -24,12 +24,13 @@ from sim_hal.emulators.ina219 import EmulatedIna219
 from sim_hal.emulators.pca9685 import EmulatedPca9685
 from sim_hal.emulators.star_camera import EmulatedStarCamera, Expose
 from sim_hal.emulators.vn100 import Vn100Emulator, Vn100EmulatorSettings
-from sim_hal.emulators.vn100_sensors import NoiseProfile
+from sim_hal.emulators.vn100_sensors import PROFILES, NoiseProfile
 from sim_hal.faults.timeline import FaultTimeline
 from sim_hal.settings import Simulation, Sky
 from sim_hal.worlds.coil_circuit import CoilCircuit
 from sim_hal.worlds.motion import Motion
 from sim_hal.worlds.simulation import TimedSimulation
+from sim_hal.worlds.surroundings import OrbitingWorld
 from sim_hal.worlds.truth import TruthRecorder
 from sim_hal.worlds.world import World, WorldInputs, make_world
 
@@ -81,8 +82,9 @@ def assemble(
     coils = assemble_coils(config, section, np.random.default_rng(circuit_seed), now_ns, wait)
     circuit = coils.circuit
     world = make_world(WorldInputs(config, section, circuit.currents, now_ns()))
-    sense = _sense(world, circuit, np.array(section.coil_field))
-    unit = _unit(config, section, sense, line, np.random.default_rng(unit_seed), now_ns())
+    sense = _sense(world, circuit, np.array(section.coil_field), np.array(section.imu.field_bias))
+    free_fall = isinstance(world, OrbitingWorld)
+    unit = _unit(config, section, sense, line, np.random.default_rng(unit_seed), now_ns(), free_fall)
     camera = _camera(config.camera, section, world, expose, now_ns)
     faults = FaultTimeline()
     if truth is not None:
@@ -95,17 +97,21 @@ def assemble(
     )
 
 
-def _sense(world: World, circuit: CoilCircuit, coil_field: FloatArray) -> Callable[[int], Motion]:
-    """Return the motion that the inertial unit feels, with the coils' field; `coil_field` is (3, 3) T/A.
+def _sense(
+    world: World, circuit: CoilCircuit, coil_field: FloatArray, bias: FloatArray
+) -> Callable[[int], Motion]:
+    """Return the motion that the inertial unit measures, with the coils' field and the magnetometer's bias.
+
+    `coil_field` is (3, 3) T/A, `bias` (3,) T, body axes.
 
     The mean currents count: the unit averages its magnetometer over one control period.
     """
-    if not coil_field.any():
+    if not (coil_field.any() or bias.any()):
         return world.motion
 
     def sense(time_ns: int) -> Motion:
         motion = world.motion(time_ns)
-        return replace(motion, field_body=motion.field_body + coil_field @ circuit.currents())
+        return replace(motion, field_body=motion.field_body + coil_field @ circuit.currents() + bias)
 
     return sense
 
@@ -117,13 +123,16 @@ def _unit(
     line: SerialEnd,
     generator: np.random.Generator,
     now_ns: int,
+    free_fall: bool,
 ) -> Vn100Emulator:
     imu = section.imu
+    profile = NoiseProfile() if imu.profile == "bounds" else PROFILES[imu.profile]
     settings = Vn100EmulatorSettings(
-        noise=NoiseProfile(attitude_bound=imu.quaternion_noise, rate_bound=imu.rate_noise),
+        noise=replace(profile, attitude_bound=imu.quaternion_noise, rate_bound=imu.rate_noise),
         mounting=np.array(config.inertial_unit.mounting),
         gyro_bias=np.array(imu.gyro_bias),
         clock_ppm=imu.clock_ppm,
+        free_fall=free_fall,
     )
     return Vn100Emulator(sense, line, generator, settings, now_ns=now_ns)
 

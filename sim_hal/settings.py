@@ -6,7 +6,7 @@ from the flight's model. SI units unless the name says otherwise.
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 from msgspec import Meta
@@ -32,11 +32,17 @@ class Thread(Section, frozen=True, kw_only=True):
 
 
 class ImuNoise(Section, frozen=True, kw_only=True):
-    """Noise of the inertial unit: uniform bounds on the quaternion and the rate, and a constant gyro bias."""
+    """Noise of the inertial unit: uniform bounds on the quaternion and the rate, and a constant gyro bias.
 
+    `profile: datasheet` adds the white noise of the unit's data sheet and a bias drawn at each start;
+    `field_bias` T is the magnetometer's, body axes.
+    """
+
+    profile: Literal["bounds", "datasheet"] = "bounds"
     quaternion_noise: NotNegative = 0.0
     rate_noise: NotNegative = 0.0
     gyro_bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    field_bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
     clock_ppm: Annotated[float, Meta(ge=-100.0, le=100.0)] = 0.0
 
 

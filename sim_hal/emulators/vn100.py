@@ -43,6 +43,7 @@ class Vn100EmulatorSettings:
         uptime_ns: its own time when the simulation begins; the remainder of 25 ms is its phase.
         boot_ns: from reset to the first message. flash_ns: to write the flash.
         temperature: degrees C. pressure: kPa.
+        free_fall: there is no gravity for its own attitude to stand on.
     """
 
     noise: NoiseProfile = PROFILES["thesis"]
@@ -55,6 +56,7 @@ class Vn100EmulatorSettings:
     flash_ns: int = 500_000_000
     temperature: float = 20.0
     pressure: float = 101.325
+    free_fall: bool = False
 
 
 class Vn100Emulator:
@@ -79,7 +81,9 @@ class Vn100Emulator:
         self._line = line
         self._settings = settings
         bias = settings.gyro_bias
-        self._sensors = Sensors(rng, settings.noise, settings.mounting, settings.reference, bias)
+        self._sensors = Sensors(
+            rng, settings.noise, settings.mounting, settings.reference, bias, settings.free_fall
+        )
         self._clock_rate = _BILLION + round(settings.clock_ppm * 1000)
         self._then: tuple[int, Callable[[int], None]] | None = None
         self._streams = OutputStreams(self.registers)

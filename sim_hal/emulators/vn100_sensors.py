@@ -16,12 +16,15 @@ from typing import Literal
 import numpy as np
 
 from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import attitude_matrix, conjugate, from_rotation_vector, multiply
+from flight.gnc.math.quaternion import attitude_matrix, conjugate, from_rotation_vector, multiply, normalise
 from sim_hal.worlds.motion import STANDARD_GRAVITY, Motion
 
 IMU_RATE_HZ = 800
 GAUSS_PER_TESLA = 1e4
 _ROOT_BANDWIDTH = math.sqrt(0.5 * IMU_RATE_HZ)  # white noise sampled at 800 Hz fills 400 Hz
+
+_LOST_DRIFT = 0.01
+"""rad a sample, of an attitude without gravity."""
 
 ProfileName = Literal["thesis", "datasheet", "none"]
 
@@ -108,8 +111,12 @@ class Sensors:
         mounting: FloatArray,
         reference: FloatArray,
         gyro_bias: FloatArray,
+        free_fall: bool = False,
     ) -> None:
-        """Take quaternions, sensor into body and NED into reference frame, and a bias (3,) rad/s."""
+        """Take quaternions, sensor into body and NED into reference frame, and a bias (3,) rad/s.
+
+        In `free_fall` the unit has no down to find: its own attitude drifts about without meaning.
+        """
         self._rng = rng
         self._profile = profile
         self._to_sensor = attitude_matrix(conjugate(mounting))
@@ -119,6 +126,7 @@ class Sensors:
         self._fixed_bias = gyro_bias
         self._static: FloatArray | None = None
         self._bias = gyro_bias
+        self._free_fall = free_fall
 
     def restart(self) -> None:
         """Draw the errors that are constant until the next start."""
@@ -126,6 +134,8 @@ class Sensors:
         self._bias = self._fixed_bias + self._profile.gyro_bias * draws[:3]
         static = np.array(self._profile.static_attitude)
         self._static = from_rotation_vector(static * draws[3:]) if static.any() else None
+        if self._free_fall:
+            self._static = normalise(self._rng.standard_normal(4))
 
     def measure(self, motion: Motion, windows: Sequence[int]) -> Measured:
         """Return one sample; `windows` are the filter lengths of magnetometer, accelerometer and gyro."""
@@ -135,6 +145,9 @@ class Sensors:
         x, y, z = (profile.attitude_bound * bounded[:3]).tolist()
         small = np.array([x, y, z, math.sqrt(1.0 - x * x - y * y - z * z)])
         q = small @ (motion.quaternion @ self._table).reshape(4, 4)
+        if self._free_fall and self._static is not None:
+            drift = from_rotation_vector(_LOST_DRIFT * self._rng.standard_normal(3))
+            self._static = normalise(multiply(drift, self._static))
         if self._static is not None:
             q = multiply(q, self._static)
         mag_window, accel_window, gyro_window = (math.sqrt(max(1, window)) for window in windows)

@@ -1,0 +1,150 @@
+"""Solar strings on ADS1115 converters (TI SBAS444): four voltages to a part, one conversion at a time.
+
+A string's current runs through a shunt whose amplifier gives `volt_per_ampere`. A job of the clock reads the
+conversion that is complete and starts the next channel's, on all parts at once, so nothing here waits: at 128
+conversions a second one takes 7.8 ms, a step of the job at least 10 ms.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hal.interfaces.errors import DeviceError, NotResponding, OutOfRange, Refused
+from hal.interfaces.readings import StringReading
+from hal.interfaces.wires import Clock, I2cBus
+
+CONVERSION, CONFIG = 0x00, 0x01
+START = 0x8000
+"""Of Config: written, a conversion starts; read, none is under way."""
+_SINGLE_ENDED, _MUX_BIT = 0b100, 12
+_RANGE_2_048 = 0b010 << 9
+_SINGLE_SHOT = 1 << 8
+_RATE_128 = 0b100 << 5
+_NO_COMPARATOR = 0b11
+FULL_SCALE = 2.048
+STEP = FULL_SCALE / 32_768
+"""V, of the converter."""
+CHANNELS = 4
+_SHORTEST_NS = 10_000_000
+
+
+def config_for(channel: int) -> int:
+    """Return the Config word that starts a conversion of a channel against ground, +-2.048 V, 128 a second."""
+    mux = (_SINGLE_ENDED | channel) << _MUX_BIT
+    return START | mux | _RANGE_2_048 | _SINGLE_SHOT | _RATE_128 | _NO_COMPARATOR
+
+
+@dataclass(frozen=True, slots=True)
+class StringWiring:
+    """Where a string is measured: the converter's address, its channel, and V per A of its amplifier."""
+
+    address: int
+    channel: int
+    volt_per_ampere: float
+
+
+class AdsSolarStrings:
+    """The strings; implements `hal.interfaces.devices.SolarStrings`."""
+
+    def __init__(
+        self, bus: I2cBus, clock: Clock, wirings: Sequence[StringWiring], period_ns: int = 500_000_000
+    ) -> None:
+        """Read all strings once in `period_ns`. Raises OutOfRange for a period or a wiring that cannot be."""
+        self.name = "solar strings"
+        self._bus = bus
+        self._clock = clock
+        self._wirings = tuple(wirings)
+        self._parts = sorted({wiring.address for wiring in wirings})
+        self._counts = dict.fromkeys(((w.address, w.channel) for w in wirings), 0)
+        if len(self._counts) != len(self._wirings) or not wirings:
+            raise OutOfRange(self.name, "strings on channels of their own", len(self._counts), 1, 16, "")
+        for wiring in wirings:
+            if not 0 <= wiring.channel < CHANNELS:
+                raise OutOfRange(self.name, "channel", wiring.channel, 0, CHANNELS - 1, "")
+            if not 0.0 < wiring.volt_per_ampere < 1e6:
+                raise OutOfRange(self.name, "volt per ampere", wiring.volt_per_ampere, 0.0, 1e6, "V/A")
+        self._channels = sorted({wiring.channel for wiring in wirings})
+        step_ns = period_ns // len(self._channels)
+        if step_ns < _SHORTEST_NS:
+            shortest = _SHORTEST_NS * len(self._channels)
+            raise OutOfRange(self.name, "period", period_ns * 1e-9, shortest * 1e-9, 60.0, "s")
+        self._lock = threading.Lock()
+        self._latest: StringReading | None = None
+        self._error = ""
+        self._step = -1
+        self._ticker = clock.ticker("solar strings", step_ns, self._serve)
+
+    def latest(self) -> StringReading | None:
+        """Return the newest reading, None before the first."""
+        with self._lock:
+            return self._latest
+
+    def error(self) -> str:
+        """Return the last failure while it lasts, empty when readings arrive."""
+        with self._lock:
+            return self._error
+
+    def close(self) -> None:
+        """Stop reading. Safe to call twice."""
+        self._ticker.stop()
+
+    def _serve(self) -> None:
+        try:
+            for address in self._parts if self._step >= 0 else ():
+                self._collect(address, self._channels[self._step])
+            self._step += 1
+            if self._step == len(self._channels):
+                self._step = 0
+                self._publish()
+            for address in self._parts:
+                self._write(address, config_for(self._channels[self._step]))
+        except DeviceError as error:
+            # A reading is of one round of all strings: it begins again.
+            self._step = -1
+            with self._lock:
+                self._error = str(error)
+
+    def _collect(self, address: int, channel: int) -> None:
+        config = self._read(address, CONFIG)
+        if config != config_for(channel):
+            busy = config == config_for(channel) & ~START
+            cause = "the conversion does not end" if busy else f"Config reads 0x{config:04x} (brown-out?)"
+            raise Refused(f"ads1115 at 0x{address:02x}", cause)
+        word = self._read(address, CONVERSION)
+        if (address, channel) in self._counts:
+            self._counts[address, channel] = word - 0x10000 if word & 0x8000 else word
+
+    def _publish(self) -> None:
+        currents = np.empty(len(self._wirings))
+        for index, wiring in enumerate(self._wirings):
+            counts = self._counts[wiring.address, wiring.channel]
+            if abs(counts) >= 0x7FFF:
+                bound = FULL_SCALE / wiring.volt_per_ampere
+                current = counts * STEP / wiring.volt_per_ampere
+                raise OutOfRange(self.name, f"current of string {index + 1}", current, -bound, bound, "A")
+            currents[index] = counts * STEP / wiring.volt_per_ampere
+        with self._lock:
+            self._latest = StringReading(self._clock.now_ns(), currents)
+            self._error = ""
+
+    def _read(self, address: int, register: int) -> int:
+        try:
+            high, low = self._bus.read_i2c_block_data(address, register, 2)
+        except OSError as error:
+            raise _silent(address, error) from error
+        return high << 8 | low
+
+    def _write(self, address: int, word: int) -> None:
+        try:
+            self._bus.write_i2c_block_data(address, CONFIG, [word >> 8, word & 0xFF])
+        except OSError as error:
+            raise _silent(address, error) from error
+
+
+def _silent(address: int, error: OSError) -> NotResponding:
+    cause = f"{error.strerror}; check its power, wiring and address"
+    return NotResponding(f"ads1115 at 0x{address:02x}", cause)
