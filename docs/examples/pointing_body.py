@@ -35,6 +35,7 @@ from flight.gnc.estimation.measurements import MeanRateMeasurement
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import about_axis_y, attitude_matrix, conjugate, multiply, to_rotation_vector
 from flight.link import events
+from flight.link.modes import Mode
 from flight.link.telemetry.reader import read_run
 from flight.loop.body import Body, BodyKind
 from flight.loop.control_output import COMMANDED, KEPT, CoilCommand, ControlOutput, Target
@@ -267,6 +268,7 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
     tracker = CrossProductTracker(config, surrounding_field(config))
     direct = Direct()
     return Body(
+        modes=frozenset(Mode) - {Mode.ACQUIRE},
         filter=filter_,
         learned_problems=problems,
         paths=direct,

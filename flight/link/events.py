@@ -75,7 +75,7 @@ CONTROL_LOST = EventKind(
 CONTROL_REGAINED = EventKind(21, "control-regained", _TOLD, "the estimate is trustworthy again")
 BLIND = EventKind(22, "blind", _FAULT, "no trustworthy estimate for too long", Reaction.SAFE)
 TUMBLING = EventKind(
-    23, "tumbling", _WARNED, "the body turns faster than a hold or a slew may", Reaction.DETUMBLE
+    23, "tumbling", _WARNED, "the body turns faster than it may outside detumbling", Reaction.DETUMBLE
 )
 HOLD_IMPOSSIBLE = EventKind(
     24, "hold-impossible", _FAULT, "the attitude cannot be held: far off and not coming back", Reaction.SAFE

@@ -20,6 +20,8 @@ class Mode(IntEnum):
     """On the way to a commanded attitude."""
     TESTBED_DEMO = 5
     """Flies the configured steps."""
+    ACQUIRE = 6
+    """Coils at zero: the body turns slowly, and its attitude is not known yet."""
 
     @property
     def label(self) -> str:
@@ -36,7 +38,7 @@ class Mode(IntEnum):
 
 
 COMMANDABLE = (Mode.SAFE, Mode.DETUMBLE, Mode.HOLD, Mode.SLEW, Mode.TESTBED_DEMO)
-"""The modes that can be commanded; BOOT ends by itself."""
+"""The modes that can be commanded; BOOT ends by itself, and detumbling leads to ACQUIRE."""
 
 STEERING = frozenset({Mode.HOLD, Mode.SLEW, Mode.TESTBED_DEMO})
 """The modes in which planner and controller turn the body."""

@@ -15,6 +15,7 @@ from flight.gnc.estimation.attitude_filter import AttitudeFilter
 from flight.gnc.estimation.estimate import Estimate
 from flight.gnc.estimation.measurements import MeanRateMeasurement
 from flight.gnc.math.arrays import FloatArray
+from flight.link.modes import Mode
 from flight.loop.control_output import CoilCommand, ControlOutput, Target
 from flight.loop.executive.jobs import JobResult
 from flight.loop.executive.rate_group import Cycle
@@ -167,6 +168,7 @@ class Body:
     """A body ready to fly.
 
     Attributes:
+        modes: the modes that this body has.
         filter: estimates attitude, rate and the body's parameters.
         learned_problems: why parameters that an earlier boot learned were rejected.
         field: returns the magnetic field (3,) T in body axes at an estimate, for reallocation of currents.
@@ -177,6 +179,7 @@ class Body:
         angular_acceleration_psd: rad^2/s^3, density of the body's white angular acceleration.
     """
 
+    modes: frozenset[Mode]
     filter: AttitudeFilter
     learned_problems: list[str]
     paths: Paths
@@ -198,9 +201,9 @@ class BodyKind:
     """A kind of body.
 
     Attributes:
-        plan: the planner worker's function: a job in, a plan out; both pickle.
+        plan: the planner worker's function: a job in, a plan out; both pickle. None without a planner.
         make: builds the body of a configuration, with the parameters that an earlier boot learned.
     """
 
-    plan: Callable[[Any], Any]
+    plan: Callable[[Any], Any] | None
     make: Callable[[Config, Services, Mapping[str, Learned]], Body]

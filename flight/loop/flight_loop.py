@@ -165,10 +165,10 @@ class FlightLoop:
 
     def _rate_groups(self) -> list[RateGroup]:
         config, tasks = self._config, self._tasks
-        camera = config.camera
+        camera, replan_period = config.camera, config.replan_period()
         periods = Periods(
             round(SECOND_NS / config.executive.control_rate_hz),
-            round(config.replan_period() * SECOND_NS),
+            round(replan_period * SECOND_NS) if replan_period is not None else None,
             round(camera.period * SECOND_NS) if camera is not None else None,
         )
         return rate_groups(

@@ -14,10 +14,10 @@ COMMAND_PERIOD_NS = SECOND_NS // 10
 
 @dataclass(frozen=True, slots=True)
 class Periods:
-    """Periods from the configuration, ns; `camera_ns` is None without a camera."""
+    """Periods from the configuration, ns; None for what is not done."""
 
     control_ns: int
-    replan_ns: int
+    replan_ns: int | None
     camera_ns: int | None
 
 
@@ -37,8 +37,9 @@ def rate_groups(periods: Periods, tasks: GroupTasks) -> list[RateGroup]:
     """Return the rate groups, control first."""
     groups = [
         RateGroup(CONTROL, periods.control_ns, tasks.control),
-        RateGroup("planning", periods.replan_ns, tasks.replan),
     ]
+    if periods.replan_ns is not None:
+        groups.append(RateGroup("planning", periods.replan_ns, tasks.replan))
     if tasks.camera is not None and periods.camera_ns is not None:
         groups.append(RateGroup("camera", periods.camera_ns, tasks.camera))
     if tasks.commands is not None:

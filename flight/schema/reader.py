@@ -16,13 +16,14 @@ from flight.schema.conversion import convert
 from flight.schema.devices import Camera
 from flight.schema.document import read_document, read_text
 from flight.schema.errors import ConfigError
+from flight.schema.orbit import OrbitConfig
 from flight.schema.sections import Config
 from flight.schema.testbed import TestbedConfig
 
 T = TypeVar("T")
 S = TypeVar("S", bound=msgspec.Struct)
 
-_SHAPES: dict[str, type[Config]] = {}
+_SHAPES: dict[str, type[Config]] = {"orbit": OrbitConfig}
 """The shape of a body's configuration; a body that is not here has the testbed's."""
 
 

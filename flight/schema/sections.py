@@ -25,11 +25,11 @@ class Executive(Section, frozen=True, kw_only=True):
 
 
 class Estimation(Section, frozen=True, kw_only=True):
-    """The multiplicative Kalman filter of attitude, rate, gyro bias and disturbance about the thread.
+    """The multiplicative Kalman filter of attitude, rate, gyro bias and disturbance.
 
-    `*_start` are initial standard deviations of the other states: the gyro's bias, rad/s; the
-    thread's torsion, 1/s^2, and damping, 1/s, beyond the plant's; the coils' gain; and the age, s, that the
-    inertial unit's samples have at their stamp, which may walk by `latency_walk`, s per sqrt(s). Zero: known.
+    `*_start` are initial standard deviations of the other states: the gyro's bias, rad/s; the coils' gain;
+    and the age, s, that the inertial unit's samples have at their stamp, which may walk by `latency_walk`,
+    s per sqrt(s). Zero: known.
     `coast` is for how long, s, the model carries the estimate on without a measurement; no coil is driven by
     what it carries (`inertial_unit.max_age`). Since an earlier boot learned a value it may have `changed` by
     this part of its standard deviation at the start.
@@ -38,8 +38,6 @@ class Estimation(Section, frozen=True, kw_only=True):
     current_noise: NotNegative = 2.0e-3
     disturbance_walk: Positive = 5.0e-5
     bias_start: Positive = 1.0e-3
-    torsion_start: NotNegative = 0.02
-    damping_start: NotNegative = 4.0e-3
     gain_start: NotNegative = 0.15
     latency_start: NotNegative = 0.03
     latency_walk: NotNegative = 3.0e-3
@@ -74,19 +72,15 @@ class Modes(Section, frozen=True, kw_only=True):
 
 
 class Detumble(Section, frozen=True, kw_only=True):
-    """B-dot on the magnetometer (`flight.gnc.control.detumble`): windows with the coils off, and the law.
+    """Detumbling by the magnetometer: windows with the coils off, and its end.
 
     Times in s: `settle` after the coils went off until the field is trusted, `measure` while it is averaged,
-    `act` with the coils on. `share` of the rate is to go in each window, as far as the coils can. It is over
-    when the rate has been below `low_rate` rad/s for `low_for` s. Where the field's direction turns by
-    `field_turn` rad/s, as in an orbit, the share follows from that; zero for the testbed, where it stands.
+    `act` with the coils on. Detumbling is over when the rate has been below `low_rate` rad/s for `low_for` s.
     """
 
     settle: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.05
     measure: Annotated[float, Meta(ge=0.02, le=1.0)] = 0.05
     act: Annotated[float, Meta(ge=0.02, le=5.0)] = 0.15
-    share: Annotated[float, Meta(gt=0.0, le=0.5)] = 0.3
-    field_turn: NotNegative = 0.0
     low_rate: Positive = 0.02
     low_for: Positive = 2.0
 
@@ -180,8 +174,8 @@ class Config(Section, frozen=True, kw_only=True):
         """Return the smallest and the largest strength of a valid magnetometer reading, T."""
         raise NotImplementedError
 
-    def replan_period(self) -> float:
-        """Return how often a path is planned from the newest estimate, s."""
+    def replan_period(self) -> float | None:
+        """Return how often a path is planned from the newest estimate, s; None for a body that plans none."""
         raise NotImplementedError
 
     def hardware(self) -> tuple[Section, ...]:

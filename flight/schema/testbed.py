@@ -8,7 +8,7 @@ import msgspec
 from msgspec import Meta
 
 from flight.schema.errors import ConfigError
-from flight.schema.sections import Config
+from flight.schema.sections import Config, Detumble, Estimation
 from flight.schema.values import Q2, NotNegative, Positive, Section
 
 
@@ -21,6 +21,24 @@ class Plant(Section, frozen=True, kw_only=True):
     field: Annotated[float, Meta(gt=0.0, le=1.0)]
     thread_stiffness: NotNegative = 0.0
     thread_damping: NotNegative = 0.0
+
+
+class ThreadEstimation(Estimation, frozen=True, kw_only=True):
+    """The filter on the thread: also the thread's torsion, 1/s^2, and damping, 1/s, beyond the plant's."""
+
+    torsion_start: NotNegative = 0.02
+    damping_start: NotNegative = 4.0e-3
+
+
+class BdotDetumble(Detumble, frozen=True, kw_only=True):
+    """Detumbling by B-dot (`flight.gnc.control.detumble`).
+
+    `share` of the rate is to go in each window, as far as the coils can. Where the field's direction turns by
+    `field_turn` rad/s the share follows from that; zero where it stands, as on the testbed.
+    """
+
+    share: Annotated[float, Meta(gt=0.0, le=0.5)] = 0.3
+    field_turn: NotNegative = 0.0
 
 
 class Guidance(Section, frozen=True, kw_only=True):
@@ -96,6 +114,8 @@ class TestbedConfig(Config, frozen=True, kw_only=True):
     __test__ = False  # pytest: not a test, in spite of its name
 
     plant: Plant
+    estimation: ThreadEstimation = ThreadEstimation()
+    detumble: BdotDetumble = BdotDetumble()
     guidance: Guidance = Guidance()
     control: Control = Control()
     identification: Identification = Identification()

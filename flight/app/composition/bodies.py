@@ -8,7 +8,7 @@ from flight.loop.body import BodyKind
 from flight.schema.errors import ConfigError
 from flight.schema.sections import Config
 
-BODIES = {"testbed": "flight.bodies.testbed.body:TESTBED"}
+BODIES = {"testbed": "flight.bodies.testbed.body:TESTBED", "orbit": "flight.bodies.orbit.body:ORBIT"}
 
 
 def body_kind(config: Config) -> BodyKind:

@@ -17,7 +17,8 @@ def workers(config: Config, planner_latency_ns: int = 0, vision_latency_ns: int 
     """Return the workers that a configuration needs; latencies apply to lock-step simulation only."""
     planner_timeout_ns = round(config.executive.planner_timeout * SECOND_NS)
     vision_timeout_ns = round(config.executive.vision_timeout * SECOND_NS)
-    made = [Worker(PLANNER, body_kind(config).plan, planner_latency_ns, planner_timeout_ns)]
+    plan = body_kind(config).plan
+    made = [] if plan is None else [Worker(PLANNER, plan, planner_latency_ns, planner_timeout_ns)]
     if config.camera is not None:
         made.append(Worker(imaging_task.WORKER, frame_job.run, vision_latency_ns, vision_timeout_ns))
     return made

@@ -117,6 +117,21 @@ ATTITUDE = Packet(
     ),
 )
 
+SPIN = Packet(
+    "spin",
+    0x115,
+    "4 Hz",
+    "The rate by the magnetometer alone, of a satellite in orbit",
+    (
+        Field("known", "u1", "-", "1 once enough samples of the field agree"),
+        Field("rate", "f8", "rad/s", "body rate, body axes", 3),
+        Field("rate_sigma", "f4", "rad/s", "standard deviation of the rate's worst axis"),
+        Field("field", "f8", "T", "magnetic field, body axes", 3),
+        Field("restarts", "u4", "-", "how often the samples contradicted the rate until it was found again"),
+        Field("dipole", "f4", "A m^2", "dipole wanted of the coils, body axes", 3),
+    ),
+)
+
 TARGET = Packet(
     "target",
     0x112,
@@ -136,7 +151,7 @@ MODE = Packet(
     "A new mode, and what led to it",
     (
         Field("before", "u1", "-", "mode until now, numbered as in mode"),
-        Field("mode", "u1", "-", "0 boot, 1 safe, 2 detumble, 3 hold, 4 slew, 5 testbed-demo"),
+        Field("mode", "u1", "-", "0 boot, 1 safe, 2 detumble, 3 hold, 4 slew, 5 testbed-demo, 6 acquire"),
         Field("trigger", "S32", "-", "what led to it (flight.loop.modes.triggers)"),
         Field("reason", "S96", "-", "of the trigger: the event, the values"),
         Field("target_q2", "f8", "-", "q2 wanted by a hold or a slew, NaN when not yet known"),
@@ -344,6 +359,7 @@ PACKETS: tuple[Packet, ...] = (
     IMU,
     CONTROL,
     ATTITUDE,
+    SPIN,
     TARGET,
     MODE,
     PLAN,

@@ -35,6 +35,7 @@ TRANSITIONS: Table = {
         Trigger.REACT_DETUMBLE: Answer.STAY,
         Trigger.REACT_HOLD: Answer.STAY,
         Trigger.DETUMBLED: Answer.STAY,
+        Trigger.SLOWED: Answer.STAY,
         Trigger.ARRIVED: Answer.STAY,
     },
     Mode.SAFE: {  # left by command only
@@ -45,6 +46,7 @@ TRANSITIONS: Table = {
         Trigger.REACT_DETUMBLE: Answer.STAY,
         Trigger.REACT_HOLD: Answer.STAY,
         Trigger.DETUMBLED: Answer.STAY,
+        Trigger.SLOWED: Answer.STAY,
         Trigger.ARRIVED: Answer.STAY,
     },
     Mode.DETUMBLE: {
@@ -55,6 +57,7 @@ TRANSITIONS: Table = {
         Trigger.REACT_DETUMBLE: Answer.STAY,
         Trigger.REACT_HOLD: Answer.STAY,
         Trigger.DETUMBLED: Mode.HOLD,
+        Trigger.SLOWED: Mode.ACQUIRE,
         Trigger.ARRIVED: Answer.STAY,
     },
     Mode.HOLD: {  # commanded again it keeps the attitude of that moment
@@ -64,6 +67,7 @@ TRANSITIONS: Table = {
         Trigger.REACT_DETUMBLE: Mode.DETUMBLE,
         Trigger.REACT_HOLD: Answer.STAY,
         Trigger.DETUMBLED: Answer.STAY,
+        Trigger.SLOWED: Answer.STAY,
         Trigger.ARRIVED: Answer.STAY,
     },
     Mode.SLEW: {  # commanded again it goes to the new target
@@ -73,6 +77,7 @@ TRANSITIONS: Table = {
         Trigger.REACT_DETUMBLE: Mode.DETUMBLE,
         Trigger.REACT_HOLD: Mode.HOLD,
         Trigger.DETUMBLED: Answer.STAY,
+        Trigger.SLOWED: Answer.STAY,
         Trigger.ARRIVED: Mode.HOLD,
     },
     Mode.TESTBED_DEMO: {  # without a plan it holds the attitude, and continues with the next plan
@@ -83,6 +88,17 @@ TRANSITIONS: Table = {
         Trigger.REACT_DETUMBLE: Mode.DETUMBLE,
         Trigger.REACT_HOLD: Answer.STAY,
         Trigger.DETUMBLED: Answer.STAY,
+        Trigger.SLOWED: Answer.STAY,
+        Trigger.ARRIVED: Answer.STAY,
+    },
+    Mode.ACQUIRE: {
+        **_STARTED,
+        **_COMMANDED,
+        Trigger.REACT_SAFE: Mode.SAFE,
+        Trigger.REACT_DETUMBLE: Mode.DETUMBLE,
+        Trigger.REACT_HOLD: Answer.STAY,
+        Trigger.DETUMBLED: Answer.STAY,
+        Trigger.SLOWED: Answer.STAY,
         Trigger.ARRIVED: Answer.STAY,
     },
 }

@@ -23,6 +23,7 @@ class Trigger(Enum):
     REACT_DETUMBLE = "reaction detumble"
     REACT_HOLD = "reaction hold"
     DETUMBLED = "rate is low"
+    SLOWED = "rate is low, attitude unknown"
     ARRIVED = "arrived"
 
 
@@ -41,7 +42,7 @@ COMMANDS = {
     Mode.SLEW: Trigger.COMMAND_SLEW,
     Mode.TESTBED_DEMO: Trigger.COMMAND_DEMO,
 }
-"""The trigger of a command for each mode; BOOT cannot be commanded."""
+"""The trigger of a command for each mode; BOOT and ACQUIRE cannot be commanded."""
 
 SAFING = (Trigger.COMMAND_SAFE, Trigger.REACT_SAFE)
 """The triggers that must lead to SAFE from every mode."""

@@ -25,6 +25,7 @@ from flight.loop.modes.triggers import COMMANDS, STARTS, Trigger
 from flight.loop.services import Services
 from flight.loop.tasks.pointing_watch import PointingWatch
 from flight.loop.tasks.steering import Steering
+from flight.schema.errors import ConfigError
 from flight.schema.sections import Modes
 
 SAFING_REACTIONS = {
@@ -67,7 +68,11 @@ class ModeControl:
     """
 
     def __init__(self, settings: ModeSettings, body: Body, steering: Steering, services: Services) -> None:
-        """Take the tasks that modes act on. Raises FlightError for a fact whose reaction has no effect."""
+        """Take the tasks that modes act on.
+
+        Raises FlightError for a fact whose reaction has no effect, ConfigError for an initial mode that the
+        body does not have.
+        """
         facts.check(facts.FACTS, modes_moved_by)
         self._settings = settings.modes
         self._stop = settings.stop
@@ -80,7 +85,11 @@ class ModeControl:
         self._recorder = services.recorder
         self._events = services.events
         self._low_rate = settings.low_rate
+        self._modes = body.modes
         self._initial = Mode.named(settings.modes.initial)
+        if self._initial not in body.modes:
+            has = ", ".join(sorted(mode.label for mode in STARTS.keys() & body.modes))
+            raise ConfigError("modes.initial", f"is {self._initial.label}: this body has {has}")
         self._crashed = 0
         self._commands = 0
         self._seen_ns = 0
@@ -127,18 +136,19 @@ class ModeControl:
         `overdue` rad is the angle to where the demonstration should have brought the body by now, None while
         the body is on its way.
         """
-        if estimate is not None:
+        # A body that is not steered needs no attitude: it sees while its rate is measured.
+        sees = estimate is not None if self._modes & STEERING else rate is not None
+        if sees:
             self._seen_ns = now_ns
         if self.mode is Mode.BOOT:
-            self._boot(estimate is not None and coils_answer, now_ns)
+            self._boot(sees and coils_answer, now_ns)
         blind = (now_ns - self._seen_ns) * 1e-9
         text = f"no estimate for {blind:.0f} s"
         self._facts.update(facts.BLIND, blind > self._settings.blind_limit, now_ns, text)
         if self.mode is Mode.DETUMBLE and rate is not None:
-            # Where the coils have no authority no hold is possible: wait until the body has turned further.
-            within = estimate is not None and self._targets.can_hold(estimate)
-            if self._slow.update(rate < self._low_rate and within, now_ns):
-                self._fire(Trigger.DETUMBLED, f"below {self._low_rate:g} rad/s", now_ns)
+            self._brake(estimate, rate, now_ns)
+        elif self.mode is Mode.ACQUIRE and rate is not None:
+            self._pointing.watch_rate(rate, now_ns)
         if estimate is not None and self.mode in {Mode.HOLD, Mode.SLEW}:
             self._keep(estimate, now_ns)
         elif estimate is not None and self.mode is Mode.TESTBED_DEMO:
@@ -148,8 +158,8 @@ class ModeControl:
     def command(self, mode: Mode, now_ns: int, slew: float | None = None) -> str:
         """Execute a command; return why it is refused, empty when done. SLEW needs `slew`, its argument."""
         trigger = COMMANDS.get(mode)
-        if trigger is None:
-            return f"{mode.label} cannot be commanded"
+        if trigger is None or mode not in self._modes:
+            return f"{mode.label} cannot be commanded" + (" of this body" if trigger else "")
         answer = self._machine.answer(trigger)
         if answer is Answer.REFUSE:
             return f"not while in {self.mode.label}"
@@ -196,6 +206,15 @@ class ModeControl:
         else:
             late = waited > self._settings.boot_patience
             self._facts.update(facts.BOOT_WAITS, late, now_ns, f"for {waited:.1f} s: coils at zero")
+
+    def _brake(self, estimate: Estimate | None, rate: float, now_ns: int) -> None:
+        """Check whether detumbling is over."""
+        # Where the coils have no authority no hold is possible: wait until the body has turned further.
+        holds = Mode.HOLD in self._modes
+        within = not holds or (estimate is not None and self._targets.can_hold(estimate))
+        if self._slow.update(rate < self._low_rate and within, now_ns):
+            over = Trigger.DETUMBLED if holds else Trigger.SLOWED
+            self._fire(over, f"below {self._low_rate:g} rad/s", now_ns)
 
     def _keep(self, estimate: Estimate, now_ns: int) -> None:
         """Check the progress of a hold or a slew."""

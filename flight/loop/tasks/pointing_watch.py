@@ -23,14 +23,18 @@ class PointingWatch:
         """Restart the timer of the pointing error: another mode is entered."""
         self._off.reset()
 
+    def watch_rate(self, rate: float, now_ns: int) -> None:
+        """Update TUMBLING from a rate, rad/s, not negative."""
+        limit = self._settings.tumble_rate
+        self._facts.update(facts.TUMBLING, rate > limit, now_ns, f"{rate:.3f} rad/s, {limit:g} allowed")
+
     def watch(self, estimate: Estimate, off: float | None, now_ns: int) -> float:
         """Update both facts from the pointing error `off`, rad; return the error, 0 where `off` is None.
 
         `off` is None while there is no attitude to be reached yet.
         """
-        settings, speed = self._settings, self._targets.speed(estimate)
-        text = f"{speed:.3f} rad/s, {settings.tumble_rate:g} allowed"
-        self._facts.update(facts.TUMBLING, speed > settings.tumble_rate, now_ns, text)
+        settings = self._settings
+        self.watch_rate(self._targets.speed(estimate), now_ns)
         error = 0.0 if off is None else off
         impossible = self._off.update(error > settings.hold_error, now_ns)
         text = f"{error:.2f} rad off for {settings.hold_patience:g} s"

@@ -1,0 +1,61 @@
+"""The packets and texts of a satellite in orbit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from flight.bodies.orbit.brake import FieldBrake
+from flight.gnc.estimation.measurements import MeanRateMeasurement
+from flight.link.modes import Mode
+from flight.link.telemetry.definitions import SPIN
+from flight.loop.control_output import ControlOutput, Target
+from flight.loop.services import Services
+
+SPIN_EVERY = 10
+"""Control cycles from one spin packet to the next."""
+_NAN3 = [math.nan] * 3
+
+
+class OrbitView:
+    """Implements `flight.loop.body.BodyView`."""
+
+    def __init__(self, brake: FieldBrake, services: Services) -> None:
+        self._detumbler = brake.detumbler
+        self._recorder = services.recorder
+
+    def record_cycle(self, output: ControlOutput) -> None:
+        """Record the spin packet while the body is braked."""
+        if output.mode is not Mode.DETUMBLE or output.cycle.slot % SPIN_EVERY:
+            return
+        found = self._detumbler
+        rate, field = found.rate, found.field
+        self._recorder.record(
+            SPIN,
+            output.cycle.start_ns,
+            known=int(rate is not None),
+            rate=_NAN3 if rate is None else rate.tolist(),
+            rate_sigma=found.rate_sigma,
+            field=_NAN3 if field is None else field.tolist(),
+            restarts=found.restarts,
+            dipole=output.steered.dipole.tolist(),
+        )
+
+    def announce(self, target: Target, now_ns: int) -> None:
+        """Record nothing: there are no targets."""
+
+    def mode_fields(self, wanted: Target | None) -> Mapping[str, float]:
+        """Return the body's fields of the mode packet."""
+        return {"target_q2": math.nan}
+
+    def rate_text(self, rate: MeanRateMeasurement) -> str:
+        """Return a rate from streaks as text."""
+        return f"{np.rad2deg(rate.rate).round(3).tolist()} deg/s"
+
+    def progress(self, output: ControlOutput | None) -> str:
+        """Return mode and rate as text, for the progress line."""
+        rate = self._detumbler.rate
+        text = "   -  " if rate is None else f"{math.degrees(float(np.linalg.norm(rate))):6.2f}"
+        return f"{output.mode.label if output else 'boot':9} {text} deg/s by the magnetometer"

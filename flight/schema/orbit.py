@@ -1,0 +1,64 @@
+"""The shape of the configuration of a satellite in orbit: its own sections beside those of every body."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from msgspec import Meta
+
+from flight.schema.errors import ConfigError
+from flight.schema.sections import Config, Detumble
+from flight.schema.values import Positive, Section
+
+LEAST_FIELD, LARGEST_FIELD = 5e-6, 2e-4
+"""T: the Earth's field in a low orbit is 1.5e-5 to 6.5e-5; acting coils add or take as much."""
+
+
+class Craft(Section, frozen=True, kw_only=True):
+    """The flight application's model of the satellite.
+
+    `inertia` kg m^2 of the body axes; `dipole_per_ampere` m^2, n A of every coil.
+    """
+
+    inertia: tuple[Positive, Positive, Positive]
+    dipole_per_ampere: Positive
+
+
+class FieldDetumble(Detumble, frozen=True, kw_only=True):
+    """Detumbling by the momentum plan in the measured field (`flight.gnc.control.three_axes`).
+
+    `field_noise` T of an axis of a sample, constant errors of the magnetometer included; `torque_noise`
+    rad/s per sqrt(s), from torques that are not modelled. Times in s: the plan looks `horizon` ahead and is
+    made again every `replan`.
+    """
+
+    field_noise: Positive = 5.0e-7
+    torque_noise: Positive = 1.0e-5
+    horizon: Positive = 1500.0
+    replan: Annotated[float, Meta(ge=1.0)] = 5.0
+
+
+class OrbitConfig(Config, frozen=True, kw_only=True):
+    """The configuration of a satellite in orbit."""
+
+    craft: Craft
+    detumble: FieldDetumble = FieldDetumble()
+
+    def field_range(self) -> tuple[float, float]:
+        """Return the smallest and the largest strength of a valid magnetometer reading, T."""
+        return LEAST_FIELD, LARGEST_FIELD
+
+    def replan_period(self) -> float | None:
+        """Return None: no path is planned."""
+        return None
+
+    def hardware(self) -> tuple[Section, ...]:
+        """Return the sections of body and devices for which learned parameters hold."""
+        return (self.craft, *super().hardware())
+
+
+def as_orbit(config: Config) -> OrbitConfig:
+    """Return a configuration as that of a satellite in orbit. Raises ConfigError for another body's."""
+    if not isinstance(config, OrbitConfig):
+        raise ConfigError("body", f"is {config.body}: this needs the configuration of a satellite in orbit")
+    return config
