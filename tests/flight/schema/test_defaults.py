@@ -49,6 +49,7 @@ OTHERS = {
     "ClassicalSettings": "the thesis's star tracker, for comparison",
     "DeterminationSettings": "a satellite's attitude determination, which the testbed does not fly",
     "EdgeSettings": "horizon cameras",
+    "FieldRateSettings": "a satellite's detumbling, which the testbed does not fly",
     "HorizonSettings": "horizon cameras",
     "IdentificationSettings": "limits of the method",
     "IndexSettings": "an index is built on the ground",

@@ -7,6 +7,7 @@ from tests.studies.campaigns.coil_faults import COIL_FAULTS
 from tests.studies.campaigns.consistency import CONSISTENCY
 from tests.studies.campaigns.controllers import CONTROLLERS_CAMPAIGN
 from tests.studies.campaigns.coverage import COVERAGE
+from tests.studies.campaigns.detumble import DETUMBLE
 from tests.studies.campaigns.failures import FAILURES
 from tests.studies.campaigns.false_horizons import FALSE_HORIZONS
 from tests.studies.campaigns.faults import FAULTS
@@ -49,5 +50,6 @@ CAMPAIGNS: dict[str, Campaign] = {
         SOAK,
         COVERAGE,
         ORBIT_ATTITUDE,
+        DETUMBLE,
     )
 }

@@ -1,0 +1,1 @@
+"""Control of a free satellite by three magnetic coils alone."""

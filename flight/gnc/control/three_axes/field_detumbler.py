@@ -1,0 +1,139 @@
+"""Detumbling of a free satellite by its magnetometer alone.
+
+The coils' own field swamps the magnetometer, so the coils pause: off to settle, off to measure, then on.
+From the samples of the pauses a filter follows the body's whole rate and how the field turns among the stars
+(`flight.gnc.estimation.field_rate`), and the momentum plan brakes with the field turned ahead at that speed.
+Unlike B-dot
+the law cannot get stuck with the spin along the field: the plan holds what lies along the field until the
+field has turned. One sample starts nothing: the coils wait until `TRUSTED` samples in a row agree with the
+filter's prediction.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from flight.gnc.control.detumble import WindowSchedule
+from flight.gnc.control.three_axes.momentum import MomentumPlan, braking_dipole, momentum_plan, turning_field
+from flight.gnc.errors import UsageError
+from flight.gnc.estimation.field_rate import RATE, FieldRate, FieldRateSettings
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import attitude_matrix, conjugate, multiply
+
+TRUSTED = 4
+"""Samples in a row that agree, before the coils act."""
+INSTANTS = 150
+_SECOND = 1e-9
+_NO_DIPOLE: FloatArray = np.zeros(3)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FieldBraking:
+    """The law's constants.
+
+    Attributes:
+        limit: A m^2 of each coil.
+        horizon: s, how far the field is turned ahead; a quarter of an orbit.
+        replan: s, between plans.
+    """
+
+    limit: float
+    horizon: float = 1500.0
+    replan: float = 5.0
+
+    def __post_init__(self) -> None:
+        """Raise UsageError for constants that do not brake."""
+        for name in ("limit", "horizon", "replan"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise UsageError(f"detumbling {name} is {value}: it must be finite and positive")
+
+
+class FieldDetumbler:
+    """Runs the pauses: takes each magnetometer sample and returns the dipole each cycle, in order of time."""
+
+    def __init__(self, schedule: WindowSchedule, braking: FieldBraking, settings: FieldRateSettings) -> None:
+        self._schedule = schedule
+        self._braking = braking
+        self._filter = FieldRate(settings)
+        self.begin(0)
+
+    def begin(self, now_ns: int) -> None:
+        """Begin the first pause with no knowledge of the field."""
+        self._begun_ns = self._time_ns = now_ns
+        self._dipole = _NO_DIPOLE
+        self._plan: MomentumPlan | None = None
+        self._planned_ns = now_ns
+        self._planned_turn = _NO_DIPOLE
+        self._trusted = 0
+        self._filter.restart()
+
+    def listens(self, time_ns: int) -> bool:
+        """Return whether the coils were off and settled at `time_ns`."""
+        schedule = self._schedule
+        phase_ns = (time_ns - self._begun_ns) % schedule.period_ns
+        inside = schedule.settle_ns <= phase_ns < schedule.settle_ns + schedule.measure_ns
+        return time_ns >= self._begun_ns and inside
+
+    def sample(self, time_ns: int, field: FloatArray) -> None:
+        """Accept a field (3,) T measured at `time_ns`; ignored unless the coils were off and settled."""
+        if not self.listens(time_ns) or time_ns < self._time_ns:
+            return
+        self._advance(time_ns)
+        starts = self._filter.restarts
+        accepted = self._filter.measure(field)
+        if accepted and self._filter.started:
+            self._trusted += 1
+        elif not accepted and (self._trusted < TRUSTED or self._filter.restarts != starts):
+            self._trusted = 0
+            self._plan = None
+
+    def dipole(self, now_ns: int) -> FloatArray:
+        """Return the dipole (3,) A m^2 now: zero while the field is measured or the rate is not known."""
+        self._advance(max(now_ns, self._time_ns))
+        schedule = self._schedule
+        phase_ns = (now_ns - self._begun_ns) % schedule.period_ns
+        acting = phase_ns >= schedule.settle_ns + schedule.measure_ns
+        self._dipole = self._braking_dipole(now_ns) if acting and self.trusted else _NO_DIPOLE
+        return self._dipole
+
+    @property
+    def trusted(self) -> bool:
+        """Whether enough samples agreed."""
+        return self._trusted >= TRUSTED
+
+    @property
+    def rate(self) -> FloatArray | None:
+        """The body's rate (3,) rad/s; None before it is known."""
+        return self._filter.rate if self.trusted else None
+
+    @property
+    def rate_sigma(self) -> float:
+        """Standard deviation of the rate's worst axis, rad/s; infinite before it is known."""
+        if not self.trusted:
+            return math.inf
+        return math.sqrt(float(np.linalg.eigvalsh(self._filter.covariance[RATE, RATE])[-1]))
+
+    @property
+    def restarts(self) -> int:
+        """How often samples contradicted the filter until it began again: a spin beyond the sampling does."""
+        return self._filter.restarts
+
+    def _advance(self, time_ns: int) -> None:
+        self._filter.advance(self._dipole, (time_ns - self._time_ns) * _SECOND)
+        self._time_ns = time_ns
+
+    def _braking_dipole(self, now_ns: int) -> FloatArray:
+        found, braking = self._filter, self._braking
+        if self._plan is None or (now_ns - self._planned_ns) * _SECOND >= braking.replan:
+            share = self._schedule.act_ns / self._schedule.period_ns
+            step = braking.horizon / INSTANTS
+            ahead = turning_field(found.field, found.change, step, INSTANTS)
+            self._plan = momentum_plan(found.momentum, ahead, step, share * braking.limit)
+            self._planned_ns, self._planned_turn = now_ns, found.turn
+        # The plan is fixed among the stars: into the body's axes of now.
+        since = attitude_matrix(multiply(found.turn, conjugate(self._planned_turn)))
+        return braking_dipole(since @ self._plan.costate, found.field, braking.limit)

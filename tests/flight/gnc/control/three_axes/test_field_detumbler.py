@@ -1,0 +1,89 @@
+"""Detumbling by the magnetometer alone: started by agreement, and out of a spin along the field."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from flight.gnc.control.detumble import WindowSchedule
+from flight.gnc.control.three_axes.field_detumbler import TRUSTED, FieldBraking, FieldDetumbler
+from flight.gnc.errors import UsageError
+from flight.gnc.estimation.field_rate import FieldRateSettings
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import IDENTITY, attitude_matrix, from_rotation_vector, multiply
+
+SCHEDULE = WindowSchedule(100_000_000, 300_000_000, 600_000_000)
+INERTIA = np.diag([1.1e-3, 1.05e-3, 0.99e-3])
+LIMIT = 0.1
+FIELD, TURN = np.array([0.0, 0.0, 4e-5]), np.array([0.0, 2.2e-3, 0.0])
+OWN_FIELD = 4e-4
+"""T by A m^2: the coils at the magnetometer, as strong as the Earth's field at full dipole."""
+CYCLE_NS = 100_000_000
+
+
+def detumbler() -> FieldDetumbler:
+    noise = FieldRateSettings(inertia=INERTIA, field_sigma=2e-7, torque_walk=1e-4)
+    return FieldDetumbler(SCHEDULE, FieldBraking(limit=LIMIT), noise)
+
+
+def fly(rate: FloatArray, seconds: float, spikes: float = 0.0) -> float:
+    """Return the speed (rad/s) at the end."""
+    law, rng = detumbler(), np.random.default_rng(4)
+    law.begin(0)
+    attitude, dipole = IDENTITY, np.zeros(3)
+    dt = 1e-9 * CYCLE_NS
+    for cycle in range(round(seconds / dt)):
+        now_ns = cycle * CYCLE_NS
+        field = attitude_matrix(attitude) @ attitude_matrix(from_rotation_vector(TURN * cycle * dt)).T @ FIELD
+        sample = field + OWN_FIELD * dipole + 1e-7 * rng.standard_normal(3)
+        if rng.uniform() < spikes:
+            sample = sample + 1e-4 * rng.standard_normal(3)
+        law.dipole(now_ns)
+        law.sample(now_ns, sample)
+        dipole = law.dipole(now_ns)
+        assert np.abs(dipole).max() <= LIMIT * (1.0 + 1e-12)
+        momentum = INERTIA @ rate
+        middle = rate + 0.5 * dt * np.linalg.solve(
+            INERTIA, np.cross(dipole, field) - np.cross(rate, momentum)
+        )
+        torque = np.cross(dipole, field) - np.cross(middle, INERTIA @ middle)
+        rate = rate + dt * np.linalg.solve(INERTIA, torque)
+        attitude = multiply(from_rotation_vector(dt * middle), attitude)
+    return float(np.linalg.norm(rate))
+
+
+def test_a_spin_along_the_field_is_braked_as_the_field_turns_and_spiked_samples_do_not_mislead() -> None:
+    """B-dot takes 2,000 s and more. The plan makes the momentum cross the field, so the speed grows first."""
+    assert fly(np.array([0.0, 0.0, 0.03]), 250.0, spikes=0.1) < math.radians(1.0)
+
+
+def test_no_dipole_in_the_pause_nor_before_enough_samples_agree() -> None:
+    law = detumbler()
+    law.begin(0)
+    for k in range(TRUSTED):
+        now_ns = SCHEDULE.settle_ns + 20_000_000 * k
+        law.dipole(now_ns)
+        law.sample(now_ns, FIELD if k else FIELD + 1e-4)  # the first is spiked
+        assert not law.dipole(now_ns).any()
+    assert not law.trusted
+    assert law.rate is None
+    assert law.rate_sigma == math.inf
+    assert not law.dipole(SCHEDULE.settle_ns + SCHEDULE.measure_ns).any()
+
+
+def test_a_sample_taken_while_the_coils_act_or_settle_is_ignored() -> None:
+    law = detumbler()
+    law.begin(0)
+    for now_ns in range(0, 5_000_000_000, 25_000_000):
+        law.sample(now_ns, FIELD if law.listens(now_ns) else np.array([1.0, 0.0, 0.0]))
+        law.dipole(now_ns)
+    assert law.trusted
+    assert law.restarts == 0
+    assert np.linalg.norm(law.rate) < 0.02
+
+
+def test_constants_that_do_not_brake_are_refused() -> None:
+    with pytest.raises(UsageError, match="limit"):
+        FieldBraking(limit=0.0)

@@ -1,0 +1,84 @@
+"""The momentum plan removes what it says in the time it says, near the least time there is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flight.gnc.control.three_axes.momentum import LIMIT_GAIN, braking_dipole, momentum_plan, turning_field
+from flight.gnc.errors import UsageError
+from flight.gnc.math.arrays import FloatArray
+
+STEP, LIMIT = 5.0, 0.1
+FIELD = turning_field(np.array([0.0, 0.0, 4e-5]), np.array([4e-5 * 0.0022, 0.0, 0.0]), STEP, 400)
+"""T: it turns by two turns in 95 min, as in a polar orbit."""
+
+
+def left(momentum: FloatArray, field: FloatArray, costate: FloatArray, horizon: float) -> float:
+    """Return the share of the momentum that is left when the dipole's length is cut at the plan's limit."""
+    now = momentum.copy()
+    for there in field[: round(horizon / STEP)]:
+        dipole = -np.cross(there, costate)
+        dipole *= min(1.0, LIMIT_GAIN * LIMIT / float(np.linalg.norm(dipole)))
+        now += STEP * np.cross(dipole, there)
+    return float(np.linalg.norm(now) / np.linalg.norm(momentum))
+
+
+def least_time(momentum: FloatArray, field: FloatArray) -> float:
+    """Return a bound from below: for any p, a dipole of that length takes at most its integral from p . h."""
+    directions = np.random.default_rng(1).standard_normal((3000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    most = (
+        np.cumsum(np.linalg.norm(np.cross(field[:, None], directions), axis=2), axis=0)
+        * STEP
+        * LIMIT
+        * LIMIT_GAIN
+    )
+    enough = np.all(most >= directions @ momentum, axis=1)
+    return float(STEP * (np.argmax(enough) + 1))
+
+
+@pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.3, -0.7, 0.6)])
+def test_the_plan_removes_the_momentum_in_nearly_the_least_time(
+    direction: tuple[float, float, float],
+) -> None:
+    momentum = 1e-3 * np.array(direction)
+    plan = momentum_plan(momentum, FIELD, STEP, LIMIT)
+    assert left(momentum, FIELD, plan.costate, plan.horizon) < 0.06
+    assert (
+        least_time(momentum, FIELD) - STEP <= plan.horizon < 1.25 * least_time(momentum, FIELD) + 2.0 * STEP
+    )
+
+
+def test_momentum_along_the_field_waits_for_the_field_to_turn() -> None:
+    along = momentum_plan(np.array([0.0, 0.0, 1e-3]), FIELD, STEP, LIMIT)
+    across = momentum_plan(np.array([1e-3, 0.0, 0.0]), FIELD, STEP, LIMIT)
+    assert along.horizon > 1.2 * across.horizon
+    still = np.broadcast_to(FIELD[0], FIELD.shape)
+    stuck = momentum_plan(np.array([0.0, 0.0, 1e-3]), still, STEP, LIMIT)
+    assert stuck.horizon == STEP * len(FIELD)
+    assert np.all(np.isfinite(stuck.costate))
+
+
+def test_the_dipole_never_adds_energy_to_what_the_plan_brakes_and_keeps_each_limit() -> None:
+    rng = np.random.default_rng(2)
+    for _ in range(50):
+        costate, field = rng.standard_normal(3), 4e-5 * rng.standard_normal(3)
+        dipole = braking_dipole(1e4 * costate, field, LIMIT)
+        assert float(np.abs(dipole).max()) <= LIMIT
+        assert float(np.cross(dipole, field) @ costate) <= 0.0
+
+
+def test_the_field_turned_ahead_keeps_its_strength_and_begins_with_its_change() -> None:
+    field, change = np.array([1e-5, -2e-5, 3e-5]), np.array([3e-8, 2e-8, 5e-8])
+    ahead = turning_field(field, change, 1.0, 50)
+    np.testing.assert_allclose(np.linalg.norm(ahead, axis=1), np.linalg.norm(field), rtol=1e-12)
+    across = change - field * float(field @ change) / float(field @ field)
+    np.testing.assert_allclose(ahead[1] - ahead[0], across, rtol=0.01, atol=1e-10)
+    np.testing.assert_array_equal(turning_field(field, np.zeros(3), 1.0, 3), np.tile(field, (3, 1)))
+
+
+def test_a_field_of_two_instants_is_refused_and_no_momentum_needs_no_dipole() -> None:
+    with pytest.raises(UsageError, match="three instants"):
+        momentum_plan(np.ones(3), FIELD[:2], STEP, LIMIT)
+    np.testing.assert_array_equal(momentum_plan(np.zeros(3), FIELD, STEP, LIMIT).costate, np.zeros(3))

@@ -1,0 +1,105 @@
+"""A free satellite for campaigns: the simulated world, its orbit of one seed, and ideal sensors with noise.
+
+The executive and the wires are left out, so a flight costs the world's time alone; control rates are lower
+than 40 Hz.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flight.gnc.earth.ephemeris import Ephemeris, predict
+from flight.gnc.earth.orbit_knowledge import OrbitState
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import from_rotation_vector, multiply
+from sim_hal.worlds.free_body.body import FreeBody
+from sim_hal.worlds.free_body.craft import CRAFTS
+from sim_hal.worlds.free_body.section import Disturbances, FreeBodySection, OrbitSection, TipOff
+
+SECOND = 1_000_000_000
+CRAFT = {"knightcube": 0.0959, "cubesat_3u": 0.2}
+"""A m^2, the limit of each coil."""
+WATTS = {"knightcube": 54.8, "cubesat_3u": 5.0}
+"""W/(A m^2)^2, of the coils."""
+ORBITS = {"sso": (500e3, 97.4), "iss": (420e3, 51.6)}
+"""Altitude m, inclination deg."""
+UTC = "2026-11-23T00:00:00Z"
+FIELD_NOISE, HARD_IRON = 1e-7, 1.5e-7
+"""T: a VN-100's magnetometer at 40 Hz, and what calibration leaves of an axis."""
+GYRO_NOISE, GYRO_BIAS, GYRO_BIAS_WALK = 6.1e-5, 5e-4, 2e-6
+"""rad/s per sqrt(Hz); rad/s; rad/s per sqrt(s): a VN-100's noise, and its bias with its in-run change."""
+FIX_SIGMA, FIX_VELOCITY_SIGMA = 10.0, 0.05
+"""m, m/s."""
+_STREAM = 0xF11
+
+
+class FreeFlight:
+    """The truth of one seed under the dipole that is commanded."""
+
+    def __init__(
+        self,
+        craft: str,
+        seed: int,
+        orbit: str,
+        release: TipOff,
+        disturbances: Disturbances | None = None,
+    ) -> None:
+        """Release the craft at time 0 on `orbit`, its node and place in the orbit drawn by the seed."""
+        self.generator = np.random.default_rng([seed, _STREAM])
+        altitude, inclination = ORBITS[orbit]
+        node, anomaly = self.generator.uniform(0.0, 360.0, 2).tolist()
+        section = FreeBodySection(
+            craft=craft,  # type: ignore[arg-type]  # a name that a test has checked
+            orbit=OrbitSection(
+                altitude=altitude,
+                inclination_deg=inclination,
+                ascending_node_deg=node,
+                true_anomaly_deg=anomaly,
+            ),
+            release=release,
+            disturbances=disturbances or Disturbances(),
+        )
+        self._currents: FloatArray = np.zeros(3)
+        self.body = FreeBody(section, lambda: self._currents, seed=seed, utc=UTC)
+        self.body.release_at(0)
+        shape = CRAFTS[craft]
+        self.inertia: FloatArray = np.diag(shape.inertia)
+        self.limit = CRAFT[craft]
+        self._dipole_per_ampere = shape.dipole_per_ampere
+        self.time_ns = 0
+        self.square = 0.0
+        """A^2 m^4 s: the integral of the commanded dipole squared."""
+        self.hard_iron = HARD_IRON * self.generator.standard_normal(3)
+        self.gyro_bias = GYRO_BIAS * self.generator.standard_normal(3)
+
+    def act(self, dipole: FloatArray) -> None:
+        """Command a dipole (3,) A m^2 from now on."""
+        self._currents = dipole / self._dipole_per_ampere
+
+    def advance(self, time_ns: int) -> None:
+        """Let time pass until `time_ns`."""
+        seconds = (time_ns - self.time_ns) / SECOND
+        dipole = self._currents * self._dipole_per_ampere
+        self.square += seconds * float(dipole @ dipole)
+        self.gyro_bias = self.gyro_bias + GYRO_BIAS_WALK * np.sqrt(seconds) * self.generator.standard_normal(
+            3
+        )
+        self.motion = self.body.motion(time_ns)
+        self.time_ns = time_ns
+
+    def field(self) -> FloatArray:
+        """Return a sample (3,) T of the magnetometer now; the coils must be off."""
+        noise = FIELD_NOISE * self.generator.standard_normal(3)
+        return np.asarray(self.motion.field_body + self.hard_iron + noise)
+
+    def attitude(self, sigma: float) -> FloatArray:
+        """Return the attitude (4,) with an error of `sigma` rad an axis."""
+        error = from_rotation_vector(sigma * self.generator.standard_normal(3))
+        return multiply(error, self.motion.quaternion)
+
+    def ephemeris(self, duration: float) -> Ephemeris:
+        """Return what flight software predicts from a GPS fix now, over `duration` s from the fix on."""
+        truth = self.body.truth()
+        position = truth.position + FIX_SIGMA * self.generator.standard_normal(3)
+        velocity = truth.velocity + FIX_VELOCITY_SIGMA * self.generator.standard_normal(3)
+        return predict(OrbitState(truth.utc, position, velocity, FIX_SIGMA), duration)
