@@ -2,6 +2,7 @@
 
 COMMANDS = {
     "command": "send a command to a flight",
+    "watch": "show a flight in the terminal, live or as it ended",
     "report": "report the performance of a run",
     "export": "write a run's packets as CSV",
     "plan": "plan a single slew",
