@@ -6,15 +6,12 @@ Its frames have a truth: the attitude at any time, and the rate.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector, multiply
 from flight.schema.sections import Config
-from hal.interfaces.devices import FrameSource
-from hal.interfaces.wires import Clock
 from sim_hal.assembly import StarRenderer, inline_exposure
 from sim_hal.clock import SimClock
 from sim_hal.emulators.star_camera import EmulatedStarCamera
@@ -24,19 +21,13 @@ from sim_hal.worlds.simulation import TimedSimulation
 from sim_hal.worlds.world import WorldInputs, make_world
 
 
-@dataclass(frozen=True, slots=True)
-class PosedCamera:
-    """A camera, its clock, and its attitude (4,), ICRS into camera, at a time of that clock."""
+def posed_camera(
+    config: Config, section: Simulation, clock: SimClock, rate: FloatArray
+) -> tuple[EmulatedStarCamera, Callable[[int], FloatArray]]:
+    """Return the camera of a configuration on a clock, and its attitude (4,), ICRS into camera, at a time.
 
-    clock: Clock
-    frames: FrameSource
-    attitude: Callable[[int], FloatArray]
-
-
-def posed_camera(config: Config, section: Simulation, clock: SimClock, rate: FloatArray) -> PosedCamera:
-    """Return the camera of a configuration on a clock, turning at `rate` (3,) rad/s, camera axes.
-
-    It begins at the attitude at which the body is released. Raises ConfigError for a world that cannot be.
+    It turns at `rate` (3,) rad/s, camera axes, from the attitude at which the body is released. Raises
+    ConfigError for a world that cannot be.
     """
     camera = config.camera
     assert camera is not None, "the caller has seen to a camera section"
@@ -58,4 +49,4 @@ def posed_camera(config: Config, section: Simulation, clock: SimClock, rate: Flo
         round(section.sky.line_time * camera.rows * 1e9),
     )
     clock.attach(TimedSimulation(lambda _: None, [device]))
-    return PosedCamera(clock, device, lambda time_ns: multiply(mounting, motion(time_ns).quaternion))
+    return device, lambda time_ns: multiply(mounting, motion(time_ns).quaternion)

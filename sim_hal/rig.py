@@ -6,6 +6,7 @@ their own.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,15 +17,16 @@ from flight.schema import reader as configuration
 from flight.schema.errors import ConfigError
 from flight.schema.sections import Config
 from hal.guardian.client import CoilReach
+from hal.interfaces.devices import FrameSource
 from hal.interfaces.rig import Rig
-from hal.interfaces.wires import SECOND_NS
+from hal.interfaces.wires import SECOND_NS, Clock
 from sim_hal import lockstep
 from sim_hal.clock import SimClock
 from sim_hal.faults import grammar
 from sim_hal.faults.catalogue import listing
 from sim_hal.faults.host import corrupted_by, host_faults
 from sim_hal.faults.schedule import check, scheduled
-from sim_hal.posed_camera import PosedCamera, posed_camera
+from sim_hal.posed_camera import posed_camera
 from sim_hal.serving import remote
 from sim_hal.settings import Simulation
 
@@ -73,10 +75,20 @@ def open_rig(request: SimulationRequest, config: Config, stack: ExitStack) -> Ri
     return with_host_faults(opener(request, config, section, stack), section)
 
 
+@dataclass(frozen=True, slots=True)
+class PosedCamera:
+    """A camera, its clock, and its attitude (4,), ICRS into camera, at a time of that clock."""
+
+    clock: Clock
+    frames: FrameSource
+    attitude: Callable[[int], FloatArray]
+
+
 def open_camera(request: SimulationRequest, config: Config, rate: FloatArray) -> PosedCamera:
     """Return the emulated camera of a configuration, turning at `rate` (3,) rad/s in camera axes."""
     section = request.section()
-    return posed_camera(config, section, SimClock(lockstep.utc_ns(section.utc)), rate)
+    clock = SimClock(lockstep.utc_ns(section.utc))
+    return PosedCamera(clock, *posed_camera(config, section, clock, rate))
 
 
 def fault_catalogue() -> tuple[str, str]:

@@ -15,8 +15,7 @@ from flight.schema.sections import Config
 from hal.interfaces.rig import Rig
 
 if TYPE_CHECKING:
-    from sim_hal.posed_camera import PosedCamera
-    from sim_hal.rig import SimulationRequest
+    from sim_hal.rig import PosedCamera, SimulationRequest
 
 
 def fault_catalogue() -> tuple[str, str]:

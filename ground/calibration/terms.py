@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -81,7 +82,9 @@ def _as_fitted(found: Calibration, term: str) -> LeftOut:
 
 def _without(lens: Lens, left_out: dict[str, LeftOut]) -> Lens:
     """Return a lens with terms left out at what is assumed."""
-    values = {term: gone.assumed if term == "centre" else gone.assumed[0] for term, gone in left_out.items()}
+    values: dict[str, Any] = {
+        term: gone.assumed if term == "centre" else gone.assumed[0] for term, gone in left_out.items()
+    }
     return replace(lens, **values)
 
 

@@ -2,8 +2,9 @@
 
 COMMANDS = {
     "command": "send a command to a flight",
+    "watch": "show a flight in the terminal, live or as it ended",
     "report": "report the performance of a run",
-    "export": "write a run's packets as CSV",
+    "export": "write a run's packets as CSV, Parquet or SQLite",
     "plan": "plan a single slew",
     "identify": "identify the body's constants from a short flight",
     "rate": "estimate the body rate from a picture of star streaks",

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from ground.identification.fit import Fit
     from ground.identification.record import Record
 
-__all__ = ["draw", "draw_fit", "draw_path", "format_report", "summarise"]
+__all__ = ["draw", "draw_both", "draw_fit", "draw_path", "format_report", "summarise"]
 
 
 def draw(run: Run, folder: Path) -> list[Path]:
@@ -31,6 +31,15 @@ def draw(run: Run, folder: Path) -> list[Path]:
 
         folder.mkdir(parents=True, exist_ok=True)
         return draw_figures(run, folder)
+
+
+def draw_both(first: Run, second: Run, folder: Path) -> Path:
+    """Draw two runs over each other into `folder`; returns the file. Raises UsageError as `draw`."""
+    with _drawing(folder):
+        from ground.report.figures import draw_comparison  # noqa: PLC0415
+
+        folder.mkdir(parents=True, exist_ok=True)
+        return draw_comparison(first, second, folder)
 
 
 def draw_path(plan: Plan, plant: SingleAxisPlant, file: Path) -> None:

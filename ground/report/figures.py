@@ -46,6 +46,25 @@ def draw_figures(run: Run, folder: Path) -> list[Path]:
     return files
 
 
+def draw_comparison(first: Run, second: Run, folder: Path) -> Path:
+    """Draw attitude, rate and power of two runs over each other; returns the file. Raises OSError."""
+    figure = Figure(figsize=TALL, layout="constrained")
+    axes = figure.subplots(3, 1, sharex=True)
+    for run, letter, colour in ((first, "A", panels.BLUE), (second, "B", panels.ORANGE)):
+        panels.compared(axes, Scene(run), letter, colour)
+    for ax, label, title in zip(
+        axes,
+        ("$q_2$", "rate, mrad/s", "power, mW"),
+        ("Attitude", "Rate", "Average coil power so far"),
+        strict=True,
+    ):
+        panels.style(ax, label, title, "" if ax is not axes[-1] else "mission time, s")
+        panels.legend(ax)
+    path = folder / "comparison.png"
+    figure.savefig(path, dpi=DPI, facecolor="white")
+    return path
+
+
 def _single(scene: Scene, panel: Callable[[Axes, Scene], None]) -> Figure:
     figure = Figure(figsize=WIDE, layout="constrained")
     panel(figure.subplots(), scene)

@@ -5,6 +5,8 @@ Colours are of the Okabe-Ito palette, distinguishable with all common kinds of c
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator
@@ -131,6 +133,16 @@ def power(ax: Axes, scene: Scene) -> None:
     ax.set_ylim(bottom=0.0)
     style(ax, "power, W", "Coil power")
     legend(ax)
+
+
+def compared(axes: Sequence[Axes], scene: Scene, name: str, colour: str) -> None:
+    """Draw q2, the rate and the average power so far of one run of several into three axes."""
+    flown, power = scene.flown, scene.power
+    axes[0].plot(flown.time, flown.q2, color=colour, linewidth=1.4, label=name)
+    axes[1].plot(flown.time, 1e3 * flown.rate, color=colour, linewidth=1.0, label=name)
+    if power is not None:
+        average = np.cumsum(power.power * power.spans) / np.cumsum(power.spans)
+        axes[2].plot(power.time + power.spans, 1e3 * average, color=colour, linewidth=1.4, label=name)
 
 
 def paths(ax: Axes, scene: Scene, start: float, stop: float, target: float, title: str) -> None:

@@ -1,19 +1,23 @@
-"""CSV files hold what the packets hold, to the last bit."""
+"""Exported files hold what the packets hold, to the last bit."""
 
 from __future__ import annotations
 
 import csv
+import sqlite3
+import sys
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from flight.gnc.errors import UsageError
-from flight.link.telemetry.definitions import EVENT
+from flight.link.telemetry.definitions import EVENT, HOUSEKEEPING, RUN
 from flight.link.telemetry.log import FlightLog
 from flight.link.telemetry.packets import Packer
-from flight.link.telemetry.reader import read_run
+from flight.link.telemetry.reader import Run, read_run
 from ground.export import export
+from tests.ground.commands.in_process import command
 from tests.ground.report.synthetic import Recipe, make_run
 from tests.manual_clock import ManualClock
 
@@ -66,5 +70,91 @@ def test_texts_with_commas_quotes_and_accents_survive(tmp_path: Path) -> None:
 def test_a_place_that_cannot_be_written_is_a_clear_error(tmp_path: Path) -> None:
     run = read_run(make_run(tmp_path / "run", Recipe(duration=1.0, rate_hz=10.0)))
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(UsageError, match="no CSV can be written there"):
+    with pytest.raises(UsageError, match="no csv can be written there"):
         export(run, tmp_path / "file")
+
+
+@pytest.fixture
+def rich_run(tmp_path: Path) -> Run:
+    """Return a run with texts, NaN, and whole numbers of 64 bits."""
+    log = FlightLog(tmp_path / "run", clock=ManualClock())
+    packer = Packer()
+    for n in range(3):
+        values = {"imu_packets": 7 + n, "coil_voltage": np.nan if n else 5.0}
+        fields = {field.name: values.get(field.name, 0) for field in HOUSEKEEPING.fields}
+        log.write(packer.pack(HOUSEKEEPING, n * 10**9, fields))
+    identity = {f.name: [1.0] * 3 if f.count == 3 else "é" if f.kind[0] == "S" else 1 for f in RUN.fields}
+    log.write(packer.pack(RUN, 0, {**identity, "seed": 2**64 - 1}))
+    log.write(packer.pack(EVENT, 1, code=1, severity=0, suppressed=0, name="a", text='x "y", z\n'))
+    log.close()
+    return read_run(tmp_path / "run")
+
+
+def test_one_sqlite_file_has_a_table_for_each_packet_and_the_units(rich_run: Run, tmp_path: Path) -> None:
+    file = tmp_path / "new" / "all.sqlite"
+    for _ in range(2):  # again, in the place of the first
+        assert export(rich_run, file, "sqlite") == [file]
+    assert list(file.parent.iterdir()) == [file]
+    with closing(sqlite3.connect(file)) as database:
+        rows = database.execute("SELECT time_s, imu_packets, coil_voltage FROM housekeeping").fetchall()
+        assert rows == [(0.0, 7, 5.0), (1.0, 8, None), (2.0, 9, None)]
+        assert database.execute("SELECT seed, config_name, coil_resistance_3 FROM run").fetchall() == [
+            (str(2**64 - 1), "é", 1.0)
+        ]
+        assert database.execute("SELECT text FROM event").fetchone() == ('x "y", z\n',)
+        unit = "SELECT unit FROM fields WHERE packet = 'housekeeping' AND name = 'coil_voltage'"
+        assert database.execute(unit).fetchone() == ("V",)
+
+
+def test_parquet_files_hold_every_number_with_its_unit(rich_run: Run, tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `parquet`")
+    files = {path.stem: path for path in export(rich_run, tmp_path / "parquet", "parquet")}
+    assert set(files) == {"run", "event", "housekeeping"}
+    table = parquet.read_table(files["housekeeping"])
+    np.testing.assert_array_equal(table["coil_voltage"].to_numpy(), [5.0, np.nan, np.nan])
+    np.testing.assert_array_equal(table["imu_packets"].to_numpy(), [7, 8, 9])
+    assert table.schema.field("coil_voltage").metadata[b"unit"] == b"V"
+    identity = parquet.read_table(files["run"])
+    assert identity["seed"].to_pylist() == [2**64 - 1]
+    assert identity["config_name"].to_pylist() == ["é"]
+
+
+def test_all_formats_have_the_same_columns(tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `parquet`")
+    run = read_run(make_run(tmp_path / "run", Recipe(duration=2.0, rate_hz=10.0)))
+    export(run, tmp_path / "csv")
+    export(run, tmp_path / "parquet", "parquet")
+    export(run, tmp_path / "one.sqlite", "sqlite")
+    with closing(sqlite3.connect(tmp_path / "one.sqlite")) as database:
+        for path in (tmp_path / "csv").iterdir():
+            names, _, rows = read(path)
+            assert parquet.read_schema(tmp_path / "parquet" / f"{path.stem}.parquet").names == names
+            cursor = database.execute(f'SELECT * FROM "{path.stem}"')
+            assert [column[0] for column in cursor.description] == names
+            assert len(cursor.fetchall()) == len(rows)
+
+
+def test_without_pyarrow_the_cure_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = read_run(make_run(tmp_path / "run", Recipe(duration=1.0, rate_hz=10.0)))
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(UsageError, match=r"pip install 'knightcube-flight\[parquet\]'"):
+        export(run, tmp_path / "parquet", "parquet")
+
+
+@pytest.mark.parametrize("form", ["parquet", "sqlite"])
+def test_no_format_is_written_where_nothing_can_be(tmp_path: Path, form: str) -> None:
+    run = read_run(make_run(tmp_path / "run", Recipe(duration=1.0, rate_hz=10.0)))
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(UsageError, match=f"no {form} can be written there"):
+        export(run, tmp_path / "file" / "x", form)
+    (tmp_path / "folder.sqlite").mkdir()
+    if form == "sqlite":
+        with pytest.raises(UsageError, match="no sqlite can be written there"):
+            export(run, tmp_path / "folder.sqlite", form)
+
+
+def test_the_command_names_the_file_that_it_wrote(tmp_path: Path) -> None:
+    folder = make_run(tmp_path / "run", Recipe(duration=1.0, rate_hz=10.0))
+    done = command("export", folder, "--format", "sqlite")
+    assert (done.returncode, done.stdout) == (0, f"{folder / 'run.sqlite'}\n"), done.stderr
+    assert command("export", folder, "--format", "xml").returncode == 2

@@ -1,0 +1,109 @@
+"""Two runs side by side: every figure of both with its difference, and what was configured otherwise."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from flight.link.telemetry.reader import read_run
+from ground.report import summarise
+from ground.report.comparison import compare, format_comparison
+from tests.ground.commands.in_process import command
+from tests.ground.report.synthetic import Recipe, make_run
+
+LONG = Recipe(duration=90.0, planned=90.0, hold=30.0, rate_hz=10.0)
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Return two runs of which the second is shorter and has no truth, and another horizon."""
+    place = tmp_path_factory.mktemp("pair")
+    first = make_run(place / "a", LONG)
+    second = make_run(place / "b", Recipe(60.0, 60.0, 30.0, 10.0, truth=False))
+    text = "name: x\nguidance: {horizon: %s, strategy: goal}\nsteps: [{at: 0.0, q2: 0.1}]\n"
+    (first / "config.yaml").write_text(text % "10.0")
+    (second / "config.yaml").write_text(text % "13.0" + "seedless: true\n")
+    return first, second
+
+
+def test_every_figure_has_both_values_and_the_difference_of_the_second_less_the_first(
+    pair: tuple[Path, Path],
+) -> None:
+    facts = json.loads(command("report", *pair, "--json").stdout)
+    figures = {row["figure"]: row for row in facts["figures"]}
+    assert figures["duration"] == {
+        "figure": "duration", "unit": "s", "a": 90.0, "b": 60.0, "difference": -30.0
+    }  # fmt: skip
+    alone = [summarise(read_run(folder)) for folder in pair]
+    settling = [one["steps"][1]["settling_s"] for one in alone]
+    row = figures["step 1: settling"]
+    assert [row["a"], row["b"]] == settling
+    assert row["difference"] == pytest.approx(settling[1] - settling[0])
+    assert figures["streaks: frames"]["difference"] == (
+        alone[1]["streaks"]["frames"] - alone[0]["streaks"]["frames"]
+    )
+    step = figures["step 2: overshoot"]
+    assert (step["b"], step["difference"]) == (None, None), "only the first flew it"
+    error = figures["estimate: rate, rms error"]
+    assert error["a"] == pytest.approx(0.1, rel=1e-3)
+    assert error["b"] is None, "no truth to judge by"
+
+
+def test_what_was_configured_otherwise_is_listed_by_its_key(pair: tuple[Path, Path]) -> None:
+    facts = json.loads(command("report", *pair, "--json").stdout)
+    assert facts["configuration"] == [
+        {"key": "guidance.horizon", "a": 10.0, "b": 13.0},
+        {"key": "seedless", "a": None, "b": True},
+    ]
+
+
+def test_events_are_counted_in_both(pair: tuple[Path, Path]) -> None:
+    facts = json.loads(command("report", *pair, "--json").stdout)
+    assert facts["events"] == [{"name": "target", "a": 8, "b": 6}]
+
+
+def test_as_text_the_runs_stand_beside_each_other(pair: tuple[Path, Path]) -> None:
+    done = command("report", *pair)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith(f"A  {pair[0]}: 90.0 s of made-up, lock-step, seed 7")
+    lines = [line.split() for line in done.stdout.splitlines()]
+    assert ["guidance.horizon", "10.0", "13.0"] in lines
+    assert ["duration", "s", "90", "60", "-30", "(-33", "%)"] in lines
+    assert ["target", "8", "6"] in lines
+    assert "note: B: no truth log: judged on the estimate" in done.stdout
+
+
+def test_a_run_beside_itself_differs_in_nothing(pair: tuple[Path, Path]) -> None:
+    summary = summarise(read_run(pair[0]))
+    compared = compare(summary, summary)
+    assert compared["configuration"] == []
+    assert {row["difference"] for row in compared["figures"]} <= {0, None}
+    assert "Configured alike" in format_comparison(compared)
+
+
+def test_a_configuration_that_cannot_be_read_is_no_obstacle(pair: tuple[Path, Path], tmp_path: Path) -> None:
+    bare = make_run(tmp_path / "bare", Recipe(5.0, 5.0, 5.0, 10.0, identity=False, commands=False))
+    done = command("report", bare, pair[1])
+    assert done.returncode == 0, done.stderr
+    assert "Configurations not compared" in done.stdout
+
+
+def test_both_are_drawn_over_each_other_where_a_folder_is_given(
+    pair: tuple[Path, Path], tmp_path: Path
+) -> None:
+    pytest.importorskip("matplotlib", reason="pictures need the extra 'plots'")
+    from matplotlib.image import imread  # noqa: PLC0415
+
+    done = command("report", *pair, "--figures", tmp_path / "new")
+    assert done.returncode == 0, done.stderr
+    picture = imread(tmp_path / "new" / "comparison.png")[..., :3]
+    blue = (abs(picture - [0.0, 0.447, 0.698]).max(axis=2) < 0.05).sum()
+    orange = (abs(picture - [0.902, 0.624, 0.0]).max(axis=2) < 0.05).sum()
+    assert min(blue, orange) > 500
+
+
+def test_what_is_no_run_is_refused(pair: tuple[Path, Path], tmp_path: Path) -> None:
+    done = command("report", pair[0], tmp_path)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)

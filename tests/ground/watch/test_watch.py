@@ -1,0 +1,208 @@
+"""`flight watch`: a log that is over, one that grows, one that stands still, and a flight that listens."""
+
+from __future__ import annotations
+
+import io
+import json
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flight.link import events
+from flight.link.telemetry.definitions import EVENT, HEALTH, MODE, PACKETS, Packet
+from flight.link.telemetry.packets import Packer
+from flight.link.telemetry.scanner import scan
+from ground.commands import watch
+from ground.watch.plain import PlainLines
+from ground.watch.tail import LogTail
+from ground.watch.view import View
+from tests.ground.commands.in_process import command
+from tests.ground.commands.test_commands import ROOT
+from tests.ground.report.synthetic import Recipe, make_run
+from tests.studies.fuzz.furnishings import Listener
+
+
+def pack(packer: Packer, packet: Packet, time_s: float, **values: object) -> bytes:
+    """Return a packet whose other fields are zero or empty."""
+    fields: dict[str, object] = {}
+    for field in packet.fields:
+        value: object = "" if field.kind.startswith("S") else 0
+        fields[field.name] = [value] * field.count if field.count > 1 else value
+    return packer.pack(packet, round(time_s * 1e9), {**fields, **values})
+
+
+def event(packer: Packer, kind: events.EventKind, time_s: float, text: str) -> bytes:
+    severity = int(kind.severity)
+    return pack(packer, EVENT, time_s, code=kind.code, severity=severity, name=kind.name, text=text)
+
+
+@pytest.fixture
+def growing(tmp_path: Path) -> Path:
+    """Return the folder of a flight that goes on: six seconds, then an event of severity fault."""
+    folder = make_run(tmp_path / "run", Recipe(duration=6.0, rate_hz=10.0, hold=3.0))
+    packer = Packer()
+    with (folder / "flight-0001.ccsds").open("ab") as file:
+        file.write(pack(packer, MODE, 5.5, before=0, mode=3, trigger="ready"))
+        file.write(pack(packer, HEALTH, 5.6, mode=3, imu=5, coils=2, slips=4))
+        file.write(event(packer, events.IMU_SILENT, 5.7, "0.2 s without a byte"))
+    return folder
+
+
+def end(folder: Path) -> None:
+    with (folder / "flight-0001.ccsds").open("ab") as file:
+        file.write(event(Packer(), events.STOPPED, 6.5, "stopped by SIGTERM"))
+
+
+def test_a_flight_that_is_over_is_shown_to_its_end(growing: Path) -> None:
+    end(growing)
+    done = command("watch", growing, "--every", "2")
+    assert (done.returncode, done.stderr) == (0, "")
+    lines = done.stdout.splitlines()
+    assert sum("  FAULT    imu-silent: 0.2 s without a byte" in line for line in lines) == 1
+    states = [line for line in lines if "mA" in line]
+    assert [float(line.split()[0]) // 2 for line in states] == [0, 1, 2, 3]
+    last = states[-1]
+    for part in ("hold", "q2 ", "slips 4", "faults 1"):
+        assert part in last
+    assert lines[-1].endswith("mA  following a path  slips 4  faults 1")
+    assert any(line.endswith("stopped: stopped by SIGTERM") for line in lines)
+
+
+def test_one_look_as_json_has_mode_currents_streams_and_events(growing: Path) -> None:
+    facts = json.loads(command("watch", growing, "--json").stdout)
+    assert (facts["mode"], facts["faults"], facts["ended"]) == ("hold", 1, None)
+    assert facts["currents_a"] == [0.1, 0.0, 0.0]
+    assert (facts["streams"]["imu"], facts["streams"]["coils"]) == ("good", "stale")
+    assert facts["events"][-1] == {
+        "time_s": 5.7, "severity": 2, "name": "imu-silent", "text": "0.2 s without a byte"
+    }  # fmt: skip
+    assert command("watch", growing, "--once").stdout.count("\n") == 1
+
+
+def test_a_log_that_stands_still_is_left_after_the_patience_with_status_1(growing: Path) -> None:
+    done = command("watch", growing, "--patience", "0.2")
+    assert done.returncode == 1
+    assert "the log just stops" in done.stderr
+
+
+def test_an_archive_shows_its_newest_run(growing: Path, tmp_path: Path) -> None:
+    for number in (1, 2):
+        folder = tmp_path / "archive" / f"run-00000{number}"
+        make_run(folder, Recipe(duration=1.0, rate_hz=10.0))
+    growing.rename(tmp_path / "archive" / "run-000003")
+    assert json.loads(command("watch", tmp_path / "archive", "--json").stdout)["mode"] == "hold"
+
+
+@pytest.fixture
+def watcher(growing: Path) -> Iterator[subprocess.Popen[str]]:
+    """Yield a `watch` of a log that grows, after its first lines."""
+    words = [sys.executable, "-m", "flight", "watch", str(growing), "--every", "2"]
+    with subprocess.Popen(
+        words, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        while "imu-silent" not in process.stdout.readline():
+            pass
+        yield process
+        process.kill()
+
+
+def test_what_comes_while_a_flight_is_watched_is_shown_and_its_end_ends_it(
+    watcher: subprocess.Popen[str], growing: Path
+) -> None:
+    end(growing)
+    output, complaint = watcher.communicate(timeout=20.0)
+    assert (watcher.returncode, complaint) == (0, "")
+    assert "stopped by SIGTERM" in output
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_ends_a_watch_in_order(watcher: subprocess.Popen[str], number: signal.Signals) -> None:
+    watcher.send_signal(number)
+    _, complaint = watcher.communicate(timeout=20.0)
+    assert (watcher.returncode, complaint) == (0, "")
+
+
+def test_a_damaged_log_does_not_steer_the_terminal_and_gives_lines_all_the_same() -> None:
+    packer, view, lines = Packer(), View(), []
+    data = event(packer, events.STARTED, 1.0, "\x1b[2Jgone\x07\r")
+    data += pack(packer, EVENT, -9e9, severity=200, name="odd", text="ü")
+    data += pack(packer, MODE, 9e9, mode=77)
+    for packet in PACKETS:
+        wild = {field.name: _wild(field.kind, field.count) for field in packet.fields}
+        data += packer.pack(packet, 2**62, wild)
+    PlainLines(view, 10.0, lines.append).feed(scan(data).packets)
+    text = "".join(lines)
+    assert "?[2Jgone??" in text
+    assert all(letter.isprintable() or letter == "\n" for letter in text)
+    console = pytest.importorskip("rich.console").Console(record=True, width=100, file=io.StringIO())
+    from ground.watch.panel import panel  # noqa: PLC0415 - needs rich
+
+    console.print(panel(view, 0.0))
+    assert "\x1b" not in console.export_text()
+
+
+def _wild(kind: str, count: int) -> object:
+    value: object = "\x1b]0;x" if kind.startswith("S") else np.nan if kind.startswith("f") else 255
+    return [value] * count if count > 1 else value
+
+
+def test_the_panel_shows_mode_attitude_currents_streams_and_the_newest_events(growing: Path) -> None:
+    console = pytest.importorskip("rich.console").Console(record=True, width=100, file=io.StringIO())
+    from ground.watch.panel import LISTED_EVENTS, panel  # noqa: PLC0415 - needs rich
+
+    view = View()
+    view.update(scan((growing / "flight-0001.ccsds").read_bytes()).packets)
+    packer = Packer()
+    many = b"".join(event(packer, events.MODE, 6.0 + 0.1 * n, f"note {n}") for n in range(30))
+    view.update(scan(many).packets)
+    console.print(panel(view, 12.0))
+    text = console.export_text()
+    for part in (
+        "hold", "of 700", "made-up, simulated", "q2 ", "coil x", "+100.0 mA ██████████████░", "imu good",
+        "coils stale", "slips 4", "faults 1", "note 29", "no packet for 12 s",
+    ):  # fmt: skip
+        assert part in text, part
+    assert f"note {30 - LISTED_EVENTS}" in text
+    assert f"note {29 - LISTED_EVENTS}\n" not in text
+    assert "nan" not in text
+
+
+def test_a_terminal_without_rich_gets_lines_and_the_cure(
+    growing: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "rich.live", None)
+    assert watch._panel(View(), LogTail(growing)) is None
+    assert "pip install 'knightcube-flight[watch]'" in capsys.readouterr().err
+
+
+def test_a_flight_that_listens_is_asked_for_its_mode(tmp_path: Path) -> None:
+    listener = Listener(tmp_path / "socket")
+    facts = json.loads(command("watch", tmp_path / "socket", "--json").stdout)
+    assert facts["mode"] == "hold"
+    assert 0.0 < facts["answered_s"] < 2.0
+    listener.will_say(b"nonsense")
+    done = command("watch", tmp_path / "socket", "--patience", "0.1")
+    assert (done.returncode, done.stderr) == (1, f"flight: {tmp_path / 'socket'}: no answer\n")
+
+
+def test_a_flight_that_stops_to_answer_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ground.commands.watch._PING_S", 0.05)
+    listener = Listener(tmp_path / "socket")
+    threading.Thread(target=lambda: (time.sleep(0.2), listener.will_say(b"x"))).start()
+    done = command("watch", tmp_path / "socket", "--patience", "0.2")
+    assert done.returncode == 1
+    assert done.stdout.startswith("hold, answered in ")
+    assert done.stderr.endswith("no answer any more\n")
+
+
+def test_what_is_neither_a_run_nor_a_socket_is_refused(tmp_path: Path) -> None:
+    done = command("watch", tmp_path)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
