@@ -24,6 +24,7 @@ from flight.gnc.vision.streaks.maximum_likelihood.hypotheses import (
     alike,
     first_fits,
     rescanned_fits,
+    seen_angles,
     still_fit,
 )
 from flight.gnc.vision.streaks.maximum_likelihood.iteration import ExposedCamera, Fit
@@ -39,7 +40,6 @@ from flight.gnc.vision.streaks.maximum_likelihood.shutter_direction import (
     Misfits,
     rolling_answer,
 )
-from flight.gnc.vision.streaks.maximum_likelihood.whole_frame_scan import frame_angles
 from flight.gnc.vision.streaks.maximum_likelihood.wholeness import Wholeness, wholeness
 from flight.gnc.vision.streaks.maximum_likelihood.work import Work
 from flight.gnc.vision.streaks.streak_result import StreakStatus
@@ -47,8 +47,7 @@ from flight.gnc.vision.streaks.streak_result import StreakStatus
 _MOST_BLOBS = 48
 # This many motions are fitted in full before the frame is given up.
 _MOST_MOTIONS = 2
-# This many angles of the whole frame's light are tried, and distinguished to this part.
-_MOST_ANGLES = 2
+# Angles are distinguished to this part.
 _SAME_ANGLE = 0.05
 # Median length, px, of regions below which a frame without an agreed motion is one of stars at rest.
 _AT_REST = 4.0
@@ -163,8 +162,7 @@ def _answer(camera: ExposedCamera, seen: MotionResult, blobs: Blobs, near: float
     # A doubted motion to which the light of the whole frame leads again has two witnesses. To ask it costs
     # less than to fit a rival, and the axis is often right, known well from pieces of streaks, where the
     # angle is not.
-    camera.work.passed(camera.frame.signal.size)
-    angles = frame_angles(camera.frame, camera.pinhole, leading.turn, _MOST_ANGLES)
+    angles = seen_angles(camera, leading.turn)
     if leading.stands and _witnessed(leading.turn, angles):
         return leading.answer
     candidates = [leading]

@@ -32,10 +32,13 @@ from flight.gnc.vision.streaks.maximum_likelihood.matched_filter import find_fai
 from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion
 from flight.gnc.vision.streaks.maximum_likelihood.polar_grid import polar_grid
 from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene, mid_exposure, window_times
+from flight.gnc.vision.streaks.maximum_likelihood.whole_frame_scan import frame_angles
 
 _FIRST_STARS = 12
 # This many guesses are tried at most.
 _MOST_GUESSES = 5
+# This many angles of the whole frame's light.
+_MOST_ANGLES = 2
 # Of them, for a rate that changes.
 _MOST_GROWING = 2
 _STILL_ROUNDS = 12
@@ -43,10 +46,11 @@ _STILL_ROUNDS = 12
 _WHOLE = 8
 _CONTRADICTED = 0.3
 # A hypothesis with this many stars needs no rival where it explains this part of them, the rest being crowded
-# by others, and this part of their ends is in place.
+# by others, this part of their ends is in place, and it explains so much light, in sigmas squared.
 _MANY = 3
 _EXPLAINED = 0.4
 _IN_PLACE = 0.6
+_EVIDENT = 3000.0
 _WORST_FIRST = 12.0
 # A star is explained when at most this part of its light is left; none counts more than this many sigmas.
 _LEFT_OVER = 0.01
@@ -81,6 +85,14 @@ def first_fits(camera: ExposedCamera, blobs: Blobs, near: float | None) -> Itera
             yield done
         elif misfit(done.evaluation) <= _WORST_FIRST:
             rivals.append((explained, done))
+    if rivals and not yielded:
+        # No region shows the angle: the light of the whole frame may.
+        axis = max(rivals, key=lambda rival: rival[0])[1].scene.motion.whole
+        angles = seen_angles(camera, axis)
+        for explained, convincing, done in _rescanned(camera, axis, angles):
+            rivals.append((explained, done))
+            if convincing:
+                break
     rivals.sort(key=lambda rival: -rival[0])
     for _, done in rivals:
         if not any(alike(done.scene.motion.whole, other) for other in yielded):
@@ -88,8 +100,22 @@ def first_fits(camera: ExposedCamera, blobs: Blobs, near: float | None) -> Itera
             yield done
 
 
+def seen_angles(camera: ExposedCamera, turn: FloatArray) -> list[float]:
+    """Return the likeliest angles, rad, about the axis of `turn` (3,), by the light of the whole frame."""
+    camera.work.passed(camera.frame.signal.size)
+    return frame_angles(camera.frame, camera.pinhole, turn, _MOST_ANGLES)
+
+
 def rescanned_fits(camera: ExposedCamera, turn: FloatArray, angles: list[float]) -> Iterator[Fit]:
     """Yield fits of the brightest stars about the axis of `turn` (3,), near each of `angles` (rad)."""
+    for _, _, done in _rescanned(camera, turn, angles):
+        yield done
+
+
+def _rescanned(
+    camera: ExposedCamera, turn: FloatArray, angles: list[float]
+) -> Iterator[tuple[float, bool, Fit]]:
+    """Yield how much light the fits near `angles` explain, whether that convinces, and the fits."""
     settings, pinhole = camera.settings, camera.pinhole
     nothing = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.float32)
     frame = polar_grid(pinhole, Motion.steady(turn)).frame
@@ -106,10 +132,9 @@ def rescanned_fits(camera: ExposedCamera, turn: FloatArray, angles: list[float])
             stars, light = turned.stars[:_FIRST_STARS], turned.light[:_FIRST_STARS]
             if len(light) < settings.least_stars:
                 continue
-            guess = Guess(Motion.steady(frame[2] * turned.angle), stars, light, 0.0)
-            tried = _tried(camera, guess)
+            tried = _tried(camera, Guess(Motion.steady(frame[2] * turned.angle), stars, light, 0.0))
             if tried is not None:
-                yield tried[2]
+                yield tried
 
 
 def alike(one: FloatArray, other: FloatArray) -> bool:
@@ -153,7 +178,7 @@ def _tried(camera: ExposedCamera, guess: Guess) -> tuple[float, bool, Fit] | Non
     evidence, share = _borne_out(done)
     ends = _ending(camera, done.scene)
     explained = evidence * (1.0 - _CONTRADICTION * guess.contradicted) * max(ends - _BY_CHANCE, 0.02)
-    convincing = share > _EXPLAINED and ends > _IN_PLACE and count >= _MANY
+    convincing = explained > _EVIDENT and share > _EXPLAINED and ends > _IN_PLACE and count >= _MANY
     return explained, convincing, done
 
 

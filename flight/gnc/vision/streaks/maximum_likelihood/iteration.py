@@ -69,7 +69,7 @@ class Rounds:
 
 FIRST = Rounds(6, clipped=False, tolerance=0.1, settled=SETTLED, conjugate=4, patience=2)
 ROUGH = Rounds(3, clipped=True, tolerance=0.003, settled=1.5, conjugate=12, patience=3)
-LAST = Rounds(10, clipped=True, tolerance=0.003, settled=SETTLED, conjugate=12, patience=4)
+LAST = Rounds(7, clipped=True, tolerance=0.003, settled=SETTLED, conjugate=12, patience=4)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -153,9 +153,8 @@ def iterate(
     camera: ExposedCamera, scene: Scene, free: BoolArray, how: Rounds, windows: Windows | None = None
 ) -> Fit | None:
     """Return the fit after some rounds, None when the stars do not fix the motion."""
-    fresh = windows is None
-    whole, cut_at = windows or camera.windows(scene), scene
-    windows = whole
+    faint_drift, cut_at = _FAINT_DRIFT if windows is None else np.inf, scene
+    windows = whole = windows or camera.windows(scene)
     restless, asked, before = np.inf, np.inf, np.zeros(SHARED)
     widest = _WIDER * scene.width if how.clipped else _WIDEST
     solution, evaluation = None, None
@@ -180,7 +179,7 @@ def iterate(
         if turn >= how.patience and wanted > _LEAST_PROGRESS * asked and not onward:
             break
         asked, before = wanted, solution.shared
-        if _drifted(camera, cut_at, scene, _FAINT_DRIFT if turn == 0 and fresh else np.inf):
+        if _drifted(camera, cut_at, scene, faint_drift if turn == 0 else np.inf):
             del windows, whole  # tens of MB, as are the new ones
             windows = whole = camera.windows(scene)
             cut_at = scene

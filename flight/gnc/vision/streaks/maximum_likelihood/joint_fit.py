@@ -41,7 +41,7 @@ _MOST_REPEATS = 2
 _DOUBT = 0.35
 # Pixels of all windows that a fit looks at, those that stars share once for each: what a crowd of long
 # streaks needs of memory and time is bounded so, and the brightest stars hold most of the information.
-_MOST_PIXELS = 200_000
+_MOST_PIXELS = 100_000
 # This many stars' light is taken out at a time.
 _AT_ONCE = 16
 

@@ -19,6 +19,9 @@ _MOST_CHAINED = 0.45
 _TRUE_ENDS = (0.75, 0.6)
 # Share of the stars that are dark along a good part of their path, which one may be for reasons of its own.
 _BROKEN = (0.12, 0.35)
+# This many stars with both ends on the detector, this part of those in place, leave no doubt.
+_VOUCHING = 3
+_VOUCHED = 0.9
 # Share of the light of streaks that lie in the frame from end to end which the motion must have on its side.
 _WHOLE_LIGHT = 0.5
 # Where the rate changes by more than the first part of itself, the second part of the stars may have light
@@ -39,8 +42,8 @@ def wholeness(camera: ExposedCamera, scene: Scene, faint: FaintStars) -> Wholene
     """Return whether the stars that decide are as long as their light; doubted when some of them are not.
 
     In a crowded frame what passes for a star may be several: a few that are dark here or there do not speak
-    against the motion, but ask for another witness. So does a motion that most of the streaks disown which
-    show both ends, which alone give the angle turned, and one that no such streak
+    against the motion, but ask for another witness, unless enough streaks vouch for it with both ends, which
+    alone give the angle turned. So does a motion that most streaks with both ends disown, and one that none
     vouches for; where the ends of those that decide are not where they should be, it is not the motion.
     """
     stars = np.concatenate([scene.stars, faint.stars])
@@ -59,14 +62,16 @@ def wholeness(camera: ExposedCamera, scene: Scene, faint: FaintStars) -> Wholene
     right = float(np.mean(ends[known])) if known.any() else 1.0
     if both.any() and float(np.mean(ends[both])) < _TRUE_ENDS[1]:
         return Wholeness.BROKEN
+    vouched = np.count_nonzero(both) >= _VOUCHING and float(np.mean(ends[both])) >= _VOUCHED
     dark = np.count_nonzero(lit == 0.0)
     for worst, (least_ends, most_broken) in zip(
         (Wholeness.BROKEN, Wholeness.DOUBTED), zip(_TRUE_ENDS[::-1], _BROKEN[::-1], strict=True), strict=True
     ):
         if right < least_ends or dark > max(1.0, most_broken * len(lit)):
-            return worst
+            return Wholeness.WHOLE if vouched and worst is Wholeness.DOUBTED else worst
     unvouched = bool(known.any()) and not both.any()
-    return Wholeness.DOUBTED if unvouched or _disowned(camera, scene) else Wholeness.WHOLE
+    doubted = unvouched or (not vouched and _disowned(camera, scene))
+    return Wholeness.DOUBTED if doubted else Wholeness.WHOLE
 
 
 def _disowned(camera: ExposedCamera, scene: Scene) -> bool:
