@@ -7,7 +7,7 @@ TESTS  := $(RUN) -m pytest -n auto
 # The tests start hundreds of processes: without kept bytecode each would compile every module again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo quick test test-container lint types arrows docs house unit fast slow-list pictures lock clean help
+.PHONY: demo orbit quick test test-container lint types arrows docs house unit fast slow-list pictures lock clean help
 
 help:           ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
@@ -21,6 +21,11 @@ demo: $(READY)  ## fly the 700 s step demonstration on simulated hardware and pr
 	@rm -rf runs/demo
 	$(RUN) -m flight run config/step_demo.yaml --out runs/demo
 	$(RUN) -m flight report runs/demo
+
+orbit: $(READY) ## fly a KnightCube in orbit: detumble from 10 deg/s, and print the report
+	@rm -rf runs/orbit
+	$(RUN) -m flight run config/orbit.yaml --out runs/orbit
+	$(RUN) -m flight report runs/orbit
 
 quick: $(READY) ## style, import arrows and the fast tests: under 90 s on two cores
 	@$(MAKE) --no-print-directory lint arrows fast

@@ -17,6 +17,7 @@ from flight.link.telemetry.reader import Run
 from ground.report import panels
 from ground.report.scene import Scene
 from ground.report.signals import seconds
+from ground.report.spin_figure import spin_figure
 
 DPI = 110
 WIDE = (11.0, 5.2)
@@ -36,7 +37,10 @@ def draw_figures(run: Run, folder: Path) -> list[Path]:
         "cycle_times": _cycle_times,
         "rate": _rate,
         "overview": _overview,
+        "spin": lambda scene: spin_figure(scene.run),
     }
+    if len(run["spin"]):  # a satellite in orbit has no q2
+        pictures = {name: pictures[name] for name in ("power", "cycle_times", "spin")}
     files = []
     for name, picture in pictures.items():
         figure = picture(scene)

@@ -14,6 +14,7 @@ from flight.gnc.math.arrays import FloatArray
 from flight.link.telemetry.packets import to_text
 from flight.link.telemetry.reader import Run
 from ground.report import performance as limits
+from ground.report.detumbling import detumbling
 from ground.report.operations import (
     cycles,
     events,
@@ -38,13 +39,15 @@ def summarise(run: Run) -> Object:
     attitude = true_attitude(run) or estimated_attitude(run)
     notes: list[str] = []
     identity = _identity(run, attitude, notes)
-    steps = _steps(run, attitude, identity["duration_planned_s"], notes)
+    in_orbit = len(run["spin"]) > 0
+    steps = [] if in_orbit else _steps(run, attitude, identity["duration_planned_s"], notes)
     power = _power(run, notes)
     summary: Object = {
         "run": identity,
         "attitude_source": attitude.source,
         "steps": [_step_row(*step) for step in steps],
-        "thesis": _against_thesis([(c, r) for c, r in steps if r is not None], power),
+        "detumbling": detumbling(run),
+        "thesis": [] if in_orbit else _against_thesis([(c, r) for c, r in steps if r is not None], power),
         "power": power,
         "rate_groups": rate_groups(run["rate_group"]),
         "cycles": cycles(run["cycle_timing"], run["control"]),

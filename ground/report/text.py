@@ -20,8 +20,9 @@ def format_report(summary: Object) -> str:
     blocks = [
         _headline(summary),
         _steps(summary),
+        _detumbling(summary["detumbling"]),
         _thesis(summary),
-        _power(summary["power"]),
+        _power(summary["power"], bool(summary["thesis"])),
         _loop(summary),
         _planner(summary),
         _sensing(summary),
@@ -96,7 +97,32 @@ def _steps(summary: Object) -> list[str]:
     ]
 
 
+def _detumbling(found: Object | None) -> list[str]:
+    if found is None:
+        return []
+    degrees = 180.0 / math.pi
+    rows = [
+        [
+            number(period["begin_s"], 1),
+            number(period["duration_s"], 1),
+            *(number(period[f"{name}_rate_rad_s"], 2, degrees) for name in ("first", "largest", "last")),
+            "yes" if period["slowed"] else "no",
+        ]
+        for period in found["periods"]
+    ]
+    head = ["braked from s", "for s", "first deg/s", "largest deg/s", "last deg/s", "slow in the end"]
+    known, error = found["rate_known_share"], found["rate_error_rms_rad_s"]
+    return [
+        f"Detumbling, rates of the {'truth' if found['rate_source'] == 'truth' else 'gyro'}",
+        *table(head, rows),
+        f"  rate by the magnetometer alone: known {number(known, 1, 100.0)} % of the time, error "
+        f"{number(error, 3, degrees)} deg/s rms an axis, found again {found['restarts']} times",
+    ]
+
+
 def _thesis(summary: Object) -> list[str]:
+    if not summary["thesis"]:
+        return []
     digits = {"W": 4, "A": 4}
     rows = [
         [
@@ -113,14 +139,17 @@ def _thesis(summary: Object) -> list[str]:
     ]
 
 
-def _power(power: Object) -> list[str]:
+def _power(power: Object, compared: bool) -> list[str]:
+    """Return the lines of the power, `compared` with the thesis's."""
     if power["source"] is None:
         return []
     actual = power["peak_current_actual_a"]
+    thesis = ("   (thesis: on the order of 100 mW)", "   (thesis: about 0.5 W)")
+    average, peak = thesis if compared else ("", "")
     return [
         f"Coil power, from the currents {'in the coils' if power['source'] == 'truth' else 'written'}",
-        f"  average R I^2   {number(power['average_w'], 3, 1e3)} mW   (thesis: on the order of 100 mW)",
-        f"  peak R I^2      {number(power['peak_w'], 3)} W   (thesis: about 0.5 W)",
+        f"  average R I^2   {number(power['average_w'], 3, 1e3)} mW{average}",
+        f"  peak R I^2      {number(power['peak_w'], 3)} W{peak}",
         f"  supply, V |I|   {number(power['supply_average_w'], 3, 1e3)} mW on average",
         f"  energy          {number(power['energy_j'], 3)} J",
         f"  largest current {number(power['peak_current_a'], 4)} A written"

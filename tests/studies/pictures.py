@@ -37,6 +37,8 @@ from flight.schema.testbed import as_testbed
 from ground.pictures.horizon import draw_horizon
 from ground.pictures.sky_picture import draw_solution
 from ground.report import draw, draw_path
+from ground.report.figures import DPI
+from ground.report.spin_figure import spin_figure
 from sim_hal.assembly import StarRenderer
 from sim_hal.earth_camera import render as render_earth
 from sim_hal.settings import Sky
@@ -46,6 +48,9 @@ from tests.studies.campaigns import nadir
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG = ROOT / "config" / "step_demo.yaml"
+ORBIT = ROOT / "config" / "orbit.yaml"
+DETUMBLED = 400.0
+"""s, of the flight in orbit."""
 RATE = 0.03
 """rad/s: the peak of a 0.1 step."""
 ORION_DEG = 84.0, -2.0, 15.0
@@ -65,13 +70,25 @@ def main() -> int:
         drawn = {path.name: path for path in draw(read_run(run_folder), Path(place) / "figures")}
         for name in ("overview.png", "paths.png"):
             (folder / name).write_bytes(drawn[name].read_bytes())
+        fly(RunRequest(ORBIT, Path(place) / "orbit", duration=DETUMBLED))
+        spin = spin_figure(read_run(Path(place) / "orbit"))
+        assert spin is not None
+        spin.savefig(folder / "spin.png", dpi=DPI, facecolor="white")
     config = as_testbed(configuration.load(CONFIG))
     plant = plant_of(config)
     draw_path(plan(plant, 0.4, 0.015, -0.3, 0.0, 10.0), plant, folder / "path.png")
     _draw_frame(folder / "frame.png")
     _draw_solved(folder / "solved.png")
     _draw_horizons(folder / "horizons.png")
-    for name in ("overview.png", "paths.png", "path.png", "frame.png", "solved.png", "horizons.png"):
+    for name in (
+        "overview.png",
+        "paths.png",
+        "spin.png",
+        "path.png",
+        "frame.png",
+        "solved.png",
+        "horizons.png",
+    ):
         sys.stdout.write(f"{folder / name}\n")
     return 0
 

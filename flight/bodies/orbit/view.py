@@ -56,6 +56,8 @@ class OrbitView:
 
     def progress(self, output: ControlOutput | None) -> str:
         """Return mode and rate as text, for the progress line."""
-        rate = self._detumbler.rate
-        text = "   -  " if rate is None else f"{math.degrees(float(np.linalg.norm(rate))):6.2f}"
-        return f"{output.mode.label if output else 'boot':9} {text} deg/s by the magnetometer"
+        mode = output.mode if output else Mode.BOOT
+        rate = self._detumbler.rate if mode is Mode.DETUMBLE else None
+        if rate is None:
+            return mode.label
+        return f"{mode.label} {math.degrees(float(np.linalg.norm(rate))):.2f} deg/s by the magnetometer"

@@ -111,6 +111,11 @@ class FieldDetumbler:
         return self._filter.rate if self.trusted else None
 
     @property
+    def field(self) -> FloatArray | None:
+        """The field (3,) T in body axes at the last time; None before it is known."""
+        return self._filter.field if self.trusted else None
+
+    @property
     def rate_sigma(self) -> float:
         """Standard deviation of the rate's worst axis, rad/s; infinite before it is known."""
         if not self.trusted:

@@ -1,0 +1,124 @@
+"""A satellite in orbit flies the same loop: it detumbles by its magnetometer, rests, and is braked again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flight.gnc.math.arrays import FloatArray
+from flight.link.modes import Mode
+from flight.link.telemetry.packets import to_text
+from flight.link.telemetry.reader import Run
+from flight.schema import reader as configuration
+from flight.schema.errors import ConfigError
+from flight.schema.orbit import OrbitConfig, as_orbit
+from flight.schema.sections import Commands, CommandStep
+from ground.report import format_report, summarise
+from sim_hal.settings import FaultEntry, Simulation
+from tests.scenario.flights import CONFIG, event_names, fly
+from tests.scenario.mode_flights import currents, entered, modes_of
+
+ORBIT = CONFIG.parent / "orbit.yaml"
+TEXT = ORBIT.read_text(encoding="utf-8")
+SPEED, SLOW = 0.1745, 0.04
+"""At the release, and where braking ends, rad/s."""
+SILENT, MUTE = 20.0, 1.0
+"""When the inertial unit falls silent, and for how long, s."""
+
+
+def orbit_config(duration: float, **modes: object) -> OrbitConfig:
+    config = as_orbit(configuration.load(ORBIT))
+    section = configuration.replace(config.modes, **modes)
+    return configuration.replace(config, duration=duration, modes=section)
+
+
+def world(speed: float, *faults: FaultEntry) -> Simulation:
+    section = configuration.simulation_section(TEXT, str(ORBIT), Simulation)
+    assert section is not None
+    assert section.free_body is not None
+    release = configuration.replace(section.free_body.release, speed=speed)
+    return configuration.replace(
+        section, free_body=configuration.replace(section.free_body, release=release), faults=faults
+    )
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """Fly from 10 deg/s, with a silence of the unit while braking; a low limit ends the rest at once."""
+    config = orbit_config(86.0, tumble_rate=0.01)
+    section = configuration.replace(config.detumble, low_rate=SLOW, low_for=3.0)
+    timeline = (CommandStep(at=1.0, mode="hold"), CommandStep(at=2.0, slew=0.1))
+    config = configuration.replace(config, detumble=section, commands=Commands(timeline=timeline))
+    silence = FaultEntry(fault="imu: silent", at=SILENT, span=MUTE)
+    return fly(config, tmp_path_factory.mktemp("orbit"), section=world(SPEED, silence))
+
+
+def speed(run: Run) -> FloatArray:
+    return np.asarray(np.linalg.norm(run["truth"]["rate"], axis=1))
+
+
+def test_it_detumbles_rests_and_is_braked_again_when_it_turns_too_fast(flown: Run) -> None:
+    assert modes_of(flown)[:4] == [Mode.BOOT, Mode.DETUMBLE, Mode.ACQUIRE, Mode.DETUMBLE]
+    assert speed(flown)[0] == pytest.approx(SPEED, rel=0.05)
+    rested = flown["mode"]["time_ns"][2] * 1e-9
+    time = flown["truth"]["time_ns"] * 1e-9
+    assert speed(flown)[time >= rested][0] < SLOW + 1e-3
+    again = flown["mode"]["time_ns"][3] * 1e-9
+    assert again > rested
+    assert not currents(flown, rested + 0.05, again).any()
+
+
+def test_its_own_rate_is_right_within_what_it_claims(flown: Run) -> None:
+    spin = flown["spin"][flown["spin"]["known"] == 1]
+    spin = spin[spin["time_ns"] > 5e9]
+    times = spin["time_ns"] * 1e-9
+    true = np.column_stack(
+        [np.interp(times, flown["truth"]["time_ns"] * 1e-9, flown["truth"]["rate"][:, k]) for k in range(3)]
+    )
+    error = np.linalg.norm(spin["rate"] - true, axis=1)
+    assert len(spin) > 60
+    assert np.median(error) < np.radians(0.3)
+    assert np.mean(error > 3.0 * spin["rate_sigma"]) < 0.05
+
+
+def test_the_coils_are_at_zero_while_the_unit_is_silent(flown: Run) -> None:
+    assert currents(flown, SILENT - 3.0, SILENT).any()
+    assert not currents(flown, SILENT + 0.2, SILENT + MUTE).any()
+    assert currents(flown, SILENT + MUTE + 2.0, SILENT + MUTE + 6.0).any()
+    assert {"control-lost", "control-regained", "imu-silent"} <= set(event_names(flown))
+
+
+def test_the_coils_pause_while_the_magnetometer_measures(flown: Run) -> None:
+    """The last 0.1 s of each pause of 0.2 s, behind the fall of the current."""
+    time = flown["truth"]["time_ns"] * 1e-9
+    began = entered_first(flown, Mode.DETUMBLE)
+    phase = (time - began) % 1.0
+    measuring = (time > began + 1.0) & (time < SILENT) & (phase > 0.1) & (phase < 0.2)
+    assert np.abs(flown["truth"]["current"][measuring]).max() < 1e-3
+
+
+def entered_first(run: Run, mode: Mode) -> float:
+    return float(run["mode"]["time_ns"][run["mode"]["mode"] == mode][0]) * 1e-9
+
+
+def test_modes_that_need_an_attitude_are_refused(flown: Run) -> None:
+    answers = [to_text(text) for text in flown["command"]["text"]]
+    assert ["cannot be commanded of this body" in text for text in answers] == [True, True]
+    assert entered(flown, Mode.DETUMBLE) > 2.0
+
+
+def test_the_report_shows_the_detumbling_and_no_steps(flown: Run) -> None:
+    summary = summarise(flown)
+    first = summary["detumbling"]["periods"][0]
+    assert first["slowed"]
+    assert first["first_rate_rad_s"] == pytest.approx(SPEED, rel=0.05)
+    text = format_report(summary)
+    assert "Detumbling, rates of the truth" in text
+    assert "thesis" not in text
+
+
+def test_an_initial_mode_that_the_body_does_not_have_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"modes\.initial.*hold.*this body has detumble, safe"):
+        fly(orbit_config(1.0, initial="hold"), tmp_path, section=world(0.01))
