@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import threading
 from types import FrameType
 
 from flight.loop.flight_loop import FlightLoop
@@ -34,6 +35,9 @@ class EndingSignals:
             self._stop(self._received[0])
 
     def __enter__(self) -> EndingSignals:
+        # Signals come to the main thread alone; they do not end a flight in another, as a Dask worker's is.
+        if threading.current_thread() is not threading.main_thread():
+            return self
         for number in _ENDING:
             if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
                 self._before[number] = signal.signal(number, self._receive)

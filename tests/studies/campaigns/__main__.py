@@ -9,12 +9,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from flight.gnc.errors import UsageError
-from tests.studies.campaigns.campaign import Campaign, fly
+from tests.studies.campaigns.campaign import Campaign, CampaignError, fly
 from tests.studies.campaigns.registry import CAMPAIGNS
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a campaign; return the exit status: 0 done, 2 wrong use, 130 broken off."""
+    """Run a campaign; return the exit status: 0 done, 1 the cluster was lost, 2 wrong use, 130 broken off."""
     listed = "\n".join(f"  {c.name:15} {c.purpose}" for c in CAMPAIGNS.values())
     parser = argparse.ArgumentParser(
         prog="python -m tests.studies.campaigns",
@@ -43,11 +43,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
             out,
             options.workers,
             options.dask,
-            progress=sys.stderr.isatty(),
+            progress=True,
         )
     except UsageError as error:
         sys.stderr.write(f"campaigns: {error}\n")
         return 2
+    except CampaignError as error:
+        sys.stderr.write(f"campaigns: {error}; the same command goes on where it was ({out})\n")
+        return 1
     except KeyboardInterrupt:
         sys.stderr.write(f"\nbroken off; the same command goes on where it was ({out})\n")
         return 130

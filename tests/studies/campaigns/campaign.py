@@ -7,22 +7,28 @@ where it was; whoever runs which case, and in which order, changes nothing.
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
-import sys
-import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import closing
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from flight.gnc.errors import UsageError
+from flight.gnc.errors import FlightError, UsageError
+from tests.studies.campaigns import cluster
+from tests.studies.campaigns.progress import Progress
 
 Result = dict[str, Any]
 Parameters = dict[str, Any]
+Results = Generator[tuple[str, Result], None, None]
+
+
+class CampaignError(FlightError):
+    """A campaign that cannot go on here; what is done is kept."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +79,8 @@ def fly(
 ) -> Summary:
     """Run the missing cases of a campaign in `out`, then summarise.
 
-    Raises UsageError when the folder holds another campaign.
+    `dask` is the address of a cluster's scheduler, which runs them instead of this machine. Raises UsageError
+    when the folder holds another campaign or there is no cluster, CampaignError when the cluster is lost.
     """
     cases = campaign.cases(runs, seed)
     out.mkdir(parents=True, exist_ok=True)
@@ -81,16 +88,17 @@ def fly(
     missing = [case for case in cases if case.key not in done]
     if missing:
         log = out / "results.jsonl"
-        with log.open("a", encoding="utf-8") as sink, _executor(workers, dask) as executor:
-            bar = _Bar(len(cases), len(cases) - len(missing)) if progress else None
-            for key, result in _finished(executor, campaign.run, missing):
+        bar = Progress(len(cases), len(cases) - len(missing)) if progress else None
+        results = _on_cluster(dask, campaign, missing, bar) if dask else _here(workers, campaign, missing)
+        with log.open("a", encoding="utf-8") as sink, closing(results):
+            for key, result in results:
                 done[key] = result
                 sink.write(json.dumps({"key": key, "result": result}, allow_nan=True) + "\n")
                 sink.flush()
                 if bar is not None:
                     bar.advance()
-            if bar is not None:
-                bar.close()
+        if bar is not None:
+            bar.close()
     summary = campaign.summarise([done[case.key] for case in cases], out)
     facts = json.dumps(summary.facts, indent=1, allow_nan=False) + "\n"
     (out / "summary.json").write_text(facts, encoding="utf-8")
@@ -125,57 +133,24 @@ def _resume(campaign: Campaign, runs: int, seed: int, out: Path) -> dict[str, Re
     return done
 
 
-@contextmanager
-def _executor(workers: int | None, dask: str | None) -> Iterator[Executor]:
-    """Give an executor of this machine's cores, or of a Dask cluster whose scheduler is named."""
-    if dask is not None:
-        try:
-            from distributed import Client  # noqa: PLC0415 - an optional extra
-        except ModuleNotFoundError as error:
-            raise UsageError("--dask needs the extra of that name: pip install '.[dask]'") from error
-        with Client(dask) as client:
-            yield client.get_executor()
-        return
+def _here(workers: int | None, campaign: Campaign, cases: Sequence[Case]) -> Results:
+    """Run cases on this machine's cores; yield them as they come."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     with ProcessPoolExecutor(workers or os.cpu_count(), mp_context=get_context("spawn")) as pool:
+        keys = {pool.submit(campaign.run, case): case.key for case in cases}
         try:
-            yield pool
+            for future in as_completed(keys):
+                yield keys[future], future.result()
         except BaseException:
             # Ctrl-C: what has come is on disk, what has not begun need not begin.
             pool.shutdown(wait=False, cancel_futures=True)
             raise
 
 
-def _finished(
-    executor: Executor, run: Callable[[Case], Result], cases: Sequence[Case]
-) -> Iterator[tuple[str, Result]]:
-    keys = {executor.submit(run, case): case.key for case in cases}
-    for future in as_completed(keys):
-        yield keys[future], future.result()
-
-
-class _Bar:
-    """A line of progress on standard error, with the time that is left."""
-
-    def __init__(self, total: int, done: int) -> None:
-        self._total = total
-        self._before = done
-        self._done = done
-        self._begun = time.perf_counter()
-
-    def advance(self) -> None:
-        """Count one more."""
-        self._done += 1
-        elapsed = time.perf_counter() - self._begun
-        left = elapsed / (self._done - self._before) * (self._total - self._done)
-        width = 30
-        filled = width * self._done // self._total
-        bar = "#" * filled + "." * (width - filled)
-        sys.stderr.write(f"\r\x1b[K[{bar}] {self._done}/{self._total}  {left:.0f} s left")
-        sys.stderr.flush()
-
-    def close(self) -> None:
-        """Take the line away."""
-        sys.stderr.write("\r\x1b[K")
-        sys.stderr.flush()
+def _on_cluster(address: str, campaign: Campaign, cases: Sequence[Case], bar: Progress | None) -> Results:
+    """Run cases on a cluster; yield them as they come."""
+    if importlib.util.find_spec("distributed") is None:
+        raise UsageError("--dask needs the extra of that name: pip install '.[dask]'")
+    report = bar.note if bar is not None else lambda _: None
+    yield from cluster.finished(address, campaign.run, cases, report)

@@ -27,7 +27,7 @@ SUITES = ("vt", "uw", "usu")
 @cache
 def suite(name: str) -> SensorSuite:
     """Return one of the paper's three."""
-    return sensor_suite.load(Path("config") / "sensors" / f"{name}.yaml")
+    return sensor_suite.load(Path(__file__).parents[3] / "config" / "sensors" / f"{name}.yaml")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

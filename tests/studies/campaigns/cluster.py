@@ -1,0 +1,167 @@
+"""Campaigns on a Dask cluster whose machines have the packages, but not this checkout.
+
+A plugin sends the checkout's packages to every worker, also to those that join later; a case then travels as
+the name of its function and as data. This module itself is pickled by value, so scheduler and workers import
+nothing of ours to read it: nothing at its top level may import ours or Dask.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import io
+import os
+import shutil
+import sys
+import threading
+import zipfile
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import CancelledError
+from pathlib import Path
+from typing import Any
+
+PACKAGES = ("flight", "ground", "hal", "sim_hal", "tests")
+FOLDERS = (*PACKAGES, "config")
+_ROOT = Path(__file__).parents[3]
+_PLUGIN = "knightcube-code"
+_SENT = (".py", ".npz", ".npy", ".yaml", ".yml", ".json", ".csv", ".txt", ".c", ".png")
+CONNECT_S = 15.0
+"""How long the scheduler may take to answer, and the first worker to be there."""
+
+_one_case = threading.Lock()
+
+
+class ShippedCode:
+    """A worker plugin that unpacks the checkout's packages into the worker's own folder and imports those."""
+
+    name = _PLUGIN
+    idempotent = False
+
+    def __init__(self, archive: bytes) -> None:
+        self._archive = archive
+        self.version = hashlib.sha256(archive).hexdigest()[:16]
+
+    def setup(self, worker: Any) -> None:
+        """Unpack, and forget the modules of other code that came before."""
+        folder = Path(worker.local_directory) / f"{_PLUGIN}-{self.version}"
+        if not folder.is_dir():
+            beside = folder.with_name(f"{folder.name}-{os.getpid()}")
+            with zipfile.ZipFile(io.BytesIO(self._archive)) as archive:
+                archive.extractall(beside)
+            try:
+                beside.rename(folder)
+            except OSError:  # another worker in the same folder was faster
+                shutil.rmtree(beside)
+        sys.path[:] = [str(folder), *(place for place in sys.path if _PLUGIN not in place)]
+        for name in [name for name in sys.modules if name.split(".")[0] in PACKAGES]:
+            del sys.modules[name]
+        importlib.invalidate_caches()
+        os.environ["KNIGHTCUBE_CODE"] = self.version
+
+    def teardown(self, worker: Any) -> None:
+        """Leave the files: the worker removes its folder."""
+
+
+def carry_out(version: str, module: str, function: str, case: dict[str, Any]) -> Any:
+    """Run one case on a worker, with the code that was sent."""
+    if os.environ.get("KNIGHTCUBE_CODE") != version:
+        raise RuntimeError("the worker has another checkout's code: two campaigns share the cluster")
+    sent = importlib.import_module("tests.studies.campaigns.cluster")
+    return sent.run_alone(module, function, case)
+
+
+def run_alone(module: str, function: str, case: dict[str, Any]) -> Any:
+    """Run a case while no other runs in this process: the code under test need not bear threads."""
+    campaign = importlib.import_module("tests.studies.campaigns.campaign")
+    with _one_case:
+        return getattr(importlib.import_module(module), function)(campaign.Case(**case))
+
+
+def archive_of(root: Path) -> bytes:
+    """Return the packages of a checkout as a zip file, the same bytes for the same files."""
+    held = io.BytesIO()
+    with zipfile.ZipFile(held, "w", zipfile.ZIP_DEFLATED) as archive:
+        for top in FOLDERS:
+            # flight.schema carries config/ by a link.
+            for folder, below, files in os.walk(root / top, followlinks=True):
+                below[:] = sorted(name for name in below if name != "__pycache__")
+                for name in sorted(files):
+                    if name.endswith(_SENT):
+                        path = Path(folder) / name
+                        entry = zipfile.ZipInfo(str(path.relative_to(root)))
+                        archive.writestr(entry, path.read_bytes(), zipfile.ZIP_DEFLATED)
+    return held.getvalue()
+
+
+def finished(
+    address: str, run: Callable[[Any], Any], cases: Sequence[Any], report: Callable[[str], None]
+) -> Iterator[tuple[str, Any]]:
+    """Run cases on the cluster of the scheduler at `address`; yield (key, result) as they come.
+
+    `report` takes lines about the cluster. Cases of a worker that dies are run by the others. Raises
+    UsageError when there is no cluster to begin with, CampaignError when the scheduler is lost or a case ends
+    its workers.
+    """
+    distributed, cloudpickle = map(importlib.import_module, ("distributed", "cloudpickle"))
+
+    def carried(*words: Any) -> Any:
+        """Run `carry_out`: a function within a function is pickled by value, with those it calls."""
+        return carry_out(*words)
+
+    here = sys.modules[__name__]
+    cloudpickle.register_pickle_by_value(here)
+    try:
+        with _client(address) as client:
+            plugin = type("Shipped", (ShippedCode, distributed.WorkerPlugin), {})(archive_of(_ROOT))
+            client.register_plugin(plugin, name=_PLUGIN)
+            workers = len(client.scheduler_info(n_workers=-1)["workers"])
+            report(f"cluster at {address}, workers: {workers}, dashboard: {client.dashboard_link}")
+            futures = {
+                client.submit(
+                    carried,
+                    plugin.version,
+                    run.__module__,
+                    run.__name__,
+                    {"key": case.key, "seed": case.seed, "parameters": case.parameters},
+                    pure=False,
+                ): case.key
+                for case in cases
+            }
+            for future in distributed.as_completed(futures):
+                yield futures[future], _result(future, futures[future], address)
+    finally:
+        cloudpickle.unregister_pickle_by_value(here)
+
+
+def _client(address: str) -> Any:
+    """Connect to a scheduler that has a worker. Raises UsageError."""
+    from flight.gnc.errors import UsageError  # noqa: PLC0415 - see the module's text
+
+    try:
+        client = importlib.import_module("distributed").Client(address, timeout=CONNECT_S)
+    except (OSError, ValueError) as error:
+        first = str(error).splitlines()[0]
+        raise UsageError(f"--dask {address}: no scheduler answers there ({first})") from error
+    try:
+        client.wait_for_workers(1, timeout=CONNECT_S)
+    except TimeoutError as error:
+        client.close()
+        raise UsageError(
+            f"--dask {address}: the scheduler has no worker: start `dask worker {address}`"
+        ) from error
+    return client
+
+
+def _result(future: Any, key: str, address: str) -> Any:
+    """Return a case's result. Raises CampaignError, or what the case raised."""
+    from tests.studies.campaigns.campaign import CampaignError  # noqa: PLC0415
+
+    distributed = importlib.import_module("distributed")
+    try:
+        return future.result()
+    except (CancelledError, distributed.comm.CommClosedError) as error:
+        raise CampaignError(f"the scheduler at {address} is lost") from error
+    except distributed.KilledWorker as error:
+        raise CampaignError(
+            f"case {key} has ended every worker that tried it: {error.last_worker}"
+        ) from error

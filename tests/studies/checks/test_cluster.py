@@ -1,0 +1,136 @@
+"""A campaign on a Dask cluster without this checkout loses nothing to a dead worker or a lost scheduler."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flight.gnc.errors import UsageError
+from tests.studies.campaigns.campaign import Campaign, CampaignError, Case, Result, Summary, fly, fly_here
+
+distributed = pytest.importorskip("distributed", reason="Dask is an optional extra and not installed")
+
+pytestmark = pytest.mark.filterwarnings("ignore")  # of Dask's own libraries
+
+
+def cases(runs: int, seed: int) -> list[Case]:
+    return [Case(f"{k}", (seed, k), {"factor": k}) for k in range(runs)]
+
+
+def draw(case: Case) -> Result:
+    time.sleep(0.05)
+    value = case.parameters["factor"] + float(np.random.default_rng(case.seed).random())
+    return {"value": value, "worker": os.getpid(), "code": __file__}
+
+
+def summarise(results: Sequence[Result], out: Path) -> Summary:
+    return Summary("", {"total": sum(result["value"] for result in results), "runs": len(results)})
+
+
+HOST = ("--host", "127.0.0.1", "--dashboard-address", "127.0.0.1:0")
+TOY = Campaign("toy-cluster", "adds draws", cases, draw, summarise, 40)
+
+
+@contextmanager
+def started(folder: Path, *words: str) -> Iterator[subprocess.Popen[bytes]]:
+    """Start `dask ...` as its documentation says, in a folder elsewhere and without our paths."""
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    command = [sys.executable, "-m", "dask", *words]
+    with (folder / "dask.log").open("ab") as log:
+        process = subprocess.Popen(command, cwd=folder, env=environment, stdout=log, stderr=log)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+@contextmanager
+def cluster(folder: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
+    """Start a scheduler and two workers; yield the address, and the processes, the scheduler first."""
+    facts = folder / "scheduler.json"
+    where = ("--scheduler-file", str(facts))
+    worker = ("worker", *where, "--no-nanny", "--nthreads", "1", *HOST)
+    with (
+        started(folder, "scheduler", *where, "--port", "0", *HOST) as scheduler,
+        started(folder, *worker) as first,
+        started(folder, *worker) as second,
+    ):
+        deadline = time.monotonic() + 30.0
+        while not facts.is_file() and time.monotonic() < deadline:
+            time.sleep(0.05)
+        address = json.loads(facts.read_text())["address"]
+        with distributed.Client(address) as client:
+            client.wait_for_workers(2, timeout=30)
+        yield address, [scheduler, first, second]
+
+
+def lines(out: Path) -> int:
+    log = out / "results.jsonl"
+    return log.read_text().count("\n") if log.is_file() else 0
+
+
+def results(out: Path) -> dict[str, Result]:
+    entries = map(json.loads, (out / "results.jsonl").read_text().splitlines())
+    return {entry["key"]: entry["result"] for entry in entries}
+
+
+@contextmanager
+def killing(process: subprocess.Popen[bytes], out: Path, count: int) -> Iterator[None]:
+    """Kill a process as soon as a campaign has `count` results on disk."""
+
+    def wait_and_kill() -> None:
+        while lines(out) < count and not over.wait(0.02):
+            pass
+        process.kill()
+
+    over = threading.Event()
+    thread = threading.Thread(target=wait_and_kill)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+@pytest.mark.slow
+def test_a_cluster_without_the_checkout_survives_a_workers_death_and_a_lost_scheduler_loses_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole, part = tmp_path / "whole", tmp_path / "part"
+    expected = sum(case.parameters["factor"] for case in cases(30, 3))
+    with cluster(tmp_path) as (address, (scheduler, first, _)):
+        with killing(first, whole, 8):
+            facts = fly(TOY, 30, 3, whole, dask=address, progress=True).facts
+        assert first.wait(timeout=10) == -signal.SIGKILL
+        assert facts["runs"] == 30
+        assert expected < facts["total"] < expected + 30
+        assert len({result["worker"] for result in results(whole).values()}) == 2
+        assert all("knightcube-code-" in result["code"] for result in results(whole).values())
+        assert f"cluster at {address}, workers: 2, dashboard: http" in capsys.readouterr().err
+
+        with killing(scheduler, part, 8), pytest.raises(CampaignError, match=r"scheduler at .* is lost"):
+            fly(TOY, 30, 3, part, dask=address)
+    kept = lines(part)
+    assert 8 <= kept < 30
+    assert fly(TOY, 30, 3, part, workers=2).facts == facts
+    assert lines(part) == 30
+    assert fly_here(TOY, 1, 3)[0]["value"] == results(part)["0"]["value"]
+
+
+def test_no_scheduler_is_said_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tests.studies.campaigns.cluster.CONNECT_S", 0.3)
+    with pytest.raises(UsageError, match=r"--dask tcp://127.0.0.1:9: no scheduler answers there"):
+        fly(TOY, 1, 3, tmp_path, dask="tcp://127.0.0.1:9")
