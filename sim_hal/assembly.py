@@ -26,6 +26,8 @@ from sim_hal.emulators.star_camera import EmulatedStarCamera, Expose
 from sim_hal.emulators.vn100 import Vn100Emulator, Vn100EmulatorSettings
 from sim_hal.emulators.vn100_sensors import PROFILES, NoiseProfile
 from sim_hal.faults.timeline import FaultTimeline
+from sim_hal.orbit_devices import ExposeWide, OrbitDevices, wanted
+from sim_hal.orbit_sky import from_orbit
 from sim_hal.settings import Simulation, Sky
 from sim_hal.worlds.coil_circuit import CoilCircuit
 from sim_hal.worlds.motion import Motion
@@ -55,6 +57,7 @@ class Hardware:
     camera: EmulatedStarCamera | None
     truth: TruthRecorder | None
     faults: FaultTimeline
+    orbit: OrbitDevices
 
     def release(self, epoch_ns: int) -> None:
         """Release the body at `epoch_ns`, mission time zero."""
@@ -71,12 +74,14 @@ def assemble(
     truth: TruthRecorder | None = None,
     expose: Expose | None = None,
     wait: Callable[[int], None] | None = None,
+    gps_line: SerialEnd | None = None,
+    expose_wide: ExposeWide | None = None,
 ) -> Hardware:
     """Build the hardware of `config` in the world of its simulation `section`.
 
-    `now_ns` returns the simulation's time; `line` is the device end of the serial line; `expose` replaces
-    the camera's renderer (in real time a process of its own); `wait` advances time while the bus hangs.
-    Raises ConfigError for a world that cannot be made.
+    `now_ns` returns the simulation's time; `line` and `gps_line` are the device ends of the serial lines;
+    `expose` and `expose_wide` replace the cameras' renderers (in real time a process of its own); `wait`
+    advances time while the bus hangs. Raises ConfigError for a world that cannot be made.
     """
     unit_seed, circuit_seed = np.random.SeedSequence(section.seed).spawn(2)
     coils = assemble_coils(config, section, np.random.default_rng(circuit_seed), now_ns, wait)
@@ -86,14 +91,17 @@ def assemble(
     free_fall = isinstance(world, OrbitingWorld)
     unit = _unit(config, section, sense, line, np.random.default_rng(unit_seed), now_ns(), free_fall)
     camera = _camera(config.camera, section, world, expose, now_ns)
+    orbit = _orbit(config, section, world, now_ns, gps_line, expose_wide)
+    for part in orbit.strings.parts if orbit.strings is not None else ():
+        coils.bus.attach(part)
     faults = FaultTimeline()
     if truth is not None:
         truth.watch(world)
     # At equal times devices run in this order.
-    devices: list[EmulatedDevice | None] = [unit, camera, faults, truth]
+    devices: list[EmulatedDevice | None] = [unit, camera, orbit.gps, *orbit.wide, faults, truth]
     simulation = TimedSimulation(world.advance_to, [device for device in devices if device is not None])
     return Hardware(
-        simulation, world, unit, coils.bus, coils.pwm, coils.monitor, circuit, camera, truth, faults
+        simulation, world, unit, coils.bus, coils.pwm, coils.monitor, circuit, camera, truth, faults, orbit
     )
 
 
@@ -147,14 +155,31 @@ def _camera(
     if camera is None:
         return None
     make = expose or inline_exposure(StarRenderer(camera, section.sky, section.seed))
+    if isinstance(world, OrbitingWorld):
+        make = from_orbit(make, world, camera)
     readout_ns = round(section.sky.readout * 1e9)
     scan_ns = round(section.sky.line_time * camera.rows * 1e9)
     return EmulatedStarCamera(world.motion, make, now_ns, readout_ns, np.array(camera.mounting), scan_ns)
 
 
-def line_generator(seed: int) -> np.random.Generator:
-    """Return the generator of the serial line's faults, independent of all others of the same seed."""
-    return np.random.default_rng([seed, _LINE_STREAM])
+def _orbit(
+    config: Config,
+    section: Simulation,
+    world: World,
+    now_ns: Callable[[], int],
+    line: SerialEnd | None,
+    expose: ExposeWide | None,
+) -> OrbitDevices:
+    if not wanted(config):
+        return OrbitDevices()
+    from sim_hal.orbit_assembly import assemble_orbit  # noqa: PLC0415 - see `orbit_devices`
+
+    return assemble_orbit(config, section, world, now_ns, line, expose)
+
+
+def line_generator(seed: int, *line: int) -> np.random.Generator:
+    """Return the generator of a serial line's faults, independent of all others of the same seed."""
+    return np.random.default_rng([seed, _LINE_STREAM, *line])
 
 
 def fault_generator(seed: int) -> np.random.Generator:

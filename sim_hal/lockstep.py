@@ -16,6 +16,7 @@ from sim_hal.clock import SimClock
 from sim_hal.emulators.serial_line import SerialLine
 from sim_hal.faults.bench import Bench
 from sim_hal.faults.schedule import put, scheduled
+from sim_hal.orbit_devices import GPS_LINE
 from sim_hal.settings import Simulation
 from sim_hal.worlds.truth import TruthRecorder
 
@@ -29,6 +30,7 @@ class LockStep:
     release: Callable[[int], None]
     hardware: Hardware
     line: SerialLine
+    gps_line: SerialLine | None = None
 
 
 def utc_ns(label: str) -> int:
@@ -39,17 +41,23 @@ def utc_ns(label: str) -> int:
 def build(config: Config, section: Simulation, truth: TruthRecorder | None, clock: SimClock) -> LockStep:
     """Put the simulated hardware on a clock."""
     line = SerialLine(clock.now_ns, config.inertial_unit.baud_rate, line_generator(section.seed))
-    hardware = assemble(config, section, clock.now_ns, line.device, truth)
+    gps_line = None
+    if config.gps is not None:
+        generator = line_generator(section.seed, GPS_LINE)
+        gps_line = SerialLine(clock.now_ns, config.gps.baud_rate, generator)
+    gps_end = None if gps_line is None else gps_line.device
+    hardware = assemble(config, section, clock.now_ns, line.device, truth, gps_line=gps_end)
     clock.attach(hardware.simulation)
-    wires = Wires(line.host, hardware.bus, hardware.camera)
+    gps_port = None if gps_line is None else gps_line.host
+    wires = Wires(line.host, hardware.bus, hardware.camera, gps_port, hardware.orbit.wide)
     faults = scheduled(section.faults, realtime=False)
-    bench = Bench(hardware, line, clock.now_ns, fault_generator(section.seed), line.host)
+    bench = Bench(hardware, line, clock.now_ns, fault_generator(section.seed), line.host, gps_line=gps_line)
 
     def release(epoch_ns: int) -> None:
         hardware.release(epoch_ns)
         put(faults, bench, epoch_ns)
 
-    return LockStep(clock, wires, release, hardware, line)
+    return LockStep(clock, wires, release, hardware, line, gps_line)
 
 
 @contextmanager

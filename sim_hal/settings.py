@@ -75,6 +75,21 @@ class Sky(Section, frozen=True, kw_only=True):
     line_time: NotNegative = 0.0
 
 
+class OrbitDeviceTruth(Section, frozen=True, kw_only=True):
+    """Errors of the devices of an orbit.
+
+    GPS: m of the slow and the white error of each axis, s from power to the first fix. Strings: relative
+    spread of their gains, A of noise, and the Earth's albedo.
+    """
+
+    gps_walk: NotNegative = 2.0
+    gps_noise: NotNegative = 1.0
+    gps_start: NotNegative = 30.0
+    string_gain: Annotated[float, Meta(ge=0.0, le=0.5)] = 0.02
+    string_noise: NotNegative = 2e-3
+    albedo: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.3
+
+
 class FaultEntry(Section, frozen=True, kw_only=True):
     """A fault and when: `at` in s of mission time, `for` in s.
 
@@ -103,5 +118,6 @@ class Simulation(Section, frozen=True, kw_only=True):
     sky: Sky = Sky()
     truth: Truth = Truth()
     free_body: FreeBodySection | None = None
+    orbit_devices: OrbitDeviceTruth = OrbitDeviceTruth()
     latency: Latency = Latency()
     faults: tuple[FaultEntry, ...] = ()

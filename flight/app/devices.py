@@ -11,13 +11,16 @@ from flight.gnc.math.quaternion import attitude_matrix
 from flight.loop.services import Devices
 from flight.schema.errors import ConfigError
 from flight.schema.sections import Config
+from hal.drivers.ads1115 import AdsSolarStrings, StringWiring
 from hal.drivers.coil_settings import CoilSettings, wirings
 from hal.drivers.coils import PwmTorqueCoils
 from hal.drivers.ina219 import Ina219
 from hal.drivers.pca9685 import Pca9685
+from hal.drivers.ublox.receiver import UbloxReceiver
 from hal.drivers.vn100.driver import Vn100, Vn100Settings
 from hal.interfaces.errors import DeviceError, OutOfRange
 from hal.interfaces.rig import Rig
+from hal.interfaces.wires import SECOND_NS
 
 
 def open_devices(config: Config, rig: Rig, stack: ExitStack, patient: bool) -> Devices:
@@ -42,7 +45,31 @@ def open_devices(config: Config, rig: Rig, stack: ExitStack, patient: bool) -> D
     camera = rig.wires.frames
     if camera is not None:
         stack.callback(camera.close)
-    return Devices(unit, coils, power, camera)
+    for wide in rig.wires.wide:
+        stack.callback(wide.close)
+    gps = open_gps(config, rig, stack)
+    strings = open_strings(config, rig, stack)
+    return Devices(unit, coils, power, camera, gps, strings, rig.wires.wide)
+
+
+def open_gps(config: Config, rig: Rig, stack: ExitStack) -> UbloxReceiver | None:
+    """Open the GPS receiver where one is configured; it is set up while it is read."""
+    if config.gps is None or rig.wires.gps is None:
+        return None
+    gps = UbloxReceiver(rig.wires.gps, rig.clock, round(config.gps.period * SECOND_NS))
+    stack.callback(gps.close)
+    return gps
+
+
+def open_strings(config: Config, rig: Rig, stack: ExitStack) -> AdsSolarStrings | None:
+    """Open the solar strings' converters where they are configured."""
+    section = config.solar_strings
+    if section is None:
+        return None
+    wired = [StringWiring(s.address, s.channel, s.volt_per_ampere) for s in section.strings]
+    strings = AdsSolarStrings(rig.wires.i2c, rig.clock, wired, round(section.period * SECOND_NS))
+    stack.callback(strings.close)
+    return strings
 
 
 def check_settings(config: Config) -> None:

@@ -8,6 +8,7 @@ from contextlib import ExitStack, nullcontext, suppress
 from flight.loop.state.opening import state_folder
 from flight.schema.devices import AravisDevice, Camera, V4l2Device
 from flight.schema.errors import ConfigError
+from flight.schema.orbit_devices import WideCamera
 from flight.schema.sections import Config
 from hal.buses.clock import SystemClock
 from hal.buses.i2c_bus import LinuxI2cBus
@@ -41,10 +42,18 @@ def linux_rig(config: Config, stack: ExitStack, patient: bool) -> Rig:
     if (folder := state_folder(config, os.environ)) is not None:
         reach.note(folder)
     frames = linux_camera(config.camera, clock, stack, patient) if config.camera is not None else None
-    return Rig(clock, Wires(serial, i2c, frames), lambda _: None, True, 0, reach=reach)
+    gps = None
+    if config.gps is not None:
+        gps = PySerialPort(config.gps.device, config.gps.baud_rate, clock, patient)
+        stack.callback(gps.close)
+    wide = tuple(linux_camera(camera, clock, stack, patient) for camera in config.wide_cameras)
+    wires = Wires(serial, i2c, frames, gps, wide)
+    return Rig(clock, wires, lambda _: None, True, 0, reach=reach)
 
 
-def linux_camera(camera: Camera, clock: Clock, stack: ExitStack, patient: bool = False) -> FrameSource:
+def linux_camera(
+    camera: Camera | WideCamera, clock: Clock, stack: ExitStack, patient: bool = False
+) -> FrameSource:
     """Open the configured camera.
 
     Raises ConfigError when none is named; DeviceError, but a `patient` camera is opened once it appears.

@@ -9,18 +9,28 @@ from flight.loop.executive.jobs import JobRunner
 from flight.loop.fdir.event_log import EventLog
 from flight.loop.fdir.facts import Facts
 from flight.loop.fdir.streams import Streams
-from hal.interfaces.devices import FrameSource, InertialUnit, PowerMonitor, TorqueCoils
+from hal.interfaces.devices import (
+    FrameSource,
+    GpsReceiver,
+    InertialUnit,
+    PowerMonitor,
+    SolarStrings,
+    TorqueCoils,
+)
 from hal.interfaces.wires import Clock
 
 
 @dataclass(frozen=True, slots=True)
 class Devices:
-    """The open devices; a current monitor and a camera are optional."""
+    """The open devices; all but unit and coils are optional, those of an orbit come last."""
 
     unit: InertialUnit
     coils: TorqueCoils
     power: PowerMonitor | None
     camera: FrameSource | None
+    gps: GpsReceiver | None = None
+    strings: SolarStrings | None = None
+    wide: tuple[FrameSource, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

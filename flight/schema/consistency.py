@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 from flight.schema.devices import Camera
 from flight.schema.document import Document
+from flight.schema.orbit_devices import SolarStrings
 from flight.schema.peers import peer_networks
 from flight.schema.sections import Commands, Config
 from flight.schema.testbed import TestbedConfig
@@ -46,6 +47,10 @@ def check_consistency(config: Config, document: Document) -> None:
         _check_camera(config.camera, refuse)
         _check_length("camera.mounting", config.camera.mounting, refuse)
     _check_length("inertial_unit.mounting", config.inertial_unit.mounting, refuse)
+    for index, camera in enumerate(config.wide_cameras):
+        _check_length(f"wide_cameras[{index}].mounting", camera.mounting, refuse)
+    if config.solar_strings is not None:
+        _check_strings(config, config.solar_strings, refuse)
 
 
 def _check_testbed(config: TestbedConfig, refuse: Refuse) -> None:
@@ -71,6 +76,20 @@ def _check_coils(config: Config, refuse: Refuse) -> None:
             f"is 0x{config.power_monitor.address:02x}, the PWM chip's: both leave the factory at 0x40, "
             "set the monitor's address pins (0x45) and say so here",
         )
+
+
+def _check_strings(config: Config, strings: SolarStrings, refuse: Refuse) -> None:
+    others = {config.coils.address} | ({config.power_monitor.address} if config.power_monitor else set())
+    inputs = set()
+    for index, string in enumerate(strings.strings):
+        place = f"solar_strings.strings[{index}]"
+        if string.address in others:
+            refuse(f"{place}.address", f"is 0x{string.address:02x}, another part's on the same bus")
+        if (string.address, string.channel) in inputs:
+            refuse(f"{place}.channel", f"is {string.channel}: another string is measured there")
+        inputs.add((string.address, string.channel))
+        if abs(math.hypot(*string.normal) - 1.0) > 1e-6:
+            refuse(f"{place}.normal", f"has length {math.hypot(*string.normal):.6g}: give a unit vector")
 
 
 def _check_times(config: Config, refuse: Refuse) -> None:

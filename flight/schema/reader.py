@@ -35,7 +35,7 @@ def load(path: Path) -> Config:
 def parse(text: str, name: str = "configuration") -> Config:
     """Validate configuration text; `name` stands for the file in complaints. Raises ConfigError."""
     document = read_document(text, name)
-    for optional in ("camera", "power_monitor"):
+    for optional in ("camera", "power_monitor", "gps", "solar_strings"):
         if document.values.get(optional) == "none":
             document.values[optional] = None
     shape = _SHAPES.get(str(document.values.get("body")), TestbedConfig)

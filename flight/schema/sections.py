@@ -13,6 +13,7 @@ import msgspec
 from msgspec import Meta
 
 from flight.schema.devices import Camera, Coils, InertialUnit, PowerMonitor
+from flight.schema.orbit_devices import Gps, SolarStrings, WideCamera
 from flight.schema.values import Q2, NotNegative, Peer, PlainMode, Positive, Section
 
 
@@ -159,6 +160,9 @@ class Config(Section, frozen=True, kw_only=True):
     coils: Coils
     power_monitor: PowerMonitor | None = None
     camera: Camera | None
+    gps: Gps | None = None
+    solar_strings: SolarStrings | None = None
+    wide_cameras: Annotated[tuple[WideCamera, ...], Meta(max_length=6)] = ()
     executive: Executive = Executive()
     estimation: Estimation = Estimation()
     modes: Modes = Modes()

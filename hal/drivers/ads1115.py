@@ -33,7 +33,7 @@ _SHORTEST_NS = 10_000_000
 
 
 def config_for(channel: int) -> int:
-    """Return the Config word that starts a conversion of a channel against ground, +-2.048 V, 128 a second."""
+    """Return the Config word that starts a conversion of a channel: against ground, +-2.048 V, 128 a s."""
     mux = (_SINGLE_ENDED | channel) << _MUX_BIT
     return START | mux | _RANGE_2_048 | _SINGLE_SHOT | _RATE_128 | _NO_COMPARATOR
 

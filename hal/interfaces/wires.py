@@ -110,8 +110,13 @@ class I2cBus(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Wires:
-    """The connections of the drivers: one serial line, one I2C bus, and a camera or None."""
+    """The connections of the drivers: the inertial unit's serial line, one I2C bus, and a camera or None.
+
+    A satellite has a GPS receiver's serial line and wide cameras besides.
+    """
 
     serial: SerialPort
     i2c: I2cBus
     frames: FrameSource | None
+    gps: SerialPort | None = None
+    wide: tuple[FrameSource, ...] = ()

@@ -44,7 +44,7 @@ class EmulatedStarCamera:
     """A FrameSource and an emulated device.
 
     Attributes:
-        fault: "off", "black", "frozen", "saturated", "torn", "garbage", "wrong" (upside down), or none.
+        fault: "off", "frozen", "torn", one of `SPOILT`, or none.
         late_ns: how much later than its read-out a frame comes.
         one_of: it exposes on one trigger of this many and ignores the others.
     """
@@ -141,19 +141,42 @@ class EmulatedStarCamera:
                 frame.arrival_ns,
                 self._last.pixels,
             )
-        if self.fault in {"black", "saturated"}:
-            level = 0 if self.fault == "black" else np.iinfo(frame.pixels.dtype).max
-            return _with_pixels(frame, np.full_like(frame.pixels, level))
         if self.fault == "torn" and self._last is not None:
             middle = len(frame.pixels) // 2
             return _with_pixels(frame, np.concatenate([self._last.pixels[:middle], frame.pixels[middle:]]))
-        if self.fault == "garbage":
-            top = np.iinfo(frame.pixels.dtype).max
-            noise = np.random.default_rng(frame.sequence).integers(0, top, frame.pixels.shape)
-            return _with_pixels(frame, noise.astype(frame.pixels.dtype))
-        if self.fault == "wrong":
-            return _with_pixels(frame, np.ascontiguousarray(frame.pixels[::-1]))
+        if self.fault in SPOILT:
+            return _with_pixels(frame, SPOILT[self.fault](frame.pixels, frame.sequence))
         return frame
+
+
+def _level(pixels: Image, count: int) -> Image:
+    return np.full_like(pixels, count)
+
+
+def _garbage(pixels: Image, seed: int) -> Image:
+    top = np.iinfo(pixels.dtype).max
+    return np.asarray(np.random.default_rng(seed).integers(0, top, pixels.shape).astype(pixels.dtype))
+
+
+def blinded(pixels: Image, seed: int) -> Image:
+    """Return a frame with the stray light of a Sun beside the field: saturated there, falling off from it."""
+    rows, columns = pixels.shape
+    top = np.iinfo(pixels.dtype).max
+    angle = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi)
+    y, x = np.mgrid[0:rows, 0:columns] / max(rows, columns) - 0.5
+    away = np.hypot(x - 0.7 * np.cos(angle), y - 0.7 * np.sin(angle))
+    veil = top * (0.1 + 1.5 * np.exp(-((away / 0.5) ** 2)))
+    return np.asarray(np.clip(pixels + veil, 0, top).astype(pixels.dtype))
+
+
+SPOILT: dict[str, Callable[[Image, int], Image]] = {
+    "black": lambda pixels, _: _level(pixels, 0),
+    "saturated": lambda pixels, _: _level(pixels, np.iinfo(pixels.dtype).max),
+    "blinded": blinded,
+    "garbage": _garbage,
+    "wrong": lambda pixels, _: np.ascontiguousarray(pixels[::-1]),
+}
+"""What each fault makes of the pixels (rows, columns) of a frame with this number."""
 
 
 def _with_pixels(frame: Frame, pixels: Image) -> Frame:

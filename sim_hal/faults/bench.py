@@ -46,6 +46,7 @@ class Bench:
         generator: for random faults.
         host: the line's host end, where it is in memory.
         flight_process: its process identifier, where it is not this process.
+        gps_line: the GPS receiver's line, where one is fitted.
     """
 
     hardware: Hardware
@@ -54,6 +55,7 @@ class Bench:
     generator: np.random.Generator
     host: HostEnd | None = None
     flight_process: int | None = None
+    gps_line: Line | None = None
     _on_wires: dict[int, list[LineFaults]] = field(default_factory=dict)
 
     def disturb(self, wire: Wire, faults: LineFaults) -> Lift:

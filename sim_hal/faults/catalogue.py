@@ -6,11 +6,26 @@ from sim_hal.faults.circuit import COILS
 from sim_hal.faults.imaging import CAMERA
 from sim_hal.faults.kinds import FaultKind, Parameter, Where
 from sim_hal.faults.machine import MACHINE
+from sim_hal.faults.orbit import GPS, STRINGS, WIDE
 from sim_hal.faults.parts import BUS, MONITOR, PWM
 from sim_hal.faults.serial import IMU
 from sim_hal.faults.upsets import IMU_UPSET, MONITOR_UPSET, PWM_UPSET
 
-_ALL = (*IMU, IMU_UPSET, *PWM, PWM_UPSET, *MONITOR, MONITOR_UPSET, *BUS, *COILS, *CAMERA, *MACHINE)
+_ALL = (
+    *IMU,
+    IMU_UPSET,
+    *PWM,
+    PWM_UPSET,
+    *MONITOR,
+    MONITOR_UPSET,
+    *BUS,
+    *COILS,
+    *CAMERA,
+    *GPS,
+    *STRINGS,
+    *WIDE,
+    *MACHINE,
+)
 
 CATALOGUE: dict[str, FaultKind] = {kind.name: kind for kind in _ALL}
 

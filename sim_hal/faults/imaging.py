@@ -36,6 +36,7 @@ CAMERA = (
     FaultKind("camera", "off", "ignores triggers, delivers no frame", _showing("off")),
     FaultKind("camera", "black", "frames without light", _showing("black")),
     FaultKind("camera", "saturated", "saturated frames", _showing("saturated")),
+    FaultKind("camera", "blinded", "the Sun's stray light over the whole frame", _showing("blinded")),
     FaultKind("camera", "frozen", "the same frame repeatedly", _showing("frozen")),
     FaultKind("camera", "torn", "upper part of the previous frame, lower part of this one", _showing("torn")),
     FaultKind("camera", "garbage", "random pixels", _showing("garbage")),

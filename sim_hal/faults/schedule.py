@@ -11,7 +11,14 @@ from sim_hal.faults.grammar import ScheduledFault, schedule
 from sim_hal.faults.kinds import Where
 from sim_hal.settings import FaultEntry
 
-_SECTIONS = {"camera": "camera", "vision": "camera", "monitor": "power_monitor"}
+_SECTIONS = {
+    "camera": "camera",
+    "vision": "camera",
+    "monitor": "power_monitor",
+    "gps": "gps",
+    "strings": "solar_strings",
+    "wide": "wide_cameras",
+}
 """The optional configuration section of each device that can be absent."""
 
 
@@ -37,7 +44,7 @@ def check(entries: Sequence[FaultEntry], config: Config, realtime: bool) -> tupl
                 "begin it earlier, or fly longer (--duration)"
             )
         section = _SECTIONS.get(fault.kind.device)
-        if section is not None and getattr(config, section) is None:
+        if not fitted(fault.kind.device, config):
             raise UsageError(
                 f"fault {str(fault)!r}: no {fault.kind.device} flies here: the configuration needs a "
                 f"`{section}` section"
@@ -45,6 +52,12 @@ def check(entries: Sequence[FaultEntry], config: Config, realtime: bool) -> tupl
         if fault.kind.name == "imu: baud" and fault.parameters["rate"] == config.inertial_unit.baud_rate:
             raise UsageError(f"fault {str(fault)!r}: it speaks at this speed already: give another rate")
     return faults
+
+
+def fitted(device: str, config: Config) -> bool:
+    """Return whether a configuration has the device of a fault."""
+    section = _SECTIONS.get(device)
+    return section is None or getattr(config, section) not in (None, ())
 
 
 def _check_apart(faults: Sequence[ScheduledFault]) -> None:

@@ -66,6 +66,9 @@ def serve(options: argparse.Namespace) -> int:
             "baud_rate": config.inertial_unit.baud_rate,
             "socket": str(server.socket_path),
             "camera": config.camera is not None,
+            "gps": server.gps_device,
+            "gps_baud_rate": None if config.gps is None else config.gps.baud_rate,
+            "wide": len(config.wide_cameras),
         }
         if options.facts is not None:
             beside = options.facts.with_suffix(".part")

@@ -30,13 +30,16 @@ PATIENCE_S = 5.0
 """How long the devices outlive a flight process that died."""
 
 _START_S = 20.0
+_FACTS = ("serial", "baud_rate", "socket", "camera", "gps", "gps_baud_rate", "wide")
 OPENER = "sim_hal.serving.device_link:open_bus"
 
 
 class RemoteFrameSource:
     """A FrameSource whose camera is in the server's process; frames are announced, and read from a file."""
 
-    def __init__(self, path: Path, clock: SystemClock) -> None:
+    def __init__(self, path: Path, clock: SystemClock, number: int = 0) -> None:
+        """Connect to the star camera, number 0, or to a wide one."""
+        self._number = number
         self._link = Link(path)
         self._folder = path.parent
         self._clock = clock
@@ -44,7 +47,7 @@ class RemoteFrameSource:
     def trigger(self, exposure_ns: int) -> None:
         """Start an exposure without waiting for the answer."""
         try:
-            self._link.send("trigger", exposure_ns)
+            self._link.send("trigger", exposure_ns, self._number)
         except OSError as error:
             raise NotResponding("camera", f"the emulated devices are gone ({error})") from error
 
@@ -128,7 +131,7 @@ def running(facts_path: Path) -> Iterator[Served]:
     """
     try:
         facts = json.loads(facts_path.read_text(encoding="utf-8"))
-        facts = {name: facts[name] for name in ("serial", "baud_rate", "socket", "camera")}
+        facts = {name: facts[name] for name in _FACTS}
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise UsageError(f"{facts_path} names no server: give what `sim_hal serve --facts` wrote") from error
     with _connected(facts) as devices:
@@ -147,11 +150,16 @@ def _connected(facts: dict[str, Any]) -> Iterator[Served]:
             bus = RemoteI2cBus(path)
             stack.callback(bus.close)
             camera = RemoteFrameSource(path, clock) if facts["camera"] else None
+            wide = tuple(RemoteFrameSource(path, clock, number + 1) for number in range(facts["wide"]))
         except OSError as error:
             raise NotResponding("emulated devices", f"no server answers on {path} ({error})") from error
-        if camera is not None:
-            stack.callback(camera.close)
-        wires = Wires(serial, bus, camera)
+        for source in wide if camera is None else (camera, *wide):
+            stack.callback(source.close)
+        gps = None
+        if facts["gps"] is not None:
+            gps = PySerialPort(facts["gps"], facts["gps_baud_rate"], clock)
+            stack.callback(gps.close)
+        wires = Wires(serial, bus, camera, gps, wide)
 
         def release(epoch_ns: int, faults: Sequence[str] = ()) -> None:
             bus.call("release", epoch_ns, list(faults), os.getpid())

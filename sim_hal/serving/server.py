@@ -18,7 +18,7 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from flight.gnc.math.arrays import FloatArray, Image
 from flight.link.telemetry.log import FlightLog
@@ -29,12 +29,17 @@ from hal.interfaces.errors import DeviceError
 from hal.interfaces.readings import Frame
 from sim_hal.assembly import Hardware, StarRenderer, assemble, fault_generator, line_generator
 from sim_hal.emulators.pty_line import PtyLine
+from sim_hal.emulators.star_camera import EmulatedStarCamera
 from sim_hal.faults.bench import Bench
 from sim_hal.faults.grammar import parse
 from sim_hal.faults.schedule import put
+from sim_hal.orbit_devices import GPS_LINE
 from sim_hal.serving.device_link import Inbox, pack
 from sim_hal.settings import Simulation, Sky
 from sim_hal.worlds.truth import TruthRecorder
+
+if TYPE_CHECKING:
+    from sim_hal.earth_camera import EarthCameraModel, EarthScene
 
 SOCKET_NAME = "devices.sock"
 _LONGEST_WAIT_NS = 20_000_000
@@ -44,11 +49,12 @@ _PR_SET_PDEATHSIG = 1
 _renderer: list[StarRenderer] = []
 
 
-def _prepare_renderer(camera: Camera, sky: Sky, seed: int) -> None:
+def _prepare_renderer(camera: Camera | None, sky: Sky, seed: int) -> None:
     """Load the sky once in the rendering process, which ends whenever the server does."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _renderer.append(StarRenderer(camera, sky, seed))
+    if camera is not None:
+        _renderer.append(StarRenderer(camera, sky, seed))
 
 
 def _render(sequence: int, times: FloatArray, attitudes: FloatArray) -> Image:
@@ -60,7 +66,7 @@ class _Connection:
 
     def __init__(self, line: socket.socket) -> None:
         self.line = line
-        self.wants_frames = False
+        self.wants_frames: set[int] = set()
         self._inbox = Inbox()
 
     def requests(self) -> list[Any] | None:
@@ -78,7 +84,7 @@ class _Connection:
         try:
             self.line.sendall(pack(message))
         except OSError:
-            self.wants_frames = False
+            self.wants_frames.clear()
 
 
 class DeviceServer:
@@ -92,9 +98,20 @@ class DeviceServer:
         self._pool = _renderer_pool(config, section)
         self._rendering: Future[Image] | None = None
         self._pty = PtyLine(config.inertial_unit.baud_rate, line_generator(section.seed))
+        self._gps_pty = None
+        if config.gps is not None:
+            self._gps_pty = PtyLine(config.gps.baud_rate, line_generator(section.seed, GPS_LINE))
         self.hardware: Hardware = assemble(
-            config, section, self._clock.now_ns, self._pty, TruthRecorder(self._log), self._expose
+            config,
+            section,
+            self._clock.now_ns,
+            self._pty,
+            TruthRecorder(self._log),
+            self._expose,
+            gps_line=self._gps_pty,
+            expose_wide=self._expose_wide,
         )
+        self._lines = [line for line in (self._pty, self._gps_pty) if line is not None]
         self._faults_drawn = fault_generator(section.seed)
         self._frames_sent = 0
         self._served_anybody = False
@@ -105,8 +122,10 @@ class DeviceServer:
         self._listener.bind(str(self.socket_path))
         self._listener.listen(8)
         self._selector.register(self._listener, selectors.EVENT_READ)
-        self._selector.register(self._pty.fileno(), selectors.EVENT_READ)
+        for line in self._lines:
+            self._selector.register(line.fileno(), selectors.EVENT_READ)
         self.serial_device = self._pty.name
+        self.gps_device = None if self._gps_pty is None else self._gps_pty.name
 
     def stop(self, *_: int | FrameType | None) -> None:
         """End `serve`; a signal handler."""
@@ -123,12 +142,13 @@ class DeviceServer:
                 left_ns = now_ns
             elif patience_ns is not None and now_ns - left_ns > patience_ns:
                 return
-            self._pty.exchange(now_ns)
+            for pty in self._lines:
+                pty.exchange(now_ns)
             self.hardware.simulation.advance_to(now_ns)
-            self._deliver_frame()
+            self._deliver_frames()
             due_ns = min(
                 self.hardware.simulation.next_event_ns(),
-                self._pty.to_host.next_arrival_ns(),
+                *(pty.to_host.next_arrival_ns() for pty in self._lines),
                 now_ns + _LONGEST_WAIT_NS,
             )
             for key, _ in self._selector.select(max(0, due_ns - self._clock.now_ns()) * 1e-9):
@@ -145,7 +165,8 @@ class DeviceServer:
             connection.line.close()
         self._listener.close()
         self._place.cleanup()
-        self._pty.close()
+        for pty in self._lines:
+            pty.close()
         self._log.close()
 
     def _expose(self, sequence: int, times: FloatArray, attitudes: FloatArray) -> Future[Image]:
@@ -155,6 +176,14 @@ class DeviceServer:
             self._rendering.cancel()
         self._rendering = self._pool.submit(_render, sequence, times, attitudes)
         return self._rendering
+
+    def _expose_wide(
+        self, model: EarthCameraModel, scene: EarthScene, seed: tuple[int, ...]
+    ) -> Future[Image]:
+        from sim_hal.orbit_assembly import render_wide  # noqa: PLC0415 - see `orbit_devices`
+
+        assert self._pool is not None
+        return self._pool.submit(render_wide, model, scene, seed)
 
     def _accept(self) -> None:
         line, _ = self._listener.accept()
@@ -181,11 +210,12 @@ class DeviceServer:
                 connection.answer([number, "done", result, ""])
 
     def _operations(self) -> dict[str, Callable[..., Any]]:
-        bus, camera = self.hardware.bus, self.hardware.camera
+        bus, cameras = self.hardware.bus, self._cameras()
 
-        def trigger(connection: _Connection, exposure_ns: int) -> None:
+        def trigger(connection: _Connection, exposure_ns: int, number: int = 0) -> None:
+            camera = cameras[number]
             if camera is not None:
-                connection.wants_frames = True
+                connection.wants_frames.add(number)
                 camera.trigger(exposure_ns)
 
         return {
@@ -202,19 +232,27 @@ class DeviceServer:
         """Release the body and schedule the faults of a flight process."""
         self.hardware.release(epoch_ns)
         generator = self._faults_drawn
-        bench = Bench(self.hardware, self._pty, self._clock.now_ns, generator, None, flight_process)
+        bench = Bench(
+            self.hardware, self._pty, self._clock.now_ns, generator, None, flight_process, self._gps_pty
+        )
         put([parse(text) for text in faults], bench, epoch_ns)
 
-    def _deliver_frame(self) -> None:
-        camera = self.hardware.camera
-        frame = camera.poll() if camera is not None else None
-        if frame is None:
-            return
-        path = self.socket_path.parent / f"frame-{self._frames_sent % _FRAME_SLOTS}.raw"
+    def _cameras(self) -> tuple[EmulatedStarCamera | None, ...]:
+        """Return the star camera, which has number 0, and the wide ones."""
+        return self.hardware.camera, *self.hardware.orbit.wide
+
+    def _deliver_frames(self) -> None:
+        for number, camera in enumerate(self._cameras()):
+            frame = camera.poll() if camera is not None else None
+            if frame is not None:
+                self._announce(number, frame)
+
+    def _announce(self, number: int, frame: Frame) -> None:
+        path = self.socket_path.parent / f"frame-{number}-{self._frames_sent % _FRAME_SLOTS}.raw"
         self._frames_sent += 1
         path.write_bytes(frame.pixels.tobytes())
         for connection in self._connections.values():
-            if connection.wants_frames:
+            if number in connection.wants_frames:
                 connection.answer([0, "frame", _describe(frame), path.name])
 
 
@@ -230,7 +268,7 @@ def _describe(frame: Frame) -> list[Any]:
 
 def _renderer_pool(config: Config, section: Simulation) -> ProcessPoolExecutor | None:
     """Start the rendering process, which loads the sky at once, without waiting for it."""
-    if config.camera is None:
+    if config.camera is None and not config.wide_cameras:
         return None
     pool = ProcessPoolExecutor(
         1,

@@ -36,6 +36,7 @@ from sim_hal.worlds.free_body.rotation import (
     turned,
 )
 from sim_hal.worlds.free_body.section import FreeBodySection, OrbitSection, TipOff
+from sim_hal.worlds.free_body.streams import generators
 from sim_hal.worlds.motion import Motion
 from sim_hal.worlds.orbit import KeplerianElements
 from sim_hal.worlds.surroundings import Surroundings
@@ -45,7 +46,6 @@ UNIX_EPOCH = 2_440_587.5
 """The Julian date of 1970."""
 LONGEST_STEP = 0.1
 """s; air, sunlight and residual dipole are held as long, as they are in the middle of that time."""
-_STREAM = 0xF4EE
 ZERO: Floats = (0.0, 0.0, 0.0)
 
 
@@ -94,7 +94,7 @@ class FreeBody:
         start_ns: int = 0,
     ) -> None:
         """Hold the body still until it is released; `utc` labels `start_ns`."""
-        errors, tip_off, weather = (np.random.default_rng([seed, _STREAM, stream]) for stream in range(3))
+        errors, tip_off, weather = generators(seed)
         multiples = section.disturbances
         craft = CRAFTS[section.craft] if isinstance(section.craft, str) else section.craft
         self.craft = build(craft, multiples, errors)

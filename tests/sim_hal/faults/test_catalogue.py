@@ -10,6 +10,7 @@ from hal.drivers.pca9685 import PRE_SCALE
 from hal.interfaces.errors import NotResponding
 from sim_hal import lockstep
 from sim_hal.clock import SimClock
+from sim_hal.emulators.device import NEVER
 from sim_hal.emulators.serial_line import SOUND, LineFaults
 from sim_hal.faults.bench import Bench
 from sim_hal.faults.catalogue import CATALOGUE
@@ -19,9 +20,13 @@ from sim_hal.faults.schedule import put
 from sim_hal.lockstep import LockStep
 from sim_hal.worlds.coil_circuit import Condition
 from tests.scenario.flights import demo_config, demo_world
+from tests.sim_hal.orbit_devices.fitted import orbit_config, orbit_world
 
 OUTSIDE = [kind for kind in CATALOGUE.values() if kind.begin is not None and kind.where is Where.BOTH]
 SECOND_NS = 1_000_000_000
+
+
+IN_ORBIT = {"gps", "strings", "wide"}
 
 
 @pytest.fixture
@@ -30,9 +35,16 @@ def lock() -> LockStep:
     return lockstep.build(config, demo_world(), None, SimClock())
 
 
+@pytest.fixture(scope="module")
+def orbit() -> LockStep:
+    """Return the devices of an orbit; every fault leaves them as they were."""
+    return lockstep.build(orbit_config(), orbit_world(), None, SimClock())
+
+
 def bench_of(lock: LockStep) -> Bench:
     generator = np.random.default_rng(1)
-    return Bench(lock.hardware, lock.line, lock.clock.now_ns, generator, lock.line.host)
+    line = lock.line
+    return Bench(lock.hardware, line, lock.clock.now_ns, generator, line.host, gps_line=lock.gps_line)
 
 
 def is_sound(lock: LockStep) -> bool:
@@ -57,7 +69,41 @@ def is_sound(lock: LockStep) -> bool:
     )
 
 
-@pytest.mark.parametrize("kind", OUTSIDE, ids=lambda kind: kind.name)
+def orbit_is_sound(lock: LockStep) -> bool:
+    """Return whether no effect of any fault remains on the devices of an orbit."""
+    devices, bus = lock.hardware.orbit, lock.hardware.bus
+    gps, strings = devices.gps, devices.strings
+    assert gps is not None
+    assert strings is not None
+    assert lock.gps_line is not None
+    return (
+        lock.gps_line.to_host.faults == SOUND
+        and gps.next_event_ns() < NEVER
+        and not (gps.blind or gps.frozen or gps.clock_ns or gps.shift.any())
+        and not (strings.frozen or strings.dead.any() or strings.gain != 1.0)
+        and set(strings.parts) <= set(bus._parts)
+        and all(not camera.fault and not camera.late_ns for camera in devices.wide)
+    )
+
+
+@pytest.mark.parametrize(
+    "kind", [kind for kind in OUTSIDE if kind.device in IN_ORBIT], ids=lambda kind: kind.name
+)
+def test_a_fault_of_an_orbits_device_that_is_lifted_leaves_nothing_broken(
+    orbit: LockStep, kind: FaultKind
+) -> None:
+    begin_ns = orbit.clock.now_ns()
+    put([parse(f"{kind.name} @ 0.1 for 0.3")], bench_of(orbit), begin_ns)
+    assert orbit_is_sound(orbit)
+    orbit.clock.sleep_until_ns(begin_ns + SECOND_NS // 5)
+    assert not orbit_is_sound(orbit)
+    orbit.clock.sleep_until_ns(begin_ns + SECOND_NS)
+    assert orbit_is_sound(orbit)
+
+
+@pytest.mark.parametrize(
+    "kind", [kind for kind in OUTSIDE if kind.device not in IN_ORBIT], ids=lambda kind: kind.name
+)
 def test_a_fault_that_is_lifted_leaves_nothing_broken(lock: LockStep, kind: FaultKind) -> None:
     put([parse(f"{kind.name} @ 1 for 1.3")], bench_of(lock), 0)
     assert is_sound(lock)

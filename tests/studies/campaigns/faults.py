@@ -23,6 +23,7 @@ from flight.schema import reader as configuration
 from flight.schema.sections import Commands, CommandStep, Config, Modes
 from sim_hal.faults.catalogue import CATALOGUE
 from sim_hal.faults.kinds import FaultKind, Where
+from sim_hal.faults.schedule import fitted
 from sim_hal.settings import FaultEntry
 from tests.scenario.flights import demo_config, demo_world, fly
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
@@ -38,8 +39,10 @@ _LOOKS = {"camera", "vision"}
 
 
 def faults() -> list[FaultKind]:
-    """Return the faults that make sense in lock-step."""
-    return [kind for kind in CATALOGUE.values() if kind.where is Where.BOTH]
+    """Return the faults of the testbed's devices that make sense in lock-step."""
+    config = demo_config(30.0)
+    both = [kind for kind in CATALOGUE.values() if kind.where is Where.BOTH]
+    return [kind for kind in both if fitted(kind.device, config)]
 
 
 def cases(runs: int, seed: int) -> list[Case]:

@@ -1,0 +1,192 @@
+"""Basilisk as the world of a flight: `simulation.world: sim_hal.worlds.basilisk.world:make`.
+
+It reads the section `simulation.free_body` and builds the same craft from the same seed as our own world, so
+their figures can be laid side by side. Basilisk steps by 25 ms; between two steps the motion is carried on at
+its rate. A change of currents acts from the next step on. The walks of air and dipole, the ring current and
+the day bulge are ours alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from datetime import datetime
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from flight.gnc.earth.sun import ASTRONOMICAL_UNIT, DAY
+from flight.gnc.math import quaternion
+from flight.gnc.math.arrays import FloatArray
+from flight.schema.errors import ConfigError
+from hal.interfaces.wires import SECOND_NS
+from sim_hal.emulators.device import NEVER
+from sim_hal.worlds import sun
+from sim_hal.worlds.free_body.body import CoilPower, elements, julian_date, released
+from sim_hal.worlds.free_body.craft import CRAFTS, build
+from sim_hal.worlds.free_body.section import FreeBodySection
+from sim_hal.worlds.free_body.streams import generators
+from sim_hal.worlds.motion import Motion
+from sim_hal.worlds.surroundings import Floats, Surroundings
+from sim_hal.worlds.world import WorldInputs, WorldTruth
+
+if TYPE_CHECKING:
+    from sim_hal.worlds.basilisk.scenario import Scenario
+
+
+STEP_NS = 25_000_000
+
+
+class BasiliskWorld:
+    """A craft in a Basilisk simulation; an `OrbitingWorld`."""
+
+    def __init__(
+        self,
+        section: FreeBodySection,
+        currents: Callable[[], FloatArray],
+        power: CoilPower,
+        seed: int,
+        utc: str,
+        start_ns: int,
+    ) -> None:
+        """Hold the body still until it is released. Raises ConfigError where Basilisk is missing."""
+        if section.disturbances.gravity_gradient not in {0.0, 1.0}:
+            raise ConfigError("simulation.free_body.disturbances.gravity_gradient", "is 0 or 1 in Basilisk")
+        errors, tip_off, _ = generators(seed)
+        craft = CRAFTS[section.craft] if isinstance(section.craft, str) else section.craft
+        self.craft = build(craft, section.disturbances, errors)
+        self._attitude, rate = released(section.release, tip_off)
+        self._tip_off = np.array(rate)
+        self._utc_start_ns = round(datetime.fromisoformat(utc).timestamp()) * SECOND_NS
+        self._start_ns, self._release_ns, self._held = start_ns, NEVER, True
+        orbit = elements(section.orbit, julian_date(utc))
+        self._scenario = _scenario()(
+            self.craft, section.disturbances, orbit, self._attitude, self._utc_start_ns
+        )
+        self._currents, self._power = currents, power
+        self._acting: FloatArray = np.zeros(3)
+        self._stepped_ns = 0  # since the start; Basilisk's own time
+        self._placed_ns = 0
+        self.time_ns = start_ns
+        self.energy = self.supply_energy = 0.0
+
+    def release_at(self, time_ns: int) -> None:
+        """Release the body at `time_ns`, now or later; in effect at the next step."""
+        self._release_ns = time_ns
+
+    def advance_to(self, time_ns: int) -> None:
+        """Advance to `time_ns` under the present currents."""
+        if time_ns <= self.time_ns:
+            return
+        self._acting = self._currents()
+        if not self._held:
+            self._spend((time_ns - self.time_ns) * 1e-9)
+        self.time_ns = time_ns
+        since = time_ns - self._start_ns
+        while self._stepped_ns + STEP_NS <= since:
+            if self._held and self._start_ns + self._stepped_ns >= self._release_ns:
+                self._held = False
+                self._scenario.set_rotation(self._attitude, self._tip_off)
+            self._step(since)
+
+    def motion(self, time_ns: int) -> Motion:
+        """Advance to `time_ns` and return the motion there; in free fall nothing presses on the body."""
+        self.advance_to(time_ns)
+        attitude, rate = self._attitude, np.zeros(3)
+        if not self._held:
+            state = self._scenario.craft.scStateOutMsg.read()
+            rate = np.array(state.omega_BN_B)
+            turn = quaternion.from_rotation_vector(rate * self._behind())
+            attitude = quaternion.multiply(turn, _of_rodrigues(np.array(state.sigma_BN)))
+        field = quaternion.attitude_matrix(attitude) @ self._field()
+        return Motion(self.time_ns, attitude, rate, field, np.zeros(3))
+
+    def surroundings(self) -> Surroundings:
+        """Return what surrounds the craft now, ICRS."""
+        state = self._scenario.craft.scStateOutMsg.read()
+        velocity = np.array(state.v_BN_N)
+        position = np.array(state.r_BN_N) + velocity * self._behind()
+        away = sun.position(self._date()) - position
+        distance = float(np.linalg.norm(away))
+        seen = float(self._scenario.shadow.eclipseOutMsgs[0].read().shadowFactor)
+        return Surroundings(
+            _floats(position),
+            _floats(velocity),
+            _floats(self._field()),
+            _floats(away / distance),
+            seen * (ASTRONOMICAL_UNIT / distance) ** 2,
+            seen,
+            float(self._scenario.air.envOutMsgs[0].read().neutralDensity),
+            (0.0, 0.0, 0.0),
+        )
+
+    def utc_ns(self) -> int:
+        """Return UTC of the present state, ns since 1970."""
+        return self._utc_start_ns + self.time_ns - self._start_ns
+
+    def truth(self) -> WorldTruth:
+        """Return currents and energies of the state as it is."""
+        return WorldTruth(self._acting, self.energy, self.supply_energy)
+
+    def _step(self, until_ns: int) -> None:
+        """Run as many steps as fit before `until_ns`, the release and the next whole second."""
+        ends = min(until_ns, (self._stepped_ns // SECOND_NS + 1) * SECOND_NS)
+        if self._held and self._release_ns < NEVER:
+            ends = min(ends, max(self._stepped_ns + STEP_NS, self._release_ns - self._start_ns))
+        steps = max(1, (ends - self._stepped_ns) // STEP_NS)
+        if self._stepped_ns - self._placed_ns >= SECOND_NS:
+            self._placed_ns = self._stepped_ns
+            self._scenario.place_bodies(self._date(), self._stepped_ns)
+        light = float(self._scenario.shadow.eclipseOutMsgs[0].read().shadowFactor)
+        residual = self.craft.constant_dipole + light * self.craft.sunlit_dipole
+        dipole = _floats(self.craft.coil_dipole @ self._acting + residual)
+        self._scenario.set_dipole(dipole, self._stepped_ns)
+        self._stepped_ns += steps * STEP_NS
+        self._scenario.run_to(self._stepped_ns)
+
+    def _field(self) -> FloatArray:
+        return np.array(self._scenario.field.envOutMsgs[0].read().magField_N)
+
+    def _behind(self) -> float:
+        """Return by how many seconds Basilisk is behind the present time."""
+        return (self.time_ns - self._start_ns - self._stepped_ns) * 1e-9
+
+    def _date(self) -> float:
+        return 2_440_587.5 + (self._utc_start_ns + self._stepped_ns) * 1e-9 / DAY
+
+    def _spend(self, span: float) -> None:
+        squares = self._acting * self._acting
+        self.energy += span * float(np.dot(self._power.resistance, squares))
+        self.supply_energy += span * self._power.supply_voltage * float(np.abs(self._acting).sum())
+
+
+def _scenario() -> type[Scenario]:
+    try:
+        from sim_hal.worlds.basilisk.scenario import Scenario  # noqa: PLC0415 - seven seconds, and optional
+    except ImportError as error:
+        problem = f"needs Basilisk ({error}): pip install 'knightcube-flight[worlds]'"
+        raise ConfigError("simulation.world", problem) from error
+    return Scenario
+
+
+def _of_rodrigues(parameters: FloatArray) -> FloatArray:
+    """Return the quaternion (4,) of modified Rodrigues parameters (3,)."""
+    square = float(parameters @ parameters)
+    return np.append(2.0 * parameters, 1.0 - square) / (1.0 + square)
+
+
+def _floats(vector: FloatArray) -> Floats:
+    x, y, z = vector.tolist()
+    return x, y, z
+
+
+def make(inputs: WorldInputs) -> BasiliskWorld:
+    """Return the world of a configuration. Raises ConfigError without its section, or without Basilisk."""
+    config, section = inputs.config, inputs.section
+    if section.free_body is None:
+        raise ConfigError("simulation.free_body", "is missing: this world needs it")
+    power = CoilPower(
+        section.truth.resistance or config.coils.resistance,
+        section.truth.supply_voltage or config.coils.supply_voltage,
+    )
+    body = section.free_body
+    return BasiliskWorld(body, inputs.currents, power, section.seed, section.utc, inputs.start_ns)

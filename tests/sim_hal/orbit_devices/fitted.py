@@ -1,0 +1,64 @@
+"""A configuration with every device of an orbit, in the world of a free body."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flight.gnc.math import quaternion
+from flight.gnc.math.arrays import FloatArray
+from flight.schema import reader
+from flight.schema.orbit_devices import Gps, SolarString, SolarStrings, WideCamera
+from flight.schema.testbed import TestbedConfig
+from sim_hal.settings import Simulation
+from sim_hal.worlds.free_body.body import FreeBody
+from sim_hal.worlds.free_body.section import FreeBodySection, OrbitSection, TipOff
+from sim_hal.worlds.surroundings import Surroundings
+from tests.scenario.flights import demo_config, demo_world
+
+UTC = "2026-03-20T12:00:00Z"
+FACES = (
+    (1.0, 0.0, 0.0),
+    (0.0, 1.0, 0.0),
+    (0.0, 0.0, 1.0),
+    (-1.0, 0.0, 0.0),
+    (0.0, -1.0, 0.0),
+    (0.0, 0.0, -1.0),
+)
+DOWN = float(np.sqrt(0.5))
+
+
+def orbit_config(camera: bool = False) -> TestbedConfig:
+    """Return the demonstration's configuration with receiver, six strings and two wide cameras."""
+    strings = tuple(
+        SolarString(normal=face, address=0x48 + index // 4, channel=index % 4)
+        for index, face in enumerate(FACES)
+    )
+    wide = (
+        WideCamera(),
+        WideCamera(columns=128, rows=128, mounting=(DOWN, 0.0, 0.0, DOWN)),
+    )
+    config = demo_config(10.0, camera=camera)
+    return reader.replace(config, gps=Gps(), solar_strings=SolarStrings(strings=strings), wide_cameras=wide)
+
+
+def orbit_world(boresight: FloatArray | None = None) -> Simulation:
+    """Return a world in orbit with the ascending node under the Sun; body +z points to `boresight`, ICRS."""
+    attitude = None
+    if boresight is not None:
+        boresight = boresight / np.linalg.norm(boresight)
+        across = np.cross(boresight, [0.3, 0.5, 0.8])
+        across = across / np.linalg.norm(across)
+        x, y, z, w = quaternion.from_matrix(
+            np.stack([across, np.cross(boresight, across), boresight])
+        ).tolist()
+        attitude = (x, y, z, w)
+    release = TipOff(speed=0.02, attitude=attitude)
+    body = FreeBodySection(orbit=OrbitSection(local_time=12.0), release=release)
+    return reader.replace(demo_world(), world="free_body", free_body=body, release=None, utc=UTC, seed=3)
+
+
+def at_first() -> Surroundings:
+    """Return what surrounds the craft at the beginning."""
+    section = orbit_world().free_body
+    assert section is not None
+    return FreeBody(section, lambda: np.zeros(3), seed=3, utc=UTC).surroundings()

@@ -1,0 +1,236 @@
+"""The devices of an orbit through the drivers that fly, in lock-step."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flight.app.devices import open_gps, open_strings
+from flight.gnc.camera.pinhole import Pinhole
+from flight.gnc.camera.pixel_access import ArrayPixels
+from flight.gnc.earth.figure import EARTH_RADIUS
+from flight.gnc.math import quaternion
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.vision.sun_sensor.direction import find_sun
+from flight.gnc.vision.sun_sensor.settings import SunSettings
+from flight.schema import reader
+from flight.schema.errors import ConfigError
+from hal.interfaces.errors import NotResponding
+from hal.interfaces.readings import Frame, GpsReading
+from hal.interfaces.rig import Rig
+from hal.interfaces.wires import SECOND_NS
+from sim_hal import lockstep
+from sim_hal.clock import SimClock
+from sim_hal.faults.grammar import parse
+from sim_hal.faults.schedule import put
+from sim_hal.lockstep import LockStep, utc_ns
+from sim_hal.orbit_assembly import wide_model
+from sim_hal.orbit_sky import aberrated, view
+from sim_hal.worlds.free_body.body import FreeBody
+from tests.scenario.flights import TEXT, demo_world
+from tests.sim_hal.faults.test_catalogue import bench_of
+from tests.sim_hal.orbit_devices.fitted import UTC, at_first, orbit_config, orbit_world
+
+
+@pytest.fixture
+def lock() -> LockStep:
+    return lockstep.build(orbit_config(), orbit_world(), None, SimClock(utc_ns(UTC)))
+
+
+def opened(lock: LockStep, stack: ExitStack) -> Rig:
+    return Rig(lock.clock, lock.wires, lock.release, False, 1)
+
+
+def shot(lock: LockStep, number: int = 0) -> Frame | None:
+    """Return the frame of a wide camera half a second after its trigger."""
+    camera = lock.wires.wide[number]
+    camera.trigger(5_000_000)
+    lock.clock.sleep_until_ns(lock.clock.now_ns() + SECOND_NS // 2)
+    return camera.poll()
+
+
+def fixes(lock: LockStep, rig: Rig, stack: ExitStack, seconds: int) -> list[GpsReading]:
+    gps = open_gps(orbit_config(), rig, stack)
+    assert gps is not None
+    found = []
+    for _ in range(10 * seconds):
+        lock.clock.sleep_until_ns(lock.clock.now_ns() + SECOND_NS // 10)
+        found += gps.poll()
+    return found
+
+
+def test_the_receivers_time_is_the_simulations_and_its_place_the_worlds(lock: LockStep) -> None:
+    with ExitStack() as stack:
+        newest = fixes(lock, opened(lock, stack), stack, 5)[-1]
+    assert newest.valid
+    age = lock.clock.utc_ns() - newest.utc_ns
+    assert 0 < age < 2 * SECOND_NS
+    world = lock.hardware.world
+    assert isinstance(world, FreeBody)
+    assert np.linalg.norm(newest.position) == pytest.approx(
+        np.linalg.norm(world.surroundings().position), abs=2e3
+    )
+
+
+def test_the_strings_are_read_over_the_coils_bus(lock: LockStep) -> None:
+    with ExitStack() as stack:
+        strings = open_strings(orbit_config(), opened(lock, stack), stack)
+        assert strings is not None
+        lock.clock.sleep_until_ns(2 * SECOND_NS)
+        reading = strings.latest()
+        assert reading is not None
+        assert reading.currents.max() > 0.25  # one of six faces stands within 55 deg of the Sun
+        assert strings.error() == ""
+
+
+def looking(boresight: FloatArray, camera: bool = False) -> LockStep:
+    return lockstep.build(orbit_config(camera), orbit_world(boresight), None, SimClock(utc_ns(UTC)))
+
+
+def test_a_wide_camera_sees_the_sun_where_it_is() -> None:
+    around = at_first()
+    aside = np.cross(around.sun, [0.0, 0.0, 1.0])
+    frame = shot(looking(np.array(around.sun) + 0.2 * aside))
+    assert frame is not None
+    model = wide_model(orbit_config().wide_cameras[0])
+    solution = find_sun(ArrayPixels(frame.pixels), model.lens, SunSettings())
+    assert solution.sun is not None
+    tilt = np.arccos(np.clip(solution.sun.direction[2], -1.0, 1.0))
+    assert tilt == pytest.approx(np.arctan(0.2 * np.linalg.norm(aside)), abs=np.radians(0.5))
+
+
+def test_a_wide_camera_sees_the_dark_sky_above_and_the_bright_earth_below() -> None:
+    around = at_first()
+    up = np.array(around.position) / np.linalg.norm(around.position)
+    north = np.cross(up, np.cross([0.0, 0.0, 1.0], up))
+    sky, ground = shot(looking(north + 0.8 * up)), shot(looking(-up))
+    assert sky is not None
+    assert ground is not None
+    assert np.median(sky.pixels) < 20
+    assert np.median(ground.pixels) > 40
+
+
+def test_frames_repeat_with_the_seed_and_cost_little(lock: LockStep) -> None:
+    other = lockstep.build(orbit_config(), orbit_world(), None, SimClock(utc_ns(UTC)))
+    first, second = shot(lock, 1), shot(other, 1)
+    assert first is not None
+    assert second is not None
+    np.testing.assert_array_equal(first.pixels, second.pixels)
+
+
+def test_faults_reach_the_drivers(lock: LockStep) -> None:
+    faults = ["gps: false (distance=50000) @ 3", "strings: off @ 1", "wide: off (camera=2) @ 1"]
+    put([parse(fault) for fault in faults], bench_of(lock), 0)
+    with ExitStack() as stack:
+        rig = opened(lock, stack)
+        strings = open_strings(orbit_config(), rig, stack)
+        assert strings is not None
+        found = fixes(lock, rig, stack, 6)
+        # In a second the satellite moves by 7.1 km over the ground.
+        jumps = np.diff([fix.position for fix in found if fix.valid], axis=0)
+        assert sorted(np.linalg.norm(jumps, axis=1))[-1] > 4e4
+        assert "check its power" in strings.error()
+    assert shot(lock, 0) is not None
+    with pytest.raises(NotResponding):
+        lock.wires.wide[1].trigger(5_000_000)
+
+
+def test_a_world_without_an_orbit_has_no_such_devices() -> None:
+    with pytest.raises(ConfigError, match=r"gps: needs a world with an orbit"):
+        lockstep.build(orbit_config(), demo_world(), None, SimClock())
+
+
+DEVICES = """
+gps: {period: 2.0}
+solar_strings:
+  strings:
+    - {normal: [1, 0, 0], channel: 0}
+    - {normal: [-1, 0, 0], channel: 1}
+    - {normal: [0, 1, 0], channel: 2}
+    - {normal: [0, 0, 1], channel: 3}
+wide_cameras:
+  - {mounting: [0, 0, 0, 1], field_of_view_deg: 70}
+"""
+
+
+def test_a_configuration_describes_the_devices() -> None:
+    config = reader.parse(TEXT + DEVICES)
+    assert config.gps is not None
+    assert config.solar_strings is not None
+    assert (config.gps.period, len(config.solar_strings.strings), len(config.wide_cameras)) == (2.0, 4, 1)
+    page = Path("docs/fly/simulation.md").read_text(encoding="utf-8")
+    shown = page.split("orbit_devices/test_in_lockstep.py -->\n```yaml\n")[1].split("```")[0]
+    documented = reader.parse(TEXT + shown)
+    assert documented.gps is not None
+    assert documented.gps.device == "/dev/ttyS2"
+    assert reader.parse(TEXT + "gps: none\n").gps is None
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "complaint"),
+    [
+        ("channel: 1}", "channel: 0}", r"strings\[1\].channel.*another string"),
+        (
+            "[0, 1, 0], channel: 2",
+            "[0, 1, 0], channel: 2, address: 0x40",
+            r"strings\[2\].address.*another part",
+        ),
+        ("[0, 0, 1]", "[0, 1, 1]", r"strings\[3\].normal.*unit vector"),
+        ("[0, 0, 0, 1]", "[0, 0, 0, 2]", r"wide_cameras\[0\].mounting.*length"),
+        ("period: 2.0", "period: 0.0", r"gps.period"),
+    ],
+)
+def test_impossible_devices_are_refused(old: str, new: str, complaint: str) -> None:
+    assert old in DEVICES
+    with pytest.raises(ConfigError, match=complaint):
+        reader.parse(TEXT + DEVICES.replace(old, new))
+
+
+def star_frame(boresight: FloatArray) -> Frame:
+    """Return a frame of the star camera along a direction, ICRS."""
+    lock = looking(boresight, camera=True)
+    frames = lock.wires.frames
+    assert frames is not None
+    frames.trigger(200_000_000)
+    lock.clock.sleep_until_ns(SECOND_NS)
+    frame = frames.poll()
+    assert frame is not None
+    return frame
+
+
+def test_sun_and_lit_earth_blind_the_star_camera_and_the_free_sky_shows_stars() -> None:
+    around = at_first()
+    up = np.array(around.position) / np.linalg.norm(around.position)
+    assert star_frame(np.array(around.sun)).pixels.min() == 65_535
+    assert star_frame(-up).pixels.min() == 65_535
+    stars = star_frame(np.cross(up, np.cross([0.0, 0.0, 1.0], up)) + 0.8 * up).pixels
+    assert stars.max() > 2 * np.median(stars)
+    assert np.median(stars) < 1000
+
+
+def test_the_dark_earth_hides_the_stars_behind_it() -> None:
+    pinhole = Pinhole.from_field_of_view(200, 200, np.radians(20.0))
+    around = at_first()._replace(position=(-7e6, 0.0, 0.0), sun=(1.0, 0.0, 0.0), sunlit=0.0)
+    disc = np.arcsin(EARTH_RADIUS / 7e6)
+    limb = np.array([np.cos(disc), np.sin(disc), 0.0])
+    to_camera = np.stack([np.array([-limb[1], limb[0], 0.0]), [0.0, 0.0, -1.0], limb])
+    blinded, hidden = view(pinhole, to_camera, around)
+    assert not blinded
+    assert hidden is not None
+    assert np.mean(hidden) == pytest.approx(0.5, abs=0.05)
+    assert hidden[100, 0]
+    assert not hidden[100, 199]
+
+
+def test_aberration_moves_the_stars_towards_the_velocity() -> None:
+    """20.5 arcsec at 29.8 km/s across, none along."""
+    attitude = quaternion.IDENTITY[None, :]
+    moved = aberrated(attitude, np.array([29_800.0, 0.0, 0.0]))
+    star = quaternion.attitude_matrix(moved)[0] @ [0.0, 0.0, 1.0]
+    assert np.degrees(star[0]) * 3600.0 == pytest.approx(20.5, abs=0.1)
+    assert star[1] == 0.0
+    along = aberrated(attitude, np.array([0.0, 0.0, 29_800.0]))
+    np.testing.assert_array_equal(along, attitude)
