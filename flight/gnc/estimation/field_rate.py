@@ -9,8 +9,8 @@ error:
 
     J(a) w' = m x B - w x J(a) w,    B' = v - w x B,    v' = -w x v,    a' = 0.
 
-The dipole m of the coils is known, so the coils may act between measurements. The filter keeps the turn
-since its start, which serves as an inertial frame.
+The dipole m of the coils is known, so the coils may act between measurements. The filter keeps the turn since
+its start, which serves as an inertial frame.
 """
 
 from __future__ import annotations

@@ -1,12 +1,11 @@
 """Detumbling of a free satellite by its magnetometer alone.
 
-The coils' own field swamps the magnetometer, so the coils pause: off to settle, off to measure, then on.
-From the samples of the pauses a filter follows the body's whole rate and how the field turns among the stars
+The coils' own field swamps the magnetometer, so the coils pause: off to settle, off to measure, then on. From
+the samples of the pauses a filter follows the body's whole rate and how the field turns among the stars
 (`flight.gnc.estimation.field_rate`), and the momentum plan brakes with the field turned ahead at that speed.
-Unlike B-dot
-the law cannot get stuck with the spin along the field: the plan holds what lies along the field until the
-field has turned. One sample starts nothing: the coils wait until `TRUSTED` samples in a row agree with the
-filter's prediction.
+Unlike B-dot the law cannot get stuck with the spin along the field: the plan holds what lies along the field
+until the field has turned. One sample starts nothing: the coils wait until `TRUSTED` samples in a row agree
+with the filter's prediction.
 """
 
 from __future__ import annotations

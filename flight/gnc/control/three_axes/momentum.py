@@ -5,8 +5,8 @@ Pontryagin's principle the dipole of least time has its limit's length and the d
 constant vector y; with a smooth limit it is m = -B x y, cut at the limit. Over a horizon it removes W y, W
 the integral of the weighted B^2 I - B B^T, where the weight of an instant is the share of -B x y that the
 limit lets pass. Weight and y follow from each other by iteration; the horizon is the shortest whose plan
-removes h. A field that keeps its direction cannot
-remove the momentum along itself: the plan then waits for the field to turn, and uses how it turns.
+removes h. A field that keeps its direction cannot remove the momentum along itself: the plan then waits for
+the field to turn, and uses how it turns.
 """
 
 from __future__ import annotations

@@ -1,0 +1,126 @@
+"""The pointing law: from an estimate and a table of gains to a dipole."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from flight.gnc.control.three_axes.pointing_table import PointingTable
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import (
+    attitude_matrix,
+    conjugate,
+    from_rotation_vector,
+    multiply,
+    to_rotation_vector,
+)
+
+LARGEST_TURN = math.radians(20.0)
+"""rad: a larger error is cut to this, its direction kept; the law is linear in small turns."""
+LARGEST_RATE = math.radians(1.0)
+"""rad/s, likewise."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reference:
+    """The wanted attitude (4,), rate (3,) rad/s and acceleration (3,) rad/s^2 at one time, in its axes."""
+
+    quaternion: FloatArray
+    rate: FloatArray
+    acceleration: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointingCommand:
+    """A command.
+
+    Attributes:
+        dipole: (3,) A m^2, within the limit.
+        turn: (3,) rad, of the body against the reference.
+        rate: (3,) rad/s, likewise.
+    """
+
+    dipole: FloatArray
+    turn: FloatArray
+    rate: FloatArray
+
+
+class PointingLaw:
+    """Computes dipoles from a table; has no state but the table."""
+
+    def __init__(self, table: PointingTable, limit: float) -> None:
+        """`limit` A m^2 of each coil."""
+        self._table = table
+        self._limit = limit
+        times = table.references.times
+        self._begin, self._step = float(times[0]), float(times[1] - times[0])
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """The first and last time of the table, s; the last revolution's gains have less preview."""
+        return self._begin, float(self._table.references.times[-1])
+
+    def reference(self, time: float) -> Reference:
+        """Return the wanted motion at a time, s, within the table's; at its ends that of the end."""
+        table, (k, share) = self._table.references, self._place(time)
+        near = k + round(share)
+        since = (share - round(share)) * self._step
+        rate, acceleration = table.rate[near], table.acceleration[near]
+        turned = from_rotation_vector(since * rate + 0.5 * since * since * acceleration)
+        return Reference(
+            multiply(turned, table.quaternion[near]),
+            (1.0 - share) * table.rate[k] + share * table.rate[k + 1],
+            (1.0 - share) * table.acceleration[k] + share * table.acceleration[k + 1],
+        )
+
+    def command(
+        self,
+        time: float,
+        quaternion: FloatArray,
+        rate: FloatArray,
+        field: FloatArray,
+        residual_dipole: FloatArray,
+        sizes: FloatArray,
+    ) -> PointingCommand:
+        """Return the command at `time` s for an attitude (4,) and a rate (3,) rad/s.
+
+        `field` (3,) T is in body axes. `residual_dipole` (3,) A m^2 and `sizes` (n,) of the torques are the
+        estimated disturbances: the dipole is cancelled at once, the torques as the field allows.
+        """
+        wanted = self.reference(time)
+        turn = to_rotation_vector(multiply(quaternion, conjugate(wanted.quaternion)))
+        # Both in the body's axes: at a large turn they differ from the reference's.
+        missed = rate - attitude_matrix(from_rotation_vector(turn)) @ wanted.rate
+        cut_turn, cut_rate = _cut(turn, LARGEST_TURN), _cut(missed, LARGEST_RATE)
+        # The table's rate error is the difference of components: without the reference's turned by the error.
+        error = np.concatenate([cut_turn, cut_rate - np.cross(cut_turn, wanted.rate)])
+        k, share = self._place(time)
+        table = self._table
+        pull = np.zeros(3)
+        for place, weight in ((k, 1.0 - share), (k + 1, share)):
+            pull += weight * (
+                table.gain[place] @ error + table.reference_part[place] + table.torque_part[place] @ sizes
+            )
+        # What lies along the field makes no torque.
+        dipole = field * (float(field @ pull) / float(field @ field)) - pull - residual_dipole
+        return PointingCommand(_limited(dipole, self._limit), turn, missed)
+
+    def _place(self, time: float) -> tuple[int, float]:
+        """Return the instant before a time, and the share of the step since."""
+        place = (time - self._begin) / self._step
+        last = len(self._table.references.times) - 2
+        k = min(max(math.floor(place), 0), last)
+        return k, min(max(place - k, 0.0), 1.0)
+
+
+def _cut(vector: FloatArray, longest: float) -> FloatArray:
+    length = math.sqrt(float(vector @ vector))
+    return vector if length <= longest else vector * (longest / length)
+
+
+def _limited(dipole: FloatArray, limit: float) -> FloatArray:
+    """Return the dipole, scaled as a whole to the limit of the coils, which keeps its torque's direction."""
+    largest = float(np.abs(dipole).max())
+    return dipole if largest <= limit else dipole * (limit / largest)

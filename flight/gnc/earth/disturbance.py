@@ -1,0 +1,63 @@
+"""Shapes of the torques that turn a satellite besides its coils: constant, of the air, of sunlight.
+
+The sizes are unknown and estimated; the shapes follow from the orbit. Air presses against the flight, four
+times as hard below the day's bulge as by night (Montenbruck & Gill 2000, 3.5.2: cos^4 of half the angle from
+an apex 30 deg behind the Sun); light presses away from the Sun. Each torque is c x d: c a constant of the
+body, N m (force by arm of the centre of pressure), d the direction in body axes by the strength. What is
+constant in body axes stands for the rest, above all the gravity gradient about principal axes that are
+turned.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from flight.gnc.earth.ephemeris import Ephemeris
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.directions import cross_matrices
+
+CONSTANT, AIR, LIGHT = slice(0, 3), slice(3, 6), slice(6, 9)
+SIZES = 9
+"""N m each: of the constant torque, of the air's and of sunlight's."""
+_NIGHT, _DAY = 0.4, 1.6
+_LAG = math.radians(30.0)
+_SCALE_HEIGHT = 65e3
+"""m, at 500 km."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pressures:
+    """Directions by strength, ICRS: of the flight through the air `air` (n, 3), to the Sun `light` (n, 3)."""
+
+    air: FloatArray
+    light: FloatArray
+
+
+def pressures(ephemeris: Ephemeris, times: FloatArray) -> Pressures:
+    """Return the shapes at times (n,) s: the air's about one in the mean, light's one in full sunlight."""
+    position, velocity = ephemeris.position_at(times), ephemeris.velocity_at(times)
+    sun = ephemeris.sun_at(times)
+    distance = np.linalg.norm(position, axis=1)
+    cosine, sine = math.cos(_LAG), math.sin(_LAG)
+    x, y, z = sun.T
+    apex = np.stack([cosine * x - sine * y, sine * x + cosine * y, z], axis=-1)
+    facing = np.sum(position * apex, axis=1) / distance
+    mean = float(np.mean(np.linalg.norm(ephemeris.position, axis=1)))
+    density = (_NIGHT + (_DAY - _NIGHT) * (0.5 + 0.5 * facing) ** 2) * np.exp(
+        (mean - distance) / _SCALE_HEIGHT
+    )
+    flight = velocity / np.linalg.norm(velocity, axis=1, keepdims=True)
+    return Pressures(density[:, None] * flight, ephemeris.sunlit_at(times)[:, None] * sun)
+
+
+def shapes(found: Pressures, to_body: FloatArray) -> FloatArray:
+    """Return the torques (n, 3, 9) of one newton metre of each size; `to_body` (n, 3, 3) from ICRS."""
+    torque = np.empty((len(to_body), 3, SIZES))
+    torque[:, :, CONSTANT] = np.eye(3)
+    # c x d = -[d x] c
+    torque[:, :, AIR] = -cross_matrices(np.einsum("nij,nj->ni", to_body, found.air))
+    torque[:, :, LIGHT] = -cross_matrices(np.einsum("nij,nj->ni", to_body, found.light))
+    return torque

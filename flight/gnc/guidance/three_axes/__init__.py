@@ -1,0 +1,1 @@
+"""Guidance of a free satellite: attitude laws, and the references that they give."""
