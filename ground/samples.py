@@ -78,8 +78,9 @@ def _streaks(name: str, generator: np.random.Generator) -> Sample:
 def _limb(name: str, generator: np.random.Generator) -> Sample:
     """Show the Earth's limb by day from a low orbit, the boresight 8 deg below it."""
     lens = Pinhole.from_field_of_view(EARTH_PIXELS, EARTH_PIXELS, math.radians(EARTH_FIELD_DEG))
-    size = {"rows": EARTH_PIXELS, "columns": EARTH_PIXELS}
-    model = earth_camera.EarthCameraModel(lens=lens, **size, response="linear", seed=1)
+    model = earth_camera.EarthCameraModel(
+        lens=lens, rows=EARTH_PIXELS, columns=EARTH_PIXELS, response="linear", seed=1
+    )
     radius = SEMI_MAJOR_AXIS + 1e3 * ALTITUDE_KM
     zenith, ahead = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.8, 0.6])
     angle = math.asin(SEMI_MAJOR_AXIS / radius) - math.radians(8.0)

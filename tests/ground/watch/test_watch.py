@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -131,7 +130,8 @@ def test_ctrl_c_ends_a_watch_in_order(watcher: subprocess.Popen[str], number: si
 
 
 def test_a_damaged_log_does_not_steer_the_terminal_and_gives_lines_all_the_same() -> None:
-    packer, view, lines = Packer(), View(), []
+    packer, view = Packer(), View()
+    lines: list[str] = []
     data = event(packer, events.STARTED, 1.0, "\x1b[2Jgone\x07\r")
     data += pack(packer, EVENT, -9e9, severity=200, name="odd", text="ü")
     data += pack(packer, MODE, 9e9, mode=77)
@@ -196,7 +196,7 @@ def test_a_flight_that_listens_is_asked_for_its_mode(tmp_path: Path) -> None:
 def test_a_flight_that_stops_to_answer_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ground.commands.watch._PING_S", 0.05)
     listener = Listener(tmp_path / "socket")
-    threading.Thread(target=lambda: (time.sleep(0.2), listener.will_say(b"x"))).start()
+    threading.Timer(0.2, listener.will_say, [b"x"]).start()
     done = command("watch", tmp_path / "socket", "--patience", "0.2")
     assert done.returncode == 1
     assert done.stdout.startswith("hold, answered in ")

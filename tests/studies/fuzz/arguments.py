@@ -37,7 +37,7 @@ from flight.link.telemetry.segments import SUFFIX
 from ground import samples
 from ground.commands import COMMANDS as GROUND_COMMANDS
 from ground.commands import camera as camera_command
-from ground.commands import watch as watch_command
+from ground.watch.socket import answers
 from sim_hal.faults.catalogue import CATALOGUE
 from tests.studies.fuzz.furnishings import Listener, answer, furnish
 from tests.studies.fuzz.harness import Finding
@@ -195,7 +195,7 @@ def _fault(draw: Draw) -> str:
     return os.fsdecode(spoilt) if chance(draw, 0.3) else fault
 
 
-_made_parser, _fly, _frames, _answers = cli._parser, flown.fly, camera_command._frames, watch_command.answers
+_made_parser, _fly, _frames = cli._parser, flown.fly, camera_command._frames
 _DRAWERS = tuple(f"ground.report.{name}" for name in ("draw", "draw_both", "draw_fit", "draw_path"))
 
 
@@ -268,7 +268,7 @@ def _few_frames(clock: Any, source: Any, exposure_ns: int, count: int) -> Iterat
 
 
 def _few_answers(to: str, patience: float, ended: threading.Event) -> Iterator[Any]:
-    return itertools.islice(_answers(to, min(patience, 0.1), ended), 2)
+    return itertools.islice(answers(to, min(patience, 0.1), ended), 2)
 
 
 def _not_drawn(*order: Any) -> list[Path]:
