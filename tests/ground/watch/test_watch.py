@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 
 from flight.link import events
-from flight.link.telemetry.definitions import EVENT, HEALTH, MODE, PACKETS, Packet
+from flight.link.telemetry.definitions import ATTITUDE, EVENT, HEALTH, MODE, PACKETS, Packet
 from flight.link.telemetry.packets import Packer
 from flight.link.telemetry.scanner import scan
 from ground.commands import watch
-from ground.watch.plain import PlainLines
+from ground.watch.plain import PlainLines, state_line
 from ground.watch.tail import LogTail
 from ground.watch.view import View
 from tests.ground.commands.in_process import command
@@ -173,6 +173,13 @@ def test_the_panel_shows_mode_attitude_currents_streams_and_the_newest_events(gr
     assert f"note {30 - LISTED_EVENTS}" in text
     assert f"note {29 - LISTED_EVENTS}\n" not in text
     assert "nan" not in text
+
+
+def test_a_body_without_an_estimate_has_no_attitude_and_one_without_currents_its_dipole() -> None:
+    view, nothing = View(), [float("nan")] * 4
+    fields = {"quaternion": nothing, "rate": nothing[:3], "target": nothing, "dipole": [0.01, -0.02, 0.0]}
+    view.update(scan(pack(Packer(), ATTITUDE, 1.0, mode=2, **fields)).packets)
+    assert state_line(view) == "    1.000 s   detumble  dipole +10.00 -20.00 +0.00 mA m^2"
 
 
 def test_a_terminal_without_rich_gets_lines_and_the_cure(
