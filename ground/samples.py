@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -79,7 +78,9 @@ def _streaks(name: str, generator: np.random.Generator) -> Sample:
 def _limb(name: str, generator: np.random.Generator) -> Sample:
     """Show the Earth's limb by day from a low orbit, the boresight 8 deg below it."""
     lens = Pinhole.from_field_of_view(EARTH_PIXELS, EARTH_PIXELS, math.radians(EARTH_FIELD_DEG))
-    model = earth_camera.EarthCameraModel(lens=lens, response="linear", seed=1)
+    model = earth_camera.EarthCameraModel(
+        lens=lens, rows=EARTH_PIXELS, columns=EARTH_PIXELS, response="linear", seed=1
+    )
     radius = SEMI_MAJOR_AXIS + 1e3 * ALTITUDE_KM
     zenith, ahead = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.8, 0.6])
     angle = math.asin(SEMI_MAJOR_AXIS / radius) - math.radians(8.0)
@@ -104,7 +105,6 @@ _MAKERS: dict[str, Callable[[str, np.random.Generator], Sample]] = {
 }
 
 
-@cache
 def _camera() -> star_camera.StarCameraModel:
     return star_camera.StarCameraModel(columns=PIXELS, rows=PIXELS, field_of_view=math.radians(FIELD_DEG))
 

@@ -121,8 +121,8 @@ def _merged(first: Object, second: Object) -> list[str]:
 
 def _row(name: str, first: tuple[Any, str] | None, second: tuple[Any, str] | None) -> Object:
     (a, unit), (b, other) = first or (None, ""), second or (None, "")
-    known = a is not None and b is not None
-    return {"figure": name, "unit": unit or other, "a": a, "b": b, "difference": b - a if known else None}
+    difference = None if a is None or b is None else b - a
+    return {"figure": name, "unit": unit or other, "a": a, "b": b, "difference": difference}
 
 
 def _events(first: Object, second: Object) -> list[Object]:

@@ -58,14 +58,14 @@ def state_line(view: View) -> str:
 
 
 def attitude_text(view: View) -> str:
-    """Return the attitude and the rate; empty before the first estimate."""
+    """Return the attitude and the rate; empty without an estimate."""
     rate = view.value("attitude", "rate")
     parts = []
-    if (q2 := view.value("control", "q2")) is not None:
+    if (q2 := view.value("control", "q2")) is not None and np.isfinite(q2):
         parts.append(f"q2 {q2:+.4f} -> {view.value('control', 'target_q2'):+.2f}")
     if (error := view.error_deg) is not None:
         parts.append(f"{error:.2f} deg off")
-    if rate is not None:
+    if rate is not None and np.all(np.isfinite(rate)):
         parts.append(f"{1e3 * float(np.linalg.norm(rate)):.2f} mrad/s")
     return "  ".join(parts)
 

@@ -87,7 +87,7 @@ def config(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_frames_of_a_turning_camera_have_their_truth_beside_them(config: Path, tmp_path: Path) -> None:
     """The rate is in the camera's own axes, whichever way it is mounted."""
     rate = ["0.03", "0.02", "-0.01"]
-    words = ["--exposure", "0.3", "--rate", *rate, "--count", "2", "--out", tmp_path / "turn.png"]
+    words = ["--exposure", "0.3", "--rate", *rate, "--count", "2", "--out", str(tmp_path / "turn.png")]
     done = command("camera", "--config", config, *words)
     assert done.returncode == 0, done.stderr
     truths = [json.loads((tmp_path / f"turn-{number}.json").read_text()) for number in (1, 2)]

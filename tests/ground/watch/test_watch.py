@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,11 +15,11 @@ import numpy as np
 import pytest
 
 from flight.link import events
-from flight.link.telemetry.definitions import EVENT, HEALTH, MODE, PACKETS, Packet
+from flight.link.telemetry.definitions import ATTITUDE, EVENT, HEALTH, MODE, PACKETS, Packet
 from flight.link.telemetry.packets import Packer
 from flight.link.telemetry.scanner import scan
 from ground.commands import watch
-from ground.watch.plain import PlainLines
+from ground.watch.plain import PlainLines, state_line
 from ground.watch.tail import LogTail
 from ground.watch.view import View
 from tests.ground.commands.in_process import command
@@ -131,7 +130,8 @@ def test_ctrl_c_ends_a_watch_in_order(watcher: subprocess.Popen[str], number: si
 
 
 def test_a_damaged_log_does_not_steer_the_terminal_and_gives_lines_all_the_same() -> None:
-    packer, view, lines = Packer(), View(), []
+    packer, view = Packer(), View()
+    lines: list[str] = []
     data = event(packer, events.STARTED, 1.0, "\x1b[2Jgone\x07\r")
     data += pack(packer, EVENT, -9e9, severity=200, name="odd", text="ü")
     data += pack(packer, MODE, 9e9, mode=77)
@@ -175,6 +175,13 @@ def test_the_panel_shows_mode_attitude_currents_streams_and_the_newest_events(gr
     assert "nan" not in text
 
 
+def test_a_body_without_an_estimate_has_no_attitude_and_one_without_currents_its_dipole() -> None:
+    view, nothing = View(), [float("nan")] * 4
+    fields = {"quaternion": nothing, "rate": nothing[:3], "target": nothing, "dipole": [0.01, -0.02, 0.0]}
+    view.update(scan(pack(Packer(), ATTITUDE, 1.0, mode=2, **fields)).packets)
+    assert state_line(view) == "    1.000 s   detumble  dipole +10.00 -20.00 +0.00 mA m^2"
+
+
 def test_a_terminal_without_rich_gets_lines_and_the_cure(
     growing: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -196,7 +203,7 @@ def test_a_flight_that_listens_is_asked_for_its_mode(tmp_path: Path) -> None:
 def test_a_flight_that_stops_to_answer_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ground.commands.watch._PING_S", 0.05)
     listener = Listener(tmp_path / "socket")
-    threading.Thread(target=lambda: (time.sleep(0.2), listener.will_say(b"x"))).start()
+    threading.Timer(0.2, listener.will_say, [b"x"]).start()
     done = command("watch", tmp_path / "socket", "--patience", "0.2")
     assert done.returncode == 1
     assert done.stdout.startswith("hold, answered in ")

@@ -1,10 +1,10 @@
 """Wrong command lines, in process: whatever is typed, the answer is a status and a line, never a traceback.
 
-A part of them are right ones with a word or two changed, or with a damaged file behind a name: they lead far
-into the commands. A flight lasts three control cycles, a camera takes two frames, few pictures are really
-drawn. A part is typed in a process that a signal or a closed pipe disturbs (`interrupted`). Broken promises
-are: a status other than 0, 1, 2; wrong use without a word on standard error; with --json and status 0
-anything but one JSON object on standard output.
+A part of them are right ones with a word or two changed, or with a damaged file behind a name: they lead
+far into the commands. A flight lasts three control cycles, a camera takes two frames, samples are small,
+nobody waits for a log to grow, few pictures are really drawn. A part is typed in a process that a signal or
+a closed pipe disturbs (`interrupted`). Broken promises are: a status other than 0, 1, 2; wrong use without
+a word on standard error; with --json and status 0 anything but one JSON object on standard output.
 """
 
 from __future__ import annotations
@@ -13,10 +13,13 @@ import argparse
 import contextlib
 import functools
 import io
+import itertools
 import json
+import math
 import os
 import shutil
 import tempfile
+import threading
 import weakref
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -31,8 +34,10 @@ from flight.app.request import RunRequest, RunResult
 from flight.app.requested_config import requested_config
 from flight.gnc.errors import UsageError
 from flight.link.telemetry.segments import SUFFIX
+from ground import samples
 from ground.commands import COMMANDS as GROUND_COMMANDS
 from ground.commands import camera as camera_command
+from ground.watch.socket import answers
 from sim_hal.faults.catalogue import CATALOGUE
 from tests.studies.fuzz.furnishings import Listener, answer, furnish
 from tests.studies.fuzz.harness import Finding
@@ -191,7 +196,7 @@ def _fault(draw: Draw) -> str:
 
 
 _made_parser, _fly, _frames = cli._parser, flown.fly, camera_command._frames
-_DRAWERS = ("ground.report.draw_path", "ground.report.draw_fit", "ground.report.draw")
+_DRAWERS = tuple(f"ground.report.{name}" for name in ("draw", "draw_both", "draw_fit", "draw_path"))
 
 
 @functools.cache
@@ -231,6 +236,12 @@ def _in_folder(folder: Path, drawn: bool) -> Iterator[None]:
         "flight.app.cli._parser": _parser,
         "flight.app.flight.fly": _briefly,
         "ground.commands.camera._frames": _few_frames,
+        "ground.commands.watch.answers": _few_answers,
+        "ground.commands.watch._PING_S": 0.0,
+        "ground.watch.tail.LogTail.silence": math.inf,
+        "ground.samples._MAKERS": {name: samples._MAKERS[name] for name in ("stars", "limb")},
+        "ground.samples.PIXELS": 64,
+        "ground.samples.EARTH_PIXELS": 64,
     }
     if not drawn:
         changes |= dict.fromkeys(_DRAWERS, _not_drawn)
@@ -254,6 +265,10 @@ def _briefly(request: RunRequest, progress: Callable[[Any], None] | None = None)
 
 def _few_frames(clock: Any, source: Any, exposure_ns: int, count: int) -> Iterator[Any]:
     return _frames(clock, source, exposure_ns, min(count, _FRAMES))
+
+
+def _few_answers(to: str, patience: float, ended: threading.Event) -> Iterator[Any]:
+    return itertools.islice(answers(to, min(patience, 0.1), ended), 2)
 
 
 def _not_drawn(*order: Any) -> list[Path]:

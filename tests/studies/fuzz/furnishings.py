@@ -49,6 +49,7 @@ def furnish(folder: Path) -> None:
         "exposure": 0.2,
     }
     _write(folder / "camera.yaml", {**tree, "camera": small})
+    shutil.copy(ROOT / "config" / "testbed.yaml", folder / "real.yaml")
     (folder / "bad.yaml").write_text("name: [\n")
     (folder / "notes.txt").write_bytes(bytes(range(256)))
     (folder / "empty").mkdir()
