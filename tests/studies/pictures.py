@@ -80,16 +80,8 @@ def main() -> int:
     _draw_frame(folder / "frame.png")
     _draw_solved(folder / "solved.png")
     _draw_horizons(folder / "horizons.png")
-    for name in (
-        "overview.png",
-        "paths.png",
-        "spin.png",
-        "path.png",
-        "frame.png",
-        "solved.png",
-        "horizons.png",
-    ):
-        sys.stdout.write(f"{folder / name}\n")
+    for name in ("overview", "paths", "spin", "path", "frame", "solved", "horizons"):
+        sys.stdout.write(f"{folder / name}.png\n")
     return 0
 
 

@@ -18,6 +18,7 @@ from flight.link.telemetry.definitions import MODE
 from flight.loop.body import Body
 from flight.loop.control_output import Target
 from flight.loop.fdir import facts
+from flight.loop.fdir.facts import Facts
 from flight.loop.fdir.hold_timer import HoldTimer
 from flight.loop.modes.machine import Change, ModeMachine
 from flight.loop.modes.table import TRANSITIONS, Answer
@@ -88,9 +89,8 @@ class ModeControl:
         self._modes = body.modes
         self._initial = Mode.named(settings.modes.initial)
         if self._initial not in body.modes:
-            has = ", ".join(sorted(mode.label for mode in STARTS.keys() & body.modes))
-            raise ConfigError("modes.initial", f"is {self._initial.label}: this body has {has}")
-        self._crashed = 0
+            raise ConfigError("modes.initial", f"is {self._initial.label}: this body has {_starts(body)}")
+        self._crashed, self._too_many_crashes = 0, False
         self._commands = 0
         self._seen_ns = 0
         self._slow = HoldTimer(settings.low_for)
@@ -120,6 +120,7 @@ class ModeControl:
         """Begin to boot; `unclean_recent` shutdowns shortly before were unclean."""
         self._machine.since_ns = self._seen_ns = now_ns
         self._crashed = unclean_recent
+        self._too_many_crashes = unclean_recent >= self._settings.crash_limit
         self._record(Mode.BOOT, "begin", "", now_ns)
 
     def step(
@@ -138,8 +139,7 @@ class ModeControl:
         """
         # A body that is not steered needs no attitude: it sees while its rate is measured.
         sees = estimate is not None if self._modes & STEERING else rate is not None
-        if sees:
-            self._seen_ns = now_ns
+        self._seen_ns = now_ns if sees else self._seen_ns
         if self.mode is Mode.BOOT:
             self._boot(sees and coils_answer, now_ns)
         blind = (now_ns - self._seen_ns) * 1e-9
@@ -165,7 +165,7 @@ class ModeControl:
             return f"not while in {self.mode.label}"
         if answer is Answer.STAY:
             return ""
-        if self.mode is Mode.SAFE and (barred := self._barred()):
+        if self.mode is Mode.SAFE and (barred := _barred(self._facts)):
             return barred
         text = ""
         if mode is Mode.SLEW:
@@ -190,10 +190,6 @@ class ModeControl:
             self._stop(f"restart wanted: {self.restart}")
         elif reaction in SAFING_REACTIONS:
             self._fire(SAFING_REACTIONS[reaction], kind.name, time_ns)
-
-    @property
-    def _too_many_crashes(self) -> bool:
-        return self._crashed >= self._settings.crash_limit
 
     def _boot(self, good: bool, now_ns: int) -> None:
         waited = (now_ns - self._machine.since_ns) * 1e-9
@@ -229,15 +225,6 @@ class ModeControl:
         text = f"{error:.3f} rad off after {slewing:.0f} s"
         self._facts.update(facts.SLEW_LATE, slewing > settings.slew_limit, now_ns, text)
 
-    def _barred(self) -> str:
-        """Return why SAFE may not be left: latched facts that are not cleared; empty when it may."""
-        held = [
-            fact.begins.name
-            for fact in self._facts.held()
-            if fact.latching and fact.begins.reaction is Reaction.SAFE
-        ]
-        return f"not before it is cleared: {', '.join(held)}" if held else ""
-
     def _fire(self, trigger: Trigger, reason: str, now_ns: int) -> None:
         change = self._machine.fire(trigger, now_ns)
         if change is not None:
@@ -272,3 +259,16 @@ class ModeControl:
             reason=reason,
             **self._view.mode_fields(self.wanted),
         )
+
+
+def _barred(known: Facts) -> str:
+    """Return why SAFE may not be left: latched facts that are not cleared; empty when it may."""
+    held = [
+        fact.begins.name for fact in known.held() if fact.latching and fact.begins.reaction is Reaction.SAFE
+    ]
+    return f"not before it is cleared: {', '.join(held)}" if held else ""
+
+
+def _starts(body: Body) -> str:
+    """Return the modes in which this body can start, as text."""
+    return ", ".join(sorted(mode.label for mode in STARTS.keys() & body.modes))
