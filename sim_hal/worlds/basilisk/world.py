@@ -21,13 +21,20 @@ from flight.schema.errors import ConfigError
 from hal.interfaces.wires import SECOND_NS
 from sim_hal.emulators.device import NEVER
 from sim_hal.worlds import sun
-from sim_hal.worlds.free_body.body import CoilPower, elements, julian_date, released
+from sim_hal.worlds.free_body.body import (
+    KNIGHTCUBE_POWER,
+    CoilPower,
+    FreeBodyTruth,
+    elements,
+    julian_date,
+    released,
+)
 from sim_hal.worlds.free_body.craft import CRAFTS, build
 from sim_hal.worlds.free_body.section import FreeBodySection
 from sim_hal.worlds.free_body.streams import generators
 from sim_hal.worlds.motion import Motion
 from sim_hal.worlds.surroundings import Floats, Surroundings
-from sim_hal.worlds.world import WorldInputs, WorldTruth
+from sim_hal.worlds.world import WorldInputs
 
 if TYPE_CHECKING:
     from sim_hal.worlds.basilisk.scenario import Scenario
@@ -43,10 +50,10 @@ class BasiliskWorld:
         self,
         section: FreeBodySection,
         currents: Callable[[], FloatArray],
-        power: CoilPower,
-        seed: int,
-        utc: str,
-        start_ns: int,
+        power: CoilPower = KNIGHTCUBE_POWER,
+        seed: int = 1,
+        utc: str = "2026-01-01T00:00:00Z",
+        start_ns: int = 0,
     ) -> None:
         """Hold the body still until it is released. Raises ConfigError where Basilisk is missing."""
         if section.disturbances.gravity_gradient not in {0.0, 1.0}:
@@ -123,9 +130,24 @@ class BasiliskWorld:
         """Return UTC of the present state, ns since 1970."""
         return self._utc_start_ns + self.time_ns - self._start_ns
 
-    def truth(self) -> WorldTruth:
-        """Return currents and energies of the state as it is."""
-        return WorldTruth(self._acting, self.energy, self.supply_energy)
+    def truth(self) -> FreeBodyTruth:
+        """Return the state as it is; torques by their causes are not known here."""
+        motion, around = self.motion(self.time_ns), self.surroundings()
+        return FreeBodyTruth(
+            current=self._acting,
+            energy=self.energy,
+            supply_energy=self.supply_energy,
+            utc=2_440_587.5 + self.utc_ns() * 1e-9 / DAY,
+            quaternion=motion.quaternion,
+            rate=motion.rate,
+            position=np.array(around.position),
+            velocity=np.array(around.velocity),
+            field=np.array(around.field),
+            sun=np.array(around.sun),
+            sunlit=around.sunlit,
+            torques={},
+            residual_dipole=self._residual(),
+        )
 
     def _step(self, until_ns: int) -> None:
         """Run as many steps as fit before `until_ns`, the release and the next whole second."""
@@ -136,12 +158,14 @@ class BasiliskWorld:
         if self._stepped_ns - self._placed_ns >= SECOND_NS:
             self._placed_ns = self._stepped_ns
             self._scenario.place_bodies(self._date(), self._stepped_ns)
-        light = float(self._scenario.shadow.eclipseOutMsgs[0].read().shadowFactor)
-        residual = self.craft.constant_dipole + light * self.craft.sunlit_dipole
-        dipole = _floats(self.craft.coil_dipole @ self._acting + residual)
+        dipole = _floats(self.craft.coil_dipole @ self._acting + self._residual())
         self._scenario.set_dipole(dipole, self._stepped_ns)
         self._stepped_ns += steps * STEP_NS
         self._scenario.run_to(self._stepped_ns)
+
+    def _residual(self) -> FloatArray:
+        light = float(self._scenario.shadow.eclipseOutMsgs[0].read().shadowFactor)
+        return np.asarray(self.craft.constant_dipole + light * self.craft.sunlit_dipole)
 
     def _field(self) -> FloatArray:
         return np.array(self._scenario.field.envOutMsgs[0].read().magField_N)

@@ -81,6 +81,9 @@ class CoilPower:
     supply_voltage: float
 
 
+KNIGHTCUBE_POWER = CoilPower((23.0, 23.0, 23.0), 3.4)
+
+
 class FreeBody:
     """The state of a free body, advanced in time under the coil currents."""
 
@@ -88,7 +91,7 @@ class FreeBody:
         self,
         section: FreeBodySection,
         currents: Callable[[], FloatArray],
-        power: CoilPower = CoilPower((23.0, 23.0, 23.0), 3.4),
+        power: CoilPower = KNIGHTCUBE_POWER,
         seed: int = 1,
         utc: str = "2026-01-01T00:00:00Z",
         start_ns: int = 0,

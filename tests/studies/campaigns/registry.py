@@ -24,6 +24,7 @@ from tests.studies.campaigns.rso_orbits import RSO_ORBITS
 from tests.studies.campaigns.soak import SOAK
 from tests.studies.campaigns.step_robust import STEP_ROBUST
 from tests.studies.campaigns.streaks import STREAKS
+from tests.studies.campaigns.worlds import WORLD_COMPARISON
 
 CAMPAIGNS: dict[str, Campaign] = {
     campaign.name: campaign
@@ -51,5 +52,6 @@ CAMPAIGNS: dict[str, Campaign] = {
         COVERAGE,
         ORBIT_ATTITUDE,
         DETUMBLE,
+        WORLD_COMPARISON,
     )
 }

@@ -1,0 +1,42 @@
+"""The comparison of worlds: both fly the same cases, and a difference shows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sim_hal.worlds.free_body.body import FreeBody
+from tests.studies.campaigns import worlds
+from tests.studies.campaigns.campaign import Case
+
+
+class HeavyBody(FreeBody):
+    """Another world, in which the coils have less effect."""
+
+    def advance_to(self, time_ns: int) -> None:
+        super().advance_to(time_ns)
+        if self.time_ns == time_ns:
+            x, y, z = self._acting
+            self._acting = 0.7 * x, 0.7 * y, 0.7 * z
+
+
+@pytest.mark.parametrize(("other", "within"), [(FreeBody, True), (HeavyBody, False)])
+def test_equal_worlds_agree_and_an_unlike_one_does_not(
+    other: type, within: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(worlds, "BasiliskWorld", other)
+    results = [
+        worlds.run(Case(case.key, case.seed, {**case.parameters, "speed": np.radians(3.0)}))
+        for case in worlds.cases(1, 1)
+    ]
+    facts = worlds.summarise(results, tmp_path).facts
+    assert (facts["flights"], facts["lost"], facts["within"]) == (1, 0, within)
+
+
+def test_each_flight_is_flown_in_both_worlds() -> None:
+    cases = worlds.cases(3, 1)
+    assert [case.parameters["world"] for case in cases] == ["free_body", "basilisk"] * 3
+    assert len({case.parameters["flight"] for case in cases}) == 3
+    assert {case.parameters["craft"] for case in cases} == {"knightcube"}
