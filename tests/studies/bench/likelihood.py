@@ -4,6 +4,9 @@ Random fields of the real sky on the simulator's default camera (1024 x 1024, 20
 error over the bound of the 20 brightest stars, each taken alone in the sky: of the whole rate vector, of the
 rate's magnitude, of mid-exposure positions (the eight brightest). NEES: 1 for an honest covariance. Single
 ends may beat the bound of a lone streak, since all streaks share one motion. Seeds of its own.
+
+With `--known-sky` the stars are then identified, nothing being known of the attitude, and the streaks are
+fitted again with all stars of the catalogue, as in flight: figures and times are of that.
 """
 
 from __future__ import annotations
@@ -15,7 +18,12 @@ import time
 import numpy as np
 
 from flight.gnc.math.arrays import FloatArray
+from flight.gnc.vision.startracker.catalogue_refit import refit_with_catalogue
+from flight.gnc.vision.startracker.index.build import default_index
+from flight.gnc.vision.startracker.solve import SolveSettings, solve_motion
 from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion
+from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion, positions
+from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from sim_hal.star_camera import render
 from tests.flight.gnc.vision.maximum_likelihood.scenes import (
@@ -34,13 +42,25 @@ _SETTINGS = LikelihoodSettings(saturation=SATURATION)
 _BRIGHT = 8
 
 
-def rate_row(theta: float, length: float, exposure: float, frames: int, seed: int, faintest: float) -> str:
+def estimated(scene: Scene, known_sky: bool) -> MotionResult:
+    """Return the motion of a frame, the true rate giving its sign; of the second fit for a known sky."""
+    found = estimate_motion(scene.pixels, CAMERA.pinhole, scene.exposure, _SETTINGS, scene.rate, 0.0)
+    if not known_sky or found.rate is None:
+        return found
+    sky, settings = default_index(), SolveSettings(likelihood=_SETTINGS)
+    solution = solve_motion(found, CAMERA.pinhole, (1.0, 1.0), sky, settings)
+    return refit_with_catalogue(scene.pixels, solution, sky, settings, _SETTINGS).motion or found
+
+
+def rate_row(
+    theta: float, length: float, exposure: float, frames: int, seed: int, faintest: float, known_sky: bool
+) -> str:
     """Return one row of the table of rates."""
     vector, magnitude, nees, places, times = [], [], [], [], []
     for frame in range(frames):
         scene = real_sky(seed + frame, theta, length, exposure, faintest=faintest)
         start = time.process_time()
-        found = estimate_motion(scene.pixels, CAMERA.pinhole, exposure, _SETTINGS, scene.rate, 0.0)
+        found = estimated(scene, known_sky)
         times.append(1e3 * (time.process_time() - start))
         if found.rate is None or found.covariance is None:
             continue
@@ -59,9 +79,18 @@ def rate_row(theta: float, length: float, exposure: float, frames: int, seed: in
 
 
 def _place_errors(stars: FloatArray, scene: Scene, bounds: FloatArray) -> list[float]:
-    """Return the squared errors, over the bound, of the brightest stars' places; 1 is expected."""
+    """Return the squared errors, over the bound, of the brightest stars' places; 1 is expected.
+
+    A streak with both ends outside has no place along itself and is left out.
+    """
     out = []
-    for place, covariance in zip(scene.stars[:_BRIGHT], bounds[:_BRIGHT], strict=True):
+    bright = scene.stars[:_BRIGHT]
+    motion = Motion.steady(scene.rate * scene.exposure)
+    ended = np.zeros(len(bright), dtype=np.bool_)
+    for end in (-0.5, 0.5):
+        there = positions(CAMERA.pinhole, motion, bright, np.full(len(bright), end))
+        ended |= CAMERA.pinhole.contains(there)
+    for place, covariance in zip(bright[ended], bounds[:_BRIGHT][ended], strict=True):
         off = stars[np.argmin(np.linalg.norm(stars - place, axis=1))] - place
         if np.hypot(*off) < 5.0:
             out.append(float(off @ np.linalg.solve(covariance, off)) / 2.0)
@@ -159,6 +188,8 @@ def main() -> None:
     parser.add_argument("--theta", type=float, nargs="+", default=[90.0, 45.0, 10.0, 0.0], help="deg")
     parser.add_argument("--length", type=float, nargs="+", default=[51.0, 102.0, 205.0, 512.0], help="px")
     parser.add_argument("--exposure", type=float, nargs="+", default=[0.2, 1.0], help="s")
+    parser.add_argument("--known-sky", action="store_true", help="identify the stars and fit again")
+    parser.add_argument("--only-rates", action="store_true", help="the first table alone")
     options = parser.parse_args()
     out = sys.stdout
     out.write(f"{options.frames} frames a row, seed {options.seed}, stars to V {options.faintest}\n")
@@ -167,11 +198,11 @@ def main() -> None:
     for theta in options.theta:
         for length in options.length:
             for exposure in options.exposure:
-                row = rate_row(
-                    np.deg2rad(theta), length, exposure, options.frames, options.seed, options.faintest
-                )
-                out.write(row + "\n")
+                asked = options.frames, options.seed, options.faintest, options.known_sky
+                out.write(rate_row(np.deg2rad(theta), length, exposure, *asked) + "\n")
                 out.flush()
+    if options.only_rates:
+        return
     out.write("\nchange %     px    s   rates  seen to change   NEES\n")
     for growth in (0.0, 0.02, 0.05, 0.1, 0.3, 1.0):
         for exposure in options.exposure:

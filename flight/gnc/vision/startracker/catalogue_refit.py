@@ -21,7 +21,7 @@ from flight.gnc.vision.startracker.aberration import apparent
 from flight.gnc.vision.startracker.index.sky_index import SkyIndex
 from flight.gnc.vision.startracker.solution import FrameSolution, SolveStatus
 from flight.gnc.vision.startracker.solve import AttitudePrior, SolveSettings, solve_motion
-from flight.gnc.vision.streaks.maximum_likelihood.chains import close_by
+from flight.gnc.vision.streaks.maximum_likelihood.chains import apart, circles, close_by
 from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import ExposedFrame, expose_frame
 from flight.gnc.vision.streaks.maximum_likelihood.iteration import ExposedCamera
 from flight.gnc.vision.streaks.maximum_likelihood.joint_fit import joint_fit
@@ -41,6 +41,8 @@ _NEAR = 1.4
 _TWIN = 2.0
 # A found star is a catalogue star that is within this distance, px, and has at least this share of its light.
 _SAME, _ALIKE = 5.0, 0.3
+# So many px beside the streak of such a star, and along it, a found star is a piece of that streak.
+_BESIDE = 2.5
 # Relative error of a star's light as the catalogue predicts it.
 _LIGHT_ERROR = 0.15
 # Stars whose pixels are held at a time while their light is subtracted.
@@ -223,7 +225,7 @@ def _scenes(
     fitted = np.flatnonzero(near & (leading | seen) & ~twin)[: settings.most_stars + settings.most_neighbours]
     hidden = near.copy()
     hidden[fitted] = False
-    foreign = _foreign(motion, known)
+    foreign = _foreign(camera.pinhole, course, motion, known)
     scene = _scene(course, width, known.places[fitted], known.light[fitted], leading[fitted])
     return scene.with_stars(motion.stars[foreign], motion.flux[foreign]), _scene(
         course, width, known.places[hidden], known.light[hidden], leading[hidden]
@@ -234,9 +236,16 @@ def _scene(course: Motion, width: float, places: FloatArray, light: FloatArray, 
     return Scene(course, width, places, light, np.zeros(len(light)), trusted)
 
 
-def _foreign(motion: MotionResult, known: _Known) -> IntArray:
-    """Return which stars found are not in the catalogue: it has no such light at their place."""
+def _foreign(pinhole: Pinhole, course: Motion, motion: MotionResult, known: _Known) -> IntArray:
+    """Return which stars found are not in the catalogue: it has no such light at their place.
+
+    Nor on their streak: the first fit may have made two stars of a bright one, one behind the other.
+    """
     near = np.linalg.norm(motion.stars[:, None] - known.places, axis=2) < _SAME
+    polar, azimuth = circles(pinhole, course, motion.stars)
+    known_polar, known_azimuth = circles(pinhole, course, known.places)
+    beside = np.abs(polar[:, None] - known_polar) * pinhole.focal_length < _BESIDE
+    near |= beside & (apart(azimuth, known_azimuth) < float(np.linalg.norm(course.whole)))
     alike = known.light > _ALIKE * motion.flux[:, None]
     return np.flatnonzero(~(near & alike).any(axis=1))
 

@@ -49,6 +49,8 @@ _UNTOLD_SIGMA_PX = 0.3
 _UNTOLD_LENS_PX = 0.25
 # Standard deviations of light; fainter stars of a motion are not identified.
 _LEAST_SIGNIFICANCE = 5.0
+# px, standard deviation from which a star has no place: both ends of its streak may lie outside of the frame.
+_PLACELESS_PX = 5.0
 # Tracking looks for this number of stars, within PRIOR_SIGMAS of the prior.
 _LOOKED_FOR = 30
 PRIOR_SIGMAS = 4.0
@@ -146,7 +148,8 @@ def solve_motion(
         camera,
         motion=motion,
     )
-    chosen = np.flatnonzero(motion.significance > _LEAST_SIGNIFICANCE)
+    placed = np.trace(motion.star_covariance, axis1=1, axis2=2) < 2.0 * _PLACELESS_PX**2
+    chosen = np.flatnonzero(placed & (motion.significance > _LEAST_SIGNIFICANCE))
     chosen = chosen[np.argsort(-motion.flux[chosen], kind="stable")]
     if not len(chosen):
         return seen

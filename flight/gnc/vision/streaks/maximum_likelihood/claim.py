@@ -36,6 +36,8 @@ _SAME_SPREAD = 0.05
 _END_SHARE = 0.6
 # Px by which ends are uncertain for each px, or unit of brightness, that all streaks waver in common.
 _END_SHAKING = 25.0
+# A covariance beyond this many times that of noise is by errors of the model: three deviations.
+_BEYOND_NOISE = 9.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,7 +47,8 @@ class Claim:
     Attributes:
         turn: (3,) rad, corrected for the camera's errors where the stars show them.
         covariance: (3, 3) rad^2.
-        doubt: share of the turn to which model errors common to all stars leave it uncertain.
+        doubt: share of the turn to which errors of the model leave it uncertain: common to all stars or
+            not.
         shaking: of the body.
     """
 
@@ -79,8 +82,9 @@ def claim(result: MotionResult, camera: ExposedCamera, last: Fit) -> Claim:
     # to and fro, as pixels are left out and taken in, is known no better than that.
     covariance = noise * spread * (1.0 + last.restless**2)
     common = added + ends**2 * float(turn @ turn) * np.eye(3)
-    doubt = float(np.sqrt(np.linalg.eigvalsh(common)[-1] / (turn @ turn)))
-    return Claim(turn, covariance + common, doubt, shaking)
+    covariance = covariance + common
+    unmodelled = max(np.linalg.eigvalsh(part)[-1] for part in (common, covariance - _BEYOND_NOISE * noise))
+    return Claim(turn, covariance, float(np.sqrt(unmodelled / (turn @ turn))), shaking)
 
 
 def _with_lens(

@@ -112,8 +112,8 @@ def _why_not(result: MotionResult, camera: ExposedCamera, last: Fit, whole: Whol
         ),
         (
             known.doubt > settings.worst_doubt,
-            f"uncertain by {100.0 * known.doubt:.1f} %: the point spread is {result.psf_sigma:.2f} px,"
-            f" {settings.psf_sigma:g} px as described, or the lens is not known well enough",
+            f"uncertain by {100.0 * known.doubt:.1f} %: streaks disagree, the lens is not known well enough,"
+            f" or the point spread is {result.psf_sigma:.2f} px, {settings.psf_sigma:g} px as described",
         ),
     )
     return next((reason for failed, reason in checks if failed), "")

@@ -39,7 +39,7 @@ class LikelihoodSettings:
         worst_misfit: chi-square per degree of freedom above which the motion is not believed.
         worst_shaking: px of displacement, or share of brightness, that all streaks waver in common, above
             which the motion is not smooth.
-        worst_doubt: share of the rate to which model errors may leave it uncertain.
+        worst_doubt: share of the rate to which errors of the model may leave it uncertain, one deviation.
         knowledge: how well the camera is known.
         sign_sigmas: the prior's projection on the axis must exceed this many of its sigmas to decide the
             direction of time.
@@ -63,6 +63,6 @@ class LikelihoodSettings:
     least_significance: float = 5.0
     worst_misfit: float = 4.0
     worst_shaking: float = 0.05
-    worst_doubt: float = 0.015
+    worst_doubt: float = 0.01
     sign_sigmas: float = 3.0
     knowledge: CameraKnowledge = _UNCALIBRATED
