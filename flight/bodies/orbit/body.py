@@ -73,6 +73,8 @@ def _filter(config: OrbitConfig, learned: Mapping[str, Learned]) -> tuple[Attitu
         control_period=1.0 / config.executive.control_rate_hz,
         disturbance_walk=section.disturbance_walk,
         bias_start=section.bias_start,
+        torsion_start=0.0,
+        damping_start=0.0,
         gain_start=section.gain_start,
         latency_start=section.latency_start,
         latency_walk=section.latency_walk,

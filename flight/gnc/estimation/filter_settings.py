@@ -47,8 +47,8 @@ class FilterSettings:
     disturbance_start: float = 0.02
     bias_walk: float = 1e-7
     bias_start: float
-    torsion_start: float = 0.0
-    damping_start: float = 0.0
+    torsion_start: float
+    damping_start: float
     gain_start: float
     latency_start: float
     latency_walk: float

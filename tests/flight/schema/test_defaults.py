@@ -16,7 +16,7 @@ import numpy as np
 import flight
 import hal
 import sim_hal
-from flight.schema import devices, sections, testbed
+from flight.schema import devices, orbit, sections, testbed
 from hal.interfaces.wires import SECOND_NS
 
 OF_CAMERA = (devices.Camera, devices.StarTracker)
@@ -27,7 +27,8 @@ SERVES: dict[str, tuple[type[msgspec.Struct], ...]] = {
     "CoilSettings": (devices.Coils,),
     "CoilWatchSettings": (devices.Coils, devices.PowerMonitor),
     "ExcitationSettings": (testbed.Identification,),
-    "FilterSettings": (sections.Estimation,),
+    "FieldRateSettings": (orbit.FieldDetumble, orbit.Craft),
+    "FilterSettings": (testbed.ThreadEstimation,),
     "ImagingSettings": OF_CAMERA,
     "LikelihoodSettings": OF_CAMERA,
     "ModeSettings": (sections.Modes, sections.Detumble),
@@ -49,7 +50,6 @@ OTHERS = {
     "ClassicalSettings": "the thesis's star tracker, for comparison",
     "DeterminationSettings": "a satellite's attitude determination, which the testbed does not fly",
     "EdgeSettings": "horizon cameras",
-    "FieldRateSettings": "a satellite's detumbling, which the testbed does not fly",
     "HorizonSettings": "horizon cameras",
     "IdentificationSettings": "limits of the method",
     "IndexSettings": "an index is built on the ground",
@@ -63,7 +63,8 @@ OTHERS = {
 
 def _modules(package: ModuleType) -> Iterator[ModuleType]:
     for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
-        if not found.name.endswith("__main__"):
+        # Basilisk is an extra that no flight needs; its world takes its values from the configuration.
+        if not found.name.endswith("__main__") and ".basilisk" not in found.name:
             yield importlib.import_module(found.name)
 
 

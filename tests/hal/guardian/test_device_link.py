@@ -114,7 +114,8 @@ def test_a_file_that_names_no_server_is_refused(tmp_path: Path, facts: str | Non
 
 def test_a_server_that_has_gone_is_said_so(tmp_path: Path) -> None:
     path = tmp_path / "facts.json"
-    gone = {"serial": "/dev/ptmx", "baud_rate": 115200, "socket": str(tmp_path / "gone"), "camera": False}
+    unit = {"serial": "/dev/ptmx", "baud_rate": 115200, "camera": False}
+    gone = {**unit, "socket": str(tmp_path / "gone"), "gps": None, "gps_baud_rate": 0, "wide": []}
     path.write_text(json.dumps(gone), encoding="utf-8")
     with pytest.raises(NotResponding):
         fly(RunRequest(CONFIG, tmp_path / "run", realtime=True, devices=path))
