@@ -205,6 +205,8 @@ def camera_model(camera: Camera, sky: Sky) -> StarCameraModel:
         full_well=sky.full_well,
         psf_sigma=camera.psf_sigma,
         line_time=sky.line_time,
+        psf=sky.psf,
+        noise=sky.noise,
     )
 
 

@@ -63,7 +63,7 @@ class Truth(Section, frozen=True, kw_only=True):
 
 
 class Sky(Section, frozen=True, kw_only=True):
-    """Sky and optics of the emulated star camera (Sease ch. 2)."""
+    """Sky and optics of the emulated star camera (Sease ch. 2); the thesis's own are bilinear and uniform."""
 
     magnitude_limit: Annotated[float, Meta(ge=0.0, le=8.5)] = 8.5
     year: Annotated[float, Meta(ge=1900.0, le=2100.0)] = 2026.5
@@ -73,6 +73,8 @@ class Sky(Section, frozen=True, kw_only=True):
     full_well: Positive = 20000.0
     readout: NotNegative = 0.05
     line_time: NotNegative = 0.0
+    psf: Literal["integrated", "bilinear"] = "integrated"
+    noise: Literal["poisson", "uniform"] = "poisson"
 
 
 class OrbitDeviceTruth(Section, frozen=True, kw_only=True):

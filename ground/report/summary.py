@@ -205,6 +205,7 @@ def _power(run: Run, notes: list[str]) -> Object:
             "average_w": math.nan,
             "peak_w": math.nan,
             "supply_average_w": math.nan,
+            "bus_average_w": math.nan,
             "energy_j": math.nan,
         }
     return {
@@ -213,8 +214,16 @@ def _power(run: Run, notes: list[str]) -> Object:
         "average_w": power.energy / power.duration,
         "peak_w": float(power.power.max()),
         "supply_average_w": float(power.supply @ power.spans) / power.duration,
+        "bus_average_w": _bus_power(run),
         "energy_j": power.energy,
     }
+
+
+def _bus_power(run: Run) -> float:
+    """Return the mean power, W, that the monitor in the coils' supply measured; NaN without a monitor."""
+    measured = run["housekeeping"]["coil_power"]
+    known = measured[np.isfinite(measured)]
+    return float(known.mean()) if len(known) else math.nan
 
 
 def _against_thesis(steps: list[tuple[Command, Response]], power: Object) -> list[Object]:

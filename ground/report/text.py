@@ -150,7 +150,8 @@ def _power(power: Object, compared: bool) -> list[str]:
         f"Coil power, from the currents {'in the coils' if power['source'] == 'truth' else 'written'}",
         f"  average R I^2   {number(power['average_w'], 3, 1e3)} mW{average}",
         f"  peak R I^2      {number(power['peak_w'], 3)} W{peak}",
-        f"  supply, V |I|   {number(power['supply_average_w'], 3, 1e3)} mW on average",
+        f"  supply, V |I|   {number(power['supply_average_w'], 3, 1e3)} mW on average at the coils, "
+        f"{number(power['bus_average_w'], 1, 1e3)} mW at the bus (monitor, once a second)",
         f"  energy          {number(power['energy_j'], 3)} J",
         f"  largest current {number(power['peak_current_a'], 4)} A written"
         + ("" if actual is None else f", {number(actual, 4)} A in the coils (truth)"),

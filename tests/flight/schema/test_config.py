@@ -15,6 +15,7 @@ from flight.schema.camera_model import camera_knowledge
 from flight.schema.document import read_document, to_yaml
 from flight.schema.errors import ConfigError
 from flight.schema.testbed import as_testbed
+from sim_hal.assembly import camera_model
 from sim_hal.settings import Simulation
 
 FOLDER = Path(__file__).resolve().parents[3] / "config"
@@ -28,7 +29,7 @@ def test_every_configuration_in_the_repository_is_valid(path: Path) -> None:
     assert (section is None) == (loaded.simulation is None)
 
 
-@pytest.mark.parametrize("name", ["step_demo.yaml", "step_thesis.yaml"])
+@pytest.mark.parametrize("name", ["step_demo.yaml", "step_thesis.yaml", "step_simulation.yaml"])
 def test_the_demonstration_is_the_thesis(name: str) -> None:
     loaded = as_testbed(reader.load(FOLDER / name))
     assert [step.at for step in loaded.steps] == [100.0 * k for k in range(7)]
@@ -43,6 +44,36 @@ def test_the_thesis_loop_stays_as_it_was_in_the_same_world() -> None:
     assert (thesis.control.state_weight, thesis.control.control_weight) == (20.0, 1.0)
     assert thesis.simulation == demo.simulation
     assert (thesis.plant, thesis.inertial_unit, thesis.coils) == (demo.plant, demo.inertial_unit, demo.coils)
+
+
+def test_the_simulation_case_is_the_thesis_s() -> None:
+    """Ch. 5, Simulation Results: the loop of step_thesis.yaml, from another state, no thread, no camera."""
+    loop, case = (reader.load(FOLDER / name) for name in ("step_thesis.yaml", "step_simulation.yaml"))
+    assert (case.guidance, case.control, case.coils) == (loop.guidance, loop.control, loop.coils)
+    assert (case.plant, case.inertial_unit, case.camera) == (loop.plant, loop.inertial_unit, None)
+    text = (FOLDER / "step_simulation.yaml").read_text(encoding="utf-8")
+    world = reader.simulation_section(text, "step_simulation.yaml", Simulation)
+    assert world is not None
+    assert (world.release.q2, world.release.rate, world.thread.stiffness) == (0.4, 0.015, 0.0)
+    assert (world.current_noise, world.imu.quaternion_noise, world.imu.rate_noise) == (
+        3.5e-3,
+        1.75e-3,
+        1.75e-4,
+    )
+
+
+def test_the_thesis_s_camera_model_is_chosen_in_yaml() -> None:
+    sky = "latency: {planner: 0.05, vision: 0.25}"
+    assert sky in DEMO
+    own = DEMO.replace(sky, f"{sky}\n  sky: {{psf: bilinear, noise: uniform}}\n #")
+    section = reader.simulation_section(own, "demo.yaml", Simulation)
+    loaded = reader.parse(own, "demo.yaml")
+    assert section is not None
+    assert loaded.camera is not None
+    model = camera_model(loaded.camera, section.sky)
+    assert (model.psf, model.noise) == ("bilinear", "uniform")
+    with pytest.raises(ConfigError, match=r"`simulation.sky.noise` is 'gaussian'"):
+        reader.simulation_section(own.replace("uniform", "gaussian"), "demo.yaml", Simulation)
 
 
 @pytest.mark.parametrize(

@@ -23,13 +23,14 @@ from tests.studies.campaigns.rso import RSO_SLEW, RSO_TRACK
 from tests.studies.campaigns.rso_orbits import RSO_ORBITS
 from tests.studies.campaigns.soak import SOAK
 from tests.studies.campaigns.step_robust import STEP_ROBUST
-from tests.studies.campaigns.streaks import STREAKS
+from tests.studies.campaigns.streaks import STREAKS, STREAKS_THESIS
 from tests.studies.campaigns.worlds import WORLD_COMPARISON
 
 CAMPAIGNS: dict[str, Campaign] = {
     campaign.name: campaign
     for campaign in (
         STREAKS,
+        STREAKS_THESIS,
         FAILURES,
         MISMATCH,
         VIBRATION,

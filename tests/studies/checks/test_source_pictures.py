@@ -1,0 +1,45 @@
+"""The figures of the thesis can be drawn by one command, and show what the thesis shows in them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image as Picture
+
+from flight.gnc.vision.streaks.corners.settings import StreakSettings
+from flight.gnc.vision.streaks.corners.streaks import measure_streaks, segment_frame
+from sim_hal.star_camera import StarCameraModel
+from tests.studies import source_pictures
+from tests.studies.campaigns.rso import draw_sky
+from tests.studies.campaigns.scenes import FIELD
+
+
+@pytest.mark.slow
+def test_one_command_draws_every_figure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert source_pictures.main(["--out", str(tmp_path)]) == 0
+    paths = [Path(line) for line in capsys.readouterr().out.splitlines()]
+    assert [path.stem for path in paths] == list(source_pictures.PICTURES)
+    for path in paths:
+        with Picture.open(path) as picture:
+            pixels = np.asarray(picture.convert("L"))
+        assert pixels.shape[1] >= 800
+        assert np.ptp(pixels) == 255
+
+
+@pytest.mark.slow
+def test_every_indicator_has_the_object_as_its_outlier() -> None:
+    """The thesis prints 3.6, 3.5 and 3.6 sigma from the mean for its object of magnitude 1."""
+    camera = StarCameraModel(field_of_view=FIELD)
+    generator = np.random.default_rng(source_pictures.OBJECT_SEED)
+    sky = draw_sky(camera, generator, tracked=False)
+    pixels = sky.frame(camera, source_pictures.OBJECT_MAGNITUDE, generator)
+    ends = measure_streaks(segment_frame(pixels, StreakSettings()), StreakSettings()).endpoints
+    item = int(np.linalg.norm(ends.mean(axis=1) - sky.path.mean(axis=0), axis=1).argmin())
+    shown = source_pictures.indicators(ends, sky.rate, camera.pinhole)
+    assert [label for label, _ in shown] == ["slope", "length, px", "OLAE residual"]
+    for _, values in shown:
+        away = np.abs(values - values.mean()) / values.std()
+        assert away[item] > 3.5
+        assert np.delete(away, item).max() < 1.0

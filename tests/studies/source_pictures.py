@@ -1,0 +1,194 @@
+"""`python -m tests.studies.source_pictures`: figures of Sease 2013, of this camera and these estimators.
+
+2.1 the star table over the whole sky; 3.1 to 3.4 a streak and its four cornerness maps; 3.5 the centre of
+rotation and the vectors of a streak; 4.2 to 4.4 the indicators of an object among stars, with their outlier.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from flight.gnc import catalogue
+from flight.gnc.camera.pinhole import Pinhole
+from flight.gnc.math.arrays import FloatArray, Image
+from flight.gnc.vision.objects.rso_indicators import lengths, olae_residuals, slopes, star_ends
+from flight.gnc.vision.streaks.corners.detectors import cornerness
+from flight.gnc.vision.streaks.corners.grouping import centre_of_rotation
+from flight.gnc.vision.streaks.corners.settings import DETECTOR_NAMES, StreakSettings
+from flight.gnc.vision.streaks.corners.streak_rate import estimate_rate
+from flight.gnc.vision.streaks.corners.streaks import measure_streaks, segment_frame
+from sim_hal.star_camera import StarCameraModel
+from tests.studies.campaigns.rso import EXPOSURE, draw_sky
+from tests.studies.campaigns.scenes import FIELD, YEAR, slew
+
+STREAK_SEED, CENTRE_SEED, OBJECT_SEED = 1, 1, 1
+TURN = 1.0
+"""Of the frame of the centre of rotation, in parts of the field: long arcs."""
+OBJECT_MAGNITUDE = 1.0
+"""As in the thesis, "for visualization purposes"."""
+_ORANGE, _BLUE, _GREEN = "#D55E00", "#0072B2", "#009E73"
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Draw all figures and name them."""
+    parser = argparse.ArgumentParser(prog="python -m tests.studies.source_pictures", description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("runs") / "source_pictures", metavar="DIR")
+    folder: Path = parser.parse_args(arguments).out
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, draw in PICTURES.items():
+        path = folder / f"{name}.png"
+        draw().savefig(path, dpi=100, facecolor="white")
+        sys.stdout.write(f"{path}\n")
+    return 0
+
+
+def draw_star_table() -> Figure:
+    """Draw the star table over the whole sky, brighter stars larger: Fig. 2.1."""
+    stars = catalogue.load()
+    x, y, z = stars.directions_at(YEAR).T
+    figure = Figure(figsize=(11.0, 5.6), layout="constrained")
+    axes = figure.subplots()
+    axes.set_facecolor("black")
+    size = 10.0 ** (-0.28 * (stars.magnitude - 5.0))
+    hours = np.degrees(np.arctan2(y, x)) % 360.0 / 15.0
+    axes.scatter(hours, np.degrees(np.arcsin(z)), s=size, c="white", linewidths=0.0)
+    axes.set(xlim=(24.0, 0.0), ylim=(-90.0, 90.0), xlabel="right ascension, h", ylabel="declination, deg")
+    axes.set_xticks(range(0, 25, 3))
+    axes.set_yticks(range(-90, 91, 30))
+    axes.set_title(f"{len(stars.magnitude):,} Hipparcos stars to V {stars.magnitude.max():.1f}", fontsize=10)
+    return figure
+
+
+def draw_cornerness() -> Figure:
+    """Draw a streak and its cornerness by the four detectors, the maxima circled: Fig. 3.1 to 3.4."""
+    camera = StarCameraModel(field_of_view=FIELD)
+    scene = slew(np.random.default_rng(STREAK_SEED), np.pi / 3.0, 0.04, 0.2, model=camera)
+    window = _window_of_a_streak(scene.pixels, camera)
+    figure = Figure(figsize=(12.0, 5.6), layout="constrained")
+    panels = figure.subplots(1, 5)
+    panels[0].imshow(window, cmap="gray")
+    panels[0].set_title("a streak", fontsize=10)
+    for axes, name in zip(panels[1:], DETECTOR_NAMES, strict=True):
+        response = cornerness(window, StreakSettings.of(name))
+        axes.imshow(np.maximum(response, 0.0), cmap="inferno")
+        row, column = np.unravel_index(response.argmax(), response.shape)
+        axes.plot(column, row, "o", color=_GREEN, markersize=12, markerfacecolor="none")
+        axes.set_title(name, fontsize=10)
+    for axes in figure.axes:
+        axes.set(xticks=[], yticks=[])
+    return figure
+
+
+def _window_of_a_streak(pixels: Image, camera: StarCameraModel) -> FloatArray:
+    """Return the surroundings of the strongest streak that is far from the border, background removed."""
+    streaks = measure_streaks(segment_frame(pixels, StreakSettings()), StreakSettings())
+    middles = streaks.endpoints.mean(axis=1)
+    room = np.abs(middles - 0.5 * camera.columns).max(axis=1) < 0.5 * camera.columns - 60.0
+    best = int(np.flatnonzero(room)[0])
+    (x0, y0), (x1, y1) = streaks.endpoints[best].min(axis=0), streaks.endpoints[best].max(axis=0)
+    cut = pixels[int(y0) - 10 : int(y1) + 12, int(x0) - 10 : int(x1) + 12].astype(float)
+    return np.asarray(cut - np.median(pixels))
+
+
+def draw_centre() -> Figure:
+    """Draw the bisectors of a frame's streaks, their centre, and the vectors of one streak: Fig. 3.5."""
+    camera = StarCameraModel(field_of_view=FIELD)
+    scene = slew(np.random.default_rng(CENTRE_SEED), np.radians(6.0), TURN, 0.2, model=camera)
+    settings = StreakSettings()
+    found = estimate_rate(scene.pixels, camera.pinhole, scene.exposure, settings, scene.rate, 0.0)
+    ends = found.endpoints[found.used]
+    centre = centre_of_rotation(ends)
+    figure = Figure(figsize=(13.0, 6.6), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    _show(left, scene.pixels)
+    for middle in ends.mean(axis=1):
+        left.plot(*np.stack([middle, centre]).T, color=_BLUE, linewidth=0.7)
+    left.plot(*centre, "+", color=_ORANGE, markersize=18, markeredgewidth=2.0)
+    true = camera.pinhole.project(np.sign(scene.rate[2]) * scene.rate)
+    away = float(np.linalg.norm(centre - true))
+    left.set_title(f"centre of rotation, {away:.2f} px from the true one", fontsize=10)
+    # The one that the centre sees under the largest angle: its vectors are then of like lengths.
+    one = ends[int((lengths(ends) / np.linalg.norm(ends.mean(axis=1) - centre, axis=1)).argmax())]
+    middle = one.mean(axis=0)
+    _show(right, scene.pixels)
+    for label, tail, head, colour in (
+        ("$V_c$", centre, middle, _ORANGE),
+        ("$V_1$", middle, one[0], _BLUE),
+        ("$V_2$", middle, one[1], _GREEN),
+    ):
+        right.annotate("", head, tail, arrowprops={"arrowstyle": "->", "color": colour, "linewidth": 1.6})
+        right.annotate(label, 0.5 * (tail + head), color=colour, fontsize=14, ha="right", va="bottom")
+    corners = np.stack([centre, *one])
+    about = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
+    reach = 0.75 * float(np.ptp(corners, axis=0).max())
+    right.set(xlim=(about[0] - reach, about[0] + reach), ylim=(about[1] + reach, about[1] - reach))
+    right.set_title("the vectors of one streak", fontsize=10)
+    return figure
+
+
+def draw_indicators() -> Figure:
+    """Draw slope, length and OLAE residual of every streak beside an object: Fig. 4.2 to 4.4."""
+    camera = StarCameraModel(field_of_view=FIELD)
+    generator = np.random.default_rng(OBJECT_SEED)
+    sky = draw_sky(camera, generator, tracked=False)
+    pixels = sky.frame(camera, OBJECT_MAGNITUDE, generator)
+    streaks = measure_streaks(segment_frame(pixels, StreakSettings()), StreakSettings())
+    ends = streaks.endpoints
+    item = int(np.linalg.norm(ends.mean(axis=1) - sky.path.mean(axis=0), axis=1).argmin())
+    figure = Figure(figsize=(8.0, 8.4), layout="constrained")
+    panels = figure.subplots(3, 1, sharex=True)
+    for axes, (label, values) in zip(panels, indicators(ends, sky.rate, camera.pinhole), strict=True):
+        mean, spread = float(values.mean()), float(values.std())
+        axes.plot(values, "o", color=_BLUE, markersize=4)
+        axes.plot(item, values[item], "o", color=_ORANGE, markersize=9, markerfacecolor="none")
+        axes.axhline(mean, color="black", linewidth=0.8)
+        axes.axhspan(mean - spread, mean + spread, color="gray", alpha=0.2, linewidth=0.0)
+        beyond = abs(values[item] - mean) / spread
+        axes.set_title(f"{label}: the object lies {beyond:.1f} sigma from the mean", fontsize=10)
+        axes.set_ylabel(label)
+        axes.grid(alpha=0.3)
+    panels[-1].set_xlabel("streak index (the object circled; the band is 1 sigma)")
+    return figure
+
+
+def indicators(ends: FloatArray, rate: FloatArray, pinhole: Pinhole) -> list[tuple[str, FloatArray]]:
+    """Return the thesis's three indicators (n,) of streaks (n, 2, 2), as it plots them: 4.2 to 4.4.
+
+    `rate` is the stars', rad/s over `EXPOSURE`. Streaks are ordered in time as a star would go; slopes are
+    those of the chords, without the projection's bend removed.
+    """
+    vectors = pinhole.unit_vectors(ends)
+    expected = star_ends(vectors, rate * EXPOSURE)
+    backward = np.sum((vectors[:, 1] - vectors[:, 0]) * (expected[:, 1] - expected[:, 0]), axis=-1) < 0.0
+    vectors = np.where(backward[:, None, None], vectors[:, ::-1], vectors)
+    ordered = np.where(backward[:, None, None], ends[:, ::-1], ends)
+    slope = np.tan(slopes(ordered))
+    return [
+        ("slope", np.asarray(slope)),
+        ("length, px", lengths(ends)),
+        ("OLAE residual", olae_residuals(vectors, rate * EXPOSURE)),
+    ]
+
+
+def _show(axes: Axes, pixels: Image) -> None:
+    low, high = np.percentile(pixels, (1.0, 99.9))
+    axes.imshow(pixels, cmap="gray_r", vmin=low, vmax=high, interpolation="nearest")
+    axes.set(xticks=[], yticks=[])
+
+
+PICTURES: dict[str, Callable[[], Figure]] = {
+    "fig_2_1_sky": draw_star_table,
+    "fig_3_1_to_3_4_cornerness": draw_cornerness,
+    "fig_3_5_centre_of_rotation": draw_centre,
+    "fig_4_2_to_4_4_indicators": draw_indicators,
+}
+
+if __name__ == "__main__":
+    raise SystemExit(main())
