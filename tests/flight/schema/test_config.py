@@ -48,12 +48,15 @@ def test_the_thesis_loop_stays_as_it_was_in_the_same_world() -> None:
 
 def test_the_simulation_case_is_the_thesis_s() -> None:
     """Ch. 5, Simulation Results: the loop of step_thesis.yaml, from another state, no thread, no camera."""
-    loop, case = (reader.load(FOLDER / name) for name in ("step_thesis.yaml", "step_simulation.yaml"))
+    loop, case = (
+        as_testbed(reader.load(FOLDER / name)) for name in ("step_thesis.yaml", "step_simulation.yaml")
+    )
     assert (case.guidance, case.control, case.coils) == (loop.guidance, loop.control, loop.coils)
     assert (case.plant, case.inertial_unit, case.camera) == (loop.plant, loop.inertial_unit, None)
     text = (FOLDER / "step_simulation.yaml").read_text(encoding="utf-8")
     world = reader.simulation_section(text, "step_simulation.yaml", Simulation)
     assert world is not None
+    assert world.release is not None
     assert (world.release.q2, world.release.rate, world.thread.stiffness) == (0.4, 0.015, 0.0)
     assert (world.current_noise, world.imu.quaternion_noise, world.imu.rate_noise) == (
         3.5e-3,

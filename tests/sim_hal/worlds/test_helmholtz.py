@@ -6,6 +6,7 @@ import pytest
 
 from flight.schema import reader
 from flight.schema.carried import config_path
+from flight.schema.testbed import as_testbed
 from sim_hal.worlds.helmholtz import helmholtz_field
 
 RADIUS, CURRENT, MEASURED = 0.15, 2.19, 9.98e-4
@@ -22,7 +23,7 @@ def test_the_measured_field_is_that_of_76_turns() -> None:
 
 def test_the_field_that_is_flown_takes_0_99_ampere() -> None:
     """4.5 gauss, "approximately 9 times Earth's ambient magnetic field strength of 0.5 gauss"."""
-    flown = reader.load(config_path("step_simulation")).plant.field
+    flown = as_testbed(reader.load(config_path("step_simulation"))).plant.field
     current = CURRENT * flown / MEASURED
     assert current == pytest.approx(0.99, abs=0.005)
     assert helmholtz_field(TURNS, current, RADIUS) == pytest.approx(4.5e-4, rel=2e-3)
