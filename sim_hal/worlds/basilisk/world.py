@@ -34,7 +34,7 @@ from sim_hal.worlds.free_body.section import FreeBodySection
 from sim_hal.worlds.free_body.streams import generators
 from sim_hal.worlds.motion import Motion
 from sim_hal.worlds.surroundings import Floats, Surroundings
-from sim_hal.worlds.world import WorldInputs
+from sim_hal.worlds.world import WorldInputs, WorldTruth
 
 if TYPE_CHECKING:
     from sim_hal.worlds.basilisk.scenario import Scenario
@@ -130,8 +130,12 @@ class BasiliskWorld:
         """Return UTC of the present state, ns since 1970."""
         return self._utc_start_ns + self.time_ns - self._start_ns
 
-    def truth(self) -> FreeBodyTruth:
-        """Return the state as it is; torques by their causes are not known here."""
+    def truth(self) -> WorldTruth:
+        """Return currents and energies of the state as it is."""
+        return WorldTruth(self._acting, self.energy, self.supply_energy)
+
+    def whole_truth(self) -> FreeBodyTruth:
+        """Return all of the state; torques by their causes are not known here."""
         motion, around = self.motion(self.time_ns), self.surroundings()
         return FreeBodyTruth(
             current=self._acting,

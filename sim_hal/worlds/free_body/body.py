@@ -159,8 +159,13 @@ class FreeBody:
         """Return UTC of the present state, ns since 1970."""
         return self._utc_start_ns + self.time_ns
 
-    def truth(self) -> FreeBodyTruth:
-        """Return the state as it is; torques by their causes."""
+    def truth(self) -> WorldTruth:
+        """Return currents and energies of the state as it is."""
+        self._integrate()
+        return WorldTruth(np.array(self._acting), self.energy, self.supply_energy)
+
+    def whole_truth(self) -> FreeBodyTruth:
+        """Return all of the state, with the torques by their causes."""
         self._integrate()
         around = self.surroundings()
         to_body = self._body_matrix()
