@@ -9,21 +9,25 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from flight.app.devices import unit_settings
 from flight.app.linux import linux_camera
 from flight.schema.devices import Camera
+from flight.schema.orbit_devices import WideCamera
 from flight.schema.sections import Config
 from hal.buses.clock import SystemClock
 from hal.buses.i2c_bus import LinuxI2cBus, device_file
 from hal.buses.serial_port import PySerialPort
-from hal.drivers.ina219 import CONFIG
+from hal.drivers import ads1115, ina219
 from hal.drivers.pca9685 import MODE1
 from hal.drivers.vn100.driver import Vn100
 from hal.interfaces.errors import DeviceError, NotResponding
 
 _CHIP_CURE = "is it powered, wired and at this address? `i2cdetect -y` shows who answers"
+_LISTENED_NS = 2_500_000_000
+_LOOK_NS = 20_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,9 +45,13 @@ def probe(config: Config) -> list[Probed]:
     found = list(_chips(config))
     unit = config.inertial_unit
     found.append(_probed("inertial_unit", unit.device, lambda stack: _ask_unit(config, stack)))
-    if config.camera is not None:
-        camera = config.camera
-        found.append(_probed("camera", _camera_place(camera), lambda stack: _open_camera(camera, stack)))
+    if config.gps is not None:
+        gps = config.gps
+        found.append(_probed("gps", gps.device, lambda stack: _listen(gps.device, gps.baud_rate, stack)))
+    cameras: dict[str, Camera | WideCamera] = {} if config.camera is None else {"camera": config.camera}
+    cameras |= {f"wide_cameras[{index}]": camera for index, camera in enumerate(config.wide_cameras)}
+    for name, camera in cameras.items():
+        found.append(_probed(name, _camera_place(camera), partial(_open_camera, camera)))
     return found + list(_files(config))
 
 
@@ -60,7 +68,10 @@ def _chips(config: Config) -> Iterator[Probed]:
     bus = device_file(config.coils.bus)
     addresses = {"coils": (config.coils.address, MODE1)}
     if config.power_monitor is not None:
-        addresses["power_monitor"] = config.power_monitor.address, CONFIG
+        addresses["power_monitor"] = config.power_monitor.address, ina219.CONFIG
+    if config.solar_strings is not None:
+        for address in sorted({string.address for string in config.solar_strings.strings}):
+            addresses[f"solar_strings, 0x{address:02x}"] = address, ads1115.CONFIG
     for name, (address, register) in addresses.items():
 
         def ask(stack: ExitStack, address: int = address, register: int = register) -> str:
@@ -82,12 +93,26 @@ def _ask_unit(config: Config, stack: ExitStack) -> str:
     return f"answers: {Vn100(port, clock, unit_settings(config)).model()}"
 
 
-def _open_camera(camera: Camera, stack: ExitStack) -> str:
+def _listen(device: str, baud_rate: int, stack: ExitStack) -> str:
+    """Wait for what a GPS receiver sends by itself, at least once a second."""
+    clock = SystemClock()
+    port = PySerialPort(device, baud_rate, clock)
+    stack.callback(port.close)
+    deadline_ns = clock.now_ns() + _LISTENED_NS
+    while clock.now_ns() < deadline_ns:
+        if port.receive():
+            return "sends"
+        clock.sleep_until_ns(clock.now_ns() + _LOOK_NS)
+    silence = f"opens, but not one byte came in {_LISTENED_NS * 1e-9:g} s"
+    raise NotResponding(device, f"{silence}: check power, the cable and the baud rate")
+
+
+def _open_camera(camera: Camera | WideCamera, stack: ExitStack) -> str:
     linux_camera(camera, SystemClock(), stack)
     return "opens; `flight camera` shows what it sees"
 
 
-def _camera_place(camera: Camera) -> str:
+def _camera_place(camera: Camera | WideCamera) -> str:
     device = camera.device
     return "" if device is None else str(getattr(device, "path", None) or getattr(device, "name", ""))
 

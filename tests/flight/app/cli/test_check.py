@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import time
@@ -126,6 +127,38 @@ def test_devices_that_are_missing_are_named_with_the_cure_and_one_that_is_there_
     text = command("check", path).stdout
     assert "MISSING  coils" in text
     assert "found    inertial_unit" in text
+
+
+def test_the_devices_of_an_orbit_are_looked_for_too(unit: Path, tmp_path: Path) -> None:
+    """The emulated unit stands for a receiver that sends by itself; a port that nobody feeds is silent."""
+    strings = [
+        {"normal": normal, "address": address, "channel": channel}
+        for normal, address, channel in (
+            ([1.0, 0.0, 0.0], 0x48, 0), ([-1.0, 0.0, 0.0], 0x48, 1),
+            ([0.0, 1.0, 0.0], 0x49, 0), ([0.0, -1.0, 0.0], 0x49, 1),
+        )
+    ]  # fmt: skip
+    master, slave = os.openpty()
+    try:
+        for device, answer in ((unit, True), (Path(os.ttyname(slave)), False)):
+            tree = yaml.safe_load((ROOT / "config" / "orbit.yaml").read_text())
+            del tree["simulation"]
+            path = tmp_path / "orbit.yaml"
+            changes = {
+                "gps": {"device": str(device)},
+                "solar_strings": {"strings": strings},
+                "wide_cameras": [{"device": {"kind": "v4l2", "path": str(tmp_path / "none")}}],
+            }
+            path.write_text(yaml.safe_dump({**tree, **changes}), encoding="utf-8")
+            done = command("check", path, "--json")
+            assert done.returncode == 1, done.stderr
+            found = {item["name"]: item for item in json.loads(done.stdout)["devices"]}
+            assert found["gps"]["found"] is answer, found["gps"]
+            assert {"solar_strings, 0x48", "solar_strings, 0x49", "wide_cameras[0]"} < set(found)
+            assert "not one byte came" in found["gps"]["text"] or answer
+    finally:
+        os.close(master)
+        os.close(slave)
 
 
 @pytest.mark.parametrize(
