@@ -156,6 +156,12 @@ def test_its_report_prints_the_figures_of_table_5_3_and_draws_seven_pictures(
     assert len(list((tmp_path / "figures").glob("*.png"))) == 7
 
 
+def test_the_bus_gives_the_same_charge_at_its_higher_voltage(demonstration: Run) -> None:
+    """5 V at the bus and 3.4 V at the coils carry one current; the monitor is read once a second."""
+    power = report.summarise(demonstration)["power"]
+    assert power["bus_average_w"] == pytest.approx(power["supply_average_w"] * 5.0 / 3.4, rel=0.05)
+
+
 def test_the_same_seed_gives_the_same_log_bit_for_bit_and_another_seed_does_not(tmp_path: Path) -> None:
     config = demo_config(8.0)
     logs = []
