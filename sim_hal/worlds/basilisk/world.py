@@ -24,7 +24,6 @@ from sim_hal.worlds import sun
 from sim_hal.worlds.free_body.body import (
     KNIGHTCUBE_POWER,
     CoilPower,
-    FreeBodyTruth,
     elements,
     julian_date,
     released,
@@ -33,7 +32,7 @@ from sim_hal.worlds.free_body.craft import CRAFTS, build
 from sim_hal.worlds.free_body.section import FreeBodySection
 from sim_hal.worlds.free_body.streams import generators
 from sim_hal.worlds.motion import Motion
-from sim_hal.worlds.surroundings import Floats, Surroundings
+from sim_hal.worlds.surroundings import Floats, OrbitTruth, Surroundings
 from sim_hal.worlds.world import WorldInputs
 
 if TYPE_CHECKING:
@@ -130,10 +129,10 @@ class BasiliskWorld:
         """Return UTC of the present state, ns since 1970."""
         return self._utc_start_ns + self.time_ns - self._start_ns
 
-    def truth(self) -> FreeBodyTruth:
+    def truth(self) -> OrbitTruth:
         """Return the state as it is; torques by their causes are not known here."""
         motion, around = self.motion(self.time_ns), self.surroundings()
-        return FreeBodyTruth(
+        return OrbitTruth(
             current=self._acting,
             energy=self.energy,
             supply_energy=self.supply_energy,
@@ -145,8 +144,8 @@ class BasiliskWorld:
             field=np.array(around.field),
             sun=np.array(around.sun),
             sunlit=around.sunlit,
-            torques={},
             residual_dipole=self._residual(),
+            causes=dict,
         )
 
     def _step(self, until_ns: int) -> None:
