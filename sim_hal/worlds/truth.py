@@ -1,15 +1,20 @@
-"""Records the true state of the world at 40 Hz, as packets in a log of its own."""
+"""Records the true state of the world at 40 Hz, and of an orbit at 1 Hz, as packets in a log of its own."""
 
 from __future__ import annotations
 
 from typing import Protocol
 
-from flight.link.telemetry.definitions import TRUTH
+import numpy as np
+
+from flight.link.telemetry.definitions import ORBIT_TRUTH, TRUTH
 from flight.link.telemetry.packets import Packer
 from sim_hal.emulators.device import NEVER
+from sim_hal.worlds.surroundings import CAUSES, OrbitingWorld, OrbitTruth
 from sim_hal.worlds.world import World
 
 PERIOD_NS = 25_000_000
+ORBIT_PERIOD_NS = 1_000_000_000
+_UNKNOWN = np.full(3, np.nan)
 
 
 class PacketLog(Protocol):
@@ -64,4 +69,26 @@ class TruthRecorder:
                 energy=truth.energy,
                 supply_energy=truth.supply_energy,
             )
+        )
+        if (time_ns - self._epoch_ns) % ORBIT_PERIOD_NS == 0 and isinstance(world, OrbitingWorld):
+            self._log.write(self._of_orbit(time_ns, world.orbit_truth()))
+
+    def _of_orbit(self, time_ns: int, truth: OrbitTruth) -> bytes:
+        torques = truth.torques
+        coils, dipole, gravity, drag, sunlight = (torques.get(cause, _UNKNOWN).tolist() for cause in CAUSES)
+        return self._packer.pack(
+            ORBIT_TRUTH,
+            time_ns - self._epoch_ns,
+            utc=truth.utc,
+            position=truth.position.tolist(),
+            velocity=truth.velocity.tolist(),
+            field=truth.field.tolist(),
+            sun=truth.sun.tolist(),
+            sunlit=truth.sunlit,
+            residual_dipole=truth.residual_dipole.tolist(),
+            coil_torque=coils,
+            dipole_torque=dipole,
+            gravity_torque=gravity,
+            drag_torque=drag,
+            sunlight_torque=sunlight,
         )

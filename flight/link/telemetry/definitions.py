@@ -314,6 +314,27 @@ TRUTH = Packet(
     ),
 )
 
+ORBIT_TRUTH = Packet(
+    "orbit_truth",
+    0x141,
+    "1 Hz, simulation of an orbit only",
+    "What surrounded the satellite and turned it; written by sim_hal beside truth; NaN is not known",
+    (
+        Field("utc", "f8", "day", "Julian date UTC of the simulated world"),
+        Field("position", "f8", "m", "geocentric, ICRS", 3),
+        Field("velocity", "f8", "m/s", "ICRS", 3),
+        Field("field", "f8", "T", "of the Earth, ICRS", 3),
+        Field("sun", "f8", "-", "direction of the Sun, ICRS", 3),
+        Field("sunlit", "f8", "-", "share of the Sun's disc that is seen"),
+        Field("residual_dipole", "f8", "A m^2", "body axes", 3),
+        Field("coil_torque", "f8", "N m", "body axes", 3),
+        Field("dipole_torque", "f8", "N m", "of the residual dipole, body axes", 3),
+        Field("gravity_torque", "f8", "N m", "of the gravity gradient, body axes", 3),
+        Field("drag_torque", "f8", "N m", "body axes", 3),
+        Field("sunlight_torque", "f8", "N m", "body axes", 3),
+    ),
+)
+
 CYCLE_TIMING = Packet(
     "cycle_timing",
     0x150,
@@ -370,6 +391,7 @@ PACKETS: tuple[Packet, ...] = (
     HEALTH,
     COMMAND,
     TRUTH,
+    ORBIT_TRUTH,
     CYCLE_TIMING,
     RATE_GROUP,
     JOB_TIMING,

@@ -34,7 +34,7 @@ from flight.gnc.earth.orientation import celestial_to_terrestrial
 from flight.gnc.math import quaternion
 from flight.gnc.math.arrays import FloatArray
 from sim_hal.worlds import sun
-from sim_hal.worlds.basilisk.world import STEP_NS
+from sim_hal.worlds.basilisk import STEP_NS
 from sim_hal.worlds.free_body.craft import TrueCraft
 from sim_hal.worlds.free_body.pressure import DRAG_COEFFICIENT
 from sim_hal.worlds.free_body.section import Disturbances

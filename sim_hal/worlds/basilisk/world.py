@@ -21,10 +21,10 @@ from flight.schema.errors import ConfigError
 from hal.interfaces.wires import SECOND_NS
 from sim_hal.emulators.device import NEVER
 from sim_hal.worlds import sun
+from sim_hal.worlds.basilisk import STEP_NS
 from sim_hal.worlds.free_body.body import (
     KNIGHTCUBE_POWER,
     CoilPower,
-    FreeBodyTruth,
     elements,
     julian_date,
     released,
@@ -33,14 +33,11 @@ from sim_hal.worlds.free_body.craft import CRAFTS, build
 from sim_hal.worlds.free_body.section import FreeBodySection
 from sim_hal.worlds.free_body.streams import generators
 from sim_hal.worlds.motion import Motion
-from sim_hal.worlds.surroundings import Floats, Surroundings
+from sim_hal.worlds.surroundings import Floats, OrbitTruth, Surroundings
 from sim_hal.worlds.world import WorldInputs, WorldTruth
 
 if TYPE_CHECKING:
     from sim_hal.worlds.basilisk.scenario import Scenario
-
-
-STEP_NS = 25_000_000
 
 
 class BasiliskWorld:
@@ -134,10 +131,10 @@ class BasiliskWorld:
         """Return currents and energies of the state as it is."""
         return WorldTruth(self._acting, self.energy, self.supply_energy)
 
-    def whole_truth(self) -> FreeBodyTruth:
-        """Return all of the state; torques by their causes are not known here."""
+    def orbit_truth(self) -> OrbitTruth:
+        """Return the state as it is; torques by their causes are not known here."""
         motion, around = self.motion(self.time_ns), self.surroundings()
-        return FreeBodyTruth(
+        return OrbitTruth(
             current=self._acting,
             energy=self.energy,
             supply_energy=self.supply_energy,
@@ -149,8 +146,8 @@ class BasiliskWorld:
             field=np.array(around.field),
             sun=np.array(around.sun),
             sunlit=around.sunlit,
-            torques={},
             residual_dipole=self._residual(),
+            causes=dict,
         )
 
     def _step(self, until_ns: int) -> None:

@@ -28,7 +28,6 @@ from sim_hal.worlds.free_body.load_model import LoadModel
 from sim_hal.worlds.free_body.rotation import (
     Floats,
     Loads,
-    Matrix,
     Rotation,
     State,
     matrix,
@@ -39,7 +38,7 @@ from sim_hal.worlds.free_body.section import FreeBodySection, OrbitSection, TipO
 from sim_hal.worlds.free_body.streams import generators
 from sim_hal.worlds.motion import Motion
 from sim_hal.worlds.orbit import KeplerianElements
-from sim_hal.worlds.surroundings import Surroundings
+from sim_hal.worlds.surroundings import OrbitTruth, Surroundings
 from sim_hal.worlds.world import WorldInputs, WorldTruth
 
 UNIX_EPOCH = 2_440_587.5
@@ -47,30 +46,6 @@ UNIX_EPOCH = 2_440_587.5
 LONGEST_STEP = 0.1
 """s; air, sunlight and residual dipole are held as long, as they are in the middle of that time."""
 ZERO: Floats = (0.0, 0.0, 0.0)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FreeBodyTruth(WorldTruth):
-    """The state of the world; vectors in ICRS where nothing else is said.
-
-    Attributes:
-        utc: Julian date. quaternion: (4,) ICRS into body. rate: (3,) rad/s, body axes.
-        position: (3,) m. velocity: (3,) m/s. field: (3,) T.
-        sun: (3,) its direction. sunlit: share of its disc that is seen.
-        torques: (3,) N m, body axes, by cause: coils, residual dipole, gravity gradient, drag, sunlight.
-        residual_dipole: (3,) A m^2, body axes.
-    """
-
-    utc: float
-    quaternion: FloatArray
-    rate: FloatArray
-    position: FloatArray
-    velocity: FloatArray
-    field: FloatArray
-    sun: FloatArray
-    sunlit: float
-    torques: dict[str, FloatArray]
-    residual_dipole: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,35 +139,43 @@ class FreeBody:
         self._integrate()
         return WorldTruth(np.array(self._acting), self.energy, self.supply_energy)
 
-    def whole_truth(self) -> FreeBodyTruth:
-        """Return all of the state, with the torques by their causes."""
+    def orbit_truth(self) -> OrbitTruth:
+        """Return the state as it is; torques by their causes."""
         self._integrate()
-        around = self.surroundings()
-        to_body = self._body_matrix()
-        field = turned(to_body, around.field)
-        residual = self._loads.residual_dipole(around)
-        drag, sunlight = self._loads.pressures(around, to_body)
-        return FreeBodyTruth(
-            current=np.array(self._acting),
+        around, state, acting = self.surroundings(), self._state, self._acting
+        return OrbitTruth(
+            current=np.array(acting),
             energy=self.energy,
             supply_energy=self.supply_energy,
             utc=self.utc_start + self._seconds(self.time_ns) / DAY,
             quaternion=self._attitude(),
-            rate=np.array(turned(self._to_body, self._state[4:])),
+            rate=np.array(turned(self._to_body, state[4:])),
             position=np.array(around.position),
             velocity=np.array(around.velocity),
             field=np.array(around.field),
             sun=np.array(around.sun),
             sunlit=around.sunlit,
-            torques={
-                "coils": np.cross(self._loads.coil_dipole(self._acting), field),
-                "residual dipole": np.cross(residual, field),
-                "gravity gradient": self._gradient(around),
-                "drag": np.array(drag),
-                "sunlight": np.array(sunlight),
-            },
-            residual_dipole=np.array(residual),
+            residual_dipole=np.array(self._loads.residual_dipole(around)),
+            causes=lambda: self._torques(around, state, acting),
         )
+
+    def _torques(self, around: Surroundings, state: State, acting: Floats) -> dict[str, FloatArray]:
+        """Return the torques (3,) N m, body axes, by their causes."""
+        turn = matrix(*state[:4])
+        attitude = quaternion.multiply(self._from_principal, np.array(state[:4]))
+        to_body = matrix(*attitude.tolist())
+        field = turned(to_body, around.field)
+        drag, sunlight = self._loads.pressures(around, to_body)
+        gx, gy, gz = turned(turn, self._loads.pull(around.position))
+        a, b, c = self.craft.inertia
+        gradient = (c - b) * gy * gz, (a - c) * gz * gx, (b - a) * gx * gy
+        return {
+            "coils": np.cross(self._loads.coil_dipole(acting), field),
+            "residual dipole": np.cross(self._loads.residual_dipole(around), field),
+            "gravity gradient": np.array(turned(self._to_body, gradient)),
+            "drag": np.array(drag),
+            "sunlight": np.array(sunlight),
+        }
 
     def _integrate(self) -> None:
         """Bring the state to `time_ns`."""
@@ -243,17 +226,8 @@ class FreeBody:
         position, field = self.environment.position_and_field(time)
         return self._loads.pull(position), field
 
-    def _gradient(self, around: Surroundings) -> FloatArray:
-        """Return the torque (3,) N m of the gravity gradient, body axes."""
-        gx, gy, gz = turned(matrix(*self._state[:4]), self._loads.pull(around.position))
-        a, b, c = self.craft.inertia
-        return np.array(turned(self._to_body, ((c - b) * gy * gz, (a - c) * gz * gx, (b - a) * gx * gy)))
-
     def _attitude(self) -> FloatArray:
         return quaternion.multiply(self._from_principal, np.array(self._state[:4]))
-
-    def _body_matrix(self) -> Matrix:
-        return matrix(*self._attitude().tolist())
 
     def _spend(self, span: float) -> None:
         x, y, z = self._acting

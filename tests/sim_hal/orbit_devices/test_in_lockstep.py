@@ -16,6 +16,7 @@ from flight.gnc.math import quaternion
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.vision.sun_sensor.direction import find_sun
 from flight.gnc.vision.sun_sensor.settings import SunSettings
+from flight.link.telemetry.scanner import scan
 from flight.schema import reader
 from flight.schema.errors import ConfigError
 from hal.interfaces.errors import NotResponding
@@ -234,3 +235,20 @@ def test_aberration_moves_the_stars_towards_the_velocity() -> None:
     assert star[1] == 0.0
     along = aberrated(attitude, np.array([0.0, 0.0, 29_800.0]))
     np.testing.assert_array_equal(along, attitude)
+
+
+def test_the_truth_of_the_orbit_is_logged_once_a_second(tmp_path: Path) -> None:
+    with lockstep.opened(orbit_config(), orbit_world(), tmp_path) as lock:
+        lock.release(0)
+        lock.clock.sleep_until_ns(5 * SECOND_NS + 1)
+    packets = scan(b"".join(path.read_bytes() for path in sorted(tmp_path.glob("truth-*")))).packets
+    logged = packets["orbit_truth"]
+    assert logged["time_ns"].tolist() == [second * SECOND_NS for second in range(6)]
+    first, around = logged[0], at_first()
+    np.testing.assert_array_equal(first["position"], around.position)
+    np.testing.assert_array_equal(first["sun"], around.sun)
+    assert first["sunlit"] == 1.0
+    assert abs(first["residual_dipole"] @ first["dipole_torque"]) < 1e-20
+    sizes = [np.linalg.norm(first[f"{cause}_torque"]) for cause in ("dipole", "gravity", "drag", "sunlight")]
+    assert all(0.0 < size < 1e-7 for size in sizes)
+    assert len(packets["truth"]) == 201

@@ -99,7 +99,7 @@ class FreeFlight:
 
     def ephemeris(self, duration: float) -> Ephemeris:
         """Return what flight software predicts from a GPS fix now, over `duration` s from the fix on."""
-        truth = self.body.whole_truth()
+        truth = self.body.orbit_truth()
         position = truth.position + FIX_SIGMA * self.generator.standard_normal(3)
         velocity = truth.velocity + FIX_VELOCITY_SIGMA * self.generator.standard_normal(3)
         return predict(OrbitState(truth.utc, position, velocity, FIX_SIGMA), duration)

@@ -35,7 +35,7 @@ def test_the_body_is_held_until_its_release_while_the_orbit_goes_on() -> None:
     held = body.motion(2 * SECOND - 1)
     np.testing.assert_array_equal(first.quaternion, held.quaternion)
     assert not held.rate.any()
-    assert np.linalg.norm(body.whole_truth().velocity) == pytest.approx(7612.6, abs=20.0)
+    assert np.linalg.norm(body.orbit_truth().velocity) == pytest.approx(7612.6, abs=20.0)
     assert np.abs(held.field_body - first.field_body).max() > 1e-9
     later = body.motion(3 * SECOND)
     assert np.linalg.norm(later.rate) == pytest.approx(0.2, abs=0.01)
@@ -114,7 +114,7 @@ def test_the_disturbances_of_a_3u_have_the_sizes_that_the_design_names() -> None
         body = FreeBody(FreeBodySection(craft="cubesat_3u"), lambda: np.zeros(3), seed=seed)
         for time in range(0, 2000, 100):
             body.advance_to(time * SECOND)
-            for cause, torque in body.whole_truth().torques.items():
+            for cause, torque in body.orbit_truth().torques.items():
                 sizes.setdefault(cause, []).append(float(np.linalg.norm(torque)))
     assert 4.4e-8 < max(sizes["gravity gradient"]) <= 5.0e-8
     assert 1e-8 < np.median(sizes["residual dipole"]) < max(sizes["residual dipole"]) < 7e-8
@@ -129,7 +129,7 @@ def test_the_residual_dipole_has_a_part_that_goes_in_shadow() -> None:
     dark: list[FloatArray] = []
     for time in range(0, 5600, 50):
         body.advance_to(time * SECOND)
-        truth = body.whole_truth()
+        truth = body.orbit_truth()
         (lit if truth.sunlit == 1.0 else dark if truth.sunlit == 0.0 else []).append(truth.residual_dipole)
     difference = np.linalg.norm(np.mean(lit, axis=0) - np.mean(dark, axis=0))
     assert difference == pytest.approx(3e-4, abs=1.2e-4)
