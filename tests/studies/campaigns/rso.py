@@ -30,6 +30,7 @@ from flight.gnc.vision.streaks.streak_result import StreakStatus
 from sim_hal.star_camera import SourceTrack, StarCameraModel, render
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.rso_pictures import draw_detection_rate, draw_frames
+from tests.studies.campaigns.rso_table import thesis_table
 from tests.studies.campaigns.scenes import FIELD, SAMPLES, catalogue
 
 EXPOSURE = 0.5
@@ -131,7 +132,8 @@ def run(case: Case) -> Result:
         "error_px": found.error,
         "false": found.false,
         "seconds": seconds,
-        "rates": _rates(pixels, camera, sky.rate),
+        "true_rate": sky.rate.tolist(),
+        **_rates(pixels, camera, sky.rate),
     }
 
 
@@ -166,7 +168,10 @@ def ends_error(ends: FloatArray, truth: FloatArray) -> float:
 
 
 def _rates(pixels: Image, camera: StarCameraModel, rate: FloatArray) -> Result:
-    """Return the two estimators' errors: magnitude in parts of it, axis in rad; None without a rate."""
+    """Return the two estimators' rates, (3,) rad/s, and errors: magnitude in parts of it, axis in rad.
+
+    None without a rate.
+    """
     saturation = float(camera.highest_count)
     streaks = StreakSettings(saturation=saturation, gain=camera.gain)
     likelihood = LikelihoodSettings(saturation=saturation, gain=camera.gain, knowledge=EXACT)
@@ -174,14 +179,18 @@ def _rates(pixels: Image, camera: StarCameraModel, rate: FloatArray) -> Result:
         "harris": estimate_rate(pixels, camera.pinhole, EXPOSURE, streaks, rate, 0.0),
         "likelihood": estimate_motion(pixels, camera.pinhole, EXPOSURE, likelihood, rate, 0.0),
     }
-    return {name: _rate_error(estimate, rate) for name, estimate in found.items()}
+    rates = {name: e.rate if e.status is StreakStatus.RATE else None for name, e in found.items()}
+    return {
+        "estimated": {name: None if own is None else own.tolist() for name, own in rates.items()},
+        "rates": {name: _rate_error(own, rate) for name, own in rates.items()},
+    }
 
 
-def _rate_error(found: Any, rate: FloatArray) -> list[float] | None:
-    if found.status is not StreakStatus.RATE:
+def _rate_error(own: FloatArray | None, rate: FloatArray) -> list[float] | None:
+    if own is None:
         return None
-    size, true = float(np.linalg.norm(found.rate)), float(np.linalg.norm(rate))
-    away = float(np.arctan2(np.linalg.norm(np.cross(found.rate, rate)), found.rate @ rate))
+    size, true = float(np.linalg.norm(own)), float(np.linalg.norm(rate))
+    away = float(np.arctan2(np.linalg.norm(np.cross(own, rate)), own @ rate))
     return [size / true - 1.0, away]
 
 
@@ -209,6 +218,13 @@ def summarise_as(name: str, results: Sequence[Result], out: Path) -> Summary:
     for label, key, thesis in (("rate, %", "rate_percent", 0), ("axis, deg", "axis_deg", 1)):
         here = " | ".join(number(rates[estimator][key], 4) for estimator in ESTIMATORS)
         lines.append(f"  {label:10} {THESIS[name][thesis]} | {here}")
+    # The thesis's own table is of one frame, with an object of magnitude 1 in it.
+    one = next((r for r in results if r["magnitude"] == MAGNITUDES[0]), None)
+    if one is not None:
+        rows_of_one, facts["one_frame"] = thesis_table(
+            name, EXPOSURE, np.array(one["true_rate"]), one["estimated"]
+        )
+        lines = [*rows_of_one, "", *lines]
     counted = " | ".join(f"{rates[e]['rates']} of {rates[e]['frames']}" for e in ESTIMATORS)
     lines += [f"  rates given  - | {counted}", "", "magnitude  found        ends px (median)  false"]
     lines += [_magnitude_line(row) for row in rows]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import signal
@@ -9,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+import zipfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +19,7 @@ import numpy as np
 import pytest
 
 from flight.gnc.errors import UsageError
+from tests.studies.campaigns import cluster as cluster_code
 from tests.studies.campaigns.campaign import Campaign, CampaignError, Case, Result, Summary, fly, fly_here
 
 distributed = pytest.importorskip("distributed", reason="Dask is an optional extra and not installed")
@@ -134,3 +137,20 @@ def test_no_scheduler_is_said_in_one_line(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr("tests.studies.campaigns.cluster.CONNECT_S", 0.3)
     with pytest.raises(UsageError, match=r"--dask tcp://127.0.0.1:9: no scheduler answers there"):
         fly(TOY, 1, 3, tmp_path, dask="tcp://127.0.0.1:9")
+
+
+def test_a_worker_with_another_checkouts_code_runs_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    words = (__name__, "draw", {"key": "1", "seed": (3, 1), "parameters": {"factor": 1}})
+    monkeypatch.setenv("KNIGHTCUBE_CODE", "this")
+    assert cluster_code.carry_out("this", *words)["value"] == draw(cases(2, 3)[1])["value"]
+    assert cluster_code.carry_out("other", *words) is None
+
+
+def test_the_archive_is_the_same_for_the_same_files_and_holds_what_is_imported() -> None:
+    root = Path(__file__).parents[3]
+    sent = cluster_code.archive_of(root)
+    assert sent == cluster_code.archive_of(root)
+    names = set(zipfile.ZipFile(io.BytesIO(sent)).namelist())
+    assert {"flight/gnc/catalogue/hipparcos.npz", "config/step_demo.yaml"} <= names
+    assert {"flight/schema/configurations/step_demo.yaml", "tests/studies/checks/test_cluster.py"} <= names
+    assert not any("__pycache__" in name for name in names)
