@@ -54,6 +54,9 @@ _AT_REST = 4.0
 # The same of the brightest regions, below which no streak of the least length can be among them.
 _SPOT = 2.2
 _BRIGHTEST = 12
+# Why there is no rate where a motion was fitted, and where none was.
+_NONE = "light and ends of the streaks bear out no motion"
+_NO_MOTION = "the bright areas agree on no motion"
 
 
 def estimate_motion(
@@ -176,7 +179,10 @@ def _answer(camera: ExposedCamera, seen: MotionResult, blobs: Blobs, near: float
         ):
             return candidate.answer
         candidates.append(candidate)
-    refused = replace(leading.answer.result, status=StreakStatus.FAILED, rate=None, covariance=None)
+    seen = leading.answer.result
+    refused = replace(
+        seen, status=StreakStatus.FAILED, rate=None, covariance=None, reason=seen.reason or _NONE
+    )
     return replace(leading.answer, result=refused)
 
 
@@ -235,7 +241,7 @@ def _without_rate(seen: MotionResult, camera: ExposedCamera, blobs: Blobs) -> Mo
     """Return `seen` for a frame without an agreed motion: stars at rest, or a failure."""
     length = float(np.median(blobs.length))
     if length >= _AT_REST:
-        return replace(seen, status=StreakStatus.FAILED, length=length)
+        return replace(seen, status=StreakStatus.FAILED, length=length, reason=_NO_MOTION)
     resting = still_fit(camera, blobs)
     if resting is None:
         return replace(seen, status=StreakStatus.TOO_SHORT, length=length)

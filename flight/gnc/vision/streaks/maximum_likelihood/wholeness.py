@@ -19,9 +19,8 @@ _MOST_CHAINED = 0.45
 _TRUE_ENDS = (0.75, 0.6)
 # Share of the stars that are dark along a good part of their path, which one may be for reasons of its own.
 _BROKEN = (0.12, 0.35)
-# This many stars with both ends on the detector, this part of those in place, leave no doubt.
+# With this many stars both of whose ends are in place nothing else raises doubt.
 _VOUCHING = 3
-_VOUCHED = 0.9
 # Share of the light of streaks that lie in the frame from end to end which the motion must have on its side.
 _WHOLE_LIGHT = 0.5
 # Where the rate changes by more than the first part of itself, the second part of the stars may have light
@@ -62,7 +61,8 @@ def wholeness(camera: ExposedCamera, scene: Scene, faint: FaintStars) -> Wholene
     right = float(np.mean(ends[known])) if known.any() else 1.0
     if both.any() and float(np.mean(ends[both])) < _TRUE_ENDS[1]:
         return Wholeness.BROKEN
-    vouched = np.count_nonzero(both) >= _VOUCHING and float(np.mean(ends[both])) >= _VOUCHED
+    in_place = ends[both].all(axis=1)
+    vouched = np.count_nonzero(in_place) >= _VOUCHING and float(np.mean(in_place)) >= _TRUE_ENDS[0]
     dark = np.count_nonzero(lit == 0.0)
     for worst, (least_ends, most_broken) in zip(
         (Wholeness.BROKEN, Wholeness.DOUBTED), zip(_TRUE_ENDS[::-1], _BROKEN[::-1], strict=True), strict=True
