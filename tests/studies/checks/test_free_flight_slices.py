@@ -7,7 +7,6 @@ from pathlib import Path
 from tests.studies.campaigns import detumble, orbit_pointing
 from tests.studies.campaigns.campaign import Case
 
-
 CASE = {"craft": "knightcube", "orbit": "sso"}
 
 
