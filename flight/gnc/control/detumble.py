@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flight.gnc.errors import UsageError
+from flight.gnc.estimation.field_rate import rate_across
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector
 
@@ -81,19 +82,6 @@ def share_in_turning_field(turn: float, schedule: WindowSchedule) -> float:
     per revolution.
     """
     return min(2.0 * turn * schedule.period_ns * _SECOND, MOST_SHARE)
-
-
-def rate_across(before: FloatArray, after: FloatArray, seconds: float) -> FloatArray:
-    """Return the rate (3,) across the field, rad/s, that turned `before` into `after` (3,) T in the body.
-
-    Exact for a steady rotation across the field by less than half a turn. Zero without a field.
-    """
-    turned = np.cross(after, before)  # -w x B: the field turns opposite to the body
-    length = float(np.linalg.norm(turned))
-    if length == 0.0:
-        return np.zeros(3)
-    angle = math.atan2(length, float(before @ after))
-    return turned * (angle / (length * seconds))
 
 
 def braking_current(braking: Braking, rate: FloatArray, field: FloatArray, act_time: float) -> FloatArray:

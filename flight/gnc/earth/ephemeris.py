@@ -101,14 +101,15 @@ def predict(state: OrbitState, duration: float, step: float = STEP) -> Ephemeris
 
     Over two revolutions the neglected air and gravity move a satellite by a kilometre, 15 nT of its field.
     """
-    times = step * np.arange(int(np.ceil(duration / step)) + 2)
+    times: FloatArray = step * np.arange(np.ceil(duration / step) + 2.0)
     dates = state.julian_date + times / DAY
     states = [np.concatenate([state.position, state.velocity])]
     for _ in times[1:]:
         states.append(carried_on(states[-1], step))
     along = np.array(states)
     position = along[:, :3]
-    sun = np.linspace(*(-earth_from_sun(float(terrestrial_time(d)))[0] for d in dates[[0, -1]]), len(dates))
+    first, last = (-earth_from_sun(float(terrestrial_time(date)))[0] for date in dates[[0, -1]])
+    sun = first + np.linspace(0.0, 1.0, len(dates))[:, None] * (last - first)
     return Ephemeris(
         state.julian_date,
         times,

@@ -21,7 +21,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.control.detumble import rate_across
 from flight.gnc.estimation.turn import (
     Matrix,
     Quaternion,
@@ -74,6 +73,19 @@ class FieldRateSettings:
     gate_sigma: float = 5.0
     refusals: int = 5
     longest_gap: float = 0.2
+
+
+def rate_across(before: FloatArray, after: FloatArray, seconds: float) -> FloatArray:
+    """Return the rate (3,) across the field, rad/s, that turned `before` into `after` (3,) T in the body.
+
+    Exact for a steady rotation across the field by less than half a turn. Zero without a field.
+    """
+    turned = np.cross(after, before)  # -w x B: the field turns opposite to the body
+    length = float(np.linalg.norm(turned))
+    if length == 0.0:
+        return np.zeros(3)
+    angle = math.atan2(length, float(before @ after))
+    return turned * (angle / (length * seconds))
 
 
 class FieldRate:

@@ -51,6 +51,7 @@ OTHERS = {
     "DeterminationSettings": "a satellite's attitude determination, which the testbed does not fly",
     "EdgeSettings": "horizon cameras",
     "HorizonSettings": "horizon cameras",
+    "FreeFilterSettings": "a satellite's navigation, which the testbed does not fly",
     "IdentificationSettings": "limits of the method",
     "IndexSettings": "an index is built on the ground",
     "ObjectSettings": "objects in frames of a run on the ground",

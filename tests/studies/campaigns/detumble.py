@@ -8,6 +8,7 @@ body turns by 0.3 rad.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ from sim_hal.worlds.free_body.section import TipOff
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.free_flight import CRAFT, GYRO_NOISE, ORBITS, SECOND, FreeFlight
 
-SPEED, SLOW = np.radians(10.0), np.radians(0.5)
+SPEED, SLOW = math.radians(10.0), math.radians(0.5)
 SCHEDULE = WindowSchedule(100_000_000, 100_000_000, 800_000_000)
 DUTY = SCHEDULE.act_ns / SCHEDULE.period_ns
 SAMPLES_NS = range(SCHEDULE.settle_ns, SCHEDULE.settle_ns + SCHEDULE.measure_ns, 25_000_000)
@@ -63,7 +64,7 @@ def cases(runs: int, seed: int) -> list[Case]:
 def run(case: Case) -> Result:
     """Fly until the body is slow, or lost."""
     wanted = case.parameters
-    release = TipOff(speed=wanted.get("speed", SPEED))
+    release = TipOff(speed=wanted.get("speed") or SPEED)
     flight = FreeFlight(wanted["craft"], hash_of(case), wanted["orbit"], release)
     law = _MagnetometerAlone(flight, wanted) if wanted["law"] == "magnetometer" else _AttitudeKnown(flight)
     longest = wanted.get("longest", LONGEST)

@@ -16,6 +16,7 @@ from tests.studies.campaigns.lost_in_space import LOST_IN_SPACE
 from tests.studies.campaigns.mismatch import MISMATCH, VIBRATION
 from tests.studies.campaigns.nadir import NADIR
 from tests.studies.campaigns.orbit_attitude import ORBIT_ATTITUDE
+from tests.studies.campaigns.orbit_pointing import ORBIT_POINTING
 from tests.studies.campaigns.planner_edge import PLANNER_EDGE
 from tests.studies.campaigns.rate_change import RATE_CHANGE
 from tests.studies.campaigns.rolling_shutter import ROLLING_SHUTTER
@@ -54,5 +55,6 @@ CAMPAIGNS: dict[str, Campaign] = {
         ORBIT_ATTITUDE,
         DETUMBLE,
         WORLD_COMPARISON,
+        ORBIT_POINTING,
     )
 }

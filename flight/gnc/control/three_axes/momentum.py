@@ -80,7 +80,7 @@ def turning_field(field: FloatArray, change: FloatArray, step: float, instants: 
     if speed == 0.0:
         return np.broadcast_to(field, (instants, 3)).copy()
     angle = (speed * step) * np.arange(instants)[:, None]
-    return strength * np.cos(angle) * along + np.sin(angle) * across / speed
+    return np.asarray(strength * np.cos(angle) * along + np.sin(angle) * across / speed)
 
 
 def _cut_plan(

@@ -13,10 +13,10 @@ from flight.gnc.control.detumble import (
     Detumbler,
     WindowSchedule,
     braking_current,
-    rate_across,
     share_in_turning_field,
 )
 from flight.gnc.errors import UsageError
+from flight.gnc.estimation.field_rate import rate_across
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import IDENTITY, attitude_matrix, derivative, from_rotation_vector, normalise
 

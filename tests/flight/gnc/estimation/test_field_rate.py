@@ -16,8 +16,8 @@ NOISE = 1e-7
 DIPOLE = np.array([0.05, -0.1, 0.02])
 
 
-def settings(inertia: FloatArray = INERTIA, **changes: float) -> FieldRateSettings:
-    return FieldRateSettings(inertia=inertia, field_sigma=NOISE, torque_walk=1e-5, **changes)
+def settings(inertia: FloatArray = INERTIA) -> FieldRateSettings:
+    return FieldRateSettings(inertia=inertia, field_sigma=NOISE, torque_walk=1e-5)
 
 
 def tumbling(rate: FloatArray, inertia: FloatArray, times: FloatArray, dipole: FloatArray) -> FloatArray:

@@ -81,6 +81,7 @@ def test_a_sample_taken_while_the_coils_act_or_settle_is_ignored() -> None:
         law.dipole(now_ns)
     assert law.trusted
     assert law.restarts == 0
+    assert law.rate is not None
     assert np.linalg.norm(law.rate) < 0.02
 
 

@@ -1,0 +1,286 @@
+"""The navigation filter of a free satellite: attitude, rate, biases, residual dipole and torques.
+
+A multiplicative extended Kalman filter that integrates Euler's equation over the coils' dipole, the gravity
+gradient and the estimated disturbances, a second or two at a step; gyros are measurements. That is leaner
+than the filter of the testbed (`attitude_filter`), which replays each late sample at its own time: here a
+late attitude is turned on to now by the present rate, and its innovation knows that rate's error: right for
+the seconds in which a body slow enough for star images turns evenly. One step with its gyro sample takes 0.3
+ms.
+
+The residual dipole has a constant part and a part that comes and goes with sunlight. The other torques have
+the shapes of `flight.gnc.earth.disturbance`; their sizes are states.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from flight.gnc.earth.disturbance import SIZES, Pressures, shapes
+from flight.gnc.earth.figure import GRAVITATIONAL_PARAMETER
+from flight.gnc.math import chi_square
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.directions import tangent_basis
+from flight.gnc.math.quaternion import (
+    attitude_matrix,
+    conjugate,
+    from_rotation_vector,
+    multiply,
+    to_rotation_vector,
+)
+
+TURN, RATE, GYRO, DIPOLE, SUNLIT, MAGNET = (slice(3 * k, 3 * k + 3) for k in range(6))
+TORQUES = slice(18, 18 + SIZES)
+STATES = 18 + SIZES
+"""Where the parts of the error stand in the covariance."""
+LARGEST_TURN = 0.1
+"""rad, of a step of integration."""
+_EYE: FloatArray = np.eye(3)
+
+
+class Knowledge(Enum):
+    """How well the attitude is known."""
+
+    FINE = "fine"
+    COARSE = "coarse"
+    LOST = "lost"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FreeFilterSettings:
+    """Noise and limits; a pair is the standard deviation at the start and the random walk per sqrt(s).
+
+    Attributes:
+        gyro: rad/s.
+        dipole, sunlit: A m^2, of the residual dipole's parts.
+        magnet: T, of the magnetometer.
+        torque: N m, of each size.
+        torque_noise: N m sqrt(s), white, of what has no shape.
+        coil_error: share of the coils' torque that is uncertain for tens of seconds.
+        rate_start: rad/s, of the first rate.
+        fine, coarse: rad, largest sigma of the worst axis that is called so.
+        gate_sigma: a measurement less likely than this many sigma of one component is refused.
+    """
+
+    gyro: tuple[float, float] = (1e-3, 2e-6)
+    dipole: tuple[float, float] = (1e-3, 1.5e-6)
+    sunlit: tuple[float, float] = (3e-4, 2e-7)
+    magnet: tuple[float, float] = (3e-7, 1e-9)
+    torque: tuple[float, float] = (3e-9, 5e-12)
+    torque_noise: float = 3e-9
+    coil_error: float = 0.03
+    rate_start: float = 1e-3
+    fine: float = math.radians(0.1)
+    coarse: float = math.radians(5.0)
+    gate_sigma: float = 5.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Around:
+    """What surrounds the satellite, ICRS.
+
+    `field` (3,) T, `position` (3,) m, the `pressures` of one time, and the share `sunlit` of the Sun's disc.
+    """
+
+    field: FloatArray
+    position: FloatArray
+    pressures: Pressures
+    sunlit: float
+
+
+class FreeFilter:
+    """Owns the estimate. `refused` counts the measurements that did not pass their gate.
+
+    Attributes:
+        quaternion: (4,) ICRS into body.
+        rate: (3,) rad/s, body axes.
+        covariance: (27, 27) of the errors (TURN, RATE, ...).
+        knowledge: how well the attitude is known.
+    """
+
+    def __init__(self, inertia: FloatArray, settings: FreeFilterSettings) -> None:
+        """`inertia` (3, 3) kg m^2, body axes."""
+        self._inertia = np.asarray(inertia, dtype=float)
+        self._inverse = np.linalg.inv(self._inertia)
+        self._settings = settings
+        tail = math.erfc(settings.gate_sigma / math.sqrt(2.0))
+        self._gates = {n: chi_square.bound(tail, n) for n in (1, 2, 3)}
+        self._constants: FloatArray = np.zeros(STATES)
+        self._acceleration_now: FloatArray = np.zeros(3)
+        self.started = False
+        self.refused = 0
+        self.quaternion: FloatArray = np.array([0.0, 0.0, 0.0, 1.0])
+        self.rate: FloatArray = np.zeros(3)
+        self.covariance: FloatArray = np.zeros((STATES, STATES))
+
+    def start(self, quaternion: FloatArray, covariance: FloatArray, gyro: FloatArray) -> None:
+        """Start from an attitude (4,) with covariance (3, 3) rad^2, body axes, and a gyro's rate (3,) rad/s.
+
+        What was learned of the slow states is kept.
+        """
+        s = self._settings
+        if not self.started:
+            starts = [s.gyro[0], s.dipole[0], s.sunlit[0], s.magnet[0], *[s.torque[0]] * (SIZES // 3)]
+            self.covariance[6:, 6:] = np.diag(np.repeat(starts, 3) ** 2)
+        self.covariance[:6] = self.covariance[:, :6] = 0.0
+        self.covariance[TURN, TURN] = covariance
+        bias = self.covariance[GYRO, GYRO]
+        self.covariance[RATE, RATE] = bias + s.rate_start**2 * _EYE
+        # The gyro measures the sum of rate and bias, so their errors are opposite.
+        self.covariance[RATE, GYRO] = self.covariance[GYRO, RATE] = -bias
+        self.quaternion, self.rate = quaternion, gyro - self._constants[GYRO]
+        self.started = True
+
+    @property
+    def knowledge(self) -> Knowledge:
+        """How well the attitude is known."""
+        if not self.started:
+            return Knowledge.LOST
+        sigma = math.sqrt(float(np.diag(self.covariance)[TURN].max()))
+        if sigma > self._settings.coarse:
+            return Knowledge.LOST
+        return Knowledge.FINE if sigma <= self._settings.fine else Knowledge.COARSE
+
+    @property
+    def gyro_bias(self) -> FloatArray:
+        """The gyros' bias (3,) rad/s."""
+        return self._constants[GYRO].copy()
+
+    @property
+    def magnet_bias(self) -> FloatArray:
+        """The magnetometer's bias (3,) T, body axes."""
+        return self._constants[MAGNET].copy()
+
+    @property
+    def torque_sizes(self) -> FloatArray:
+        """The sizes (9,) N m of the torques."""
+        return self._constants[TORQUES].copy()
+
+    def residual_dipole(self, sunlit: float) -> FloatArray:
+        """Return the residual dipole (3,) A m^2 in a share of sunlight, body axes."""
+        return np.asarray(self._constants[DIPOLE] + sunlit * self._constants[SUNLIT])
+
+    def advance(self, seconds: float, dipole: FloatArray, around: Around) -> None:
+        """Propagate by `seconds` under the coils' dipole (3,) A m^2, body axes; a second or two at once."""
+        speed = math.sqrt(float(self.rate @ self.rate))
+        steps = max(1, math.ceil(speed * seconds / LARGEST_TURN))
+        for _ in range(steps):
+            self._step(seconds / steps, dipole, around)
+
+    def gyro(self, rate: FloatArray, covariance: FloatArray, change: FloatArray | None = None) -> bool:
+        """Accept a gyro's rate (3,) rad/s and its covariance (3, 3).
+
+        Of a mean over the past, `change` (3,) is by how much the rate has changed since its middle.
+        """
+        rows = np.zeros((3, STATES))
+        rows[:, RATE] = rows[:, GYRO] = _EYE
+        value = rate - self.rate - self._constants[GYRO]
+        return self._update(value if change is None else value + change, rows, covariance)
+
+    def attitude(self, quaternion: FloatArray, covariance: FloatArray, age: float = 0.0) -> bool:
+        """Accept an attitude (4,) measured `age` s ago, covariance (3, 3) rad^2, body axes of now."""
+        since = from_rotation_vector(age * self.rate - 0.5 * age**2 * self._acceleration_now)
+        rows = np.zeros((3, STATES))
+        # The turn since then has the error of the rate.
+        rows[:, TURN], rows[:, RATE] = _EYE, -age * _EYE
+        error = multiply(multiply(since, quaternion), conjugate(self.quaternion))
+        return self._update(to_rotation_vector(error), rows, covariance)
+
+    def direction(self, observed: FloatArray, reference: FloatArray, covariance: FloatArray) -> bool:
+        """Accept a direction: unit vectors (3,) in body axes and ICRS, covariance (3, 3) rad^2, body axes."""
+        expected = attitude_matrix(self.quaternion) @ reference
+        across = tangent_basis(expected)
+        rows = np.zeros((2, STATES))
+        rows[:, TURN] = across @ _crossed(expected)
+        return self._update(across @ observed, rows, across @ covariance @ across.T)
+
+    def field(self, measured: FloatArray, reference: FloatArray, covariance: FloatArray) -> bool:
+        """Accept the field (3,) T of now in body axes, the model's (3,) T, ICRS; covariance (3, 3) T^2."""
+        expected = attitude_matrix(self.quaternion) @ reference
+        rows = np.zeros((3, STATES))
+        rows[:, TURN], rows[:, MAGNET] = _crossed(expected), _EYE
+        return self._update(measured - expected - self._constants[MAGNET], rows, covariance)
+
+    def _step(self, dt: float, dipole: FloatArray, around: Around) -> None:
+        """Take one step of the midpoint rule, with its covariance."""
+        middle = multiply(from_rotation_vector(0.5 * dt * self.rate), self.quaternion)
+        torque, flow = self._torque(middle, dipole, around)
+        start = self._acceleration(self.rate, torque)
+        half = self.rate + 0.5 * dt * start
+        acceleration = self._acceleration(half, torque)
+        flow[0:3, TURN], flow[0:3, RATE] = -_crossed(half), _EYE
+        flow[3:6, RATE] = self._inverse @ (_crossed(self._inertia @ half) - _crossed(half) @ self._inertia)
+        turn = from_rotation_vector(dt * (self.rate + 0.5 * dt * acceleration))
+        self.quaternion = multiply(turn, self.quaternion)
+        self._acceleration_now = acceleration
+        self.rate = self.rate + dt * acceleration
+        flow *= dt
+        flow += 0.5 * (flow[:, :6] @ flow)
+        flow[:, :6] += np.eye(6)
+        covariance = self.covariance
+        covariance[:6] = flow @ covariance
+        covariance[:, :6] = covariance @ flow.T
+        self._add_noise(dt, dipole, around)
+
+    def _acceleration(self, rate: FloatArray, torque: FloatArray) -> FloatArray:
+        return np.asarray(self._inverse @ (torque - np.cross(rate, self._inertia @ rate)))
+
+    def _torque(
+        self, quaternion: FloatArray, dipole: FloatArray, around: Around
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the torque (3,) N m, and the flow (6, 27) with what all but the rate do to the rate."""
+        turned = attitude_matrix(quaternion)
+        field, position = turned @ around.field, turned @ around.position
+        radius = math.sqrt(float(position @ position))
+        up = position / radius
+        stiff = self._inertia @ up
+        strength = 3.0 * GRAVITATIONAL_PARAMETER / radius**3
+        shape = shapes(around.pressures, turned[None])[0]
+        whole = dipole + self.residual_dipole(around.sunlit)
+        crossed, upright = _crossed(field), _crossed(up)
+        torque = -crossed @ whole + strength * upright @ stiff + shape @ self._constants[TORQUES]
+        flow = np.zeros((6, STATES))
+        stiffness = strength * (upright @ self._inertia - _crossed(stiff)) @ upright
+        flow[3:6, TURN] = self._inverse @ (_crossed(whole) @ crossed + stiffness)
+        flow[3:6, DIPOLE] = -self._inverse @ crossed
+        flow[3:6, SUNLIT] = around.sunlit * flow[3:6, DIPOLE]
+        flow[3:6, TORQUES] = self._inverse @ shape
+        return torque, flow
+
+    def _add_noise(self, dt: float, dipole: FloatArray, around: Around) -> None:
+        s = self._settings
+        coils = s.coil_error**2 * 20.0 * float(dipole @ dipole) * float(around.field @ around.field)
+        density = (s.torque_noise**2 + coils) * dt * (self._inverse @ self._inverse)
+        covariance = self.covariance
+        covariance[RATE, RATE] += density
+        covariance[TURN, TURN] += dt * dt / 3.0 * density
+        covariance[TURN, RATE] += 0.5 * dt * density
+        covariance[RATE, TURN] += 0.5 * dt * density
+        walks = [s.gyro[1], s.dipole[1], s.sunlit[1], s.magnet[1], *[s.torque[1]] * (SIZES // 3)]
+        diagonal = covariance.reshape(-1)[:: STATES + 1]
+        diagonal[6:] += dt * np.repeat(walks, 3) ** 2
+
+    def _update(self, value: FloatArray, rows: FloatArray, noise: FloatArray) -> bool:
+        """Correct by an innovation (k,), derivative (k, 27) and noise (k, k); return whether it was used."""
+        cross = self.covariance @ rows.T
+        weight = np.linalg.inv(rows @ cross + noise)
+        if not 0.0 <= float(value @ weight @ value) <= self._gates[len(value)]:  # a NaN does not pass
+            self.refused += 1
+            return False
+        gain = cross @ weight
+        error = gain @ value
+        covariance = self.covariance - gain @ cross.T
+        self.covariance = 0.5 * (covariance + covariance.T)
+        self.quaternion = multiply(from_rotation_vector(error[TURN]), self.quaternion)
+        self.rate = self.rate + error[RATE]
+        self._constants[6:] += error[6:]
+        return True
+
+
+def _crossed(vector: FloatArray) -> FloatArray:
+    """Return [v x] (3, 3)."""
+    x, y, z = vector.tolist()
+    return np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
