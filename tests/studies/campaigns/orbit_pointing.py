@@ -154,7 +154,7 @@ class _Flight:
         both = np.concatenate([error, flight.gyro_bias - found.gyro_bias])
         pick = np.r_[TURN, GYRO]
         nees = float(both @ np.linalg.solve(found.covariance[np.ix_(pick, pick)], both)) / 6.0
-        truth = flight.body.whole_truth()
+        truth = flight.body.orbit_truth()
         missing = truth.residual_dipole - found.residual_dipole(truth.sunlit)
         known, unknown = float(np.linalg.norm(error)), float(np.linalg.norm(missing))
         self._notes.append([time, *turn, known, nees, unknown, truth.sunlit])
