@@ -19,6 +19,7 @@ from tests.studies.campaigns.orbit_attitude import ORBIT_ATTITUDE
 from tests.studies.campaigns.orbit_pointing import ORBIT_POINTING
 from tests.studies.campaigns.planner_edge import PLANNER_EDGE
 from tests.studies.campaigns.rate_change import RATE_CHANGE
+from tests.studies.campaigns.robust_controllers import ROBUST_CONTROLLERS
 from tests.studies.campaigns.rolling_shutter import ROLLING_SHUTTER
 from tests.studies.campaigns.rso import RSO_SLEW, RSO_TRACK
 from tests.studies.campaigns.rso_orbits import RSO_ORBITS
@@ -46,6 +47,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         FALSE_HORIZONS,
         CONTROLLERS_CAMPAIGN,
         STEP_ROBUST,
+        ROBUST_CONTROLLERS,
         PLANNER_EDGE,
         FAULTS,
         FAULTS_KILL,

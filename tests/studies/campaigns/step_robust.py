@@ -120,8 +120,12 @@ def disturb(rigged: Rigged, drawn: dict[str, Any]) -> None:
 
 def run(case: Case) -> Result:
     """Fly one world."""
-    drawn = draw(case.seed)
-    config = configuration.replace(demo_config(DURATION, camera=False), steps=STEPS)
+    return fly_world(draw(case.seed), demo_config(DURATION, camera=False))
+
+
+def fly_world(drawn: dict[str, Any], config: TestbedConfig) -> Result:
+    """Fly the two steps in a drawn world with the loop of `config`."""
+    config = configuration.replace(config, steps=STEPS, duration=DURATION)
     with tempfile.TemporaryDirectory() as place:
         flown = fly(
             config,
