@@ -18,13 +18,15 @@ from flight.schema.document import read_document, read_text
 from flight.schema.errors import ConfigError
 from flight.schema.orbit import OrbitConfig
 from flight.schema.sections import Config
-from flight.schema.testbed import TestbedConfig
+from flight.schema.testbed import TestbedConfig, as_testbed
 
 T = TypeVar("T")
 S = TypeVar("S", bound=msgspec.Struct)
 
 _SHAPES: dict[str, type[Config]] = {"orbit": OrbitConfig}
 """The shape of a body's configuration; a body that is not here has the testbed's."""
+_EVERY: tuple[type[Config], ...] = (TestbedConfig, *_SHAPES.values())
+_FIELDS = {name for shape in _EVERY for name in shape.__struct_fields__}
 
 
 def load(path: Path) -> Config:
@@ -42,6 +44,14 @@ def parse(text: str, name: str = "configuration") -> Config:
     config = convert(document, shape)
     check_consistency(config, document)
     return config
+
+
+def load_testbed(path: Path) -> TestbedConfig:
+    """Read and validate a configuration of the testbed. Raises ConfigError, also for another body's."""
+    try:
+        return as_testbed(load(path))
+    except ConfigError as error:
+        raise placed(error, read_text(path), str(path)) from error
 
 
 def load_camera(path: Path) -> Camera:
@@ -62,7 +72,7 @@ def load_camera(path: Path) -> Camera:
 def placed(error: UsageError, text: str, name: str) -> UsageError:
     """Return a complaint that begins with a value's dotted name with file and line; others as they are."""
     where, _, problem = str(error).partition(": ")
-    if where.partition(".")[0].partition("[")[0] not in Config.__struct_fields__:
+    if where.partition(".")[0].partition("[")[0] not in _FIELDS:
         return error
     return read_document(text, name).error(where, problem)
 

@@ -16,7 +16,7 @@ from flight.gnc.errors import UsageError
 from flight.link.telemetry.reader import read_run
 from flight.schema import reader as configuration
 from flight.schema.carried import config_path
-from flight.schema.testbed import TestbedConfig, as_testbed
+from flight.schema.testbed import TestbedConfig
 from ground.commands.options import positive, write_new
 from ground.identification.constants import NAMES, UNITS, Constants
 from ground.identification.fit import Fit, fit
@@ -126,7 +126,7 @@ def _fly(options: argparse.Namespace) -> Path:
     from flight.app.flight import fly  # noqa: PLC0415 - only who flies needs devices
     from flight.app.run_folder import default_folder  # noqa: PLC0415
 
-    config = excitation_config(as_testbed(configuration.load(options.source)), options.duration or DURATION)
+    config = excitation_config(configuration.load_testbed(options.source), options.duration or DURATION)
     out = options.run or default_folder(Path(f"{options.source.stem}-identify"))
     with_line = sys.stderr.isatty()
     with tempfile.TemporaryDirectory() as place:
@@ -144,7 +144,7 @@ def _fly(options: argparse.Namespace) -> Path:
 
 
 def _identify(folder: Path) -> _Identified:
-    config = as_testbed(configuration.load(folder / "config.yaml"))
+    config = configuration.load_testbed(folder / "config.yaml")
     record = read_record(read_run(folder), config.coils.stale_after)
     with_line = sys.stderr.isatty()
     found = fit(record, noise_of(config), _show_round if with_line else None)

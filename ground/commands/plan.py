@@ -18,7 +18,6 @@ from flight.gnc.guidance.one_axis.plant import SingleAxisPlant
 from flight.gnc.guidance.one_axis.vmc import FASTEST, HORIZON_RANGE, NODES, NODES_RANGE, Plan, plan
 from flight.schema import reader as configuration
 from flight.schema.carried import config_path
-from flight.schema.testbed import as_testbed
 from ground.commands.options import finite, positive
 
 _DEFAULT_CONFIG = "step_demo"
@@ -65,7 +64,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Plan, print, draw."""
     _check(options)
-    config = as_testbed(configuration.load(options.config))
+    config = configuration.load_testbed(options.config)
     plant = plant_of(config)
     horizon = config.guidance.horizon if options.horizon is None else options.horizon
     begun = time.perf_counter()

@@ -45,10 +45,8 @@ def check(entries: Sequence[FaultEntry], config: Config, realtime: bool) -> tupl
             )
         section = _SECTIONS.get(fault.kind.device)
         if not fitted(fault.kind.device, config):
-            raise UsageError(
-                f"fault {str(fault)!r}: no {fault.kind.device} flies here: the configuration needs a "
-                f"`{section}` section"
-            )
+            cure = f"the configuration needs a `{section}` section" if section else "the body plans no paths"
+            raise UsageError(f"fault {str(fault)!r}: no {fault.kind.device} flies here: {cure}")
         if fault.kind.name == "imu: baud" and fault.parameters["rate"] == config.inertial_unit.baud_rate:
             raise UsageError(f"fault {str(fault)!r}: it speaks at this speed already: give another rate")
     return faults
@@ -56,6 +54,8 @@ def check(entries: Sequence[FaultEntry], config: Config, realtime: bool) -> tupl
 
 def fitted(device: str, config: Config) -> bool:
     """Return whether a configuration has the device of a fault."""
+    if device == "planner":
+        return config.replan_period() is not None
     section = _SECTIONS.get(device)
     return section is None or getattr(config, section) not in (None, ())
 

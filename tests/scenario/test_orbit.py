@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from flight.gnc.errors import UsageError
 from flight.gnc.math.arrays import FloatArray
 from flight.link.modes import Mode
 from flight.link.telemetry.packets import to_text
@@ -16,6 +17,7 @@ from flight.schema.errors import ConfigError
 from flight.schema.orbit import OrbitConfig, as_orbit
 from flight.schema.sections import Commands, CommandStep
 from ground.report import format_report, summarise
+from sim_hal.faults.schedule import check
 from sim_hal.settings import FaultEntry, Simulation
 from tests.scenario.flights import CONFIG, event_names, fly
 from tests.scenario.mode_flights import currents, entered, modes_of
@@ -122,3 +124,13 @@ def test_the_report_shows_the_detumbling_and_no_steps(flown: Run) -> None:
 def test_an_initial_mode_that_the_body_does_not_have_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"modes\.initial.*hold.*this body has detumble, safe"):
         fly(orbit_config(1.0, initial="hold"), tmp_path, section=world(0.01))
+
+
+def test_tools_of_the_testbed_refuse_it_with_file_and_line() -> None:
+    with pytest.raises(ConfigError, match=r"orbit\.yaml:\d+: `body` is orbit: .* of the testbed"):
+        configuration.load_testbed(ORBIT)
+
+
+def test_a_fault_of_the_planner_is_refused_because_no_path_is_planned() -> None:
+    with pytest.raises(UsageError, match="no planner flies here: the body plans no paths"):
+        check((FaultEntry(fault="planner: nan"),), orbit_config(5.0), realtime=False)

@@ -1,7 +1,7 @@
 """Campaign `robust-controllers`: the controllers of `controllers` in the worlds of `step-robust`.
 
-Every controller flies the same worlds. Those tuned by the same criterion in the believed world are compared: this
-loop, the thesis's behind the same filter, the tuned PID and the tuned adaptive controller.
+Every controller flies the same worlds: this loop, the thesis's behind the same filter, and PID and adaptive
+control, tuned in the believed world by one criterion.
 """
 
 from __future__ import annotations
