@@ -24,7 +24,7 @@ FIGURES = (
     ("settling_s", "settling, s"),
     ("overshoot_percent", "overshoot, %"),
 )
-_ROW = "{:12}{:>8}{:>6}{:>12}" + "{:>24}" * len(FIGURES)
+_ROW = "{:12}{:>8}{:>6}{:>12}" + "{:>30}" * len(FIGURES)
 
 
 def cases(runs: int, seed: int) -> list[Case]:

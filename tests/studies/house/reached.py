@@ -30,6 +30,7 @@ FLOWN: tuple[tuple[Flight, tuple[str, ...]], ...] = (
     (Flight("demo", _DEMO, 110), ()),
     (Flight("thesis", "config/step_thesis.yaml", 30), ()),
     (Flight("realtime", _DEMO, 12), ("--realtime",)),
+    (Flight("orbit", "config/orbit.yaml", 320), ()),
     *((flight, ()) for flight in FLIGHTS if flight.faults),
     (Flight("bridge", _DEMO, 60, ("bridge-x: a-high @ 12 for 20", "pwm: stuck @ 45 for 3")), ()),
     (
