@@ -116,6 +116,7 @@ def measure(root: Path) -> list[FileReach]:
         flights.fly_commanded()
         flights.fly_as_service()
         flights.refuse()
+        flights.check()
         found = list(_analyse(root, flights.settings))
     return sorted(found, key=lambda file: (file.reached - file.lines, file.file))
 
@@ -180,16 +181,24 @@ class _Flights:
             if refused.wait() == 0:
                 raise subprocess.CalledProcessError(0, f"{right!r} -> {wrong!r} was flown")
 
+    def check(self) -> None:
+        """Run the check before a flight, of simulated devices and of devices that are missing."""
+        for words in ((_DEMO,), (_DEMO, "--json"), ("config/testbed.yaml",)):
+            self._run("check", *words).wait()
+
     def _config(self, name: str, more: str) -> Path:
         path = self._folder / f"{name}.yaml"
         path.write_text(self._demonstration + more, encoding="utf-8")
         return path
 
     def _start(self, flight: Flight, *more: str) -> subprocess.Popen[bytes]:
-        words = ["-m", "coverage", "run", f"--rcfile={self.settings}", "-m", "flight", "run"]
+        return self._run("run", *flight.arguments, *more)
+
+    def _run(self, *arguments: str) -> subprocess.Popen[bytes]:
+        words = ["-m", "coverage", "run", f"--rcfile={self.settings}", "-m", "flight"]
         places = f"{self._folder}{os.pathsep}{self._root}"
         return subprocess.Popen(
-            [sys.executable, *words, *flight.arguments, *more],
+            [sys.executable, *words, *arguments],
             cwd=self._root,
             env={**os.environ, "PYTHONPATH": places, "STATE_DIRECTORY": str(self._state)},
             stdout=subprocess.DEVNULL,
