@@ -48,10 +48,6 @@ class OrbitConfig(Config, frozen=True, kw_only=True):
         """Return the smallest and the largest strength of a valid magnetometer reading, T."""
         return LEAST_FIELD, LARGEST_FIELD
 
-    def replan_period(self) -> float | None:
-        """Return None: no path is planned."""
-        return None
-
     def hardware(self) -> tuple[Section, ...]:
         """Return the sections of body and devices for which learned parameters hold."""
         return (self.craft, *super().hardware())

@@ -176,11 +176,11 @@ class Config(Section, frozen=True, kw_only=True):
 
     def field_range(self) -> tuple[float, float]:
         """Return the smallest and the largest strength of a valid magnetometer reading, T."""
-        raise NotImplementedError
+        return 0.0, self.inertial_unit.field_range
 
     def replan_period(self) -> float | None:
         """Return how often a path is planned from the newest estimate, s; None for a body that plans none."""
-        raise NotImplementedError
+        return None
 
     def hardware(self) -> tuple[Section, ...]:
         """Return the sections of body and devices for which learned parameters hold."""

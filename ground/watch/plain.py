@@ -1,4 +1,4 @@
-"""A flight in plain lines: one every so many seconds of mission time, and one for each event."""
+"""A flight in plain lines: one per period of mission time, and one for each event."""
 
 from __future__ import annotations
 
