@@ -11,9 +11,9 @@ from pathlib import Path
 from flight.link.commands.codec import CommandPacker, Note
 from flight.link.telemetry.definitions import COMMAND
 from flight.link.telemetry.packets import to_text
-from flight.link.telemetry.reader import read_run
-from flight.link.telemetry.scanner import decode
 from ground.commands.command import exchange
+from ground.telemetry.reader import read_run
+from ground.telemetry.scanner import decode
 
 CONFIG = Path("config/step_demo.yaml")
 

@@ -7,10 +7,10 @@ from pathlib import Path
 
 from flight.link.telemetry.definitions import THERMAL
 from flight.link.telemetry.log import FlightLog
-from flight.link.telemetry.reader import read_run
 from flight.link.telemetry.recorder import Recorder
 from ground.documentation import markdown
 from ground.export import export
+from ground.telemetry.reader import read_run
 from sim_hal.clock import SimClock
 
 

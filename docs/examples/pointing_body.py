@@ -36,7 +36,6 @@ from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import about_axis_y, attitude_matrix, conjugate, multiply, to_rotation_vector
 from flight.link import events
 from flight.link.modes import Mode
-from flight.link.telemetry.reader import read_run
 from flight.loop.body import Body, BodyKind
 from flight.loop.control_output import COMMANDED, KEPT, CoilCommand, ControlOutput, Target
 from flight.loop.executive.jobs import JobResult
@@ -45,6 +44,7 @@ from flight.loop.services import Services
 from flight.loop.state.content import Learned
 from flight.schema.sections import Config
 from flight.schema.testbed import TestbedConfig, as_testbed
+from ground.telemetry.reader import read_run
 
 DUE_NS = 60_000_000_000
 """After this time a target should have been reached."""

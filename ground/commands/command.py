@@ -16,7 +16,7 @@ from flight.link.commands.codec import ChangeMode, Clear, Command, CommandError,
 from flight.link.modes import COMMANDABLE, Mode
 from flight.link.telemetry.definitions import COMMAND
 from flight.link.telemetry.packets import LONGEST_PACKET, TelemetryError, to_text
-from flight.link.telemetry.scanner import decode
+from ground.telemetry.scanner import decode
 
 _MODES = [mode.label for mode in COMMANDABLE if mode is not Mode.SLEW]
 

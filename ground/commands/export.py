@@ -7,9 +7,9 @@ import json
 import sys
 from pathlib import Path
 
-from flight.link.telemetry.reader import read_run
 from ground.export import FORMATS
 from ground.export import export as export_packets
+from ground.telemetry.reader import read_run
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

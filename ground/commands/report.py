@@ -9,10 +9,10 @@ from pathlib import Path
 
 from flight.gnc.errors import UsageError
 from flight.link.telemetry.archive import find_runs
-from flight.link.telemetry.reader import read_run
 from ground import report as reporting
 from ground.report.archive import format_archive, summarise_archive
 from ground.report.comparison import compare, format_comparison
+from ground.telemetry.reader import read_run
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

@@ -9,8 +9,8 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
-from flight.link.telemetry.reader import Run
 from ground.export.columns import tables
+from ground.telemetry.reader import Run
 
 
 def write_csv(run: Run, folder: Path) -> list[Path]:

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from flight.link.telemetry.reader import Run
 from ground.export.columns import Column, tables
+from ground.telemetry.reader import Run
 
 _TYPES = {"f": "REAL", "i": "INTEGER", "u": "INTEGER"}
 _LARGEST = (1 << 63) - 1

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from flight.gnc.errors import UsageError
-from flight.link.telemetry.reader import Run
 from ground.export.columns import tables
+from ground.telemetry.reader import Run
 
 
 def write_parquet(run: Run, folder: Path) -> list[Path]:

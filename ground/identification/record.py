@@ -15,7 +15,7 @@ import numpy as np
 from flight.gnc.errors import FlightError, UsageError
 from flight.gnc.math.arrays import BoolArray, FloatArray
 from flight.link.telemetry.packets import PacketArray
-from flight.link.telemetry.reader import Run
+from ground.telemetry.reader import Run
 
 LEAST_SAMPLES = 200
 _AT_LIMIT = 0.97

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flight.gnc.errors import UsageError
-from flight.link.telemetry.reader import Run
 from ground.report.summary import summarise
 from ground.report.text import format_report
+from ground.telemetry.reader import Run
 
 if TYPE_CHECKING:
     from flight.gnc.guidance.one_axis.plant import SingleAxisPlant

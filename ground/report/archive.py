@@ -10,8 +10,8 @@ from flight.gnc.errors import UsageError
 from flight.link import events
 from flight.link.telemetry.archive import find_runs
 from flight.link.telemetry.packets import to_text
-from flight.link.telemetry.reader import Run, read_run
 from ground.report.text import number, table
+from ground.telemetry.reader import Run, read_run
 
 Object = dict[str, Any]
 

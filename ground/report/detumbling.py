@@ -10,8 +10,8 @@ import numpy as np
 from flight.gnc.math.arrays import FloatArray
 from flight.link.modes import Mode
 from flight.link.telemetry.packets import PacketArray
-from flight.link.telemetry.reader import Run
 from ground.report.signals import seconds
+from ground.telemetry.reader import Run
 
 Object = dict[str, Any]
 

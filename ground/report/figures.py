@@ -13,11 +13,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from flight.link.telemetry.packets import to_text
-from flight.link.telemetry.reader import Run
 from ground.report import panels
 from ground.report.scene import Scene
 from ground.report.signals import seconds
 from ground.report.spin_figure import spin_figure
+from ground.telemetry.reader import Run
 
 DPI = 110
 WIDE = (11.0, 5.2)

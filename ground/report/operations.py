@@ -10,10 +10,10 @@ import numpy as np
 from flight.gnc.math.arrays import FloatArray
 from flight.link.modes import STEERING, Mode
 from flight.link.telemetry.packets import PacketArray, to_text
-from flight.link.telemetry.reader import Run
 from flight.loop.fdir.facts import FACTS
 from flight.loop.fdir.streams import StreamState
 from ground.report.signals import seconds
+from ground.telemetry.reader import Run
 
 Object = dict[str, Any]
 

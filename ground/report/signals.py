@@ -8,7 +8,7 @@ import numpy as np
 
 from flight.gnc.math.arrays import FloatArray
 from flight.link.telemetry.packets import PacketArray
-from flight.link.telemetry.reader import Run
+from ground.telemetry.reader import Run
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from flight.link.telemetry.reader import Run
 from ground.report import panels
 from ground.report.detumbling import braked, known_rates, speeds
 from ground.report.signals import seconds
+from ground.telemetry.reader import Run
 
 SIZE = (10.9, 9.4)
 AXES = ("x", "y", "z")

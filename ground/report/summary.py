@@ -12,7 +12,6 @@ import numpy as np
 
 from flight.gnc.math.arrays import FloatArray
 from flight.link.telemetry.packets import to_text
-from flight.link.telemetry.reader import Run
 from ground.report import performance as limits
 from ground.report.detumbling import detumbling
 from ground.report.operations import (
@@ -29,6 +28,7 @@ from ground.report.operations import (
 from ground.report.performance import Command, Response, commands, interrupted, placed, response
 from ground.report.sensing import estimate_errors, failed_frames, star_attitudes, streaks
 from ground.report.signals import Attitude, coil_power, estimated_attitude, seconds, true_attitude
+from ground.telemetry.reader import Run
 
 Object = dict[str, Any]
 

@@ -12,8 +12,8 @@ from flight.gnc.errors import FlightError, UsageError
 from flight.link.commands.codec import CommandPacker, Ping
 from flight.link.telemetry.definitions import COMMAND
 from flight.link.telemetry.packets import TelemetryError
-from flight.link.telemetry.scanner import decode
 from ground.commands.command import exchange
+from ground.telemetry.scanner import decode
 from ground.watch.view import mode_label
 
 _TIMEOUT_S = 2.0

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from flight.gnc.errors import UsageError
 from flight.link.telemetry.packets import PacketArray
-from flight.link.telemetry.scanner import scan
 from flight.link.telemetry.segments import find_segments
+from ground.telemetry.scanner import scan
 
 _STEM = "flight"
 

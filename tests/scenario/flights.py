@@ -10,12 +10,12 @@ from pathlib import Path
 from flight.app import opening
 from flight.app.mission_time import next_whole_second
 from flight.link.telemetry.packets import to_text
-from flight.link.telemetry.reader import Run, read_run
 from flight.loop.flight_loop import FlightLoop
 from flight.loop.run_label import RunLabel
 from flight.schema import reader as configuration
 from flight.schema.sections import Config
 from flight.schema.testbed import TestbedConfig, as_testbed
+from ground.telemetry.reader import Run, read_run
 from hal.interfaces.rig import Rig
 from hal.interfaces.wires import SECOND_NS
 from sim_hal import lockstep

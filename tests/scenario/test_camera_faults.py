@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.link.telemetry.reader import Run
 from flight.schema.reader import replace
+from ground.telemetry.reader import Run
 from sim_hal.settings import FaultEntry
 from tests.scenario.flights import demo_world, event_names, fly
 from tests.studies.campaigns.faults import config_for

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flight.link.telemetry.reader import Run, read_run
 from flight.schema import reader as configuration
 from ground import report
+from ground.telemetry.reader import Run, read_run
 from tests.scenario.flights import CONFIG, demo_config, demo_world, fly
 from tests.studies.campaigns.controllers import clairvoyant_power
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from flight.link.telemetry.reader import read_run
+from ground.telemetry.reader import read_run
 from tests.scenario.flights import Rigged, demo_config, event_names, fly
 
 

@@ -11,12 +11,12 @@ from flight.gnc.errors import UsageError
 from flight.gnc.math.arrays import FloatArray
 from flight.link.modes import Mode
 from flight.link.telemetry.packets import to_text
-from flight.link.telemetry.reader import Run
 from flight.schema import reader as configuration
 from flight.schema.errors import ConfigError
 from flight.schema.orbit import OrbitConfig, as_orbit
 from flight.schema.sections import Commands, CommandStep
 from ground.report import format_report, summarise
+from ground.telemetry.reader import Run
 from sim_hal.faults.schedule import check
 from sim_hal.settings import FaultEntry, Simulation
 from tests.scenario.flights import CONFIG, event_names, fly

@@ -10,9 +10,9 @@ import pytest
 
 from flight.gnc.guidance.one_axis.plant import angle_of
 from flight.gnc.math.arrays import FloatArray
-from flight.link.telemetry.reader import Run
 from flight.schema import reader as configuration
 from flight.schema.testbed import Step, TestbedConfig
+from ground.telemetry.reader import Run
 from tests.scenario.flights import Rigged, demo_config, event_names, fly, thesis_config
 
 

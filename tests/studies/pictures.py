@@ -30,7 +30,6 @@ from flight.gnc.vision.startracker.solve import SolveSettings
 from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from flight.gnc.vision.streaks.streak_result import StreakStatus
-from flight.link.telemetry.reader import read_run
 from flight.schema import reader as configuration
 from flight.schema.camera_model import camera_model
 from flight.schema.testbed import as_testbed
@@ -39,6 +38,7 @@ from ground.pictures.sky_picture import draw_solution
 from ground.report import draw, draw_path
 from ground.report.figures import DPI
 from ground.report.spin_figure import spin_figure
+from ground.telemetry.reader import read_run
 from sim_hal.assembly import StarRenderer
 from sim_hal.earth_camera import render as render_earth
 from sim_hal.settings import Sky

@@ -12,10 +12,10 @@ from flight.app.cli import main
 from flight.app.flight import fly
 from flight.app.request import RunRequest
 from flight.link.telemetry.packets import to_text
-from flight.link.telemetry.reader import read_run
 from flight.schema import reader as configuration
 from flight.schema.errors import ConfigError
 from flight.schema.testbed import as_testbed
+from ground.telemetry.reader import read_run
 from sim_hal.faults.host import corrupted
 from tests.manual_clock import ManualClock
 from tests.scenario.flights import CONFIG

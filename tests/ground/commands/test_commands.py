@@ -15,8 +15,8 @@ import pytest
 
 from flight.app.cli import main
 from flight.app.cli.run import progress_on
-from flight.link.telemetry.reader import read_run
 from flight.loop.progress import Progress
+from ground.telemetry.reader import read_run
 from tests.ground.report.synthetic import Recipe, make_run
 
 ROOT = Path(__file__).resolve().parents[3]

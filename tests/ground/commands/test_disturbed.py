@@ -43,7 +43,9 @@ def test_output_that_does_not_fit_the_disk_is_one_line(words: str, run_folder: P
 def test_ctrl_c_ends_a_command_by_the_signal_itself_from_its_first_import_on() -> None:
     """So no code of ours or of a library's is there to be interrupted."""
     script = (
-        "import signal, sys, flight.__main__\n"
+        # As from a terminal: a shell's `&` has the signal ignored.
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "import flight.__main__\n"
         "assert signal.getsignal(signal.SIGINT) is signal.SIG_DFL\n"
         "signal.raise_signal(signal.SIGINT)"
     )

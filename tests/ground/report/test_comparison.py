@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from flight.link.telemetry.reader import read_run
 from ground.report import summarise
 from ground.report.comparison import compare, format_comparison
+from ground.telemetry.reader import read_run
 from tests.ground.commands.in_process import command
 from tests.ground.report.synthetic import Recipe, make_run
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from flight.gnc.errors import UsageError
-from flight.link.telemetry.reader import read_run
 from ground.report import draw
+from ground.telemetry.reader import read_run
 from tests.ground.report.synthetic import CURRENT, Recipe, make_run
 
 pytest.importorskip("matplotlib", reason="pictures need the extra 'plots'")
@@ -120,7 +120,7 @@ def test_a_planned_path_passes_through_its_nodes_and_is_the_polynomial_between(t
 
 
 def test_the_report_on_board_imports_no_matplotlib() -> None:
-    code = "import sys, ground.report, flight.link.telemetry.reader; print('matplotlib' in sys.modules)"
+    code = "import sys, ground.report, ground.telemetry.reader; print('matplotlib' in sys.modules)"
     printed = subprocess.run(
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
     )

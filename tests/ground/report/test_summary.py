@@ -12,11 +12,11 @@ import pytest
 from flight.link.telemetry.definitions import STREAK, TRUTH
 from flight.link.telemetry.log import FlightLog
 from flight.link.telemetry.packets import Packer
-from flight.link.telemetry.reader import Run, read_run
-from flight.link.telemetry.scanner import scan
 from ground.report import format_report, summarise
 from ground.report.sensing import covariance_matrices, mean_rates
 from ground.report.signals import coil_power
+from ground.telemetry.reader import Run, read_run
+from ground.telemetry.scanner import scan
 from tests.ground.report.synthetic import (
     CURRENT,
     DAMPING,

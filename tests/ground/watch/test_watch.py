@@ -17,8 +17,8 @@ import pytest
 from flight.link import events
 from flight.link.telemetry.definitions import ATTITUDE, EVENT, HEALTH, MODE, PACKETS, Packet
 from flight.link.telemetry.packets import Packer
-from flight.link.telemetry.scanner import scan
 from ground.commands import watch
+from ground.telemetry.scanner import scan
 from ground.watch.plain import PlainLines, state_line
 from ground.watch.tail import LogTail
 from ground.watch.view import View

@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from flight.link.telemetry.reader import Run, read_run
 from flight.link.telemetry.segments import find_segments
+from ground.telemetry.reader import Run, read_run
 from tests.scenario.flights import CONFIG
 
 ROOT = CONFIG.parents[1]

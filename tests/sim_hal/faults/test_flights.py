@@ -8,8 +8,8 @@ from typing import Any, cast
 import pytest
 
 from flight.link.events import EVENTS, Reaction, Severity
-from flight.link.telemetry.reader import Run
 from flight.schema import reader as configuration
+from ground.telemetry.reader import Run
 from sim_hal.faults.catalogue import CATALOGUE
 from sim_hal.faults.kinds import FaultKind
 from sim_hal.settings import FaultEntry

@@ -23,7 +23,7 @@ from tests.scenario.flights import demo_config, demo_world
 from tests.studies.campaigns import fault_judgement
 
 if TYPE_CHECKING:
-    from flight.link.telemetry.reader import Run
+    from ground.telemetry.reader import Run
 
 MS = 1_000_000
 CYCLE_NS = 25 * MS

@@ -16,9 +16,9 @@ from flight.gnc.math import quaternion
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.vision.sun_sensor.direction import find_sun
 from flight.gnc.vision.sun_sensor.settings import SunSettings
-from flight.link.telemetry.scanner import scan
 from flight.schema import reader
 from flight.schema.errors import ConfigError
+from ground.telemetry.scanner import scan
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.readings import Frame, GpsReading
 from hal.interfaces.rig import Rig

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from flight.link.telemetry.packets import to_text
-from flight.link.telemetry.reader import Run
+from ground.telemetry.reader import Run
 from tests.hal.guardian.live_flight import CoilTruth
 from tests.studies.bench.lateness import Grid, on_grid, robbed, slope_per_hour, stalled
 from tests.studies.bench.process_watch import MIB, Look

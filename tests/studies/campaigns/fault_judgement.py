@@ -12,7 +12,7 @@ import numpy as np
 from flight.gnc.math.arrays import BoolArray, FloatArray
 from flight.link.events import EVENTS, EventKind, Reaction, Severity
 from flight.link.telemetry.packets import to_text
-from flight.link.telemetry.reader import Run
+from ground.telemetry.reader import Run
 from sim_hal.faults.kinds import FaultKind
 from sim_hal.settings import FaultEntry
 from tests.scenario.flights import demo_world

@@ -22,7 +22,7 @@ import numpy as np
 from flight.gnc.errors import UsageError
 from flight.link.modes import Mode
 from flight.link.telemetry.packets import LONGEST_PACKET
-from flight.link.telemetry.reader import Run, read_run
+from ground.telemetry.reader import Run, read_run
 from sim_hal.serving.device_link import RemoteI2cBus
 from tests.hal.guardian.campaign import lives
 from tests.hal.guardian.live_flight import devices_running

@@ -18,10 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from flight.link.telemetry.reader import Run
 from flight.schema import reader as configuration
 from flight.schema.sections import Commands, CommandStep, Telemetry
 from flight.schema.testbed import Step, TestbedConfig
+from ground.telemetry.reader import Run
 from sim_hal.settings import FaultEntry
 from tests.scenario.flights import Rigged, demo_config, demo_world, event_names, fly
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary

@@ -21,11 +21,11 @@ from typing import Any
 
 import numpy as np
 
-from flight.link.telemetry.reader import Run
 from flight.schema import reader as configuration
 from flight.schema.testbed import Step, TestbedConfig
 from ground import report
 from ground.report.performance import STEADY_STATE_S
+from ground.telemetry.reader import Run
 from sim_hal.emulators.serial_line import LineFaults
 from sim_hal.settings import ImuNoise, Simulation, Thread, Truth
 from tests.scenario.flights import Rigged, demo_config, demo_world, event_names, fly

@@ -74,7 +74,7 @@ def test_a_parser_that_skips_the_checksum_is_found_out(monkeypatch: pytest.Monke
 
 
 def test_a_scanner_that_skips_the_checksum_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("flight.link.telemetry.scanner.crc16", lambda _: 0)
+    monkeypatch.setattr("ground.telemetry.scanner.crc16", lambda _: 0)
     assert not run("logs", target_of("logs"), 30, seed=7).sound
 
 

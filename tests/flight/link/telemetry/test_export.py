@@ -15,8 +15,8 @@ from flight.gnc.errors import UsageError
 from flight.link.telemetry.definitions import EVENT, HOUSEKEEPING, RUN
 from flight.link.telemetry.log import FlightLog
 from flight.link.telemetry.packets import Packer
-from flight.link.telemetry.reader import Run, read_run
 from ground.export import export
+from ground.telemetry.reader import Run, read_run
 from tests.ground.commands.in_process import command
 from tests.ground.report.synthetic import Recipe, make_run
 from tests.manual_clock import ManualClock

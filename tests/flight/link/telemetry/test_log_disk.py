@@ -12,8 +12,8 @@ import pytest
 
 from flight.gnc.errors import UsageError
 from flight.link.telemetry.log import FlightLog
-from flight.link.telemetry.scanner import scan
 from flight.link.telemetry.segments import SegmentFile, open_segment
+from ground.telemetry.scanner import scan
 from tests.flight.link.telemetry.samples import timing_packets
 from tests.flight.link.telemetry.small_disk import SmallDisk, SmallDiskFile, content
 from tests.manual_clock import ManualClock

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 
 from flight.link.telemetry.packets import LAYOUTS, crc16
-from flight.link.telemetry.reader import read_run
-from flight.link.telemetry.scanner import ScanResult, scan
 from flight.link.telemetry.segments import find_segments
 from ground.report import format_report, summarise
+from ground.telemetry.reader import read_run
+from ground.telemetry.scanner import ScanResult, scan
 from tests.ground.report.synthetic import Recipe, make_run
 
 TAIL = 4096

@@ -10,12 +10,12 @@ import pytest
 from flight.app.flight import fly
 from flight.app.request import RunRequest
 from flight.link.telemetry.packets import to_text
-from flight.link.telemetry.reader import read_run
 from flight.loop.state.content import StoredState
 from flight.loop.state.opening import open_state, state_folder
 from flight.loop.state.store import StateStore
 from flight.schema import reader as configuration
 from flight.schema.sections import Config
+from ground.telemetry.reader import read_run
 from hal.interfaces.errors import NotResponding
 from tests.manual_clock import ManualClock
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from flight.gnc.errors import UsageError
 from flight.link.telemetry.packets import LAYOUTS, PacketArray
-from flight.link.telemetry.scanner import ScanResult, scan
 from flight.link.telemetry.segments import find_segments
+from ground.telemetry.scanner import ScanResult, scan
 
 
 @dataclass(frozen=True)

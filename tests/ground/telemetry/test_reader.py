@@ -8,7 +8,7 @@ import pytest
 
 from flight.gnc.errors import UsageError
 from flight.link.telemetry.log import FlightLog
-from flight.link.telemetry.reader import read_run
+from ground.telemetry.reader import read_run
 from tests.flight.link.telemetry.samples import timing_packets
 from tests.ground.report.synthetic import Recipe, make_run
 from tests.manual_clock import ManualClock

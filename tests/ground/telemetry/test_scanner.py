@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from flight.link.telemetry.definitions import CONTROL, EVENT, IMU, TARGET
 from flight.link.telemetry.packets import LAYOUTS, Packer, TelemetryError, crc16
-from flight.link.telemetry.scanner import ScanResult, decode, scan
+from ground.telemetry.scanner import ScanResult, decode, scan
 from tests.flight.link.telemetry.samples import plain_contents, timing_packets
 from tests.pace import ordinary_seconds
 from tests.studies.bench.scan import log

@@ -1,0 +1,1 @@
+"""A flight watched in the terminal."""
