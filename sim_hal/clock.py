@@ -19,6 +19,9 @@ class TimedWorld(Protocol):
     def next_event_ns(self) -> int:
         """Return the time of the next event."""
 
+    def run_events(self, event_ns: int) -> None:
+        """Process the events of that time, the next."""
+
     def advance_to(self, time_ns: int) -> None:
         """Process all events due at or before `time_ns`."""
 
@@ -71,7 +74,7 @@ class SimClock:
         if world is not None:
             while (event_ns := world.next_event_ns()) <= time_ns:
                 self._now_ns = max(self._now_ns, event_ns)
-                world.advance_to(event_ns)
+                world.run_events(event_ns)
             world.advance_to(time_ns)
         self._now_ns = max(self._now_ns, time_ns)
 

@@ -35,6 +35,8 @@ class PwmTorqueCoils:
         self._settings = settings
         self._steps = tuple(current_step(coil.resistance, settings.supply_voltage) for coil in settings.coils)
         self._largest = tuple(largest_counts(step, settings.current_limit) for step in self._steps)
+        # Currents of one count; the sign is exact in either place.
+        self._signed = tuple(coil.sign * step for coil, step in zip(settings.coils, self._steps, strict=True))
         self._mailbox = CommandMailbox(clock, round(settings.stale_after * 1e9))
         self._outputs = CoilOutputs(pca, clock, settings, self._mailbox.lock)
         self._running = False
@@ -125,9 +127,10 @@ class PwmTorqueCoils:
         """Return what is on the wire; after a failure, what was last acknowledged."""
         mailbox, outputs = self._mailbox, self._outputs
         with mailbox.lock:
+            (a, b, c), (x, y, z) = self._signed, outputs.written
             return CoilState(
                 command=np.array(mailbox.command),
-                current=np.array(list(map(self._mean_current, range(3), outputs.written))),
+                current=np.array((mean_current(x, a), mean_current(y, b), mean_current(z, c))),
                 written_ns=outputs.written_ns,
                 saturated=mailbox.saturated,
                 command_ns=mailbox.command_ns,
@@ -153,16 +156,13 @@ class PwmTorqueCoils:
             return OutOfRange(DEVICE, "number of currents", values.size, 3, 3, "")
         for axis, value in enumerate(values.tolist()):
             if not math.isfinite(value):
-                bound = self._mean_current(axis, self._largest[axis] * self._settings.coils[axis].sign)
+                bound = mean_current(self._largest[axis], self._steps[axis])
                 return OutOfRange(DEVICE, f"current of coil {_AXES[axis]}", value, -bound, bound, "A")
         return None
 
     def _counts(self, axis: int, current: float) -> tuple[int, bool]:
         counts, limited = counts_for(current, self._steps[axis], self._largest[axis])
         return counts * self._settings.coils[axis].sign, limited
-
-    def _mean_current(self, axis: int, counts: int) -> float:
-        return self._settings.coils[axis].sign * mean_current(counts, self._steps[axis])
 
     def _try_zero(self) -> bool:
         return self._outputs.zero(self._mailbox.braked)

@@ -9,7 +9,6 @@ samples) is not modelled.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -127,6 +126,7 @@ class Sensors:
         self._static: FloatArray | None = None
         self._bias = gyro_bias
         self._free_fall = free_fall
+        self._scales: dict[tuple[int, ...], FloatArray] = {}
 
     def restart(self) -> None:
         """Draw the errors that are constant until the next start."""
@@ -137,11 +137,11 @@ class Sensors:
         if self._free_fall:
             self._static = normalise(self._rng.standard_normal(4))
 
-    def measure(self, motion: Motion, windows: Sequence[int]) -> Measured:
+    def measure(self, motion: Motion, windows: tuple[int, ...]) -> Measured:
         """Return one sample; `windows` are the filter lengths of magnetometer, accelerometer and gyro."""
         profile = self._profile
-        bounded = self._rng.uniform(-1.0, 1.0, 6)
-        white = self._rng.standard_normal(9) * _ROOT_BANDWIDTH
+        bounded = 2.0 * self._rng.random(6) - 1.0
+        white = self._scale(windows) * (self._rng.standard_normal(9) * _ROOT_BANDWIDTH)
         x, y, z = (profile.attitude_bound * bounded[:3]).tolist()
         small = np.array([x, y, z, math.sqrt(1.0 - x * x - y * y - z * z)])
         q = small @ (motion.quaternion @ self._table).reshape(4, 4)
@@ -150,14 +150,23 @@ class Sensors:
             self._static = normalise(multiply(drift, self._static))
         if self._static is not None:
             q = multiply(q, self._static)
-        mag_window, accel_window, gyro_window = (math.sqrt(max(1, window)) for window in windows)
-        rate_noise = profile.rate_density / gyro_window * white[:3]
-        mag_noise = profile.field_density / mag_window * white[3:6]
-        accel_noise = profile.acceleration_density / accel_window * white[6:]
         turn = self._to_sensor
         return Measured(
             quaternion=q,
-            rate=turn @ (motion.rate + profile.rate_bound * bounded[3:]) + self._bias + rate_noise,
-            mag=GAUSS_PER_TESLA * (turn @ motion.field_body + mag_noise),
-            accel=turn @ motion.specific_force_body + accel_noise,
+            rate=turn @ (motion.rate + profile.rate_bound * bounded[3:]) + self._bias + white[:3],
+            mag=GAUSS_PER_TESLA * (turn @ motion.field_body + white[3:6]),
+            accel=turn @ motion.specific_force_body + white[6:],
         )
+
+    def _scale(self, windows: tuple[int, ...]) -> FloatArray:
+        """Return the noise densities (9,) of gyro, magnetometer and accelerometer behind their filters."""
+        if windows not in self._scales:
+            mag, accel, gyro = (math.sqrt(max(1, window)) for window in windows)
+            profile = self._profile
+            of_each = (
+                profile.rate_density / gyro,
+                profile.field_density / mag,
+                profile.acceleration_density / accel,
+            )
+            self._scales[windows] = np.repeat(of_each, 3)
+        return self._scales[windows]

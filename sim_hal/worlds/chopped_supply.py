@@ -7,8 +7,8 @@ A coil's L/R of 0.1 ms is neglected beside the PWM's period of 20 ms (SN754410 a
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 from hal.drivers.pca9685 import COUNTS
 
@@ -18,8 +18,7 @@ Pulse = tuple[int, int]
 _HISTORY_NS = 500_000_000
 
 
-@dataclass(frozen=True, slots=True)
-class Bridge:
+class Bridge(NamedTuple):
     """The pulses on inputs A and B of a bridge, and on its enable input."""
 
     a: Pulse
@@ -47,8 +46,7 @@ class Bridge:
         return spans
 
 
-@dataclass(frozen=True, slots=True)
-class Chopping:
+class Chopping(NamedTuple):
     """The supply's current from `since_ns` on.
 
     Attributes:

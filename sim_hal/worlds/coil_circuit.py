@@ -13,10 +13,10 @@ from enum import Enum
 import numpy as np
 
 from flight.gnc.math.arrays import FloatArray
-from hal.drivers.coil_settings import CoilSettings
+from hal.drivers.coil_settings import CoilSettings, CoilWiring
 from hal.drivers.pca9685 import COUNTS
 from sim_hal.emulators.pca9685 import EmulatedPca9685
-from sim_hal.worlds.chopped_supply import Bridge, ChoppedSupply, Chopping
+from sim_hal.worlds.chopped_supply import Bridge, ChoppedSupply, Chopping, Pulse
 
 CURRENT_UNCERTAINTY = 3.5e-3
 """A; the thesis's bound on the error of a coil's current."""
@@ -36,6 +36,16 @@ class Condition(Enum):
     A_LOW = "A stuck low"
     B_HIGH = "B stuck high"
     B_LOW = "B stuck low"
+
+
+_FREE: tuple[Pulse | None, Pulse | None] = (None, None)
+_STUCK: dict[Condition, tuple[Pulse | None, Pulse | None]] = {
+    Condition.A_HIGH: (_HIGH, None),
+    Condition.A_LOW: (_LOW, None),
+    Condition.B_HIGH: (None, _HIGH),
+    Condition.B_LOW: (None, _LOW),
+}
+"""The pulses of the legs A and B that do not follow their inputs."""
 
 
 class CoilCircuit:
@@ -71,6 +81,7 @@ class CoilCircuit:
         self._bus_voltage = truth.supply_voltage if bus_voltage is None else bus_voltage
         self._supply_voltage = truth.supply_voltage
         self._conditions = [Condition.SOUND] * 3
+        self._stuck = [_FREE] * 3
         self._short_ohm = [1.0, 1.0, 1.0]
         self._bridges = [_OFF] * 3
         self._values = [0.0, 0.0, 0.0]
@@ -87,6 +98,7 @@ class CoilCircuit:
     def become(self, axis: int, condition: Condition, short_ohm: float = 5.0) -> None:
         """Set the condition of a coil; a shorted coil loads its bridge with `short_ohm`."""
         self._conditions[axis] = condition
+        self._stuck[axis] = _STUCK.get(condition, _FREE)
         self._short_ohm[axis] = short_ohm
         self.update(self._coils[axis][1])
 
@@ -94,23 +106,29 @@ class CoilCircuit:
         """Update the currents after a STOP; `written` is the mask of the channels that were written."""
         draws = self._generator.random(3).tolist() if written else (0.5, 0.5, 0.5)
         for axis, (coil, channels, step, limit) in enumerate(self._coils):
-            condition = self._conditions[axis]
-            bridge = self._bridge(coil.channel_a, coil.channel_b, coil.enable_channel, condition)
+            bridge = self._bridge(coil, *self._stuck[axis])
             if bridge == self._bridges[axis] and not written & channels:
                 continue
             self._bridges[axis] = bridge
             counts = bridge.net_counts()
             current, drawn = 0.0, abs(step) * COUNTS
-            if counts and condition is not Condition.OPEN:
+            if counts:
                 current = counts * step + self._uncertainty * (2.0 * draws[axis] - 1.0)
                 current = min(limit, max(-limit, current))
                 drawn = abs(current) * COUNTS / abs(counts)
-            if condition is Condition.OPEN:
-                drawn = 0.0
-            elif condition is Condition.SHORTED:
-                current, drawn = 0.0, self._supply_voltage / self._short_ohm[axis]
+            match self._conditions[axis]:
+                case Condition.SOUND:
+                    pass
+                case Condition.OPEN:
+                    current, drawn = 0.0, 0.0
+                case Condition.SHORTED:
+                    current, drawn = 0.0, self._supply_voltage / self._short_ohm[axis]
+                case Condition.REVERSED:
+                    current = -current
+                case _:
+                    pass
             self._drawn[axis] = drawn
-            self._values[axis] = -current if condition is Condition.REVERSED else current
+            self._values[axis] = current
         self._currents = np.array(self._values)
         self._remember()
 
@@ -121,18 +139,14 @@ class CoilCircuit:
         """
         return self._bus_voltage, self._supply.charge(start_ns, end_ns) / (end_ns - start_ns)
 
-    def _bridge(self, channel_a: int, channel_b: int, enable: int | None, condition: Condition) -> Bridge:
-        """Return the pulses that a bridge's legs follow."""
-        high = self._chip.high
-        a, b = high(channel_a), high(channel_b)
-        match condition:
-            case Condition.A_HIGH | Condition.A_LOW:
-                a = _HIGH if condition is Condition.A_HIGH else _LOW
-            case Condition.B_HIGH | Condition.B_LOW:
-                b = _HIGH if condition is Condition.B_HIGH else _LOW
-            case _:
-                pass
-        return Bridge(a, b, _HIGH if enable is None else high(enable))
+    def _bridge(self, coil: CoilWiring, stuck_a: Pulse | None, stuck_b: Pulse | None) -> Bridge:
+        """Return the pulses that a bridge's legs follow: their inputs', or those at which they are stuck."""
+        high, enable = self._chip.high, coil.enable_channel
+        return Bridge(
+            stuck_a or high(coil.channel_a),
+            stuck_b or high(coil.channel_b),
+            _HIGH if enable is None else high(enable),
+        )
 
     def _remember(self) -> None:
         # Without a clock the outputs are constant, and any frequency is right.

@@ -16,13 +16,17 @@ class TimedSimulation:
 
     def next_event_ns(self) -> int:
         """Return the time of the next event of any device."""
-        return min((device.next_event_ns() for device in self._devices), default=NEVER)
+        return min([device.next_event_ns() for device in self._devices], default=NEVER)
+
+    def run_events(self, event_ns: int) -> None:
+        """Advance to the next event, and run the devices that are due then."""
+        self._advance_world(event_ns)
+        for device in self._devices:
+            if device.next_event_ns() <= event_ns:
+                device.advance(event_ns)
 
     def advance_to(self, time_ns: int) -> None:
         """Process all events due at or before `time_ns`, in order."""
         while (event_ns := self.next_event_ns()) <= time_ns:
-            self._advance_world(event_ns)
-            for device in self._devices:
-                if device.next_event_ns() <= event_ns:
-                    device.advance(event_ns)
+            self.run_events(event_ns)
         self._advance_world(time_ns)

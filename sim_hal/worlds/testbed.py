@@ -91,7 +91,7 @@ class Testbed:
         if span <= 0.0:
             return
         self.mean_current = self._currents()
-        ix, iy, iz = (float(i) for i in self.mean_current)
+        ix, iy, iz = self.mean_current.tolist()
         steps = max(1, math.ceil(span / _LONGEST_STEP))
         for _ in range(steps):
             self._step(span / steps, ix, iz)

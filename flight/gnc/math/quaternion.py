@@ -7,6 +7,7 @@ corrected (the upper left block is minus the cross-product matrix). No other mod
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import Any
 
@@ -24,6 +25,9 @@ def _components(q: FloatArray) -> Iterable[Any]:
 
 def normalise(q: FloatArray) -> FloatArray:
     """Return q (..., 4) scaled to unit length."""
+    if q.ndim == 1:
+        a, b, c, d = q.tolist()
+        return np.asarray(q / math.sqrt(a * a + b * b + c * c + d * d))
     return np.asarray(q / np.linalg.norm(q, axis=-1, keepdims=True))
 
 
@@ -87,6 +91,12 @@ def from_rotation_vector(vector: FloatArray) -> FloatArray:
     A body that turns with constant rate w for t has q(t) = multiply(from_rotation_vector(w t), q(0)).
     """
     v = np.asarray(vector, dtype=float)
+    if v.ndim == 1:
+        x, y, z = v.tolist()
+        turn = 0.5 * math.sqrt(x * x + y * y + z * z)
+        phase = np.pi * (turn / np.pi)  # rounded as numpy's sinc does
+        scale = 0.5 * (np.sin(phase) / phase) if phase else 0.5
+        return np.array([scale * x, scale * y, scale * z, np.cos(turn)])
     half = 0.5 * np.linalg.norm(v, axis=-1, keepdims=True)
     # sin(x)/x through numpy's sinc keeps the small-angle limit exact.
     return np.concatenate([0.5 * np.sinc(half / np.pi) * v, np.cos(half)], axis=-1)

@@ -162,33 +162,34 @@ class Packer:
         means "none". Raises TelemetryError, and counts no packet, for a field missing, unknown, of the
         wrong length or out of its type's range.
         """
-        if values is not None:
-            fields = {**values, **fields}
+        given = fields if values is None else {**values, **fields} if fields else values
         layout = self._layouts[packet.name]
         count = self._counts[packet.name]
         data_length = layout.length - HEADER_BYTES - 1
         flat: list[Any] = [layout.identifier, UNSEGMENTED | count, data_length, packet.version, time_ns]
         try:
             for name, text_size, items in layout.fields:
-                value = fields[name]
+                value = given[name]
                 if text_size:
                     flat.append(_to_bytes(value, text_size))
                 elif items == 1:
                     flat.append(value)
                 else:
-                    flat.extend(_to_items(value, items))
+                    flat += _to_items(value, items)
             body = layout.body.pack(*flat)
         except (KeyError, TypeError, ValueError, OverflowError, struct.error) as error:
-            raise _explain(layout, time_ns, fields) from error
-        if len(fields) != len(layout.fields):
-            raise _unknown_fields(layout, fields)
+            raise _explain(layout, time_ns, given) from error
+        if len(given) != len(layout.fields):
+            raise _unknown_fields(layout, given)
         self._counts[packet.name] = (count + 1) % SEQUENCE_MODULUS
         return body + crc16(body).to_bytes(CRC_BYTES, "big")
 
 
 def _to_items(value: Any, count: int) -> list[Any]:
     """Return the numbers of an array field. Raises ValueError unless there are `count` of them."""
-    items = value.tolist() if isinstance(value, np.ndarray) else list(value)
+    items: list[Any] = value.tolist() if isinstance(value, np.ndarray) else value
+    if type(items) is not list:
+        items = list(items)
     if len(items) != count:
         raise ValueError(f"{len(items)} values where {count} are needed")
     return items

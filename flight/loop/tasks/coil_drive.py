@@ -117,7 +117,7 @@ class CoilDrive:
 
     def send(self, currents: FloatArray, field: Callable[[], FloatArray | None]) -> None:
         """Command currents (3,) A; `field` returns the field (3,) T in body axes, for a reallocation."""
-        if not self.available.all() and currents.any():
+        if not all(self.available.tolist()) and currents.any():
             currents = self._reallocated(currents, field())
         self.command = np.zeros(3) if self._watch.at_rest else currents + self._watch.probe
         self._coils.command(self.command)

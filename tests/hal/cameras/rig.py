@@ -84,6 +84,8 @@ class _World:
     def advance_to(self, time_ns: int) -> None:
         self._camera.advance(time_ns)
 
+    run_events = advance_to
+
 
 def emulated_rig() -> Rig:
     """Return the simulated camera, its pictures flat."""

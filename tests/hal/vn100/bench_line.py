@@ -48,6 +48,8 @@ class Alone:
         """Let the unit act."""
         self.unit.advance(time_ns)
 
+    run_events = advance_to
+
 
 @dataclass(frozen=True, slots=True)
 class BenchLine:

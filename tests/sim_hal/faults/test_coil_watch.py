@@ -9,7 +9,16 @@ import numpy as np
 import pytest
 
 from flight.gnc.math.arrays import FloatArray
-from flight.loop.fdir.coils.hypotheses import MEAN, NEWEST, Bounds, CoilFault, fits, predict, supply_current
+from flight.loop.fdir.coils.hypotheses import (
+    MEAN,
+    NEWEST,
+    PLACE,
+    Bounds,
+    CoilFault,
+    fits,
+    predict,
+    supply_currents,
+)
 from flight.loop.fdir.coils.stuck_leg import NONE, StuckLeg, Supplied
 from flight.loop.fdir.coils.watch import CoilWatch, CoilWatchSettings
 from hal.interfaces.readings import ImuReading, PowerReading
@@ -112,8 +121,8 @@ def reading(time: float, current: float) -> PowerReading:
 
 def test_a_stuck_leg_of_an_axis_that_is_driven_is_distinguished_from_one_that_carries_nothing() -> None:
     """Under an opposing command a stuck leg draws no supply current, like an open coil: rest decides."""
-    command = np.array([-FULL])
-    assert supply_current(command, CoilFault.A_HIGH, FULL) == pytest.approx(0.0)
+    drawn = supply_currents(np.array([[-FULL]]), np.array([[FULL]]))
+    assert drawn[0, PLACE[CoilFault.A_HIGH]] == pytest.approx(0.0)
     leg = StuckLeg(0.04)
     driven = Supplied(0.0, 0.08, 0.21, (1, 2), True)
     for _ in range(2):

@@ -28,6 +28,8 @@ class Beeper:
             self._notes.append(("beep", self._next))
             self._next += 10 * MS
 
+    run_events = advance_to
+
 
 def test_sleeping_takes_the_world_and_the_tickers_along_in_order() -> None:
     clock, notes = SimClock(), list[tuple[str, int]]()

@@ -51,11 +51,15 @@ class CoilCommands:
 
     def window(self, begin_ns: int, end_ns: int) -> FloatArray:
         """Return the commands (k, 3) A that may have been in force between two times, evenly sampled."""
-        times = np.array([time_ns for time_ns, _ in self._commands])
-        values = np.array([currents for _, currents in self._commands])
-        at = np.arange(begin_ns, end_ns + _NOTED_LATE_NS + 1, _SAMPLES_NS)
-        newest: FloatArray = values[np.maximum(np.searchsorted(times, at, side="right") - 1, 0)]
-        return newest
+        later = iter(self._commands)
+        _, currents = next(later)
+        following = next(later, None)
+        sampled: list[tuple[float, ...]] = []
+        for time_ns in range(begin_ns, end_ns + _NOTED_LATE_NS + 1, _SAMPLES_NS):
+            while following is not None and following[0] <= time_ns:
+                currents, following = following[1], next(later, None)
+            sampled.append(currents)
+        return np.array(sampled)
 
     def supplied(self, reading: PowerReading, bounds: Bounds, known: Mapping[int, CoilFault]) -> Supplied:
         """Return the newest conversion with the bounds of the current that healthy coils would draw.
@@ -64,16 +68,18 @@ class CoilCommands:
         """
         sizes = np.abs(self.window(reading.newest_since_ns, reading.time_ns))
         free = [axis for axis, fault in known.items() if fault in {CoilFault.SHORTED, CoilFault.UNCERTAIN}]
-        sure = sizes.copy()
-        sure[:, [axis for axis, fault in known.items() if fault is not CoilFault.SHORTED]] = 0.0
-        slack = np.count_nonzero(sizes.any(axis=0)) * bounds.uncertainty + bounds.noise
+        unsure = [axis for axis, fault in known.items() if fault is not CoilFault.SHORTED]
+        driven: list[bool] = [any(column) for column in sizes.T.tolist()]
+        total = sizes.sum(axis=1)
+        sure = np.delete(sizes, unsure, axis=1).sum(axis=1) if unsure else total
+        slack = sum(driven) * bounds.uncertainty + bounds.noise
         error = bounds.gain + NEWEST.scatter
-        most = float(sizes.sum(axis=1).max()) * (1.0 + error) + slack
+        lowest, highest = float(total.min()), float(total.max())
         return Supplied(
             reading.newest,
-            least=float(sure.sum(axis=1).min()) * (1.0 - error) - slack,
-            most=most + sum(bounds.full_current[axis] for axis in free),
-            at_rest=[axis for axis in range(3) if not sizes[:, axis].any() and axis not in known],
-            driven=bool(sizes.any()),
-            spread=float(np.ptp(sizes.sum(axis=1))),
+            least=float(sure.min()) * (1.0 - error) - slack,
+            most=highest * (1.0 + error) + slack + sum(bounds.full_current[axis] for axis in free),
+            at_rest=[axis for axis in range(3) if not driven[axis] and axis not in known],
+            driven=any(driven),
+            spread=highest - lowest,
         )

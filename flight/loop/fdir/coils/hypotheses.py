@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from functools import cache
 
 import numpy as np
 
@@ -38,8 +39,9 @@ ELECTRICAL = (
     CoilFault.B_HIGH,
 )
 _VARIANTS: tuple[CoilFault | None, ...] = (None, *ELECTRICAL)
-_PLACE = {fault: place for place, fault in enumerate(_VARIANTS)}
-_SHORTED_FACTORS = np.geomspace(1.6, 20.0, 40)
+PLACE = {fault: place for place, fault in enumerate(_VARIANTS)}
+"""Of each variant in a prediction; None is a healthy bridge."""
+_SHORTED_FACTORS = np.geomspace(1.6, 20.0, 40)[:, None]
 _SHORTED_SLACK = 0.04
 _OUTLIERS = 0.15
 """Fraction of the readings that a hypothesis may miss: those whose window contains the fault's onset."""
@@ -93,34 +95,27 @@ class Predicted:
 
 def predict(current: float, commands: FloatArray, bounds: Bounds, sampling: Sampling) -> Predicted:
     """Predict the current of each variant under the commands (k, 3) A of a reading's window."""
-    drawn = np.empty((3, len(_VARIANTS), len(commands)))
-    for axis in range(3):
-        for place, fault in enumerate(_VARIANTS):
-            drawn[axis, place] = supply_current(commands[:, axis], fault, bounds.full_current[axis])
-    driven = np.count_nonzero(drawn, axis=2) / len(commands)
-    slack = bounds.uncertainty * driven + sampling.range_share * np.ptp(drawn, axis=2)
-    return Predicted(current, drawn.mean(axis=2), slack, sampling.scatter)
+    drawn = supply_currents(commands.T, np.array(bounds.full_current)[:, None])
+    count = len(commands)
+    slack = bounds.uncertainty * ((drawn != 0.0).sum(axis=2) / count)
+    slack += sampling.range_share * (drawn.max(axis=2) - drawn.min(axis=2))
+    return Predicted(current, drawn.sum(axis=2) / count, slack, sampling.scatter)
 
 
-def supply_current(command: FloatArray, fault: CoilFault | None, full: float) -> FloatArray:
-    """Return the supply current of a bridge for commands (k,) A, `full` A when fully on.
+def supply_currents(commands: FloatArray, full: FloatArray) -> FloatArray:
+    """Return the supply currents (n, v, k) of n bridges under each variant for commands (n, k) A.
 
-    For a shorted coil, return that of a healthy coil.
+    `full` (n, 1) A is drawn when fully on. A shorted coil's are those of a healthy coil.
     """
-    nothing = np.zeros_like(command)
-    match fault:
-        case CoilFault.OPEN:
-            return nothing
-        case CoilFault.A_LOW:
-            return np.maximum(-command, nothing)
-        case CoilFault.B_LOW:
-            return np.maximum(command, nothing)
-        case CoilFault.A_HIGH:
-            return np.maximum(full - np.maximum(-command, nothing), nothing)
-        case CoilFault.B_HIGH:
-            return np.maximum(full - np.maximum(command, nothing), nothing)
-        case _:
-            return np.abs(command)
+    forward, backward = np.maximum(commands, 0.0), np.maximum(-commands, 0.0)
+    drawn = np.empty((len(commands), len(_VARIANTS), commands.shape[1]))
+    drawn[:, PLACE[None]] = drawn[:, PLACE[CoilFault.SHORTED]] = forward + backward
+    drawn[:, PLACE[CoilFault.OPEN]] = 0.0
+    drawn[:, PLACE[CoilFault.A_LOW]] = backward
+    drawn[:, PLACE[CoilFault.B_LOW]] = forward
+    drawn[:, PLACE[CoilFault.A_HIGH]] = np.maximum(full - backward, 0.0)
+    drawn[:, PLACE[CoilFault.B_HIGH]] = np.maximum(full - forward, 0.0)
+    return drawn
 
 
 def fits(
@@ -134,26 +129,32 @@ def fits(
     variants: list[CoilFault | None] = [known.get(number) for number in range(3)]
     if axis is not None:
         variants[axis] = fault
-    current = np.array([one.current for one in evidence])
-    mean, slack = np.zeros(len(evidence)), np.full(len(evidence), bounds.noise)
-    free = np.zeros(len(evidence))  # current that an axis of unknown state may add
-    own = np.zeros(len(evidence))
+    current, scatter = np.array([(one.current, one.scatter) for one in evidence]).T
+    means, slacks = np.array([one.mean for one in evidence]), np.array([one.slack for one in evidence])
+    mean, own = np.zeros(len(evidence)), np.zeros(len(evidence))
+    slack: FloatArray = np.full(len(evidence), bounds.noise)
+    free = 0.0  # current that axes of unknown state may add
     for number, variant in enumerate(variants):
         if variant is CoilFault.UNCERTAIN or (variant is CoilFault.SHORTED and number != axis):
             free += bounds.full_current[number]
             continue
-        place = _PLACE.get(variant, 0)
-        part = np.array([one.mean[number, place] for one in evidence])
-        slack += np.array([one.slack[number, place] for one in evidence])
+        place = PLACE.get(variant, 0)
+        slack += slacks[:, number, place]
         if variant is CoilFault.SHORTED:
-            own = part
+            own = means[:, number, place]
         else:
-            mean += part
-    factors = _SHORTED_FACTORS if own.any() else np.ones(1)
-    scales = np.linspace(1.0 - bounds.gain, 1.0 + bounds.gain, 9)
-    explained = scales[:, None, None] * mean + factors[None, :, None] * own
-    scatter = np.array([one.scatter for one in evidence])
-    spare = slack + scatter * explained + _SHORTED_SLACK * factors[None, :, None] * own
+            mean += means[:, number, place]
+    explained = _scales(bounds.gain) * mean
+    spare: FloatArray = slack + scatter * explained
+    if own.any():
+        explained = explained + _SHORTED_FACTORS * own
+        spare = slack + scatter * explained + _SHORTED_SLACK * _SHORTED_FACTORS * own
     inside = (current >= explained - spare) & (current <= explained + spare + free)
     misses = len(evidence) - int(inside.sum(axis=2).max())
     return misses <= _OUTLIERS * len(evidence)
+
+
+@cache
+def _scales(gain: float) -> FloatArray:
+    """Return factors (9, 1, 1) over the range of the gain error."""
+    return np.linspace(1.0 - gain, 1.0 + gain, 9)[:, None, None]

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.directions import cross_matrices
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +74,13 @@ class CoilResponse:
     def __init__(self, settings: ResponseSettings) -> None:
         self._settings = settings
         self._per_field = settings.dipole_per_ampere * np.linalg.inv(settings.inertia).T
-        self._free = np.array(settings.free)
+        self._free = np.flatnonzero(settings.free)
+        self._mask: FloatArray = np.array(settings.free, dtype=float)[:, None]
+        count = len(self._free)
+        # Each free axis has its own torsion and damping: parameters 3 .. 3 + f, 3 + f .. 3 + 2 f.
+        spreads = [_GAIN_PRIOR] * 3 + [settings.torsion] * count + [settings.damping] * count
+        self._prior: FloatArray = np.diag(1.0 / np.array(spreads) ** 2)
+        self._expected: FloatArray = self._prior @ np.array([1.0] * 3 + [0.0] * (2 * count))
         self._commands: deque[tuple[int, tuple[float, ...]]] = deque([(0, (0.0, 0.0, 0.0))])
         self._known_ns = 0
         self._last_ns = 0
@@ -86,19 +93,14 @@ class CoilResponse:
     def reset(self) -> None:
         """Discard all samples."""
         self._asked: FloatArray = np.zeros((3, 3))
-        self._asked_sum: FloatArray = np.zeros((3, 3))
-        self._rate_sum: FloatArray = np.zeros(3)
-        self._time_sum = 0
-        self._count = 0
+        # Time and time since the sample before, s; rate and field (3,); currents (3,).
+        self._samples: list[tuple[int, float, FloatArray, FloatArray, tuple[float, ...]]] = []
         self._previous: tuple[float, FloatArray, FloatArray] | None = None
         self._turned: FloatArray = np.zeros(3)
-        # Commanded accelerations of each coil (3, 3), observed (3,), mean rate and angle (3,) of the bin.
-        self._rows: deque[tuple[FloatArray, FloatArray, FloatArray, FloatArray]] = deque(
-            maxlen=self._settings.bins
-        )
+        # Of each free axis (f, 6): accelerations by the coils (3), observed, mean rate and angle of the bin.
+        self._rows: deque[FloatArray] = deque(maxlen=self._settings.bins)
         # Time; commanded accelerations of each coil and those per ampere (3, 3); residual (3,).
         self._remainders: deque[tuple[int, FloatArray, FloatArray, FloatArray]] = deque()
-        self._per_ampere: FloatArray = np.zeros((3, 3))
         self._wrong_for = [0, 0, 0]
         self._sound_for = [0, 0, 0]
         self.sigma = np.full(3, np.inf)
@@ -125,18 +127,8 @@ class CoilResponse:
         if not 0 < since_ns < _STALE_NS:
             self.reset()
             return False
-        # Row a: acceleration per ampere in coil a alone, J^-1 (n e_a x B).
-        x, y, z = field.tolist()
-        self._per_ampere = np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))) @ self._per_field
-        currents = np.array(self._command_at(time_ns))[:, None]
-        self._asked = self._asked + currents * self._per_ampere * (since_ns * 1e-9)
-        self._asked_sum = self._asked_sum + self._asked
-        self._rate_sum = self._rate_sum + rate
-        self._time_sum += time_ns
-        self._count += 1
-        if self._count < self._settings.bin_samples:
-            return False
-        return self._close_bin()
+        self._samples.append((time_ns, since_ns * 1e-9, rate, field, self._command_at(time_ns)))
+        return len(self._samples) >= self._settings.bin_samples and self._close_bin()
 
     def _command_at(self, time_ns: int) -> tuple[float, ...]:
         for since_ns, currents in reversed(self._commands):
@@ -175,25 +167,30 @@ class CoilResponse:
         return f"the body feels {self.gain[axis]:+.2f} +- {self.sigma[axis]:.2f} of its torque"
 
     def _close_bin(self) -> bool:
-        count = self._count
-        middle = self._time_sum / count * 1e-9
-        rate, asked = self._rate_sum / count, self._asked_sum / count
+        times, spans, rates, fields, currents = zip(*self._samples, strict=True)
+        self._samples.clear()
+        count = len(times)
+        # Row a: acceleration per ampere in coil a alone, J^-1 (n e_a x B).
+        per_ampere = cross_matrices(np.array(fields)) @ self._per_field
+        steps = np.array(currents)[:, :, None] * per_ampere * np.array(spans)[:, None, None]
+        steps[0] += self._asked
+        integral = np.cumsum(steps, axis=0)
+        self._asked = integral[-1]
+        middle = sum(times) / count * 1e-9
+        rate, asked = np.array(rates).sum(axis=0) / count, integral.sum(axis=0) / count
         before, self._previous = self._previous, (middle, rate, asked)
-        self._rate_sum, self._asked_sum = np.zeros(3), np.zeros((3, 3))
-        self._time_sum = self._count = 0
         if before is None:
             return False
         span = middle - before[0]
-        inputs, output = (asked - before[2]).T / span, (rate - before[1]) / span
         mean_rate = 0.5 * (rate + before[1])
         self._turned = self._turned + mean_rate * span
-        self._rows.append((inputs, output, mean_rate, self._turned))
-        free = self._free
-        remainder = np.where(free, output - inputs.sum(axis=1), 0.0)
-        kept = free[:, None]
-        self._remainders.append(
-            (self._last_ns, np.where(kept, inputs, 0.0), np.where(kept, self._per_ampere.T, 0.0), remainder)
-        )
+        row = np.empty((3, 6))
+        row[:, :3], row[:, 3] = (asked - before[2]).T / span, (rate - before[1]) / span
+        row[:, 4], row[:, 5] = mean_rate, self._turned
+        self._rows.append(row[self._free])
+        row *= self._mask
+        remainder = row[:, 3] - row[:, :3].sum(axis=1)
+        self._remainders.append((self._last_ns, row[:, :3], per_ampere[-1].T * self._mask, remainder))
         while self._remainders[0][0] < self._last_ns - self._settings.memory_ns:
             self._remainders.popleft()
         if len(self._rows) < self._settings.bins // 2:
@@ -202,35 +199,29 @@ class CoilResponse:
         return True
 
     def _fit(self, span: float) -> None:
-        free = np.flatnonzero(self._free)
-        count = len(free)
-        asked = np.array([row[0][free] for row in self._rows])  # (k, f, 3)
-        outputs = np.array([row[1][free] for row in self._rows])  # (k, f)
-        # Each free axis has its own torsion and damping: columns 3 .. 3 + f, 3 + f .. 3 + 2 f.
-        inputs = np.zeros((len(asked), count, 3 + 2 * count))
-        inputs[:, :, :3] = asked
-        for place, axis in enumerate(free):
-            inputs[:, place, 3 + place] = [-row[3][int(axis)] for row in self._rows]
-            inputs[:, place, 3 + count + place] = [-row[2][int(axis)] for row in self._rows]
+        rows = np.array(self._rows)
         # A constant disturbance about each free axis drops out with the means.
-        inputs = (inputs - inputs.mean(axis=0)).reshape(-1, 3 + 2 * count)
-        outputs = (outputs - outputs.mean(axis=0)).reshape(-1)
+        rows -= rows.sum(axis=0) / len(rows)
+        count = len(self._free)
+        inputs = np.zeros((len(rows), count, 3 + 2 * count))
+        inputs[:, :, :3] = rows[:, :, :3]
+        for place in range(count):
+            inputs[:, place, 3 + place] = -rows[:, place, 5]
+            inputs[:, place, 3 + count + place] = -rows[:, place, 4]
+        matrix, outputs = inputs.reshape(-1, 3 + 2 * count), rows[:, :, 3].reshape(-1)
         settings = self._settings
         floor = settings.rate_noise * np.sqrt(2.0 / settings.bin_samples) / span + _MODEL_ERROR
         weight = 1.0 / floor**2
-        spreads = [_GAIN_PRIOR] * 3 + [settings.torsion] * count + [settings.damping] * count
-        known = 1.0 / np.array(spreads) ** 2
-        expected = np.array([1.0] * 3 + [0.0] * (2 * count))
-        covariance = np.linalg.inv(inputs.T @ inputs * weight + np.diag(known))
-        found = covariance @ (inputs.T @ outputs * weight + known * expected)
-        residual = outputs - inputs @ found
+        covariance = np.linalg.inv(matrix.T @ matrix * weight + self._prior)
+        found = covariance @ (matrix.T @ outputs * weight + self._expected)
+        residual = outputs - matrix @ found
         freedom = max(len(outputs) - count - 3, 1)
         spread = max(1.0, float(residual @ residual) * weight / freedom)
         self.gain = found[:3]
-        self.sigma = np.sqrt(spread * np.diag(covariance)[:3])
-        for number in range(3):
-            gain, three_sigma = self.gain[number], 3.0 * self.sigma[number]
-            wrong = gain + three_sigma < 0.0 and gain < self._settings.highest_reversed
-            sound = self.sigma[number] < self._settings.sure and gain > self._settings.lowest_sound
+        self.sigma = np.sqrt(spread * covariance.diagonal()[:3])
+        pairs = zip(self.gain.tolist(), self.sigma.tolist(), strict=True)
+        for number, (gain, sigma) in enumerate(pairs):
+            wrong = gain + 3.0 * sigma < 0.0 and gain < settings.highest_reversed
+            sound = sigma < settings.sure and gain > settings.lowest_sound
             self._wrong_for[number] = self._wrong_for[number] + 1 if wrong else 0
             self._sound_for[number] = self._sound_for[number] + 1 if sound else 0

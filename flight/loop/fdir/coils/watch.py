@@ -113,6 +113,8 @@ class CoilWatch:
     @property
     def braked(self) -> Axes:
         """Which bridges are to be braked: those with a leg stuck high, and those of a search for one."""
+        if not self._verdicts:
+            return self._leg.brake
         x, y, z = (
             asked or (axis in self._verdicts and self._verdicts[axis].fault in _BRAKED)
             for axis, asked in enumerate(self._leg.brake)
