@@ -37,20 +37,18 @@ class PointSpread:
 
     def shares(self, positions: FloatArray, size: int) -> Float32Array:
         """Return the light (..., size) on pixels 0 .. size - 1 in a line, of points at `positions` (...)."""
-        table = _table(self, size)
+        table, rise = _table(self, size)
         entry, beyond = _entries(positions)
-        shares = table[entry]
-        shares += beyond[..., None] * (table[entry + 1] - shares)
+        shares = table.take(entry, axis=0)
+        shares += beyond[..., None] * rise.take(entry, axis=0)
         return np.asarray(shares)
 
     def own_shares(self, positions: FloatArray) -> Float32Array:
         """Return the light (..., size) on pixels 0 .. size - 1, each of its own point of `positions`."""
         pixel = np.arange(positions.shape[-1])
-        table = _table(self, len(pixel))
+        table, rise = _table(self, len(pixel))
         entry, beyond = _entries(positions)
-        shares = table[entry, pixel]
-        shares += beyond * (table[entry + 1, pixel] - shares)
-        return np.asarray(shares)
+        return np.asarray(table[entry, pixel] + beyond * rise[entry, pixel])
 
 
 @lru_cache(maxsize=8)
@@ -92,9 +90,10 @@ def _entries(positions: FloatArray) -> tuple[IntArray, Float32Array]:
 
 
 @lru_cache(maxsize=32)
-def _table(spread: PointSpread, size: int) -> Float32Array:
-    """Return the shares (size * STEPS + 2, size) of points at 0, 1/STEPS, ... along the line of pixels."""
+def _table(spread: PointSpread, size: int) -> tuple[Float32Array, Float32Array]:
+    """Return the shares (size * STEPS + 1, size) of points 1/STEPS px apart, and their rises to the next."""
     positions = np.arange(size * STEPS + 2) / STEPS
     table = spread.profile(np.arange(size) - positions[:, None])
     # Normalised, so that the light beyond the reach is not lost.
-    return np.asarray(table / table.sum(axis=1, keepdims=True), dtype=np.float32)
+    shares = np.asarray(table / table.sum(axis=1, keepdims=True), dtype=np.float32)
+    return shares[:-1], np.diff(shares, axis=0)

@@ -92,6 +92,7 @@ class FreeBody:
         self._start_ns, self._release_ns = start_ns, NEVER
         self._held = True
         self._acting: Floats = ZERO
+        self._seen: tuple[State, Motion | None] = self._state, None
         self._slot = -1
         self._torque, self._residual = ZERO, ZERO
         # The state is of `_done_ns`; from there to `time_ns` the currents `_acting` act.
@@ -118,13 +119,17 @@ class FreeBody:
         """Advance to `time_ns` and return the motion there; in free fall nothing presses on the body."""
         self.advance_to(time_ns)
         self._integrate()
-        return Motion(
-            time_ns=self.time_ns,
-            quaternion=self._attitude(),
-            rate=np.array(turned(self._to_body, self._state[4:])),
-            field_body=np.array(turned(self._to_body, turned(matrix(*self._state[:4]), self._field))),
-            specific_force_body=np.zeros(3),
-        )
+        state, motion = self._seen
+        if motion is None or motion.time_ns != self.time_ns or state is not self._state:
+            motion = Motion(
+                time_ns=self.time_ns,
+                quaternion=self._attitude(),
+                rate=np.array(turned(self._to_body, self._state[4:])),
+                field_body=np.array(turned(self._to_body, turned(matrix(*self._state[:4]), self._field))),
+                specific_force_body=np.zeros(3),
+            )
+            self._seen = self._state, motion  # the truth recorder looks when the inertial unit does
+        return motion
 
     def surroundings(self) -> Surroundings:
         """Return what surrounds the craft now, ICRS."""
