@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 from flight.app import opening
@@ -49,12 +50,19 @@ class Rigged:
 
 def demo_config(duration: float, camera: bool = True) -> TestbedConfig:
     """Return the step demonstration, cut to `duration` s."""
-    config = as_testbed(configuration.parse(TEXT))
+    config = _demo()
     steps = tuple(step for step in config.steps if step.at < duration)
     changed = configuration.replace(config, duration=duration, steps=steps)
     return changed if camera else configuration.replace(changed, camera=None)
 
 
+@cache
+def _demo() -> TestbedConfig:
+    """Return the whole demonstration, read once for all flights."""
+    return as_testbed(configuration.parse(TEXT))
+
+
+@cache
 def demo_world() -> Simulation:
     """Return the world of the step demonstration."""
     section = configuration.simulation_section(TEXT, CONFIG.name, Simulation)

@@ -18,6 +18,15 @@ from tests.studies.campaigns import fault_judgement, fault_table, faults, soak
 from tests.studies.campaigns.campaign import Case
 
 AT = 5.0
+BRIEF = 14.0
+"""s, of a flight with one fault: enough for it to be found, to end, and to be recovered from."""
+
+
+@pytest.fixture
+def brief(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let flights of the campaign end sooner."""
+    for module in (faults, fault_judgement):
+        monkeypatch.setattr(module, "DURATION", BRIEF)
 
 
 def flown(fault: str, mode: str = "testbed-demo", span: float | None = 3.0) -> dict[str, Any]:
@@ -25,6 +34,7 @@ def flown(fault: str, mode: str = "testbed-demo", span: float | None = 3.0) -> d
     return faults.fly_with(kind, mode, FaultEntry(fault=fault, at=AT, span=span), seed=3)
 
 
+@pytest.mark.usefixtures("brief")
 @pytest.mark.parametrize(
     ("fault", "events", "detected_in", "recovered_in"),
     [
@@ -52,6 +62,7 @@ def test_a_device_that_fails_is_reported_and_good_again_within_two_seconds(
     assert not result["task_failed"]
 
 
+@pytest.mark.usefixtures("brief")
 def test_a_coil_that_breaks_is_taken_out_of_use() -> None:
     result = flown("coil-x: open", span=None)
     assert "isolate" in result["reactions"]
@@ -59,6 +70,7 @@ def test_a_coil_that_breaks_is_taken_out_of_use() -> None:
     assert result["recovered_s"] <= 6.0
 
 
+@pytest.mark.usefixtures("brief")
 def test_a_report_by_another_name_does_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(fault_table.OWN_OF_KIND, "imu: silent", frozenset({"clock-step"}))
     result = flown("imu: silent")
@@ -73,6 +85,7 @@ class Doctored(dict[str, Any]):
     logs: Any
 
 
+@pytest.mark.usefixtures("brief")
 def test_a_loop_that_steers_while_it_measures_nothing_is_found_out(tmp_path: Any) -> None:
     """The log of a flight whose unit falls silent, as if the loop had gone on: both figures ring."""
     entry = FaultEntry(fault="imu: silent", at=AT, span=3.0)
@@ -103,6 +116,7 @@ def test_each_fault_has_events_of_its_own_that_exist(kind: FaultKind) -> None:
     assert reaction is None or names[reaction].reaction is not Reaction.NOTE
 
 
+@pytest.mark.usefixtures("brief")
 @pytest.mark.parametrize("mode", [mode for mode in faults.MODES if mode not in {"detumble", "slew"}])
 def test_the_twin_without_a_fault_reports_none_of_their_events(mode: str, tmp_path: Any) -> None:
     """The same seed and mode as the flights with faults above; the two other modes are below."""
