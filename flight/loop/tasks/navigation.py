@@ -6,10 +6,9 @@ values.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-
-import numpy as np
 
 from flight.gnc.estimation.estimate import Estimate
 from flight.gnc.estimation.measurements import Measurement
@@ -93,7 +92,7 @@ class Navigation:
         for reading in readings:
             self._ingest(reading)
             self._streams.note("imu", reading.time_ns)
-            self._streams.note("field", reading.time_ns, float(np.linalg.norm(reading.field)))
+            self._streams.note("field", reading.time_ns, math.hypot(*reading.field.tolist()))
             self._heard_ns = reading.time_ns
         self._watch_line(now_ns)
         doubted = self._filter.doubts_commands
