@@ -68,8 +68,9 @@ class ReadingConverter:
         if sample is None:
             return None
         device_ns, q, rate, mag, accel = sample
+        numbers = (*q, *rate, *mag, *accel)
         # The sum is finite only when all are: floats of 32 bits cannot overflow it.
-        if not math.isfinite(sum(map(abs, (*q, *rate, *mag, *accel)))):
+        if not math.isfinite(sum(numbers)):
             self.not_finite += 1
             return None
         settings = self._settings
@@ -86,7 +87,7 @@ class ReadingConverter:
             self.out_of_range += 1
             return None
         # One array for all: making one of each takes longer than the products.
-        values = np.array((*q, *rate, *mag, *accel))
+        values = np.array(numbers)
         quaternion = settings.attitude_map @ values[:4]
         # Both signs are one attitude; the one of the shorter turn from the reference frame is returned.
         quaternion /= math.copysign(norm, quaternion[3])
