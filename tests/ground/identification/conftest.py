@@ -13,7 +13,7 @@ from tests.ground.identification.worlds import World, believed, drawn, fly_bare
 Identified = tuple[World, Record, Fit]
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="session")
 def identified() -> list[Identified]:
     """Four drawn worlds, flown on the bare testbed and fitted."""
     rng = np.random.default_rng(20)
