@@ -107,5 +107,5 @@ def _imaging(
     camera, source = config.camera, devices.camera
     if camera is None or source is None:
         return None
-    settings = imaging_settings(camera, body.angular_acceleration_psd)
+    settings = imaging_settings(camera, body)
     return Imaging(source, settings, navigation, body.view, services)

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from flight.bodies.orbit.brake import FieldBrake
+from flight.bodies.orbit.filter import OrbitFilter
 from flight.gnc.estimation.measurements import MeanRateMeasurement
 from flight.link.modes import Mode
 from flight.link.telemetry.definitions import SPIN
@@ -22,7 +23,8 @@ _NAN3 = [math.nan] * 3
 class OrbitView:
     """Implements `flight.loop.body.BodyView`."""
 
-    def __init__(self, brake: FieldBrake, services: Services) -> None:
+    def __init__(self, brake: FieldBrake, filter_: OrbitFilter, services: Services) -> None:
+        self._filter = filter_
         self._detumbler = brake.detumbler
         self._recorder = services.recorder
 

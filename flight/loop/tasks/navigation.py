@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flight.gnc.estimation.estimate import Estimate
-from flight.gnc.estimation.measurements import Measurement
+from flight.gnc.estimation.measurements import AttitudeMeasurement, Measurement
 from flight.gnc.math.arrays import FloatArray, IntArray
 from flight.link import events
 from flight.link.telemetry.definitions import IMU
@@ -130,6 +130,10 @@ class Navigation:
     def rates(self, begin_ns: int, end_ns: int) -> tuple[IntArray, FloatArray] | None:
         """Return times (n,) ns and rates (n, 3) rad/s that span a past interval; None beyond the history."""
         return self._filter.rates(begin_ns, end_ns) if self._filter.started else None
+
+    def begin_from(self, attitude: AttitudeMeasurement) -> bool:
+        """Offer an attitude of the stars while there is no estimate; return whether it began one."""
+        return not self._filter.started and self._feed.begin(attitude)
 
     def ingest_late(self, late: Sequence[Measurement], report: Callable[[list[bool]], None]) -> None:
         """Apply measurements of a frame at their times, over the next cycles.
