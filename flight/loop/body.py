@@ -22,7 +22,7 @@ from flight.loop.fdir.coils.watch import CoilWatch
 from flight.loop.services import Services
 from flight.loop.state.content import Learned
 from flight.schema.sections import Config
-from hal.interfaces.readings import ImuReading
+from hal.interfaces.readings import GpsReading, ImuReading
 
 PLANNER = "planner"
 """The planner worker's name."""
@@ -219,6 +219,7 @@ class Body:
         knowledge: returns how well the attitude is known now.
         velocity: returns the velocity (3,) m/s about the Sun at a time, reference axes, by which starlight is
             aberrated; None where the configured one holds.
+        fix: accepts a valid GPS reading; returns whether the body uses it.
     """
 
     modes: frozenset[Mode]
@@ -238,6 +239,7 @@ class Body:
     angular_acceleration_psd: float
     knowledge: Callable[[], Knowledge]
     velocity: Callable[[int], FloatArray | None]
+    fix: Callable[[GpsReading], bool]
 
 
 @dataclass(frozen=True, slots=True)

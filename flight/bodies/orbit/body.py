@@ -57,13 +57,14 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
         feed=OrbitFeed(filter_),
         brake=brake,
         coil_watch=_coil_watch(config),
-        view=OrbitView(brake, filter_, services),
+        view=OrbitView(brake, filter_, surroundings, services),
         field=field,
         free_axis=None,
         dipole_per_ampere=config.craft.dipole_per_ampere,
         angular_acceleration_psd=(config.detumble.torque_noise) ** 2,
         knowledge=lambda: filter_.knowledge,
         velocity=surroundings.velocity,
+        fix=surroundings.fix,
     )
 
 

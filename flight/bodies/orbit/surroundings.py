@@ -47,6 +47,11 @@ class Surroundings:
         self._refused_in_a_row = 0
         self.refused = 0
 
+    @property
+    def known(self) -> bool:
+        """Whether the orbit was known when it was last asked for."""
+        return self._near is not None
+
     def julian_date(self, now_ns: int) -> float:
         """Return the Julian date UTC, by the receiver's time, before the first fix by the host's clock."""
         offset_ns = self._utc_offset_ns

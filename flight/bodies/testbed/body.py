@@ -81,6 +81,7 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
         angular_acceleration_psd=angular_acceleration_psd_of(config, plant),
         knowledge=lambda: Knowledge.FINE if filter_.started else Knowledge.LOST,
         velocity=lambda _: None,
+        fix=lambda _: False,
     )
 
 

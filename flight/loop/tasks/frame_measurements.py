@@ -39,7 +39,7 @@ class ImagingSettings:
         slow_ns: processing time from which vision is slow.
         mounting: (4,) body axes to camera axes.
         angular_acceleration_psd: rad^2/s^3, density of the body's white angular acceleration.
-        velocity: returns the velocity (3,) m/s about the Sun at a time, for aberration; None: as in `tracker`.
+        velocity: returns the velocity (3,) m/s about the Sun at a time; None: as in `tracker`.
     """
 
     camera: CameraModel
