@@ -40,6 +40,7 @@ def imaging_settings(camera: Camera, body: Body) -> ImagingSettings:
         max_age_ns=round(camera.max_age * SECOND_NS),
         late_ns=round(camera.late_after * SECOND_NS),
         slow_ns=round(camera.vision_slow_after * SECOND_NS),
+        max_rate=camera.max_rate,
         mounting=np.array(camera.mounting),
         estimator=_estimator(camera),
         tracker=_tracker(camera),

@@ -59,7 +59,10 @@ class CarriedOn:
         spread = np.zeros((_SIZE, _SIZE))
         spread[np.ix_(_TO, _TO)] = covariance[np.ix_(_FROM, _FROM)]
         mixed = seconds * spread[form.TURN, form.RATE]
-        spread[form.TURN, form.TURN] += mixed + mixed.T + seconds**2 * spread[form.RATE, form.RATE]
+        grown = seconds * self._free.rate_noise(dipole, around)
+        spread[form.TURN, form.TURN] += mixed + mixed.T
+        spread[form.TURN, form.TURN] += seconds**2 * (spread[form.RATE, form.RATE] + grown / 3.0)
+        spread[form.RATE, form.RATE] += grown
         return Estimate(
             time_ns=time_ns,
             quaternion=multiply(from_rotation_vector(turn), quaternion),

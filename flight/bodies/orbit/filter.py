@@ -148,10 +148,10 @@ class OrbitFilter:
             return False
         rest_ns = self._dipoles.at_rest_since()
         listens = rest_ns is not None and reading.time_ns - rest_ns >= self._settings.settle_ns
-        self._open.add(reading, listens)
+        self._open.add(reading, self._dipoles.total(reading.time_ns), listens)
         if self._open.is_over(self._acts(), self._settings.step_ns):
             self._close()
-        return self.started and not self._refused_gyros
+        return self.started and not self.doubts_commands
 
     def begin(self, attitude: AttitudeMeasurement) -> bool:
         """Start from an attitude; return False where no step was taken at its time."""
@@ -245,7 +245,7 @@ class OrbitFilter:
         around = self._around((begin_ns + end_ns) // 2)
         if around is None:
             return
-        doubtful = self._dipoles.unknown_ns >= begin_ns or self._refused_gyros > 0
+        doubtful = self._dipoles.unknown_ns >= begin_ns or self.doubts_commands
         doubt = self._settings.dipole_limit if doubtful else 0.0
         step = gathered.close(self._dipoles.mean(begin_ns, end_ns), doubt, around)
         if step.fields:
@@ -293,7 +293,11 @@ class OrbitFilter:
     def _end(self, step: Step) -> None:
         """Apply the gyro's and the magnetometer's means of a step, at its end."""
         free, settings = self._free, self._settings
-        change = free.acceleration * ((step.end_ns - step.gyro_ns) / SECOND_NS)
+        since = (step.end_ns - step.gyro_ns) / SECOND_NS
+        shown = attitude_matrix(free.quaternion) @ step.around.field
+        # The coils act for a part of the step: after its samples by `impulse`, not by the mean.
+        uneven = np.cross(step.impulse - since * step.dipole, shown)
+        change = since * free.acceleration + free.motion.inverse @ uneven
         spread = settings.free.coil_error**2 * float(change @ change) + settings.gyro_noise**2 / step.samples
         refused = not free.gyro(step.gyro, spread * _EYE, change)
         self._refused_gyros = self._refused_gyros + 1 if refused else 0

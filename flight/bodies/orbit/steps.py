@@ -47,6 +47,10 @@ class DipoleHistory:
         if oldest > 64:  # in batches, not each cycle
             del self._times[:oldest], self._dipoles[:oldest], self._sums[:oldest]
 
+    def total(self, time_ns: int) -> FloatArray:
+        """Return the integral (3,) A m^2 s of the dipole until a time; only differences have a meaning."""
+        return np.array(self._sum(time_ns)) / SECOND_NS
+
     def mean(self, from_ns: int, to_ns: int) -> FloatArray:
         """Return the mean dipole (3,) A m^2 between two times; before the first record it is zero."""
         if to_ns <= from_ns:
@@ -75,6 +79,7 @@ class Step:
     Attributes:
         dipole: (3,) A m^2, the mean on the wire; `doubt` A m^2 by which an axis may differ where not known.
         gyro: (3,) rad/s, the mean of `samples` readings, whose mean time is `gyro_ns`.
+        impulse: (3,) A m^2 s, of the dipole after a sample, in the mean of the samples.
         field: (3,) T, the mean of `fields` readings about `field_ns`; None without one. `field_span` is the
             time, s, since the last one.
         late: the measurements of times within the step, in their order.
@@ -89,6 +94,7 @@ class Step:
     gyro: FloatArray
     gyro_ns: int
     samples: int
+    impulse: FloatArray
     field: FloatArray | None
     field_ns: int
     fields: int
@@ -110,14 +116,16 @@ class OpenStep:
         self.begin_ns = self.end_ns = begin_ns
         self._acts = acts
         self._rates: list[FloatArray] = []
+        self._totals: list[FloatArray] = []
         self._fields: list[FloatArray] = []
         self._rates_ns = self._fields_ns = 0
 
-    def add(self, reading: ImuReading, listens: bool) -> None:
-        """Add a reading; `listens`: its field is not disturbed by the coils."""
+    def add(self, reading: ImuReading, total: FloatArray, listens: bool) -> None:
+        """Add a reading and the dipole's `total` (3,) then; `listens`: the coils do not disturb its field."""
         since = reading.time_ns - self.begin_ns
         self.end_ns = reading.time_ns
         self._rates.append(reading.rate)
+        self._totals.append(total)
         self._rates_ns += since
         if listens:
             self._fields.append(reading.field)
@@ -139,6 +147,7 @@ class OpenStep:
             np.mean(self._rates, axis=0),
             self.begin_ns + self._rates_ns // samples,
             samples,
+            self._totals[-1] - np.mean(self._totals, axis=0),
             np.mean(self._fields, axis=0) if fields else None,
             self.begin_ns + self._fields_ns // max(fields, 1),
             fields,

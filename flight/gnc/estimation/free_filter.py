@@ -246,11 +246,16 @@ class FreeFilter:
         covariance[:, :6] = covariance @ flow.T
         self._add_noise(dt, dipole, around, doubt)
 
-    def _add_noise(self, dt: float, dipole: FloatArray, around: Around, doubt: float) -> None:
+    def rate_noise(self, dipole: FloatArray, around: Around, doubt: float = 0.0) -> FloatArray:
+        """Return the density (3, 3) rad^2/s^3 of the acceleration's noise under the coils' dipole (3,)."""
         s, inverse = self._settings, self.motion.inverse
         unknown = s.coil_error**2 * float(dipole @ dipole) + doubt**2
         coils = 20.0 * unknown * float(around.field @ around.field)
-        density = (s.torque_noise**2 + coils) * dt * (inverse @ inverse)
+        return np.asarray((s.torque_noise**2 + coils) * (inverse @ inverse))
+
+    def _add_noise(self, dt: float, dipole: FloatArray, around: Around, doubt: float) -> None:
+        s = self._settings
+        density = dt * self.rate_noise(dipole, around, doubt)
         covariance = self.covariance
         covariance[RATE, RATE] += density
         covariance[TURN, TURN] += dt * dt / 3.0 * density

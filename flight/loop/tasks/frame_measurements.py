@@ -36,6 +36,7 @@ class ImagingSettings:
 
     Attributes:
         late_ns: age after the exposure from which a frame is late.
+        max_rate: rad/s of the body, beyond which no exposure is begun.
         slow_ns: processing time from which vision is slow.
         mounting: (4,) body axes to camera axes.
         angular_acceleration_psd: rad^2/s^3, density of the body's white angular acceleration.
@@ -47,6 +48,7 @@ class ImagingSettings:
     max_age_ns: int
     late_ns: int
     slow_ns: int
+    max_rate: float
     mounting: FloatArray
     estimator: StreakSettings | LikelihoodSettings
     tracker: TrackerSettings | None

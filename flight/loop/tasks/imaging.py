@@ -68,7 +68,10 @@ class Imaging:
         self._last_frame_ns = time_ns
 
     def trigger(self, cycle: Cycle) -> None:
-        """Start an exposure: the task of the camera's rate group."""
+        """Start an exposure, unless the body turns too fast for one: the task of the camera's rate group."""
+        if self._navigation.speed > self._settings.max_rate:
+            self._last_frame_ns = cycle.start_ns
+            return
         try:
             self._camera.trigger(self._settings.exposure_ns)
         except DeviceError as error:

@@ -6,6 +6,7 @@ values.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -62,6 +63,8 @@ class Navigation:
         self._agreed_ns = 0
         self._link = unit.link()
         self._heard_since_ns = 0
+        self.speed = 0.0
+        """rad/s, of the newest reading, the gyro's bias included."""
 
     def begin(self, time_ns: int) -> None:
         """Use samples from `time_ns` on only: the body is released then."""
@@ -95,6 +98,7 @@ class Navigation:
             self._streams.note("imu", reading.time_ns)
             self._streams.note("field", reading.time_ns, float(np.linalg.norm(reading.field)))
             self._heard_ns = reading.time_ns
+            self.speed = math.hypot(*reading.rate.tolist())
         self._watch_line(now_ns)
         doubted = self._filter.doubts_commands
         text = "the rate departs from the commanded" if doubted else "the rate follows the commands"
