@@ -144,7 +144,7 @@ class Camera(Section, frozen=True, kw_only=True):
     star_tracker: StarTracker | None = None
     endpoint_bias: float | None = None
     mounting: Quaternion = (0.0, 0.0, 0.0, 1.0)
-    max_age: Positive = 12.0
     max_rate: Positive = math.inf
+    max_age: Positive = 12.0
     late_after: Positive = 1.0
     vision_slow_after: Positive = 1.0

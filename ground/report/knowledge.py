@@ -16,6 +16,8 @@ from ground.report.signals import seconds
 Object = dict[str, Any]
 LOST, COARSE, FINE = 0, 1, 2
 """The knowledge as the navigation packet has it."""
+WITH_STARS = 10.0
+"""s after an accepted attitude of the stars for which the estimate is one with stars."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,7 +46,7 @@ def attitude_errors(run: Run) -> AttitudeErrors:
 def knowledge(run: Run) -> Object | None:
     """Return the shares of time by knowledge, and the errors of what was called fine; None without packets.
 
-    `acquired_s`: from the first time below the limit of detumbling on, or from the start; NaN if never fine.
+    With stars: at most `WITH_STARS` s after one of their attitudes was used.
     """
     packets = run["navigation"]
     if not len(packets):
@@ -54,11 +56,13 @@ def knowledge(run: Run) -> Object | None:
     at = np.searchsorted(seconds(packets), errors.times, side="right") - 1
     fine = level[np.maximum(at, 0)] == FINE
     error, sigma = errors.error[fine], errors.sigma[fine]
+    starry = errors.error[fine & (_since_stars(run, errors.times) < WITH_STARS)]
     last = packets[-1]
     return {
         "share": {name: float(np.mean(level == k)) for k, name in enumerate(("lost", "coarse", "fine"))},
         "fine_after_s": float(seconds(packets)[level == FINE][0]) if (level == FINE).any() else math.nan,
-        "fine_error_rms_rad": float(np.sqrt(np.mean(np.sum(error**2, axis=1)))) if len(error) else math.nan,
+        "fine_error_rms_rad": _rms(error),
+        "with_stars_error_rms_rad": _rms(starry),
         "fine_error_worst_rad": float(np.linalg.norm(error, axis=1).max()) if len(error) else math.nan,
         "worst_sigmas": float((np.abs(error) / sigma).max()) if len(error) else math.nan,
         "nees_per_axis": float(np.mean((error / sigma) ** 2)) if len(error) else math.nan,
@@ -66,3 +70,15 @@ def knowledge(run: Run) -> Object | None:
         "fixes_refused": int(last["fixes_refused"]),
         "restarts": int(last["restarts"]),
     }
+
+
+def _since_stars(run: Run, times: FloatArray) -> FloatArray:
+    """Return for each of the times (n,) s how long ago an attitude of the stars was used; infinite before."""
+    stars = run["stars"]
+    used = np.concatenate([[-math.inf], seconds(stars[stars["accepted"] == 1])])
+    return np.asarray(times - used[np.searchsorted(used, times, side="right") - 1])
+
+
+def _rms(error: FloatArray) -> float:
+    """Return the rms of the length of errors (n, 3); NaN without one."""
+    return float(np.sqrt(np.mean(np.sum(error**2, axis=1)))) if len(error) else math.nan

@@ -129,7 +129,8 @@ def _knowledge(found: Object | None) -> list[str]:
     return [
         "Attitude knowledge",
         f"  {share}; fine first at {number(found['fine_after_s'], 1)} s",
-        f"  error while fine {number(found['fine_error_rms_rad'], 4, degrees)} deg rms of three axes, "
+        f"  error while fine {number(found['fine_error_rms_rad'], 4, degrees)} deg rms of three axes "
+        f"(with stars {number(found['with_stars_error_rms_rad'], 4, degrees)}), "
         f"at most {number(found['fine_error_worst_rad'], 4, degrees)}; "
         f"{number(found['worst_sigmas'], 1)} sigma of an axis at most, "
         f"NEES of an axis {number(found['nees_per_axis'], 2)}",

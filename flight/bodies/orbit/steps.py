@@ -7,7 +7,8 @@ magnetometer counts only while the coils are at rest and their field has decayed
 from __future__ import annotations
 
 import bisect
-from dataclasses import dataclass, field
+import dataclasses
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -99,7 +100,7 @@ class Step:
     field_ns: int
     fields: int
     field_span: float = 1.0
-    late: list[Measurement] = field(default_factory=list)
+    late: list[Measurement] = dataclasses.field(default_factory=list)
     before: FreeMemory | None = None
 
     @property

@@ -71,6 +71,7 @@ class Imaging:
         """Start an exposure, unless the body turns too fast for one: the task of the camera's rate group."""
         if self._navigation.speed > self._settings.max_rate:
             self._last_frame_ns = cycle.start_ns
+            self._streams.note("camera", cycle.start_ns)  # it rests on purpose
             return
         try:
             self._camera.trigger(self._settings.exposure_ns)
