@@ -216,7 +216,7 @@ class Body:
         feed: gives the filter the readings of the inertial unit.
         brake: brakes a tumble by the magnetometer alone.
         angular_acceleration_psd: rad^2/s^3, density of the body's white angular acceleration.
-        knowledge: returns how well the attitude is known now.
+        knowledge: returns how well the attitude is known now, where there is an estimate.
         velocity: returns the velocity (3,) m/s about the Sun at a time, reference axes, by which starlight is
             aberrated; None where the configured one holds.
         fix: accepts a valid GPS reading; returns whether the body uses it.
@@ -237,9 +237,9 @@ class Body:
     free_axis: FloatArray | None
     dipole_per_ampere: float
     angular_acceleration_psd: float
-    knowledge: Callable[[], Knowledge]
-    velocity: Callable[[int], FloatArray | None]
-    fix: Callable[[GpsReading], bool]
+    knowledge: Callable[[], Knowledge] = lambda: Knowledge.FINE
+    velocity: Callable[[int], FloatArray | None] = lambda _: None
+    fix: Callable[[GpsReading], bool] = lambda _: False
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,7 @@ from flight.bodies.testbed.tracker import ThreadTracker, controller_of
 from flight.bodies.testbed.view import ThreadView
 from flight.gnc.control.detumble import Braking, Detumbler, WindowSchedule, share_in_turning_field
 from flight.gnc.estimation.attitude_filter import AttitudeFilter
-from flight.gnc.estimation.estimate import Estimate, Knowledge
+from flight.gnc.estimation.estimate import Estimate
 from flight.gnc.estimation.filter_settings import FilterSettings, slow_prior
 from flight.gnc.estimation.rigid_body import Parameters, RigidBody
 from flight.gnc.guidance.one_axis import job as plan_job
@@ -79,9 +79,6 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
         free_axis=_THREAD_AXIS,
         dipole_per_ampere=dipole,
         angular_acceleration_psd=angular_acceleration_psd_of(config, plant),
-        knowledge=lambda: Knowledge.FINE if filter_.started else Knowledge.LOST,
-        velocity=lambda _: None,
-        fix=lambda _: False,
     )
 
 
