@@ -10,7 +10,7 @@ import json
 import sys
 from typing import Any
 
-from flight.link.telemetry.definitions import Field
+from flight.link.telemetry.form import Field
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, Layout
 
 _FOREWORD = """\

@@ -168,6 +168,11 @@ GUARDIAN_BLIND = EventKind(
 REAL_TIME = EventKind(94, "real-time", _TOLD, "what was obtained of real-time scheduling and locked memory")
 REAL_TIME_REFUSED = EventKind(95, "real-time-refused", _WARNED, "scheduling or locked memory was refused")
 
+ATTITUDE_KNOWLEDGE = EventKind(100, "attitude-knowledge", _TOLD, "how well the attitude is known has changed")
+GPS_LOST = EventKind(101, "gps-lost", _WARNED, "no fix of use has come for too long")
+GPS_RECOVERED = EventKind(102, "gps-recovered", _TOLD, "fixes of use come again")
+GPS_REFUSED = EventKind(103, "gps-refused", _WARNED, "a fix contradicts what is known of the orbit")
+
 EVENTS: tuple[EventKind, ...] = tuple(
     value for value in dict(vars()).values() if isinstance(value, EventKind)
 )

@@ -7,14 +7,13 @@ named in the configuration as `module:object`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from flight.gnc.estimation.attitude_filter import AttitudeFilter
-from flight.gnc.estimation.estimate import Estimate
-from flight.gnc.estimation.measurements import MeanRateMeasurement
-from flight.gnc.math.arrays import FloatArray
+from flight.gnc.estimation.estimate import Estimate, Knowledge
+from flight.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement, Measurement
+from flight.gnc.math.arrays import FloatArray, IntArray
 from flight.link.modes import Mode
 from flight.loop.control_output import CoilCommand, ControlOutput, Target
 from flight.loop.executive.jobs import JobResult
@@ -23,7 +22,7 @@ from flight.loop.fdir.coils.watch import CoilWatch
 from flight.loop.services import Services
 from flight.loop.state.content import Learned
 from flight.schema.sections import Config
-from hal.interfaces.readings import ImuReading
+from hal.interfaces.readings import GpsReading, ImuReading
 
 PLANNER = "planner"
 """The planner worker's name."""
@@ -42,11 +41,51 @@ class Agreement:
     objection: str = ""
 
 
+class Filter(Protocol):
+    """Estimates attitude and rate from measurements, each at its own time."""
+
+    @property
+    def started(self) -> bool:
+        """Whether there is an estimate."""
+
+    @property
+    def measured_ns(self) -> int:
+        """The time of the newest accepted measurement."""
+
+    @property
+    def doubts_commands(self) -> bool:
+        """Whether the body does not move as commanded, so that the coil currents are unknown."""
+
+    def command(self, time_ns: int, currents: FloatArray, *, known: bool = True) -> None:
+        """Record the coil currents (3,) A in force from `time_ns` on; only a guess unless `known`."""
+
+    def mark_unknown(self, since_ns: int) -> None:
+        """Treat the currents recorded since then as unknown: they may not have flown."""
+
+    def measure_late(self, late: Sequence[Measurement], applied: Callable[[list[bool]], None]) -> None:
+        """Apply measurements of past times; `applied` is called with which of them passed the gate."""
+
+    def catch_up(self, most: int | None = None) -> None:
+        """Continue with late measurements by `most` steps, or to their end."""
+
+    def at(self, time_ns: int) -> Estimate:
+        """Return the estimate propagated to `time_ns`; the filter itself does not change."""
+
+    def past(self, time_ns: int) -> Estimate | None:
+        """Return the estimate at a past time, None beyond the history."""
+
+    def rates(self, begin_ns: int, end_ns: int) -> tuple[IntArray, FloatArray] | None:
+        """Return times (n,) ns and rates (n, 3) rad/s that span an interval; None beyond the history."""
+
+
 class Feed(Protocol):
     """Gives the filter the quantities of a reading that have a meaning for this body."""
 
     def accept(self, reading: ImuReading) -> Agreement:
         """Start the filter from a reading, or apply it."""
+
+    def begin(self, attitude: AttitudeMeasurement) -> bool:
+        """Start the filter from an attitude of the stars, without an estimate; return whether it did."""
 
 
 class Brake(Protocol):
@@ -177,10 +216,14 @@ class Body:
         feed: gives the filter the readings of the inertial unit.
         brake: brakes a tumble by the magnetometer alone.
         angular_acceleration_psd: rad^2/s^3, density of the body's white angular acceleration.
+        knowledge: returns how well the attitude is known now, where there is an estimate.
+        velocity: returns the velocity (3,) m/s about the Sun at a time, reference axes, by which starlight is
+            aberrated; None where the configured one holds.
+        fix: accepts a valid GPS reading; returns whether the body uses it.
     """
 
     modes: frozenset[Mode]
-    filter: AttitudeFilter
+    filter: Filter
     learned_problems: list[str]
     paths: Paths
     planner: Planner
@@ -194,6 +237,9 @@ class Body:
     free_axis: FloatArray | None
     dipole_per_ampere: float
     angular_acceleration_psd: float
+    knowledge: Callable[[], Knowledge] = lambda: Knowledge.FINE
+    velocity: Callable[[int], FloatArray | None] = lambda _: None
+    fix: Callable[[GpsReading], bool] = lambda _: False
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal
 
 from msgspec import Meta
@@ -121,7 +122,7 @@ class Camera(Section, frozen=True, kw_only=True):
     """The star camera: what flight must know to read its frames; `device` is the real one.
 
     A frame is late `late_after` s after the exposure that it may have waited for; vision is slow after
-    `vision_slow_after` s.
+    `vision_slow_after` s. Beyond `max_rate` rad/s of the body no exposure is begun.
     """
 
     device: V4l2Device | AravisDevice | None = None
@@ -143,6 +144,7 @@ class Camera(Section, frozen=True, kw_only=True):
     star_tracker: StarTracker | None = None
     endpoint_bias: float | None = None
     mounting: Quaternion = (0.0, 0.0, 0.0, 1.0)
+    max_rate: Positive = math.inf
     max_age: Positive = 12.0
     late_after: Positive = 1.0
     vision_slow_after: Positive = 1.0

@@ -7,8 +7,8 @@ from typing import Annotated
 from msgspec import Meta
 
 from flight.schema.errors import ConfigError
-from flight.schema.sections import Config, Detumble
-from flight.schema.values import Positive, Section
+from flight.schema.sections import Config, Detumble, Estimation
+from flight.schema.values import NotNegative, Positive, Section
 
 LEAST_FIELD, LARGEST_FIELD = 5e-6, 2e-4
 """T: the Earth's field in a low orbit is 1.5e-5 to 6.5e-5; acting coils add or take as much."""
@@ -38,10 +38,26 @@ class FieldDetumble(Detumble, frozen=True, kw_only=True):
     replan: Annotated[float, Meta(ge=1.0)] = 5.0
 
 
+class OrbitEstimation(Estimation, frozen=True, kw_only=True):
+    """The filter of a satellite in orbit (`flight.gnc.estimation.free_filter`).
+
+    `bias_walk` rad/s per sqrt(s), of the gyro's bias; `field_noise` T of an axis of a sample of the
+    magnetometer; `field_error` T of an axis of the field's model.
+    """
+
+    bias_walk: NotNegative = 2.0e-6
+    field_noise: Positive = 1.0e-7
+    field_error: Positive = 5.0e-8
+    gate_sigma: Annotated[float, Meta(ge=3.0)] = 5.0
+    history: Positive = 12.0
+
+
 class OrbitConfig(Config, frozen=True, kw_only=True):
-    """The configuration of a satellite in orbit."""
+    """The configuration of a satellite in orbit; `elements` are the two lines of its orbit, where known."""
 
     craft: Craft
+    elements: tuple[str, str] | None = None
+    estimation: OrbitEstimation = OrbitEstimation()
     detumble: FieldDetumble = FieldDetumble()
 
     def field_range(self) -> tuple[float, float]:

@@ -13,11 +13,12 @@ Normal = tuple[float, float, float]
 
 
 class Gps(Section, frozen=True, kw_only=True):
-    """The u-blox receiver on a serial line of its own; a fix every `period` s."""
+    """The u-blox receiver on a serial line of its own: a fix every `period` s, lost after `max_age` s."""
 
     device: Annotated[str, Meta(min_length=1)] = "/dev/knightcube-gps"
     baud_rate: Literal[9600, 19200, 38400, 57600, 115200, 230400, 460800, 921600] = 115200
     period: Annotated[float, Meta(ge=0.1, le=60.0)] = 1.0
+    max_age: Positive = 60.0
 
 
 class SolarString(Section, frozen=True, kw_only=True):

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 
 from flight.link.telemetry.packets import to_text
 from ground.report import panels
+from ground.report.knowledge_figure import knowledge_figure
 from ground.report.scene import Scene
 from ground.report.signals import seconds
 from ground.report.spin_figure import spin_figure
@@ -38,9 +39,10 @@ def draw_figures(run: Run, folder: Path) -> list[Path]:
         "rate": _rate,
         "overview": _overview,
         "spin": lambda scene: spin_figure(scene.run),
+        "knowledge": lambda scene: knowledge_figure(scene.run),
     }
     if len(run["spin"]):  # a satellite in orbit has no q2
-        pictures = {name: pictures[name] for name in ("power", "cycle_times", "spin")}
+        pictures = {name: pictures[name] for name in ("power", "cycle_times", "spin", "knowledge")}
     files = []
     for name, picture in pictures.items():
         figure = picture(scene)

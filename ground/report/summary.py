@@ -14,6 +14,7 @@ from flight.gnc.math.arrays import FloatArray
 from flight.link.telemetry.packets import to_text
 from ground.report import performance as limits
 from ground.report.detumbling import detumbling
+from ground.report.knowledge import knowledge
 from ground.report.operations import (
     cycles,
     events,
@@ -47,6 +48,7 @@ def summarise(run: Run) -> Object:
         "attitude_source": attitude.source,
         "steps": [_step_row(*step) for step in steps],
         "detumbling": detumbling(run),
+        "knowledge": knowledge(run),
         "thesis": [] if in_orbit else _against_thesis([(c, r) for c, r in steps if r is not None], power),
         "power": power,
         "rate_groups": rate_groups(run["rate_group"]),

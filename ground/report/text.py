@@ -21,6 +21,7 @@ def format_report(summary: Object) -> str:
         _headline(summary),
         _steps(summary),
         _detumbling(summary["detumbling"]),
+        _knowledge(summary["knowledge"]),
         _thesis(summary),
         _power(summary["power"], bool(summary["thesis"])),
         _loop(summary),
@@ -117,6 +118,24 @@ def _detumbling(found: Object | None) -> list[str]:
         *table(head, rows),
         f"  rate by the magnetometer alone: known {number(known, 1, 100.0)} % of the time, error "
         f"{number(error, 3, degrees)} deg/s rms an axis, found again {found['restarts']} times",
+    ]
+
+
+def _knowledge(found: Object | None) -> list[str]:
+    if found is None:
+        return []
+    degrees = 180.0 / math.pi
+    share = ", ".join(f"{name} {number(part, 1, 100.0)} %" for name, part in found["share"].items())
+    return [
+        "Attitude knowledge",
+        f"  {share}; fine first at {number(found['fine_after_s'], 1)} s",
+        f"  error while fine {number(found['fine_error_rms_rad'], 4, degrees)} deg rms of three axes "
+        f"(with stars {number(found['with_stars_error_rms_rad'], 4, degrees)}), "
+        f"at most {number(found['fine_error_worst_rad'], 4, degrees)}; "
+        f"{number(found['worst_sigmas'], 1)} sigma of an axis at most, "
+        f"NEES of an axis {number(found['nees_per_axis'], 2)}",
+        f"  refused {found['refused']} measurements and {found['fixes_refused']} fixes, "
+        f"{found['restarts']} new starts",
     ]
 
 

@@ -13,6 +13,7 @@ from flight.gnc.vision.startracker.identification.lost_in_space import Identific
 from flight.gnc.vision.startracker.solve import SolveSettings
 from flight.gnc.vision.streaks.corners.settings import StreakSettings
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from flight.loop.body import Body
 from flight.loop.tasks.frame_measurements import ImagingSettings
 from flight.loop.tasks.navigation import NavigationSettings
 from flight.schema.camera_model import camera_knowledge, camera_model
@@ -31,18 +32,20 @@ def navigation_settings(config: Config) -> NavigationSettings:
     )
 
 
-def imaging_settings(camera: Camera, angular_acceleration_psd: float) -> ImagingSettings:
-    """Return the settings of imaging; the density is in rad^2/s^3."""
+def imaging_settings(camera: Camera, body: Body) -> ImagingSettings:
+    """Return the settings of imaging."""
     return ImagingSettings(
         camera=camera_model(camera),
         exposure_ns=round(camera.exposure * SECOND_NS),
         max_age_ns=round(camera.max_age * SECOND_NS),
         late_ns=round(camera.late_after * SECOND_NS),
         slow_ns=round(camera.vision_slow_after * SECOND_NS),
+        max_rate=camera.max_rate,
         mounting=np.array(camera.mounting),
         estimator=_estimator(camera),
         tracker=_tracker(camera),
-        angular_acceleration_psd=angular_acceleration_psd,
+        angular_acceleration_psd=body.angular_acceleration_psd,
+        velocity=body.velocity,
     )
 
 

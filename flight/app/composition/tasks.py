@@ -29,9 +29,10 @@ from flight.loop.tasks.imaging import Imaging
 from flight.loop.tasks.mode_control import ModeControl, ModeSettings
 from flight.loop.tasks.navigation import Navigation
 from flight.loop.tasks.performance import PerformanceObserver
+from flight.loop.tasks.positioning import Positioning
 from flight.loop.tasks.steering import Steering
 from flight.schema.sections import Config
-from hal.interfaces.wires import Clock
+from hal.interfaces.wires import SECOND_NS, Clock
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,9 +91,9 @@ def _tasks(
     watched = Watched(navigation, body.planner, imaging, devices.coils, devices.power, opened.log_error)
     commanded = bool(opened.channels or timeline)
     commanding = Commanding(modes, drive, timeline, opened.channels, services) if commanded else None
-    return LoopTasks(
-        navigation, imaging, modes, control, observer, health, Housekeeping(watched, services), commanding
-    )
+    positioning = _positioning(config, devices, body, services)
+    house = Housekeeping(watched, services)
+    return LoopTasks(navigation, imaging, positioning, modes, control, observer, health, house, commanding)
 
 
 def _drive(config: Config, devices: Devices, body: Body, services: Services) -> CoilDrive:
@@ -101,11 +102,17 @@ def _drive(config: Config, devices: Devices, body: Body, services: Services) -> 
     return CoilDrive(devices.coils, devices.power, body.coil_watch, settings, services)
 
 
+def _positioning(config: Config, devices: Devices, body: Body, services: Services) -> Positioning | None:
+    if config.gps is None or devices.gps is None:
+        return None
+    return Positioning(devices.gps, body.fix, round(config.gps.max_age * SECOND_NS), services)
+
+
 def _imaging(
     config: Config, devices: Devices, navigation: Navigation, body: Body, services: Services
 ) -> Imaging | None:
     camera, source = config.camera, devices.camera
     if camera is None or source is None:
         return None
-    settings = imaging_settings(camera, body.angular_acceleration_psd)
+    settings = imaging_settings(camera, body)
     return Imaging(source, settings, navigation, body.view, services)

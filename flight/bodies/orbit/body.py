@@ -10,32 +10,35 @@ from collections.abc import Mapping
 import numpy as np
 
 from flight.bodies.orbit.brake import FieldBrake
-from flight.bodies.orbit.feed import MagnetometerFeed
+from flight.bodies.orbit.feed import OrbitFeed
+from flight.bodies.orbit.filter import OrbitFilter, OrbitFilterSettings
+from flight.bodies.orbit.surroundings import Surroundings
 from flight.bodies.orbit.view import OrbitView
 from flight.gnc.control.detumble import WindowSchedule
 from flight.gnc.control.three_axes.field_detumbler import FieldBraking, FieldDetumbler
-from flight.gnc.estimation.attitude_filter import AttitudeFilter
+from flight.gnc.earth.orbit_knowledge import TwoLineElements
+from flight.gnc.errors import UsageError
 from flight.gnc.estimation.estimate import Estimate
 from flight.gnc.estimation.field_rate import FieldRateSettings
-from flight.gnc.estimation.filter_settings import FilterSettings, slow_prior
-from flight.gnc.estimation.rigid_body import RigidBody
+from flight.gnc.estimation.free_filter import FreeFilterSettings
 from flight.gnc.math.arrays import FloatArray
 from flight.loop.body import Body, BodyKind
 from flight.loop.fdir.coils.response import ResponseSettings
 from flight.loop.fdir.coils.watch import CoilWatch, CoilWatchSettings
 from flight.loop.services import Services
 from flight.loop.state.content import Learned
-from flight.loop.state.learning import start_from
 from flight.loop.unsteered import MODES, Unsteered
+from flight.schema.errors import ConfigError
 from flight.schema.orbit import OrbitConfig, as_orbit
 from flight.schema.sections import Config
 from hal.interfaces.wires import SECOND_NS
 
 
 def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> Body:
-    """Return the satellite of a configuration, with the parameters that an earlier boot learned."""
+    """Return the satellite of a configuration; parameters that an earlier boot learned are not used yet."""
     config = as_orbit(config)
-    filter_, problems = _filter(config, learned)
+    surroundings = Surroundings(_elements(config), services.clock)
+    filter_ = _filter(config, surroundings)
     brake = FieldBrake(_detumbler(config), config.craft.dipole_per_ampere)
     unsteered = Unsteered()
 
@@ -46,44 +49,52 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
     return Body(
         modes=MODES,
         filter=filter_,
-        learned_problems=problems,
+        learned_problems=[],
         paths=unsteered,
         planner=unsteered,
         targets=unsteered,
         tracker=unsteered,
-        feed=MagnetometerFeed(),
+        feed=OrbitFeed(filter_),
         brake=brake,
         coil_watch=_coil_watch(config),
-        view=OrbitView(brake, services),
+        view=OrbitView(brake, filter_, surroundings, services),
         field=field,
         free_axis=None,
         dipole_per_ampere=config.craft.dipole_per_ampere,
         angular_acceleration_psd=(config.detumble.torque_noise) ** 2,
+        knowledge=lambda: filter_.knowledge,
+        velocity=surroundings.velocity,
+        fix=surroundings.fix,
     )
 
 
 ORBIT = BodyKind(None, make)
 
 
-def _filter(config: OrbitConfig, learned: Mapping[str, Learned]) -> tuple[AttitudeFilter, list[str]]:
-    section, craft = config.estimation, config.craft
-    body = RigidBody(np.diag(craft.inertia), craft.dipole_per_ampere, np.zeros(3))
-    settings = FilterSettings(
-        current_noise=section.current_noise,
-        control_period=1.0 / config.executive.control_rate_hz,
-        disturbance_walk=section.disturbance_walk,
-        bias_start=section.bias_start,
-        torsion_start=0.0,
-        damping_start=0.0,
-        gain_start=section.gain_start,
-        latency_start=section.latency_start,
-        latency_walk=section.latency_walk,
-        unknown_current=config.coils.current_limit,
-        gate_sigma=section.gate_sigma,
+def _filter(config: OrbitConfig, surroundings: Surroundings) -> OrbitFilter:
+    craft, section, unit = config.craft, config.estimation, config.inertial_unit
+    settings = OrbitFilterSettings(
+        inertia=np.diag(craft.inertia),
+        dipole_per_ampere=craft.dipole_per_ampere,
+        dipole_limit=config.coils.current_limit * craft.dipole_per_ampere,
+        gyro_noise=unit.rate_noise,
+        field_noise=section.field_noise,
+        field_error=section.field_error,
+        settle_ns=round(config.detumble.settle * SECOND_NS),
         history_ns=round(section.history * SECOND_NS),
+        free=FreeFilterSettings(gyro=(section.bias_start, section.bias_walk), gate_sigma=section.gate_sigma),
     )
-    prior, problems = start_from(learned, slow_prior(body, settings), section.changed)
-    return AttitudeFilter(body, settings, prior), problems
+    return OrbitFilter(settings, surroundings.at)
+
+
+def _elements(config: OrbitConfig) -> TwoLineElements | None:
+    """Return the configured two-line elements. Raises ConfigError for lines that are none."""
+    if config.elements is None:
+        return None
+    try:
+        return TwoLineElements(*config.elements)
+    except UsageError as error:
+        raise ConfigError("elements", f"are no two-line elements: {error}") from error
 
 
 def _detumbler(config: OrbitConfig) -> FieldDetumbler:

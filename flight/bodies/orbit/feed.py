@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+from flight.bodies.orbit.filter import OrbitFilter
+from flight.gnc.estimation.measurements import AttitudeMeasurement
 from flight.loop.body import Agreement
 from hal.interfaces.readings import ImuReading
 
 
-class MagnetometerFeed:
-    """Implements `flight.loop.body.Feed`: the unit gives no attitude; the brake takes the field itself."""
+class OrbitFeed:
+    """Implements `flight.loop.body.Feed`: gyro and magnetometer of a reading; the stars give the attitude."""
+
+    def __init__(self, filter_: OrbitFilter) -> None:
+        self._filter = filter_
 
     def accept(self, reading: ImuReading) -> Agreement:
-        """Leave the filter as it is."""
-        return Agreement(True)
+        """Gather rate and field for the filter's next step."""
+        return Agreement(self._filter.accept(reading))
+
+    def begin(self, attitude: AttitudeMeasurement) -> bool:
+        """Start the filter from an attitude of the stars; return whether it did."""
+        return self._filter.begin(attitude)

@@ -8,26 +8,41 @@ from collections.abc import Mapping
 import numpy as np
 
 from flight.bodies.orbit.brake import FieldBrake
+from flight.bodies.orbit.filter import OrbitFilter
+from flight.bodies.orbit.surroundings import Surroundings
+from flight.gnc.estimation.estimate import Knowledge
 from flight.gnc.estimation.measurements import MeanRateMeasurement
+from flight.link import events
 from flight.link.modes import Mode
-from flight.link.telemetry.definitions import SPIN
+from flight.link.telemetry.orbit_definitions import NAVIGATION, SPIN
 from flight.loop.control_output import ControlOutput, Target
 from flight.loop.services import Services
 
 SPIN_EVERY = 10
 """Control cycles from one spin packet to the next."""
+NAVIGATION_EVERY = 40
+"""Control cycles from one navigation packet to the next."""
+LEVELS = (Knowledge.LOST, Knowledge.COARSE, Knowledge.FINE)
+"""The knowledge by its number in the packet."""
 _NAN3 = [math.nan] * 3
 
 
 class OrbitView:
     """Implements `flight.loop.body.BodyView`."""
 
-    def __init__(self, brake: FieldBrake, services: Services) -> None:
+    def __init__(
+        self, brake: FieldBrake, filter_: OrbitFilter, surroundings: Surroundings, services: Services
+    ) -> None:
+        self._filter = filter_
+        self._surroundings = surroundings
+        self._events = services.events
+        self._knowledge = Knowledge.LOST
         self._detumbler = brake.detumbler
         self._recorder = services.recorder
 
     def record_cycle(self, output: ControlOutput) -> None:
-        """Record the spin packet while the body is braked."""
+        """Record how well the attitude is known, and the spin packet while the body is braked."""
+        self._record_knowledge(output)
         if output.mode is not Mode.DETUMBLE or output.cycle.slot % SPIN_EVERY:
             return
         found = self._detumbler
@@ -41,6 +56,29 @@ class OrbitView:
             field=_NAN3 if field is None else field.tolist(),
             restarts=found.restarts,
             dipole=output.steered.dipole.tolist(),
+        )
+
+    def _record_knowledge(self, output: ControlOutput) -> None:
+        """Record the navigation packet; report another knowledge as an event."""
+        found, now_ns, estimate = self._filter, output.cycle.start_ns, output.estimate
+        known = found.knowledge
+        if known is not self._knowledge:
+            text = f"{self._knowledge.value} -> {known.value}"
+            self._events.report(events.ATTITUDE_KNOWLEDGE, now_ns, text)
+            self._knowledge = known
+        if output.cycle.slot % NAVIGATION_EVERY:
+            return
+        self._recorder.record(
+            NAVIGATION,
+            now_ns,
+            knowledge=LEVELS.index(known),
+            placed=int(self._surroundings.known),
+            refused=found.refused,
+            fixes_refused=self._surroundings.refused,
+            restarts=found.restarts,
+            gyro_bias=_NAN3 if estimate is None else estimate.bias.tolist(),
+            field_bias=_NAN3 if estimate is None else estimate.field_bias.tolist(),
+            residual_dipole=_NAN3 if estimate is None else found.residual_dipole.tolist(),
         )
 
     def announce(self, target: Target, now_ns: int) -> None:
@@ -57,6 +95,8 @@ class OrbitView:
     def progress(self, output: ControlOutput | None) -> str:
         """Return mode and rate as text, for the progress line."""
         mode = output.mode if output else Mode.BOOT
+        if self._knowledge is not Knowledge.LOST:
+            return f"{mode.label}, attitude {self._knowledge.value}"
         rate = self._detumbler.rate if mode is Mode.DETUMBLE else None
         if rate is None:
             return mode.label

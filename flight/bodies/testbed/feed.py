@@ -38,3 +38,7 @@ class UnitFeed:
             return Agreement(True)
         angle = angle_about_axis_y(reading.quaternion)
         return Agreement(turned or moved, f"angle {angle:.4f} rad, rate {reading.rate[1]:.5f} rad/s")
+
+    def begin(self, attitude: AttitudeMeasurement) -> bool:
+        """Return False: the unit's own attitude starts the filter."""
+        return False

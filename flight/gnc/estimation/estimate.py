@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from enum import Enum
 
 import numpy as np
 
@@ -13,6 +14,14 @@ TURN, RATE, BIAS, DISTURBANCE, PARAMETERS = slice(0, 3), slice(3, 6), slice(6, 9
 LATENCY = 15
 FIELD_BIAS = slice(16, 19)
 """Where the parts of the error stand in the covariance (19, 19)."""
+
+
+class Knowledge(Enum):
+    """How well the attitude is known."""
+
+    FINE = "fine"
+    COARSE = "coarse"
+    LOST = "lost"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,12 +15,24 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from enum import Enum
 
 import numpy as np
 
-from flight.gnc.earth.disturbance import SIZES, Pressures, shapes
-from flight.gnc.earth.figure import GRAVITATIONAL_PARAMETER
+from flight.gnc.earth.disturbance import SIZES
+from flight.gnc.estimation.estimate import Knowledge
+from flight.gnc.estimation.free_motion import (
+    DIPOLE,
+    GYRO,
+    MAGNET,
+    RATE,
+    STATES,
+    SUNLIT,
+    TORQUES,
+    TURN,
+    Around,
+    FreeMotion,
+    crossed,
+)
 from flight.gnc.math import chi_square
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.directions import tangent_basis
@@ -32,21 +44,9 @@ from flight.gnc.math.quaternion import (
     to_rotation_vector,
 )
 
-TURN, RATE, GYRO, DIPOLE, SUNLIT, MAGNET = (slice(3 * k, 3 * k + 3) for k in range(6))
-TORQUES = slice(18, 18 + SIZES)
-STATES = 18 + SIZES
-"""Where the parts of the error stand in the covariance."""
 LARGEST_TURN = 0.1
 """rad, of a step of integration."""
 _EYE: FloatArray = np.eye(3)
-
-
-class Knowledge(Enum):
-    """How well the attitude is known."""
-
-    FINE = "fine"
-    COARSE = "coarse"
-    LOST = "lost"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,16 +79,14 @@ class FreeFilterSettings:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Around:
-    """What surrounds the satellite, ICRS.
+class FreeMemory:
+    """An estimate of the filter: its attributes of these names."""
 
-    `field` (3,) T, `position` (3,) m, the `pressures` of one time, and the share `sunlit` of the Sun's disc.
-    """
-
-    field: FloatArray
-    position: FloatArray
-    pressures: Pressures
-    sunlit: float
+    quaternion: FloatArray
+    rate: FloatArray
+    acceleration: FloatArray
+    constants: FloatArray
+    covariance: FloatArray
 
 
 class FreeFilter:
@@ -97,19 +95,19 @@ class FreeFilter:
     Attributes:
         quaternion: (4,) ICRS into body.
         rate: (3,) rad/s, body axes.
+        acceleration: (3,) rad/s^2, body axes, of the last step.
         covariance: (27, 27) of the errors (TURN, RATE, ...).
         knowledge: how well the attitude is known.
     """
 
     def __init__(self, inertia: FloatArray, settings: FreeFilterSettings) -> None:
         """`inertia` (3, 3) kg m^2, body axes."""
-        self._inertia = np.asarray(inertia, dtype=float)
-        self._inverse = np.linalg.inv(self._inertia)
+        self.motion = FreeMotion(inertia)
         self._settings = settings
         tail = math.erfc(settings.gate_sigma / math.sqrt(2.0))
         self._gates = {n: chi_square.bound(tail, n) for n in (1, 2, 3)}
         self._constants: FloatArray = np.zeros(STATES)
-        self._acceleration_now: FloatArray = np.zeros(3)
+        self.acceleration: FloatArray = np.zeros(3)
         self.started = False
         self.refused = 0
         self.quaternion: FloatArray = np.array([0.0, 0.0, 0.0, 1.0])
@@ -144,6 +142,16 @@ class FreeFilter:
             return Knowledge.LOST
         return Knowledge.FINE if sigma <= self._settings.fine else Knowledge.COARSE
 
+    def memory(self) -> FreeMemory:
+        """Return the estimate as it stands, for `recall`."""
+        constants, covariance = self._constants.copy(), self.covariance.copy()
+        return FreeMemory(self.quaternion, self.rate, self.acceleration, constants, covariance)
+
+    def recall(self, then: FreeMemory) -> None:
+        """Return to an earlier estimate."""
+        self.quaternion, self.rate, self.acceleration = then.quaternion, then.rate, then.acceleration
+        self._constants, self.covariance = then.constants.copy(), then.covariance.copy()
+
     @property
     def gyro_bias(self) -> FloatArray:
         """The gyros' bias (3,) rad/s."""
@@ -163,12 +171,15 @@ class FreeFilter:
         """Return the residual dipole (3,) A m^2 in a share of sunlight, body axes."""
         return np.asarray(self._constants[DIPOLE] + sunlit * self._constants[SUNLIT])
 
-    def advance(self, seconds: float, dipole: FloatArray, around: Around) -> None:
-        """Propagate by `seconds` under the coils' dipole (3,) A m^2, body axes; a second or two at once."""
+    def advance(self, seconds: float, dipole: FloatArray, around: Around, doubt: float = 0.0) -> None:
+        """Propagate by `seconds` under the coils' dipole (3,) A m^2, body axes; a second or two at once.
+
+        `doubt` A m^2 is the standard deviation of an axis of a dipole that may not have flown.
+        """
         speed = math.sqrt(float(self.rate @ self.rate))
         steps = max(1, math.ceil(speed * seconds / LARGEST_TURN))
         for _ in range(steps):
-            self._step(seconds / steps, dipole, around)
+            self._step(seconds / steps, dipole, around, doubt)
 
     def gyro(self, rate: FloatArray, covariance: FloatArray, change: FloatArray | None = None) -> bool:
         """Accept a gyro's rate (3,) rad/s and its covariance (3, 3).
@@ -180,9 +191,18 @@ class FreeFilter:
         value = rate - self.rate - self._constants[GYRO]
         return self._update(value if change is None else value + change, rows, covariance)
 
+    def mean_rate(self, rate: FloatArray, covariance: FloatArray, change: FloatArray) -> bool:
+        """Accept a rate (3,) rad/s without the gyros' bias, such as of streaks, and its covariance (3, 3).
+
+        `change` (3,) is by how much the rate has changed since.
+        """
+        rows = np.zeros((3, STATES))
+        rows[:, RATE] = _EYE
+        return self._update(rate + change - self.rate, rows, covariance)
+
     def attitude(self, quaternion: FloatArray, covariance: FloatArray, age: float = 0.0) -> bool:
         """Accept an attitude (4,) measured `age` s ago, covariance (3, 3) rad^2, body axes of now."""
-        since = from_rotation_vector(age * self.rate - 0.5 * age**2 * self._acceleration_now)
+        since = from_rotation_vector(age * self.rate - 0.5 * age**2 * self.acceleration)
         rows = np.zeros((3, STATES))
         # The turn since then has the error of the rate.
         rows[:, TURN], rows[:, RATE] = _EYE, -age * _EYE
@@ -194,28 +214,29 @@ class FreeFilter:
         expected = attitude_matrix(self.quaternion) @ reference
         across = tangent_basis(expected)
         rows = np.zeros((2, STATES))
-        rows[:, TURN] = across @ _crossed(expected)
+        rows[:, TURN] = across @ crossed(expected)
         return self._update(across @ observed, rows, across @ covariance @ across.T)
 
     def field(self, measured: FloatArray, reference: FloatArray, covariance: FloatArray) -> bool:
         """Accept the field (3,) T of now in body axes, the model's (3,) T, ICRS; covariance (3, 3) T^2."""
         expected = attitude_matrix(self.quaternion) @ reference
         rows = np.zeros((3, STATES))
-        rows[:, TURN], rows[:, MAGNET] = _crossed(expected), _EYE
+        rows[:, TURN], rows[:, MAGNET] = crossed(expected), _EYE
         return self._update(measured - expected - self._constants[MAGNET], rows, covariance)
 
-    def _step(self, dt: float, dipole: FloatArray, around: Around) -> None:
+    def _step(self, dt: float, dipole: FloatArray, around: Around, doubt: float) -> None:
         """Take one step of the midpoint rule, with its covariance."""
+        motion = self.motion
         middle = multiply(from_rotation_vector(0.5 * dt * self.rate), self.quaternion)
-        torque, flow = self._torque(middle, dipole, around)
-        start = self._acceleration(self.rate, torque)
-        half = self.rate + 0.5 * dt * start
-        acceleration = self._acceleration(half, torque)
-        flow[0:3, TURN], flow[0:3, RATE] = -_crossed(half), _EYE
-        flow[3:6, RATE] = self._inverse @ (_crossed(self._inertia @ half) - _crossed(half) @ self._inertia)
+        whole = dipole + self.residual_dipole(around.sunlit)
+        torque, flow = motion.torque(middle, whole, self._constants[TORQUES], around)
+        half = self.rate + 0.5 * dt * motion.acceleration(self.rate, torque)
+        acceleration = motion.acceleration(half, torque)
+        flow[0:3, TURN], flow[0:3, RATE] = -crossed(half), _EYE
+        flow[3:6, RATE] = motion.stiffness(half)
         turn = from_rotation_vector(dt * (self.rate + 0.5 * dt * acceleration))
         self.quaternion = multiply(turn, self.quaternion)
-        self._acceleration_now = acceleration
+        self.acceleration = acceleration
         self.rate = self.rate + dt * acceleration
         flow *= dt
         flow += 0.5 * (flow[:, :6] @ flow)
@@ -223,37 +244,18 @@ class FreeFilter:
         covariance = self.covariance
         covariance[:6] = flow @ covariance
         covariance[:, :6] = covariance @ flow.T
-        self._add_noise(dt, dipole, around)
+        self._add_noise(dt, dipole, around, doubt)
 
-    def _acceleration(self, rate: FloatArray, torque: FloatArray) -> FloatArray:
-        return np.asarray(self._inverse @ (torque - np.cross(rate, self._inertia @ rate)))
+    def rate_noise(self, dipole: FloatArray, around: Around, doubt: float = 0.0) -> FloatArray:
+        """Return the density (3, 3) rad^2/s^3 of the acceleration's noise under the coils' dipole (3,)."""
+        s, inverse = self._settings, self.motion.inverse
+        unknown = s.coil_error**2 * float(dipole @ dipole) + doubt**2
+        coils = 20.0 * unknown * float(around.field @ around.field)
+        return np.asarray((s.torque_noise**2 + coils) * (inverse @ inverse))
 
-    def _torque(
-        self, quaternion: FloatArray, dipole: FloatArray, around: Around
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return the torque (3,) N m, and the flow (6, 27) with what all but the rate do to the rate."""
-        turned = attitude_matrix(quaternion)
-        field, position = turned @ around.field, turned @ around.position
-        radius = math.sqrt(float(position @ position))
-        up = position / radius
-        stiff = self._inertia @ up
-        strength = 3.0 * GRAVITATIONAL_PARAMETER / radius**3
-        shape = shapes(around.pressures, turned[None])[0]
-        whole = dipole + self.residual_dipole(around.sunlit)
-        crossed, upright = _crossed(field), _crossed(up)
-        torque = -crossed @ whole + strength * upright @ stiff + shape @ self._constants[TORQUES]
-        flow = np.zeros((6, STATES))
-        stiffness = strength * (upright @ self._inertia - _crossed(stiff)) @ upright
-        flow[3:6, TURN] = self._inverse @ (_crossed(whole) @ crossed + stiffness)
-        flow[3:6, DIPOLE] = -self._inverse @ crossed
-        flow[3:6, SUNLIT] = around.sunlit * flow[3:6, DIPOLE]
-        flow[3:6, TORQUES] = self._inverse @ shape
-        return torque, flow
-
-    def _add_noise(self, dt: float, dipole: FloatArray, around: Around) -> None:
+    def _add_noise(self, dt: float, dipole: FloatArray, around: Around, doubt: float) -> None:
         s = self._settings
-        coils = s.coil_error**2 * 20.0 * float(dipole @ dipole) * float(around.field @ around.field)
-        density = (s.torque_noise**2 + coils) * dt * (self._inverse @ self._inverse)
+        density = dt * self.rate_noise(dipole, around, doubt)
         covariance = self.covariance
         covariance[RATE, RATE] += density
         covariance[TURN, TURN] += dt * dt / 3.0 * density
@@ -278,9 +280,3 @@ class FreeFilter:
         self.rate = self.rate + error[RATE]
         self._constants[6:] += error[6:]
         return True
-
-
-def _crossed(vector: FloatArray) -> FloatArray:
-    """Return [v x] (3, 3)."""
-    x, y, z = vector.tolist()
-    return np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))

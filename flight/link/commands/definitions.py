@@ -6,7 +6,7 @@ obeyed once, so that a datagram which a network brings twice does no harm.
 
 from __future__ import annotations
 
-from flight.link.telemetry.definitions import Field, Packet
+from flight.link.telemetry.form import Field, Packet
 from flight.link.telemetry.packets import Layout, compile_layouts
 
 

@@ -6,35 +6,8 @@ is never changed in place once it has flown: a field is appended and the packet'
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
-
-@dataclass(frozen=True, slots=True)
-class Field:
-    """One field: `kind` is a numpy type code (f8, f4, u1, u2, u4, u8, i8) or S<n> for n bytes of UTF-8.
-
-    `count` > 1 makes an array. All numbers are big-endian on the wire.
-    """
-
-    name: str
-    kind: str
-    unit: str
-    meaning: str
-    count: int = 1
-
-
-@dataclass(frozen=True, slots=True)
-class Packet:
-    """One packet: its application process identifier (APID), rate and fields."""
-
-    name: str
-    apid: int
-    rate: str
-    meaning: str
-    fields: tuple[Field, ...]
-    version: int = field(default=1)
-    telecommand: bool = False
-
+from flight.link.telemetry.form import Field, Packet
+from flight.link.telemetry.orbit_definitions import NAVIGATION, ORBIT_TRUTH, SPIN
 
 MAX_NODES = 40
 
@@ -113,21 +86,6 @@ ATTITUDE = Packet(
         Field("wanted", "f8", "-", "attitude of the path now, NaN without a path", 4),
         Field("wanted_rate", "f8", "rad/s", "rate of the path now, body axes", 3),
         Field("target", "f8", "-", "attitude to be reached, NaN without a target", 4),
-        Field("dipole", "f4", "A m^2", "dipole wanted of the coils, body axes", 3),
-    ),
-)
-
-SPIN = Packet(
-    "spin",
-    0x115,
-    "4 Hz",
-    "The rate by the magnetometer alone, of a satellite in orbit",
-    (
-        Field("known", "u1", "-", "1 once enough samples of the field agree"),
-        Field("rate", "f8", "rad/s", "body rate, body axes", 3),
-        Field("rate_sigma", "f4", "rad/s", "standard deviation of the rate's worst axis"),
-        Field("field", "f8", "T", "magnetic field, body axes", 3),
-        Field("restarts", "u4", "-", "how often the samples contradicted the rate until it was found again"),
         Field("dipole", "f4", "A m^2", "dipole wanted of the coils, body axes", 3),
     ),
 )
@@ -314,27 +272,6 @@ TRUTH = Packet(
     ),
 )
 
-ORBIT_TRUTH = Packet(
-    "orbit_truth",
-    0x141,
-    "1 Hz, simulation of an orbit only",
-    "What surrounded the satellite and turned it; written by sim_hal beside truth; NaN is not known",
-    (
-        Field("utc", "f8", "day", "Julian date UTC of the simulated world"),
-        Field("position", "f8", "m", "geocentric, ICRS", 3),
-        Field("velocity", "f8", "m/s", "ICRS", 3),
-        Field("field", "f8", "T", "of the Earth, ICRS", 3),
-        Field("sun", "f8", "-", "direction of the Sun, ICRS", 3),
-        Field("sunlit", "f8", "-", "share of the Sun's disc that is seen"),
-        Field("residual_dipole", "f8", "A m^2", "body axes", 3),
-        Field("coil_torque", "f8", "N m", "body axes", 3),
-        Field("dipole_torque", "f8", "N m", "of the residual dipole, body axes", 3),
-        Field("gravity_torque", "f8", "N m", "of the gravity gradient, body axes", 3),
-        Field("drag_torque", "f8", "N m", "body axes", 3),
-        Field("sunlight_torque", "f8", "N m", "body axes", 3),
-    ),
-)
-
 CYCLE_TIMING = Packet(
     "cycle_timing",
     0x150,
@@ -381,6 +318,7 @@ PACKETS: tuple[Packet, ...] = (
     CONTROL,
     ATTITUDE,
     SPIN,
+    NAVIGATION,
     TARGET,
     MODE,
     PLAN,

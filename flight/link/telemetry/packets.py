@@ -25,7 +25,8 @@ from spacepackets.ccsds.spacepacket import (  # type: ignore[import-untyped]  # 
 )
 
 from flight.gnc.errors import FlightError
-from flight.link.telemetry.definitions import PACKETS, Field, Packet
+from flight.link.telemetry.definitions import PACKETS
+from flight.link.telemetry.form import Field, Packet
 
 PacketArray = npt.NDArray[np.void]
 

@@ -9,7 +9,8 @@ from __future__ import annotations
 from typing import Any, Protocol
 
 from flight.link.events import EventKind
-from flight.link.telemetry.definitions import EVENT, Packet
+from flight.link.telemetry.definitions import EVENT
+from flight.link.telemetry.form import Packet
 from flight.link.telemetry.packets import Packer
 
 

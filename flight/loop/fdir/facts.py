@@ -79,6 +79,8 @@ IMU_POOR, FIELD_POOR, COILS_POOR, POWER_POOR, CAMERA_POOR = (
 SERVICE_FAILING = Fact("service-failing", events.SERVICE_FAILING, events.SERVICE_RECOVERED)
 CAMERA_LATE = Fact("camera-late", events.CAMERA_LATE, events.CAMERA_RECOVERED)
 VISION_SLOW = Fact("vision-slow", events.VISION_SLOW)
+GPS_LOST = Fact("gps-lost", events.GPS_LOST, events.GPS_RECOVERED)
+GPS_POOR = Fact("gps-poor", events.STREAM_POOR, events.STREAM_GOOD, after=4, mended_after=8)
 
 FACTS: tuple[Fact, ...] = tuple(value for value in dict(vars()).values() if isinstance(value, Fact))
 

@@ -63,6 +63,8 @@ def streams_of(config: Config) -> tuple[Stream, ...]:
     if config.camera is not None:
         camera = config.camera
         rows.append(Stream("camera", 1.0 / camera.period, camera.max_age, facts.CAMERA_POOR))
+    if config.gps is not None:
+        rows.append(Stream("gps", 1.0 / config.gps.period, config.gps.max_age, facts.GPS_POOR))
     return tuple(rows)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,9 +36,11 @@ class ImagingSettings:
 
     Attributes:
         late_ns: age after the exposure from which a frame is late.
+        max_rate: rad/s of the body, beyond which no exposure is begun.
         slow_ns: processing time from which vision is slow.
         mounting: (4,) body axes to camera axes.
         angular_acceleration_psd: rad^2/s^3, density of the body's white angular acceleration.
+        velocity: returns the velocity (3,) m/s about the Sun at a time; None: as in `tracker`.
     """
 
     camera: CameraModel
@@ -45,10 +48,12 @@ class ImagingSettings:
     max_age_ns: int
     late_ns: int
     slow_ns: int
+    max_rate: float
     mounting: FloatArray
     estimator: StreakSettings | LikelihoodSettings
     tracker: TrackerSettings | None
     angular_acceleration_psd: float
+    velocity: Callable[[int], FloatArray | None]
 
 
 class FrameMeasurer:
@@ -67,11 +72,17 @@ class FrameMeasurer:
             self._settings.camera,
             frame.exposure_ns * 1e-9,
             self._estimator(past),
-            self._settings.tracker,
+            self._tracker(frame),
             self._rate_prior(frame, past) if past is not None else None,
             self._attitude_prior(past) if past is not None else None,
             last_checksum,
         )
+
+    def _tracker(self, frame: Frame) -> TrackerSettings | None:
+        tracker, velocity = self._settings.tracker, self._settings.velocity(middle_ns(frame))
+        if tracker is None or velocity is None:
+            return tracker
+        return replace(tracker, solve=replace(tracker.solve, velocity=velocity))
 
     def _estimator(self, past: Estimate | None) -> StreakSettings | LikelihoodSettings:
         estimator = self._settings.estimator

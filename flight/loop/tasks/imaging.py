@@ -68,7 +68,11 @@ class Imaging:
         self._last_frame_ns = time_ns
 
     def trigger(self, cycle: Cycle) -> None:
-        """Start an exposure: the task of the camera's rate group."""
+        """Start an exposure, unless the body turns too fast for one: the task of the camera's rate group."""
+        if self._navigation.speed > self._settings.max_rate:
+            self._last_frame_ns = cycle.start_ns
+            self._streams.note("camera", cycle.start_ns)  # it rests on purpose
+            return
         try:
             self._camera.trigger(self._settings.exposure_ns)
         except DeviceError as error:
@@ -147,13 +151,14 @@ class Imaging:
         if rate is None and attitude is None:
             self._report.unused(frame, found, now_ns)
         known = self._navigation.past(middle_ns(frame)) is not None
+        began = attitude is not None and self._navigation.begin_from(attitude)
         late = [m for m in (rate, attitude if known else None) if m is not None]
 
         def report(accepted: list[bool]) -> None:
             took = dict(zip(map(type, late), accepted, strict=True))
             self._report.rate(frame, motion, rate, now_ns, took.get(MeanRateMeasurement, False))
             if found.solution is not None:
-                taken = took.get(AttitudeMeasurement)
+                taken = True if began else took.get(AttitudeMeasurement)
                 self._report.stars(frame, found.solution, attitude, now_ns, taken)
 
         if late:

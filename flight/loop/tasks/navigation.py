@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from flight.gnc.estimation.estimate import Estimate
-from flight.gnc.estimation.measurements import Measurement
+from flight.gnc.estimation.measurements import AttitudeMeasurement, Measurement
 from flight.gnc.math.arrays import FloatArray, IntArray
 from flight.link import events
 from flight.link.telemetry.definitions import IMU
@@ -61,6 +61,8 @@ class Navigation:
         self._agreed_ns = 0
         self._link = unit.link()
         self._heard_since_ns = 0
+        self.speed = 0.0
+        """rad/s, of the newest reading, the gyro's bias included."""
 
     def begin(self, time_ns: int) -> None:
         """Use samples from `time_ns` on only: the body is released then."""
@@ -94,6 +96,7 @@ class Navigation:
             self._streams.note("imu", reading.time_ns)
             self._streams.note("field", reading.time_ns, math.hypot(*reading.field.tolist()))
             self._heard_ns = reading.time_ns
+            self.speed = math.hypot(*reading.rate.tolist())
         self._watch_line(now_ns)
         doubted = self._filter.doubts_commands
         text = "the rate departs from the commanded" if doubted else "the rate follows the commands"
@@ -129,6 +132,10 @@ class Navigation:
     def rates(self, begin_ns: int, end_ns: int) -> tuple[IntArray, FloatArray] | None:
         """Return times (n,) ns and rates (n, 3) rad/s that span a past interval; None beyond the history."""
         return self._filter.rates(begin_ns, end_ns) if self._filter.started else None
+
+    def begin_from(self, attitude: AttitudeMeasurement) -> bool:
+        """Offer an attitude of the stars while there is no estimate; return whether it began one."""
+        return not self._filter.started and self._feed.begin(attitude)
 
     def ingest_late(self, late: Sequence[Measurement], report: Callable[[list[bool]], None]) -> None:
         """Apply measurements of a frame at their times, over the next cycles.

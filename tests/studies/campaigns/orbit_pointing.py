@@ -20,7 +20,8 @@ from flight.gnc.control.three_axes.pointing import PointingLaw
 from flight.gnc.control.three_axes.pointing_table import PointingWeights, pointing_table
 from flight.gnc.earth.disturbance import pressures, shapes
 from flight.gnc.earth.ephemeris import Ephemeris
-from flight.gnc.estimation.free_filter import GYRO, TURN, Around, FreeFilter, FreeFilterSettings
+from flight.gnc.estimation.free_filter import FreeFilter, FreeFilterSettings
+from flight.gnc.estimation.free_motion import GYRO, TURN, Around
 from flight.gnc.guidance.three_axes.attitude_law import AttitudeLaw, nadir, references, velocity
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector

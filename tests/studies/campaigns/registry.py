@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from tests.studies.campaigns.acquisition import ACQUISITION
 from tests.studies.campaigns.campaign import Campaign
 from tests.studies.campaigns.coil_faults import COIL_FAULTS
 from tests.studies.campaigns.consistency import CONSISTENCY
@@ -58,5 +59,6 @@ CAMPAIGNS: dict[str, Campaign] = {
         DETUMBLE,
         WORLD_COMPARISON,
         ORBIT_POINTING,
+        ACQUISITION,
     )
 }

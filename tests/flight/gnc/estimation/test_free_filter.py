@@ -6,17 +6,9 @@ import numpy as np
 import pytest
 
 from flight.gnc.earth.disturbance import Pressures
-from flight.gnc.estimation.free_filter import (
-    DIPOLE,
-    GYRO,
-    RATE,
-    STATES,
-    TURN,
-    Around,
-    FreeFilter,
-    FreeFilterSettings,
-    Knowledge,
-)
+from flight.gnc.estimation.estimate import Knowledge
+from flight.gnc.estimation.free_filter import FreeFilter, FreeFilterSettings
+from flight.gnc.estimation.free_motion import DIPOLE, GYRO, RATE, STATES, TURN, Around
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import (
     IDENTITY,

@@ -1,0 +1,160 @@
+"""What surrounds the satellite by belief: its place, the field, the Sun and the shadow at any time.
+
+The place is that of the newest GPS fix, carried on; without one, of two-line elements. The surroundings are
+predicted for some 20 s at once (2 ms) and interpolated between. Long predictions, of a revolution, belong
+into a worker: 0.3 ms for each 10 s.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from flight.gnc.earth.disturbance import Pressures, pressures
+from flight.gnc.earth.ephemeris import STEP, Ephemeris, predict
+from flight.gnc.earth.geomagnetism import GeomagneticError
+from flight.gnc.earth.orbit_knowledge import GpsFix, OrbitError, OrbitState, TwoLineElements
+from flight.gnc.earth.orientation import terrestrial_time
+from flight.gnc.earth.sun import DAY, earth_velocity
+from flight.gnc.estimation.free_motion import Around
+from flight.gnc.math.arrays import FloatArray
+from hal.interfaces.readings import GpsReading
+from hal.interfaces.wires import SECOND_NS, Clock
+
+AHEAD, BEHIND = 2.0 * STEP, STEP
+"""s, of the short prediction, after and before the time that it was made for."""
+GPS_DELAY_NS = 100_000_000
+"""From an epoch of the receiver to the first byte of its report; 0.2 s at most."""
+GATE, LEAST_GATE = 5.0, 5e3
+"""Sigmas by which a fix may differ from what is known, and m that are always allowed."""
+CONTRADICTED = 30
+"""Fixes in a row that contradict the last accepted one: then that one was wrong."""
+_UNIX_EPOCH = 2_440_587.5
+_SHORTEST = 1.0
+
+
+class Surroundings:
+    """Owns the knowledge of the orbit. `refused` counts the fixes that contradict what is known."""
+
+    def __init__(self, elements: TwoLineElements | None, clock: Clock) -> None:
+        """`elements`: known before the flight; None: nothing is known until the first fix."""
+        self._elements = elements
+        self._clock = clock
+        self._fix: GpsFix | None = None
+        self._utc_offset_ns: int | None = None
+        self._near: Ephemeris | None = None
+        self._refused_in_a_row = 0
+        self.refused = 0
+
+    @property
+    def known(self) -> bool:
+        """Whether the orbit was known when it was last asked for."""
+        return self._near is not None
+
+    def julian_date(self, now_ns: int) -> float:
+        """Return the Julian date UTC, by the receiver's time, before the first fix by the host's clock."""
+        offset_ns = self._utc_offset_ns
+        if offset_ns is None:
+            offset_ns = self._clock.utc_ns() - self._clock.now_ns()
+        return _UNIX_EPOCH + (now_ns + offset_ns) / (DAY * SECOND_NS)
+
+    def fix(self, reading: GpsReading) -> bool:
+        """Accept an epoch of the receiver; return whether it is used."""
+        if not reading.valid:
+            return False
+        date = _UNIX_EPOCH + reading.utc_ns / (DAY * SECOND_NS)
+        try:
+            fix = GpsFix(date, reading.position, reading.velocity, reading.sigma, reading.velocity_sigma)
+            contradicts = self._contradicts(fix)
+        except OrbitError:
+            contradicts = True
+        if contradicts:
+            self.refused += 1
+            self._refused_in_a_row += 1
+            return False
+        self._refused_in_a_row = 0
+        self._fix = fix
+        self._utc_offset_ns = reading.utc_ns + GPS_DELAY_NS - reading.time_ns
+        return True
+
+    def state(self, now_ns: int) -> OrbitState | None:
+        """Return place and velocity, ICRS; None while no orbit is known."""
+        return self._state(self.julian_date(now_ns))
+
+    def at(self, now_ns: int) -> Around | None:
+        """Return field, place, torques' shapes and sunlight; None while no orbit is known."""
+        near, times = self._prediction(now_ns)
+        if near is None:
+            return None
+        shape = pressures(near, times)
+        return Around(
+            near.field_at(times)[0],
+            near.position_at(times)[0],
+            Pressures(shape.air, shape.light),
+            float(near.sunlit_at(times)[0]),
+        )
+
+    def sun(self, now_ns: int) -> FloatArray | None:
+        """Return the Sun's direction (3,), ICRS, without aberration (21"); None while no orbit is known."""
+        near, times = self._prediction(now_ns)
+        return None if near is None else np.asarray(near.sun_at(times)[0])
+
+    def velocity(self, now_ns: int) -> FloatArray | None:
+        """Return the velocity (3,) m/s about the Sun, ICRS, for aberration; None while no orbit is known."""
+        near, times = self._prediction(now_ns)
+        if near is None:
+            return None
+        date = float(terrestrial_time(self.julian_date(now_ns)))
+        return np.asarray(earth_velocity(date) + near.velocity_at(times)[0])
+
+    def ephemeris(self, now_ns: int, seconds: float) -> Ephemeris | None:
+        """Return a prediction of `seconds` s from now on, 0.3 ms for each 10 s; None where none is possible.
+
+        `seconds_into` gives its time of the clock's.
+        """
+        state = self.state(now_ns)
+        return None if state is None else _predicted(state, seconds)
+
+    def seconds_into(self, ephemeris: Ephemeris, now_ns: int) -> float:
+        """Return the time, s, of `ephemeris` at a time of the clock."""
+        return (self.julian_date(now_ns) - ephemeris.julian_date) * DAY
+
+    def _state(self, date: float) -> OrbitState | None:
+        for source in (self._fix, self._elements):
+            if source is not None:
+                try:
+                    return source.at(date)
+                except OrbitError:
+                    continue
+        return None
+
+    def _prediction(self, now_ns: int) -> tuple[Ephemeris | None, FloatArray]:
+        """Return the short prediction and the time (1,) s in it, made again near its end."""
+        near = self._near
+        seconds = math.inf if near is None else self.seconds_into(near, now_ns)
+        if near is None or not 0.0 <= seconds <= float(near.times[-1]) - _SHORTEST:
+            state = self._state(self.julian_date(now_ns) - BEHIND / DAY)
+            near = self._near = None if state is None else _predicted(state, BEHIND + AHEAD)
+            seconds = BEHIND if near is None else self.seconds_into(near, now_ns)
+        return near, np.array([seconds])
+
+    def _contradicts(self, fix: GpsFix) -> bool:
+        """Return whether a fix is too far from the elements, or from the last fix."""
+        known: GpsFix | TwoLineElements | None = self._elements or self._fix
+        if known is None or (known is self._fix and self._refused_in_a_row >= CONTRADICTED):
+            return False
+        try:
+            expected = known.at(fix.julian_date)
+        except OrbitError:
+            return False
+        found = fix.at(fix.julian_date)
+        off = float(np.linalg.norm(found.position - expected.position))
+        return off > max(LEAST_GATE, GATE * math.sqrt(3.0) * math.hypot(expected.sigma, found.sigma))
+
+
+def _predicted(state: OrbitState, seconds: float) -> Ephemeris | None:
+    try:
+        return predict(state, seconds)
+    except GeomagneticError:
+        return None

@@ -1,0 +1,58 @@
+"""The packets that only a satellite in orbit writes."""
+
+from __future__ import annotations
+
+from flight.link.telemetry.form import Field, Packet
+
+SPIN = Packet(
+    "spin",
+    0x115,
+    "4 Hz",
+    "The rate by the magnetometer alone, of a satellite in orbit",
+    (
+        Field("known", "u1", "-", "1 once enough samples of the field agree"),
+        Field("rate", "f8", "rad/s", "body rate, body axes", 3),
+        Field("rate_sigma", "f4", "rad/s", "standard deviation of the rate's worst axis"),
+        Field("field", "f8", "T", "magnetic field, body axes", 3),
+        Field("restarts", "u4", "-", "how often the samples contradicted the rate until it was found again"),
+        Field("dipole", "f4", "A m^2", "dipole wanted of the coils, body axes", 3),
+    ),
+)
+
+NAVIGATION = Packet(
+    "navigation",
+    0x116,
+    "1 Hz",
+    "How well a satellite in orbit knows its attitude, and what its filter has learned",
+    (
+        Field("knowledge", "u1", "-", "0 lost, 1 coarse, 2 fine"),
+        Field("placed", "u1", "-", "1 while the orbit is known"),
+        Field("refused", "u4", "-", "measurements that did not pass their gate, replays included"),
+        Field("fixes_refused", "u4", "-", "GPS fixes that contradict what is known of the orbit"),
+        Field("restarts", "u4", "-", "how often the estimate was discarded for a new one"),
+        Field("gyro_bias", "f8", "rad/s", "body axes, NaN before an estimate", 3),
+        Field("field_bias", "f8", "T", "of the magnetometer, body axes", 3),
+        Field("residual_dipole", "f8", "A m^2", "in the present light, body axes", 3),
+    ),
+)
+
+ORBIT_TRUTH = Packet(
+    "orbit_truth",
+    0x141,
+    "1 Hz, simulation of an orbit only",
+    "What surrounded the satellite and turned it; written by sim_hal beside truth; NaN is not known",
+    (
+        Field("utc", "f8", "day", "Julian date UTC of the simulated world"),
+        Field("position", "f8", "m", "geocentric, ICRS", 3),
+        Field("velocity", "f8", "m/s", "ICRS", 3),
+        Field("field", "f8", "T", "of the Earth, ICRS", 3),
+        Field("sun", "f8", "-", "direction of the Sun, ICRS", 3),
+        Field("sunlit", "f8", "-", "share of the Sun's disc that is seen"),
+        Field("residual_dipole", "f8", "A m^2", "body axes", 3),
+        Field("coil_torque", "f8", "N m", "body axes", 3),
+        Field("dipole_torque", "f8", "N m", "of the residual dipole, body axes", 3),
+        Field("gravity_torque", "f8", "N m", "of the gravity gradient, body axes", 3),
+        Field("drag_torque", "f8", "N m", "body axes", 3),
+        Field("sunlight_torque", "f8", "N m", "body axes", 3),
+    ),
+)

@@ -1,0 +1,179 @@
+"""The satellite's filter: takes stars at their own times, starts by them, and begins again where wrong."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flight.bodies.orbit.filter import REFUSALS_TO_RESTART, OrbitFilter, OrbitFilterSettings
+from flight.bodies.orbit.steps import DipoleHistory
+from flight.gnc.earth.disturbance import Pressures
+from flight.gnc.estimation.estimate import RATE, TURN, Knowledge
+from flight.gnc.estimation.free_motion import Around
+from flight.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import (
+    IDENTITY,
+    angle_between,
+    attitude_matrix,
+    from_rotation_vector,
+    multiply,
+)
+from hal.interfaces.readings import ImuReading
+from hal.interfaces.wires import SECOND_NS
+
+PERIOD_NS = SECOND_NS // 40
+INERTIA = np.diag([1.1e-3, 1.05e-3, 0.99e-3])
+FIELD = np.array([1e-5, 2e-5, 3e-5])
+BIAS, SPIN = np.array([4e-4, -5e-4, 3e-4]), np.array([3e-3, -2e-3, 4e-3])
+STAR = 2e-5
+DIPOLE = 0.02
+"""A m^2, about x."""
+
+
+def around(_: int) -> Around:
+    nothing = Pressures(np.zeros((1, 3)), np.zeros((1, 3)))
+    return Around(FIELD, np.array([1e9, 0.0, 0.0]), nothing, 1.0)
+
+
+class Flown:
+    """A body under its coils, a few steps of Euler's equation a reading, and its filter."""
+
+    def __init__(self, pulses: bool = False) -> None:
+        self.filter = OrbitFilter(
+            OrbitFilterSettings(
+                inertia=INERTIA,
+                dipole_per_ampere=1.0,
+                dipole_limit=0.1,
+                gyro_noise=1e-4,
+                field_noise=1e-7,
+                field_error=5e-8,
+                settle_ns=100_000_000,
+                history_ns=12 * SECOND_NS,
+            ),
+            around,
+        )
+        self.generator = np.random.default_rng(5)
+        self.attitude, self.rate, self.time_ns = IDENTITY, SPIN, 0
+        self.attitudes = {0: IDENTITY}
+        self._pulses = pulses
+
+    def fly(self, seconds: float) -> None:
+        """Fly on; with pulses the coils act for 0.8 s of each second."""
+        for _ in range(round(seconds * SECOND_NS / PERIOD_NS)):
+            acts = self._pulses and self.time_ns % SECOND_NS >= 200_000_000
+            dipole = np.array([DIPOLE if acts else 0.0, 0.0, 0.0])
+            self.filter.command(self.time_ns, dipole)
+            for _ in range(5):
+                shown = attitude_matrix(self.attitude) @ FIELD
+                torque = np.cross(dipole, shown) - np.cross(self.rate, INERTIA @ self.rate)
+                change = np.linalg.solve(INERTIA, torque) * 5e-3
+                turn = 5e-3 * (self.rate + 0.5 * change)
+                self.attitude = multiply(from_rotation_vector(turn), self.attitude)
+                self.rate = self.rate + change
+            self.time_ns += PERIOD_NS
+            self.attitudes[self.time_ns] = self.attitude
+            self.filter.accept(self._reading())
+
+    def stars(self, time_ns: int, off: FloatArray | None = None) -> AttitudeMeasurement:
+        """Return the stars' attitude of a past time, wrong by `off` (3,) rad."""
+        error = STAR * self.generator.standard_normal(3) + (0.0 if off is None else off)
+        seen = multiply(from_rotation_vector(error), self.attitudes[time_ns])
+        return AttitudeMeasurement(time_ns, seen, STAR**2 * np.eye(3))
+
+    def see(self, age_ns: int, off: FloatArray | None = None) -> bool:
+        """Give the filter the stars' attitude of `age_ns` ago; return whether it was used."""
+        used: list[bool] = []
+        self.filter.measure_late([self.stars(self.time_ns - age_ns, off)], used.extend)
+        return used == [True]
+
+    def error(self) -> float:
+        """Return the error of the present attitude, rad."""
+        return float(angle_between(self.filter.at(self.time_ns).quaternion, self.attitude))
+
+    def _reading(self) -> ImuReading:
+        noise = self.generator.standard_normal(6)
+        field = attitude_matrix(self.attitude) @ FIELD + 1e-7 * noise[3:]
+        rate, nothing = self.rate + BIAS + 1e-4 * noise[:3], np.zeros(3)
+        return ImuReading(self.time_ns, self.time_ns, self.time_ns, IDENTITY, rate, field, nothing)
+
+
+def acquired(pulses: bool = False) -> Flown:
+    """Return a body that began by stars 0.6 s old and saw them each 5 s."""
+    flown = Flown(pulses)
+    flown.fly(3.0)
+    assert flown.filter.knowledge is Knowledge.LOST
+    assert not flown.filter.started
+    assert flown.filter.begin(flown.stars(flown.time_ns - 24 * PERIOD_NS))
+    for _ in range(5):
+        flown.fly(5.0)
+        assert flown.see(52 * PERIOD_NS)
+    return flown
+
+
+@pytest.mark.parametrize("pulses", [False, True])
+def test_stars_of_over_a_second_ago_are_applied_at_their_own_time(pulses: bool) -> None:
+    flown = acquired(pulses)
+    found = flown.filter.at(flown.time_ns)
+    sigma = np.sqrt(np.diag(found.covariance))
+    assert flown.filter.knowledge is Knowledge.FINE
+    assert flown.error() < 3.0 * np.linalg.norm(sigma[TURN])
+    assert (np.abs(found.rate - flown.rate) < 4.0 * sigma[RATE]).all()
+    assert found.bias == pytest.approx(BIAS, abs=5e-5)
+    assert flown.filter.refused == 0
+
+
+def test_the_past_and_the_rates_of_an_exposure_are_kept() -> None:
+    flown = acquired(pulses=True)
+    then = flown.time_ns - 60 * PERIOD_NS
+    past = flown.filter.past(then)
+    assert past is not None
+    assert angle_between(past.quaternion, flown.attitudes[then]) < 3e-4
+    spanning = flown.filter.rates(then, then + SECOND_NS)
+    assert spanning is not None
+    assert spanning[0][0] <= then < then + SECOND_NS <= spanning[0][-1]
+    assert flown.filter.past(flown.time_ns - 30 * SECOND_NS) is None
+
+
+def test_stars_older_than_the_history_are_refused() -> None:
+    flown = acquired()
+    assert not flown.see(20 * SECOND_NS)
+
+
+def test_after_some_attitudes_that_contradict_it_the_filter_begins_again() -> None:
+    flown = acquired()
+    off = np.array([0.0, 0.1, 0.0])
+    for number in range(REFUSALS_TO_RESTART):
+        assert flown.filter.restarts == 0, number
+        flown.fly(2.0)
+        assert not flown.see(10 * PERIOD_NS, off)
+    assert flown.filter.restarts == 1
+    assert flown.error() == pytest.approx(0.1, abs=5e-3)
+
+
+def test_a_rate_from_streaks_is_used() -> None:
+    flown = acquired()
+    flown.fly(1.0)
+    since_ns, until_ns = flown.time_ns - 60 * PERIOD_NS, flown.time_ns - 20 * PERIOD_NS
+    used: list[bool] = []
+    rate = MeanRateMeasurement(since_ns, until_ns, flown.rate, 1e-10 * np.eye(3))
+    flown.filter.measure_late([rate], used.extend)
+    assert used == [True]
+
+
+def test_currents_that_may_not_have_flown_widen_the_claim() -> None:
+    flown = acquired()
+    before = flown.filter.at(flown.time_ns).covariance[RATE, RATE].trace()
+    flown.filter.mark_unknown(flown.time_ns - SECOND_NS)
+    assert flown.filter.at(flown.time_ns).covariance[RATE, RATE].trace() > 2.0 * before
+
+
+def test_the_mean_dipole_is_that_on_the_wire() -> None:
+    history = DipoleHistory(10 * SECOND_NS)
+    assert history.at_rest_since() is not None
+    history.record(0, (0.0, 0.0, 0.0), True)
+    history.record(2 * SECOND_NS, (0.1, 0.0, 0.0), True)
+    assert history.at_rest_since() is None
+    history.record(3 * SECOND_NS, (0.0, 0.0, 0.0), True)
+    assert history.mean(SECOND_NS, 5 * SECOND_NS) == pytest.approx([0.025, 0.0, 0.0])
+    assert history.at_rest_since() == 3 * SECOND_NS

@@ -1,0 +1,111 @@
+"""A satellite in orbit acquires its attitude by its star camera, in a world unlike its belief."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flight.gnc.math import quaternion
+from flight.link.telemetry.reader import Run
+from flight.schema import reader as configuration
+from flight.schema.orbit import OrbitConfig
+from ground.report import format_report, summarise
+from ground.report.knowledge import FINE, AttitudeErrors, attitude_errors
+from sim_hal.settings import FaultEntry, Simulation
+from sim_hal.worlds.free_body.body import FreeBody
+from tests.scenario.flights import event_names, fly
+from tests.scenario.test_orbit import orbit_config, world
+
+NEAR_REST = 0.00524
+"""rad/s, 0.3 deg/s: slower than where braking ends."""
+DURATION, ACQUIRED = 62.0, 20.0
+"""s, of the flight, and by when the attitude is fine."""
+GYRO_BIAS, FIELD_BIAS = (4e-4, -5e-4, 3e-4), (2e-7, -1e-7, 1.5e-7)
+"""rad/s and T, which the belief takes for zero."""
+MUTE = FaultEntry(fault="gps: off", at=35.0, span=60.0)
+
+
+def skyward() -> Simulation:
+    """Return the world with the star camera's boresight, body -y, across the orbit."""
+    section = world(NEAR_REST, MUTE)
+    craft = section.free_body
+    assert craft is not None
+    around = FreeBody(craft, lambda: np.zeros(3), seed=section.seed, utc=section.utc).surroundings()
+    across = np.cross(around.position, around.velocity)
+    across, ahead = across / np.linalg.norm(across), np.array(around.velocity)
+    ahead = ahead / np.linalg.norm(ahead)
+    rows = np.stack([ahead, -across, np.cross(ahead, -across)])
+    qx, qy, qz, qw = quaternion.from_matrix(rows).tolist()
+    release = configuration.replace(craft.release, attitude=(qx, qy, qz, qw))
+    unit = configuration.replace(section.imu, profile="datasheet", gyro_bias=GYRO_BIAS, field_bias=FIELD_BIAS)
+    body = configuration.replace(craft, release=release)
+    return configuration.replace(section, imu=unit, free_body=body)
+
+
+def navigating() -> OrbitConfig:
+    config = orbit_config(DURATION)
+    assert config.gps is not None
+    at_rest = configuration.replace(config.detumble, low_rate=0.0175, low_for=0.5)
+    gps = configuration.replace(config.gps, max_age=10.0)
+    return configuration.replace(config, gps=gps, detumble=at_rest)
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    return fly(navigating(), tmp_path_factory.mktemp("acquired"), section=skyward())
+
+
+@pytest.fixture(scope="module")
+def settled(flown: Run) -> AttitudeErrors:
+    """Return the errors from some frames after the acquisition on."""
+    found = attitude_errors(flown)
+    later = found.times > ACQUIRED
+    return AttitudeErrors(found.times[later], found.error[later], found.sigma[later])
+
+
+def test_lost_in_space_it_becomes_fine_and_stays_so(flown: Run) -> None:
+    packets = flown["navigation"]
+    after = packets[packets["time_ns"] > ACQUIRED * 1e9]
+    assert len(after) > 30
+    assert (after["knowledge"] == FINE).all()
+    assert after["refused"][-1] == 0
+    assert "attitude-knowledge" in event_names(flown)
+
+
+def test_its_attitude_is_within_a_hundredth_of_a_degree_and_within_its_claim(settled: AttitudeErrors) -> None:
+    angle = np.degrees(np.linalg.norm(settled.error, axis=1))
+    assert np.sqrt(np.mean(angle**2)) < 0.01
+    assert (np.abs(settled.error) < 5.0 * settled.sigma).all()
+
+
+def test_it_claims_what_it_can_do(settled: AttitudeErrors) -> None:
+    assert np.degrees(settled.sigma).max() < 0.02
+
+
+def test_it_learns_the_biases_of_the_inertial_unit(flown: Run) -> None:
+    last = flown["navigation"][-1]
+    assert last["gyro_bias"] == pytest.approx(flown_bias(flown), abs=1.5e-4)
+
+
+def flown_bias(run: Run) -> np.ndarray:
+    """Return the mean of gyro less truth: the configured bias and one that the unit draws."""
+    imu, truth = run["imu"], run["truth"]
+    rates = [
+        np.interp(imu["sample_time_ns"], truth["time_ns"], truth["rate"][:, axis].astype(float))
+        for axis in range(3)
+    ]
+    return np.asarray(np.mean(imu["rate"] - np.column_stack(rates), axis=0))
+
+
+def test_a_receiver_without_power_is_reported_and_the_orbit_stays_known(flown: Run) -> None:
+    assert "gps-lost" in event_names(flown)
+    assert (flown["navigation"]["placed"][2:] == 1).all()
+
+
+def test_the_report_shows_how_well_the_attitude_was_known(flown: Run, tmp_path: Path) -> None:
+    summary = summarise(flown)["knowledge"]
+    assert summary["share"]["fine"] > 0.6
+    assert summary["fine_error_worst_rad"] < np.radians(0.3)
+    assert "Attitude knowledge" in format_report(summarise(flown))
