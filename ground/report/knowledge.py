@@ -10,8 +10,8 @@ import numpy as np
 
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import conjugate, multiply, to_rotation_vector
-from flight.link.telemetry.reader import Run
 from ground.report.signals import seconds
+from ground.telemetry.reader import Run
 
 Object = dict[str, Any]
 LOST, COARSE, FINE = 0, 1, 2

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from flight.link.telemetry.reader import Run
 from ground.report import panels
 from ground.report.knowledge import attitude_errors
 from ground.report.signals import seconds
+from ground.telemetry.reader import Run
 
 SIZE = (10.9, 9.4)
 LEVELS = ("lost", "coarse", "fine")

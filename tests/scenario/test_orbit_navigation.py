@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from flight.gnc.math import quaternion
-from flight.link.telemetry.reader import Run
 from flight.schema import reader as configuration
 from flight.schema.orbit import OrbitConfig
 from ground.report import format_report, summarise
 from ground.report.knowledge import FINE, AttitudeErrors, attitude_errors
+from ground.telemetry.reader import Run
 from sim_hal.settings import FaultEntry, Simulation
 from sim_hal.worlds.free_body.body import FreeBody
 from tests.scenario.flights import event_names, fly

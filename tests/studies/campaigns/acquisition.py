@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from flight.link.telemetry.reader import Run
 from flight.schema import reader as configuration
 from flight.schema.orbit import OrbitConfig, as_orbit
 from ground.report.knowledge import COARSE, FINE, attitude_errors
 from ground.report.signals import seconds
+from ground.telemetry.reader import Run
 from sim_hal.settings import Simulation
 from tests.scenario.flights import CONFIG, fly
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
