@@ -33,6 +33,8 @@ class Bridge(NamedTuple):
 
     def driven(self) -> list[tuple[int, int]]:
         """Return the spans of counts [begin, end) in which the coil is driven either way."""
+        if self.a == self.b:
+            return []
         pulses = (self.a, self.b, self.enable)
         edges = {0, COUNTS}
         for first, length in pulses:

@@ -10,6 +10,7 @@ import json
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -70,8 +71,9 @@ def at_most(name: str, value: float, limit: float) -> Bar:
     return Bar(name, value, f"<= {limit:g}", value <= limit)
 
 
+@cache
 def draw(root: Path = ROOT) -> House:
-    """Read the product's source."""
+    """Read the product's source, once in a process."""
     files = graph.product_files(root)
     modules = graph.import_graph(files)
     rooms = graph.room_graph(modules)

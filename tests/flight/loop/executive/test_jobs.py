@@ -16,29 +16,9 @@ from flight.loop.executive.lockstep import LockStepRunner
 from flight.loop.executive.processes import ProcessRunner
 from hal.buses.clock import SystemClock
 from sim_hal.clock import SimClock
+from tests.flight.loop.executive.odd_jobs import die, double, fail, hang
 
 MS = 1_000_000
-
-
-def double(value: Any) -> Any:
-    """Return twice the value."""
-    return 2 * value
-
-
-def fail(value: Any) -> Any:
-    """Raise."""
-    raise ValueError(f"cannot do {value}")
-
-
-def hang(_: Any) -> Any:
-    """Never return."""
-    while True:
-        time.sleep(1.0)
-
-
-def die(_: Any) -> Any:
-    """End the process."""
-    os._exit(3)
 
 
 def worker(name: str, function: Callable[[Any], Any]) -> Worker:
@@ -60,8 +40,9 @@ def wait(runner: JobRunner, seconds: float = 20.0) -> list[JobResult]:
     raise AssertionError("no result arrived")
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def processes() -> Iterator[ProcessRunner]:
+    """Return workers for all tests here: each of them leaves every worker idle, or replaced."""
     runner = ProcessRunner(SystemClock(), [*WORKERS, worker("hang", hang), worker("die", die)])
     yield runner
     runner.close()

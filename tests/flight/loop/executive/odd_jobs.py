@@ -1,0 +1,28 @@
+"""Jobs for worker processes, apart from their tests: a worker imports this module alone."""
+
+from __future__ import annotations
+
+import os
+import time
+from typing import Any
+
+
+def double(value: Any) -> Any:
+    """Return twice the value."""
+    return 2 * value
+
+
+def fail(value: Any) -> Any:
+    """Raise."""
+    raise ValueError(f"cannot do {value}")
+
+
+def hang(_: Any) -> Any:
+    """Never return."""
+    while True:
+        time.sleep(1.0)
+
+
+def die(_: Any) -> Any:
+    """End the process."""
+    os._exit(3)
