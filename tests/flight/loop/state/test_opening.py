@@ -17,6 +17,7 @@ from flight.schema import reader as configuration
 from flight.schema.sections import Config
 from ground.telemetry.reader import read_run
 from hal.interfaces.errors import NotResponding
+from tests.hal.guardian.live_flight import write_config
 from tests.manual_clock import ManualClock
 
 CONFIG = Path(__file__).resolve().parents[4] / "config" / "step_demo.yaml"
@@ -93,9 +94,9 @@ def test_a_folder_that_cannot_be_made_is_no_reason_not_to_fly(tmp_path: Path) ->
 
 def test_a_service_flies_run_after_run_into_its_archive_and_shows_a_crash_before(tmp_path: Path) -> None:
     """Two short flights; the process of the second finds that the one before was killed."""
-    text = CONFIG.read_text(encoding="utf-8") + f"\nstate: {{folder: {tmp_path / 'state'}}}\n"
-    path = tmp_path / "flight.yaml"
-    path.write_text(text)
+    path = write_config(tmp_path)
+    with path.open("a", encoding="utf-8") as file:
+        file.write(f"\nstate: {{folder: {tmp_path / 'state'}}}\n")
     request = RunRequest(path, tmp_path / "unused", duration=2.0, archive=tmp_path / "runs")
     assert fly(request).folder == tmp_path / "runs" / "run-000001"
     state = stored(tmp_path / "state")
