@@ -37,6 +37,7 @@ from ground.pictures.horizon import draw_horizon
 from ground.pictures.sky_picture import draw_solution
 from ground.report import draw, draw_path
 from ground.report.figures import DPI
+from ground.report.knowledge_figure import knowledge_figure
 from ground.report.spin_figure import spin_figure
 from ground.telemetry.reader import read_run
 from sim_hal.assembly import StarRenderer
@@ -49,8 +50,6 @@ from tests.studies.campaigns import nadir
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG = ROOT / "config" / "step_demo.yaml"
 ORBIT = ROOT / "config" / "orbit.yaml"
-DETUMBLED = 400.0
-"""s, of the flight in orbit."""
 RATE = 0.03
 """rad/s: the peak of a 0.1 step."""
 ORION_DEG = 84.0, -2.0, 15.0
@@ -70,17 +69,18 @@ def main() -> int:
         drawn = {path.name: path for path in draw(read_run(run_folder), Path(place) / "figures")}
         for name in ("overview.png", "paths.png"):
             (folder / name).write_bytes(drawn[name].read_bytes())
-        fly(RunRequest(ORBIT, Path(place) / "orbit", duration=DETUMBLED))
-        spin = spin_figure(read_run(Path(place) / "orbit"))
-        assert spin is not None
-        spin.savefig(folder / "spin.png", dpi=DPI, facecolor="white")
+        fly(RunRequest(ORBIT, Path(place) / "orbit"))
+        in_orbit = read_run(Path(place) / "orbit")
+        for name, figure in (("spin", spin_figure(in_orbit)), ("knowledge", knowledge_figure(in_orbit))):
+            assert figure is not None
+            figure.savefig(folder / f"{name}.png", dpi=DPI, facecolor="white")
     config = as_testbed(configuration.load(CONFIG))
     plant = plant_of(config)
     draw_path(plan(plant, 0.4, 0.015, -0.3, 0.0, 10.0), plant, folder / "path.png")
     _draw_frame(folder / "frame.png")
     _draw_solved(folder / "solved.png")
     _draw_horizons(folder / "horizons.png")
-    for name in ("overview", "paths", "spin", "path", "frame", "solved", "horizons"):
+    for name in ("overview", "paths", "spin", "knowledge", "path", "frame", "solved", "horizons"):
         sys.stdout.write(f"{folder / name}.png\n")
     return 0
 

@@ -11,7 +11,8 @@ import numpy as np
 
 from flight.bodies.orbit.brake import FieldBrake
 from flight.bodies.orbit.feed import OrbitFeed
-from flight.bodies.orbit.filter import OrbitFilter, OrbitFilterSettings
+from flight.bodies.orbit.filter import OrbitFilter
+from flight.bodies.orbit.replay import OrbitFilterSettings
 from flight.bodies.orbit.surroundings import Surroundings
 from flight.bodies.orbit.view import OrbitView
 from flight.gnc.control.detumble import WindowSchedule

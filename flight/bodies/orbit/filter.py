@@ -8,61 +8,25 @@ again.
 
 from __future__ import annotations
 
-import math
-from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 
 from flight.bodies.orbit.carried import CarriedOn
-from flight.bodies.orbit.steps import DipoleHistory, OpenStep, Step
+from flight.bodies.orbit.replay import FIELD_MEMORY, OrbitFilterSettings, StepReplay
+from flight.bodies.orbit.steps import DipoleHistory, OpenStep
 from flight.gnc.estimation.estimate import Estimate, Knowledge
-from flight.gnc.estimation.free_filter import FreeFilter, FreeFilterSettings
 from flight.gnc.estimation.free_motion import Around
 from flight.gnc.estimation.measurements import (
     AttitudeMeasurement,
-    DirectionMeasurement,
-    FieldMeasurement,
-    MeanRateMeasurement,
     Measurement,
 )
 from flight.gnc.math.arrays import FloatArray, IntArray
-from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector
 from hal.interfaces.readings import ImuReading
 from hal.interfaces.wires import SECOND_NS
 
-FIELD_MEMORY = 300.0
-"""s, for which the error of the field's model keeps its sign."""
 REFUSALS_TO_RESTART = 3
 """Attitudes in a row that contradict the estimate: the estimate is wrong."""
-_LONGEST = 2.0
-_EYE: FloatArray = np.eye(3)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OrbitFilterSettings:
-    """The body, its sensors, and the steps.
-
-    Attributes:
-        inertia: (3, 3) kg m^2. dipole_per_ampere: m^2. dipole_limit: A m^2 of each coil.
-        gyro_noise: rad/s of an axis of a sample. field_noise: T, likewise.
-        field_error: T of an axis, of the field's model.
-        settle_ns: after the coils have come to rest, until the magnetometer is free of their field.
-        history_ns: how old a measurement may be.
-        step_ns: the longest step.
-    """
-
-    inertia: FloatArray
-    dipole_per_ampere: float
-    dipole_limit: float
-    gyro_noise: float
-    field_noise: float
-    field_error: float
-    settle_ns: int
-    history_ns: int
-    step_ns: int = SECOND_NS
-    free: FreeFilterSettings = field(default_factory=FreeFilterSettings)
 
 
 class OrbitFilter:
@@ -76,13 +40,13 @@ class OrbitFilter:
         """`around` returns what surrounds the satellite at a time of the clock; None while not known."""
         self._settings = settings
         self._around = around
-        self._free = FreeFilter(settings.inertia, settings.free)
+        self._replay = StepReplay(settings)
+        self._free, self._steps = self._replay.free, self._replay.steps
         self._carried = CarriedOn(self._free)
         self._dipoles = DipoleHistory(settings.history_ns)
         self._open: OpenStep | None = None
-        self._steps: deque[Step] = deque()
         self._field_ns = 0
-        self._refused_gyros = self._refused_attitudes = 0
+        self._refused_attitudes = 0
         self.restarts = 0
 
     @property
@@ -103,7 +67,7 @@ class OrbitFilter:
     @property
     def doubts_commands(self) -> bool:
         """Whether the gyro contradicts the motion that the commanded dipoles make."""
-        return self._refused_gyros >= 2
+        return self._replay.refused_gyros >= 2
 
     @property
     def refused(self) -> int:
@@ -137,7 +101,7 @@ class OrbitFilter:
         first = next((k for k, step in enumerate(steps) if step.end_ns > since_ns), len(steps))
         for k in range(first, len(steps)):
             steps[k].doubt = self._settings.dipole_limit
-        self._take_again(first)
+        self._replay.take_again(first)
 
     def accept(self, reading: ImuReading) -> bool:
         """Accept a reading; return whether there is an estimate with which the gyro agrees."""
@@ -156,25 +120,18 @@ class OrbitFilter:
     def begin(self, attitude: AttitudeMeasurement) -> bool:
         """Start from an attitude; return False where no step was taken at its time."""
         self._close()
-        place = self._place(attitude.time_ns)
+        place = self._replay.place(attitude.time_ns)
         if place is None:
             return False
-        steps, first = self._steps, self._steps[place]
         self.restarts += self._free.started
-        self._free.start(attitude.quaternion, attitude.covariance, first.gyro)
-        for k in range(place + 1):
-            steps[k].before = None
-            steps[k].late.clear()
-        self._advance(first, attitude.time_ns, first.end_ns)
-        self._end(first)
-        self._take_on(place + 1)
+        self._replay.start(attitude, place)
         self._refused_attitudes = 0
         return True
 
     def measure_late(self, late: Sequence[Measurement], applied: Callable[[list[bool]], None]) -> None:
         """Apply measurements of past times; `applied` is called with which of them passed the gate."""
         self._close()
-        places = [self._place(m.time_ns) for m in late]
+        places = [self._replay.place(m.time_ns) for m in late]
         inside = [k for k in places if k is not None and self._steps[k].before is not None]
         taken: list[bool] = [False] * len(late)
         if inside:
@@ -182,7 +139,7 @@ class OrbitFilter:
             for m, k in zip(late, places, strict=True):
                 if k is not None and id(m) in known:
                     self._steps[k].late = sorted([*self._steps[k].late, m], key=lambda other: other.time_ns)
-            used = self._take_again(min(inside))
+            used = self._replay.take_again(min(inside))
             taken = [id(m) in used for m in late]
         applied(taken)
         for m, was in zip(late, taken, strict=True):
@@ -203,7 +160,7 @@ class OrbitFilter:
         """Return the estimate at a past time, None beyond the history."""
         if self._steps and time_ns >= self._steps[-1].end_ns:
             return self.at(time_ns) if time_ns <= self.measured_ns else None
-        place = self._place(time_ns)
+        place = self._replay.place(time_ns)
         if place is None:
             return None
         step = self._steps[place]
@@ -228,13 +185,6 @@ class OrbitFilter:
     def _acts(self) -> bool:
         return self._dipoles.at_rest_since() is None
 
-    def _place(self, time_ns: int) -> int | None:
-        """Return the number of the step that holds a time; None beyond the history."""
-        for k, step in enumerate(self._steps):
-            if step.begin_ns <= time_ns < step.end_ns:
-                return k
-        return None
-
     def _close(self) -> None:
         """End the step under way at the newest reading, and take it."""
         gathered = self._open
@@ -251,75 +201,7 @@ class OrbitFilter:
         if step.fields:
             step.field_span = min((end_ns - self._field_ns) / SECOND_NS, FIELD_MEMORY)
             self._field_ns = end_ns
-        self._steps.append(step)
-        while self._steps[0].end_ns < end_ns - self._settings.history_ns:
-            self._steps.popleft()
-        if self._free.started:
-            self._take_on(len(self._steps) - 1)
-
-    def _take_again(self, first: int) -> set[int]:
-        """Return to the beginning of step `first` and take it and the later ones; return what was used."""
-        while first < len(self._steps) and self._steps[first].before is None:
-            first += 1
-        if first == len(self._steps):
-            return set()
-        then = self._steps[first].before
-        assert then is not None
-        self._free.recall(then)
-        return self._take_on(first)
-
-    def _take_on(self, first: int) -> set[int]:
-        """Take the steps from number `first` on; return the identities of the late measurements used."""
-        used: set[int] = set()
-        for k in range(first, len(self._steps)):
-            step = self._steps[k]
-            step.before = self._free.memory()
-            time_ns = step.begin_ns
-            for measurement in step.late:
-                self._advance(step, time_ns, measurement.time_ns)
-                time_ns = measurement.time_ns
-                if self._apply(measurement, step):
-                    used.add(id(measurement))
-            self._advance(step, time_ns, step.end_ns)
-            self._end(step)
-        return used
-
-    def _advance(self, step: Step, from_ns: int, to_ns: int) -> None:
-        seconds = (to_ns - from_ns) / SECOND_NS
-        parts = math.ceil(seconds / _LONGEST)
-        for _ in range(parts):
-            self._free.advance(seconds / parts, step.dipole, step.around, step.doubt)
-
-    def _end(self, step: Step) -> None:
-        """Apply the gyro's and the magnetometer's means of a step, at its end."""
-        free, settings = self._free, self._settings
-        since = (step.end_ns - step.gyro_ns) / SECOND_NS
-        shown = attitude_matrix(free.quaternion) @ step.around.field
-        # The coils act for a part of the step: after its samples by `impulse`, not by the mean.
-        uneven = np.cross(step.impulse - since * step.dipole, shown)
-        change = since * free.acceleration + free.motion.inverse @ uneven
-        spread = settings.free.coil_error**2 * float(change @ change) + settings.gyro_noise**2 / step.samples
-        refused = not free.gyro(step.gyro, spread * _EYE, change)
-        self._refused_gyros = self._refused_gyros + 1 if refused else 0
-        if step.field is not None:
-            turn = free.rate * ((step.end_ns - step.field_ns) / SECOND_NS)
-            now = attitude_matrix(from_rotation_vector(turn)) @ step.field
-            model = settings.field_error**2 * 2.0 * FIELD_MEMORY / step.field_span
-            free.field(now, step.around.field, (settings.field_noise**2 / step.fields + model) * _EYE)
-
-    def _apply(self, measurement: Measurement, step: Step) -> bool:
-        """Apply a measurement to the estimate of its time; return whether it passed the gate."""
-        free = self._free
-        if isinstance(measurement, AttitudeMeasurement):
-            return free.attitude(measurement.quaternion, measurement.covariance)
-        if isinstance(measurement, MeanRateMeasurement):
-            since = 0.5 * (measurement.time_ns - measurement.since_ns) / SECOND_NS
-            return free.mean_rate(measurement.rate, measurement.covariance, since * free.acceleration)
-        if isinstance(measurement, DirectionMeasurement):
-            return free.direction(measurement.observed, measurement.reference, measurement.covariance)
-        if isinstance(measurement, FieldMeasurement):
-            return free.field(measurement.field, measurement.reference, measurement.covariance)
-        return free.gyro(measurement.rate, measurement.covariance)
+        self._replay.add(step)
 
     def _judge(self, attitude: AttitudeMeasurement, used: bool) -> None:
         """Begin again after too many attitudes that contradict the estimate."""

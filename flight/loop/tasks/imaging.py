@@ -137,14 +137,7 @@ class Imaging:
         found: FrameFound = result.value
         motion = found.motion
         self._last_checksum = motion.checksum
-        if motion.status is StreakStatus.FROZEN:
-            self._events.report(
-                events.CAMERA_FROZEN, now_ns, f"frame {frame.sequence} has the pixels of the last"
-            )
-        elif motion.status in {StreakStatus.BLACK, StreakStatus.SATURATED}:
-            self._events.report(
-                events.CAMERA_BLACK, now_ns, f"frame {frame.sequence} is {motion.status.value}"
-            )
+        self._look_at_light(frame, motion.status, now_ns)
         rate, attitude = self._measurer.mean_rate(frame, motion), self._measurer.attitude(frame, found)
         if is_strange(found.solution):
             rate = None  # its pixels are invalid
@@ -158,13 +151,22 @@ class Imaging:
             took = dict(zip(map(type, late), accepted, strict=True))
             self._report.rate(frame, motion, rate, now_ns, took.get(MeanRateMeasurement, False))
             if found.solution is not None:
-                taken = True if began else took.get(AttitudeMeasurement)
-                self._report.stars(frame, found.solution, attitude, now_ns, taken)
+                self._report.stars(
+                    frame, found.solution, attitude, now_ns, began or took.get(AttitudeMeasurement)
+                )
 
         if late:
             self._navigation.ingest_late(late, report)
         else:
             report([])
+
+    def _look_at_light(self, frame: Frame, status: StreakStatus, now_ns: int) -> None:
+        """Report a frame with the pixels of the last one, or without stars for lack or excess of light."""
+        if status is StreakStatus.FROZEN:
+            text = f"frame {frame.sequence} has the pixels of the last"
+            self._events.report(events.CAMERA_FROZEN, now_ns, text)
+        elif status in {StreakStatus.BLACK, StreakStatus.SATURATED}:
+            self._events.report(events.CAMERA_BLACK, now_ns, f"frame {frame.sequence} is {status.value}")
 
     def _look_at_worker(self, now_ns: int) -> None:
         """Report a slow worker while the frame is still in process."""

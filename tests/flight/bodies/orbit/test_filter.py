@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flight.bodies.orbit.filter import REFUSALS_TO_RESTART, OrbitFilter, OrbitFilterSettings
+from flight.bodies.orbit.filter import REFUSALS_TO_RESTART, OrbitFilter
+from flight.bodies.orbit.replay import OrbitFilterSettings
 from flight.bodies.orbit.steps import DipoleHistory
 from flight.gnc.earth.disturbance import Pressures
 from flight.gnc.estimation.estimate import RATE, TURN, Knowledge

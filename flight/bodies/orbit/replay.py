@@ -1,0 +1,157 @@
+"""The recent steps of a satellite's filter, taken one after another, and again for a late measurement."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from flight.bodies.orbit.steps import Step
+from flight.gnc.estimation.free_filter import FreeFilter, FreeFilterSettings
+from flight.gnc.estimation.measurements import (
+    AttitudeMeasurement,
+    DirectionMeasurement,
+    FieldMeasurement,
+    MeanRateMeasurement,
+    Measurement,
+)
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector
+from hal.interfaces.wires import SECOND_NS
+
+FIELD_MEMORY = 300.0
+"""s, for which the error of the field's model keeps its sign."""
+_LONGEST = 2.0
+_EYE: FloatArray = np.eye(3)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OrbitFilterSettings:
+    """The body, its sensors, and the steps.
+
+    Attributes:
+        inertia: (3, 3) kg m^2. dipole_per_ampere: m^2. dipole_limit: A m^2 of each coil.
+        gyro_noise: rad/s of an axis of a sample. field_noise: T, likewise.
+        field_error: T of an axis, of the field's model.
+        settle_ns: after the coils have come to rest, until the magnetometer is free of their field.
+        history_ns: how old a measurement may be.
+        step_ns: the longest step.
+    """
+
+    inertia: FloatArray
+    dipole_per_ampere: float
+    dipole_limit: float
+    gyro_noise: float
+    field_noise: float
+    field_error: float
+    settle_ns: int
+    history_ns: int
+    step_ns: int = SECOND_NS
+    free: FreeFilterSettings = field(default_factory=FreeFilterSettings)
+
+
+class StepReplay:
+    """Owns the filter and its recent steps, oldest first.
+
+    Attributes:
+        free: the estimate at the end of the newest step.
+        refused_gyros: how many steps in a row had a gyro that contradicts the motion.
+    """
+
+    def __init__(self, settings: OrbitFilterSettings) -> None:
+        self._settings = settings
+        self.free = FreeFilter(settings.inertia, settings.free)
+        self.steps: deque[Step] = deque()
+        self.refused_gyros = 0
+
+    def add(self, step: Step) -> None:
+        """Add the newest step and forget those beyond the history; take it if there is an estimate."""
+        self.steps.append(step)
+        while self.steps[0].end_ns < step.end_ns - self._settings.history_ns:
+            self.steps.popleft()
+        if self.free.started:
+            self.take_on(len(self.steps) - 1)
+
+    def start(self, attitude: AttitudeMeasurement, place: int) -> None:
+        """Start from an attitude in step number `place`; the estimates before it are forgotten."""
+        first = self.steps[place]
+        self.free.start(attitude.quaternion, attitude.covariance, first.gyro)
+        for k in range(place + 1):
+            self.steps[k].before = None
+            self.steps[k].late.clear()
+        self._advance(first, attitude.time_ns, first.end_ns)
+        self._end(first)
+        self.take_on(place + 1)
+
+    def place(self, time_ns: int) -> int | None:
+        """Return the number of the step that holds a time; None beyond the history."""
+        for k, step in enumerate(self.steps):
+            if step.begin_ns <= time_ns < step.end_ns:
+                return k
+        return None
+
+    def take_again(self, first: int) -> set[int]:
+        """Return to the beginning of step `first` and take it and the later ones; return what was used."""
+        while first < len(self.steps) and self.steps[first].before is None:
+            first += 1
+        if first == len(self.steps):
+            return set()
+        then = self.steps[first].before
+        assert then is not None
+        self.free.recall(then)
+        return self.take_on(first)
+
+    def take_on(self, first: int) -> set[int]:
+        """Take the steps from number `first` on; return the identities of the late measurements used."""
+        used: set[int] = set()
+        for k in range(first, len(self.steps)):
+            step = self.steps[k]
+            step.before = self.free.memory()
+            time_ns = step.begin_ns
+            for measurement in step.late:
+                self._advance(step, time_ns, measurement.time_ns)
+                time_ns = measurement.time_ns
+                if self._apply(measurement, step):
+                    used.add(id(measurement))
+            self._advance(step, time_ns, step.end_ns)
+            self._end(step)
+        return used
+
+    def _advance(self, step: Step, from_ns: int, to_ns: int) -> None:
+        seconds = (to_ns - from_ns) / SECOND_NS
+        parts = math.ceil(seconds / _LONGEST)
+        for _ in range(parts):
+            self.free.advance(seconds / parts, step.dipole, step.around, step.doubt)
+
+    def _end(self, step: Step) -> None:
+        """Apply the gyro's and the magnetometer's means of a step, at its end."""
+        free, settings = self.free, self._settings
+        since = (step.end_ns - step.gyro_ns) / SECOND_NS
+        shown = attitude_matrix(free.quaternion) @ step.around.field
+        # The coils act for a part of the step: after its samples by `impulse`, not by the mean.
+        uneven = np.cross(step.impulse - since * step.dipole, shown)
+        change = since * free.acceleration + free.motion.inverse @ uneven
+        spread = settings.free.coil_error**2 * float(change @ change) + settings.gyro_noise**2 / step.samples
+        refused = not free.gyro(step.gyro, spread * _EYE, change)
+        self.refused_gyros = self.refused_gyros + 1 if refused else 0
+        if step.field is not None:
+            turn = free.rate * ((step.end_ns - step.field_ns) / SECOND_NS)
+            now = attitude_matrix(from_rotation_vector(turn)) @ step.field
+            model = settings.field_error**2 * 2.0 * FIELD_MEMORY / step.field_span
+            free.field(now, step.around.field, (settings.field_noise**2 / step.fields + model) * _EYE)
+
+    def _apply(self, measurement: Measurement, step: Step) -> bool:
+        """Apply a measurement to the estimate of its time; return whether it passed the gate."""
+        free = self.free
+        if isinstance(measurement, AttitudeMeasurement):
+            return free.attitude(measurement.quaternion, measurement.covariance)
+        if isinstance(measurement, MeanRateMeasurement):
+            since = 0.5 * (measurement.time_ns - measurement.since_ns) / SECOND_NS
+            return free.mean_rate(measurement.rate, measurement.covariance, since * free.acceleration)
+        if isinstance(measurement, DirectionMeasurement):
+            return free.direction(measurement.observed, measurement.reference, measurement.covariance)
+        if isinstance(measurement, FieldMeasurement):
+            return free.field(measurement.field, measurement.reference, measurement.covariance)
+        return free.gyro(measurement.rate, measurement.covariance)
