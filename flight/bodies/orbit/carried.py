@@ -8,13 +8,14 @@ from flight.gnc.estimation import estimate as form
 from flight.gnc.estimation import free_motion as states
 from flight.gnc.estimation.estimate import FIELD_BIAS, Estimate
 from flight.gnc.estimation.free_filter import FreeFilter, FreeMemory
-from flight.gnc.estimation.free_motion import Around
+from flight.gnc.estimation.free_motion import Around, crossed
 from flight.gnc.estimation.rigid_body import Parameters
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector, multiply
 
 _FROM = np.r_[states.TURN, states.RATE, states.GYRO, states.MAGNET]
 _TO = np.r_[form.TURN, form.RATE, form.BIAS, form.FIELD_BIAS]
+_PICKED, _PLACED = np.ix_(_FROM, _FROM), np.ix_(_TO, _TO)
 _SIZE = FIELD_BIAS.stop
 _PARAMETERS = Parameters()
 
@@ -54,10 +55,10 @@ class CarriedOn:
         quaternion, rate, bias, magnet, covariance = parts
         field = attitude_matrix(quaternion) @ around.field
         whole = dipole + self._free.residual_dipole(around.sunlit)
-        acceleration = self._free.motion.acceleration(rate, np.cross(whole, field))
+        acceleration = self._free.motion.acceleration(rate, crossed(whole) @ field)
         turn = seconds * (rate + 0.5 * seconds * acceleration)
         spread = np.zeros((_SIZE, _SIZE))
-        spread[np.ix_(_TO, _TO)] = covariance[np.ix_(_FROM, _FROM)]
+        spread[_PLACED] = covariance[_PICKED]
         mixed = seconds * spread[form.TURN, form.RATE]
         grown = seconds * self._free.rate_noise(dipole, around)
         spread[form.TURN, form.TURN] += mixed + mixed.T

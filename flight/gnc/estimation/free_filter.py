@@ -137,7 +137,8 @@ class FreeFilter:
         """How well the attitude is known."""
         if not self.started:
             return Knowledge.LOST
-        sigma = math.sqrt(float(np.diag(self.covariance)[TURN].max()))
+        covariance = self.covariance
+        sigma = math.sqrt(max(covariance[0, 0], covariance[1, 1], covariance[2, 2]))
         if sigma > self._settings.coarse:
             return Knowledge.LOST
         return Knowledge.FINE if sigma <= self._settings.fine else Knowledge.COARSE
@@ -248,10 +249,10 @@ class FreeFilter:
 
     def rate_noise(self, dipole: FloatArray, around: Around, doubt: float = 0.0) -> FloatArray:
         """Return the density (3, 3) rad^2/s^3 of the acceleration's noise under the coils' dipole (3,)."""
-        s, inverse = self._settings, self.motion.inverse
+        s = self._settings
         unknown = s.coil_error**2 * float(dipole @ dipole) + doubt**2
         coils = 20.0 * unknown * float(around.field @ around.field)
-        return np.asarray((s.torque_noise**2 + coils) * (inverse @ inverse))
+        return np.asarray((s.torque_noise**2 + coils) * self.motion.by_torque)
 
     def _add_noise(self, dt: float, dipole: FloatArray, around: Around, doubt: float) -> None:
         s = self._settings

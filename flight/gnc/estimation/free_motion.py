@@ -42,10 +42,12 @@ class FreeMotion:
         """`inertia` (3, 3) kg m^2, body axes."""
         self.inertia = np.asarray(inertia, dtype=float)
         self.inverse: FloatArray = np.linalg.inv(self.inertia)
+        self.by_torque: FloatArray = self.inverse @ self.inverse
+        """(3, 3), the covariance of the acceleration by a variance of the torque."""
 
     def acceleration(self, rate: FloatArray, torque: FloatArray) -> FloatArray:
         """Return the angular acceleration (3,) rad/s^2 at a rate (3,) rad/s under a torque (3,) N m."""
-        return np.asarray(self.inverse @ (torque - np.cross(rate, self.inertia @ rate)))
+        return np.asarray(self.inverse @ (torque - crossed(rate) @ (self.inertia @ rate)))
 
     def stiffness(self, rate: FloatArray) -> FloatArray:
         """Return the derivative (3, 3) of the acceleration by the rate (3,) rad/s."""
