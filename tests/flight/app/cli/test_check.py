@@ -145,6 +145,7 @@ def test_the_devices_of_an_orbit_are_looked_for_too(unit: Path, tmp_path: Path) 
             del tree["simulation"]
             path = tmp_path / "orbit.yaml"
             changes = {
+                "camera": "none",
                 "gps": {"device": str(device)},
                 "solar_strings": {"strings": strings},
                 "wide_cameras": [{"device": {"kind": "v4l2", "path": str(tmp_path / "none")}}],
