@@ -11,6 +11,7 @@ import numpy as np
 
 from flight.gnc.errors import UsageError
 from flight.gnc.estimation.estimate import Estimate
+from flight.gnc.guidance.three_axes.pointing_target import PointingTarget
 from flight.gnc.math.arrays import FloatArray
 from flight.link.modes import STEERING, Mode
 from flight.loop.control_output import CoilCommand, Target
@@ -70,7 +71,7 @@ class Unsteered:
         """Raise UsageError: there are no targets."""
         raise UsageError("this body is not steered: it has no targets")
 
-    def slew(self, wanted: float, number: int, now_ns: int) -> Target:
+    def commanded(self, wanted: float | PointingTarget, number: int) -> Target:
         """Raise UsageError: there are no targets."""
         raise UsageError("this body is not steered: it has no targets")
 
