@@ -65,6 +65,8 @@ class ModeSettings:
 class ModeControl:
     """Owns the state machine, and the targets that are not configured.
 
+    Longer than 200 lines because commands, reactions and achievements all act on the one mode and its target.
+
     Attributes:
         restart: why the process should be restarted; empty when it should not.
         wanted: the target of a hold, a slew, the Sun, or a command to point; None in other modes.
