@@ -32,10 +32,11 @@ from flight.bodies.testbed.feed import UnitFeed
 from flight.bodies.testbed.plant_model import angular_acceleration_psd_of, plant_of
 from flight.gnc.estimation.estimate import Estimate
 from flight.gnc.estimation.measurements import MeanRateMeasurement
+from flight.gnc.guidance.three_axes.pointing_target import PointingTarget
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import about_axis_y, attitude_matrix, conjugate, multiply, to_rotation_vector
 from flight.link import events
-from flight.link.modes import Mode
+from flight.link.modes import ORBITAL, Mode
 from flight.loop.body import Body, BodyKind
 from flight.loop.control_output import COMMANDED, KEPT, CoilCommand, ControlOutput, Target
 from flight.loop.executive.jobs import JobResult
@@ -195,8 +196,9 @@ class Attitudes:
         """Return the configured target in force."""
         return self._steps[max(sum(time <= mission_time_ns for time in self._times) - 1, 0)]
 
-    def slew(self, wanted: float, number: int, now_ns: int) -> Target:
+    def commanded(self, wanted: float | PointingTarget, number: int) -> Target:
         """Return the target of a commanded slew."""
+        assert not isinstance(wanted, PointingTarget), "this body has no mode POINT"
         return Target(COMMANDED + number, _about_thread(wanted))
 
     def hold_here(self, estimate: Estimate, now_ns: int) -> Target:
@@ -268,7 +270,7 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
     tracker = CrossProductTracker(config, surrounding_field(config))
     direct = Direct()
     return Body(
-        modes=frozenset(Mode) - {Mode.ACQUIRE},
+        modes=frozenset(Mode) - ORBITAL,
         filter=filter_,
         learned_problems=problems,
         paths=direct,

@@ -22,6 +22,10 @@ class Mode(IntEnum):
     """Flies the configured steps."""
     ACQUIRE = 6
     """Coils at zero: the body turns slowly, and its attitude is not known yet."""
+    SUN = 7
+    """Points to the Sun."""
+    POINT = 8
+    """Points to the targets of the configuration, or to a commanded one."""
 
     @property
     def label(self) -> str:
@@ -37,8 +41,14 @@ class Mode(IntEnum):
         raise ValueError(f"{label!r} is no mode: {', '.join(mode.label for mode in cls)}")
 
 
-COMMANDABLE = (Mode.SAFE, Mode.DETUMBLE, Mode.HOLD, Mode.SLEW, Mode.TESTBED_DEMO)
+COMMANDABLE = (Mode.SAFE, Mode.DETUMBLE, Mode.HOLD, Mode.SLEW, Mode.TESTBED_DEMO, Mode.SUN, Mode.POINT)
 """The modes that can be commanded; BOOT ends by itself, and detumbling leads to ACQUIRE."""
 
-STEERING = frozenset({Mode.HOLD, Mode.SLEW, Mode.TESTBED_DEMO})
+POINTING = frozenset({Mode.SUN, Mode.POINT})
+"""The modes of a satellite that knows its attitude."""
+
+ORBITAL = POINTING | {Mode.ACQUIRE}
+"""The modes of a body that must acquire its attitude."""
+
+STEERING = POINTING | {Mode.HOLD, Mode.SLEW, Mode.TESTBED_DEMO}
 """The modes in which planner and controller turn the body."""

@@ -13,6 +13,7 @@ from typing import Any, Protocol
 
 from flight.gnc.estimation.estimate import Estimate, Knowledge
 from flight.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement, Measurement
+from flight.gnc.guidance.three_axes.pointing_target import PointingTarget
 from flight.gnc.math.arrays import FloatArray, IntArray
 from flight.link.modes import Mode
 from flight.loop.control_output import CoilCommand, ControlOutput, Target
@@ -164,8 +165,8 @@ class Targets(Protocol):
     def configured(self, mission_time_ns: int) -> Target:
         """Return the configured target in force at a mission time."""
 
-    def slew(self, wanted: float, number: int, now_ns: int) -> Target:
-        """Return the target of a commanded slew. Raises UsageError if it cannot be flown."""
+    def commanded(self, wanted: float | PointingTarget, number: int) -> Target:
+        """Return the target of a command, in this body's form. Raises UsageError if it cannot be flown."""
 
     def hold_here(self, estimate: Estimate, now_ns: int) -> Target:
         """Hold the present attitude, as near as the body can; return it as a target."""

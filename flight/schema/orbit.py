@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+import math
+from typing import Annotated, Literal
 
 from msgspec import Meta
 
+from flight.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 from flight.schema.errors import ConfigError
+from flight.schema.orbit_devices import Normal
 from flight.schema.sections import Config, Detumble, Estimation
-from flight.schema.values import NotNegative, Positive, Section
+from flight.schema.values import NotNegative, Positive, Quaternion, Section
 
 LEAST_FIELD, LARGEST_FIELD = 5e-6, 2e-4
 """T: the Earth's field in a low orbit is 1.5e-5 to 6.5e-5; acting coils add or take as much."""
@@ -52,6 +55,44 @@ class OrbitEstimation(Estimation, frozen=True, kw_only=True):
     history: Positive = 12.0
 
 
+class PointingSection(Section, frozen=True, kw_only=True):
+    """How a satellite points (`flight.gnc.control.three_axes`).
+
+    `axis` of the body points; a given roll is measured from `across`, normal to it. `turn` rad, `rate` rad/s
+    and `dipole` A m^2 are the errors and the dipole that cost the same. The coils act for `act` s between
+    pauses as long as those of detumbling. A plan is made again every `replan_period` s.
+    """
+
+    axis: Normal = (0.0, 0.0, 1.0)
+    across: Normal = (1.0, 0.0, 0.0)
+    turn: Positive = 0.0175
+    rate: Positive = 1.0
+    dipole: Positive = 1.0e-4
+    act: Annotated[float, Meta(ge=0.1, le=10.0)] = 1.8
+    replan_period: Annotated[float, Meta(ge=10.0, le=900.0)] = 300.0
+
+
+class TargetStep(Section, frozen=True, kw_only=True):
+    """From `at` s of mission time point to a goal; without `roll_deg` the roll is free.
+
+    `quaternion`, ICRS into body, scalar last, belongs to `inertial`; latitude and longitude to `ground`.
+    """
+
+    at: NotNegative
+    point: Literal["nadir", "velocity", "sun", "inertial", "ground"]
+    quaternion: Quaternion | None = None
+    latitude_deg: Annotated[float, Meta(ge=-90.0, le=90.0)] | None = None
+    longitude_deg: Annotated[float, Meta(ge=-360.0, le=360.0)] | None = None
+    roll_deg: Annotated[float, Meta(ge=-360.0, le=360.0)] | None = None
+
+    def target(self) -> PointingTarget:
+        """Return the target. Raises UsageError for values that do not belong to the goal, or lack."""
+        place = (self.latitude_deg, self.longitude_deg)
+        numbers = tuple(math.radians(value) for value in place if value is not None)
+        roll = None if self.roll_deg is None else math.radians(self.roll_deg)
+        return PointingTarget(Goal.named(self.point), (*numbers, *(self.quaternion or ())), roll)
+
+
 class OrbitConfig(Config, frozen=True, kw_only=True):
     """The configuration of a satellite in orbit; `elements` are the two lines of its orbit, where known."""
 
@@ -59,10 +100,16 @@ class OrbitConfig(Config, frozen=True, kw_only=True):
     elements: tuple[str, str] | None = None
     estimation: OrbitEstimation = OrbitEstimation()
     detumble: FieldDetumble = FieldDetumble()
+    pointing: PointingSection = PointingSection()
+    targets: Annotated[tuple[TargetStep, ...], Meta(min_length=1)] = (TargetStep(at=0.0, point="nadir"),)
 
     def field_range(self) -> tuple[float, float]:
         """Return the smallest and the largest strength of a valid magnetometer reading, T."""
         return LEAST_FIELD, LARGEST_FIELD
+
+    def replan_period(self) -> float:
+        """Return how often the pointing is planned again, s."""
+        return self.pointing.replan_period
 
     def hardware(self) -> tuple[Section, ...]:
         """Return the sections of body and devices for which learned parameters hold."""

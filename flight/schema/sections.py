@@ -7,14 +7,14 @@ SI units unless the name says otherwise.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Self
 
 import msgspec
 from msgspec import Meta
 
 from flight.schema.devices import Camera, Coils, InertialUnit, PowerMonitor
 from flight.schema.orbit_devices import Gps, SolarStrings, WideCamera
-from flight.schema.values import Q2, NotNegative, Peer, PlainMode, Positive, Section
+from flight.schema.values import Q2, CommandedMode, NotNegative, Peer, PlainMode, Positive, Section
 
 
 class Executive(Section, frozen=True, kw_only=True):
@@ -56,6 +56,8 @@ class Modes(Section, frozen=True, kw_only=True):
     it is late after `slew_limit` s. A hold is impossible that is `hold_error` rad off for `hold_patience` s;
     a target of the demonstration is to be held from the end of the first path to it on. A body turns too fast
     to hold or slew beyond `tumble_rate` rad/s. Without an estimate for `blind_limit` s the mode is safe.
+    A body that acquires its attitude goes on to `acquired` once the attitude has been known for `known_for`
+    s, and acquires the attitude again after `lost_for` s without it.
     """
 
     initial: PlainMode = "testbed-demo"
@@ -70,6 +72,9 @@ class Modes(Section, frozen=True, kw_only=True):
     hold_patience: Positive = 15.0
     tumble_rate: Positive = 0.5
     blind_limit: Positive = 60.0
+    acquired: Literal["point", "sun", "acquire"] = "point"
+    known_for: Positive = 5.0
+    lost_for: Positive = 10.0
 
 
 class Detumble(Section, frozen=True, kw_only=True):
@@ -109,7 +114,7 @@ class CommandStep(Section, frozen=True, kw_only=True):
     """One command of a time line: at `at` s of mission time a mode, a slew to q2, or an event to clear."""
 
     at: NotNegative
-    mode: PlainMode | None = None
+    mode: CommandedMode | None = None
     slew: Q2 | None = None
     clear: Annotated[str, Meta(min_length=1, max_length=32)] | None = None
 

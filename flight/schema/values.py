@@ -31,6 +31,7 @@ Channel = Annotated[int, Meta(ge=0, le=15)]
 Estimator = Literal["likelihood", "harris", "minimum-eigenvalue", "trajkovic-4", "trajkovic-8"]
 Quaternion = tuple[float, float, float, float]
 PlainMode = Literal["testbed-demo", "hold", "detumble", "safe"]
+CommandedMode = Literal[PlainMode, "sun", "point"]
 
 
 class Section(msgspec.Struct, forbid_unknown_fields=True, frozen=True):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import socket
 import sys
@@ -12,7 +13,17 @@ from pathlib import Path
 
 from flight.app.utc_label import utc_ns
 from flight.gnc.errors import FlightError, UsageError
-from flight.link.commands.codec import ChangeMode, Clear, Command, CommandError, CommandPacker, Ping, Slew
+from flight.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from flight.link.commands.codec import (
+    ChangeMode,
+    Clear,
+    Command,
+    CommandError,
+    CommandPacker,
+    Ping,
+    Point,
+    Slew,
+)
 from flight.link.modes import COMMANDABLE, Mode
 from flight.link.telemetry.definitions import COMMAND
 from flight.link.telemetry.packets import LONGEST_PACKET, TelemetryError, to_text
@@ -44,7 +55,18 @@ def configure(parser: argparse.ArgumentParser) -> None:
     slew.add_argument("q2", type=float, help="commanded final q2, within +-0.68")
     clear = words.add_parser("clear", help="clear a latched event")
     clear.add_argument("event", help="its name, as in the log")
+    _configure_point(words.add_parser("point", help="point a satellite to a goal"))
     parser.set_defaults(command=command)
+
+
+def _configure_point(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Point to nadir, velocity or sun; to inertial QX QY QZ QW, an attitude ICRS into body, scalar last; "
+        "or to ground LAT LON, degrees."
+    )
+    parser.add_argument("goal", choices=[goal.label for goal in Goal])
+    parser.add_argument("numbers", type=float, nargs="*", metavar="NUMBER", help="of inertial and ground")
+    parser.add_argument("--roll", type=float, metavar="DEG", help="about the pointing axis (default free)")
 
 
 def command(options: argparse.Namespace) -> int:
@@ -120,5 +142,14 @@ def _command_of(options: argparse.Namespace) -> Command:
             return ChangeMode(Mode.named(options.mode))
         case "slew":
             return Slew(options.q2)
+        case "point":
+            return Point(_target_of(options))
         case _:
             return Clear(options.event)
+
+
+def _target_of(options: argparse.Namespace) -> PointingTarget:
+    """Return the target of the words of `point`. Raises UsageError."""
+    goal = Goal.named(options.goal)
+    numbers = options.numbers if goal is not Goal.GROUND else map(math.radians, options.numbers)
+    return PointingTarget(goal, tuple(numbers), None if options.roll is None else math.radians(options.roll))

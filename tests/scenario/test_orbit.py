@@ -131,6 +131,11 @@ def test_tools_of_the_testbed_refuse_it_with_file_and_line() -> None:
         configuration.load_testbed(ORBIT)
 
 
-def test_a_fault_of_the_planner_is_refused_because_no_path_is_planned() -> None:
+def test_a_fault_of_the_planner_is_refused_only_where_no_path_is_planned(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    config, fault = orbit_config(5.0), (FaultEntry(fault="planner: nan"),)
+    check(fault, config, realtime=False)
+    monkeypatch.setattr(OrbitConfig, "replan_period", lambda _: None)
     with pytest.raises(UsageError, match="no planner flies here: the body plans no paths"):
-        check((FaultEntry(fault="planner: nan"),), orbit_config(5.0), realtime=False)
+        check(fault, config, realtime=False)

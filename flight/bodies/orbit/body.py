@@ -1,6 +1,6 @@
 """A satellite in orbit with three coils. `ORBIT` builds it from the configuration.
 
-This body detumbles and rests; it is not steered to attitudes yet, and its modes say so.
+It detumbles by its magnetometer, acquires its attitude with its coils at rest, and points.
 """
 
 from __future__ import annotations
@@ -12,23 +12,32 @@ import numpy as np
 from flight.bodies.orbit.brake import FieldBrake
 from flight.bodies.orbit.feed import OrbitFeed
 from flight.bodies.orbit.filter import OrbitFilter
+from flight.bodies.orbit.paths import PointingPaths
+from flight.bodies.orbit.planning import PlannedCraft, PointingPlanner
 from flight.bodies.orbit.replay import OrbitFilterSettings
 from flight.bodies.orbit.surroundings import Surroundings
+from flight.bodies.orbit.targets import PointingTargets
+from flight.bodies.orbit.tracker import PointingTracker
 from flight.bodies.orbit.view import OrbitView
 from flight.gnc.control.detumble import WindowSchedule
+from flight.gnc.control.three_axes import pointing_job
 from flight.gnc.control.three_axes.field_detumbler import FieldBraking, FieldDetumbler
+from flight.gnc.control.three_axes.pointing_table import PointingWeights
 from flight.gnc.earth.orbit_knowledge import TwoLineElements
 from flight.gnc.errors import UsageError
 from flight.gnc.estimation.estimate import Estimate
 from flight.gnc.estimation.field_rate import FieldRateSettings
 from flight.gnc.estimation.free_filter import FreeFilterSettings
+from flight.gnc.guidance.three_axes.pointing_target import PointingTarget
+from flight.gnc.guidance.three_axes.target_law import BodyAxes
 from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import attitude_matrix
+from flight.link.modes import Mode
 from flight.loop.body import Body, BodyKind
 from flight.loop.fdir.coils.response import ResponseSettings
 from flight.loop.fdir.coils.watch import CoilWatch, CoilWatchSettings
 from flight.loop.services import Services
 from flight.loop.state.content import Learned
-from flight.loop.unsteered import MODES, Unsteered
 from flight.schema.errors import ConfigError
 from flight.schema.orbit import OrbitConfig, as_orbit
 from flight.schema.sections import Config
@@ -41,20 +50,21 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
     surroundings = Surroundings(_elements(config), services.clock)
     filter_ = _filter(config, surroundings)
     brake = FieldBrake(_detumbler(config), config.craft.dipole_per_ampere)
-    unsteered = Unsteered()
+    paths, pauses, limit = PointingPaths(_limit(config)), _pauses(config), _limit(config)
+    inertia, dipole_per_ampere = np.diag(config.craft.inertia), config.craft.dipole_per_ampere
 
     def field(estimate: Estimate) -> FloatArray:
-        found = brake.field(estimate.time_ns)
-        return np.zeros(3) if found is None else found
+        around = surroundings.at(estimate.time_ns)
+        return np.zeros(3) if around is None else attitude_matrix(estimate.quaternion) @ around.field
 
     return Body(
-        modes=MODES,
+        modes=frozenset(Mode) - {Mode.HOLD, Mode.SLEW, Mode.TESTBED_DEMO},
         filter=filter_,
         learned_problems=[],
-        paths=unsteered,
-        planner=unsteered,
-        targets=unsteered,
-        tracker=unsteered,
+        paths=paths,
+        planner=PointingPlanner(_planned(config), paths, surroundings, services),
+        targets=PointingTargets(_timed(config), paths),
+        tracker=PointingTracker(filter_, surroundings, pauses, limit, dipole_per_ampere, inertia),
         feed=OrbitFeed(filter_),
         brake=brake,
         coil_watch=_coil_watch(config),
@@ -69,7 +79,29 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
     )
 
 
-ORBIT = BodyKind(None, make)
+ORBIT = BodyKind(pointing_job.run, make)
+
+
+def _limit(config: OrbitConfig) -> float:
+    """Return the largest dipole of a coil, A m^2."""
+    return config.coils.current_limit * config.craft.dipole_per_ampere
+
+
+def _pauses(config: OrbitConfig) -> WindowSchedule:
+    """Return the windows of pointing: the pauses of detumbling, and longer times to act."""
+    settle, measure, act = config.detumble.settle, config.detumble.measure, config.pointing.act
+    return WindowSchedule(*(round(seconds * SECOND_NS) for seconds in (settle, measure, act)))
+
+
+def _planned(config: OrbitConfig) -> PlannedCraft:
+    section = config.pointing
+    axes = BodyAxes(np.array(section.axis), np.array(section.across))
+    weights = PointingWeights(turn=section.turn, rate=section.rate, dipole=section.dipole)
+    return PlannedCraft(np.diag(config.craft.inertia), axes, weights)
+
+
+def _timed(config: OrbitConfig) -> list[tuple[float, PointingTarget]]:
+    return [(step.at, step.target()) for step in config.targets]
 
 
 def _filter(config: OrbitConfig, surroundings: Surroundings) -> OrbitFilter:
@@ -106,8 +138,7 @@ def _detumbler(config: OrbitConfig) -> FieldDetumbler:
     settings = FieldRateSettings(
         inertia=np.diag(craft.inertia), field_sigma=section.field_noise, torque_walk=section.torque_noise
     )
-    limit = config.coils.current_limit * craft.dipole_per_ampere
-    braking = FieldBraking(limit=limit, horizon=section.horizon, replan=section.replan)
+    braking = FieldBraking(limit=_limit(config), horizon=section.horizon, replan=section.replan)
     return FieldDetumbler(WindowSchedule(settle_ns, measure_ns, act_ns), braking, settings)
 
 

@@ -82,7 +82,8 @@ class OrbitView:
         )
 
     def announce(self, target: Target, now_ns: int) -> None:
-        """Record nothing: there are no targets."""
+        """Report a new target as an event."""
+        self._events.report(events.TARGET, now_ns, target.law.text)
 
     def mode_fields(self, wanted: Target | None) -> Mapping[str, float]:
         """Return the body's fields of the mode packet."""

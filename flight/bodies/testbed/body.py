@@ -29,7 +29,7 @@ from flight.gnc.guidance.one_axis.plant import SingleAxisPlant
 from flight.gnc.guidance.one_axis.vmc import NODES
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import about_axis_y, attitude_matrix
-from flight.link.modes import Mode
+from flight.link.modes import ORBITAL, Mode
 from flight.loop.body import Body, BodyKind
 from flight.loop.fdir.coils.response import ResponseSettings
 from flight.loop.fdir.coils.watch import CoilWatch, CoilWatchSettings
@@ -64,7 +64,7 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
         return np.asarray(attitude_matrix(about_axis_y(angle)) @ reference_field)
 
     return Body(
-        modes=frozenset(Mode) - {Mode.ACQUIRE},
+        modes=frozenset(Mode) - ORBITAL,
         filter=filter_,
         learned_problems=problems,
         paths=guidance,

@@ -15,6 +15,7 @@ from flight.gnc.estimation.estimate import Estimate
 from flight.gnc.guidance.one_axis.guidance import Guidance
 from flight.gnc.guidance.one_axis.limits import Q2_LIMIT
 from flight.gnc.guidance.one_axis.plant import angle_of
+from flight.gnc.guidance.three_axes.pointing_target import PointingTarget
 from flight.loop.control_output import COMMANDED, KEPT, Target
 
 
@@ -44,8 +45,10 @@ class ThreadTargets:
         """Return the configured target in force at a mission time."""
         return self._steps[max(bisect.bisect_right(self._times, mission_time_ns) - 1, 0)]
 
-    def slew(self, wanted: float, number: int, now_ns: int) -> Target:
+    def commanded(self, wanted: float | PointingTarget, number: int) -> Target:
         """Return the target of slew `number` to q2 `wanted`. Raises UsageError beyond the limit."""
+        if isinstance(wanted, PointingTarget):
+            raise UsageError("the testbed goes to a q2, not to a direction")
         if not abs(wanted) <= Q2_LIMIT:  # NaN compares false
             raise UsageError(f"q2 {wanted} is not within +-{Q2_LIMIT}")
         return Target(COMMANDED + number, ThreadLaw(wanted))

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from flight.gnc.errors import FlightError
+from flight.gnc.errors import FlightError, UsageError
 from flight.gnc.guidance.one_axis.limits import Q2_LIMIT
-from flight.link.commands.definitions import CLEAR, LAYOUTS, MODE, PING, SAFE, SLEW
+from flight.gnc.guidance.three_axes.pointing_target import NUMBERS, Goal, PointingTarget
+from flight.link.commands.definitions import CLEAR, LAYOUTS, MODE, PING, POINT, SAFE, SLEW
 from flight.link.modes import COMMANDABLE, Mode
 from flight.link.telemetry.packets import HEADER_BYTES, Packer, TelemetryError, crc16, to_text
 
@@ -50,7 +51,14 @@ class Clear:
     event: str
 
 
-Command = Ping | ChangeMode | Slew | Clear
+@dataclass(frozen=True, slots=True)
+class Point:
+    """Point to a goal."""
+
+    target: PointingTarget
+
+
+Command = Ping | ChangeMode | Slew | Clear | Point
 
 
 def name_of(command: Command) -> str:
@@ -64,6 +72,8 @@ def name_of(command: Command) -> str:
             return SLEW.name
         case Clear():
             return CLEAR.name
+        case Point():
+            return POINT.name
 
 
 def check(command: Command) -> None:
@@ -99,6 +109,8 @@ class CommandPacker:
                     return self._packer.pack(SLEW, utc_ns, q2=q2)
                 case Clear(event):
                     return self._packer.pack(CLEAR, utc_ns, event=event)
+                case Point(target):
+                    return self._packer.pack(POINT, utc_ns, **_fields(target))
         except TelemetryError as error:
             raise CommandError(str(error)) from error
 
@@ -128,6 +140,8 @@ def unpack(data: bytes) -> Command:
             command = ChangeMode(_mode(int(row["mode"])))
         case SLEW.name:
             command = Slew(float(row["q2"]))
+        case POINT.name:
+            command = Point(_target(int(row["goal"]), row["numbers"].tolist(), float(row["roll"])))
         case _:
             command = Clear(to_text(row["event"]))
     check(command)
@@ -145,6 +159,8 @@ def describe(command: Command) -> str:
             return f"slew to q2 {q2:+.4f}" if math.isfinite(q2) else "slew"
         case Clear(event):
             return f"clear {event}"
+        case Point(target):
+            return f"point {target.text}"
 
 
 def _mode(number: int) -> Mode:
@@ -152,3 +168,25 @@ def _mode(number: int) -> Mode:
         return Mode(number)
     except ValueError:
         raise CommandError(f"{number} is no mode") from None
+
+
+def _fields(target: PointingTarget) -> dict[str, object]:
+    spare = 4 - len(target.numbers)
+    return {
+        "goal": int(target.goal),
+        "numbers": [*target.numbers, *[math.nan] * spare],
+        "roll": math.nan if target.roll is None else target.roll,
+    }
+
+
+def _target(number: int, numbers: list[float], roll: float) -> PointingTarget:
+    """Return the target of a packet's fields. Raises CommandError; a roll of NaN is free."""
+    try:
+        goal = Goal(number)
+    except ValueError:
+        raise CommandError(f"{number} is no goal") from None
+    try:
+        count = NUMBERS.get(goal, 0)
+        return PointingTarget(goal, tuple(numbers[:count]), None if math.isnan(roll) else roll)
+    except UsageError as error:
+        raise CommandError(str(error)) from error

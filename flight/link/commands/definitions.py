@@ -23,8 +23,16 @@ SLEW = _command(
     "slew", 0x204, "Go to an attitude, then hold it", Field("q2", "f8", "-", "commanded final q2, +-0.68")
 )
 CLEAR = _command("clear", 0x205, "Clear a latched event", Field("event", "S32", "-", "name of the event"))
+POINT = _command(
+    "point",
+    0x206,
+    "Point a satellite to a goal",
+    Field("goal", "u1", "-", "0 nadir, 1 velocity, 2 sun, 3 inertial, 4 ground"),
+    Field("numbers", "f8", "-", "inertial: quaternion, ICRS into body; ground: latitude, longitude, rad", 4),
+    Field("roll", "f8", "rad", "about the pointing axis, NaN: free"),
+)
 
-COMMANDS: tuple[Packet, ...] = (PING, SAFE, MODE, SLEW, CLEAR)
+COMMANDS: tuple[Packet, ...] = (PING, SAFE, MODE, SLEW, CLEAR, POINT)
 
 LAYOUTS: dict[str, Layout] = compile_layouts(COMMANDS)
 """Their bytes, by name."""

@@ -10,7 +10,7 @@ from enum import Enum
 
 from flight.gnc.errors import FlightError
 from flight.link.modes import Mode
-from flight.loop.modes.triggers import COMMANDS, SAFING, STARTS, Trigger
+from flight.loop.modes.triggers import COMMANDS, KNOWN, SAFING, STARTS, Trigger
 
 
 class Answer(Enum):
@@ -25,11 +25,25 @@ Table = Mapping[Mode, Row]
 
 _COMMANDED: Row = {trigger: mode for mode, trigger in COMMANDS.items()}
 _STARTED: Row = dict.fromkeys(STARTS.values(), Answer.STAY)
+_ACQUIRED: Row = dict.fromkeys((*KNOWN.values(), Trigger.LOST), Answer.STAY)
+_POINTING: Row = {  # a new target is approached from the present attitude
+    **_STARTED,
+    **_COMMANDED,
+    **_ACQUIRED,
+    Trigger.LOST: Mode.ACQUIRE,
+    Trigger.REACT_SAFE: Mode.SAFE,
+    Trigger.REACT_DETUMBLE: Mode.DETUMBLE,
+    Trigger.REACT_HOLD: Answer.STAY,
+    Trigger.DETUMBLED: Answer.STAY,
+    Trigger.SLOWED: Answer.STAY,
+    Trigger.ARRIVED: Answer.STAY,
+}
 
 TRANSITIONS: Table = {
     Mode.BOOT: {
         **{trigger: mode for mode, trigger in STARTS.items()},
         **dict.fromkeys(COMMANDS.values(), Answer.REFUSE),
+        **_ACQUIRED,
         Trigger.COMMAND_SAFE: Mode.SAFE,
         Trigger.REACT_SAFE: Mode.SAFE,
         Trigger.REACT_DETUMBLE: Answer.STAY,
@@ -38,9 +52,12 @@ TRANSITIONS: Table = {
         Trigger.SLOWED: Answer.STAY,
         Trigger.ARRIVED: Answer.STAY,
     },
-    Mode.SAFE: {  # left by command only
+    Mode.SAFE: {  # left by command only; the way to pointing leads through the acquisition
         **_STARTED,
         **_COMMANDED,
+        **_ACQUIRED,
+        Trigger.COMMAND_SUN: Mode.ACQUIRE,
+        Trigger.COMMAND_POINT: Mode.ACQUIRE,
         Trigger.COMMAND_SAFE: Answer.STAY,
         Trigger.REACT_SAFE: Answer.STAY,
         Trigger.REACT_DETUMBLE: Answer.STAY,
@@ -49,9 +66,12 @@ TRANSITIONS: Table = {
         Trigger.SLOWED: Answer.STAY,
         Trigger.ARRIVED: Answer.STAY,
     },
-    Mode.DETUMBLE: {
+    Mode.DETUMBLE: {  # commanded to point it does so once its rate is low and its attitude known
         **_STARTED,
         **_COMMANDED,
+        **_ACQUIRED,
+        Trigger.COMMAND_SUN: Answer.STAY,
+        Trigger.COMMAND_POINT: Answer.STAY,
         Trigger.COMMAND_DETUMBLE: Answer.STAY,
         Trigger.REACT_SAFE: Mode.SAFE,
         Trigger.REACT_DETUMBLE: Answer.STAY,
@@ -63,6 +83,7 @@ TRANSITIONS: Table = {
     Mode.HOLD: {  # commanded again it keeps the attitude of that moment
         **_STARTED,
         **_COMMANDED,
+        **_ACQUIRED,
         Trigger.REACT_SAFE: Mode.SAFE,
         Trigger.REACT_DETUMBLE: Mode.DETUMBLE,
         Trigger.REACT_HOLD: Answer.STAY,
@@ -73,6 +94,7 @@ TRANSITIONS: Table = {
     Mode.SLEW: {  # commanded again it goes to the new target
         **_STARTED,
         **_COMMANDED,
+        **_ACQUIRED,
         Trigger.REACT_SAFE: Mode.SAFE,
         Trigger.REACT_DETUMBLE: Mode.DETUMBLE,
         Trigger.REACT_HOLD: Mode.HOLD,
@@ -83,6 +105,7 @@ TRANSITIONS: Table = {
     Mode.TESTBED_DEMO: {  # without a plan it holds the attitude, and continues with the next plan
         **_STARTED,
         **_COMMANDED,
+        **_ACQUIRED,
         Trigger.COMMAND_DEMO: Answer.STAY,
         Trigger.REACT_SAFE: Mode.SAFE,
         Trigger.REACT_DETUMBLE: Mode.DETUMBLE,
@@ -94,6 +117,10 @@ TRANSITIONS: Table = {
     Mode.ACQUIRE: {
         **_STARTED,
         **_COMMANDED,
+        **_ACQUIRED,
+        **{trigger: mode for mode, trigger in KNOWN.items()},
+        Trigger.COMMAND_SUN: Answer.STAY,
+        Trigger.COMMAND_POINT: Answer.STAY,
         Trigger.REACT_SAFE: Mode.SAFE,
         Trigger.REACT_DETUMBLE: Mode.DETUMBLE,
         Trigger.REACT_HOLD: Answer.STAY,
@@ -101,6 +128,8 @@ TRANSITIONS: Table = {
         Trigger.SLOWED: Answer.STAY,
         Trigger.ARRIVED: Answer.STAY,
     },
+    Mode.SUN: {**_POINTING, Trigger.COMMAND_SUN: Answer.STAY},
+    Mode.POINT: _POINTING,
 }
 
 

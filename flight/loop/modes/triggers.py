@@ -19,12 +19,17 @@ class Trigger(Enum):
     COMMAND_HOLD = "commanded hold"
     COMMAND_SLEW = "commanded slew"
     COMMAND_DEMO = "commanded testbed-demo"
+    COMMAND_SUN = "commanded sun"
+    COMMAND_POINT = "commanded point"
     REACT_SAFE = "reaction safe"
     REACT_DETUMBLE = "reaction detumble"
     REACT_HOLD = "reaction hold"
     DETUMBLED = "rate is low"
     SLOWED = "rate is low, attitude unknown"
     ARRIVED = "arrived"
+    KNOWN_SUN = "attitude known, to the sun"
+    KNOWN_POINT = "attitude known"
+    LOST = "attitude lost"
 
 
 STARTS = {
@@ -41,8 +46,13 @@ COMMANDS = {
     Mode.HOLD: Trigger.COMMAND_HOLD,
     Mode.SLEW: Trigger.COMMAND_SLEW,
     Mode.TESTBED_DEMO: Trigger.COMMAND_DEMO,
+    Mode.SUN: Trigger.COMMAND_SUN,
+    Mode.POINT: Trigger.COMMAND_POINT,
 }
 """The trigger of a command for each mode; BOOT and ACQUIRE cannot be commanded."""
+
+KNOWN = {Mode.SUN: Trigger.KNOWN_SUN, Mode.POINT: Trigger.KNOWN_POINT}
+"""The trigger that ends the acquisition, for each mode that may follow."""
 
 SAFING = (Trigger.COMMAND_SAFE, Trigger.REACT_SAFE)
 """The triggers that must lead to SAFE from every mode."""

@@ -17,6 +17,7 @@ from flight.link.commands.codec import (
     Command,
     CommandError,
     Ping,
+    Point,
     Slew,
     describe,
     name_of,
@@ -116,6 +117,8 @@ class Commanding:
                 return self._modes.command(Mode.SLEW, now_ns, wanted)
             case Clear(event):
                 return self._clear(event, now_ns)
+            case Point(target):
+                return self._modes.command(Mode.POINT, now_ns, target)
 
     def _clear(self, event: str, now_ns: int) -> str:
         if not self._facts.clear(event):

@@ -119,7 +119,7 @@ class ControlCycle:
         steering = self._tasks.steering
         if mode in STEERING:
             return steering.run(estimate, now_ns, self._ever_started)
-        if mode is Mode.DETUMBLE:
+        if self._tasks.modes.brakes:
             return steering.brake(readings, self._tasks.navigation.is_heard(now_ns), now_ns)
         return steering.rest(now_ns)
 
@@ -127,7 +127,7 @@ class ControlCycle:
         """Set the target in force; announce a new target and request a path at once."""
         modes = self._tasks.modes
         mission_ns = now_ns - self._recorder.epoch_ns
-        target = self._body.targets.configured(mission_ns) if modes.flies_steps else modes.wanted
+        target = modes.target(mission_ns)
         if target is self._target:
             return
         self._target = target

@@ -11,9 +11,10 @@ from dataclasses import dataclass
 
 from flight.gnc.errors import UsageError
 from flight.gnc.estimation.estimate import Estimate
+from flight.gnc.guidance.three_axes.pointing_target import SUN, PointingTarget
 from flight.link import events
 from flight.link.events import EventKind, Reaction
-from flight.link.modes import STEERING, Mode
+from flight.link.modes import ORBITAL, POINTING, STEERING, Mode
 from flight.link.telemetry.definitions import MODE
 from flight.loop.body import Body
 from flight.loop.control_output import Target
@@ -24,6 +25,7 @@ from flight.loop.modes.machine import Change, ModeMachine
 from flight.loop.modes.table import TRANSITIONS, Answer
 from flight.loop.modes.triggers import COMMANDS, STARTS, Trigger
 from flight.loop.services import Services
+from flight.loop.tasks.attitude_watch import AttitudeWatch
 from flight.loop.tasks.pointing_watch import PointingWatch
 from flight.loop.tasks.steering import Steering
 from flight.schema.errors import ConfigError
@@ -61,11 +63,13 @@ class ModeSettings:
 
 
 class ModeControl:
-    """Owns the state machine, and the target of a hold or a slew.
+    """Owns the state machine, and the targets that are not configured.
+
+    Longer than 200 lines because commands, reactions and achievements all act on the one mode and its target.
 
     Attributes:
         restart: why the process should be restarted; empty when it should not.
-        wanted: the target of a hold or a slew, None in other modes.
+        wanted: the target of a hold, a slew, the Sun, or a command to point; None in other modes.
     """
 
     def __init__(self, settings: ModeSettings, body: Body, steering: Steering, services: Services) -> None:
@@ -96,8 +100,10 @@ class ModeControl:
         self._slow = HoldTimer(settings.low_for)
         self._arrived = HoldTimer(settings.modes.arrived_for)
         self._pointing = PointingWatch(settings.modes, body.targets, services.facts)
+        self._attitude = AttitudeWatch(settings.modes, settings.low_rate, settings.low_for)
         self.restart = ""
         self.wanted: Target | None = None
+        self._pointed: Target | None = None
         services.events.react_by(self.react)
 
     @property
@@ -115,6 +121,16 @@ class ModeControl:
         """Whether the configured steps are flown, or will be once the devices give good data."""
         booting = self.mode is Mode.BOOT and self._initial is Mode.TESTBED_DEMO
         return self.mode is Mode.TESTBED_DEMO or (booting and not self._too_many_crashes)
+
+    @property
+    def brakes(self) -> bool:
+        """Whether the body is to be braked: in DETUMBLE, and in SAFE while it spins."""
+        return self.mode is Mode.DETUMBLE or self._attitude.brakes
+
+    def target(self, mission_time_ns: int) -> Target | None:
+        """Return the target in force at a mission time; None in a mode without one."""
+        configured = self.flies_steps or (self.mode is Mode.POINT and self.wanted is None)
+        return self._targets.configured(mission_time_ns) if configured else self.wanted
 
     def begin(self, now_ns: int, unclean_recent: int) -> None:
         """Begin to boot; `unclean_recent` shutdowns shortly before were unclean."""
@@ -137,8 +153,8 @@ class ModeControl:
         `overdue` rad is the angle to where the demonstration should have brought the body by now, None while
         the body is on its way.
         """
-        # A body that is not steered needs no attitude: it sees while its rate is measured.
-        sees = estimate is not None if self._modes & STEERING else rate is not None
+        # A body that acquires its attitude can do without one: it sees while its rate is measured.
+        sees = rate is not None if Mode.ACQUIRE in self._modes else estimate is not None
         self._seen_ns = now_ns if sees else self._seen_ns
         if self.mode is Mode.BOOT:
             self._boot(sees and coils_answer, now_ns)
@@ -147,35 +163,48 @@ class ModeControl:
         self._facts.update(facts.BLIND, blind > self._settings.blind_limit, now_ns, text)
         if self.mode is Mode.DETUMBLE and rate is not None:
             self._brake(estimate, rate, now_ns)
-        elif self.mode is Mode.ACQUIRE and rate is not None:
+        elif self.mode in ORBITAL and rate is not None:
             self._pointing.watch_rate(rate, now_ns)
+        elif self.mode is Mode.SAFE and rate is not None and Mode.ACQUIRE in self._modes:
+            barred = bool(_barred(self._facts))
+            self._attitude.watch_spin(rate, barred, self._steering.begin_braking, now_ns)
+        if (trigger := self._attitude.trigger(self.mode, estimate is not None, now_ns)) is not None:
+            self._fire(trigger, "", now_ns)
         if estimate is not None and self.mode in {Mode.HOLD, Mode.SLEW}:
             self._keep(estimate, now_ns)
         elif estimate is not None and self.mode is Mode.TESTBED_DEMO:
             self._pointing.watch(estimate, overdue, now_ns)
         return self.mode
 
-    def command(self, mode: Mode, now_ns: int, slew: float | None = None) -> str:
-        """Execute a command; return why it is refused, empty when done. SLEW needs `slew`, its argument."""
+    def command(self, mode: Mode, now_ns: int, wanted: float | PointingTarget | None = None) -> str:
+        """Execute a command; return why it is refused, empty when done.
+
+        SLEW needs `wanted`, its argument; POINT without one returns to the configured targets.
+        """
         trigger = COMMANDS.get(mode)
         if trigger is None or mode not in self._modes:
             return f"{mode.label} cannot be commanded" + (" of this body" if trigger else "")
         answer = self._machine.answer(trigger)
         if answer is Answer.REFUSE:
             return f"not while in {self.mode.label}"
-        if answer is Answer.STAY:
+        if answer is Answer.STAY and mode not in POINTING:
             return ""
         if self.mode is Mode.SAFE and (barred := _barred(self._facts)):
             return barred
-        text = ""
-        if mode is Mode.SLEW:
+        target = None
+        if mode is Mode.SLEW or wanted is not None:
             try:
-                wanted = self._targets.slew(math.nan if slew is None else slew, self._commands + 1, now_ns)
+                target = self._targets.commanded(math.nan if wanted is None else wanted, self._commands + 1)
             except UsageError as error:
                 return str(error)
             self._commands += 1
-            self.wanted, text = wanted, f"to {wanted.law.text}"
-        self._fire(trigger, text, now_ns)
+        if mode in POINTING:
+            self._attitude.follows = mode
+        if mode is Mode.POINT:
+            self._pointed = target
+        elif target is not None:
+            self.wanted = target
+        self._fire(trigger, "" if target is None else f"to {target.law.text}", now_ns)
         return ""
 
     def react(self, kind: EventKind, time_ns: int, text: str) -> None:
@@ -233,13 +262,17 @@ class ModeControl:
     def _enter(self, change: Change, reason: str, now_ns: int) -> None:
         """Enter a mode: reset timers, release an old path, zero the coils of a mode without steering."""
         self._facts.enter(change.after)
-        for timer in (self._slow, self._arrived, self._pointing):
+        for timer in (self._slow, self._arrived, self._pointing, self._attitude):
             timer.reset()
         if change.before not in STEERING | {Mode.BOOT}:
             self._paths.release()  # an old path does not start where the body is now
         if change.after is Mode.DETUMBLE:
             self._steering.begin_braking(now_ns)
-        if change.after is not Mode.SLEW and change.trigger is not Trigger.ARRIVED:
+        if change.after is Mode.SUN:
+            self.wanted = self._targets.commanded(SUN, 0)
+        elif change.after is Mode.POINT:
+            self.wanted = self._pointed
+        elif change.after is not Mode.SLEW and change.trigger is not Trigger.ARRIVED:
             self.wanted = None
         if change.after not in STEERING:
             self._steering.zero()

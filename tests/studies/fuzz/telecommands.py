@@ -11,6 +11,7 @@ from collections import Counter
 import numpy as np
 
 from flight.gnc.guidance.one_axis.limits import Q2_LIMIT
+from flight.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 from flight.link.commands.codec import (
     ChangeMode,
     Clear,
@@ -18,6 +19,7 @@ from flight.link.commands.codec import (
     CommandError,
     CommandPacker,
     Ping,
+    Point,
     Slew,
     check,
     describe,
@@ -82,14 +84,20 @@ class Telecommands:
             raise Finding(f"a change to {command.mode}")
         if isinstance(command, Clear) and not command.event:
             raise Finding("an event without a name")
+        if isinstance(command, Point) and not np.all(np.isfinite((0.0, *command.target.numbers))):
+            raise Finding(f"a target at {command.target.numbers}")
         return Counter(right_crc=int(data not in self._sent))
 
 
 def _command(draw: Draw) -> Command:
-    kind = integer(draw, 0, 3)
+    kind = integer(draw, 0, 5)
     if kind == 0:
         return Ping(integer(draw, 0, 2**16 - 1))
     if kind == 1:
         mode = _MODES[integer(draw, 0, len(_MODES) - 1)]
         return ChangeMode(mode, "by hand" if mode is Mode.SAFE and chance(draw, 0.5) else "")
-    return Slew(float(draw.uniform(-Q2_LIMIT, Q2_LIMIT))) if kind == 2 else Clear("imu-silent")
+    if kind == 2:
+        return Point(PointingTarget(Goal.GROUND, (float(draw.uniform(-1.5, 1.5)), 0.3)))
+    if kind == 3:
+        return Point(PointingTarget(Goal.NADIR, roll=0.1 if chance(draw, 0.5) else None))
+    return Slew(float(draw.uniform(-Q2_LIMIT, Q2_LIMIT))) if kind == 4 else Clear("imu-silent")

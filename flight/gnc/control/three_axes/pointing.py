@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flight.gnc.control.three_axes.pointing_table import PointingTable
+from flight.gnc.guidance.three_axes.attitude_law import Reference
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import (
     attitude_matrix,
@@ -21,15 +22,6 @@ LARGEST_TURN = math.radians(20.0)
 """rad: a larger error is cut to this, its direction kept; the law is linear in small turns."""
 LARGEST_RATE = math.radians(1.0)
 """rad/s, likewise."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Reference:
-    """The wanted attitude (4,), rate (3,) rad/s and acceleration (3,) rad/s^2 at one time, in its axes."""
-
-    quaternion: FloatArray
-    rate: FloatArray
-    acceleration: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,26 +46,16 @@ class PointingLaw:
         """`limit` A m^2 of each coil."""
         self._table = table
         self._limit = limit
-        times = table.references.times
-        self._begin, self._step = float(times[0]), float(times[1] - times[0])
 
     @property
     def span(self) -> tuple[float, float]:
         """The first and last time of the table, s; the last revolution's gains have less preview."""
-        return self._begin, float(self._table.references.times[-1])
+        times = self._table.references.times
+        return float(times[0]), float(times[-1])
 
     def reference(self, time: float) -> Reference:
         """Return the wanted motion at a time, s, within the table's; at its ends that of the end."""
-        table, (k, share) = self._table.references, self._place(time)
-        near = k + round(share)
-        since = (share - round(share)) * self._step
-        rate, acceleration = table.rate[near], table.acceleration[near]
-        turned = from_rotation_vector(since * rate + 0.5 * since * since * acceleration)
-        return Reference(
-            multiply(turned, table.quaternion[near]),
-            (1.0 - share) * table.rate[k] + share * table.rate[k + 1],
-            (1.0 - share) * table.acceleration[k] + share * table.acceleration[k + 1],
-        )
+        return self._table.references.at(time)
 
     def command(
         self,
@@ -96,7 +78,7 @@ class PointingLaw:
         cut_turn, cut_rate = _cut(turn, LARGEST_TURN), _cut(missed, LARGEST_RATE)
         # The table's rate error is the difference of components: without the reference's turned by the error.
         error = np.concatenate([cut_turn, cut_rate - np.cross(cut_turn, wanted.rate)])
-        k, share = self._place(time)
+        k, share = self._table.references.place(time)
         table = self._table
         pull = np.zeros(3)
         for place, weight in ((k, 1.0 - share), (k + 1, share)):
@@ -106,13 +88,6 @@ class PointingLaw:
         # What lies along the field makes no torque.
         dipole = field * (float(field @ pull) / float(field @ field)) - pull - residual_dipole
         return PointingCommand(_limited(dipole, self._limit), turn, missed)
-
-    def _place(self, time: float) -> tuple[int, float]:
-        """Return the instant before a time, and the share of the step since."""
-        place = (time - self._begin) / self._step
-        last = len(self._table.references.times) - 2
-        k = min(max(math.floor(place), 0), last)
-        return k, min(max(place - k, 0.0), 1.0)
 
 
 def _cut(vector: FloatArray, longest: float) -> FloatArray:

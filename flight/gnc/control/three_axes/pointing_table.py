@@ -64,6 +64,15 @@ class PointingTable:
     reference_part: FloatArray
     torque_part: FloatArray
 
+    def until(self, count: int) -> PointingTable:
+        """Return the first `count` instants."""
+        return PointingTable(
+            self.references.until(count),
+            self.gain[:count],
+            self.reference_part[:count],
+            self.torque_part[:count],
+        )
+
 
 def pointing_table(
     references: References,

@@ -9,6 +9,7 @@ turns about the first.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -38,8 +39,17 @@ LEAST_SINE = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Reference:
+    """The wanted attitude (4,), rate (3,) rad/s and acceleration (3,) rad/s^2 at one time, in its axes."""
+
+    quaternion: FloatArray
+    rate: FloatArray
+    acceleration: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class References:
-    """The wanted motion at `times` (n,) s: attitudes (n, 4), rates (n, 3), accelerations (n, 3).
+    """The wanted motion at even `times` (n,) s: attitudes (n, 4), rates (n, 3), accelerations (n, 3).
 
     Rates, rad/s, and accelerations, rad/s^2, are in the axes of the wanted attitude.
     """
@@ -48,6 +58,32 @@ class References:
     quaternion: FloatArray
     rate: FloatArray
     acceleration: FloatArray
+
+    def place(self, time: float) -> tuple[int, float]:
+        """Return the instant before a time, s, and the share of the step since; the ends stand still."""
+        begin, step = float(self.times[0]), float(self.times[1] - self.times[0])
+        place = (time - begin) / step
+        k = min(max(math.floor(place), 0), len(self.times) - 2)
+        return k, min(max(place - k, 0.0), 1.0)
+
+    def at(self, time: float) -> Reference:
+        """Return the wanted motion at a time, s, within the times; at the ends that of the end."""
+        k, share = self.place(time)
+        near = k + round(share)
+        since = (share - round(share)) * float(self.times[1] - self.times[0])
+        rate, acceleration = self.rate[near], self.acceleration[near]
+        turned = from_rotation_vector(since * rate + 0.5 * since * since * acceleration)
+        return Reference(
+            multiply(turned, self.quaternion[near]),
+            (1.0 - share) * self.rate[k] + share * self.rate[k + 1],
+            (1.0 - share) * self.acceleration[k] + share * self.acceleration[k + 1],
+        )
+
+    def until(self, count: int) -> References:
+        """Return the first `count` instants."""
+        return References(
+            self.times[:count], self.quaternion[:count], self.rate[:count], self.acceleration[:count]
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,6 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from flight.gnc.errors import UsageError
+from flight.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 from flight.link.commands.codec import (
     ChangeMode,
     Clear,
@@ -17,6 +19,7 @@ from flight.link.commands.codec import (
     CommandError,
     CommandPacker,
     Ping,
+    Point,
     Slew,
     describe,
     name_of,
@@ -29,10 +32,22 @@ from flight.link.telemetry.packets import crc16
 
 PLAIN_MODES = [Mode.SAFE, Mode.DETUMBLE, Mode.HOLD, Mode.TESTBED_DEMO]
 
+TARGETS = st.one_of(
+    st.builds(
+        PointingTarget,
+        st.sampled_from([Goal.NADIR, Goal.VELOCITY, Goal.SUN]),
+        st.just(()),
+        st.one_of(st.none(), st.floats(-3.2, 3.2)),
+    ),
+    st.builds(PointingTarget, st.just(Goal.GROUND), st.tuples(st.floats(-1.57, 1.57), st.floats(-3.2, 3.2))),
+    st.just(PointingTarget(Goal.INERTIAL, (0.6, 0.0, 0.0, 0.8))),
+)
+
 ANY: st.SearchStrategy[Command] = st.one_of(
     st.builds(Ping, st.integers(0, 2**32 - 1)),
     st.builds(ChangeMode, st.sampled_from(PLAIN_MODES)),
     st.builds(Slew, st.floats(-0.68, 0.68)),
+    st.builds(Point, TARGETS),
     st.builds(Clear, st.text(st.characters(codec="ascii", exclude_characters="\0"), min_size=1, max_size=32)),
 )
 
@@ -112,3 +127,21 @@ def test_random_bytes_are_never_a_command_and_never_anything_worse() -> None:
         data = heads[k % len(heads)] + noise if k % 2 else noise
         with contextlib.suppress(CommandError):
             pytest.fail(f"taken for {unpack(data)}: {data!r}")
+
+
+@pytest.mark.parametrize(
+    ("goal", "numbers", "roll", "why"),
+    [
+        (Goal.NADIR, (1.0,), None, "takes 0 numbers"),
+        (Goal.GROUND, (2.0, 0.0), None, "beyond a pole"),
+        (Goal.GROUND, (math.nan, 0.0), None, "finite"),
+        (Goal.INERTIAL, (1.0, 1.0, 0.0, 0.0), None, "length 1"),
+        (Goal.INERTIAL, (0.6, 0.0, 0.0, 0.8), 0.1, "its roll in its quaternion"),
+        (Goal.SUN, (), math.inf, "finite"),
+    ],
+)
+def test_a_target_that_nothing_can_point_to_is_refused(
+    goal: Goal, numbers: tuple[float, ...], roll: float | None, why: str
+) -> None:
+    with pytest.raises(UsageError, match=why):
+        PointingTarget(goal, numbers, roll)

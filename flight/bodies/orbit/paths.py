@@ -1,0 +1,81 @@
+"""The path of a satellite: the table of the pointing law that is flown, until its end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flight.gnc.control.three_axes.pointing import PointingLaw
+from flight.gnc.control.three_axes.pointing_table import PointingTable
+from flight.gnc.guidance.three_axes.attitude_law import Reference
+from flight.gnc.guidance.three_axes.pointing_target import PointingTarget
+from flight.gnc.math.arrays import FloatArray
+from hal.interfaces.wires import SECOND_NS
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PathPoint:
+    """The path at one time of the clock, `seconds` after its origin; implements `Reference` of the loop."""
+
+    law: PointingLaw
+    time_ns: int
+    seconds: float
+
+    @property
+    def motion(self) -> Reference:
+        """The wanted motion."""
+        return self.law.reference(self.seconds)
+
+    @property
+    def quaternion(self) -> FloatArray:
+        """(4,) ICRS into body."""
+        return self.motion.quaternion
+
+    @property
+    def body_rate(self) -> FloatArray:
+        """(3,) rad/s, body axes."""
+        return self.motion.rate
+
+
+class PointingPaths:
+    """Implements `flight.loop.body.Paths`."""
+
+    def __init__(self, limit: float) -> None:
+        """`limit` A m^2 of each coil, mean over a window of pause and action."""
+        self._limit = limit
+        self._law: PointingLaw | None = None
+        self._target: PointingTarget | None = None
+        self._origin_ns = 0
+
+    def offer(self, table: PointingTable, target: PointingTarget, origin_ns: int) -> str:
+        """Fly a table from now on; return why it is refused, empty when it is flown."""
+        parts = (table.gain, table.reference_part, table.torque_part, table.references.quaternion)
+        if not all(np.isfinite(part).all() for part in parts):
+            return "it holds values that are not finite"
+        self._law, self._target, self._origin_ns = PointingLaw(table, self._limit), target, origin_ns
+        return ""
+
+    def sample(self, now_ns: int) -> PathPoint | None:
+        """Return the path now; None without one, or after its end."""
+        if self._law is None:
+            return None
+        seconds = (now_ns - self._origin_ns) / SECOND_NS
+        return PathPoint(self._law, now_ns, seconds) if seconds <= self._law.span[1] else None
+
+    def attitude(self, target: PointingTarget, now_ns: int) -> FloatArray | None:
+        """Return the attitude (4,) of a target now; None while no path to this target is flown."""
+        point = self.sample(now_ns)
+        return None if point is None or target != self._target else point.quaternion
+
+    def is_following(self, now_ns: int) -> bool:
+        """Return whether there is a path: all of it is followed."""
+        return self.sample(now_ns) is not None
+
+    def is_adrift(self, now_ns: int) -> bool:
+        """Return False: the coils rest after the end of a path."""
+        return False
+
+    def release(self) -> None:
+        """Discard the path."""
+        self._law = self._target = None

@@ -1,0 +1,112 @@
+"""Planning of a satellite: requests tables of the pointing law from the planner worker.
+
+A table is made when a target is set, when the attitude is known again, and periodically: the orbit's
+prediction ages, and a free roll follows the body's own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from flight.bodies.orbit.paths import PointingPaths
+from flight.bodies.orbit.surroundings import Surroundings
+from flight.bodies.orbit.targets import target_of
+from flight.gnc.control.three_axes.pointing_job import PointingJob
+from flight.gnc.control.three_axes.pointing_table import PointingWeights
+from flight.gnc.estimation.estimate import Estimate
+from flight.gnc.guidance.three_axes.target_law import BodyAxes
+from flight.gnc.math.arrays import FloatArray
+from flight.link import events
+from flight.loop.body import PLANNER
+from flight.loop.control_output import Target
+from flight.loop.executive.jobs import JobResult
+from flight.loop.executive.rate_group import Cycle
+from flight.loop.services import Services
+
+AGAIN_NS = 10_000_000_000
+"""After a plan that failed, or while no orbit is known, the next is asked for after this time."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlannedCraft:
+    """What the planner believes of the craft: `inertia` (3, 3) kg m^2, body axes."""
+
+    inertia: FloatArray
+    axes: BodyAxes
+    weights: PointingWeights
+
+
+class PointingPlanner:
+    """Implements `flight.loop.body.Planner`."""
+
+    def __init__(
+        self, craft: PlannedCraft, paths: PointingPaths, surroundings: Surroundings, services: Services
+    ) -> None:
+        self._craft, self._paths, self._surroundings = craft, paths, surroundings
+        self._jobs, self._events = services.jobs, services.events
+        self._job: PointingJob | None = None
+        self._wanted = False
+        self._after_ns = 0
+        self._count = self._accepted = self._refused = 0
+
+    def busy_since_ns(self) -> int | None:
+        """Return since when the worker has been planning, None while idle."""
+        return None if self._job is None else self._job.origin_ns
+
+    def aim(self, target: Target, now_ns: int) -> None:
+        """Request a plan for a new target; the present path is flown until then."""
+        self._wanted, self._after_ns = True, now_ns
+
+    def request(self, now_ns: int) -> None:
+        """Request a plan."""
+        self._wanted = True
+
+    def resume(self, now_ns: int) -> None:
+        """Do nothing: the path goes on while there is no control."""
+
+    def replan(self, cycle: Cycle) -> None:
+        """Request the periodic plan: the task of the replanning rate group."""
+        self._wanted = True
+
+    def serve(self, estimate: Estimate | None, target: Target, now_ns: int) -> None:
+        """Submit the requested job to the worker."""
+        if estimate is None or not self._wanted or self._job is not None or now_ns < self._after_ns:
+            return
+        orbit, craft = self._surroundings.state(now_ns), self._craft
+        if orbit is None:
+            self._fail("no plan: the orbit is not known", now_ns)
+            return
+        job = PointingJob(
+            self._count + 1,
+            now_ns,
+            orbit,
+            craft.inertia,
+            craft.axes,
+            craft.weights,
+            target_of(target),
+            estimate.quaternion,
+        )
+        if self._jobs.submit(PLANNER, job):
+            self._wanted, self._job, self._count = False, job, job.number
+
+    def finish(self, result: JobResult, now_ns: int) -> None:
+        """Fly the worker's plan."""
+        job, self._job = self._job, None
+        if job is None:
+            return
+        if result.outcome != "done":
+            self._fail(f"plan {job.number}: {result.outcome}: {result.error}", now_ns)
+        elif reason := self._paths.offer(result.value, job.target, job.origin_ns):
+            self._fail(f"plan {job.number}: {reason}", now_ns)
+        else:
+            self._accepted += 1
+
+    def counts(self) -> tuple[int, int]:
+        """Return how many plans were accepted and refused since the start."""
+        return self._accepted, self._refused
+
+    def _fail(self, text: str, now_ns: int) -> None:
+        """Report a plan that is not flown, and ask for another one later."""
+        self._refused += 1
+        self._wanted, self._after_ns = True, now_ns + AGAIN_NS
+        self._events.report(events.PLANNER_FAILED, now_ns, text)

@@ -1,0 +1,73 @@
+"""A satellite in orbit that knows its attitude points to its target; its coils pause to measure the field."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flight.gnc.math.quaternion import angle_between
+from flight.link.modes import Mode
+from flight.link.telemetry.packets import to_text
+from flight.schema import reader as configuration
+from flight.schema.orbit import TargetStep
+from flight.schema.sections import Commands, CommandStep
+from ground.telemetry.reader import Run
+from tests.scenario.flights import event_names, fly
+from tests.scenario.mode_flights import modes_of
+from tests.scenario.test_orbit_navigation import navigating, skyward
+
+DURATION, SUNWARD = 60.0, 45.0
+"""s: the flight, and when the mode SUN is commanded."""
+SPEED = 0.001
+"""rad/s, the orbit's own: the body keeps what it has while the field lets the coils act."""
+WITHIN = 12.0
+"""deg: what a release away from the target and the rate leave at the end."""
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """Fly from near rest: the target is the attitude of the release, as an inertial one."""
+    section = skyward()
+    assert section.free_body is not None
+    attitude = section.free_body.release.attitude
+    release = configuration.replace(section.free_body.release, speed=SPEED)
+    section = configuration.replace(
+        section, free_body=configuration.replace(section.free_body, release=release), faults=()
+    )
+    config = configuration.replace(
+        navigating(),
+        duration=DURATION,
+        targets=(TargetStep(at=0.0, point="inertial", quaternion=attitude),),
+        commands=Commands(timeline=(CommandStep(at=SUNWARD, mode="sun"),)),
+    )
+    return fly(config, tmp_path_factory.mktemp("pointing"), section=section)
+
+
+def entered(run: Run, mode: Mode) -> float:
+    return float(run["mode"]["time_ns"][run["mode"]["mode"] == mode][0]) * 1e-9
+
+
+def test_it_points_as_soon_as_its_attitude_is_known(flown: Run) -> None:
+    assert modes_of(flown) == [Mode.BOOT, Mode.DETUMBLE, Mode.ACQUIRE, Mode.POINT, Mode.SUN]
+    assert entered(flown, Mode.POINT) < 30.0
+    assert not {"planner-failed", "control-lost", "tumbling"} & set(event_names(flown))
+    targets = [to_text(e["text"]) for e in flown["event"] if to_text(e["name"]) == "target"]
+    assert targets[0].startswith("inertial")
+    assert targets[1] == "sun, roll free"
+
+
+def test_it_stays_near_its_target(flown: Run) -> None:
+    packets = flown["attitude"]
+    pointing = packets[(packets["mode"] == Mode.POINT) & np.isfinite(packets["target"][:, 0])]
+    assert len(pointing) > 50
+    off = np.degrees(angle_between(pointing["quaternion"], pointing["target"]))
+    assert off.max() < WITHIN
+
+
+def test_the_coils_act_and_pause_for_the_magnetometer(flown: Run) -> None:
+    """A tenth of the time is pause."""
+    truth = flown["truth"]
+    time = truth["time_ns"] * 1e-9
+    inside = (time > entered(flown, Mode.POINT) + 4.0) & (time < DURATION)
+    currents = np.abs(truth["current"][inside]).max(axis=1)
+    assert np.mean(currents < 1e-3) == pytest.approx(0.1, abs=0.06)
