@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from flight.gnc.estimation.estimate import FIELD_BIAS, LATENCY
+from flight.gnc.estimation.estimate import FIELD_BIAS, LATENCY, RATE
 from flight.gnc.estimation.innovation import Innovation
 from flight.gnc.estimation.measurements import MeanRateMeasurement
 from flight.gnc.estimation.rigid_body import Parameters
@@ -58,6 +58,13 @@ def correct(
         _sum(state.field_bias, error[FIELD_BIAS]),
     )
     return corrected, covariance
+
+
+def of_the_rate_alone(gain: FloatArray) -> FloatArray:
+    """Return a gain that corrects the rate and leaves all else as it is; Joseph's form stays right for it."""
+    alone = np.zeros_like(gain)
+    alone[RATE] = gain[RATE]
+    return alone
 
 
 def keep_attitude(

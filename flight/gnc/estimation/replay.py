@@ -18,11 +18,26 @@ from flight.gnc.estimation.estimate import LATENCY, Estimate
 from flight.gnc.estimation.innovation import innovation
 from flight.gnc.estimation.latency import Motion, considered, motion
 from flight.gnc.estimation.measurements import MeanRateMeasurement, Measurement, RateMeasurement
-from flight.gnc.estimation.mekf import correct, keep_attitude, normalised_square, release_attitude
+from flight.gnc.estimation.mekf import (
+    correct,
+    keep_attitude,
+    normalised_square,
+    of_the_rate_alone,
+    release_attitude,
+)
 from flight.gnc.estimation.propagation import ProcessNoise, propagate
 from flight.gnc.estimation.rigid_body import RigidBody
 from flight.gnc.estimation.state import SIZE, State
+from flight.gnc.math import chi_square
 from flight.gnc.math.arrays import FloatArray
+
+_SURPRISING = {size: chi_square.bound(0.025, size) for size in (1, 3)}
+"""Normalised squares of a gyro's sample, by its size, beyond which it corrects the rate alone.
+
+A sample corrects angle, disturbance and coil gain too, by what the model says of the coils. In the tenths of
+a second before a broken coil is noticed that is wrong: the angle went off by up to 40 of its sigmas while the
+rate was right. A sound filter has one such sample in forty.
+"""
 
 
 @dataclass(slots=True, eq=False)
@@ -137,6 +152,12 @@ class Replay:
         used = 0.0 <= nis <= model.gate[len(found.value)]  # a NaN does not pass
         if aging is not None:
             gain = considered(gain)
+        if (
+            isinstance(measurement, RateMeasurement)
+            and model.noise.unknown_current
+            and nis > _SURPRISING[len(found.value)]
+        ):
+            gain = of_the_rate_alone(gain)
         if used:
             state, covariance = correct(state, covariance, found, gain)
         if isinstance(measurement, MeanRateMeasurement):
