@@ -15,7 +15,7 @@ from typing import Any
 
 from flight.link.telemetry.archive import find_runs
 from ground.commands.options import positive
-from ground.watch.plain import PlainLines, attitude_text, state_line
+from ground.watch.plain import PlainLines, attitude_text, event_line, state_line
 from ground.watch.socket import answers
 from ground.watch.tail import LogTail
 from ground.watch.view import STREAM_STATES, STREAMS, View, named
@@ -29,8 +29,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Show a flight in the terminal: mode, attitude, coil currents, devices and events, from its log as "
         "it grows; of a flight that is over, how it ended. On a terminal with rich (extra `watch`) it is a "
-        "panel, else plain lines. Given a flight's command socket, the flight is asked for its mode every "
-        "two seconds. Ctrl-C ends. Exit status 0: the flight is over, or Ctrl-C; 1: nothing more came."
+        "panel, else plain lines. Given a flight's command socket, a ping every two seconds asks how the "
+        "flight stands, and plain lines show the answers. Ctrl-C ends. Exit status 0: the flight is over, or "
+        "Ctrl-C; 1: nothing more came."
     )
     parser.epilog = "example: python -m flight watch runs/demo"
     parser.add_argument(
@@ -160,14 +161,17 @@ def _finite(value: float) -> float | None:
 
 
 def _watch_socket(options: argparse.Namespace) -> int:
-    """Ask a flight for its mode until it does not answer, or a signal."""
-    once, heard = options.once or options.json, False
+    """Ask a flight how it stands until it does not answer, or a signal."""
+    once, heard, view = options.once or options.json, False, View()
     with _ending() as ended:
         for answer in answers(options.flight, options.patience, ended):
             heard = True
-            facts = {"mode": answer.mode, "commands": answer.count, "answered_s": answer.delay}
-            text = f"{answer.mode}, answered in {1e3 * answer.delay:.1f} ms, {answer.count} commands so far"
-            sys.stdout.write((json.dumps(facts) if options.json else text) + "\n")
+            came = view.update(answer.packets)
+            if not options.json:
+                sys.stdout.writelines(f"{event_line(event)}\n" for event in came)
+            facts = {"commands": answer.count, "answered_s": answer.delay}
+            text = f"{state_line(view)}  answered in {1e3 * answer.delay:.1f} ms"
+            sys.stdout.write((json.dumps(_facts(view) | facts) if options.json else text) + "\n")
             sys.stdout.flush()
             if once or ended.wait(_PING_S):
                 return 0

@@ -87,7 +87,7 @@ class View:
 
 
 def _with_mode(packets: Mapping[str, PacketArray]) -> list[PacketArray]:
-    return [packets[name] for name in ("mode", "attitude", "health") if len(packets[name])]
+    return [packets[name] for name in ("mode", "attitude", "health", "command") if len(packets[name])]
 
 
 def mode_label(number: int) -> str:

@@ -79,6 +79,16 @@ def test_each_command_is_obeyed_recorded_and_answered(tmp_path: Path) -> None:
     answers = np.concatenate([decode(answer)["command"] for answer in channel.answers])
     assert answers["count"].tolist() == [1, 2, 3, 4]
     assert answers["mode"].tolist() == [Mode.TESTBED_DEMO, Mode.HOLD, Mode.SLEW, Mode.SAFE]
+    status = decode(channel.answers[0])
+    for name in ("run", "control", "attitude", "health"):
+        (row,) = status[name]
+        assert row.tobytes() in {logged.tobytes() for logged in run[name]}, name
+        assert 0.9 < row["time_ns"] * 1e-9 <= 1.0 or name in ("run", "health")
+    names = [to_text(name) for name in status["event"]["name"]]
+    assert 0 < len(names) <= 2
+    assert "commanded" not in names
+    assert len(channel.answers[0]) <= 1472, "a UDP datagram in one Ethernet frame"
+    assert [len(decode(answer)["control"]) for answer in channel.answers[1:]] == [0, 0, 0]
     assert event_names(run).count("commanded") == 2, "reported at once, the others at the end: throttled"
 
 

@@ -6,12 +6,17 @@ same bit for bit each time.
 
 from __future__ import annotations
 
+from collections import deque
 from typing import Any, Protocol
 
-from flight.link.events import EventKind
-from flight.link.telemetry.definitions import EVENT
+from flight.link.events import COMMANDED, EventKind
+from flight.link.telemetry.definitions import ATTITUDE, CONTROL, EVENT, HEALTH, HOUSEKEEPING, RUN
 from flight.link.telemetry.form import Packet
 from flight.link.telemetry.packets import Packer
+
+_STATUS = (RUN, CONTROL, ATTITUDE, HOUSEKEEPING, HEALTH)
+_STATUS_EVENTS = 2
+"""With these and the answer to a command a datagram fits into one Ethernet frame."""
 
 
 class Log(Protocol):
@@ -29,11 +34,23 @@ class Recorder:
         self._performance = performance
         self._flight_packer = Packer()
         self._performance_packer = Packer()
+        self._newest: dict[str, bytes] = {}
+        self._events: deque[bytes] = deque(maxlen=_STATUS_EVENTS)
         self.epoch_ns = 0
 
     def record(self, packet: Packet, time_ns: int, **values: Any) -> None:
         """Write a packet to the flight log."""
-        self._flight.write(self._flight_packer.pack(packet, time_ns - self.epoch_ns, values))
+        packed = self._flight_packer.pack(packet, time_ns - self.epoch_ns, values)
+        self._newest[packet.name] = packed
+        self._flight.write(packed)
+
+    def status(self) -> bytes:
+        """Return the newest packets that show how a flight stands, then its newest events, oldest first.
+
+        Obeyed commands are left out of the events: who asks for the status would see its own question.
+        """
+        newest = [self._newest[packet.name] for packet in _STATUS if packet.name in self._newest]
+        return b"".join([*newest, *self._events])
 
     def time(self, packet: Packet, time_ns: int, **values: Any) -> None:
         """Write a packet to the performance log."""
@@ -50,3 +67,5 @@ class Recorder:
             name=kind.name,
             text=text,
         )
+        if kind is not COMMANDED:
+            self._events.append(self._newest[EVENT.name])

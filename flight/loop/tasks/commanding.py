@@ -23,6 +23,7 @@ from flight.link.commands.codec import (
     name_of,
     unpack,
 )
+from flight.link.commands.definitions import PING
 from flight.link.modes import Mode
 from flight.link.telemetry.definitions import COMMAND
 from flight.link.telemetry.packets import Packer
@@ -66,7 +67,8 @@ class Commanding:
             for data, sender in channel.poll():
                 fields = self._execute(channel.name, data, now_ns)
                 mission_ns = now_ns - self._recorder.epoch_ns
-                channel.answer(self._answers.pack(COMMAND, mission_ns, fields), sender)
+                status = self._recorder.status() if fields["obeyed"] and fields["name"] == PING.name else b""
+                channel.answer(self._answers.pack(COMMAND, mission_ns, fields) + status, sender)
 
     def _execute(self, source: str, data: bytes, now_ns: int) -> dict[str, Any]:
         """Execute a datagram; return the fields of the answer."""

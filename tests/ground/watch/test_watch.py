@@ -26,7 +26,7 @@ from ground.watch.view import View
 from tests.ground.commands.in_process import command
 from tests.ground.commands.test_commands import ROOT
 from tests.ground.report.synthetic import Recipe, make_run
-from tests.studies.fuzz.furnishings import Listener
+from tests.studies.fuzz.furnishings import Listener, answer
 
 
 def pack(packer: Packer, packet: Packet, time_s: float, **values: object) -> bytes:
@@ -196,9 +196,28 @@ def test_a_flight_that_listens_is_asked_for_its_mode(tmp_path: Path) -> None:
     facts = json.loads(command("watch", tmp_path / "socket", "--json").stdout)
     assert facts["mode"] == "hold"
     assert 0.0 < facts["answered_s"] < 2.0
+    assert (facts["attitude"], facts["currents_a"], facts["events"]) == (None, None, [])
     listener.will_say(b"nonsense")
     done = command("watch", tmp_path / "socket", "--patience", "0.1")
     assert (done.returncode, done.stderr) == (1, f"flight: {tmp_path / 'socket'}: no answer\n")
+
+
+def test_the_state_and_events_of_an_answer_are_shown_and_each_event_once(
+    tmp_path: Path, growing: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ground.commands.watch._PING_S", 0.05)
+    listener = Listener(tmp_path / "socket")
+    log = scan((growing / "flight-0001.ccsds").read_bytes()).packets
+    control = log["control"][-1:].tobytes()
+    listener.will_say(answer(True) + control + event(Packer(), events.IMU_SILENT, 5.7, "no byte"))
+    threading.Timer(0.3, listener.will_say, [b"x"]).start()
+    lines = command("watch", tmp_path / "socket", "--patience", "0.2").stdout.splitlines()
+    assert lines[0] == "    5.700 s  FAULT    imu-silent: no byte"
+    assert len(lines) > 2
+    for line in lines[1:]:
+        assert "hold  q2 " in line
+        assert "coils +100.0 +0.0 +0.0 mA" in line
+        assert "answered in" in line
 
 
 def test_a_flight_that_stops_to_answer_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -207,7 +226,7 @@ def test_a_flight_that_stops_to_answer_is_left(tmp_path: Path, monkeypatch: pyte
     threading.Timer(0.2, listener.will_say, [b"x"]).start()
     done = command("watch", tmp_path / "socket", "--patience", "0.2")
     assert done.returncode == 1
-    assert done.stdout.startswith("hold, answered in ")
+    assert "  hold  answered in " in done.stdout
     assert done.stderr.endswith("no answer any more\n")
 
 

@@ -26,3 +26,9 @@ def test_against_a_strong_thread_the_body_is_swung(
 ) -> None:
     problem = Problem(replace(PLANT, stiffness=stiffness), start, 0.0, end, 0.0, horizon)
     assert problem.planned().status is PlanStatus.OPTIMAL
+
+
+def test_a_horizon_slightly_shorter_than_the_first_path_found_is_kept() -> None:
+    """Case 149 of seed 6: the first path is 0.4 % longer than asked."""
+    case = cases(150, 6)[149]
+    assert verdict(run(case)) != "late"

@@ -24,6 +24,9 @@ PRICE_OF_HASTE = 7.0
 shortest path, bang-bang, whose cost is up to 1 % above the true optimum at that horizon; this price ends
 about 0.3 % later, where the cost is within 0.25 %."""
 
+_HASTE_STRETCH = 1.015
+"""That price may stretch a horizon by as much although the asked one has a path."""
+
 _START_BELOW = 1.7
 _GROW_TO = 1.4
 _RETRY = 1.4
@@ -64,7 +67,7 @@ class Search:
             trial = self._resumed(program, self.warm, asked, longest)
             self.evaluations += program.evaluations
             if trial is not None:
-                return program, trial
+                return self._kept(program, trial, asked)
         time = asked
         for _ in range(_ATTEMPTS):
             program = self.program_at(time)
@@ -82,7 +85,9 @@ class Search:
             if trial is not None or time == longest:
                 break
             time = min(longest, time * growth)
-        return (program, trial) if trial is not None else self._continued(program, asked, longest)
+        if trial is None:
+            return self._continued(program, asked, longest)
+        return self._kept(program, trial, asked)
 
     def priced(
         self, guess: float, least: float, longest: float, price: float
@@ -119,6 +124,16 @@ class Search:
                 break
             time = following
         return self.within(time, longest)
+
+    def _kept(self, program: Program, trial: Trial, asked: float) -> tuple[Program, Trial]:
+        """Return a path over `asked` s in place of a slightly longer one, where there is such a path.
+
+        It starts from the longer path, in a program whitened around the asked horizon.
+        """
+        if not asked * (1.0 + _AT_BOUND) < trial.horizon <= asked * _HASTE_STRETCH:
+            return program, trial
+        at_asked, found = self.over(asked, program.from_prey(trial))
+        return (program, trial) if found is None else (at_asked, found)
 
     def _continued(self, failed: Program, asked: float, longest: float) -> tuple[Program, Trial | None]:
         """Return a path over `asked` s, or longer, by continuation from horizons that can be solved.
