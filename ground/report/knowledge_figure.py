@@ -15,9 +15,9 @@ LEVELS = ("lost", "coarse", "fine")
 
 
 def knowledge_figure(run: Run) -> Figure | None:
-    """Return the picture, None for a run without attitude errors."""
+    """Return the picture, None for a run without packets of navigation or without a truth."""
     found = attitude_errors(run)
-    if not len(found.times):
+    if not (len(found.times) and len(run["navigation"])):
         return None
     figure = Figure(figsize=SIZE, layout="constrained")
     rows = figure.subplots(4, 1, sharex=True)
