@@ -65,7 +65,7 @@ class CommandDoubt:
         self._model = model
         self._scale = 1.0
         self._axes = slice(1, 2) if model.body.suspended else slice(3)
-        self._departures: deque[tuple[int, FloatArray]] = deque(maxlen=max(_SURPRISE))
+        self._departures: deque[tuple[int, list[float]]] = deque(maxlen=max(_SURPRISE))
         self._samples: deque[tuple[int, FloatArray, FloatArray]] = deque()
         self._natural: FloatArray = np.zeros(1)
         self._commanded: FloatArray = np.zeros(1)
@@ -86,15 +86,18 @@ class CommandDoubt:
     def _compare(self, newest: Checkpoint) -> int | None:
         """Test the departures from the model."""
         assert newest.variance is not None  # only the first checkpoint has none, and it is not judged
-        departure = np.array(newest.innovation) / np.sqrt(newest.variance.diagonal())
-        if not np.abs(departure).max() <= _SURPRISE[1] * self._scale and not self._explains(newest):
+        spreads = [math.sqrt(variance) for variance in newest.variance.diagonal().tolist()]
+        departure = [value / spread for value, spread in zip(newest.innovation, spreads, strict=True)]
+        most = _SURPRISE[1] * self._scale
+        if not all(abs(value) <= most for value in departure) and not self._explains(newest):
             return None
-        self._departures.append((newest.time_ns, departure / self._scale))
-        size = min(float(departure @ departure) / len(departure), _SURPRISE[1] ** 2)
+        self._departures.append((newest.time_ns, [value / self._scale for value in departure]))
+        size = min(sum(value * value for value in departure) / len(departure), _SURPRISE[1] ** 2)
         self._scale = math.sqrt(max(1.0, self._scale**2 + (size - self._scale**2) / _SCALE_OVER))
-        sums = np.cumsum([value for _, value in reversed(self._departures)], axis=0)
+        recent = [value for _, value in reversed(self._departures)]
         for count, limit in _SURPRISE.items():
-            if count <= len(sums) and np.abs(sums[count - 1]).max() > limit * math.sqrt(count):
+            sums = map(sum, zip(*recent[:count], strict=True))
+            if count <= len(recent) and any(abs(total) > limit * math.sqrt(count) for total in sums):
                 since_ns = self._departures[-count][0] - _BEFORE_NS
                 self.active = True
                 self._forget()

@@ -46,12 +46,16 @@ def motion(before: Accelerated, after: Accelerated, disturbance: Vector, covaria
     """
     pairs = zip(before.acceleration, after.acceleration, disturbance, strict=True)
     x, y, z = (0.5 * (a + b) + d for a, b, d in pairs)
-    bend = 0.5 * (np.array(after.acceleration) - before.acceleration)
-    by_parameters = 0.5 * (np.array(before.by_parameters) + after.by_parameters)
     rows = _BY_PUSHES.copy()
-    rows[:, 3:] = by_parameters
-    spread = rows @ covariance[_PUSHES, _PUSHES] @ rows.T
-    return Motion((x, y, z), covariance[LATENCY, LATENCY] * (spread + bend[:, np.newaxis] * bend))
+    rows[:, 3:] = before.by_parameters
+    if after is not before:
+        rows[:, 3:] = 0.5 * (rows[:, 3:] + after.by_parameters)
+    spread = rows.dot(covariance[_PUSHES, _PUSHES]).dot(rows.T)
+    if after is not before:
+        bend = 0.5 * (np.array(after.acceleration) - before.acceleration)
+        spread += bend[:, np.newaxis] * bend
+    spread *= covariance[LATENCY, LATENCY]
+    return Motion((x, y, z), spread)
 
 
 def aged(more: float, change: Vector, value: Vector, rows: FloatArray) -> tuple[Vector, FloatArray]:

@@ -9,6 +9,8 @@ model makes it better than the gyro's. Past attitudes that are still needed are 
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 
 from flight.gnc.estimation.estimate import FIELD_BIAS, LATENCY, RATE
@@ -22,28 +24,30 @@ from flight.gnc.math.arrays import FloatArray
 
 def normalised_square(found: Innovation, covariance: FloatArray) -> tuple[float, FloatArray, FloatArray]:
     """Return y^T S^-1 y, a chi-square with the degrees of freedom of y; the gain P H^T S^-1; and S."""
-    cross = covariance @ found.rows.T
-    spread = found.rows @ cross + found.noise
+    cross = covariance.dot(found.rows.T)
+    spread = found.rows.dot(cross) + found.noise
     weight = _inverted(spread)
     y = np.array(found.value)
-    return float(y @ weight @ y), cross @ weight, spread
+    return float(y @ weight @ y), cross.dot(weight), spread
 
 
 def correct(
     state: State, covariance: FloatArray, found: Innovation, gain: FloatArray
 ) -> tuple[State, FloatArray]:
     """Return the corrected state and covariance, by Joseph's form, symmetric and positive."""
-    keep = -(gain @ found.rows)
-    keep.reshape(-1)[:: len(keep) + 1] += 1.0
-    error = (gain @ np.array(found.value)).tolist()
+    # ndarray.dot takes two thirds of the time of @ for matrices as small as these.
+    keep = _identity(len(covariance)) - gain.dot(found.rows)
+    error = gain.dot(found.value).tolist()
     # The reset: the remaining turn refers to axes turned by half the correction.
     for first in (0, *range(SIZE, len(covariance), 3)):
         x, y, z = error[first : first + 3]
         reset = np.array(((1.0, 0.5 * z, -0.5 * y), (-0.5 * z, 1.0, 0.5 * x), (0.5 * y, -0.5 * x, 1.0)))
-        keep[first : first + 3] = reset @ keep[first : first + 3]
-        gain[first : first + 3] = reset @ gain[first : first + 3]
-    covariance = keep @ covariance @ keep.T + gain @ found.noise @ gain.T
-    covariance = 0.5 * (covariance + covariance.T)
+        keep[first : first + 3] = reset.dot(keep[first : first + 3])
+        gain[first : first + 3] = reset.dot(gain[first : first + 3])
+    covariance = keep.dot(covariance).dot(keep.T)
+    covariance += gain.dot(found.noise).dot(gain.T)
+    covariance = covariance + covariance.T
+    covariance *= 0.5
     corrected = State(
         compose(exponential(*error[0:3]), state.quaternion),
         _sum(state.rate, error[3:6]),
@@ -85,6 +89,11 @@ def release_attitude(
     pick = [*range(first), *range(first + 3, len(covariance))]
     kept = state.kept[:place] + state.kept[place + 1 :]
     return state._replace(kept=kept), covariance[np.ix_(pick, pick)]
+
+
+@functools.cache
+def _identity(size: int) -> FloatArray:
+    return np.eye(size)
 
 
 def _sum(a: Vector, b: list[float]) -> Vector:

@@ -79,19 +79,14 @@ def _step(
         state.latency,
         state.field_bias,
     )
-    transition = _transition(state.rate, model, dt)
-    if state.kept:
-        covariance = covariance.copy()
-        covariance[:SIZE] = transition @ covariance[:SIZE]
-        covariance[:, :SIZE] = covariance[:, :SIZE] @ transition.T
-    else:
-        covariance = transition @ covariance @ transition.T
-    _add_noise(covariance, noise, model.by_current, torquing, dt)
-    return propagated, covariance
+    return propagated, _carried(noise, covariance, _transition(state.rate, model, dt), model, torquing, dt)
 
 
 def _transition(rate: Vector, model: Linearised, dt: float) -> FloatArray:
-    """Return I + F dt + (F dt)^2 / 2 of the error's dynamics: turn' = -w x turn + rate error, and so on."""
+    """Return the rows (6, 19) of turn and rate of I + F dt + (F dt)^2 / 2; all other rows are those of I.
+
+    F is the error's dynamics: turn' = -w x turn + rate error, and so on.
+    """
     x, y, z = rate
     flow = _FLOW.copy()
     flow[TURN, TURN] = ((0.0, z, -y), (-z, 0.0, x), (y, -x, 0.0))
@@ -99,26 +94,53 @@ def _transition(rate: Vector, model: Linearised, dt: float) -> FloatArray:
     flow[RATE, RATE] = model.by_rate
     flow[RATE, PARAMETERS] = model.by_parameters
     flow *= dt
-    return np.asarray(_IDENTITY + flow + 0.5 * (flow @ flow))
+    # Only turn and rate change, so the square of F needs only their columns.
+    half = flow[:, _MOTION] * 0.5
+    half += _IDENTITY
+    transition = np.asarray(half.dot(flow))
+    transition[:, _MOTION] += _IDENTITY
+    return transition
+
+
+def _carried(
+    noise: ProcessNoise,
+    covariance: FloatArray,
+    transition: FloatArray,
+    model: Linearised,
+    torquing: Torquing,
+    dt: float,
+) -> FloatArray:
+    """Return the covariance after a step: only the rows and columns of turn and rate change, but for walks.
+
+    What does not change is copied, so that the result stays exactly symmetric there.
+    """
+    moved = transition.dot(covariance[:SIZE])
+    among = moved[:, :SIZE].dot(transition.T)
+    _add_noise(among, noise, model.by_current, torquing, dt)
+    carried = covariance.copy()
+    carried[_MOTION] = moved
+    carried[:, _MOTION] = moved.T
+    carried[_MOTION, _MOTION] = among
+    carried.reshape(-1)[: SIZE * len(carried) : len(carried) + 1] += dt * noise.walks
+    return carried
 
 
 def _add_noise(
-    covariance: FloatArray, noise: ProcessNoise, by_current: FloatArray, torquing: Torquing, dt: float
+    among: FloatArray, noise: ProcessNoise, by_current: FloatArray, torquing: Torquing, dt: float
 ) -> None:
-    """Add the effect of white angular acceleration and the random walks over dt, in place."""
+    """Add the effect of white angular acceleration over dt to the covariance (6, 6) of turn and rate."""
+    steady = 0.0 if torquing.known else noise.unknown_current**2 * _UNKNOWN_FOR
+    weights = [noise.current * driven + steady for driven in torquing.driven]
     density = noise.rate
-    if noise.current and any(torquing.driven):
-        density = density + noise.current * ((by_current * torquing.driven) @ by_current.T)
-    if not torquing.known:
-        density = density + noise.unknown_current**2 * _UNKNOWN_FOR * (by_current @ by_current.T)
+    if any(weights):
+        density = density + (by_current * np.array(weights)).dot(by_current.T)
     turn, cross = dt**3 / 3.0, 0.5 * dt * dt
     over = np.array((turn, cross, cross, dt)).reshape(2, 1, 2, 1)
-    covariance[_MOTION, _MOTION] += (over * density[:, np.newaxis]).reshape(6, 6)
-    covariance.reshape(-1)[: SIZE * len(covariance) : len(covariance) + 1] += dt * noise.walks
+    among += (over * density[:, np.newaxis]).reshape(6, 6)
 
 
-_IDENTITY: FloatArray = np.eye(SIZE)
 _MOTION = slice(TURN.start, RATE.stop)
-_FLOW: FloatArray = np.zeros((SIZE, SIZE))
+_IDENTITY: FloatArray = np.eye(6)
+_FLOW: FloatArray = np.zeros((6, SIZE))
 _FLOW[TURN, RATE] = np.eye(3)
 _FLOW[RATE, DISTURBANCE] = np.eye(3)

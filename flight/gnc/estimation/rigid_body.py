@@ -151,10 +151,9 @@ class RigidBody:
         rate = (rate[0] + ahead * x, rate[1] + ahead * y, rate[2] + ahead * z)
         field_body = times(matrix(q), torquing.field)
         acceleration, by_parameters = self._accelerate(q, rate, parameters, torquing, field_body)
-        derivatives = np.array(
-            [*_by_turn(torquing.dipole, field_body), *self._by_rate(rate), *skew(field_body)]
-        )
-        by_turn, by_rate, by_field = self.response @ derivatives.reshape(3, 3, 3)
+        parts = zip(_by_turn(torquing.dipole, field_body), self._by_rate(rate), skew(field_body), strict=True)
+        derivatives = self.response @ np.array([(*turn, *spin, *field) for turn, spin, field in parts])
+        by_turn, by_rate, by_field = derivatives[:, :3], derivatives[:, 3:6], derivatives[:, 6:]
         torsion, damping, gain = parameters
         by_turn *= gain
         by_turn[1, 1] -= torsion

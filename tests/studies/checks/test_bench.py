@@ -45,6 +45,12 @@ def test_a_bench_gets_its_own_arguments(name: str, capsys: pytest.CaptureFixture
     assert f"python -m tests.studies.bench {name}" in capsys.readouterr().out.replace(".plan", " plan")
 
 
+def test_the_cycle_of_the_filter_is_timed_for_both_bodies(capsys: pytest.CaptureFixture[str]) -> None:
+    assert bench.main(["filter_cycle", "--cycles", "20"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.partition(":")[0] for line in lines] == ["suspended", "free"]
+
+
 def _busy() -> float:
     return sum(float(np.linalg.norm(np.ones(1000))) for _ in range(2000))
 

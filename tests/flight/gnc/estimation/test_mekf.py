@@ -13,9 +13,9 @@ from flight.gnc.estimation.latency import Motion
 from flight.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement, RateMeasurement
 from flight.gnc.estimation.mekf import correct, keep_attitude, normalised_square, release_attitude
 from flight.gnc.estimation.propagation import ProcessNoise, propagate
-from flight.gnc.estimation.rigid_body import Parameters
+from flight.gnc.estimation.rigid_body import Parameters, RigidBody, Torquing
 from flight.gnc.estimation.state import SIZE, State
-from flight.gnc.estimation.turn import compose, exponential, inverse, logarithm
+from flight.gnc.estimation.turn import compose, exponential, inverse, logarithm, skew
 from flight.gnc.math.arrays import FloatArray
 from tests.flight.gnc.estimation.flights import FREE, RATE_COVARIANCE, SUSPENDED, TURN_COVARIANCE
 
@@ -72,6 +72,40 @@ def test_the_transition_is_how_errors_grow() -> None:
             # The square root of a covariance of rank one is the column, but for its sign.
             grown = difference(up, down) / (2.0 * step)
             np.testing.assert_allclose(carried, np.outer(grown, grown), atol=3e-5)
+
+
+def test_a_step_is_the_product_of_the_whole_matrices() -> None:
+    """Transition, noise and a kept attitude as plain dense products (22, 22), to rounding."""
+    rng = np.random.default_rng(4)
+    rate_noise = np.diag(rng.uniform(0.0, 1e-8, 3))
+    noise = ProcessNoise(1e-7, rate_noise, rng.uniform(0.0, 1e-9, SIZE), unknown_current=0.1)
+    exposure = MeanRateMeasurement(0, 10, np.zeros(3), RATE_COVARIANCE)
+    root = rng.normal(0.0, 0.1, (SIZE, SIZE))
+    for body, begun in ((FREE, STATE), (SUSPENDED, HUNG)):
+        for torquing in (TORQUING, replace(TORQUING, known=False), body.torquing(np.zeros(3))):
+            state, before = keep_attitude(begun, root @ root.T, exposure)
+            _, carried = propagate(body, noise, state, before, torquing, 0.025)
+            transition, added = dense_step(body, noise, state, torquing, 0.025)
+            expected = transition @ before @ transition.T + added
+            np.testing.assert_allclose(carried, expected, rtol=1e-12, atol=1e-15)
+
+
+def dense_step(
+    body: RigidBody, noise: ProcessNoise, state: State, torquing: Torquing, dt: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return transition and added noise (22, 22) of one step with one kept attitude, written out whole."""
+    middle = compose(exponential(*(0.5 * dt * w for w in state.rate)), state.quaternion)
+    model = body.linearise(middle, state.rate, state.parameters, torquing, 0.5 * dt)
+    flow, added = np.zeros((22, 22)), np.zeros((22, 22))
+    flow[0:3, 0:3], flow[0:3, 3:6] = -np.array(skew(state.rate)), np.eye(3)
+    flow[3:6, 0:3], flow[3:6, 3:6] = model.by_turn, model.by_rate
+    flow[3:6, 9:12], flow[3:6, 12:15] = np.eye(3), model.by_parameters
+    known = noise.current * np.diag(torquing.driven)
+    unknown = (0.0 if torquing.known else 0.3 * noise.unknown_current**2) * np.eye(3)
+    density = noise.rate + model.by_current @ (known + unknown) @ model.by_current.T
+    added[0:6, 0:6] = np.kron([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]], density)
+    added[:SIZE, :SIZE] += np.diag(dt * noise.walks)
+    return np.eye(22) + flow * dt + 0.5 * (flow * dt) @ (flow * dt), added
 
 
 def test_the_process_noise_is_what_random_currents_and_walks_make() -> None:
