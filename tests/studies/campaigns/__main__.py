@@ -26,6 +26,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--runs", type=_positive, metavar="N", help="runs of each cell, or of the whole")
     parser.add_argument("--hours", type=_positive, dest="runs", metavar="H", help="of soak: hours of flight")
     parser.add_argument("--seed", type=int, default=1, metavar="S", help="seed of all draws (default 1)")
+    parser.add_argument(
+        "--only", default="", metavar="TEXT", help="only cases whose key contains it: 'coil-x: open', ' 3.0 '"
+    )
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder (default runs/campaigns/NAME)")
     parser.add_argument("--workers", type=_positive, metavar="N", help="processes (default: the cores)")
     parser.add_argument(
@@ -44,6 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             options.workers,
             options.dask,
             progress=True,
+            only=options.only,
         )
     except UsageError as error:
         sys.stderr.write(f"campaigns: {error}\n")

@@ -76,15 +76,18 @@ def fly(
     workers: int | None = None,
     dask: str | None = None,
     progress: bool = False,
+    only: str = "",
 ) -> Summary:
     """Run the missing cases of a campaign in `out`, then summarise.
 
+    Of the cases, `only` keeps those whose key contains it.
     `dask` is the address of a cluster's scheduler, which runs them instead of this machine. Raises UsageError
     when the folder holds another campaign or there is no cluster, CampaignError when the cluster is lost.
     """
-    cases = campaign.cases(runs, seed)
+    cases = _selected(campaign, runs, seed, only)
     out.mkdir(parents=True, exist_ok=True)
-    done = _resume(campaign, runs, seed, out)
+    label = {"campaign": campaign.name, "runs": runs, "seed": seed} | ({"only": only} if only else {})
+    done = _resume(label, out)
     missing = [case for case in cases if case.key not in done]
     if missing:
         log = out / "results.jsonl"
@@ -111,9 +114,19 @@ def fly_here(campaign: Campaign, runs: int, seed: int) -> list[Result]:
     return [campaign.run(case) for case in campaign.cases(runs, seed)]
 
 
-def _resume(campaign: Campaign, runs: int, seed: int, out: Path) -> dict[str, Result]:
-    """Return the results that a folder already holds; a line cut off by a kill is left out."""
-    label = {"campaign": campaign.name, "runs": runs, "seed": seed}
+def _selected(campaign: Campaign, runs: int, seed: int, only: str) -> list[Case]:
+    """Return the cases whose key contains `only`. Raises UsageError where none does."""
+    cases = [case for case in campaign.cases(runs, seed) if only in case.key]
+    if only and not cases:
+        raise UsageError(f"--only {only!r}: {campaign.name} has no such case")
+    return cases
+
+
+def _resume(label: Parameters, out: Path) -> dict[str, Result]:
+    """Return the results that a folder already holds; a line cut off by a kill is left out.
+
+    Raises UsageError when the folder holds a campaign with another `label`.
+    """
     label_path, results_path = out / "campaign.json", out / "results.jsonl"
     if label_path.exists():
         found = json.loads(label_path.read_text(encoding="utf-8"))
