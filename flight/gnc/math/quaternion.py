@@ -24,8 +24,8 @@ def _components(q: FloatArray) -> Iterable[Any]:
 
 
 def normalise(q: FloatArray) -> FloatArray:
-    """Return q (..., 4) scaled to unit length."""
-    if q.ndim == 1:
+    """Return q (..., 4), or vectors (..., 3), scaled to unit length."""
+    if q.shape == (4,):
         a, b, c, d = q.tolist()
         return np.asarray(q / math.sqrt(a * a + b * b + c * c + d * d))
     return np.asarray(q / np.linalg.norm(q, axis=-1, keepdims=True))
