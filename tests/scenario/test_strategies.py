@@ -47,7 +47,7 @@ def test_a_price_of_time_sets_the_goal_which_then_stands(tmp_path: Path) -> None
     steps = (Step(at=0.0, q2=0.2), Step(at=20.0, q2=0.1))
     horizons = []
     for price in (0.04, 0.08):
-        config = configured(45.0, steps, time_price=price, replan_period=2.0)
+        config = configured(28.0, steps, time_price=price, replan_period=2.0)
         plans = fly(config, tmp_path / str(price))["plan"]
         second = plans[plans["target_q2"] == 0.1]
         goals = second["origin_ns"] * 1e-9 + second["horizon"]
@@ -96,10 +96,10 @@ def test_a_body_that_is_pushed_off_its_hold_is_planned_for_again(tmp_path: Path)
 def test_without_a_path_every_controller_is_shown_the_target_itself(
     tmp_path: Path, control: dict[str, Any]
 ) -> None:
-    config = configured(60.0, (Step(at=0.0, q2=0.1),), strategy="step")
+    config = configured(40.0, (Step(at=0.0, q2=0.1),), strategy="step")
     config = configuration.replace(config, control=configuration.replace(config.control, **control))
     run = fly(config, tmp_path)
     assert len(run["plan"]) == 0
     assert event_names(run) == ["started", "target", "stopped"]
     time, angle = true_angle(run)
-    assert np.degrees(np.abs(angle - angle_of(0.1))[time > 50.0]).max() < 0.2
+    assert np.degrees(np.abs(angle - angle_of(0.1))[time > 33.0]).max() < 0.2

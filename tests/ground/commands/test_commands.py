@@ -102,7 +102,7 @@ def test_a_signal_ends_a_flight_with_its_log_whole(tmp_path: Path, number: signa
     log = tmp_path / "run" / "flight-0001.ccsds"
     deadline = time.monotonic() + 60.0
     try:
-        while time.monotonic() < deadline and not (log.exists() and log.stat().st_size > 100_000):
+        while time.monotonic() < deadline and not (log.exists() and log.stat().st_size > 30_000):
             time.sleep(0.05)
         os.kill(flight.pid, number)
         out, err = flight.communicate(timeout=60)

@@ -33,14 +33,14 @@ def test_over_many_worlds_the_uncertainty_of_all_constants_is_true(identified: l
     rng = np.random.default_rng(3)
     _, _, made = identified[0]
     squares, keep = [], [0, 1, 2, 4, 5]
-    for _ in range(200):
+    for _ in range(80):
         world = drawn(rng)
         noise = rng.multivariate_normal(np.zeros(6), made.covariance, method="cholesky")
         found = replace(made, constants=Constants.of(world.constants.to_array() + noise))
         plant = scaled(found, BELIEFS, world.field * world.magnetometer)
         error = scale_error(world, plant)[keep]
         squares.append(error @ np.linalg.solve(plant.covariance[np.ix_(keep, keep)], error))
-    low, high = chi2.ppf([0.001, 0.999], 5 * 200) / 200
+    low, high = chi2.ppf([0.001, 0.999], 5 * 80) / 80
     assert low < np.mean(squares) < high
 
 

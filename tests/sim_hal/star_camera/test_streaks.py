@@ -39,9 +39,11 @@ def _worst_against_brute_force(
     return float(np.abs(image - expected).max() / expected.max())
 
 
-@pytest.mark.parametrize("sigma", [0.5, 1.0, 2.0])
-@pytest.mark.parametrize("streak", [0.1, 0.7, 3.3, 17.0, 90.0])
-def test_a_streak_is_the_integral_of_the_still_images(sigma: float, streak: float) -> None:
+@pytest.mark.parametrize(
+    ("streak", "sigma"),
+    [(0.1, 1.0), (0.7, 0.5), (3.3, 0.5), (3.3, 2.0), (17.0, 1.0), (90.0, 0.5), (90.0, 2.0)],
+)
+def test_a_streak_is_the_integral_of_the_still_images(streak: float, sigma: float) -> None:
     model = StarCameraModel(columns=200, rows=160, field_of_view=MODEL.field_of_view, psf_sigma=sigma)
     star = at_pixels(model, [120.3, 60.8])
     rate = streak / FOCAL * np.array([0.6, 0.8, 0.0])

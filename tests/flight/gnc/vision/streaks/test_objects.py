@@ -109,7 +109,7 @@ def test_with_time_reversed_everything_moves_the_other_way() -> None:
 
 
 def test_frames_without_an_object_have_none() -> None:
-    for seed, theta_deg in enumerate((90.0, 60.0, 30.0, 10.0, 75.0, 45.0)):
+    for seed, theta_deg in enumerate((90.0, 30.0, 10.0)):
         theta = np.deg2rad(theta_deg)
         rotation = rate_at(theta, min(60.0 / _FOCAL / np.sin(theta), 0.2), 0.7 * seed)
         report = _detect(frame_with(_CAMERA, rotation, 1.0, 40 + seed, [], 7.0), rotation)

@@ -52,13 +52,12 @@ def _small_frame(seed: int, length: float = 50.0, theta: float = 0.5 * np.pi) ->
 def test_the_rate_vector_is_within_a_percent(theta_deg: float, length: float) -> None:
     """Thesis: 0.69 % of the rate at 102 px (Table 3.1), 2 % in its abstract; here the whole vector."""
     theta = np.deg2rad(theta_deg)
-    for seed in (1, 2) if length < 100.0 else (1,):
-        rate = rate_at(theta, length / _FOCAL / np.sin(theta), 0.3 * seed)
-        result = _estimate(star_frame(_WHOLE, rate, 1.0, seed, faintest=6.5), _WHOLE, rate)
-        error = _rate_of(result) - rate
-        assert np.linalg.norm(error) < 0.01 * np.linalg.norm(rate)
-        # The magnitude is better known than the direction: 0.25 % is 0.06 px of 25.
-        assert np.linalg.norm(_rate_of(result)) == pytest.approx(np.linalg.norm(rate), rel=0.0025)
+    rate = rate_at(theta, length / _FOCAL / np.sin(theta), 0.3)
+    result = _estimate(star_frame(_WHOLE, rate, 1.0, 1, faintest=6.5), _WHOLE, rate)
+    error = _rate_of(result) - rate
+    assert np.linalg.norm(error) < 0.01 * np.linalg.norm(rate)
+    # The magnitude is better known than the direction: 0.25 % is 0.06 px of 25.
+    assert np.linalg.norm(_rate_of(result)) == pytest.approx(np.linalg.norm(rate), rel=0.0025)
 
 
 @pytest.mark.parametrize("theta_deg", [3.0, 10.0])
@@ -70,20 +69,20 @@ def test_curved_streaks_about_an_axis_near_the_boresight_are_measured(theta_deg:
 
 
 def test_the_covariance_is_that_of_the_errors_over_many_frames() -> None:
-    """Normalised squared errors over 66 frames lie in chi-square's band; the bias floor aside."""
+    """Normalised squared errors over 40 frames lie in chi-square's band; the bias floor aside."""
     settings = dataclasses.replace(StreakSettings(), endpoint_bias_sigma=0.0)
     nees = []
-    for seed in range(66):
-        pixels, rate = _small_frame(1000 + seed, 25.0 + 0.5 * seed, np.deg2rad((90.0, 60.0, 30.0)[seed % 3]))
+    for seed in range(40):
+        pixels, rate = _small_frame(1000 + seed, 25.0 + 0.8 * seed, np.deg2rad((90.0, 60.0, 30.0)[seed % 3]))
         result = _estimate(pixels, _SMALL, rate, settings)
         error = _rate_of(result) - rate
         assert result.covariance is not None
         nees.append(float(error @ np.linalg.solve(result.covariance, error)))
-    # The mean of 66 chi-squares of 3 degrees: 3 +- 0.30. The scale, estimated from some 15 streaks a frame,
+    # The mean of 40 chi-squares of 3 degrees: 3 +- 0.39. The scale, estimated from some 15 streaks a frame,
     # and the detector's bias, constant to 0.02 px, widen that: 3 sigma down, 4.5 up.
-    assert 2.1 < np.mean(nees) < 4.35
+    assert 1.83 < np.mean(nees) < 4.75
     # 16.3 is passed by one in a thousand.
-    assert np.count_nonzero(np.array(nees) > 16.3) <= 3
+    assert np.count_nonzero(np.array(nees) > 16.3) <= 2
 
 
 def test_a_prior_decides_the_direction_of_time() -> None:
