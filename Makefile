@@ -12,9 +12,10 @@ unexport PYTHONDONTWRITEBYTECODE
 help:           ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
 
+# Python compiles a module when it first imports it, and keeps that: most of what is installed is never imported.
 $(READY): pyproject.toml requirements.lock
 	$(PYTHON) -m venv $(VENV)
-	$(VENV)/bin/pip install --quiet --constraint requirements.lock --editable '.[plots,images,test,docs]'
+	$(VENV)/bin/pip install --quiet --no-compile --constraint requirements.lock --editable '.[plots,images,test,docs]'
 	@touch $@
 
 demo: $(READY)  ## fly the 700 s step demonstration on simulated hardware and print its report

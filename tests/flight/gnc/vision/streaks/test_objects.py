@@ -65,8 +65,7 @@ def _only(report: ObjectReport) -> SpaceObject:
     return report.objects[0]
 
 
-@pytest.mark.parametrize("towards", [0.3, 2.4, 4.0])
-@pytest.mark.parametrize("px", [25.0, 60.0])
+@pytest.mark.parametrize(("towards", "px"), [(0.3, 25.0), (2.4, 60.0), (4.0, 25.0)])
 def test_a_moving_object_is_found_with_its_ends_direction_and_rate(towards: float, px: float) -> None:
     exposure = 0.5
     motion = motion_across(_PLACE, px / _FOCAL, towards)
