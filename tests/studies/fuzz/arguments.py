@@ -324,4 +324,5 @@ def _anything(draw: Draw) -> str:
 
 def _asks_for_help(word: str) -> bool:
     """Return whether a word is answered with text whatever else is asked: argparse takes beginnings, too."""
-    return word == "-h" or (len(word) > 2 and any(name.startswith(word) for name in ("--help", "--version")))
+    short = word.startswith("-h") and set(word[1:]) == {"h"}  # "-hh" is -h twice
+    return short or (len(word) > 2 and any(name.startswith(word) for name in ("--help", "--version")))
