@@ -7,7 +7,7 @@ TESTS  := $(RUN) -m pytest -n auto
 # The tests start hundreds of processes: without kept bytecode each would compile every module again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo orbit quick test test-container lint types arrows docs house unit fast slow-list pictures lock clean help
+.PHONY: demo orbit console quick test test-container lint types arrows docs house unit fast slow-list pictures lock clean help
 
 help:           ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
@@ -27,6 +27,10 @@ orbit: $(READY) ## fly a KnightCube in orbit: detumble from 10 deg/s, and print 
 	@rm -rf runs/orbit
 	$(RUN) -m flight run config/orbit.yaml --out runs/orbit
 	$(RUN) -m flight report runs/orbit
+
+console: $(READY) ## the demonstration flying in real time in the browser, with forms to command it
+	@rm -rf runs/console
+	$(RUN) -m flight console runs/console --fly config/step_demo.yaml --open
 
 quick: $(READY) ## style, import arrows and the fast tests: under 90 s on two cores
 	@$(MAKE) --no-print-directory lint arrows fast

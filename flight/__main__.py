@@ -12,5 +12,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from flight.app.cli import main
 
+__all__ = ["main"]
+
 if __name__ == "__main__":
     raise SystemExit(main())

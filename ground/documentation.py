@@ -10,6 +10,7 @@ import json
 import sys
 from typing import Any
 
+from flight.link.commands.definitions import LAYOUTS as COMMAND_LAYOUTS
 from flight.link.telemetry.form import Field
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, Layout
 
@@ -49,6 +50,11 @@ def database() -> dict[str, Any]:
         "error_control": {"polynomial": 0x1021, "preset": 0xFFFF, "bytes": CRC_BYTES},
         "packets": [_packet(layout) for layout in LAYOUTS.values()],
     }
+
+
+def command_table() -> list[dict[str, Any]]:
+    """Return the telecommands with their fields, ready for JSON."""
+    return [_packet(layout) for layout in COMMAND_LAYOUTS.values()]
 
 
 def markdown() -> str:

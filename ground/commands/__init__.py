@@ -3,6 +3,7 @@
 COMMANDS = {
     "command": "send a command to a flight",
     "watch": "show a flight in the terminal, live or as it ended",
+    "console": "show a flight in the browser, live or replayed, and command it",
     "report": "report the performance of a run",
     "export": "write a run's packets as CSV, Parquet or SQLite",
     "plan": "plan a single slew",

@@ -1,0 +1,6 @@
+"""`python -m ground`: the same commands as `python -m flight`."""
+
+from flight.__main__ import main
+
+if __name__ == "__main__":
+    raise SystemExit(main())

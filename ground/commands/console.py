@@ -1,0 +1,97 @@
+"""`flight console`: a flight in the browser, live or as a replay, and commands to it."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import socket
+import sys
+import webbrowser
+from pathlib import Path
+
+from flight.gnc.errors import FlightError, UsageError
+from flight.link.telemetry.archive import find_runs
+from ground.watch.tail import LogTail
+
+PORT = 8040
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of this command to the parser."""
+    parser.description = (
+        "Show a flight in the browser: attitude in 3-D, plots with history, mode and health, events, the "
+        "orbit on a map, and forms for commands. A flight that goes on is shown live; a run that is over is "
+        "replayed on the same page. The page is served on loopback only. Needs the extra `ground`. "
+        "Ctrl-C ends."
+    )
+    parser.epilog = (
+        "examples: python -m flight console runs/demo; "
+        "python -m flight console --fly config/step_demo.yaml runs/live"
+    )
+    parser.add_argument(
+        "run", metavar="RUN", type=Path, nargs="?", help="folder of a run, or of an archive: newest run"
+    )
+    parser.add_argument(
+        "--to",
+        metavar="SOCKET",
+        help="command by the flight's UNIX socket, or HOST:PORT (default: look)",
+    )
+    parser.add_argument(
+        "--fly", metavar="CONFIG", type=Path, help="fly this simulated configuration too, in real time"
+    )
+    parser.add_argument("--port", type=int, default=PORT, metavar="N", help=f"0: any (default {PORT})")
+    parser.add_argument("--open", action="store_true", help="open the page in the browser")
+    parser.set_defaults(command=console)
+
+
+def console(options: argparse.Namespace) -> int:
+    """Serve until Ctrl-C."""
+    try:
+        from aiohttp import web  # noqa: PLC0415 - an extra
+
+        from ground.console.commanding import Commanding, by_socket  # noqa: PLC0415
+        from ground.console.flying import flying  # noqa: PLC0415
+        from ground.console.history import History  # noqa: PLC0415
+        from ground.console.server import Console, application  # noqa: PLC0415
+        from ground.console.surroundings import Surroundings  # noqa: PLC0415
+    except ModuleNotFoundError as error:
+        raise FlightError(
+            f"the console needs {error.name}: pip install 'knightcube-flight[ground]'"
+        ) from error
+    if options.run is None:
+        raise UsageError("RUN: give the folder of a run; with --fly, the folder that the flight writes to")
+    address = _listening(options.port)
+    with address, contextlib.ExitStack() as stack:
+        folder, to = options.run, options.to
+        if options.fly is not None:
+            if to is not None:
+                raise UsageError("--fly and --to: the flight that --fly starts is commanded already")
+            flight = stack.enter_context(flying(options.fly, options.run))
+            folder, to = flight.folder, flight.socket
+        runs = find_runs(folder) if folder.is_dir() else []
+        folder = runs[-1] if runs else folder
+        commanding = Commanding(by_socket(to) if to else None)
+        history = stack.enter_context(History())
+        shown = Console(LogTail(folder), history, Surroundings.of(folder), commanding, folder)
+        shown.look()
+        url = f"http://127.0.0.1:{address.getsockname()[1]}/"
+        sys.stdout.write(f"console of {folder}: {url} (Ctrl-C ends)\n")
+        sys.stdout.flush()
+        if options.open:
+            webbrowser.open(url)
+        web.run_app(application(shown), sock=address, print=None, access_log=None)
+    return 0
+
+
+def _listening(port: int) -> socket.socket:
+    """Return a socket that listens on loopback. Raises UsageError for a port that is none or is taken."""
+    if not 0 <= port < 65536:
+        raise UsageError(f"--port {port}: must lie within 0 and 65535")
+    line = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    line.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        line.bind(("127.0.0.1", port))
+    except OSError as error:
+        line.close()
+        raise UsageError(f"--port {port}: {error.strerror or error}; give another, or 0 for any") from error
+    return line

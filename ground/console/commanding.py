@@ -1,0 +1,88 @@
+"""Commands out of the page's forms: values by the command table, sent, and what became of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+from flight.app.utc_label import utc_ns
+from flight.gnc.errors import FlightError, UsageError
+from flight.link.commands import codec
+from flight.link.commands.definitions import COMMANDS, LAYOUTS
+from flight.link.telemetry.form import Field
+from flight.link.telemetry.packets import Packer, TelemetryError
+from ground.commands.command import exchange
+from ground.console.instant import values
+from ground.telemetry.scanner import decode
+
+Object = dict[str, Any]
+Send = Callable[[bytes], bytes]
+"""Sends a command packet and returns the answering packets. Raises FlightError."""
+_TIMEOUT_S = 3.0
+
+
+def by_socket(to: str) -> Send:
+    """Return what sends to a flight's own socket, or to its HOST:PORT."""
+    return lambda packet: exchange(to, packet, _TIMEOUT_S)
+
+
+class Commanding:
+    """Packs what the page's forms hold; `send` is None where this console only looks."""
+
+    def __init__(self, send: Send | None) -> None:
+        self._send = send
+        self._packer = Packer(LAYOUTS)
+
+    @property
+    def possible(self) -> bool:
+        """Whether there is a way to the flight."""
+        return self._send is not None
+
+    def words(self, name: str, given: Object) -> str:
+        """Return a command in words, for its confirmation. Raises UsageError for values that are none."""
+        return codec.describe(codec.unpack(self._pack(name, given)))
+
+    def obey(self, name: str, given: Object) -> Object:
+        """Send a command; return the flight's answer. Raises UsageError for values, else FlightError."""
+        if self._send is None:
+            raise UsageError("this console only looks: start it with --to SOCKET to command")
+        packets = decode(self._send(self._pack(name, given)))["command"]
+        if not len(packets):
+            raise FlightError("the flight's answer holds no report of the command")
+        return values(packets[-1])
+
+    def _pack(self, name: str, given: Object) -> bytes:
+        packet = next((packet for packet in COMMANDS if packet.name == name), None)
+        if packet is None:
+            raise UsageError(f"{name}: no such command: {', '.join(packet.name for packet in COMMANDS)}")
+        unknown = sorted(set(given) - {field.name for field in packet.fields})
+        if unknown:
+            raise UsageError(f"{name}: no such value: {', '.join(unknown)}")
+        fields = {field.name: _value(name, field, given.get(field.name)) for field in packet.fields}
+        try:
+            data = self._packer.pack(packet, utc_ns(), fields)
+            codec.unpack(data)
+        except (TelemetryError, codec.CommandError) as error:
+            raise UsageError(str(error)) from error
+        return data
+
+
+def _value(name: str, field: Field, given: Any) -> Any:
+    """Return a field's value; empty numbers are NaN where the field can hold that. Raises UsageError."""
+    if field.count > 1:
+        items = list(given) if isinstance(given, list) else [given] if given is not None else []
+        return [_number(name, field, item) for item in [*items, *[None] * field.count][: field.count]]
+    return str(given or "") if field.kind.startswith("S") else _number(name, field, given)
+
+
+def _number(name: str, field: Field, given: Any) -> float | int:
+    real = field.kind.startswith("f")
+    if given is None or given == "":
+        if real:
+            return math.nan
+        raise UsageError(f"{name}: {field.name} is missing: {field.meaning}")
+    try:
+        return float(given) if real else int(given)
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"{name}: {field.name} = {given!r} is no number: {field.meaning}") from error

@@ -1,0 +1,63 @@
+// Lists that grow: events with filters, frames with what was found in them, commands and their answers.
+const MOST_ROWS = 500;
+const SEVERITIES = ["note", "warning", "FAULT"];
+
+function row(cells, kind = "") {
+  const line = document.createElement("tr");
+  line.className = kind;
+  for (const cell of cells) line.append(Object.assign(document.createElement("td"), { textContent: cell }));
+  line.firstChild.className = "t";
+  return line;
+}
+const seconds = (packet) => `${(packet.time_ns / 1e9).toFixed(1)}`;
+
+class Rows {
+  constructor(table) { this.body = table.tBodies[0]; this.kept = []; }
+  clear() { this.body.replaceChildren(); this.kept = []; }
+  add(line) { this.body.prepend(line); while (this.body.rows.length > MOST_ROWS) this.body.lastChild.remove(); }
+}
+
+export class Events extends Rows {
+  constructor(table, severity, filter) {
+    super(table);
+    this.severity = severity; this.filter = filter;
+    severity.onchange = filter.oninput = () => { this.body.replaceChildren(); this.kept.forEach((event) => this.list(event)); };
+  }
+  show(_, __, listed, again) {
+    if (again) this.clear();
+    for (const event of listed.event ?? []) { this.kept.push(event); this.list(event); }
+    this.kept = this.kept.slice(-5 * MOST_ROWS);
+  }
+  list(event) {
+    const words = `${event.name} ${event.text}`;
+    if (event.severity < Number(this.severity.value) || !words.toLowerCase().includes(this.filter.value.toLowerCase())) return;
+    this.add(row([seconds(event), SEVERITIES[event.severity] ?? event.severity, `${event.name}: ${event.text}`], `s${event.severity}`));
+  }
+}
+
+export class Frames extends Rows {
+  show(_, __, listed, again) {
+    if (again) { this.clear(); this.lines = new Map(); }
+    for (const frame of listed.streak ?? []) {
+      const rate = frame.rate.every((part) => part !== null) ? `${(180 / Math.PI * Math.hypot(...frame.rate)).toFixed(3)} deg/s` : frame.status;
+      const line = row([seconds(frame), `${frame.used} of ${frame.streaks}`, frame.length?.toFixed(0) ?? "-", `${rate}${frame.accepted ? " ✓" : ""}`, "", ""]);
+      this.lines.set(frame.sequence, line);
+      this.add(line);
+    }
+    for (const frame of listed.stars ?? []) {
+      const line = this.lines.get(frame.sequence) ?? row([seconds(frame), "", "", "", "", ""]);
+      if (!line.isConnected) this.add(line);
+      line.cells[4].textContent = `${frame.matched} of ${frame.found}`;
+      line.cells[5].textContent = `${frame.status}${frame.accepted ? " ✓" : ""}`;
+    }
+  }
+}
+
+export class History extends Rows {
+  show(_, __, listed, again) {
+    if (again) this.clear();
+    for (const command of listed.command ?? []) {
+      this.add(row([seconds(command), command.source, command.obeyed ? "obeyed" : "refused", command.text], command.obeyed ? "" : "s1"));
+    }
+  }
+}

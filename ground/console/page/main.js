@@ -1,0 +1,100 @@
+// Holds the connection, the newest values and the time line; each other module draws one thing of them.
+import { Attitude } from "/page/attitude.js";
+import { CommandForms } from "/page/commands.js";
+import { Events, Frames, History } from "/page/lists.js";
+import { GroundTrack } from "/page/map.js";
+import { Health, Packets } from "/page/values.js";
+import { Plots } from "/page/plots.js";
+
+const DEAD_AFTER = 3; // s without telemetry, or without a word of the console itself
+const byId = (name) => document.getElementById(name);
+const table = await (await fetch("/api/table")).json();
+const newest = {};
+const state = { time: 0, span: [0, 0], live: true, speed: 1, silence: 0, surroundings: null };
+let heard = 0;
+let line = null;
+let seeking = false;
+
+byId("name").textContent = table.name;
+document.title = `${table.name} - KnightCube console`;
+const views = [
+  new Attitude(byId("attitude"), byId("legend"), table),
+  new Health(byId("health"), table),
+  new Packets(byId("packets"), byId("all"), table),
+  new Events(byId("events"), byId("severity"), byId("filter")),
+  new Frames(byId("frames")),
+  new History(byId("commands")),
+  new CommandForms(byId("forms"), byId("looking"), byId("confirm"), table),
+];
+if (table.orbit) {
+  byId("orbit").hidden = false;
+  views.push(new GroundTrack(byId("map"), byId("place")));
+}
+const plots = new Plots(byId("panels"), byId("add"), byId("window"), table, () => state);
+
+function connect() {
+  line = new WebSocket(`ws://${location.host}/api/live`);
+  line.onopen = () => { if (state.live) moment(); else move(state.time, state.speed); };
+  line.onmessage = (message) => take(JSON.parse(message.data));
+  line.onclose = () => setTimeout(connect, 1000);
+}
+
+function take(said) {
+  heard = performance.now();
+  if (said.again) for (const name of Object.keys(newest)) delete newest[name];
+  Object.assign(newest, said.newest);
+  Object.assign(state, { time: said.time, span: said.span, live: said.live, speed: said.speed, silence: said.silence,
+    surroundings: said.surroundings, utc_ns: said.utc_ns });
+  for (const view of views) view.show(newest, state, said.listed, said.again);
+  byId("trouble").hidden = !said.trouble;
+  byId("trouble").textContent = said.trouble;
+  const packet = table.packets.find((each) => each.name === "mode");
+  const states = packet?.fields.find((field) => field.name === "mode")?.states;
+  const mode = newest.attitude?.mode ?? newest.health?.mode ?? newest.mode?.mode;
+  const label = mode === undefined ? "-" : (table.modes[mode] ?? states?.[mode] ?? `mode ${mode}`);
+  byId("mode").textContent = label;
+  byId("mode").classList.toggle("safe", label === "safe");
+  byId("time").textContent = `${said.time.toFixed(1)} s`;
+  byId("utc").textContent = said.utc_ns === null ? "" : new Date(said.utc_ns / 1e6).toISOString().slice(0, 19) + "Z";
+  if (!seeking) byId("seek").value = String(1000 * (said.time - said.span[0]) / Math.max(said.span[1] - said.span[0], 1e-9));
+  byId("live").classList.toggle("chosen", said.live);
+  byId("play").textContent = said.live || said.speed > 0 ? "pause" : "play";
+  document.body.dataset.time = String(said.time);
+}
+
+// A flight that has ended says so in its last event; a log that just stops is a dead link.
+function light() {
+  const silent = (performance.now() - heard) / 1000;
+  const ended = newest.event?.name === "stopped";
+  const [kind, words] = silent > DEAD_AFTER || line.readyState !== WebSocket.OPEN ? ["dead", "console lost"]
+    : !state.live ? ["past", state.speed > 0 ? `replay ${state.speed} x` : "replay, paused"]
+    : ended ? ["over", "flight ended"]
+    : state.silence > DEAD_AFTER ? ["dead", `no telemetry for ${state.silence.toFixed(0)} s`] : ["alive", "live"];
+  byId("light").className = `light ${kind}`;
+  byId("light").textContent = words;
+}
+
+function move(at, speed) {
+  if (line.readyState === WebSocket.OPEN) line.send(JSON.stringify({ at, speed }));
+}
+const chosenSpeed = () => Number(byId("speed").value);
+byId("live").onclick = () => line.send(JSON.stringify({ live: true }));
+byId("play").onclick = () => move(state.time, state.live || state.speed > 0 ? 0 : chosenSpeed());
+byId("speed").onchange = () => { if (!state.live) move(state.time, chosenSpeed()); };
+byId("seek").oninput = () => {
+  seeking = true;
+  const share = Number(byId("seek").value) / 1000;
+  move(state.span[0] + share * (state.span[1] - state.span[0]), 0);
+};
+byId("seek").onchange = () => { seeking = false; };
+
+// A moment of a flight as an address: #at=123.4 shows it, paused.
+function moment() {
+  const at = Number(new URLSearchParams(location.hash.slice(1)).get("at") ?? NaN);
+  if (Number.isFinite(at)) move(at, 0);
+}
+window.addEventListener("hashchange", moment);
+
+connect();
+setInterval(light, 250);
+plots.begin();

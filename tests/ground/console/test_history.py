@@ -1,0 +1,104 @@
+"""The console's history: every packet once, peaks kept, and the state of an instant."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from flight.link.telemetry.packets import LAYOUTS
+from ground.console.cursor import Cursor
+from ground.console.history import History
+from ground.console.instant import Instant, values
+from ground.telemetry.reader import Run, read_run
+from tests.ground.report.synthetic import Recipe, make_run
+
+LATER = 10**15
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    return read_run(make_run(tmp_path_factory.mktemp("run"), Recipe(duration=6.0, rate_hz=10.0, hold=3.0)))
+
+
+@pytest.fixture
+def history(run: Run) -> Iterator[History]:
+    """Yield the run's history, taken in by two looks."""
+    with History() as history:
+        for half in (0, 1):
+            cut = {name: len(rows) // 2 for name, rows in run.flight.packets.items()}
+            history.append(
+                {n: rows[cut[n] :] if half else rows[: cut[n]] for n, rows in run.flight.packets.items()}
+            )
+        yield history
+
+
+def test_all_packets_come_back_as_they_were(history: History, run: Run) -> None:
+    for name, rows in run.flight.packets.items():
+        assert history.rows(name, 0, 10**9).tobytes() == rows.tobytes()
+    assert history.span_ns[1] == max(rows["time_ns"][-1] for rows in run.flight.packets.values() if len(rows))
+
+
+def test_a_series_of_few_points_keeps_the_least_and_the_greatest(history: History, run: Run) -> None:
+    rows = run["control"]
+    times, whole = history.series("control", "current_written", 0, (0, LATER), 10**6)
+    np.testing.assert_array_equal(whole, rows["current_written"][:, 0])
+    few, thinned = history.series("control", "current_written", 0, (0, LATER), 10)
+    assert len(thinned) == 10
+    assert (thinned.min(), thinned.max()) == (whole.min(), whole.max())
+    assert (np.diff(few) >= 0.0).all()
+    assert set(few) <= set(times)
+    part, _ = history.series("control", "q2", 0, (int(2e9), int(3e9)), 10**6)
+    assert (part.min() >= 2.0, part.max() <= 3.0, len(part)) == (True, True, 11)
+
+
+def test_a_peak_among_gaps_is_not_lost() -> None:
+    layout = LAYOUTS["control"]
+    rows = np.zeros(1000, dtype=layout.dtype)
+    rows["time_ns"], rows["q2"] = np.arange(1000) * 10**7, np.nan
+    rows["q2"][[333, 501]] = 7.0, -7.0
+    with History() as history:
+        history.append({"control": rows})
+        _, values = history.series("control", "q2", 0, (0, LATER), 20)
+    assert (np.nanmax(values), np.nanmin(values)) == (7.0, -7.0)
+
+
+def test_an_instant_shows_what_had_come_and_each_event_once(history: History, run: Run) -> None:
+    instant = Instant(history)
+    seen = [instant.at(int(time * 1e9), LAYOUTS) for time in (0.0, 2.0, 4.0, 99.0)]
+    assert [state["again"] for state in seen] == [True, False, False, False]
+    events = [event for state in seen for event in state["listed"].get("event", [])]
+    assert events == [values(row) for row in run["event"]]
+    assert seen[1]["newest"]["control"]["time_ns"] <= 2 * 10**9
+    assert "run" not in seen[1]["newest"], "nothing new"
+    instant.forget()
+    assert instant.at(LATER, LAYOUTS)["newest"]["control"] == values(run["control"][-1])
+
+
+def test_a_replay_shows_at_each_time_what_was_live_then(history: History, run: Run) -> None:
+    """Live is a history that ends at that time."""
+    for until in (1_000_000_000, 3_300_000_000):
+        with History() as then:
+            then.append({n: rows[rows["time_ns"] <= until] for n, rows in run.flight.packets.items()})
+            live = Instant(then).at(then.span_ns[1], LAYOUTS)
+        assert Instant(history).at(until, LAYOUTS) == live
+
+
+@pytest.mark.parametrize(
+    "message",
+    ["", "[]", "null", '{"at": NaN, "speed": 1}', '{"at": 1, "speed": -1}', '{"at": 1, "speed": 1e9}', "{}"],
+)
+def test_a_cursor_takes_no_nonsense(message: str) -> None:
+    cursor = Cursor()
+    assert not cursor.obey(message, 0.0)
+    assert cursor.live
+
+
+def test_a_cursor_moves_at_its_speed_stays_within_and_goes_live_again() -> None:
+    cursor, span = Cursor(), (0, 10 * 10**9)
+    assert cursor.at_ns(span, 5.0) == span[1]
+    assert cursor.obey('{"at": 2.0, "speed": 3.0}', 100.0)
+    assert [cursor.at_ns(span, now) for now in (100.0, 101.0, 200.0)] == [2 * 10**9, 5 * 10**9, span[1]]
+    assert cursor.obey('{"live": true}', 200.0)
+    assert cursor.live

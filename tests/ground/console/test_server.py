@@ -1,0 +1,219 @@
+"""The console as its page asks for it, and as strangers do."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+from collections.abc import Awaitable, Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from aiohttp.test_utils import TestClient, TestServer
+
+from flight.link.commands import codec
+from flight.link.commands.definitions import COMMANDS
+from flight.link.modes import Mode
+from flight.link.telemetry.definitions import COMMAND
+from flight.link.telemetry.packets import Packer
+from ground.console.commanding import Commanding
+from ground.console.history import History
+from ground.console.server import Console, application
+from ground.console.surroundings import Surroundings
+from ground.watch.tail import LogTail
+from tests.ground.report.synthetic import Recipe, make_run
+
+Answer = tuple[int, Any]
+Ask = Callable[..., Awaitable[Answer]]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_run(tmp_path_factory.mktemp("run"), Recipe(duration=6.0, rate_hz=10.0, hold=3.0))
+
+
+def asked(folder: Path, ask: Callable[[TestClient[Any, Any]], Awaitable[Any]], send: Any = None) -> Any:
+    """Serve a run, and return what a client gets."""
+
+    async def talk(history: History) -> Any:
+        console = Console(LogTail(folder), history, Surroundings.of(folder), Commanding(send), folder)
+        console.look()
+        async with TestClient(TestServer(application(console), host="127.0.0.1")) as client:
+            return await ask(client)
+
+    with History() as history:
+        return asyncio.run(talk(history))
+
+
+def get(folder: Path, path: str, headers: dict[str, str] | None = None) -> tuple[int, Any]:
+    async def ask(client: TestClient[Any, Any]) -> tuple[int, Any]:
+        async with client.get(path, headers=headers) as answer:
+            return (
+                answer.status,
+                await answer.json() if "json" in answer.content_type else await answer.text(),
+            )
+
+    found: tuple[int, Any] = asked(folder, ask)
+    return found
+
+
+def test_the_page_and_all_that_it_names_are_served_and_stay_small(folder: Path) -> None:
+    """Issue: 1.5 MB at most."""
+    page = Path(__file__).parents[3] / "ground/console/page"
+    names = [path.relative_to(page) for path in page.rglob("*") if path.is_file()]
+    assert sum((page / name).stat().st_size for name in names) < 400_000
+
+    async def ask(client: TestClient[Any, Any]) -> None:
+        async with client.get("/") as answer:
+            assert answer.status == 200
+            assert "default-src 'self'" in answer.headers["Content-Security-Policy"]
+        for name in names:
+            async with client.get(f"/page/{name}") as answer:
+                assert answer.status == 200, name
+
+    asked(folder, ask)
+
+
+@pytest.mark.parametrize(
+    "headers", [{"Host": "evil.example"}, {"Host": "10.0.0.1"}, {"Origin": "http://evil.example"}]
+)
+def test_another_page_of_the_same_browser_gets_nothing(folder: Path, headers: dict[str, str]) -> None:
+    for path in ("/", "/api/table", "/api/live"):
+        assert get(folder, path, headers)[0] == 403
+
+
+def test_the_table_has_every_field_and_every_command(folder: Path) -> None:
+    _, table = get(folder, "/api/table")
+    assert {"control", "event", "navigation"} <= {packet["name"] for packet in table["packets"]}
+    assert [command["name"] for command in table["commands"]] == [packet.name for packet in COMMANDS]
+    assert (table["commanding"], table["orbit"]) == (False, False)
+
+
+@pytest.mark.parametrize(
+    ("query", "complaint"),
+    [
+        ("packet=none&field=q2&from=0&to=1", "none.q2: no such field"),
+        ("packet=event&field=text&from=0&to=1", "no such number"),
+        ("packet=imu&field=rate&component=3&from=0&to=1", "no such number"),
+        ("packet=imu&field=rate&from=nan&to=1", "from = 'nan'"),
+        ("packet=imu&field=rate&from=0&to=1&points=-3", "points = '-3'"),
+    ],
+)
+def test_a_wrong_question_is_answered_in_words(folder: Path, query: str, complaint: str) -> None:
+    status, answer = get(folder, f"/api/series?{query}")
+    assert status == 400
+    assert complaint in answer["error"]
+
+
+def test_the_reader_is_pushed_the_newest_and_then_a_moment_of_the_past(folder: Path) -> None:
+    async def ask(client: TestClient[Any, Any]) -> tuple[Any, Any]:
+        async with client.ws_connect("/api/live") as line:
+            newest = await line.receive_json()
+            await line.send_json({"at": 2.0, "speed": 0.0})
+            while not (past := await line.receive_json())["again"]:
+                pass
+            return newest, past
+
+    newest, past = asked(folder, ask)
+    assert (newest["live"], newest["again"], newest["time"]) == (True, True, newest["span"][1])
+    assert (past["live"], past["time"], past["speed"]) == (False, 2.0, 0.0)
+    assert past["newest"]["control"]["time_ns"] == 2 * 10**9
+
+
+def test_a_log_that_grows_is_shown_within_a_second(folder: Path, tmp_path: Path) -> None:
+    data = (folder / "flight-0001.ccsds").read_bytes()
+    growing = tmp_path / "flight-0001.ccsds"
+    growing.write_bytes(data[: len(data) // 2])
+
+    async def ask(client: TestClient[Any, Any]) -> tuple[float, float]:
+        async with client.ws_connect("/api/live") as line:
+            first = (await line.receive_json())["time"]
+            growing.write_bytes(data)
+            for _ in range(10):  # pushes, ten a second
+                if (time := (await line.receive_json())["time"]) > first:
+                    break
+            return first, time
+
+    first, time = asked(tmp_path, ask)
+    assert time > first
+
+
+def commanded(folder: Path, name: str, values: Any, send: Any) -> tuple[int, Any]:
+    async def ask(client: TestClient[Any, Any]) -> tuple[int, Any]:
+        async with client.post("/api/command", json={"command": name, "values": values}) as answer:
+            return answer.status, await answer.json()
+
+    found: tuple[int, Any] = asked(folder, ask, send)
+    return found
+
+
+def test_each_command_of_the_table_is_packed_from_a_form_as_the_codec_reads_it(folder: Path) -> None:
+    forms: dict[str, dict[str, Any]] = {
+        "ping": {"number": "7"},
+        "safe": {"reason": "bored"},
+        "mode": {"mode": int(Mode.HOLD)},
+        "slew": {"q2": "0.25"},
+        "clear": {"event": "coil-broken"},
+        "point": {"goal": 4, "numbers": ["0.5", "0.6"], "roll": ""},
+    }
+    assert set(forms) == {packet.name for packet in COMMANDS}
+    sent: list[codec.Command] = []
+
+    def send(packet: bytes) -> bytes:
+        sent.append(codec.unpack(packet))
+        fields = {"obeyed": 1, "name": "x", "source": "socket", "count": 1, "mode": 1, "text": "done"}
+        return Packer().pack(COMMAND, 0, fields)
+
+    for name, values in forms.items():
+        status, answer = commanded(folder, name, values, send)
+        assert (status, answer["obeyed"], answer["text"]) == (200, 1, "done")
+    words = [codec.describe(command) for command in sent]
+    assert words[:5] == ["ping 7", "mode safe: bored", "mode hold", "slew to q2 +0.2500", "clear coil-broken"]
+    assert words[5].startswith("point ground")
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "complaint"),
+    [
+        ("none", {}, "none: no such command"),
+        ("slew", {"q2": "0.9"}, "q2 = 0.9 must lie within"),
+        ("slew", {"q2": "much"}, "'much' is no number"),
+        ("ping", {}, "number is missing"),
+        ("slew", {"q2": 0.1, "fast": 1}, "no such value: fast"),
+        ("slew", "0.1", "a command is"),
+    ],
+)
+def test_values_that_are_no_command_are_never_sent(
+    folder: Path, name: str, values: Any, complaint: str
+) -> None:
+    status, answer = commanded(folder, name, values, lambda packet: pytest.fail("sent"))
+    assert status == 400
+    assert complaint in answer["error"]
+
+
+def test_without_a_way_to_the_flight_nothing_is_sent(folder: Path) -> None:
+    status, answer = commanded(folder, "safe", {"reason": ""}, None)
+    assert (status, "--to" in answer["error"]) == (400, True)
+
+
+def test_a_satellites_place_is_known_from_its_elements_and_without_a_configuration_nothing_is(
+    tmp_path: Path,
+) -> None:
+    """On an equinox at noon UTC the Sun stands over the equator, some 2 deg east of Greenwich."""
+    shutil.copy(Path(__file__).parents[3] / "config/orbit.yaml", tmp_path / "config.yaml")
+    noon = int(datetime(2026, 3, 20, 12, tzinfo=UTC).timestamp() * 1e9)
+    place = Surroundings.of(tmp_path).at(noon)
+    assert place is not None
+    assert place["altitude_km"] == pytest.approx(500.0, abs=25.0)
+    assert (place["sun_latitude"], place["sun_longitude"]) == (
+        pytest.approx(0.0, abs=0.3),
+        pytest.approx(1.9, abs=0.5),
+    )
+    # Straight up is away from nadir, and the track passes below the satellite.
+    track = np.array(Surroundings.of(tmp_path).track(noon))
+    assert np.hypot(*(track - [place["latitude"], place["longitude"]]).T).min() < 0.5
+    assert np.dot(place["nadir"], place["velocity"]) == pytest.approx(0.0, abs=0.01)
+    unknown = Surroundings.of(tmp_path / "nowhere")
+    assert (unknown.at(noon), unknown.track(noon)) == (None, [])

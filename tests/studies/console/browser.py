@@ -1,0 +1,100 @@
+"""Chromium by playwright, as Debian installs it; counts what the page complains of and whom it asks."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+from urllib.parse import urlsplit
+
+HOST = "127.0.0.1"
+
+
+@dataclass  # without slots: playwright marks the object whose methods it calls
+class Page:
+    """An open page. `complaints` of its console; `strangers`: addresses beyond loopback that were asked."""
+
+    page: Any
+    complaints: list[str] = field(default_factory=list)
+    strangers: list[str] = field(default_factory=list)
+
+    def heard(self, said: Any) -> None:
+        """Keep an error or a warning of the browser's console."""
+        if said.type in ("error", "warning"):
+            self.complaints.append(said.text)
+
+    def failed(self, error: Any) -> None:
+        """Keep an error that no script caught."""
+        self.complaints.append(str(error))
+
+    def asked(self, request: Any) -> None:
+        """Keep a request that leaves the machine."""
+        if urlsplit(request.url).hostname not in (HOST, None):
+            self.strangers.append(request.url)
+
+    def wait(self, condition: str, patience: float = 30.0) -> None:
+        """Wait until an expression is true; the page's own rules forbid playwright's way, which is `eval`."""
+        until = time.monotonic() + patience
+        while not self.page.evaluate(condition):
+            assert time.monotonic() < until, f"not within {patience:g} s: {condition}"
+            self.page.wait_for_timeout(50)
+
+    def text(self, place: str) -> str:
+        """Return the text of an element by its CSS selector."""
+        return str(self.page.inner_text(place))
+
+    @property
+    def shown(self) -> tuple[float, str]:
+        """The time that is shown, s, and the values of all packets at that time."""
+        self.page.evaluate("document.getElementById('all').open = true")
+        self.page.wait_for_timeout(300)
+        both = "[document.body.dataset.time, document.getElementById('packets').textContent]"
+        time, values = self.page.evaluate(both)
+        return float(time), values
+
+    def command(self, name: str, **values: str) -> str:
+        """Fill a command's form, confirm, and return the answer that the page shows."""
+        form = self.page.locator(f"form.command:has(b:text-is('{name}'))")
+        for label, value in values.items():
+            form.locator(f"label:has-text('{label}') >> css=input, select").first.fill(value)
+        form.locator("button").click()
+        self.page.wait_for_selector("dialog[open]")
+        self.page.click("#send")
+        self.wait("document.querySelector('form.command p.answer, form.command p.error') !== null")
+        return str(form.locator("p").inner_text())
+
+
+def missing() -> str:
+    """Return what is missing for a browser, empty when nothing is."""
+    try:
+        import playwright.sync_api  # noqa: F401, PLC0415 - an extra of the tests
+    except ModuleNotFoundError:
+        return "playwright is not installed"
+    return "" if _chromium() else "chromium is not installed (Debian's package chromium)"
+
+
+@contextlib.contextmanager
+def opened(url: str, width: int = 1600, height: int = 1150) -> Iterator[Page]:
+    """Open a page and yield it once it shows a time."""
+    from playwright.sync_api import sync_playwright  # noqa: PLC0415
+
+    with sync_playwright() as play:
+        browser = play.chromium.launch(executable_path=_chromium(), args=["--no-sandbox"])
+        try:
+            page = browser.new_page(viewport={"width": width, "height": height})
+            found = Page(page)
+            page.on("console", found.heard)
+            page.on("pageerror", found.failed)
+            page.on("request", found.asked)
+            page.goto(url)
+            found.wait("document.body.dataset.time !== undefined")
+            yield found
+        finally:
+            browser.close()
+
+
+def _chromium() -> str | None:
+    return shutil.which("chromium") or shutil.which("chromium-browser")
