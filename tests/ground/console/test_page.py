@@ -52,7 +52,7 @@ def test_it_shows_a_log_to_its_end_a_moment_of_it_and_a_link_that_is_dead_or_ove
     page.wait("document.getElementById('light').textContent === 'replay, paused'")
     assert page.shown[1] != values
     page.page.click("#live")
-    page.wait(f"document.body.dataset.time === '{live!r}'")
+    page.wait(f"Number(document.body.dataset.time) === {live!r}")
     assert page.shown == (live, values)
     stopped = {"code": 1, "severity": 0, "suppressed": 0, "name": events.STOPPED.name, "text": "<b>done</b>"}
     with (folder / "flight-0001.ccsds").open("ab") as file:

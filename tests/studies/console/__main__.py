@@ -84,7 +84,7 @@ def measure(config: Path, seconds: float, pictures: Path | None) -> Figures:
             _picture(page, pictures, "live")
             commanded = page.command("ping", number="7")
             page.page.goto(f"{url}#at={live!r}")
-            page.wait(f"document.body.dataset.time === '{live!r}'.replace(/\\.0$/, '')")
+            page.wait(f"Number(document.body.dataset.time) === {live!r}")
             replayed = page.shown
             _picture(page, pictures, "replay")
             return Figures(
