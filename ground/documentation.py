@@ -11,8 +11,8 @@ import sys
 from typing import Any
 
 from flight.link.commands.definitions import LAYOUTS as COMMAND_LAYOUTS
-from flight.link.telemetry.form import Field
-from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, Layout
+from flight.link.telemetry.form import Field, Range
+from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, Layout, wraps_at
 
 _FOREWORD = """\
 # Telemetry
@@ -79,10 +79,42 @@ def _packet(layout: Layout) -> dict[str, Any]:
                 "offset": offset,
                 "unit": field.unit,
                 "meaning": field.meaning,
+                **_details(field),
             }
             for field, offset in _offsets(layout)
         ],
     }
+
+
+def _details(field: Field) -> dict[str, Any]:
+    """Return what only some fields have: states, limits, the number at which a counter wraps."""
+    limits = field.limits
+    details: dict[str, Any] = {
+        "states": {str(number): label for number, label in field.states},
+        "warning_outside": limits.warning if limits else None,
+        "fault_outside": limits.fault if limits else None,
+        "valid": field.valid,
+        "wraps_at": wraps_at(field),
+    }
+    return {name: value for name, value in details.items() if value}
+
+
+def meaning_of(field: Field) -> str:
+    """Return the meaning of a field in words, with its states, its ranges and its end."""
+    parts = [field.meaning] if field.meaning else []
+    if field.states:
+        parts.append(", ".join(f"{number} {label}" for number, label in field.states))
+    ranges = {"valid": field.valid}
+    if field.limits is not None:
+        ranges |= {"warning outside": field.limits.warning, "fault outside": field.limits.fault}
+    parts += [f"{word} {low:g} to {high:g}" for word, (low, high) in _given(ranges)]
+    if field.wraps:
+        parts.append(f"wraps at 2^{8 * int(field.kind[1:])}")
+    return "; ".join(parts)
+
+
+def _given(ranges: dict[str, Range | None]) -> list[tuple[str, Range]]:
+    return [(word, bounds) for word, bounds in ranges.items() if bounds is not None]
 
 
 def _offsets(layout: Layout) -> list[tuple[Field, int]]:
@@ -104,7 +136,7 @@ def _section(layout: Layout) -> str:
     ]
     for field, offset in _offsets(layout):
         kind = f"{field.kind} x {field.count}" if field.count > 1 else field.kind
-        lines.append(f"| {offset} | {field.name} | {kind} | {field.unit} | {field.meaning} |")
+        lines.append(f"| {offset} | {field.name} | {kind} | {field.unit} | {meaning_of(field)} |")
     return "\n".join(lines) + "\n"
 
 

@@ -133,6 +133,7 @@ CAMERA_LATE = EventKind(
 )
 LOG_FAULT = EventKind(60, "log-fault", _FAULT, "the flight log cannot be written")
 LOG_RECOVERED = EventKind(65, "log-recovered", _TOLD, "packets reach the disk again")
+RECORD_LOST = EventKind(110, "record-lost", _FAULT, "values did not fit their packet: the record is lost")
 STATE_RECOVERED = EventKind(
     61, "state-recovered", _WARNED, "a copy of the kept state is bad: the other is used"
 )

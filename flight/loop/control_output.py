@@ -14,8 +14,8 @@ from hal.interfaces.readings import CoilState
 
 COMMANDED = 1000
 """Commanded slews are numbered from here on."""
-KEPT = 65535
-"""The number of an attitude that is only held."""
+KEPT = -1
+"""The number of an attitude that is only held: no step or slew reaches it, and no packet carries it."""
 
 
 class Reference(Protocol):

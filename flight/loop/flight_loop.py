@@ -135,6 +135,7 @@ class FlightLoop:
             now_ns = services.clock.now_ns()
             self._requests.ended_ns = max(now_ns - epoch_ns, 0)
             reason = self._requests.stop_reason or "the configured duration is over"
+            self._tasks.housekeeping.report_lost(now_ns)
             services.events.flush(now_ns)
             services.events.report(events.STOPPED, now_ns, reason)
             self._record_performance(now_ns)

@@ -77,7 +77,7 @@ def test_a_new_field_is_flown_and_exported(tmp_path: Path) -> None:
     run(["-m", "flight", "run", "config/step_demo.yaml", "--duration", "2", "--out", "out"], tree)
     run(["-m", "flight", "export", "out", "--out", "csv"], tree)
     names = (tree / "csv" / "housekeeping.csv").read_text(encoding="utf-8").splitlines()[0]
-    assert names.endswith("events,braked_1,braked_2,braked_3")
+    assert names.endswith("records_lost,braked_1,braked_2,braked_3")
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ is never changed in place once it has flown: a field is appended and the packet'
 
 from __future__ import annotations
 
-from flight.link.telemetry.form import Field, Packet
+from flight.link.telemetry.form import Field, Packet, counter
 from flight.link.telemetry.orbit_definitions import NAVIGATION, ORBIT_TRUTH, SPIN
 
 MAX_NODES = 40
@@ -53,7 +53,7 @@ CONTROL = Packet(
     "40 Hz",
     "One control cycle: estimate, path, command",
     (
-        Field("cycle", "u4", "-", "slot of the control grid since start, skipped ones counted"),
+        Field("cycle", "u8", "-", "slot of the control grid since start, skipped ones counted"),
         Field("state", "u1", "-", "0 coils off, 1 following a path, 2 holding, 3 braking"),
         Field("estimate_age", "f8", "s", "age of the newest measurement in the estimate"),
         Field("angle", "f8", "rad", "estimated turn about the thread"),
@@ -65,11 +65,12 @@ CONTROL = Packet(
         Field("path_q2", "f8", "-", "planned q2 now"),
         Field("path_rate", "f8", "rad/s", "planned rate now"),
         Field("path_acceleration", "f8", "rad/s^2", "planned angular acceleration now"),
-        Field("plan", "u4", "-", "number of the plan being flown, 0 when none"),
+        counter("plan", "number of the plan being flown, 0 when none"),
         Field("current_command", "f8", "A", "currents asked of the coils", 3),
         Field("current_written", "f8", "A", "currents on the wire, limited and quantised", 3),
         Field("saturated", "u1", "-", "1 when any coil was limited"),
     ),
+    version=2,
 )
 
 ATTITUDE = Packet(
@@ -96,10 +97,11 @@ TARGET = Packet(
     "at each command",
     "A new commanded attitude",
     (
-        Field("index", "u2", "-", "number of the step, from 0"),
+        counter("index", "number of the step, from 0; of a commanded slew from 1001"),
         Field("q2", "f8", "-", "commanded final q2"),
         Field("rate", "f8", "rad/s", "commanded final rate"),
     ),
+    version=2,
 )
 
 MODE = Packet(
@@ -122,7 +124,7 @@ PLAN = Packet(
     "every 5 s",
     "One result of the path planner, flown or not",
     (
-        Field("number", "u4", "-", "number of the plan, from 1"),
+        counter("number", "number of the plan, from 1"),
         Field("accepted", "u1", "-", "1 when flown"),
         Field("status", "S32", "-", "optimal, stretched, or the reason of refusal"),
         Field("origin_ns", "i8", "ns", "mission time of the path's start"),
@@ -145,7 +147,7 @@ STREAK = Packet(
     "each frame",
     "What vision found in one frame",
     (
-        Field("sequence", "u4", "-", "the camera's count"),
+        counter("sequence", "the camera's count"),
         Field("exposure_start_ns", "i8", "ns", "mission time of the exposure's start"),
         Field("exposure", "f8", "s", "exposure time"),
         Field("status", "S32", "-", "rate, ambiguous, too-short, too-few, failed, black, saturated, frozen"),
@@ -165,7 +167,7 @@ STARS = Packet(
     "each frame",
     "Which stars one frame shows, and the attitude that they give",
     (
-        Field("sequence", "u4", "-", "the camera's count"),
+        counter("sequence", "the camera's count"),
         Field("middle_ns", "i8", "ns", "mission time of the exposure's middle"),
         Field("status", "S32", "-", "solved, no-stars, too-few-stars, no-match, ambiguous"),
         Field("tracked", "u1", "-", "1 when the search began at the estimate's attitude, 0 lost in space"),
@@ -186,7 +188,7 @@ EVENT = Packet(
     (
         Field("code", "u2", "-", "number of the event (flight.link.events)"),
         Field("severity", "u1", "-", "0 information, 1 warning, 2 fault"),
-        Field("suppressed", "u4", "-", "how many of its kind the throttle held back since the last report"),
+        counter("suppressed", "how many of its kind the throttle held back since the last report"),
         Field("name", "S32", "-", "name of the event"),
         Field("text", "S160", "-", "what happened, with its values"),
     ),
@@ -199,21 +201,23 @@ HOUSEKEEPING = Packet(
     "Health of the devices and of the loop",
     (
         Field("state", "u1", "-", "as in control"),
-        Field("imu_packets", "u4", "-", "packets accepted since start"),
-        Field("imu_bad_checksum", "u4", "-", "packets with a wrong checksum"),
-        Field("imu_discarded_bytes", "u4", "-", "bytes that belonged to no packet"),
-        Field("imu_out_of_range", "u4", "-", "packets with implausible values"),
-        Field("imu_not_finite", "u4", "-", "packets with NaN or infinity"),
-        Field("coil_faults", "u4", "-", "failed transactions with the PWM chip"),
+        counter("imu_packets", "packets accepted since start"),
+        counter("imu_bad_checksum", "packets with a wrong checksum"),
+        counter("imu_discarded_bytes", "bytes that belonged to no packet"),
+        counter("imu_out_of_range", "packets with implausible values"),
+        counter("imu_not_finite", "packets with NaN or infinity"),
+        counter("coil_faults", "failed transactions with the PWM chip"),
         Field("coil_voltage", "f8", "V", "supply of the coils, measured; NaN when unknown"),
         Field("coil_current", "f8", "A", "total current of the coils, measured; NaN when unknown"),
         Field("coil_power", "f8", "W", "power of the coils, measured; NaN when unknown"),
-        Field("plans_accepted", "u4", "-", "plans flown since start"),
-        Field("plans_refused", "u4", "-", "plans refused since start"),
-        Field("frames", "u4", "-", "frames received since start"),
-        Field("streak_rates", "u4", "-", "rates from streaks that entered the estimate"),
-        Field("events", "u4", "-", "events since start, suppressed ones counted"),
+        counter("plans_accepted", "plans flown since start"),
+        counter("plans_refused", "plans refused since start"),
+        counter("frames", "frames received since start"),
+        counter("streak_rates", "rates from streaks that entered the estimate"),
+        counter("events", "events since start, suppressed ones counted"),
+        counter("records_lost", "records since start whose values did not fit their packet"),
     ),
+    version=2,
 )
 
 HEALTH = Packet(
@@ -231,9 +235,9 @@ HEALTH = Packet(
         Field("camera", "u1", "-", "frames, as imu"),
         Field("facts", "u8", "-", "bit n: fact n of the table (flight.loop.fdir.facts) counts"),
         Field("coils_in_use", "u1", "-", "bits 0, 1, 2: the coils on body x, y, z"),
-        Field("fed", "u4", "-", "how often the watchdog was fed"),
-        Field("slips", "u4", "-", "slots of the control group skipped since start"),
-        Field("clock_steps", "u4", "-", "how often the wall clock was set"),
+        counter("fed", "how often the watchdog was fed"),
+        counter("slips", "slots of the control group skipped since start"),
+        counter("clock_steps", "how often the wall clock was set"),
         Field("cpu_share", "f8", "-", "processor time of the control process over time; NaN when unknown"),
         Field("resident", "f8", "B", "resident set of the control process; NaN when unknown"),
         Field("proportional", "f8", "B", "proportional set of all flight processes; NaN when unknown"),
@@ -252,7 +256,7 @@ COMMAND = Packet(
         Field("obeyed", "u1", "-", "1 when obeyed, 0 when refused"),
         Field("name", "S16", "-", "name of the command; empty for bytes that are none"),
         Field("source", "S16", "-", "socket, udp or timeline"),
-        Field("count", "u4", "-", "commands since start"),
+        counter("count", "commands since start"),
         Field("mode", "u1", "-", "mode after it, as in mode"),
         Field("text", "S128", "-", "its values, or why it was refused"),
     ),
@@ -278,10 +282,11 @@ CYCLE_TIMING = Packet(
     "40 Hz, performance record",
     "When a control cycle ran and how long it took, on the machine's clock",
     (
-        Field("cycle", "u4", "-", "slot of the control grid"),
+        Field("cycle", "u8", "-", "slot of the control grid"),
         Field("lateness", "f8", "s", "start of the cycle after its slot"),
         Field("execution", "f8", "s", "time spent in the cycle"),
     ),
+    version=2,
 )
 
 RATE_GROUP = Packet(
@@ -292,9 +297,9 @@ RATE_GROUP = Packet(
     (
         Field("name", "S16", "-", "name of the group"),
         Field("period", "f8", "s", "its period"),
-        Field("cycles", "u4", "-", "slots that ran"),
-        Field("slips", "u4", "-", "slots that were skipped"),
-        Field("overruns", "u4", "-", "cycles longer than the period"),
+        counter("cycles", "slots that ran"),
+        counter("slips", "slots that were skipped"),
+        counter("overruns", "cycles longer than the period"),
         Field("mean", "f8", "s", "mean execution time"),
         Field("max", "f8", "s", "longest execution time"),
     ),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from flight.link.telemetry.form import Field, Packet
+from flight.link.telemetry.form import Field, Packet, counter
 
 SPIN = Packet(
     "spin",
@@ -14,7 +14,7 @@ SPIN = Packet(
         Field("rate", "f8", "rad/s", "body rate, body axes", 3),
         Field("rate_sigma", "f4", "rad/s", "standard deviation of the rate's worst axis"),
         Field("field", "f8", "T", "magnetic field, body axes", 3),
-        Field("restarts", "u4", "-", "how often the samples contradicted the rate until it was found again"),
+        counter("restarts", "how often the samples contradicted the rate until it was found again"),
         Field("dipole", "f4", "A m^2", "dipole wanted of the coils, body axes", 3),
     ),
 )
@@ -27,9 +27,9 @@ NAVIGATION = Packet(
     (
         Field("knowledge", "u1", "-", "0 lost, 1 coarse, 2 fine"),
         Field("placed", "u1", "-", "1 while the orbit is known"),
-        Field("refused", "u4", "-", "measurements that did not pass their gate, replays included"),
-        Field("fixes_refused", "u4", "-", "GPS fixes that contradict what is known of the orbit"),
-        Field("restarts", "u4", "-", "how often the estimate was discarded for a new one"),
+        counter("refused", "measurements that did not pass their gate, replays included"),
+        counter("fixes_refused", "GPS fixes that contradict what is known of the orbit"),
+        counter("restarts", "how often the estimate was discarded for a new one"),
         Field("gyro_bias", "f8", "rad/s", "body axes, NaN before an estimate", 3),
         Field("field_bias", "f8", "T", "of the magnetometer, body axes", 3),
         Field("residual_dipole", "f8", "A m^2", "in the present light, body axes", 3),

@@ -67,6 +67,11 @@ def _text_size(field: Field) -> int:
     return int(field.kind[1:]) if field.kind.startswith("S") else 0
 
 
+def wraps_at(field: Field) -> int:
+    """Return the number at which a counter goes on at 0; 0 for a field that does not wrap."""
+    return 1 << 8 * np.dtype(field.kind).itemsize if field.wraps else 0
+
+
 def _struct_code(field: Field) -> str:
     return f"{_text_size(field)}s" if _text_size(field) else f"{field.count}{_STRUCT_CODES[field.kind]}"
 
@@ -94,9 +99,11 @@ class Layout:
         return self.body.size + CRC_BYTES
 
     @cached_property
-    def fields(self) -> tuple[tuple[str, int, int], ...]:
-        """Of each field its name, its bytes when it is a text (else 0), its count."""
-        return tuple((field.name, _text_size(field), field.count) for field in self.packet.fields)
+    def fields(self) -> tuple[tuple[str, int, int, int], ...]:
+        """Of each field its name, its bytes when it is a text (else 0), its count, its end if it wraps."""
+        return tuple(
+            (field.name, _text_size(field), field.count, wraps_at(field)) for field in self.packet.fields
+        )
 
     @cached_property
     def offsets(self) -> dict[str, int]:
@@ -159,9 +166,9 @@ class Packer:
     ) -> bytes:
         """Return the bytes of one packet at mission time `time_ns`, all fields given by name.
 
-        Texts too long for their field are cut between two characters. NaN passes: the table says where it
-        means "none". Raises TelemetryError, and counts no packet, for a field missing, unknown, of the
-        wrong length or out of its type's range.
+        Texts too long for their field are cut between two characters, counters past their end wrap. NaN
+        passes: the table says where it means "none". Raises TelemetryError, and counts no packet, for a field
+        missing, unknown, of the wrong length or out of its type's range.
         """
         given = fields if values is None else {**values, **fields} if fields else values
         layout = self._layouts[packet.name]
@@ -169,10 +176,12 @@ class Packer:
         data_length = layout.length - HEADER_BYTES - 1
         flat: list[Any] = [layout.identifier, UNSEGMENTED | count, data_length, packet.version, time_ns]
         try:
-            for name, text_size, items in layout.fields:
-                value = given[name]
+            for name, text_size, items, end in layout.fields:
+                value: Any = given[name]
                 if text_size:
                     flat.append(_to_bytes(value, text_size))
+                elif end and value >= end:
+                    flat.append(value % end)
                 elif items == 1:
                     flat.append(value)
                 else:
@@ -214,6 +223,8 @@ def _explain(layout: Layout, time_ns: int, given: Mapping[str, object]) -> Telem
         try:
             if _text_size(field):
                 _to_bytes(value, _text_size(field))
+            elif wraps_at(field):
+                struct.pack(">" + _struct_code(field), value % wraps_at(field) if value >= 0 else value)
             else:
                 items = _to_items(value, field.count) if field.count > 1 else [value]
                 struct.pack(">" + _struct_code(field), *items)

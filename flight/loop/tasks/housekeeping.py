@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from flight.link import events
 from flight.link.telemetry.definitions import HOUSEKEEPING
 from flight.loop.body import Planner
 from flight.loop.control_output import SteeringState
@@ -38,6 +39,7 @@ class Housekeeping:
         self._recorder = services.recorder
         self._events = services.events
         self._facts = services.facts
+        self._lost = 0
 
     def coils(self) -> CoilState:
         """Return the state of the coils."""
@@ -50,6 +52,7 @@ class Housekeeping:
         log_error = watched.log_error()
         text = log_error or "packets reach the disk again"
         self._facts.update(facts.LOG_FAULT, bool(log_error), now_ns, text)
+        self.report_lost(now_ns)
         reading = watched.power.latest() if watched.power and not error else None
         link = watched.navigation.link()
         accepted, refused = watched.planner.counts()
@@ -72,4 +75,13 @@ class Housekeeping:
             frames=frames,
             streak_rates=streak_rates,
             events=self._events.count,
+            records_lost=self._recorder.lost,
         )
+
+    def report_lost(self, now_ns: int) -> None:
+        """Report the records that were lost since the last call, with the newest reason."""
+        lost = self._recorder.lost
+        if lost != self._lost:
+            text = f"{lost - self._lost} more, the newest: {self._recorder.lost_text}"
+            self._lost = lost
+            self._events.report(events.RECORD_LOST, now_ns, text)

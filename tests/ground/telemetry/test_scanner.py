@@ -98,7 +98,7 @@ def test_a_packet_of_another_version_is_stepped_over_and_counted() -> None:
     first, second = timing_packets(2)
     other = bytearray(first[:-2] + b"one field more")
     other[4:6] = (len(other) + 2 - 7).to_bytes(2, "big")
-    other[6] = 2
+    other[6] += 1
     newer = bytes(other) + crc16(bytes(other)).to_bytes(2, "big")
     result = scan(first + newer + second)
     assert cycles(result) == [0, 1]

@@ -151,7 +151,9 @@ def test_labels_may_differ_and_other_fields_of_run_may_not(tmp_path: Path) -> No
 
 
 def test_an_appended_field_with_a_raised_version_is_left_out(tmp_path: Path) -> None:
-    longer = replace(TARGET, version=2, fields=(*TARGET.fields, Field("hold", "f8", "s", "time to hold")))
+    longer = replace(
+        TARGET, version=TARGET.version + 1, fields=(*TARGET.fields, Field("hold", "f8", "s", "time to hold"))
+    )
     table = (RUN, IMU, longer)
     for name, q2 in (("same", -0.3), ("other", -0.31)):
         (tmp_path / name).mkdir()

@@ -96,7 +96,7 @@ def test_a_packet_of_a_segment_or_of_a_sequence_is_none_of_ours() -> None:
     body = bytearray(LAYOUTS["cycle_timing"].length - 2)
     body[:2] = LAYOUTS["cycle_timing"].identifier.to_bytes(2, "big")
     body[4:6] = (len(body) + 2 - 7).to_bytes(2, "big")
-    body[6] = 1
+    body[6] = LAYOUTS["cycle_timing"].packet.version
     for flags in range(4):
         body[2] = flags << 6
         raw = bytes(body) + crc16(bytes(body)).to_bytes(2, "big")

@@ -1,0 +1,127 @@
+"""No number of telemetry ends a flight: counters wrap, and what does not fit is counted and reported."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flight.link.telemetry.definitions import PACKETS
+from flight.link.telemetry.form import Field, Packet
+from flight.link.telemetry.packets import to_text
+from flight.link.telemetry.recorder import Recorder
+from flight.loop.executive.rate_group import RateGroup
+from flight.loop.fdir.facts import FACTS
+from flight.schema import reader as configuration
+from flight.schema.sections import Commands, CommandStep
+from ground.telemetry.reader import Run
+from tests.scenario.flights import Rigged, demo_config, event_names, fly
+from tests.scenario.test_orbit import orbit_config, world
+
+NEAR = (1 << 32) - 30
+"""A count that passes 32 bits within a second of control cycles."""
+FEW_LEFT = (1 << 32) - 3
+"""The same for what counts slower."""
+SLEWS = 64_535
+"""Slews commanded before: the next one was numbered as an attitude that is only held."""
+
+Driven = dict[tuple[str, str], bool]
+
+
+def end_of(field: Field) -> int:
+    """Return one more than the largest number of an integer field."""
+    return int(np.iinfo(field.kind).max) + 1
+
+
+def whole(packet: Packet) -> list[Field]:
+    return [field for field in packet.fields if field.kind[0] in "ui"]
+
+
+def drive(monkeypatch: pytest.MonkeyPatch) -> Driven:
+    """Write each record once more for each of its integer fields, with that field past its end."""
+    driven: Driven = {}
+    for name in ("record", "time"):
+        plain = getattr(Recorder, name)
+
+        def both(
+            self: Recorder, packet: Packet, time_ns: int, plain: Any = plain, **values: Any
+        ) -> bytes | None:
+            for field in whole(packet):
+                if (packet.name, field.name) not in driven:
+                    before = self.lost
+                    past = {field.name: end_of(field) + values[field.name]}
+                    plain(self, packet, time_ns, **{**values, **past})
+                    driven[packet.name, field.name] = self.lost == before
+            result: bytes | None = plain(self, packet, time_ns, **values)
+            return result
+
+        monkeypatch.setattr(Recorder, name, both)
+    return driven
+
+
+def assert_survived(run: Run, driven: Driven, written: set[str]) -> None:
+    """Each field was driven, none failed a task, and what did not fit was counted and reported."""
+    due = {(p.name, f.name): f.wraps for p in PACKETS if p.name in written for f in whole(p)}
+    assert {key: kept for key, kept in driven.items() if key[0] in written} == due
+    assert "task-failed" not in event_names(run)
+    assert "record-lost" in event_names(run)
+    lost = sum(not kept for kept in driven.values())
+    assert run["housekeeping"]["records_lost"][-1] == lost
+
+
+def test_every_integer_of_the_testbed_may_pass_its_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    driven = drive(monkeypatch)
+    config = configuration.replace(
+        demo_config(7.0), commands=Commands(timeline=(CommandStep(at=1.0, slew=0.1),))
+    )
+    run = fly(config, tmp_path)
+    elsewhere = {"spin", "navigation", "truth", "orbit_truth"}
+    assert_survived(run, driven, {packet.name for packet in PACKETS} - elsewhere)
+
+
+def test_every_integer_of_an_orbit_may_pass_its_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    driven = drive(monkeypatch)
+    run = fly(configuration.replace(orbit_config(4.0), camera=None), tmp_path, section=world(0.1))
+    assert_survived(run, driven, {"spin", "navigation"})
+
+
+def test_counts_of_ten_years_neither_end_the_flight_nor_its_slews(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In three seconds each count passes 32 bits, and the commanded slew gets the number 65,535 or more."""
+    begin = RateGroup.begin
+
+    def late(group: RateGroup, epoch_ns: int) -> None:
+        begin(group, epoch_ns - NEAR * group.period_ns)
+        group.claim(epoch_ns + group._offset_ns - 1)
+        group.cycles = group.completed = group.slips = group.overruns = NEAR
+
+    def count(rigged: Rigged) -> None:
+        services = rigged.loop._services
+        services.events.count = FEW_LEFT
+        monkeypatch.setattr(rigged.loop._tasks.modes, "_commands", SLEWS - 1)
+        rigged.loop._tasks.health._fed = FEW_LEFT
+
+    monkeypatch.setattr(RateGroup, "begin", late)
+    slews = (CommandStep(at=1.0, slew=0.1), CommandStep(at=2.0, slew=0.2))
+    config = configuration.replace(demo_config(3.2, camera=False), commands=Commands(timeline=slews))
+    run = fly(config, tmp_path, prepare=count)
+    assert not {"task-failed", "record-lost", "no-progress"} & set(event_names(run))
+    assert run["target"]["index"].tolist()[1:] == [1000 + SLEWS, 1001 + SLEWS]
+    assert run["plan"]["target_q2"].tolist()[-1] == 0.2
+    cycles = run["control"]["cycle"].astype(np.int64)
+    assert cycles[0] < 1 << 32 <= cycles[-1]
+    assert (np.diff(cycles) == 1).all()
+    assert run["rate_group"]["cycles"].min() < 1000, "documented to wrap"
+    assert run["health"]["fed"][-1] < 1000
+    assert run["housekeeping"]["events"][-1] < 1000
+    assert np.diff(run["housekeeping"]["time_ns"]).max() == 1_000_000_000
+    assert to_text(run["event"]["name"][-1]) == "stopped"
+
+
+def test_facts_fit_their_field() -> None:
+    assert len(FACTS) <= 64
