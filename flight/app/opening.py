@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Set
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -17,13 +18,14 @@ from flight.link.telemetry.log import FlightLog
 from flight.link.telemetry.recorder import Recorder
 from flight.loop.executive.jobs import JobResult, JobRunner
 from flight.loop.executive.lockstep import LockStepRunner
-from flight.loop.executive.processes import ProcessRunner
+from flight.loop.executive.supervisor import ProcessRunner
 from flight.loop.fdir.board import Board
 from flight.loop.flight_loop import FlightLoop, Supervisors, nothing
 from flight.loop.state.opening import open_state
 from flight.schema.errors import ConfigError
 from flight.schema.peers import peer_networks
 from flight.schema.sections import Config
+from hal.buses.real_time import worker_cores
 from hal.interfaces.rig import Rig
 
 
@@ -45,7 +47,7 @@ def open_flight(
         ensure_default_index()
     elif tracker is not None and not patient and not Path(tracker.index or "").is_file():
         raise ConfigError("camera.star_tracker.index", f"is {tracker.index!r}: there is no such file")
-    jobs = _open_jobs(config, rig, stack)
+    jobs = _open_jobs(config, rig, stack, worker_cores() if patient else frozenset())
     recorder = Recorder(flight_log, performance_log)
     feed, beat = nothing, nothing
     if guardian is not None:
@@ -59,10 +61,12 @@ def open_flight(
     return loop, flight_log
 
 
-def _open_jobs(config: Config, rig: Rig, stack: ExitStack) -> JobRunner:
+def _open_jobs(config: Config, rig: Rig, stack: ExitStack, cores: Set[int]) -> JobRunner:
     specs = workers(config, *rig.latency)
     made = specs if rig.host is None else rig.host.workers(specs)
-    runner: JobRunner = ProcessRunner(rig.clock, made) if rig.realtime else LockStepRunner(rig.clock, made)
+    runner: JobRunner = (
+        ProcessRunner(rig.clock, made, cores) if rig.realtime else LockStepRunner(rig.clock, made)
+    )
     stack.callback(runner.close)
     return runner if rig.host is None else rig.host.jobs(runner, specs, JobResult)
 

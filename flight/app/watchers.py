@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import threading
 from contextlib import ExitStack
@@ -15,12 +16,13 @@ from hal.buses.service_manager import ServiceManager
 from hal.drivers.coil_settings import DEVICE as COILS
 from hal.guardian.client import GuardianLine
 from hal.interfaces.rig import Rig
-from hal.interfaces.wires import Clock
+from hal.interfaces.wires import SECOND_NS, Clock
 
 CONTROL_PRIORITY = 50
 """SCHED_FIFO priority of the control thread and of the coil driver's thread."""
 NEXT_PRIORITY = CONTROL_PRIORITY - 10
 """Priority of the other threads of the control process."""
+_COLLECT_NS = 60 * SECOND_NS
 
 
 def start_guardian(rig: Rig, stack: ExitStack) -> GuardianLine | None:
@@ -41,6 +43,10 @@ def supervise(guardian: GuardianLine, clock: Clock, recorder: Recorder, stack: E
     stack.callback(real_time.relinquish)
     stack.callback(overseer.stopping)
     coils = next(ticker for ticker in clock.tickers if ticker.name == COILS)
+
+    stack.callback(gc.enable)
+    collector = clock.ticker("garbage", _COLLECT_NS, memory.collect)
+    stack.callback(collector.stop)
 
     def settle() -> None:
         memory.settle()

@@ -110,6 +110,11 @@ PLANNER_BUSY = EventKind(43, "planner-busy", _WARNED, "the planner has not finis
 PLANNER_FAILED = EventKind(44, "planner-failed", _WARNED, "the planner gave no plan, with the reason")
 HOLDING = EventKind(45, "holding", _WARNED, "the last good path has ended: holding its final attitude")
 SLEW_LATE = EventKind(46, "slew-late", _WARNED, "a slew does not arrive", Reaction.HOLD)
+WORKER_DIED = EventKind(47, "worker-died", _WARNED, "the process of a worker ended or was killed")
+WORKER_READY = EventKind(48, "worker-ready", _TOLD, "a worker runs again")
+WORKER_RESTS = EventKind(
+    49, "worker-rests", _FAULT, "a worker died too often in a row: it is started again minutes later"
+)
 CAMERA_LOST = EventKind(50, "camera-lost", _WARNED, "no frame has come for too long")
 CAMERA_RECOVERED = EventKind(51, "camera-recovered", _TOLD, "frames come again")
 CAMERA_FROZEN = EventKind(52, "camera-frozen", _WARNED, "the camera gives the same frame again")

@@ -32,6 +32,14 @@ def relinquish() -> None:
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
+def worker_cores() -> frozenset[int]:
+    """Return the cores for worker processes: all but the last, which stays free for the control process.
+
+    Empty where there is only one. The control process itself may use every core.
+    """
+    return frozenset(sorted(os.sched_getaffinity(0))[:-1])
+
+
 def lock_memory() -> str:
     """Keep every page that this process touches in memory.
 

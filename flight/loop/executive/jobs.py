@@ -1,13 +1,14 @@
 """Jobs outside the control loop: workers, their results, and the runner's interface.
 
 The control thread submits a job and later collects the finished result; it never waits. There are two
-runners: `lockstep.LockStepRunner` in simulated time and `processes.ProcessRunner` in real time.
+runners: `lockstep.LockStepRunner` in simulated time and `supervisor.ProcessRunner` in real time.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import Enum
 from typing import Any, Literal, Protocol
 
 Outcome = Literal["done", "failed", "timed-out", "died"]
@@ -19,7 +20,8 @@ class Worker:
 
     Attributes:
         name: short name for telemetry.
-        function: runs in a process of its own in real time, so argument and result must pickle.
+        function: runs in a process of its own in real time, so argument and result must pickle; the result
+            of plain values, arrays, and dataclasses and enumerations that the control process has imported.
         latency_ns: delay of a result in lock-step simulation.
         timeout_ns: in real time, a job that runs for longer is killed.
     """
@@ -43,14 +45,34 @@ class JobResult:
     execution_ns: int
 
 
+class Change(Enum):
+    """What happened to a worker: its process ended, runs again, or died too often and rests."""
+
+    DIED = "died"
+    READY = "ready"
+    SPENT = "spent"
+
+
+@dataclass(frozen=True, slots=True)
+class WorkerNews:
+    """A change in a worker's life, and its circumstances."""
+
+    worker: str
+    change: Change
+    text: str
+
+
 class JobRunner(Protocol):
     """Runs the jobs of several workers, at most one at a time for each."""
 
     def submit(self, worker: str, argument: Any) -> bool:
-        """Submit a job; return False when that worker is busy. Never waits."""
+        """Submit a job; return False when that worker is busy or not running. Never waits."""
 
     def collect(self) -> list[JobResult]:
         """Return the results that have arrived. Never waits."""
+
+    def news(self) -> list[WorkerNews]:
+        """Return what happened to the workers since the last call. Never waits."""
 
     @property
     def borrowed_ns(self) -> int:

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from flight.loop.executive.jobs import JobResult, Outcome, Worker
+from flight.loop.executive.jobs import JobResult, Outcome, Worker, WorkerNews
 from hal.interfaces.wires import Clock
 
 
@@ -56,6 +56,10 @@ class LockStepRunner:
         for result in ready:
             del self._pending[result.worker]
         return ready
+
+    def news(self) -> list[WorkerNews]:
+        """Return nothing: there are no processes that could die."""
+        return []
 
     def close(self) -> None:
         """Discard pending results."""

@@ -1,30 +1,36 @@
 """A worker process of `flight.loop.executive.processes`: serves one function until its socket closes.
 
 The function's module may define `prepare`, for imports that only the worker needs: called before the first
-job. Run as `python -m flight.loop.executive.worker MODULE:FUNCTION SOCKET_FD MEMORY_FD`, by the runner only.
+job. Run by the runner only, as `python -m flight.loop.executive.worker MODULE:FUNCTION SOCKET_FD MEMORY_FD
+PARENT CORES`. The kernel kills the process when its parent's thread ends, so no worker outlives its flight.
 """
 
 from __future__ import annotations
 
+import ctypes
 import importlib
 import mmap
 import os
+import signal
 import socket
 import sys
 import time
 from typing import Any
 
 from flight.loop.executive.memory import give_back
-from flight.loop.executive.processes import SLAB_BYTES, message_length, pack_message, unpack_message
+from flight.loop.executive.messages import SLAB_BYTES, message_length, pack_message, unpack_trusted
+
+_PR_SET_PDEATHSIG = 1  # prctl(2)
 
 
 def serve(function: Any, line: socket.socket, slab: mmap.mmap) -> None:
-    """Answer each message with (outcome, value, error, execution time in ns)."""
+    """Announce readiness, then answer each message with (outcome, value, error, execution time in ns)."""
+    line.sendall(pack_message(None, slab))
     received = bytearray()
     while chunk := line.recv(1 << 20):
         received += chunk
         while (length := message_length(received)) is not None and len(received) >= length:
-            argument = unpack_message(bytes(received[:length]), slab)
+            argument = unpack_trusted(bytes(received[:length]), slab)
             del received[:length]
             line.sendall(pack_message(_run(function, argument), slab))
             del argument
@@ -45,17 +51,30 @@ def _nothing() -> None:
     """No-op."""
 
 
+def end_with(parent: int) -> None:
+    """Have the kernel kill this process when its parent ends; end now where the parent has ended already."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    if os.getppid() != parent:
+        os._exit(0)
+
+
 def main(arguments: list[str]) -> None:
     """Import the function, then serve."""
-    function_name, socket_fd, memory_fd = arguments
+    function_name, socket_fd, memory_fd, parent, cores = arguments
+    end_with(int(parent))
     module, _, name = function_name.partition(":")
     os.nice(5)  # the control loop comes first
+    if cores:
+        os.sched_setaffinity(0, map(int, cores.split(",")))
     home = importlib.import_module(module)
     getattr(home, "prepare", _nothing)()
     function = getattr(home, name)
     line = socket.socket(fileno=int(socket_fd))
     slab = mmap.mmap(int(memory_fd), SLAB_BYTES)
-    serve(function, line, slab)
+    try:
+        serve(function, line, slab)
+    except ConnectionError:
+        return  # the control process ended
 
 
 if __name__ == "__main__":

@@ -8,8 +8,10 @@ from dataclasses import dataclass
 
 from flight.link import events
 from flight.link.telemetry.definitions import HEALTH
+from flight.loop.executive.jobs import Change
 from flight.loop.executive.rate_group import Cycle, RateGroup
 from flight.loop.fdir import facts
+from flight.loop.fdir.event_log import EventLog
 from flight.loop.fdir.facts import FACTS
 from flight.loop.fdir.progress import GroupsAndWorkers, WorkerWatch, failing
 from flight.loop.fdir.resources import ClockWatch, ResourceMonitor, ResourceReader, ResourceSample
@@ -22,6 +24,11 @@ from hal.interfaces.wires import Ticker
 
 RUNS_PER_PACKET = 4
 _FAILING_CYCLES = 60
+_WORKER_EVENTS = {
+    Change.DIED: events.WORKER_DIED,
+    Change.READY: events.WORKER_READY,
+    Change.SPENT: events.WORKER_RESTS,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +54,9 @@ class HealthWatch:
         self._clock = services.clock
         self._recorder = services.recorder
         self._events = services.events
+        self._jobs = services.jobs
+        # Every death of a worker is written: the budget of restarts bounds them, so there is no throttle.
+        self._worker_events = EventLog(services.recorder.event, 0)
         self._facts = services.facts
         self._streams = services.streams
         self._feed = feed
@@ -85,6 +95,9 @@ class HealthWatch:
         self._look_at_streams(now_ns)
         self._look_at_progress(now_ns)
         self._look_at_services(now_ns)
+        for news in self._jobs.news():
+            text = f"{news.worker}: {news.text}"
+            self._worker_events.report(_WORKER_EVENTS[news.change], now_ns, text)
         step = self._clock_watch.look()
         if step is not None:
             self._events.report(events.CLOCK_STEP, now_ns, f"by {step:+.3f} s")

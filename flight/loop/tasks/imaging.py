@@ -122,7 +122,7 @@ class Imaging:
             self._frame = frame
             self._busy_since_ns = now_ns
         else:
-            self._events.report(events.VISION_FAILED, now_ns, "the worker has not finished the last frame")
+            self._events.report(events.VISION_FAILED, now_ns, "the worker is busy or not running")
 
     def finish(self, result: JobResult, now_ns: int) -> None:
         """Accept the worker's result."""

@@ -19,7 +19,7 @@ import numpy.typing as npt
 import pytest
 
 from flight.loop.executive.jobs import Worker
-from flight.loop.executive.processes import ProcessRunner
+from flight.loop.executive.supervisor import ProcessRunner
 from hal.buses.clock import SystemClock
 from tests.studies.bench import bare_loop, process_watch
 from tests.studies.bench.executive import Load, fly

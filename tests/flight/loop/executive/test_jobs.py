@@ -2,21 +2,34 @@
 
 from __future__ import annotations
 
+import mmap
 import os
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing, suppress
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from flight.loop.executive.jobs import JobResult, JobRunner, Worker
+from flight.gnc.camera.lens import Lens
+from flight.gnc.errors import FlightError
+from flight.gnc.vision.streaks.streak_result import StreakStatus
+from flight.loop.executive.attempts import BUDGET, STEADY_NS, Attempts
+from flight.loop.executive.jobs import Change, JobResult, JobRunner, Worker, WorkerNews
 from flight.loop.executive.lockstep import LockStepRunner
-from flight.loop.executive.processes import ProcessRunner
+from flight.loop.executive.messages import SLAB_BYTES, message_length, pack_message, unpack_values
+from flight.loop.executive.supervisor import ProcessRunner
 from hal.buses.clock import SystemClock
+from hal.interfaces.wires import SECOND_NS
 from sim_hal.clock import SimClock
 from tests.flight.loop.executive.odd_jobs import die, double, fail, hang
+from tests.hal.guardian.campaign import lives
 
 MS = 1_000_000
 
@@ -101,17 +114,117 @@ def test_a_hung_worker_is_killed_and_replaced(processes: ProcessRunner) -> None:
     processes.submit("hang", None)
     (result,) = wait(processes)
     assert (result.worker, result.outcome) == ("hang", "timed-out")
-    assert processes.process_identifiers()["hang"] != old
+    assert processes.process_identifiers().get("hang") != old
     with pytest.raises(ProcessLookupError):
         os.kill(old, 0)
 
 
-def test_a_worker_that_dies_is_reported_and_replaced(processes: ProcessRunner) -> None:
-    processes.submit("die", None)
+def hear(runner: ProcessRunner, name: str, change: Change) -> WorkerNews:
+    """Return the first news of a kind of a worker, as the health task would hear it."""
+    deadline = time.monotonic() + 20.0
+    while time.monotonic() < deadline:
+        for news in runner.news():
+            if (news.worker, news.change) == (name, change):
+                return news
+        time.sleep(0.005)
+    raise AssertionError(f"{name} was not {change.value}")
+
+
+def test_a_worker_that_dies_is_reported_and_replaced_at_work_or_idle(processes: ProcessRunner) -> None:
+    assert processes.submit("die", None)
     (result,) = wait(processes)
     assert (result.worker, result.outcome) == ("die", "died")
+    assert "status 3" in hear(processes, "die", Change.DIED).text
     os.kill(processes.process_identifiers()["double"], signal.SIGKILL)
-    (result,) = wait(processes)
-    assert (result.worker, result.outcome) == ("double", "died")
+    assert "signal 9" in hear(processes, "double", Change.DIED).text
+    hear(processes, "double", Change.READY)
+    assert processes.collect() == [], "no job was lost"
     assert processes.submit("double", 3)
     assert wait(processes)[0].value == 6
+
+
+def test_a_worker_that_cannot_start_takes_no_jobs_and_costs_the_control_thread_nothing() -> None:
+    def nowhere(_: Any) -> Any: ...
+
+    nowhere.__module__ = "tests.flight.loop.executive.no_such_module"
+    with closing(ProcessRunner(SystemClock(), [worker("nowhere", nowhere)])) as runner:
+        begun = time.thread_time()
+        assert runner.submit("nowhere", 1)
+        assert wait(runner)[0].outcome == "died"
+        assert "status 1" in hear(runner, "nowhere", Change.DIED).text
+        hear(runner, "nowhere", Change.DIED)
+        assert not runner.submit("nowhere", 2)
+        assert time.thread_time() - begun < 0.5, "it polls 200 times a second here, and no more"
+
+
+def test_restarts_come_at_growing_intervals_within_a_budget_and_a_new_one_after_a_rest() -> None:
+    attempts = Attempts()
+    waits = [attempts.died(lived_ns=SECOND_NS) / SECOND_NS for _ in range(2 * BUDGET)]
+    one = [0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 600.0]
+    assert waits == 2 * one
+    assert attempts.is_spent
+    attempts.died(SECOND_NS)
+    attempts.died(SECOND_NS)
+    assert attempts.died(STEADY_NS) == 0
+    assert not attempts.is_spent
+
+
+_ORPHANED = """
+import sys, time
+from flight.loop.executive.jobs import Worker
+from flight.loop.executive.supervisor import ProcessRunner
+from hal.buses.clock import SystemClock
+from hal.interfaces.wires import SECOND_NS
+from tests.flight.loop.executive.odd_jobs import hang
+runner = ProcessRunner(SystemClock(), [Worker("hang", hang, 0, 10**12)])
+runner.submit("hang", None)
+while not all(kept.process and kept.process.ready for kept in runner._kept.values()):
+    time.sleep(0.01)
+print(*runner.process_identifiers().values(), flush=True)
+time.sleep(60.0)
+"""
+
+
+def test_a_worker_ends_quietly_in_the_middle_of_a_job_when_its_flight_is_killed() -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", _ORPHANED], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as flight:
+        assert flight.stdout is not None
+        assert flight.stderr is not None
+        orphan = int(flight.stdout.readline())
+        flight.kill()
+        # The worker inherited standard error: its end is that of the last process which had it.
+        assert flight.stderr.read() == ""
+    assert not lives(orphan)
+
+
+class _Harmful:
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.getpid, ()
+
+
+@pytest.mark.parametrize("value", [_Harmful(), os.getpid, subprocess.Popen, np.load, {"deep": [np.fromfile]}])
+def test_what_a_worker_sends_can_call_nothing(value: Any) -> None:
+    slab = mmap.mmap(-1, SLAB_BYTES)
+    with pytest.raises(FlightError, match="no class of values"):
+        unpack_values(pack_message(value, slab), slab)
+
+
+def test_what_a_worker_sends_may_be_any_value_of_ours() -> None:
+    slab = mmap.mmap(-1, SLAB_BYTES)
+    lens = Lens(1024, 768, 500.0, (511.5, 383.5))
+    value = (StreakStatus.BLACK, lens, np.float64(2.0), {"a": np.eye(3)}, frozenset({1}), None)
+    status, again, number, arrays, numbers, nothing = unpack_values(pack_message(value, slab), slab)
+    assert (status, again, number, numbers, nothing) == (StreakStatus.BLACK, lens, 2.0, {1}, None)
+    np.testing.assert_array_equal(arrays["a"], np.eye(3))
+
+
+@given(st.binary(max_size=200), st.integers(0, 400))
+def test_a_damaged_message_is_refused_or_read_and_nothing_else(noise: bytes, place: int) -> None:
+    slab = mmap.mmap(-1, SLAB_BYTES)
+    message = bytearray(pack_message(("done", Lens(1024, 768, 500.0, (511.5, 383.5)), "", 7), slab))
+    message[place : place + len(noise)] = noise
+    with suppress(FlightError):
+        length = message_length(message)
+        if length is not None:
+            unpack_values(bytes(message[:length]), slab)
