@@ -163,6 +163,9 @@ TOO_HOT = EventKind(76, "too-hot", _FAULT, "the board is too hot to drive coils"
 RESOURCE_NORMAL = EventKind(77, "resource-normal", _TOLD, "a resource is within its bounds again")
 COMMANDED = EventKind(80, "commanded", _TOLD, "a command was obeyed")
 COMMAND_REFUSED = EventKind(81, "command-refused", _WARNED, "a command was not obeyed, with the reason")
+COMMAND_SOCKET = EventKind(
+    82, "command-socket", _WARNED, "the file of the command socket was removed: it is bound again"
+)
 GUARDIAN_LOST = EventKind(90, "guardian-lost", _FAULT, "the guardian has died or hangs: another is started")
 GUARDIAN_READY = EventKind(91, "guardian-ready", _TOLD, "a guardian is on watch again")
 GUARDIAN_ACTED = EventKind(

@@ -23,6 +23,7 @@ from flight.link.commands.codec import (
     Ping,
     Point,
     Slew,
+    shown,
 )
 from flight.link.modes import COMMANDABLE, Mode
 from flight.link.telemetry.definitions import COMMAND
@@ -81,7 +82,7 @@ def command(options: argparse.Namespace) -> int:
         mode = Mode(int(row["mode"]))
     except (TelemetryError, ValueError) as error:
         raise FlightError(f"{options.to}: its answer of {len(raw)} bytes is invalid") from error
-    obeyed, text = bool(row["obeyed"]), to_text(row["text"])
+    obeyed, text = bool(row["obeyed"]), shown(to_text(row["text"]))
     if options.json:
         facts = {"obeyed": obeyed, "mode": mode.label, "text": text, "count": int(row["count"])}
         sys.stdout.write(json.dumps(facts) + "\n")

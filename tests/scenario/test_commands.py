@@ -26,6 +26,7 @@ class Script:
     def __init__(self) -> None:
         self.due: list[bytes] = []
         self.answers: list[bytes] = []
+        self.happened = "its file was gone"
 
     def say(self, data: bytes) -> None:
         self.due.append(data)
@@ -33,6 +34,10 @@ class Script:
     def poll(self) -> list[tuple[bytes, Any]]:
         said, self.due = self.due, []
         return [(data, "somebody") for data in said]
+
+    def news(self) -> str:
+        news, self.happened = self.happened, ""
+        return news
 
     def answer(self, data: bytes, sender: Any) -> None:
         assert sender == "somebody"
@@ -95,7 +100,7 @@ def test_each_command_is_obeyed_recorded_and_answered(tmp_path: Path) -> None:
 def test_rubbish_and_repetitions_are_refused_with_the_reason_and_change_nothing(tmp_path: Path) -> None:
     (hold,) = packed(ChangeMode(Mode.HOLD))
     broken = bytes([*hold[:-1], hold[-1] ^ 1])
-    run, _ = said(tmp_path, (1.0, b"abort!"), (1.2, broken), (1.4, b""), (1.6, hold), (2.0, hold))
+    run, channel = said(tmp_path, (1.0, b"abort!"), (1.2, broken), (1.4, b""), (1.6, hold), (2.0, hold))
     rows = run["command"]
     assert rows["obeyed"].tolist() == [0, 0, 0, 1, 0]
     reasons = [to_text(text) for text in rows["text"]]
@@ -104,8 +109,16 @@ def test_rubbish_and_repetitions_are_refused_with_the_reason_and_change_nothing(
     assert "0 bytes are no packet" in reasons[2]
     assert "has come before" in reasons[4]
     assert modes_of(run)[2:] == [Mode.HOLD]
+    assert len(channel.answers) == 2, "nothing that is no command is answered"
+    assert "command-socket" in event_names(run)
     assert "command-refused" in event_names(run)
     assert "task-failed" not in event_names(run)
+
+
+def test_control_characters_are_shown_escaped(tmp_path: Path) -> None:
+    (safe,) = packed(ChangeMode(Mode.SAFE, "smoke\x1b[2J\n"))
+    run, _ = said(tmp_path, (1.0, safe))
+    assert to_text(run["command"][0]["text"]) == "mode safe: smoke\\x1b[2J\\n"
 
 
 def test_nothing_latched_is_nothing_to_clear(tmp_path: Path) -> None:

@@ -1,4 +1,7 @@
-"""Where commands come from: datagrams on a UNIX socket or on UDP, never waited for."""
+"""Where commands come from: datagrams on a UNIX socket or on UDP, never waited for.
+
+The kernel passes on only datagrams that begin as a command does and come from a peer (`admission`).
+"""
 
 from __future__ import annotations
 
@@ -12,10 +15,14 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from flight.gnc.errors import UsageError
-from flight.link.commands.codec import LONGEST
+from flight.link.commands.admission import admit
+from flight.link.commands.codec import IDENTIFIERS, LONGEST
 
 AT_MOST = 16
 """Datagrams taken at once: a flood costs its senders, not the loop."""
+
+_LOOK_EVERY = 10
+"""Polls between two looks whether the socket's file is there: a second, in flight."""
 
 
 class Channel(Protocol):
@@ -26,6 +33,9 @@ class Channel(Protocol):
     def poll(self) -> list[tuple[bytes, Any]]:
         """Return what has come, oldest first. Never waits, never raises."""
 
+    def news(self) -> str:
+        """Return what happened to the channel since the last call, empty when nothing did."""
+
     def answer(self, data: bytes, sender: Any) -> None:
         """Answer if there is somebody; whoever does not listen has no answer. Never waits, never raises."""
 
@@ -34,7 +44,7 @@ class Channel(Protocol):
 
 
 class DatagramChannel:
-    """A bound datagram socket."""
+    """A bound datagram socket. One with a file is bound again when the file is gone."""
 
     def __init__(
         self,
@@ -48,10 +58,17 @@ class DatagramChannel:
         self._socket = bound
         self._path = path
         self._peers = peers
+        self._polls = 0
+        self._news = ""
+        self._closed = False
         bound.setblocking(False)
+        self._file = _identity(path)
 
     def poll(self) -> list[tuple[bytes, Any]]:
         """Return what has come, oldest first; of a datagram too long for a command, enough to refuse it."""
+        self._polls += 1
+        if self._path is not None and not self._closed and self._polls % _LOOK_EVERY == 0:
+            self._look(self._path)
         found = []
         for _ in range(AT_MOST):
             try:
@@ -62,6 +79,11 @@ class DatagramChannel:
                 found.append((data, sender))
         return found
 
+    def news(self) -> str:
+        """Return what happened to the channel since the last call, empty when nothing did."""
+        news, self._news = self._news, ""
+        return news
+
     def answer(self, data: bytes, sender: Any) -> None:
         """Answer a sender that has an address."""
         if sender:
@@ -69,10 +91,28 @@ class DatagramChannel:
                 self._socket.sendto(data, sender)
 
     def close(self) -> None:
-        """Close, and remove the socket's file."""
+        """Close, and remove the socket's file unless another stands there."""
         self._socket.close()
-        if self._path is not None:
-            self._path.unlink(missing_ok=True)
+        self._closed = True
+        if self._path is not None and self._file is not None and _identity(self._path) == self._file:
+            with contextlib.suppress(OSError):
+                self._path.unlink()
+
+    def _look(self, path: Path) -> None:
+        """Bind the socket again when its file is gone or another stands there; try again at the next look."""
+        if self._file is not None and _identity(path) == self._file:
+            return
+        try:
+            bound = _bound_unix(path)
+        except OSError as error:
+            if self._file is not None:
+                self._news = f"{path} is gone and cannot be bound again: {error.strerror or error}"
+            self._file = None
+            return
+        bound.setblocking(False)
+        old, self._socket, self._file = self._socket, bound, _identity(path)
+        old.close()
+        self._news = f"{path} was gone: bound again"
 
 
 def open_unix(path: Path) -> DatagramChannel:
@@ -80,6 +120,16 @@ def open_unix(path: Path) -> DatagramChannel:
 
     The file of a flight that is gone is replaced; anything else that stands there is not touched.
     """
+    try:
+        bound = _bound_unix(path)
+    except OSError as error:
+        reason = error.strerror or error
+        raise UsageError(f"commands.socket: {path} cannot be listened to: {reason}") from error
+    return DatagramChannel("socket", bound, path)
+
+
+def _bound_unix(path: Path) -> socket.socket:
+    """Return a bound socket. Raises OSError."""
     bound = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     try:
         with contextlib.suppress(FileNotFoundError):
@@ -93,11 +143,11 @@ def open_unix(path: Path) -> DatagramChannel:
             bound.bind(str(path))
         finally:
             os.umask(before)
-    except OSError as error:
+    except OSError:
         bound.close()
-        reason = error.strerror or error
-        raise UsageError(f"commands.socket: {path} cannot be listened to: {reason}") from error
-    return DatagramChannel("socket", bound, path)
+        raise
+    admit(bound, IDENTIFIERS)
+    return bound
 
 
 def open_udp(address: str, peers: Sequence[IPv4Network] | None = None) -> DatagramChannel:
@@ -109,7 +159,17 @@ def open_udp(address: str, peers: Sequence[IPv4Network] | None = None) -> Datagr
     except (OSError, OverflowError) as error:
         bound.close()
         raise UsageError(f"commands.udp: {address} cannot be listened to: {error}") from error
+    admit(bound, IDENTIFIERS, peers)
     return DatagramChannel("udp", bound, peers=peers)
+
+
+def _identity(path: Path | None) -> tuple[int, int] | None:
+    """Return the device and inode of a file, None when it is not there."""
+    try:
+        found = os.lstat(path) if path is not None else None
+    except OSError:
+        return None
+    return None if found is None else (found.st_dev, found.st_ino)
 
 
 def _is_served(path: Path) -> bool:

@@ -16,10 +16,16 @@ LONGEST = max(layout.length for layout in LAYOUTS.values())
 """Bytes of the longest command; longer packets are refused."""
 
 _BY_IDENTIFIER = {layout.identifier: layout for layout in LAYOUTS.values()}
+IDENTIFIERS = tuple(_BY_IDENTIFIER)
+"""The first 16 bits of a command: one of these."""
 
 
 class CommandError(FlightError):
     """Bytes or values that are no command; says why."""
+
+
+class MalformedError(CommandError):
+    """Bytes that are no packet of a command: never answered, so that two flights cannot answer each other."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,17 +122,20 @@ class CommandPacker:
 
 
 def unpack(data: bytes) -> Command:
-    """Return the command that `data` is, all of it. Raises CommandError for anything else."""
+    """Return the command that `data` is, all of it.
+
+    Raises MalformedError for bytes that are no packet of a command, CommandError for values that are none.
+    """
     if len(data) < HEADER_BYTES:
-        raise CommandError(f"{len(data)} bytes are no packet")
+        raise MalformedError(f"{len(data)} bytes are no packet")
     layout = _BY_IDENTIFIER.get(int.from_bytes(data[:2], "big"))
     if layout is None:
-        raise CommandError(f"no command begins with 0x{int.from_bytes(data[:2], 'big'):04x}")
+        raise MalformedError(f"no command begins with 0x{int.from_bytes(data[:2], 'big'):04x}")
     stated = int.from_bytes(data[4:HEADER_BYTES], "big") + HEADER_BYTES + 1
     if not len(data) == stated == layout.length:
-        raise CommandError(f"{len(data)} bytes, {stated} stated, {layout.packet.name} has {layout.length}")
+        raise MalformedError(f"{len(data)} bytes, {stated} stated, {layout.packet.name} has {layout.length}")
     if crc16(data) != 0:
-        raise CommandError("its CRC is wrong")
+        raise MalformedError("its CRC is wrong")
     if data[HEADER_BYTES] != layout.packet.version:
         raise CommandError(f"version {data[HEADER_BYTES]} of {layout.packet.name} is not known")
     (row,) = layout.array(data)
@@ -148,17 +157,23 @@ def unpack(data: bytes) -> Command:
     return command
 
 
+def shown(text: str) -> str:
+    """Return a text with its control characters, and others that do not print, as escapes."""
+    escaped = (c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+    return "".join(escaped)
+
+
 def describe(command: Command) -> str:
-    """Return a command in words."""
+    """Return a command in words that print."""
     match command:
         case Ping(number):
             return f"ping {number}"
         case ChangeMode(mode, reason):
-            return f"mode {mode.label}" + (f": {reason}" if reason else "")
+            return f"mode {mode.label}" + (f": {shown(reason)}" if reason else "")
         case Slew(q2):
             return f"slew to q2 {q2:+.4f}" if math.isfinite(q2) else "slew"
         case Clear(event):
-            return f"clear {event}"
+            return f"clear {shown(event)}"
         case Point(target):
             return f"point {target.text}"
 

@@ -16,6 +16,7 @@ from flight.link.commands.codec import (
     Clear,
     Command,
     CommandError,
+    MalformedError,
     Ping,
     Point,
     Slew,
@@ -64,16 +65,22 @@ class Commanding:
         while self._timeline and self._timeline[0].at <= (now_ns - self._recorder.epoch_ns) * 1e-9:
             self._conclude("timeline", command_of(self._timeline.popleft()), "", now_ns)
         for channel in self._channels:
-            for data, sender in channel.poll():
-                fields = self._execute(channel.name, data, now_ns)
+            received = channel.poll()
+            if news := channel.news():
+                self._events.report(events.COMMAND_SOCKET, now_ns, news)
+            for data, sender in received:
+                fields, well_formed = self._execute(channel.name, data, now_ns)
+                if not well_formed:
+                    continue
                 mission_ns = now_ns - self._recorder.epoch_ns
                 status = self._recorder.status() if fields["obeyed"] and fields["name"] == PING.name else b""
                 channel.answer(self._answers.pack(COMMAND, mission_ns, fields) + status, sender)
 
-    def _execute(self, source: str, data: bytes, now_ns: int) -> dict[str, Any]:
-        """Execute a datagram; return the fields of the answer."""
+    def _execute(self, source: str, data: bytes, now_ns: int) -> tuple[dict[str, Any], bool]:
+        """Execute a datagram; return the fields of the answer, and whether it is a packet of a command."""
         command: Command | None = None
         problem = ""
+        well_formed = True
         if data in self._seen:
             problem = "the very same packet has come before"
         else:
@@ -82,7 +89,8 @@ class Commanding:
                 self._seen.append(data)
             except CommandError as error:
                 problem = str(error)
-        return self._conclude(source, command, problem, now_ns)
+                well_formed = not isinstance(error, MalformedError)
+        return self._conclude(source, command, problem, now_ns), well_formed
 
     def _conclude(self, source: str, command: Command | None, problem: str, now_ns: int) -> dict[str, Any]:
         """Execute a command, unless there is a `problem`; report and record the result."""

@@ -10,6 +10,8 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
+from ipaddress import IPv4Network
 from pathlib import Path
 
 import pytest
@@ -17,7 +19,16 @@ import pytest
 from flight.app.cli import main
 from flight.gnc.errors import FlightError, UsageError
 from flight.link.commands.channel import AT_MOST, Channel, DatagramChannel, open_udp, open_unix
-from flight.link.commands.codec import LONGEST, ChangeMode, Command, Slew, unpack
+from flight.link.commands.codec import (
+    IDENTIFIERS,
+    LONGEST,
+    ChangeMode,
+    Command,
+    CommandPacker,
+    Ping,
+    Slew,
+    unpack,
+)
 from flight.link.modes import Mode
 from flight.link.telemetry.definitions import COMMAND
 from flight.link.telemetry.packets import Packer
@@ -120,6 +131,10 @@ def test_an_answer_of_a_mode_that_there_is_not_is_none(
     assert capsys.readouterr().err.endswith("bytes is invalid\n")
 
 
+BEGINS = IDENTIFIERS[0].to_bytes(2, "big")
+"""A datagram that begins as a command does: the kernel passes no other on."""
+
+
 def flood(to: Path, count: int, data: bytes) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as line:
         line.setblocking(False)
@@ -132,7 +147,7 @@ def flood(to: Path, count: int, data: bytes) -> None:
 
 def test_a_flood_is_taken_in_small_portions_and_a_long_datagram_is_cut(place: Path) -> None:
     channel = open_unix(place)
-    flood(place, 200, b"x" * 5000)
+    flood(place, 200, BEGINS + b"x" * 5000)
     taken = channel.poll()
     assert len(taken) <= AT_MOST
     assert {len(data) for data, _ in taken} == {LONGEST + 1}
@@ -143,7 +158,7 @@ def test_a_sender_without_an_address_and_one_that_is_gone_get_no_answer_and_do_n
     place: Path, tmp_path: Path
 ) -> None:
     channel = open_unix(place)
-    flood(place, 1, b"x")
+    flood(place, 1, BEGINS)
     ((_, nobody),) = channel.poll()
     channel.answer(b"y", nobody)
     channel.answer(b"y", str(tmp_path / "gone"))
@@ -151,6 +166,50 @@ def test_a_sender_without_an_address_and_one_that_is_gone_get_no_answer_and_do_n
     channel.close()
     channel.close()
     assert channel.poll() == []
+    assert not place.exists()
+
+
+def test_whoever_is_no_peer_or_sends_no_command_takes_no_place_in_the_queue(place: Path) -> None:
+    """More datagrams than any queue holds, from a stranger's address and from a peer's."""
+    ping = CommandPacker().pack(Ping(5), 1)
+    channels = [open_udp("127.0.0.1:0", [IPv4Network("127.0.0.9"), IPv4Network("127.1.0.0/16")])]
+    to = channels[0]._socket.getsockname()
+    with ExitStack() as stack:
+        senders = [stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) for _ in range(3)]
+        for sender, host in zip(senders, ("127.0.0.2", "127.0.0.9", "127.1.2.3"), strict=True):
+            sender.bind((host, 0))
+        for _ in range(1000):
+            senders[0].sendto(ping, to)
+            senders[1].sendto(b"no command", to)
+        senders[1].sendto(ping, to)
+        senders[2].sendto(ping, to)
+    channels.append(open_unix(place))
+    flood(place, 1000, b"no command")
+    flood(place, 1, ping)
+    assert [[data for data, _ in channel.poll()] for channel in channels] == [[ping, ping], [ping]]
+    for channel in channels:
+        channel.close()
+
+
+def test_a_socket_whose_file_was_removed_is_bound_again_and_reported(place: Path) -> None:
+    channel = open_unix(place)
+    place.unlink()
+    ping = CommandPacker().pack(Ping(5), 1)
+    assert [channel.poll() for _ in range(10)] == [[]] * 10
+    assert "bound again" in channel.news()
+    assert channel.news() == ""
+    flood(place, 1, ping)
+    assert [data for data, _ in channel.poll()] == [ping]
+    place.unlink()
+    place.mkdir()
+    for _ in range(30):
+        channel.poll()
+    assert "cannot be bound again" in channel.news()
+    place.rmdir()
+    for _ in range(10):
+        channel.poll()
+    assert place.is_socket()
+    channel.close()
     assert not place.exists()
 
 
@@ -174,7 +233,7 @@ def test_a_service_is_answered_where_it_can_see_the_socket() -> None:
         thread = threading.Thread(target=serve)
         thread.start()
         with pytest.raises(FlightError, match="no answer"):
-            exchange(f"{folder}/commands", b"ping", 0.2)
+            exchange(f"{folder}/commands", BEGINS, 0.2)
         thread.join()
         channel.close()
         assert senders[0].startswith(folder)

@@ -8,6 +8,7 @@ from ipaddress import IPv4Network
 import pytest
 
 from flight.link.commands.channel import open_udp
+from flight.link.commands.codec import CommandPacker, Ping
 from flight.schema.errors import ConfigError
 from flight.schema.peers import peer_networks
 from flight.schema.reader import parse
@@ -53,9 +54,10 @@ def test_peers_that_make_no_sense_are_refused_with_what_would(commands: str, pro
 
 
 def test_a_datagram_of_somebody_else_is_not_listened_to() -> None:
+    ping = CommandPacker().pack(Ping(), 1)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        for peers, heard in ((["127.0.0.0/8"], [b"hello"]), (["192.0.2.0/24"], [])):
+        for peers, heard in ((["127.0.0.0/8"], [ping]), (["192.0.2.0/24"], [])):
             channel = open_udp("127.0.0.1:0", [IPv4Network(peer) for peer in peers])
-            sender.sendto(b"hello", channel._socket.getsockname())
+            sender.sendto(ping, channel._socket.getsockname())
             assert [data for data, _ in channel.poll()] == heard
             channel.close()
