@@ -38,7 +38,7 @@ COPIES = ("a", "b")
 _RECORD = struct.Struct(f">4sHIQ{KEY_BYTES}s")
 _MAGIC = b"KCS1"
 _CRC_BYTES = 4
-_LOCK = "lock"
+_LOCK, _OWNER = "lock", "owner"
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -97,6 +97,21 @@ class Vault:
         finally:
             os.close(file)
 
+    @contextmanager
+    def owned(self) -> Iterator[None]:
+        """Keep a second link process from this folder. Raises UsageError where there is one."""
+        path = self._folder / _OWNER
+        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            os.close(file)
+            raise UsageError(f"{self._folder}: another link process has these counters") from error
+        try:
+            yield
+        finally:
+            os.close(file)
+
     def read(self, name: int | str) -> Association | None:
         """Return the newer copy of an association, None where both are lost."""
         return max(self._copies(name), default=None)
@@ -111,6 +126,14 @@ class Vault:
         data = encode(association)
         spi = association.spi if name is None else name
         return sum(_overwrite(self._path(spi, copy), data) for copy in COPIES)
+
+    def advance(self, association: Association) -> int:
+        """Write both copies unless another process wrote a newer one; return how many are durable."""
+        with self.locked():
+            newest = self.read(association.spi)
+            if newest is not None and newest >= association:
+                return self.copies(association.spi)
+            return self.write(association)
 
     def remove(self, name: int | str) -> None:
         """Remove an association."""

@@ -57,7 +57,7 @@ class Admitted:
 
     spi: int
     counter: int
-    channel_header: bytes
+    header: bytes
     data: bytes
 
 
@@ -127,7 +127,7 @@ class Gate:
         """Make the counters durable that are not."""
         for entry in self._open.values():
             if entry is not None and entry.unused > self._stored[entry.spi]:
-                self._vault.write(entry)
+                self._vault.advance(entry)
 
     def _admit(self, frame: bytes) -> Admitted:
         if crc16(frame) != 0:
@@ -152,7 +152,7 @@ class Gate:
             raise RefusedError(Refusal.BEYOND, spi, counter)
         used = replace(entry, unused=counter + 1)
         if used.unused >= self._stored[spi] + self._store_every:
-            if self._vault.write(used) == 0:
+            if self._vault.advance(used) == 0:
                 raise RefusedError(Refusal.UNSTORED, spi, counter)
             self._stored[spi] = used.unused
         self._open[spi] = used
@@ -179,20 +179,26 @@ class Gate:
 class Sealer:
     """Protects what is sent under one SPI; each counter is reserved on disk before its frame is made."""
 
-    def __init__(self, vault: Vault, spi: int, mask: bytes, block: int = 1) -> None:
-        """`block` counters are reserved at once; those that a crash leaves over are never used."""
+    def __init__(self, vault: Vault, name: int | str, mask: bytes, block: int = 1) -> None:
+        """Take the SPI, or the name of its next key. `block` counters are reserved at once.
+
+        Those that a crash leaves over are never used.
+        """
         self._vault = vault
-        self._spi = spi
+        self._name = name
+        self._spi = int(str(name).partition("-")[0])
         self._mask = mask
         self._block = block
-        self._entry: Association | None = None
         self._next = 0
         self._end = 0
         self._cipher: AESGCM | None = None
 
-    def forget(self) -> None:
-        """Read the association from disk before the next frame: its key was changed."""
+    def replace_key(self, generation: int, key: bytes) -> bool:
+        """Change the key, the counter back to 0; return whether that is durable."""
+        if self._vault.write(Association(self._spi, generation, 0, key)) == 0:
+            return False
         self._next = self._end = 0
+        return True
 
     def seal(self, header: bytes, data: bytes) -> tuple[bytes, int]:
         """Return a protected frame without CRC, and its counter. Raises FlightError without a counter."""
@@ -205,11 +211,11 @@ class Sealer:
 
     def _reserve(self) -> None:
         with self._vault.locked():
-            entry = self._vault.read(self._spi)
+            entry = self._vault.read(self._name)
             if entry is None:
                 raise FlightError(f"both copies of the counter of SPI {self._spi} are lost: use its reserve")
             reserved = replace(entry, unused=entry.unused + self._block)
-            if self._vault.write(reserved) == 0:
+            if self._vault.write(reserved, self._name) == 0:
                 raise FlightError(f"the counter of SPI {self._spi} cannot be stored")
         self._next, self._end = entry.unused, reserved.unused
         self._cipher = entry.cipher
