@@ -1,7 +1,8 @@
 """Print the drop-in that a configuration needs for a unit: its devices, network and bus.
 
-Run by install.sh with the installed Python: board_dropin.py [--safe] CONFIG; with --safe for
-knightcube-safe.service, else for knightcube.service. Exit status 2, and one line, for a wrong configuration.
+Run by install.sh with the installed Python: board_dropin.py [--safe | --link] CONFIG; with --safe for
+knightcube-safe.service, with --link for knightcube-link.service (nothing where there is no link), else for
+knightcube.service. Exit status 2, and one line, for a wrong configuration.
 """
 
 from __future__ import annotations
@@ -10,11 +11,13 @@ import os
 import stat
 import string
 import sys
+from collections.abc import Sequence
+from ipaddress import IPv4Network
 from pathlib import Path
 
 from flight.gnc.errors import UsageError
 from flight.schema.devices import V4l2Device
-from flight.schema.peers import peer_networks
+from flight.schema.peers import LOOPBACK, peer_networks
 from flight.schema.reader import load
 from flight.schema.sections import Config
 from hal.buses.i2c_bus import device_file
@@ -30,16 +33,27 @@ def dropin(config: Config) -> str:
         awaited = [device_unit(path) for path, _ in _nodes(config)]
         lines += ["[Unit]", *(f"{word}={unit}" for unit in awaited for word in ("Wants", "After"))]
     lines += ["[Service]", *_devices(config)]
-    if peers := peer_networks(config.commands):
-        # IPAddressDeny=any of the unit stays in force for all other addresses, both ways.
-        lines += ["PrivateNetwork=no", "RestrictAddressFamilies=AF_INET"]
-        lines += [f"IPAddressAllow={peer}" for peer in peers]
+    if config.commands.udp is not None:  # a bench, on this machine alone
+        lines += _network([LOOPBACK])
     return _text(lines)
 
 
 def safe_dropin(config: Config) -> str:
     """Return the drop-in of the safe state's unit, which accesses the coils alone."""
     return _text(["[Service]", *(_bus(config) if config.simulation is None else [])])
+
+
+def link_dropin(config: Config) -> str:
+    """Return the drop-in of the link's unit, empty where the configuration has no link."""
+    link = config.link
+    if link is None:
+        return ""
+    lines = ["[Service]", f"ReadWritePaths=-{Path(link.keys).absolute()}"]
+    if peers := peer_networks(link):
+        lines += _network(peers)
+    if link.serial is not None:
+        lines += ["SupplementaryGroups=dialout", *allowed(link.serial.device, SERIAL)]
+    return _text(lines)
 
 
 def device_unit(path: str) -> str:
@@ -73,6 +87,12 @@ def _driver_classes(major: int, root: Path) -> tuple[str, ...]:
     listed = (root / "proc/devices").read_text(encoding="ascii").partition("Block devices:")[0]
     pairs = (words for line in listed.splitlines() if len(words := line.split()) == 2)
     return tuple(name for number, name in pairs if number == str(major))
+
+
+def _network(peers: Sequence[IPv4Network]) -> list[str]:
+    """Return the lines that open the network; IPAddressDeny=any of the unit stays in force for all others."""
+    opened = ["PrivateNetwork=no", "RestrictAddressFamilies=AF_INET"]
+    return [*opened, *(f"IPAddressAllow={peer}" for peer in peers)]
 
 
 def _text(lines: list[str]) -> str:
@@ -112,7 +132,7 @@ def _bus(config: Config) -> list[str]:
 
 def main(words: list[str]) -> int:
     """Print the drop-in of a configuration."""
-    make = safe_dropin if words[:1] == ["--safe"] else dropin
+    make = {"--safe": safe_dropin, "--link": link_dropin}.get(words[0], dropin)
     try:
         sys.stdout.write(make(load(Path(words[-1]))))
     except UsageError as error:

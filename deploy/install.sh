@@ -140,7 +140,8 @@ reload() {
 
 make_user() {
     if [ -n "$root" ]; then
-        echo "install: make a system user $user in the image, in the groups dialout, i2c and video" >&2
+        echo "install: make a system user $user in the image, in the groups dialout, i2c and video," \
+            "and for a link a system user $user-link of the group $user" >&2
         return
     fi
     for group in dialout i2c video; do
@@ -148,6 +149,10 @@ make_user() {
     done
     getent passwd "$user" >/dev/null ||
         run useradd --system --user-group --home-dir "$logs" --no-create-home --shell /usr/sbin/nologin "$user"
+    # The link is another user: it reads the logs and may command, and the flight cannot read its keys.
+    getent passwd "$user-link" >/dev/null ||
+        run useradd --system --gid "$user" --home-dir "$logs-link" --no-create-home --shell /usr/sbin/nologin \
+            "$user-link"
 }
 
 install_software() {
@@ -177,7 +182,7 @@ install_settings() {
     python=$prefix/venv/bin/python
     if [ -n "$dry" ] && [ ! -x "$python" ]; then
         echo "would write: $settings/flight.yaml and its checksum, from $flown"
-        echo "would write: $units/knightcube.service.d/board.conf, from $flown"
+        echo "would write: $units/knightcube.service.d/board.conf, from $flown; the link's unit if it has a link"
         return
     fi
     made=$(mktemp -d)
@@ -185,16 +190,37 @@ install_settings() {
     # These come first because they reject a wrong configuration.
     "$python" "$deploy/board_dropin.py" "$flown" >"$made/flight" || exit 2
     "$python" "$deploy/board_dropin.py" --safe "$flown" >"$made/safe" || exit 2
+    "$python" "$deploy/board_dropin.py" --link "$flown" >"$made/link" || exit 2
     place 644 "$flown" "$settings/flight.yaml"
     sum_of "$flown" >"$made/sum"
     place 644 "$made/sum" "$settings/flight.yaml.sha256"
     place 644 "$made/flight" "$units/knightcube.service.d/board.conf"
     place 644 "$made/safe" "$units/knightcube-safe.service.d/board.conf"
+    if [ -s "$made/link" ]; then
+        place 644 "$deploy/knightcube-link.service" "$units/knightcube-link.service"
+        place 644 "$made/link" "$units/knightcube-link.service.d/board.conf"
+        in_root is-enabled --quiet knightcube-link.service 2>/dev/null ||
+            run in_root enable --quiet knightcube-link.service
+    else
+        remove_link
+    fi
     wanted=$(XDG_CACHE_HOME="$cache" "$python" "$deploy/sky_index.py" --wanted "$flown")
     if [ -n "$wanted" ]; then
         run install -d "$cache" # systemd hands it to the service's user
         run env XDG_CACHE_HOME="$cache" "$python" "$deploy/sky_index.py" "$flown"
     fi
+}
+
+# The link's unit is there only where the configuration has a link.
+remove_link() {
+    [ -e "$units/knightcube-link.service" ] || return 0
+    if systemd_runs; then
+        run systemctl stop knightcube-link.service || true
+    fi
+    if in_root is-enabled --quiet knightcube-link.service 2>/dev/null; then
+        run in_root disable --quiet knightcube-link.service
+    fi
+    run rm -rf "$units/knightcube-link.service" "$units/knightcube-link.service.d"
 }
 
 # The rules are meant to be edited: edited rules are kept.
@@ -256,6 +282,7 @@ say_next() {
 }
 
 uninstall_all() {
+    remove_link
     if systemd_runs; then
         run systemctl stop knightcube.service knightcube-safe.service || true
     fi
@@ -265,9 +292,12 @@ uninstall_all() {
     run rm -rf "$units/knightcube.service" "$units/knightcube-safe.service" \
         "$units/knightcube.service.d" "$units/knightcube-safe.service.d" "$rules" "$modules" "$prefix" "$cache"
     if [ -n "$purge" ]; then
-        run rm -rf "$settings" "$root$logs"
+        run rm -rf "$settings" "$root$logs" "$root$logs-link"
         if [ -z "$root" ] && getent passwd "$user" >/dev/null; then
             run userdel "$user"
+        fi
+        if [ -z "$root" ] && getent passwd "$user-link" >/dev/null; then
+            run userdel "$user-link"
         fi
     fi
     reload

@@ -23,7 +23,6 @@ from flight.loop.fdir.board import Board
 from flight.loop.flight_loop import FlightLoop, Supervisors, nothing
 from flight.loop.state.opening import open_state
 from flight.schema.errors import ConfigError
-from flight.schema.peers import peer_networks
 from flight.schema.sections import Config
 from hal.buses.real_time import worker_cores
 from hal.interfaces.rig import Rig
@@ -77,7 +76,7 @@ def _open_channels(config: Config, stack: ExitStack) -> list[Channel]:
     if config.commands.socket is not None:
         channels.append(open_unix(Path(config.commands.socket)))
     if config.commands.udp is not None:
-        channels.append(open_udp(config.commands.udp, peer_networks(config.commands)))
+        channels.append(open_udp(config.commands.udp))
     for channel in channels:
         stack.callback(channel.close)
     return channels

@@ -8,8 +8,8 @@ from collections.abc import Callable
 from flight.schema.devices import Camera
 from flight.schema.document import Document
 from flight.schema.orbit_devices import SolarStrings
-from flight.schema.peers import peer_networks
-from flight.schema.sections import Commands, Config
+from flight.schema.peers import is_loopback, peer_networks
+from flight.schema.sections import Commands, Config, Link
 from flight.schema.testbed import TestbedConfig
 from flight.schema.values import Quaternion
 
@@ -38,6 +38,8 @@ def check_consistency(config: Config, document: Document) -> None:
     if isinstance(config, TestbedConfig):
         _check_testbed(config, refuse)
     _check_commands(config.commands, refuse)
+    if config.link is not None:
+        _check_link(config.link, config.commands, refuse)
     _check_coils(config, refuse)
     _check_times(config, refuse)
     telemetry = config.telemetry
@@ -112,10 +114,22 @@ def _check_commands(commands: Commands, refuse: Refuse) -> None:
         given = [name for name in ("mode", "slew", "clear") if getattr(step, name) is not None]
         if len(given) != 1:
             refuse(f"commands.timeline[{index}]", f"gives {given}: must give one of mode, slew, clear")
+    if not is_loopback(commands):
+        problem = "is plain and open beyond this machine: give `link` with keys, and here a loopback address"
+        refuse("commands.udp", f"{commands.udp} {problem}")
+
+
+def _check_link(link: Link, commands: Commands, refuse: Refuse) -> None:
+    if commands.socket is None:
+        refuse("link", "needs `commands.socket`, by which it hands commands to the flight")
+    if link.udp is None and link.tcp is None and link.serial is None:
+        refuse("link", "has no line: give `udp`, `tcp` or `serial`")
+    if link.telemetry_to is not None and link.udp is None:
+        refuse("link.telemetry_to", "goes with `link.udp`")
     try:
-        peer_networks(commands)
+        peer_networks(link)
     except ValueError as error:
-        refuse("commands.peers" if commands.peers else "commands.udp", str(error))
+        refuse("link.peers" if link.peers else "link.udp" if link.udp else "link.tcp", str(error))
 
 
 def _check_camera(camera: Camera, refuse: Refuse) -> None:

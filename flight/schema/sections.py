@@ -14,7 +14,7 @@ from msgspec import Meta
 
 from flight.schema.devices import Camera, Coils, InertialUnit, PowerMonitor
 from flight.schema.orbit_devices import Gps, SolarStrings, WideCamera
-from flight.schema.values import Q2, CommandedMode, NotNegative, Peer, PlainMode, Positive, Section
+from flight.schema.values import Q2, CommandedMode, HostPort, NotNegative, Peer, PlainMode, Positive, Section
 
 
 class Executive(Section, frozen=True, kw_only=True):
@@ -120,19 +120,42 @@ class CommandStep(Section, frozen=True, kw_only=True):
 
 
 class Commands(Section, frozen=True, kw_only=True):
-    """Where commands come from: a UNIX datagram socket, a UDP address (HOST:PORT), and a time line.
+    """Where commands come from: a UNIX datagram socket, UDP on a bench, and a time line.
 
-    `peers` are the IPv4 addresses and subnets that UDP is open to, both ways; without them those of `udp`
-    itself: the machine where that is a loopback address, the 256 addresses around it where it is another.
+    `udp` (HOST:PORT) must be a loopback address: beyond the machine commands come by the `link`, with keys.
     """
 
     socket: Annotated[str, Meta(min_length=1, max_length=100)] | None = None
-    udp: (
-        Annotated[str, Meta(pattern=r"^[^:\s]+:[0-9]{1,5}$", description="HOST:PORT, such as 127.0.0.1:5005")]
-        | None
-    ) = None
-    peers: Annotated[tuple[Peer, ...], Meta(min_length=1)] | None = None
+    udp: HostPort | None = None
     timeline: tuple[CommandStep, ...] = ()
+
+
+class LinkSerial(Section, frozen=True, kw_only=True):
+    """A serial line to a radio: device file and bits per second."""
+
+    device: Annotated[str, Meta(pattern=r"^/[A-Za-z0-9_./:+-]+$", description="a device file")]
+    baud: Annotated[int, Meta(ge=1200, le=4_000_000)] = 115200
+
+
+class Link(Section, frozen=True, kw_only=True):
+    """The link process (`python -m flight link`): protected frames to and from the ground.
+
+    `keys` is the folder of keys and counters (`python -m ground keys`), `spacecraft` the identifier in each
+    frame. Lines: `udp` and `tcp` listen at HOST:PORT, open to `peers` only (without them the machine itself
+    where the address is a loopback address, the 256 addresses around it where it is another); `serial` is a
+    radio's. Telemetry goes to authentic senders, to `telemetry_to` (HOST:PORT, UDP), to all of `tcp` and to
+    `serial`: frames of `frame_bytes`, at most `rate` bytes/s of each line.
+    """
+
+    keys: Annotated[str, Meta(min_length=1)]
+    spacecraft: Annotated[int, Meta(ge=0, le=1023)] = 0x1A5
+    udp: HostPort | None = None
+    telemetry_to: HostPort | None = None
+    tcp: HostPort | None = None
+    serial: LinkSerial | None = None
+    peers: Annotated[tuple[Peer, ...], Meta(min_length=1)] | None = None
+    frame_bytes: Annotated[int, Meta(ge=128, le=2048)] = 1115
+    rate: Annotated[float, Meta(ge=100.0, le=1.0e7)] = 50_000.0
 
 
 class Telemetry(Section, frozen=True, kw_only=True):
@@ -174,6 +197,7 @@ class Config(Section, frozen=True, kw_only=True):
     detumble: Detumble = Detumble()
     health: Health = Health()
     commands: Commands = Commands()
+    link: Link | None = None
     duration: Positive
     telemetry: Telemetry = Telemetry()
     state: State = State()

@@ -26,6 +26,9 @@ Peer = Annotated[
         description="an IPv4 address or subnet, such as 192.168.7.0/24",
     ),
 ]
+HostPort = Annotated[
+    str, Meta(pattern=r"^[^:\s]+:[0-9]{1,5}$", description="HOST:PORT, such as 127.0.0.1:5005")
+]
 Sign = Literal[-1, 1]
 Channel = Annotated[int, Meta(ge=0, le=15)]
 Estimator = Literal["likelihood", "harris", "minimum-eigenvalue", "trajkovic-4", "trajkovic-8"]

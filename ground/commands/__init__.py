@@ -2,6 +2,7 @@
 
 COMMANDS = {
     "command": "send a command to a flight",
+    "keys": "make the keys of an authenticated link",
     "watch": "show a flight in the terminal, live or as it ended",
     "console": "show a flight in the browser, live or replayed, and command it",
     "report": "report the performance of a run",

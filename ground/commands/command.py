@@ -26,10 +26,18 @@ from flight.link.commands.codec import (
     shown,
 )
 from flight.link.modes import COMMANDABLE, Mode
+from flight.link.process import directives
+from flight.link.process.directives import Play, Stop
+from flight.link.process.verification import Report
+from flight.link.security.associations import COMMAND_SPIS, TELEMETRY_SPIS, Vault
 from flight.link.telemetry.definitions import COMMAND
 from flight.link.telemetry.packets import LONGEST_PACKET, TelemetryError, to_text
+from ground.link.commanding import change_key, obeyed
+from ground.link.commanding import command as send
+from ground.link.terminal import DEFAULTS, TerminalSettings, open_terminal
 from ground.telemetry.scanner import decode
 
+_DIRECTIVES = ("play", "stop-playback", "new-key")
 _MODES = [mode.label for mode in COMMANDABLE if mode is not Mode.SLEW]
 
 
@@ -39,11 +47,22 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "Send a command to a flight that listens (`commands` in its configuration) and print its answer. "
         "Exit status 0 when the flight obeyed, 1 when it refused or did not answer."
     )
+    way = parser.add_mutually_exclusive_group(required=True)
+    way.add_argument(
+        "--to", metavar="SOCKET", help="path of its UNIX socket, or HOST:PORT of its UDP address, on a bench"
+    )
+    way.add_argument(
+        "--link", metavar="ADDRESS", help="its link: HOST:PORT (UDP), tcp:HOST:PORT or /dev/FILE@BAUD"
+    )
+    parser.add_argument("--keys", type=Path, metavar="FOLDER", help="the ground's keys, with --link")
     parser.add_argument(
-        "--to",
-        required=True,
-        metavar="SOCKET",
-        help="path of its UNIX socket, or HOST:PORT of its UDP address",
+        "--spi", type=int, choices=COMMAND_SPIS, default=COMMAND_SPIS[0], help="with --link (default 1)"
+    )
+    parser.add_argument(
+        "--spacecraft", type=int, default=DEFAULTS.spacecraft, metavar="N", help="with --link"
+    )
+    parser.add_argument(
+        "--frame-bytes", type=int, default=DEFAULTS.frame_bytes, metavar="N", help="with --link"
     )
     parser.add_argument("--timeout", type=float, default=2.0, metavar="S", help="for the answer (default 2)")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
@@ -57,6 +76,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     clear = words.add_parser("clear", help="clear a latched event")
     clear.add_argument("event", help="its name, as in the log")
     _configure_point(words.add_parser("point", help="point a satellite to a goal"))
+    _configure_directives(words)
     parser.set_defaults(command=command)
 
 
@@ -70,12 +90,23 @@ def _configure_point(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--roll", type=float, metavar="DEG", help="about the pointing axis (default free)")
 
 
+def _configure_directives(words: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    play = words.add_parser("play", help="with --link: play a stretch of the archive back")
+    play.add_argument("begin", type=float, metavar="BEGIN", help="mission time, s")
+    play.add_argument("end", type=float, metavar="END", help="mission time, s")
+    play.add_argument("--run", type=int, default=0, metavar="N", help="of the archive (default the newest)")
+    words.add_parser("stop-playback", help="with --link: end the playback")
+    key = words.add_parser("new-key", help="with --link: change a key at both ends")
+    key.add_argument("changed", type=int, choices=(*COMMAND_SPIS, *TELEMETRY_SPIS), metavar="SPI")
+
+
 def command(options: argparse.Namespace) -> int:
     """Send, wait, print."""
-    try:
-        data = CommandPacker().pack(_command_of(options), utc_ns())  # the time makes it unique
-    except CommandError as error:
-        raise UsageError(str(error)) from error
+    if options.link is not None:
+        return _by_link(options)
+    if options.what in _DIRECTIVES:
+        raise UsageError(f"{options.what} goes by --link: it is a command of the link itself")
+    data = _packet_of(options)
     raw = exchange(options.to, data, options.timeout)
     try:
         (row,) = decode(raw)[COMMAND.name]
@@ -89,6 +120,50 @@ def command(options: argparse.Namespace) -> int:
     else:
         sys.stdout.write(f"{'obeyed' if obeyed else 'refused'}: {text}; mode {mode.label}\n")
     return 0 if obeyed else 1
+
+
+def _by_link(options: argparse.Namespace) -> int:
+    """Send by protected frames and show each stage."""
+    if options.keys is None:
+        raise UsageError("--link needs --keys, the ground's folder of `python -m ground keys`")
+    terminal = open_terminal(
+        options.link, options.keys, TerminalSettings(options.spacecraft, options.frame_bytes)
+    )
+
+    def show(report: Report) -> None:
+        if not options.json:
+            sys.stdout.write(f"{report.stage.name.lower()}: {report.text}\n")
+            sys.stdout.flush()
+
+    try:
+        if options.what == "new-key":
+            vault = Vault(options.keys)
+            reports = change_key(terminal, vault, options.changed, options.spi, options.timeout, show)
+        else:
+            reports = send(terminal, _packet_of(options), options.spi, options.timeout, show)
+    finally:
+        terminal.close()
+    done = obeyed(reports)
+    if options.json:
+        stages = [{"stage": report.stage.name.lower(), "text": report.text} for report in reports]
+        sys.stdout.write(
+            json.dumps({"obeyed": done, "counter": reports[-1].counter, "stages": stages}) + "\n"
+        )
+    return 0 if done else 1
+
+
+def _packet_of(options: argparse.Namespace) -> bytes:
+    """Return the packet of the words; its time makes it unique. Raises UsageError."""
+    try:
+        match options.what:
+            case "play":
+                return directives.pack(Play(options.run, options.begin, options.end), utc_ns())
+            case "stop-playback":
+                return directives.pack(Stop(), utc_ns())
+            case _:
+                return CommandPacker().pack(_command_of(options), utc_ns())
+    except CommandError as error:
+        raise UsageError(str(error)) from error
 
 
 def exchange(to: str, data: bytes, timeout: float) -> bytes:

@@ -1,12 +1,7 @@
-"""Finds the packets in a stretch of bytes, whatever has happened to it, and makes arrays of them.
-
-A packet is valid when its version bits, APID, sequence flags, length and CRC are right. After anything
-else the search goes on at the next byte that could begin a packet, so that only damaged packets are lost.
-"""
+"""Makes arrays of the packets in a stretch of bytes, and accounts for all of its bytes."""
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,22 +9,12 @@ import numpy as np
 from flight.link.telemetry.packets import (
     HEADER_BYTES,
     LAYOUTS,
-    LONGEST_PACKET,
     SEQUENCE_MODULUS,
-    UNSEGMENTED,
     Layout,
     PacketArray,
     TelemetryError,
-    crc16,
 )
-
-_BY_IDENTIFIER = {layout.identifier.to_bytes(2, "big"): layout for layout in LAYOUTS.values()}
-# A known identifier, or its first byte as the last byte of all.
-_START = re.compile(
-    b"|".join(re.escape(i) + b"|" + re.escape(i[:1]) + rb"\Z" for i in _BY_IDENTIFIER), re.DOTALL
-)
-
-_SEQUENCE_FLAGS = UNSEGMENTED >> 8  # as the first byte of the sequence control carries them
+from flight.link.telemetry.walk import truncated_bytes, walk
 
 
 @dataclass(frozen=True)
@@ -68,32 +53,20 @@ class ScanResult:
 def scan(data: bytes) -> ScanResult:
     """Return the packets in `data` and an account of all its bytes."""
     found: dict[str, list[bytes]] = {name: [] for name in LAYOUTS}
-    position = claimed = other_versions = 0
-    incomplete = -1  # where the first packet cut short may begin, since the last valid one
-    end = len(data)
-    while position < end:
-        layout = _BY_IDENTIFIER.get(data[position : position + 2])
-        length = 0 if layout is None else _valid_length(data, position, layout)
-        if layout is not None and length > 0:
-            packet = data[position : position + length]
-            if packet[HEADER_BYTES] == layout.packet.version:
-                found[layout.packet.name].append(packet)
-            else:
-                other_versions += 1
-            position += length
-            claimed += length
-            incomplete = -1
-            continue
-        if incomplete < 0 and _cut_short(data, position):
-            incomplete = position
-        match = _START.search(data, position + 1)
-        position = match.start() if match else end
-    truncated = end - incomplete if incomplete >= 0 else 0
+    claimed = other_versions = last = 0
+    for layout, begin, end in walk(data):
+        if data[begin + HEADER_BYTES] == layout.packet.version:
+            found[layout.packet.name].append(data[begin:end])
+        else:
+            other_versions += 1
+        claimed += end - begin
+        last = end
+    truncated = truncated_bytes(data, last)
     joined = {name: b"".join(packets) for name, packets in found.items()}
     return ScanResult(
         packets={name: LAYOUTS[name].array(raw) for name, raw in joined.items()},
-        total_bytes=end,
-        skipped_bytes=end - claimed - truncated,
+        total_bytes=len(data),
+        skipped_bytes=len(data) - claimed - truncated,
         truncated_bytes=truncated,
         missing={name: _missing(LAYOUTS[name], raw) for name, raw in joined.items()},
         other_versions=other_versions,
@@ -108,36 +81,6 @@ def decode(data: bytes) -> dict[str, PacketArray]:
         others = result.other_versions
         raise TelemetryError(f"{bad} bytes are no packets, {others} packets are of another version")
     return result.packets
-
-
-def _valid_length(data: bytes, position: int, layout: Layout) -> int:
-    """Return the length of the valid packet at `position`, 0 when there is none."""
-    length = _stated_length(data, position)
-    stop = position + length
-    if length < HEADER_BYTES + 1 or stop > len(data):
-        return 0
-    if data[position + 2] & _SEQUENCE_FLAGS != _SEQUENCE_FLAGS:
-        return 0
-    own_version = data[position + HEADER_BYTES] == layout.packet.version
-    plausible = length == layout.length if own_version else length <= LONGEST_PACKET
-    return length if plausible and crc16(data[position:stop]) == 0 else 0
-
-
-def _stated_length(data: bytes, position: int) -> int:
-    """Return the length that the header at `position` states, 0 when the header itself is incomplete."""
-    header = data[position : position + HEADER_BYTES]
-    return int.from_bytes(header[4:], "big") + HEADER_BYTES + 1 if len(header) == HEADER_BYTES else 0
-
-
-def _cut_short(data: bytes, position: int) -> bool:
-    """Return whether `position` may begin a packet of which the end is missing."""
-    left = len(data) - position
-    if left == 1:
-        return any(identifier[:1] == data[position:] for identifier in _BY_IDENTIFIER)
-    layout = _BY_IDENTIFIER.get(data[position : position + 2])
-    if layout is None or left >= layout.length:
-        return False
-    return left < HEADER_BYTES or _stated_length(data, position) == layout.length
 
 
 def _missing(layout: Layout, packets: bytes) -> int:

@@ -38,6 +38,11 @@ def safe_dropin(config: Path) -> str:
     return str(board_dropin.safe_dropin(load(config)))
 
 
+def link_dropin(config: Path) -> str:
+    """Return that of the link's unit."""
+    return str(board_dropin.link_dropin(load(config)))
+
+
 def changed_testbed(folder: Path, **sections: str) -> Path:
     """Return a copy of the testbed's configuration with other sections, or other values `coils_bus`."""
     text = TESTBED.read_text(encoding="utf-8")

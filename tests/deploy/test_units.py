@@ -21,11 +21,13 @@ from tests.deploy.scripts import (
     board_dropin,
     changed_testbed,
     dropin,
+    link_dropin,
     safe_dropin,
 )
 from tests.scenario.flights import CONFIG
 
-UNITS = ("knightcube.service", "knightcube-safe.service")
+UNITS = ("knightcube.service", "knightcube-safe.service", "knightcube-link.service")
+LINK = "{keys: /var/lib/knightcube-link/keys, udp: '192.168.7.2:5000', serial: {device: /dev/ttyS0}}"
 CAMERA = "{device: {kind: v4l2, path: /dev/knightcube-camera, pixel_format: Y16}}"
 
 needs_systemd = pytest.mark.skipif(
@@ -35,7 +37,7 @@ needs_systemd = pytest.mark.skipif(
 
 def put_units(folder: Path, config: Path) -> Path:
     """Put the units in a folder, the commands in them where they are now, the drop-ins at their end."""
-    for name, added in zip(UNITS, (dropin(config), safe_dropin(config)), strict=True):
+    for name, added in zip(UNITS, (dropin(config), safe_dropin(config), link_dropin(config)), strict=True):
         text = (DEPLOY / name).read_text(encoding="utf-8")
         text = text.replace("/opt/knightcube/venv/bin/python", sys.executable)
         text = text.replace("/opt/knightcube/bin/coils-off", str(DEPLOY / "coils-off"))
@@ -48,7 +50,11 @@ def units(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the units of a board that uses all there is: lasting names, a camera, a ground link."""
     folder = tmp_path_factory.mktemp("units")
     config = changed_testbed(
-        folder, camera=CAMERA, coils_bus="/dev/knightcube-i2c", commands="{udp: '192.168.7.2:5000'}"
+        folder,
+        camera=CAMERA,
+        coils_bus="/dev/knightcube-i2c",
+        commands="{socket: /run/knightcube/commands}",
+        link=LINK,
     )
     return put_units(folder, config)
 
@@ -79,7 +85,9 @@ def test_the_sandbox_leaves_an_exposure_of_at_most_1_5(units: Path, name: str) -
 @needs_systemd
 def test_a_usb3_vision_camera_beside_a_ground_link_leaves_no_more(tmp_path: Path) -> None:
     camera = "{device: {kind: aravis, name: Some-1, pixel_format: Mono16}}"
-    config = changed_testbed(tmp_path, camera=camera, commands="{udp: '10.1.2.3:5000', peers: [10.0.0.0/8]}")
+    config = changed_testbed(
+        tmp_path, camera=camera, commands="{socket: /run/knightcube/commands}", link=LINK
+    )
     assert exposure(put_units(tmp_path, config) / UNITS[0]) <= 1.5
 
 
@@ -132,23 +140,33 @@ def test_simulated_devices_ask_for_none_of_the_boards() -> None:
 
 
 @pytest.mark.parametrize(
-    ("commands", "allowed"),
+    ("lines", "allowed"),
     [
-        ("{udp: '127.0.0.1:5000'}", ["127.0.0.0/8"]),
-        ("{udp: 'localhost:5000'}", ["127.0.0.0/8"]),
-        ("{udp: '192.168.7.2:5000'}", ["192.168.7.0/24"]),
-        ("{udp: '0.0.0.0:5000', peers: [192.168.7.9, 10.1.0.0/16]}", ["192.168.7.9/32", "10.1.0.0/16"]),
+        ("udp: '127.0.0.1:5000'", ["127.0.0.0/8"]),
+        ("tcp: 'localhost:5000'", ["127.0.0.0/8"]),
+        ("udp: '192.168.7.2:5000'", ["192.168.7.0/24"]),
+        ("udp: '0.0.0.0:5000', peers: [192.168.7.9, 10.1.0.0/16]", ["192.168.7.9/32", "10.1.0.0/16"]),
     ],
 )
-def test_the_dropin_opens_the_network_only_for_a_command_link_and_its_peers(
-    tmp_path: Path, commands: str, allowed: list[str]
+def test_the_network_is_open_only_to_the_link_and_its_peers(
+    tmp_path: Path, lines: str, allowed: list[str]
 ) -> None:
-    text = dropin(changed_testbed(tmp_path, commands=commands))
+    config = changed_testbed(tmp_path, commands="{socket: /run/x}", link=f"{{keys: /k, {lines}}}")
+    assert "AF_INET" not in dropin(config)
+    assert "Device" not in link_dropin(config)
+    text = link_dropin(config)
     assert "RestrictAddressFamilies=AF_INET\n" in text
     assert "PrivateNetwork=no\n" in text
     assert "IPAddressDeny" not in text, "any, as the unit says, stays"
     assert re.findall("IPAddressAllow=(.*)", text) == allowed
-    assert "IPAddressDeny=any\n" in (DEPLOY / "knightcube.service").read_text(encoding="utf-8")
+    for unit in UNITS:
+        assert "IPAddressDeny=any\n" in (DEPLOY / unit).read_text(encoding="utf-8")
+
+
+def test_plain_commands_on_a_bench_open_the_machine_itself_alone(tmp_path: Path) -> None:
+    text = dropin(changed_testbed(tmp_path, commands="{udp: '127.0.0.1:5000'}"))
+    assert re.findall("IPAddressAllow=(.*)", text) == ["127.0.0.0/8"]
+    assert link_dropin(TESTBED) == ""
 
 
 def test_the_coils_bus_may_have_a_lasting_name_everywhere(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from hal.interfaces.errors import DeviceError
 
 COMMANDS = {
     "run": "fly a configuration",
+    "link": "connect a flight to its ground by protected frames",
     "check": "check a configuration and the devices that it names, before it is flown",
 }
 """What a board has; the packages of `GROUP` add theirs."""

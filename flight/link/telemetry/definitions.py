@@ -7,6 +7,7 @@ is never changed in place once it has flown: a field is appended and the packet'
 from __future__ import annotations
 
 from flight.link.telemetry.form import Field, Packet, counter
+from flight.link.telemetry.link_definitions import LINK, VERIFICATION
 from flight.link.telemetry.orbit_definitions import NAVIGATION, ORBIT_TRUTH, SPIN
 
 MAX_NODES = 40
@@ -338,4 +339,6 @@ PACKETS: tuple[Packet, ...] = (
     CYCLE_TIMING,
     RATE_GROUP,
     JOB_TIMING,
+    LINK,
+    VERIFICATION,
 )

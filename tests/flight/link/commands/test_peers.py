@@ -1,4 +1,4 @@
-"""UDP commands come from the configured peers alone; the defaults without `peers` are reported or refused."""
+"""The link is open to its peers alone; plain UDP commands stay on the machine."""
 
 from __future__ import annotations
 
@@ -15,42 +15,54 @@ from flight.schema.reader import parse
 from tests.scenario.flights import CONFIG
 
 
-def networks(commands: str) -> list[str]:
+def networks(lines: str, commands: str = "{socket: /run/x}") -> list[str]:
     text = CONFIG.read_text(encoding="utf-8")
-    return [str(network) for network in peer_networks(parse(f"{text}\ncommands: {commands}\n").commands)]
+    link = parse(f"{text}\ncommands: {commands}\nlink: {{keys: /k, {lines}}}\n").link
+    assert link is not None
+    return [str(network) for network in peer_networks(link)]
 
 
 @pytest.mark.parametrize(
-    ("commands", "expected"),
+    ("lines", "expected"),
     [
-        ("{}", []),
-        ("{udp: '127.0.0.3:5000'}", ["127.0.0.0/8"]),
-        ("{udp: '10.20.30.40:5000'}", ["10.20.30.0/24"]),
-        ("{udp: '10.20.30.40:5000', peers: [10.20.30.7]}", ["10.20.30.7/32"]),
-        ("{udp: 'board:5000', peers: [10.20.0.0/16, 127.0.0.1]}", ["10.20.0.0/16", "127.0.0.1/32"]),
+        ("serial: {device: /dev/ttyS0}", []),
+        ("udp: '127.0.0.3:5000'", ["127.0.0.0/8"]),
+        ("udp: '10.20.30.40:5000'", ["10.20.30.0/24"]),
+        ("udp: '10.20.30.40:5000', peers: [10.20.30.7]", ["10.20.30.7/32"]),
+        ("tcp: 'board:5000', peers: [10.20.0.0/16, 127.0.0.1]", ["10.20.0.0/16", "127.0.0.1/32"]),
     ],
 )
-def test_without_a_word_the_peers_are_those_around_the_address(commands: str, expected: list[str]) -> None:
-    assert networks(commands) == expected
+def test_without_a_word_the_peers_are_those_around_the_address(lines: str, expected: list[str]) -> None:
+    assert networks(lines) == expected
 
 
 @pytest.mark.parametrize(
-    ("commands", "problem"),
+    ("lines", "problem"),
     [
-        ("{udp: '0.0.0.0:5000'}", r"`commands.udp` 0\.0\.0\.0 is every network: say who may command"),
-        ("{udp: 'board:5000'}", r"`commands.udp` board may be anywhere: say who may command"),
-        (
-            "{udp: '10.0.0.1:5000', peers: [10.0.0.5/24]}",
-            r"`commands.peers` 10\.0\.0\.5/24 has host bits",
-        ),
-        ("{udp: '10.0.0.1:5000', peers: [10.0.0.500]}", "`commands.peers` .*not permitted"),
-        ("{udp: '10.0.0.1:5000', peers: [ground]}", "`commands.peers"),
-        ("{udp: '10.0.0.1:5000', peers: []}", "`commands.peers"),
+        ("udp: '0.0.0.0:5000'", r"`link.udp` 0\.0\.0\.0 is every network: say who may connect"),
+        ("tcp: 'board:5000'", r"`link.tcp` board may be anywhere: say who may connect"),
+        ("udp: '10.0.0.1:5000', peers: [10.0.0.5/24]", r"`link.peers` 10\.0\.0\.5/24 has host bits"),
+        ("udp: '10.0.0.1:5000', peers: [10.0.0.500]", "`link.peers` .*not permitted"),
+        ("udp: '10.0.0.1:5000', peers: [ground]", "`link.peers"),
+        ("udp: '10.0.0.1:5000', peers: []", "`link.peers"),
+        ("spacecraft: 5", "`link` has no line"),
+        ("tcp: '127.0.0.1:5', telemetry_to: '127.0.0.1:6'", "`link.telemetry_to` goes with `link.udp`"),
     ],
 )
-def test_peers_that_make_no_sense_are_refused_with_what_would(commands: str, problem: str) -> None:
+def test_lines_that_make_no_sense_are_refused_with_what_would(lines: str, problem: str) -> None:
     with pytest.raises(ConfigError, match=problem):
-        networks(commands)
+        networks(lines)
+
+
+@pytest.mark.parametrize("address", ["192.168.7.2:5000", "0.0.0.0:5000", "board:5000"])
+def test_plain_commands_from_beyond_the_machine_are_refused(address: str) -> None:
+    with pytest.raises(ConfigError, match=r"`commands.udp` .* is plain and open beyond this machine"):
+        networks("udp: '10.0.0.1:5000'", f"{{socket: /run/x, udp: '{address}'}}")
+
+
+def test_a_link_needs_the_flights_socket() -> None:
+    with pytest.raises(ConfigError, match=r"`link` needs `commands.socket`"):
+        networks("udp: '10.0.0.1:5000'", "{}")
 
 
 def test_a_datagram_of_somebody_else_is_not_listened_to() -> None:

@@ -1,0 +1,59 @@
+"""Telecommand transfer frames, CCSDS 232.0-B-4: a header of 5 bytes, one space packet, a CRC of 2.
+
+All are of type BD (bypass, data): neither acknowledged nor sent again by the frame layer. The security of
+CCSDS 355.0-B stands between header and CRC (`flight.link.security.sdls`). There is no segment header.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+
+from flight.gnc.errors import FlightError
+from flight.link.telemetry.packets import CRC_BYTES, crc16
+
+HEADER = struct.Struct(">HHB")
+LONGEST_FRAME = 1024
+AUTHENTICATED = bytes((0, 0, 0xFC, 0, 0))
+"""Bits of the header that the MAC covers, those of the virtual channel (355.0-B-2, 2.3.2.3.3)."""
+
+_BYPASS = 1 << 13
+_CHANNEL_BITS = 10
+
+
+class FrameError(FlightError):
+    """Bytes that are no frame of this link; says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class TelecommandHeader:
+    """The fields of the header that differ from frame to frame."""
+
+    spacecraft: int
+    channel: int
+    sequence: int
+
+    def pack(self, length: int) -> bytes:
+        """Return the header of a frame of `length` bytes."""
+        second = self.channel << _CHANNEL_BITS | (length - 1)
+        return HEADER.pack(_BYPASS | self.spacecraft, second, self.sequence % 256)
+
+
+def stated_length(header: bytes) -> int:
+    """Return the bytes of the frame that begins with these 5."""
+    return (int.from_bytes(header[2:4], "big") & 0x3FF) + 1
+
+
+def open_frame(frame: bytes, spacecraft: int) -> bytes:
+    """Return a frame without its CRC. Raises FrameError for another spacecraft's and for no frame at all."""
+    if len(frame) < HEADER.size + CRC_BYTES or stated_length(frame) != len(frame):
+        raise FrameError("its length is wrong")
+    first = int.from_bytes(frame[:2], "big")
+    if first != _BYPASS | spacecraft:
+        raise FrameError("it is for another spacecraft, or of another type than BD")
+    return frame[:-CRC_BYTES]
+
+
+def close_frame(body: bytes) -> bytes:
+    """Return a frame with its CRC."""
+    return body + crc16(body).to_bytes(CRC_BYTES, "big")

@@ -1,0 +1,231 @@
+"""The link process's own loop: frames in, commands over, telemetry down, fifty times a second.
+
+One thread, no waiting but for the next turn. A frame that is let in is used up before anything is done with
+it. The link keeps nothing but the counters: killed at any moment, it obeys no command twice.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from flight.gnc.errors import FlightError
+from flight.link.commands import codec
+from flight.link.commands.codec import CommandError, describe
+from flight.link.frames import telecommand, telemetry
+from flight.link.process import directives
+from flight.link.process.archive_reader import LogFollower, stretch, time_of
+from flight.link.process.control_line import ControlLine
+from flight.link.process.directives import Directive, NewKey, Play
+from flight.link.process.downlink import Downlink
+from flight.link.process.lines import Line
+from flight.link.process.verification import Report, Sent, Stage, Verification, report
+from flight.link.security.associations import COMMAND_SPIS, TELEMETRY_SPIS, Vault
+from flight.link.security.gate import Admitted, Gate, Refusal, RefusedError, Sealer
+from flight.link.telemetry.form import Packet
+from flight.link.telemetry.link_definitions import LINK, VERIFICATION
+from flight.link.telemetry.packets import Packer
+from hal.interfaces.wires import SECOND_NS, Clock
+
+TURN_NS = SECOND_NS // 50
+_LABEL_NS = 10 * SECOND_NS
+_RESERVED_BLOCK = 4096
+_REFUSALS_A_SECOND = 4
+
+
+@dataclass(frozen=True, slots=True)
+class StationSettings:
+    """What the link is set to: spacecraft identifier, bytes of each frame, bytes/s of all."""
+
+    spacecraft: int
+    frame_bytes: int
+    rate: float
+
+
+class Station:
+    """The satellite's end of the link."""
+
+    def __init__(
+        self,
+        settings: StationSettings,
+        vault: Vault,
+        lines: Sequence[Line],
+        control: ControlLine[Sent],
+        log: LogFollower,
+        clock: Clock,
+    ) -> None:
+        """Take open lines; the caller closes them."""
+        self._vault = vault
+        self._lines = lines
+        self._control = control
+        self._log = log
+        self._clock = clock
+        self._gate = Gate(vault, COMMAND_SPIS, _parser(settings.spacecraft), telecommand.AUTHENTICATED)
+        self._sealers = {
+            spi: Sealer(vault, spi, telemetry.AUTHENTICATED, _RESERVED_BLOCK) for spi in TELEMETRY_SPIS
+        }
+        self._downlink = Downlink(settings.spacecraft, settings.frame_bytes, settings.rate, self._seal)
+        self._verification = Verification()
+        self._packer = Packer()
+        self._mission_ns, self._mission_at_ns = 0, clock.now_ns()
+        self._status_ns = self._label_ns = clock.now_ns()
+        self._refusals: deque[int] = deque(maxlen=_REFUSALS_A_SECOND)
+        self._received = self._refused_commands = 0
+        self._problem = ""
+        self._status()
+
+    def run(self, ended: Callable[[], bool], complain: Callable[[str], object]) -> None:
+        """Turn until `ended` returns true; complain once of each trouble with sending."""
+        due_ns, complained = self._clock.now_ns(), ""
+        while not ended():
+            self.turn()
+            if self._problem and self._problem != complained:
+                complain(self._problem)
+            complained = self._problem
+            due_ns = max(due_ns + TURN_NS, self._clock.now_ns())
+            self._clock.sleep_until_ns(due_ns)
+        self._control.close()
+
+    def turn(self) -> None:
+        """Take what came, send what is due."""
+        now_ns = self._clock.now_ns()
+        for line in self._lines:
+            for frame, sender in line.receive():
+                self._take(frame, line, sender, now_ns)
+        for sent, answer in self._control.answers(now_ns):
+            reports = self._verification.answered(sent, answer)
+            self._refused_commands += reports[0].stage is Stage.FAILED
+            self._report(*reports)
+        self._follow(now_ns)
+        if now_ns >= self._status_ns:
+            self._status_ns = now_ns + SECOND_NS
+            self._status()
+        try:
+            frames = self._downlink.frames(now_ns)
+            self._problem = ""
+        except FlightError as error:  # no counter: commands still come, a new key makes an end of that
+            self._problem, frames = str(error), []
+        for line in self._lines:
+            line.send(frames, now_ns)
+
+    def _take(self, frame: bytes, line: Line, sender: Any, now_ns: int) -> None:
+        self._received += 1
+        try:
+            admitted = self._gate.admit(frame)
+        except RefusedError as error:
+            if error.counter is not None:
+                self._report_refusal(error.spi, error.counter, str(error), now_ns)
+            return
+        line.trust(sender, now_ns)
+        try:
+            directive = directives.unpack(admitted.data)
+            if directive is not None:
+                self._obey(admitted, directive)
+                return
+            sent = Sent(admitted.spi, admitted.counter, codec.unpack(admitted.data))
+        except CommandError as error:
+            self._refused_commands += 1
+            self._report(Report(admitted.spi, admitted.counter, Stage.REFUSED, "", str(error)))
+            return
+        self._report(report(sent, Stage.ACCEPTED, describe(sent.command)))
+        if problem := self._control.send(sent, admitted.data, now_ns):
+            self._refused_commands += 1
+            self._report(report(sent, Stage.FAILED, problem))
+
+    def _report_refusal(self, spi: int, counter: int, text: str, now_ns: int) -> None:
+        """Report an authentic frame that was refused; few of a flood of repeated ones."""
+        if len(self._refusals) < _REFUSALS_A_SECOND or now_ns - self._refusals[0] > SECOND_NS:
+            self._refusals.append(now_ns)
+            self._report(Report(spi, counter, Stage.REFUSED, "", text))
+
+    def _obey(self, admitted: Admitted, directive: Directive) -> None:
+        """Execute a directive and report its stages."""
+        name, text = directives.name_of(directive), str(directive)
+        self._report(Report(admitted.spi, admitted.counter, Stage.ACCEPTED, name, text))
+        problem = ""
+        if isinstance(directive, Play):
+            folder = self._log.folder(directive.run)
+            if folder is None:
+                problem = f"there is no run {directive.run}"
+            else:
+                self._downlink.play(stretch(folder, directive.begin, directive.end))
+        elif isinstance(directive, NewKey):
+            problem = self._change_key(directive)
+        else:
+            self._downlink.play(None)
+        self._refused_commands += bool(problem)
+        stage = Stage.FAILED if problem else Stage.COMPLETED
+        self._report(Report(admitted.spi, admitted.counter, stage, name, problem or text))
+
+    def _change_key(self, change: NewKey) -> str:
+        """Change a key; return why not, empty when done."""
+        if change.spi not in (*COMMAND_SPIS, *TELEMETRY_SPIS):
+            return f"there is no SPI {change.spi}"
+        before = self._vault.read(change.spi)
+        if before is not None and change.generation != before.generation + 1:
+            return f"the key of SPI {change.spi} is of generation {before.generation}"
+        if change.spi in COMMAND_SPIS:
+            done = self._gate.replace_key(change.spi, change.generation, change.key)
+        else:
+            done = self._sealers[change.spi].replace_key(change.generation, change.key)
+        return "" if done else "the key could not be stored"
+
+    def _follow(self, now_ns: int) -> None:
+        for packet in self._log.new():
+            self._mission_ns, self._mission_at_ns = time_of(packet), now_ns
+            self._downlink.live(packet)
+            self._report(*self._verification.followed(packet))
+        if self._log.label and now_ns >= self._label_ns:
+            self._label_ns = now_ns + _LABEL_NS
+            self._downlink.live(self._log.label)
+
+    def _seal(self, header: bytes, data: bytes) -> bytes:
+        """Protect a frame by the first SPI of telemetry that has a counter. Raises FlightError."""
+        problem: FlightError | None = None
+        for sealer in self._sealers.values():
+            try:
+                return sealer.seal(header, data)[0]
+            except FlightError as error:
+                problem = problem or error
+        raise problem or FlightError("there is no SPI of telemetry")
+
+    def _report(self, *reports: Report) -> None:
+        for one in reports:
+            values = {name: getattr(one, name) for name in ("spi", "counter", "name", "text")}
+            self._send(VERIFICATION, {**values, "stage": int(one.stage)})
+
+    def _status(self) -> None:
+        refused = {f"refused_{cause.name.lower()}": self._gate.refused[cause] for cause in Refusal}
+        known = {spi: self._vault.read(spi) for spi in (*COMMAND_SPIS, *TELEMETRY_SPIS)}
+        gates = [self._gate.association(spi) for spi in COMMAND_SPIS]
+        values = {
+            "received": self._received,
+            "admitted": self._gate.admitted,
+            **refused,
+            "refused_command": self._refused_commands,
+            "highest": [-2 if entry is None else entry.unused - 1 for entry in gates],
+            "generation": [0 if entry is None else entry.generation for entry in known.values()],
+            "copies": [self._vault.copies(spi) for spi in known],
+            "sent": self._downlink.sent,
+            "thinned": self._downlink.thinned,
+            "playing": int(self._downlink.playing),
+            "played_ns": self._downlink.played_ns,
+        }
+        self._send(LINK, values)
+
+    def _send(self, packet: Packet, values: dict[str, Any]) -> None:
+        time_ns = self._mission_ns + self._clock.now_ns() - self._mission_at_ns
+        self._downlink.report(self._packer.pack(packet, time_ns, values))
+
+
+def _parser(spacecraft: int) -> Callable[[bytes], tuple[bytes, bytes]]:
+    """Return the function that splits a telecommand frame of this spacecraft."""
+    size = telecommand.HEADER.size
+
+    def parse(frame: bytes) -> tuple[bytes, bytes]:
+        body = telecommand.open_frame(frame, spacecraft)
+        return body[:size], body[size:]
+
+    return parse

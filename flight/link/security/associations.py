@@ -1,0 +1,174 @@
+"""Security associations on disk: key and counter of each SPI in two copies, replaced in place and synced.
+
+A copy is a record of fixed size that ends in its CRC-32. Both are written each time, one after the other,
+over the bytes that they have: that needs no room on a full disk, and a crash tears one copy at most. The
+newer copy counts; it has the later key or the higher counter. A folder holds the associations of one end of
+the link. Only its owner may read the files, and a key leaves them for the cipher alone.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import stat
+import struct
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from cryptography.hazmat.primitives.ciphers.aead import AESGCM
+
+from flight.gnc.errors import FlightError, UsageError
+from flight.link.security.sdls import KEY_BYTES
+from flight.link.telemetry.segments import make_lasting
+
+COMMAND_SPIS = (1, 2)
+"""Of commands: the usual one and its reserve."""
+
+TELEMETRY_SPIS = (3, 4)
+"""Of telemetry: the usual one and its reserve."""
+
+HIGHEST_COUNTER = 2**63
+"""Higher ones are refused; a sender that makes a thousand frames a second reaches it in 292 million years."""
+
+COPIES = ("a", "b")
+
+_RECORD = struct.Struct(f">4sHIQ{KEY_BYTES}s")
+_MAGIC = b"KCS1"
+_CRC_BYTES = 4
+_LOCK, _OWNER = "lock", "owner"
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Association:
+    """Key and counter of an SPI: `unused` is the lowest counter that is still good under this key."""
+
+    spi: int
+    generation: int
+    unused: int
+    key: bytes = field(repr=False, compare=False)
+
+    @property
+    def cipher(self) -> AESGCM:
+        """AES-256-GCM under this key."""
+        return AESGCM(self.key)
+
+
+def encode(association: Association) -> bytes:
+    """Return the bytes of a copy."""
+    a = association
+    record = _RECORD.pack(_MAGIC, a.spi, a.generation, a.unused, a.key)
+    return record + zlib.crc32(record).to_bytes(_CRC_BYTES, "big")
+
+
+def decode(data: bytes) -> Association | None:
+    """Return the association of a copy, None for anything that `encode` does not produce."""
+    record, crc = data[: _RECORD.size], data[_RECORD.size :]
+    if len(record) != _RECORD.size or zlib.crc32(record).to_bytes(_CRC_BYTES, "big") != crc:
+        return None
+    magic, spi, generation, unused, key = _RECORD.unpack(record)
+    return Association(spi, generation, unused, key) if magic == _MAGIC else None
+
+
+class Vault:
+    """The associations of a folder. Several processes of one user may share it."""
+
+    def __init__(self, folder: Path) -> None:
+        """Open a folder. Raises UsageError where there is none, or with files that others may read."""
+        self._folder = folder
+        if not folder.is_dir():
+            raise UsageError(f"{folder}: no such folder; `python -m ground keys` makes keys")
+        for path in folder.glob("spi-*"):
+            if stat.S_IMODE(path.stat().st_mode) & 0o077:
+                raise UsageError(f"{path}: others may read this key: chmod 600, or make new keys")
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Keep other processes from writing meanwhile. Raises FlightError where the folder takes nothing."""
+        try:
+            file = os.open(self._folder / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        except OSError as error:
+            raise FlightError(f"{self._folder}: cannot be written: {error.strerror or error}") from error
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            yield
+        finally:
+            os.close(file)
+
+    @contextmanager
+    def owned(self) -> Iterator[None]:
+        """Keep a second link process from this folder. Raises UsageError where there is one."""
+        path = self._folder / _OWNER
+        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            os.close(file)
+            raise UsageError(f"{self._folder}: another link process has these counters") from error
+        try:
+            yield
+        finally:
+            os.close(file)
+
+    def read(self, name: int | str) -> Association | None:
+        """Return the newer copy of an association, None where both are lost."""
+        return max(self._copies(name), default=None)
+
+    def copies(self, name: int | str) -> int:
+        """Return how many copies are good and the newest."""
+        found = self._copies(name)
+        return found.count(max(found)) if found else 0
+
+    def write(self, association: Association, name: int | str | None = None) -> int:
+        """Write both copies; return how many are durable. Raises nothing: a disk that fails makes none."""
+        data = encode(association)
+        spi = association.spi if name is None else name
+        return sum(_overwrite(self._path(spi, copy), data) for copy in COPIES)
+
+    def advance(self, association: Association) -> int:
+        """Write both copies unless another process wrote a newer one; return how many are durable."""
+        with self.locked():
+            newest = self.read(association.spi)
+            if newest is not None and newest >= association:
+                return self.copies(association.spi)
+            return self.write(association)
+
+    def remove(self, name: int | str) -> None:
+        """Remove an association."""
+        for copy in COPIES:
+            self._path(name, copy).unlink(missing_ok=True)
+
+    def _path(self, name: int | str, copy: str) -> Path:
+        return self._folder / f"spi-{name}.{copy}"
+
+    def _copies(self, name: int | str) -> list[Association]:
+        found = []
+        for copy in COPIES:
+            try:
+                association = decode(self._path(name, copy).read_bytes())
+            except OSError:
+                continue
+            if association is not None and str(association.spi) == str(name).partition("-")[0]:
+                found.append(association)
+        return found
+
+
+def _overwrite(path: Path, data: bytes) -> bool:
+    """Write a file of fixed size in place, durably; return whether that worked."""
+    try:
+        new = not path.exists()
+        file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        try:
+            if os.pwrite(file, data, 0) != len(data):
+                return False
+            os.ftruncate(file, len(data))
+            os.fsync(file)
+        finally:
+            os.close(file)
+        if new:
+            make_lasting(path.parent)
+    except OSError:
+        return False
+    return True

@@ -1,0 +1,46 @@
+"""The telemetry of the link process: how the link stands, and what became of each command."""
+
+from __future__ import annotations
+
+from flight.link.telemetry.form import Field, Packet, counter
+
+LINK = Packet(
+    "link",
+    0x160,
+    "1 Hz, of the link process; not in the flight log",
+    "Frames that came, by their fate, and the counters of the security associations",
+    (
+        counter("received", "frames that came since the link's start"),
+        counter("admitted", "of them let in"),
+        counter("refused_crc", "refused: the CRC is wrong"),
+        counter("refused_header", "refused: no frame of this spacecraft"),
+        counter("refused_spi", "refused: no association of that SPI"),
+        counter("refused_lost", "refused: both copies of the counter of that SPI are lost"),
+        counter("refused_mac", "refused: the MAC is wrong, as of a forgery or of an old key"),
+        counter("refused_repeated", "refused: the counter was used"),
+        counter("refused_beyond", "refused: the counter is 65,536 or more ahead"),
+        counter("refused_unstored", "refused: the counter could not be stored"),
+        counter("refused_command", "let in, but no command; no answer; or refused by the flight"),
+        Field("highest", "i8", "-", "highest accepted counter of SPI 1 and 2; -1 none yet, -2 lost", 2),
+        Field("generation", "u4", "-", "of the keys of SPI 1 to 4; 0 lost", 4),
+        Field("copies", "u1", "-", "good copies of the counters of SPI 1 to 4", 4),
+        counter("sent", "telemetry frames sent since the link's start"),
+        counter("thinned", "live packets left out for want of rate; the archive has them"),
+        Field("playing", "u1", "-", "1 while the archive is played back"),
+        Field("played_ns", "i8", "ns", "mission time that the playback has reached"),
+    ),
+)
+
+VERIFICATION = Packet(
+    "verification",
+    0x161,
+    "at each step of a command, of the link process; not in the flight log",
+    "What became of a command that came by the link",
+    (
+        Field("spi", "u2", "-", "of its frame"),
+        Field("counter", "i8", "-", "of its frame: with the SPI its identifier"),
+        Field("stage", "u1", "-", "1 accepted, 2 refused, 3 started, 4 completed, 5 failed"),
+        Field("name", "S16", "-", "name of the command, empty for none"),
+        Field("text", "S128", "-", "its values, or the reason"),
+    ),
+)

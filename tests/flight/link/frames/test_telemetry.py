@@ -1,0 +1,101 @@
+"""Packets come whole out of telemetry frames, whatever their sizes and whichever frames are lost."""
+
+from __future__ import annotations
+
+import random
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from flight.link.frames.stream import SYNC, telemetry_stream
+from flight.link.frames.telemetry import (
+    MasterCount,
+    PacketAssembler,
+    TelemetryFramer,
+    idle_packet,
+    open_frame,
+)
+
+SPACECRAFT, ROOM = 0x1A5, 97
+FRAME = 6 + ROOM + 2
+
+
+def framer(channel: int = 3) -> TelemetryFramer:
+    return TelemetryFramer(SPACECRAFT, channel, ROOM, MasterCount(), lambda header, data: header + data)
+
+
+def packet(number: int, size: int) -> bytes:
+    return (
+        (0x0100 + number % 256).to_bytes(2, "big") + b"\xc0\0" + (size - 1).to_bytes(2, "big") + bytes(size)
+    )
+
+
+def assembled(frames: list[bytes], assembler: PacketAssembler) -> list[bytes]:
+    found = []
+    for frame in frames:
+        header, data, channel = open_frame(frame, SPACECRAFT)
+        assert channel == 3
+        found += assembler.add(header, data)
+    return found
+
+
+@settings(max_examples=40)
+@given(st.lists(st.tuples(st.integers(1, 300), st.booleans()), max_size=30))
+def test_packets_of_all_sizes_come_out_as_they_went_in(sizes: list[tuple[int, bool]]) -> None:
+    made, frames, sent = framer(), [], []
+    for number, (size, flush) in enumerate(sizes):
+        sent.append(packet(number, size))
+        frames += made.add(sent[-1])
+        if flush:
+            frames += made.flush()
+            assert not made.waits
+    frames += made.flush()
+    assert {len(frame) for frame in frames} == {FRAME}
+    assert assembled(frames, PacketAssembler()) == sent
+
+
+def test_a_lost_frame_costs_the_packets_that_it_touched_and_no_others() -> None:
+    draw = random.Random(5)
+    sent = [packet(n, draw.randrange(1, 200)) for n in range(400)]
+    made = framer()
+    frames = [frame for one in sent for frame in made.add(one)] + made.flush()
+    lost = set(draw.sample(range(len(frames)), len(frames) // 10))
+    assembler = PacketAssembler()
+    found = assembled([frame for n, frame in enumerate(frames) if n not in lost], assembler)
+    begin, whole = 0, []
+    for one in sent:
+        end = begin + len(one)
+        if not lost & set(range(begin // ROOM, (end - 1) // ROOM + 1)):
+            whole.append(one)
+        begin = end
+    assert found == whole
+    assert assembler.lost_frames == len(lost - {len(frames) - 1})
+
+
+def test_the_header_is_that_of_the_standard() -> None:
+    (frame,) = framer(channel=5).add(packet(0, ROOM - 6))
+    bits = "00" + f"{SPACECRAFT:010b}" + "101" + "0" + "00000000" * 2 + "0" + "0" + "0" + "11" + f"{0:011b}"
+    assert frame[:6] == int(bits, 2).to_bytes(6, "big")
+    assert idle_packet(9) == bytes.fromhex("07ffc0000002000000")
+
+
+@settings(max_examples=25)
+@given(st.binary(max_size=12), st.lists(st.integers(1, 60), min_size=1), st.randoms(use_true_random=False))
+def test_frames_are_found_in_a_stream_however_it_is_cut(
+    noise: bytes, cuts: list[int], draw: random.Random
+) -> None:
+    made = framer()
+    frames = [frame for n in range(4) for frame in made.add(packet(n, 80))]
+    stream = noise.join([b"", *(SYNC + frame for frame in frames)])
+    finder, found, position = telemetry_stream(FRAME), [], 0
+    while position < len(stream):
+        step = draw.choice(cuts)
+        found += finder.add(stream[position : position + step])
+        position += step
+    assert found == frames
+
+
+def test_a_false_marker_hides_no_frame() -> None:
+    (frame,) = framer().add(packet(0, ROOM - 6))
+    found = telemetry_stream(FRAME).add(SYNC + b"\x1a\xcf" + SYNC + frame + SYNC)
+    assert found[-1] == frame

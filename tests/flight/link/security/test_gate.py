@@ -1,0 +1,149 @@
+"""Forged and repeated frames are refused with their cause; lost counters cost one SPI."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from cryptography.hazmat.primitives.ciphers.aead import AESGCM
+
+from flight.gnc.errors import FlightError, UsageError
+from flight.link.frames.telecommand import close_frame
+from flight.link.security.associations import COPIES, Vault, decode
+from flight.link.security.gate import WINDOW, Gate, Refusal, RefusedError
+from tests.flight.link.security.vaults import Ground, gate, vault
+
+KEYS = {1: bytes(range(32)), 2: bytes(range(32, 64))}
+
+
+@pytest.fixture
+def sky(tmp_path: Path) -> Vault:
+    return vault(tmp_path / "sky", KEYS)
+
+
+@pytest.fixture
+def ground(tmp_path: Path) -> Vault:
+    return vault(tmp_path / "ground", KEYS)
+
+
+def cause(entrance: Gate, frame: bytes) -> Refusal:
+    with pytest.raises(RefusedError) as refused:
+        entrance.admit(frame)
+    return refused.value.cause
+
+
+def test_the_frame_is_that_of_the_standard_byte_by_byte(ground: Vault) -> None:
+    """Header 5 | SPI 2 | IV 12 | ciphertext | MAC 16 | CRC 2, the MAC over VCID, SPI and data."""
+    maker = Ground(ground)
+    maker.frame(b"first")
+    frame = maker.frame(b"second")
+    assert len(frame) == 5 + 2 + 12 + len(b"second") + 16 + 2
+    assert frame[5:7] == b"\0\1"
+    assert frame[7:19] == (1).to_bytes(12, "big")
+    covered = bytes([0, 0, frame[2] & 0xFC, 0, 0]) + b"\0\1" + bytes(12)
+    assert AESGCM(KEYS[1]).decrypt(frame[7:19], frame[19:-2], covered) == b"second"
+
+
+def test_a_frame_is_let_in_once_and_forgeries_by_their_cause_not_at_all(sky: Vault, ground: Vault) -> None:
+    entrance, maker = gate(sky), Ground(ground)
+    first, second = maker.frame(b"one"), maker.frame(b"two")
+    assert entrance.admit(second).data == b"two"
+    assert cause(entrance, second) is Refusal.REPEATED
+    assert cause(entrance, first) is Refusal.REPEATED
+    third = maker.frame(b"three")
+    assert cause(entrance, third[:-1] + bytes([third[-1] ^ 1])) is Refusal.CRC
+    assert cause(entrance, close_frame(third[:20] + bytes([third[20] ^ 1]) + third[21:-2])) is Refusal.MAC
+    assert cause(entrance, close_frame(third[:6] + b"\2" + third[7:-2])) is Refusal.MAC  # another SPI
+    assert cause(entrance, close_frame(third[:6] + b"\7" + third[7:-2])) is Refusal.SPI
+    assert cause(entrance, close_frame(third[:2] + bytes([third[2] ^ 4]) + third[3:-2])) is Refusal.MAC
+    assert cause(entrance, close_frame(b"\x25" + third[1:-2])) is Refusal.HEADER
+    assert entrance.admit(third).counter == 2  # none of these advanced anything
+    assert sum(entrance.refused.values()) == 8
+    assert entrance.admitted == 2
+
+
+def test_the_window_reaches_65536_ahead(sky: Vault, ground: Vault) -> None:
+    entrance = gate(sky)
+    skip(ground, WINDOW - 1)
+    assert entrance.admit(Ground(ground).frame(b"last of the window")).counter == WINDOW - 1
+    skip(ground, WINDOW)
+    assert cause(entrance, Ground(ground).frame(b"one too far")) is Refusal.BEYOND
+
+
+def skip(at: Vault, count: int) -> None:
+    """Use up counters without a frame."""
+    entry = at.read(1)
+    assert entry is not None
+    at.write(replace(entry, unused=entry.unused + count))
+
+
+def test_a_restart_lets_nothing_in_again_and_one_copy_is_enough(
+    sky: Vault, ground: Vault, tmp_path: Path
+) -> None:
+    frame = Ground(ground).frame(b"one")
+    gate(sky).admit(frame)
+    assert cause(gate(sky), frame) is Refusal.REPEATED
+    for copy in COPIES:
+        torn = tmp_path / "sky" / f"spi-1.{copy}"
+        torn.write_bytes(torn.read_bytes()[:30])
+        assert sky.copies(1) == 1
+        assert cause(gate(sky), frame) is Refusal.REPEATED
+        assert sky.copies(1) == 2  # made again from the other
+
+
+def test_both_copies_lost_refuse_that_spi_and_its_reserve_changes_the_key(
+    sky: Vault, ground: Vault, tmp_path: Path
+) -> None:
+    old = Ground(ground).frame(b"old")
+    (tmp_path / "sky" / "spi-1.a").unlink()
+    (tmp_path / "sky" / "spi-1.b").write_bytes(b"")
+    entrance = gate(sky)
+    assert cause(entrance, old) is Refusal.LOST
+    assert entrance.admit(Ground(ground, 2).frame(b"by the reserve")).spi == 2
+    assert entrance.replace_key(1, 2, bytes(32))
+    assert cause(entrance, old) is Refusal.MAC
+    assert cause(gate(sky), old) is Refusal.MAC
+    ground.write(sky.read(1) or pytest.fail("it was written"))
+    assert gate(sky).admit(Ground(ground).frame(b"new")).counter == 0
+
+
+def test_a_counter_that_cannot_be_stored_lets_nothing_in(
+    sky: Vault, ground: Vault, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entrance, frame = gate(sky), Ground(ground).frame(b"one")
+
+    def fail(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as full:
+        full.setattr(os, "fsync", fail)
+        assert cause(entrance, frame) is Refusal.UNSTORED
+        with pytest.raises(FlightError, match="cannot be stored"):
+            Ground(ground).frame(b"two")
+    assert entrance.admit(frame).data == b"one"
+
+
+def test_no_counter_is_used_twice_by_senders_that_share_a_folder(ground: Vault) -> None:
+    makers = [Ground(ground), Ground(ground)]
+    counters = [maker.frame(b"")[7:19] for _ in range(3) for maker in makers]
+    assert len(set(counters)) == len(counters)
+
+
+def test_keys_are_for_their_owner_only_and_not_in_what_is_printed(sky: Vault, tmp_path: Path) -> None:
+    path = tmp_path / "sky" / "spi-1.a"
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert KEYS[1].hex() not in repr(sky.read(1))
+    assert repr(KEYS[1]) not in repr(sky.read(1))
+    path.chmod(0o640)
+    with pytest.raises(UsageError, match="others may read"):
+        Vault(tmp_path / "sky")
+
+
+def test_a_damaged_record_is_none(tmp_path: Path, sky: Vault) -> None:
+    record = (tmp_path / "sky" / "spi-1.a").read_bytes()
+    assert decode(record) == sky.read(1)
+    for place in range(len(record)):
+        assert decode(record[:place] + bytes([record[place] ^ 0x40]) + record[place + 1 :]) is None
+        assert decode(record[:place]) is None

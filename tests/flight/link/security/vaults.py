@@ -1,0 +1,45 @@
+"""Folders of associations for both ends of a link."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from flight.link.frames import telecommand
+from flight.link.security.associations import COMMAND_SPIS, Association, Vault
+from flight.link.security.gate import Gate, Sealer
+
+SPACECRAFT = 0x1A5
+
+
+def vault(folder: Path, keys: dict[int, bytes]) -> Vault:
+    """Return a new vault with these keys."""
+    folder.mkdir()
+    made = Vault(folder)
+    for spi, key in keys.items():
+        made.write(Association(spi, 1, 0, key))
+    return made
+
+
+def parse(frame: bytes) -> tuple[bytes, bytes]:
+    """Split a telecommand frame as the satellite does."""
+    body = telecommand.open_frame(frame, SPACECRAFT)
+    size = telecommand.HEADER.size
+    return body[:size], body[size:]
+
+
+def gate(at: Vault) -> Gate:
+    """Return the satellite's gate of commands."""
+    return Gate(at, COMMAND_SPIS, parse, telecommand.AUTHENTICATED)
+
+
+class Ground:
+    """Makes protected telecommand frames."""
+
+    def __init__(self, at: Vault, spi: int = 1) -> None:
+        self._sealer = Sealer(at, spi, telecommand.AUTHENTICATED)
+
+    def frame(self, data: bytes) -> bytes:
+        """Return the next frame."""
+        header = telecommand.TelecommandHeader(SPACECRAFT, 0, 0)
+        length = telecommand.HEADER.size + 30 + len(data) + 2
+        return telecommand.close_frame(self._sealer.seal(header.pack(length), data)[0])
