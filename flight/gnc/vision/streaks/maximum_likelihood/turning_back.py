@@ -29,8 +29,9 @@ _BEYOND = 1.9
 # Px to either side of the path that count.
 _ASIDE = 3
 # The motions compared: times of the shorter way over the longer one's, and lengths over that of the fit.
-_SHARES = np.arange(0.15, 0.97, 0.1)
-_LENGTHS = np.linspace(0.9, 1.7, 17)
+# Ways nearly alike differ by a px or two of the path.
+_SHARES = np.concatenate([np.arange(0.15, 0.96, 0.1), [0.97, 0.98, 0.99]])
+_LENGTHS = np.concatenate([np.arange(0.95, 1.1, 0.01), np.arange(1.1, 1.71, 0.05)])
 # Part of the light by which the profile across may be wrong.
 _ROUGH = 0.05
 # No star says more than this many sigmas squared.
