@@ -24,7 +24,7 @@ _LIGHT = 9
 # The last step, in standard deviations, from which a fit has not settled.
 _RESTLESS = 2.0
 # A motion that turned back within the exposure must explain the streaks better by this many sigmas squared.
-_TURNED_BACK = 50.0
+_TURNED_BACK = 30.0
 # Streaks so close, px, and as bright as this part of one run beside it; a sky has few such pairs.
 _BESIDE = 8.0
 _LIKE = 0.3
