@@ -31,15 +31,25 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Find the Earth's limb in a picture and the direction to the Earth's centre, in camera axes: z along "
         "the boresight, x to the right, y down. PNG, TIFF, JPEG or FITS, colour too. Without --altitude the "
-        "altitude is fitted as well. The Earth is taken as a sphere; the uncertainty includes the error of "
-        "that."
+        "altitude is fitted as well, within --altitudes. The Earth is taken as a sphere; the "
+        "uncertainty includes the error of that."
     )
     parser.epilog = (
         "example: python -m flight horizon limb.png --fov 67 --altitude 515 --overlay limb_found.png"
     )
     add_picture(parser)
     add_field(parser, required=True)
-    parser.add_argument("--altitude", type=positive, metavar="KM", help="above the mean Earth")
+    height = parser.add_mutually_exclusive_group()
+    height.add_argument("--altitude", type=positive, metavar="KM", help="above the mean Earth")
+    low, high = (1e-3 * bound for bound in HorizonSettings().altitudes)
+    height.add_argument(
+        "--altitudes",
+        type=positive,
+        nargs=2,
+        metavar=("LEAST", "MOST"),
+        default=(low, high),
+        help=f"km, between which an unknown altitude lies (default {low:g} {high:g})",
+    )
     parser.add_argument(
         "--log-response",
         type=positive,
@@ -59,7 +69,8 @@ def run(options: argparse.Namespace) -> int:
         least = f"{1e-3 * LEAST_ALTITUDE:g} km"
         raise UsageError(f"--altitude {options.altitude:g}: the limb is seen as one from {least} up")
     response = None if options.log_response is None else LogarithmicResponse(*options.log_response)
-    settings = HorizonSettings(edges=EdgeSettings(response=response))
+    least, most = (1e3 * bound for bound in options.altitudes)
+    settings = HorizonSettings(edges=EdgeSettings(response=response), altitudes=(least, most))
     solution = find_nadir(pixels, camera, HorizonKnowledge(altitude=altitude), settings)
     if options.json:
         sys.stdout.write(json.dumps(facts(solution, altitude is None), allow_nan=False) + "\n")

@@ -72,6 +72,8 @@ def test_a_picture_without_a_horizon_says_so_with_exit_status_1(folder: Path) ->
         (["--fov", "170"], "1 to 150 degrees"),
         (["--fov", "67", "--altitude", "-3"], "not a positive number"),
         (["--fov", "67", "--altitude", "5"], "--altitude 5: the limb is seen as one from 50 km up"),
+        (["--fov", "67", "--altitudes", "900", "300"], "altitudes of 900 to 300 km"),
+        (["--fov", "67", "--altitude", "600", "--altitudes", "300", "900"], "not allowed with"),
         ([], "--fov --camera"),
         (["--camera", "config/step_demo.yaml"], "512 x 512 pixels, but the camera of"),
         (["--fov", "67", "--camera", "config/step_demo.yaml"], "not allowed with"),

@@ -111,7 +111,7 @@ def test_options_describe_the_camera_and_a_refusal_says_why(scene: Scene, pictur
     assert right["reason"] == ""
     wrong = command("rate", picture, *told, "--psf", "2")
     assert wrong.returncode == 1
-    assert "2 px as described" in json.loads(wrong.stdout)["reason"]
+    assert "times as wide as described" in json.loads(wrong.stdout)["reason"]
 
 
 def test_a_cameras_configuration_says_how_well_it_is_known(picture: Path, tmp_path: Path) -> None:

@@ -90,12 +90,10 @@ def limb_picture(
     kind: str, generator: np.random.Generator
 ) -> tuple[Image, EarthScene, EarthCameraModel, HorizonSettings]:
     """Return a rendered limb of one of `HARD`, its scene, its camera and the finder's settings."""
-    model, settings = camera_model(), None
     if kind == "narrow":
-        model = EarthCameraModel.fuga15d(
-            np.radians(generator.uniform(15.0, 40.0)), seed=1, response="linear", sensitivity=30_000.0
-        )
-        settings = HorizonSettings()
+        model, scene = _narrow(generator)
+        return render(model, scene, generator), scene, model, HorizonSettings()
+    model = camera_model()
 
     def accepted(scene: EarthScene) -> bool:
         if kind == "glare":
@@ -110,7 +108,18 @@ def limb_picture(
         frame = _hidden(frame, scene, model, generator)
     elif kind == "glint":
         frame = _glinting(frame, scene, model, generator)
-    return frame, scene, model, settings or finder_settings(model)
+    return frame, scene, model, finder_settings(model)
+
+
+def _narrow(generator: np.random.Generator) -> tuple[EarthCameraModel, EarthScene]:
+    """Return a narrow camera and a scene; another camera where one sees too little of any limb."""
+    while True:
+        field = np.radians(generator.uniform(15.0, 40.0))
+        model = EarthCameraModel.fuga15d(field, seed=1, response="linear", sensitivity=30_000.0)
+        try:
+            return model, random_scene(generator, model, "sunlit")
+        except RuntimeError:
+            continue
 
 
 def _hidden(

@@ -218,4 +218,5 @@ IMPERFECTIONS: dict[str, Imperfection] = {
     "axis 5 px off": Imperfection(Optics(offset=(4.0, -3.0))),
     "rolling untold": Imperfection(line_time=20e-6, known={"knowledge": CameraKnowledge(line_time=10e-6)}),
     "rolling told": Imperfection(line_time=20e-6, known={"line_time": 20e-6}),
+    "sigma 3 px told": Imperfection(Optics((gaussian(3.0),), radius=18.0), known={"psf_sigma": 3.0}),
 }

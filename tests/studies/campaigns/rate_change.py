@@ -1,7 +1,10 @@
-"""Campaign `rate-change`: frames over which the rate changes, up to 200 % of its mean.
+"""Campaign `rate-change`: frames over which the rate changes, up to 200 % of its mean and beyond.
 
 Random fields, theta over 0..90 deg, streaks of 16 to 90 px, exposures of 0.2 and 1 s; the rate changes evenly
 along its axis by 0 to 200 % of its mean, up or down, a third of the frames by 200 %: from rest, or to it.
+Half as many frames more are of turns that reverse within the exposure: 220 to 400 % in half of them, to
+4,000 % in the others, over paths of the same lengths; the model has none of them, a refusal is right. Beyond
+that both ways are alike to a pixel, and no frame distinguishes the turn from one that begins at rest.
 The frames are summed instant by instant (`row_exposure`), not by the estimator's model. Right is an answer
 within 6 of its own standard deviations, or within 1 % of the rate.
 """
@@ -31,7 +34,9 @@ FROM_REST_SHARE = 1 / 3
 WRONG_SIGMAS = 6.0
 WRONG_SHARE = 0.01
 # Changes of the rate in percent of its mean, upper edges.
-CHANGES = (50, 100, 150, 199, 200)
+CHANGES = (50, 100, 150, 199, 200, 300, 400, 4000)
+# From which change on a turn reverses visibly, and up to which in each half of those frames.
+REVERSING = (2.2, 4.0, 40.0)
 
 
 def cases(runs: int, seed: int) -> list[Case]:
@@ -47,7 +52,21 @@ def cases(runs: int, seed: int) -> list[Case]:
             "change": float(change * draw.choice([-1.0, 1.0])),
         }
         found.append(Case(str(run), (seed, run, 1), parameters))
-    return found
+    return found + [_reversing(run, seed) for run in range(runs // 2)]
+
+
+def _reversing(run: int, seed: int) -> Case:
+    draw = np.random.default_rng((seed, run, 2))
+    change = float(np.exp(draw.uniform(*np.log(REVERSING[:2] if run % 2 else REVERSING[1:]))))
+    path = float(np.exp(draw.uniform(*np.log(LENGTHS))))
+    parameters = {
+        "theta": float(np.rad2deg(draw.uniform(0.0, 0.5 * np.pi))),
+        # Of the mean rate; the longer way of the path is some times as long.
+        "length": path / (0.5 * change * (0.5 + 1.0 / change) ** 2),
+        "exposure": float(draw.choice(EXPOSURES)),
+        "change": change * float(draw.choice([-1.0, 1.0])),
+    }
+    return Case(f"back-{run}", (seed, run, 3), parameters)
 
 
 def run(case: Case) -> Result:
@@ -105,7 +124,7 @@ def _row(results: Sequence[Result]) -> dict[str, Any]:
 
 RATE_CHANGE = Campaign(
     "rate-change",
-    "frames over which the rate changes by up to 200 % of its mean: right, refused, beyond 6 sigma",
+    "frames over which the rate changes, or reverses: right, refused, beyond 6 sigma",
     cases,
     run,
     summarise,

@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
-from tests.studies.campaigns.campaign import fly_here
-from tests.studies.campaigns.rate_change import RATE_CHANGE
+from tests.studies.campaigns.campaign import Case, fly_here
+from tests.studies.campaigns.rate_change import RATE_CHANGE, run
+
+# A turn that goes back nearly as far as it came: its streaks are fitted well as those of a motion from rest,
+# of quite another rate.
+FOLDED = {"theta": 21.97996, "length": 6.63953, "exposure": 0.2, "change": 18.80413}
 
 
 def test_a_rate_that_changes_by_up_to_twice_its_mean_is_found_within_its_covariance() -> None:
     """Chi-square of 3: 16.3 is exceeded once in a thousand."""
-    for result in fly_here(RATE_CHANGE, 4, 20_261_123):
+    results = fly_here(RATE_CHANGE, 4, 20_261_123)
+    assert len(results) == 6
+    for result in results[:4]:
         assert result["status"] == "rate"
         assert result["nees"] < 16.3
+    # Turns that reverse.
+    assert all(result["nees"] is None for result in results[4:])
+
+
+def test_a_turn_that_reverses_is_not_taken_for_one_from_rest() -> None:
+    assert run(Case("folded", (7, 49, 1), dict(FOLDED)))["nees"] is None

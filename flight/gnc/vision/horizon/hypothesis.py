@@ -18,7 +18,12 @@ from flight.gnc.vision.horizon.illumination import (
     limb_rays,
     sun_elevation,
 )
-from flight.gnc.vision.horizon.initial_guess import InitialGuess, sun_from
+from flight.gnc.vision.horizon.initial_guess import (
+    SPHERE_ALTITUDE_SIGMA,
+    InitialGuess,
+    Place,
+    sun_from,
+)
 from flight.gnc.vision.horizon.knowledge import HorizonKnowledge
 from flight.gnc.vision.horizon.limb_equation import View, limb_residuals
 from flight.gnc.vision.horizon.limb_fit import UNKNOWN, FittedLimb, Prior, fit_limb, stepped
@@ -60,6 +65,8 @@ class Hypothesis:
         allowance: rad an axis, added to the covariance for unmodelled effects.
         chance: log10 of the expected number of cones as good among chance edges, see `log10_chance`.
         breadth: of the members' edges over the air's, medians.
+        altitude_off: sigmas by which a fitted altitude lies beyond `HorizonSettings.altitudes`; 0 for a
+            known one.
     """
 
     fit: FittedLimb
@@ -72,6 +79,7 @@ class Hypothesis:
     allowance: float
     chance: float
     breadth: float
+    altitude_off: float
 
     @property
     def covariance(self) -> FloatArray:
@@ -113,7 +121,15 @@ def examine(
         settings.sphere_sigma if np.isinf(stand.sigma) else 0.0,
         _chance(guess, fit, limb, seen, used, sun, camera, settings),
         _breadth(fit.view, seen, used, settings),
+        _altitude_off(fit, place, settings),
     )
+
+
+def _altitude_off(fit: FittedLimb, place: Place, settings: HorizonSettings) -> float:
+    if place.altitude_sigma < UNKNOWN:
+        return 0.0
+    (low, high), altitude = settings.altitudes, fit.view.surface.height_of(fit.view.position)
+    return max(low - altitude, altitude - high, 0.0) / fit.altitude_sigma(SPHERE_ALTITUDE_SIGMA)
 
 
 def _chance(

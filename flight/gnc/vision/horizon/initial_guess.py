@@ -64,6 +64,11 @@ class InitialGuess:
     members: BoolArray
 
 
+def cosine_at(altitude: float) -> float:
+    """Return the cosine of the half-angle of the limb's cone from `altitude` m above the mean sphere."""
+    return _above_sphere(altitude, 0.0).cosine
+
+
 def place_of(knowledge: HorizonKnowledge, settings: HorizonSettings) -> Place | None:
     """Return the known place of the camera; None if its altitude is unknown."""
     if knowledge.position is not None:

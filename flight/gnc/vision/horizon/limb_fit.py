@@ -74,6 +74,10 @@ class FittedLimb:
         cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
         return np.asarray(cross @ self.covariance[:3, :3] @ cross.T)
 
+    def altitude_sigma(self, allowance: float) -> float:
+        """Return the standard deviation of the altitude, m, with an `allowance` for unmodelled effects."""
+        return float(np.hypot(np.sqrt(self.covariance[ALTITUDE, ALTITUDE]), allowance))
+
 
 def fit_limb(start: View, rays: FloatArray, sigma: FloatArray, prior: Prior) -> FittedLimb | None:
     """Return the limb through rays (n, 3) of spreads (n,) rad, from a view near it.

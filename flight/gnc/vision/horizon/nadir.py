@@ -27,18 +27,21 @@ from flight.gnc.vision.horizon.initial_guess import (
     SPHERE_ALTITUDE_SIGMA,
     InitialGuess,
     Place,
+    cosine_at,
     initial_guess,
     place_of,
 )
 from flight.gnc.vision.horizon.knowledge import HorizonKnowledge
-from flight.gnc.vision.horizon.limb_equation import ALTITUDE
 from flight.gnc.vision.horizon.limb_points import near_limb
 from flight.gnc.vision.horizon.observation import Observation, observe
 from flight.gnc.vision.horizon.settings import HorizonSettings
 from flight.gnc.vision.horizon.solution import HorizonSolution, HorizonStatus, NadirMeasurement
 
-_ALTITUDES = 100e3, 40_000e3
-"""m: range of an unknown altitude."""
+_WIDER = 2.0
+"""Cones are searched for beyond the range of an unknown altitude by this factor: three edges show it
+roughly."""
+_MOST_ALTITUDE = 3.0
+"""Standard deviations by which the fitted altitude may lie beyond that range."""
 _STRAY, _COVERED, _NIGHT = 0.05, 0.6, 0.1
 _RIVAL = 0.3
 """Of the best horizon's edges: a second horizon with this share of its own is a rival."""
@@ -161,7 +164,8 @@ def _hypotheses(
 ) -> list[Hypothesis]:
     """Return the possible horizons, those without a flaw first, then by their edges."""
     if place is None:
-        low, high = (float(np.sqrt(1.0 - (6.37e6 / (6.37e6 + h)) ** 2)) for h in _ALTITUDES)
+        least, most = settings.altitudes
+        low, high = (cosine_at(altitude) for altitude in (least / _WIDER, most * _WIDER))
     else:
         low = high = place.cosine
     free = np.ones(len(seen.edges), dtype=bool)
@@ -217,6 +221,9 @@ def _flaw(one: Hypothesis) -> str:
     light = one.lighting
     if one.guess.orientation.mismatch > MOST_MISMATCH:
         return f"a coarse direction is {one.guess.orientation.mismatch:.1f} sigma off"
+    if one.altitude_off > _MOST_ALTITUDE:
+        altitude = one.fit.view.surface.height_of(one.fit.view.position)
+        return f"a limb of that size is seen from {1e-3 * altitude:.0f} km: give the altitude if so"
     if light.stray > _STRAY:
         return f"{100.0 * light.stray:.0f} % of sky and night are bright"
     if one.coverage < _COVERED:
@@ -233,7 +240,7 @@ def _measurement(one: Hypothesis) -> NadirMeasurement:
         view.nadir,
         one.covariance,
         view.surface.height_of(view.position),
-        float(np.hypot(np.sqrt(one.fit.covariance[ALTITUDE, ALTITUDE]), allowance)),
+        one.fit.altitude_sigma(allowance),
         one.residual,
         int(np.count_nonzero(one.members)),
     )

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field
 
 from flight.gnc.errors import UsageError
+from flight.gnc.vision.horizon.knowledge import LEAST_ALTITUDE
 from flight.gnc.vision.horizon.response import LogarithmicResponse
 
 
@@ -52,6 +53,8 @@ class HorizonSettings:
         limb_height_sigma: m, of the apparent limb's height: the default is for air of unknown scale height
             (6.5 to 9.5 km) and haze (a third more or less), 1,000 for known air.
         altitude_sigma: m, of a given position.
+        altitudes: m, least and greatest of an unknown altitude. A disc of any size is the limb of some
+            altitude: the default, of low orbits, refuses logos and ghosts of a lens.
         tolerance: px, within which edges agree with a circular cone; the Earth's flattening fits into it.
         least_edges: of a horizon.
         enough_edges: a horizon of fewer edges is searched again on more lines.
@@ -64,6 +67,7 @@ class HorizonSettings:
     edges: EdgeSettings = field(default_factory=EdgeSettings)
     limb_height_sigma: float = 3000.0
     altitude_sigma: float = 50.0
+    altitudes: tuple[float, float] = (100e3, 2_000e3)
     tolerance: float = 2.0
     least_edges: int = 8
     enough_edges: int = 20
@@ -71,3 +75,11 @@ class HorizonSettings:
     candidates: int = 4
     tries: int = 400
     sphere_sigma: float = math.radians(0.1)
+
+    def __post_init__(self) -> None:
+        low, high = self.altitudes
+        if not LEAST_ALTITUDE <= low < high < math.inf:
+            raise UsageError(
+                f"altitudes of {1e-3 * low:g} to {1e-3 * high:g} km: the limb is seen as one from"
+                f" {1e-3 * LEAST_ALTITUDE:g} km up, and the least comes first"
+            )

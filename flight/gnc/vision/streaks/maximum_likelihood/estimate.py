@@ -16,6 +16,7 @@ from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.math.arrays import FloatArray, Image
 from flight.gnc.vision.frame.saturation import saturation_count
 from flight.gnc.vision.streaks.admission import admit, in_time, validate
+from flight.gnc.vision.streaks.maximum_likelihood.binning import Binning
 from flight.gnc.vision.streaks.maximum_likelihood.blobs import Blobs, find_blobs
 from flight.gnc.vision.streaks.maximum_likelihood.course import Course
 from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import ExposedFrame, expose_frame
@@ -89,14 +90,16 @@ def estimate_motion(
     checksum, unusable = admit(pixels, previous_checksum, saturation, settings.saturated_fraction)
     if unusable is not None:
         return MotionResult(unusable, checksum, exposure)
-    frame = expose_frame(pixels, saturation, settings.gain)
-    camera = _exposed_camera(frame, pinhole, exposure, settings, prior_course)
+    binning = Binning.suited(pinhole, settings.psf_sigma)
+    settings = binning.settings(settings)
+    frame = expose_frame(*binning.frame(pixels, saturation), settings.gain)
+    camera = _exposed_camera(frame, binning.pinhole, exposure, settings, prior_course)
     blobs = find_blobs(frame, settings.threshold_sigmas, _MOST_BLOBS)
     seen = MotionResult(StreakStatus.FAILED, checksum, exposure, hot_pixels=frame.hot_pixels)
     if len(blobs) < settings.least_stars:
         return replace(seen, status=StreakStatus.TOO_FEW)
     answer = None if _resting(blobs) else _in_time(camera, seen, blobs, prior_rate, prior_sigma, prior_course)
-    return _without_rate(seen, camera, blobs) if answer is None else answer
+    return binning.in_pixels(_without_rate(seen, camera, blobs) if answer is None else answer)
 
 
 def _exposed_camera(

@@ -14,6 +14,7 @@ from flight.gnc.vision.streaks.maximum_likelihood.motion import positions, sensi
 from flight.gnc.vision.streaks.maximum_likelihood.normal_equations import ALONE, Evaluation
 from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
 from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene, path_lengths, window_times
+from flight.gnc.vision.streaks.maximum_likelihood.turning_back import turning_back
 from flight.gnc.vision.streaks.maximum_likelihood.wholeness import Wholeness
 from flight.gnc.vision.streaks.streak_result import StreakStatus
 
@@ -22,6 +23,8 @@ _GEOMETRY = np.array([0, 1, 2, 3, 4, 5, 7, 8])
 _LIGHT = 9
 # The last step, in standard deviations, from which a fit has not settled.
 _RESTLESS = 2.0
+# A motion that turned back within the exposure must explain the streaks better by this many sigmas squared.
+_TURNED_BACK = 30.0
 # Streaks so close, px, and as bright as this part of one run beside it; a sky has few such pairs.
 _BESIDE = 8.0
 _LIKE = 0.3
@@ -113,10 +116,13 @@ def _why_not(result: MotionResult, camera: ExposedCamera, last: Fit, whole: Whol
         (
             known.doubt > settings.worst_doubt,
             f"uncertain by {100.0 * known.doubt:.1f} %: streaks disagree, the lens is not known well enough,"
-            f" or the point spread is {result.psf_sigma:.2f} px, {settings.psf_sigma:g} px as described",
+            f" or the point spread, {result.psf_sigma / settings.psf_sigma:.2f} times as wide as described",
         ),
     )
-    return next((reason for failed, reason in checks if failed), "")
+    reason = next((reason for failed, reason in checks if failed), "")
+    if not reason and turning_back(camera, last.scene) > _TURNED_BACK:
+        return "the motion turned back within the exposure"
+    return reason
 
 
 def _paired(result: MotionResult) -> float:

@@ -21,7 +21,7 @@ class LikelihoodSettings:
         saturation: counts at which a pixel clips; None takes the frame's highest count when several pixels
             share it, else the top of the integer type.
         saturated_fraction: of the pixels, from which the frame is called saturated.
-        psf_sigma: px, where the fit of the point spread starts.
+        psf_sigma: px, where the fit of the point spread starts; from 2 on, pixels are summed (`Binning`).
         rate_model: `constant`; `accelerating`: the rate's change over the exposure is fitted too; `auto`: the
             pixels decide.
         line_time: s from the start of one row's exposure to the next's (rolling shutter); 0 is global.

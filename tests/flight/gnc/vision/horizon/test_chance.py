@@ -9,12 +9,15 @@ import pytest
 
 from flight.gnc.camera.images import read_image
 from flight.gnc.camera.pinhole import Pinhole
+from flight.gnc.errors import UsageError
 from flight.gnc.vision.horizon.chance import LimbInView, limb_in_view, log10_chance
 from flight.gnc.vision.horizon.knowledge import HorizonKnowledge
 from flight.gnc.vision.horizon.nadir import find_nadir
+from flight.gnc.vision.horizon.settings import HorizonSettings
 from flight.gnc.vision.horizon.solution import HorizonStatus
 
 CAMERA = Pinhole.from_field_of_view(512, 512, np.radians(67.0))
+FAR = (100e3, 40e6)
 DATA = Path(__file__).resolve().parents[6] / "shared/data"
 PHOTOGRAPHS = ("esa_alt40_azi45.tiff", "esa_alt60_azi135.tiff", "tree.jpg", "hale_bopp.jpg", "orion2.jpg")
 
@@ -48,6 +51,19 @@ def test_points_that_the_lens_does_not_image_are_no_limb() -> None:
     view = limb_in_view(points, np.zeros(8, dtype=bool), np.ones(8, dtype=bool), (10.0, 10.0))
     assert view == LimbInView(0.0, 0.0, 0.0)
     assert log10_chance(view, np.zeros(0), np.zeros(0), CAMERA, 2) > 0.0
+
+
+def test_a_small_disc_is_the_limb_of_no_low_orbit() -> None:
+    """A ghost of the lens, 10.6 deg in radius: the Earth's from 28,000 km."""
+    y, x = np.mgrid[0:512, 0:512]
+    disc = np.clip(74.0 - np.hypot(x - 200.0, y - 230.0), 0.0, 1.0)
+    pixels = np.random.default_rng(1).normal(10.0 + 100.0 * disc, 1.0).clip(0, 255).astype(np.uint8)
+    low, any_ = (find_nadir(pixels, CAMERA, settings=each) for each in (None, HorizonSettings(altitudes=FAR)))
+    assert low.nadir is None
+    assert any_.nadir is not None
+    assert 27e6 < any_.nadir.altitude < 30e6
+    with pytest.raises(UsageError, match="least comes first"):
+        HorizonSettings(altitudes=FAR[::-1])
 
 
 @pytest.mark.slow

@@ -110,7 +110,7 @@ def test_a_point_spread_far_from_the_one_described_is_refused_with_a_reason() ->
     settings = LikelihoodSettings(saturation=SATURATION, psf_sigma=2.0)
     result = estimate_motion(scene.pixels, CAMERA.pinhole, 0.2, settings, scene.rate, 0.0)
     assert result.rate is None
-    assert "point spread is 1.0" in result.reason
+    assert "point spread, 0.5" in result.reason
 
 
 def test_two_stars_fix_a_rate_with_a_covariance_that_says_so() -> None:
