@@ -103,8 +103,12 @@ class Terminal:
         until = time.monotonic() + seconds
         while (left := until - time.monotonic()) > 0.0:
             if select.select([self._line], [], [], left)[0]:
-                for frame in self._line.receive():
-                    yield from self._open(frame)
+                yield from self.take()
+
+    def take(self) -> Iterator[tuple[int, bytes]]:
+        """Yield virtual channel and packet of the telemetry that has come."""
+        for frame in self._line.receive():
+            yield from self._open(frame)
 
     def follow(self, counter: int, spi: int, seconds: float) -> Iterator[Report]:
         """Yield the reports on a command until its last, or until the time is over."""

@@ -78,7 +78,8 @@ class LogFollower:
     def _go_on(self) -> None:
         """Turn to the next segment, or to a newer run, where there is one."""
         if self._path is not None:
-            later = [path for path in find_segments(self._path.parent, _STEM) if path.name > self._path.name]
+            number = _number(self._path)
+            later = [path for path in find_segments(self._path.parent, _STEM) if _number(path) > number]
             if later:
                 self._path, self._offset = later[0], 0
                 return
@@ -123,6 +124,11 @@ def _segments_from(folder: Path, begin_ns: float) -> list[Path]:
             break
         segments = segments[1:]
     return segments
+
+
+def _number(path: Path) -> int:
+    """Return the number at the end of the name of a segment or a run."""
+    return int(path.stem.rpartition("-")[2])
 
 
 def _read(path: Path, offset: int) -> bytes:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from flight.gnc.errors import FlightError
@@ -74,6 +74,7 @@ class Station:
         self._refusals: deque[int] = deque(maxlen=_REFUSALS_A_SECOND)
         self._received = self._refused_commands = 0
         self._problem = ""
+        self._playback: Report | None = None
         self._status()
 
     def run(self, ended: Callable[[], bool], complain: Callable[[str], object]) -> None:
@@ -99,6 +100,9 @@ class Station:
             self._refused_commands += reports[0].stage is Stage.FAILED
             self._report(*reports)
         self._follow(now_ns)
+        if self._playback is not None and not self._downlink.playing:
+            self._report(self._playback)
+            self._playback = None
         if now_ns >= self._status_ns:
             self._status_ns = now_ns + SECOND_NS
             self._status()
@@ -143,21 +147,38 @@ class Station:
     def _obey(self, admitted: Admitted, directive: Directive) -> None:
         """Execute a directive and report its stages."""
         name, text = directives.name_of(directive), str(directive)
-        self._report(Report(admitted.spi, admitted.counter, Stage.ACCEPTED, name, text))
+        done = Report(admitted.spi, admitted.counter, Stage.COMPLETED, name, text)
+        self._report(replace(done, stage=Stage.ACCEPTED))
         problem = ""
         if isinstance(directive, Play):
-            folder = self._log.folder(directive.run)
-            if folder is None:
-                problem = f"there is no run {directive.run}"
-            else:
-                self._downlink.play(stretch(folder, directive.begin, directive.end))
+            problem = self._play(directive, done)
         elif isinstance(directive, NewKey):
             problem = self._change_key(directive)
         else:
-            self._downlink.play(None)
+            self._end_playback("stopped")
         self._refused_commands += bool(problem)
-        stage = Stage.FAILED if problem else Stage.COMPLETED
-        self._report(Report(admitted.spi, admitted.counter, stage, name, problem or text))
+        if problem:
+            self._report(replace(done, stage=Stage.FAILED, text=problem))
+        elif not isinstance(directive, Play):
+            self._report(done)
+
+    def _play(self, play: Play, done: Report) -> str:
+        """Begin a playback, at whose end `done` is reported; return why not, empty when it began."""
+        folder = self._log.folder(play.run)
+        if folder is None:
+            return f"there is no run {play.run}"
+        self._end_playback("another takes its place")
+        self._downlink.play(stretch(folder, play.begin, play.end))
+        self._playback = done
+        self._report(replace(done, stage=Stage.STARTED))
+        return ""
+
+    def _end_playback(self, reason: str) -> None:
+        """Report a playback that goes on as failed, and end it."""
+        if self._playback is not None:
+            self._report(replace(self._playback, stage=Stage.FAILED, text=reason))
+        self._playback = None
+        self._downlink.play(None)
 
     def _change_key(self, change: NewKey) -> str:
         """Change a key; return why not, empty when done."""

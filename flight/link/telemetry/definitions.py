@@ -334,11 +334,11 @@ PACKETS: tuple[Packet, ...] = (
     HOUSEKEEPING,
     HEALTH,
     COMMAND,
+    LINK,
+    VERIFICATION,
     TRUTH,
     ORBIT_TRUTH,
     CYCLE_TIMING,
     RATE_GROUP,
     JOB_TIMING,
-    LINK,
-    VERIFICATION,
 )

@@ -6,7 +6,7 @@ from flight.link.telemetry.form import Field, Packet, counter
 
 LINK = Packet(
     "link",
-    0x160,
+    0x170,
     "1 Hz, of the link process; not in the flight log",
     "Frames that came, by their fate, and the counters of the security associations",
     (
@@ -33,7 +33,7 @@ LINK = Packet(
 
 VERIFICATION = Packet(
     "verification",
-    0x161,
+    0x171,
     "at each step of a command, of the link process; not in the flight log",
     "What became of a command that came by the link",
     (

@@ -37,6 +37,7 @@ SERVES: dict[str, tuple[type[msgspec.Struct], ...]] = {
     "PlanningSettings": (testbed.Guidance,),
     "ResponseSettings": (testbed.Plant, devices.InertialUnit),
     "SolveSettings": OF_CAMERA,
+    "StationSettings": (sections.Link,),
     "StreakSettings": OF_CAMERA,
     "TrackerSettings": OF_CAMERA,
     "V4l2Settings": (devices.V4l2Device, devices.Camera),

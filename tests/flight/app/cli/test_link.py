@@ -1,0 +1,171 @@
+"""`flight link` and `flight command --link` over real lines, and the keys that both need."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import socket
+import subprocess
+import sys
+import threading
+import tty
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from flight.app.cli import main
+from flight.gnc.errors import UsageError
+from flight.link.commands.channel import open_unix
+from flight.link.commands.codec import CommandPacker, Ping
+from flight.link.modes import Mode
+from flight.link.process.verification import Stage
+from flight.link.security.associations import Vault
+from flight.link.telemetry.definitions import COMMAND
+from flight.link.telemetry.packets import Packer
+from ground.__main__ import main as ground
+from ground.link.terminal import DEFAULTS, StreamGround, Terminal, TerminalSettings
+from tests.scenario.flights import CONFIG
+
+ROOT = Path(__file__).resolve().parents[4]
+
+
+def free_ports(kinds: list[socket.SocketKind]) -> list[int]:
+    with ExitStack() as stack:
+        lines = [stack.enter_context(socket.socket(socket.AF_INET, kind)) for kind in kinds]
+        for line in lines:
+            line.bind(("127.0.0.1", 0))
+        return [line.getsockname()[1] for line in lines]
+
+
+@pytest.fixture(scope="module")
+def lines(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
+    """Return the addresses of a link on each kind of line, beside a flight that obeys; and its folder."""
+    place = tmp_path_factory.mktemp("link")
+    assert ground(["keys", str(place / "keys")]) == 0
+    udp, tcp = free_ports([socket.SOCK_DGRAM, socket.SOCK_STREAM])
+    radio, device = pty.openpty()
+    for end in (radio, device):
+        tty.setraw(end)
+    section = {
+        "keys": str(place / "keys" / "satellite"),
+        "udp": f"127.0.0.1:{udp}",
+        "tcp": f"127.0.0.1:{tcp}",
+        "serial": {"device": os.ttyname(device)},
+    }
+    config = place / "flight.yaml"
+    text = CONFIG.read_text(encoding="utf-8")
+    commands = json.dumps({"socket": str(place / "commands")})
+    config.write_text(f"{text}\ncommands: {commands}\nlink: {json.dumps(section)}\n", encoding="utf-8")
+    flight, ended = open_unix(place / "commands"), threading.Event()
+
+    def obey() -> None:
+        packer = Packer()
+        while not ended.wait(0.01):
+            for _, sender in flight.poll():
+                fields = {"obeyed": 1, "name": "x", "source": "socket", "count": 1, "text": "as commanded"}
+                flight.answer(packer.pack(COMMAND, 0, {**fields, "mode": int(Mode.SAFE)}), sender)
+
+    thread = threading.Thread(target=obey)
+    thread.start()
+    words = [sys.executable, "-m", "flight", "link", str(config), "--log", str(place)]
+    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True, cwd=ROOT) as link:
+        assert link.stderr is not None
+        try:
+            assert "link open on" in link.stderr.readline()
+            yield {
+                "udp": f"127.0.0.1:{udp}",
+                "tcp": f"tcp:127.0.0.1:{tcp}",
+                "radio": str(radio),
+                "place": str(place),
+            }
+        finally:
+            link.terminate()
+            ended.set()
+            thread.join()
+    assert link.returncode == 0
+    flight.close()
+    os.close(radio)
+    os.close(device)
+
+
+def command(lines: dict[str, str], kind: str, *words: str) -> int:
+    way = ["--link", lines[kind], "--keys", f"{lines['place']}/keys/ground", "--timeout", "10"]
+    return main(["command", *way, *words])
+
+
+@pytest.mark.parametrize("kind", ["udp", "tcp"])
+def test_a_command_goes_by_each_line_and_each_stage_is_shown(
+    lines: dict[str, str], kind: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command(lines, kind, "safe", "end of pass") == 0
+    shown = capsys.readouterr().out.splitlines()
+    assert [line.partition(":")[0] for line in shown] == ["accepted", "started", "completed"]
+    assert command(lines, kind, "--json", "ping") == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert [stage["stage"] for stage in facts["stages"]] == ["accepted", "started", "completed"]
+
+
+def test_a_command_goes_by_a_serial_line_with_a_marker_before_each_frame(lines: dict[str, str]) -> None:
+    radio = int(lines["radio"])
+    line = StreamGround("radio", radio, DEFAULTS.frame_bytes, lambda: None)
+    terminal = Terminal(line, Vault(Path(lines["place"]) / "keys" / "ground"), TerminalSettings())
+    counter = terminal.send(CommandPacker().pack(Ping(3), 1))
+    stages = [report.stage for report in terminal.follow(counter, 1, 10.0)]
+    assert stages == [Stage.ACCEPTED, Stage.STARTED, Stage.COMPLETED]
+
+
+def test_a_key_is_changed_at_both_ends_also_when_the_answer_was_lost(
+    lines: dict[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command(lines, "udp", "new-key", "1") == 0
+    assert command(lines, "udp", "ping") == 0
+    vault = Vault(Path(lines["place"]) / "keys" / "ground")
+    new, old = vault.read(1), vault.read(2)
+    assert new is not None
+    assert old is not None
+    assert new.generation == old.generation + 1
+    # The ground as it was before the satellite's answer came: the old key in force, the new one next.
+    vault.write(new, "1-next")
+    vault.write(replace(new, generation=1, key=bytes(32)))
+    assert command(lines, "udp", "new-key", "1") == 0
+    assert vault.read("1-next") is None
+    assert command(lines, "udp", "ping") == 0
+    text = capsys.readouterr()
+    assert new.key.hex() not in text.out + text.err
+
+
+def test_one_link_at_a_time_has_the_counters(lines: dict[str, str]) -> None:
+    with (
+        pytest.raises(UsageError, match="another link process has these counters"),
+        Vault(Path(lines["place"]) / "keys" / "satellite").owned(),
+    ):
+        pytest.fail("two at a time")
+
+
+@pytest.mark.parametrize(
+    ("words", "problem"),
+    [
+        (["command", "--link", "127.0.0.1:5", "ping"], "--link needs --keys"),
+        (["command", "--to", "x", "play", "0", "1"], "goes by --link"),
+        (["command", "--link", "nowhere", "--keys", "{keys}", "ping"], "give HOST:PORT"),
+        (["command", "--link", "127.0.0.1:5", "--keys", "/nowhere", "ping"], "no such folder"),
+        (["link", str(CONFIG), "--log", "."], "no `link` section"),
+    ],
+)
+def test_wrong_use_is_one_line(
+    lines: dict[str, str], words: list[str], problem: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    keys = f"{lines['place']}/keys/ground"
+    assert main([word.format(keys=keys) for word in words]) == 2
+    assert problem in capsys.readouterr().err
+
+
+def test_keys_are_never_overwritten(lines: dict[str, str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert ground(["keys", f"{lines['place']}/keys"]) == 2
+    assert "never overwritten" in capsys.readouterr().err
+    modes = {path.stat().st_mode & 0o777 for path in Path(lines["place"], "keys").rglob("spi-*")}
+    assert modes == {0o600}

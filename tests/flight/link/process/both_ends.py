@@ -1,0 +1,143 @@
+"""Both ends of a link in one process, on a clock that is moved: a station, its flight, and a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from flight.gnc.errors import UsageError
+from flight.link.commands.channel import open_unix
+from flight.link.modes import Mode
+from flight.link.process.archive_reader import LogFollower
+from flight.link.process.control_line import ControlLine
+from flight.link.process.station import TURN_NS, Station, StationSettings
+from flight.link.process.verification import Report, Sent
+from flight.link.security.associations import Vault
+from flight.link.telemetry.definitions import COMMAND, MODE
+from flight.link.telemetry.link_definitions import LINK, VERIFICATION
+from flight.link.telemetry.packets import LAYOUTS, Packer, PacketArray
+from flight.link.telemetry.segments import SegmentStore
+from ground.link.keys import make_keys
+from ground.link.terminal import Terminal, TerminalSettings, report_of
+from tests.manual_clock import ManualClock
+
+SETTINGS = TerminalSettings(frame_bytes=512)
+
+
+class Wire:
+    """A line of either end that keeps what is put on it."""
+
+    name = "wire"
+
+    def __init__(self) -> None:
+        self.up: list[bytes] = []
+        self.down: list[bytes] = []
+
+    def receive(self) -> list[tuple[bytes, Any]]:
+        taken, self.up = self.up, []
+        return [(frame, None) for frame in taken]
+
+    def trust(self, sender: Any, now_ns: int) -> None:
+        pass
+
+    def send(self, frames: Sequence[bytes], now_ns: int) -> None:
+        self.down += frames
+
+    def close(self) -> None:
+        pass
+
+
+class GroundWire:
+    """The ground's side of a wire."""
+
+    def __init__(self, wire: Wire) -> None:
+        self.wire = wire
+
+    def fileno(self) -> int:
+        raise UsageError("a wire of this test is not waited for")
+
+    def receive(self) -> list[bytes]:
+        taken, self.wire.down = self.wire.down, []
+        return taken
+
+    def send(self, frame: bytes) -> None:
+        self.wire.up.append(frame)
+
+    def close(self) -> None:
+        pass
+
+
+class BothEnds:
+    """A satellite in orbit and its ground."""
+
+    def __init__(self, place: Path, rate: float = 1e6) -> None:
+        """Make keys and an empty run under `place`."""
+        make_keys(place / "keys")
+        self.place, self.rate, self.clock, self.wire = place, rate, ManualClock(), Wire()
+        run = place / "runs" / "run-000001"
+        run.mkdir(parents=True)
+        self.log = SegmentStore(run, "flight", 1 << 16, 1 << 24)
+        self.packer = Packer()
+        self.flight = open_unix(place / "commands")
+        self.obeyed: list[bytes] = []
+        self.mode = Mode.HOLD
+        self.packets: list[tuple[int, bytes]] = []
+        self.restart()
+
+    def restart(self) -> None:
+        """Start another link process, and another terminal."""
+        settings = StationSettings(SETTINGS.spacecraft, SETTINGS.frame_bytes, self.rate)
+        control: ControlLine[Sent] = ControlLine(self.place / "commands", self.place)
+        self.sky = Vault(self.place / "keys" / "satellite")
+        follower = LogFollower(self.place / "runs")
+        self.station = Station(settings, self.sky, [self.wire], control, follower, self.clock)
+        self.ground = Vault(self.place / "keys" / "ground")
+        self.terminal = Terminal(GroundWire(self.wire), self.ground, SETTINGS)
+
+    def record(self, *packets: bytes) -> None:
+        """Write packets into the flight log."""
+        self.log.append(list(packets))
+
+    def mode_packet(self, mode: Mode, trigger: str) -> bytes:
+        """Return the packet of a change of mode, now."""
+        fields = {"before": 0, "mode": int(mode), "trigger": trigger, "reason": "", "target_q2": 0.0}
+        return self.packer.pack(MODE, self.clock.now_ns(), fields)
+
+    def turn(self, seconds: float = 0.5, answer: Callable[[bytes], bool] | None = None) -> None:
+        """Let time pass; the flight obeys what comes, or what `answer` says."""
+        until = self.clock.now_ns() + round(seconds * 1e9)
+        while self.clock.now_ns() < until:
+            self.station.turn()
+            for data, sender in self.flight.poll():
+                good = answer is None or answer(data)
+                if good:
+                    self.obeyed.append(data)
+                fields = {"obeyed": int(good), "name": "x", "source": "socket", "count": 1}
+                fields |= {"mode": int(self.mode), "text": "as commanded"}
+                self.flight.answer(self.packer.pack(COMMAND, self.clock.now_ns(), fields), sender)
+            self.clock.advance(TURN_NS)
+        self.packets += self.terminal.take()
+
+    def stages(self, counter: int, spi: int = 1) -> list[str]:
+        """Return the stages of a command as the ground has seen them."""
+        return [r.stage.name.lower() for r in self.reports() if (r.counter, r.spi) == (counter, spi)]
+
+    def reports(self) -> list[Report]:
+        """Return all reports that came down."""
+        return [report_of(packet) for packet in self.of(VERIFICATION.name)]
+
+    def of(self, name: str) -> list[bytes]:
+        """Return the packets of a name that came down."""
+        identifier = LAYOUTS[name].identifier.to_bytes(2, "big")
+        return [packet for _, packet in self.packets if packet[:2] == identifier]
+
+    def status(self) -> PacketArray:
+        """Return the newest status of the link."""
+        (row,) = LAYOUTS[LINK.name].array(self.of(LINK.name)[-1])
+        return row  # type: ignore[no-any-return]  # numpy types no row of a structured array
+
+    def close(self) -> None:
+        """Close what is open."""
+        self.flight.close()
+        self.log.close()
