@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from flight.link.telemetry.form import Field, Packet, counter
 
+STAGES = ((1, "accepted"), (2, "refused"), (3, "started"), (4, "completed"), (5, "failed"))
+
 LINK = Packet(
     "link",
     0x170,
@@ -39,7 +41,7 @@ VERIFICATION = Packet(
     (
         Field("spi", "u2", "-", "of its frame"),
         Field("counter", "i8", "-", "of its frame: with the SPI its identifier"),
-        Field("stage", "u1", "-", "1 accepted, 2 refused, 3 started, 4 completed, 5 failed"),
+        Field("stage", "u1", "-", "step that the command has come to", states=STAGES),
         Field("name", "S16", "-", "name of the command, empty for none"),
         Field("text", "S128", "-", "its values, or the reason"),
     ),

@@ -26,7 +26,6 @@ from flight.link.process.verification import Stage
 from flight.link.security.associations import Vault
 from flight.link.telemetry.definitions import COMMAND
 from flight.link.telemetry.packets import Packer
-from ground.__main__ import main as ground
 from ground.link.terminal import DEFAULTS, StreamGround, Terminal, TerminalSettings
 from tests.scenario.flights import CONFIG
 
@@ -45,7 +44,7 @@ def free_ports(kinds: list[socket.SocketKind]) -> list[int]:
 def lines(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
     """Return the addresses of a link on each kind of line, beside a flight that obeys; and its folder."""
     place = tmp_path_factory.mktemp("link")
-    assert ground(["keys", str(place / "keys")]) == 0
+    assert main(["keys", str(place / "keys")]) == 0
     udp, tcp = free_ports([socket.SOCK_DGRAM, socket.SOCK_STREAM])
     radio, device = pty.openpty()
     for end in (radio, device):
@@ -165,7 +164,7 @@ def test_wrong_use_is_one_line(
 
 
 def test_keys_are_never_overwritten(lines: dict[str, str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert ground(["keys", f"{lines['place']}/keys"]) == 2
+    assert main(["keys", f"{lines['place']}/keys"]) == 2
     assert "never overwritten" in capsys.readouterr().err
     modes = {path.stat().st_mode & 0o777 for path in Path(lines["place"], "keys").rglob("spi-*")}
     assert modes == {0o600}
