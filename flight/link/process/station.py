@@ -62,7 +62,7 @@ class Station:
         self._control = control
         self._log = log
         self._clock = clock
-        self._gate = Gate(vault, COMMAND_SPIS, _parser(settings.spacecraft), telecommand.AUTHENTICATED)
+        self._gate = Gate(vault, COMMAND_SPIS, parser_of(settings.spacecraft), telecommand.AUTHENTICATED)
         self._sealers = {
             spi: Sealer(vault, spi, telemetry.AUTHENTICATED, _RESERVED_BLOCK) for spi in TELEMETRY_SPIS
         }
@@ -241,7 +241,7 @@ class Station:
         self._downlink.report(self._packer.pack(packet, time_ns, values))
 
 
-def _parser(spacecraft: int) -> Callable[[bytes], tuple[bytes, bytes]]:
+def parser_of(spacecraft: int) -> Callable[[bytes], tuple[bytes, bytes]]:
     """Return the function that splits a telecommand frame of this spacecraft."""
     size = telecommand.HEADER.size
 

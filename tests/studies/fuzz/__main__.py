@@ -16,6 +16,7 @@ TARGETS = {
     "config": "tests.studies.fuzz.configurations:Configurations",
     "commands": "tests.studies.fuzz.telecommands:Telecommands",
     "logs": "tests.studies.fuzz.logs:Logs",
+    "link": "tests.studies.fuzz.link_frames:LinkFrames",
     "cli": "tests.studies.fuzz.arguments:Arguments",
 }
 

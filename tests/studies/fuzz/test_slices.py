@@ -16,7 +16,7 @@ from tests.studies.fuzz.logs import collisions_allowed
 from tests.studies.fuzz.vn100 import candidates
 from tests.studies.fuzz.vn100_packets import checksum
 
-SLICES = {"vn100": 250, "config": 40, "commands": 1500, "logs": 80, "cli": 60}
+SLICES = {"vn100": 250, "config": 40, "commands": 1500, "logs": 80, "link": 800, "cli": 60}
 
 
 @pytest.mark.parametrize("name", TARGETS)
@@ -73,8 +73,16 @@ def test_a_parser_that_skips_the_checksum_is_found_out(monkeypatch: pytest.Monke
     assert not run("vn100", target_of("vn100"), 30, seed=7).sound
 
 
+def test_a_gate_that_skips_the_mac_or_the_counter_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as forged:
+        forged.setattr("flight.link.security.gate.unprotect", lambda *parts: parts[-1][14:-16])
+        assert not run("link", target_of("link"), 60, seed=7).sound
+    monkeypatch.setattr("flight.link.security.gate.counter_of", lambda _: 5)
+    assert not run("link", target_of("link"), 60, seed=7).sound
+
+
 def test_a_scanner_that_skips_the_checksum_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ground.telemetry.scanner.crc16", lambda _: 0)
+    monkeypatch.setattr("flight.link.telemetry.walk.crc16", lambda _: 0)
     assert not run("logs", target_of("logs"), 30, seed=7).sound
 
 
