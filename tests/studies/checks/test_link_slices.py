@@ -1,0 +1,29 @@
+"""A slice of the kills of the link, and the proof that they would find a link that stores too late."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from flight.link.security.associations import Vault
+from ground.link.keys import make_keys
+from tests.studies.bench.link_kills import measure
+
+
+def test_nothing_is_obeyed_twice_and_no_counter_used_twice(tmp_path: Path) -> None:
+    found = measure(tmp_path, 20, seed=3)
+    assert len(found.obeyed) > 10
+    assert (found.obeyed_twice, found.counters_twice) == (0, 0)
+
+
+def test_a_link_that_stores_nothing_is_found_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Vault, "advance", lambda *_: 2)
+    assert measure(tmp_path, 12, seed=3).obeyed_twice > 0
+
+
+def test_a_sender_that_stores_nothing_is_found_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    make_keys(tmp_path / "keys")
+    monkeypatch.setattr("tests.studies.bench.link_kills.make_keys", lambda _: None)
+    monkeypatch.setattr(Vault, "write", lambda *_: 2)
+    assert measure(tmp_path, 3, seed=3).counters_twice > 0
