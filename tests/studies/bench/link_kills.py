@@ -1,8 +1,8 @@
 """The link killed between accepting, storing and handing over: python -m tests.studies.bench link_kills.
 
-Each time a link process takes the commands of a ground, under the eyes of an attacker who sends every old
-frame again, and is killed (SIGKILL) before or after one of its calls that write to the disk or to the flight's
-socket; some of the writes are cut in the middle first. The ground's sender is killed in the same way. Counted
+Each time a link process takes the commands of a ground while an attacker sends every old frame again, and is
+killed (SIGKILL) before or after one of its calls that write to the disk or to the socket of the flight;
+some of the writes are cut in the middle first. The ground's sender is killed in the same way. Counted
 are commands that the flight got twice, and counters that two frames have.
 """
 

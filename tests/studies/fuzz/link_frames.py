@@ -53,7 +53,7 @@ class LinkFrames:
 
     def attempt(self, draw: np.random.Generator) -> Counter[str]:
         """Let the attacker or the ground send one frame. Raises Finding."""
-        kind, frame = self._frame(draw)
+        kind, frame = self.frame(draw)
         self._last = frame
         if chance(draw, 0.002):
             self._gate = self._opened()
@@ -73,7 +73,8 @@ class LinkFrames:
     def _opened(self) -> Gate:
         return Gate(self._sky, COMMAND_SPIS, parser_of(_SPACECRAFT), telecommand.AUTHENTICATED)
 
-    def _frame(self, draw: Draw) -> tuple[str, bytes]:
+    def frame(self, draw: Draw) -> tuple[str, bytes]:
+        """Return the kind and the bytes of the next frame."""
         if not self._seen or chance(draw, 0.1):
             self._held.clear()  # what was held back is now old
             return "fresh", self._new(draw)
