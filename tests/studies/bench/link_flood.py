@@ -1,6 +1,6 @@
 """The loop's lateness while its link is flooded: `python -m tests.studies.bench link_flood [--seconds S]`.
 
-The step demonstration flies in real time on its emulated devices beside its link process: alone, and then with
+The step demonstration flies in real time on its emulated devices beside its link process: alone, then with
 10,000 forged frames a second at the link while it plays the archive back at a megabyte a second. Stated are
 the lateness of the control cycles and what the link and its ground counted.
 """
