@@ -1,0 +1,78 @@
+"""Lines to the ground take floods in portions, listen to peers alone, and drop who does not read."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable
+from contextlib import ExitStack
+from ipaddress import IPv4Network
+
+import pytest
+
+from flight.gnc.errors import UsageError
+from flight.link.frames.stream import SYNC
+from flight.link.frames.telecommand import TelecommandHeader, close_frame
+from flight.link.process.lines import AT_MOST, TcpLine, UdpLine
+
+FRAME = close_frame(TelecommandHeader(1, 0, 0).pack(11) + b"data")
+ELSEWHERE = [IPv4Network("192.0.2.0/24")]
+
+
+def test_udp_telemetry_goes_to_authentic_senders_for_a_minute_and_to_nobody_else() -> None:
+    line = UdpLine("127.0.0.1:0")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ground:
+        ground.bind(("127.0.0.1", 0))
+        ground.setblocking(False)
+        for _ in range(AT_MOST + 20):
+            ground.sendto(FRAME, ("127.0.0.1", line.port))
+        taken = line.receive()
+        assert len(taken) <= AT_MOST
+        line.send([b"secret"], 0)
+        with pytest.raises(BlockingIOError):
+            ground.recv(100)
+        line.trust(taken[0][1], 0)
+        line.send([b"first"], 59 * 10**9)
+        line.send([b"second"], 61 * 10**9)
+        assert ground.recv(100) == b"first"
+        with pytest.raises(BlockingIOError):
+            ground.recv(100)
+    line.close()
+
+
+def test_a_sender_that_is_no_peer_is_not_listened_to() -> None:
+    line = UdpLine("127.0.0.1:0", peers=ELSEWHERE)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        stranger.sendto(FRAME, ("127.0.0.1", line.port))
+    assert line.receive() == []
+    line.close()
+    stream = TcpLine("127.0.0.1:0", peers=ELSEWHERE)
+    with socket.create_connection(("127.0.0.1", stream.port), timeout=5.0) as caller:
+        caller.sendall(SYNC + FRAME)
+        assert stream.receive() == []
+    stream.close()
+
+
+def test_of_five_connections_the_oldest_goes_and_who_does_not_read_too() -> None:
+    line = TcpLine("127.0.0.1:0")
+    with ExitStack() as stack:
+        callers = []
+        for _ in range(5):
+            caller = stack.enter_context(socket.create_connection(("127.0.0.1", line.port), timeout=5.0))
+            callers.append(caller)
+            line.receive()
+        assert callers[0].recv(1) == b""
+        callers[4].sendall(SYNC + FRAME)
+        found: list[tuple[bytes, object]] = []
+        while not found:
+            found = line.receive()
+        assert [frame for frame, _ in found] == [FRAME]
+        for _ in range(300):  # far more than the sockets hold
+            line.send([bytes(1 << 16)], 0)
+        assert line._connections == {}
+    line.close()
+
+
+@pytest.mark.parametrize("kind", [UdpLine, TcpLine])
+def test_an_address_that_is_not_there_is_a_mistake_of_the_users(kind: Callable[[str], object]) -> None:
+    with pytest.raises(UsageError, match="cannot be listened to"):
+        kind("203.0.113.7:9")
