@@ -46,7 +46,11 @@ from tests.studies.fuzz.logs import hostile, split
 from tests.studies.fuzz.mutation import Draw, chance, damage, integer
 from tests.studies.fuzz.vocabulary import FLIGHT, NUMBERS, PATHS, RIGHT, WORDS
 
-_COMMANDS = cli.COMMANDS | GROUND_COMMANDS
+_COMMANDS = {
+    name: purpose
+    for name, purpose in (cli.COMMANDS | GROUND_COMMANDS).items()
+    if name != "console"  # serves until it is ended
+}
 _DRAWN_EVERY = 200
 _FLOWN_S = 0.075
 _FRAMES = 2
