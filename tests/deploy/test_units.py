@@ -40,6 +40,7 @@ def put_units(folder: Path, config: Path) -> Path:
     for name, added in zip(UNITS, (dropin(config), safe_dropin(config), link_dropin(config)), strict=True):
         text = (DEPLOY / name).read_text(encoding="utf-8")
         text = text.replace("/opt/knightcube/bin/fly", str(DEPLOY / "fly"))
+        text = text.replace("/opt/knightcube/venv/bin/python", sys.executable)
         text = text.replace("/opt/knightcube/bin/coils-off", str(DEPLOY / "coils-off"))
         (folder / name).write_text(text + "\n" + added, encoding="utf-8")
     return folder
