@@ -26,6 +26,7 @@ SOURCE = "source"
 SELF_TEST_S = 10
 _PARTS = ("flight", "hal", "sim_hal", "deploy", "config/step_demo.yaml", "pyproject.toml")
 _BOARD_LOCK = "deploy/requirements.lock"
+_NOT_BUILT = shutil.ignore_patterns(".*", "build", "runs", "tests", "*.egg-info", "__pycache__")
 
 
 class Build:
@@ -70,7 +71,12 @@ class Build:
         self._run([options.python, "-m", "venv", venv])
         # setuptools is among them, by hash like the rest: the build of ours takes nothing from elsewhere.
         self._run([*quiet, *found, "--require-hashes", "--no-deps", "-r", self._source / _BOARD_LOCK])
-        self._run([*quiet, "--no-index", "--no-deps", "--no-build-isolation", self._source])
+        with tempfile.TemporaryDirectory() as folder:
+            # Of a copy: a build that was killed leaves files in its source, which a later one would ship.
+            source = Path(folder) / "source" if not options.dry_run else self._source
+            if not options.dry_run:
+                shutil.copytree(self._source, source, symlinks=True, ignore=_NOT_BUILT)
+            self._run([*quiet, "--no-index", "--no-deps", "--no-build-isolation", source])
         # The distribution carries the ground tools too, which have no place on a board.
         for ground in venv.glob("lib/python3*/site-packages/ground"):
             shutil.rmtree(ground)
