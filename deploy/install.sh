@@ -6,6 +6,7 @@ usage() {
     cat <<'TEXT'
 usage: install.sh [--config FILE] [--wheels DIR | --venv DIR] [--python PYTHON] [--dry-run]
        install.sh --accept [--dry-run]
+       install.sh --rollback
        install.sh --uninstall [--purge] [--dry-run]
 
   --config FILE   configuration to fly; stored as /etc/knightcube/flight.yaml with its
@@ -15,12 +16,14 @@ usage: install.sh [--config FILE] [--wheels DIR | --venv DIR] [--python PYTHON] 
   --python PYTHON make the virtual environment with this Python (default python3)
   --dry-run       print the steps without doing them
   --accept        accept /etc/knightcube/flight.yaml after it was edited
+  --rollback      fly the previous release from the next start on
   --uninstall     stop and remove the service, the software and the udev rules
   --purge         with --uninstall: also configuration, flight logs, state and user
 
 Folders:
-  /opt/knightcube/venv   software, no ground    /etc/knightcube          configuration
-  /opt/knightcube/bin    coils-off              /var/lib/knightcube      flight logs, state
+  /opt/knightcube/releases  the software: the current and the previous release
+  /opt/knightcube/bin    fly, coils-off         /etc/knightcube          configuration
+  /opt/knightcube/venv   link to the current    /var/lib/knightcube      flight logs, state
   /etc/systemd/system    the units              /etc/udev/rules.d        device names
   /etc/modules-load.d    i2c-dev
 DESTDIR=FOLDER in the environment installs into an image mounted there; make its user yourself.
@@ -68,6 +71,7 @@ while [ $# -gt 0 ]; do
             ;;
         --dry-run) dry=yes ;;
         --accept) action=accept ;;
+        --rollback) action=rollback ;;
         --uninstall) action=uninstall ;;
         --purge) purge=yes ;;
         -h | --help)
@@ -88,10 +92,11 @@ run() {
     fi
 }
 
-# Install a file unless an identical one is there, so that a second run changes nothing.
+# Install a file by one rename, unless an identical one is there: a second run changes nothing.
 place() {
     if ! cmp -s "$2" "$3" 2>/dev/null; then
-        run install -D -m "$1" "$2" "$3"
+        run install -D -m "$1" "$2" "$3.part"
+        run mv -f "$3.part" "$3"
     fi
 }
 
@@ -102,14 +107,18 @@ sum_of() { sha256sum <"$1" | sed 's/-$/flight.yaml/'; }
 check_inputs() {
     [ "$action" != uninstall ] || return 0
     [ -z "$purge" ] || fail "--purge goes with --uninstall"
-    [ "$action" = install ] || [ -z "$config$wheels$venv" ] || fail "--accept goes alone, see --help"
+    [ "$action" = install ] || [ -z "$config$wheels$venv" ] || fail "--$action goes alone, see --help"
+    if [ "$action" = rollback ]; then
+        [ -e "$prefix/previous" ] || fail "--rollback: there is no previous release"
+        return
+    fi
     [ -z "$wheels" ] || [ -z "$venv" ] || fail "--wheels and --venv: one of them, see --help"
     [ -z "$wheels" ] || [ -d "$wheels" ] || fail "--wheels $wheels: no such folder"
     [ -z "$venv" ] || [ -x "$venv/bin/python" ] ||
         fail "--venv $venv: no virtual environment, bin/python is missing"
     if [ "$action" = accept ]; then
         [ -e "$settings/flight.yaml" ] || fail "--accept: there is no $settings/flight.yaml"
-        [ -x "$prefix/venv/bin/python" ] || fail "--accept: nothing is installed"
+        [ -x "$prefix/current/venv/bin/python" ] || fail "--accept: nothing is installed"
         return
     fi
     [ -n "$venv" ] || "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' ||
@@ -155,31 +164,42 @@ make_user() {
             "$user-link"
 }
 
-install_software() {
-    [ -d "$prefix/bin" ] || run mkdir -p "$prefix/bin"
+# Build a release beside the one that flies, and test it; deploy/build_release.py has the steps.
+build_release() {
     if [ -n "$venv" ]; then
-        target=$(cd "$venv" && pwd)
-        [ "$(readlink "$prefix/venv")" = "$target" ] || run ln -sfn "$target" "$prefix/venv"
+        builder=$venv/bin/python
+        set -- --venv "$venv"
     else
-        [ ! -L "$prefix/venv" ] || run rm "$prefix/venv"
-        [ -x "$prefix/venv/bin/python" ] || run "$python" -m venv "$prefix/venv"
-        if [ -n "$wheels" ]; then
-            set -- --no-index --find-links "$wheels"
-        else
-            set --
-        fi
-        run "$prefix/venv/bin/pip" install --quiet --upgrade --constraint "$source/requirements.lock" "$@" "$source"
-        # The distribution carries the ground tools too, which have no place on a board.
-        for ground in "$prefix"/venv/lib/python3*/site-packages/ground; do
-            [ ! -d "$ground" ] || run rm -rf "$ground"
-        done
+        builder=$python
+        set -- --python "$python" ${wheels:+--wheels "$wheels"}
     fi
-    place 755 "$deploy/coils-off" "$prefix/bin/coils-off"
+    if [ -n "$dry" ]; then
+        "$builder" "$deploy/build_release.py" "$prefix" build --dry-run "$@"
+        release=$prefix/current
+        return
+    fi
+    mkdir -p "$prefix"
+    release=$prefix/releases/$("$builder" "$deploy/build_release.py" "$prefix" build "$@")
+}
+
+# Have the new release fly from the next start on. What starts it is placed first, and serves both releases.
+switch_release() {
+    for file in coils-off fly releases.py; do
+        place 755 "$deploy/$file" "$prefix/bin/$file"
+    done
     place 644 "$source/hal/buses/smbus_byte.py" "$prefix/bin/smbus_byte.py"
+    run "$release/venv/bin/python" "$deploy/build_release.py" "$prefix" switch "$(basename "$release")"
+}
+
+# A board of before had its software here, and flies it until its units are replaced.
+link_venv() {
+    [ "$(readlink "$prefix/venv")" != current/venv ] || return 0
+    run rm -rf "$prefix/venv"
+    run ln -s current/venv "$prefix/venv"
 }
 
 install_settings() {
-    python=$prefix/venv/bin/python
+    python=$release/venv/bin/python
     if [ -n "$dry" ] && [ ! -x "$python" ]; then
         echo "would write: $settings/flight.yaml and its checksum, from $flown"
         echo "would write: $units/knightcube.service.d/board.conf, from $flown; the link's unit if it has a link"
@@ -253,9 +273,11 @@ install_units() {
 
 install_all() {
     make_user
-    install_software
+    build_release
     install_settings
+    switch_release
     install_units
+    link_venv
     install_rules
     install_modules
     reload
@@ -266,9 +288,14 @@ install_all() {
 
 accept_settings() {
     flown=$settings/flight.yaml
+    release=$prefix/current
     install_settings
     reload
     say_next accepted
+}
+
+roll_back() {
+    say_next "rolled back to $("$prefix/previous/venv/bin/python" "$deploy/build_release.py" "$prefix" rollback)"
 }
 
 say_next() {
@@ -310,5 +337,6 @@ check_inputs
 case $action in
     install) install_all ;;
     accept) accept_settings ;;
+    rollback) roll_back ;;
     uninstall) uninstall_all ;;
 esac

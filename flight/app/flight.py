@@ -12,6 +12,7 @@ from flight.app.ending_signals import EndingSignals
 from flight.app.linux import linux_rig
 from flight.app.mission_time import mission_zero, next_whole_second
 from flight.app.opening import open_flight
+from flight.app.release import Release
 from flight.app.request import RunRequest, RunResult
 from flight.app.requested_config import requested_config
 from flight.app.run_folder import begin_folder
@@ -41,11 +42,18 @@ def fly(request: RunRequest, progress: Callable[[Progress], None] | None = None)
             loop.note(events.CONFIG_DAMAGED, request.config_problem)
         elif rig.realtime and (folder := service_folder(os.environ)) is not None:
             stack.callback(FlownConfig(text, folder).serve(rig.clock).stop)
+        release = Release(os.environ)
+        if release.note:
+            loop.note(events.RELEASE_LEFT, release.note)
+        if rig.realtime:
+            release.serve(rig.clock, stack)
         label = RunLabel(text, rig.seed, config.simulation is not None, rig.realtime)
         epoch_ns = mission_zero(rig.clock) if rig.realtime else next_whole_second(rig.clock)
         rig.release(epoch_ns)
         signals.end(loop)
         reason = loop.run(epoch_ns, label)
+        if not loop.restart:
+            release.end()
         ending = loop.ending()
     faults = () if config.simulation is None else injected_faults(request, text)
     return RunResult(request.out, reason, signals.received, flight_log.error(), ending, loop.restart, faults)

@@ -161,6 +161,12 @@ DISK_LOW = EventKind(74, "disk-low", _WARNED, "little room is left for the fligh
 HOT = EventKind(75, "hot", _WARNED, "the board is warm")
 TOO_HOT = EventKind(76, "too-hot", _FAULT, "the board is too hot to drive coils", Reaction.SAFE)
 RESOURCE_NORMAL = EventKind(77, "resource-normal", _TOLD, "a resource is within its bounds again")
+RELEASE_LEFT = EventKind(
+    79,
+    "release-left",
+    _FAULT,
+    "the current release is damaged or did not start: the text names the one that flies",
+)
 COMMANDED = EventKind(80, "commanded", _TOLD, "a command was obeyed")
 COMMAND_REFUSED = EventKind(81, "command-refused", _WARNED, "a command was not obeyed, with the reason")
 COMMAND_SOCKET = EventKind(

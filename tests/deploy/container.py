@@ -18,7 +18,6 @@ from typing import Any
 from tests.hal.guardian.live_flight import ROOT, write_config
 
 LIMIT_S = 180.0
-_CGROUP = "knightcube-test"
 _SHARE = "/share"
 _UNITS = "etc/systemd/system"
 _FACTS = "/run/knightcube-devices/facts.json"
@@ -163,7 +162,6 @@ def _furnish(root: Path, folder: Path) -> None:
         inside = root / place.relative_to("/")
         inside.chmod(inside.stat().st_mode | 0o055)
     units = root / _UNITS
-    python = "/opt/knightcube/venv/bin/python"
     (units / "knightcube-devices.service").write_text(
         f"""[Service]
 Type=exec
@@ -179,7 +177,7 @@ ExecStart={sys.prefix}/bin/python -m sim_hal serve /etc/knightcube/flight.yaml \
     (units / "knightcube.service.d/test.conf").write_text(
         f"""{_OPENED}
 ExecStart=
-ExecStart={python} -m flight run /etc/knightcube/flight.yaml --archive /var/lib/knightcube/runs \
+ExecStart=/opt/knightcube/bin/fly /etc/knightcube/flight.yaml --archive /var/lib/knightcube/runs \
     --realtime --devices {_FACTS}
 """,
         encoding="utf-8",
@@ -232,14 +230,19 @@ def _enter_cgroup() -> Path:
     _do("mount", "-t", "cgroup2", "cgroup2", "/sys/fs/cgroup")
     before = Path("/proc/self/cgroup").read_text(encoding="ascii").splitlines()
     home = next(line.removeprefix("0::") for line in before if line.startswith("0::"))
-    own = Path("/sys/fs/cgroup") / _CGROUP
-    own.mkdir(exist_ok=True)
+    # A name of this process's own: another run's cgroup, and what lives in it, is none of this one's.
+    own = _own_cgroup()
+    own.mkdir()
     (own / "cgroup.procs").write_text(str(os.getpid()), encoding="ascii")
     return Path("/sys/fs/cgroup") / home.lstrip("/")
 
 
+def _own_cgroup() -> Path:
+    return Path("/sys/fs/cgroup") / f"knightcube-test-{os.getpid()}"
+
+
 def _leave_cgroup(home: Path) -> None:
-    own = Path("/sys/fs/cgroup") / _CGROUP
+    own = _own_cgroup()
     (home / "cgroup.procs").write_text(str(os.getpid()), encoding="ascii")
     (own / "cgroup.kill").write_text("1", encoding="ascii")
     for inside, _, _ in os.walk(own, topdown=False):

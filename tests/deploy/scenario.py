@@ -155,11 +155,11 @@ def _devices_closed() -> bool:
 
 
 def _broken(service: Service) -> dict[str, Any]:
-    """Take the interpreter away under a running service; see it given up with the coils at zero."""
+    """Take the releases away under a running service; see it given up with the coils at zero."""
     systemctl("reset-failed", SERVICE)
     systemctl("start", SERVICE)
     wait(service.driven, 20.0)
-    Path("/opt/knightcube/venv").unlink()
+    Path("/opt/knightcube/current").unlink()
     systemctl("kill", "--kill-whom=all", "--signal=KILL", SERVICE)
     wait(lambda: service.show("ActiveState") == "failed", 20.0)
     safe = "knightcube-safe.service"

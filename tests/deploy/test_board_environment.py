@@ -36,18 +36,24 @@ class Board:
 
     def install(self) -> None:
         """Install; the dependencies are those of the interpreter that runs the tests."""
-        subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(self.venv)], check=True)
-        packages = next(self.venv.glob("lib/python3*/site-packages"))
+        python = self.folder / "python"
         # A line in a .pth file adds the folder but not what its own .pth files add, such as this checkout.
-        (packages / "dependencies.pth").write_text(f"{sysconfig.get_path('purelib')}\n", encoding="utf-8")
-        pip = self.venv / "bin/pip"
-        pip.write_text(f'#!/bin/sh\nexec "{self.venv}/bin/python" -m pip "$@"\n', encoding="utf-8")
-        pip.chmod(0o755)
-        # PIP_NO_BUILD_ISOLATION=0 is pip's spelling for: build with the setuptools at hand.
-        offline = {"PIP_NO_INDEX": "1", "PIP_NO_DEPS": "1", "PIP_NO_BUILD_ISOLATION": "0"}
+        python.write_text(
+            f"""#!/bin/sh
+if [ "$2" = venv ]; then
+    {sys.executable} -m venv --without-pip "$3"
+    echo {sysconfig.get_path("purelib")} >"$(echo "$3"/lib/python3*/site-packages)/dependencies.pth"
+else
+    exec {sys.executable} "$@"
+fi
+""",
+            encoding="utf-8",
+        )
+        python.chmod(0o755)
+        words = ["sh", str(self.source / "deploy/install.sh"), "--config", str(TESTBED)]
         done = subprocess.run(
-            ["sh", str(self.source / "deploy/install.sh"), "--config", str(TESTBED)],
-            env={**os.environ, **offline, "DESTDIR": str(self.folder / "image")},
+            [*words, "--python", str(python)],
+            env={**os.environ, "PIP_NO_INDEX": "1", "DESTDIR": str(self.folder / "image")},
             capture_output=True,
             text=True,
             check=False,

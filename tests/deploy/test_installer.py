@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
 
 from sim_hal.faults.host import corrupted
-from tests.deploy.scripts import DEPLOY, TESTBED, changed_testbed
+from tests.deploy.scripts import DEPLOY, ROOT, TESTBED, changed_testbed
 from tests.scenario.flights import CONFIG
 
 pytestmark = pytest.mark.skipif(
@@ -160,7 +162,8 @@ def test_a_dry_run_prints_every_step_and_touches_nothing() -> None:
     for step in (
         "useradd",
         "venv",
-        "pip install",
+        "--require-hashes",
+        "--no-build-isolation",
         "coils-off",
         "flight.yaml and its checksum",
         "knightcube.service",
@@ -170,6 +173,25 @@ def test_a_dry_run_prints_every_step_and_touches_nothing() -> None:
         assert step in output
     assert sorted(Path("/etc/systemd/system").iterdir()) == before
     assert not Path("/opt/knightcube").exists()
+
+
+def _pins(path: Path) -> dict[str, str]:
+    """Return the versions in a lock, by the normalised names of the packages."""
+    found = re.findall(r"^([\w.-]+)==([^\s\\]+)", path.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[-_.]+", "-", name).lower(): version for name, version in found}
+
+
+def test_the_boards_lock_has_all_that_a_board_needs_each_with_hashes_and_the_versions_of_the_tests() -> None:
+    board, tested = _pins(DEPLOY / "requirements.lock"), _pins(ROOT / "requirements.lock")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    wanted = [*project["project"]["dependencies"], *project["build-system"]["requires"]]
+    names = {re.sub(r"[-_.]+", "-", re.split(r"[<>=~!]", line)[0]).lower() for line in wanted}
+    assert names <= board.keys(), "run `make lock`"
+    assert {name: board[name] for name in board.keys() & tested.keys()} == {
+        name: tested[name] for name in board.keys() & tested.keys()
+    }
+    blocks = re.split(r"^(?=\S)", (DEPLOY / "requirements.lock").read_text(encoding="utf-8"), flags=re.M)
+    assert all("--hash=sha256:" in block for block in blocks if "==" in block)
 
 
 @pytest.mark.parametrize(
@@ -186,6 +208,7 @@ def test_a_dry_run_prints_every_step_and_touches_nothing() -> None:
         (["--dry-run", "--purge"], "--purge goes with --uninstall"),
         (["--dry-run", "--accept", "--config", str(TESTBED)], "--accept goes alone"),
         (["--dry-run", "--accept"], "there is no"),
+        (["--dry-run", "--rollback"], "there is no previous release"),
     ],
 )
 def test_wrong_use_of_the_installer_is_refused_before_the_first_step_with_status_2(

@@ -39,6 +39,7 @@ def put_units(folder: Path, config: Path) -> Path:
     """Put the units in a folder, the commands in them where they are now, the drop-ins at their end."""
     for name, added in zip(UNITS, (dropin(config), safe_dropin(config), link_dropin(config)), strict=True):
         text = (DEPLOY / name).read_text(encoding="utf-8")
+        text = text.replace("/opt/knightcube/bin/fly", str(DEPLOY / "fly"))
         text = text.replace("/opt/knightcube/venv/bin/python", sys.executable)
         text = text.replace("/opt/knightcube/bin/coils-off", str(DEPLOY / "coils-off"))
         (folder / name).write_text(text + "\n" + added, encoding="utf-8")
@@ -249,7 +250,7 @@ def test_a_wrong_configuration_is_one_line_and_status_2(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(shutil.which("shellcheck") is None, reason="shellcheck is missing")
 def test_shellcheck_is_silent() -> None:
-    words = ["shellcheck", str(DEPLOY / "install.sh"), str(DEPLOY / "coils-off")]
+    words = ["shellcheck", *(str(DEPLOY / name) for name in ("install.sh", "coils-off", "fly"))]
     assert subprocess.run(words, capture_output=True, text=True, check=False).stdout == ""
 
 

@@ -28,6 +28,9 @@ from flight.loop.executive.messages import (
 Answer = tuple[Outcome, Any, str, int]
 """Outcome, value, error and execution time in ns of a job."""
 
+MODULE = "flight.loop.executive.worker"
+"""The module that a worker's process runs."""
+
 _REAPED_WITHIN_S = 1.0
 
 
@@ -60,7 +63,7 @@ class WorkerProcess:
         function = f"{worker.function.__module__}:{worker.function.__qualname__}"
         words = [function, str(line), str(memory), str(os.getpid()), ",".join(map(str, sorted(cores)))]
         return subprocess.Popen(
-            [sys.executable, "-m", "flight.loop.executive.worker", *words],
+            [sys.executable, "-m", MODULE, *words],
             pass_fds=(line, memory),
             stdin=subprocess.DEVNULL,
             start_new_session=True,  # Ctrl-C is for the control process, which then closes its workers

@@ -30,7 +30,7 @@ HANG_S = 1.0
 SLEEPS, SPINS = signal.SIGUSR1, signal.SIGUSR2
 """Signals that hang the control thread: other threads go on; or none does, the interpreter being held."""
 
-_FLIGHT = f"""
+FLIGHT = f"""
 import ctypes, os, signal, time
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 held = ctypes.PyDLL(None)  # unlike CDLL, keeps the interpreter's lock
@@ -72,7 +72,7 @@ class LiveFlight:
         ]
         self.begun_ns = time.monotonic_ns()
         self.process = subprocess.Popen(
-            [sys.executable, "-c", _FLIGHT, *words],
+            [sys.executable, "-c", FLIGHT, *words],
             cwd=ROOT,
             env={**os.environ, "NOTIFY_SOCKET": notifications.getsockname(), "WATCHDOG_USEC": "2000000"},
             stdout=subprocess.DEVNULL,

@@ -218,19 +218,19 @@ def _watch(flight: LiveFlight, notifications: socket.socket, load: Load) -> Watc
     """Watch the flight to its end, reading the service manager's end of the socket."""
     alone = None
     enough = time.monotonic() + 0.5 * (load.duration + load.warm_up)
-    with closing(ProcessWatch(lambda: _members(flight), load.look_period)) as watch:
+    with closing(ProcessWatch(lambda: members(flight), load.look_period)) as watch:
         while flight.process.poll() is None:
             if select.select([notifications], [], [], 0.5)[0]:
                 notifications.recv(4096)
             if alone is None and time.monotonic() > enough:
                 with suppress(OSError, LookupError, ValueError):  # one of them has just ended: again then
-                    members = _members(flight)
-                    shared = sum(process_watch.look(members).memory.values())
-                    alone = process_watch.unshared(members) - shared
+                    present = members(flight)
+                    shared = sum(process_watch.look(present).memory.values())
+                    alone = process_watch.unshared(present) - shared
     return Watched(watch.looks, alone or 0.0)
 
 
-def _members(flight: LiveFlight) -> dict[str, int]:
+def members(flight: LiveFlight) -> dict[str, int]:
     """Return the flight's processes by what they do."""
     found = {"control": flight.process.pid}
     for process in process_watch.below(flight.process.pid):

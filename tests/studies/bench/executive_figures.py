@@ -179,6 +179,8 @@ def judged_slope(seconds: list[float], levels: list[float]) -> tuple[float, floa
 def _share(looks: list[Look], name: str) -> float:
     """Return the share of a core that a process took; a replaced process counts with its successors."""
     spent = np.diff([look.processor[name] for look in looks])
+    if len(looks) < 2:  # it was seen once, and had ended
+        return 0.0
     return float(spent[spent > 0.0].sum()) / (looks[-1].time - looks[0].time)
 
 

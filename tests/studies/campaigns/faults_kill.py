@@ -89,7 +89,7 @@ def _kill(board: Board, number: int, rng: np.random.Generator) -> Result:
         before = _current_until(board, kill_ns)
         board.left += flight.children()
         killed_ns = flight.do(signal.SIGKILL)
-        zero_after, current_after = _watch_coils(board, killed_ns, before)
+        zero_after, current_after = watch_coils(board, killed_ns, before)
     ready_for = None if ready_ns is None else (killed_ns - ready_ns) * 1e-9
     return {
         "early": early,
@@ -116,7 +116,7 @@ def _current_until(board: Board, kill_ns: int) -> float:
     return current
 
 
-def _watch_coils(board: Board, killed_ns: int, before: float) -> tuple[float, float]:
+def watch_coils(board: Board, killed_ns: int, before: float) -> tuple[float, float]:
     """Return when the coils came to zero for good, s after the kill, and the largest current after the limit.
 
     The first answer of zero counts: it is late by at most the time between two samples, never early.

@@ -13,12 +13,14 @@ from tests.studies.campaigns.failures import FAILURES
 from tests.studies.campaigns.false_horizons import FALSE_HORIZONS
 from tests.studies.campaigns.faults import FAULTS
 from tests.studies.campaigns.faults_kill import FAULTS_KILL
+from tests.studies.campaigns.installer_kill import INSTALLER_KILL
 from tests.studies.campaigns.lost_in_space import LOST_IN_SPACE
 from tests.studies.campaigns.mismatch import MISMATCH, VIBRATION
 from tests.studies.campaigns.nadir import NADIR
 from tests.studies.campaigns.orbit_attitude import ORBIT_ATTITUDE
 from tests.studies.campaigns.orbit_pointing import ORBIT_POINTING
 from tests.studies.campaigns.planner_edge import PLANNER_EDGE
+from tests.studies.campaigns.process_kill import PROCESS_KILL
 from tests.studies.campaigns.rate_change import RATE_CHANGE
 from tests.studies.campaigns.robust_controllers import ROBUST_CONTROLLERS
 from tests.studies.campaigns.rolling_shutter import ROLLING_SHUTTER
@@ -52,6 +54,8 @@ CAMPAIGNS: dict[str, Campaign] = {
         PLANNER_EDGE,
         FAULTS,
         FAULTS_KILL,
+        INSTALLER_KILL,
+        PROCESS_KILL,
         COIL_FAULTS,
         SOAK,
         COVERAGE,

@@ -58,9 +58,9 @@ def test_a_coil_that_nobody_zeroes_is_reported_and_one_that_is_zeroed_is_not(
     monkeypatch.setattr(faults_kill, "LIMIT_S", 0.1)
     monkeypatch.setattr(faults_kill, "_GIVE_UP_S", 0.3)
     left_on = board(tmp_path / "left on", Coils(0.05))
-    assert faults_kill._watch_coils(left_on, time.monotonic_ns(), 0.05) == (0.3, 0.05)
+    assert faults_kill.watch_coils(left_on, time.monotonic_ns(), 0.05) == (0.3, 0.05)
     zeroed = board(tmp_path / "zeroed", Coils(0.05, 0.05, 0.0))
-    zero_after, later = faults_kill._watch_coils(zeroed, time.monotonic_ns(), 0.05)
+    zero_after, later = faults_kill.watch_coils(zeroed, time.monotonic_ns(), 0.05)
     assert 0.0 < zero_after < 0.1
     assert later == 0.0
 

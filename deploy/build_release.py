@@ -1,0 +1,222 @@
+"""Builds a release beside the one that flies, tests it, and switches to it by one rename.
+
+Called by install.sh: `build_release.py PREFIX build|switch|rollback`. A release is complete once it has its
+manifest, which is written last; only a complete release is ever linked. A build that was interrupted is
+removed by the next one. Standard library only.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+from releases import MANIFEST, linked, manifest_text
+
+SOURCE = "source"
+"""File of a release with the digest of all that it was built from."""
+SELF_TEST_S = 10
+_PARTS = ("flight", "hal", "sim_hal", "deploy", "config/step_demo.yaml", "pyproject.toml")
+_BOARD_LOCK = "deploy/requirements.lock"
+_NOT_BUILT = shutil.ignore_patterns(".*", "build", "runs", "tests", "*.egg-info", "__pycache__")
+
+
+class Build:
+    """One build: its source, its steps, and whether they are only printed."""
+
+    def __init__(self, prefix: Path, options: argparse.Namespace) -> None:
+        self.releases = prefix / "releases"
+        self._prefix = prefix
+        self._source = Path(__file__).resolve().parents[1]
+        self._options = options
+
+    def make(self) -> int:
+        """Build a release unless the current one is of the same source; print its name."""
+        current = linked(self._prefix, "current")
+        wanted = self._digest()
+        if current is not None and _text(current / SOURCE) == wanted:
+            sys.stdout.write(f"{current.name}\n")
+            return 0
+        release = self.releases / self._name()
+        if not self._options.dry_run:
+            self._remove_incomplete()
+            release.mkdir(parents=True)
+        python = self._environment(release)
+        self._test(python)
+        if not self._options.dry_run:
+            (release / SOURCE).write_text(wanted, encoding="ascii")
+            os.sync()  # all that the manifest speaks of is on the disk before the manifest
+            _write(release / MANIFEST, manifest_text(release))
+        sys.stdout.write(f"{release.name}\n")
+        return 0
+
+    def _environment(self, release: Path) -> Path:
+        """Make the virtual environment; return its Python."""
+        options, venv = self._options, release / "venv"
+        python = venv / "bin/python"
+        if options.venv:
+            if not options.dry_run:
+                venv.symlink_to(Path(options.venv).resolve())
+            return Path(options.venv) / "bin/python"
+        found = ["--no-index", "--find-links", options.wheels] if options.wheels else []
+        quiet = [python, "-m", "pip", "--disable-pip-version-check", "install", "--quiet"]
+        self._run([options.python, "-m", "venv", venv])
+        # setuptools is among them, by hash like the rest: the build of ours takes nothing from elsewhere.
+        self._run([*quiet, *found, "--require-hashes", "--no-deps", "-r", self._source / _BOARD_LOCK])
+        with tempfile.TemporaryDirectory() as folder:
+            # Of a copy: a build that was killed leaves files in its source, which a later one would ship.
+            source = Path(folder) / "source" if not options.dry_run else self._source
+            if not options.dry_run:
+                shutil.copytree(self._source, source, symlinks=True, ignore=_NOT_BUILT)
+            self._run([*quiet, "--no-index", "--no-deps", "--no-build-isolation", source])
+        # The distribution carries the ground tools too, which have no place on a board.
+        for ground in venv.glob("lib/python3*/site-packages/ground"):
+            shutil.rmtree(ground)
+        return python
+
+    def _test(self, python: Path) -> None:
+        """Import, ask for the version, and fly ten seconds in lock-step."""
+        self._run([python, "-c", "import flight.app.flight, flight.loop.executive.worker"])
+        self._run([python, "-m", "flight", "--version"])
+        with tempfile.TemporaryDirectory() as folder:
+            words = ["run", self._source / "config/step_demo.yaml", "--duration", SELF_TEST_S]
+            self._run([python, "-m", "flight", *words, "--out", Path(folder) / "run"])
+
+    def _run(self, words: Sequence[object]) -> None:
+        """Run a step, or print it; what a step prints is shown where it fails."""
+        command = [str(word) for word in words]
+        if self._options.dry_run:
+            sys.stdout.write(f"would run: {' '.join(command)}\n")
+            return
+        # The release is tested as the service runs it: with nothing from this shell's Python path.
+        own = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+        done = subprocess.run(
+            command,
+            cwd="/",
+            env=own,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            check=False,
+        )
+        if done.returncode != 0:
+            sys.stderr.write(f"{done.stdout}\ninstall: failed: {' '.join(command)}\n")
+            raise SystemExit(1)
+
+    def _remove_incomplete(self) -> None:
+        for release in sorted(self.releases.glob("*")):
+            if not (release / MANIFEST).is_file():
+                _remove(release)
+
+    def _name(self) -> str:
+        """Return a name that no release has: the version, and a number that only grows."""
+        text = (self._source / "pyproject.toml").read_text(encoding="utf-8")
+        version = next(line.split('"')[1] for line in text.splitlines() if line.startswith("version = "))
+        numbers = [int(path.name.rpartition("+")[2]) for path in self.releases.glob("*+*")]
+        return f"{version}+{max(numbers, default=0) + 1}"
+
+    def _digest(self) -> str:
+        """Return the SHA-256 of the source and of how it is built."""
+        options = self._options
+        digest = hashlib.sha256(f"{options.python} {options.venv}\n".encode())
+        for part in _PARTS:
+            for path in sorted([self._source / part, *(self._source / part).rglob("*")]):
+                if path.is_file() and path.suffix != ".pyc":
+                    digest.update(f"{path.relative_to(self._source)}\n".encode() + path.read_bytes())
+        return digest.hexdigest()
+
+
+def switch(prefix: Path, name: str) -> None:
+    """Have a release fly from the next start on, the present one kept as the previous; remove all others."""
+    release, current = prefix / "releases" / name, linked(prefix, "current")
+    if current == release:
+        return
+    if not (release / MANIFEST).is_file():
+        raise SystemExit(f"install: {release} is no complete release")
+    os.sync()
+    if current is not None:
+        _link(prefix / "previous", current)
+    _link(prefix / "current", release)
+    for other in (prefix / "releases").iterdir():
+        if other not in {release, current}:
+            _remove(other)
+
+
+def rollback(prefix: Path) -> str:
+    """Have the previous release fly from the next start on; return its name."""
+    current, previous = linked(prefix, "current"), linked(prefix, "previous")
+    if previous is None or previous == current:
+        raise SystemExit("install: --rollback: there is no previous release")
+    _link(prefix / "current", previous)
+    if current is not None:
+        _link(prefix / "previous", current)
+    return previous.name
+
+
+def _link(link: Path, release: Path) -> None:
+    """Point a link to a release, by one rename."""
+    beside = link.with_name(f".{link.name}.part")
+    beside.unlink(missing_ok=True)
+    beside.symlink_to(Path("releases") / release.name)
+    beside.replace(link)
+    _sync(link.parent)
+
+
+def _remove(release: Path) -> None:
+    """Remove a release: first the manifest, without which nobody takes it for one."""
+    (release / MANIFEST).unlink(missing_ok=True)
+    shutil.rmtree(release)
+
+
+def _write(path: Path, text: str) -> None:
+    beside = path.with_name(f"{path.name}.part")
+    with beside.open("w", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    beside.replace(path)
+    _sync(path.parent)
+
+
+def _sync(folder: Path) -> None:
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _text(path: Path) -> str:
+    return path.read_text(encoding="ascii") if path.is_file() else ""
+
+
+def main(words: list[str]) -> int:
+    """Build, switch or roll back below a prefix."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("prefix", type=Path)
+    parser.add_argument("action", choices=["build", "switch", "rollback"])
+    parser.add_argument("name", nargs="?", help="with switch: the release")
+    parser.add_argument("--python", default="python3")
+    parser.add_argument("--wheels", default="")
+    parser.add_argument("--venv", default="")
+    parser.add_argument("--dry-run", action="store_true")
+    options = parser.parse_args(words)
+    if options.action == "build":
+        return Build(options.prefix, options).make()
+    if options.action == "switch":
+        switch(options.prefix, options.name)
+    else:
+        sys.stdout.write(f"{rollback(options.prefix)}\n")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

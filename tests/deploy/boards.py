@@ -1,0 +1,82 @@
+"""A board's files with releases that are built in a second: its Python makes empty environments.
+
+The Python that the installer is given is a script: it makes virtual environments whose Python is the script
+again, "installs" by writing one file, and flies by printing which release it is. All else, such as the
+installer's own modules, is run by the real Python.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from tests.deploy.scripts import DEPLOY, ROOT, TESTBED
+
+_PYTHON = f"""#!/bin/sh
+home=$(dirname "$(dirname "$0")")
+packages=$home/lib/python3/site-packages
+case "$*" in
+    *"-m venv "*)
+        for folder; do :; done
+        mkdir -p "$folder/bin" "$folder/lib/python3/site-packages/flight"
+        ln "$(readlink -f "$0")" "$folder/bin/python"
+        cp "$home/label" "$folder/label" ;;
+    *"-m pip "*"-r "*) mkdir -p "$packages/numpy"; echo numpy >"$packages/numpy/numpy.py" ;;
+    *"-m pip "*) mkdir -p "$packages/ground"; cp "$home/label" "$packages/flight/label" ;;
+    *"-m flight run /"*"step_demo.yaml"*) grep -q . "$packages/flight/label" ;;
+    *"-m flight --version"* | *"import flight"*) ;;
+    *"-m flight run "*) echo "flies $(cat "$packages/flight/label")" ;;
+    *) PYTHONPATH={ROOT} exec {sys.executable} "$@" ;;
+esac
+"""
+
+
+@dataclass(frozen=True)
+class FakeBoard:
+    """A board's files below `root`, and Pythons that build releases of several labels."""
+
+    root: Path
+
+    @property
+    def prefix(self) -> Path:
+        """Where the software stands."""
+        return self.root / "opt/knightcube"
+
+    def python(self, label: str) -> Path:
+        """Return a Python whose environments fly as `label`."""
+        home = self.root.parent / f"python-{label}"
+        path = home / "bin/python"
+        if not path.exists():
+            path.parent.mkdir(parents=True)
+            (home / "label").write_text(label, encoding="ascii")
+            path.write_text(_PYTHON, encoding="utf-8")
+            path.chmod(0o755)
+        return path
+
+    def words(self, label: str) -> list[str]:
+        """Return the command that installs a release."""
+        options = ["--python", str(self.python(label)), "--config", str(TESTBED)]
+        return ["sh", str(DEPLOY / "install.sh"), *options]
+
+    def environment(self) -> dict[str, str]:
+        """Return the environment of the installer."""
+        return {**os.environ, "DESTDIR": str(self.root)}
+
+    def install(self, label: str) -> str:
+        """Install a release; return what was printed."""
+        words = self.words(label)
+        done = subprocess.run(words, env=self.environment(), capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+    def fly(self) -> tuple[str, str]:
+        """Start as the service does; return the label of what flew, "" for nothing, and the complaints."""
+        state = self.root / "state"
+        state.mkdir(exist_ok=True)
+        words = [str(self.prefix / "bin/fly"), "/etc/knightcube/flight.yaml"]
+        own = {**os.environ, "STATE_DIRECTORY": str(state)}
+        done = subprocess.run(words, env=own, capture_output=True, text=True, check=False)
+        return done.stdout.removeprefix("flies ").strip(), done.stderr

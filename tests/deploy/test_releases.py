@@ -1,0 +1,140 @@
+"""Releases side by side: built aside, switched by one rename, chosen at the start, taken back."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from flight.app.release import NAME, NOTE, TRIALS, Release
+from tests.deploy.boards import FakeBoard
+from tests.deploy.scripts import script
+
+releases = script("releases")
+
+pytestmark = pytest.mark.skipif(
+    shutil.which("systemctl") is None, reason="systemctl is missing: install systemd"
+)
+
+
+@pytest.fixture(scope="module")
+def updated(tmp_path_factory: pytest.TempPathFactory) -> FakeBoard:
+    board = FakeBoard(tmp_path_factory.mktemp("board") / "root")
+    board.install("old")
+    board.install("new")
+    return board
+
+
+@pytest.fixture
+def board(updated: FakeBoard, tmp_path: Path) -> FakeBoard:
+    """Return a copy of a board with the releases old and new."""
+    shutil.copytree(updated.root, tmp_path / "root", symlinks=True)
+    return FakeBoard(tmp_path / "root")
+
+
+def _flown(board: FakeBoard, times: int) -> list[str]:
+    return [board.fly()[0] for _ in range(times)]
+
+
+def test_a_new_release_that_is_never_proven_gives_way_to_the_old_one_which_reports_it(
+    board: FakeBoard,
+) -> None:
+    assert _flown(board, 3) == ["new", "new", "new"]
+    label, complaint = board.fly()
+    assert label == "old"
+    assert "ended 3 times before it was proven; 0.1.0+1 flies" in complaint
+    Release({NAME: "0.1.0+2", "STATE_DIRECTORY": str(board.root / "state")}).prove()
+    assert _flown(board, 5) == ["new"] * 5, "proven: power cuts no longer count"
+
+
+def test_a_release_that_ends_by_itself_has_its_starts_forgiven(board: FakeBoard) -> None:
+    assert _flown(board, 2) == ["new", "new"]
+    Release({NAME: "0.1.0+2", "STATE_DIRECTORY": str(board.root / "state")}).end()
+    assert _flown(board, 3) == ["new", "new", "new"]
+    assert _flown(board, 1) == ["old"]
+
+
+@pytest.mark.parametrize("content", ["", "[", "[]", '{"starts": [], "proven": 7}', '{"starts": {"a": "b"}}'])
+def test_a_damaged_record_of_the_starts_keeps_nothing_from_flying(board: FakeBoard, content: str) -> None:
+    (board.root / "state").mkdir()
+    (board.root / "state" / TRIALS).write_text(content, encoding="ascii")
+    assert _flown(board, 1) == ["new"]
+    assert json.loads((board.root / "state" / TRIALS).read_text())["starts"] == {"0.1.0+2": 1}
+
+
+def _ours(board: FakeBoard, link: str) -> Path:
+    return board.prefix / link / "venv/lib/python3/site-packages/flight/label"
+
+
+def test_a_damaged_release_gives_way_to_a_whole_one_but_flies_where_there_is_none(board: FakeBoard) -> None:
+    _ours(board, "current").write_text("nEw", encoding="ascii")
+    label, complaint = board.fly()
+    assert label == "old"
+    assert (
+        "release 0.1.0+2: venv/lib/python3/site-packages/flight/label is damaged; 0.1.0+1 flies" in complaint
+    )
+    _ours(board, "previous").write_text("oLd", encoding="ascii")
+    label, complaint = board.fly()
+    assert label == "nEw"
+    assert "0.1.0+1: venv/lib/python3/site-packages/flight/label is damaged; 0.1.0+2 flies" in complaint
+
+
+def test_of_libraries_the_size_is_compared_at_a_start_and_the_content_on_request(board: FakeBoard) -> None:
+    library = board.prefix / "current/venv/lib/python3/site-packages/numpy/numpy.py"
+    library.write_text("NUMPY\n", encoding="ascii")
+    current = releases.linked(board.prefix, "current")
+    assert releases.damage(current) == ""
+    assert "numpy.py is damaged" in releases.damage(current, thorough=True)
+    library.write_text("numpy", encoding="ascii")
+    assert "another size" in releases.damage(current)
+    (current / releases.MANIFEST).write_text("x", encoding="ascii")
+    assert releases.damage(current) == "its manifest is damaged"
+
+
+def test_a_board_without_any_usable_python_in_its_current_release_flies_the_previous_one(
+    board: FakeBoard,
+) -> None:
+    (board.prefix / "current/venv/bin/python").unlink()
+    assert board.fly()[0] == "old"
+
+
+def test_rollback_flies_the_previous_release_and_back_again(board: FakeBoard) -> None:
+    words = [*board.words("new")[:2], "--rollback"]
+    for label in ("old", "new"):
+        done = subprocess.run(words, env=board.environment(), capture_output=True, text=True, check=True)
+        assert "rolled back to 0.1.0+" in done.stdout
+        assert board.fly()[0] == label
+
+
+def test_an_update_keeps_two_releases_and_a_second_run_of_it_none_more(board: FakeBoard) -> None:
+    board.install("newest")
+    before = sorted((board.prefix / "releases").iterdir())
+    board.install("newest")
+    assert sorted((board.prefix / "releases").iterdir()) == before
+    assert [path.name for path in before] == ["0.1.0+2", "0.1.0+3"]
+    assert not list((board.prefix / "current").glob("venv/lib/python3/site-packages/ground"))
+
+
+def test_a_release_that_fails_its_self_test_changes_nothing(board: FakeBoard) -> None:
+    (board.python("").parents[1] / "label").write_text("", encoding="ascii")
+    done = subprocess.run(
+        board.words(""), env=board.environment(), capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 1
+    assert "install: failed: " in done.stderr
+    assert board.fly()[0] == "new"
+    board.install("newest")
+    assert board.fly()[0] == "newest"
+
+
+def test_a_flight_without_a_release_has_nothing_to_prove(tmp_path: Path) -> None:
+    release = Release({"STATE_DIRECTORY": str(tmp_path), NOTE: ""})
+    with ExitStack() as stack:
+        release.serve(None, stack)  # type: ignore[arg-type] # no ticker is asked for
+    release.prove()
+    release.end()
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,67 @@
+"""Workers that cannot start, in real time: `python -m tests.studies.bench dead_worker [--minutes M]`.
+
+The full load of `bench executive` is flown with a module for the workers that does not exist: each of their
+processes ends at once. Printed are the attempts, their reports, and the cycles that were lost beyond what a
+bare loop beside the flight lost as well. Run it alone on two cores.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from flight.link import events
+from flight.loop.executive.attempts import BUDGET
+from ground.telemetry.reader import read_run
+from tests.hal.guardian import live_flight
+from tests.studies.bench.executive import Load, fifo_allowed, fly
+
+_BREAK = """
+from flight.loop.executive import processes
+processes.MODULE = "flight.loop.executive.no_such_module"
+"""
+WORKERS = ("planner", "vision")
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Fly, print the figures; return 1 where a cycle was lost or an attempt was not bounded and reported."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--minutes", type=float, default=10.0, metavar="M", help="default %(default)s")
+    minutes = parser.parse_args(arguments).minutes
+    with tempfile.TemporaryDirectory() as name, _broken_workers():
+        load = Load(60.0 * minutes, warm_up=0.0)
+        figures = fly(Path(name), load, fifo_allowed()).figures
+        happened = read_run(Path(name) / "run")["event"]
+        codes, texts = happened["code"], happened["text"]
+    kinds = (events.WORKER_DIED, events.WORKER_RESTS, events.WORKER_READY)
+    found = {kind.name: Counter(_workers(texts[codes == kind.code].tolist())) for kind in kinds}
+    sys.stdout.write(
+        f"{minutes:g} min, {figures['slots']} slots: lost {figures['lost']}, "
+        f"beyond the machine's stalls {figures['lost_beyond_machine']}\n"
+        f"lateness p99 {1e3 * figures['lateness_s']['p99']:.2f} ms, "
+        f"execution max {1e3 * figures['execution_s']['max']:.1f} ms\n"
+    )
+    for kind, counts in found.items():
+        sys.stdout.write(f"{kind}: {', '.join(f'{name} {counts[name]}' for name in WORKERS)}\n")
+    bounded = all(1 <= found["worker-died"][name] <= BUDGET for name in WORKERS)
+    return int(not bounded or figures["lost_beyond_machine"] > 0)
+
+
+def _workers(texts: Sequence[bytes]) -> list[str]:
+    """Return the workers that the texts of events begin with."""
+    return [text.decode().partition(":")[0] for text in texts]
+
+
+@contextmanager
+def _broken_workers() -> Iterator[None]:
+    whole = live_flight.FLIGHT
+    live_flight.FLIGHT = _BREAK + whole
+    try:
+        yield
+    finally:
+        live_flight.FLIGHT = whole

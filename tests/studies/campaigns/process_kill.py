@@ -1,0 +1,172 @@
+"""Campaign `process-kill`: kill -9 and SIGSTOP of workers, guardian and flight, in real time.
+
+A case is one flight with planner and vision at work on devices in a process of their own. Workers and
+guardian are killed or stopped at random moments; each must be reported in the log, and be replaced. At last
+the flight process itself is killed or stopped: the coils must come to zero, and nothing of the flight may be
+left, neither a process nor a file in the folder for temporary files or in shared memory.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+
+from flight.link import events
+from ground.telemetry.reader import read_run
+from sim_hal.serving.device_link import RemoteI2cBus
+from tests.hal.guardian.campaign import lives
+from tests.hal.guardian.live_flight import LiveFlight
+from tests.studies.bench.executive import Load, full_load, members
+from tests.studies.bench.process_watch import answering
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.faults_kill import watch_coils
+from tests.studies.campaigns.kill_board import Board
+
+LIMIT_S = 0.35
+ACTS = 10
+"""On workers and guardian of one flight; the last act is on the flight itself."""
+_LOAD = Load(600.0, camera_period=1.0, replan_period=0.5)
+_NOTICED_S = 13.0
+"""A vision worker that was stopped is noticed by its timeout of 10 s."""
+_GONE_S = 3.0
+_SHARED = Path("/dev/shm")
+
+
+def cases(runs: int, seed: int) -> list[Case]:
+    """Return flights that come to `runs` acts together."""
+    sizes = [min(ACTS, runs - done) for done in range(0, runs, ACTS)]
+    return [Case(str(number), (seed, number), {"acts": size}) for number, size in enumerate(sizes)]
+
+
+def run(case: Case) -> Result:
+    """Fly; kill and stop; read the log."""
+    rng = np.random.default_rng(case.seed)
+    with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
+        folder = Path(name)
+        config, facts, temporary = folder / "flight.yaml", folder / "facts.json", folder / "temporary"
+        config.write_text(full_load(_LOAD), encoding="utf-8")
+        temporary.mkdir()
+        shared = _in_shared_memory()
+        words = "--folder", str(folder), "--facts", str(facts)
+        stack.enter_context(answering("sim_hal", "serve", str(config), *words))
+        bus = RemoteI2cBus(json.loads(facts.read_text(encoding="utf-8"))["socket"])
+        stack.callback(bus.close)
+        notifications = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
+        notifications.bind(str(folder / "notify"))
+        os.environ["TMPDIR"] = str(temporary)
+        flight = LiveFlight(folder, config, notifications, _LOAD.duration, "--devices", str(facts))
+        stack.callback(flight.end)
+        del os.environ["TMPDIR"]
+        flight.wait_for("READY=1", 60.0)
+        acts = _hurt_parts(flight, case.parameters["acts"] - 1, rng)
+        time.sleep(_NOTICED_S)
+        end = _hurt_flight(flight, Board(folder, facts, bus), rng)
+        reported = _reported(flight.folder)
+        left = [str(path) for path in (*temporary.iterdir(), *(_in_shared_memory() - shared))]
+    return {"acts": dict(acts), "reported": reported, "left": left, **end}
+
+
+def _in_shared_memory() -> set[Path]:
+    """Return the files in shared memory but semaphores of Python's process pools, which no flight has."""
+    return {path for path in _SHARED.iterdir() if not path.name.startswith("sem.mp-")}
+
+
+def _hurt_parts(flight: LiveFlight, number: int, rng: np.random.Generator) -> Counter[str]:
+    """Kill or stop a worker or the guardian, one after the other; return how often which."""
+    acts: Counter[str] = Counter()
+    hurt: set[int] = set()
+    deadline = time.monotonic() + 20.0 * max(number, 1)
+    while acts.total() < number and time.monotonic() < deadline:
+        time.sleep(float(rng.uniform(0.5, 3.0)))
+        victims = {
+            role: pid for role, pid in members(flight).items() if pid not in hurt and role != "control"
+        }
+        if not victims:
+            continue
+        role = str(rng.choice(sorted(victims)))
+        number_sent = signal.SIGKILL if rng.random() < 0.5 else signal.SIGSTOP
+        os.kill(victims[role], number_sent)
+        hurt.add(victims[role])
+        acts[role] += 1
+    return acts
+
+
+def _hurt_flight(flight: LiveFlight, board: Board, rng: np.random.Generator) -> Result:
+    """Kill or stop the flight; return when the coils came to zero and how many processes were left."""
+    children = flight.children()
+    before = max(board.current() for _ in range(20))
+    sent = signal.SIGKILL if rng.random() < 0.5 else signal.SIGSTOP
+    zero_after, _ = watch_coils(board, flight.do(sent), before)
+    flight.process.kill()
+    flight.process.wait()
+    deadline = time.monotonic() + _GONE_S
+    while any(map(lives, children)) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    return {
+        "sent": sent.name,
+        "current_before_a": before,
+        "zero_after_s": zero_after,
+        "orphans": sum(map(lives, children)),
+    }
+
+
+def _reported(folder: Path) -> dict[str, int]:
+    """Return how many deaths of each part the log has."""
+    log = read_run(folder)["event"]
+    died = log["code"] == events.WORKER_DIED.code
+    found = Counter(text.decode().partition(":")[0] for text in log["text"][died].tolist())
+    lost = log["code"] == events.GUARDIAN_LOST.code
+    return {**found, "guardian": int(lost.sum() + log["suppressed"][lost].sum())}
+
+
+def summarise(results: Sequence[Result], folder: Path) -> Summary:
+    """Return how many deaths were reported, when the coils came to zero, and what was left."""
+    del folder
+    acts: Counter[str] = sum((Counter(result["acts"]) for result in results), Counter())
+    reported = sum(
+        (
+            Counter({r: min(n, result["reported"].get(r, 0)) for r, n in result["acts"].items()})
+            for result in results
+        ),
+        Counter(),
+    )
+    driven = [result for result in results if result["current_before_a"] > 0.0]
+    worst = max((result["zero_after_s"] for result in driven), default=0.0)
+    facts = {
+        "acts": dict(acts),
+        "reported": dict(reported),
+        "flights": len(results),
+        "driven": len(driven),
+        "worst_zero_after_s": worst,
+        "beyond_limit": sum(result["zero_after_s"] > LIMIT_S for result in driven),
+        "orphans": sum(result["orphans"] for result in results),
+        "left": [path for result in results for path in result["left"]],
+    }
+    parts = ", ".join(f"{role} {reported[role]} of {number}" for role, number in sorted(acts.items()))
+    text = (
+        f"{acts.total() + len(results)} acts in {len(results)} flights; reported: {parts}\n"
+        f"flight itself killed or stopped {len(results)} times, {len(driven)} with current: coils at zero "
+        f"within {worst:.3f} s (limit {LIMIT_S:g} s, beyond it {facts['beyond_limit']})\n"
+        f"orphans {facts['orphans']}, files left {len(facts['left'])}\n"
+    )
+    return Summary(text, facts)
+
+
+PROCESS_KILL = Campaign(
+    "process-kill",
+    "kill -9 and SIGSTOP of workers, guardian and flight, in real time (use --workers 1)",
+    cases,
+    run,
+    summarise,
+    default_runs=500,
+)
