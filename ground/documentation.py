@@ -34,7 +34,7 @@ Every packet is a CCSDS space packet (133.0-B-2), all numbers big-endian:
 | last 2 | u2 | CRC-16: x^16 + x^12 + x^5 + 1, preset to ones, over everything before it |
 
 Types are u unsigned, i signed, f IEEE 754, followed by their bytes; S is UTF-8 text in so many bytes, padded
-with zeros.
+with zeros, with at least one.
 """
 
 
@@ -71,6 +71,7 @@ def _packet(layout: Layout) -> dict[str, Any]:
         "rate": packet.rate,
         "bytes": layout.length,
         "meaning": packet.meaning,
+        **({"hazard": packet.hazard} if packet.hazard else {}),
         "fields": [
             {
                 "name": field.name,
@@ -90,10 +91,11 @@ def _details(field: Field) -> dict[str, Any]:
     """Return what only some fields have: states, limits, the number at which a counter wraps."""
     limits = field.limits
     details: dict[str, Any] = {
-        "states": {str(number): label for number, label in field.states},
-        "warning_outside": limits.warning if limits else None,
-        "fault_outside": limits.fault if limits else None,
-        "valid": field.valid,
+        "states": [list(state) for state in field.states],
+        "alarms": [list(alarm) for alarm in field.alarms],
+        "warning_outside": list(limits.warning or ()) if limits else None,
+        "fault_outside": list(limits.fault or ()) if limits else None,
+        "valid": list(field.valid or ()),
         "wraps_at": wraps_at(field),
     }
     return {name: value for name, value in details.items() if value}
@@ -103,7 +105,8 @@ def meaning_of(field: Field) -> str:
     """Return the meaning of a field in words, with its states, its ranges and its end."""
     parts = [field.meaning] if field.meaning else []
     if field.states:
-        parts.append(", ".join(f"{number} {label}" for number, label in field.states))
+        levels = {number: f" ({level})" for number, level in field.alarms}
+        parts.append(", ".join(f"{number} {label}{levels.get(number, '')}" for number, label in field.states))
     ranges = {"valid": field.valid}
     if field.limits is not None:
         ranges |= {"warning outside": field.limits.warning, "fault outside": field.limits.fault}

@@ -9,36 +9,37 @@ import os
 import socket
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 from flight.app.utc_label import utc_ns
 from flight.gnc.errors import FlightError, UsageError
 from flight.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 from flight.link.commands.codec import (
-    ChangeMode,
-    Clear,
     Command,
     CommandError,
     CommandPacker,
     Ping,
     Point,
-    Slew,
+    command_of,
     shown,
 )
-from flight.link.modes import COMMANDABLE, Mode
+from flight.link.commands.definitions import COMMANDS, LAYOUTS, PING, POINT, SAFE
+from flight.link.modes import Mode
 from flight.link.process import directives
 from flight.link.process.directives import Play, Stop
 from flight.link.process.verification import Report
 from flight.link.security.associations import COMMAND_SPIS, TELEMETRY_SPIS, Vault
 from flight.link.telemetry.definitions import COMMAND
+from flight.link.telemetry.form import Field, Packet
 from flight.link.telemetry.packets import LONGEST_PACKET, TelemetryError, to_text
+from ground.documentation import meaning_of
 from ground.link.commanding import change_key, obeyed
 from ground.link.commanding import command as send
 from ground.link.terminal import DEFAULTS, TerminalSettings, open_terminal
 from ground.telemetry.scanner import decode
 
 _DIRECTIVES = ("play", "stop-playback", "new-key")
-_MODES = [mode.label for mode in COMMANDABLE if mode is not Mode.SLEW]
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -67,23 +68,37 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--timeout", type=float, default=2.0, metavar="S", help="for the answer (default 2)")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     words = parser.add_subparsers(required=True, metavar="WHAT", dest="what")
-    words.add_parser("ping", help="answer and do nothing else")
-    safe = words.add_parser("safe", help="abort: coils to zero, mode safe")
-    safe.add_argument("reason", nargs="?", default="", help="for the log")
-    words.add_parser("mode", help="change the mode").add_argument("mode", choices=_MODES)
-    slew = words.add_parser("slew", help="go to an attitude, then hold it")
-    slew.add_argument("q2", type=float, help="commanded final q2, within +-0.68")
-    clear = words.add_parser("clear", help="clear a latched event")
-    clear.add_argument("event", help="its name, as in the log")
-    _configure_point(words.add_parser("point", help="point a satellite to a goal"))
+    for packet in COMMANDS:
+        _configure_word(words.add_parser(packet.name, help=packet.meaning.lower()), packet)
     _configure_directives(words)
     parser.set_defaults(command=command)
+
+
+def _configure_word(parser: argparse.ArgumentParser, packet: Packet) -> None:
+    """Add the arguments of one command, as the table of telecommands has them."""
+    parser.description = f"{packet.meaning}. Hazard: {packet.hazard or 'none'}."
+    if packet is POINT:
+        _configure_point(parser)
+        return
+    for field in packet.fields:
+        if packet is not PING:
+            _add_argument(parser, field, optional=packet is SAFE)
+
+
+def _add_argument(parser: argparse.ArgumentParser, field: Field, optional: bool) -> None:
+    meaning = meaning_of(replace(field, states=())).replace("%", "%%")
+    if field.states:
+        parser.add_argument(field.name, choices=[label for _, label in field.states], help=meaning)
+    elif field.kind.startswith("S"):
+        parser.add_argument(field.name, nargs="?" if optional else None, default="", help=meaning)
+    else:
+        parser.add_argument(field.name, type=float if field.kind.startswith("f") else int, help=meaning)
 
 
 def _configure_point(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Point to nadir, velocity or sun; to inertial QX QY QZ QW, an attitude ICRS into body, scalar last; "
-        "or to ground LAT LON, degrees."
+        f"or to ground LAT LON, degrees. Hazard: {POINT.hazard}."
     )
     parser.add_argument("goal", choices=[goal.label for goal in Goal])
     parser.add_argument("numbers", type=float, nargs="*", metavar="NUMBER", help="of inertial and ground")
@@ -209,19 +224,17 @@ def _ask(line: socket.socket, address: str | tuple[str, int], data: bytes, timeo
 
 
 def _command_of(options: argparse.Namespace) -> Command:
-    match options.what:
-        case "ping":
-            return Ping(os.getpid() & 0xFFFFFFFF)
-        case "safe":
-            return ChangeMode(Mode.SAFE, options.reason)
-        case "mode":
-            return ChangeMode(Mode.named(options.mode))
-        case "slew":
-            return Slew(options.q2)
-        case "point":
-            return Point(_target_of(options))
-        case _:
-            return Clear(options.event)
+    packet = LAYOUTS[options.what].packet
+    if packet is PING:
+        return Ping(os.getpid() & 0xFFFFFFFF)
+    if packet is POINT:
+        return Point(_target_of(options))
+    fields = {}
+    for field in packet.fields:
+        value = getattr(options, field.name)
+        numbers = {label: number for number, label in field.states}
+        fields[field.name] = numbers[value] if field.states else value
+    return command_of(packet, fields)
 
 
 def _target_of(options: argparse.Namespace) -> PointingTarget:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from flight.gnc.errors import FlightError, UsageError
-from flight.gnc.guidance.one_axis.limits import Q2_LIMIT
 from flight.gnc.guidance.three_axes.pointing_target import NUMBERS, Goal, PointingTarget
 from flight.link.commands.definitions import CLEAR, LAYOUTS, MODE, PING, POINT, SAFE, SLEW
-from flight.link.modes import COMMANDABLE, Mode
+from flight.link.modes import Mode
+from flight.link.telemetry.form import Packet
 from flight.link.telemetry.packets import HEADER_BYTES, Packer, TelemetryError, crc16, to_text
 
 LONGEST = max(layout.length for layout in LAYOUTS.values())
@@ -82,16 +84,51 @@ def name_of(command: Command) -> str:
             return POINT.name
 
 
-def check(command: Command) -> None:
-    """Refuse values that no flight can obey; raises CommandError."""
+def fields_of(command: Command) -> dict[str, Any]:
+    """Return the fields of the packet that carries a command, by name."""
     match command:
-        case ChangeMode(mode) if mode not in COMMANDABLE or mode is Mode.SLEW:
-            allowed = ", ".join(m.label for m in COMMANDABLE if m is not Mode.SLEW)
-            raise CommandError(f"mode {mode.label} is not to be commanded so: one of {allowed}")
-        case Slew(q2) if not abs(q2) <= Q2_LIMIT:  # NaN compares false
-            raise CommandError(f"q2 = {q2} must lie within +-{Q2_LIMIT}")
-        case Clear(event) if not event:
-            raise CommandError("clear needs the name of an event")
+        case Ping(number):
+            return {"number": number}
+        case ChangeMode(mode, reason):
+            return {"reason": reason} if mode is Mode.SAFE else {"mode": int(mode)}
+        case Slew(q2):
+            return {"q2": q2}
+        case Clear(event):
+            return {"event": event}
+        case Point(target):
+            return _fields(target)
+
+
+def command_of(packet: Packet, fields: Mapping[str, Any]) -> Command:
+    """Return the command of a packet's fields by name. Raises CommandError for values that are none."""
+    check(packet, fields)
+    match packet.name:
+        case PING.name:
+            return Ping(fields["number"])
+        case SAFE.name:
+            return ChangeMode(Mode.SAFE, fields["reason"])
+        case MODE.name:
+            return ChangeMode(Mode(fields["mode"]))
+        case SLEW.name:
+            return Slew(fields["q2"])
+        case POINT.name:
+            return Point(_target(fields["goal"], fields["numbers"], fields["roll"]))
+        case _:
+            return Clear(fields["event"])
+
+
+def check(packet: Packet, fields: Mapping[str, Any]) -> None:
+    """Refuse fields outside the states and ranges of the table. Raises CommandError."""
+    for field in packet.fields:
+        value = fields[field.name]
+        if field.states and value not in dict(field.states):
+            allowed = ", ".join(f"{number} {label}" for number, label in field.states)
+            raise CommandError(f"{field.name} = {value} is not to be commanded so: one of {allowed}")
+        if field.valid is not None and not field.valid[0] <= value <= field.valid[1]:  # NaN compares false
+            low, high = field.valid
+            raise CommandError(f"{field.name} = {value} must lie within {low:g} to {high:g}")
+    if packet is CLEAR and not fields["event"]:
+        raise CommandError("clear needs the name of an event")
 
 
 class CommandPacker:
@@ -102,21 +139,10 @@ class CommandPacker:
 
     def pack(self, command: Command, utc_ns: int) -> bytes:
         """Return the bytes of a command sent at `utc_ns`. Raises CommandError for values that are none."""
-        check(command)
+        packet, fields = LAYOUTS[name_of(command)].packet, fields_of(command)
+        check(packet, fields)
         try:
-            match command:
-                case Ping(number):
-                    return self._packer.pack(PING, utc_ns, number=number)
-                case ChangeMode(mode, reason) if mode is Mode.SAFE:
-                    return self._packer.pack(SAFE, utc_ns, reason=reason)
-                case ChangeMode(mode):
-                    return self._packer.pack(MODE, utc_ns, mode=int(mode))
-                case Slew(q2):
-                    return self._packer.pack(SLEW, utc_ns, q2=q2)
-                case Clear(event):
-                    return self._packer.pack(CLEAR, utc_ns, event=event)
-                case Point(target):
-                    return self._packer.pack(POINT, utc_ns, **_fields(target))
+            return self._packer.pack(packet, utc_ns, fields)
         except TelemetryError as error:
             raise CommandError(str(error)) from error
 
@@ -139,22 +165,11 @@ def unpack(data: bytes) -> Command:
     if data[HEADER_BYTES] != layout.packet.version:
         raise CommandError(f"version {data[HEADER_BYTES]} of {layout.packet.name} is not known")
     (row,) = layout.array(data)
-    command: Command
-    match layout.packet.name:
-        case PING.name:
-            command = Ping(int(row["number"]))
-        case SAFE.name:
-            command = ChangeMode(Mode.SAFE, to_text(row["reason"]))
-        case MODE.name:
-            command = ChangeMode(_mode(int(row["mode"])))
-        case SLEW.name:
-            command = Slew(float(row["q2"]))
-        case POINT.name:
-            command = Point(_target(int(row["goal"]), row["numbers"].tolist(), float(row["roll"])))
-        case _:
-            command = Clear(to_text(row["event"]))
-    check(command)
-    return command
+    fields = {
+        field.name: to_text(row[field.name]) if field.kind.startswith("S") else row[field.name].tolist()
+        for field in layout.packet.fields
+    }
+    return command_of(layout.packet, fields)
 
 
 def shown(text: str) -> str:
@@ -178,14 +193,7 @@ def describe(command: Command) -> str:
             return f"point {target.text}"
 
 
-def _mode(number: int) -> Mode:
-    try:
-        return Mode(number)
-    except ValueError:
-        raise CommandError(f"{number} is no mode") from None
-
-
-def _fields(target: PointingTarget) -> dict[str, object]:
+def _fields(target: PointingTarget) -> dict[str, Any]:
     spare = 4 - len(target.numbers)
     return {
         "goal": int(target.goal),
@@ -196,10 +204,7 @@ def _fields(target: PointingTarget) -> dict[str, object]:
 
 def _target(number: int, numbers: list[float], roll: float) -> PointingTarget:
     """Return the target of a packet's fields. Raises CommandError; a roll of NaN is free."""
-    try:
-        goal = Goal(number)
-    except ValueError:
-        raise CommandError(f"{number} is no goal") from None
+    goal = Goal(number)
     try:
         count = NUMBERS.get(goal, 0)
         return PointingTarget(goal, tuple(numbers[:count]), None if math.isnan(roll) else roll)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 Range = tuple[float, float]
 States = tuple[tuple[int, str], ...]
+Alarms = tuple[tuple[int, Literal["warning", "fault"]], ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +26,8 @@ class Field:
 
     Attributes:
         states: the numbers that may stand in the field, each with its name.
-        limits: when the value is a warning or a fault.
+        alarms: the states that are a warning or a fault.
+        limits: when a value without states is a warning or a fault.
         valid: the range (low, high) of a command's argument.
         wraps: past its largest number the field goes on at 0, as a counter may.
     """
@@ -35,6 +38,7 @@ class Field:
     meaning: str
     count: int = 1
     states: States = ()
+    alarms: Alarms = ()
     limits: Limits | None = None
     valid: Range | None = None
     wraps: bool = False

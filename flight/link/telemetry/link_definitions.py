@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from flight.link.telemetry.form import Field, Packet, counter
-
-STAGES = ((1, "accepted"), (2, "refused"), (3, "started"), (4, "completed"), (5, "failed"))
+from flight.link.telemetry.states import NO_YES, STAGES
 
 LINK = Packet(
     "link",
@@ -28,7 +27,7 @@ LINK = Packet(
         Field("copies", "u1", "-", "good copies of the counters of SPI 1 to 4", 4),
         counter("sent", "telemetry frames sent since the link's start"),
         counter("thinned", "live packets left out for want of rate; the archive has them"),
-        Field("playing", "u1", "-", "1 while the archive is played back"),
+        Field("playing", "u1", "-", "the archive is played back", states=NO_YES),
         Field("played_ns", "i8", "ns", "mission time that the playback has reached"),
     ),
 )
@@ -41,7 +40,7 @@ VERIFICATION = Packet(
     (
         Field("spi", "u2", "-", "of its frame"),
         Field("counter", "i8", "-", "of its frame: with the SPI its identifier"),
-        Field("stage", "u1", "-", "step that the command has come to", states=STAGES),
+        Field("stage", "u1", "-", "how far the command is", states=STAGES),
         Field("name", "S16", "-", "name of the command, empty for none"),
         Field("text", "S128", "-", "its values, or the reason"),
     ),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from flight.link.telemetry.form import Field, Packet, counter
+from flight.link.telemetry.states import KNOWLEDGE, LOST_ALARM, NO_YES
 
 SPIN = Packet(
     "spin",
@@ -10,7 +11,7 @@ SPIN = Packet(
     "4 Hz",
     "The rate by the magnetometer alone, of a satellite in orbit",
     (
-        Field("known", "u1", "-", "1 once enough samples of the field agree"),
+        Field("known", "u1", "-", "enough samples of the field agree", states=NO_YES),
         Field("rate", "f8", "rad/s", "body rate, body axes", 3),
         Field("rate_sigma", "f4", "rad/s", "standard deviation of the rate's worst axis"),
         Field("field", "f8", "T", "magnetic field, body axes", 3),
@@ -25,8 +26,8 @@ NAVIGATION = Packet(
     "1 Hz",
     "How well a satellite in orbit knows its attitude, and what its filter has learned",
     (
-        Field("knowledge", "u1", "-", "0 lost, 1 coarse, 2 fine"),
-        Field("placed", "u1", "-", "1 while the orbit is known"),
+        Field("knowledge", "u1", "-", "of the attitude", states=KNOWLEDGE, alarms=LOST_ALARM),
+        Field("placed", "u1", "-", "the orbit is known", states=NO_YES),
         counter("refused", "measurements that did not pass their gate, replays included"),
         counter("fixes_refused", "GPS fixes that contradict what is known of the orbit"),
         counter("restarts", "how often the estimate was discarded for a new one"),

@@ -55,11 +55,14 @@ def to_text(value: bytes) -> str:
 
 
 def _to_bytes(value: object, size: int) -> bytes:
-    """Return at most `size` bytes of UTF-8, cut between characters; what UTF-8 cannot say becomes '?'."""
+    """Return less than `size` bytes of UTF-8, cut between characters; what UTF-8 cannot say becomes '?'.
+
+    A zero always follows: clients of the XTCE form find the end of a text by it.
+    """
     if not isinstance(value, str):
         raise TypeError("a text is needed")
     raw = value.encode("utf-8", "replace")
-    return raw if len(raw) <= size else raw[:size].decode("utf-8", "ignore").encode("utf-8")
+    return raw if len(raw) < size else raw[: size - 1].decode("utf-8", "ignore").encode("utf-8")
 
 
 def _text_size(field: Field) -> int:

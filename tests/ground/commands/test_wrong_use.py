@@ -20,7 +20,7 @@ PLAN = "plan --from 0.1 --to 0"
         (f"{PLAN} --nodes 2", "--nodes 2: must be 8 to 40"),
         (f"{PLAN} --time-price -1", "-1 is not a positive number"),
         (f"{PLAN} --picture TMP/no/where.png", "where.png: no pictures can be written there"),
-        ("command --to TMP/none slew 5", "q2 = 5.0 must lie within +-0.68"),
+        ("command --to TMP/none slew 5", "q2 = 5.0 must lie within -0.68 to 0.68"),
         ("solve TMP/sky.png --prior nan 0 0", "nan is not a finite number"),
         ("rate TMP/sky.png --prior nan 0 0", "nan is not a finite number"),
         ("run step_demo --out TMP/a --seed 1e22", "'1e22' is no whole number"),

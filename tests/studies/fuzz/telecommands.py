@@ -23,9 +23,11 @@ from flight.link.commands.codec import (
     Slew,
     check,
     describe,
+    fields_of,
     name_of,
     unpack,
 )
+from flight.link.commands.definitions import LAYOUTS
 from flight.link.modes import COMMANDABLE, Mode
 from tests.studies.fuzz.harness import Finding
 from tests.studies.fuzz.logs import ccitt, hostile
@@ -75,7 +77,7 @@ class Telecommands:
     def _judge(self, command: Command, data: bytes) -> Counter[str]:
         if ccitt(data) != 0:
             raise Finding("a command with a wrong CRC")
-        check(command)
+        check(LAYOUTS[name_of(command)].packet, fields_of(command))
         describe(command)
         name_of(command)
         if isinstance(command, Slew) and not -Q2_LIMIT <= command.q2 <= Q2_LIMIT:

@@ -38,8 +38,8 @@ def values_of(field: Field) -> st.SearchStrategy[object]:
 
 
 def cut(text: str, size: int) -> str:
-    """Return as many whole characters of `text` as fit in `size` bytes of UTF-8."""
-    while len(text.encode()) > size:
+    """Return as many whole characters of `text` as fit in `size` bytes of UTF-8 before a zero."""
+    while len(text.encode()) >= size:
         text = text[:-1]
     return text
 

@@ -124,10 +124,10 @@ def test_a_time_out_of_range_is_refused() -> None:
 
 def test_a_text_is_cut_between_characters_and_made_valid() -> None:
     values: dict[str, Any] = {"code": 1, "severity": 0, "suppressed": 0, "name": "é" * 20}
-    raw = Packer().pack(EVENT, 0, values, text="a" * 159 + "é\udc80")
+    raw = Packer().pack(EVENT, 0, values, text="a" * 158 + "é\udc80")
     row = decode(raw)["event"][0]
-    assert to_text(row["name"]) == "é" * 16
-    assert to_text(row["text"]) == "a" * 159
+    assert to_text(row["name"]) == "é" * 15
+    assert to_text(row["text"]) == "a" * 158
     raw = Packer().pack(EVENT, 0, values, text="lone \udc80")
     assert to_text(decode(raw)["event"][0]["text"]) == "lone ?"
 

@@ -1,0 +1,24 @@
+"""The states of fields: the numbers that stand in them, each with its name, and which of them are poor."""
+
+from __future__ import annotations
+
+from flight.link.events import Severity
+from flight.link.modes import Mode
+from flight.link.telemetry.form import Alarms, States
+
+NO_YES: States = ((0, "no"), (1, "yes"))
+MODES: States = tuple((int(mode), mode.label) for mode in Mode)
+SEVERITIES: States = tuple((int(severity), severity.name.lower()) for severity in Severity)
+STEERING: States = ((0, "off"), (1, "following"), (2, "holding"), (3, "braking"))
+"""The use of the coils (`flight.loop.control_output.SteeringState`)."""
+STREAMS: States = ((0, "not-fitted"), (1, "never"), (2, "stale"), (3, "invalid"), (4, "slow"), (5, "good"))
+"""The quality of a stream of readings (`flight.loop.fdir.streams.StreamState`)."""
+KNOWLEDGE: States = ((0, "lost"), (1, "coarse"), (2, "fine"))
+"""How well the attitude is known (`flight.bodies.orbit.view`)."""
+STAGES: States = ((1, "accepted"), (2, "refused"), (3, "started"), (4, "completed"), (5, "failed"))
+"""The stages of a command (`flight.link.process.verification.Stage`)."""
+
+SAFE_ALARM: Alarms = ((int(Mode.SAFE), "warning"),)
+SEVERITY_ALARMS: Alarms = ((int(Severity.WARNING), "warning"), (int(Severity.FAULT), "fault"))
+STREAM_ALARMS: Alarms = ((1, "fault"), (2, "fault"), (3, "fault"), (4, "warning"))
+LOST_ALARM: Alarms = ((0, "warning"),)

@@ -1,0 +1,233 @@
+"""The definition tables as XTCE (OMG, XTCE 1.2), for ground stations that we did not write.
+
+`python -m ground.xtce [--epoch UTC] > knightcube.xml`
+
+The form keeps to what the clients read: one flat space system, arrays spread out (`rate_1`), names without
+`. / : [ ]`, texts with a terminating zero, telecommand headers of fixed values in each command. A parameter
+is named `<packet>_<field>`. Yamcs counts mission time from the epoch that stands in the file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator, Mapping
+from xml.etree.ElementTree import Element, SubElement, indent, tostring
+
+from flight.link.commands.definitions import LAYOUTS as COMMANDS
+from flight.link.process.directives import LAYOUTS as DIRECTIVES
+from flight.link.process.directives import PLAY, STOP
+from flight.link.telemetry.form import Field
+from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, Layout
+
+SPACE = "KnightCube"
+TELECOMMANDS = {**COMMANDS, **{packet.name: DIRECTIVES[packet.name] for packet in (PLAY, STOP)}}
+"""The commands that a ground station may make; new keys are made by our own tool alone."""
+_XTCE = "http://www.omg.org/spec/XTCE/20180204"
+_EPOCH = "2000-01-01T00:00:00"
+_BITS_OF = {"u1": 8, "u2": 16, "u4": 32, "u8": 64, "i8": 64, "f4": 32, "f8": 64}
+_PRIMARY = (
+    ("VERSION", 3),
+    ("TYPE", 1),
+    ("SEC_HDR_FLG", 1),
+    ("PKT_APID", 11),
+    ("SEQ_FLGS", 2),
+    ("SRC_SEQ_CTR", 14),
+    ("PKT_LEN", 16),
+)
+"""The primary header in the order of its bits; clients look for these names."""
+
+
+def document(
+    telemetry: Mapping[str, Layout] = LAYOUTS,
+    commands: Mapping[str, Layout] = TELECOMMANDS,
+    epoch: str = _EPOCH,
+) -> str:
+    """Return the tables as one XTCE document; `epoch` is the UTC of mission time zero, in ISO 8601."""
+    root = Element("SpaceSystem", {"xmlns": _XTCE, "name": SPACE})
+    meta = SubElement(root, "TelemetryMetaData")
+    types, parameters = SubElement(meta, "ParameterTypeSet"), SubElement(meta, "ParameterSet")
+    containers = SubElement(meta, "ContainerSet")
+    _add_headers(types, parameters, epoch)
+    _add_primary_container(containers)
+    for layout in telemetry.values():
+        _add_packet(layout, types, parameters, containers)
+    meta = SubElement(root, "CommandMetaData")
+    arguments, listed = SubElement(meta, "ArgumentTypeSet"), SubElement(meta, "MetaCommandSet")
+    for layout in commands.values():
+        _add_command(layout, arguments, listed)
+    indent(root)
+    return '<?xml version="1.0" encoding="UTF-8"?>\n' + tostring(root, encoding="unicode") + "\n"
+
+
+def spread(layout: Layout) -> Iterator[tuple[str, Field]]:
+    """Give the name and the field of each parameter of a packet, in order, arrays spread out from 1."""
+    for field in layout.packet.fields:
+        base = f"{layout.packet.name}_{field.name}"
+        yield from ((base if field.count == 1 else f"{base}_{i + 1}", field) for i in range(field.count))
+
+
+def _add_headers(types: Element, parameters: Element, epoch: str) -> None:
+    """Add the types and parameters that all packets share."""
+    for name, bits in (*_PRIMARY, ("definition_version", 8), ("error_control", 16)):
+        _add_integer(types, f"{name}_Type", "u", bits)
+        SubElement(parameters, "Parameter", {"name": name, "parameterTypeRef": f"{name}_Type"})
+    time = SubElement(types, "AbsoluteTimeParameterType", {"name": "time_ns_Type"})
+    scale = SubElement(time, "Encoding", {"units": "seconds", "scale": "1e-9"})
+    SubElement(scale, "IntegerDataEncoding", {"sizeInBits": "64", "encoding": "twosComplement"})
+    SubElement(SubElement(time, "ReferenceTime"), "Epoch").text = epoch
+    SubElement(parameters, "Parameter", {"name": "time_ns", "parameterTypeRef": "time_ns_Type"})
+
+
+def _add_primary_container(containers: Element) -> None:
+    """Add the abstract container that holds both headers."""
+    header = SubElement(containers, "SequenceContainer", {"name": "CCSDSPacket", "abstract": "true"})
+    entries = SubElement(header, "EntryList")
+    for name in (*(name for name, _ in _PRIMARY), "definition_version", "time_ns"):
+        SubElement(entries, "ParameterRefEntry", {"parameterRef": name})
+
+
+def _add_packet(layout: Layout, types: Element, parameters: Element, containers: Element) -> None:
+    packet = layout.packet
+    container = SubElement(containers, "SequenceContainer", {"name": packet.name})
+    _describe(container, packet.meaning)
+    entries = SubElement(container, "EntryList")
+    typed: set[str] = set()
+    for name, field in spread(layout):
+        type_name = f"{packet.name}_{field.name}_Type"
+        if type_name not in typed:
+            _add_type(types, type_name, field, "Parameter")
+            typed.add(type_name)
+        parameter = SubElement(parameters, "Parameter", {"name": name, "parameterTypeRef": type_name})
+        _describe(parameter, field.meaning)
+        SubElement(entries, "ParameterRefEntry", {"parameterRef": name})
+    SubElement(entries, "ParameterRefEntry", {"parameterRef": "error_control"})
+    base = SubElement(container, "BaseContainer", {"containerRef": "CCSDSPacket"})
+    comparisons = SubElement(SubElement(base, "RestrictionCriteria"), "ComparisonList")
+    for name, value in (("TYPE", 0), ("PKT_APID", packet.apid), ("definition_version", packet.version)):
+        SubElement(comparisons, "Comparison", {"parameterRef": name, "value": str(value)})
+
+
+def _describe(element: Element, text: str) -> None:
+    if text:
+        element.set("shortDescription", text)
+
+
+def _add_type(types: Element, name: str, field: Field, role: str) -> None:
+    """Add the type of a parameter or, where `role` is "Argument", of an argument."""
+    kind = field.kind
+    if kind.startswith("S"):
+        text = SubElement(types, f"String{role}Type", {"name": name})
+        _add_text_encoding(text, int(kind[1:]))
+    elif field.states:
+        _add_enumeration(types, name, field, role)
+    elif kind.startswith("f"):
+        bits = str(_BITS_OF[kind])
+        number = SubElement(types, f"Float{role}Type", {"name": name, "sizeInBits": bits})
+        _add_unit(number, field.unit)
+        SubElement(number, "FloatDataEncoding", {"sizeInBits": bits, "encoding": "IEEE754_1985"})
+        _add_ranges(number, field, role)
+    else:
+        number = _add_integer(types, name, kind[0], _BITS_OF[kind], role, field.unit)
+        _add_ranges(number, field, role)
+
+
+def _add_text_encoding(text: Element, size: int) -> None:
+    encoding = SubElement(text, "StringDataEncoding", {"encoding": "UTF-8"})
+    in_bits = SubElement(encoding, "SizeInBits")
+    SubElement(SubElement(in_bits, "Fixed"), "FixedValue").text = str(8 * size)
+    SubElement(in_bits, "TerminationChar").text = "00"
+
+
+def _add_enumeration(types: Element, name: str, field: Field, role: str) -> None:
+    states = SubElement(types, f"Enumerated{role}Type", {"name": name})
+    bits = str(_BITS_OF[field.kind])
+    SubElement(states, "IntegerDataEncoding", {"sizeInBits": bits, "encoding": "unsigned"})
+    listed = SubElement(states, "EnumerationList")
+    for number, label in field.states:
+        SubElement(listed, "Enumeration", {"value": str(number), "label": label})
+    if field.alarms and role == "Parameter":
+        alarms = SubElement(SubElement(states, "DefaultAlarm"), "EnumerationAlarmList")
+        labels = dict(field.states)
+        for number, level in field.alarms:
+            word = {"warning": "warning", "fault": "critical"}[level]
+            SubElement(alarms, "EnumerationAlarm", {"alarmLevel": word, "enumerationLabel": labels[number]})
+
+
+def _add_integer(
+    types: Element, name: str, sign: str, bits: int, role: str = "Parameter", unit: str = "-"
+) -> Element:
+    signed = sign == "i"
+    sizes = {"sizeInBits": str(bits), "signed": str(signed).lower()}
+    number = SubElement(types, f"Integer{role}Type", {"name": name, **sizes})
+    _add_unit(number, unit)
+    coding = "twosComplement" if signed else "unsigned"
+    SubElement(number, "IntegerDataEncoding", {"sizeInBits": str(bits), "encoding": coding})
+    return number
+
+
+def _add_unit(number: Element, unit: str) -> None:
+    units = SubElement(number, "UnitSet")
+    if unit != "-":
+        SubElement(units, "Unit").text = unit
+
+
+def _add_ranges(number: Element, field: Field, role: str) -> None:
+    """Add the alarms of a parameter, or the valid range of an argument."""
+    if role == "Argument":
+        if field.valid is not None:
+            _add_range(SubElement(number, "ValidRangeSet"), "ValidRange", field.valid)
+    elif field.limits is not None:
+        ranges = SubElement(SubElement(number, "DefaultAlarm"), "StaticAlarmRanges")
+        for word, bounds in (("Warning", field.limits.warning), ("Critical", field.limits.fault)):
+            if bounds is not None:
+                _add_range(ranges, f"{word}Range", bounds)
+
+
+def _add_range(parent: Element, name: str, bounds: tuple[float, float]) -> None:
+    low, high = bounds
+    SubElement(parent, name, {"minInclusive": f"{low:g}", "maxInclusive": f"{high:g}"})
+
+
+def _add_command(layout: Layout, types: Element, listed: Element) -> None:
+    packet = layout.packet
+    command = SubElement(listed, "MetaCommand", {"name": packet.name})
+    _describe(command, packet.meaning)
+    arguments = SubElement(command, "ArgumentList")
+    container = SubElement(command, "CommandContainer", {"name": f"{packet.name}_packet"})
+    entries = SubElement(container, "EntryList")
+    header = layout.identifier << 32 | 0xC000 << 16 | layout.length - HEADER_BYTES - 1
+    _add_fixed(entries, "primary_header", f"{header:012x}")
+    _add_fixed(entries, "secondary_header", f"{packet.version:02x}" + "00" * 8)
+    typed: set[str] = set()
+    for name, field in spread(layout):
+        type_name, short = f"{packet.name}_{field.name}_Argument", name.removeprefix(f"{packet.name}_")
+        if type_name not in typed:
+            _add_type(types, type_name, field, "Argument")
+            typed.add(type_name)
+        argument = SubElement(arguments, "Argument", {"name": short, "argumentTypeRef": type_name})
+        _describe(argument, field.meaning)
+        SubElement(entries, "ArgumentRefEntry", {"argumentRef": short})
+    _add_fixed(entries, "error_control", "00" * CRC_BYTES)
+    if packet.hazard:
+        significance = {"consequenceLevel": "critical", "reasonForWarning": packet.hazard}
+        SubElement(command, "DefaultSignificance", significance)
+
+
+def _add_fixed(entries: Element, name: str, value: str) -> None:
+    """Add fixed bytes; the link that sends a command writes sequence count, time and CRC over them."""
+    size = {"sizeInBits": str(4 * len(value)), "binaryValue": value}
+    SubElement(entries, "FixedValueEntry", {"name": name, **size})
+
+
+def main() -> None:
+    """Print the document."""
+    parser = argparse.ArgumentParser(prog="python -m ground.xtce", description=__doc__)
+    parser.add_argument(
+        "--epoch", default=_EPOCH, metavar="UTC", help=f"mission time zero (default {_EPOCH})"
+    )
+    sys.stdout.write(document(epoch=parser.parse_args().epoch))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,101 @@
+"""The XTCE form is read by a client that we did not write, and holds the tables whole."""
+
+from __future__ import annotations
+
+from xml.etree.ElementTree import Element, fromstring
+
+import pytest
+
+from flight.bodies.orbit.view import LEVELS
+from flight.link.commands.definitions import COMMANDS
+from flight.link.process.directives import PLAY, STOP
+from flight.link.process.verification import Stage
+from flight.link.telemetry import states
+from flight.link.telemetry.definitions import PACKETS
+from flight.link.telemetry.form import Field, Limits, Packet
+from flight.link.telemetry.packets import LAYOUTS, Packer, compile_layouts
+from flight.loop.control_output import SteeringState
+from flight.loop.fdir.streams import StreamState
+from ground import documentation
+from ground.xtce import document, main, spread
+from tests.flight.link.telemetry.samples import plain_contents
+from tests.studies.interop.fields import compare, definition_of, shifted
+
+SPACE = {"x": "http://www.omg.org/spec/XTCE/20180204"}
+DOOR = Packet(
+    "door",
+    0x1F0,
+    "1 Hz",
+    "A packet made up",
+    (
+        Field(
+            "leaf", "u1", "-", "of each side", 2, states=((0, "shut"), (7, "ajar")), alarms=((7, "fault"),)
+        ),
+        Field("gap", "f4", "mm", "between the leaves", limits=Limits(warning=(-1.5, 2.0))),
+    ),
+)
+
+
+def found(root: Element, path: str) -> Element:
+    element = root.find(path, SPACE)
+    assert element is not None, path
+    return element
+
+
+def test_a_field_with_states_appears_everywhere_from_its_row_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    layouts = compile_layouts([DOOR])
+    raw = Packer(layouts).pack(DOOR, 5, leaf=[7, 0], gap=1.5)
+    text = document(layouts, {})
+    types = found(fromstring(text), "x:TelemetryMetaData/x:ParameterTypeSet")
+    assert found(types, ".//x:Enumeration[@value='7']").get("label") == "ajar"
+    assert found(types, ".//x:EnumerationAlarm").get("alarmLevel") == "critical"
+    assert found(types, ".//x:WarningRange").attrib == {"minInclusive": "-1.5", "maxInclusive": "2"}
+    read = definition_of(text).parse_bytes(raw)
+    assert (read["door_leaf_1"], read["door_leaf_2"], read["door_gap"]) == ("ajar", "shut", 1.5)
+    monkeypatch.setattr(documentation, "LAYOUTS", layouts)
+    assert "of each side; 0 shut, 7 ajar (fault)" in documentation.markdown()
+    field = documentation.database()["packets"][0]["fields"][0]
+    assert (field["states"], field["alarms"]) == ([[0, "shut"], [7, "ajar"]], [[7, "fault"]])
+
+
+def test_every_packet_is_read_alike_by_the_other_client_and_a_shifted_field_is_noticed() -> None:
+    packer = Packer()
+    packets = [packer.pack(packet, 77, plain_contents(packet)) for packet in PACKETS]
+    total = sum(len(list(spread(layout))) + 3 for layout in LAYOUTS.values())
+    raw = b"".join(packets)
+    assert compare(raw, document()) == {"fields": total, "different": 0, "packets": len(PACKETS), "unread": 0}
+    noticed = compare(raw, shifted(document()))
+    assert noticed["different"] + noticed["unread"] > 0
+
+
+def test_the_command_prints_the_document_with_its_epoch(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["xtce", "--epoch", "2026-11-23T12:00:00"])
+    main()
+    printed = capsys.readouterr().out
+    assert found(fromstring(printed), ".//x:Epoch").text == "2026-11-23T12:00:00"
+    assert printed == document(epoch="2026-11-23T12:00:00")
+
+
+def test_names_are_plain_and_commands_carry_ranges_and_hazards() -> None:
+    root = fromstring(document())
+    names = [element.get("name", "") for element in root.iter()]
+    assert not [name for name in names if set(name) & set("./:[] ")]
+    commands = found(root, "x:CommandMetaData/x:MetaCommandSet")
+    assert [command.get("name") for command in commands] == [
+        packet.name for packet in (*COMMANDS, PLAY, STOP)
+    ]
+    arguments = found(root, "x:CommandMetaData/x:ArgumentTypeSet")
+    assert found(arguments, ".//x:ValidRange").attrib == {"minInclusive": "-0.68", "maxInclusive": "0.68"}
+    significance = found(commands, "x:MetaCommand[@name='slew']/x:DefaultSignificance")
+    assert significance.get("reasonForWarning") == "moves the body"
+
+
+def test_the_states_of_the_table_are_those_of_the_code() -> None:
+    """What the link cannot import: states that the loop and the bodies number."""
+    assert tuple((int(state), state.name.lower()) for state in SteeringState) == states.STEERING
+    streams = tuple((int(state), state.name.lower().replace("_", "-")) for state in StreamState)
+    assert streams == states.STREAMS
+    assert tuple((int(stage), stage.name.lower()) for stage in Stage) == states.STAGES
+    assert tuple((i, level.value) for i, level in enumerate(LEVELS)) == states.KNOWLEDGE

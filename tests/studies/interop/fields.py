@@ -1,0 +1,113 @@
+"""Every field of every packet, read by `space-packet-parser` from our XTCE and by our own reader.
+
+`python -m tests.studies.interop.fields RUN...` prints how many fields of the runs' logs are equal; exit
+status 1 when one differs, when a packet is not read, or when a shifted field is not noticed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import space_packet_parser as other
+from space_packet_parser.xtce.definitions import XtcePacketDefinition
+
+from flight.link.telemetry.packets import LAYOUTS, Layout, to_text
+from flight.link.telemetry.segments import find_segments
+from ground.telemetry.scanner import scan
+from ground.xtce import document, spread
+
+_BY_APID = {layout.packet.apid: layout for layout in LAYOUTS.values()}
+
+
+def definition_of(text: str) -> XtcePacketDefinition:
+    """Return what the other client makes of an XTCE document."""
+    return XtcePacketDefinition.from_xtce(io.BytesIO(text.encode()))
+
+
+def compare(data: bytes, text: str) -> dict[str, int]:
+    """Return how many packets and fields of `data` were compared, how many differ, and how many are unread.
+
+    Of each packet also its sequence count, mission time and version are compared.
+    """
+    definition = definition_of(text)
+    rows = {name: iter(array) for name, array in scan(data).packets.items()}
+    counts = {"fields": 0, "different": 0, "packets": 0, "unread": 0}
+    for raw in other.ccsds_generator(io.BytesIO(data)):
+        layout = _BY_APID[raw.apid]
+        counts["packets"] += 1
+        try:
+            read = definition.parse_bytes(raw)
+        except Exception:  # noqa: BLE001 - whatever the other client raises, the packet was not read
+            counts["unread"] += 1
+            next(rows[layout.packet.name])
+            continue
+        wanted = _wanted(layout, next(rows[layout.packet.name]), bytes(raw))
+        counts["fields"] += len(wanted)
+        counts["different"] += sum(not _alike(read.get(name), value) for name, value in wanted.items())
+    counts["unread"] += sum(len(list(left)) for left in rows.values())
+    return counts
+
+
+def _wanted(layout: Layout, row: Any, raw: bytes) -> dict[str, Any]:
+    """Return the values of a packet by the names of the XTCE form, as our reader has them."""
+    sequence = int(layout.sequence_counts(raw)[0])
+    values: dict[str, Any] = {
+        "time_ns": int(row["time_ns"]),
+        "SRC_SEQ_CTR": sequence,
+        "definition_version": layout.packet.version,
+    }
+    flat: list[Any] = []
+    for field in layout.packet.fields:
+        value = to_text(row[field.name]) if field.kind.startswith("S") else row[field.name].tolist()
+        flat += value if field.count > 1 else [value]
+    return values | dict(zip((name for name, _ in spread(layout)), flat, strict=True))
+
+
+def _alike(read: Any, wanted: Any) -> bool:
+    """Return whether the other client's value is ours; where there are names or scales its raw value is."""
+    if read is None:
+        return False
+    value = read if isinstance(wanted, str) else read.raw_value
+    if isinstance(wanted, float) and math.isnan(wanted):
+        return math.isnan(value)
+    return bool(value == wanted)
+
+
+def shifted(text: str) -> str:
+    """Return an XTCE document in which the second field of the packet `imu` begins a byte too late."""
+    entry = '<ParameterRefEntry parameterRef="imu_device_time_ns" />'
+    pad = '<ParameterRefEntry parameterRef="definition_version" />'
+    assert entry in text
+    return text.replace(entry, pad + entry)
+
+
+def logs_of(run: Path) -> bytes:
+    """Return the bytes of all logs of a run."""
+    stems = ("flight", "truth", "performance")
+    return b"".join(path.read_bytes() for stem in stems for path in find_segments(run, stem))
+
+
+def main() -> int:
+    """Print the comparison of each run."""
+    parser = argparse.ArgumentParser(prog="python -m tests.studies.interop.fields", description=__doc__)
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN")
+    sound = True
+    for run in parser.parse_args().runs:
+        data = logs_of(run)
+        counts = compare(data, document())
+        noticed = compare(data[:200_000], shifted(document()))
+        sound &= counts["fields"] > 0 and counts["different"] == counts["unread"] == 0
+        sound &= noticed["different"] + noticed["unread"] > 0
+        line = {"run": str(run), **counts, "bytes_shifted_noticed": noticed["different"] > 0}
+        sys.stdout.write(json.dumps(line) + "\n")
+    return 0 if sound else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
