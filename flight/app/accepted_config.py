@@ -1,28 +1,47 @@
 """Chooses the configuration to fly: the accepted file or, if damaged, the last configuration that flew.
 
-`deploy/install.sh` writes the SHA-256 of an accepted configuration beside the file. A flight verifies its
-file against the sum, and a service keeps a copy of a configuration that flew, with its own sum, in its state
-folder: a flipped bit on the disk makes 1.05e-3 a 1.05e-7, which validation would not detect. A file without a
-sum is not verified.
+`deploy/install.sh` writes the SHA-256 of an accepted configuration beside the file. A flight reads its file
+once, verifies these bytes against the sum and flies them: a flipped bit on the disk makes 1.05e-3 a 1.05e-7,
+which validation would not detect. A service keeps the accepted configurations that flew in its state folder
+(`kept_configs`). A file without a sum is flown as it stands, unless an accepted configuration is kept: then
+there was a sum.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
-from contextlib import suppress
+import os
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
-from flight.loop.state.files import LinuxFiles, replace_file
+from flight.app.kept_configs import kept_configs
+from flight.loop.state.files import LARGEST_FILE, LinuxFiles
 from flight.loop.state.opening import service_folder
-from flight.schema.errors import ConfigError
-from hal.interfaces.wires import Clock, Ticker
-
-KEPT = "flown.yaml"
-GOOD_START_NS = 10_000_000_000
-"""After this flight time a configuration is kept."""
+from flight.schema import reader as configuration
+from flight.schema.document import checked_length, no_such_file
+from flight.schema.errors import ConfigError, UnreadConfigError
 
 _CURE = "was it edited? Then accept it: deploy/install.sh --accept; else put back what was there"
+_PAUSES_S = (0.05, 0.2)
+"""Between three tries to read: an error of a disk may pass."""
+
+
+@dataclass(frozen=True, slots=True)
+class Chosen:
+    """A configuration to fly.
+
+    Attributes:
+        path: the file that `text` was read from.
+        problem: why `path` is not the requested file, empty where it is.
+        accepted: whether its bytes are those of a checksum beside the requested file.
+    """
+
+    path: Path
+    text: str
+    problem: str = ""
+    accepted: bool = False
 
 
 def sum_file(path: Path) -> Path:
@@ -30,55 +49,68 @@ def sum_file(path: Path) -> Path:
     return path.parent / f"{path.name}.sha256"  # `with_name` would fail on `.`
 
 
-def accepted_config(path: Path, environment: Mapping[str, str]) -> tuple[Path, str]:
-    """Return the configuration to fly and, if another than `path`, the problem of `path`.
+def accepted_config(path: Path, environment: Mapping[str, str]) -> Chosen:
+    """Return the configuration to fly, read once.
 
-    Raises ConfigError, with the cure, when `path` is damaged and no configuration that flew is kept.
+    Raises UnreadConfigError, with the cure, when `path` is damaged and no configuration that flew is kept.
     """
-    problem = _problem(path)
-    if not problem:
-        return path, ""
     folder = service_folder(environment)
-    kept = folder / KEPT if folder is not None else None
-    if kept is None or not sum_file(kept).exists() or _problem(kept):
-        raise ConfigError(str(path), f"{problem}, and no copy of one that flew is kept; {_CURE}")
-    return kept, f"{path}: {problem}: the last one that flew is flown; {_CURE}"
+    read = _read_any if folder is None else LinuxFiles().read
+    data, problem, accepted = _verified(path, read)
+    kept = kept_configs(folder) if folder is not None and not accepted else []
+    if kept and not problem:
+        problem = f"{sum_file(path).name} is missing"
+    if data is not None and not problem:
+        return Chosen(path, _text(path, data), "", accepted)
+    for one in kept:
+        try:
+            configuration.parse(one.text, str(one.path))
+        except ConfigError:  # it flew with another version of the software
+            continue
+        return Chosen(one.path, one.text, f"{path}: {problem}: the last one that flew is flown; {_CURE}")
+    if os.path.lexists(sum_file(path)) or folder is not None:
+        problem += f", and no copy of one that flew is kept; {_CURE}"
+    raise UnreadConfigError(str(path), problem)
 
 
-class FlownConfig:
-    """Keeps the configuration of a flight that has started well."""
-
-    def __init__(self, text: str, folder: Path) -> None:
-        """Take the configuration's text as read, and the folder to keep the copy in."""
-        self._data = text.encode()
-        self._path = folder / KEPT
-        self._kept = False
-
-    def serve(self, clock: Clock) -> Ticker:
-        """Return the ticker that keeps the configuration, outside the loop, after `GOOD_START_NS`."""
-        return clock.ticker("configuration", GOOD_START_NS, self.keep)
-
-    def keep(self) -> None:
-        """Write the copy, unless the same one is kept already; a failed write is retried next time."""
-        if self._kept:
-            return
-        with suppress(OSError):
-            held = LinuxFiles().read(self._path)
-            if held != self._data or _problem(self._path) or not sum_file(self._path).exists():
-                line = f"{hashlib.sha256(self._data).hexdigest()}  {KEPT}\n"
-                # Between the two writes the sum does not match, and the copy would not be flown.
-                replace_file(LinuxFiles(), self._path, self._data)
-                replace_file(LinuxFiles(), sum_file(self._path), line.encode())
-            self._kept = True
-
-
-def _problem(path: Path) -> str:
-    """Verify a file by its sum; return the problem, empty for a valid file or a file without a sum."""
+def _verified(path: Path, read: Callable[[Path], bytes | None]) -> tuple[bytes | None, str, bool]:
+    """Return a file's bytes, the problem, empty for none, and whether a sum confirms them."""
     try:
-        expected = LinuxFiles().read(sum_file(path))
-        if expected is None:
-            return ""
-        found = hashlib.sha256(path.read_bytes()).hexdigest()
+        data = _persistently(read, path)
+        expected = _persistently(LinuxFiles().read, sum_file(path))
     except OSError as error:
-        return f"cannot be read: {error.strerror}"
-    return "" if expected.split()[:1] == [found.encode()] else "is not what was accepted (sha256)"
+        return None, f"cannot be read: {error.strerror or error}", False
+    if data is None:
+        return None, f"cannot be read: {no_such_file()}", False
+    if expected is None:
+        dangling = os.path.lexists(sum_file(path))
+        return data, f"{sum_file(path).name} leads nowhere" if dangling else "", False
+    accepted = expected.split()[:1] == [hashlib.sha256(data).hexdigest().encode()]
+    return data, "" if accepted else "is not what was accepted (sha256)", accepted
+
+
+def _persistently(read: Callable[[Path], bytes | None], path: Path) -> bytes | None:
+    """Read a file, again after an error. Raises OSError."""
+    for pause in _PAUSES_S:
+        try:
+            return read(path)
+        except OSError:
+            time.sleep(pause)
+    return read(path)
+
+
+def _read_any(path: Path) -> bytes | None:
+    """Return what any kind of file gives, a bounded number of bytes: by hand one may fly a pipe."""
+    try:
+        with path.open("rb") as file:
+            return file.read(4 * LARGEST_FILE + 1)
+    except FileNotFoundError:
+        return None
+
+
+def _text(path: Path, data: bytes) -> str:
+    """Return a configuration's text. Raises ConfigError for bytes that are none."""
+    try:
+        return checked_length(data.decode("utf-8"), path)
+    except UnicodeDecodeError as error:
+        raise ConfigError(str(path), f"cannot be read: {error}") from error

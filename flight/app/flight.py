@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from shutil import rmtree
 
-from flight.app.accepted_config import FlownConfig
+from flight.app.accepted_config import Chosen, accepted_config
 from flight.app.devices import check_settings
 from flight.app.ending_signals import EndingSignals
+from flight.app.kept_configs import FlownConfig
 from flight.app.linux import linux_rig
 from flight.app.mission_time import mission_zero, next_whole_second
 from flight.app.opening import open_flight
+from flight.app.patient_start import Patience, patiently
 from flight.app.release import Release
 from flight.app.request import RunRequest, RunResult
 from flight.app.requested_config import requested_config
@@ -19,29 +25,49 @@ from flight.app.run_folder import begin_folder
 from flight.app.simulated import injected_faults, simulated_rig
 from flight.gnc.errors import UsageError
 from flight.link import events
+from flight.link.telemetry.log import FlightLog
+from flight.loop.flight_loop import FlightLoop
 from flight.loop.progress import Progress
 from flight.loop.run_label import RunLabel
 from flight.loop.state.opening import service_folder
 from flight.schema import reader as configuration
+from flight.schema.document import read_text
 from flight.schema.sections import Config
 from hal.interfaces.rig import Rig
 
 
+@dataclass(frozen=True, slots=True)
+class _Judged:
+    """A request whose configuration, in the file that `chosen` names, was read and found right."""
+
+    request: RunRequest
+    chosen: Chosen
+    text: str
+    config: Config
+
+
+@dataclass(frozen=True, slots=True)
+class _Opened:
+    """A flight that is ready to begin."""
+
+    request: RunRequest
+    text: str
+    config: Config
+    rig: Rig
+    loop: FlightLoop
+    log: FlightLog
+
+
 def fly(request: RunRequest, progress: Callable[[Progress], None] | None = None) -> RunResult:
-    """Fly a configuration to its end. Raises UsageError for a user mistake, DeviceError for a device."""
+    """Fly a configuration to its end. Raises UsageError for a user mistake, DeviceError for a device.
+
+    On a board the start is tried until it succeeds; then StoppedError, where a signal ends the attempts.
+    """
     with EndingSignals() as signals, ExitStack() as stack:
-        text, config = requested_config(request)
-        stack.enter_context(placing(text, str(request.config_path)))
-        check_settings(config)
-        request = begin_folder(request, text, config)
-        rig = _open_rig(request, text, config, stack)
-        loop, flight_log = open_flight(config, rig, request.out, stack, patient=_is_patient(request))
+        opened = _start(request, signals, stack)
+        loop, rig, config, text = opened.loop, opened.rig, opened.config, opened.text
         if progress is not None:
             loop.watch(progress)
-        if request.config_problem:
-            loop.note(events.CONFIG_DAMAGED, request.config_problem)
-        elif rig.realtime and (folder := service_folder(os.environ)) is not None:
-            stack.callback(FlownConfig(text, folder).serve(rig.clock).stop)
         release = Release(os.environ)
         if release.note:
             loop.note(events.RELEASE_LEFT, release.note)
@@ -55,8 +81,53 @@ def fly(request: RunRequest, progress: Callable[[Progress], None] | None = None)
         if not loop.restart:
             release.end()
         ending = loop.ending()
-    faults = () if config.simulation is None else injected_faults(request, text)
-    return RunResult(request.out, reason, signals.received, flight_log.error(), ending, loop.restart, faults)
+    faults = () if config.simulation is None else injected_faults(opened.request, text)
+    folder, error = opened.request.out, opened.log.error()
+    return RunResult(folder, reason, signals.received, error, ending, loop.restart, faults)
+
+
+def _start(request: RunRequest, signals: EndingSignals, stack: ExitStack) -> _Opened:
+    """Return a flight that is ready; `stack` closes it. A board tries again until it is."""
+    judge = partial(_judge, request)
+    if not _is_patient(request):
+        return _open(judge(), stack)
+    patience = Patience(lambda: signals.received)
+    stack.callback(patience.close)
+    opened = patiently(judge, _open, stack, patience)
+    if summary := patience.summary():
+        opened.loop.note(events.START_WAITED, summary)
+    return opened
+
+
+def _judge(request: RunRequest) -> _Judged:
+    """Read the configuration once, and judge it. Raises UnreadConfigError, UsageError for a wrong one."""
+    path = request.config_path
+    chosen = accepted_config(path, os.environ) if request.accepted else Chosen(path, read_text(path))
+    request = replace(request, config_path=chosen.path)
+    text, config = requested_config(request, chosen.text)
+    with placing(text, str(chosen.path)):
+        check_settings(config)
+    return _Judged(request, chosen, text, config)
+
+
+def _open(judged: _Judged, stack: ExitStack) -> _Opened:
+    """Open a flight. An archive keeps no folder of a run that did not come so far."""
+    chosen, text, config = judged.chosen, judged.text, judged.config
+    stack.enter_context(placing(text, str(chosen.path)))
+    request, earlier = begin_folder(judged.request, text, config)
+    unflown = stack.enter_context(ExitStack())
+    if request.archive is not None:
+        unflown.callback(rmtree, request.out, ignore_errors=True)
+    rig = _open_rig(request, text, config, stack)
+    patient = _is_patient(request)
+    loop, log = open_flight(config, rig, request.out, stack, patient=patient, earlier=earlier)
+    if chosen.problem:
+        sys.stderr.write(f"flight: {chosen.problem}\n")
+        loop.note(events.CONFIG_DAMAGED, chosen.problem)
+    elif chosen.accepted and rig.realtime and (folder := service_folder(os.environ)) is not None:
+        stack.callback(FlownConfig(text, folder).serve(rig.clock).stop)
+    unflown.pop_all()
+    return _Opened(request, text, config, rig, loop, log)
 
 
 @contextmanager

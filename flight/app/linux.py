@@ -31,7 +31,7 @@ def linux_rig(config: Config, stack: ExitStack, patient: bool) -> Rig:
     Raises ConfigError; DeviceError for missing hardware, but `patient` wires are opened once they appear.
     """
     clock = SystemClock()
-    i2c = LinuxI2cBus(config.coils.bus, patient=patient)
+    i2c = LinuxI2cBus(config.coils.bus, patient=patient, exclusive=True)
     stack.callback(i2c.close)
     with suppress(DeviceError) if patient else nullcontext():
         switch_off(i2c, config.coils.address)

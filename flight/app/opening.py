@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Set
+from collections.abc import Sequence, Set
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -29,16 +29,24 @@ from hal.interfaces.rig import Rig
 
 
 def open_flight(
-    config: Config, rig: Rig, folder: Path, stack: ExitStack, *, patient: bool = False
+    config: Config,
+    rig: Rig,
+    folder: Path,
+    stack: ExitStack,
+    *,
+    patient: bool = False,
+    earlier: Sequence[Path] = (),
 ) -> tuple[FlightLoop, FlightLog]:
     """Open logs, devices and workers; return the loop, ready to run, and its log.
 
     `stack` closes everything in the opposite order, the coils at zero. Raises DeviceError for a device that
     does not answer; a `patient` flight waits in BOOT for devices and for a disk that cannot be written.
+    `earlier` are folders of earlier runs, which show an old state.
     """
     flight_log = open_log(folder, "flight", rig, config, stack, patient)
     performance_log = open_log(folder, "performance", rig, config, stack, patient)
-    keeper = open_state(config, os.environ, rig.clock, stack)
+    # Closed after the devices, with the coils at zero; opened last, so that a boot counts once it flies.
+    after_coils = stack.enter_context(ExitStack())
     guardian = start_guardian(rig, stack)
     devices = open_devices(config, rig, stack, patient)
     tracker = config.camera.star_tracker if config.camera is not None else None
@@ -54,6 +62,7 @@ def open_flight(
         supervision = supervise(guardian, rig.clock, recorder, stack)
         feed, beat = supervision.feed, supervision.beat
     channels = _open_channels(config, stack)
+    keeper = open_state(config, os.environ, rig.clock, after_coils, [*earlier, folder])
     opened = Opened(rig.clock, devices, jobs, recorder, flight_log.error, channels, feed)
     board = Board(folder) if rig.realtime else None
     loop = build_loop(config, opened, Supervisors(beat, keeper, board))

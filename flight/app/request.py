@@ -14,7 +14,7 @@ class RunRequest:
 
     `devices` is the file of a running server of simulated devices; without it, a server is started.
     `archive` holds the runs of a board: the flight's folder is the archive's next, instead of `out`.
-    `config_problem` says why `config_path` is not the requested file, empty where it is.
+    `accepted` flies `config_path` only if it is the accepted file, else the last one that flew.
     `faults` are injected in simulation, in addition to the configuration's, see `sim_hal.faults.grammar`.
     """
 
@@ -26,7 +26,7 @@ class RunRequest:
     devices: Path | None = None
     archive: Path | None = None
     faults: tuple[str, ...] = ()
-    config_problem: str = ""
+    accepted: bool = False
 
 
 @dataclass(frozen=True, slots=True)

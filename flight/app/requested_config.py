@@ -1,4 +1,4 @@
-"""The configuration of a run request: the file, with the changes that the request asks for."""
+"""The configuration of a run request: the file, read once, with the changes that the request asks for."""
 
 from __future__ import annotations
 
@@ -8,16 +8,18 @@ from flight.app.request import RunRequest
 from flight.app.simulated import corrupted_text
 from flight.gnc.errors import UsageError
 from flight.schema import reader as configuration
+from flight.schema.document import read_text
 from flight.schema.sections import Config
 
 
-def requested_config(request: RunRequest) -> tuple[str, Config]:
+def requested_config(request: RunRequest, text: str | None = None) -> tuple[str, Config]:
     """Return the configuration as text and as values, with the request's changes in the values.
 
-    Raises ConfigError for the file's mistakes, UsageError for the request's.
+    `text` is the file as it was read; without it the file is read. Raises ConfigError for the file's
+    mistakes, UsageError for the request's.
     """
-    config = configuration.load(request.config_path)
-    text = request.config_path.read_text(encoding="utf-8")
+    text = read_text(request.config_path) if text is None else text
+    config = configuration.parse(text, str(request.config_path))
     if request.faults and config.simulation is None:
         raise UsageError("--fault: this configuration flies real devices, which break by themselves")
     if request.faults:

@@ -9,12 +9,15 @@ from pathlib import Path
 from flight.app.request import RunRequest
 from flight.app.utc_label import utc_text
 from flight.gnc.errors import UsageError
-from flight.link.telemetry.archive import DISK_TROUBLE, begin_run
+from flight.link.telemetry.archive import DISK_TROUBLE, begin_run, find_runs
 from flight.link.telemetry.log import FlightLog
 from flight.link.telemetry.segments import open_segment
 from flight.schema.sections import Config
 from hal.interfaces.rig import Rig
 from hal.interfaces.wires import SECOND_NS
+
+_NEWEST = 4
+"""Runs that are asked for the number of their boot."""
 
 
 def default_folder(config_path: Path) -> Path:
@@ -22,13 +25,17 @@ def default_folder(config_path: Path) -> Path:
     return Path("runs") / f"{config_path.stem}-{utc_text()}"
 
 
-def begin_folder(request: RunRequest, text: str, config: Config) -> RunRequest:
-    """Create the run's folder, the archive's next if there is an archive; return the request with its path.
+def begin_folder(request: RunRequest, text: str, config: Config) -> tuple[RunRequest, list[Path]]:
+    """Create the run's folder, the archive's next if there is an archive.
+
+    Return the request with its path, and the folders of the archive's newest runs before.
 
     Raises UsageError for a folder that holds a run, and for a folder that cannot be written; a board with an
     archive flies on in spite of disk trouble, and its logs wait for the disk.
     """
+    earlier: list[Path] = []
     if request.archive is not None:
+        earlier = find_runs(request.archive)[-_NEWEST:]
         logs_bytes = (2 if config.simulation is None else 3) * config.telemetry.budget_bytes
         run = begin_run(request.archive, config.telemetry.archive_bytes, logs_bytes)
         request = replace(request, out=run.folder)
@@ -40,9 +47,9 @@ def begin_folder(request: RunRequest, text: str, config: Config) -> RunRequest:
         (out / "config.yaml").write_text(text, encoding="utf-8")
     except OSError as error:
         if request.archive is not None and error.errno in DISK_TROUBLE:
-            return request
+            return request, earlier
         raise UsageError(f"{out}: cannot be written: {error.strerror or error}") from error
-    return request
+    return request, earlier
 
 
 def open_log(folder: Path, stem: str, rig: Rig, config: Config, stack: ExitStack, patient: bool) -> FlightLog:

@@ -144,6 +144,10 @@ STATE_RECOVERED = EventKind(
 )
 STATE_LOST = EventKind(62, "state-lost", _WARNED, "both copies of the kept state are bad: defaults")
 STATE_UNWRITTEN = EventKind(63, "state-unwritten", _WARNED, "the state cannot be kept on disk")
+STATE_OLD = EventKind(
+    98, "state-old", _WARNED, "the kept state counts fewer boots than there were: an unclean shutdown"
+)
+START_WAITED = EventKind(99, "start-waited", _WARNED, "the start failed and was tried again, with the reason")
 CONFIG_DAMAGED = EventKind(
     67, "config-damaged", _WARNED, "the configuration is not the accepted one: the last that flew is flown"
 )

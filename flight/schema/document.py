@@ -19,7 +19,7 @@ from ruamel.yaml.events import AliasEvent
 from ruamel.yaml.nodes import MappingNode, Node, SequenceNode
 
 from flight.schema.carried import names
-from flight.schema.errors import ConfigError
+from flight.schema.errors import ConfigError, UnreadConfigError
 
 _LONGEST = 1 << 20
 
@@ -47,10 +47,21 @@ def read_text(path: Path) -> str:
         with path.open(encoding="utf-8") as file:
             text = file.read(_LONGEST + 1)  # a device may have no end
     except FileNotFoundError as error:
-        carried = ", ".join(names())
-        raise ConfigError(str(path), f"cannot be read: no such file; by name there are {carried}") from error
-    except (OSError, UnicodeDecodeError) as error:
+        raise UnreadConfigError(str(path), f"cannot be read: {no_such_file()}") from error
+    except OSError as error:
+        raise UnreadConfigError(str(path), f"cannot be read: {error}") from error
+    except UnicodeDecodeError as error:
         raise ConfigError(str(path), f"cannot be read: {error}") from error
+    return checked_length(text, path)
+
+
+def no_such_file() -> str:
+    """Return the complaint about a file that is not there, with the names that would be right."""
+    return f"no such file; by name there are {', '.join(names())}"
+
+
+def checked_length(text: str, path: Path) -> str:
+    """Return the text of a file. Raises ConfigError when it is longer than 1 MiB."""
     if len(text) > _LONGEST:
         raise ConfigError(str(path), f"is longer than {_LONGEST} characters")
     return text

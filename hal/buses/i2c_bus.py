@@ -16,6 +16,7 @@ from typing import TypeVar
 
 from smbus2 import I2cFunc, SMBus
 
+from hal.buses.exclusive import hold
 from hal.interfaces.errors import NotResponding, OutOfRange, Refused
 
 _Answer = TypeVar("_Answer")
@@ -33,6 +34,7 @@ _MEANING = {
     errno.EAGAIN: "arbitration lost",
     errno.EBUSY: "the address is held by a kernel driver",
     errno.EBADF: "the bus has been closed",
+    errno.EUSERS: "another flight drives the coils on this bus",
 }
 # After these the line is in order, and the descriptor is kept.
 _LINE_IN_ORDER = frozenset({errno.EREMOTEIO, errno.ENXIO, errno.EAGAIN, errno.EBUSY})
@@ -41,12 +43,19 @@ _LINE_IN_ORDER = frozenset({errno.EREMOTEIO, errno.ENXIO, errno.EAGAIN, errno.EB
 class LinuxI2cBus:
     """One /dev/i2c-N, safe to share between drivers and threads; reopened after the line has failed."""
 
-    def __init__(self, device: int | str, timeout_ns: int = 20_000_000, patient: bool = False) -> None:
+    def __init__(
+        self,
+        device: int | str,
+        timeout_ns: int = 20_000_000,
+        patient: bool = False,
+        exclusive: bool = False,
+    ) -> None:
         """Open bus number N, or the device file of a udev name.
 
         The time-out is rounded up to the kernel's steps of 10 ms. Raises NotResponding when there is no such
         bus, Refused without permission to open it or when it cannot do block transfers; a `patient` bus that
-        does not exist yet is opened by the first transaction that finds it.
+        does not exist yet is opened by the first transaction that finds it. An `exclusive` bus is locked
+        before its first transaction: two flights never drive one set of coils.
         """
         if timeout_ns <= 0:
             raise OutOfRange("i2c bus", "time-out", timeout_ns * 1e-9, 0.01, 1.0, "s")
@@ -54,6 +63,7 @@ class LinuxI2cBus:
         self._timeout_units = -(-timeout_ns // _TIMEOUT_UNIT_NS)
         # A transaction has at most two messages, each of which may time out.
         self._patience = 2.0 * self._timeout_units * _TIMEOUT_UNIT_NS * 1e-9
+        self._exclusive = exclusive
         self._lock = threading.Lock()
         self._bus: SMBus | None = None
         self._closed = False
@@ -66,7 +76,8 @@ class LinuxI2cBus:
         except PermissionError as error:
             raise Refused(self.name, "no permission: add the user to the group that owns it (i2c)") from error
         except OSError as error:
-            raise NotResponding(self.name, f"not a usable I2C bus: {error.strerror}") from error
+            reason = _MEANING.get(error.errno or 0, error.strerror)
+            raise NotResponding(self.name, f"not a usable I2C bus: {reason}") from error
         if self._bus.funcs & I2cFunc.SMBUS_I2C_BLOCK != I2cFunc.SMBUS_I2C_BLOCK:
             self.close()
             raise Refused(self.name, "the adapter cannot do I2C block transfers; choose another bus")
@@ -106,6 +117,8 @@ class LinuxI2cBus:
         try:
             bus.open(self.name)
             if bus.fd is not None:
+                if self._exclusive:
+                    hold(bus.fd)
                 ioctl(bus.fd, I2C_TIMEOUT, self._timeout_units)
                 ioctl(bus.fd, I2C_RETRIES, 0)
         except OSError:

@@ -40,6 +40,10 @@ class ServiceManager:
         if self.watchdog_ns:
             self._notify("WATCHDOG=1")
 
+    def extend_start(self, seconds: float) -> None:
+        """Ask for more time before the start counts as failed."""
+        self._notify(f"EXTEND_TIMEOUT_USEC={round(seconds * 1e6)}")
+
     def stopping(self) -> None:
         """Report that the process is stopping."""
         self._notify("STOPPING=1")

@@ -20,6 +20,7 @@ import numpy as np
 
 from flight.gnc.errors import UsageError
 from hal.buses.clock import SystemClock
+from hal.buses.exclusive import hold
 from hal.buses.serial_port import PySerialPort
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.readings import Frame
@@ -129,13 +130,19 @@ def running(facts_path: Path) -> Iterator[Served]:
 
     `facts_path` is the file that `python -m sim_hal serve CONFIG --facts FILE` wrote.
     """
-    try:
-        facts = json.loads(facts_path.read_text(encoding="utf-8"))
-        facts = {name: facts[name] for name in _FACTS}
-    except (OSError, ValueError, LookupError, TypeError) as error:
-        raise UsageError(f"{facts_path} names no server: give what `sim_hal serve --facts` wrote") from error
-    with _connected(facts) as devices:
-        yield devices
+    with ExitStack() as stack:
+        try:
+            file = stack.enter_context(facts_path.open(encoding="utf-8"))
+            facts = json.load(file)
+            facts = {name: facts[name] for name in _FACTS}
+        except (OSError, ValueError, LookupError, TypeError) as error:
+            problem = f"{facts_path} names no server: give what `sim_hal serve --facts` wrote"
+            raise UsageError(problem) from error
+        try:
+            hold(file.fileno())
+        except OSError as error:
+            raise NotResponding(str(facts_path), error.strerror or "is locked") from error
+        yield stack.enter_context(_connected(facts))
 
 
 @contextmanager

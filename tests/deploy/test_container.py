@@ -56,8 +56,8 @@ def test_a_command_over_its_socket_is_answered(seen: dict[str, Any]) -> None:
     assert seen["commanded"].startswith("obeyed: "), seen["commanded"]
 
 
-def test_a_configuration_with_a_flipped_bit_is_not_flown(seen: dict[str, Any]) -> None:
-    assert seen["damaged"] == {"driven": False, "status": "2", "restarted": False}
+def test_a_configuration_with_a_flipped_bit_is_not_flown_but_waited_for(seen: dict[str, Any]) -> None:
+    assert seen["damaged"] == {"driven": False, "state": "activating", "restarted": False}
 
 
 def test_devices_that_were_not_named_are_closed_to_it(seen: dict[str, Any]) -> None:

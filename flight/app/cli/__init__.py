@@ -67,7 +67,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _obey(words: Sequence[str]) -> int:
     try:
-        options = _parser(words).parse_args(words)
+        try:
+            parser = _parser(words)
+        except OSError as error:  # a module that cannot be read is no mistake of the user's
+            raise FlightError(str(error)) from error
+        options = parser.parse_args(words)
         status: int = options.command(options)
     finally:
         sys.stdout.flush()

@@ -55,10 +55,11 @@ def check(options: argparse.Namespace) -> int:
     from flight.app.flight import placing  # noqa: PLC0415
     from flight.app.probing import probe  # noqa: PLC0415
 
-    path, damaged = accepted_config(options.config, os.environ)
-    config = configuration.load(path)
-    verdict = Verdict(config, path, [damaged] if damaged else [])
-    with placing(path.read_text(encoding="utf-8"), str(path)):
+    chosen = accepted_config(options.config, os.environ)
+    path = chosen.path
+    config = configuration.parse(chosen.text, str(path))
+    verdict = Verdict(config, path, [chosen.problem] if chosen.problem else [])
+    with placing(chosen.text, str(path)):
         body_kind(config)
         check_settings(config)
         if config.simulation is None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 import time
 from collections.abc import Callable
@@ -14,6 +13,7 @@ from typing import TextIO
 
 from flight.app.cli.summary import summary_facts, summary_text
 from flight.app.request import RunRequest
+from flight.gnc.errors import FlightError
 from flight.loop.progress import Progress
 from flight.schema.carried import config_path, names
 
@@ -70,29 +70,33 @@ def _faults_help() -> str:
 
 def run(options: argparse.Namespace) -> int:
     """Fly, showing progress on standard error; print the summary."""
-    from flight.app.accepted_config import accepted_config  # noqa: PLC0415
     from flight.app.flight import fly  # noqa: PLC0415 - no other command needs devices
+    from flight.app.patient_start import StoppedError  # noqa: PLC0415
     from flight.app.run_folder import default_folder  # noqa: PLC0415
 
-    config, problem = accepted_config(options.config, os.environ)
-    if problem:
-        sys.stderr.write(f"flight: {problem}\n")
-    out = options.out or default_folder(options.config)
     request = RunRequest(
-        config,
-        out,
+        options.config,
+        options.out or default_folder(options.config),
         options.realtime,
         options.duration,
         options.seed,
         options.devices,
         options.archive,
         tuple(options.fault),
-        problem,
+        accepted=True,
     )
     begun = time.perf_counter()
     # A service writes no lines into the journal for days: its log has all of it.
     progress = None if options.archive and not sys.stderr.isatty() else progress_on(sys.stderr)
-    result = fly(request, progress)
+    try:
+        result = fly(request, progress)
+    except StoppedError as error:  # by whoever started the service
+        sys.stderr.write(f"flight: {error}\n")
+        return 0
+    except OSError as error:
+        if options.archive is None:
+            raise
+        raise FlightError(str(error)) from error  # no mistake of a user's: the service is started again
     if sys.stderr.isatty():
         sys.stderr.write("\r\x1b[K")
     elapsed = time.perf_counter() - begun

@@ -7,9 +7,11 @@ reported.
 
 from __future__ import annotations
 
+import errno
 import threading
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 from flight.gnc.errors import UsageError
@@ -152,6 +154,7 @@ class FlightLog:
             if self._closed or (self._failure and now_ns < self._retry_ns):
                 return
             self._busy_since_ns = now_ns
+            self._look()
             self._write_queue()
             now_ns = self._clock.now_ns()
             due = self._sync_period_ns is not None and now_ns - self._synced_ns >= self._sync_period_ns
@@ -163,9 +166,21 @@ class FlightLog:
                     self._fail(error)
             self._busy_since_ns = None
 
+    def _look(self) -> None:
+        """Report files that were removed from outside, and go on in a new folder at the next try."""
+        store = self._store
+        with suppress(OSError):
+            if store is not None and store.removed():
+                self._store = None
+                self._unwritten += store.packets
+                self._fail(FileNotFoundError(errno.ENOENT, "the run's files were removed"))
+                store.close()
+
     def _write_queue(self) -> None:
         """Write the packets queued now; those that the disk does not take wait on."""
         if self._store is None:
+            if self._failure and self._clock.now_ns() < self._retry_ns and not self._closed:
+                return
             try:
                 self._store = self._begin()
             except OSError as error:

@@ -112,6 +112,14 @@ class SegmentStore:
             size += len(packet)
         self._write(chunk)
 
+    def removed(self) -> bool:
+        """Return whether the segment was removed from outside. Raises OSError."""
+        try:
+            os.stat(self._path)
+        except FileNotFoundError:
+            return True
+        return False
+
     def sync(self) -> None:
         """Make durable what was written. Raises OSError."""
         os.fsync(self._file.fileno())

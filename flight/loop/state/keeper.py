@@ -11,6 +11,8 @@ from collections import deque
 from collections.abc import Mapping
 from datetime import UTC, datetime
 
+import msgspec
+
 from flight.link import events
 from flight.link.events import EventKind
 from flight.loop.state import history
@@ -44,6 +46,7 @@ class StateKeeper:
     Attributes:
         record: the history of earlier boots.
         learned: what earlier boots learned, by name.
+        counted: whether this boot is on disk.
     """
 
     def __init__(
@@ -55,17 +58,22 @@ class StateKeeper:
         window: float,
         devices: str = "",
         period_ns: int,
+        boots: int = 0,
     ) -> None:
         """Load the state, count this boot and store it as running.
 
         `window` is the operating time, s, in which unclean shutdowns count as recent; `devices` is the digest
-        of the devices flown: parameters learned of others are discarded.
+        of the devices flown: parameters learned of others are discarded. A state of fewer `boots` than known
+        from elsewhere is old or lost, and the last boot counts as unclean.
         """
         self._store = store
         self._notices = notices
         self._clock = clock
         self._begun_ns = clock.now_ns()
         loaded = store.load()
+        if boots > loaded.boot_count:
+            notices.report(events.STATE_OLD, f"of boot {loaded.boot_count}, but boot {boots} was noted")
+            loaded = msgspec.structs.replace(loaded, boot_count=boots, running=True)
         self._begun = history.begin(loaded, self._label(), devices)
         if loaded.learned and not self._begun.learned:
             text = f"learned of the devices {loaded.devices or 'of an older version'}, these are {devices}"
@@ -79,7 +87,7 @@ class StateKeeper:
             last = self._begun.unclean[-1]
             text = f"boot {last.boot}, last heard of {last.utc}: {self.record.unclean_recent} of late"
             notices.report(events.UNCLEAN_SHUTDOWN, text)
-        store.store(self._begun)
+        self.counted = store.store(self._begun)
         self._ticker = clock.ticker("state", period_ns, self._write)
 
     def note(self, mode: str, learned: Mapping[str, Learned] | None = None) -> None:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
 from flight.loop.state.keeper import Notices, StateKeeper
 from flight.loop.state.learning import digest_of
 from flight.loop.state.store import StateStore
+from flight.loop.state.witness import newest_boot, note_boot
 from flight.schema.sections import Config
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.wires import Clock
@@ -31,10 +32,15 @@ def service_folder(environment: Mapping[str, str]) -> Path | None:
 
 
 def open_state(
-    config: Config, environment: Mapping[str, str], clock: Clock, stack: ExitStack
+    config: Config,
+    environment: Mapping[str, str],
+    clock: Clock,
+    stack: ExitStack,
+    runs: Sequence[Path] = (),
 ) -> StateKeeper | None:
     """Count this boot; return None where no state is stored.
 
+    `runs` are the folders of the newest runs, this one the last: the boot's number is noted in them.
     `stack` closes the state: cleanly, unless an exception passes. A DeviceError counts as clean: the device
     is reported, and safe mode would not help.
     """
@@ -51,7 +57,10 @@ def open_state(
         window=config.modes.crash_window,
         devices=digest_of(config),
         period_ns=round(config.state.period * 1e9),
+        boots=newest_boot([folder, *runs]),
     )
+    if keeper.counted:
+        note_boot([folder, *runs[-1:]], keeper.record.boot_count)
 
     def close(kind: type[BaseException] | None, *_: object) -> bool:
         keeper.close(clean=kind is None or issubclass(kind, DeviceError))

@@ -18,10 +18,9 @@ from msgspec import Meta
 from flight.link import events
 from flight.link.events import EventKind
 from flight.loop.state.content import StoredState, check
-from flight.loop.state.files import Files, LinuxFiles, replace_file
+from flight.loop.state.files import LARGEST_FILE, Files, LinuxFiles, replace_file
 
 COPIES = ("state-a.json", "state-b.json")
-LARGEST_FILE = 1 << 20
 
 Report = Callable[[EventKind, str], None]
 """Reports an event: kind and text."""
@@ -51,6 +50,7 @@ class StateStore:
         self._report = report
         self._files = files or LinuxFiles()
         self._generation = 0
+        self._order: tuple[str, ...] = COPIES
 
     def load(self) -> StoredState:
         """Return the newest valid copy; defaults when there is none. Never raises.
@@ -59,9 +59,12 @@ class StateStore:
         """
         read = [self._read(name) for name in COPIES]
         whole = [r for r in read if r.copy is not None]
-        # A missing copy is no problem: the very first write may have been interrupted.
-        bad = "; ".join(f"{r.name}: {r.problem}" for r in read if r.problem)
         newest = max(whole, key=lambda r: r.copy.generation if r.copy else 0, default=None)
+        # A missing copy is written first: only an interrupted first write leaves one copy alone.
+        self._order = tuple(r.name for r in sorted(read, key=lambda r: r.copy is not None or bool(r.problem)))
+        first = newest is None or newest.copy is None or newest.copy.generation == 1
+        problems = ((r.name, r.problem or ("is gone" if r.copy is None and not first else "")) for r in read)
+        bad = "; ".join(f"{name}: {problem}" for name, problem in problems if problem)
         if newest is None or newest.copy is None:
             if not bad:
                 return StoredState()
@@ -76,7 +79,7 @@ class StateStore:
         """Write both copies; return whether at least one is durable. Raises ValueError if invalid."""
         data = encode(self._generation + 1, state)
         failures = []
-        for name in COPIES:
+        for name in self._order:
             try:
                 replace_file(self._files, self._folder / name, data)
             except OSError as error:

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import hashlib
+import shutil
 from pathlib import Path
 
 import pytest
 
-from flight.app.accepted_config import GOOD_START_NS, KEPT, FlownConfig, accepted_config, sum_file
+from flight.app.accepted_config import Chosen, accepted_config, sum_file
 from flight.app.cli import main
 from flight.app.flight import fly
+from flight.app.kept_configs import FOLDER, GOOD_START_NS, FlownConfig, kept_configs
 from flight.app.request import RunRequest
 from flight.link.telemetry.packets import to_text
 from flight.schema import reader as configuration
-from flight.schema.errors import ConfigError
+from flight.schema.errors import ConfigError, UnreadConfigError
 from flight.schema.testbed import as_testbed
 from ground.telemetry.reader import read_run
 from sim_hal.faults.host import corrupted
+from tests.hal.guardian.live_flight import write_config
 from tests.manual_clock import ManualClock
 from tests.scenario.flights import CONFIG
 
@@ -47,12 +50,16 @@ def service(tmp_path: Path) -> dict[str, str]:
     return {"STATE_DIRECTORY": str(folder)}
 
 
+def texts_kept(folder: Path) -> list[str]:
+    return [kept.text for kept in kept_configs(folder)]
+
+
 def test_no_single_bit_that_flips_is_flown(accepted: Path, service: dict[str, str]) -> None:
-    for seed in range(300):
+    for seed in range(40):
         accepted.write_text(corrupted(TEXT, 1, seed), encoding="utf-8")
-        path, problem = accepted_config(accepted, service)
-        assert path.read_text(encoding="utf-8") == TEXT
-        assert "is not what was accepted" in problem
+        chosen = accepted_config(accepted, service)
+        assert chosen.text == TEXT
+        assert "is not what was accepted" in chosen.problem
 
 
 def test_a_flip_that_reads_as_another_body_is_found_by_the_checksum_alone(
@@ -62,18 +69,56 @@ def test_a_flip_that_reads_as_another_body_is_found_by_the_checksum_alone(
     assert ord("3") ^ ord("7") == 4
     accepted.write_text(TEXT.replace("1.05e-3", "1.05e-7", 1), encoding="utf-8")
     assert as_testbed(configuration.load(accepted)).plant.inertia == 1.05e-7
-    assert as_testbed(configuration.load(accepted_config(accepted, service)[0])).plant.inertia == 1.05e-3
+    flown = configuration.parse(accepted_config(accepted, service).text)
+    assert as_testbed(flown).plant.inertia == 1.05e-3
 
 
 def test_what_was_accepted_is_flown(accepted: Path, service: dict[str, str]) -> None:
-    assert accepted_config(accepted, service) == (accepted, "")
-    assert accepted_config(accepted, {}) == (accepted, "")
+    assert accepted_config(accepted, service) == Chosen(accepted, TEXT, "", True)
+    assert accepted_config(accepted, {}) == Chosen(accepted, TEXT, "", True)
 
 
-def test_without_a_checksum_a_file_is_taken_as_it_stands(tmp_path: Path, service: dict[str, str]) -> None:
+def test_without_a_checksum_a_file_is_taken_as_it_stands_unless_an_accepted_one_flew(
+    tmp_path: Path, service: dict[str, str]
+) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text("name: whatever", encoding="utf-8")
-    assert accepted_config(path, service) == (path, "")
+    assert accepted_config(path, {"STATE_DIRECTORY": str(tmp_path / "new")}) == Chosen(path, "name: whatever")
+    chosen = accepted_config(path, service)
+    assert chosen.text == TEXT
+    assert "mine.yaml.sha256 is missing" in chosen.problem
+
+
+@pytest.mark.parametrize("odd", ["dangling", "folder", "empty", "short", "text"])
+def test_an_odd_checksum_is_damage(accepted: Path, service: dict[str, str], odd: str) -> None:
+    beside = sum_file(accepted)
+    line = beside.read_text(encoding="ascii")
+    beside.unlink()
+    if odd == "dangling":
+        beside.symlink_to("nowhere")
+    elif odd == "folder":
+        beside.mkdir()
+    else:
+        beside.write_text({"empty": "", "short": line[:40], "text": "x" * 64}[odd], encoding="ascii")
+    assert accepted_config(accepted, service).path.parent.name == FOLDER
+    with pytest.raises(UnreadConfigError, match="no copy of one that flew"):
+        accepted_config(accepted, {})
+
+
+def test_one_error_of_the_disk_is_not_yet_damage(
+    accepted: Path, service: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from flight.loop.state.files import LinuxFiles  # noqa: PLC0415
+
+    read, calls = LinuxFiles.read, iter(range(100))
+
+    def failing(files: LinuxFiles, path: Path) -> bytes | None:
+        if next(calls) in (0, 2):
+            raise OSError(5, "Input/output error")
+        return read(files, path)
+
+    monkeypatch.setattr(LinuxFiles, "read", failing)
+    assert accepted_config(accepted, service) == Chosen(accepted, TEXT, "", True)
 
 
 def test_without_a_copy_that_flew_it_is_refused_with_the_cure(
@@ -89,44 +134,75 @@ def test_without_a_copy_that_flew_it_is_refused_with_the_cure(
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("damage", [KEPT, f"{KEPT}.sha256"])
-def test_a_copy_that_is_damaged_too_is_not_flown(
-    accepted: Path, service: dict[str, str], damage: str
-) -> None:
-    accepted.write_text(TEXT + "\n", encoding="utf-8")
-    path = Path(service["STATE_DIRECTORY"]) / damage
-    for content in (path.read_text(encoding="utf-8").replace("0", "1"), "", None):
-        if content is None:
-            path.unlink()
-        else:
-            path.write_text(content, encoding="utf-8")
-        with pytest.raises(ConfigError, match="no copy"):
-            accepted_config(accepted, service)
-
-
-def test_a_file_that_is_gone_is_replaced_by_the_one_that_flew(
+def test_configuration_and_sum_that_are_gone_or_damaged_are_replaced_by_the_newest_whole_one_that_flew(
     accepted: Path, service: dict[str, str]
 ) -> None:
+    folder = Path(service["STATE_DIRECTORY"])
+    for text in (TEXT + "# 2\n", TEXT + "# 3\n", TEXT + "# 4\n", TEXT + "# 5\n"):
+        FlownConfig(text, folder).keep()
+    assert texts_kept(folder) == [TEXT + "# 5\n", TEXT + "# 4\n", TEXT + "# 3\n"]
     accepted.unlink()
-    path, problem = accepted_config(accepted, service)
-    assert path.name == KEPT
-    assert "No such file" in problem
+    sum_file(accepted).unlink()
+    for number, wanted in enumerate(("# 5\n", "# 4\n", "# 3\n")):
+        chosen = accepted_config(accepted, service)
+        assert chosen.text == TEXT + wanted
+        assert "no such file" in chosen.problem
+        if number:
+            chosen.path.write_text(chosen.text[:-3], encoding="utf-8")
+        else:
+            chosen.path.unlink()
+            (chosen.path.parent / chosen.path.name.replace("5-", "9-")).write_bytes(b"name: other")
+    with pytest.raises(UnreadConfigError, match="no copy"):
+        accepted_config(accepted, service)
+
+
+def test_a_kept_one_that_this_version_does_not_fly_is_passed_over(
+    accepted: Path, service: dict[str, str]
+) -> None:
+    FlownConfig("name: of another version\n", Path(service["STATE_DIRECTORY"])).keep()
+    accepted.unlink()
+    assert accepted_config(accepted, service).text == TEXT
 
 
 def test_a_configuration_is_kept_after_a_good_start_and_mended_where_it_was_damaged(tmp_path: Path) -> None:
     clock = ManualClock()
-    kept = tmp_path / KEPT
     FlownConfig(TEXT, tmp_path).serve(clock)
     clock.sleep_until_ns(clock.now_ns() + GOOD_START_NS - 1)
-    assert not kept.exists()
+    assert not (tmp_path / FOLDER).exists()
     clock.sleep_until_ns(clock.now_ns() + 2)
-    assert kept.read_text(encoding="utf-8") == TEXT
-    kept.write_text("torn", encoding="utf-8")
+    assert texts_kept(tmp_path) == [TEXT]
+    (kept,) = kept_configs(tmp_path)
+    kept.path.write_text("torn", encoding="utf-8")
     FlownConfig(TEXT, tmp_path).keep()
-    assert kept.read_text(encoding="utf-8") == TEXT
-    before = kept.stat().st_ino
+    (mended,) = kept_configs(tmp_path)
+    assert mended.text == TEXT
+    assert [path.name for path in (tmp_path / FOLDER).iterdir()] == [mended.path.name]
+    before = mended.path.stat().st_ino
     FlownConfig(TEXT, tmp_path).keep()
-    assert kept.stat().st_ino == before, "not written again where it is whole"
+    assert mended.path.stat().st_ino == before, "not written again where it is whole"
+    FlownConfig(TEXT + "#", tmp_path).keep()
+    FlownConfig(TEXT, tmp_path).keep()
+    assert texts_kept(tmp_path) == [TEXT, TEXT + "#"], "what flies again is the newest again"
+
+
+def test_a_crash_anywhere_while_one_is_kept_leaves_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The calls that change the disk fail one after the other, as if the process ended there."""
+    FlownConfig(TEXT, tmp_path).keep()
+    for name in ("open", "write", "fsync", "rename", "unlink"):
+        folder = tmp_path.parent / f"{tmp_path.name}-{name}"
+        shutil.copytree(tmp_path, folder)
+
+        def crash(*_: object, **__: object) -> int:
+            raise OSError(5, "crash")
+
+        with monkeypatch.context() as patch:
+            patch.setattr(f"flight.loop.state.files.os.{name}", crash)
+            FlownConfig(TEXT + "#", folder).keep()
+        assert TEXT in texts_kept(folder)
+        FlownConfig(TEXT + "#", folder).keep()
+        assert texts_kept(folder) == [TEXT + "#", TEXT]
 
 
 def test_a_disk_that_fails_is_tried_again(tmp_path: Path) -> None:
@@ -135,33 +211,19 @@ def test_a_disk_that_fails_is_tried_again(tmp_path: Path) -> None:
     flown.keep()
     folder.mkdir()
     flown.keep()
-    assert accepted_config(folder / KEPT, {}) == (folder / KEPT, "")
+    assert texts_kept(folder) == [TEXT]
 
 
-def test_the_flight_of_a_kept_configuration_records_it_as_an_event(tmp_path: Path) -> None:
-    request = RunRequest(CONFIG, tmp_path / "run", duration=2.0, config_problem="a bit has flipped")
+def test_a_flight_of_a_kept_configuration_says_so_and_records_it_as_an_event(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config, state = write_config(tmp_path), tmp_path / "state"
+    state.mkdir()
+    FlownConfig(config.read_text(encoding="utf-8"), state).keep()
+    config.unlink()
+    monkeypatch.setenv("STATE_DIRECTORY", str(state))
+    request = RunRequest(config, tmp_path / "run", duration=1.0, accepted=True)
     fly(request)
     events = {to_text(row["name"]): to_text(row["text"]) for row in read_run(request.out)["event"]}
-    assert events["config-damaged"] == "a bit has flipped"
-
-
-def test_the_command_line_flies_the_kept_one_and_says_so(
-    accepted: Path, service: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    requests: list[RunRequest] = []
-
-    class Flown(Exception):
-        """The flight would begin."""
-
-    def take(request: RunRequest, _: object) -> None:
-        requests.append(request)
-        raise Flown
-
-    monkeypatch.setattr("flight.app.flight.fly", take)
-    monkeypatch.setenv("STATE_DIRECTORY", service["STATE_DIRECTORY"])
-    accepted.write_text(TEXT + "\n", encoding="utf-8")
-    with pytest.raises(Flown):
-        main(["run", str(accepted), "--out", str(tmp_path / "run")])
-    assert requests[0].config_path == Path(service["STATE_DIRECTORY"]) / KEPT
-    assert "the last one that flew" in requests[0].config_problem
-    assert accepted_config(requests[0].config_path, {}) == (requests[0].config_path, "")
+    assert "no such file" in events["config-damaged"]
+    assert "the last one that flew is flown" in capsys.readouterr().err

@@ -124,6 +124,22 @@ def test_a_patient_bus_is_opened_when_it_comes(kernel: IoctlWire, tmp_path: Path
     bus.close()
 
 
+def test_an_exclusive_bus_is_of_one_flight_and_the_lock_comes_before_anything_else(
+    kernel: IoctlWire, tmp_path: Path
+) -> None:
+    """The guardian's and a check's openings are not exclusive: they are never kept out."""
+    node = tmp_path / "i2c"
+    node.touch()
+    first = LinuxI2cBus(str(node), exclusive=True)
+    settings = len(kernel.settings)
+    with pytest.raises(NotResponding, match="another flight drives the coils"):
+        LinuxI2cBus(str(node), exclusive=True)
+    assert len(kernel.settings) == settings
+    LinuxI2cBus(str(node)).close()
+    first.close()
+    LinuxI2cBus(str(node), exclusive=True).close()
+
+
 def test_a_missing_bus_says_which_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hal.buses.i2c_bus.adapters", lambda: [(1, "Synopsys DesignWare I2C adapter")])
     with pytest.raises(NotResponding, match=r"/dev/i2c-97: .*i2c-1 \(Synopsys.*udev rule"):

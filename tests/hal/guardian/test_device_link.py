@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 from flight.app.flight import fly
 from flight.app.request import RunRequest
 from flight.gnc.errors import UsageError
+from hal.buses.exclusive import hold
 from hal.interfaces.errors import NotResponding
 from sim_hal.serving.device_link import Inbox, RemoteI2cBus, open_bus, pack
 from tests.scenario.flights import CONFIG
@@ -117,5 +118,10 @@ def test_a_server_that_has_gone_is_said_so(tmp_path: Path) -> None:
     unit = {"serial": "/dev/ptmx", "baud_rate": 115200, "camera": False}
     gone = {**unit, "socket": str(tmp_path / "gone"), "gps": None, "gps_baud_rate": 0, "wide": []}
     path.write_text(json.dumps(gone), encoding="utf-8")
-    with pytest.raises(NotResponding):
-        fly(RunRequest(CONFIG, tmp_path / "run", realtime=True, devices=path))
+    request = RunRequest(CONFIG, tmp_path / "run", realtime=True, devices=path)
+    with path.open(encoding="utf-8") as held:
+        hold(held.fileno())
+        with pytest.raises(NotResponding, match="another flight drives the coils"):
+            fly(request)
+    with pytest.raises(NotResponding, match=r"ptmx|server"):
+        fly(request)

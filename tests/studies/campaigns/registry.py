@@ -27,6 +27,7 @@ from tests.studies.campaigns.rolling_shutter import ROLLING_SHUTTER
 from tests.studies.campaigns.rso import RSO_SLEW, RSO_TRACK
 from tests.studies.campaigns.rso_orbits import RSO_ORBITS
 from tests.studies.campaigns.soak import SOAK
+from tests.studies.campaigns.start import START
 from tests.studies.campaigns.step_robust import STEP_ROBUST
 from tests.studies.campaigns.streaks import STREAKS, STREAKS_THESIS
 from tests.studies.campaigns.worlds import WORLD_COMPARISON
@@ -58,6 +59,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         PROCESS_KILL,
         COIL_FAULTS,
         SOAK,
+        START,
         COVERAGE,
         ORBIT_ATTITUDE,
         DETUMBLE,

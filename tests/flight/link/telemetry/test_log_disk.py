@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 import threading
 import time
 from pathlib import Path
@@ -230,3 +231,25 @@ def test_a_patient_log_begins_without_its_disk_and_writes_all_when_it_comes(tmp_
     assert (log.error(), log.lost) == ("", 0)
     log.close()
     assert content(tmp_path) == b"".join(packets)
+
+
+def test_a_folder_that_is_removed_in_flight_is_reported_at_once_and_made_again(tmp_path: Path) -> None:
+    clock, folder = ManualClock(0), tmp_path / "run"
+    packets = timing_packets(30)
+    log = FlightLog(folder, clock=clock)
+    for packet in packets[:10]:
+        log.write(packet)
+    clock.advance(SECOND)
+    shutil.rmtree(folder)
+    for packet in packets[10:20]:
+        log.write(packet)
+    clock.advance(SECOND // 4)
+    reported = "log flight: writing stopped: the run's files were removed; 10 packets lost, 10 waiting"
+    assert log.error() == reported
+    clock.advance(2 * SECOND)
+    assert log.error() == ""
+    for packet in packets[20:]:
+        log.write(packet)
+    log.close()
+    assert content(folder) == b"".join(packets[10:])
+    assert log.lost == 10

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from flight.app.request import RunRequest
 from flight.link.telemetry.packets import to_text
 from flight.loop.state.content import StoredState
 from flight.loop.state.opening import open_state, state_folder
-from flight.loop.state.store import StateStore
+from flight.loop.state.store import COPIES, StateStore
 from flight.schema import reader as configuration
 from flight.schema.sections import Config
 from ground.telemetry.reader import read_run
@@ -90,6 +91,38 @@ def test_a_folder_that_cannot_be_made_is_no_reason_not_to_fly(tmp_path: Path) ->
         assert keeper is not None
         events = [kind.name for kind, _ in keeper.notices()]
         assert events == ["state-lost", "unclean-shutdown", "state-unwritten"]
+
+
+def begun(folder: Path, runs: list[Path]) -> tuple[StoredState, list[str]]:
+    """Return the state after a boot that ended cleanly, and the names of its events."""
+    with ExitStack() as stack:
+        keeper = open_state(simulated(folder), {}, ManualClock(), stack, runs)
+        assert keeper is not None
+        names = [kind.name for kind, _ in keeper.notices()]
+    return stored(folder), names
+
+
+@pytest.mark.parametrize("vanished", ["copies", "folder", "newest"])
+def test_a_state_that_vanished_or_is_older_than_a_run_counts_as_an_unclean_stop(
+    tmp_path: Path, vanished: str
+) -> None:
+    folder, runs = tmp_path / "state", [tmp_path / f"run-{number}" for number in range(4)]
+    for number, run in enumerate(runs[:3]):
+        run.mkdir()
+        assert begun(folder, runs[: number + 1])[1] == []
+        if number == 0:
+            shutil.copytree(folder, tmp_path / "old")
+    if vanished == "copies":
+        for copy in COPIES:
+            (folder / copy).unlink()
+    else:
+        shutil.rmtree(folder)
+    if vanished == "newest":
+        shutil.copytree(tmp_path / "old", folder)
+    state, names = begun(folder, runs)
+    assert names == ["state-old", "unclean-shutdown"]
+    assert (state.boot_count, [shutdown.boot for shutdown in state.unclean]) == (4, [3])
+    assert begun(folder, runs)[1] == []
 
 
 def test_a_service_flies_run_after_run_into_its_archive_and_shows_a_crash_before(tmp_path: Path) -> None:

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import errno
 import json
+import os
+import socket
 import subprocess
 import sys
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -159,15 +162,43 @@ def test_the_newer_copy_wins_and_its_loss_falls_back_to_the_older(tmp_path: Path
     assert StateStore(tmp_path, Reports()).load() == state_of(9)
 
 
-def test_a_copy_that_is_not_there_is_no_damage(tmp_path: Path) -> None:
-    """First writes that are interrupted repeatedly leave the first copy alone."""
-    (tmp_path / COPIES[0]).write_bytes(encode(3, state_of(3)))
-    reports = Reports()
-    assert StateStore(tmp_path, reports).load() == state_of(3)
-    assert not reports.kinds
+def test_a_copy_that_is_not_there_is_damage_unless_the_first_write_was_interrupted(tmp_path: Path) -> None:
+    for generation, reported in ((1, []), (3, [events.STATE_RECOVERED])):
+        (tmp_path / COPIES[0]).write_bytes(encode(generation, state_of(3)))
+        reports = Reports()
+        assert StateStore(tmp_path, reports).load() == state_of(3)
+        assert reports.kinds == reported
+    assert "state-b.json: is gone" in reports.texts[0]
     (tmp_path / COPIES[0]).write_bytes(b"torn")
     assert StateStore(tmp_path, reports).load() == StoredState(running=True)
-    assert reports.kinds == [events.STATE_LOST]
+    assert reports.kinds[-1] == events.STATE_LOST
+
+
+def _sparse(path: Path) -> None:
+    with path.open("wb") as file:
+        file.truncate(900 << 30)
+
+
+def _socket(path: Path) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as bound:
+        bound.bind(str(path))
+
+
+@pytest.mark.parametrize("place", [os.mkfifo, _socket, _sparse])
+def test_what_is_no_file_or_too_large_is_damage_that_the_next_write_mends(
+    tmp_path: Path, place: Callable[[Path], None]
+) -> None:
+    StateStore(tmp_path, Reports()).store(state_of(1))
+    (tmp_path / COPIES[0]).unlink()
+    for name in (COPIES[0], "state-b.tmp"):
+        place(tmp_path / name)
+    reports = Reports()
+    store = StateStore(tmp_path, reports)
+    assert store.load() == state_of(1)
+    assert reports.kinds == [events.STATE_RECOVERED]
+    assert store.store(state_of(2))
+    assert StateStore(tmp_path, reports).load() == state_of(2)
+    assert len(reports.kinds) == 1
 
 
 def test_two_damaged_copies_give_defaults_that_count_as_an_unclean_shutdown(tmp_path: Path) -> None:
