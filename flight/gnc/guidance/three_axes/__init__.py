@@ -1,1 +1,1 @@
-"""Guidance of a free satellite: attitude laws, and the references that they give."""
+"""Guidance of a free satellite: attitude laws, the references that they give, and slews at the optimum."""
