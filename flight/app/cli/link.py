@@ -21,7 +21,7 @@ from flight.link.process.verification import Sent
 from flight.link.security.associations import Vault
 from flight.schema.carried import config_path
 from flight.schema.peers import peer_networks
-from flight.schema.reader import load
+from flight.schema.reader import parse
 from flight.schema.sections import Link
 from hal.buses.clock import SystemClock
 from hal.buses.serial_port import PySerialPort
@@ -50,12 +50,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def link(options: argparse.Namespace) -> int:
     """Open the lines and turn until a signal."""
     # A service keeps the last configuration that flew beside its archive.
-    path, problem = accepted_config(options.config, {"STATE_DIRECTORY": str(options.log.absolute().parent)})
-    if problem:
-        sys.stderr.write(f"flight: {problem}\n")
-    config = load(path)
+    chosen = accepted_config(options.config, {"STATE_DIRECTORY": str(options.log.absolute().parent)})
+    if chosen.problem:
+        sys.stderr.write(f"flight: {chosen.problem}\n")
+    config = parse(chosen.text, str(chosen.path))
     if config.link is None or config.commands.socket is None:
-        raise UsageError(f"{path}: no `link` section: there is nothing to connect")
+        raise UsageError(f"{chosen.path}: no `link` section: there is nothing to connect")
     section, clock = config.link, SystemClock()
     ended = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from timeit import timeit
 from typing import Any
 
 import numpy as np
@@ -147,12 +148,16 @@ def test_a_table_that_cannot_work_is_refused() -> None:
         compile_layouts([Packet("one", 1, "-", "-", (Field("a", "S4080", "-", "-"),))])
 
 
-def test_packing_costs_well_under_15_microseconds() -> None:
+def test_packing_costs_less_than_ten_times_the_bare_struct() -> None:
+    """Of the same run, so that a busy machine slows both; 4 times measured 2026-11-23."""
     packer, values = Packer(), plain_contents(CONTROL)
-    best = float("inf")
-    for _ in range(5):
-        start = time.perf_counter()
-        for i in range(500):
-            packer.pack(CONTROL, i, values)
-        best = min(best, (time.perf_counter() - start) / 500)
-    assert best < 15e-6
+    layout = LAYOUTS[CONTROL.name]
+    numbers = layout.body.unpack(packer.pack(CONTROL, 0, values)[: layout.body.size])
+
+    def bare() -> bytes:
+        body = layout.body.pack(*numbers)
+        return body + crc16(body).to_bytes(2, "big")
+
+    times = [[timeit(work, timer=time.process_time, number=500) for _ in range(5)]
+             for work in (lambda: packer.pack(CONTROL, 0, values), bare)]  # fmt: skip
+    assert min(times[0]) < 10.0 * min(times[1])
