@@ -65,7 +65,8 @@ def test_every_packet_is_read_alike_by_the_other_client_and_a_shifted_field_is_n
     raw = b"".join(packets)
     assert compare(raw, document()) == {"fields": total, "different": 0, "packets": len(PACKETS), "unread": 0}
     noticed = compare(raw, shifted(document()))
-    assert noticed["different"] + noticed["unread"] > 0
+    assert noticed["unread"] == 0
+    assert noticed["different"] > 10, "of the packet imu nearly all"
 
 
 def test_the_command_prints_the_document_with_its_epoch(
