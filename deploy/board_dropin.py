@@ -39,8 +39,11 @@ def dropin(config: Config) -> str:
 
 
 def safe_dropin(config: Config) -> str:
-    """Return the drop-in of the safe state's unit, which accesses the coils alone."""
-    return _text(["[Service]", *(_bus(config) if config.simulation is None else [])])
+    """Return the drop-in of the safe state's unit, which accesses the coils and the command socket."""
+    lines = ["[Service]", *(_bus(config) if config.simulation is None else [])]
+    if config.commands.socket is not None:
+        lines.append(f'Environment="KNIGHTCUBE_COMMANDS={config.commands.socket}"')
+    return _text(lines)
 
 
 def link_dropin(config: Config) -> str:

@@ -184,7 +184,7 @@ build_release() {
 
 # Have the new release fly from the next start on. What starts it is placed first, and serves both releases.
 switch_release() {
-    for file in coils-off fly releases.py; do
+    for file in coils-off fly releases.py safe_state.py; do
         place 755 "$deploy/$file" "$prefix/bin/$file"
     done
     place 644 "$source/hal/buses/smbus_byte.py" "$prefix/bin/smbus_byte.py"

@@ -92,6 +92,23 @@ def test_a_usb3_vision_camera_beside_a_ground_link_leaves_no_more(tmp_path: Path
     assert exposure(put_units(tmp_path, config) / UNITS[0]) <= 1.5
 
 
+@needs_systemd
+@pytest.mark.parametrize("name", UNITS[:2])
+def test_flight_and_safe_state_leave_an_exposure_of_at_most_1_0(units: Path, name: str) -> None:
+    assert exposure(units / name) <= 1.0
+
+
+def test_the_safe_state_listens_where_the_flight_does_and_starts_it_again(tmp_path: Path) -> None:
+    config = changed_testbed(tmp_path, commands="{socket: /run/knightcube/commands}")
+    assert 'Environment="KNIGHTCUBE_COMMANDS=/run/knightcube/commands"\n' in safe_dropin(config)
+    assert "KNIGHTCUBE_COMMANDS" not in safe_dropin(TESTBED)
+    text = (DEPLOY / "knightcube-safe.service").read_text(encoding="utf-8")
+    begun = re.findall("^ExecStart=(.*)$", text, re.MULTILINE)
+    assert begun[0].endswith("/opt/knightcube/bin/safe_state.py")
+    assert begun[-1].endswith("--no-block start knightcube.service")
+    assert "RestartPreventExitStatus=2\n" in (DEPLOY / "knightcube.service").read_text(encoding="utf-8")
+
+
 def test_the_watchdog_leaves_room_for_four_meals() -> None:
     text = (DEPLOY / "knightcube.service").read_text(encoding="utf-8")
     (seconds,) = re.findall(r"^WatchdogSec=(\d+)$", text, re.MULTILINE)

@@ -1,0 +1,184 @@
+"""The safe state of a board whose flight was given up: coils at zero, ears open, and the flight tried again.
+
+Run by knightcube-safe.service with Python's standard library alone, from the folder of `coils-off`. It ends
+with status 0 when the flight is to be tried: after 30 s, and after twice as long each time that the flight is
+given up again, up to an hour; at once after the command `mode`. The command `safe` puts the next try an hour
+off, `ping` is answered. Other commands are refused, and datagrams that are no commands are not answered.
+
+Environment: KNIGHTCUBE_COMMANDS, the command socket, none without it; RUNTIME_DIRECTORY, where the number of
+tries is kept until the next boot of the board.
+"""
+
+from __future__ import annotations
+
+import binascii
+import contextlib
+import os
+import select
+import socket
+import stat
+import struct
+import subprocess
+import sys
+import time
+
+FIRST_S, LONGEST_S = 30.0, 3600.0
+FLEW_S = 600.0
+"""A flight that lasted so long beyond its pause ends the series of tries."""
+
+COILS_S, RETRY_S = 30.0, 1.0
+"""Between two zeros of the coils: while they are acknowledged, and while they are not."""
+
+# flight/link/commands/definitions.py and telemetry/definitions.py; the tests compare them.
+COMMANDS = {0x1A01: "ping", 0x1A02: "safe", 0x1A03: "mode", 0x1A04: "slew", 0x1A05: "clear", 0x1A06: "point"}
+LENGTHS = {"ping": 21, "safe": 81, "mode": 18, "slew": 25, "clear": 49, "point": 58}
+ANSWER, ANSWER_ID, ANSWER_VERSION = ">HHHBqB16s16sIB128s", 0x0933, 1
+SAFE_MODE = 1
+
+
+class Tries:
+    """The number of the next try of the flight, kept over the processes of one boot."""
+
+    def __init__(self, folder: str, now: float) -> None:
+        self._path = os.path.join(folder, "tries") if folder else ""
+        self.number = 1
+        with contextlib.suppress(OSError, ValueError):
+            with open(self._path, encoding="ascii") as file:
+                number, ended = file.read(64).split()
+            if now - float(ended) < FLEW_S + self.pause(int(number)):
+                self.number = int(number) + 1
+
+    @staticmethod
+    def pause(number: int) -> float:
+        """Return how long to wait before a try, s."""
+        return min(FIRST_S * 2.0 ** (min(number, 20) - 1), LONGEST_S)
+
+    def keep(self, now: float) -> None:
+        """Note that the flight is tried now."""
+        with contextlib.suppress(OSError):
+            with open(self._path + ".part", "w", encoding="ascii") as file:
+                file.write(f"{self.number} {now}\n")
+            os.replace(self._path + ".part", self._path)
+
+
+class SafeState:
+    """Answers commands until the flight is to be tried."""
+
+    def __init__(self, tries: Tries, now: float) -> None:
+        self._tries = tries
+        self._count = 0
+        self._seen: list[bytes] = []
+        self.due = now + tries.pause(tries.number)
+
+    def answer(self, data: bytes, now: float) -> bytes | None:
+        """Obey a datagram; return the answer, None for one that is no command."""
+        name = command_name(data)
+        if not name:
+            return None
+        obeyed, text = True, ""
+        if data in self._seen:
+            obeyed, text = False, "the very same packet has come before"
+        elif name == "mode":
+            self.due = now
+        elif name == "safe":
+            self.due = now + LONGEST_S
+        elif name != "ping":
+            obeyed, text = False, "the board is in its safe state: ping, safe and mode are obeyed"
+        self._seen = [*self._seen[-63:], data]
+        self._count += 1
+        left = max(0.0, self.due - now)
+        text = text or f"{name}: safe state, flight tried in {left:.0f} s, try {self._tries.number}"
+        say(text)
+        return pack(obeyed, name, self._count, text)
+
+
+def command_name(data: bytes) -> str:
+    """Return the name of the command that a datagram is, empty for anything else."""
+    name = COMMANDS.get(int.from_bytes(data[:2], "big"), "")
+    whole = name and len(data) == LENGTHS[name] == int.from_bytes(data[4:6], "big") + 7
+    return name if whole and binascii.crc_hqx(data, 0xFFFF) == 0 else ""
+
+
+def pack(obeyed: bool, name: str, count: int, text: str) -> bytes:
+    """Return the telemetry packet that answers a command."""
+    length = struct.calcsize(ANSWER) + 2 - 7
+    head = (ANSWER_ID, 0xC000 | (count - 1) % 0x4000, length, ANSWER_VERSION, 0)
+    fields = (int(obeyed), name.encode(), b"safe state", count, SAFE_MODE, text.encode()[:128])
+    body = struct.pack(ANSWER, *head, *fields)
+    return body + binascii.crc_hqx(body, 0xFFFF).to_bytes(2, "big")
+
+
+def say(text: str) -> None:
+    """Write a line for the journal."""
+    sys.stderr.write(f"safe state: {text}\n")
+    sys.stderr.flush()
+
+
+def listen(path: str) -> socket.socket | None:
+    """Return the bound command socket, None where there is none or another process has it."""
+    try:
+        if not path:
+            return None
+        if os.path.lexists(path) and stat.S_ISSOCK(os.lstat(path).st_mode):
+            os.unlink(path)
+        ears = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        before = os.umask(0o117)
+        try:
+            ears.bind(path)
+        finally:
+            os.umask(before)
+        ears.setblocking(False)
+        return ears
+    except OSError as error:
+        say(f"{path} cannot be listened to: {error.strerror}")
+        return None
+
+
+def coils_off() -> bool:
+    """Set the coils to zero; return whether the chip acknowledged."""
+    beside = os.path.join(os.path.dirname(os.path.abspath(__file__)), "coils-off")
+    with contextlib.suppress(OSError):
+        return subprocess.run([beside], check=False).returncode == 0
+    return False
+
+
+def serve(state: SafeState, path: str) -> None:
+    """Keep the coils at zero and answer commands until the flight is to be tried."""
+    ears: socket.socket | None = None
+    zero_due, zeroed = 0.0, None
+    while (now := time.monotonic()) < state.due:
+        if now >= zero_due:
+            acknowledged = coils_off()
+            if acknowledged is not zeroed:
+                say("coils at zero" if acknowledged else "the coils' chip does not answer")
+            zeroed = acknowledged
+            zero_due = time.monotonic() + (COILS_S if zeroed else RETRY_S)
+            # Also where the socket's file was removed.
+            if ears is None or not os.path.exists(path):
+                ears = listen(path)
+        left = max(0.0, min(state.due, zero_due) - time.monotonic())
+        if select.select([ears] if ears else [], [], [], left)[0]:
+            assert ears is not None
+            with contextlib.suppress(OSError):
+                data, sender = ears.recvfrom(256)
+                answer = state.answer(data, time.monotonic())
+                if answer and sender:
+                    ears.sendto(answer, sender)
+    if ears is not None:
+        ears.close()
+
+
+def main() -> int:
+    """Stay safe until the flight is to be tried."""
+    now = time.monotonic()
+    tries = Tries(os.environ.get("RUNTIME_DIRECTORY", "").partition(":")[0], now)
+    state = SafeState(tries, now)
+    say(f"the flight was given up; try {tries.number} in {state.due - now:.0f} s")
+    serve(state, os.environ.get("KNIGHTCUBE_COMMANDS", ""))
+    tries.keep(time.monotonic())
+    say(f"the flight is tried again, try {tries.number}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

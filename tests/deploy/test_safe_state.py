@@ -1,0 +1,120 @@
+"""The safe state zeroes the coils, answers commands with the standard library, and tries the flight again."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from flight.link.commands.codec import (
+    ChangeMode,
+    Clear,
+    Command,
+    CommandPacker,
+    Ping,
+    Slew,
+)
+from flight.link.commands.definitions import LAYOUTS as COMMANDS
+from flight.link.modes import Mode
+from flight.link.telemetry.definitions import COMMAND
+from flight.link.telemetry.packets import LAYOUTS, to_text
+from ground.commands.command import exchange
+from ground.telemetry.scanner import decode
+from tests.deploy.scripts import DEPLOY, script
+
+safe_state = script("safe_state")
+
+
+def packed(command: Command, number: int = 1) -> bytes:
+    return CommandPacker().pack(command, number)
+
+
+def test_its_packets_are_those_of_the_tables() -> None:
+    assert {layout.identifier: name for name, layout in COMMANDS.items()} == safe_state.COMMANDS
+    assert {name: layout.length for name, layout in COMMANDS.items()} == safe_state.LENGTHS
+    layout = LAYOUTS[COMMAND.name]
+    assert layout.body.format.replace("1B", "B").replace("1I", "I") == safe_state.ANSWER
+    assert (layout.identifier, COMMAND.version) == (safe_state.ANSWER_ID, safe_state.ANSWER_VERSION)
+    assert int(Mode.SAFE) == safe_state.SAFE_MODE
+
+
+@pytest.mark.parametrize(
+    ("command", "obeyed", "due", "text"),
+    [
+        (Ping(7), 1, 130.0, "ping: safe state, flight tried in 20 s, try 1"),
+        (ChangeMode(Mode.HOLD), 1, 110.0, "mode: safe state, flight tried in 0 s, try 1"),
+        (ChangeMode(Mode.SAFE), 1, 3710.0, "safe: safe state, flight tried in 3600 s, try 1"),
+        (Slew(0.1), 0, 130.0, "the board is in its safe state: ping, safe and mode are obeyed"),
+        (Clear("x"), 0, 130.0, "the board is in its safe state: ping, safe and mode are obeyed"),
+    ],
+)
+def test_a_command_is_answered_once_and_mode_tries_the_flight(
+    tmp_path: Path, command: Command, obeyed: int, due: float, text: str
+) -> None:
+    state = safe_state.SafeState(safe_state.Tries(str(tmp_path), 100.0), 100.0)
+    (row,) = decode(state.answer(packed(command), 110.0))["command"]
+    assert (row["obeyed"], row["mode"], row["count"]) == (obeyed, Mode.SAFE, 1)
+    assert to_text(row["text"]) == text
+    assert state.due == due
+    (row,) = decode(state.answer(packed(command), 115.0))["command"]
+    assert to_text(row["text"]) == "the very same packet has come before"
+    assert state.due == due
+
+
+def test_what_is_no_command_is_not_answered(tmp_path: Path) -> None:
+    state = safe_state.SafeState(safe_state.Tries(str(tmp_path), 0.0), 0.0)
+    ping = packed(Ping(7))
+    answer = state.answer(ping, 1.0)
+    damaged = [bytes([*ping[:i], ping[i] ^ 4, *ping[i + 1 :]]) for i in range(len(ping))]
+    assert [data for data in (b"", ping[:-1], ping + b"x", answer, *damaged) if state.answer(data, 1.0)] == []
+
+
+def test_each_try_waits_twice_as_long_until_a_flight_has_lasted(tmp_path: Path) -> None:
+    now, found = 0.0, []
+    for _ in range(9):
+        tries = safe_state.Tries(str(tmp_path), now)
+        found.append(tries.pause(tries.number))
+        now += found[-1]
+        tries.keep(now)
+        now += 60.0
+    assert found == [30.0, 60.0, 120.0, 240.0, 480.0, 960.0, 1920.0, 3600.0, 3600.0]
+    assert safe_state.Tries(str(tmp_path), now + 5000.0).number == 1
+    (tmp_path / "tries").write_bytes(b"\xff torn")
+    assert safe_state.Tries(str(tmp_path), now).number == 1
+
+
+def test_the_process_zeroes_the_coils_answers_and_ends_when_the_flight_is_to_be_tried(tmp_path: Path) -> None:
+    shutil.copy(DEPLOY / "safe_state.py", tmp_path)
+    off = tmp_path / "coils-off"
+    off.write_text(f'#!/bin/sh\necho off >>"{tmp_path}/calls"\n', encoding="ascii")
+    off.chmod(0o755)
+    place = tmp_path / "commands"
+    process = subprocess.Popen(
+        [sys.executable, "-I", "-S", str(tmp_path / "safe_state.py")],
+        env={**os.environ, "KNIGHTCUBE_COMMANDS": str(place), "RUNTIME_DIRECTORY": str(tmp_path)},
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        deadline = time.monotonic() + 20.0
+        while not place.is_socket() and time.monotonic() < deadline:
+            time.sleep(0.01)
+        (row,) = decode(exchange(str(place), packed(Ping(), time.time_ns()), 10.0))["command"]
+        assert row["obeyed"] == 1
+        exchange(str(place), packed(ChangeMode(Mode.HOLD), time.time_ns()), 10.0)
+        said = process.communicate(timeout=20.0)[1]
+    finally:
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    assert process.returncode == 0
+    assert (tmp_path / "calls").read_text(encoding="ascii") == "off\n"
+    assert "try 1 in 30 s" in said
+    assert "coils at zero" in said
+    assert "the flight is tried again, try 1" in said
+    assert (tmp_path / "tries").read_text(encoding="ascii").startswith("1 ")
