@@ -78,6 +78,11 @@ class CoilDrive:
         """Return why the PWM chip does not take commands; empty while it does."""
         return self._coils.state().error
 
+    @property
+    def suspects(self) -> bool:
+        """Whether a coil may carry another current than its command, no verdict being given yet."""
+        return bool(self._watch.suspicion)
+
     def look(
         self, in_force: CoilState, readings: Sequence[ImuReading], now_ns: int, *, known: bool = True
     ) -> None:

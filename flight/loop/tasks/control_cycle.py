@@ -66,7 +66,7 @@ class ControlCycle:
         tasks, body, now_ns = self._tasks, self._body, cycle.start_ns
         # The last command may have reached the wire late: the coils' thread sends it.
         in_force = tasks.drive.state()
-        known = self._knowledge.look(in_force, now_ns)
+        known = self._knowledge.look(in_force, now_ns, suspected=tasks.drive.suspects)
         tasks.navigation.commanded(in_force, known)
         readings = tasks.navigation.update(now_ns)
         if not in_force.error:

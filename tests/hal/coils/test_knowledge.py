@@ -32,6 +32,16 @@ def test_what_a_chip_does_not_keep_is_in_doubt_since_it_was_last_read_back() -> 
     assert then == CurrentValidity(True, True, 1075 * MS, None)
 
 
+def test_a_suspected_coil_may_carry_any_current_since_before_the_suspicion() -> None:
+    knowledge = CoilKnowledge()
+    knowledge.look(OBEYS, 1000 * MS)
+    begun, on = (knowledge.look(OBEYS, now * MS, suspected=True) for now in (1025, 1050))
+    assert begun == CurrentValidity(False, True, -1, 225 * MS)
+    assert on == CurrentValidity(False, True, -1, None)
+    over = knowledge.look(OBEYS, 1075 * MS)
+    assert over == CurrentValidity(True, True, 1075 * MS, None), "unknown until the suspicion was over"
+
+
 def test_what_the_coils_carried_while_the_loop_stood_still_is_in_doubt() -> None:
     knowledge = CoilKnowledge()
     knowledge.look(OBEYS, 1000 * MS)

@@ -1,4 +1,7 @@
-"""Tracks whether the coil currents are known; not while the PWM driver fails or the loop has stalled."""
+"""Tracks whether the coil currents are known.
+
+They are not while the PWM driver fails, the loop has stalled, or the supply current speaks against them.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,8 @@ from hal.interfaces.readings import CoilState
 
 _UNSEEN_NS = 600_000_000
 """The coil driver reads its outputs back twice a second: an error may be this old when found."""
+_UNSUSPECTED_NS = 800_000_000
+"""Four readings of the monitor: `CoilWatchSettings.persistence` of them in a row begin a suspicion."""
 STOOD_NS = 200_000_000
 """If the loop stalls for longer, the guardian may have zeroed the coils."""
 
@@ -18,7 +23,7 @@ class CurrentValidity:
 
     Attributes:
         now: whether the currents in force are known.
-        since_last_look: whether all currents since the previous look are known.
+        since_last_look: whether the chip kept all commands since the previous look.
         since_ns: time since which they are known.
         uncertain_since_ns: time from which currents assumed so far turn out to be uncertain; None if none do.
     """
@@ -33,19 +38,27 @@ class CoilKnowledge:
     """Checks the coil driver once a cycle."""
 
     def __init__(self) -> None:
-        self._known = True
+        self._obeys = True
+        self._suspected = False
         self._since_ns = -1
         self._looked_ns: int | None = None
 
-    def look(self, in_force: CoilState, now_ns: int) -> CurrentValidity:
-        """Return which currents are known, from the driver's state and the time since the last look."""
-        obeyed, self._known = self._known, not in_force.error
+    def look(self, in_force: CoilState, now_ns: int, *, suspected: bool = False) -> CurrentValidity:
+        """Return which currents are known, from the driver's state and the time since the last look.
+
+        `suspected` is whether the supply current fits no healthy circuit: a coil may carry any current then.
+        """
+        obeyed, self._obeys = self._obeys, not in_force.error
+        was_suspected, self._suspected = self._suspected, suspected
         looked_ns, self._looked_ns = self._looked_ns, now_ns
         stood = looked_ns is not None and now_ns - looked_ns > STOOD_NS
-        since_last_look = obeyed and self._known and not stood
-        if self._known and not since_last_look:
+        since_last_look = obeyed and self._obeys and not stood
+        now = self._obeys and not suspected
+        if now and (was_suspected or not since_last_look):
             self._since_ns = now_ns
-        uncertain = [now_ns - _UNSEEN_NS] if obeyed and not self._known else []
+        uncertain = [now_ns - _UNSEEN_NS] if obeyed and not self._obeys else []
+        if suspected and not was_suspected:
+            uncertain.append(now_ns - _UNSUSPECTED_NS)
         if looked_ns is not None and stood:
             uncertain.append(looked_ns)
-        return CurrentValidity(self._known, since_last_look, self._since_ns, min(uncertain, default=None))
+        return CurrentValidity(now, since_last_look, self._since_ns, min(uncertain, default=None))
