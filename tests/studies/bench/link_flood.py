@@ -9,16 +9,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import signal
-import socket
 import subprocess
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -31,16 +28,11 @@ from flight.link.telemetry.link_definitions import LINK
 from flight.link.telemetry.packets import LAYOUTS
 from ground.link.keys import make_keys
 from ground.link.terminal import open_terminal
-from ground.telemetry.reader import read_run
-from tests.hal.guardian.live_flight import ROOT
 from tests.scenario.flights import CONFIG
-from tests.studies.bench.lateness import QUANTILES
+from tests.studies.bench.flooded_flight import flood, free_port, lateness, process, wait_for
 from tests.studies.fuzz.link_frames import LinkFrames
 
 _FRAMES_A_SECOND = 10_000
-_BURST_S = 0.01
-_START_S = 20.0
-_WARM_UP_S = 5.0
 _KINDS = 500
 
 
@@ -62,27 +54,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def measure(place: Path, seconds: float, *, flooded: bool) -> dict[str, Any]:
     """Fly once; return lateness in ms by quantile, cycles, and the link's counts."""
     with ExitStack() as stack:
-        port = _free_port()
+        port = free_port()
         config = _config(place, port)
         run = place / "run"
         flight = stack.enter_context(
-            _process("run", config, "--realtime", "--out", run, "--duration", seconds, "--json")
+            process("run", config, "--realtime", "--out", run, "--duration", seconds, "--json")
         )
-        _wait_for(run / "flight-0001.ccsds")
-        link = stack.enter_context(_process("link", config, "--log", run))
+        wait_for(run / "flight-0001.ccsds")
+        link = stack.enter_context(process("link", config, "--log", run))
         ended, forged = threading.Event(), list[int]()
         stack.callback(ended.set)
         if flooded:
-            _wait_for(place / "commands")
+            wait_for(place / "commands")
             attacker = threading.Thread(target=_flood, args=(port, ended, forged))
             attacker.start()
         counts = _listen(port, place, flight, flooded)
         ended.set()
         assert link.poll() is None, "the link has ended by itself"
-    cycles = read_run(run)["cycle_timing"]
-    lateness = cycles["lateness"][cycles["time_ns"] > _WARM_UP_S * 1e9]
-    figures = {name: round(1e3 * float(np.quantile(lateness, part)), 3) for name, part in QUANTILES.items()}
-    return {"cycles": len(lateness), "lateness_ms": figures, "forged": sum(forged), **counts}
+    return {**lateness(run), "forged": sum(forged), **counts}
 
 
 def _listen(port: int, place: Path, flight: subprocess.Popen[bytes], play: bool) -> dict[str, int]:
@@ -105,29 +94,10 @@ def _listen(port: int, place: Path, flight: subprocess.Popen[bytes], play: bool)
 
 
 def _flood(port: int, ended: threading.Event, forged: list[int]) -> None:
-    """Send forged and damaged frames, ten thousand a second; note how many in each burst."""
+    """Send forged and damaged frames until `ended`; note how many in each burst."""
     attacker, draw = LinkFrames(), np.random.default_rng(1)
     frames = [attacker.frame(draw)[1] for _ in range(_KINDS)]
-    burst = round(_FRAMES_A_SECOND * _BURST_S)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
-        due = time.monotonic()
-        while not ended.is_set():
-            for number in draw.integers(0, len(frames), burst).tolist():
-                line.sendto(frames[number], ("127.0.0.1", port))
-            forged.append(burst)
-            due += _BURST_S
-            time.sleep(max(0.0, due - time.monotonic()))
-
-
-@contextmanager
-def _process(*words: object) -> Iterator[subprocess.Popen[bytes]]:
-    line = [sys.executable, "-m", "flight", *map(str, words)]
-    with subprocess.Popen(line, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
-        try:
-            yield process
-        finally:
-            if process.poll() is None:
-                os.kill(process.pid, signal.SIGTERM)
+    flood(port, frames, _FRAMES_A_SECOND, ended, forged)
 
 
 def _config(place: Path, port: int) -> Path:
@@ -139,20 +109,6 @@ def _config(place: Path, port: int) -> Path:
     text = CONFIG.read_text(encoding="utf-8")
     path.write_text(f"{text}\ncommands: {commands}\nlink: {json.dumps(link)}\n", encoding="utf-8")
     return path
-
-
-def _free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
-        line.bind(("127.0.0.1", 0))
-        return int(line.getsockname()[1])
-
-
-def _wait_for(path: Path) -> None:
-    until = time.monotonic() + _START_S
-    while not path.exists():
-        if time.monotonic() > until:
-            raise TimeoutError(f"{path} did not come within {_START_S:g} s")
-        time.sleep(0.05)
 
 
 if __name__ == "__main__":

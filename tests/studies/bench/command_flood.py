@@ -1,0 +1,98 @@
+"""The command socket under a flood: `python -m tests.studies.bench command_flood [--seconds S]`.
+
+The step demonstration flies in real time and listens on UDP for commands: left alone, then with 20,000
+datagrams a second at its port that are no commands, then with as many that begin as commands do. A peer sends
+twenty pings, each once. Stated are the lateness of the control cycles and how many pings were answered.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+import threading
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flight.app.utc_label import utc_ns
+from flight.gnc.errors import FlightError
+from flight.link.commands.codec import CommandPacker, Ping
+from ground.commands.command import exchange
+from tests.scenario.flights import CONFIG
+from tests.studies.bench.flooded_flight import flood, free_port, lateness, process, wait_for
+
+PINGS = 20
+_DATAGRAMS_A_SECOND = 20_000
+_KINDS = 500
+_ANSWER_S = 2.0
+_AFTER_START_S = 5.0
+FLOODS = ("none", "no commands", "begin as commands")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Fly all, print; return 1 where a ping went unanswered under datagrams that are no commands."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument(
+        "--seconds", type=float, default=60.0, metavar="S", help="of each flight (default %(default)s)"
+    )
+    seconds = parser.parse_args(arguments).seconds
+    answered = {}
+    for kind in FLOODS:
+        with tempfile.TemporaryDirectory(prefix="knightcube-") as place:
+            facts = measure(Path(place), seconds, kind)
+        answered[kind] = facts["answered"]
+        sys.stdout.write(json.dumps({"flood": kind, **facts}) + "\n")
+        sys.stdout.flush()
+    return int(min(answered[kind] for kind in FLOODS[:2]) < PINGS)
+
+
+def measure(place: Path, seconds: float, kind: str) -> dict[str, Any]:
+    """Fly once under a kind of flood; return lateness, strangers' datagrams and the answered pings."""
+    port, run, config = free_port(), place / "run", place / "flight.yaml"
+    commands = json.dumps({"udp": f"127.0.0.1:{port}"})
+    config.write_text(f"{CONFIG.read_text(encoding='utf-8')}\ncommands: {commands}\n", encoding="utf-8")
+    ended, sent = threading.Event(), list[int]()
+    with ExitStack() as stack:
+        words = ("run", config, "--realtime", "--out", run, "--duration", seconds, "--json")
+        flight = stack.enter_context(process(*words))
+        wait_for(run / "flight-0001.ccsds")
+        stack.callback(ended.set)
+        ended.wait(_AFTER_START_S)
+        if kind != FLOODS[0]:
+            own = (port, _datagrams(kind), _DATAGRAMS_A_SECOND, ended, sent)
+            threading.Thread(target=flood, args=own, daemon=True).start()
+        pause = max(0.0, seconds - 2.0 * _AFTER_START_S) / PINGS
+        answered = 0
+        for number in range(PINGS):
+            answered += _is_answered(port, number)
+            ended.wait(pause)
+        flight.wait()
+    return {**lateness(run), "sent_by_strangers": sum(sent), "pings": PINGS, "answered": answered}
+
+
+def _datagrams(kind: str) -> list[bytes]:
+    """Return what strangers send: random bytes, or commands of which all but the beginning is random."""
+    draw = np.random.default_rng(2)
+    sizes = draw.integers(16, 200, _KINDS).tolist()
+    found = [draw.bytes(size) for size in sizes]
+    if kind == FLOODS[1]:
+        return found
+    begins = CommandPacker().pack(Ping(0), utc_ns())[:2]
+    return [begins + data[2:] for data in found]
+
+
+def _is_answered(port: int, number: int) -> bool:
+    """Send a ping once; return whether its answer came."""
+    try:
+        return bool(exchange(f"127.0.0.1:{port}", CommandPacker().pack(Ping(number), utc_ns()), _ANSWER_S))
+    except FlightError:
+        return False
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
