@@ -1,4 +1,4 @@
-"""`flight plan`: one path by virtual motion camouflage, with its cost."""
+"""`flight plan`: one path by virtual motion camouflage, with its cost; with --orbit a slew in three axes."""
 
 from __future__ import annotations
 
@@ -18,24 +18,40 @@ from flight.gnc.guidance.one_axis.plant import SingleAxisPlant
 from flight.gnc.guidance.one_axis.vmc import FASTEST, HORIZON_RANGE, NODES, NODES_RANGE, Plan, plan
 from flight.schema import reader as configuration
 from flight.schema.carried import config_path
+from ground.commands import plan_orbit
 from ground.commands.options import finite, positive
 
 _DEFAULT_CONFIG = "step_demo"
+_ONLY = ("from_rate", "to_rate", "horizon", "cost", "config")
+"""Options that have no meaning with --orbit."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of this command to the parser."""
     parser.description = (
-        "Plan the least-energy slew between two attitudes by virtual motion camouflage; print it "
-        "or draw it. A horizon that is too short is stretched to the shortest feasible one."
+        "Plan the least-energy slew between two attitudes, of the testbed by virtual motion camouflage, or "
+        "with --orbit of a satellite in three axes; print it or draw it. A horizon that is too short is "
+        "stretched to the shortest feasible one."
     )
-    parser.epilog = "example: python -m flight plan --from 0.4 --from-rate 0.015 --to -0.3 --picture path.png"
+    parser.epilog = (
+        "example: python -m flight plan --from 0.4 --from-rate 0.015 --to -0.3 --picture path.png; in orbit: "
+        "python -m flight plan --orbit orbit --from nadir --to sun --at 2026-03-01T12:00:00 --within 600"
+    )
     parser.add_argument(
-        "--from", dest="start", type=finite, required=True, metavar="Q2", help="q2 at the start"
+        "--from", dest="start", required=True, metavar="Q2", help="q2 at the start; with --orbit a target"
     )
-    parser.add_argument("--to", dest="end", type=finite, required=True, metavar="Q2", help="q2 at the end")
-    parser.add_argument("--from-rate", type=finite, default=0.0, metavar="W", help="rad/s at the start")
-    parser.add_argument("--to-rate", type=finite, default=0.0, metavar="W", help="rad/s at the end")
+    parser.add_argument(
+        "--to", dest="end", required=True, metavar="Q2", help="q2 at the end; with --orbit a target"
+    )
+    parser.add_argument("--from-rate", type=finite, metavar="W", help="rad/s at the start (default 0)")
+    parser.add_argument("--to-rate", type=finite, metavar="W", help="rad/s at the end (default 0)")
+    _add_options(parser)
+    plan_orbit.configure(parser)
+    parser.set_defaults(command=run)
+
+
+def _add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments that may be left out."""
     parser.add_argument("--horizon", type=finite, metavar="S", help="seconds (default: the configuration's)")
     parser.add_argument(
         "--time-price",
@@ -52,28 +68,38 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--config",
         type=config_path,
-        default=_DEFAULT_CONFIG,
         metavar="CONFIG",
         help=f"configuration of the plant, a file or a carried name (default {_DEFAULT_CONFIG})",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object, with the nodes")
     parser.add_argument("--picture", type=Path, metavar="PNG", help="draw the path, its rate and its current")
-    parser.set_defaults(command=run)
 
 
 def run(options: argparse.Namespace) -> int:
     """Plan, print, draw."""
+    in_orbit = options.orbit is not None
+    for name in _ONLY if in_orbit else plan_orbit.ONLY:
+        if getattr(options, name) not in (None, False):
+            option = name.replace("_", "-")
+            raise UsageError(f"--{option}: has no meaning {'with' if in_orbit else 'without'} --orbit")
+    return plan_orbit.run(options) if in_orbit else _run(options)
+
+
+def _run(options: argparse.Namespace) -> int:
+    """Plan the testbed's path, print, draw."""
+    start, end = _q2("--from", options.start), _q2("--to", options.end)
+    start_rate, end_rate = options.from_rate or 0.0, options.to_rate or 0.0
     _check(options)
-    config = configuration.load_testbed(options.config)
+    config = configuration.load_testbed(options.config or config_path(_DEFAULT_CONFIG))
     plant = plant_of(config)
     horizon = config.guidance.horizon if options.horizon is None else options.horizon
     begun = time.perf_counter()
     made = plan(
         plant,
-        options.start,
-        options.from_rate,
-        options.end,
-        options.to_rate,
+        start,
+        start_rate,
+        end,
+        end_rate,
         horizon,
         nodes=options.nodes or config.guidance.nodes or NODES,
         time_price=options.time_price,
@@ -127,11 +153,20 @@ def _text(made: Plan, plant: SingleAxisPlant, solved_s: float) -> str:
     )
 
 
+def _q2(option: str, text: str) -> float:
+    """Return a q2 within the thread's range. Raises UsageError."""
+    try:
+        value = finite(text)
+    except argparse.ArgumentTypeError as error:
+        raise UsageError(f"{option}: {error}; targets need --orbit") from error
+    if not abs(value) <= Q2_LIMIT:
+        raise UsageError(f"{option} {value:g}: must be {-Q2_LIMIT:g} to {Q2_LIMIT:g}")
+    return value
+
+
 def _check(options: argparse.Namespace) -> None:
     """Raise UsageError for an option that no plan can follow."""
     for option, value, (low, high) in (
-        ("--from", options.start, (-Q2_LIMIT, Q2_LIMIT)),
-        ("--to", options.end, (-Q2_LIMIT, Q2_LIMIT)),
         ("--from-rate", options.from_rate, (-FASTEST, FASTEST)),
         ("--to-rate", options.to_rate, (-FASTEST, FASTEST)),
         ("--horizon", options.horizon, HORIZON_RANGE),

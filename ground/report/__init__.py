@@ -15,10 +15,11 @@ from ground.telemetry.reader import Run
 if TYPE_CHECKING:
     from flight.gnc.guidance.one_axis.plant import SingleAxisPlant
     from flight.gnc.guidance.one_axis.vmc import Plan
+    from flight.gnc.guidance.three_axes.slew_order import OrderedSlew, SlewOrder
     from ground.identification.fit import Fit
     from ground.identification.record import Record
 
-__all__ = ["draw", "draw_both", "draw_fit", "draw_path", "format_report", "summarise"]
+__all__ = ["draw", "draw_both", "draw_fit", "draw_path", "draw_slew", "format_report", "summarise"]
 
 
 def draw(run: Run, folder: Path) -> list[Path]:
@@ -51,6 +52,17 @@ def draw_path(plan: Plan, plant: SingleAxisPlant, file: Path) -> None:
         from ground.report.path_figure import save_path  # noqa: PLC0415
 
         save_path(plan, plant, file)
+
+
+def draw_slew(made: OrderedSlew, order: SlewOrder, file: Path) -> None:
+    """Draw one planned slew in orbit as a PNG.
+
+    Raises UsageError when matplotlib is not installed or the file cannot be written.
+    """
+    with _drawing(file):
+        from ground.report.slew_figure import save_slew  # noqa: PLC0415
+
+        save_slew(made, order, file)
 
 
 def draw_fit(record: Record, found: Fit, file: Path) -> None:

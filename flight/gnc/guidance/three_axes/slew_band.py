@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy.linalg.lapack import dgbsv
+from scipy.linalg.lapack import dgbtrf, dgbtrs
 
 from flight.gnc.errors import PlanningError
 from flight.gnc.math.arrays import FloatArray, IntArray
@@ -91,9 +91,18 @@ def layout(count: int, ends: int) -> Layout:
     )
 
 
-def solve(band: FloatArray, right: FloatArray) -> FloatArray:
-    """Return the solution (size, n) of a band's equations. Raises PlanningError where they are singular."""
-    _, _, found, info = dgbsv(_BAND, _BAND, band, right, overwrite_ab=1)
-    if info or not np.isfinite(found).all():
-        raise PlanningError("the equations of a slew are singular")
-    return np.asarray(found)
+class Factors:
+    """The factors of a band, for as many right sides as are wanted."""
+
+    def __init__(self, band: FloatArray) -> None:
+        """Factor a `band` in its place. Raises PlanningError where it is singular."""
+        self._factors, self._pivots, info = dgbtrf(band, _BAND, _BAND, overwrite_ab=1)
+        if info:
+            raise PlanningError("the equations of a slew are singular")
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """Return the solution (size,) of a right side (size,). Raises PlanningError without any."""
+        found, _ = dgbtrs(self._factors, _BAND, _BAND, right[:, None], self._pivots)
+        if not np.isfinite(found).all():
+            raise PlanningError("the equations of a slew are singular")
+        return np.asarray(found[:, 0])

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.guidance.three_axes.slew_model import shown, shown_curvature, shown_slope
+from flight.gnc.guidance.three_axes.slew_model import shown, shown_curvature
 from flight.gnc.math.arrays import FloatArray
 
 
@@ -32,29 +32,25 @@ class Cone:
 
 
 class Kept:
-    """Cones as inequalities g >= 0 at n times: the limit's cosine less the one found."""
+    """Cones as inequalities g >= 0 at n times: the limit's cosine less that of axis and direction.
 
-    def __init__(self, cones: tuple[Cone, ...], margin: float) -> None:
-        """`margin` rad is added to each cone, for the way between the times."""
-        self._cones = cones
+    That cosine is a quadratic form of the attitude.
+    """
+
+    def __init__(self, cones: tuple[Cone, ...], margin: float, times: FloatArray) -> None:
+        """`margin` rad is added to each cone, for the way between the `times` (n,) s."""
         self._limits = np.cos([min(cone.angle + margin, np.pi) for cone in cones])
-        self.count = len(cones)
-
-    def values(self, q: FloatArray, times: FloatArray) -> FloatArray:
-        """Return g (cones, n)."""
-        found = [shown(q, cone.direction(times)) @ cone.axis for cone in self._cones]
-        return self._limits[:, None] - np.array(found).reshape(self.count, len(q))
-
-    def slopes(self, q: FloatArray, times: FloatArray) -> FloatArray:
-        """Return the derivative (cones, n, 4) by the attitude."""
-        found = [-cone.axis @ shown_slope(q, cone.direction(times)) for cone in self._cones]
-        return np.array(found).reshape(self.count, len(q), 4)
-
-    def curvatures(self, times: FloatArray) -> FloatArray:
-        """Return the second derivative (cones, n, 4, 4)."""
-        size = len(times)
+        self.count, size = len(cones), len(times)
         found = [
-            -shown_curvature(np.broadcast_to(cone.axis, (size, 3)), cone.direction(times))
-            for cone in self._cones
+            -shown_curvature(np.broadcast_to(cone.axis, (size, 3)), cone.direction(times)) for cone in cones
         ]
-        return np.array(found).reshape(self.count, size, 4, 4)
+        self.curvatures = np.array(found).reshape(self.count, size, 4, 4)
+        """(cones, n, 4, 4), the second derivative by the attitude."""
+
+    def values(self, q: FloatArray) -> FloatArray:
+        """Return g (cones, n) at attitudes (n, 4)."""
+        return np.asarray(self._limits[:, None] + 0.5 * np.sum(self.slopes(q) * q, axis=2))
+
+    def slopes(self, q: FloatArray) -> FloatArray:
+        """Return the derivative (cones, n, 4) by the attitude."""
+        return np.asarray((self.curvatures @ q[:, :, None])[..., 0])

@@ -1,7 +1,7 @@
 """The ends of a slew: the state that it starts from, and the attitude or the direction that it ends in.
 
 A whole attitude is three equations, a boresight with a free roll two; the end's rate is three more. All are
-quadratic forms of the quaternion, so their derivatives are exact.
+quadratic in the quaternion, so their derivatives are exact.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.guidance.three_axes.slew_model import shown, shown_curvature, shown_slope
+from flight.gnc.guidance.three_axes.slew_model import shown, shown_curvature
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.directions import cross_matrices, tangent_basis
 
@@ -23,22 +23,18 @@ class Whole:
     quaternion: FloatArray
     rate: FloatArray
 
-    def misses(self, q: FloatArray) -> FloatArray:
-        """Return half the sines (3,) by which an attitude (4,) misses."""
-        return np.asarray(self.slope(q) @ q)
-
     def is_met(self, q: FloatArray) -> bool:
         """Return True: an attitude that misses by nothing is the target."""
         return True
 
-    def slope(self, q: FloatArray) -> FloatArray:
-        """Return the derivative (3, 4) of `misses`: the vector part of q times the target's inverse."""
-        v, s = self.quaternion[:3], self.quaternion[3]
-        return np.concatenate([s * np.eye(3) + cross_matrices(v[None])[0], -v[:, None]], axis=1)
+    def misses(self) -> tuple[FloatArray, FloatArray]:
+        """Return the linear (3, 4) and the quadratic part (3, 4, 4) of half the sines that q misses by.
 
-    def curvature(self, pull: FloatArray) -> FloatArray:
-        """Return the second derivative (4, 4) of pull . misses."""
-        return np.zeros((4, 4))
+        They are the vector part of q times the target's inverse.
+        """
+        v, s = self.quaternion[:3], self.quaternion[3]
+        linear = np.concatenate([s * np.eye(3) + cross_matrices(v[None])[0], -v[:, None]], axis=1)
+        return linear, np.zeros((3, 4, 4))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,22 +45,14 @@ class Boresight:
     direction: FloatArray
     rate: FloatArray
 
-    def misses(self, q: FloatArray) -> FloatArray:
-        """Return the sines (2,) by which an attitude (4,) misses."""
-        return np.asarray(tangent_basis(self.axis) @ shown(q[None], self.direction[None])[0])
-
     def is_met(self, q: FloatArray) -> bool:
         """Return whether an attitude (4,) that misses by nothing points to it, not away from it."""
         return float(self.axis @ shown(q[None], self.direction[None])[0]) > 0.0
 
-    def slope(self, q: FloatArray) -> FloatArray:
-        """Return the derivative (2, 4) of `misses`."""
-        return np.asarray(tangent_basis(self.axis) @ shown_slope(q[None], self.direction[None])[0])
-
-    def curvature(self, pull: FloatArray) -> FloatArray:
-        """Return the second derivative (4, 4) of pull . misses."""
-        pulled = pull @ tangent_basis(self.axis)
-        return np.asarray(shown_curvature(pulled[None], self.direction[None])[0])
+    def misses(self) -> tuple[FloatArray, FloatArray]:
+        """Return the linear (2, 4) and the quadratic part (2, 4, 4) of the sines that q misses by."""
+        across = tangent_basis(self.axis)
+        return np.zeros((2, 4)), shown_curvature(across, np.broadcast_to(self.direction, (2, 3)))
 
 
 End = Whole | Boresight
@@ -72,23 +60,28 @@ EndLaw = Callable[[float], End]
 """Gives the end of a slew that lasts so long, s."""
 
 
-def miss(end: End, x: FloatArray, scale: float) -> FloatArray:
-    """Return by how much a state (7,), times in `scale` s, misses its end: attitude, then rate (3,)."""
-    wanted = scale * shown(x[None, :4], end.rate[None])[0]
-    return np.concatenate([end.misses(x[:4]), x[4:] - wanted])
+class Ending:
+    """The equations of an end: by how much a state (7,) misses it, attitude, then rate (3,)."""
 
+    def __init__(self, end: End, scale: float) -> None:
+        """Take the end, and the unit of times, s."""
+        linear, forms = end.misses()
+        self.count = len(linear) + 3
+        self._linear = np.zeros((self.count, 7))
+        self._linear[:-3, :4], self._linear[-3:, 4:] = linear, np.eye(3)
+        turning = shown_curvature(np.eye(3), np.broadcast_to(-scale * end.rate, (3, 3)))
+        self._forms = np.concatenate([forms, turning])
 
-def miss_slope(end: End, x: FloatArray, scale: float) -> FloatArray:
-    """Return the derivative (n, 7) of `miss`."""
-    attitude = end.slope(x[:4])
-    result = np.zeros((len(attitude) + 3, 7))
-    result[:-3, :4] = attitude
-    result[-3:, :4] = -scale * shown_slope(x[None, :4], end.rate[None])[0]
-    result[-3:, 4:] = np.eye(3)
-    return result
+    def miss(self, x: FloatArray) -> FloatArray:
+        """Return by how much a state misses."""
+        return np.asarray(self._linear @ x + 0.5 * (self._forms @ x[:4]) @ x[:4])
 
+    def slope(self, x: FloatArray) -> FloatArray:
+        """Return the derivative (n, 7) of `miss`."""
+        result = self._linear.copy()
+        result[:, :4] += self._forms @ x[:4]
+        return result
 
-def miss_curvature(end: End, pull: FloatArray, scale: float) -> FloatArray:
-    """Return the second derivative (4, 4) of pull . miss by the quaternion."""
-    turning = shown_curvature(pull[None, -3:], end.rate[None])[0]
-    return np.asarray(end.curvature(pull[:-3]) - scale * turning)
+    def curvature(self, pull: FloatArray) -> FloatArray:
+        """Return the second derivative (4, 4) of pull . miss by the quaternion."""
+        return np.asarray(np.tensordot(pull, self._forms, 1))

@@ -28,7 +28,7 @@ class Limits:
         if self.dipole is not None:
             found += [(at.dipoles + self.dipole).ravel(), (self.dipole - at.dipoles).ravel()]
         if self.cones.count:
-            found.append(self.cones.values(at.states[1:, :4], self.equations.times[1:]).ravel())
+            found.append(self.cones.values(at.states[1:, :4]).ravel())
         return np.concatenate(found)
 
     def pull(self, at: Trajectory, weights: FloatArray) -> FloatArray:
@@ -39,7 +39,7 @@ class Limits:
         if self.dipole is not None:
             result[place.dipoles] = dipoles[0] - dipoles[1]
         if self.cones.count:
-            slopes = self.cones.slopes(at.states[1:, :4], self.equations.times[1:])
+            slopes = self.cones.slopes(at.states[1:, :4])
             result[place.states[1:, :4]] = np.einsum("cn,cnj->nj", cones, slopes)
         return result
 
@@ -50,21 +50,22 @@ class Limits:
         if self.dipole is not None:
             found += [change[place.dipoles].ravel(), -change[place.dipoles].ravel()]
         if self.cones.count:
-            slopes = self.cones.slopes(at.states[1:, :4], self.equations.times[1:])
+            slopes = self.cones.slopes(at.states[1:, :4])
             found.append(np.einsum("cnj,nj->cn", slopes, change[place.states[1:, :4]]).ravel())
         return np.concatenate(found)
 
-    def stiffness(self, at: Trajectory, dual: FloatArray, slack: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return what the limits add to the curvature by states (2 k + 1, 7, 7) and by dipoles (k + 1, 3)."""
-        stiff = dual / slack
+    def stiffness(self, at: Trajectory, stiff: FloatArray, bent: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return what the limits add to the curvature by states (2 k + 1, 7, 7) and by dipoles (k + 1, 3).
+
+        `stiff` are the squares' weights, `bent` those of the limits' own curvature.
+        """
         dipoles, cones = self._parts(stiff, at)
-        _, bent = self._parts(dual, at)
+        _, weights = self._parts(bent, at)
         states = np.zeros((len(at.states), 7, 7))
         if self.cones.count:
-            times = self.equations.times[1:]
-            slopes = self.cones.slopes(at.states[1:, :4], times)
+            slopes = self.cones.slopes(at.states[1:, :4])
             states[1:, :4, :4] = np.einsum("cn,cni,cnj->nij", cones, slopes, slopes)
-            states[1:, :4, :4] -= np.einsum("cn,cnij->nij", bent, self.cones.curvatures(times))
+            states[1:, :4, :4] -= np.einsum("cn,cnij->nij", weights, self.cones.curvatures)
         heavy = np.zeros_like(at.dipoles) if self.dipole is None else dipoles.sum(axis=0)
         return states, heavy
 

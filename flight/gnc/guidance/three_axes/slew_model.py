@@ -20,6 +20,7 @@ from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.directions import cross_matrices
 
 _EYE3: FloatArray = np.eye(3)
+_AXES = np.arange(3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,22 +67,6 @@ def shown(q: FloatArray, vector: FloatArray) -> FloatArray:
     return np.asarray(square * vector + 2.0 * inner * v - 2.0 * s * cross(v, vector))
 
 
-def shown_slope(q: FloatArray, vector: FloatArray) -> FloatArray:
-    """Return the derivative (n, 3, 4) of A(q) v by q."""
-    v, s = q[:, :3], q[:, 3]
-    slope = np.empty((len(q), 3, 4))
-    inner = np.sum(v * vector, axis=1)
-    outer = v[:, :, None] * vector[:, None, :]
-    slope[:, :, :3] = 2.0 * (
-        outer
-        - outer.transpose(0, 2, 1)
-        + inner[:, None, None] * _EYE3
-        + s[:, None, None] * cross_matrices(vector)
-    )
-    slope[:, :, 3] = 2.0 * (s[:, None] * vector - cross(v, vector))
-    return slope
-
-
 def shown_curvature(pull: FloatArray, vector: FloatArray) -> FloatArray:
     """Return the second derivative (n, 4, 4) of pull . A(q) v by q: twice Davenport's matrix."""
     curvature = np.empty((len(pull), 4, 4))
@@ -94,72 +79,89 @@ def shown_curvature(pull: FloatArray, vector: FloatArray) -> FloatArray:
 
 
 class Motion:
-    """The motion of one craft; times are counted in units of `scale` s, dipoles in `unit` A m^2."""
+    """The motion of one craft at n times; times are counted in units of `scale` s, dipoles in `unit` A m^2.
 
-    def __init__(self, craft: SlewCraft, scale: float, unit: float) -> None:
-        self._scale, self._unit = scale, unit
-        self._inertia = craft.inertia
-        self._inverse = np.linalg.inv(craft.inertia)
+    With z = (m + residual, b, e, w, q), b and e quadratic in q, all of x' but a constant is quadratic in z:
+    1/2 z . H z. So one product gives the derivatives of all times at once.
+    """
+
+    def __init__(self, craft: SlewCraft, scale: float, unit: float, around: Around) -> None:
+        """`around` the craft at the n times; e is scaled with the gradient's strength."""
         self._residual = craft.residual / unit
-        self._torque = scale**2 * craft.torque
-        self.push = scale**2 * unit
-
-    def flow(self, x: FloatArray, m: FloatArray, around: Around) -> FloatArray:
-        """Return x' (n, 7) at states (n, 7) and dipoles (n, 3)."""
-        q, w = x[:, :4], x[:, 4:]
         down, strength = around.gradient()
-        b, e = self.push * shown(q, around.field), shown(q, down)
-        torque = cross(m + self._residual, b) + self._torque - cross(w, w @ self._inertia)
-        torque += (self._scale**2 * strength)[:, None] * cross(e, e @ self._inertia)
-        result = np.empty_like(x)
-        result[:, :3] = 0.5 * (cross(q[:, :3], w) + q[:, 3:] * w)
-        result[:, 3] = -0.5 * np.sum(w * q[:, :3], axis=1)
-        result[:, 4:] = torque @ self._inverse
-        return result
-
-    def slopes(self, x: FloatArray, m: FloatArray, around: Around) -> tuple[FloatArray, FloatArray]:
-        """Return the derivatives of x' by the state (n, 7, 7) and by the dipole (n, 7, 3)."""
-        q, w = x[:, :4], x[:, 4:]
-        down, strength = around.gradient()
-        b, e = self.push * shown(q, around.field), shown(q, down)
-        by_state, by_dipole = np.zeros((len(x), 7, 7)), np.zeros((len(x), 7, 3))
-        by_state[:, :3, :3] = -0.5 * cross_matrices(w)
-        by_state[:, :3, 3] = 0.5 * w
-        by_state[:, 3, :3] = -0.5 * w
-        by_state[:, :3, 4:] = 0.5 * (q[:, 3, None, None] * _EYE3 + cross_matrices(q[:, :3]))
-        by_state[:, 3, 4:] = -0.5 * q[:, :3]
-        turned = cross_matrices(m + self._residual) @ (self.push * shown_slope(q, around.field))
-        stiff = cross_matrices(e) @ self._inertia - cross_matrices(e @ self._inertia)
-        turned += (self._scale**2 * strength)[:, None, None] * (stiff @ shown_slope(q, down))
-        by_state[:, 4:, :4] = self._inverse @ turned
-        spin = cross_matrices(w @ self._inertia) - cross_matrices(w) @ self._inertia
-        by_state[:, 4:, 4:] = self._inverse @ spin
-        by_dipole[:, 4:] = -self._inverse @ cross_matrices(b)
-        return by_state, by_dipole
-
-    def curvature(self, x: FloatArray, m: FloatArray, around: Around, y: FloatArray) -> FloatArray:
-        """Return the second derivative (n, 10, 10) of y . x' by state and dipole, for `y` (n, 7)."""
-        q, pull = x[:, :4], y[:, 4:] @ self._inverse
-        down, strength = around.gradient()
-        result = np.zeros((len(x), 10, 10))
-        mixed = result[:, 4:7, :4]
-        mixed[:, :, :3] = 0.5 * (cross_matrices(y[:, :3]) - y[:, 3, None, None] * _EYE3)
-        mixed[:, :, 3] = 0.5 * y[:, :3]
-        result[:, :4, 4:7] = mixed.transpose(0, 2, 1)
-        crossed = cross_matrices(pull)
-        swirl = self._inertia @ crossed - crossed @ self._inertia
-        result[:, 4:7, 4:7] = -swirl
-        e, slope = shown(q, down), shown_slope(q, down)
-        tide = (self._scale**2 * strength)[:, None]
-        by_e = tide * (cross(e @ self._inertia, pull) + cross(pull, e) @ self._inertia)
-        result[:, :4, :4] = (
-            shown_curvature(self.push * cross(pull, m + self._residual), around.field)
-            + shown_curvature(by_e, down)
-            + tide[:, :, None] * (slope.transpose(0, 2, 1) @ swirl @ slope)
+        vectors = np.stack(
+            [scale**2 * unit * around.field, (scale * np.sqrt(strength))[:, None] * down], axis=1
         )
-        result[:, 7:, :4] = -crossed @ (self.push * shown_slope(q, around.field))
-        result[:, :4, 7:] = result[:, 7:, :4].transpose(0, 2, 1)
-        return result
+        axes = np.broadcast_to(_EYE3, (len(down), 2, 3, 3)).reshape(-1, 3)
+        forms = shown_curvature(axes, np.repeat(vectors.reshape(-1, 3), 3, axis=0))
+        self._forms = forms.reshape(-1, 6, 4, 4)
+        self._constant = np.concatenate(
+            [np.zeros(4), scale**2 * np.linalg.solve(craft.inertia, craft.torque)]
+        )
+        self._quadratic = _quadratic(craft.inertia)
+        self._parts = np.zeros((len(down), _Z, 10))
+        for part, place in ((_M, _DIPOLE), (_W, _RATE), (_Q, _ATTITUDE)):
+            self._parts[:, part, place] = np.eye(part.stop - part.start)
+
+    def field(self, q: FloatArray) -> FloatArray:
+        """Return b (n, 3) at attitudes (n, 4): the field in the units of the motion, body axes."""
+        return np.asarray(0.5 * np.einsum("nijk,nj,nk->ni", self._forms[:, :3], q, q))
+
+    def flow(self, x: FloatArray, m: FloatArray) -> FloatArray:
+        """Return x' (n, 7) at states (n, 7) and dipoles (n, 3)."""
+        z, _ = self._quantities(x, m)
+        return np.asarray(0.5 * np.einsum("nij,nj->ni", self._steepness(z), z) + self._constant)
+
+    def slopes(self, x: FloatArray, m: FloatArray) -> FloatArray:
+        """Return the derivatives (n, 7, 10) of x' by the state and the dipole."""
+        z, turned = self._quantities(x, m)
+        return np.asarray(self._steepness(z) @ self._by_unknowns(turned))
+
+    def curvature(self, x: FloatArray, m: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the second derivative (n, 10, 10) of y . x' by state and dipole, for `y` (n, 7)."""
+        z, turned = self._quantities(x, m)
+        bend = (y @ self._quadratic.reshape(7, -1)).reshape(-1, _Z, _Z)
+        parts = self._by_unknowns(turned)
+        result = parts.transpose(0, 2, 1) @ (bend @ parts)
+        pull = (bend @ z[:, :, None])[:, _BE]
+        result[:, :4, :4] += np.sum(pull[:, :, :, None] * self._forms, axis=1)
+        return np.asarray(result)
+
+    def _quantities(self, x: FloatArray, m: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return z (n, 16), and the derivative (n, 6, 4) of b and e by the attitude."""
+        z, q = np.empty((len(x), _Z)), x[:, :4]
+        turned = (self._forms.reshape(-1, 24, 4) @ q[:, :, None]).reshape(-1, 6, 4)
+        z[:, _M], z[:, _W], z[:, _Q] = m + self._residual, x[:, 4:], q
+        z[:, _BE] = 0.5 * (turned @ q[:, :, None])[:, :, 0]
+        return z, turned
+
+    def _steepness(self, z: FloatArray) -> FloatArray:
+        """Return the derivative (n, 7, 16) of x' by z."""
+        return np.asarray((z @ self._quadratic.reshape(-1, _Z).T).reshape(-1, 7, _Z))
+
+    def _by_unknowns(self, turned: FloatArray) -> FloatArray:
+        """Return the derivative (n, 16, 10) of z by state and dipole; the next call overwrites the array."""
+        self._parts[:, _BE, _ATTITUDE] = turned
+        return self._parts
+
+
+_Z = 16
+_M, _B, _E, _W, _Q, _BE = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 16), slice(3, 9)
+_ATTITUDE, _RATE, _DIPOLE = slice(0, 4), slice(4, 7), slice(7, 10)
+
+
+def _quadratic(inertia: FloatArray) -> FloatArray:
+    """Return H (7, 16, 16), symmetric: 1/2 z . H z is the state's derivative but for the constant torque."""
+    result = np.zeros((7, _Z, _Z))
+    crossed = -cross_matrices(_EYE3)  # crossed[i] . (a, c) is the part i of a x c
+    result[:3, _Q, _W][:, :3] = 0.5 * crossed
+    result[_AXES, 15, 9 + _AXES] = 0.5
+    result[3, 12 + _AXES, 9 + _AXES] = -0.5
+    spun = np.linalg.inv(inertia) @ crossed.reshape(3, 9)
+    result[4:, _M, _B] = spun.reshape(3, 3, 3)
+    result[4:, _E, _E] = spun.reshape(3, 3, 3) @ inertia
+    result[4:, _W, _W] = -spun.reshape(3, 3, 3) @ inertia
+    return result + result.transpose(0, 2, 1)
 
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:

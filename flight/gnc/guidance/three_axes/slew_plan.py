@@ -18,7 +18,7 @@ from flight.gnc.errors import PlanningError
 from flight.gnc.guidance.three_axes.slew_cones import Cone, Kept
 from flight.gnc.guidance.three_axes.slew_ends import EndLaw
 from flight.gnc.guidance.three_axes.slew_limits import Limits
-from flight.gnc.guidance.three_axes.slew_model import Along, Motion, SlewCraft
+from flight.gnc.guidance.three_axes.slew_model import Along, SlewCraft
 from flight.gnc.guidance.three_axes.slew_path import SlewPath
 from flight.gnc.guidance.three_axes.slew_prey import guesses
 from flight.gnc.guidance.three_axes.slew_program import Program
@@ -140,7 +140,7 @@ class _Search:
         self._unit = float(np.mean(task.craft.limit))
         self._limit = task.craft.limit / self._unit
         self._full = task.craft.weights / float(task.craft.weights @ self._limit**2)
-        self._kept = Kept(task.cones, margin)
+        self._margin = margin
         self.steps = self.tried = 0
 
     def within(self) -> Found | None:
@@ -208,8 +208,9 @@ class _Search:
     def _equations(self, scale: float) -> Transcription:
         task = self._task
         start = np.concatenate([task.quaternion, scale * task.rate])
-        motion = Motion(task.craft, scale, self._unit)
-        return Transcription(motion, task.along, start, task.end, task.nodes, scale, self._full)
+        return Transcription(
+            task.craft, self._unit, task.along, start, task.end, task.nodes, scale, self._full
+        )
 
     def _relaxed(self) -> list[Found]:
         """Return paths without limits, the cheapest first, over the asked horizon or the next that has any.
@@ -257,7 +258,7 @@ class _Search:
         price = start.price * float(equations.weights[0] / before[0])
         if last == _LAST_BARRIER or self._peak(start) > 1.0:
             at = replace(at, dipoles=np.clip(at.dipoles, -0.98 * self._limit, 0.98 * self._limit))
-        program = Program(equations, Limits(equations, self._limit, self._kept))
+        program = Program(equations, Limits(equations, self._limit, self._kept(equations)))
         point = program.minimise(at, price, last=last, most=_STEPS_LIMITED)
         self.steps += program.steps
         if point is None or not equations.end.is_met(point.at.states[-1, :4]):
@@ -265,18 +266,19 @@ class _Search:
         return Found(equations, point.at, point.price)
 
     def _free(self, equations: Transcription) -> Limits:
-        return Limits(equations, None, Kept((), 0.0))
+        return Limits(equations, None, Kept((), 0.0, equations.times[1:]))
+
+    def _kept(self, equations: Transcription) -> Kept:
+        return Kept(self._task.cones, self._margin, equations.times[1:])
 
     def _is_kept(self, found: Found) -> bool:
-        times = found.equations.times[1:]
-        return self._peak(found) <= 1.0 and bool(
-            np.all(self._kept.values(found.at.states[1:, :4], times) >= 0.0)
-        )
+        kept = self._kept(found.equations).values(found.at.states[1:, :4])
+        return self._peak(found) <= 1.0 and bool(np.all(kept >= 0.0))
 
     def plan(self, found: Found) -> SlewPlan:
         """Return the plan that flies a path. Raises PlanningError when the path is not finite."""
         task, equations, at, scale = self._task, found.equations, found.at, found.equations.scale
-        flow = equations.motion.flow(at.states, at.all_dipoles(), equations.around)
+        flow = equations.motion.flow(at.states, at.all_dipoles())
         q = at.states[:, :4] / np.linalg.norm(at.states[:, :4], axis=1, keepdims=True)
         dipole = self._unit * at.all_dipoles()
         path = SlewPath(equations.times, q, at.states[:, 4:] / scale, flow[:, 4:] / scale**2, dipole)

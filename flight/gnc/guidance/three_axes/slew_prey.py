@@ -13,7 +13,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from flight.gnc.guidance.three_axes.slew_ends import Boresight, End
-from flight.gnc.guidance.three_axes.slew_model import Around, Motion, SlewCraft, cross, shown
+from flight.gnc.guidance.three_axes.slew_model import Around, Motion, SlewCraft, cross
 from flight.gnc.guidance.three_axes.slew_transcription import Trajectory
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.directions import tangent_basis
@@ -57,7 +57,7 @@ def guesses(
         field = normalise(attitude_matrix(middle) @ around.field[len(around.field) // 2])
         for phase in _PHASES:
             states = _circling(start, turn, field, float(phase), len(around.field))
-            yield Trajectory(states, _dipoles(motion, craft, states, around)[::2])
+            yield Trajectory(states, _dipoles(motion, craft, states)[::2])
 
 
 def _circling(start: FloatArray, turn: FloatArray, field: FloatArray, phase: float, count: int) -> FloatArray:
@@ -85,9 +85,9 @@ def _across(field: FloatArray) -> FloatArray:
     return tangent_basis(field)
 
 
-def _dipoles(motion: Motion, craft: SlewCraft, states: FloatArray, around: Around) -> FloatArray:
+def _dipoles(motion: Motion, craft: SlewCraft, states: FloatArray) -> FloatArray:
     """Return the least dipoles (n, 3) for the part of the states' torque that lies across the field."""
-    still = motion.flow(states, np.zeros((len(states), 3)), around)
+    still = motion.flow(states, np.zeros((len(states), 3)))
     wanted = np.gradient(states[:, 4:], 1.0 / (len(states) - 1), axis=0) - still[:, 4:]
-    field = motion.push * shown(states[:, :4], around.field)
+    field = motion.field(states[:, :4])
     return np.asarray(cross(field, wanted @ craft.inertia) / np.sum(field * field, axis=1, keepdims=True))

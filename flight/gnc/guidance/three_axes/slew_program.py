@@ -1,7 +1,8 @@
 """Newton's method on a slew's equations, with barriers for its limits: a primal-dual interior point method.
 
 Wachter and Biegler, Math. Program. 106 (2006), with the curvature test of Chiang and Zavala (Math. Program.
-2016) in place of a count of eigenvalues. Without limits it is Newton's method itself.
+2016) in place of a count of eigenvalues, and second-order corrections. Without limits it is Newton's method
+itself. Far from the equations, their curvature is left out (Gauss and Newton): it misleads there.
 """
 
 from __future__ import annotations
@@ -11,14 +12,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from flight.gnc.errors import PlanningError
-from flight.gnc.guidance.three_axes.slew_band import solve
+from flight.gnc.guidance.three_axes.slew_band import Factors
 from flight.gnc.guidance.three_axes.slew_limits import Limits
 from flight.gnc.guidance.three_axes.slew_transcription import Linear, Trajectory, Transcription
 from flight.gnc.math.arrays import FloatArray
 
+_EYE7: FloatArray = np.eye(7)
 _TOLERANCE = 1e-6
 _TO_BOUNDARY = 0.995
 _HALVINGS = 7
+_CORRECTED, _CORRECTIONS = 4, 2
+"""The first halvings are corrected, so often each."""
+_HEAVIER = 1.2
+"""The merit's weight of the equations over their largest multiplier."""
+_FAR = 0.03
+"""Sum of all equations' violations beyond which their curvature is left out."""
 _CONVEX = 1e-3, 1e4
 
 
@@ -47,11 +55,15 @@ class Point:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Step:
-    """A Newton step: of all unknowns (size,), and of the limits' slacks and duals."""
+    """A Newton step: of all unknowns (size,) and of the limits' duals; `off` is what the slacks lack.
+
+    `factors` are those of its equations.
+    """
 
     change: FloatArray
-    slack: FloatArray
     dual: FloatArray
+    off: FloatArray
+    factors: Factors
 
 
 class Program:
@@ -114,9 +126,14 @@ class Program:
 
     def _moved(self, point: Point, barrier: float, convex: float, error: float) -> tuple[Point | None, float]:
         """Return the next iterate, None without one, and the convexity that it took."""
-        stiffness = self._limits.stiffness(point.at, point.dual, point.slack)
+        is_far = float(np.abs(point.slope[self._equal]).sum()) > _FAR
+        bent = np.zeros_like(point.dual) if is_far else point.dual
+        stiffness = self._limits.stiffness(point.at, point.dual / point.slack, bent)
+        price = np.zeros_like(point.price) if is_far else point.price
         for _ in range(10):
-            step = self._newton(point, barrier, convex, stiffness)
+            states, heavy = stiffness
+            stiff = states + convex * _EYE7, heavy + convex
+            step = self._newton(point, barrier, convex, self._equations.band(point.linear, price, *stiff))
             if step is not None:
                 moved = self._searched(point, step, barrier, error)
                 if moved is not None:
@@ -126,56 +143,71 @@ class Program:
                 break
         return None, convex
 
-    def _newton(
-        self, point: Point, barrier: float, convex: float, stiffness: tuple[FloatArray, FloatArray]
-    ) -> Step | None:
-        """Return the Newton step with `convex` added to the curvature; None where that stays concave."""
-        limits, at, (states, heavy) = self._limits, point.at, stiffness
+    def _newton(self, point: Point, barrier: float, convex: float, band: FloatArray) -> Step | None:
+        """Return the Newton step of a `band` with `convex` added; None where the curvature stays concave."""
+        limits, at = self._limits, point.at
         stiff = point.dual / point.slack
         off = limits.values(at) - point.slack
         # The limits' duals after the step, were it to move nothing.
         toward = barrier / point.slack - stiff * off
-        band = self._equations.band(point.linear, point.price, states + convex * np.eye(7), heavy + convex)
         right = limits.pull(at, toward) - point.slope
-        change = solve(band, right[:, None])[:, 0]
+        factors = Factors(band)
+        change = factors.solve(right)
         # d.H.d, from the equations just solved: H d = right - C' dl, C d = right.
         equal, primal = self._equal, self._primal
         bend = right[primal] @ change[primal] - right[equal] @ change[equal]
         if bend <= 1e-8 * min(convex, 1.0) * float(change[primal] @ change[primal]):
             return None
-        along = limits.along(at, change)
-        return Step(change, along + off, toward - stiff * along - point.dual)
+        return Step(change, toward - stiff * limits.along(at, change) - point.dual, off, factors)
 
     def _searched(self, point: Point, step: Step, barrier: float, error: float) -> Point | None:
         """Return the point along a step that lowers the error, or the merit; None without one."""
-        equal, at, place = self._equal, point.at, self._equations.layout
-        size = _share(point.slack, step.slack)
+        equal, missed = self._equal, point.slope[self._equal]
+        size = _share(point.slack, self._limits.along(point.at, step.change) + step.off)
         dual = point.dual + _share(point.dual, step.dual) * step.dual
-        weight = 2.0 * float(np.abs(point.price[equal] + step.change[equal]).max())
-        before, violation = self._merit(at, point.slack, barrier, weight)
+        weight = _HEAVIER * float(np.abs(point.price[equal] + step.change[equal]).max())
+        before = self._merit(point.at, point.slack, barrier, weight, missed)
+        violation = float(np.abs(missed).sum() + np.abs(step.off).sum())
+        left = missed
         for attempt in range(_HALVINGS):
-            there = Trajectory(
-                at.states + size * step.change[place.states],
-                at.dipoles + size * step.change[place.dipoles],
-            )
-            slack = point.slack + size * step.slack
-            after, _ = self._merit(there, slack, barrier, weight)
-            lowered = after < before - 1e-5 * size * weight * violation
-            if lowered or attempt == 0:
-                price = point.price.copy()
-                price[equal] += size * step.change[equal]
-                moved = self._point(there, price, slack, dual)
-                if lowered or self._error(moved, barrier) < 0.9 * error:
-                    return moved
+            lower = before - 1e-5 * size * weight * violation
+            change = size * step.change
+            for correction in range(_CORRECTIONS + 1 if attempt < _CORRECTED else 1):
+                if correction:
+                    # What the curvature of the equations adds is taken back by the same factors.
+                    back = np.zeros(len(change))
+                    back[equal] = (1.0 - size) * missed - left
+                    change = change + step.factors.solve(back)
+                there, slack = self._shifted(point, change, size * step.off)
+                if slack.size and float((slack - (1.0 - _TO_BOUNDARY) * point.slack).min()) < 0.0:
+                    break
+                left = self._violations(there)
+                lowered = self._merit(there, slack, barrier, weight, left) < lower
+                if lowered or (attempt == 0 and correction == _CORRECTIONS):
+                    price = point.price.copy()
+                    price[equal] += size * step.change[equal]
+                    moved = self._point(there, price, slack, dual)
+                    if lowered or self._error(moved, barrier) < 0.9 * error:
+                        return moved
             size *= 0.5
         return None
 
-    def _merit(self, at: Trajectory, slack: FloatArray, barrier: float, weight: float) -> tuple[float, float]:
-        """Return cost and barriers plus `weight` times the violation of all equations, and that violation."""
-        violation = sum(float(np.abs(part).sum()) for part in self._equations.remainders(at))
-        violation += float(np.abs(self._limits.values(at) - slack).sum())
-        barriers = barrier * float(np.log(slack).sum())
-        return self._equations.cost(at) + weight * violation - barriers, violation
+    def _shifted(self, point: Point, change: FloatArray, off: FloatArray) -> tuple[Trajectory, FloatArray]:
+        """Return the trajectory and the slacks after a change (size,); the slacks mend `off`, too."""
+        at, place = point.at, self._equations.layout
+        there = Trajectory(at.states + change[place.states], at.dipoles + change[place.dipoles])
+        return there, point.slack + self._limits.along(at, change) + off
+
+    def _violations(self, at: Trajectory) -> FloatArray:
+        """Return what remains of all equations."""
+        return np.concatenate([part.ravel() for part in self._equations.remainders(at)])
+
+    def _merit(
+        self, at: Trajectory, slack: FloatArray, barrier: float, weight: float, missed: FloatArray
+    ) -> float:
+        """Return cost and barriers plus `weight` times the violation of all equations."""
+        violation = float(np.abs(missed).sum() + np.abs(self._limits.values(at) - slack).sum())
+        return self._equations.cost(at) + weight * violation - barrier * float(np.log(slack).sum())
 
 
 def _share(values: FloatArray, change: FloatArray) -> float:

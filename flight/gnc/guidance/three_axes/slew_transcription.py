@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from flight.gnc.guidance.three_axes.slew_band import EQUATIONS, STEP, WIDE, layout
-from flight.gnc.guidance.three_axes.slew_ends import EndLaw, miss, miss_curvature, miss_slope
-from flight.gnc.guidance.three_axes.slew_model import Along, Motion
+from flight.gnc.guidance.three_axes.slew_ends import Ending, EndLaw
+from flight.gnc.guidance.three_axes.slew_model import Along, Motion, SlewCraft
 from flight.gnc.math.arrays import FloatArray
 
 _EYE7: FloatArray = np.eye(7)
@@ -57,12 +57,13 @@ class Linear:
 class Transcription:
     """The equations of a slew from a state (7,) over `scale` s, the unit of its times, on `count` intervals.
 
-    `weights` (3,) are those of the dipoles' squares in the cost.
+    `unit` A m^2 is that of the dipoles; `weights` (3,) are those of the dipoles' squares in the cost.
     """
 
     def __init__(
         self,
-        motion: Motion,
+        craft: SlewCraft,
+        unit: float,
         along: Along,
         start: FloatArray,
         end: EndLaw,
@@ -70,11 +71,13 @@ class Transcription:
         scale: float,
         weights: FloatArray,
     ) -> None:
-        self.motion, self.start, self.end = motion, start, end(scale)
+        self.start, self.end = start, end(scale)
+        self._ending = Ending(self.end, scale)
         self.weights, self.count, self.scale = weights, count, scale
         self.times = np.linspace(0.0, scale, 2 * count + 1)
         self.around = along(self.times)
-        self.layout = layout(count, len(miss(self.end, start, scale)))
+        self.motion = Motion(craft, scale, unit, self.around)
+        self.layout = layout(count, self._ending.count)
         self._step = 1.0 / count
 
     def cost(self, at: Trajectory) -> float:
@@ -86,17 +89,18 @@ class Transcription:
     def remainders(self, at: Trajectory) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return what remains of the intervals' equations (k, 14), the start's (7,) and the end's."""
         x, h = at.states, self._step
-        flow = self.motion.flow(x, at.all_dipoles(), self.around)
+        flow = self.motion.flow(x, at.all_dipoles())
         a, c, b = flow[:-1:2], flow[1::2], flow[2::2]
         left, middle, right = x[:-1:2], x[1::2], x[2::2]
         half = middle - 0.5 * (left + right) - h / 8.0 * (a - b)
         whole = right - left - h / 6.0 * (a + 4.0 * c + b)
-        return np.concatenate([half, whole], axis=1), x[0] - self.start, miss(self.end, x[-1], self.scale)
+        return np.concatenate([half, whole], axis=1), x[0] - self.start, self._ending.miss(x[-1])
 
     def linear(self, at: Trajectory) -> Linear:
         """Return the equations around a trajectory."""
         h = self._step
-        by_state, by_dipole = self.motion.slopes(at.states, at.all_dipoles(), self.around)
+        slopes = self.motion.slopes(at.states, at.all_dipoles())
+        by_state, by_dipole = slopes[:, :, :7], slopes[:, :, 7:]
         jacobian = np.zeros((self.count, 14, WIDE))
         a, c, b = by_state[:-1:2], by_state[1::2], by_state[2::2]
         jacobian[:, :7, :7] = -0.5 * _EYE7 - h / 8.0 * a
@@ -110,7 +114,7 @@ class Transcription:
         jacobian[:, 7:, 7:10] = -h / 6.0 * a - h / 3.0 * c
         jacobian[:, :7, 38:41] = h / 8.0 * b
         jacobian[:, 7:, 38:41] = -h / 6.0 * b - h / 3.0 * c
-        ending = miss_slope(self.end, at.states[-1], self.scale)
+        ending = self._ending.slope(at.states[-1])
         return Linear(at, *self.remainders(at), jacobian, ending)
 
     def slope(self, linear: Linear, price: FloatArray) -> FloatArray:
@@ -162,7 +166,7 @@ class Transcription:
         block[:, :, EQUATIONS] += linear.jacobian.transpose(0, 2, 1)
         tail = np.zeros((10 + len(linear.ended),) * 2)
         tail[:10, :10] = nodes[-1]
-        tail[:4, :4] += miss_curvature(self.end, price[self.layout.end], self.scale)
+        tail[:4, :4] += self._ending.curvature(price[self.layout.end])
         tail[10:, :7], tail[:7, 10:] = linear.ending, linear.ending.T
         return self.layout.band(block, tail)
 
@@ -174,4 +178,4 @@ class Transcription:
         y[:-1:2] += -h / 8.0 * half - h / 6.0 * whole
         y[2::2] += h / 8.0 * half - h / 6.0 * whole
         y[1::2] = -4.0 * h / 6.0 * whole
-        return self.motion.curvature(at.states, at.all_dipoles(), self.around, y)
+        return self.motion.curvature(at.states, at.all_dipoles(), y)

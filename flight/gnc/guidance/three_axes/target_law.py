@@ -38,15 +38,15 @@ def law_of(
     if target.goal is Goal.INERTIAL:
         fixed = normalise(np.array(target.numbers))
         return lambda _, times: np.broadcast_to(fixed, (len(times), 4))
-    first, second = _directions(target)
+    first, second = directions_of(target)
     if target.roll is None:
         return attitude_law.free_roll(axes.pointing, first, quaternion, ephemeris, time).attitudes
     turned = attitude_matrix(from_rotation_vector(target.roll * axes.pointing)) @ axes.across
     return AttitudeLaw(axes.pointing, first, turned, second).attitudes
 
 
-def _directions(target: PointingTarget) -> tuple[Direction, Direction]:
-    """Return the direction of a goal, and the second direction that a roll of zero is measured from."""
+def directions_of(target: PointingTarget) -> tuple[Direction, Direction]:
+    """Return a goal's direction, and the direction that a roll of zero is measured from. Not for INERTIAL."""
     if target.goal is Goal.GROUND:
         return attitude_law.ground(*target.numbers), attitude_law.velocity
     return {

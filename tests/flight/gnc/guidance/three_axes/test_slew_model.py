@@ -14,17 +14,17 @@ def test_slopes_and_curvature_are_those_of_central_differences() -> None:
     craft = SlewCraft(
         inertia, np.full(3, 0.2), np.ones(3), 1e-3 * rng.normal(size=3), 1e-8 * rng.normal(size=3)
     )
-    motion = Motion(craft, 300.0, 0.2)
     point, pull = rng.normal(size=(4, 10)), rng.normal(size=(4, 7))
     around = Around(3e-5 * rng.normal(size=(4, 3)), 4e6 * rng.normal(size=(4, 3)))
+    motion = Motion(craft, 300.0, 0.2, around)
 
     def flow(z: np.ndarray) -> np.ndarray:
-        return motion.flow(z[:, :7], z[:, 7:], around)
+        return motion.flow(z[:, :7], z[:, 7:])
 
     def slopes(z: np.ndarray) -> np.ndarray:
-        return np.concatenate(motion.slopes(z[:, :7], z[:, 7:], around), axis=2)
+        return motion.slopes(z[:, :7], z[:, 7:])
 
-    curvature = motion.curvature(point[:, :7], point[:, 7:], around, pull)
+    curvature = motion.curvature(point[:, :7], point[:, 7:], pull)
     for k in range(10):
         shift = 1e-5 * np.eye(10)[k]
         rise = (flow(point + shift) - flow(point - shift)) / 2e-5

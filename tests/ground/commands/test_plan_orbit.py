@@ -1,0 +1,60 @@
+"""`flight plan --orbit`: one slew in three axes as JSON, text and picture, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.ground.commands.in_process import command
+
+PLAN = ("plan", "--orbit", "orbit", "--at", "2026-03-01T12:05:00", "--nodes", "12")
+TO_THE_SUN = (*PLAN, "--from", "nadir", "--to", "sun", "--earth-cone", "5")
+
+
+def test_a_slew_begins_in_its_start_and_ends_in_its_target_whose_length_is_mended() -> None:
+    done = command(*PLAN, "--from", "nadir", "--to", "inertial 0.1 0.2 0.3 0.9", "--within", "120", "--json")
+    assert done.returncode == 0, done.stderr
+    facts = json.loads(done.stdout)
+    assert (facts["status"], facts["horizon_s"]) == ("optimal", 120.0)
+    wanted = np.array([0.1, 0.2, 0.3, 0.9]) / np.sqrt(0.95)
+    assert abs(wanted @ facts["quaternion"][-1]) == pytest.approx(1.0, abs=1e-6)
+    # Nadir turns once a revolution of 5,677 s.
+    assert np.linalg.norm(facts["rate_rad_s"][0]) == pytest.approx(2.0 * np.pi / 5677.0, rel=0.01)
+    assert np.abs(facts["dipole_A_m2"]).max() == pytest.approx(
+        facts["peak_of_limit"] * facts["dipole_limit_A_m2"][0]
+    )
+
+
+def test_the_picture_is_drawn_and_the_text_says_how_far_the_camera_keeps_from_the_earth(
+    tmp_path: Path,
+) -> None:
+    pytest.importorskip("matplotlib", reason="pictures need the extra 'plots'")
+    picture = tmp_path / "slew.png"
+    done = command(*TO_THE_SUN, "--within", "100", "--picture", picture)
+    assert done.returncode == 0, done.stderr
+    assert "to sun, roll free" in done.stdout
+    (clear,) = [line for line in done.stdout.splitlines() if line.startswith("earth:")]
+    assert float(clear.split()[1]) >= 0.0
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        ((*PLAN, "--from", "nadir", "--to", "moon", "--within", "9"), "--to 'moon': 'moon' is no goal"),
+        ((*PLAN, "--from", "nadir", "--to", "inertial 1 2 3 4", "--within", "9"), "must have length 1"),
+        ((*PLAN, "--from", "nadir", "--to", "sun"), "--orbit needs --at UTC and --within S"),
+        ((*TO_THE_SUN, "--within", "90", "--window", "-1"), "a window of -1 s: must be 0 to 20000"),
+        ((*TO_THE_SUN, "--within", "90", "--horizon", "9"), "--horizon: has no meaning with --orbit"),
+        (("plan", "--from", "0", "--to", "0", "--within", "9"), "--within: has no meaning without --orbit"),
+        (("plan", "--from", "nadir", "--to", "0"), "--from: 'nadir' is not a number; targets need --orbit"),
+        ((*PLAN, "--orbit", "step_demo", "--within", "9", "--from", "sun", "--to", "sun"),
+         "needs the configuration of a satellite"),
+    ],
+)  # fmt: skip
+def test_wrong_use_is_status_2(words: tuple[str, ...], complaint: str) -> None:
+    done = command(*words)
+    assert (done.returncode, complaint in done.stderr) == (2, True), done.stderr
