@@ -93,6 +93,20 @@ class TargetStep(Section, frozen=True, kw_only=True):
         return PointingTarget(Goal.named(self.point), (*numbers, *(self.quaternion or ())), roll)
 
 
+class Requirements(Section, frozen=True, kw_only=True):
+    """What `flight report` judges an orbit flight by; what is left out is not judged.
+
+    `slow_within` s from the start to the end of the braking; `fine_within` s from there to a fine attitude.
+    In deg, rms: `knowledge_deg` of the attitude called fine, three axes; `pointing_deg` of the pointed axis,
+    once a target was pointed to for ten minutes.
+    """
+
+    slow_within: Positive | None = None
+    fine_within: Positive | None = None
+    knowledge_deg: Positive | None = None
+    pointing_deg: Positive | None = None
+
+
 class OrbitConfig(Config, frozen=True, kw_only=True):
     """The configuration of a satellite in orbit; `elements` are the two lines of its orbit, where known."""
 
@@ -102,6 +116,7 @@ class OrbitConfig(Config, frozen=True, kw_only=True):
     detumble: FieldDetumble = FieldDetumble()
     pointing: PointingSection = PointingSection()
     targets: Annotated[tuple[TargetStep, ...], Meta(min_length=1)] = (TargetStep(at=0.0, point="nadir"),)
+    requirements: Requirements = Requirements()
 
     def field_range(self) -> tuple[float, float]:
         """Return the smallest and the largest strength of a valid magnetometer reading, T."""

@@ -15,9 +15,11 @@ from matplotlib.figure import Figure
 from flight.link.telemetry.packets import to_text
 from ground.report import panels
 from ground.report.knowledge_figure import knowledge_figure
+from ground.report.orbit_figure import orbit_figure
 from ground.report.scene import Scene
 from ground.report.signals import seconds
 from ground.report.spin_figure import spin_figure
+from ground.report.track_figure import track_figure
 from ground.telemetry.reader import Run
 
 DPI = 110
@@ -25,6 +27,7 @@ WIDE = (11.0, 5.2)
 TALL = (11.0, 7.6)
 OVERVIEW = (10.9, 12.7)
 PATH_WINDOW_S = 20.0
+_IN_ORBIT = ("power", "cycle_times", "spin", "knowledge", "pointing", "track")
 
 
 def draw_figures(run: Run, folder: Path) -> list[Path]:
@@ -40,9 +43,11 @@ def draw_figures(run: Run, folder: Path) -> list[Path]:
         "overview": _overview,
         "spin": lambda scene: spin_figure(scene.run),
         "knowledge": lambda scene: knowledge_figure(scene.run),
+        "pointing": orbit_figure,
+        "track": lambda scene: track_figure(scene.run),
     }
     if len(run["spin"]):  # a satellite in orbit has no q2
-        pictures = {name: pictures[name] for name in ("power", "cycle_times", "spin", "knowledge")}
+        pictures = {name: pictures[name] for name in _IN_ORBIT}
     files = []
     for name, picture in pictures.items():
         figure = picture(scene)

@@ -10,7 +10,7 @@ import numpy as np
 
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import conjugate, multiply, to_rotation_vector
-from ground.report.signals import seconds
+from ground.report.signals import seconds, true_rows
 from ground.telemetry.reader import Run
 
 Object = dict[str, Any]
@@ -35,9 +35,8 @@ def attitude_errors(run: Run) -> AttitudeErrors:
     known = packets[np.isfinite(packets["quaternion"][:, 0])]
     if not len(known) or not len(truth):
         return AttitudeErrors(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
-    place = np.minimum(np.searchsorted(truth["time_ns"], known["time_ns"]), len(truth) - 1)
-    same = truth["time_ns"][place] == known["time_ns"]
-    known, place = known[same], place[same]
+    place = true_rows(truth, known)
+    known, place = known[place >= 0], place[place >= 0]
     true = truth["quaternion"][place].astype(float)
     error = to_rotation_vector(multiply(true, conjugate(known["quaternion"].astype(float))))
     return AttitudeErrors(seconds(known), error, known["angle_sigma"].astype(float))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.arrays import FloatArray, IntArray
 from flight.link.telemetry.packets import PacketArray
 from ground.telemetry.reader import Run
 
@@ -61,6 +61,14 @@ class CoilPower:
 def seconds(packets: PacketArray) -> FloatArray:
     """Return the mission times (n,) of packets, in s."""
     return np.asarray(packets["time_ns"] / 1e9)
+
+
+def true_rows(truth: PacketArray, packets: PacketArray) -> IntArray:
+    """Return for each packet (n,) the row of the truth at the same time, -1 where there is none."""
+    if not len(truth):
+        return np.full(len(packets), -1)
+    place = np.minimum(np.searchsorted(truth["time_ns"], packets["time_ns"]), len(truth) - 1)
+    return np.where(truth["time_ns"][place] == packets["time_ns"], place, -1)
 
 
 def true_attitude(run: Run) -> Attitude | None:

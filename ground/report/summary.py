@@ -12,6 +12,9 @@ import numpy as np
 
 from flight.gnc.math.arrays import FloatArray
 from flight.link.telemetry.packets import to_text
+from flight.schema import reader
+from flight.schema.errors import ConfigError
+from flight.schema.orbit import OrbitConfig, as_orbit
 from ground.report import performance as limits
 from ground.report.detumbling import detumbling
 from ground.report.knowledge import knowledge
@@ -27,6 +30,8 @@ from ground.report.operations import (
     step_ends,
 )
 from ground.report.performance import Command, Response, commands, interrupted, placed, response
+from ground.report.pointing import pointing
+from ground.report.requirements import judge, required
 from ground.report.sensing import estimate_errors, failed_frames, star_attitudes, streaks
 from ground.report.signals import Attitude, coil_power, estimated_attitude, seconds, true_attitude
 from ground.telemetry.reader import Run
@@ -43,12 +48,17 @@ def summarise(run: Run) -> Object:
     in_orbit = len(run["spin"]) > 0
     steps = [] if in_orbit else _steps(run, attitude, identity["duration_planned_s"], notes)
     power = _power(run, notes)
+    braked, known = detumbling(run), knowledge(run)
+    config = _orbit_config(run, notes) if in_orbit else None
+    pointed = None if config is None else pointing(run, config.pointing.axis, coil_power(run))
     summary: Object = {
         "run": identity,
         "attitude_source": attitude.source,
         "steps": [_step_row(*step) for step in steps],
-        "detumbling": detumbling(run),
-        "knowledge": knowledge(run),
+        "detumbling": braked,
+        "knowledge": known,
+        "pointing": pointed,
+        "requirements": [] if config is None else required(config, braked, known, pointed),
         "thesis": [] if in_orbit else _against_thesis([(c, r) for c, r in steps if r is not None], power),
         "power": power,
         "rate_groups": rate_groups(run["rate_group"]),
@@ -67,6 +77,15 @@ def summarise(run: Run) -> Object:
     }
     plain: Object = _plain(summary)
     return plain
+
+
+def _orbit_config(run: Run, notes: list[str]) -> OrbitConfig | None:
+    """Return the configuration that was flown, None where its copy beside the log cannot be read."""
+    try:
+        return as_orbit(reader.load(run.folder / "config.yaml"))
+    except ConfigError as error:
+        notes.append(f"pointing and requirements not judged: {error}")
+        return None
 
 
 def _plain(value: Any) -> Any:
@@ -233,24 +252,15 @@ def _against_thesis(steps: list[tuple[Command, Response]], power: Object) -> lis
     judged = [r.rise_s for c, r in steps if _rise_is_judged(c)]
     responses = [r for _, r in steps]
     return [
-        _judge(
+        judge(
             "steady-state error",
             [r.steady_state_deg for r in responses],
             limits.STEADY_STATE_LIMIT_DEG,
             "deg",
         ),
-        _judge("overshoot", [r.overshoot_percent for r in responses], limits.OVERSHOOT_LIMIT_PERCENT, "%"),
-        _judge("rise time", judged, limits.RISE_LIMIT_S, "s"),
-        _judge("settling time", [r.settling_s for r in responses], limits.SETTLING_LIMIT_S, "s"),
-        _judge("average power", [power["average_w"]], limits.AVERAGE_POWER_LIMIT_W, "W"),
-        _judge("largest current", [power["peak_current_a"]], limits.CURRENT_LIMIT_A, "A"),
+        judge("overshoot", [r.overshoot_percent for r in responses], limits.OVERSHOOT_LIMIT_PERCENT, "%"),
+        judge("rise time", judged, limits.RISE_LIMIT_S, "s"),
+        judge("settling time", [r.settling_s for r in responses], limits.SETTLING_LIMIT_S, "s"),
+        judge("average power", [power["average_w"]], limits.AVERAGE_POWER_LIMIT_W, "W"),
+        judge("largest current", [power["peak_current_a"]], limits.CURRENT_LIMIT_A, "A"),
     ]
-
-
-def _judge(quantity: str, values: list[float], limit: float, unit: str) -> Object:
-    """Return the largest of `values`, NaN left out, with its verdict: "pass", "miss", "unknown" if none."""
-    known = [value for value in values if not math.isnan(value)]
-    worst = max(known, default=math.nan)
-    within = worst <= limit * (1.0 + 1e-9)
-    verdict = ("pass" if within else "miss") if known else "unknown"
-    return {"quantity": quantity, "worst": worst, "limit": limit, "unit": unit, "verdict": verdict}

@@ -22,7 +22,9 @@ def format_report(summary: Object) -> str:
         _steps(summary),
         _detumbling(summary["detumbling"]),
         _knowledge(summary["knowledge"]),
-        _thesis(summary),
+        _pointing(summary["pointing"]),
+        _bounds("Against the requirements of the configuration", "required", summary["requirements"]),
+        _bounds("Worst against the thesis (Sease 2013, Table 5.3 and ch. 5)", "bound", summary["thesis"]),
         _power(summary["power"], bool(summary["thesis"])),
         _loop(summary),
         _planner(summary),
@@ -139,30 +141,53 @@ def _knowledge(found: Object | None) -> list[str]:
     ]
 
 
-def _thesis(summary: Object) -> list[str]:
-    if not summary["thesis"]:
+def _pointing(found: Object | None) -> list[str]:
+    if found is None:
         return []
-    digits = {"W": 4, "A": 4}
+    degrees = 180.0 / math.pi
+    errors = ("axis_rms_rad", "axis_worst_rad", "all_axes_rms_rad")
+    rows = [
+        [
+            aim["target"],
+            number(aim["begin_s"], 1),
+            number(aim["duration_s"], 1),
+            *(number(aim[name], 2, degrees) for name in errors),
+            number(aim["power_w"], 2, 1e3),
+        ]
+        for aim in found["targets"]
+    ]
+    head = ["pointing to", "from s", "for s", "axis deg rms", "at most", "all axes deg rms", "R I^2 mW"]
+    return [
+        f"Pointing, {'true' if found['source'] == 'truth' else 'estimated'} attitude",
+        *table(head, rows),
+        f"  errors from {number(found['settled_after_s'], 0)} s after the begin on",
+    ]
+
+
+def _bounds(title: str, bound: str, judged: list[Object]) -> list[str]:
+    if not judged:
+        return []
     rows = [
         [
             row["quantity"],
-            number(row["worst"], digits.get(row["unit"], 2)),
+            number(row["worst"], 2 if row["limit"] >= 1.0 else 4),
             f"{row['limit']:g} {row['unit']}",
             row["verdict"],
         ]
-        for row in summary["thesis"]
+        for row in judged
     ]
-    return [
-        "Worst against the thesis (Sease 2013, Table 5.3 and ch. 5)",
-        *table(["", "here", "bound", ""], rows),
-    ]
+    return [title, *table(["", "here", bound, ""], rows)]
 
 
 def _power(power: Object, compared: bool) -> list[str]:
     """Return the lines of the power, `compared` with the thesis's."""
     if power["source"] is None:
         return []
-    actual = power["peak_current_actual_a"]
+    currents = (
+        (power["peak_current_a"], "written"),
+        (power["peak_current_actual_a"], "in the coils (truth)"),
+    )
+    largest = [f"{number(value, 4)} A {where}" for value, where in currents if value is not None]
     thesis = ("   (thesis: on the order of 100 mW)", "   (thesis: about 0.5 W)")
     average, peak = thesis if compared else ("", "")
     return [
@@ -172,8 +197,7 @@ def _power(power: Object, compared: bool) -> list[str]:
         f"  supply, V |I|   {number(power['supply_average_w'], 3, 1e3)} mW on average at the coils, "
         f"{number(power['bus_average_w'], 1, 1e3)} mW at the bus (monitor, once a second)",
         f"  energy          {number(power['energy_j'], 3)} J",
-        f"  largest current {number(power['peak_current_a'], 4)} A written"
-        + ("" if actual is None else f", {number(actual, 4)} A in the coils (truth)"),
+        f"  largest current {', '.join(largest)}",
     ]
 
 

@@ -1,0 +1,117 @@
+"""The report of a flight in orbit: pointing errors of each target, and the verdicts of its requirements."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flight.gnc.math.quaternion import from_rotation_vector, multiply
+from flight.link import events
+from flight.link.modes import Mode
+from flight.link.telemetry import definitions as table
+from flight.link.telemetry.log import FlightLog
+from flight.link.telemetry.orbit_definitions import ORBIT_TRUTH, SPIN
+from flight.link.telemetry.packets import Packer
+from ground.report import draw, summarise
+from ground.telemetry.reader import read_run
+from tests.manual_clock import ManualClock
+from tests.scenario.flights import CONFIG
+
+NAN3 = (math.nan,) * 3
+PERIOD_S, SECOND_AIM_S, DURATION_S = 10, 1000, 2000
+OFF_DEG = (3.0, 4.0, 12.0)
+"""About x, y, z once settled; ten times as much before."""
+LIMITS = "requirements: {slow_within: 100.0, knowledge_deg: 0.1, pointing_deg: %s}"
+
+
+def flown(folder: Path, limit_deg: float) -> Path:
+    """Write a flight that turns slowly from two targets by `OFF_DEG`, as its configuration and logs say."""
+    clock, packer = ManualClock(0), Packer()
+    flight, truth = (
+        FlightLog(folder, stem, clock=clock, sync_period_ns=None) for stem in ("flight", "truth")
+    )
+    text = CONFIG.with_name("orbit.yaml").read_text(encoding="utf-8")
+    begin, end = text.index("requirements:"), text.index("executive:")
+    limits = LIMITS % limit_deg
+    (folder / "config.yaml").write_text(f"{text[:begin]}{limits}\n\n{text[end:]}", encoding="utf-8")
+    target = from_rotation_vector(np.array([0.3, -0.2, 1.0]))
+    for at in range(0, DURATION_S, PERIOD_S):
+        stamp = at * 1_000_000_000
+        clock.sleep_until_ns(stamp)
+        if at % SECOND_AIM_S == 0:
+            event = {"code": events.TARGET.code, "name": "target", "severity": 0, "suppressed": 0}
+            flight.write(packer.pack(table.EVENT, stamp, **event, text="sun" if at == 0 else "nadir"))
+        settled = at % SECOND_AIM_S >= 600
+        off = np.radians(OFF_DEG) * (1.0 if settled else 10.0)
+        true = multiply(from_rotation_vector(off), target).tolist()
+        wanted = {"wanted": [math.nan] * 4, "wanted_rate": NAN3, "target": target.tolist(), "dipole": NAN3}
+        sigma = {"angle_sigma": (1e-4,) * 3, "rate_sigma": (1e-5,) * 3}
+        known = {"mode": int(Mode.POINT), "quaternion": target.tolist(), "rate": NAN3}
+        flight.write(packer.pack(table.ATTITUDE, stamp, **known, **sigma, **wanted))
+        flight.write(
+            packer.pack(
+                SPIN, stamp, known=0, rate=NAN3, rate_sigma=1.0, field=NAN3, restarts=0, dipole=(0.0,) * 3
+            )
+        )
+        coils = {"current": (0.0,) * 3, "energy": 0.002 * at, "supply_energy": 0.0}
+        truth.write(packer.pack(table.TRUTH, stamp, quaternion=true, rate=(0.0, 0.001, 0.0), **coils))
+        turn = 2.0 * math.pi * at / 5700.0
+        place = [7e6 * math.cos(turn), 0.0, 7e6 * math.sin(turn)]
+        torques = {f"{name}_torque": NAN3 for name in ("coil", "dipole", "gravity", "drag", "sunlight")}
+        around = {"velocity": NAN3, "field": (2e-5, 0.0, 1e-5), "sun": NAN3, "residual_dipole": NAN3}
+        sky = {"utc": 2461000.5 + at / 86400.0, "position": place, "sunlit": float(at < 1500)}
+        truth.write(packer.pack(ORBIT_TRUTH, stamp, **sky, **around, **torques))
+    flight.close()
+    truth.close()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of a flight whose axis may be off by 4.9 deg: it is by 5."""
+    place = tmp_path_factory.mktemp("orbit")
+    return flown(place, 4.9)
+
+
+def test_each_target_is_judged_by_the_true_attitude_once_settled(folder: Path) -> None:
+    found = summarise(read_run(folder))["pointing"]
+    assert found["source"] == "truth"
+    assert [(aim["target"], aim["begin_s"], aim["duration_s"]) for aim in found["targets"]] == [
+        ("sun", 0.0, 990.0),
+        ("nadir", 1000.0, 990.0),
+    ]
+    for aim in found["targets"]:
+        assert math.degrees(aim["axis_rms_rad"]) == pytest.approx(5.0), "x and y; z is the axis that points"
+        assert math.degrees(aim["all_axes_rms_rad"]) == pytest.approx(13.0)
+        assert aim["power_w"] == pytest.approx(0.002)
+
+
+def test_requirements_are_judged_and_what_cannot_be_known_is_unknown(folder: Path, tmp_path: Path) -> None:
+    verdicts = {row["quantity"]: row["verdict"] for row in summarise(read_run(folder))["requirements"]}
+    assert verdicts == {
+        "slow after": "unknown",
+        "pointing to sun, rms": "miss",
+        "pointing to nadir, rms": "miss",
+    }
+    wider = summarise(read_run(flown(tmp_path, 5.1)))["requirements"]
+    assert [row["verdict"] for row in wider] == ["unknown", "pass", "pass"]
+
+
+def test_without_the_configuration_nothing_is_judged_and_the_report_says_so(
+    folder: Path, tmp_path: Path
+) -> None:
+    for log in folder.glob("*.ccsds"):
+        (tmp_path / log.name).write_bytes(log.read_bytes())
+    summary = summarise(read_run(tmp_path))
+    assert summary["pointing"] is None
+    assert summary["requirements"] == []
+    assert any(note.startswith("pointing and requirements not judged") for note in summary["notes"])
+
+
+def test_the_pictures_of_an_orbit_are_drawn(folder: Path, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib", reason="pictures need the extra 'plots'")
+    names = {path.stem for path in draw(read_run(folder), tmp_path)}
+    assert {"pointing", "track"} <= names
