@@ -21,7 +21,7 @@ from flight.link.process.control_line import ControlLine
 from flight.link.process.directives import Directive, NewKey, Play
 from flight.link.process.downlink import Downlink
 from flight.link.process.lines import Line
-from flight.link.process.verification import Report, Sent, Stage, Verification, report
+from flight.link.process.verification import Report, Sent, Stage, Verification, report, request_of
 from flight.link.security.associations import COMMAND_SPIS, TELEMETRY_SPIS, Vault
 from flight.link.security.gate import Admitted, Gate, Refusal, RefusedError, Sealer
 from flight.link.telemetry.form import Packet
@@ -126,15 +126,16 @@ class Station:
                 self._report_refusal(error.spi, error.counter, str(error), now_ns)
             return
         line.trust(sender, now_ns)
+        request = request_of(admitted.data)
         try:
             directive = directives.unpack(admitted.data)
             if directive is not None:
                 self._obey(admitted, directive)
                 return
-            sent = Sent(admitted.spi, admitted.counter, codec.unpack(admitted.data))
+            sent = Sent(admitted.spi, admitted.counter, codec.unpack(admitted.data), request)
         except CommandError as error:
             self._refused_commands += 1
-            self._report(Report(admitted.spi, admitted.counter, Stage.REFUSED, "", str(error)))
+            self._report(Report(admitted.spi, admitted.counter, Stage.REFUSED, "", str(error), request))
             return
         self._report(report(sent, Stage.ACCEPTED, describe(sent.command)))
         if problem := self._control.send(sent, admitted.data, now_ns):
@@ -150,7 +151,8 @@ class Station:
     def _obey(self, admitted: Admitted, directive: Directive) -> None:
         """Execute a directive and report its stages."""
         name, text = directives.name_of(directive), str(directive)
-        done = Report(admitted.spi, admitted.counter, Stage.COMPLETED, name, text)
+        request = request_of(admitted.data)
+        done = Report(admitted.spi, admitted.counter, Stage.COMPLETED, name, text, request)
         self._report(replace(done, stage=Stage.ACCEPTED))
         problem = ""
         if isinstance(directive, Play):
@@ -218,7 +220,7 @@ class Station:
     def _report(self, *reports: Report) -> None:
         for one in reports:
             values = {name: getattr(one, name) for name in ("spi", "counter", "name", "text")}
-            self._send(VERIFICATION, {**values, "stage": int(one.stage)})
+            self._send(VERIFICATION, {**values, "stage": int(one.stage), **one.request._asdict()})
 
     def _status(self) -> None:
         refused = {f"refused_{cause.name.lower()}": self._gate.refused[cause] for cause in Refusal}
