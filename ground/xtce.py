@@ -16,14 +16,14 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 from flight.link.commands.definitions import LAYOUTS as COMMANDS
 from flight.link.process.directives import LAYOUTS as DIRECTIVES
-from flight.link.process.directives import PLAY, STOP
+from flight.link.process.directives import NEW_KEY
 from flight.link.process.verification import Stage
 from flight.link.telemetry.form import Field
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, Layout
 from flight.link.telemetry.states import STAGES
 
 SPACE = "KnightCube"
-TELECOMMANDS = {**COMMANDS, **{packet.name: DIRECTIVES[packet.name] for packet in (PLAY, STOP)}}
+TELECOMMANDS = {**COMMANDS, **{name: layout for name, layout in DIRECTIVES.items() if name != NEW_KEY.name}}
 """The commands that a ground station may make; new keys are made by our own tool alone."""
 _XTCE = "http://www.omg.org/spec/XTCE/20180204"
 EPOCH = "2000-01-01T00:00:00"

@@ -46,6 +46,9 @@ _KINDS: dict[str, list[tuple[str, dict[str, Any]]]] = {
         ("safe", {"reason": "end of pass"}),
         ("play", {"run": 0, "begin": 0, "end": 2}),
         ("stop-playback", {}),
+        ("schedule", {"at": "2099-01-01T00:00:00", "words": "ping 1"}),
+        ("list-schedule", {}),
+        ("unschedule", {"number": 0}),
     ],
     "orbit.yaml": [
         ("point", {"goal": "sun", **{f"numbers_{i}": 0 for i in range(1, 5)}, "roll": 0.0}),

@@ -122,6 +122,18 @@ def test_a_command_goes_by_each_line_and_each_stage_is_shown(
     assert [stage["stage"] for stage in facts["stages"]] == ["accepted", "started", "completed"]
 
 
+def test_a_command_is_scheduled_listed_and_deleted(
+    lines: dict[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command(lines, "udp", "schedule", "2099-01-01T00:00:00", "safe", "end", "of", "pass") == 0
+    assert command(lines, "udp", "list-schedule") == 0
+    shown = capsys.readouterr().out
+    assert "started: 1: 2099-01-01T00:00:00Z safe end of pass\ncompleted: 1 scheduled" in shown
+    assert command(lines, "udp", "unschedule", "1") == 0
+    assert command(lines, "udp", "schedule", "1999-01-01T00:00:00", "ping", "1") == 1
+    assert "1999-01-01T00:00:00 has passed" in capsys.readouterr().out
+
+
 def test_a_command_goes_by_a_serial_line_with_a_marker_before_each_frame(lines: dict[str, str]) -> None:
     radio = int(lines["radio"])
     line = StreamGround("radio", radio, DEFAULTS.frame_bytes, lambda: None)
