@@ -1,6 +1,6 @@
 """The definition tables as XTCE (OMG, XTCE 1.2), for ground stations that we did not write.
 
-`python -m ground.xtce [--epoch UTC] > knightcube.xml`
+`python -m ground.xtce [--epoch UTC] [--verified] > knightcube.xml`
 
 The form keeps to what the clients read: one flat space system, arrays spread out (`rate_1`), names without
 `. / : [ ]`, texts with a terminating zero, telecommand headers of fixed values in each command. A parameter
@@ -16,15 +16,17 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 from flight.link.commands.definitions import LAYOUTS as COMMANDS
 from flight.link.process.directives import LAYOUTS as DIRECTIVES
-from flight.link.process.directives import PLAY, STOP
+from flight.link.process.directives import NEW_KEY
+from flight.link.process.verification import Stage
 from flight.link.telemetry.form import Field
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, Layout
+from flight.link.telemetry.states import STAGES
 
 SPACE = "KnightCube"
-TELECOMMANDS = {**COMMANDS, **{packet.name: DIRECTIVES[packet.name] for packet in (PLAY, STOP)}}
+TELECOMMANDS = {**COMMANDS, **{name: layout for name, layout in DIRECTIVES.items() if name != NEW_KEY.name}}
 """The commands that a ground station may make; new keys are made by our own tool alone."""
 _XTCE = "http://www.omg.org/spec/XTCE/20180204"
-_EPOCH = "2000-01-01T00:00:00"
+EPOCH = "2000-01-01T00:00:00"
 _BITS_OF = {"u1": 8, "u2": 16, "u4": 32, "u8": 64, "i8": 64, "f4": 32, "f8": 64}
 _PRIMARY = (
     ("VERSION", 3),
@@ -36,14 +38,27 @@ _PRIMARY = (
     ("PKT_LEN", 16),
 )
 """The primary header in the order of its bits; clients look for these names."""
+_VERIFIERS = (
+    ("Accepted", "PT20S", (Stage.ACCEPTED,)),
+    ("Execution", "PT20S", (Stage.STARTED,)),
+    ("Complete", "PT1H", (Stage.COMPLETED,)),
+    ("Failed", "PT1H", (Stage.REFUSED, Stage.FAILED)),
+)
+"""Stages of a command: name in XTCE, how long Yamcs waits for each from the release, ours."""
+_SENT_SEQUENCE = "/yamcs/cmdHist/ccsds-seqcount"
+"""What Yamcs calls the sequence count of a command that it has sent."""
 
 
 def document(
     telemetry: Mapping[str, Layout] = LAYOUTS,
     commands: Mapping[str, Layout] = TELECOMMANDS,
-    epoch: str = _EPOCH,
+    epoch: str = EPOCH,
+    verified: bool = False,
 ) -> str:
-    """Return the tables as one XTCE document; `epoch` is the UTC of mission time zero, in ISO 8601."""
+    """Return the tables as one XTCE document; `epoch` is the UTC of mission time zero, in ISO 8601.
+
+    `verified` adds to each command how Yamcs follows it: by a name of Yamcs that others do not know.
+    """
     root = Element("SpaceSystem", {"xmlns": _XTCE, "name": SPACE})
     meta = SubElement(root, "TelemetryMetaData")
     types, parameters = SubElement(meta, "ParameterTypeSet"), SubElement(meta, "ParameterSet")
@@ -55,7 +70,9 @@ def document(
     meta = SubElement(root, "CommandMetaData")
     arguments, listed = SubElement(meta, "ArgumentTypeSet"), SubElement(meta, "MetaCommandSet")
     for layout in commands.values():
-        _add_command(layout, arguments, listed)
+        command = _add_command(layout, arguments, listed)
+        if verified:
+            _add_verifiers(command, layout)
     indent(root)
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + tostring(root, encoding="unicode") + "\n"
 
@@ -189,7 +206,7 @@ def _add_range(parent: Element, name: str, bounds: tuple[float, float]) -> None:
     SubElement(parent, name, {"minInclusive": f"{low:g}", "maxInclusive": f"{high:g}"})
 
 
-def _add_command(layout: Layout, types: Element, listed: Element) -> None:
+def _add_command(layout: Layout, types: Element, listed: Element) -> Element:
     packet = layout.packet
     command = SubElement(listed, "MetaCommand", {"name": packet.name})
     _describe(command, packet.meaning)
@@ -212,6 +229,34 @@ def _add_command(layout: Layout, types: Element, listed: Element) -> None:
     if packet.hazard:
         significance = {"consequenceLevel": "critical", "reasonForWarning": packet.hazard}
         SubElement(command, "DefaultSignificance", significance)
+    return command
+
+
+def _add_verifiers(command: Element, layout: Layout) -> None:
+    """Add the stages of a command: packets `verification` with its identifier and its sequence count."""
+    verifiers = SubElement(command, "VerifierSet")
+    for kind, window, stages in _VERIFIERS:
+        verifier = SubElement(verifiers, f"{kind}Verifier")
+        conditions = SubElement(SubElement(verifier, "BooleanExpression"), "ANDedConditions")
+        _add_condition(conditions, "verification_packet", layout.identifier)
+        _add_condition(conditions, "verification_sequence", _SENT_SEQUENCE)
+        either = SubElement(conditions, "ORedConditions") if len(stages) > 1 else conditions
+        for stage in stages:
+            _add_condition(either, "verification_stage", dict(STAGES)[stage])
+        window_of = {"timeToStopChecking": window, "timeWindowIsRelativeTo": "commandRelease"}
+        SubElement(verifier, "CheckWindow", window_of)
+        SubElement(verifier, "ReturnParmRef", {"parameterRef": "verification_text"})
+
+
+def _add_condition(parent: Element, name: str, value: int | str) -> None:
+    """Add that a parameter equals a number, a label, or another parameter, whose name begins with /."""
+    condition = SubElement(parent, "Condition")
+    SubElement(condition, "ParameterInstanceRef", {"parameterRef": name})
+    SubElement(condition, "ComparisonOperator").text = "=="
+    if str(value).startswith("/"):
+        SubElement(condition, "ParameterInstanceRef", {"parameterRef": str(value)})
+    else:
+        SubElement(condition, "Value").text = str(value)
 
 
 def _add_fixed(entries: Element, name: str, value: str) -> None:
@@ -223,10 +268,10 @@ def _add_fixed(entries: Element, name: str, value: str) -> None:
 def main() -> None:
     """Print the document."""
     parser = argparse.ArgumentParser(prog="python -m ground.xtce", description=__doc__)
-    parser.add_argument(
-        "--epoch", default=_EPOCH, metavar="UTC", help=f"mission time zero (default {_EPOCH})"
-    )
-    sys.stdout.write(document(epoch=parser.parse_args().epoch))
+    parser.add_argument("--epoch", default=EPOCH, metavar="UTC", help=f"mission time zero (default {EPOCH})")
+    parser.add_argument("--verified", action="store_true", help="commands say how Yamcs follows them")
+    options = parser.parse_args()
+    sys.stdout.write(document(epoch=options.epoch, verified=options.verified))
 
 
 if __name__ == "__main__":

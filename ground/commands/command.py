@@ -27,7 +27,7 @@ from flight.link.commands.codec import (
 from flight.link.commands.definitions import COMMANDS, LAYOUTS, PING, POINT, SAFE
 from flight.link.modes import Mode
 from flight.link.process import directives
-from flight.link.process.directives import Play, Stop
+from flight.link.process.directives import Deletion, Listing, Play, Scheduled, Stop
 from flight.link.process.verification import Report
 from flight.link.security.associations import COMMAND_SPIS, TELEMETRY_SPIS, Vault
 from flight.link.telemetry.definitions import COMMAND
@@ -39,7 +39,7 @@ from ground.link.commanding import command as send
 from ground.link.options import add_link_options, terminal_of
 from ground.telemetry.scanner import decode
 
-_DIRECTIVES = ("play", "stop-playback", "new-key")
+_DIRECTIVES = ("play", "stop-playback", "new-key", "schedule", "unschedule", "list-schedule")
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -102,6 +102,12 @@ def _configure_directives(words: argparse._SubParsersAction[argparse.ArgumentPar
     play.add_argument("end", type=float, metavar="END", help="mission time, s")
     play.add_argument("--run", type=int, default=0, metavar="N", help="of the archive (default the newest)")
     words.add_parser("stop-playback", help="with --link: end the playback")
+    timed = words.add_parser("schedule", help="with --link: execute a command at a UTC")
+    timed.add_argument("at", metavar="UTC", help="such as 2026-11-23T21:00:00")
+    timed.add_argument("words", nargs="+", metavar="WHAT", help="a command, such as slew 0.2")
+    deleted = words.add_parser("unschedule", help="with --link: delete a scheduled command")
+    deleted.add_argument("number", type=int, metavar="N", help="as list-schedule shows it; 0: all")
+    words.add_parser("list-schedule", help="with --link: show the scheduled commands")
     key = words.add_parser("new-key", help="with --link: change a key at both ends")
     key.add_argument("changed", type=int, choices=(*COMMAND_SPIS, *TELEMETRY_SPIS), metavar="SPI")
 
@@ -162,6 +168,12 @@ def _packet_of(options: argparse.Namespace) -> bytes:
                 return directives.pack(Play(options.run, options.begin, options.end), utc_ns())
             case "stop-playback":
                 return directives.pack(Stop(), utc_ns())
+            case "schedule":
+                return directives.pack(Scheduled(options.at, " ".join(options.words)), utc_ns())
+            case "unschedule":
+                return directives.pack(Deletion(options.number), utc_ns())
+            case "list-schedule":
+                return directives.pack(Listing(), utc_ns())
             case _:
                 return CommandPacker().pack(_command_of(options), utc_ns())
     except CommandError as error:

@@ -19,7 +19,7 @@ from flight.link.frames import telecommand, telemetry
 from flight.link.frames.stream import SYNC, FrameStream, telemetry_stream
 from flight.link.frames.telemetry import PacketAssembler
 from flight.link.process.lines import host_port
-from flight.link.process.verification import Report, Stage
+from flight.link.process.verification import Report, Request, Stage
 from flight.link.security.associations import TELEMETRY_SPIS, Vault
 from flight.link.security.gate import Gate, RefusedError, Sealer
 from flight.link.security.sdls import OVERHEAD_BYTES
@@ -84,6 +84,10 @@ class Terminal:
         """Frames that are missing between those that came."""
         return sum(channel.lost_frames for channel in self._channels.values())
 
+    def fileno(self) -> int:
+        """Return the line's descriptor, to wait for."""
+        return self._line.fileno()
+
     def send(self, packet: bytes, spi: int = 1) -> int:
         """Send a command packet; return the counter of its frame. Raises FlightError."""
         sealer = self._sealers.setdefault(spi, Sealer(self._vault, spi, telecommand.AUTHENTICATED))
@@ -146,7 +150,9 @@ def report_of(packet: bytes) -> Report:
     """Return what a verification packet reports."""
     (row,) = LAYOUTS[VERIFICATION.name].array(packet)
     stage = Stage(int(row["stage"]))
-    return Report(int(row["spi"]), int(row["counter"]), stage, to_text(row["name"]), to_text(row["text"]))
+    name, text = to_text(row["name"]), to_text(row["text"])
+    request = Request(int(row["packet"]), int(row["sequence"]))
+    return Report(int(row["spi"]), int(row["counter"]), stage, name, text, request)
 
 
 class UdpGround:

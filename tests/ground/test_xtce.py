@@ -8,7 +8,7 @@ import pytest
 
 from flight.bodies.orbit.view import LEVELS
 from flight.link.commands.definitions import COMMANDS
-from flight.link.process.directives import PLAY, STOP
+from flight.link.process.directives import DIRECTIVES, NEW_KEY
 from flight.link.process.verification import Stage
 from flight.link.telemetry import states
 from flight.link.telemetry.definitions import PACKETS
@@ -85,7 +85,7 @@ def test_names_are_plain_and_commands_carry_ranges_and_hazards() -> None:
     assert not [name for name in names if set(name) & set("./:[] ")]
     commands = found(root, "x:CommandMetaData/x:MetaCommandSet")
     assert [command.get("name") for command in commands] == [
-        packet.name for packet in (*COMMANDS, PLAY, STOP)
+        packet.name for packet in (*COMMANDS, *DIRECTIVES) if packet is not NEW_KEY
     ]
     arguments = found(root, "x:CommandMetaData/x:ArgumentTypeSet")
     assert found(arguments, ".//x:ValidRange").attrib == {"minInclusive": "-0.68", "maxInclusive": "0.68"}

@@ -1,13 +1,25 @@
-"""Commands that the link process executes itself: playback, and new keys."""
+"""Commands that the link process executes itself: playback, new keys, and the schedule."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 from flight.link.commands.codec import CommandError
+from flight.link.process.timetable import LONGEST_COMMAND
 from flight.link.security.sdls import KEY_BYTES
 from flight.link.telemetry.form import Field, Packet
-from flight.link.telemetry.packets import HEADER_BYTES, Layout, Packer, TelemetryError, compile_layouts, crc16
+from flight.link.telemetry.packets import (
+    HEADER_BYTES,
+    Layout,
+    Packer,
+    TelemetryError,
+    compile_layouts,
+    crc16,
+    to_text,
+)
+
+_LONGEST_UTC = 32
 
 PLAY = Packet(
     "play",
@@ -35,7 +47,34 @@ NEW_KEY = Packet(
     telecommand=True,
 )
 
-DIRECTIVES: tuple[Packet, ...] = (PLAY, STOP, NEW_KEY)
+SCHEDULE = Packet(
+    "schedule",
+    0x220,
+    "at will",
+    "Execute a command at a UTC, also after a restart",
+    (
+        Field("at", f"S{_LONGEST_UTC}", "-", "UTC, such as 2026-11-23T21:00:00"),
+        Field(
+            "words",
+            f"S{LONGEST_COMMAND}",
+            "-",
+            "a command, such as slew 0.2; units as in its form",
+        ),
+    ),
+    telecommand=True,
+    hazard="does later what the command does",
+)
+UNSCHEDULE = Packet(
+    "unschedule",
+    0x221,
+    "at will",
+    "Delete a scheduled command",
+    (Field("number", "u4", "-", "as the list has it; 0: all"),),
+    telecommand=True,
+)
+LIST = Packet("list-schedule", 0x222, "at will", "Report each scheduled command", (), telecommand=True)
+
+DIRECTIVES: tuple[Packet, ...] = (PLAY, STOP, NEW_KEY, SCHEDULE, UNSCHEDULE, LIST)
 LAYOUTS: dict[str, Layout] = compile_layouts(DIRECTIVES)
 _BY_IDENTIFIER = {layout.identifier: layout for layout in LAYOUTS.values()}
 
@@ -73,7 +112,36 @@ class NewKey:
         return f"new key of SPI {self.spi}, generation {self.generation}"
 
 
-Directive = Play | Stop | NewKey
+@dataclass(frozen=True, slots=True)
+class Scheduled:
+    """Execute a command in words at a UTC in ISO 8601."""
+
+    at: str
+    words: str
+
+    def __str__(self) -> str:
+        return f"at {self.at}: {self.words}"
+
+
+@dataclass(frozen=True, slots=True)
+class Deletion:
+    """Delete a scheduled command; 0 deletes all."""
+
+    number: int
+
+    def __str__(self) -> str:
+        return f"delete scheduled command {self.number}" if self.number else "delete all scheduled commands"
+
+
+@dataclass(frozen=True, slots=True)
+class Listing:
+    """Report each scheduled command."""
+
+    def __str__(self) -> str:
+        return "list scheduled commands"
+
+
+Directive = Play | Stop | NewKey | Scheduled | Deletion | Listing
 
 
 def name_of(directive: Directive) -> str:
@@ -85,6 +153,12 @@ def name_of(directive: Directive) -> str:
             return NEW_KEY.name
         case Stop():
             return STOP.name
+        case Scheduled():
+            return SCHEDULE.name
+        case Deletion():
+            return UNSCHEDULE.name
+        case Listing():
+            return LIST.name
 
 
 def pack(directive: Directive, utc_ns: int) -> bytes:
@@ -98,6 +172,14 @@ def pack(directive: Directive, utc_ns: int) -> bytes:
                 return packer.pack(STOP, utc_ns)
             case NewKey(spi, generation, key):
                 return packer.pack(NEW_KEY, utc_ns, spi=spi, generation=generation, key=list(key))
+            case Scheduled(at, words):
+                if len(at.encode()) >= _LONGEST_UTC or len(words.encode()) >= LONGEST_COMMAND:
+                    raise CommandError(f"{at}: {words}: too long")
+                return packer.pack(SCHEDULE, utc_ns, at=at, words=words)
+            case Deletion(number):
+                return packer.pack(UNSCHEDULE, utc_ns, number=number)
+            case Listing():
+                return packer.pack(LIST, utc_ns)
     except TelemetryError as error:
         raise CommandError("these values fit no directive of the link") from error
 
@@ -109,8 +191,12 @@ def unpack(data: bytes) -> Directive | None:
         return None
     if len(data) != layout.length or crc16(data) != 0 or data[HEADER_BYTES] != layout.packet.version:
         raise CommandError(f"its length, CRC or version is not that of {layout.packet.name}")
-    (row,) = layout.array(data)
-    match layout.packet.name:
+    return _directive_of(layout.packet.name, layout.array(data)[0])
+
+
+def _directive_of(name: str, row: Any) -> Directive:
+    """Return the directive of a packet's row. Raises CommandError."""
+    match name:
         case PLAY.name:
             play = Play(int(row["run"]), float(row["begin"]), float(row["end"]))
             if not play.begin <= play.end:  # NaN compares false
@@ -118,5 +204,11 @@ def unpack(data: bytes) -> Directive | None:
             return play
         case NEW_KEY.name:
             return NewKey(int(row["spi"]), int(row["generation"]), bytes(row["key"].tolist()))
+        case SCHEDULE.name:
+            return Scheduled(to_text(row["at"]), to_text(row["words"]))
+        case UNSCHEDULE.name:
+            return Deletion(int(row["number"]))
+        case LIST.name:
+            return Listing()
         case _:
             return Stop()

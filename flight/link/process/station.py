@@ -13,15 +13,18 @@ from typing import Any
 
 from flight.gnc.errors import FlightError
 from flight.link.commands import codec
-from flight.link.commands.codec import CommandError, describe
+from flight.link.commands.codec import CommandError, CommandPacker, describe
 from flight.link.frames import telecommand, telemetry
 from flight.link.process import directives
 from flight.link.process.archive_reader import LogFollower, stretch, time_of
 from flight.link.process.control_line import ControlLine
-from flight.link.process.directives import Directive, NewKey, Play
+from flight.link.process.directives import Directive, NewKey, Play, Stop
 from flight.link.process.downlink import Downlink
+from flight.link.process.key_change import change_key
 from flight.link.process.lines import Line
-from flight.link.process.verification import Report, Sent, Stage, Verification, report
+from flight.link.process.scheduling import Scheduling
+from flight.link.process.timetable import Timetable
+from flight.link.process.verification import Report, Sent, Stage, Verification, report, request_of
 from flight.link.security.associations import COMMAND_SPIS, TELEMETRY_SPIS, Vault
 from flight.link.security.gate import Admitted, Gate, Refusal, RefusedError, Sealer
 from flight.link.telemetry.form import Packet
@@ -70,13 +73,15 @@ class Station:
         }
         self._downlink = Downlink(settings.spacecraft, settings.frame_bytes, settings.rate, self._seal)
         self._verification = Verification()
-        self._packer = Packer()
+        self._packer, self._commands = Packer(), CommandPacker()
         self._mission_ns, self._mission_at_ns = 0, clock.now_ns()
         self._status_ns = self._label_ns = clock.now_ns()
         self._refusals: deque[int] = deque(maxlen=_REFUSALS_A_SECOND)
         self._received = self._refused_commands = 0
         self._problem = ""
         self._playback: Report | None = None
+        self._scheduling = Scheduling(Timetable(vault.folder))
+        self._report(*self._scheduling.beginning())
         self._status()
 
     def run(self, ended: Callable[[], bool], complain: Callable[[str], object]) -> None:
@@ -102,6 +107,7 @@ class Station:
             self._refused_commands += reports[0].stage is Stage.FAILED
             self._report(*reports)
         self._follow(now_ns)
+        self._execute_due(now_ns)
         if self._playback is not None and not self._downlink.playing:
             self._report(self._playback)
             self._playback = None
@@ -126,20 +132,33 @@ class Station:
                 self._report_refusal(error.spi, error.counter, str(error), now_ns)
             return
         line.trust(sender, now_ns)
+        request = request_of(admitted.data)
         try:
             directive = directives.unpack(admitted.data)
             if directive is not None:
                 self._obey(admitted, directive)
                 return
-            sent = Sent(admitted.spi, admitted.counter, codec.unpack(admitted.data))
+            sent = Sent(admitted.spi, admitted.counter, codec.unpack(admitted.data), request)
         except CommandError as error:
             self._refused_commands += 1
-            self._report(Report(admitted.spi, admitted.counter, Stage.REFUSED, "", str(error)))
+            self._report(Report(admitted.spi, admitted.counter, Stage.REFUSED, "", str(error), request))
             return
         self._report(report(sent, Stage.ACCEPTED, describe(sent.command)))
-        if problem := self._control.send(sent, admitted.data, now_ns):
+        self._hand_over(sent, admitted.data, now_ns)
+
+    def _hand_over(self, sent: Sent, packet: bytes, now_ns: int) -> None:
+        if problem := self._control.send(sent, packet, now_ns):
             self._refused_commands += 1
             self._report(report(sent, Stage.FAILED, problem))
+
+    def _execute_due(self, now_ns: int) -> None:
+        """Hand over the scheduled commands that are due, or report why not."""
+        utc_ns = self._clock.utc_ns()
+        for due in self._scheduling.due(utc_ns):
+            if isinstance(due, Sent):
+                self._hand_over(due, self._commands.pack(due.command, utc_ns), now_ns)
+            else:
+                self._report(due)
 
     def _report_refusal(self, spi: int, counter: int, text: str, now_ns: int) -> None:
         """Report an authentic frame that was refused; few of a flood of repeated ones."""
@@ -150,15 +169,21 @@ class Station:
     def _obey(self, admitted: Admitted, directive: Directive) -> None:
         """Execute a directive and report its stages."""
         name, text = directives.name_of(directive), str(directive)
-        done = Report(admitted.spi, admitted.counter, Stage.COMPLETED, name, text)
+        request = request_of(admitted.data)
+        done = Report(admitted.spi, admitted.counter, Stage.COMPLETED, name, text, request)
         self._report(replace(done, stage=Stage.ACCEPTED))
         problem = ""
         if isinstance(directive, Play):
             problem = self._play(directive, done)
         elif isinstance(directive, NewKey):
-            problem = self._change_key(directive)
-        else:
+            problem = change_key(directive, self._vault, self._gate, self._sealers)
+        elif isinstance(directive, Stop):
             self._end_playback("stopped")
+        else:
+            reports = self._scheduling.obey(directive, done, self._clock.utc_ns())
+            self._refused_commands += reports[-1].stage is Stage.FAILED
+            self._report(*reports)
+            return
         self._refused_commands += bool(problem)
         if problem:
             self._report(replace(done, stage=Stage.FAILED, text=problem))
@@ -183,23 +208,11 @@ class Station:
         self._playback = None
         self._downlink.play(None)
 
-    def _change_key(self, change: NewKey) -> str:
-        """Change a key; return why not, empty when done."""
-        if change.spi not in (*COMMAND_SPIS, *TELEMETRY_SPIS):
-            return f"there is no SPI {change.spi}"
-        before = self._vault.read(change.spi)
-        if before is not None and change.generation != before.generation + 1:
-            return f"the key of SPI {change.spi} is of generation {before.generation}"
-        if change.spi in COMMAND_SPIS:
-            done = self._gate.replace_key(change.spi, change.generation, change.key)
-        else:
-            done = self._sealers[change.spi].replace_key(change.generation, change.key)
-        return "" if done else "the key could not be stored"
-
     def _follow(self, now_ns: int) -> None:
         for packet in self._log.new():
             self._mission_ns, self._mission_at_ns = time_of(packet), now_ns
             self._downlink.live(packet)
+            self._scheduling.followed(packet)
             self._report(*self._verification.followed(packet))
         if self._log.label and now_ns >= self._label_ns:
             self._label_ns = now_ns + _LABEL_NS
@@ -218,20 +231,13 @@ class Station:
     def _report(self, *reports: Report) -> None:
         for one in reports:
             values = {name: getattr(one, name) for name in ("spi", "counter", "name", "text")}
-            self._send(VERIFICATION, {**values, "stage": int(one.stage)})
+            self._send(VERIFICATION, {**values, "stage": int(one.stage), **one.request._asdict()})
 
     def _status(self) -> None:
-        refused = {f"refused_{cause.name.lower()}": self._gate.refused[cause] for cause in Refusal}
-        known = {spi: self._vault.read(spi) for spi in (*COMMAND_SPIS, *TELEMETRY_SPIS)}
-        gates = [self._gate.association(spi) for spi in COMMAND_SPIS]
         values = {
             "received": self._received,
-            "admitted": self._gate.admitted,
-            **refused,
+            **_security(self._gate, self._vault),
             "refused_command": self._refused_commands,
-            "highest": [-2 if entry is None else entry.unused - 1 for entry in gates],
-            "generation": [0 if entry is None else entry.generation for entry in known.values()],
-            "copies": [self._vault.copies(spi) for spi in known],
             "sent": self._downlink.sent,
             "thinned": self._downlink.thinned,
             "playing": int(self._downlink.playing),
@@ -242,6 +248,19 @@ class Station:
     def _send(self, packet: Packet, values: dict[str, Any]) -> None:
         time_ns = self._mission_ns + self._clock.now_ns() - self._mission_at_ns
         self._downlink.report(self._packer.pack(packet, time_ns, values))
+
+
+def _security(gate: Gate, vault: Vault) -> dict[str, Any]:
+    """Return what the link packet says of frames and associations."""
+    known = {spi: vault.read(spi) for spi in (*COMMAND_SPIS, *TELEMETRY_SPIS)}
+    gates = [gate.association(spi) for spi in COMMAND_SPIS]
+    return {
+        "admitted": gate.admitted,
+        **{f"refused_{cause.name.lower()}": gate.refused[cause] for cause in Refusal},
+        "highest": [-2 if entry is None else entry.unused - 1 for entry in gates],
+        "generation": [0 if entry is None else entry.generation for entry in known.values()],
+        "copies": [vault.copies(spi) for spi in known],
+    }
 
 
 def parser_of(spacecraft: int) -> Callable[[bytes], tuple[bytes, bytes]]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import NamedTuple
 
 from flight.link.commands.codec import ChangeMode, Command, Point, Slew, describe, name_of
 from flight.link.modes import Mode
@@ -34,6 +35,22 @@ class Stage(IntEnum):
         return self in {Stage.REFUSED, Stage.COMPLETED, Stage.FAILED}
 
 
+class Request(NamedTuple):
+    """How whoever sent a packet knows it: its first 16 bits and its sequence count."""
+
+    packet: int
+    sequence: int
+
+
+UNREAD = Request(0, 0)
+"""Of a frame whose packet was not read."""
+
+
+def request_of(packet: bytes) -> Request:
+    """Return what identifies a command's packet."""
+    return Request(int.from_bytes(packet[:2], "big"), int.from_bytes(packet[2:4], "big") & 0x3FFF)
+
+
 @dataclass(frozen=True, slots=True)
 class Sent:
     """A command that was handed over, with SPI and counter of its frame."""
@@ -41,6 +58,7 @@ class Sent:
     spi: int
     counter: int
     command: Command
+    request: Request = UNREAD
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,11 +70,12 @@ class Report:
     stage: Stage
     name: str
     text: str
+    request: Request = UNREAD
 
 
 def report(sent: Sent, stage: Stage, text: str) -> Report:
     """Return the report of a stage."""
-    return Report(sent.spi, sent.counter, stage, name_of(sent.command), text)
+    return Report(sent.spi, sent.counter, stage, name_of(sent.command), text, sent.request)
 
 
 def final_mode(command: Command) -> Mode | None:

@@ -84,6 +84,11 @@ class Vault:
             if stat.S_IMODE(path.stat().st_mode) & 0o077:
                 raise UsageError(f"{path}: others may read this key: chmod 600, or make new keys")
 
+    @property
+    def folder(self) -> Path:
+        """Where the associations are."""
+        return self._folder
+
     @contextmanager
     def locked(self) -> Iterator[None]:
         """Keep other processes from writing meanwhile. Raises FlightError where the folder takes nothing."""
@@ -125,7 +130,7 @@ class Vault:
         """Write both copies; return how many are durable. Raises nothing: a disk that fails makes none."""
         data = encode(association)
         spi = association.spi if name is None else name
-        return sum(_overwrite(self._path(spi, copy), data) for copy in COPIES)
+        return sum(overwrite(self._path(spi, copy), data) for copy in COPIES)
 
     def advance(self, association: Association) -> int:
         """Write both copies unless another process wrote a newer one; return how many are durable."""
@@ -155,8 +160,8 @@ class Vault:
         return found
 
 
-def _overwrite(path: Path, data: bytes) -> bool:
-    """Write a file of fixed size in place, durably; return whether that worked."""
+def overwrite(path: Path, data: bytes) -> bool:
+    """Write a file in place, durably; return whether that worked."""
     try:
         new = not path.exists()
         file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o600)

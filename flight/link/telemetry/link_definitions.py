@@ -43,5 +43,8 @@ VERIFICATION = Packet(
         Field("stage", "u1", "-", "how far the command is", states=STAGES),
         Field("name", "S16", "-", "name of the command, empty for none"),
         Field("text", "S128", "-", "its values, or the reason"),
+        Field("packet", "u2", "-", "first 16 bits of the command's packet, 0 where it was not read"),
+        Field("sequence", "u2", "-", "sequence count of the command's packet"),
     ),
+    version=2,
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import pty
@@ -9,6 +10,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 import tty
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -21,12 +23,24 @@ from flight.app.cli import main
 from flight.gnc.errors import UsageError
 from flight.link.commands.channel import open_unix
 from flight.link.commands.codec import CommandPacker, Ping
+from flight.link.commands.definitions import PING
 from flight.link.modes import Mode
-from flight.link.process.verification import Stage
+from flight.link.process.verification import Report, Request, Stage
 from flight.link.security.associations import Vault
 from flight.link.telemetry.definitions import COMMAND
-from flight.link.telemetry.packets import Packer
-from ground.link.terminal import DEFAULTS, StreamGround, Terminal, TerminalSettings
+from flight.link.telemetry.link_definitions import VERIFICATION
+from flight.link.telemetry.packets import CRC_BYTES, Packer
+from flight.link.telemetry.walk import walk
+from ground.link.gateway import Gateway
+from ground.link.terminal import (
+    DEFAULTS,
+    StreamGround,
+    Terminal,
+    TerminalSettings,
+    open_terminal,
+    report_of,
+)
+from ground.xtce import TELECOMMANDS
 from tests.scenario.flights import CONFIG
 
 ROOT = Path(__file__).resolve().parents[4]
@@ -108,6 +122,18 @@ def test_a_command_goes_by_each_line_and_each_stage_is_shown(
     assert [stage["stage"] for stage in facts["stages"]] == ["accepted", "started", "completed"]
 
 
+def test_a_command_is_scheduled_listed_and_deleted(
+    lines: dict[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command(lines, "udp", "schedule", "2099-01-01T00:00:00", "safe", "end", "of", "pass") == 0
+    assert command(lines, "udp", "list-schedule") == 0
+    shown = capsys.readouterr().out
+    assert "started: 1: 2099-01-01T00:00:00Z safe end of pass\ncompleted: 1 scheduled" in shown
+    assert command(lines, "udp", "unschedule", "1") == 0
+    assert command(lines, "udp", "schedule", "1999-01-01T00:00:00", "ping", "1") == 1
+    assert "1999-01-01T00:00:00 has passed" in capsys.readouterr().out
+
+
 def test_a_command_goes_by_a_serial_line_with_a_marker_before_each_frame(lines: dict[str, str]) -> None:
     radio = int(lines["radio"])
     line = StreamGround("radio", radio, DEFAULTS.frame_bytes, lambda: None)
@@ -135,6 +161,36 @@ def test_a_key_is_changed_at_both_ends_also_when_the_answer_was_lost(
     assert command(lines, "udp", "ping") == 0
     text = capsys.readouterr()
     assert new.key.hex() not in text.out + text.err
+
+
+def test_a_ground_station_without_keys_commands_by_the_gateway_and_knows_its_commands_by_their_sequence(
+    lines: dict[str, str],
+) -> None:
+    terminal = open_terminal(lines["tcp"], Path(lines["place"]) / "keys" / "ground")
+    complaints: list[str] = []
+    gateway = Gateway(terminal, "127.0.0.1:0", complaints.append)
+    layout = TELECOMMANDS[PING.name]
+    raw = bytearray(CommandPacker().pack(Ping(3), 1))
+    raw[2:4] = (0xC000 | 77).to_bytes(2, "big")
+    raw[7:15], raw[-CRC_BYTES:] = bytes(8), bytes(CRC_BYTES)  # as a client of the XTCE form leaves them
+    reports: list[Report] = []
+    came = b""
+    with socket.create_connection(("127.0.0.1", gateway.port)) as station:
+        station.sendall(b"\x08\x00\x00\x00\x00\x02abc" + raw)
+        until = time.monotonic() + 20.0
+        while len(reports) < 3 and time.monotonic() < until:
+            gateway.turn(0.05)
+            with contextlib.suppress(BlockingIOError):
+                came += station.recv(1 << 16, socket.MSG_DONTWAIT)
+            found = [report_of(came[begin:end]) for at, begin, end in walk(came) if at.packet is VERIFICATION]
+            reports = [report for report in found if report.request == Request(layout.identifier, 77)]
+    assert [report.stage for report in reports] == [Stage.ACCEPTED, Stage.STARTED, Stage.COMPLETED]
+    assert len(found) == 3, "the gateway's own ping is nobody's command"
+    assert len(complaints) == 1, "bytes that are no command do not go up"
+    gateway.close()
+    terminal.close()
+    with pytest.raises(UsageError, match="loopback only"):
+        Gateway(terminal, "0.0.0.0:0", complaints.append)
 
 
 def test_one_link_at_a_time_has_the_counters(lines: dict[str, str]) -> None:

@@ -1,0 +1,135 @@
+"""A configuration of Yamcs 5.12 for this satellite: `python -m ground.yamcs FOLDER [--epoch UTC]`.
+
+Yamcs connects to `flight gateway`, which holds the keys and hands plain packets over (`ground.link.gateway`).
+Both listen on loopback alone. Packets are archived by mission time and sequence count; commands are verified
+by the packet `verification`, whose packet identifier and sequence count are those of the command.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from pathlib import Path
+
+from flight.gnc.errors import UsageError
+from ground.link.gateway import ADDRESS
+from ground.xtce import EPOCH, SPACE, document
+
+INSTANCE = SPACE.lower()
+HTTP_PORT = 8090
+_LOOPBACK = "127.0.0.1"
+
+_SERVER = """\
+services:
+  - class: org.yamcs.http.HttpServer
+    args: {{address: {host}, port: {http}}}
+instances: [{instance}]
+dataDir: {data}
+cacheDir: {data}/cache
+secretKey: {instance}
+"""
+
+_INSTANCE = """\
+services:
+  - class: org.yamcs.archive.XtceTmRecorder
+  - class: org.yamcs.archive.ParameterRecorder
+  - class: org.yamcs.archive.AlarmRecorder
+  - class: org.yamcs.archive.EventRecorder
+  - class: org.yamcs.archive.ReplayServer
+  - class: org.yamcs.archive.CommandHistoryRecorder
+  - class: org.yamcs.parameterarchive.ParameterArchive
+  - class: org.yamcs.ProcessorCreatorService
+    args: {{name: realtime, type: realtime}}
+dataLinks:
+  - name: gateway
+    class: org.yamcs.tctm.TcpTcTmDataLink
+    tmStream: tm_realtime
+    tcStream: tc_realtime
+    host: {gateway_host}
+    port: {gateway_port}
+    packetInputStreamClassName: org.yamcs.tctm.CcsdsPacketInputStream
+    packetInputStreamArgs: {{maxPacketLength: 65542}}
+    packetPreprocessorClassName: org.yamcs.tctm.GenericPacketPreprocessor
+    packetPreprocessorArgs:
+      timestampOffset: 7
+      seqCountOffset: 2
+      errorDetection: {{type: CRC-16-CCIIT}}
+      timeEncoding:
+        {{type: FIXED, size: 8, multiplier: 1.0e-6, epoch: CUSTOM, epochUTC: "{epoch}Z"}}
+    commandPostprocessorClassName: org.yamcs.pus.PusCommandPostprocessor
+    commandPostprocessorArgs: {{pus11Crc: false}}
+mdb:
+  - type: xtce
+    args: {{file: {folder}/{instance}.xml}}
+streamConfig:
+  tm: [{{name: tm_realtime, processor: realtime}}]
+  invalidTm: invalid_tm_stream
+  cmdHist: [cmdhist_realtime, cmdhist_dump]
+  event: [events_realtime, events_dump]
+  param: [pp_realtime, sys_param, proc_param]
+  parameterAlarm: [alarms_realtime]
+  eventAlarm: [event_alarms_realtime]
+  tc: [{{name: tc_realtime, processor: realtime}}]
+"""
+
+_PROCESSORS = """\
+realtime:
+  services:
+    - class: org.yamcs.StreamTmPacketProvider
+    - class: org.yamcs.StreamTcCommandReleaser
+    - class: org.yamcs.tctm.StreamParameterProvider
+    - class: org.yamcs.algorithms.AlgorithmManager
+    - class: org.yamcs.parameter.LocalParameterManager
+  config:
+    subscribeAll: true
+    alarm: {parameterCheck: true, parameterServer: enabled, eventServer: enabled}
+Archive: &replay
+  services:
+    - class: org.yamcs.tctm.ReplayService
+    - class: org.yamcs.algorithms.AlgorithmManager
+ParameterArchive: *replay
+ArchiveRetrieval: *replay
+"""
+
+
+def files(folder: Path, gateway: str, http_port: int, epoch: str) -> Mapping[str, str]:
+    """Return the content of each file by its name below `folder`."""
+    host, _, port = gateway.rpartition(":")
+    server = _SERVER.format(host=_LOOPBACK, http=http_port, instance=INSTANCE, data=folder / "data")
+    instance = _INSTANCE.format(
+        gateway_host=host, gateway_port=port, folder=folder, instance=INSTANCE, epoch=epoch
+    )
+    return {
+        "etc/yamcs.yaml": server,
+        f"etc/yamcs.{INSTANCE}.yaml": instance,
+        "etc/processor.yaml": _PROCESSORS,
+        f"{INSTANCE}.xml": document(epoch=epoch, verified=True),
+    }
+
+
+def write(folder: Path, gateway: str = ADDRESS, http_port: int = HTTP_PORT, epoch: str = EPOCH) -> None:
+    """Write the configuration into a folder. Raises UsageError."""
+    folder = folder.absolute()
+    try:
+        for name, text in files(folder, gateway, http_port, epoch).items():
+            path = folder / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text, encoding="utf-8")
+        (folder / "data").mkdir(exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"{folder}: cannot be written: {error.strerror or error}") from error
+
+
+def main() -> None:
+    """Write the configuration that the words ask for."""
+    parser = argparse.ArgumentParser(prog="python -m ground.yamcs", description=__doc__)
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="of the configuration and the archive")
+    parser.add_argument("--gateway", default=ADDRESS, metavar="HOST:PORT", help=f"default {ADDRESS}")
+    parser.add_argument("--http", type=int, default=HTTP_PORT, metavar="PORT", help=f"default {HTTP_PORT}")
+    parser.add_argument("--epoch", default=EPOCH, metavar="UTC", help=f"mission time zero (default {EPOCH})")
+    options = parser.parse_args()
+    write(options.folder, options.gateway, options.http, options.epoch)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,152 @@
+"""Scheduled commands: executed once at their UTC, also after a restart; late ones are reported alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from flight.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from flight.link.commands.codec import ChangeMode, CommandError, Ping, Point, Slew, unpack
+from flight.link.commands.words import command_of_words
+from flight.link.modes import Mode
+from flight.link.process import directives, timetable
+from flight.link.process.directives import Deletion, Directive, Listing, Scheduled
+from flight.link.process.timetable import MOST_ENTRIES, Timetable, TimetableError
+from flight.link.security.associations import overwrite
+from tests.flight.link.process.both_ends import BothEnds
+
+
+@pytest.fixture
+def link(tmp_path: Path) -> Iterator[BothEnds]:
+    both = BothEnds(tmp_path)
+    both.record(both.mode_packet(Mode.HOLD, "start"))
+    yield both
+    both.close()
+
+
+def send(link: BothEnds, directive: Directive) -> int:
+    counter = link.terminal.send(directives.pack(directive, link.clock.utc_ns()))
+    link.turn()
+    return counter
+
+
+def in_seconds(link: BothEnds, seconds: float) -> str:
+    utc = datetime.fromtimestamp(link.clock.utc_ns() * 1e-9, UTC) + timedelta(seconds=seconds)
+    return f"{utc:%Y-%m-%dT%H:%M:%S}"
+
+
+def texts(link: BothEnds, counter: int) -> list[str]:
+    return [report.text for report in link.reports() if report.counter == counter]
+
+
+def test_a_scheduled_command_outlives_a_restart_and_is_executed_once_at_its_time(link: BothEnds) -> None:
+    late = send(link, Scheduled(in_seconds(link, 60), "ping 7"))
+    soon = send(link, Scheduled(in_seconds(link, 20), "ping 3"))
+    listing = send(link, Listing())
+    assert [text[-6:] for text in texts(link, listing)[1:3]] == ["ping 3", "ping 7"]
+    link.restart()
+    link.turn(15.0)
+    assert link.obeyed == []
+    link.turn(5.0)
+    assert [unpack(data) for data in link.obeyed] == [Ping(3)]
+    assert link.stages(soon) == ["accepted", "completed", "started", "completed"], "kept, then executed"
+    link.restart()
+    link.turn(45.0)
+    assert [unpack(data) for data in link.obeyed] == [Ping(3), Ping(7)]
+    assert texts(link, late)[-1] == "ping 7"
+
+
+def test_a_time_that_passes_during_a_stop_is_reported_and_not_executed(link: BothEnds) -> None:
+    counter = send(link, Scheduled(in_seconds(link, 20), "slew 0.2"))
+    link.clock.advance(40_000_000_000)
+    link.restart()
+    link.turn()
+    assert link.obeyed == []
+    assert link.stages(counter)[-1] == "failed"
+    assert texts(link, counter)[-1].startswith("not executed, it is ")
+    assert texts(link, counter)[-1].endswith("slew 0.2")
+    assert texts(link, send(link, Listing()))[-1] == "0 scheduled"
+
+
+def test_safe_suspends_the_schedule(link: BothEnds) -> None:
+    counter = send(link, Scheduled(in_seconds(link, 5), "mode hold"))
+    link.record(link.mode_packet(Mode.SAFE, "commanded"))
+    link.turn(8.0)
+    assert link.obeyed == []
+    assert "in SAFE the ground decides" in texts(link, counter)[-1]
+
+
+def test_what_cannot_be_scheduled_is_refused_with_the_reason(link: BothEnds) -> None:
+    def refused(at: str, words: str) -> str:
+        counter = send(link, Scheduled(at, words))
+        assert link.stages(counter) == ["accepted", "failed"]
+        return texts(link, counter)[-1]
+
+    later = in_seconds(link, 3600)
+    assert "has passed" in refused(in_seconds(link, -1), "ping 1")
+    assert "is no UTC" in refused("tomorrow", "ping 1")
+    assert "is no command" in refused(later, "schedule x ping")
+    assert "must lie within" in refused(later, "slew 3")
+    assert "no command is scheduled under 5" in texts(link, send(link, Deletion(5)))[-1]
+    for _ in range(MOST_ENTRIES):
+        link.terminal.send(directives.pack(Scheduled(later, "ping 1"), 1))
+    link.turn()
+    assert "32 commands are scheduled already" in refused(later, "ping 1")
+    send(link, Deletion(0))
+    assert texts(link, send(link, Listing()))[-1] == "0 scheduled"
+    with pytest.raises(CommandError, match="too long"):
+        directives.pack(Scheduled(later, "safe " + "x" * 91), 1)
+
+
+@pytest.mark.parametrize("writes", range(3))
+def test_killed_at_any_write_an_entry_is_either_handed_over_or_still_there(
+    tmp_path: Path, writes: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    table = Timetable(tmp_path)
+    table.add(5, 1, 9, "ping 1")
+    left = iter(range(writes))
+
+    def until_killed(path: Path, data: bytes) -> bool:
+        if next(left, None) is None:
+            path.write_bytes(data[:10])  # torn
+            raise KeyboardInterrupt
+        return overwrite(path, data)
+
+    monkeypatch.setattr(timetable, "overwrite", until_killed)
+    removed = False
+    try:
+        table.remove(1)
+        removed = True
+    except KeyboardInterrupt:
+        pass
+    again = Timetable(tmp_path)
+    assert not again.lost
+    assert not (removed and again.entries), "handed over, and again after the restart"
+    assert len(again.entries) == (writes == 0)
+
+
+def test_a_lost_schedule_is_reported_and_a_full_disk_refuses(
+    link: BothEnds, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    send(link, Scheduled(in_seconds(link, 60), "ping 7"))
+    for path in link.sky.folder.glob("schedule.*"):
+        path.write_bytes(b"x")
+    link.restart()
+    link.turn()
+    assert link.reports()[-1].text == "both copies of the schedule are lost: it is empty"
+    monkeypatch.setattr(timetable, "overwrite", lambda *_: False)
+    with pytest.raises(TimetableError, match="could not be stored"):
+        Timetable(link.sky.folder).add(5, 1, 9, "ping 1")
+
+
+def test_words_are_read_by_the_table() -> None:
+    assert command_of_words("slew -0.2") == Slew(-0.2)
+    assert command_of_words("safe end of pass") == ChangeMode(Mode.SAFE, "end of pass")
+    assert command_of_words("mode hold") == ChangeMode(Mode.HOLD)
+    assert command_of_words("point sun") == Point(PointingTarget(Goal.SUN, (), None))
+    for wrong in ("", "mode up", "ping", "ping x", "slew 0.1 0.2"):
+        with pytest.raises(CommandError):
+            command_of_words(wrong)

@@ -1,0 +1,98 @@
+"""A flight in real time with its link and a gateway, each a process of its own, on loopback."""
+
+from __future__ import annotations
+
+import json
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from ground.link.keys import make_keys
+
+_START_S, _END_S, _LAST_S = 60.0, 30.0, 3.0
+_RATE = 1_000_000
+"""Bytes/s of the link: nothing is thinned, so that the archive must hold every packet of the log."""
+
+
+@dataclass(frozen=True, slots=True)
+class LinkedFlight:
+    """Where a flight writes, the gateway's address, and the processes by name; `flight` comes last."""
+
+    run: Path
+    gateway: str
+    processes: dict[str, subprocess.Popen[bytes]]
+    _start: list[str]
+    _log: Path
+
+    def start(self) -> None:
+        """Start the flight itself, and wait for its log."""
+        self.processes["flight"] = _started(self._start, self._log)
+        _wait((self.run / "flight-0001.ccsds").exists, "the flight", self._log)
+
+    def end(self) -> None:
+        """End the flight, let the link carry what is left of its log, and end link and gateway."""
+        _end(self.processes["flight"])
+        time.sleep(_LAST_S)
+        self.stop()
+
+    def stop(self) -> None:
+        """End all processes."""
+        for process in reversed(self.processes.values()):
+            _end(process)
+
+
+def free_port() -> int:
+    """Return a TCP port of loopback that nobody has."""
+    with socket.create_server(("127.0.0.1", 0)) as line:
+        return int(line.getsockname()[1])
+
+
+@contextmanager
+def linked_flight(place: Path, text: str, *words: str) -> Iterator[LinkedFlight]:
+    """Open link and gateway of a flight of a configuration's text, which `start` begins; leaving ends all."""
+    place.mkdir(parents=True)
+    make_keys(place / "keys")
+    link, gateway = (f"127.0.0.1:{free_port()}" for _ in range(2))
+    section = {"keys": str(place / "keys" / "satellite"), "tcp": link, "rate": _RATE}
+    config, run, log = place / "flight.yaml", place / "run", place / "log"
+    commands = {"socket": str(place / "commands")}
+    config.write_text(f"{text}\ncommands: {json.dumps(commands)}\nlink: {json.dumps(section)}\n")
+    flight = [sys.executable, "-m", "flight"]
+    begin = [*flight, "run", str(config), "--realtime", "--out", str(run), *words]
+    processes: dict[str, subprocess.Popen[bytes]] = {}
+    found = LinkedFlight(run, gateway, processes, begin, log)
+    with ExitStack() as stack:
+        stack.callback(found.stop)
+        processes["link"] = _started([*flight, "link", str(config), "--log", str(run)], log)
+        _wait(lambda: "link open" in log.read_text(), "the link", log)
+        way = ["--link", f"tcp:{link}", "--keys", str(place / "keys" / "ground"), "--serve", gateway]
+        processes["gateway"] = _started([*flight, "gateway", *way], log)
+        _wait(lambda: "packets on" in log.read_text(), "the gateway", log)
+        yield found
+
+
+def _started(words: list[str], log: Path) -> subprocess.Popen[bytes]:
+    with log.open("ab") as out:
+        return subprocess.Popen(words, stdout=out, stderr=subprocess.STDOUT)
+
+
+def _wait(done: Callable[[], bool], name: str, log: Path) -> None:
+    until = time.monotonic() + _START_S
+    while not done():
+        if time.monotonic() > until:
+            raise RuntimeError(f"{name} did not start:\n{log.read_text()[-2000:]}")
+        time.sleep(0.1)
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.terminate()
+    try:
+        process.wait(_END_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()

@@ -1,0 +1,209 @@
+"""Yamcs archives and commands a flying simulation through the authenticated link.
+
+`python -m tests.studies.interop.yamcs FOLDER [--orbit]` flies in real time with link, gateway and Yamcs, and
+prints one JSON line for each question: did Yamcs load our XTCE without a warning; was every kind of command
+completed, and a refused one reported; does the archive hold every packet of the flight log, byte for byte;
+are the values that Yamcs makes of them ours; did any process have a socket beyond loopback. Exit status 1
+where one of these is not so. Skips loudly without Java or the bundle.
+
+The testbed flies all commands but `point`, which with `--orbit` a satellite flies; it needs minutes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flight.link.telemetry.link_definitions import LINK, VERIFICATION
+from flight.link.telemetry.packets import LAYOUTS, Layout, PacketArray, to_text
+from flight.link.telemetry.segments import find_segments
+from flight.link.telemetry.walk import walk
+from ground.telemetry.scanner import scan
+from ground.xtce import spread
+from ground.yamcs import write
+from tests.studies.interop.linked_flight import LinkedFlight, free_port, linked_flight
+from tests.studies.interop.sockets import beyond_loopback
+from tests.studies.interop.yamcs_server import Yamcs, missing, serving, troubles
+
+_CONFIGS = Path(__file__).resolve().parents[3] / "config"
+_BROKEN = "coil-broken"
+_SETTLED_S = 3.0
+"""After the start."""
+_KINDS: dict[str, list[tuple[str, dict[str, Any]]]] = {
+    "step_demo.yaml": [
+        ("ping", {"number": 7}),
+        ("slew", {"q2": 0.05}),
+        ("mode", {"mode": "testbed-demo"}),
+        ("clear", {"event": _BROKEN}),
+        ("safe", {"reason": "end of pass"}),
+        ("play", {"run": 0, "begin": 0, "end": 2}),
+        ("stop-playback", {}),
+        ("schedule", {"at": "2099-01-01T00:00:00", "words": "ping 1"}),
+        ("list-schedule", {}),
+        ("unschedule", {"number": 0}),
+    ],
+    "orbit.yaml": [
+        ("point", {"goal": "sun", **{f"numbers_{i}": 0 for i in range(1, 5)}, "roll": 0.0}),
+    ],
+}
+_ENDED = "TM Connection closed"
+"""What Yamcs warns of when the study ends the gateway."""
+_REFUSED = ("clear", {"event": "too-hot"})
+_FAULTS = {"step_demo.yaml": ["--fault", "coil-x: open @ 45"], "orbit.yaml": []}
+_PATIENCE_S = {"step_demo.yaml": 60.0, "orbit.yaml": 700.0}
+_LINKS_OWN = {LAYOUTS[packet.name].identifier.to_bytes(2, "big") for packet in (LINK, VERIFICATION)}
+"""How the packets begin that the link process makes: no flight log has them."""
+_EPOCH = "2026-01-01T00:00:00"
+
+
+def fly(place: Path, config: str) -> bool:
+    """Fly a configuration under Yamcs and print what came of it; return whether all is as it must be."""
+    text = (_CONFIGS / config).read_text(encoding="utf-8")
+    http = free_port()
+    with linked_flight(place / config, text, *_FAULTS[config]) as flight:
+        folder = place / config / "yamcs"
+        write(folder, flight.gateway, http, _EPOCH)
+        with serving(folder, http) as server:
+            _until(server.link_up, 30.0)
+            flight.start()
+            sound = [_command(server, flight, config), _sockets(server, flight)]
+            flight.end()
+            sound += [_archive(server, flight.run), _values(server)]
+        trouble = [line for line in troubles(server.log.read_text()) if _ENDED not in line]
+    _say("without a warning", lines_of_trouble=len(trouble), first=trouble[:3])
+    return all(sound) and not trouble
+
+
+def _command(server: Yamcs, flight: LinkedFlight, config: str) -> bool:
+    """Issue each kind of command, and one that the flight refuses."""
+    time.sleep(_SETTLED_S)
+    ends = {}
+    for name, arguments in _KINDS[config]:
+        if name == "clear":
+            _until(lambda: _BROKEN.encode() in _log(flight.run), _PATIENCE_S[config])
+        history = _followed(server, server.command(name, arguments), _PATIENCE_S[config])
+        ends[name] = history.get("CommandComplete_Status", "none")
+        stages = [history.get(f"Verifier_{stage}_Status") for stage in ("Accepted", "Execution", "Complete")]
+        ends[name] += "" if "NOK" not in stages else " with a stage that failed"
+    refused = _followed(server, server.command(*_REFUSED), 20.0)
+    failed = refused.get("CommandComplete_Status") == "NOK"
+    _say("commands", **ends, refused=refused.get("CommandComplete_Message", "not reported"))
+    return failed and all(end == "OK" for end in ends.values())
+
+
+def _followed(server: Yamcs, command: str, seconds: float) -> dict[str, Any]:
+    """Return a command's history when it is completed, or when the time is over."""
+    _until(lambda: "CommandComplete_Status" in server.history(command), seconds)
+    return server.history(command)
+
+
+def _sockets(server: Yamcs, flight: LinkedFlight) -> bool:
+    processes = {"yamcs": server.process.pid, **{name: p.pid for name, p in flight.processes.items()}}
+    found = {name: beyond_loopback(pid) for name, pid in processes.items()}
+    _say("sockets beyond loopback", **{name: sorted(sockets) for name, sockets in found.items()})
+    return not any(found.values())
+
+
+def _archive(server: Yamcs, run: Path) -> bool:
+    """Compare the bytes of the archive with those of the flight log."""
+    logged = list(_packets(_log(run)))
+    archived = list(_packets(server.packets()))
+    of_the_link = [packet for packet in archived if packet[:2] in _LINKS_OWN]
+    missed = len(set(logged) - set(archived))
+    strange = len(set(archived) - set(logged) - set(of_the_link))
+    counts = {"logged": len(logged), "archived": len(archived), "of_the_link": len(of_the_link)}
+    _say("archive", **counts, missed=missed, strange=strange)
+    return bool(logged) and missed == strange == 0
+
+
+def _values(server: Yamcs) -> bool:
+    """Compare every value that Yamcs makes of the archived packets with our reader's."""
+    fields = different = absent = 0
+    packets = scan(server.packets()).packets
+    for name, rows in packets.items():
+        if not len(rows):
+            continue
+        ours = _columns(LAYOUTS[name], rows)
+        theirs: dict[str, list[Any]] = {parameter: [] for parameter in ours}
+        for value in server.values(list(ours)):
+            theirs[value["id"]["name"].rpartition("/")[2]].append(raw_of(value["rawValue"]))
+        for parameter, wanted in ours.items():
+            found = theirs[parameter]
+            fields += len(wanted)
+            absent += abs(len(wanted) - len(found))
+            different += sum(not alike(*pair) for pair in zip(wanted, found, strict=False))
+    _say("values", fields=fields, different=different, absent=absent)
+    return fields > 0 and different == absent == 0
+
+
+def _columns(layout: Layout, rows: PacketArray) -> dict[str, list[Any]]:
+    """Return the values of each parameter of a packet's rows, by the names of the XTCE form."""
+    found: dict[str, list[Any]] = {}
+    names = iter(spread(layout))
+    for field in layout.packet.fields:
+        column = rows[field.name]
+        for i in range(field.count):
+            values = column if field.count == 1 else column[:, i]
+            text = field.kind.startswith("S")
+            found[next(names)[0]] = [to_text(value) for value in values] if text else values.tolist()
+    return found
+
+
+def raw_of(value: dict[str, Any]) -> Any:
+    """Return the number or text of a value of Yamcs's JSON, in which large numbers and NaN are texts."""
+    kind = str(value["type"])
+    if kind == "STRING":
+        return value.get("stringValue", "")
+    number = value[f"{kind.lower()}Value"]
+    return np.float32(number) if kind == "FLOAT" else float(number) if kind == "DOUBLE" else int(number)
+
+
+def alike(ours: Any, theirs: Any) -> bool:
+    """Return whether two values are the same; NaN is NaN."""
+    if isinstance(ours, float) and math.isnan(ours):
+        return bool(np.isnan(theirs))
+    return bool(ours == theirs)
+
+
+def _log(run: Path) -> bytes:
+    return b"".join(path.read_bytes() for path in find_segments(run, "flight"))
+
+
+def _packets(data: bytes) -> Iterator[bytes]:
+    return (data[begin:end] for _, begin, end in walk(data))
+
+
+def _until(done: Callable[[], bool], seconds: float) -> None:
+    """Wait until something is so, at most for a time."""
+    until = time.monotonic() + seconds
+    while not done() and time.monotonic() < until:
+        time.sleep(0.3)
+
+
+def _say(what: str, **facts: Any) -> None:
+    sys.stdout.write(json.dumps({"what": what, **facts}) + "\n")
+    sys.stdout.flush()
+
+
+def main() -> int:
+    """Fly under Yamcs."""
+    parser = argparse.ArgumentParser(prog="python -m tests.studies.interop.yamcs", description=__doc__)
+    parser.add_argument("place", type=Path, metavar="FOLDER", help="does not exist yet")
+    parser.add_argument("--orbit", action="store_true", help="the satellite in place of the testbed")
+    options = parser.parse_args()
+    if problem := missing():
+        sys.stderr.write(f"SKIPPED: {problem}\n")
+        return 0
+    return 0 if fly(options.place, "orbit.yaml" if options.orbit else "step_demo.yaml") else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
