@@ -19,7 +19,8 @@ from flight.gnc.guidance.three_axes.pointing_target import NUMBERS, Goal, Pointi
 from flight.gnc.guidance.three_axes.slew_ends import Boresight
 from flight.gnc.guidance.three_axes.slew_model import SlewCraft
 from flight.gnc.guidance.three_axes.slew_order import LEAD, OrderedSlew, SlewOrder, plan_order
-from flight.gnc.guidance.three_axes.slew_plan import HORIZON_RANGE, LEAST_TIME, NODES, SlewStatus
+from flight.gnc.guidance.three_axes.slew_plan import SlewStatus
+from flight.gnc.guidance.three_axes.slew_task import HORIZON_RANGE, LEAST_TIME, NODES
 from flight.gnc.guidance.three_axes.target_law import BodyAxes
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import angle_between, attitude_matrix, conjugate, multiply

@@ -23,8 +23,9 @@ from flight.gnc.earth.orbit_knowledge import OrbitState
 from flight.gnc.errors import PlanningError
 from flight.gnc.guidance.three_axes.slew_ends import EndLaw, Whole
 from flight.gnc.guidance.three_axes.slew_model import SlewCraft
-from flight.gnc.guidance.three_axes.slew_plan import LEAST_TIME, SlewPlan, SlewStatus, SlewTask, plan_slew
+from flight.gnc.guidance.three_axes.slew_plan import SlewPlan, SlewStatus, plan_slew
 from flight.gnc.guidance.three_axes.slew_sky import along, cones
+from flight.gnc.guidance.three_axes.slew_task import LEAST_TIME, SlewTask
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import from_rotation_vector, multiply, normalise
 from tests.flight.gnc.guidance.three_axes.recorded_slews import FILE, flown, off_degrees, recorded, task_of

@@ -17,8 +17,9 @@ from flight.gnc.guidance.three_axes.attitude_law import DIFFERENCE, Attitudes, r
 from flight.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 from flight.gnc.guidance.three_axes.slew_ends import Boresight, End, EndLaw, Whole
 from flight.gnc.guidance.three_axes.slew_model import SlewCraft
-from flight.gnc.guidance.three_axes.slew_plan import NODES, SlewPlan, SlewStatus, SlewTask, plan_slew
+from flight.gnc.guidance.three_axes.slew_plan import SlewPlan, SlewStatus, plan_slew
 from flight.gnc.guidance.three_axes.slew_sky import along, cones
+from flight.gnc.guidance.three_axes.slew_task import NODES, SlewTask
 from flight.gnc.guidance.three_axes.target_law import BodyAxes, directions_of, law_of
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import attitude_matrix

@@ -50,14 +50,13 @@ def turns(q: FloatArray, end: End) -> list[FloatArray]:
 
 def guesses(
     motion: Motion, craft: SlewCraft, start: FloatArray, end: End, around: Around
-) -> Iterator[Trajectory]:
-    """Yield guesses from a state (7,) to the end, where `around` (2 k + 1) acts."""
+) -> Iterator[list[Trajectory]]:
+    """Yield guesses of each way round from a state (7,) to the end, where `around` (2 k + 1) acts."""
     for turn in turns(start[:4], end):
         middle = multiply(from_rotation_vector(0.5 * turn), start[:4])
         field = normalise(attitude_matrix(middle) @ around.field[len(around.field) // 2])
-        for phase in _PHASES:
-            states = _circling(start, turn, field, float(phase), len(around.field))
-            yield Trajectory(states, _dipoles(motion, craft, states)[::2])
+        ways = [_circling(start, turn, field, float(phase), len(around.field)) for phase in _PHASES]
+        yield [Trajectory(states, _dipoles(motion, craft, states)[::2]) for states in ways]
 
 
 def _circling(start: FloatArray, turn: FloatArray, field: FloatArray, phase: float, count: int) -> FloatArray:

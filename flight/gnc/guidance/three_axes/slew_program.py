@@ -70,7 +70,7 @@ class Program:
     """Least cost within limits."""
 
     def __init__(self, equations: Transcription, limits: Limits) -> None:
-        self._equations, self._limits = equations, limits
+        self.equations, self._limits = equations, limits
         place = equations.layout
         self._equal = np.concatenate([place.equations.ravel(), place.start, place.end])
         self._primal = np.concatenate([place.states.ravel(), place.dipoles.ravel()])
@@ -91,7 +91,7 @@ class Program:
         """
         values = self._limits.values(guess)
         slack = np.maximum(values, 1e-2)
-        price = np.zeros(self._equations.layout.size) if price is None else price
+        price = np.zeros(self.equations.layout.size) if price is None else price
         point = self._point(guess, price, slack, barrier / slack)
         barrier, convex = (barrier if slack.size else 0.0), 0.0
         for _ in range(most):
@@ -111,8 +111,13 @@ class Program:
             point = moved
         return None
 
+    def factors(self, point: Point) -> Factors:
+        """Return the factors of the equations of optimality at a point. Raises PlanningError."""
+        stiff = self._limits.stiffness(point.at, point.dual / point.slack, point.dual)
+        return Factors(self.equations.band(point.linear, point.price, *stiff))
+
     def _point(self, at: Trajectory, price: FloatArray, slack: FloatArray, dual: FloatArray) -> Point:
-        equations = self._equations
+        equations = self.equations
         linear = equations.linear(at)
         return Point(linear, price, slack, dual, equations.slope(linear, price))
 
@@ -133,7 +138,7 @@ class Program:
         for _ in range(10):
             states, heavy = stiffness
             stiff = states + convex * _EYE7, heavy + convex
-            step = self._newton(point, barrier, convex, self._equations.band(point.linear, price, *stiff))
+            step = self._newton(point, barrier, convex, self.equations.band(point.linear, price, *stiff))
             if step is not None:
                 moved = self._searched(point, step, barrier, error)
                 if moved is not None:
@@ -194,20 +199,20 @@ class Program:
 
     def _shifted(self, point: Point, change: FloatArray, off: FloatArray) -> tuple[Trajectory, FloatArray]:
         """Return the trajectory and the slacks after a change (size,); the slacks mend `off`, too."""
-        at, place = point.at, self._equations.layout
+        at, place = point.at, self.equations.layout
         there = Trajectory(at.states + change[place.states], at.dipoles + change[place.dipoles])
         return there, point.slack + self._limits.along(at, change) + off
 
     def _violations(self, at: Trajectory) -> FloatArray:
         """Return what remains of all equations."""
-        return np.concatenate([part.ravel() for part in self._equations.remainders(at)])
+        return np.concatenate([part.ravel() for part in self.equations.remainders(at)])
 
     def _merit(
         self, at: Trajectory, slack: FloatArray, barrier: float, weight: float, missed: FloatArray
     ) -> float:
         """Return cost and barriers plus `weight` times the violation of all equations."""
         violation = float(np.abs(missed).sum() + np.abs(self._limits.values(at) - slack).sum())
-        return self._equations.cost(at) + weight * violation - barrier * float(np.log(slack).sum())
+        return self.equations.cost(at) + weight * violation - barrier * float(np.log(slack).sum())
 
 
 def _share(values: FloatArray, change: FloatArray) -> float:

@@ -94,7 +94,11 @@ class Transcription:
         left, middle, right = x[:-1:2], x[1::2], x[2::2]
         half = middle - 0.5 * (left + right) - h / 8.0 * (a - b)
         whole = right - left - h / 6.0 * (a + 4.0 * c + b)
-        return np.concatenate([half, whole], axis=1), x[0] - self.start, self._ending.miss(x[-1])
+        return np.concatenate([half, whole], axis=1), *self.ends_missed(at)
+
+    def ends_missed(self, at: Trajectory) -> tuple[FloatArray, FloatArray]:
+        """Return what remains of the equations of the start (7,) and of the end."""
+        return at.states[0] - self.start, self._ending.miss(at.states[-1])
 
     def linear(self, at: Trajectory) -> Linear:
         """Return the equations around a trajectory."""

@@ -18,7 +18,8 @@ from scipy.integrate import solve_ivp
 
 from flight.gnc.guidance.three_axes.slew_ends import Whole
 from flight.gnc.guidance.three_axes.slew_model import Along, Around, SlewCraft
-from flight.gnc.guidance.three_axes.slew_plan import SlewPlan, SlewTask
+from flight.gnc.guidance.three_axes.slew_plan import SlewPlan
+from flight.gnc.guidance.three_axes.slew_task import SlewTask
 from flight.gnc.math.arrays import FloatArray
 
 FILE = Path(__file__).resolve().parents[5].parent / "shared" / "data" / "optimum_orbit.json"
@@ -97,7 +98,9 @@ def flown(plan: SlewPlan, task: SlewTask) -> FloatArray:
     start = np.concatenate([task.quaternion, task.rate])
     step = plan.horizon / task.nodes
     return np.asarray(
-        solve_ivp(flow, (0.0, plan.horizon), start, rtol=1e-7, atol=1e-9, max_step=step).y[:, -1]
+        solve_ivp(flow, (0.0, plan.horizon), start, method="DOP853", rtol=1e-8, atol=1e-10, max_step=step).y[
+            :, -1
+        ]
     )
 
 
