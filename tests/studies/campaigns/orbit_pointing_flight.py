@@ -1,0 +1,233 @@
+"""One flight of campaign `orbit-pointing`: a craft with its filter, its planner's job and its law.
+
+The tables are those of the planner worker (`pointing_job`), made again each REPLAN s, and 10 s after the body
+was more than 15 deg off its path. The coils pause a tenth of each two seconds for the magnetometer; star
+attitudes come each 10 s, two seconds late. Beside the law stands the magnetic proportional-derivative law:
+what of the torque -J (w^2 turn + 2 w rate) lies across the field (Lovera & Astolfi 2004, Automatica 40(8)).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from flight.bodies.orbit.planning import ASTRAY
+from flight.gnc.control.three_axes import pointing_job
+from flight.gnc.control.three_axes.pointing import PointingLaw
+from flight.gnc.control.three_axes.pointing_job import PointingJob
+from flight.gnc.control.three_axes.pointing_table import PointingWeights
+from flight.gnc.earth.disturbance import pressures
+from flight.gnc.earth.ephemeris import Ephemeris
+from flight.gnc.earth.orbit_knowledge import OrbitState
+from flight.gnc.estimation.free_filter import FreeFilter, FreeFilterSettings
+from flight.gnc.estimation.free_motion import GYRO, TURN, Around
+from flight.gnc.guidance.three_axes.attitude_law import references
+from flight.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from flight.gnc.guidance.three_axes.target_law import BodyAxes, law_of
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import (
+    attitude_matrix,
+    conjugate,
+    from_rotation_vector,
+    multiply,
+    to_rotation_vector,
+)
+from sim_hal.worlds.free_body.section import Disturbances, TipOff
+from tests.studies.campaigns.free_flight import (
+    FIELD_NOISE,
+    FIX_SIGMA,
+    GYRO_NOISE,
+    SECOND,
+    FreeFlight,
+)
+
+CYCLE, PAUSE = 2.0, 0.2
+"""s."""
+STARS_EVERY, REPLAN, AGAIN, AHEAD = 10.0, 600.0, 10.0, 900.0
+"""s."""
+COAST = 12.0
+"""s with the coils at rest, while the attitude is made sure of."""
+STAR_SIGMA = 5e-5
+"""rad an axis, 10"."""
+AXES = BodyAxes(np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0]))
+TARGETS = {
+    "nadir": PointingTarget(Goal.NADIR, roll=0.0),
+    "sun": PointingTarget(Goal.SUN),
+    "inertial": PointingTarget(Goal.INERTIAL, (0.0, 0.0, 0.0, 1.0)),
+}
+WEIGHTS = {
+    "knightcube": PointingWeights(turn=np.radians(1.0), rate=1.0, dipole=3e-4),
+    "cubesat_3u": PointingWeights(turn=np.radians(1.0), rate=1.0, dipole=1.5e-3),
+}
+BANDWIDTH = {"knightcube": 4e-3, "cubesat_3u": 4e-3}
+"""rad/s of the magnetic proportional-derivative law."""
+
+
+class PointingFlight:
+    """One craft with its filter and law.
+
+    `notes`: every 10 s the time, the true turn (3,) rad against the law, what is known wrong of the attitude,
+    rad, NEES of attitude and gyro bias, A m^2 that are not known of the residual dipole, the sunlight, and
+    the coils' power, A^2 m^4.
+    """
+
+    def __init__(self, wanted: dict[str, Any], seed: int) -> None:
+        """`wanted`: craft, share of the worst disturbances, law, target, and the first turn, deg, if any."""
+        self._wanted = wanted
+        self._target = TARGETS[wanted["target"]]
+        self.notes: list[list[float]] = []
+        noises = Disturbances(
+            drag=wanted["share"], solar_pressure=wanted["share"], principal_turn_deg=3.0 * wanted["share"]
+        )
+        held = FreeFlight(wanted["craft"], seed, "sso", TipOff(rate=(0.0, 0.0, 0.0)), noises)
+        held.advance(0)
+        self.flight = flight = FreeFlight(wanted["craft"], seed, "sso", self._release(held), noises)
+        flight.advance(0)
+        self._filter = FreeFilter(flight.inertia, FreeFilterSettings())
+        gyro = self._gyro(flight.motion.rate, 1.0)
+        self._filter.start(flight.attitude(STAR_SIGMA), STAR_SIGMA**2 * np.eye(3), gyro)
+        self._law: PointingLaw | None = None
+        self._begun, self._ahead_begun = 0.0, -AHEAD
+        self._ahead: Ephemeris = held.ephemeris(0.0)
+        self._stars: FloatArray | None = None
+        self._rate_then, self._turn = np.zeros(3), np.zeros(3)
+
+    def _release(self, held: FreeFlight) -> TipOff:
+        """Return the release: at the law's attitude and rate, or turned and turning at random."""
+        way = law_of(self._target, AXES, held.motion.quaternion, held.ephemeris(60.0), 2.0)
+        start = references(way, held.ephemeris(60.0), np.array([2.0]))
+        quaternion, rate = start.quaternion[0], start.rate[0]
+        if (turn := self._wanted.get("turn_deg")) is not None:
+            generator = np.random.default_rng([round(1e3 * turn), 7])
+            about, spin = generator.standard_normal((2, 3))
+            quaternion = multiply(
+                from_rotation_vector(np.radians(turn) * about / np.linalg.norm(about)), quaternion
+            )
+            rate = np.radians(self._wanted["speed_deg"]) * spin / np.linalg.norm(spin)
+        qx, qy, qz, qw = quaternion.tolist()
+        wx, wy, wz = rate.tolist()
+        return TipOff(rate=(wx, wy, wz), attitude=(qx, qy, qz, qw))
+
+    def cycle(self, time: float) -> None:
+        """Fly one cycle."""
+        flight, found = self.flight, self._filter
+        if time - self._ahead_begun >= AHEAD:
+            self._ahead, self._ahead_begun = flight.ephemeris(AHEAD + 60.0), time
+        astray = float(np.linalg.norm(self._turn)) > ASTRAY and time - self._begun >= AGAIN
+        if (
+            self._wanted["law"] != "pd"
+            and time >= COAST
+            and (self._law is None or astray or time - self._begun >= self._wanted.get("replan", REPLAN))
+        ):
+            self._plan(time)
+        around = self._around(time)
+        flight.act(np.zeros(3))
+        before = flight.motion.rate
+        flight.advance(round((time + PAUSE) * SECOND))
+        found.advance(PAUSE, np.zeros(3), around)
+        noise = (FIELD_NOISE**2 + (3e-8) ** 2) * np.eye(3)
+        found.field(flight.field(), around.field, noise)
+        dipole = self._command(time + PAUSE, around)
+        flight.act(dipole)
+        acting = flight.motion.rate
+        flight.advance(round((time + CYCLE) * SECOND))
+        found.advance(CYCLE - PAUSE, dipole, around)
+        # The mean over the cycle, compared with the rate at its end.
+        mean = 0.5 * PAUSE / CYCLE * (before + acting) + 0.5 * (1.0 - PAUSE / CYCLE) * (
+            acting + flight.motion.rate
+        )
+        slope = (found.rate - self._rate_then) / CYCLE
+        found.gyro(self._gyro(mean, CYCLE), GYRO_NOISE**2 / CYCLE * np.eye(3), 0.5 * CYCLE * slope)
+        self._see_stars(time + CYCLE)
+
+    def _command(self, time: float, around: Around) -> FloatArray:
+        """Return the dipole (3,) A m^2 until the end of the cycle."""
+        found, flight = self._filter, self.flight
+        self._rate_then = found.rate
+        law = self._wanted["law"]
+        if time < COAST:
+            return np.zeros(3)
+        field = attitude_matrix(found.quaternion) @ around.field
+        residual = found.residual_dipole(around.sunlit) * (law != "plain")
+        if law == "pd":
+            dipole = self._proportional(time, field) - residual
+        else:
+            assert self._law is not None
+            sizes = found.torque_sizes * (law != "plain")
+            since = time - self._begun
+            command = self._law.command(since, found.quaternion, found.rate, field, residual, sizes)
+            self._turn, dipole = command.turn, command.dipole
+        dipole = dipole * CYCLE / (CYCLE - PAUSE)
+        dipole = dipole * min(1.0, flight.limit / float(np.abs(dipole).max()))
+        if round(time / CYCLE) % 5 == 0:
+            self._note(time, float(dipole @ dipole))
+        return np.asarray(dipole)
+
+    def _proportional(self, time: float, field: FloatArray) -> FloatArray:
+        """Return the dipole of the magnetic proportional-derivative law."""
+        found, speed = self._filter, self._wanted.get("bandwidth", BANDWIDTH[self._wanted["craft"]])
+        wanted = self._law_at(time, found.quaternion)
+        turn = to_rotation_vector(multiply(found.quaternion, conjugate(wanted[0])))
+        missed = found.rate - attitude_matrix(from_rotation_vector(turn)) @ wanted[1]
+        torque = -self.flight.inertia @ (speed**2 * turn + 2.0 * speed * missed)
+        return np.asarray(np.cross(field, torque) / float(field @ field))
+
+    def _law_at(self, time: float, quaternion: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return attitude and rate of the target at a time; of a free roll, that of the attitude."""
+        if self._law is not None:
+            wanted = self._law.wanted(time - self._begun)
+            return wanted.quaternion, wanted.rate
+        ahead, at = self._ahead, max(time - self._ahead_begun, 2.0)
+        found = references(law_of(self._target, AXES, quaternion, ahead, at), ahead, np.array([at]))
+        return found.quaternion[0], found.rate[0]
+
+    def _note(self, time: float, square: float) -> None:
+        """Note the true error against the law, and the filter's own errors."""
+        flight, found = self.flight, self._filter
+        wanted = self._law_at(time, flight.motion.quaternion)[0]
+        turn = to_rotation_vector(multiply(flight.motion.quaternion, conjugate(wanted)))
+        error = to_rotation_vector(multiply(flight.motion.quaternion, conjugate(found.quaternion)))
+        both = np.concatenate([error, flight.gyro_bias - found.gyro_bias])
+        pick = np.r_[TURN, GYRO]
+        nees = float(both @ np.linalg.solve(found.covariance[np.ix_(pick, pick)], both)) / 6.0
+        truth = flight.body.orbit_truth()
+        missing = truth.residual_dipole - found.residual_dipole(truth.sunlit)
+        known, unknown = float(np.linalg.norm(error)), float(np.linalg.norm(missing))
+        self.notes.append([time, *turn, known, nees, unknown, truth.sunlit, square])
+
+    def _plan(self, time: float) -> None:
+        flight, found = self.flight, self._filter
+        truth, draw = flight.body.orbit_truth(), flight.generator.standard_normal
+        place, velocity = truth.position + FIX_SIGMA * draw(3), truth.velocity + 0.05 * draw(3)
+        job = PointingJob(
+            0,
+            0,
+            OrbitState(truth.utc, place, velocity, FIX_SIGMA),
+            flight.inertia,
+            AXES,
+            self._wanted.get("weights", WEIGHTS[self._wanted["craft"]]),
+            self._target,
+            found.quaternion,
+            found.rate,
+            found.torque_sizes * (self._wanted["law"] != "plain"),
+            flight.limit * (CYCLE - PAUSE) / CYCLE,
+        )
+        self._law, self._begun = PointingLaw(pointing_job.run(job), flight.limit), time
+        self._turn = np.zeros(3)
+
+    def _around(self, time: float) -> Around:
+        ahead, at = self._ahead, np.array([time - self._ahead_begun + 0.5 * CYCLE])
+        lit = float(ahead.sunlit_at(at)[0])
+        return Around(ahead.field_at(at)[0], ahead.position_at(at)[0], pressures(ahead, at), lit)
+
+    def _see_stars(self, time: float) -> None:
+        """Give the filter the attitude that was exposed a cycle ago; expose the next."""
+        if self._stars is not None and time % STARS_EVERY < CYCLE:
+            self._filter.attitude(self._stars, STAR_SIGMA**2 * np.eye(3), CYCLE)
+        self._stars = self.flight.attitude(STAR_SIGMA)
+
+    def _gyro(self, rate: FloatArray, seconds: float) -> FloatArray:
+        flight = self.flight
+        noise = GYRO_NOISE / np.sqrt(seconds) * flight.generator.standard_normal(3)
+        return np.asarray(rate + flight.gyro_bias + noise)
