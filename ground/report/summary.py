@@ -81,11 +81,15 @@ def summarise(run: Run) -> Object:
 
 def _orbit_config(run: Run, notes: list[str]) -> OrbitConfig | None:
     """Return the configuration that was flown, None where its copy beside the log cannot be read."""
+    path = run.folder / "config.yaml"
     try:
-        return as_orbit(reader.load(run.folder / "config.yaml"))
+        if path.exists():
+            return as_orbit(reader.load(path))
+        why = "no copy of the configuration beside the log"
     except ConfigError as error:
-        notes.append(f"pointing and requirements not judged: {error}")
-        return None
+        why = str(error)
+    notes.append(f"pointing and requirements not judged: {why}")
+    return None
 
 
 def _plain(value: Any) -> Any:
