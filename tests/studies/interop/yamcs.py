@@ -57,7 +57,7 @@ _KINDS: dict[str, list[tuple[str, dict[str, Any]]]] = {
 _ENDED = "TM Connection closed"
 """What Yamcs warns of when the study ends the gateway."""
 _RACE = 'because "paramProcessor" is null'
-"""Of an exception in Yamcs 5.12.8: a verifier that has finished unsubscribes while a packet is delivered to it.
+"""Of an exception in Yamcs 5.12.8: a verifier that is done unsubscribes while a packet is delivered to it.
 
 The packet is archived and its values are right; displays miss it. Counted apart.
 """
