@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Mapping
 from typing import Any
 
 from flight.link.commands.definitions import LAYOUTS as COMMAND_LAYOUTS
@@ -52,9 +53,9 @@ def database() -> dict[str, Any]:
     }
 
 
-def command_table() -> list[dict[str, Any]]:
-    """Return the telecommands with their fields, ready for JSON."""
-    return [_packet(layout) for layout in COMMAND_LAYOUTS.values()]
+def command_table(layouts: Mapping[str, Layout] = COMMAND_LAYOUTS) -> list[dict[str, Any]]:
+    """Return telecommands with their fields, ready for JSON."""
+    return [_packet(layout) for layout in layouts.values()]
 
 
 def markdown() -> str:

@@ -6,7 +6,7 @@ release the body is held still at its initial attitude.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -26,6 +26,7 @@ from sim_hal.emulators.star_camera import EmulatedStarCamera, Expose
 from sim_hal.emulators.vn100 import Vn100Emulator, Vn100EmulatorSettings
 from sim_hal.emulators.vn100_sensors import PROFILES, NoiseProfile
 from sim_hal.faults.timeline import FaultTimeline
+from sim_hal.objects import Objects
 from sim_hal.orbit_devices import ExposeWide, OrbitDevices, wanted
 from sim_hal.orbit_sky import from_orbit
 from sim_hal.settings import Simulation, Sky
@@ -37,7 +38,7 @@ from sim_hal.worlds.truth import TruthRecorder
 from sim_hal.worlds.world import World, WorldInputs, make_world
 
 if TYPE_CHECKING:
-    from sim_hal.star_camera import StarCameraModel
+    from sim_hal.star_camera import SourceTrack, StarCameraModel
 
 _LINE_STREAM = 0x11E
 _FAULT_STREAM = 0xFA017
@@ -58,10 +59,12 @@ class Hardware:
     truth: TruthRecorder | None
     faults: FaultTimeline
     orbit: OrbitDevices
+    objects: Objects
 
     def release(self, epoch_ns: int) -> None:
         """Release the body at `epoch_ns`, mission time zero."""
         self.world.release_at(epoch_ns)
+        self.objects.begin(epoch_ns)
         if self.truth is not None:
             self.truth.begin(epoch_ns)
 
@@ -90,7 +93,8 @@ def assemble(
     sense = _sense(world, circuit, np.array(section.coil_field), np.array(section.imu.field_bias))
     free_fall = isinstance(world, OrbitingWorld)
     unit = _unit(config, section, sense, line, np.random.default_rng(unit_seed), now_ns(), free_fall)
-    camera = _camera(config.camera, section, world, expose, now_ns)
+    objects = Objects(section.objects, section.utc, now_ns(), world)
+    camera = _camera(config.camera, section, world, expose, now_ns, objects)
     orbit = _orbit(config, section, world, now_ns, gps_line, expose_wide)
     for part in orbit.strings.parts if orbit.strings is not None else ():
         coils.bus.attach(part)
@@ -100,9 +104,8 @@ def assemble(
     # At equal times devices run in this order.
     devices: list[EmulatedDevice | None] = [unit, camera, orbit.gps, *orbit.wide, faults, truth]
     simulation = TimedSimulation(world.advance_to, [device for device in devices if device is not None])
-    return Hardware(
-        simulation, world, unit, coils.bus, coils.pwm, coils.monitor, circuit, camera, truth, faults, orbit
-    )
+    parts = (unit, coils.bus, coils.pwm, coils.monitor, circuit, camera, truth, faults, orbit, objects)
+    return Hardware(simulation, world, *parts)
 
 
 def _sense(
@@ -151,6 +154,7 @@ def _camera(
     world: World,
     expose: Expose | None,
     now_ns: Callable[[], int],
+    objects: Objects,
 ) -> EmulatedStarCamera | None:
     if camera is None:
         return None
@@ -159,7 +163,8 @@ def _camera(
         make = from_orbit(make, world, camera)
     readout_ns = round(section.sky.readout * 1e9)
     scan_ns = round(section.sky.line_time * camera.rows * 1e9)
-    return EmulatedStarCamera(world.motion, make, now_ns, readout_ns, np.array(camera.mounting), scan_ns)
+    mounting = np.array(camera.mounting)
+    return EmulatedStarCamera(world.motion, make, now_ns, readout_ns, mounting, scan_ns, objects.tracks)
 
 
 def _orbit(
@@ -220,20 +225,24 @@ class StarRenderer:
         self._magnitudes = catalogue.magnitude
         self._seed = seed
 
-    def render(self, sequence: int, times: FloatArray, attitudes: FloatArray) -> Image:
+    def render(
+        self, sequence: int, times: FloatArray, attitudes: FloatArray, tracks: Sequence[SourceTrack] = ()
+    ) -> Image:
         """Return frame `sequence`, exposed along `attitudes` (k, 4) at `times` (k,) s."""
         from sim_hal.star_camera import render  # noqa: PLC0415 - see `camera_model`
 
         generator = np.random.default_rng([self._seed, sequence])
-        return render(self._model, self._directions, self._magnitudes, times, attitudes, generator)
+        return render(self._model, self._directions, self._magnitudes, times, attitudes, generator, tracks)
 
 
 def inline_exposure(renderer: StarRenderer) -> Expose:
     """Return an exposure that renders at once, for lock-step."""
 
-    def expose(sequence: int, times: FloatArray, attitudes: FloatArray) -> Future[Image]:
+    def expose(
+        sequence: int, times: FloatArray, attitudes: FloatArray, tracks: Sequence[SourceTrack]
+    ) -> Future[Image]:
         future: Future[Image] = Future()
-        future.set_result(renderer.render(sequence, times, attitudes))
+        future.set_result(renderer.render(sequence, times, attitudes, tracks))
         return future
 
     return expose

@@ -109,7 +109,7 @@ def _wide(
 ) -> EmulatedStarCamera:
     model, make = wide_model(camera, seed[-1]), expose or inline_wide
 
-    def exposed(sequence: int, _: FloatArray, attitudes: FloatArray) -> Future[Image]:
+    def exposed(sequence: int, _: FloatArray, attitudes: FloatArray, __: object) -> Future[Image]:
         date = _UNIX_EPOCH + world.utc_ns() * 1e-9 / 86_400.0
         scene = EarthScene(
             position=np.array(world.surroundings().position),

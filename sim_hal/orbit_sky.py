@@ -7,7 +7,9 @@ Earth hides the stars behind it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import Future
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,6 +22,9 @@ from flight.schema.devices import Camera
 from sim_hal.emulators.star_camera import Expose
 from sim_hal.worlds.surroundings import OrbitingWorld, Surroundings
 
+if TYPE_CHECKING:
+    from sim_hal.star_camera import SourceTrack
+
 BAFFLE = np.radians(25.0)
 """rad beyond the field's corner within which the Sun blinds the camera."""
 _UNIX_EPOCH = 2_440_587.5
@@ -30,11 +35,13 @@ def from_orbit(expose: Expose, world: OrbitingWorld, camera: Camera) -> Expose:
     pinhole = Pinhole.from_field_of_view(camera.columns, camera.rows, np.radians(camera.field_of_view_deg))
     top = (1 << camera.bits) - 1
 
-    def exposed(sequence: int, times: FloatArray, attitudes: FloatArray) -> Future[Image]:
+    def exposed(
+        sequence: int, times: FloatArray, attitudes: FloatArray, tracks: Sequence[SourceTrack]
+    ) -> Future[Image]:
         around = world.surroundings()
         date = _UNIX_EPOCH + world.utc_ns() * 1e-9 / 86_400.0
         turned = aberrated(attitudes, earth_velocity(date) + around.velocity)
-        rendered = expose(sequence, times, turned)
+        rendered = expose(sequence, times, turned, tracks)
         to_camera = quaternion.attitude_matrix(attitudes[len(attitudes) // 2])
         blinded, hidden = view(pinhole, to_camera, around)
         if not blinded and hidden is None:

@@ -15,6 +15,7 @@ from flight.schema.sections import Config
 from sim_hal.assembly import StarRenderer, inline_exposure
 from sim_hal.clock import SimClock
 from sim_hal.emulators.star_camera import EmulatedStarCamera
+from sim_hal.objects import Objects
 from sim_hal.settings import Simulation
 from sim_hal.worlds.motion import Motion
 from sim_hal.worlds.simulation import TimedSimulation
@@ -33,6 +34,7 @@ def posed_camera(
     assert camera is not None, "the caller has seen to a camera section"
     begun_ns, mounting = clock.now_ns(), np.array(camera.mounting)
     world = make_world(WorldInputs(config, section, lambda: np.zeros(3), begun_ns))
+    objects = Objects(section.objects, section.utc, begun_ns, world)
     held, body_rate = world.motion(begun_ns), attitude_matrix(mounting).T @ rate
     nothing = np.zeros(3)
 
@@ -47,6 +49,7 @@ def posed_camera(
         round(section.sky.readout * 1e9),
         mounting,
         round(section.sky.line_time * camera.rows * 1e9),
+        objects.tracks,
     )
     clock.attach(TimedSimulation(lambda _: None, [device]))
     return device, lambda time_ns: multiply(mounting, motion(time_ns).quaternion)

@@ -77,6 +77,48 @@ class Sky(Section, frozen=True, kw_only=True):
     noise: Literal["poisson", "uniform"] = "poisson"
 
 
+class Tumble(Section, frozen=True, kw_only=True):
+    """How an object's brightness varies: by +-`amplitude` magnitudes, once in `period` s."""
+
+    period: Positive
+    amplitude: Annotated[float, Meta(ge=0.0, le=5.0)]
+    phase_deg: float = 0.0
+
+
+class LineOfSight(Section, frozen=True, kw_only=True):
+    """A great circle among the stars: where the object is at `at` s of mission time, and how it moves.
+
+    `rate_deg` deg/s towards the position angle `towards_deg`, from north through east;
+    `acceleration_deg` deg/s^2 along the circle.
+    """
+
+    right_ascension_deg: Annotated[float, Meta(ge=-360.0, le=360.0)]
+    declination_deg: Annotated[float, Meta(ge=-90.0, le=90.0)]
+    rate_deg: Annotated[float, Meta(ge=0.0, le=20.0)] = 0.0
+    towards_deg: Annotated[float, Meta(ge=-360.0, le=360.0)] = 0.0
+    acceleration_deg: Annotated[float, Meta(ge=-5.0, le=5.0)] = 0.0
+    at: float = 0.0
+
+
+class ObjectState(Section, frozen=True, kw_only=True):
+    """Position m and velocity m/s of an object at `simulation.utc`, ICRS, about the Earth's centre."""
+
+    position: Row
+    velocity: Row
+
+
+class SkyObject(Section, frozen=True, kw_only=True):
+    """An object in the sky of the star camera: a `line_of_sight` or an orbit's `state`, one of the two.
+
+    `magnitude` is Johnson V, of an orbit in full sunlight.
+    """
+
+    magnitude: Annotated[float, Meta(ge=-10.0, le=20.0)]
+    line_of_sight: LineOfSight | None = None
+    state: ObjectState | None = None
+    tumble: Tumble | None = None
+
+
 class OrbitDeviceTruth(Section, frozen=True, kw_only=True):
     """Errors of the devices of an orbit.
 
@@ -118,6 +160,7 @@ class Simulation(Section, frozen=True, kw_only=True):
     coil_field: tuple[Row, Row, Row] = ((0.0, 0.0, 0.0),) * 3
     imu: ImuNoise = ImuNoise()
     sky: Sky = Sky()
+    objects: Annotated[tuple[SkyObject, ...], Meta(max_length=32)] = ()
     truth: Truth = Truth()
     free_body: FreeBodySection | None = None
     orbit_devices: OrbitDeviceTruth = OrbitDeviceTruth()

@@ -84,13 +84,14 @@ def _shown(options: argparse.Namespace, stack: ExitStack) -> Console:
     from ground.console.link_feed import LinkFeed  # noqa: PLC0415
     from ground.console.server import Console  # noqa: PLC0415
     from ground.console.surroundings import NOWHERE, Surroundings  # noqa: PLC0415
+    from ground.xtce import TELECOMMANDS  # noqa: PLC0415
 
     history = stack.enter_context(History())
     if options.link is not None:
         feed = LinkFeed(terminal_of(options))
         stack.callback(feed.close)
         place = NOWHERE if options.config is None else Surroundings.of(options.config)
-        return Console(options.link, feed, history, place, Commanding(feed.send))
+        return Console(options.link, feed, history, place, Commanding(feed.send, TELECOMMANDS))
     to = options.to
     if options.fly is not None:
         to = stack.enter_context(flying(options.fly, options.run))

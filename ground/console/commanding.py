@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from flight.app.utc_label import utc_ns
 from flight.gnc.errors import FlightError, UsageError
 from flight.link.commands import codec
-from flight.link.commands.definitions import COMMANDS, LAYOUTS
+from flight.link.commands.definitions import LAYOUTS
+from flight.link.process import directives
 from flight.link.telemetry.form import Field
-from flight.link.telemetry.packets import Packer, TelemetryError
+from flight.link.telemetry.packets import Layout, Packer, TelemetryError
 from ground.commands.command import exchange
 from ground.console.instant import values
 from ground.telemetry.scanner import decode
@@ -37,9 +38,11 @@ def by_socket(to: str) -> Send:
 class Commanding:
     """Packs what the page's forms hold; `send` is None where this console only looks."""
 
-    def __init__(self, send: Send | None) -> None:
+    def __init__(self, send: Send | None, layouts: Mapping[str, Layout] = LAYOUTS) -> None:
+        """`layouts` are the commands that `send` takes: by a link also those of the link itself."""
         self._send = send
-        self._packer = Packer(LAYOUTS)
+        self.layouts = layouts
+        self._packer = Packer(dict(layouts))
 
     @property
     def possible(self) -> bool:
@@ -48,7 +51,7 @@ class Commanding:
 
     def words(self, name: str, given: Object) -> str:
         """Return a command in words, for its confirmation. Raises UsageError for values that are none."""
-        return codec.describe(codec.unpack(self._pack(name, given)))
+        return _words(self._pack(name, given))
 
     def obey(self, name: str, given: Object) -> Object:
         """Send a command; return the flight's answer. Raises UsageError for values, else FlightError."""
@@ -57,19 +60,25 @@ class Commanding:
         return self._send(self._pack(name, given))
 
     def _pack(self, name: str, given: Object) -> bytes:
-        packet = next((packet for packet in COMMANDS if packet.name == name), None)
-        if packet is None:
-            raise UsageError(f"{name}: no such command: {', '.join(packet.name for packet in COMMANDS)}")
+        if name not in self.layouts:
+            raise UsageError(f"{name}: no such command: {', '.join(self.layouts)}")
+        packet = self.layouts[name].packet
         unknown = sorted(set(given) - {field.name for field in packet.fields})
         if unknown:
             raise UsageError(f"{name}: no such value: {', '.join(unknown)}")
         fields = {field.name: _value(name, field, given.get(field.name)) for field in packet.fields}
         try:
             data = self._packer.pack(packet, utc_ns(), fields)
-            codec.unpack(data)
+            _words(data)
         except (TelemetryError, codec.CommandError) as error:
             raise UsageError(str(error)) from error
         return data
+
+
+def _words(data: bytes) -> str:
+    """Return the words of a command's packet. Raises CommandError for values that are none."""
+    directive = directives.unpack(data)
+    return codec.describe(codec.unpack(data)) if directive is None else str(directive)
 
 
 def _value(name: str, field: Field, given: Any) -> Any:

@@ -10,6 +10,7 @@ import numpy as np
 from flight.app.utc_label import utc_ns
 from flight.gnc.errors import FlightError
 from flight.link.commands.codec import CommandPacker, Ping
+from flight.link.process.directives import LIST
 from flight.link.process.downlink import LIVE
 from flight.link.process.verification import Report, Stage
 from flight.link.telemetry.link_definitions import VERIFICATION
@@ -69,7 +70,7 @@ class LinkFeed:
         while time.monotonic() < until:
             reports = list(self._reports.get(counter, ()))
             if reports and reports[-1].stage is not Stage.ACCEPTED:
-                return {"obeyed": int(obeyed(reports)), "text": reports[-1].text, "counter": counter}
+                return {"obeyed": int(obeyed(reports)), "text": _text(reports), "counter": counter}
             time.sleep(0.02)
         raise FlightError(f"no answer by the link within {_ANSWER_S:g} s")
 
@@ -82,3 +83,9 @@ class LinkFeed:
             self._reports.setdefault(report.counter, []).append(report)
             while len(self._reports) > _KEPT_REPORTS:
                 del self._reports[next(iter(self._reports))]
+
+
+def _text(reports: list[Report]) -> str:
+    """Return the newest text, of a list all lines."""
+    listed = reports[1:] if reports[-1].name == LIST.name else reports[-1:]
+    return "; ".join(report.text for report in listed)

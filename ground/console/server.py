@@ -152,7 +152,7 @@ class _Pages:
         return web.json_response(
             {
                 "packets": database()["packets"],
-                "commands": command_table(),
+                "commands": command_table(console.commanding.layouts),
                 "commanding": console.commanding.possible,
                 "name": console.name,
                 "camera": console.surroundings.camera,

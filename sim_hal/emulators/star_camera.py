@@ -6,9 +6,10 @@ along it. `expose` gives a future, so that in real time a frame is made beside t
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,10 +20,20 @@ from hal.interfaces.readings import Frame
 from sim_hal.emulators.device import NEVER
 from sim_hal.worlds.motion import Motion
 
+if TYPE_CHECKING:
+    from sim_hal.star_camera import SourceTrack
+
 SAMPLE_NS = 10_000_000
 
-Expose = Callable[[int, FloatArray, FloatArray], "Future[Image]"]
-"""Renders frame number, times (k,) s from the start and camera attitudes (k, 4) into a future image."""
+Expose = Callable[[int, FloatArray, FloatArray, "Sequence[SourceTrack]"], "Future[Image]"]
+"""Renders frame number, times (k,) s from the start, camera attitudes (k, 4) and the tracks of objects."""
+Moving = Callable[[int, FloatArray], "Sequence[SourceTrack]"]
+"""Returns the tracks of objects over an exposure that began at a time, ns, at times (k,) s after it."""
+
+
+def no_objects(_: int, __: FloatArray) -> Sequence[SourceTrack]:
+    """Return no track: a sky of stars alone."""
+    return ()
 
 
 @dataclass(slots=True)
@@ -57,6 +68,7 @@ class EmulatedStarCamera:
         readout_ns: int,
         mounting: FloatArray,
         scan_ns: int = 0,
+        moving: Moving = no_objects,
     ) -> None:
         """Take the camera's wiring; `scan_ns` is how much later the last row of a rolling shutter exposes."""
         self._motion = motion
@@ -65,6 +77,7 @@ class EmulatedStarCamera:
         self._readout_ns = readout_ns
         self._mounting = mounting
         self._scan_ns = scan_ns
+        self._moving = moving
         self._sequence = 0
         self._exposure: _Exposure | None = None
         self._last: Frame | None = None
@@ -125,7 +138,9 @@ class EmulatedStarCamera:
             exposure.attitudes.append(multiply(self._mounting, self._motion(event_ns).quaternion))
             if event_ns >= exposure.end_ns:
                 times = (np.array(exposure.times) - exposure.start_ns) * 1e-9
-                exposure.image = self._expose(exposure.sequence, times, np.array(exposure.attitudes))
+                tracks = self._moving(exposure.start_ns, times)
+                attitudes = np.array(exposure.attitudes)
+                exposure.image = self._expose(exposure.sequence, times, attitudes, tracks)
 
     def close(self) -> None:
         """Abandon the exposure under way."""

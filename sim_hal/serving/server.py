@@ -40,6 +40,7 @@ from sim_hal.worlds.truth import TruthRecorder
 
 if TYPE_CHECKING:
     from sim_hal.earth_camera import EarthCameraModel, EarthScene
+    from sim_hal.star_camera import SourceTrack
 
 SOCKET_NAME = "devices.sock"
 _LONGEST_WAIT_NS = 20_000_000
@@ -57,8 +58,8 @@ def _prepare_renderer(camera: Camera | None, sky: Sky, seed: int) -> None:
         _renderer.append(StarRenderer(camera, sky, seed))
 
 
-def _render(sequence: int, times: FloatArray, attitudes: FloatArray) -> Image:
-    return _renderer[0].render(sequence, times, attitudes)
+def _render(sequence: int, times: FloatArray, attitudes: FloatArray, tracks: Sequence[SourceTrack]) -> Image:
+    return _renderer[0].render(sequence, times, attitudes, tracks)
 
 
 class _Connection:
@@ -169,12 +170,14 @@ class DeviceServer:
             pty.close()
         self._log.close()
 
-    def _expose(self, sequence: int, times: FloatArray, attitudes: FloatArray) -> Future[Image]:
+    def _expose(
+        self, sequence: int, times: FloatArray, attitudes: FloatArray, tracks: Sequence[SourceTrack]
+    ) -> Future[Image]:
         assert self._pool is not None
         # The previous exposure has its frame or is abandoned; rendering it first would delay this one.
         if self._rendering is not None:
             self._rendering.cancel()
-        self._rendering = self._pool.submit(_render, sequence, times, attitudes)
+        self._rendering = self._pool.submit(_render, sequence, times, attitudes, tracks)
         return self._rendering
 
     def _expose_wide(

@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -34,6 +35,16 @@ NEAREST = 1.0
 """m; nearer, an object would not be a point."""
 
 
+class Way(Protocol):
+    """Where a body is: an `Orbit`, or a stretch of it."""
+
+    def states_at(self, times: FloatArray) -> FloatArray:
+        """Return positions (m) and velocities (m/s), (m, 6), at `times` (m,) s."""
+
+    def positions_at(self, times: FloatArray) -> FloatArray:
+        """Return positions (m, 3) in m at `times` (m,) s."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ResidentSpaceObject:
     """An object on its `orbit`, of Johnson V `magnitude` in full sunlight."""
@@ -43,7 +54,7 @@ class ResidentSpaceObject:
 
 
 def source_tracks(
-    camera: Orbit,
+    camera: Way,
     objects: Sequence[ResidentSpaceObject],
     epoch: float,
     start: float,
@@ -81,7 +92,7 @@ def directions(observer: FloatArray, position: FloatArray) -> FloatArray:
     return np.asarray(way / np.linalg.norm(way, axis=-1, keepdims=True))
 
 
-def _track_times(camera: Orbit, orbit: Orbit, start: float, end: float) -> FloatArray:
+def _track_times(camera: Way, orbit: Orbit, start: float, end: float) -> FloatArray:
     """Return times close enough that an even motion between them stays within `TRACK_ERROR` of the track.
 
     The direction of an object that passes at speed v and distance d accelerates by 0.65 (v/d)^2 at most; the

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from typing import Protocol
 
 import numpy as np
 from scipy.integrate import OdeSolution, solve_ivp
@@ -93,7 +94,14 @@ class Orbit:
         return self.states_at(times)[:, :3]
 
 
-def propagate(elements: KeplerianElements, duration: float, j2: float = J2) -> Orbit:
+class Start(Protocol):
+    """Where an orbit starts: elements, or a state."""
+
+    def state(self) -> tuple[FloatArray, FloatArray]:
+        """Return position (3,) m and velocity (3,) m/s."""
+
+
+def propagate(elements: Start, duration: float, j2: float = J2) -> Orbit:
     """Return the orbit that starts at `elements` at time 0, over `duration` s (Sease 2.13, 2.14).
 
     By the Runge-Kutta method of order 8 of Dormand and Prince, whose own interpolant gives what lies between

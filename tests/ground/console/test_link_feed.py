@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
-from flight.gnc.errors import FlightError
+from flight.gnc.errors import FlightError, UsageError
 from flight.link.commands.codec import ChangeMode, CommandPacker
 from flight.link.modes import Mode
 from ground.console import link_feed
+from ground.console.commanding import Commanding
 from ground.console.link_feed import LinkFeed
+from ground.xtce import TELECOMMANDS
 from tests.flight.link.process.both_ends import BothEnds
 
 
@@ -48,19 +50,36 @@ def test_it_asks_for_telemetry_once_and_gives_what_the_flight_records(satellite:
     assert feed.silence < 60.0
 
 
-def test_a_command_is_answered_with_its_counter_and_what_became_of_it(satellite: Satellite) -> None:
-    feed = satellite.feed
-    packet = CommandPacker().pack(ChangeMode(Mode.SAFE, "bored"), 7)
+def answered(satellite: Satellite, send: Callable[[], dict[str, object]]) -> dict[str, object]:
+    """Return the answer to a command that another thread sends, as the page's server does."""
     answers: list[dict[str, object]] = []
-    sending = threading.Thread(target=lambda: answers.append(feed.send(packet)))
+    sending = threading.Thread(target=lambda: answers.append(send()))
     sending.start()
     for _ in range(200):
-        feed.new()
+        satellite.feed.new()
         sending.join(0.01)
         if not sending.is_alive():
             break
-    assert packet in satellite.ends.obeyed
     (answer,) = answers
+    return answer
+
+
+def test_the_forms_of_a_link_schedule_a_command_and_list_it(satellite: Satellite) -> None:
+    forms = Commanding(satellite.feed.send, TELECOMMANDS)
+    given = {"at": "2099-01-01T00:00:00", "words": "slew 0.2"}
+    assert forms.words("schedule", given) == "at 2099-01-01T00:00:00: slew 0.2"
+    assert answered(satellite, lambda: forms.obey("schedule", given))["obeyed"] == 1
+    listed = answered(satellite, lambda: forms.obey("list-schedule", {}))
+    assert listed["text"] == "1: 2099-01-01T00:00:00Z slew 0.2; 1 scheduled"
+    with pytest.raises(UsageError, match="new-key: no such command"):
+        forms.words("new-key", {})
+
+
+def test_a_command_is_answered_with_its_counter_and_what_became_of_it(satellite: Satellite) -> None:
+    feed = satellite.feed
+    packet = CommandPacker().pack(ChangeMode(Mode.SAFE, "bored"), 7)
+    answer = answered(satellite, lambda: feed.send(packet))
+    assert packet in satellite.ends.obeyed
     assert answer["obeyed"] == 1
     assert satellite.ends.stages(int(str(answer["counter"])))[0] == "accepted"
 

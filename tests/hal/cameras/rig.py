@@ -91,7 +91,7 @@ def emulated_rig() -> Rig:
     """Return the simulated camera, its pictures flat."""
     clock = ManualClock()
 
-    def expose(sequence: int, _times: FloatArray, _attitudes: FloatArray) -> Future[Image]:
+    def expose(sequence: int, _times: FloatArray, _attitudes: FloatArray, _tracks: object) -> Future[Image]:
         promise: Future[Image] = Future()
         promise.set_result(np.full((48, 64), sequence, np.uint16))
         return promise

@@ -23,8 +23,8 @@ def test_a_frame_that_waits_to_be_rendered_is_given_up_for_the_next() -> None:
     server = DeviceServer.__new__(DeviceServer)
     server.__dict__.update(_pool=IdlePool(), _rendering=None)
     times, attitudes = np.zeros(1), np.zeros((1, 4))
-    first = server._expose(1, times, attitudes)
-    second = server._expose(2, times, attitudes)
+    first = server._expose(1, times, attitudes, ())
+    second = server._expose(2, times, attitudes, ())
     assert first.cancelled()
     assert not second.cancelled()
 

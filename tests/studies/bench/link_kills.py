@@ -114,7 +114,7 @@ def measure(place: Path, kills: int, seed: int) -> Findings:
     return found
 
 
-class _Way:
+class Way:
     """The calls of a process that is killed at one of them."""
 
     def __init__(self, point: int, torn: bool, writer: socket.socket) -> None:
@@ -169,7 +169,7 @@ class _Way:
 class _SkyWire(Wire):
     """The link's line, whose frames leave the process one by one."""
 
-    def __init__(self, way: _Way, frames: list[bytes]) -> None:
+    def __init__(self, way: Way, frames: list[bytes]) -> None:
         super().__init__()
         self.up = frames
         self._way = way
@@ -182,7 +182,7 @@ class _SkyWire(Wire):
 class _GroundOut(GroundWire):
     """The ground's line, likewise."""
 
-    def __init__(self, way: _Way) -> None:
+    def __init__(self, way: Way) -> None:
         super().__init__(Wire())
         self._way = way
 
@@ -190,7 +190,7 @@ class _GroundOut(GroundWire):
         self._way.put(frame)
 
 
-def killed(work: Callable[[_Way], None], point: int, torn: bool) -> list[bytes]:
+def killed(work: Callable[[Way], None], point: int, torn: bool) -> list[bytes]:
     """Do work in a process that is killed at its call number `point`; return the frames that left it before.
 
     Calls are those that write to the disk or send; `torn` cuts a write in the middle.
@@ -199,7 +199,7 @@ def killed(work: Callable[[_Way], None], point: int, torn: bool) -> list[bytes]:
     child = os.fork()
     if child == 0:
         try:
-            way = _Way(point, torn, writer)
+            way = Way(point, torn, writer)
             way.arm()
             work(way)
         finally:
@@ -213,14 +213,14 @@ def killed(work: Callable[[_Way], None], point: int, torn: bool) -> list[bytes]:
     return frames
 
 
-def _send(place: Path, number: int, way: _Way) -> None:
+def _send(place: Path, number: int, way: Way) -> None:
     """Send three commands from the ground."""
     terminal = Terminal(_GroundOut(way), Vault(place / "keys" / "ground"), TerminalSettings())
     for count in range(_AT_ONCE):
         terminal.send(CommandPacker().pack(Ping(count), number * _AT_ONCE + count))
 
 
-def _serve(place: Path, frames: list[bytes], way: _Way) -> None:
+def _serve(place: Path, frames: list[bytes], way: Way) -> None:
     """Serve as the link for a moment, with these frames coming in."""
     control: ControlLine[Sent] = ControlLine(place / "commands", place)
     clock = ManualClock()

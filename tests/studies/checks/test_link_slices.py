@@ -6,8 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from flight.link.process.timetable import Timetable
 from flight.link.security.associations import Vault
 from ground.link.keys import make_keys
+from tests.studies.bench import schedule_kills
 from tests.studies.bench.link_kills import measure
 
 
@@ -27,3 +29,16 @@ def test_a_sender_that_stores_nothing_is_found_out(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr("tests.studies.bench.link_kills.make_keys", lambda _: None)
     monkeypatch.setattr(Vault, "write", lambda *_: 2)
     assert measure(tmp_path, 3, seed=3).counters_twice > 0
+
+
+def test_no_scheduled_command_comes_twice_and_a_kill_costs_one_at_most(tmp_path: Path) -> None:
+    found = schedule_kills.measure(tmp_path, 12, seed=3)
+    assert (found.twice, found.lost) == (0, 0)
+    assert 0 < found.never <= found.kills
+
+
+def test_a_schedule_that_keeps_what_it_hands_over_is_found_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Timetable, "remove", Timetable.forget)
+    assert schedule_kills.measure(tmp_path, 6, seed=3).twice > 0

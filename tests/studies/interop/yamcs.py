@@ -56,6 +56,11 @@ _KINDS: dict[str, list[tuple[str, dict[str, Any]]]] = {
 }
 _ENDED = "TM Connection closed"
 """What Yamcs warns of when the study ends the gateway."""
+_RACE = 'because "paramProcessor" is null'
+"""Of an exception in Yamcs 5.12.8: a verifier that is done unsubscribes while a packet is delivered to it.
+
+The packet is archived and its values are right; displays miss it. Counted apart.
+"""
 _REFUSED = ("clear", {"event": "too-hot"})
 _FAULTS = {"step_demo.yaml": ["--fault", "coil-x: open @ 45"], "orbit.yaml": []}
 _PATIENCE_S = {"step_demo.yaml": 60.0, "orbit.yaml": 700.0}
@@ -77,8 +82,9 @@ def fly(place: Path, config: str) -> bool:
             sound = [_command(server, flight, config), _sockets(server, flight)]
             flight.end()
             sound += [_archive(server, flight.run), _values(server)]
-        trouble = [line for line in troubles(server.log.read_text()) if _ENDED not in line]
-    _say("without a warning", lines_of_trouble=len(trouble), first=trouble[:3])
+        lines = [line for line in troubles(server.log.read_text()) if _ENDED not in line]
+        trouble = [line for line in lines if _RACE not in line]
+    _say("without a warning", lines=len(trouble), first=trouble[:3], races_of_yamcs=len(lines) - len(trouble))
     return all(sound) and not trouble
 
 
