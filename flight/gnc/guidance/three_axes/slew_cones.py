@@ -39,7 +39,7 @@ class Kept:
 
     def __init__(self, cones: tuple[Cone, ...], margin: float, times: FloatArray) -> None:
         """`margin` rad is added to each cone, for the way between the `times` (n,) s."""
-        self._limits = np.cos([min(cone.angle + margin, np.pi) for cone in cones])
+        self._limits = np.cos([min(max(cone.angle + margin, 0.0), np.pi) for cone in cones])
         self.count, size = len(cones), len(times)
         found = [
             -shown_curvature(np.broadcast_to(cone.axis, (size, 3)), cone.direction(times)) for cone in cones

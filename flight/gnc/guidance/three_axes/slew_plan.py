@@ -16,7 +16,8 @@ import numpy as np
 from flight.gnc.errors import PlanningError
 from flight.gnc.guidance.three_axes.slew_closing import closed
 from flight.gnc.guidance.three_axes.slew_path import SlewPath
-from flight.gnc.guidance.three_axes.slew_search import Found, Search
+from flight.gnc.guidance.three_axes.slew_search import Search
+from flight.gnc.guidance.three_axes.slew_solver import Found
 from flight.gnc.guidance.three_axes.slew_task import SlewTask, check
 
 
@@ -58,7 +59,7 @@ def plan_slew(task: SlewTask) -> SlewPlan:
         plan = _plan(task, search, found)
         if all(clear >= 0.0 for clear in plan.clearance):
             return plan
-        found = search.widened(found)
+        found = search.widened(found, -min(plan.clearance))
     raise PlanningError(
         f"no slew within the dipole's limit{' and outside the cones' * bool(task.cones)} was found over "
         f"{task.horizon:g} to {task.longest:g} s, from {search.tried} guesses"
@@ -68,10 +69,10 @@ def plan_slew(task: SlewTask) -> SlewPlan:
 def _plan(task: SlewTask, search: Search, found: Found) -> SlewPlan:
     """Return the plan that flies a path. Raises PlanningError when the path is not finite."""
     equations, scale = found.equations, found.equations.scale
-    at = closed(task.craft, search.unit, task.along, found.program, found.point)
+    at = closed(task.craft, search.solver.unit, task.along, found.program, found.point)
     flow = equations.motion.flow(at.states, at.all_dipoles())
     q = at.states[:, :4] / np.linalg.norm(at.states[:, :4], axis=1, keepdims=True)
-    dipole = search.unit * at.all_dipoles()
+    dipole = search.solver.unit * at.all_dipoles()
     path = SlewPath(equations.times, q, at.states[:, 4:] / scale, flow[:, 4:] / scale**2, dipole)
     if not all(np.isfinite(part).all() for part in (path.quaternion, path.rate, path.dipole)):
         raise PlanningError("the optimiser returned a path that is not finite")
@@ -83,8 +84,8 @@ def _plan(task: SlewTask, search: Search, found: Found) -> SlewPlan:
         SlewStatus.OPTIMAL if kept else SlewStatus.STRETCHED,
         task.horizon,
         path.horizon,
-        search.energy(found),
+        search.solver.energy(found),
         float((np.abs(path.dipole) / task.craft.limit).max()),
         tuple(float(cone.clearance(shown, dense).min()) for cone in task.cones),
-        search.steps,
+        search.solver.steps,
     )

@@ -26,7 +26,7 @@ from flight.gnc.math.quaternion import (
     to_rotation_vector,
 )
 
-_PHASES = np.arange(4) * 0.5 * np.pi
+_PHASES = np.arange(8) * 0.25 * np.pi
 _ROLLS = np.arange(-2, 4) * np.pi / 3.0
 
 

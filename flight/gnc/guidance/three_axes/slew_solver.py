@@ -1,0 +1,122 @@
+"""One path of a slew solved: without limits from a guess, or within all limits from a path near it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import CubicHermiteSpline
+
+from flight.gnc.guidance.three_axes.slew_cones import Kept
+from flight.gnc.guidance.three_axes.slew_limits import Limits
+from flight.gnc.guidance.three_axes.slew_program import Point, Program
+from flight.gnc.guidance.three_axes.slew_task import SlewTask
+from flight.gnc.guidance.three_axes.slew_transcription import Trajectory, Transcription
+from flight.gnc.math.arrays import FloatArray
+
+WALK_BARRIER, LAST_BARRIER = 1e-5, 1e-8
+"""Of a path that others begin from, and of one that is flown."""
+_STEPS_FREE = 25
+_STEPS_LIMITED = 60
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """A solved path."""
+
+    program: Program
+    point: Point
+
+    @property
+    def equations(self) -> Transcription:
+        """Its equations."""
+        return self.program.equations
+
+    @property
+    def at(self) -> Trajectory:
+        """The trajectory."""
+        return self.point.at
+
+    @property
+    def horizon(self) -> float:
+        """The duration, s."""
+        return self.equations.scale
+
+
+class Solver:
+    """Solves for one task; `unit` A m^2 is that of its dipoles, `margin` rad is added to its cones."""
+
+    def __init__(self, task: SlewTask) -> None:
+        self._task = task
+        self.unit = float(np.mean(task.craft.limit))
+        self._limit = task.craft.limit / self.unit
+        self._full = task.craft.weights / float(task.craft.weights @ self._limit**2)
+        self.margin = 0.0
+        self.steps = 0
+
+    def energy(self, found: Found) -> float:
+        """Return the heat of a path, J."""
+        equations = found.equations
+        power = float(self._task.craft.weights @ self._task.craft.limit**2)
+        return equations.cost(found.at) * equations.scale * power / float(equations.weights @ self._limit**2)
+
+    def peak(self, found: Found) -> float:
+        """Return the largest dipole of a path over its limit."""
+        return float((np.abs(found.at.dipoles) / self._limit).max())
+
+    def is_kept(self, found: Found) -> bool:
+        """Return whether a path without limits keeps all of them."""
+        kept = self._kept(found.equations).values(found.at.states[1:, :4])
+        return self.peak(found) <= 1.0 and bool(np.all(kept >= 0.0))
+
+    def equations(self, scale: float, count: int) -> Transcription:
+        """Return the equations over `scale` s on `count` intervals."""
+        task = self._task
+        start = np.concatenate([task.quaternion, scale * task.rate])
+        return Transcription(task.craft, self.unit, task.along, start, task.end, count, scale, self._full)
+
+    def free(self, equations: Transcription, guess: Trajectory) -> Found | None:
+        """Return the path without limits from a guess."""
+        equations.weights = self._full / max(equations.cost(guess), 1e-9)
+        limits = Limits(equations, None, Kept((), 0.0, equations.times[1:]))
+        return self._solved(Program(equations, limits), guess, None, LAST_BARRIER, _STEPS_FREE)
+
+    def limited(self, start: Found, count: int, time: float, last: float) -> Found | None:
+        """Return the path within all limits on `count` intervals over `time` s, from one near it."""
+        equations = self.equations(time, count)
+        at, before = transferred(start, equations), start.equations.weights
+        equations.weights = self._full / max(equations.cost(at), 1e-9)
+        same = count == start.equations.count
+        price = start.point.price * float(equations.weights[0] / before[0]) if same else None
+        if last == LAST_BARRIER or self.peak(start) > 1.0:
+            at = Trajectory(at.states, np.clip(at.dipoles, -0.98 * self._limit, 0.98 * self._limit))
+        program = Program(equations, Limits(equations, self._limit, self._kept(equations)))
+        return self._solved(program, at, price, last, _STEPS_LIMITED)
+
+    def _solved(
+        self, program: Program, guess: Trajectory, price: FloatArray | None, last: float, most: int
+    ) -> Found | None:
+        point = program.minimise(guess, price, last=last, most=most)
+        self.steps += program.steps
+        if point is None or not program.equations.end.is_met(point.at.states[-1, :4]):
+            return None
+        return Found(program, point)
+
+    def _kept(self, equations: Transcription) -> Kept:
+        return Kept(self._task.cones, self.margin, equations.times[1:])
+
+
+def transferred(start: Found, equations: Transcription) -> Trajectory:
+    """Return a path on the grid and over the horizon of other equations.
+
+    Slower by a ratio, the same way takes dipoles smaller by its square.
+    """
+    at, own = start.at, start.equations
+    dipoles = at.dipoles * (own.scale / equations.scale) ** 2
+    if own.count == equations.count:
+        return Trajectory(at.states, dipoles)
+    share = np.linspace(0.0, 1.0, 2 * own.count + 1)
+    states = CubicHermiteSpline(share, at.states, own.motion.flow(at.states, at.all_dipoles()))
+    wanted = np.linspace(0.0, 1.0, 2 * equations.count + 1)
+    parts = [np.interp(wanted[::2], share[::2], part) for part in dipoles.T]
+    return Trajectory(np.asarray(states(wanted)), np.stack(parts, axis=1))
