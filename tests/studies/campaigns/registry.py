@@ -19,6 +19,7 @@ from tests.studies.campaigns.mismatch import MISMATCH, VIBRATION
 from tests.studies.campaigns.nadir import NADIR
 from tests.studies.campaigns.orbit_attitude import ORBIT_ATTITUDE
 from tests.studies.campaigns.orbit_pointing import ORBIT_POINTING
+from tests.studies.campaigns.orbit_slews import ORBIT_SLEWS
 from tests.studies.campaigns.planner_edge import PLANNER_EDGE
 from tests.studies.campaigns.process_kill import PROCESS_KILL
 from tests.studies.campaigns.rate_change import RATE_CHANGE
@@ -65,6 +66,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         DETUMBLE,
         WORLD_COMPARISON,
         ORBIT_POINTING,
+        ORBIT_SLEWS,
         ACQUISITION,
     )
 }
