@@ -88,6 +88,7 @@ def test_an_approach_starts_with_the_body_s_attitude_and_rate_and_ends_in_the_la
     carried = multiply(from_rotation_vector(rate), start)
     assert angle_between(begin.quaternion[0], carried) < 1e-4
     np.testing.assert_allclose(begin.rate[0], rate, atol=2e-5)
+    np.testing.assert_allclose(references(way, ORBIT, np.array([100.0])).rate[0], rate, atol=2e-5)
     np.testing.assert_allclose(begin.rate[1], [0.0, -RATE, 0.0], atol=1e-6)
     np.testing.assert_allclose(begin.quaternion[2], NADIR.attitudes(ORBIT, np.array([800.0]))[0], atol=1e-12)
 
