@@ -72,6 +72,7 @@ class CoarseSunFeed:
             return found.reason
         assert found.direction is not None
         assert found.basis is not None
+        assert found.tangent_covariance is not None
         if self._filter.knowledge is Knowledge.FINE:
             return ""
         across = found.basis.T @ found.tangent_covariance @ found.basis
@@ -90,6 +91,7 @@ class CoarseSunFeed:
         if then is None or found.basis is None:
             return False
         off = found.basis @ (attitude_matrix(then.quaternion) @ sun)
+        assert found.tangent_covariance is not None
         claimed = found.basis @ (np.trace(then.covariance[TURN, TURN]) * np.eye(3)) @ found.basis.T
         return bool(off @ np.linalg.solve(claimed + found.tangent_covariance, off) > GATE)
 
