@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import hashlib
 import os
-import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,8 +24,8 @@ from flight.schema.document import checked_length, no_such_file
 from flight.schema.errors import ConfigError, UnreadConfigError
 
 _CURE = "was it edited? Then accept it: deploy/install.sh --accept; else put back what was there"
-_PAUSES_S = (0.05, 0.2)
-"""Between three tries to read: an error of a disk may pass."""
+_TRIES = 3
+"""To read: one failed access of a disk is no damage. What lasts longer is waited for by the start."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,11 +91,9 @@ def _verified(path: Path, read: Callable[[Path], bytes | None]) -> tuple[bytes |
 
 def _persistently(read: Callable[[Path], bytes | None], path: Path) -> bytes | None:
     """Read a file, again after an error. Raises OSError."""
-    for pause in _PAUSES_S:
-        try:
+    for _ in range(_TRIES - 1):
+        with suppress(OSError):
             return read(path)
-        except OSError:
-            time.sleep(pause)
     return read(path)
 
 

@@ -5,10 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from flight.schema.aim import check_aim
 from flight.schema.devices import Camera
 from flight.schema.document import Document
-from flight.schema.orbit import OrbitConfig
 from flight.schema.orbit_devices import SolarStrings
 from flight.schema.peers import is_loopback, peer_networks
 from flight.schema.sections import Commands, Config, Link
@@ -39,9 +37,7 @@ def check_consistency(config: Config, document: Document) -> None:
 
     if isinstance(config, TestbedConfig):
         _check_testbed(config, refuse)
-    if isinstance(config, OrbitConfig):
-        _check_orbit(config, refuse)
-    _check_commands(config.commands, isinstance(config, TestbedConfig), refuse)
+    _check_commands(config.commands, refuse)
     if config.link is not None:
         _check_link(config.link, config.commands, refuse)
     _check_coils(config, refuse)
@@ -63,32 +59,13 @@ def _check_testbed(config: TestbedConfig, refuse: Refuse) -> None:
     if config.guidance.replan_period >= config.guidance.horizon:
         refuse("guidance.replan_period", "must be shorter than `guidance.horizon`")
     times = [step.at for step in config.steps]
-    _check_order("steps", times, refuse)
-    if config.duration <= times[-1]:
-        refuse("duration", f"is {config.duration!r}: the last target is given at {times[-1]!r} s")
-
-
-def _check_orbit(config: OrbitConfig, refuse: Refuse) -> None:
-    times = [step.at for step in config.targets]
-    _check_order("targets", times, refuse)
-    for index, step in enumerate(config.targets):
-        check_aim(f"targets[{index}]", step, step.point, refuse)
-    axes = (config.pointing.axis, config.pointing.across)
-    for name, axis in zip(("axis", "across"), axes, strict=True):
-        if abs(math.hypot(*axis) - 1.0) > 1e-6:
-            refuse(f"pointing.{name}", f"has length {math.hypot(*axis):.6g}: give a unit vector")
-    cosine = sum(a * b for a, b in zip(*axes, strict=True))
-    if abs(cosine) > 1e-6:
-        degrees = math.degrees(math.acos(cosine))
-        refuse("pointing.across", f"is {degrees:.1f} deg from `pointing.axis`: must be 90 deg from it")
-
-
-def _check_order(section: str, times: list[float], refuse: Refuse) -> None:
     if times[0] != 0.0:
-        refuse(f"{section}[0].at", f"is {times[0]!r}: the first target must be given at 0")
+        refuse("steps[0].at", f"is {times[0]!r}: the first target must be given at 0")
     for index in range(1, len(times)):
         if times[index] <= times[index - 1]:
-            refuse(f"{section}[{index}].at", f"is {times[index]!r}: targets must stand in order of time")
+            refuse(f"steps[{index}].at", f"is {times[index]!r}: targets must stand in order of time")
+    if config.duration <= times[-1]:
+        refuse("duration", f"is {config.duration!r}: the last target is given at {times[-1]!r} s")
 
 
 def _check_coils(config: Config, refuse: Refuse) -> None:
@@ -132,15 +109,11 @@ def _check_length(dotted: str, quaternion: Quaternion, refuse: Refuse) -> None:
         refuse(dotted, f"has length {norm:.6g}: a quaternion must have length 1")
 
 
-def _check_commands(commands: Commands, on_testbed: bool, refuse: Refuse) -> None:
+def _check_commands(commands: Commands, refuse: Refuse) -> None:
     for index, step in enumerate(commands.timeline):
-        dotted = f"commands.timeline[{index}]"
-        given = [name for name in ("mode", "slew", "point", "clear") if getattr(step, name) is not None]
+        given = [name for name in ("mode", "slew", "clear") if getattr(step, name) is not None]
         if len(given) != 1:
-            refuse(dotted, f"gives {given}: must give one of mode, slew, point, clear")
-        if step.point is not None and on_testbed:
-            refuse(f"{dotted}.point", "is of a satellite: the testbed turns by `slew`")
-        check_aim(dotted, step, step.point, refuse)
+            refuse(f"commands.timeline[{index}]", f"gives {given}: must give one of mode, slew, clear")
     if not is_loopback(commands):
         problem = "is plain and open beyond this machine: give `link` with keys, and here a loopback address"
         refuse("commands.udp", f"{commands.udp} {problem}")

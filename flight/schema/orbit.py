@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+import math
+from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from flight.gnc.guidance.three_axes.pointing_target import PointingTarget
-from flight.schema.aim import Aim, GoalName
+from flight.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 from flight.schema.errors import ConfigError
 from flight.schema.orbit_devices import Normal
 from flight.schema.sections import Config, Detumble, Estimation
-from flight.schema.values import NotNegative, Positive, Section
+from flight.schema.values import NotNegative, Positive, Quaternion, Section
 
 LEAST_FIELD, LARGEST_FIELD = 5e-6, 2e-4
 """T: the Earth's field in a low orbit is 1.5e-5 to 6.5e-5; acting coils add or take as much."""
@@ -72,15 +72,25 @@ class PointingSection(Section, frozen=True, kw_only=True):
     replan_period: Annotated[float, Meta(ge=10.0, le=900.0)] = 300.0
 
 
-class TargetStep(Aim, frozen=True, kw_only=True):
-    """From `at` s of mission time point to a goal."""
+class TargetStep(Section, frozen=True, kw_only=True):
+    """From `at` s of mission time point to a goal; without `roll_deg` the roll is free.
+
+    `quaternion`, ICRS into body, scalar last, belongs to `inertial`; latitude and longitude to `ground`.
+    """
 
     at: NotNegative
-    point: GoalName
+    point: Literal["nadir", "velocity", "sun", "inertial", "ground"]
+    quaternion: Quaternion | None = None
+    latitude_deg: Annotated[float, Meta(ge=-90.0, le=90.0)] | None = None
+    longitude_deg: Annotated[float, Meta(ge=-360.0, le=360.0)] | None = None
+    roll_deg: Annotated[float, Meta(ge=-360.0, le=360.0)] | None = None
 
     def target(self) -> PointingTarget:
         """Return the target. Raises UsageError for values that do not belong to the goal, or lack."""
-        return self.target_at(self.point)
+        place = (self.latitude_deg, self.longitude_deg)
+        numbers = tuple(math.radians(value) for value in place if value is not None)
+        roll = None if self.roll_deg is None else math.radians(self.roll_deg)
+        return PointingTarget(Goal.named(self.point), (*numbers, *(self.quaternion or ())), roll)
 
 
 class OrbitConfig(Config, frozen=True, kw_only=True):

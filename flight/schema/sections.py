@@ -12,7 +12,6 @@ from typing import Annotated, Any, Literal, Self
 import msgspec
 from msgspec import Meta
 
-from flight.schema.aim import Aim, GoalName
 from flight.schema.devices import Camera, Coils, InertialUnit, PowerMonitor
 from flight.schema.orbit_devices import Gps, SolarStrings, WideCamera
 from flight.schema.values import Q2, CommandedMode, HostPort, NotNegative, Peer, PlainMode, Positive, Section
@@ -111,16 +110,12 @@ class Health(Section, frozen=True, kw_only=True):
     clock_step: Positive = 0.5
 
 
-class CommandStep(Aim, frozen=True, kw_only=True):
-    """One command of a time line, at `at` s of mission time.
-
-    A mode, a slew to q2, a goal to point to with its values, or an event to clear.
-    """
+class CommandStep(Section, frozen=True, kw_only=True):
+    """One command of a time line: at `at` s of mission time a mode, a slew to q2, or an event to clear."""
 
     at: NotNegative
     mode: CommandedMode | None = None
     slew: Q2 | None = None
-    point: GoalName | None = None
     clear: Annotated[str, Meta(min_length=1, max_length=32)] | None = None
 
 

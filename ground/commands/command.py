@@ -36,7 +36,7 @@ from flight.link.telemetry.packets import LONGEST_PACKET, TelemetryError, to_tex
 from ground.documentation import meaning_of
 from ground.link.commanding import change_key, obeyed
 from ground.link.commanding import command as send
-from ground.link.terminal import DEFAULTS, TerminalSettings, open_terminal
+from ground.link.options import add_link_options, terminal_of
 from ground.telemetry.scanner import decode
 
 _DIRECTIVES = ("play", "stop-playback", "new-key")
@@ -52,18 +52,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     way.add_argument(
         "--to", metavar="SOCKET", help="path of its UNIX socket, or HOST:PORT of its UDP address, on a bench"
     )
-    way.add_argument(
-        "--link", metavar="ADDRESS", help="its link: HOST:PORT (UDP), tcp:HOST:PORT or /dev/FILE@BAUD"
-    )
-    parser.add_argument("--keys", type=Path, metavar="FOLDER", help="the ground's keys, with --link")
+    add_link_options(parser, way)
     parser.add_argument(
         "--spi", type=int, choices=COMMAND_SPIS, default=COMMAND_SPIS[0], help="with --link (default 1)"
-    )
-    parser.add_argument(
-        "--spacecraft", type=int, default=DEFAULTS.spacecraft, metavar="N", help="with --link"
-    )
-    parser.add_argument(
-        "--frame-bytes", type=int, default=DEFAULTS.frame_bytes, metavar="N", help="with --link"
     )
     parser.add_argument("--timeout", type=float, default=2.0, metavar="S", help="for the answer (default 2)")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
@@ -139,11 +130,7 @@ def command(options: argparse.Namespace) -> int:
 
 def _by_link(options: argparse.Namespace) -> int:
     """Send by protected frames and show each stage."""
-    if options.keys is None:
-        raise UsageError("--link needs --keys, the ground's folder of `python -m ground keys`")
-    terminal = open_terminal(
-        options.link, options.keys, TerminalSettings(options.spacecraft, options.frame_bytes)
-    )
+    terminal = terminal_of(options)
 
     def show(report: Report) -> None:
         if not options.json:

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import socket
 import sys
 import webbrowser
+from contextlib import ExitStack
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from flight.gnc.errors import FlightError, UsageError
 from flight.link.telemetry.archive import find_runs
+from ground.link.options import add_link_options, terminal_of
 from ground.watch.tail import LogTail
+
+if TYPE_CHECKING:
+    from ground.console.server import Console
 
 PORT = 8040
 
@@ -20,24 +25,26 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of this command to the parser."""
     parser.description = (
         "Show a flight in the browser: attitude in 3-D, plots with history, mode and health, events, the "
-        "orbit on a map, and forms for commands. A flight that goes on is shown live; a run that is over is "
-        "replayed on the same page. The page is served on loopback only. Needs the extra `ground`. "
-        "Ctrl-C ends."
+        "orbit on a map, and forms for commands. A flight that goes on is shown live, from its log or by its "
+        "link; a run that is over is replayed on the same page. The page is served on loopback only. Needs "
+        "the extra `ground`. Ctrl-C ends."
     )
     parser.epilog = (
         "examples: python -m flight console runs/demo; "
-        "python -m flight console --fly config/step_demo.yaml runs/live"
+        "python -m flight console --fly config/step_demo.yaml runs/live; "
+        "python -m flight console --link 192.0.2.7:5010 --keys keys/ground --config orbit.yaml"
     )
     parser.add_argument(
         "run", metavar="RUN", type=Path, nargs="?", help="folder of a run, or of an archive: newest run"
     )
-    parser.add_argument(
-        "--to",
-        metavar="SOCKET",
-        help="command by the flight's UNIX socket, or HOST:PORT (default: look)",
+    way = parser.add_mutually_exclusive_group()
+    way.add_argument("--to", metavar="SOCKET", help="command by the flight's UNIX socket, or HOST:PORT")
+    way.add_argument(
+        "--fly", metavar="CONFIG", type=Path, help="fly this simulated configuration into RUN, in real time"
     )
+    add_link_options(parser, way)
     parser.add_argument(
-        "--fly", metavar="CONFIG", type=Path, help="fly this simulated configuration too, in real time"
+        "--config", metavar="CONFIG", type=Path, help="with --link: what is flown, for the map"
     )
     parser.add_argument("--port", type=int, default=PORT, metavar="N", help=f"0: any (default {PORT})")
     parser.add_argument("--open", action="store_true", help="open the page in the browser")
@@ -49,38 +56,50 @@ def console(options: argparse.Namespace) -> int:
     try:
         from aiohttp import web  # noqa: PLC0415 - an extra
 
-        from ground.console.commanding import Commanding, by_socket  # noqa: PLC0415
-        from ground.console.flying import flying  # noqa: PLC0415
-        from ground.console.history import History  # noqa: PLC0415
-        from ground.console.server import Console, application  # noqa: PLC0415
-        from ground.console.surroundings import Surroundings  # noqa: PLC0415
+        from ground.console.server import application  # noqa: PLC0415
     except ModuleNotFoundError as error:
         raise FlightError(
             f"the console needs {error.name}: pip install 'knightcube-flight[ground]'"
         ) from error
-    if options.run is None:
-        raise UsageError("RUN: give the folder of a run; with --fly, the folder that the flight writes to")
+    if (options.run is None) == (options.link is None):
+        raise UsageError("give RUN, the folder of a run (with --fly: of the coming one), or --link ADDRESS")
     address = _listening(options.port)
-    with address, contextlib.ExitStack() as stack:
-        folder, to = options.run, options.to
-        if options.fly is not None:
-            if to is not None:
-                raise UsageError("--fly and --to: the flight that --fly starts is commanded already")
-            flight = stack.enter_context(flying(options.fly, options.run))
-            folder, to = flight.folder, flight.socket
-        runs = find_runs(folder) if folder.is_dir() else []
-        folder = runs[-1] if runs else folder
-        commanding = Commanding(by_socket(to) if to else None)
-        history = stack.enter_context(History())
-        shown = Console(LogTail(folder), history, Surroundings.of(folder), commanding, folder)
+    with address, ExitStack() as stack:
+        shown = _shown(options, stack)
         shown.look()
         url = f"http://127.0.0.1:{address.getsockname()[1]}/"
-        sys.stdout.write(f"console of {folder}: {url} (Ctrl-C ends)\n")
+        sys.stdout.write(f"console of {shown.name}: {url} (Ctrl-C ends)\n")
         sys.stdout.flush()
         if options.open:
             webbrowser.open(url)
         web.run_app(application(shown), sock=address, print=None, access_log=None)
     return 0
+
+
+def _shown(options: argparse.Namespace, stack: ExitStack) -> Console:
+    """Return what the page shows; `stack` ends it."""
+    from ground.console.commanding import Commanding, by_socket  # noqa: PLC0415
+    from ground.console.flying import flying  # noqa: PLC0415
+    from ground.console.history import History  # noqa: PLC0415
+    from ground.console.link_feed import LinkFeed  # noqa: PLC0415
+    from ground.console.server import Console  # noqa: PLC0415
+    from ground.console.surroundings import NOWHERE, Surroundings  # noqa: PLC0415
+
+    history = stack.enter_context(History())
+    if options.link is not None:
+        feed = LinkFeed(terminal_of(options))
+        stack.callback(feed.close)
+        place = NOWHERE if options.config is None else Surroundings.of(options.config)
+        return Console(options.link, feed, history, place, Commanding(feed.send))
+    to = options.to
+    if options.fly is not None:
+        to = stack.enter_context(flying(options.fly, options.run))
+    folder = options.run
+    runs = find_runs(folder) if folder.is_dir() else []
+    folder = runs[-1] if runs else folder
+    commanding = Commanding(by_socket(to) if to else None)
+    place = Surroundings.of(folder / "config.yaml")
+    return Console(folder.name, LogTail(folder), history, place, commanding)
 
 
 def _listening(port: int) -> socket.socket:

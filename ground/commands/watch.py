@@ -14,11 +14,12 @@ from types import FrameType
 from typing import Any
 
 from flight.link.telemetry.archive import find_runs
+from flight.link.telemetry.states import STREAMS as STREAM_STATES
 from ground.commands.options import positive
 from ground.watch.plain import PlainLines, attitude_text, event_line, state_line
 from ground.watch.socket import answers
 from ground.watch.tail import LogTail
-from ground.watch.view import STREAM_STATES, STREAMS, View, named
+from ground.watch.view import STREAMS, View, named
 
 _LOOK_S = 0.5
 _PING_S = 2.0

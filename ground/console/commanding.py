@@ -17,14 +17,21 @@ from ground.console.instant import values
 from ground.telemetry.scanner import decode
 
 Object = dict[str, Any]
-Send = Callable[[bytes], bytes]
-"""Sends a command packet and returns the answering packets. Raises FlightError."""
+Send = Callable[[bytes], Object]
+"""Sends a command packet and returns what became of it: `obeyed`, `text`. Raises FlightError."""
 _TIMEOUT_S = 3.0
 
 
 def by_socket(to: str) -> Send:
     """Return what sends to a flight's own socket, or to its HOST:PORT."""
-    return lambda packet: exchange(to, packet, _TIMEOUT_S)
+
+    def send(packet: bytes) -> Object:
+        answers = decode(exchange(to, packet, _TIMEOUT_S))["command"]
+        if not len(answers):
+            raise FlightError(f"{to}: the answer holds no report of the command")
+        return values(answers[-1])
+
+    return send
 
 
 class Commanding:
@@ -46,11 +53,8 @@ class Commanding:
     def obey(self, name: str, given: Object) -> Object:
         """Send a command; return the flight's answer. Raises UsageError for values, else FlightError."""
         if self._send is None:
-            raise UsageError("this console only looks: start it with --to SOCKET to command")
-        packets = decode(self._send(self._pack(name, given)))["command"]
-        if not len(packets):
-            raise FlightError("the flight's answer holds no report of the command")
-        return values(packets[-1])
+            raise UsageError("this console only looks: start it with --to or --link to command")
+        return self._send(self._pack(name, given))
 
     def _pack(self, name: str, given: Object) -> bytes:
         packet = next((packet for packet in COMMANDS if packet.name == name), None)

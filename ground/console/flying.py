@@ -9,7 +9,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 from flight.gnc.errors import FlightError, UsageError
@@ -21,17 +20,12 @@ from flight.schema.sections import Commands
 _START_S, _END_S = 60.0, 15.0
 
 
-@dataclass(frozen=True, slots=True)
-class Flying:
-    """Folder of the flight's run, and the socket that it listens on."""
-
-    folder: Path
-    socket: str
-
-
 @contextlib.contextmanager
-def flying(config: Path, out: Path) -> Iterator[Flying]:
-    """Fly a configuration with simulated devices into `out`; leaving ends the flight. Raises FlightError."""
+def flying(config: Path, out: Path) -> Iterator[str]:
+    """Fly a simulated configuration into `out`, and yield its command socket; leaving ends the flight.
+
+    Raises FlightError.
+    """
     text = read_text(config)
     parsed = parse(text, str(config))
     if parsed.simulation is None:
@@ -46,7 +40,7 @@ def flying(config: Path, out: Path) -> Iterator[Flying]:
         flight = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
         try:
             _wait_for_log(flight, out)
-            yield Flying(out, socket)
+            yield socket
         finally:
             flight.send_signal(signal.SIGTERM)
             try:

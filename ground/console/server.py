@@ -9,20 +9,18 @@ import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from aiohttp import WSMsgType, web
 
 from flight.gnc.errors import FlightError, UsageError
-from flight.link.modes import Mode
-from flight.link.telemetry.packets import LAYOUTS, TelemetryError
+from flight.link.telemetry.packets import LAYOUTS, PacketArray, TelemetryError
 from ground.console.commanding import Commanding
 from ground.console.cursor import Cursor
 from ground.console.history import History
 from ground.console.instant import Instant
 from ground.console.surroundings import Surroundings
 from ground.documentation import command_table, database
-from ground.watch.tail import LogTail
 
 PAGE = Path(__file__).parent / "page"
 PUSH_S = 0.1
@@ -39,24 +37,35 @@ _HEADERS = {
 }
 
 
+class Feed(Protocol):
+    """Where packets come from: `ground.watch.tail.LogTail`, or `ground.console.link_feed.LinkFeed`."""
+
+    @property
+    def silence(self) -> float:
+        """How long nothing has come, s."""
+
+    def new(self) -> dict[str, PacketArray]:
+        """Return the packets by name that came since the last call. Raises FlightError."""
+
+
 @dataclass(slots=True)
 class Console:
-    """One flight on the page: its growing log, the packets so far, its surroundings, a way to command it."""
+    """One flight on the page: its telemetry, the packets so far, its surroundings, a way to command it."""
 
-    tail: LogTail
+    name: str
+    feed: Feed
     history: History
     surroundings: Surroundings
     commanding: Commanding
-    folder: Path
     utc_ns: int | None = None
     trouble: str = ""
     sockets: set[web.WebSocketResponse] = field(default_factory=set)
 
     def look(self) -> None:
-        """Take in what the log has got since the last look; trouble with it is shown, and tried again."""
+        """Take in what has come since the last look; trouble is shown, and the next look tries again."""
         try:
-            packets = self.tail.new()
-        except UsageError as error:
+            packets = self.feed.new()
+        except FlightError as error:
             self.trouble = str(error)
             return
         self.trouble = ""
@@ -145,8 +154,7 @@ class _Pages:
                 "packets": database()["packets"],
                 "commands": command_table(),
                 "commanding": console.commanding.possible,
-                "modes": [mode.label for mode in Mode],
-                "name": console.folder.name,
+                "name": console.name,
                 "camera": console.surroundings.camera,
                 "orbit": console.surroundings.elements is not None,
                 "utc_ns": console.utc_ns,
@@ -218,7 +226,7 @@ class _Pages:
             "span": [span[0] * 1e-9, span[1] * 1e-9],
             "live": cursor.live,
             "speed": cursor.speed,
-            "silence": console.tail.silence,
+            "silence": console.feed.silence,
             "trouble": console.trouble,
             "utc_ns": utc,
             "surroundings": None if utc is None else console.surroundings.at(utc),

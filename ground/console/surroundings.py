@@ -34,12 +34,12 @@ class Surroundings:
     camera: tuple[list[float], float] | None
 
     @classmethod
-    def of(cls, folder: Path) -> Surroundings:
-        """Return those of the configuration that lies in a run's folder; nothing is known without one."""
+    def of(cls, path: Path) -> Surroundings:
+        """Return those of a configuration; nothing is known without one that can be read."""
         try:
-            config: Any = load(folder / "config.yaml")
+            config: Any = load(path)
         except FlightError:
-            return cls(None, None)
+            return NOWHERE
         lines = getattr(config, "elements", None)
         camera = getattr(config, "camera", None)
         sight = None if camera is None else (list(camera.mounting), math.radians(camera.field_of_view_deg))
@@ -84,6 +84,10 @@ class Surroundings:
     def _below(self, state: OrbitState) -> tuple[float, float, float]:
         longitude, latitude, height = geodetic(celestial_to_terrestrial(state.julian_date) @ state.position)
         return math.degrees(float(latitude)), math.degrees(float(longitude)), float(height)
+
+
+NOWHERE = Surroundings(None, None)
+"""Nothing is known."""
 
 
 def _julian_date(utc_ns: int) -> float:

@@ -6,13 +6,13 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from flight.link.telemetry.states import SEVERITIES
 from ground.report.performance import SETTLING_BAND, SETTLING_LIMIT_S, STEADY_STATE_S
 
 Object = dict[str, Any]
 
 ARCSECONDS = 648_000.0 / math.pi
 _LISTED = 20
-_SEVERITIES = ("information", "warning", "fault")
 
 
 def format_report(summary: Object) -> str:
@@ -318,7 +318,7 @@ def _events(events: list[Object]) -> list[str]:
 
 
 def _severity(code: int) -> str:
-    return _SEVERITIES[code] if code < len(_SEVERITIES) else str(code)
+    return dict(SEVERITIES).get(code, str(code))
 
 
 def _logs(logs: list[Object]) -> list[str]:

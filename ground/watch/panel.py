@@ -10,8 +10,10 @@ from rich.table import Table
 from rich.text import Text
 
 from flight.link.telemetry.packets import to_text
+from flight.link.telemetry.states import SEVERITIES, STEERING
+from flight.link.telemetry.states import STREAMS as STREAM_STATES
 from ground.watch.plain import attitude_text
-from ground.watch.view import COIL_STATES, SEVERITIES, STREAM_STATES, STREAMS, View, named, printable
+from ground.watch.view import STREAMS, View, named, printable
 
 LISTED_EVENTS = 12
 _BAR = 20
@@ -53,7 +55,7 @@ def _facts(view: View) -> list[tuple[str, RenderableType]]:
     rows.append(("attitude", Text(attitude_text(view) or "no estimate")))
     rows += [(f"coil {axis}", bar) for axis, bar in zip("xyz", _bars(view), strict=False)]
     if (state := view.value("control", "state")) is not None:
-        rows.append(("steering", Text(named(COIL_STATES, state))))
+        rows.append(("steering", Text(named(STEERING, state))))
     if "housekeeping" in view.newest:
         supply = [view.value("housekeeping", name) for name in ("coil_voltage", "coil_current", "coil_power")]
         volts, amperes, watts = supply
@@ -94,7 +96,7 @@ def _streams(view: View) -> Text:
     text = Text()
     for name in STREAMS:
         state = named(STREAM_STATES, view.value("health", name))
-        if state != "-":
+        if state != "not-fitted":
             text.append(f"{name} {state}  ", "green" if state == "good" else "bold red")
     return text
 

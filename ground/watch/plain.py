@@ -7,7 +7,8 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from flight.link.telemetry.packets import PacketArray
-from ground.watch.view import COIL_STATES, SEVERITIES, Event, View, named
+from flight.link.telemetry.states import SEVERITIES, STEERING
+from ground.watch.view import Event, View, named
 
 _LATEST = 1e15  # s: beyond it a time is damage, not a moment of a flight
 
@@ -49,7 +50,7 @@ def state_line(view: View) -> str:
     parts = [f"{view.time:9.3f} s ", f"{view.mode or 'mode not known'}", attitude_text(view)]
     parts += [currents_text(view)]
     if (state := view.value("control", "state")) is not None:
-        parts.append(named(COIL_STATES, state))
+        parts.append(f"coils {named(STEERING, state)}")
     if (slips := view.value("health", "slips")) is not None:
         parts.append(f"slips {int(slips)}")
     if view.faults:

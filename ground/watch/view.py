@@ -12,15 +12,11 @@ import numpy as np
 
 from flight.gnc.math.quaternion import angle_between
 from flight.link import events
-from flight.link.modes import Mode
+from flight.link.telemetry.form import States
 from flight.link.telemetry.packets import PacketArray, to_text
+from flight.link.telemetry.states import MODES
 
 STREAMS = ("imu", "field", "coils", "power", "camera")
-STREAM_STATES = ("-", "never", "stale", "invalid", "slow", "good")
-"""Of the health packet, in the order of their numbers; "-" is not fitted."""
-COIL_STATES = ("coils off", "following a path", "holding", "braking")
-"""Of the control packet."""
-SEVERITIES = ("note", "warning", "FAULT")
 KEPT_EVENTS = 200
 
 
@@ -62,7 +58,7 @@ class View:
                 self.time = max(self.time, float(rows["time_ns"][-1]) * 1e-9)
         modes = [(int(rows[-1]["time_ns"]), int(rows[-1]["mode"])) for rows in _with_mode(packets)]
         if modes:
-            self.mode = mode_label(max(modes)[1])
+            self.mode = named(MODES, max(modes)[1])
         self.events.extend(came)
         self.faults += sum(event.severity >= events.Severity.FAULT for event in came)
         ends = [event.text or event.name for event in came if event.name == events.STOPPED.name]
@@ -90,20 +86,15 @@ def _with_mode(packets: Mapping[str, PacketArray]) -> list[PacketArray]:
     return [packets[name] for name in ("mode", "attitude", "health", "command") if len(packets[name])]
 
 
-def mode_label(number: int) -> str:
-    """Return the label of a mode's number, also of one that is none."""
-    return Mode(number).label if number in set(Mode) else f"mode {number}"
-
-
 def event_of(row: Any) -> Event:
     """Return the event of a packet."""
     name, text = printable(to_text(row["name"])), printable(to_text(row["text"]))
     return Event(float(row["time_ns"]) * 1e-9, int(row["severity"]), name, text)
 
 
-def named(names: tuple[str, ...], number: Any) -> str:
+def named(states: States, number: Any) -> str:
     """Return the name of a number in a packet, or the number where it has none."""
-    return names[int(number)] if 0 <= int(number) < len(names) else str(int(number))
+    return dict(states).get(int(number), str(int(number)))
 
 
 def printable(text: str) -> str:

@@ -54,23 +54,20 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
     filter_ = _filter(config, surroundings)
     brake = FieldBrake(_detumbler(config), config.craft.dipole_per_ampere)
     paths, pauses, limit = PointingPaths(_limit(config)), _pauses(config), _limit(config)
-    dipole_per_ampere = config.craft.dipole_per_ampere
+    inertia, dipole_per_ampere = np.diag(config.craft.inertia), config.craft.dipole_per_ampere
 
     def field(estimate: Estimate) -> FloatArray:
         around = surroundings.at(estimate.time_ns)
         return np.zeros(3) if around is None else attitude_matrix(estimate.quaternion) @ around.field
-
-    def sizes() -> FloatArray:
-        return filter_.torque_sizes
 
     return Body(
         modes=frozenset(Mode) - {Mode.HOLD, Mode.SLEW, Mode.TESTBED_DEMO},
         filter=filter_,
         learned_problems=[],
         paths=paths,
-        planner=PointingPlanner(_planned(config), paths, surroundings, sizes, services),
+        planner=PointingPlanner(_planned(config), paths, surroundings, services),
         targets=PointingTargets(_timed(config), paths),
-        tracker=PointingTracker(filter_, surroundings, pauses, limit, dipole_per_ampere),
+        tracker=PointingTracker(filter_, surroundings, pauses, limit, dipole_per_ampere, inertia),
         feed=OrbitFeed(filter_),
         brake=brake,
         coil_watch=_coil_watch(config),
@@ -104,9 +101,7 @@ def _planned(config: OrbitConfig) -> PlannedCraft:
     section = config.pointing
     axes = BodyAxes(np.array(section.axis), np.array(section.across))
     weights = PointingWeights(turn=section.turn, rate=section.rate, dipole=section.dipole)
-    pauses = _pauses(config)
-    limit = _limit(config) * pauses.act_ns / pauses.period_ns
-    return PlannedCraft(np.diag(config.craft.inertia), axes, weights, limit)
+    return PlannedCraft(np.diag(config.craft.inertia), axes, weights)
 
 
 def _timed(config: OrbitConfig) -> list[tuple[float, PointingTarget]]:

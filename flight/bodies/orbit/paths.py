@@ -18,7 +18,6 @@ from hal.interfaces.wires import SECOND_NS
 class PathPoint:
     """The path at one time of the clock, `seconds` after its origin; implements `Reference` of the loop."""
 
-    paths: PointingPaths
     law: PointingLaw
     time_ns: int
     seconds: float
@@ -40,11 +39,7 @@ class PathPoint:
 
 
 class PointingPaths:
-    """Implements `flight.loop.body.Paths`.
-
-    Attributes:
-        off: rad, how far the body was off the path at the last command; zero for a new path.
-    """
+    """Implements `flight.loop.body.Paths`."""
 
     def __init__(self, limit: float) -> None:
         """`limit` A m^2 of each coil, mean over a window of pause and action."""
@@ -52,15 +47,13 @@ class PointingPaths:
         self._law: PointingLaw | None = None
         self._target: PointingTarget | None = None
         self._origin_ns = 0
-        self.off = 0.0
 
     def offer(self, table: PointingTable, target: PointingTarget, origin_ns: int) -> str:
         """Fly a table from now on; return why it is refused, empty when it is flown."""
-        parts = (table.gain, table.dipole, table.torque_part, table.path.quaternion)
+        parts = (table.gain, table.reference_part, table.torque_part, table.references.quaternion)
         if not all(np.isfinite(part).all() for part in parts):
             return "it holds values that are not finite"
         self._law, self._target, self._origin_ns = PointingLaw(table, self._limit), target, origin_ns
-        self.off = 0.0
         return ""
 
     def sample(self, now_ns: int) -> PathPoint | None:
@@ -68,14 +61,12 @@ class PointingPaths:
         if self._law is None:
             return None
         seconds = (now_ns - self._origin_ns) / SECOND_NS
-        return PathPoint(self, self._law, now_ns, seconds) if seconds <= self._law.span[1] else None
+        return PathPoint(self._law, now_ns, seconds) if seconds <= self._law.span[1] else None
 
     def attitude(self, target: PointingTarget, now_ns: int) -> FloatArray | None:
         """Return the attitude (4,) of a target now; None while no path to this target is flown."""
         point = self.sample(now_ns)
-        if point is None or target != self._target:
-            return None
-        return point.law.wanted(point.seconds).quaternion
+        return None if point is None or target != self._target else point.quaternion
 
     def is_following(self, now_ns: int) -> bool:
         """Return whether there is a path: all of it is followed."""

@@ -6,8 +6,6 @@ prediction ages, and a free roll follows the body's own.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 from flight.bodies.orbit.paths import PointingPaths
@@ -27,36 +25,24 @@ from flight.loop.services import Services
 
 AGAIN_NS = 10_000_000_000
 """After a plan that failed, or while no orbit is known, the next is asked for after this time."""
-ASTRAY = math.radians(15.0)
-"""rad off the path: a new one is planned from where the body is."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlannedCraft:
-    """What the planner believes of the craft.
-
-    `inertia` (3, 3) kg m^2, body axes; `limit` A m^2 of each coil, mean over a window of pause and action.
-    """
+    """What the planner believes of the craft: `inertia` (3, 3) kg m^2, body axes."""
 
     inertia: FloatArray
     axes: BodyAxes
     weights: PointingWeights
-    limit: float
 
 
 class PointingPlanner:
     """Implements `flight.loop.body.Planner`."""
 
     def __init__(
-        self,
-        craft: PlannedCraft,
-        paths: PointingPaths,
-        surroundings: Surroundings,
-        sizes: Callable[[], FloatArray],
-        services: Services,
+        self, craft: PlannedCraft, paths: PointingPaths, surroundings: Surroundings, services: Services
     ) -> None:
-        """`sizes` returns the torques estimated now, (9,) N m."""
-        self._craft, self._paths, self._surroundings, self._sizes = craft, paths, surroundings, sizes
+        self._craft, self._paths, self._surroundings = craft, paths, surroundings
         self._jobs, self._events = services.jobs, services.events
         self._job: PointingJob | None = None
         self._wanted = False
@@ -84,8 +70,7 @@ class PointingPlanner:
 
     def serve(self, estimate: Estimate | None, target: Target, now_ns: int) -> None:
         """Submit the requested job to the worker."""
-        wanted = self._wanted or self._paths.off > ASTRAY
-        if estimate is None or not wanted or self._job is not None or now_ns < self._after_ns:
+        if estimate is None or not self._wanted or self._job is not None or now_ns < self._after_ns:
             return
         orbit, craft = self._surroundings.state(now_ns), self._craft
         if orbit is None:
@@ -100,13 +85,9 @@ class PointingPlanner:
             craft.weights,
             target_of(target),
             estimate.quaternion,
-            estimate.rate,
-            self._sizes(),
-            craft.limit,
         )
         if self._jobs.submit(PLANNER, job):
             self._wanted, self._job, self._count = False, job, job.number
-            self._after_ns = now_ns + AGAIN_NS
 
     def finish(self, result: JobResult, now_ns: int) -> None:
         """Fly the worker's plan."""

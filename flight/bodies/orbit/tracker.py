@@ -1,4 +1,4 @@
-"""The tracker of a satellite: the pointing law along its path, and the pauses of the coils.
+"""The tracker of a satellite: the pointing law near the reference, the capture far from it, and the pauses.
 
 The coils pause at the begin of each window, so that the magnetometer is read without their field; then one
 dipole, computed at the pause's end, is held. It is raised by what the pause takes from its mean.
@@ -6,17 +6,24 @@ dipole, computed at the pause's end, is held. It is raised by what the pause tak
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from flight.bodies.orbit.filter import OrbitFilter
 from flight.bodies.orbit.paths import PathPoint
 from flight.bodies.orbit.surroundings import Surroundings
 from flight.gnc.control.detumble import WindowSchedule
+from flight.gnc.control.three_axes.capture import capture_dipole
 from flight.gnc.estimation.estimate import Estimate
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import attitude_matrix
 from flight.loop.control_output import CoilCommand
 
+FAR, NEAR = math.radians(30.0), math.radians(15.0)
+"""rad: beyond the one the capture begins, within the other it ends."""
+FAST = math.radians(0.5)
+"""rad/s off the reference: faster, and it is captured."""
 _NOTHING: FloatArray = np.zeros(3)
 
 
@@ -30,12 +37,15 @@ class PointingTracker:
         pauses: WindowSchedule,
         limit: float,
         dipole_per_ampere: float,
+        inertia: FloatArray,
     ) -> None:
-        """`limit` A m^2 and `dipole_per_ampere` m^2 of each coil."""
+        """`limit` A m^2 and `dipole_per_ampere` m^2 of each coil; `inertia` (3, 3) kg m^2."""
         self._filter, self._surroundings = filter_, surroundings
         self._pauses, self._limit, self._dipole_per_ampere = pauses, limit, dipole_per_ampere
+        self._inertia = inertia
         self._held = CoilCommand(_NOTHING, _NOTHING)
         self._window: tuple[int, object] | None = None
+        self._captures = False
 
     def command(self, estimate: Estimate, reference: PathPoint) -> CoilCommand:
         """Return the command of the present window: zero in its pause."""
@@ -50,19 +60,20 @@ class PointingTracker:
     def reset(self) -> None:
         """Forget the command that is held."""
         self._window = None
+        self._captures = False
 
     def _command(self, estimate: Estimate, reference: PathPoint) -> CoilCommand:
         around = self._surroundings.at(reference.time_ns)
         if around is None:
             return CoilCommand(_NOTHING, _NOTHING)
-        residual = self._filter.residual_dipole
+        found, residual = self._filter, self._filter.residual_dipole
         field = attitude_matrix(estimate.quaternion) @ around.field
         quaternion, rate = estimate.quaternion, estimate.rate
-        found = reference.law.command(
-            reference.seconds, quaternion, rate, field, residual, self._filter.torque_sizes
-        )
-        reference.paths.off = float(np.linalg.norm(found.turn))
-        dipole = found.dipole
+        near = reference.law.command(reference.seconds, quaternion, rate, field, residual, found.torque_sizes)
+        dipole, off = near.dipole, float(np.linalg.norm(near.turn))
+        self._captures = off > (NEAR if self._captures else FAR) or float(np.linalg.norm(near.rate)) > FAST
+        if self._captures:
+            dipole = capture_dipole(near.turn, near.rate, self._inertia, field) - residual
         # The mean over the window is what was asked for.
         dipole = dipole * (self._pauses.period_ns / self._pauses.act_ns)
         largest = float(np.abs(dipole).max())

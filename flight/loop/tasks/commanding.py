@@ -146,10 +146,8 @@ def command_of(step: CommandStep) -> Command:
         found.append(ChangeMode(Mode.named(step.mode)))
     if step.slew is not None:
         found.append(Slew(step.slew))
-    if step.point is not None:
-        found.append(Point(step.target_at(step.point)))
     if step.clear is not None:
         found.append(Clear(step.clear))
     if len(found) != 1:
-        raise CommandError(f"at {step.at:g} s: give one of mode, slew, point, clear; {len(found)} are given")
+        raise CommandError(f"at {step.at:g} s: give one of mode, slew, clear; {len(found)} are given")
     return found[0]

@@ -51,7 +51,7 @@ export class CommandForms {
       label.append(choice); form.append(label);
       return () => Number(choice.value);
     }
-    const input = Object.assign(document.createElement("input"), { type: "text", placeholder: field.count > 1 ? "a, b, ..." : field.unit === "-" ? "" : field.unit });
+    const input = Object.assign(document.createElement("input"), { type: "text", placeholder: field.count > 1 ? "a, b, ..." : field.valid ? `${field.valid[0]} to ${field.valid[1]}` : field.unit === "-" ? "" : field.unit });
     label.append(input); form.append(label);
     if (field.type.startsWith("S")) return () => input.value;
     const numbers = () => input.value.split(/[\s,]+/).filter((word) => word !== "");

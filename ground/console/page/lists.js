@@ -1,6 +1,7 @@
 // Lists that grow: events with filters, frames with what was found in them, commands and their answers.
+import { beyond, label } from "/page/values.js";
+
 const MOST_ROWS = 500;
-const SEVERITIES = ["note", "warning", "FAULT"];
 
 function row(cells, kind = "") {
   const line = document.createElement("tr");
@@ -18,9 +19,9 @@ class Rows {
 }
 
 export class Events extends Rows {
-  constructor(table, severity, filter) {
+  constructor(table, severity, filter, field) {
     super(table);
-    this.severity = severity; this.filter = filter;
+    this.severity = severity; this.filter = filter; this.field = field;
     severity.onchange = filter.oninput = () => { this.body.replaceChildren(); this.kept.forEach((event) => this.list(event)); };
   }
   show(_, __, listed, again) {
@@ -31,7 +32,7 @@ export class Events extends Rows {
   list(event) {
     const words = `${event.name} ${event.text}`;
     if (event.severity < Number(this.severity.value) || !words.toLowerCase().includes(this.filter.value.toLowerCase())) return;
-    this.add(row([seconds(event), SEVERITIES[event.severity] ?? event.severity, `${event.name}: ${event.text}`], `s${event.severity}`));
+    this.add(row([seconds(event), label(event.severity, this.field), `${event.name}: ${event.text}`], beyond(event.severity, this.field)));
   }
 }
 
@@ -53,11 +54,17 @@ export class Frames extends Rows {
   }
 }
 
+// Commands that reached the flight, and by a link each stage of a command with its counter.
 export class History extends Rows {
+  constructor(table, stage) { super(table); this.stage = stage; }
   show(_, __, listed, again) {
     if (again) this.clear();
     for (const command of listed.command ?? []) {
-      this.add(row([seconds(command), command.source, command.obeyed ? "obeyed" : "refused", command.text], command.obeyed ? "" : "s1"));
+      this.add(row([seconds(command), command.source, command.obeyed ? "obeyed" : "refused", command.text], command.obeyed ? "" : "warn"));
+    }
+    for (const step of listed.verification ?? []) {
+      const name = label(step.stage, this.stage);
+      this.add(row([seconds(step), `link ${step.spi}:${step.counter}`, name, step.text], ["refused", "failed"].includes(name) ? "warn" : ""));
     }
   }
 }

@@ -3,12 +3,13 @@ import { Attitude } from "/page/attitude.js";
 import { CommandForms } from "/page/commands.js";
 import { Events, Frames, History } from "/page/lists.js";
 import { GroundTrack } from "/page/map.js";
-import { Health, Packets } from "/page/values.js";
+import { Health, Packets, beyond, fieldOf, label } from "/page/values.js";
 import { Plots } from "/page/plots.js";
 
 const DEAD_AFTER = 3; // s without telemetry, or without a word of the console itself
 const byId = (name) => document.getElementById(name);
 const table = await (await fetch("/api/table")).json();
+const modes = fieldOf(table, "health", "mode");
 const newest = {};
 const state = { time: 0, span: [0, 0], live: true, speed: 1, silence: 0, surroundings: null };
 let heard = 0;
@@ -21,9 +22,9 @@ const views = [
   new Attitude(byId("attitude"), byId("legend"), table),
   new Health(byId("health"), table),
   new Packets(byId("packets"), byId("all"), table),
-  new Events(byId("events"), byId("severity"), byId("filter")),
+  new Events(byId("events"), byId("severity"), byId("filter"), fieldOf(table, "event", "severity")),
   new Frames(byId("frames")),
-  new History(byId("commands")),
+  new History(byId("commands"), fieldOf(table, "verification", "stage")),
   new CommandForms(byId("forms"), byId("looking"), byId("confirm"), table),
 ];
 if (table.orbit) {
@@ -48,12 +49,9 @@ function take(said) {
   for (const view of views) view.show(newest, state, said.listed, said.again);
   byId("trouble").hidden = !said.trouble;
   byId("trouble").textContent = said.trouble;
-  const packet = table.packets.find((each) => each.name === "mode");
-  const states = packet?.fields.find((field) => field.name === "mode")?.states;
   const mode = newest.attitude?.mode ?? newest.health?.mode ?? newest.mode?.mode;
-  const label = mode === undefined ? "-" : (table.modes[mode] ?? states?.[mode] ?? `mode ${mode}`);
-  byId("mode").textContent = label;
-  byId("mode").classList.toggle("safe", label === "safe");
+  byId("mode").textContent = mode === undefined ? "-" : label(mode, modes);
+  byId("mode").classList.toggle("safe", beyond(mode, modes) !== "");
   byId("time").textContent = `${said.time.toFixed(1)} s`;
   byId("utc").textContent = said.utc_ns === null ? "" : new Date(said.utc_ns / 1e6).toISOString().slice(0, 19) + "Z";
   if (!seeking) byId("seek").value = String(1000 * (said.time - said.span[0]) / Math.max(said.span[1] - said.span[0], 1e-9));

@@ -1,33 +1,40 @@
-// Values as they stand: cards of the health, and every field of every packet.
-const STREAMS = { 0: "-", 1: "never", 2: "stale", 3: "invalid", 4: "slow", 5: "good" };
+// Values as they stand: cards of the health, and every field of every packet. States, alarms and limits are the table's.
+const KINDS = { warning: "warn", fault: "bad" };
+
+export function fieldOf(table, packet, name) {
+  return table.packets.find((each) => each.name === packet)?.fields.find((field) => field.name === name);
+}
+
+// The state's name of a number, the number where it has none.
+export function label(value, field) { return field?.states?.find(([number]) => number === value)?.[1] ?? String(value); }
 
 export function text(value, field) {
   if (value === null || value === undefined) return "-";
   if (Array.isArray(value)) return value.map((part) => text(part, field)).join("  ");
-  const label = field?.states?.find(([number]) => number === value)?.[1];
-  if (label !== undefined) return `${label} (${value})`;
+  if (field?.states) return `${label(value, field)} (${value})`;
   return typeof value === "number" && !Number.isInteger(value) ? value.toPrecision(6).replace(/\.?0+(e|$)/, "$1") : String(value);
 }
 
-// The worst of a field's limits that its value is beyond: "", "warn" or "bad".
+// How poor a value is by its alarms and limits: "", "warn" or "bad".
 export function beyond(value, field) {
-  if (typeof value !== "number" || !field?.limits) return "";
-  const out = (range) => range && ((range[0] !== null && value < range[0]) || (range[1] !== null && value > range[1]));
-  return out(field.limits.fault) ? "bad" : out(field.limits.warning) ? "warn" : "";
+  if (typeof value !== "number" || !field) return "";
+  const alarm = field.alarms?.find(([number]) => number === value)?.[1];
+  const outside = (range) => range?.length && (value < range[0] || value > range[1]);
+  return KINDS[alarm] ?? (outside(field.fault_outside) ? "bad" : outside(field.warning_outside) ? "warn" : "");
 }
 
 export class Health {
   constructor(place, table) {
     this.place = place;
-    this.streams = (table.packets.find((packet) => packet.name === "health")?.fields ?? []).filter((field) => ["imu", "field", "coils", "power", "camera"].includes(field.name));
+    const fields = table.packets.find((packet) => packet.name === "health")?.fields ?? [];
+    this.streams = fields.filter((field) => field.states?.some(([, name]) => name === "not-fitted"));
   }
   show(newest) {
     const cards = [];
-    const health = newest.health, supply = newest.housekeeping;
+    const { health, housekeeping: supply, link } = newest;
     if (health) for (const field of this.streams) {
-      const state = health[field.name];
-      if (state === 0) continue;
-      cards.push([field.name, field.states?.find(([number]) => number === state)?.[1] ?? STREAMS[state] ?? state, state === 5 ? "good" : state === 4 ? "warn" : "bad"]);
+      const state = label(health[field.name], field);
+      if (state !== "not-fitted") cards.push([field.name, state, beyond(health[field.name], field) || "good"]);
     }
     if (supply) {
       cards.push(["coil supply", `${text(supply.coil_voltage)} V`, ""], ["coil power", supply.coil_power === null ? "-" : `${(1e3 * supply.coil_power).toFixed(1)} mW`, ""]);
@@ -36,6 +43,11 @@ export class Health {
       cards.push(["slots lost", String(health.slips), health.slips > 0 ? "warn" : "good"]);
       cards.push(["processor", health.cpu_share === null ? "-" : `${(100 * health.cpu_share).toFixed(0)} %`, ""]);
       cards.push(["memory", health.resident === null ? "-" : `${(health.resident / 1048576).toFixed(0)} MiB`, ""]);
+    }
+    if (link) {
+      const causes = Object.entries(link).filter(([name, count]) => name.startsWith("refused_") && count > 0);
+      const words = causes.map(([name, count]) => `${name.slice("refused_".length)} ${count}`).join(", ");
+      cards.push(["frames let in", String(link.admitted), ""], ["frames refused", words || "none", words ? "warn" : "good"]);
     }
     this.place.replaceChildren(...cards.map(([name, value, kind]) => {
       const card = Object.assign(document.createElement("div"), { className: "card" });

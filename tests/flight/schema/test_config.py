@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 from pathlib import Path
 
 import pytest
@@ -11,9 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flight.gnc.camera.knowledge import EXACT
-from flight.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
-from flight.link.commands.codec import Point
-from flight.loop.tasks.commanding import command_of
 from flight.schema import reader
 from flight.schema.camera_model import camera_knowledge
 from flight.schema.document import read_document, to_yaml
@@ -24,7 +20,6 @@ from sim_hal.settings import Simulation
 
 FOLDER = Path(__file__).resolve().parents[3] / "config"
 DEMO = (FOLDER / "step_demo.yaml").read_text(encoding="utf-8")
-ORBIT = (FOLDER / "orbit.yaml").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("path", sorted(FOLDER.glob("*.yaml")), ids=lambda path: path.name)
@@ -115,49 +110,6 @@ def test_a_mistake_gets_one_line_with_its_place_and_its_cure(right: str, wrong: 
         reader.parse(DEMO.replace(right, wrong, 1), "demo.yaml")
     assert str(caught.value).startswith("demo.yaml")
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("right", "wrong", "complaint"),
-    [
-        ("{at: 0.0, point: sun}", "{at: 1.0, point: sun}", r":\d+: `targets\[0\].at` .* must be given at 0"),
-        ("{at: 2400.0, point", "{at: 0.0, point", r"`targets\[1\].at` is 0.0: .* in order of time"),
-        ("point: sun}", "point: moon}", r"`targets\[0\].point` is 'moon'.*nadir"),
-        (
-            "point: sun}",
-            "point: ground, latitude_deg: 4.0}",
-            r"`targets\[0\].point` .* needs `longitude_deg`",
-        ),
-        ("point: sun}", "point: sun, latitude_deg: 4.0}", "belongs to `point: ground`, not to sun"),
-        ("point: sun}", "point: inertial, quaternion: [0, 0, 0, 2]}", r"quaternion` has length 2: a quat"),
-        (
-            "point: sun}",
-            "point: inertial, quaternion: [0, 0, 0, 1], roll_deg: 1.0}",
-            "has its roll in its quaternion",
-        ),
-        (
-            "axis: [0.0, 0.0, 1.0]",
-            "axis: [0.0, 0.0, 2.0]",
-            "`pointing.axis` has length 2: give a unit",
-        ),
-        ("across: [1.0, 0.0, 0.0]", "across: [0.0, 0.6, 0.8]", "is 36.9 deg from `pointing.axis`"),
-        ("duration:", "commands: {timeline: [{at: 1.0, mode: sun, roll_deg: 3.0}]}\nduration:", "to `point`"),
-        ("duration:", "commands: {timeline: [{at: 1.0}]}\nduration:", "one of mode, slew, point, clear"),
-    ],
-)
-def test_a_mistake_in_a_satellite_s_targets_gets_one_line(right: str, wrong: str, complaint: str) -> None:
-    with pytest.raises(ConfigError, match=complaint) as caught:
-        reader.parse(ORBIT.replace(right, wrong, 1), "orbit.yaml")
-    assert str(caught.value).startswith("orbit.yaml:")
-    assert "\n" not in str(caught.value)
-
-
-def test_a_time_line_points_a_satellite_and_never_the_testbed() -> None:
-    line = "commands: {timeline: [{at: 9.0, point: ground, latitude_deg: 45, longitude_deg: 9}]}\nduration:"
-    step = reader.parse(ORBIT.replace("duration:", line, 1), "orbit.yaml").commands.timeline[0]
-    assert command_of(step) == Point(PointingTarget(Goal.GROUND, (math.radians(45.0), math.radians(9.0))))
-    with pytest.raises(ConfigError, match=r"`commands.timeline\[0\].point` is of a satellite"):
-        reader.parse(DEMO.replace("duration:", line, 1), "demo.yaml")
 
 
 def test_mistakes_in_the_simulation_section_are_reported_with_their_place_too() -> None:

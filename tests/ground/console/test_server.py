@@ -16,8 +16,6 @@ from aiohttp.test_utils import TestClient, TestServer
 from flight.link.commands import codec
 from flight.link.commands.definitions import COMMANDS
 from flight.link.modes import Mode
-from flight.link.telemetry.definitions import COMMAND
-from flight.link.telemetry.packets import Packer
 from ground.console.commanding import Commanding
 from ground.console.history import History
 from ground.console.server import Console, application
@@ -38,7 +36,8 @@ def asked(folder: Path, ask: Callable[[TestClient[Any, Any]], Awaitable[Any]], s
     """Serve a run, and return what a client gets."""
 
     async def talk(history: History) -> Any:
-        console = Console(LogTail(folder), history, Surroundings.of(folder), Commanding(send), folder)
+        place = Surroundings.of(folder / "config.yaml")
+        console = Console(folder.name, LogTail(folder), history, place, Commanding(send))
         console.look()
         async with TestClient(TestServer(application(console), host="127.0.0.1")) as client:
             return await ask(client)
@@ -161,10 +160,9 @@ def test_each_command_of_the_table_is_packed_from_a_form_as_the_codec_reads_it(f
     assert set(forms) == {packet.name for packet in COMMANDS}
     sent: list[codec.Command] = []
 
-    def send(packet: bytes) -> bytes:
+    def send(packet: bytes) -> dict[str, Any]:
         sent.append(codec.unpack(packet))
-        fields = {"obeyed": 1, "name": "x", "source": "socket", "count": 1, "mode": 1, "text": "done"}
-        return Packer().pack(COMMAND, 0, fields)
+        return {"obeyed": 1, "text": "done"}
 
     for name, values in forms.items():
         status, answer = commanded(folder, name, values, send)
@@ -204,7 +202,7 @@ def test_a_satellites_place_is_known_from_its_elements_and_without_a_configurati
     """On an equinox at noon UTC the Sun stands over the equator, some 2 deg east of Greenwich."""
     shutil.copy(Path(__file__).parents[3] / "config/orbit.yaml", tmp_path / "config.yaml")
     noon = int(datetime(2026, 3, 20, 12, tzinfo=UTC).timestamp() * 1e9)
-    place = Surroundings.of(tmp_path).at(noon)
+    place = Surroundings.of(tmp_path / "config.yaml").at(noon)
     assert place is not None
     assert place["altitude_km"] == pytest.approx(500.0, abs=25.0)
     assert (place["sun_latitude"], place["sun_longitude"]) == (
@@ -212,7 +210,7 @@ def test_a_satellites_place_is_known_from_its_elements_and_without_a_configurati
         pytest.approx(1.9, abs=0.5),
     )
     # Straight up is away from nadir, and the track passes below the satellite.
-    track = np.array(Surroundings.of(tmp_path).track(noon))
+    track = np.array(Surroundings.of(tmp_path / "config.yaml").track(noon))
     assert np.hypot(*(track - [place["latitude"], place["longitude"]]).T).min() < 0.5
     assert np.dot(place["nadir"], place["velocity"]) == pytest.approx(0.0, abs=0.01)
     unknown = Surroundings.of(tmp_path / "nowhere")

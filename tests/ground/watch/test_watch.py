@@ -65,13 +65,13 @@ def test_a_flight_that_is_over_is_shown_to_its_end(growing: Path) -> None:
     done = command("watch", growing, "--every", "2")
     assert (done.returncode, done.stderr) == (0, "")
     lines = done.stdout.splitlines()
-    assert sum("  FAULT    imu-silent: 0.2 s without a byte" in line for line in lines) == 1
+    assert sum("  fault    imu-silent: 0.2 s without a byte" in line for line in lines) == 1
     states = [line for line in lines if "mA" in line]
     assert [float(line.split()[0]) // 2 for line in states] == [0, 1, 2, 3]
     last = states[-1]
     for part in ("hold", "q2 ", "slips 4", "faults 1"):
         assert part in last
-    assert lines[-1].endswith("mA  following a path  slips 4  faults 1")
+    assert lines[-1].endswith("mA  coils following  slips 4  faults 1")
     assert any(line.endswith("stopped: stopped by SIGTERM") for line in lines)
 
 
@@ -212,7 +212,7 @@ def test_the_state_and_events_of_an_answer_are_shown_and_each_event_once(
     listener.will_say(answer(True) + control + event(Packer(), events.IMU_SILENT, 5.7, "no byte"))
     threading.Timer(0.3, listener.will_say, [b"x"]).start()
     lines = command("watch", tmp_path / "socket", "--patience", "0.2").stdout.splitlines()
-    assert lines[0] == "    5.700 s  FAULT    imu-silent: no byte"
+    assert lines[0] == "    5.700 s  fault    imu-silent: no byte"
     assert len(lines) > 2
     for line in lines[1:]:
         assert "hold  q2 " in line

@@ -1,13 +1,11 @@
-"""Campaign `orbit-pointing`: pointing by coils alone, the attitude estimated, all disturbances.
+"""Campaign `orbit-pointing`: nadir along the flight by coils alone, the attitude estimated.
 
-A 3U and the KnightCube. Cells `hold` start at nadir along the flight with nothing learned and fly two
-revolutions and more; the first one teaches the filter the residual dipole and the torques and is not judged.
-Cells `turn` start 30 to 180 deg off nadir, Sun or an inertial attitude, turning at 0.3 deg/s, and fly 100
-min: `arrived` counts bodies that come within ARRIVED deg and stay there for the rest, half a revolution at
-least; `lost` is farther than LOST deg off at the end. `share` multiplies the torques that the coils can not
-cancel at once: drag, sunlight, and the turn of the principal axes; the residual dipole is always whole. Laws:
-`whole`; `plain` without feed-forward; `pd`, the magnetic proportional-derivative law
-(`orbit_pointing_flight`).
+A 3U and the KnightCube start at their law's attitude and rate with nothing learned and fly two revolutions
+and more; the first one teaches the filter the residual dipole and the torques and is not judged. `share`
+multiplies the torques that the coils can not cancel at once: drag, sunlight, and the turn of the principal
+axes, which the gravity gradient acts on; the residual dipole is always whole. The coils pause a tenth of each
+two seconds for the magnetometer; star attitudes come each 10 s, two seconds late. Tables of gains are made
+each half revolution. `plain` flies without feed-forward.
 """
 
 from __future__ import annotations
@@ -18,19 +16,33 @@ from typing import Any
 
 import numpy as np
 
+from flight.gnc.control.three_axes.pointing import PointingLaw
+from flight.gnc.control.three_axes.pointing_table import PointingWeights, pointing_table
+from flight.gnc.earth.disturbance import pressures, shapes
+from flight.gnc.earth.ephemeris import Ephemeris
+from flight.gnc.estimation.free_filter import FreeFilter, FreeFilterSettings
+from flight.gnc.estimation.free_motion import GYRO, TURN, Around
+from flight.gnc.guidance.three_axes.attitude_law import AttitudeLaw, nadir, references, velocity
 from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
+from sim_hal.worlds.free_body.section import Disturbances, TipOff
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
-from tests.studies.campaigns.free_flight import WATTS
-from tests.studies.campaigns.orbit_pointing_flight import CYCLE, TARGETS, PointingFlight
+from tests.studies.campaigns.free_flight import FIELD_NOISE, GYRO_NOISE, SECOND, WATTS, FreeFlight
 
 REVOLUTION = 5_700.0
-LOST = 60.0
-"""deg: at the end of a turn, or ever while holding."""
-ARRIVED = {"cubesat_3u": 2.0, "knightcube": 5.0}
-"""deg: the KnightCube's hold at a tenth of the worst torques has an rms of some degrees."""
-SPIN = 0.3
-"""deg/s at the start of a turn."""
-HOLDS = (
+CYCLE, PAUSE = 2.0, 0.2
+"""s."""
+STARS_EVERY = 10.0
+"""s."""
+STAR_SIGMA = 5e-5
+"""rad an axis, 10"."""
+PREVIEW, TABLE_EVERY, KNOT = 2.0 * REVOLUTION, 0.5 * REVOLUTION, 10.0
+LOST = np.radians(60.0)
+WEIGHTS = {
+    "knightcube": PointingWeights(turn=np.radians(1.0), rate=1.0, dipole=1e-4),
+    "cubesat_3u": PointingWeights(turn=np.radians(1.0), rate=1.0, dipole=1e-3),
+}
+CELLS = (
     ("cubesat_3u", 0.1, "whole", 0.4),
     ("cubesat_3u", 0.3, "whole", 1.2),
     ("cubesat_3u", 1.0, "whole", None),
@@ -39,82 +51,168 @@ HOLDS = (
     ("knightcube", 0.3, "whole", 5.0),
 )
 """Craft, share, law, and deg rms wanted of issue 19."""
-TURNS = tuple(
-    (craft, share, law)
-    for craft, share, laws in (
-        ("cubesat_3u", 0.1, ("whole", "pd")),
-        ("knightcube", 0.1, ("whole", "pd")),
-        ("cubesat_3u", 1.0, ("whole",)),
-        ("knightcube", 1.0, ("whole",)),
-    )
-    for law in laws
-)
+LAW = AttitudeLaw(np.array([0.0, 0.0, 1.0]), nadir, np.array([1.0, 0.0, 0.0]), velocity)
 
 
 def cases(runs: int, seed: int) -> list[Case]:
-    """Return `runs` flights of each cell, the same orbits and starts for each; targets by turns."""
-    found = []
-    for run in range(runs):
-        turn = float(np.random.default_rng([seed, run, 0x7E]).uniform(30.0, 180.0))
-        target = list(TARGETS)[run % len(TARGETS)]
-        for craft, share, law, _ in HOLDS:
-            same = {"craft": craft, "share": share, "law": law, "target": "nadir"}
-            found.append(Case(f"hold/{craft}/{share}/{law}/{run}", (seed, run), same))
-        for craft, share, law in TURNS:
-            same = {"craft": craft, "share": share, "law": law, "target": target}
-            start = {"turn_deg": turn, "speed_deg": SPIN}
-            found.append(Case(f"turn/{craft}/{share}/{law}/{run}", (seed, run), same | start))
-    return found
+    """Return `runs` flights of each cell, the same orbits for each."""
+    return [
+        Case(f"{craft}/{share}/{law}/{run}", (seed, run), {"craft": craft, "share": share, "law": law})
+        for run in range(runs)
+        for craft, share, law, _ in CELLS
+    ]
 
 
 def run(case: Case) -> Result:
     """Fly the case."""
-    wanted = case.parameters
-    turns = "turn_deg" in wanted
-    flight = PointingFlight(wanted, case.seed[0] * 100_003 + case.seed[1])
-    seconds = wanted.get("seconds", 6_000.0 if turns else 2.5 * REVOLUTION)
-    for cycle in range(round(seconds / CYCLE)):
-        flight.cycle(cycle * CYCLE)
-        if not turns and flight.notes and np.degrees(np.linalg.norm(flight.notes[-1][1:4])) > LOST:
+    flight = _Flight(case)
+    cycles = round(case.parameters.get("revolutions", 2.5) * REVOLUTION / CYCLE)
+    for cycle in range(cycles):
+        if not flight.cycle(cycle * CYCLE):
             break
-    notes = np.array(flight.notes)
-    facts = {**wanted, "hours": float(notes[-1, 0] / 3600.0)}
-    return facts | (_arrival(wanted, notes) if turns else _hold(notes, seconds))
+    return flight.result()
 
 
-def _hold(notes: FloatArray, seconds: float) -> Result:
-    """Return rms errors after the first revolution, deg, and what they cost."""
-    turns = np.degrees(notes[:, 1:4])
-    facts: Result = {"lost": bool(np.linalg.norm(turns[-1]) > LOST)}
-    later = notes[:, 0] > min(REVOLUTION, 0.5 * seconds)
-    if not later.any():
+class _Flight:
+    """One craft with its filter and law."""
+
+    def __init__(self, case: Case) -> None:
+        wanted = case.parameters
+        self._parameters = wanted
+        share = wanted["share"]
+        noises = Disturbances(drag=share, solar_pressure=share, principal_turn_deg=3.0 * share)
+        seed = case.seed[0] * 100_003 + case.seed[1]
+        held = FreeFlight(wanted["craft"], seed, "sso", TipOff(rate=(0.0, 0.0, 0.0)), noises)
+        held.advance(0)
+        start = references(LAW.attitudes, held.ephemeris(60.0), np.array([2.0]))
+        qx, qy, qz, qw = start.quaternion[0].tolist()
+        wx, wy, wz = start.rate[0].tolist()
+        tip_off = TipOff(rate=(wx, wy, wz), attitude=(qx, qy, qz, qw))
+        self.flight = FreeFlight(wanted["craft"], seed, "sso", tip_off, noises)
+        self.flight.advance(0)
+        self._filter = FreeFilter(self.flight.inertia, FreeFilterSettings())
+        self._filter.start(
+            self.flight.attitude(STAR_SIGMA),
+            STAR_SIGMA**2 * np.eye(3),
+            self._gyro(self.flight.motion.rate, 1.0),
+        )
+        self._law: PointingLaw | None = None
+        self._begun = 0.0
+        self._ahead: Ephemeris | None = None
+        self._stars: FloatArray | None = None
+        self._notes: list[list[float]] = []
+        self._lost = False
+        self._rate_then: FloatArray = np.zeros(3)
+
+    def cycle(self, time: float) -> bool:
+        """Fly one cycle; return whether the craft still points."""
+        flight, found = self.flight, self._filter
+        if self._law is None or time - self._begun >= TABLE_EVERY:
+            self._plan(time)
+        around = self._around(time)
+        flight.act(np.zeros(3))
+        before = flight.motion.rate
+        flight.advance(round((time + PAUSE) * SECOND))
+        found.advance(PAUSE, np.zeros(3), around)
+        noise = (FIELD_NOISE**2 + (3e-8) ** 2) * np.eye(3)
+        found.field(flight.field(), around.field, noise)
+        dipole = self._command(time + PAUSE, around)
+        flight.act(dipole)
+        acting = flight.motion.rate
+        flight.advance(round((time + CYCLE) * SECOND))
+        found.advance(CYCLE - PAUSE, dipole, around)
+        # The mean over the cycle, compared with the rate at its end.
+        mean = 0.5 * PAUSE / CYCLE * (before + acting) + 0.5 * (1.0 - PAUSE / CYCLE) * (
+            acting + flight.motion.rate
+        )
+        slope = (found.rate - self._rate_then) / CYCLE
+        found.gyro(self._gyro(mean, CYCLE), GYRO_NOISE**2 / CYCLE * np.eye(3), 0.5 * CYCLE * slope)
+        self._see_stars(time + CYCLE)
+        return not self._lost
+
+    def _command(self, time: float, around: Around) -> FloatArray:
+        found = self._filter
+        assert self._law is not None
+        self._rate_then = found.rate
+        plain = self._parameters["law"] == "plain"
+        field = attitude_matrix(found.quaternion) @ around.field
+        residual = found.residual_dipole(around.sunlit) * (not plain)
+        sizes = found.torque_sizes * (not plain)
+        dipole = self._law.command(
+            time - self._begun, found.quaternion, found.rate, field, residual, sizes
+        ).dipole
+        if round(time / CYCLE) % 5 == 0:
+            self._note(time)
+        return dipole
+
+    def _note(self, time: float) -> None:
+        """Note the true error against the law, and the filter's own errors."""
+        flight, found = self.flight, self._filter
+        assert self._ahead is not None
+        wanted = LAW.attitudes(self._ahead, np.array([time - self._begun]))[0]
+        turn = to_rotation_vector(multiply(flight.motion.quaternion, conjugate(wanted)))
+        error = to_rotation_vector(multiply(flight.motion.quaternion, conjugate(found.quaternion)))
+        both = np.concatenate([error, flight.gyro_bias - found.gyro_bias])
+        pick = np.r_[TURN, GYRO]
+        nees = float(both @ np.linalg.solve(found.covariance[np.ix_(pick, pick)], both)) / 6.0
+        truth = flight.body.orbit_truth()
+        missing = truth.residual_dipole - found.residual_dipole(truth.sunlit)
+        known, unknown = float(np.linalg.norm(error)), float(np.linalg.norm(missing))
+        self._notes.append([time, *turn, known, nees, unknown, truth.sunlit])
+        self._lost = float(np.linalg.norm(turn)) > LOST
+
+    def _plan(self, time: float) -> None:
+        flight = self.flight
+        ahead = flight.ephemeris(PREVIEW + 4.0 * KNOT)
+        times = np.arange(2.0, PREVIEW, KNOT)
+        wanted = references(LAW.attitudes, ahead, times)
+        to_body = np.array([attitude_matrix(q) for q in wanted.quaternion])
+        shape = shapes(pressures(ahead, times), to_body)
+        position, field = ahead.position_at(times), ahead.field_at(times)
+        weights = WEIGHTS[self._parameters["craft"]]
+        table = pointing_table(wanted, flight.inertia, field, position, shape, weights)
+        self._law, self._begun, self._ahead = PointingLaw(table, flight.limit), time, ahead
+
+    def _around(self, time: float) -> Around:
+        assert self._ahead is not None
+        at = np.array([time - self._begun + 0.5 * CYCLE])
+        ahead = self._ahead
+        lit = float(ahead.sunlit_at(at)[0])
+        return Around(ahead.field_at(at)[0], ahead.position_at(at)[0], pressures(ahead, at), lit)
+
+    def _see_stars(self, time: float) -> None:
+        """Give the filter the attitude that was exposed a cycle ago; expose the next."""
+        if self._stars is not None and time % STARS_EVERY < CYCLE:
+            self._filter.attitude(self._stars, STAR_SIGMA**2 * np.eye(3), CYCLE)
+        self._stars = self.flight.attitude(STAR_SIGMA)
+
+    def _gyro(self, rate: FloatArray, seconds: float) -> FloatArray:
+        flight = self.flight
+        noise = GYRO_NOISE / np.sqrt(seconds) * flight.generator.standard_normal(3)
+        return np.asarray(rate + flight.gyro_bias + noise)
+
+    def result(self) -> Result:
+        """Return rms errors after the first revolution, deg, and what they cost."""
+        notes = np.array(self._notes)
+        judged = notes[notes[:, 0] > REVOLUTION]
+        facts: dict[str, Any] = {
+            **self._parameters,
+            "lost": bool(self._lost),
+            "hours": float(notes[-1, 0] / 3600.0),
+        }
+        if len(judged):
+            turns = np.degrees(judged[:, 1:4])
+            lit = judged[:, 7] > 0.5
+            facts |= {
+                "rms": float(np.sqrt(np.mean(np.sum(turns**2, axis=1)))),
+                "nadir_rms": float(np.sqrt(np.mean(np.sum(turns[:, :2] ** 2, axis=1)))),
+                "worst": float(np.linalg.norm(turns, axis=1).max()),
+                "knowledge_rms": float(np.degrees(np.sqrt(np.mean(judged[:, 4] ** 2)))),
+                "nees": float(np.mean(judged[:, 5])),
+                "dipole_missing": [_rms(judged[at, 6]) for at in (lit, ~lit)],
+                "mean_square": self.flight.square / (self.flight.time_ns / SECOND),
+            }
         return facts
-    judged, turns, lit = notes[later], turns[later], notes[later, 7] > 0.5
-    return facts | {
-        "rms": float(np.sqrt(np.mean(np.sum(turns**2, axis=1)))),
-        "nadir_rms": float(np.sqrt(np.mean(np.sum(turns[:, :2] ** 2, axis=1)))),
-        "worst": float(np.linalg.norm(turns, axis=1).max()),
-        "knowledge_rms": float(np.degrees(np.sqrt(np.mean(judged[:, 4] ** 2)))),
-        "nees": float(np.mean(judged[:, 5])),
-        "dipole_missing": [_rms(judged[at, 6]) for at in (lit, ~lit)],
-        "mean_square": float(np.mean(judged[:, 8])),
-    }
-
-
-def _arrival(wanted: dict[str, Any], notes: FloatArray) -> Result:
-    """Return when the body arrived to stay, s, None where it did not, and the error at the end, deg."""
-    off = np.degrees(np.linalg.norm(notes[:, 1:4], axis=1))
-    near = ARRIVED[wanted["craft"]]
-    beyond = np.nonzero(off > near)[0]
-    at = float(notes[beyond[-1], 0]) if len(beyond) else 0.0
-    stayed = notes[-1, 0] - at >= 0.5 * REVOLUTION
-    return {
-        "arrived": at if stayed else None,
-        "first": next((float(t) for t, a in zip(notes[:, 0], off, strict=True) if a <= near), None),
-        "lost": bool(off[-30:].min() > LOST),
-        "end_rms": float(np.sqrt(np.mean(off[-180:] ** 2))),
-        "mean_square": float(np.mean(notes[:, 8])),
-    }
 
 
 def _rms(values: FloatArray) -> float | None:
@@ -122,19 +220,8 @@ def _rms(values: FloatArray) -> float | None:
 
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
-    """Return pointing errors and arrivals by craft, share and law."""
+    """Return pointing errors by craft and share."""
     facts: dict[str, Any] = {}
-    lines = [*_holds(results, facts), "", *_turns(results, facts)]
-    return Summary("\n".join(lines) + "\n", facts)
-
-
-def _of(results: Sequence[Result], cell: tuple[Any, ...], turns: bool) -> list[Result]:
-    """Return the results of a cell."""
-    return [r for r in results if (r["craft"], r["share"], r["law"]) == cell and ("turn_deg" in r) is turns]
-
-
-def _holds(results: Sequence[Result], facts: dict[str, Any]) -> list[str]:
-    """Return the table of the cells `hold`; add their facts."""
     heads = (
         "runs",
         "lost",
@@ -148,9 +235,9 @@ def _holds(results: Sequence[Result], facts: dict[str, Any]) -> list[str]:
         "mW",
         "wanted",
     )
-    lines = [f"{'hold: craft, share, law':26}" + "".join(f"{head:>10}" for head in heads)]
-    for craft, share, law, wanted in HOLDS:
-        mine = _of(results, (craft, share, law), turns=False)
+    lines = [f"{'craft, share, law':26}" + "".join(f"{head:>10}" for head in heads)]
+    for craft, share, law, wanted in CELLS:
+        mine = [r for r in results if (r["craft"], r["share"], r["law"]) == (craft, share, law)]
         judged = [r for r in mine if "rms" in r]
         if not judged:
             continue
@@ -168,46 +255,19 @@ def _holds(results: Sequence[Result], facts: dict[str, Any]) -> list[str]:
             "milliwatts": 1e3 * WATTS[craft] * float(np.median([r["mean_square"] for r in judged])),
             "wanted": wanted,
         }
-        facts[f"hold/{craft}/{share}/{law}"] = found
+        facts[f"{craft}/{share}/{law}"] = found
         row = [f"{found[name]:10.3g}" for name in list(found)[2:10]]
         counts = f"{f'{craft}, {share}, {law}':26}{found['runs']:10d}{found['lost']:10d}"
         lines.append(counts + "".join(row) + f"{wanted or '':>10}")
-    return [
-        *lines,
-        "deg rms of three axes and of nadir alone, largest, deg known; A m^2 not known in sunlight",
-    ]
-
-
-def _turns(results: Sequence[Result], facts: dict[str, Any]) -> list[str]:
-    """Return the table of the cells `turn`; add their facts."""
-    heads = ("runs", "lost", "arrived", "median", "worst", "end", "mW")
-    lines = [f"{'turn: craft, share, law':26}" + "".join(f"{head:>10}" for head in heads)]
-    for cell in TURNS:
-        mine = _of(results, cell, turns=True)
-        if not mine:
-            continue
-        times = [r["arrived"] for r in mine if r["arrived"] is not None]
-        found = {
-            "runs": len(mine),
-            "lost": sum(r["lost"] for r in mine),
-            "arrived": len(times),
-            "median": float(np.median(times)) if times else float("nan"),
-            "worst": max(times, default=float("nan")),
-            "end": float(np.median([r["end_rms"] for r in mine])),
-            "milliwatts": 1e3 * WATTS[cell[0]] * float(np.median([r["mean_square"] for r in mine])),
-        }
-        craft, share, law = cell
-        facts[f"turn/{craft}/{share}/{law}"] = found
-        row = [f"{found[name]:10.3g}" for name in list(found)[3:]]
-        counts = "".join(f"{found[name]:10d}" for name in ("runs", "lost", "arrived"))
-        lines.append(f"{f'{craft}, {share}, {law}':26}" + counts + "".join(row))
-    within = ", ".join(f"{name} {angle:g} deg" for name, angle in ARRIVED.items())
-    return [*lines, f"s to within {within} and staying; deg rms of the last half hour"]
+    lines.append(
+        "deg rms of three axes and of nadir alone, largest error, deg known; A m^2 not known in sunlight"
+    )
+    return Summary("\n".join(lines) + "\n", facts)
 
 
 ORBIT_POINTING = Campaign(
     "orbit-pointing",
-    "turns to nadir, Sun and inertial attitudes and their hold by coils alone, all disturbances",
+    "nadir along the flight by coils alone, estimated attitude, all disturbances",
     cases,
     run,
     summarise,

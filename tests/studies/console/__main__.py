@@ -11,6 +11,7 @@ import contextlib
 import json
 import os
 import re
+import socket
 import subprocess
 import sys
 import tempfile
@@ -19,6 +20,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from ground.link.keys import make_keys
 from ground.watch.tail import LogTail
 from tests.studies.console.browser import Page, missing, opened
 
@@ -47,13 +49,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.studies.console", description=__doc__)
     parser.add_argument("--config", type=Path, default=CONFIG, help=f"to fly (default {CONFIG})")
     parser.add_argument("--seconds", type=float, default=60.0, metavar="S", help="of flight (default 60)")
+    parser.add_argument("--by-link", action="store_true", help="telemetry and commands by protected frames")
     parser.add_argument("--pictures", type=Path, metavar="DIR", help="where to put screenshots")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
     if lacks := missing():
         sys.stderr.write(f"{lacks}\n")
         return 1
-    figures = measure(options.config, options.seconds, options.pictures)
+    figures = measure(options.config, options.seconds, options.pictures, options.by_link)
     if options.json:
         sys.stdout.write(json.dumps(asdict(figures)) + "\n")
     else:
@@ -71,11 +74,11 @@ def missed(figures: Figures) -> list[str]:
     return wrong + ([] if figures.commanded.startswith("obeyed") else ["commanded"])
 
 
-def measure(config: Path, seconds: float, pictures: Path | None) -> Figures:
+def measure(config: Path, seconds: float, pictures: Path | None, by_link: bool = False) -> Figures:
     """Fly for `seconds` s and look at the page meanwhile."""
     with tempfile.TemporaryDirectory(prefix="knightcube-") as place:
-        run = Path(place) / "run"
-        with _console(config, run) as (url, server), opened(url) as page:
+        run, way = Path(place) / "run", _linked if by_link else _flown
+        with way(config, run) as (url, server), opened(url) as page:
             begun, spent = time.monotonic(), _processor_s(server)
             lag = _lag(page, LogTail(run), seconds)
             share = (_processor_s(server) - spent) / (time.monotonic() - begun)
@@ -93,20 +96,54 @@ def measure(config: Path, seconds: float, pictures: Path | None) -> Figures:
 
 
 @contextlib.contextmanager
-def _console(config: Path, run: Path) -> Iterator[tuple[str, int]]:
-    """Yield the console's address and its process."""
-    words = [sys.executable, "-m", "flight", "console", str(run), "--fly", str(config), "--port", "0"]
-    server = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
+def _flown(config: Path, run: Path) -> Iterator[tuple[str, int]]:
+    """Yield the address and the process of a console that flies by itself."""
+    with _started("console", run, "--fly", config, "--port", "0") as server:
+        yield _address(server), server.pid
+
+
+@contextlib.contextmanager
+def _linked(config: Path, run: Path) -> Iterator[tuple[str, int]]:
+    """Yield the address and the process of a console that has nothing but the link of a flight."""
+    place, (satellite, ground) = run.parent, make_keys(run.parent / "keys")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    own = place / config.name
+    more = (
+        f"commands: {{socket: {place}/commands}}",
+        f"link: {{keys: {satellite}, udp: '{address}', rate: 100000}}",
+    )
+    own.write_text("\n".join([config.read_text(encoding="utf-8"), *more, ""]), encoding="utf-8")
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(_started("run", own, "--realtime", "--out", run))
+        while not (run / "flight-0001.ccsds").exists():
+            time.sleep(0.1)
+        stack.enter_context(_started("link", own, "--log", run))
+        words = ("--link", address, "--keys", ground, "--config", own, "--port", "0")
+        server = stack.enter_context(_started("console", *words))
+        yield _address(server), server.pid
+
+
+@contextlib.contextmanager
+def _started(*words: object) -> Iterator[subprocess.Popen[str]]:
+    """Run a command of `flight` until left."""
+    command = [sys.executable, "-m", "flight", *map(str, words)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
-        assert server.stdout is not None
-        said = server.stdout.readline()
-        found = re.search(r"http://\S+", said)
-        if found is None:
-            raise RuntimeError(f"the console did not start: {said}")
-        yield found[0], server.pid
+        yield process
     finally:
-        server.terminate()
-        server.wait(timeout=30)
+        process.terminate()
+        process.communicate(timeout=30)
+
+
+def _address(server: subprocess.Popen[str]) -> str:
+    assert server.stdout is not None
+    said = server.stdout.readline()
+    found = re.search(r"http://\S+", said)
+    if found is None:
+        raise RuntimeError(f"the console did not start: {said}")
+    return found[0]
 
 
 def _lag(page: Page, tail: LogTail, seconds: float) -> float:

@@ -50,16 +50,12 @@ class PointingLaw:
     @property
     def span(self) -> tuple[float, float]:
         """The first and last time of the table, s; the last revolution's gains have less preview."""
-        times = self._table.path.times
+        times = self._table.references.times
         return float(times[0]), float(times[-1])
 
     def reference(self, time: float) -> Reference:
-        """Return the path at a time, s, within the table's; at its ends that of the end."""
-        return self._table.path.at(time)
-
-    def wanted(self, time: float) -> Reference:
-        """Return the attitude law likewise."""
-        return self._table.wanted.at(time)
+        """Return the wanted motion at a time, s, within the table's; at its ends that of the end."""
+        return self._table.references.at(time)
 
     def command(
         self,
@@ -82,9 +78,13 @@ class PointingLaw:
         cut_turn, cut_rate = _cut(turn, LARGEST_TURN), _cut(missed, LARGEST_RATE)
         # The table's rate error is the difference of components: without the reference's turned by the error.
         error = np.concatenate([cut_turn, cut_rate - np.cross(cut_turn, wanted.rate)])
-        k, table = self._table.path.place(time)[0], self._table
-        beyond = sizes - table.sizes
-        pull = table.gain[k] @ error - table.dipole[k] + table.torque_part[k] @ beyond
+        k, share = self._table.references.place(time)
+        table = self._table
+        pull = np.zeros(3)
+        for place, weight in ((k, 1.0 - share), (k + 1, share)):
+            pull += weight * (
+                table.gain[place] @ error + table.reference_part[place] + table.torque_part[place] @ sizes
+            )
         # What lies along the field makes no torque.
         dipole = field * (float(field @ pull) / float(field @ field)) - pull - residual_dipole
         return PointingCommand(_limited(dipole, self._limit), turn, missed)

@@ -81,14 +81,9 @@ class References:
 
     def until(self, count: int) -> References:
         """Return the first `count` instants."""
-        return self._part(slice(count))
-
-    def since(self, place: int) -> References:
-        """Return the instants from `place` on."""
-        return self._part(slice(place, None))
-
-    def _part(self, part: slice) -> References:
-        return References(self.times[part], self.quaternion[part], self.rate[part], self.acceleration[part])
+        return References(
+            self.times[:count], self.quaternion[:count], self.rate[:count], self.acceleration[:count]
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -208,8 +203,7 @@ def approach(
         left = to_rotation_vector(multiply(quaternion, conjugate(start[1])))
         law_rate = to_rotation_vector(multiply(start[2], conjugate(start[0]))) / (2.0 * DIFFERENCE)
         shown = attitude_matrix(from_rotation_vector(left)) @ law_rate
-        # Before the begin the polynomial goes on: the differences at the begin need both sides.
-        share = np.minimum((np.asarray(times) - begin) / (end - begin), 1.0)[:, None]
+        share = np.clip((np.asarray(times) - begin) / (end - begin), 0.0, 1.0)[:, None]
         rest = 1.0 - share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
         drift = (end - begin) * share * (1.0 - share) ** 3 * (1.0 + 3.0 * share)
         turn = rest * left + drift * _before_turn(left, rate - shown)

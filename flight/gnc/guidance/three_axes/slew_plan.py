@@ -8,6 +8,7 @@ motion (`slew_transcription`), Newton's method with barriers (`slew_program`), f
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -33,6 +34,8 @@ LEAST_TIME = math.inf
 _ENOUGH = 2
 """Solved guesses, of which the cheapest is flown."""
 _MOST_TRIED = 8
+_LONGER = 1.0, 1.4, 2.0, 2.8
+"""Times the asked horizon, for paths without limits."""
 _STEPS_FREE = 25
 _STEPS_LIMITED = 40
 _WALK_BARRIER, _LAST_BARRIER = 1e-5, 1e-8
@@ -143,10 +146,11 @@ class _Search:
     def within(self) -> Found | None:
         """Return the path of least energy over the asked horizon, or over the shortest longer one."""
         relaxed = self._relaxed()
-        for start in relaxed:
+        in_time = [start for start in relaxed if start.horizon <= self._task.horizon]
+        for start in in_time:
             if self._is_kept(start):
                 return start
-        for start in relaxed:
+        for start in in_time:
             found = self._limited(start, start.equations, _LAST_BARRIER)
             if found is not None:
                 return found
@@ -166,12 +170,8 @@ class _Search:
         The walk begins where a path without limits just keeps the dipoles', and with the path that needs the
         least time for that.
         """
-        for start in sorted(relaxed, key=self._peak):
-            time = max(start.horizon * math.sqrt(self._peak(start) / _PEAK), least)
-            best = self._at(start, min(time, self._task.longest))
-            if best is not None:
-                break
-        else:
+        best = next(filter(None, (self._at(*begin) for begin in self._begins(relaxed, least))), None)
+        if best is None:
             return None
         step = _FIRST_STEP
         while step > _LAST_STEP and best.horizon > least:
@@ -181,6 +181,13 @@ class _Search:
             else:
                 step = math.sqrt(step)
         return self._limited(best, best.equations, _LAST_BARRIER) or best
+
+    def _begins(self, relaxed: list[Found], least: float) -> Iterator[tuple[Found, float]]:
+        """Yield paths without limits, each with horizons at which a walk may begin, s, the shortest first."""
+        for start in sorted(relaxed, key=self._peak):
+            time = max(start.horizon * math.sqrt(self._peak(start) / _PEAK), least)
+            times = [time, start.horizon] if time < start.horizon else [longer * time for longer in _LONGER]
+            yield from ((start, each) for each in times if each <= self._task.longest)
 
     def _peak(self, found: Found) -> float:
         """Return the largest dipole of a path over its limit."""
@@ -205,8 +212,19 @@ class _Search:
         return Transcription(motion, task.along, start, task.end, task.nodes, scale, self._full)
 
     def _relaxed(self) -> list[Found]:
+        """Return paths without limits, the cheapest first, over the asked horizon or the next that has any.
+
+        The longer a slew, the more the field turns under way, and the nearer a guess is to a path.
+        """
+        for longer in _LONGER:
+            horizon = min(longer * self._task.horizon, self._task.longest)
+            found = self._relaxed_over(horizon)
+            if found or horizon == self._task.longest:
+                break
+        return found
+
+    def _relaxed_over(self, horizon: float) -> list[Found]:
         """Return paths without limits from the most promising guesses, the cheapest first."""
-        horizon = self._task.horizon
         ranked = sorted(self._guesses(self._equations(horizon)), key=lambda pair: pair[0])
         found: list[Found] = []
         for _, guess in ranked[:_MOST_TRIED]:

@@ -12,6 +12,7 @@ from flight.gnc.guidance.three_axes.slew_cones import Cone
 from flight.gnc.guidance.three_axes.slew_ends import Boresight
 from flight.gnc.guidance.three_axes.slew_plan import SlewStatus, plan_slew
 from tests.flight.gnc.guidance.three_axes.recorded_slews import flown, matrix, off_degrees, problem, task_of
+from tests.studies.bench.orbit_slews import slews
 
 
 @pytest.mark.parametrize(
@@ -26,7 +27,8 @@ def test_a_slew_costs_what_the_optimum_does_and_its_dipoles_end_in_the_target(na
     assert plan.peak <= 1.001
     end = flown(plan, task)
     assert off_degrees(end[:4], np.array(case["qf"])) <= 0.005
-    np.testing.assert_allclose(end[4:], case["wf"], atol=2e-7)
+    # 1e-4 deg/s: what a solution of another machine's rounding may differ by, three times over.
+    np.testing.assert_allclose(end[4:], case["wf"], atol=1.7e-6)
 
 
 def test_a_horizon_that_does_not_suffice_is_stretched_and_the_limit_kept() -> None:
@@ -35,6 +37,15 @@ def test_a_horizon_that_does_not_suffice_is_stretched_and_the_limit_kept() -> No
     plan = plan_slew(task)
     assert plan.status is SlewStatus.STRETCHED
     assert case["T"] * 0.999 < plan.horizon < 1.02 * case["T"]
+    assert plan.peak <= 1.001
+
+
+def test_where_no_guess_leads_to_a_path_a_longer_slew_is_shortened_to_the_asked_horizon() -> None:
+    """Case 21 of `bench orbit_slews`: none of its guesses comes to a path over the asked time."""
+    *_, (_, task) = slews(22, 1, False)
+    plan = plan_slew(task)
+    assert plan.status is SlewStatus.OPTIMAL
+    assert plan.horizon == pytest.approx(task.horizon)
     assert plan.peak <= 1.001
 
 

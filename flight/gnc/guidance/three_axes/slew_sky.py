@@ -1,0 +1,54 @@
+"""What a slew's planner takes from an orbit's prediction: field, place, cones of Sun, Earth and Moon.
+
+Times of slews count from `begin` s of the ephemeris.
+"""
+
+from __future__ import annotations
+
+import math
+
+import erfa
+import numpy as np
+
+from flight.gnc.earth.ephemeris import Ephemeris
+from flight.gnc.earth.figure import EARTH_RADIUS
+from flight.gnc.earth.orientation import terrestrial_time
+from flight.gnc.earth.sun import ASTRONOMICAL_UNIT
+from flight.gnc.guidance.three_axes.slew_cones import Cone
+from flight.gnc.guidance.three_axes.slew_model import Along, Around
+from flight.gnc.math.arrays import FloatArray
+
+
+def along(ephemeris: Ephemeris, begin: float) -> Along:
+    """Return field and position over the time of a slew."""
+
+    def around(times: FloatArray) -> Around:
+        return Around(ephemeris.field_at(begin + times), ephemeris.position_at(begin + times))
+
+    return around
+
+
+def cones(ephemeris: Ephemeris, begin: float, axis: FloatArray, **angles: float) -> tuple[Cone, ...]:
+    """Return the cones that body `axis` (3,) keeps, rad: `sun` and `moon` from centre, `earth` from limb."""
+    date = float(terrestrial_time(ephemeris.julian_date + begin / 86_400.0))
+    moon = ASTRONOMICAL_UNIT * np.asarray(erfa.moon98(date, 0.0)["p"], dtype=float)
+
+    def towards_earth(times: FloatArray) -> FloatArray:
+        place = ephemeris.position_at(begin + times)
+        return np.asarray(-place / np.linalg.norm(place, axis=1, keepdims=True))
+
+    def towards_moon(times: FloatArray) -> FloatArray:
+        away = moon - ephemeris.position_at(begin + times)
+        return np.asarray(away / np.linalg.norm(away, axis=1, keepdims=True))
+
+    distance = float(np.linalg.norm(ephemeris.position_at(np.array([begin]))[0]))
+    limb = math.asin(min(1.0, EARTH_RADIUS / distance))
+    known = {
+        "sun": (lambda times: ephemeris.sun_at(begin + times), 0.0),
+        "earth": (towards_earth, limb),
+        "moon": (towards_moon, 0.0),
+    }
+    return tuple(
+        Cone(name.capitalize(), axis, known[name][0], known[name][1] + angle)
+        for name, angle in angles.items()
+    )

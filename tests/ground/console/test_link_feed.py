@@ -1,0 +1,71 @@
+"""The console by a link: telemetry out of frames, a command with its stages, and a link that stays silent."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from flight.gnc.errors import FlightError
+from flight.link.commands.codec import ChangeMode, CommandPacker
+from flight.link.modes import Mode
+from ground.console import link_feed
+from ground.console.link_feed import LinkFeed
+from tests.flight.link.process.both_ends import BothEnds
+
+
+class Satellite:
+    """Both ends of a link, whose ground is a feed; its turns are those of the feed's looks."""
+
+    def __init__(self, ends: BothEnds, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.ends = ends
+        # What the terminal waits for comes out of the turns of the other end.
+        monkeypatch.setattr(ends.terminal, "packets", self._packets)
+        self.feed = LinkFeed(ends.terminal)
+
+    def _packets(self, seconds: float) -> list[tuple[int, bytes]]:
+        before = len(self.ends.packets)
+        self.ends.turn(0.5)
+        return self.ends.packets[before:]
+
+
+@pytest.fixture
+def satellite(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Satellite]:
+    ends = BothEnds(tmp_path)
+    yield Satellite(ends, monkeypatch)
+    ends.close()
+
+
+def test_it_asks_for_telemetry_once_and_gives_what_the_flight_records(satellite: Satellite) -> None:
+    ends, feed = satellite.ends, satellite.feed
+    ends.record(ends.mode_packet(Mode.HOLD, "ready"))
+    came = [feed.new() for _ in range(4)]
+    assert sum(len(packets["mode"]) for packets in came) == 1
+    assert sum(len(packets["link"]) for packets in came) >= 1
+    assert len(ends.obeyed) == 1, "the ping that asks for telemetry"
+    assert feed.silence < 60.0
+
+
+def test_a_command_is_answered_with_its_counter_and_what_became_of_it(satellite: Satellite) -> None:
+    feed = satellite.feed
+    packet = CommandPacker().pack(ChangeMode(Mode.SAFE, "bored"), 7)
+    answers: list[dict[str, object]] = []
+    sending = threading.Thread(target=lambda: answers.append(feed.send(packet)))
+    sending.start()
+    for _ in range(200):
+        feed.new()
+        sending.join(0.01)
+        if not sending.is_alive():
+            break
+    assert packet in satellite.ends.obeyed
+    (answer,) = answers
+    assert answer["obeyed"] == 1
+    assert satellite.ends.stages(int(str(answer["counter"])))[0] == "accepted"
+
+
+def test_without_an_answer_it_says_so(satellite: Satellite, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(link_feed, "_ANSWER_S", 0.05)
+    with pytest.raises(FlightError, match=r"no answer by the link within 0\.05 s"):
+        satellite.feed.send(CommandPacker().pack(ChangeMode(Mode.SAFE), 7))

@@ -1,0 +1,142 @@
+"""Plan slews in orbit, random or recorded: `python -m tests.studies.bench orbit_slews [--recorded]`.
+
+Slews of 30 to 180 deg from rest to rest, of a 1U (inertia 1.1e-3 kg m^2, 0.0959 A m^2, 80 to 400 s) and a 3U
+(0.0066 and 0.0333 kg m^2, 0.2 A m^2, 300 to 1,200 s), in the orbits of the space station and of a
+Sun-synchronous satellite, in the field of WMM2025. `--recorded` plans those of `optimum_orbit.json` beside
+their optima, and flies the dipoles by an integrator of the test's own. Times are of this process's processor.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+
+from flight.gnc.earth.ephemeris import Ephemeris, predict
+from flight.gnc.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER
+from flight.gnc.earth.orbit_knowledge import OrbitState
+from flight.gnc.errors import PlanningError
+from flight.gnc.guidance.three_axes.slew_ends import EndLaw, Whole
+from flight.gnc.guidance.three_axes.slew_model import SlewCraft
+from flight.gnc.guidance.three_axes.slew_plan import LEAST_TIME, SlewPlan, SlewStatus, SlewTask, plan_slew
+from flight.gnc.guidance.three_axes.slew_sky import along, cones
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import from_rotation_vector, multiply, normalise
+from tests.flight.gnc.guidance.three_axes.recorded_slews import FILE, flown, off_degrees, recorded, task_of
+
+CRAFT = {
+    "1U": (
+        SlewCraft(np.diag([1.10e-3, 1.05e-3, 0.99e-3]), np.full(3, 0.0959), np.full(3, 54.8)),
+        (80.0, 400.0),
+    ),
+    "3U": (SlewCraft(np.diag([0.0066, 0.0333, 0.0333]), np.full(3, 0.2), np.full(3, 5.0)), (300.0, 1200.0)),
+}
+ORBITS = {"ISS": (420e3, 51.6), "SSO": (500e3, 97.4)}
+STAR_CAMERA: FloatArray = np.array([0.0, -1.0, 0.0])
+_DATE = 2_461_101.0  # 2026-03-01
+_REVOLUTION = 5600.0
+_LONGEST = 3.0
+
+
+@cache
+def orbit(name: str) -> Ephemeris:
+    """Return the prediction of an orbit for two revolutions."""
+    height, tilt = ORBITS[name]
+    radius, tilt = EARTH_RADIUS + height, np.radians(tilt)
+    speed = np.sqrt(GRAVITATIONAL_PARAMETER / radius)
+    velocity = speed * np.array([0.0, np.cos(tilt), np.sin(tilt)])
+    return predict(OrbitState(_DATE, np.array([radius, 0.0, 0.0]), velocity, 0.0), 2.0 * _REVOLUTION)
+
+
+def _whenever(end: Whole) -> EndLaw:
+    return lambda _: end
+
+
+def slews(count: int, seed: int, with_cones: bool) -> Iterator[tuple[str, SlewTask]]:
+    """Yield named tasks; with cones, only those that start and end outside."""
+    rng = np.random.default_rng(seed)
+    made = 0
+    while made < count:
+        craft, name = list(CRAFT)[made % 2], list(ORBITS)[made // 2 % 2]
+        model, (least, most) = CRAFT[craft]
+        horizon, begin = (
+            float(np.exp(rng.uniform(np.log(least), np.log(most)))),
+            rng.uniform(0.0, _REVOLUTION),
+        )
+        q = normalise(rng.normal(size=4))
+        angle = rng.uniform(30.0, 180.0)
+        turn = np.radians(angle) * normalise(rng.normal(size=3))
+        target = Whole(multiply(from_rotation_vector(turn), q), np.zeros(3))
+        path = orbit(name)
+        kept = cones(path, begin, STAR_CAMERA, sun=0.4, earth=0.15, moon=0.2) if with_cones else ()
+        task = SlewTask(
+            model, along(path, begin), q, np.zeros(3), _whenever(target), horizon, _LONGEST * horizon
+        )
+        ends = ((q, 0.0), (target.quaternion, horizon))
+        if all(cone.clearance(a[None], np.array([t]))[0] > 0.02 for cone in kept for a, t in ends):
+            made += 1
+            yield f"{craft} {name} {angle:.0f} deg {horizon:.0f} s", replace(task, cones=kept)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print the figures; return the exit status."""
+    parser = argparse.ArgumentParser(prog="python -m tests.studies.bench orbit_slews", description=__doc__)
+    parser.add_argument("--runs", type=int, default=200)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--recorded", action="store_true", help="those with known optima instead")
+    parser.add_argument("--cones", action="store_true", help="of Sun, Earth and Moon, for the star camera")
+    options = parser.parse_args(arguments)
+    return _recorded() if options.recorded else _random(options.runs, options.seed, options.cones)
+
+
+def _recorded() -> int:
+    """Compare with the recorded optima; return the exit status."""
+    if not FILE.exists():
+        sys.stdout.write(f"no optima of slews at {FILE.name}\n")
+        return 1
+    sys.stdout.write(f"{'slew':28} of the optimum  peak   off, deg  processor, s\n")
+    ratios = []
+    for case in recorded()["problems"]:
+        least = case["kind"] == "time"
+        task = task_of(case, case["T"], time_price=LEAST_TIME if least else None)
+        begin = time.process_time()
+        try:
+            plan = plan_slew(task)
+        except PlanningError as error:
+            sys.stdout.write(f"{case['name']:28} refused: {error}\n")
+            continue
+        spent = time.process_time() - begin
+        ratio = plan.horizon / case["T"] if least else plan.energy / case["energy_J"]
+        off = off_degrees(flown(plan, task)[:4], np.array(case["qf"]))
+        ratios.append(ratio)
+        kind = "time" if least else "heat"
+        sys.stdout.write(f"{case['name']:28} {kind} {ratio:.5f}   {plan.peak:.4f}  {off:.5f}  {spent:.2f}\n")
+    sys.stdout.write(
+        f"{len(ratios)} planned: {np.median(ratios):.5f} in the median, {max(ratios):.5f} at most\n"
+    )
+    return 0
+
+
+def _random(runs: int, seed: int, with_cones: bool) -> int:
+    """Plan random slews; return the exit status."""
+    taken, found, failed = [], list[SlewPlan](), 0
+    for name, task in slews(runs, seed, with_cones):
+        begin = time.process_time()
+        try:
+            found.append(plan_slew(task))
+        except PlanningError as error:
+            failed += 1
+            sys.stdout.write(f"{name}: {error}\n")
+        taken.append(time.process_time() - begin)
+    stretched = sum(plan.status is SlewStatus.STRETCHED for plan in found)
+    sys.stdout.write(f"{len(found)} of {runs} planned, {stretched} of them stretched, {failed} failed\n")
+    sys.stdout.write(f"{np.median(taken):.2f} s in the median, {max(taken):.2f} s at most\n")
+    clear = [clear for plan in found for clear in plan.clearance]
+    if clear:
+        sys.stdout.write(f"nearest to a cone: {np.degrees(min(clear)):.3f} deg outside\n")
+    return 0
