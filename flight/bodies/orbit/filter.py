@@ -66,18 +66,14 @@ class OrbitFilter:
         return self._free.started
 
     def heard_field(self) -> tuple[FieldMeasurement, FloatArray] | None:
-        """Return the newest field and the gyro's rate (3,) rad/s of its step; None without one.
-
-        Its covariance is for the start of an estimate: the field's bias enters again with the next.
-        """
+        """Return the newest field and the gyro's rate (`StepReplay.heard_field`)."""
         self._close()
-        step = next((step for step in reversed(self._steps) if step.field is not None), None)
-        if step is None or step.field is None:
-            return None
-        settings = self._settings
-        spread = settings.field_noise**2 + (2.0 * settings.free.magnet[0]) ** 2
-        field = FieldMeasurement(step.field_ns, step.field, step.around.field, spread * np.eye(3))
-        return field, step.gyro
+        return self._replay.heard_field()
+
+    def turned(self, from_ns: int, to_ns: int) -> FloatArray | None:
+        """Return the body's rotation (4,) between two times by the gyro; None beyond the history."""
+        self._close()
+        return self._replay.turned(from_ns, to_ns)
 
     @property
     def measured_ns(self) -> int:
