@@ -191,6 +191,10 @@ ATTITUDE_KNOWLEDGE = EventKind(100, "attitude-knowledge", _TOLD, "how well the a
 GPS_LOST = EventKind(101, "gps-lost", _WARNED, "no fix of use has come for too long")
 GPS_RECOVERED = EventKind(102, "gps-recovered", _TOLD, "fixes of use come again")
 GPS_REFUSED = EventKind(103, "gps-refused", _WARNED, "a fix contradicts what is known of the orbit")
+STRINGS_LOST = EventKind(104, "strings-lost", _WARNED, "the solar strings give no readings")
+STRINGS_RECOVERED = EventKind(105, "strings-recovered", _TOLD, "the solar strings give readings again")
+SUN_UNCLEAR = EventKind(106, "sun-unclear", _WARNED, "the solar strings see no Sun in the sunlight")
+SUN_CLEAR = EventKind(107, "sun-clear", _TOLD, "the solar strings see the Sun again")
 
 EVENTS: tuple[EventKind, ...] = tuple(
     value for value in dict(vars()).values() if isinstance(value, EventKind)

@@ -23,7 +23,7 @@ from flight.loop.fdir.coils.watch import CoilWatch
 from flight.loop.services import Services
 from flight.loop.state.content import Learned
 from flight.schema.sections import Config
-from hal.interfaces.readings import GpsReading, ImuReading
+from hal.interfaces.readings import GpsReading, ImuReading, StringReading
 
 PLANNER = "planner"
 """The planner worker's name."""
@@ -221,6 +221,8 @@ class Body:
         velocity: returns the velocity (3,) m/s about the Sun at a time, reference axes, by which starlight is
             aberrated; None where the configured one holds.
         fix: accepts a valid GPS reading; returns whether the body uses it.
+        sun: accepts a reading of the solar strings; returns why it shows no Sun, empty where it does, None
+            where it is not judged.
     """
 
     modes: frozenset[Mode]
@@ -241,6 +243,7 @@ class Body:
     knowledge: Callable[[], Knowledge] = lambda: Knowledge.FINE
     velocity: Callable[[int], FloatArray | None] = lambda _: None
     fix: Callable[[GpsReading], bool] = lambda _: False
+    sun: Callable[[StringReading], str | None] = lambda _: None
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,6 +32,7 @@ from flight.loop.tasks.mode_control import ModeControl
 from flight.loop.tasks.navigation import Navigation
 from flight.loop.tasks.performance import PerformanceObserver
 from flight.loop.tasks.positioning import Positioning
+from flight.loop.tasks.sun_sensing import SunSensing
 from flight.schema.sections import Config
 from hal.interfaces.wires import SECOND_NS
 
@@ -57,7 +58,7 @@ class Supervisors:
 
 @dataclass(frozen=True, slots=True)
 class LoopTasks:
-    """The tasks of the loop; without camera, receiver or channels no imaging, positioning or commanding.
+    """The tasks of the loop; without a device or channels the tasks of these are None.
 
     The order is that of the data flow.
     """
@@ -65,6 +66,7 @@ class LoopTasks:
     navigation: Navigation
     imaging: Imaging | None
     positioning: Positioning | None
+    sun: SunSensing | None
     modes: ModeControl
     control: ControlCycle
     observer: PerformanceObserver
@@ -155,8 +157,9 @@ class FlightLoop:
         tasks.navigation.begin(epoch_ns)
         if tasks.imaging is not None:
             tasks.imaging.begin(epoch_ns)
-        if tasks.positioning is not None:
-            tasks.positioning.begin(epoch_ns)
+        for sensing in (tasks.positioning, tasks.sun):
+            if sensing is not None:
+                sensing.begin(epoch_ns)
         services.streams.begin(epoch_ns)
         utc_ns = clock.utc_ns() - (clock.now_ns() - epoch_ns)
         record_run(recorder, config, label, epoch_ns, utc_ns, self._groups[0].period_ns)
@@ -195,8 +198,9 @@ class FlightLoop:
     def _keep_house(self, cycle: Cycle) -> None:
         now_ns, output = cycle.start_ns, self._output
         state = output.steered.state if output is not None else SteeringState.OFF
-        if self._tasks.positioning is not None:
-            self._tasks.positioning.run(now_ns)
+        for sensing in (self._tasks.positioning, self._tasks.sun):
+            if sensing is not None:
+                sensing.run(now_ns)
         self._tasks.housekeeping.run(cycle, state)
         self._keep_state(now_ns)
         self._record_performance(now_ns)

@@ -31,6 +31,7 @@ from flight.loop.tasks.navigation import Navigation
 from flight.loop.tasks.performance import PerformanceObserver
 from flight.loop.tasks.positioning import Positioning
 from flight.loop.tasks.steering import Steering
+from flight.loop.tasks.sun_sensing import SunSensing
 from flight.schema.sections import Config
 from hal.interfaces.wires import SECOND_NS, Clock
 
@@ -92,8 +93,10 @@ def _tasks(
     commanded = bool(opened.channels or timeline)
     commanding = Commanding(modes, drive, timeline, opened.channels, services) if commanded else None
     positioning = _positioning(config, devices, body, services)
-    house = Housekeeping(watched, services)
-    return LoopTasks(navigation, imaging, positioning, modes, control, observer, health, house, commanding)
+    sun, house = _sun(config, devices, body, services), Housekeeping(watched, services)
+    return LoopTasks(
+        navigation, imaging, positioning, sun, modes, control, observer, health, house, commanding
+    )
 
 
 def _drive(config: Config, devices: Devices, body: Body, services: Services) -> CoilDrive:
@@ -106,6 +109,12 @@ def _positioning(config: Config, devices: Devices, body: Body, services: Service
     if config.gps is None or devices.gps is None:
         return None
     return Positioning(devices.gps, body.fix, round(config.gps.max_age * SECOND_NS), services)
+
+
+def _sun(config: Config, devices: Devices, body: Body, services: Services) -> SunSensing | None:
+    if config.solar_strings is None or devices.strings is None:
+        return None
+    return SunSensing(devices.strings, body.sun, round(config.solar_strings.max_age * SECOND_NS), services)
 
 
 def _imaging(

@@ -5,11 +5,12 @@ It detumbles by its magnetometer, acquires its attitude with its coils at rest, 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
 from flight.bodies.orbit.brake import FieldBrake
+from flight.bodies.orbit.coarse_sun import CoarseSunFeed
 from flight.bodies.orbit.feed import OrbitFeed
 from flight.bodies.orbit.filter import OrbitFilter
 from flight.bodies.orbit.paths import PointingPaths
@@ -32,6 +33,7 @@ from flight.gnc.guidance.three_axes.pointing_target import PointingTarget
 from flight.gnc.guidance.three_axes.target_law import BodyAxes
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import attitude_matrix
+from flight.gnc.vision.sun_sensor.strings import SolarStrings
 from flight.link.modes import Mode
 from flight.loop.body import Body, BodyKind
 from flight.loop.fdir.coils.response import ResponseSettings
@@ -41,6 +43,7 @@ from flight.loop.state.content import Learned
 from flight.schema.errors import ConfigError
 from flight.schema.orbit import OrbitConfig, as_orbit
 from flight.schema.sections import Config
+from hal.interfaces.readings import StringReading
 from hal.interfaces.wires import SECOND_NS
 
 
@@ -79,6 +82,7 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
         knowledge=lambda: filter_.knowledge,
         velocity=surroundings.velocity,
         fix=surroundings.fix,
+        sun=_sun(config, filter_, surroundings),
     )
 
 
@@ -123,6 +127,17 @@ def _filter(config: OrbitConfig, surroundings: Surroundings) -> OrbitFilter:
         free=FreeFilterSettings(gyro=(section.bias_start, section.bias_walk), gate_sigma=section.gate_sigma),
     )
     return OrbitFilter(settings, surroundings.at)
+
+
+def _sun(
+    config: OrbitConfig, filter_: OrbitFilter, surroundings: Surroundings
+) -> Callable[[StringReading], str | None]:
+    section = config.solar_strings
+    if section is None:
+        return lambda _: None
+    normals = np.array([string.normal for string in section.strings])
+    strings = SolarStrings(normals, np.array([string.peak for string in section.strings]))
+    return CoarseSunFeed(strings, round(section.period * SECOND_NS), filter_, surroundings).accept
 
 
 def _elements(config: OrbitConfig) -> TwoLineElements | None:

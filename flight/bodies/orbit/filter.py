@@ -19,6 +19,7 @@ from flight.gnc.estimation.estimate import Estimate, Knowledge
 from flight.gnc.estimation.free_motion import Around
 from flight.gnc.estimation.measurements import (
     AttitudeMeasurement,
+    FieldMeasurement,
     Measurement,
 )
 from flight.gnc.math.arrays import FloatArray, IntArray
@@ -58,6 +59,21 @@ class OrbitFilter:
     def started(self) -> bool:
         """Whether there is an estimate: not while the attitude is lost."""
         return self.knowledge is not Knowledge.LOST
+
+    @property
+    def runs(self) -> bool:
+        """Whether it takes measurements: also while the attitude is not yet, or no longer, of use."""
+        return self._free.started
+
+    def heard_field(self) -> tuple[FieldMeasurement, FloatArray] | None:
+        """Return the newest field and the gyro's rate (`StepReplay.heard_field`)."""
+        self._close()
+        return self._replay.heard_field()
+
+    def turned(self, from_ns: int, to_ns: int) -> FloatArray | None:
+        """Return the body's rotation (4,) between two times by the gyro; None beyond the history."""
+        self._close()
+        return self._replay.turned(from_ns, to_ns)
 
     @property
     def measured_ns(self) -> int:
@@ -204,7 +220,8 @@ class OrbitFilter:
         self._replay.add(step)
 
     def _judge(self, attitude: AttitudeMeasurement, used: bool) -> None:
-        """Begin again after too many attitudes that contradict the estimate."""
+        """Begin again after too many attitudes that contradict the estimate; a coarse one yields at once."""
         self._refused_attitudes = 0 if used else self._refused_attitudes + 1
-        if self._refused_attitudes >= REFUSALS_TO_RESTART:
+        patience = REFUSALS_TO_RESTART if self.knowledge is Knowledge.FINE else 1
+        if self._refused_attitudes >= patience:
             self.begin(attitude)

@@ -18,7 +18,7 @@ from flight.gnc.estimation.measurements import (
     Measurement,
 )
 from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector
+from flight.gnc.math.quaternion import attitude_matrix, conjugate, from_rotation_vector, multiply
 from hal.interfaces.wires import SECOND_NS
 
 FIELD_MEMORY = 300.0
@@ -91,6 +91,31 @@ class StepReplay:
             if step.begin_ns <= time_ns < step.end_ns:
                 return k
         return None
+
+    def heard_field(self) -> tuple[FieldMeasurement, FloatArray] | None:
+        """Return the newest field and the gyro's rate (3,) rad/s of its step; None without one.
+
+        Its covariance is for the start of an estimate: the field's bias enters again with the next.
+        """
+        step = next((step for step in reversed(self.steps) if step.field is not None), None)
+        if step is None or step.field is None:
+            return None
+        spread = self._settings.field_noise**2 + (2.0 * self._settings.free.magnet[0]) ** 2
+        field = FieldMeasurement(step.field_ns, step.field, step.around.field, spread * _EYE)
+        return field, step.gyro
+
+    def turned(self, from_ns: int, to_ns: int) -> FloatArray | None:
+        """Return the body's rotation (4,) between two times by the gyro; None beyond the history."""
+        if to_ns < from_ns:
+            back = self.turned(to_ns, from_ns)
+            return None if back is None else conjugate(back)
+        rotation, left_ns = np.array([0.0, 0.0, 0.0, 1.0]), to_ns - from_ns
+        for step in self.steps:
+            span_ns = min(step.end_ns, to_ns) - max(step.begin_ns, from_ns)
+            if span_ns > 0:
+                turn = span_ns / SECOND_NS * (step.gyro - self.free.gyro_bias)
+                rotation, left_ns = multiply(from_rotation_vector(turn), rotation), left_ns - span_ns
+        return rotation if left_ns == 0 else None
 
     def take_again(self, first: int) -> set[int]:
         """Return to the beginning of step `first` and take it and the later ones; return what was used."""

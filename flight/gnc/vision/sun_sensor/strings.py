@@ -118,7 +118,7 @@ def coarse_sun(currents: FloatArray, strings: SolarStrings, nadir: FloatArray | 
         return CoarseSun(CoarseSunStatus.UNCERTAIN, reason="the currents cancel one another")
     for _ in range(_STEPS):
         basis = tangent_basis(direction)
-        modelled, gradient = _cosines(strings.normals @ direction)
+        modelled, gradient = received(strings.normals @ direction)
         slopes = gradient[:, None] * (strings.normals @ basis.T)
         weighted = slopes.T @ information
         inverse = np.linalg.inv(weighted @ slopes + 1e-6 * np.eye(2))
@@ -129,7 +129,7 @@ def coarse_sun(currents: FloatArray, strings: SolarStrings, nadir: FloatArray | 
         direction = direction / np.linalg.norm(direction)
         if np.hypot(*step) < 1e-6:
             break
-    left = readings - _cosines(strings.normals @ direction)[0]
+    left = readings - received(strings.normals @ direction)[0]
     square = float(left @ information @ left)
     if square > _chi_square(len(shares) - 2):
         reason = f"the currents fit no Sun: chi-square {square:.0f} of {len(shares) - 2}"
@@ -144,8 +144,8 @@ def _start(shares: FloatArray, strings: SolarStrings) -> FloatArray | None:
     return total / length if length > 0.5 * strings.dark else None
 
 
-def _cosines(cosines: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the shares of peak current (n,) at `cosines` (n,), none from behind, and their slopes (n,)."""
+def received(cosines: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the shares of peak current at `cosines` (...), none from behind, and their slopes."""
     root = np.sqrt(cosines**2 + _SOFT**2)
     return 0.5 * (cosines + root), 0.5 * (1.0 + cosines / root)
 

@@ -1,0 +1,31 @@
+"""Solar strings in the loop: with them the attitude is coarse without a camera, though one is dead."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flight.schema import reader as configuration
+from ground.report.knowledge import COARSE, attitude_errors
+from ground.telemetry.reader import Run
+from sim_hal.settings import FaultEntry
+from tests.scenario.flights import fly
+from tests.scenario.test_orbit import orbit_config, world
+
+DEAD = 6.0
+"""When a string gives no more current, s."""
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    config = configuration.replace(orbit_config(24.0), camera=None, gps=None)
+    dead = FaultEntry(fault="strings: dead", at=DEAD)
+    return fly(config, tmp_path_factory.mktemp("strings"), section=world(0.008, dead))
+
+
+def test_sun_and_field_give_a_coarse_attitude_that_holds_though_a_string_dies(flown: Run) -> None:
+    assert (flown["navigation"]["knowledge"][4:] == COARSE).all()
+    errors = attitude_errors(flown)
+    assert len(errors.times)
+    assert (np.abs(errors.error) < 4.0 * errors.sigma).all()
+    assert np.degrees(errors.sigma).max() < 5.0
