@@ -121,7 +121,7 @@ def test_a_mistake_gets_one_line_with_its_place_and_its_cure(right: str, wrong: 
     ("right", "wrong", "complaint"),
     [
         ("{at: 0.0, point: sun}", "{at: 1.0, point: sun}", r":\d+: `targets\[0\].at` .* must be given at 0"),
-        ("{at: 1800.0, point", "{at: 0.0, point", r"`targets\[1\].at` is 0.0: .* in order of time"),
+        ("{at: 2400.0, point", "{at: 0.0, point", r"`targets\[1\].at` is 0.0: .* in order of time"),
         ("point: sun}", "point: moon}", r"`targets\[0\].point` is 'moon'.*nadir"),
         (
             "point: sun}",
