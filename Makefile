@@ -7,7 +7,7 @@ TESTS  := $(RUN) -m pytest -n auto
 # The tests start hundreds of processes: without kept bytecode each would compile every module again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo orbit console quick test test-container lint types arrows docs house unit fast slow-list pictures lock clean help
+.PHONY: demo orbit orbit-3u console quick test test-container lint types arrows docs house unit fast slow-list pictures lock clean help
 
 help:           ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
@@ -23,10 +23,15 @@ demo: $(READY)  ## fly the 700 s step demonstration on simulated hardware and pr
 	$(RUN) -m flight run config/step_demo.yaml --out runs/demo
 	$(RUN) -m flight report runs/demo
 
-orbit: $(READY) ## fly a KnightCube in orbit: detumble from 10 deg/s, and print the report
+orbit: $(READY) ## fly a KnightCube for an orbit: detumble from 10 deg/s, point to the Sun, then nadir; print the report
 	@rm -rf runs/orbit
 	$(RUN) -m flight run config/orbit.yaml --out runs/orbit
 	$(RUN) -m flight report runs/orbit
+
+orbit-3u: $(READY) ## the same with a 3U, for two and a half hours of flight
+	@rm -rf runs/orbit_3u
+	$(RUN) -m flight run config/orbit_3u.yaml --out runs/orbit_3u
+	$(RUN) -m flight report runs/orbit_3u
 
 console: $(READY) ## the demonstration flying in real time in the browser, with forms to command it
 	@rm -rf runs/console
