@@ -5,6 +5,7 @@ It detumbles by its magnetometer, acquires its attitude with its coils at rest, 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 
 import numpy as np
@@ -46,6 +47,9 @@ from flight.schema.sections import Config
 from hal.interfaces.readings import StringReading
 from hal.interfaces.wires import SECOND_NS
 
+_BELOW = 0.8
+"""Of the rate at which the body would be braked again: what a path may take, the rest is for its errors."""
+
 
 def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> Body:
     """Return the satellite of a configuration; parameters that an earlier boot learned are not used yet."""
@@ -53,7 +57,11 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
     surroundings = Surroundings(_elements(config), services.clock)
     filter_ = _filter(config, surroundings)
     brake = FieldBrake(_detumbler(config), config.craft.dipole_per_ampere)
-    paths, pauses, limit = PointingPaths(_limit(config)), _pauses(config), _limit(config)
+    paths, pauses, limit = (
+        PointingPaths(_limit(config), fastest_rate(config)),
+        _pauses(config),
+        _limit(config),
+    )
     dipole_per_ampere = config.craft.dipole_per_ampere
 
     def field(estimate: Estimate) -> FloatArray:
@@ -103,10 +111,17 @@ def _pauses(config: OrbitConfig) -> WindowSchedule:
 def _planned(config: OrbitConfig) -> PlannedCraft:
     section = config.pointing
     axes = BodyAxes(np.array(section.axis), np.array(section.across))
-    weights = PointingWeights(turn=section.turn, rate=section.rate, dipole=section.dipole)
+    fastest = _BELOW * fastest_rate(config)
+    weights = PointingWeights(turn=section.turn, rate=section.rate, dipole=section.dipole, fastest=fastest)
     pauses = _pauses(config)
     limit = _limit(config) * pauses.act_ns / pauses.period_ns
     return PlannedCraft(np.diag(config.craft.inertia), axes, weights, limit)
+
+
+def fastest_rate(config: OrbitConfig) -> float:
+    """Return the rate, rad/s, beyond which the body is braked again or the star camera rests."""
+    camera = config.camera.max_rate if config.camera is not None else math.inf
+    return min(config.modes.tumble_rate, camera)
 
 
 def _timed(config: OrbitConfig) -> list[tuple[float, PointingTarget]]:

@@ -46,9 +46,9 @@ class PointingPaths:
         off: rad, how far the body was off the path at the last command; zero for a new path.
     """
 
-    def __init__(self, limit: float) -> None:
-        """`limit` A m^2 of each coil, mean over a window of pause and action."""
-        self._limit = limit
+    def __init__(self, limit: float, fastest: float) -> None:
+        """`limit` A m^2 of each coil, mean over a window; `fastest` rad/s, of no path to be reached."""
+        self._limit, self._fastest = limit, fastest
         self._law: PointingLaw | None = None
         self._target: PointingTarget | None = None
         self._origin_ns = 0
@@ -59,6 +59,10 @@ class PointingPaths:
         parts = (table.gain, table.dipole, table.torque_part, table.path.quaternion)
         if not all(np.isfinite(part).all() for part in parts):
             return "it holds values that are not finite"
+        speed = float(np.linalg.norm(table.path.rate, axis=1).max())
+        if speed >= self._fastest:
+            turn, most = np.rad2deg([speed, self._fastest])
+            return f"it turns the body at {turn:.2f} deg/s, where {most:.2f} are braked or blind the camera"
         self._law, self._target, self._origin_ns = PointingLaw(table, self._limit), target, origin_ns
         self.off = 0.0
         return ""

@@ -41,6 +41,8 @@ SAVED = (0.05, 2e-3)
 """Share of the cost: a sweep that saves less is the last one at its price; and at the last price."""
 NEAR = math.radians(10.0)
 """rad off the law: a motion that stays within needs no such torque to begin with."""
+EXCESS = 3e-5
+"""rad/s beyond the largest rate that cost as much as the turn that costs one."""
 SHARES = (1.0, 0.4, 0.15)
 """Of what a sweep found, tried in turn."""
 
@@ -121,12 +123,14 @@ class Criterion:
         end: the law's cost-to-go after the path; its first column is of the law and the torques expected,
             the others of each size of the torques.
         shape: (n + 1, 3, sizes) of the torques in the law's axes.
+        fastest: rad/s; a rate beyond is dear, `EXCESS`.
     """
 
     state: FloatArray
     dipole: float
     end: ToGo
     shape: FloatArray
+    fastest: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -237,10 +241,14 @@ def _swept(
     else:
         state_slope[:, :, 0] = np.einsum("nij,nj->ni", turned[:-1] @ state, off[:-1])
         control_slope[:, :, 0] = control * motion.control
+    states = turned[:-1] @ state @ bends[:-1]
+    steep, curved = _haste(motion.rate[:-1], criterion.fastest, expected.step)
+    state_slope[:, 3:, 0] += steep
+    states[:, 3:, 3:] += curved
     slope = turned[-1] @ end.slope
     slope[:, 0] += turned[-1] @ end.square @ off[-1]
     last = ToGo(turned[-1] @ end.square @ bends[-1], slope)
-    cost = Cost(turned[:-1] @ state @ bends[:-1], control, state_slope, control_slope)
+    cost = Cost(states, control, state_slope, control_slope)
     gain, steady, _ = sweep(linear, affine, cost, last)
     return Gains(gain, steady)
 
@@ -252,7 +260,20 @@ def _cost(expected: Expected, motion: Motion, criterion: Criterion, price: float
     squares = np.einsum("ni,ij,nj->", off[:-1], criterion.state, off[:-1])
     squares += criterion.dipole * np.sum(motion.control[:, :3] ** 2)
     squares += criterion.dipole * price * np.sum((motion.control[:, 3] / strength) ** 2)
+    excess = np.maximum(np.linalg.norm(motion.rate[:-1], axis=1) - criterion.fastest, 0.0)
+    squares += expected.step * np.sum((excess / EXCESS) ** 2)
     return float(0.5 * squares + off[-1] @ (0.5 * end.square @ off[-1] + end.slope[:, 0]))
+
+
+def _haste(rate: FloatArray, fastest: float, step: float) -> tuple[FloatArray, FloatArray]:
+    """Return slope (n, 3) and curvature (n, 3, 3) of the price of rates (n, 3) beyond the largest."""
+    speed = np.maximum(np.linalg.norm(rate, axis=1), 1e-9)
+    along = rate / speed[:, None]
+    excess, price = np.maximum(speed - fastest, 0.0), step / EXCESS**2
+    outer = along[:, :, None] * along[:, None, :]
+    curved = (excess > 0.0)[:, None, None] * outer
+    curved = curved + (excess / speed)[:, None, None] * (np.eye(3) - outer)
+    return price * excess[:, None] * along, price * curved
 
 
 def _off(wanted: References, motion: Motion) -> FloatArray:

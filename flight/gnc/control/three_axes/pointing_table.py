@@ -6,6 +6,7 @@ the end would cost (`pointing_sweep`).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,11 +28,13 @@ class PointingWeights:
         turn: rad, of an axis.
         rate: rad/s, of an axis.
         dipole: A m^2, of an axis.
+        fastest: rad/s, the rate of a body on its way; more is dear (`pointing_path.EXCESS`).
     """
 
     turn: float
     rate: float
     dipole: float
+    fastest: float = math.inf
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,7 +104,7 @@ def pointing_table(
         np.asarray(np.linalg.inv(inertia)),
         limit,
     )
-    motion, gains = best_path(expected, ahead.begun, Criterion(state, dipole, beyond, shape))
+    motion, gains = best_path(expected, ahead.begun, Criterion(state, dipole, beyond, shape, weights.fastest))
     path = motion.references(expected.wanted.times)
     gain, torque_part = gains.gain[:, :3], gains.steady[:, :3, 1:]
     return PointingTable(path, expected.wanted, motion.control[:, :3], gain, torque_part, ahead.sizes)
