@@ -56,13 +56,9 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
     config = as_orbit(config)
     surroundings = Surroundings(_elements(config), services.clock)
     filter_ = _filter(config, surroundings)
-    brake = FieldBrake(_detumbler(config), config.craft.dipole_per_ampere)
-    paths, pauses, limit = (
-        PointingPaths(_limit(config), fastest_rate(config)),
-        _pauses(config),
-        _limit(config),
-    )
-    dipole_per_ampere = config.craft.dipole_per_ampere
+    limit, dipole_per_ampere = _limit(config), config.craft.dipole_per_ampere
+    brake = FieldBrake(_detumbler(config), dipole_per_ampere)
+    paths = PointingPaths(limit, fastest_rate(config))
 
     def field(estimate: Estimate) -> FloatArray:
         around = surroundings.at(estimate.time_ns)
@@ -78,14 +74,14 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
         paths=paths,
         planner=PointingPlanner(_planned(config), paths, surroundings, sizes, services),
         targets=PointingTargets(_timed(config), paths),
-        tracker=PointingTracker(filter_, surroundings, pauses, limit, dipole_per_ampere),
+        tracker=PointingTracker(filter_, surroundings, _pauses(config), limit, dipole_per_ampere),
         feed=OrbitFeed(filter_),
         brake=brake,
         coil_watch=_coil_watch(config),
         view=OrbitView(brake, filter_, surroundings, services),
         field=field,
         free_axis=None,
-        dipole_per_ampere=config.craft.dipole_per_ampere,
+        dipole_per_ampere=dipole_per_ampere,
         angular_acceleration_psd=(config.detumble.torque_noise) ** 2,
         knowledge=lambda: filter_.knowledge,
         velocity=surroundings.velocity,

@@ -17,12 +17,6 @@ from sim_hal.serving import remote
 
 DEVICES = """
 gps: {period: 0.2}
-solar_strings:
-  strings:
-    - {normal: [1, 0, 0], channel: 0}
-    - {normal: [-1, 0, 0], channel: 1}
-    - {normal: [0, 1, 0], channel: 2}
-    - {normal: [0, 0, 1], channel: 3}
 wide_cameras:
   - {columns: 128, rows: 128}
   - {columns: 128, rows: 128, mounting: [1, 0, 0, 0]}

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from flight.gnc.control.three_axes.pointing import PointingLaw
-from flight.gnc.control.three_axes.pointing_table import PointingTable, PointingWeights, pointing_table
+from flight.gnc.control.three_axes.pointing_table import PointingTable, PointingWeights, table_along
 from flight.gnc.earth.ephemeris import Ephemeris
 from flight.gnc.errors import PlanningError
 from flight.gnc.guidance.three_axes.attitude_law import References, references
@@ -201,10 +201,8 @@ class _Slew:
         return multiply(from_rotation_vector(share * self.turn), self.start)
 
     def _table(self, wanted: References) -> PointingTable:
-        times = wanted.times
-        field, position = self._ahead.field_at(times), self._ahead.position_at(times)
-        nothing = np.zeros((len(times), 3, 0))
-        return pointing_table(wanted, self.flight.inertia, field, position, nothing, WEIGHTS[self._craft])
+        field, position = self._ahead.field_at(wanted.times), self._ahead.position_at(wanted.times)
+        return table_along(wanted, field, position, self.flight.inertia, WEIGHTS[self._craft])
 
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
@@ -243,5 +241,5 @@ ORBIT_SLEWS = Campaign(
 
 def _gain(table: PointingTable, time: float) -> FloatArray:
     """Return the gain (3, 6) at a time, on a line between the table's."""
-    k, share = table.references.place(time)
-    return np.asarray((1.0 - share) * table.gain[k] + share * table.gain[k + 1])
+    k, share = table.path.place(time)
+    return np.asarray((1.0 - share) * table.gain[k] + share * table.gain[min(k + 1, len(table.gain) - 1)])

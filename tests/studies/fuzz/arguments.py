@@ -49,7 +49,7 @@ from tests.studies.fuzz.vocabulary import FLIGHT, NUMBERS, PATHS, RIGHT, WORDS
 _COMMANDS = {
     name: purpose
     for name, purpose in (cli.COMMANDS | GROUND_COMMANDS).items()
-    if name != "console"  # serves until it is ended
+    if name not in {"console", "gateway"}  # they serve until they are ended
 }
 _DRAWN_EVERY = 200
 _FLOWN_S = 0.075

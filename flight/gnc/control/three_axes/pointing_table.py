@@ -90,8 +90,7 @@ def pointing_table(
     if count < 2 or len(steps) <= count or not np.allclose(steps, steps[0], rtol=1e-6):
         raise UsageError("a pointing table needs even times, three or more, and a preview beyond them")
     dt = float(steps[0])
-    state = dt * np.diag(np.repeat([weights.turn**-2.0, weights.rate**-2.0], 3))
-    dipole = dt * weights.dipole**-2.0
+    state, dipole = _prices(weights, dt)
     shape = shapes(ahead.pressures, attitude_matrix(ahead.wanted.quaternion))
     beyond = _beyond(ahead, count, inertia, state, dipole, shape)
     expected = Expected(
@@ -108,6 +107,31 @@ def pointing_table(
     path = motion.references(expected.wanted.times)
     gain, torque_part = gains.gain[:, :3], gains.steady[:, :3, 1:]
     return PointingTable(path, expected.wanted, motion.control[:, :3], gain, torque_part, ahead.sizes)
+
+
+def table_along(
+    motion: References, field: FloatArray, position: FloatArray, inertia: FloatArray, weights: PointingWeights
+) -> PointingTable:
+    """Return the table that holds a given motion (n + 1,), its torque known ahead; no other is expected.
+
+    `field` (n + 1, 3) T and `position` (n + 1, 3) m, ICRS; `inertia` (3, 3) kg m^2. The gains near the end
+    have less preview.
+    """
+    count, dt = len(motion.times) - 1, float(motion.times[1] - motion.times[0])
+    state, dipole = _prices(weights, dt)
+    linear = linearised(motion.until(count), inertia, field[:count], position[:count])
+    affine = -np.einsum("nij,nj->ni", linear.by_torque, linear.missing)[:, :, None]
+    nothing = np.zeros(affine.shape)
+    states = np.broadcast_to(state, (count, 6, 6))
+    cost = Cost(states, np.full((count, 3), dipole), nothing, nothing[:, :3])
+    gain, steady, _ = sweep(linear, affine, cost, ToGo(state, nothing[0]))
+    return PointingTable(motion, motion, -steady[:, :, 0], gain, np.zeros((count, 3, 0)), np.zeros(0))
+
+
+def _prices(weights: PointingWeights, dt: float) -> tuple[FloatArray, float]:
+    """Return what a step of `dt` s costs: (6, 6) of turn and rate, and of an axis of the dipole."""
+    state = dt * np.diag(np.repeat([weights.turn**-2.0, weights.rate**-2.0], 3))
+    return state, dt * weights.dipole**-2.0
 
 
 def _beyond(
