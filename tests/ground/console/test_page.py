@@ -42,10 +42,10 @@ def test_it_shows_a_log_to_its_end_a_moment_of_it_and_a_link_that_is_dead_or_ove
     page: Page, folder: Path
 ) -> None:
     page.wait("document.getElementById('light').textContent.startsWith('no telemetry for')")
+    page.wait("document.querySelectorAll('.uplot').length === 4")
+    page.wait("document.querySelectorAll('#events tr').length >= 1")
     live, values = page.shown
     assert live == pytest.approx(6.0, abs=0.2)
-    assert page.page.locator(".uplot").count() == 4
-    assert page.page.locator("#events tr").count() >= 1
     assert page.page.locator("form.command").count() == 0, "this console only looks"
     page.page.evaluate("location.hash = '#at=2'")
     page.wait("document.body.dataset.time === '2'")
