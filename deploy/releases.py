@@ -22,6 +22,8 @@ from pathlib import Path
 UNCLEAN = 3
 """Starts in a row after which a release that was never proven is left out."""
 MANIFEST, TRIALS = "manifest", "releases.json"
+DAMAGED = (ValueError, TypeError, AttributeError, LookupError, ArithmeticError, RecursionError)
+"""What reading a record raises that holds anything: another shape, `Infinity`, a deep nest."""
 NAME, NOTE = "KNIGHTCUBE_RELEASE", "KNIGHTCUBE_RELEASE_NOTE"
 _OURS = re.compile(r"(?!venv/)|venv/lib/python[^/]*/site-packages/(flight|hal|sim_hal)/")
 
@@ -86,10 +88,12 @@ class Trials:
         self._path = folder / TRIALS
         self.starts: dict[str, int] = {}
         self.proven: list[str] = []
-        with suppress(OSError, ValueError, TypeError, AttributeError):
+        # Whatever stands in the file, the flight starts: a damaged count is no count.
+        with suppress(OSError, *DAMAGED):
             kept = json.loads(self._path.read_text(encoding="utf-8"))
-            self.starts = {str(name): int(count) for name, count in kept["starts"].items()}
+            starts = {str(name): int(count) for name, count in kept["starts"].items()}
             self.proven = [str(name) for name in kept["proven"]]
+            self.starts = starts
 
     def failed(self, release: Path) -> bool:
         """Return whether a new release has had its starts."""

@@ -62,7 +62,7 @@ class Release:
 
 def _proven(path: Path) -> list[str]:
     """Return the releases that were proven; none where the file is missing or damaged."""
-    with suppress(OSError, ValueError, TypeError, KeyError):
+    with suppress(OSError, ValueError, TypeError, LookupError, RecursionError):
         kept: dict[str, Any] = json.loads(path.read_bytes())
         return [str(name) for name in kept["proven"]]
     return []

@@ -58,7 +58,14 @@ def test_a_release_that_ends_by_itself_has_its_starts_forgiven(board: FakeBoard)
     assert _flown(board, 1) == ["old"]
 
 
-@pytest.mark.parametrize("content", ["", "[", "[]", '{"starts": [], "proven": 7}', '{"starts": {"a": "b"}}'])
+DAMAGED = (
+    *("", "[", "[]", "{}", '{"starts": [], "proven": 7}', '{"starts": {"a": "b"}}', '{"starts": {}}'),
+    *('{"starts": {"0.1.0+2": Infinity}, "proven": []}', '{"starts": {"0.1.0+2": NaN}, "proven": []}'),
+    pytest.param("[" * 100_000, id="deep"),
+)
+
+
+@pytest.mark.parametrize("content", DAMAGED)
 def test_a_damaged_record_of_the_starts_keeps_nothing_from_flying(board: FakeBoard, content: str) -> None:
     (board.root / "state").mkdir()
     (board.root / "state" / TRIALS).write_text(content, encoding="ascii")
