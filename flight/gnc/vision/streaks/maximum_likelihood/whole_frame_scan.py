@@ -42,14 +42,14 @@ def frame_angles(frame: ExposedFrame, pinhole: Pinhole, turn: FloatArray, most: 
         return []
     count = int(np.log(longest / _SHORTEST) / np.log(_FACTOR)) + 1
     widths = np.unique(np.rint(_SHORTEST * _FACTOR ** np.arange(count)).astype(np.int64))
-    room = int(_sharper(int(widths[-1]))[-1]) // 2
+    room = int(sharper_widths(int(widths[-1]), longest)[-1]) // 2
     # Azimuth by azimuth, so that what is compared lies side by side.
     padded = np.pad(np.ascontiguousarray(held.T), ((room, room), (0, 0)), mode="edge")
     score = np.array([_standing_out(padded, room, int(width)) for width in widths])
     before, after = np.append(0.0, score[:-1]), np.append(score[1:], 0.0)
     peak = np.flatnonzero((score > before) & (score >= after))
     peak = peak[np.argsort(-score[peak], kind="stable")][:most]
-    return [_sharpened(padded, room, int(widths[index])) * step for index in peak]
+    return [_sharpened(padded, room, sharper_widths(int(widths[index]), longest)) * step for index in peak]
 
 
 def _standing_out(padded: Float32Array, room: int, width: int) -> float:
@@ -77,14 +77,13 @@ def _standing_out(padded: Float32Array, room: int, width: int) -> float:
     return float(np.sum(np.minimum(best[highest], _ENOUGH) ** 2))
 
 
-def _sharper(width: int) -> IntArray:
-    """Return the widths within half a step of those tried."""
+def sharper_widths(width: int, longest: int) -> IntArray:
+    """Return the widths within half a step of those tried, none over `longest`: half a circle holds no wider box."""
     room = max(1, round(0.6 * (_FACTOR - 1.0) * width))
-    return np.arange(max(width - room, 2), width + room + 1)
+    return np.arange(max(width - room, 2), min(width + room, longest) + 1)
 
 
-def _sharpened(padded: Float32Array, room: int, width: int) -> int:
-    """Return the best width within half a step of those tried."""
-    widths = _sharper(width)
+def _sharpened(padded: Float32Array, room: int, widths: IntArray) -> int:
+    """Return the best of the widths."""
     score = [_standing_out(padded, room, int(each)) for each in widths]
     return int(widths[int(np.argmax(score))])

@@ -13,7 +13,7 @@ from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import expose_fr
 from flight.gnc.vision.streaks.maximum_likelihood.matched_filter import find_faint
 from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
-from flight.gnc.vision.streaks.maximum_likelihood.whole_frame_scan import frame_angles
+from flight.gnc.vision.streaks.maximum_likelihood.whole_frame_scan import frame_angles, sharper_widths
 from sim_hal.star_camera import StarCameraModel
 from tests.flight.gnc.vision.maximum_likelihood.scenes import CAMERA, SATURATION, Scene, real_sky
 from tests.studies.campaigns import failures
@@ -60,6 +60,14 @@ def test_the_light_of_the_whole_frame_tells_the_angle_about_a_roughly_known_axis
     turn = scene.rate * scene.exposure
     told = frame_angles(frame, CAMERA.pinhole, turn + 0.002 * np.linalg.norm(turn), 2)
     assert abs(told[0] / np.linalg.norm(turn) - 1.0) < 0.08
+
+
+@pytest.mark.parametrize("width", [5, 485, 534])
+def test_no_box_is_wider_than_half_a_circle(width: int) -> None:
+    """A frame whose light fitted a box of 534 samples on a circle of 1,081 ended the estimate."""
+    widths = sharper_widths(width, 1081 // 2)
+    assert width in widths
+    assert widths[-1] <= 1081 // 2
 
 
 def test_hardly_any_streak_is_found_where_there_is_only_noise_near_the_axis_too() -> None:
