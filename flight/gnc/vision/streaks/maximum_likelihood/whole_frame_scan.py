@@ -78,7 +78,7 @@ def _standing_out(padded: Float32Array, room: int, width: int) -> float:
 
 
 def sharper_widths(width: int, longest: int) -> IntArray:
-    """Return the widths within half a step of those tried, none over `longest`: half a circle holds no wider box."""
+    """Return the widths within half a step of `width`, none over `longest`."""
     room = max(1, round(0.6 * (_FACTOR - 1.0) * width))
     return np.arange(max(width - room, 2), min(width + room, longest) + 1)
 
