@@ -27,6 +27,7 @@ class Blobs:
         flux: (n,) counts.
         cut: (n,) whether the region reaches the frame's border.
         owner: (m,) region of each pixel; column, row, light: (m,) of it.
+        lit: part of the frame's pixels that lie in regions, chosen or not.
     """
 
     centre: FloatArray
@@ -38,6 +39,7 @@ class Blobs:
     column: IntArray
     row: IntArray
     light: FloatArray
+    lit: float
 
     def __len__(self) -> int:
         return len(self.flux)
@@ -58,7 +60,8 @@ def find_blobs(frame: ExposedFrame, sigmas: float, most: int) -> Blobs:
     owner = rank[number]
     kept = np.flatnonzero(owner >= 0)
     row, column = np.divmod(pixel[kept], frame.shape[1])
-    return _measured(frame, owner[kept], column, row, light[kept], len(chosen))
+    lit = len(pixel) / frame.signal.size
+    return _measured(frame, owner[kept], column, row, light[kept], len(chosen), lit)
 
 
 def _above(sums: Float32Array, floor: Float32Array, sigmas: float) -> IntArray:
@@ -68,7 +71,13 @@ def _above(sums: Float32Array, floor: Float32Array, sigmas: float) -> IntArray:
 
 
 def _measured(
-    frame: ExposedFrame, owner: IntArray, column: IntArray, row: IntArray, light: FloatArray, count: int
+    frame: ExposedFrame,
+    owner: IntArray,
+    column: IntArray,
+    row: IntArray,
+    light: FloatArray,
+    count: int,
+    lit: float,
 ) -> Blobs:
     found = moments(owner, column, row, light, count)
     rows, columns = frame.shape
@@ -83,4 +92,5 @@ def _measured(
         column,
         row,
         light,
+        lit,
     )

@@ -22,6 +22,7 @@ from flight.gnc.vision.streaks.maximum_likelihood.course import Course
 from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import ExposedFrame, expose_frame
 from flight.gnc.vision.streaks.maximum_likelihood.first_guess import guess_axis
 from flight.gnc.vision.streaks.maximum_likelihood.hypotheses import (
+    SAME_ANGLE,
     alike,
     first_fits,
     rescanned_fits,
@@ -48,8 +49,6 @@ from flight.gnc.vision.streaks.streak_result import StreakStatus
 _MOST_BLOBS = 48
 # This many motions are fitted in full before the frame is given up.
 _MOST_MOTIONS = 2
-# Angles are distinguished to this part.
-_SAME_ANGLE = 0.05
 # Median length, px, of regions below which a frame without an agreed motion is one of stars at rest.
 _AT_REST = 4.0
 # The same of the brightest regions, below which no streak of the least length can be among them.
@@ -192,7 +191,7 @@ def _answer(camera: ExposedCamera, seen: MotionResult, blobs: Blobs, near: float
 def _witnessed(turn: FloatArray, angles: list[float]) -> bool:
     """Return whether `turn` (3,) is by the likeliest of the frame's `angles`."""
     size = float(np.linalg.norm(turn))
-    return bool(angles) and abs(size - angles[0]) < _SAME_ANGLE * size
+    return bool(angles) and abs(size - angles[0]) < SAME_ANGLE * size
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -34,6 +34,9 @@ from flight.gnc.vision.streaks.maximum_likelihood.polar_grid import polar_grid
 from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene, mid_exposure, window_times
 from flight.gnc.vision.streaks.maximum_likelihood.whole_frame_scan import frame_angles
 
+SAME_ANGLE = 0.05
+"""Angles are distinguished to this part."""
+
 _FIRST_STARS = 12
 # This many guesses are tried at most.
 _MOST_GUESSES = 5
@@ -52,6 +55,11 @@ _EXPLAINED = 0.4
 _IN_PLACE = 0.6
 _EVIDENT = 3000.0
 _WORST_FIRST = 12.0
+# In a crowded frame, one with this part of its pixels lit, the brightest regions are several stars in one,
+# and a motion as long as those explains a little of everything: up to this much, the light of the whole frame
+# is asked.
+_CROWDED = 0.05
+_BEYOND_CROWD = 100_000.0
 # A star is explained when at most this part of its light is left; none counts more than this many sigmas.
 _LEFT_OVER = 0.01
 _ENOUGH = 200.0
@@ -81,6 +89,10 @@ def first_fits(camera: ExposedCamera, blobs: Blobs, near: float | None) -> Itera
         if any(alike(done.scene.motion.whole, other) for other in yielded):
             continue
         if convincing and all(explained > rival for rival, _ in rivals):
+            likelier = None if rivals else _likelier(camera, blobs, explained, done)
+            if likelier is not None:
+                rivals.append((explained, done))
+                done = likelier
             yielded.append(done.scene.motion.whole)
             yield done
         elif misfit(done.evaluation) <= _WORST_FIRST:
@@ -98,6 +110,27 @@ def first_fits(camera: ExposedCamera, blobs: Blobs, near: float | None) -> Itera
         if not any(alike(done.scene.motion.whole, other) for other in yielded):
             yielded.append(done.scene.motion.whole)
             yield done
+
+
+def _likelier(camera: ExposedCamera, blobs: Blobs, explained: float, done: Fit) -> Fit | None:
+    """Return a fit that explains more than `done`, by the whole frame's light; None without one, or need."""
+    if blobs.lit <= _CROWDED or explained >= _BEYOND_CROWD:
+        return None
+    turn = done.scene.motion.whole
+    size = float(np.linalg.norm(turn))
+    angles = seen_angles(camera, turn)
+    if any(abs(size - angle) < SAME_ANGLE * size for angle in angles):
+        return None
+    best = None
+    for light, convincing, fit in _rescanned(camera, turn, angles):
+        if light <= explained:
+            continue
+        if abs(float(np.linalg.norm(fit.scene.motion.whole)) - size) < SAME_ANGLE * size:
+            return None
+        best, explained = fit, light
+        if convincing:
+            break
+    return best
 
 
 def seen_angles(camera: ExposedCamera, turn: FloatArray) -> list[float]:
