@@ -1,0 +1,1 @@
+"""Tracking of objects by the directions in which a camera sees them: bearings only."""

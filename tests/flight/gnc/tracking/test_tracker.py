@@ -1,0 +1,131 @@
+"""Tracks of objects by bearings alone: honest errors, several objects, loss of sight, no false tracks."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.tracking.line_of_sight import Motion, begin, predict, update
+from flight.gnc.tracking.tracker import Tracker, TrackerSettings
+from tests.flight.gnc.tracking.passes import PIXEL, Pass, a_pass, sightings
+
+_SIGMA, _ATTITUDE = 0.1 * PIXEL, 0.05 * PIXEL
+_PERIOD = 1.0
+
+
+def _nees(flown: Pass, rng: np.random.Generator, motion: Motion) -> tuple[FloatArray, FloatArray]:
+    """Return the squared error over its covariance of direction and of rate, two degrees each, a frame."""
+    state = None
+    places: list[float] = []
+    rates: list[float] = []
+    basis = np.zeros((2, 3))
+    for index, time in enumerate(flown.times):
+        frame = sightings(rng, time, flown.directions[index : index + 1], _SIGMA, _ATTITUDE)
+        spread = frame.covariance[0] + frame.attitude
+        if state is None:
+            state = begin(frame.time_ns, frame.directions[0], spread, motion)
+            continue
+        state = update(predict(state, frame.time_ns, motion), frame.directions[0], spread)
+        basis = np.linalg.svd(state.direction[None])[2][1:]
+        for kept, error, block in (
+            (places, flown.directions[index] - state.direction, slice(0, 3)),
+            (rates, flown.rates[index] - state.rate, slice(3, 6)),
+        ):
+            across = basis @ error
+            covariance = basis @ state.covariance[block, block] @ basis.T
+            kept.append(float(across @ np.linalg.solve(covariance, across)))
+    return np.array(places[8:]), np.array(rates[8:])
+
+
+def test_the_errors_are_as_large_as_the_covariance_says() -> None:
+    """Chi-square of the normalised errors of 60 passes, each taken at its end: 120 degrees of freedom."""
+    rng = np.random.default_rng(16)
+    times = np.arange(0.0, 40.0, _PERIOD)
+    place, rate = [], []
+    for rate_deg in np.geomspace(0.05, 0.6, 60):
+        flown = a_pass(rng, np.radians(rate_deg), times, rng.uniform(0.0, 40.0))
+        places, rates = _nees(flown, rng, Motion())
+        place.append(places[-1])
+        rate.append(rates[-1])
+    # 99 % and more of chi-square(120) / 60 lies within 1.25 and 2.9.
+    assert 1.25 < np.mean(place) < 2.9
+    assert 1.25 < np.mean(rate) < 2.9
+
+
+def test_no_pass_of_a_tracked_object_is_lost_or_doubled_through_ten_seconds_without_it() -> None:
+    rng = np.random.default_rng(3)
+    times = np.arange(0.0, 40.0, _PERIOD)
+    for rate_deg in (0.05, 0.15, 0.3, 0.6):
+        flown = a_pass(rng, np.radians(rate_deg), times, 20.0)
+        tracker = Tracker(TrackerSettings())
+        for index, time in enumerate(times):
+            lost = 14.0 <= time < 24.0
+            seen = flown.directions[index : index + 1] if not lost else np.zeros((0, 3))
+            confirmed, ended = tracker.ingest(sightings(rng, time, seen, _SIGMA, _ATTITUDE))
+            assert not ended
+            assert len(confirmed) == (time == 3.0)
+            if lost and time == 23.0:
+                (track,) = tracker.objects
+                away = np.linalg.norm(track.line.direction - flown.directions[index])
+                assert away < 3.0 * PIXEL
+        (track,) = tracker.objects
+        assert track.number == 1
+        assert np.linalg.norm(track.line.direction - flown.directions[-1]) < 0.5 * PIXEL
+
+
+def test_a_track_ends_when_its_object_stays_away() -> None:
+    rng = np.random.default_rng(4)
+    flown = a_pass(rng, np.radians(0.2), np.arange(0.0, 30.0, 1.0), 10.0)
+    tracker = Tracker(TrackerSettings())
+    ends = []
+    for index, time in enumerate(flown.times):
+        seen = flown.directions[index : index + 1] if time < 8.0 else np.zeros((0, 3))
+        ends += [time for _ in tracker.ingest(sightings(rng, time, seen, _SIGMA, _ATTITUDE))[1]]
+    # Seen at 7 s for the last time, and looked for with each frame.
+    assert ends == [7.0 + TrackerSettings().coast + 1.0]
+    assert tracker.objects == ()
+
+
+def test_two_objects_that_cross_keep_their_numbers() -> None:
+    rng = np.random.default_rng(5)
+    times = np.arange(0.0, 30.0, 1.0)
+    slow = a_pass(rng, np.radians(0.1), times, 15.0).directions
+    # The same sky, mirrored about a plane through the first one's middle: the paths cross there.
+    middle = slow[15]
+    normal = np.cross(middle, slow[16])
+    normal /= np.linalg.norm(normal)
+    aside = np.cross(normal, middle)
+    fast = slow - 2.0 * np.outer(slow @ aside, aside)
+    fast = fast + 0.02 * np.radians(times - 15.0)[:, None] * normal
+    fast /= np.linalg.norm(fast, axis=1, keepdims=True)
+    tracker = Tracker(TrackerSettings())
+    for index, time in enumerate(times):
+        both = np.array([slow[index], fast[index]])
+        tracker.ingest(sightings(rng, time, both, _SIGMA, _ATTITUDE, np.array([3.0, 5.0])))
+    first, second = sorted(tracker.objects, key=lambda track: track.magnitude)
+    assert np.linalg.norm(first.line.direction - slow[-1]) < PIXEL
+    assert np.linalg.norm(second.line.direction - fast[-1]) < PIXEL
+    assert second.magnitude == pytest.approx(5.0)
+
+
+def test_noise_and_stars_that_no_catalogue_has_make_no_track_in_100_frames() -> None:
+    rng = np.random.default_rng(6)
+    fixed = np.array([0.0, 0.0, 1.0]) + rng.uniform(-0.17, 0.17, size=(5, 3)) * [1.0, 1.0, 0.0]
+    tracker = Tracker(TrackerSettings())
+    for index in range(100):
+        noise = np.array([0.0, 0.0, 1.0]) + rng.uniform(-0.17, 0.17, size=(3, 3)) * [1.0, 1.0, 0.0]
+        seen = np.vstack([fixed, noise])
+        seen /= np.linalg.norm(seen, axis=1, keepdims=True)
+        frame = sightings(rng, index * _PERIOD, seen, _SIGMA, _ATTITUDE, rng.uniform(2.0, 6.0, len(seen)))
+        confirmed, _ = tracker.ingest(frame)
+        assert not confirmed
+
+
+def test_a_frame_older_than_the_last_is_refused() -> None:
+    rng = np.random.default_rng(7)
+    tracker = Tracker(TrackerSettings())
+    one = np.array([[0.0, 0.0, 1.0]])
+    tracker.ingest(sightings(rng, 5.0, one, _SIGMA, _ATTITUDE))
+    with pytest.raises(ValueError, match="give one from"):
+        tracker.ingest(sightings(rng, 4.0, one, _SIGMA, _ATTITUDE))
