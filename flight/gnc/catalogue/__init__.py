@@ -11,6 +11,7 @@ close pair is one entry with the joint magnitude, as in Hipparcos.
 from __future__ import annotations
 
 import zipfile
+import zlib
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -32,6 +33,18 @@ COLUMNS = {
     "magnitude": np.int16,
 }
 """The table's columns: -, mas, mas, 0.01 mas/yr (n, 2) as mu_alpha cos(delta) and mu_delta, 0.01 mag."""
+
+_DAMAGED = (
+    OSError,
+    ValueError,
+    TypeError,
+    LookupError,
+    EOFError,
+    RuntimeError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+"""What a damaged archive raises; RuntimeError for a compression or an encryption that is not known."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,7 +96,7 @@ def load(table: Path = TABLE) -> StarCatalogue:
     try:
         with table.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             columns = {name: stored[name] for name in COLUMNS}
-    except (OSError, ValueError, TypeError, KeyError, EOFError, zipfile.BadZipFile) as error:
+    except _DAMAGED as error:
         cure = "make it again with `python -m flight.gnc.catalogue.build WHEEL_OR_PARQUET`"
         raise InputError(str(table), f"no star table can be read here ({error}); {cure}") from error
     ra = columns["right_ascension"] * MILLIARCSECOND

@@ -82,10 +82,16 @@ class TwoLineElements:
     """A two-line element set; `sigma` m of an axis grows by `growth` m a day from its epoch."""
 
     def __init__(self, first: str, second: str, sigma: float = 1500.0, growth: float = 1500.0) -> None:
-        """Read the two lines. Raises UsageError for invalid lines or a wrong checksum."""
+        """Read the two lines. Raises UsageError for invalid lines and elements of no orbit."""
         for number, line in (("1", first), ("2", second)):
             _check_line(number, line)
         self._satellite = Satrec.twoline2rv(first.rstrip(), second.rstrip())
+        code, *place = self._satellite.sgp4_tsince(0.0)
+        if code or not np.all(np.isfinite(place)):
+            reason = SGP4_ERRORS[code] if code else "a column holds no number"
+            raise UsageError(
+                f"{second.rstrip()!r}: these elements describe no orbit at their epoch: {reason}"
+            )
         self._sigma, self._growth = sigma, growth
 
     def at(self, julian_date: float) -> OrbitState:
@@ -131,6 +137,8 @@ def _check_line(number: str, line: str) -> None:
     line = line.rstrip()
     if len(line) != 69 or not line.startswith(f"{number} "):
         raise UsageError(f"{line!r}: line {number} of a two-line element set has 69 columns and begins so")
+    if not (line.isascii() and line.isprintable()):
+        raise UsageError(f"{line!r}: a two-line element set is of printable ASCII characters")
     total = sum(int(c) if c.isdigit() else c == "-" for c in line[:68]) % 10
     if str(total) != line[68]:
         raise UsageError(f"{line!r}: checksum {line[68]}, its columns add up to {total}")

@@ -116,5 +116,5 @@ def _decode(data: bytes) -> _Copy | None:
         return None
     try:
         return msgspec.json.decode(line, type=_Copy)
-    except msgspec.DecodeError:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return None

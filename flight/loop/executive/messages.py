@@ -14,6 +14,7 @@ import mmap
 import pickle
 import struct
 import sys
+import zlib
 from collections.abc import Iterable
 from typing import Any
 
@@ -24,7 +25,8 @@ SLAB_BYTES = 64 * 1024 * 1024
 LONGEST_BYTES = 16 * 1024 * 1024
 """A message without its arrays that claims to be longer is damaged."""
 
-_HEADER = struct.Struct("<QQ")
+_HEADER = struct.Struct("<QQI")
+"""Lengths of the arrays' sizes and of the body, and the CRC-32 of both."""
 _BUILTINS = {"complex", "set", "frozenset", "bytearray", "slice", "range"}
 _NUMPY = {"ndarray", "dtype", "scalar", "_frombuffer", "_reconstruct"}
 
@@ -41,7 +43,7 @@ def pack_message(value: Any, slab: mmap.mmap) -> bytes:
         slab[offset : offset + view.nbytes] = view
         offset += view.nbytes
     head = struct.pack(f"<{len(views)}Q", *(view.nbytes for view in views))
-    return _HEADER.pack(len(head), len(body)) + head + body
+    return _HEADER.pack(len(head), len(body), zlib.crc32(body, zlib.crc32(head))) + head + body
 
 
 def unpack_trusted(message: bytes, slab: mmap.mmap) -> Any:
@@ -68,15 +70,17 @@ def message_length(data: bytes | bytearray) -> int | None:
     """
     if len(data) < _HEADER.size:
         return None
-    head_length, body_length = _HEADER.unpack_from(data)
+    head_length, body_length, _ = _HEADER.unpack_from(data)
     if (length := _HEADER.size + int(head_length) + int(body_length)) > LONGEST_BYTES:
         raise FlightError(f"a message of {length} bytes is damaged")
     return length
 
 
 def _parts(message: bytes, slab: mmap.mmap) -> tuple[bytes, list[bytearray]]:
-    head_length, body_length = _HEADER.unpack_from(message)
+    head_length, body_length, crc = _HEADER.unpack_from(message)
     head_end = _HEADER.size + head_length
+    if zlib.crc32(message[_HEADER.size : head_end + body_length]) != crc:
+        raise FlightError("a message with a wrong checksum is damaged")
     buffers = []
     offset = 0
     with memoryview(slab) as view:

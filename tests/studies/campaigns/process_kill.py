@@ -112,11 +112,14 @@ def _hurt_flight(flight: LiveFlight, board: Board, rng: np.random.Generator) -> 
     deadline = time.monotonic() + _GONE_S
     while any(map(lives, children)) and time.monotonic() < deadline:
         time.sleep(0.02)
+    orphans = [child for child in children if lives(child)]
+    for child in orphans:  # counted, and gone: one that is stopped would hold the flight's pipe for ever
+        os.kill(child, signal.SIGKILL)
     return {
         "sent": sent.name,
         "current_before_a": before,
         "zero_after_s": zero_after,
-        "orphans": sum(map(lives, children)),
+        "orphans": len(orphans),
     }
 
 

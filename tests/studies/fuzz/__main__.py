@@ -18,6 +18,20 @@ TARGETS = {
     "logs": "tests.studies.fuzz.logs:Logs",
     "link": "tests.studies.fuzz.link_frames:LinkFrames",
     "cli": "tests.studies.fuzz.arguments:Arguments",
+    "state": "tests.studies.fuzz.stored_files:state",
+    "schedule": "tests.studies.fuzz.stored_files:schedule",
+    "keys": "tests.studies.fuzz.stored_files:keys",
+    "releases": "tests.studies.fuzz.stored_files:releases",
+    "flown": "tests.studies.fuzz.stored_files:flown",
+    "elements": "tests.studies.fuzz.stored_files:elements",
+    "index": "tests.studies.fuzz.tables:index",
+    "stars": "tests.studies.fuzz.tables:stars",
+    "images": "tests.studies.fuzz.tables:images",
+    "gps": "tests.studies.fuzz.wires:gps",
+    "i2c": "tests.studies.fuzz.wires:Parts",
+    "uplink": "tests.studies.fuzz.wires:uplink",
+    "downlink": "tests.studies.fuzz.wires:downlink",
+    "workers": "tests.studies.fuzz.wires:workers",
 }
 
 

@@ -16,14 +16,26 @@ from tests.studies.fuzz.logs import collisions_allowed
 from tests.studies.fuzz.vn100 import candidates
 from tests.studies.fuzz.vn100_packets import checksum
 
-SLICES = {"vn100": 250, "config": 40, "commands": 1500, "logs": 80, "link": 800, "cli": 60}
+SLICES = {
+    "vn100": 250,
+    "config": 40,
+    "commands": 1500,
+    "logs": 80,
+    "link": 800,
+    "cli": 60,
+    "flown": 30,
+    "releases": 60,
+}
+OTHERS = 250
+"""Inputs of a target that reads little."""
 
 
 @pytest.mark.parametrize("name", TARGETS)
 def test_a_slice_of_the_campaign_finds_nothing(name: str) -> None:
-    campaign = run(name, target_of(name), SLICES[name], seed=7)
+    inputs = SLICES.get(name, OTHERS)
+    campaign = run(name, target_of(name), inputs, seed=7)
     assert campaign.sound, campaign.findings
-    assert campaign.inputs == SLICES[name]
+    assert campaign.inputs == inputs
     damaged = campaign.tallies["damaged"]
     assert campaign.tallies["collisions"] <= collisions_allowed(damaged)
 
@@ -84,6 +96,11 @@ def test_a_gate_that_skips_the_mac_or_the_counter_is_found_out(monkeypatch: pyte
 def test_a_scanner_that_skips_the_checksum_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("flight.link.telemetry.walk.crc16", lambda _: 0)
     assert not run("logs", target_of("logs"), 30, seed=7).sound
+
+
+def test_a_reader_of_keys_that_skips_the_checksum_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("flight.link.security.associations.zlib.crc32", lambda _: 0)
+    assert not run("keys", target_of("keys"), 60, seed=7).sound
 
 
 def test_the_second_parsers_checksum_is_that_of_the_manual() -> None:

@@ -53,6 +53,14 @@ def wait(runner: JobRunner, seconds: float = 20.0) -> list[JobResult]:
     raise AssertionError("no result arrived")
 
 
+def started(runner: ProcessRunner, name: str, seconds: float = 20.0) -> int:
+    """Return a worker's process identifier, once its supervisor has started it."""
+    deadline = time.monotonic() + seconds
+    while name not in runner.process_identifiers() and time.monotonic() < deadline:
+        time.sleep(0.005)
+    return runner.process_identifiers()[name]
+
+
 @pytest.fixture(scope="module")
 def processes() -> Iterator[ProcessRunner]:
     """Return workers for all tests here: each of them leaves every worker idle, or replaced."""
@@ -110,7 +118,7 @@ def test_a_failure_in_a_process_names_its_reason(processes: ProcessRunner) -> No
 
 @pytest.mark.slow
 def test_a_hung_worker_is_killed_and_replaced(processes: ProcessRunner) -> None:
-    old = processes.process_identifiers()["hang"]
+    old = started(processes, "hang")
     processes.submit("hang", None)
     (result,) = wait(processes)
     assert (result.worker, result.outcome) == ("hang", "timed-out")
@@ -135,7 +143,7 @@ def test_a_worker_that_dies_is_reported_and_replaced_at_work_or_idle(processes: 
     (result,) = wait(processes)
     assert (result.worker, result.outcome) == ("die", "died")
     assert "status 3" in hear(processes, "die", Change.DIED).text
-    os.kill(processes.process_identifiers()["double"], signal.SIGKILL)
+    os.kill(started(processes, "double"), signal.SIGKILL)
     assert "signal 9" in hear(processes, "double", Change.DIED).text
     hear(processes, "double", Change.READY)
     assert processes.collect() == [], "no job was lost"

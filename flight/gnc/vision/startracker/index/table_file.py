@@ -8,6 +8,7 @@ bytes, little-endian. The same columns make the same bytes.
 from __future__ import annotations
 
 import json
+import math
 import mmap
 import os
 import struct
@@ -25,6 +26,8 @@ Columns = dict[str, npt.NDArray[Any]]
 Facts = dict[str, float]
 _HEADER = struct.Struct("<8sIII")
 _ALIGNMENT = 64
+_UNFIT = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError, SyntaxError)
+"""What contents raise that another program wrote under a right checksum."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,13 +89,21 @@ def load(path: Path, kind: Kind) -> tuple[Columns, Facts]:
         raise InputError(str(path), f"a {name} of version {version}, {kind.version} is wanted; {cure}")
     if zlib.crc32(memoryview(mapped)[_HEADER.size :]) != checksum:
         raise InputError(str(path), f"the {name} is damaged, its CRC-32 is wrong; {cure}")
-    contents = json.loads(mapped[_HEADER.size : _HEADER.size + length])
-    begin = _HEADER.size + length
+    try:
+        return _columns(mapped, _HEADER.size + length)
+    except _UNFIT as error:
+        raise InputError(str(path), f"the {name}'s contents cannot be read ({error}); {cure}") from error
+
+
+def _columns(mapped: mmap.mmap, begin: int) -> tuple[Columns, Facts]:
+    contents = json.loads(mapped[_HEADER.size : begin])
     columns = {
-        name: np.frombuffer(mapped, kind, int(np.prod(shape)), begin + offset).reshape(shape)
+        name: np.frombuffer(mapped, np.dtype(kind), math.prod(shape), begin + offset).reshape(shape)
         for name, (kind, shape, offset) in contents["columns"].items()
     }
-    return columns, contents["facts"]
+    if any(column.dtype.hasobject for column in columns.values()):
+        raise TypeError("a column is not of numbers")
+    return columns, {str(name): float(fact) for name, fact in contents["facts"].items()}
 
 
 def _little(column: npt.NDArray[Any]) -> npt.NDArray[Any]:
