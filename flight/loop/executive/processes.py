@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import mmap
 import os
+import shutil
 import socket
 import subprocess
 import sys
@@ -32,6 +33,10 @@ MODULE = "flight.loop.executive.worker"
 """The module that a worker's process runs."""
 
 _REAPED_WITHIN_S = 1.0
+
+_SETPRIV = shutil.which("setpriv")  # util-linux
+_ENDS_WITH_PARENT = (_SETPRIV, "--pdeathsig", "KILL", "--") if _SETPRIV else ()
+"""The worker asks for this itself too, but only once Python has started: one stopped before would stay."""
 
 
 class WorkerProcess:
@@ -63,7 +68,7 @@ class WorkerProcess:
         function = f"{worker.function.__module__}:{worker.function.__qualname__}"
         words = [function, str(line), str(memory), str(os.getpid()), ",".join(map(str, sorted(cores)))]
         return subprocess.Popen(
-            [sys.executable, "-m", MODULE, *words],
+            [*_ENDS_WITH_PARENT, sys.executable, "-m", MODULE, *words],
             pass_fds=(line, memory),
             stdin=subprocess.DEVNULL,
             start_new_session=True,  # Ctrl-C is for the control process, which then closes its workers
