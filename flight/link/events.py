@@ -196,6 +196,11 @@ STRINGS_RECOVERED = EventKind(105, "strings-recovered", _TOLD, "the solar string
 SUN_UNCLEAR = EventKind(106, "sun-unclear", _WARNED, "the solar strings see no Sun in the sunlight")
 SUN_CLEAR = EventKind(107, "sun-clear", _TOLD, "the solar strings see the Sun again")
 
+OBJECT_FOUND = EventKind(120, "object-found", _TOLD, "a track of an object that is no star is confirmed")
+OBJECT_LOST = EventKind(
+    121, "object-lost", _TOLD, "the track of an object ended: it was not seen for too long"
+)
+
 EVENTS: tuple[EventKind, ...] = tuple(
     value for value in dict(vars()).values() if isinstance(value, EventKind)
 )

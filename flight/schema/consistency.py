@@ -162,6 +162,13 @@ def _check_link(link: Link, commands: Commands, refuse: Refuse) -> None:
 def _check_camera(camera: Camera, refuse: Refuse) -> None:
     if camera.exposure >= camera.period:
         refuse("camera.exposure", "must be shorter than `camera.period`")
+    if camera.objects is not None:
+        if camera.star_tracker is None:
+            refuse(
+                "camera.objects", "needs `camera.star_tracker`: objects are sighted among identified stars"
+            )
+        if camera.objects.needed > camera.objects.within:
+            refuse("camera.objects.needed", f"is {camera.objects.needed}: must not be above `within`")
     if camera.device is not None:
         pixel_format, possible = camera.device.pixel_format, PIXEL_BITS[camera.device.pixel_format]
         if camera.bits not in possible:

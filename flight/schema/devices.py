@@ -100,6 +100,19 @@ class StarTracker(Section, frozen=True, kw_only=True):
     velocity: tuple[float, float, float] | None = None
 
 
+class ObjectTracking(Section, frozen=True, kw_only=True):
+    """Search for objects among the stars of each frame, and their tracks.
+
+    Nothing fainter than `faintest` (V) is one. A track begins after `needed` sightings in `within` frames and
+    ends after `coast` s without one.
+    """
+
+    faintest: Annotated[float, Meta(ge=-5.0, le=8.0)] = 7.0
+    needed: Annotated[int, Meta(ge=3, le=16)] = 4
+    within: Annotated[int, Meta(ge=3, le=32)] = 6
+    coast: Positive = 15.0
+
+
 class V4l2Device(Section, frozen=True, kw_only=True, tag_field="kind", tag="v4l2"):
     """A camera of Video for Linux (`hal.drivers.v4l2_camera`); gain in its own steps, `stamp_delay` in s."""
 
@@ -142,6 +155,7 @@ class Camera(Section, frozen=True, kw_only=True):
     line_time: NotNegative = 0.0
     estimator: Estimator = "likelihood"
     star_tracker: StarTracker | None = None
+    objects: ObjectTracking | None = None
     endpoint_bias: float | None = None
     mounting: Quaternion = (0.0, 0.0, 0.0, 1.0)
     max_rate: Positive = math.inf

@@ -7,7 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from flight.gnc.tracking.tracker import TrackerSettings as TrackerOfObjects
 from flight.gnc.vision.frame_job import TrackerSettings
+from flight.gnc.vision.objects.sighted import SightSettings
 from flight.gnc.vision.startracker.detection import DetectionSettings
 from flight.gnc.vision.startracker.identification.lost_in_space import IdentificationSettings
 from flight.gnc.vision.startracker.solve import SolveSettings
@@ -17,7 +19,7 @@ from flight.loop.body import Body
 from flight.loop.tasks.frame_measurements import ImagingSettings
 from flight.loop.tasks.navigation import NavigationSettings
 from flight.schema.camera_model import camera_knowledge, camera_model
-from flight.schema.devices import Camera
+from flight.schema.devices import Camera, ObjectTracking
 from flight.schema.sections import Config
 from hal.interfaces.wires import SECOND_NS
 
@@ -46,7 +48,13 @@ def imaging_settings(camera: Camera, body: Body) -> ImagingSettings:
         tracker=_tracker(camera),
         angular_acceleration_psd=body.angular_acceleration_psd,
         velocity=body.velocity,
+        objects=None if camera.objects is None else SightSettings(faintest=camera.objects.faintest),
     )
+
+
+def tracker_settings(section: ObjectTracking) -> TrackerOfObjects:
+    """Return how tracks of objects start, go on and end."""
+    return TrackerOfObjects(needed=section.needed, within=section.within, coast=section.coast)
 
 
 def _tracker(camera: Camera) -> TrackerSettings | None:

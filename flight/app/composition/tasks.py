@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flight.app.composition.bodies import body_kind
-from flight.app.composition.settings import imaging_settings, navigation_settings
+from flight.app.composition.settings import imaging_settings, navigation_settings, tracker_settings
 from flight.app.composition.workers import worker_watches
 from flight.link.commands.channel import Channel
 from flight.link.telemetry.recorder import Recorder
@@ -28,6 +28,7 @@ from flight.loop.tasks.housekeeping import Housekeeping, Watched
 from flight.loop.tasks.imaging import Imaging
 from flight.loop.tasks.mode_control import ModeControl, ModeSettings
 from flight.loop.tasks.navigation import Navigation
+from flight.loop.tasks.object_tracking import ObjectTracking
 from flight.loop.tasks.performance import PerformanceObserver
 from flight.loop.tasks.positioning import Positioning
 from flight.loop.tasks.steering import Steering
@@ -124,4 +125,6 @@ def _imaging(
     if camera is None or source is None:
         return None
     settings = imaging_settings(camera, body)
-    return Imaging(source, settings, navigation, body.view, services)
+    section = camera.objects
+    objects = None if section is None else ObjectTracking(tracker_settings(section), services)
+    return Imaging(source, settings, navigation, body.view, services, objects)

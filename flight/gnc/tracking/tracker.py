@@ -22,6 +22,8 @@ from flight.gnc.math.directions import cross_matrices
 from flight.gnc.tracking.line_of_sight import LineOfSight, Motion, begin, compare, predict, update
 from flight.gnc.tracking.sightings import Sightings
 
+_UNSEEN = np.full(3, np.nan)
+
 
 @dataclass(frozen=True, slots=True)
 class TrackerSettings:
@@ -60,6 +62,8 @@ class Track:
         sightings: how many; `frames` since the start.
         magnitude: mean of the sightings', NaN when unknown.
         history: one bit a frame, the newest lowest: seen or not.
+        measured: (3,) direction of the newest frame's sighting, NaN where it has none.
+        measured_sigma: rad along an axis, of that, the attitude's share included.
         chi_square: of the sightings against their predictions, two degrees of freedom each after the first.
     """
 
@@ -70,6 +74,8 @@ class Track:
     frames: int
     magnitude: float
     history: int
+    measured: FloatArray
+    measured_sigma: float
     chi_square: float = 0.0
 
     @property
@@ -125,7 +131,7 @@ class Tracker:
             number = taken.get(index)
             history = (track.history << 1) & ((1 << self._settings.within) - 1)
             if number is None:
-                after.append(replace(track, history=history))
+                after.append(replace(track, history=history, measured=_UNSEEN, measured_sigma=math.nan))
             else:
                 after.append(self._seen(replace(track, history=history | 1), frame, number, spread))
         alive = [track for track in after if self._lives(track, frame.time_ns)]
@@ -173,6 +179,8 @@ class Tracker:
             seen_ns=frame.time_ns,
             sightings=count,
             magnitude=mean,
+            measured=frame.directions[number],
+            measured_sigma=_sigma(spread[number]),
             chi_square=track.chi_square + seen.chi_square,
         )
 
@@ -219,9 +227,16 @@ class Tracker:
                 1,
                 float(frame.magnitudes[number]),
                 1,
+                frame.directions[number],
+                _sigma(spread[number]),
             )
             for number in free[: max(room, 0)]
         ]
+
+
+def _sigma(covariance: FloatArray) -> float:
+    """Return the standard deviation along an axis, rad, of a direction with a covariance (3, 3)."""
+    return math.sqrt(0.5 * float(np.trace(covariance)))
 
 
 def _with_attitude(frame: Sightings) -> FloatArray:

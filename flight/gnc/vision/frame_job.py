@@ -23,6 +23,7 @@ import numpy as np
 
 from flight.gnc.camera.lens import CameraModel
 from flight.gnc.math.arrays import Image
+from flight.gnc.vision.objects.sighted import Sighted, SightSettings
 from flight.gnc.vision.startracker.detection import FrameKind, Survey, measure_areas, survey
 from flight.gnc.vision.startracker.index import sky_index
 from flight.gnc.vision.startracker.index.build import default_index
@@ -78,6 +79,7 @@ class FrameJob:
         tracker: None: stars are not identified.
         previous_checksum: of the frame before; the same pixels again mean a frozen camera.
         motion_first: whether the motion is estimated in any case, not only where a survey shows streaks.
+        objects: how objects are sighted once the stars gave the attitude; None: they are not.
     """
 
     pixels: Image
@@ -89,14 +91,19 @@ class FrameJob:
     attitude_prior: AttitudePrior | None
     previous_checksum: int | None = None
     motion_first: bool = True
+    objects: SightSettings | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class FrameFound:
-    """The motion over the exposure, and the attitude in its middle; None if stars were not looked for."""
+    """The motion over the exposure, and the attitude in its middle; None if stars were not looked for.
+
+    `objects` are what may be objects; None if they were not looked for, or the attitude is not known.
+    """
 
     motion: Found
     solution: FrameSolution | None
+    objects: Sighted | None = None
 
 
 def run(job: FrameJob) -> FrameFound:
@@ -105,7 +112,10 @@ def run(job: FrameJob) -> FrameFound:
     if tracker is None:
         return FrameFound(_motion(job), None)
     sky = default_index() if tracker.index is None else sky_index.load_once(tracker.index)
-    return attitude_and_rate(job, tracker, sky)
+    found = attitude_and_rate(job, tracker, sky)
+    if job.objects is None or found.solution is None:
+        return found
+    return replace(found, objects=_objects(job, tracker, sky, found.solution, job.objects))
 
 
 def prepare() -> tuple[Callable[..., MotionResult], Callable[..., StreakResult]]:
@@ -225,6 +235,23 @@ def _motion(job: FrameJob) -> Found:
         course = prior.course if prior is not None else None
         return estimate_motion(job.pixels, lens, job.exposure, estimator, rate, sigma, previous, course)
     return estimate_rate(job.pixels, lens, job.exposure, estimator, rate, sigma, previous)
+
+
+def _objects(
+    job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, solution: FrameSolution, settings: SightSettings
+) -> Sighted | None:
+    """Return what may be objects."""
+    from flight.gnc.vision.objects.sight import sight  # noqa: PLC0415 - scipy comes with it
+
+    return sight(
+        job.pixels,
+        solution,
+        job.exposure,
+        sky.stars.epoch,
+        tracker.solve.velocity,
+        tracker.solve.detection,
+        settings,
+    )
 
 
 def _no_motion(job: FrameJob) -> MotionResult:

@@ -22,7 +22,7 @@ from flight.link.telemetry.motion_definitions import (
 )
 from flight.link.telemetry.orbit_definitions import NAVIGATION, ORBIT_TRUTH, SPIN
 from flight.link.telemetry.performance_definitions import CYCLE_TIMING, JOB_TIMING, RATE_GROUP
-from flight.link.telemetry.vision_definitions import STARS, STREAK
+from flight.link.telemetry.vision_definitions import SIGHTINGS, STARS, STREAK, TRACK
 
 __all__ = [
     "ATTITUDE",
@@ -43,10 +43,12 @@ __all__ = [
     "PLAN",
     "RATE_GROUP",
     "RUN",
+    "SIGHTINGS",
     "SPIN",
     "STARS",
     "STREAK",
     "TARGET",
+    "TRACK",
     "TRUTH",
     "VERIFICATION",
 ]
@@ -63,6 +65,8 @@ PACKETS: tuple[Packet, ...] = (
     PLAN,
     STREAK,
     STARS,
+    SIGHTINGS,
+    TRACK,
     EVENT,
     HOUSEKEEPING,
     HEALTH,

@@ -1,4 +1,4 @@
-"""Packets of the star camera: streaks and stars."""
+"""Packets of the star camera: streaks, stars and objects."""
 
 from __future__ import annotations
 
@@ -47,5 +47,46 @@ STARS = Packet(
         Field("covariance", "f8", "rad^2", "xx yy zz xy xz yz of small turns, body axes; NaN when none", 6),
         Field("log10_false_alarm", "f8", "-", "log10 of the chance matches expected in the whole sky"),
         Field("accepted", "u1", "-", "entered the estimate", states=NO_YES),
+    ),
+)
+
+MOST_SIGHTINGS = 8
+"""Of a frame that its packet holds."""
+
+SIGHTINGS = Packet(
+    "sightings",
+    0x123,
+    "each frame searched for objects",
+    "What in one frame is no star: objects, and what only tracks over frames distinguish from them",
+    (
+        counter("sequence", "the camera's count"),
+        Field("middle_ns", "i8", "ns", "mission time of the exposure's middle"),
+        Field("found", "u2", "-", "sightings, of which the packet holds the brightest"),
+        Field("x", "f4", "px", "column of each, brightest first; NaN for none", MOST_SIGHTINGS),
+        Field("y", "f4", "px", "row of each; NaN for none", MOST_SIGHTINGS),
+        Field("magnitude", "f4", "mag", "V by the frame's stars; NaN when unknown", MOST_SIGHTINGS),
+    ),
+)
+
+TRACK = Packet(
+    "track",
+    0x124,
+    "each object in each frame searched",
+    "The line of sight to an object, tracked over frames; directions in the axes of the attitude's reference",
+    (
+        Field("number", "u4", "-", "of the object in this flight, from 1"),
+        Field("middle_ns", "i8", "ns", "mission time of the exposure's middle"),
+        Field("seen", "u1", "-", "the frame shows it; no: predicted", states=NO_YES),
+        Field("sightings", "u4", "-", "since the start of the track"),
+        Field("measured", "f8", "-", "direction in this frame; NaN when not seen", 3),
+        Field(
+            "measured_sigma", "f8", "rad", "along an axis, the attitude's share included; NaN when not seen"
+        ),
+        Field("direction", "f8", "-", "of the track", 3),
+        Field("rate", "f8", "rad/s", "change of the direction", 3),
+        Field("acceleration", "f8", "rad/s^2", "change of the rate, at right angles to the direction", 3),
+        Field("covariance", "f8", "rad^2", "xx yy zz xy xz yz of the direction", 6),
+        Field("rate_covariance", "f8", "rad^2/s^2", "xx yy zz xy xz yz of the rate", 6),
+        Field("magnitude", "f8", "mag", "V, mean over sightings; NaN when unknown"),
     ),
 )

@@ -14,6 +14,7 @@ from flight.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeas
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
 from flight.gnc.vision.frame_job import Found, FrameFound, FrameJob, TrackerSettings
+from flight.gnc.vision.objects.sighted import SightSettings
 from flight.gnc.vision.startracker.mid_exposure import NODES, middle_covariance, weighting_of
 from flight.gnc.vision.startracker.solve import AttitudePrior, RatePrior
 from flight.gnc.vision.streaks.corners.settings import StreakSettings
@@ -40,6 +41,7 @@ class ImagingSettings:
         slow_ns: processing time from which vision is slow.
         mounting: (4,) body axes to camera axes.
         angular_acceleration_psd: rad^2/s^3, density of the body's white angular acceleration.
+        objects: how objects are sighted; None: they are not.
         velocity: returns the velocity (3,) m/s about the Sun at a time; None: as in `tracker`.
     """
 
@@ -54,6 +56,7 @@ class ImagingSettings:
     tracker: TrackerSettings | None
     angular_acceleration_psd: float
     velocity: Callable[[int], FloatArray | None]
+    objects: SightSettings | None = None
 
 
 class FrameMeasurer:
@@ -64,8 +67,11 @@ class FrameMeasurer:
         self._navigation = navigation
         self._body_to_camera = attitude_matrix(settings.mounting)
 
-    def job(self, frame: Frame, last_checksum: int | None) -> FrameJob:
-        """Return the worker's job; `last_checksum` is that of the previous frame, to detect a repetition."""
+    def job(self, frame: Frame, last_checksum: int | None, spare: bool = True) -> FrameJob:
+        """Return the worker's job; `last_checksum` is that of the previous frame, to detect a repetition.
+
+        `spare`: whether there is time to look for objects.
+        """
         past = self._navigation.past(middle_ns(frame))
         return FrameJob(
             frame.pixels,
@@ -76,6 +82,7 @@ class FrameMeasurer:
             self._rate_prior(frame, past) if past is not None else None,
             self._attitude_prior(past) if past is not None else None,
             last_checksum,
+            objects=self._settings.objects if spare else None,
         )
 
     def _tracker(self, frame: Frame) -> TrackerSettings | None:

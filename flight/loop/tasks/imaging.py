@@ -19,6 +19,7 @@ from flight.loop.services import Services
 from flight.loop.tasks.frame_measurements import FrameMeasurer, ImagingSettings, middle_ns
 from flight.loop.tasks.frame_report import FrameReport, is_strange
 from flight.loop.tasks.navigation import Navigation
+from flight.loop.tasks.object_tracking import ObjectTracking
 from hal.interfaces.devices import FrameSource
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.readings import Frame
@@ -36,6 +37,7 @@ class Imaging:
         navigation: Navigation,
         view: BodyView,
         services: Services,
+        objects: ObjectTracking | None = None,
     ) -> None:
         self._camera = camera
         self._settings = settings
@@ -54,6 +56,8 @@ class Imaging:
         self._rows = RepeatedRows()
         self._busy_since_ns = 0
         self._frames = 0
+        self._objects = objects
+        self._spare = True  # the last frame left time to look for objects
 
     def counts(self) -> tuple[int, int]:
         """Return the number of frames, and of rates from streaks that entered the estimate."""
@@ -118,7 +122,7 @@ class Imaging:
         self._last_sequence = frame.sequence
         if old:
             self._report.record(frame, StreakStatus.FAILED.value, None, now_ns, False)
-        elif self._jobs.submit(WORKER, self._measurer.job(frame, self._last_checksum)):
+        elif self._jobs.submit(WORKER, self._measurer.job(frame, self._last_checksum, self._spare)):
             self._frame = frame
             self._busy_since_ns = now_ns
         else:
@@ -141,6 +145,8 @@ class Imaging:
         rate, attitude = self._measurer.mean_rate(frame, motion), self._measurer.attitude(frame, found)
         if is_strange(found.solution):
             rate = None  # its pixels are invalid
+        if found.objects is not None and self._objects is not None:
+            self._objects.ingest(frame.sequence, middle_ns(frame), found.objects, now_ns)
         if rate is None and attitude is None:
             self._report.unused(frame, found, now_ns)
         known = self._navigation.past(middle_ns(frame)) is not None
@@ -175,6 +181,7 @@ class Imaging:
 
     def _judge_speed(self, now_ns: int) -> None:
         taken_ns = now_ns - self._busy_since_ns
+        self._spare = taken_ns <= self._settings.slow_ns
         text = f"{taken_ns * 1e-9:.2f} s over a frame, {self._settings.slow_ns * 1e-9:g} s expected"
         self._facts.update(facts.VISION_SLOW, taken_ns > self._settings.slow_ns, now_ns, text)
 
