@@ -9,6 +9,7 @@ from pathlib import Path
 
 from ground.export import FORMATS
 from ground.export import export as export_packets
+from ground.export.tracking_data import write_tracking_data
 from ground.telemetry.reader import read_run
 
 
@@ -28,14 +29,23 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="PLACE",
         help=f"folder of the files, or the SQLite file (default {places})",
     )
+    parser.add_argument(
+        "--tdm",
+        type=Path,
+        metavar="FILE",
+        help="write the tracks of objects instead: a CCSDS Tracking Data Message",
+    )
     parser.add_argument("--json", action="store_true", help="print the files as one JSON object")
     parser.set_defaults(command=export)
 
 
 def export(options: argparse.Namespace) -> int:
     """Write the files and name them."""
-    place = options.out or options.run / FORMATS[options.format]
-    paths = export_packets(read_run(options.run), place, options.format)
+    if options.tdm is not None:
+        paths = write_tracking_data(read_run(options.run), options.tdm)
+    else:
+        place = options.out or options.run / FORMATS[options.format]
+        paths = export_packets(read_run(options.run), place, options.format)
     if options.json:
         sys.stdout.write(json.dumps({"files": [str(path) for path in paths]}) + "\n")
     else:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
+import pytest
 
+from flight.gnc.errors import UsageError
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import attitude_matrix
 from flight.schema import reader as configuration
 from flight.schema.devices import ObjectTracking
+from ground.export.tracking_data import write_tracking_data
 from ground.telemetry.reader import Run
 from sim_hal.settings import LineOfSight, SkyObject
 from tests.scenario.flights import demo_config, demo_world, event_names, fly
@@ -22,9 +26,11 @@ _PIXEL = np.radians(20.0) / 1024
 def _flight(folder: Path, objects: tuple[SkyObject, ...]) -> Run:
     """Return a flight at rest with a frame of 0.2 s each second."""
     config = demo_config(_DURATION)
+    world = demo_world()
+    assert config.camera is not None
+    assert world.release is not None
     camera = configuration.replace(config.camera, exposure=0.2, period=1.0, objects=ObjectTracking())
     step = configuration.replace(config.steps[0], q2=0.2)
-    world = demo_world()
     release = configuration.replace(world.release, q2=0.2, rate=0.0)
     section = configuration.replace(world, release=release, objects=objects)
     return fly(configuration.replace(config, camera=camera, steps=(step,)), folder, section=section)
@@ -54,25 +60,34 @@ def _place(line: LineOfSight, time: FloatArray) -> FloatArray:
     return np.asarray(np.cos(angle) * start + np.sin(angle) * ahead)
 
 
-def test_two_objects_are_found_and_tracked_to_a_fraction_of_a_pixel(tmp_path: Path) -> None:
-    lines = (_line(-3.0, 0.3, 40.0), _line(3.0, 0.1, 250.0))
-    brightness = (3.0, 4.5)
-    objects = tuple(
-        SkyObject(magnitude=m, line_of_sight=line) for m, line in zip(brightness, lines, strict=True)
+_LINES = (_line(-3.0, 0.3, 40.0), _line(3.0, 0.1, 250.0))
+_BRIGHTNESS = (3.0, 4.5)
+
+
+@pytest.fixture(scope="module")
+def tracked(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """Return a flight with two objects in the field."""
+    pairs = zip(_BRIGHTNESS, _LINES, strict=True)
+    return _flight(
+        tmp_path_factory.mktemp("tracked"),
+        tuple(SkyObject(magnitude=m, line_of_sight=line) for m, line in pairs),
     )
-    run = _flight(tmp_path, objects)
+
+
+def test_two_objects_are_found_and_tracked_to_a_fraction_of_a_pixel(tracked: Run) -> None:
+    run = tracked
     assert event_names(run).count("object-found") >= 1
     tracks = run["track"]
     assert set(tracks["number"].tolist()) == {1, 2}
     for number in (1, 2):
         track = tracks[tracks["number"] == number]
-        true = [_place(line, track["middle_ns"] * 1e-9) for line in lines]
+        true = [_place(line, track["middle_ns"] * 1e-9) for line in _LINES]
         away = [np.linalg.norm(track["direction"] - place, axis=1) for place in true]
         own = int(np.argmin([one[-1] for one in away]))
         assert away[own].max() < 0.3 * _PIXEL
         rate = np.degrees(np.linalg.norm(track["rate"][-1]))
-        assert abs(rate - lines[own].rate_deg) < 0.01
-        assert abs(track["magnitude"][-1] - brightness[own]) < 0.3
+        assert abs(rate - _LINES[own].rate_deg) < 0.01
+        assert abs(track["magnitude"][-1] - _BRIGHTNESS[own]) < 0.3
         assert track["seen"].all()
 
 
@@ -81,3 +96,43 @@ def test_a_sky_without_objects_has_no_track(tmp_path: Path) -> None:
     assert len(run["sightings"]) >= 8
     assert not len(run["track"])
     assert "object-found" not in event_names(run)
+
+
+def test_the_measured_track_is_read_back_from_its_message(tracked: Run, tmp_path: Path) -> None:
+    """A reader of the standard's own grammar finds the objects' places at their times."""
+    (path,) = write_tracking_data(tracked, tmp_path / "track.tdm")
+    segments = path.read_text(encoding="ascii").split("META_START")
+    assert len(segments) == 3
+    assert "CCSDS_TDM_VERS = 2.0" in segments[0]
+    zero = datetime.fromtimestamp(int(tracked["run"]["utc_ns"][-1]) * 1e-9, UTC).replace(tzinfo=None)
+    found = [_nearest_line(segment, zero) for segment in segments[1:]]
+    assert sorted(found) == [0, 1]
+
+
+def _nearest_line(segment: str, zero: datetime) -> int:
+    """Return which of the objects a segment is of; all its data must be that object's."""
+    words = [row.split(" = ") for row in segment.splitlines() if " = " in row]
+    header = {word[0]: word[1] for word in words if len(word[1].split()) == 1}
+    assert (header["ANGLE_TYPE"], header["REFERENCE_FRAME"], header["TIME_SYSTEM"]) == (
+        "RADEC",
+        "ICRF",
+        "UTC",
+    )
+    data = [(key, *value.split()) for key, value in words if len(value.split()) == 2]
+    angles = {key: [float(value) for name, _, value in data if name == key] for key in ("ANGLE_1", "ANGLE_2")}
+    times = [(datetime.fromisoformat(at) - zero).total_seconds() for name, at, _ in data if name == "ANGLE_1"]
+    right, up = np.radians(angles["ANGLE_1"]), np.radians(angles["ANGLE_2"])
+    seen = np.stack([np.cos(up) * np.cos(right), np.cos(up) * np.sin(right), np.sin(up)], axis=1)
+    assert len(seen) >= 5
+    away = [np.linalg.norm(seen - _place(line, np.array(times)), axis=1).max() for line in _LINES]
+    own = int(np.argmin(away))
+    assert away[own] < 0.5 * _PIXEL
+    magnitudes = [float(value) for name, _, value in data if name == "MAG"]
+    np.testing.assert_allclose(magnitudes, _BRIGHTNESS[own], atol=0.3)
+    return own
+
+
+def test_a_run_without_a_track_has_no_message(tmp_path: Path) -> None:
+    run = fly(demo_config(1.0, camera=False), tmp_path)
+    with pytest.raises(UsageError, match="no object was tracked"):
+        write_tracking_data(run, tmp_path / "track.tdm")

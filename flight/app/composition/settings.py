@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from flight.gnc.tracking.tracker import TrackerSettings as TrackerOfObjects
+from flight.gnc.tracking.tracker import TrackSettings
 from flight.gnc.vision.frame_job import TrackerSettings
 from flight.gnc.vision.objects.sighted import SightSettings
 from flight.gnc.vision.startracker.detection import DetectionSettings
@@ -52,9 +52,9 @@ def imaging_settings(camera: Camera, body: Body) -> ImagingSettings:
     )
 
 
-def tracker_settings(section: ObjectTracking) -> TrackerOfObjects:
+def track_settings(section: ObjectTracking) -> TrackSettings:
     """Return how tracks of objects start, go on and end."""
-    return TrackerOfObjects(needed=section.needed, within=section.within, coast=section.coast)
+    return TrackSettings(needed=section.needed, within=section.within, coast=section.coast)
 
 
 def _tracker(camera: Camera) -> TrackerSettings | None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flight.app.composition.bodies import body_kind
-from flight.app.composition.settings import imaging_settings, navigation_settings, tracker_settings
+from flight.app.composition.settings import imaging_settings, navigation_settings, track_settings
 from flight.app.composition.workers import worker_watches
 from flight.link.commands.channel import Channel
 from flight.link.telemetry.recorder import Recorder
@@ -126,5 +126,5 @@ def _imaging(
         return None
     settings = imaging_settings(camera, body)
     section = camera.objects
-    objects = None if section is None else ObjectTracking(tracker_settings(section), services)
+    objects = None if section is None else ObjectTracking(track_settings(section), services)
     return Imaging(source, settings, navigation, body.view, services, objects)

@@ -26,7 +26,7 @@ _UNSEEN = np.full(3, np.nan)
 
 
 @dataclass(frozen=True, slots=True)
-class TrackerSettings:
+class TrackSettings:
     """How tracks start, go on and end.
 
     Attributes:
@@ -92,7 +92,7 @@ class Track:
 class Tracker:
     """Owns the tracks."""
 
-    def __init__(self, settings: TrackerSettings) -> None:
+    def __init__(self, settings: TrackSettings) -> None:
         self._settings = settings
         self._gate = bound(settings.missed, 2)
         self._tracks: list[Track] = []

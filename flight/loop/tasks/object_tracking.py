@@ -8,7 +8,7 @@ import numpy as np
 
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.tracking.sightings import Sightings
-from flight.gnc.tracking.tracker import Track, Tracker, TrackerSettings
+from flight.gnc.tracking.tracker import Track, Tracker, TrackSettings
 from flight.gnc.vision.objects.sighted import Sighted
 from flight.link import events
 from flight.link.telemetry.definitions import SIGHTINGS, TRACK
@@ -19,7 +19,7 @@ from flight.loop.services import Services
 class ObjectTracking:
     """Owns the tracks of objects."""
 
-    def __init__(self, settings: TrackerSettings, services: Services) -> None:
+    def __init__(self, settings: TrackSettings, services: Services) -> None:
         self._tracker = Tracker(settings)
         self._recorder = services.recorder
         self._events = services.events
