@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import mmap
 import os
-import shutil
 import socket
 import subprocess
 import sys
@@ -33,10 +32,6 @@ MODULE = "flight.loop.executive.worker"
 """The module that a worker's process runs."""
 
 _REAPED_WITHIN_S = 1.0
-
-_SETPRIV = shutil.which("setpriv")  # util-linux
-_ENDS_WITH_PARENT = (_SETPRIV, "--pdeathsig", "KILL", "--") if _SETPRIV else ()
-"""The worker asks for this itself too, but only once Python has started: one stopped before would stay."""
 
 
 class WorkerProcess:
@@ -68,7 +63,7 @@ class WorkerProcess:
         function = f"{worker.function.__module__}:{worker.function.__qualname__}"
         words = [function, str(line), str(memory), str(os.getpid()), ",".join(map(str, sorted(cores)))]
         return subprocess.Popen(
-            [*_ENDS_WITH_PARENT, sys.executable, "-m", MODULE, *words],
+            [sys.executable, "-m", MODULE, *words],
             pass_fds=(line, memory),
             stdin=subprocess.DEVNULL,
             start_new_session=True,  # Ctrl-C is for the control process, which then closes its workers

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import mmap
 import os
-import shutil
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -205,32 +203,6 @@ def test_a_worker_ends_quietly_in_the_middle_of_a_job_when_its_flight_is_killed(
         flight.kill()
         # The worker inherited standard error: its end is that of the last process which had it.
         assert flight.stderr.read() == ""
-    assert not lives(orphan)
-
-
-_STARTED = """
-import time
-from flight.loop.executive.jobs import Worker
-from flight.loop.executive.processes import WorkerProcess
-from tests.flight.loop.executive.odd_jobs import hang
-print(WorkerProcess(Worker("hang", hang, 0, 10**12)).process_id, flush=True)
-time.sleep(60.0)
-"""
-
-
-@pytest.mark.skipif(shutil.which("setpriv") is None, reason="needs setpriv of util-linux")
-def test_a_worker_stopped_while_it_starts_does_not_outlive_its_flight() -> None:
-    with subprocess.Popen([sys.executable, "-c", _STARTED], stdout=subprocess.PIPE, text=True) as flight:
-        assert flight.stdout is not None
-        orphan = int(flight.stdout.readline())
-        command = Path(f"/proc/{orphan}/cmdline")
-        while b"setpriv" in command.read_bytes():  # a thousandth of a second
-            time.sleep(0.0005)
-        os.kill(orphan, signal.SIGSTOP)
-        flight.kill()
-    deadline = time.monotonic() + 20.0
-    while lives(orphan) and time.monotonic() < deadline:
-        time.sleep(0.01)
     assert not lives(orphan)
 
 
