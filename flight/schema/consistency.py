@@ -169,6 +169,12 @@ def _check_camera(camera: Camera, refuse: Refuse) -> None:
             )
         if camera.objects.needed > camera.objects.within:
             refuse("camera.objects.needed", f"is {camera.objects.needed}: must not be above `within`")
+    if camera.fine_period is not None and not camera.period <= camera.fine_period < camera.max_age:
+        refuse(
+            "camera.fine_period",
+            f"is {camera.fine_period:g}: from `camera.period`, {camera.period:g}, to less than "
+            f"`camera.max_age`, {camera.max_age:g}",
+        )
     if camera.device is not None:
         pixel_format, possible = camera.device.pixel_format, PIXEL_BITS[camera.device.pixel_format]
         if camera.bits not in possible:

@@ -135,7 +135,8 @@ class Camera(Section, frozen=True, kw_only=True):
     """The star camera: what flight must know to read its frames; `device` is the real one.
 
     A frame is late `late_after` s after the exposure that it may have waited for; vision is slow after
-    `vision_slow_after` s. Beyond `max_rate` rad/s of the body no exposure is begun.
+    `vision_slow_after` s. Beyond `max_rate` rad/s of the body no exposure is begun. While the attitude is
+    fine a frame is taken every `fine_period` s, without it every `period`, too.
     """
 
     device: V4l2Device | AravisDevice | None = None
@@ -147,6 +148,7 @@ class Camera(Section, frozen=True, kw_only=True):
     accuracy: CameraAccuracy = CameraAccuracy()
     exposure: Annotated[float, Meta(gt=0.0, le=10.0)] = 1.0
     period: Positive = 5.0
+    fine_period: Positive | None = None
     bits: Annotated[int, Meta(ge=8, le=16)] = 16
     gain: Positive = 1.0
     read_noise: Positive = 10.0

@@ -39,6 +39,8 @@ def imaging_settings(camera: Camera, body: Body) -> ImagingSettings:
     return ImagingSettings(
         camera=camera_model(camera),
         exposure_ns=round(camera.exposure * SECOND_NS),
+        # A trigger may come late, and the next on time.
+        fine_rest_ns=round(((camera.fine_period or camera.period) - 0.5 * camera.period) * SECOND_NS),
         max_age_ns=round(camera.max_age * SECOND_NS),
         late_ns=round(camera.late_after * SECOND_NS),
         slow_ns=round(camera.vision_slow_after * SECOND_NS),
@@ -49,6 +51,7 @@ def imaging_settings(camera: Camera, body: Body) -> ImagingSettings:
         angular_acceleration_psd=body.angular_acceleration_psd,
         velocity=body.velocity,
         objects=None if camera.objects is None else SightSettings(faintest=camera.objects.faintest),
+        knowledge=body.knowledge,
     )
 
 

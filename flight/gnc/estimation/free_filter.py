@@ -98,6 +98,7 @@ class FreeFilter:
         acceleration: (3,) rad/s^2, body axes, of the last step.
         covariance: (27, 27) of the errors (TURN, RATE, ...).
         knowledge: how well the attitude is known.
+        changes: counts the changes of the estimate.
     """
 
     def __init__(self, inertia: FloatArray, settings: FreeFilterSettings) -> None:
@@ -110,6 +111,7 @@ class FreeFilter:
         self.acceleration: FloatArray = np.zeros(3)
         self.started = False
         self.refused = 0
+        self.changes = 0
         self.quaternion: FloatArray = np.array([0.0, 0.0, 0.0, 1.0])
         self.rate: FloatArray = np.zeros(3)
         self.covariance: FloatArray = np.zeros((STATES, STATES))
@@ -120,6 +122,7 @@ class FreeFilter:
         What was learned of the slow states is kept.
         """
         s = self._settings
+        self.changes += 1
         if not self.started:
             starts = [s.gyro[0], s.dipole[0], s.sunlit[0], s.magnet[0], *[s.torque[0]] * (SIZES // 3)]
             self.covariance[6:, 6:] = np.diag(np.repeat(starts, 3) ** 2)
@@ -150,6 +153,7 @@ class FreeFilter:
 
     def recall(self, then: FreeMemory) -> None:
         """Return to an earlier estimate."""
+        self.changes += 1
         self.quaternion, self.rate, self.acceleration = then.quaternion, then.rate, then.acceleration
         self._constants, self.covariance = then.constants.copy(), then.covariance.copy()
 
@@ -227,6 +231,7 @@ class FreeFilter:
 
     def _step(self, dt: float, dipole: FloatArray, around: Around, doubt: float) -> None:
         """Take one step of the midpoint rule, with its covariance."""
+        self.changes += 1
         motion = self.motion
         middle = multiply(from_rotation_vector(0.5 * dt * self.rate), self.quaternion)
         whole = dipole + self.residual_dipole(around.sunlit)
@@ -273,6 +278,7 @@ class FreeFilter:
         if not 0.0 <= float(value @ weight @ value) <= self._gates[len(value)]:  # a NaN does not pass
             self.refused += 1
             return False
+        self.changes += 1
         gain = cross @ weight
         error = gain @ value
         covariance = self.covariance - gain @ cross.T

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from flight.gnc.camera.lens import CameraModel
-from flight.gnc.estimation.estimate import RATE, TURN, Estimate
+from flight.gnc.estimation.estimate import RATE, TURN, Estimate, Knowledge
 from flight.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
@@ -36,6 +36,7 @@ class ImagingSettings:
     """Properties and time limits of the camera, and the settings of vision.
 
     Attributes:
+        fine_rest_ns: while the attitude is fine no exposure begins sooner after the last.
         late_ns: age after the exposure from which a frame is late.
         max_rate: rad/s of the body, beyond which no exposure is begun.
         slow_ns: processing time from which vision is slow.
@@ -43,10 +44,12 @@ class ImagingSettings:
         angular_acceleration_psd: rad^2/s^3, density of the body's white angular acceleration.
         objects: how objects are sighted; None: they are not.
         velocity: returns the velocity (3,) m/s about the Sun at a time; None: as in `tracker`.
+        knowledge: returns how well the attitude is known now.
     """
 
     camera: CameraModel
     exposure_ns: int
+    fine_rest_ns: int
     max_age_ns: int
     late_ns: int
     slow_ns: int
@@ -56,6 +59,7 @@ class ImagingSettings:
     tracker: TrackerSettings | None
     angular_acceleration_psd: float
     velocity: Callable[[int], FloatArray | None]
+    knowledge: Callable[[], Knowledge]
     objects: SightSettings | None = None
 
 

@@ -6,6 +6,7 @@ sky.
 
 from __future__ import annotations
 
+from flight.gnc.estimation.estimate import Knowledge
 from flight.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement
 from flight.gnc.vision.frame_job import FrameFound
 from flight.gnc.vision.streaks.streak_result import StreakStatus
@@ -52,6 +53,7 @@ class Imaging:
         self._last_sequence = -1
         self._last_checksum: int | None = None
         self._last_frame_ns = 0
+        self._triggered_ns = -settings.fine_rest_ns
         self._due_ns: int | None = None  # when the frame of the oldest open trigger is due
         self._rows = RepeatedRows()
         self._busy_since_ns = 0
@@ -72,11 +74,18 @@ class Imaging:
         self._last_frame_ns = time_ns
 
     def trigger(self, cycle: Cycle) -> None:
-        """Start an exposure, unless the body turns too fast for one: the task of the camera's rate group."""
+        """Start an exposure: the task of the camera's rate group.
+
+        Not while the body turns too fast for one, and seldom while the attitude is fine.
+        """
         if self._navigation.speed > self._settings.max_rate:
             self._last_frame_ns = cycle.start_ns
             self._streams.note("camera", cycle.start_ns)  # it rests on purpose
             return
+        rested_ns = cycle.start_ns - self._triggered_ns
+        if rested_ns < self._settings.fine_rest_ns and self._settings.knowledge() is Knowledge.FINE:
+            return
+        self._triggered_ns = cycle.start_ns
         try:
             self._camera.trigger(self._settings.exposure_ns)
         except DeviceError as error:

@@ -18,6 +18,7 @@ from flight.schema import reader
 from flight.schema.camera_model import camera_knowledge
 from flight.schema.document import read_document, to_yaml
 from flight.schema.errors import ConfigError
+from flight.schema.orbit import as_orbit
 from flight.schema.testbed import as_testbed
 from sim_hal.assembly import camera_model
 from sim_hal.settings import Simulation
@@ -25,6 +26,7 @@ from sim_hal.settings import Simulation
 FOLDER = Path(__file__).resolve().parents[3] / "config"
 DEMO = (FOLDER / "step_demo.yaml").read_text(encoding="utf-8")
 ORBIT = (FOLDER / "orbit.yaml").read_text(encoding="utf-8")
+SECOND_TARGET = as_orbit(reader.parse(ORBIT, "orbit.yaml")).targets[1].at
 
 
 @pytest.mark.parametrize("path", sorted(FOLDER.glob("*.yaml")), ids=lambda path: path.name)
@@ -121,7 +123,16 @@ def test_a_mistake_gets_one_line_with_its_place_and_its_cure(right: str, wrong: 
     ("right", "wrong", "complaint"),
     [
         ("{at: 0.0, point: sun}", "{at: 1.0, point: sun}", r":\d+: `targets\[0\].at` .* must be given at 0"),
-        ("{at: 2400.0, point", "{at: 0.0, point", r"`targets\[1\].at` is 0.0: .* in order of time"),
+        (
+            f"{{at: {SECOND_TARGET}, point",
+            "{at: 0.0, point",
+            r"`targets\[1\].at` is 0.0: .* in order of time",
+        ),
+        (
+            "period: 5.0",
+            "fine_period: 3.0\n  period: 5.0",
+            "`camera.fine_period` is 3: from `camera.period`, 5",
+        ),
         ("point: sun}", "point: moon}", r"`targets\[0\].point` is 'moon'.*nadir"),
         (
             "point: sun}",
