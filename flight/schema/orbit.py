@@ -87,7 +87,7 @@ class Requirements(Section, frozen=True, kw_only=True):
     """What `flight report` judges an orbit flight by; what is left out is not judged.
 
     `slow_within` s from the start to the end of the braking; `fine_within` s from there to a fine attitude.
-    In deg, rms: `knowledge_deg` of the attitude called fine, three axes; `pointing_deg` of the pointed axis,
+    In deg, rms: `knowledge_deg` of the attitude with stars, three axes; `pointing_deg` of the pointed axis,
     once a target was pointed to for ten minutes.
     """
 

@@ -23,9 +23,9 @@ def required(
         slowed_at = [one["begin_s"] + one["duration_s"] for one in periods[:1] if one["slowed"]]
         fine_at = knowledge["fine_after_s"]
         fine = [math.inf if math.isnan(fine_at) else max(0.0, fine_at - at) for at in slowed_at]
-        known = [math.degrees(knowledge["fine_error_rms_rad"])]
+        known = [math.degrees(knowledge["with_stars_error_rms_rad"])]
         rows.append(("attitude fine after the braking", fine, asked.fine_within, "s"))
-        rows.append(("attitude known while fine, rms", known, asked.knowledge_deg, "deg"))
+        rows.append(("attitude known with stars, rms", known, asked.knowledge_deg, "deg"))
     for aim in pointing["targets"] if pointing else []:
         off = [math.degrees(aim["axis_rms_rad"])]
         rows.append((f"pointing to {aim['target']}, rms", off, asked.pointing_deg, "deg"))
