@@ -60,7 +60,7 @@ def unpack_values(message: bytes, slab: mmap.mmap) -> Any:
     except FlightError:
         raise
     except Exception as error:  # a damaged stream fails in any way
-        raise FlightError(f"unreadable: {type(error).__name__}: {error}") from error
+        raise FlightError(f"unreadable: {type(error).__name__}: {str(error)!r}") from error
 
 
 def message_length(data: bytes | bytearray) -> int | None:
@@ -108,7 +108,8 @@ class _ValueReader(pickle.Unpickler):
                 dataclasses.is_dataclass(found) or issubclass(found, enum.Enum) or _is_named_tuple(found)
             )
         if found is None or not known:
-            raise FlightError(f"{module_name}.{name} is no class of values that the control process has")
+            full_name = f"{module_name}.{name}"
+            raise FlightError(f"{full_name!r} is no class of values that the control process has")
         return found
 
 

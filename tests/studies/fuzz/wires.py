@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import mmap
 import struct
+import types
 import zlib
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -233,7 +234,8 @@ def workers() -> DoorTarget:
         if length is None or length > len(message):
             return "incomplete"
         value = unpack_values(message[:length], slab)
-        if callable(value) and not isinstance(value, type):
+        runs = isinstance(value, types.FunctionType | types.BuiltinFunctionType | types.MethodType)
+        if runs and not str(getattr(value, "__module__", "")).startswith("numpy"):
             raise Finding(f"a message that brings something to call: {value!r}")
         return "accepted"
 
