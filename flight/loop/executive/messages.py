@@ -27,7 +27,8 @@ LONGEST_BYTES = 16 * 1024 * 1024
 
 _HEADER = struct.Struct("<QQI")
 """Lengths of the arrays' sizes and of the body, and the CRC-32 of both."""
-_BUILTINS = {"complex", "set", "frozenset", "bytearray", "slice", "range"}
+_BUILTINS = {"complex", "slice", "range"}
+"""Sets and byte arrays have opcodes of their own; called by name, `bytearray` would fill gigabytes."""
 _NUMPY = {"ndarray", "dtype", "scalar", "_frombuffer", "_reconstruct"}
 
 
