@@ -56,6 +56,8 @@ def link_dropin(config: Config) -> str:
         lines += _network(peers)
     if link.serial is not None:
         lines += ["SupplementaryGroups=dialout", *allowed(link.serial.device, SERIAL)]
+    else:
+        lines.append("PrivateDevices=yes")
     return _text(lines)
 
 

@@ -8,7 +8,7 @@ import signal
 import sys
 import tempfile
 import threading
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 from flight.app.accepted_config import accepted_config
@@ -60,7 +60,8 @@ def link(options: argparse.Namespace) -> int:
     ended = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())
-    os.nice(_NICE)
+    with suppress(PermissionError):  # a service's unit has done so, and its sandbox forbids it
+        os.nice(_NICE)
     with ExitStack() as stack:
         vault = Vault(Path(section.keys))
         stack.enter_context(vault.owned())
