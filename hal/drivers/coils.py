@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import threading
+from functools import lru_cache
 
 import numpy as np
 
@@ -44,8 +45,6 @@ class PwmTorqueCoils:
         # Re-entrant: a signal handler may request zero in the middle of its own thread's call.
         self._wire = threading.RLock()
         self._serving = False
-        self._held: tuple[object, ...] = ()
-        self._state: CoilState | None = None  # made of `_held`
         self._served = -1  # the number of the command on the wire
 
     def start(self, patient: bool = False) -> None:
@@ -129,9 +128,10 @@ class PwmTorqueCoils:
         """Return what is on the wire; after a failure, what was last acknowledged."""
         mailbox, outputs = self._mailbox, self._outputs
         with mailbox.lock:
-            held = (
+            return _state_of(
                 mailbox.command,
                 outputs.written,
+                self._signed,
                 outputs.written_ns,
                 mailbox.saturated,
                 mailbox.command_ns,
@@ -140,10 +140,6 @@ class PwmTorqueCoils:
                 outputs.error,
                 outputs.braked,
             )
-            # Asked for several times in a cycle, in which it changes once.
-            if held != self._held or self._state is None:
-                self._held, self._state = held, self._new_state()
-            return self._state
 
     def close(self) -> None:
         """Stop the job and bring the coils to zero. Safe to call twice. The shared bus stays open."""
@@ -155,21 +151,6 @@ class PwmTorqueCoils:
             ticker.stop()
         if was_running or self._outputs.failing or any(self._outputs.written):
             self.off()
-
-    def _new_state(self) -> CoilState:
-        mailbox, outputs = self._mailbox, self._outputs
-        (a, b, c), (x, y, z) = self._signed, outputs.written
-        return CoilState(
-            command=np.array(mailbox.command),
-            current=np.array((mean_current(x, a), mean_current(y, b), mean_current(z, c))),
-            written_ns=outputs.written_ns,
-            saturated=mailbox.saturated,
-            command_ns=mailbox.command_ns,
-            stale=mailbox.stale,
-            faults=outputs.faults,
-            error=outputs.error,
-            braked=outputs.braked,
-        )
 
     def _problem(self, values: FloatArray) -> OutOfRange | None:
         if values.shape != (3,):
@@ -242,3 +223,30 @@ class PwmTorqueCoils:
                 self._served = number
                 if number == self._mailbox.number:
                     return
+
+
+@lru_cache(maxsize=4)
+def _state_of(
+    command: tuple[float, ...],
+    written: tuple[int, ...],
+    signed: tuple[float, ...],
+    written_ns: int,
+    saturated: bool,
+    command_ns: int,
+    stale: bool,
+    faults: int,
+    error: str,
+    braked: tuple[bool, bool, bool],
+) -> CoilState:
+    """Return the state, made once for all who ask in a cycle; `signed` A are the currents of a count."""
+    return CoilState(
+        command=np.array(command),
+        current=np.array([mean_current(*axis) for axis in zip(written, signed, strict=True)]),
+        written_ns=written_ns,
+        saturated=saturated,
+        command_ns=command_ns,
+        stale=stale,
+        faults=faults,
+        error=error,
+        braked=braked,
+    )
