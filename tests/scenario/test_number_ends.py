@@ -18,6 +18,7 @@ from flight.schema import reader as configuration
 from flight.schema.sections import Commands, CommandStep
 from ground.telemetry.reader import Run
 from tests.scenario.flights import Rigged, demo_config, event_names, fly
+from tests.scenario.test_objects import flight_with_objects, two_objects
 from tests.scenario.test_orbit import orbit_config, world
 
 NEAR = (1 << 32) - 30
@@ -26,6 +27,9 @@ FEW_LEFT = (1 << 32) - 3
 """The same for what counts slower."""
 SLEWS = 64_535
 """Slews commanded before: the next one was numbered as an attitude that is only held."""
+
+_OF_OBJECTS = {"sightings", "track"}
+"""Packets of a flight with objects in its field."""
 
 Driven = dict[tuple[str, str], bool]
 
@@ -79,8 +83,16 @@ def test_every_integer_of_the_testbed_may_pass_its_end(
         demo_config(7.0), commands=Commands(timeline=(CommandStep(at=1.0, slew=0.1),))
     )
     run = fly(config, tmp_path)
-    elsewhere = {"spin", "navigation", "truth", "orbit_truth", "link", "verification"}
+    elsewhere = {"spin", "navigation", "truth", "orbit_truth", "link", "verification", *_OF_OBJECTS}
     assert_survived(run, driven, {packet.name for packet in PACKETS} - elsewhere)
+
+
+def test_every_integer_of_an_object_s_track_may_pass_its_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    driven = drive(monkeypatch)
+    run = flight_with_objects(tmp_path, two_objects(), duration=5.5)
+    assert_survived(run, driven, _OF_OBJECTS)
 
 
 def test_every_integer_of_an_orbit_may_pass_its_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

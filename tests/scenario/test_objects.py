@@ -23,9 +23,9 @@ _HELD = np.array([0.0, 0.2, 0.0, np.sqrt(0.96)])
 _PIXEL = np.radians(20.0) / 1024
 
 
-def _flight(folder: Path, objects: tuple[SkyObject, ...]) -> Run:
+def flight_with_objects(folder: Path, objects: tuple[SkyObject, ...], duration: float = _DURATION) -> Run:
     """Return a flight at rest with a frame of 0.2 s each second."""
-    config = demo_config(_DURATION)
+    config = demo_config(duration)
     world = demo_world()
     assert config.camera is not None
     assert world.release is not None
@@ -64,14 +64,16 @@ _LINES = (_line(-3.0, 0.3, 40.0), _line(3.0, 0.1, 250.0))
 _BRIGHTNESS = (3.0, 4.5)
 
 
+def two_objects() -> tuple[SkyObject, ...]:
+    """Return an object on either side of the boresight."""
+    pairs = zip(_BRIGHTNESS, _LINES, strict=True)
+    return tuple(SkyObject(magnitude=m, line_of_sight=line) for m, line in pairs)
+
+
 @pytest.fixture(scope="module")
 def tracked(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """Return a flight with two objects in the field."""
-    pairs = zip(_BRIGHTNESS, _LINES, strict=True)
-    return _flight(
-        tmp_path_factory.mktemp("tracked"),
-        tuple(SkyObject(magnitude=m, line_of_sight=line) for m, line in pairs),
-    )
+    return flight_with_objects(tmp_path_factory.mktemp("tracked"), two_objects())
 
 
 def test_two_objects_are_found_and_tracked_to_a_fraction_of_a_pixel(tracked: Run) -> None:
@@ -92,7 +94,7 @@ def test_two_objects_are_found_and_tracked_to_a_fraction_of_a_pixel(tracked: Run
 
 
 def test_a_sky_without_objects_has_no_track(tmp_path: Path) -> None:
-    run = _flight(tmp_path, ())
+    run = flight_with_objects(tmp_path, ())
     assert len(run["sightings"]) >= 8
     assert not len(run["track"])
     assert "object-found" not in event_names(run)
