@@ -86,6 +86,9 @@ class TwoLineElements:
         for number, line in (("1", first), ("2", second)):
             _check_line(number, line)
         self._satellite = Satrec.twoline2rv(first.rstrip(), second.rstrip())
+        if not 1.0 <= self._satellite.epochdays < 367.0:
+            # SGP4 steps from the epoch of a resonant orbit in half days: one of 1e12 days never ends.
+            raise UsageError(f"{first.rstrip()!r}: its epoch's day of the year must be from 1 to 366")
         code, *place = self._satellite.sgp4_tsince(0.0)
         if code or not np.all(np.isfinite(place)):
             reason = SGP4_ERRORS[code] if code else "a column holds no number"

@@ -118,6 +118,20 @@ def test_lines_that_are_no_elements_are_refused() -> None:
         TwoLineElements(FIRST, FIRST)
 
 
+@pytest.mark.parametrize("day", ["000.50000000", "367.00000000", "999999999999"])
+def test_an_epoch_on_no_day_of_the_year_is_refused(day: str) -> None:
+    """In an orbit of half a day a place 1e12 days from the epoch is found in half days, and so never."""
+    first = FIRST[:20] + day + FIRST[32:]
+    high = SECOND[:26] + "7000000" + SECOND[33:52] + " 2.00000000" + SECOND[63:]
+    with pytest.raises(UsageError, match="day of the year must be from 1 to 366"):
+        TwoLineElements(_summed(first), _summed(high))
+
+
+def _summed(line: str) -> str:
+    """Return a line whose last column is its checksum."""
+    return line[:68] + str(sum(int(c) if c.isdigit() else c == "-" for c in line[:68]) % 10)
+
+
 def test_a_decayed_orbit_is_reported() -> None:
     """The verification set's 28872, which SGP4 lets fall within 50 minutes of its epoch."""
     first = "1 28872U 05037B   05333.02012661  .25992681  00000-0  24476-3 0  1534"
