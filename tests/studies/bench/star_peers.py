@@ -27,9 +27,9 @@ def direction(right_ascension: float, declination: float) -> list[float]:
 
 def cedar(**extraction: Any) -> Solver:
     """Return cedar-solve with the database it comes with, 10 to 30 deg."""
-    import numpy as np  # noqa: PLC0415 - the peers are imported where they are asked for
-    import tetra3  # type: ignore[import-not-found]  # noqa: PLC0415 - of the peer's Python
+    import numpy as np  # noqa: PLC0415 - of the peer's Python, where it is asked for
 
+    tetra3: Any = importlib.import_module("tetra3")
     solver = tetra3.Tetra3("default_database")
 
     def solve(job: dict[str, Any]) -> "list[float] | None":
@@ -50,8 +50,8 @@ def cedar(**extraction: Any) -> Solver:
 def tetra3rs(**extraction: Any) -> Solver:
     """Return tetra3rs with a database for 10 to 30 deg."""
     import numpy as np  # noqa: PLC0415
-    import tetra3rs as peer  # type: ignore[import-not-found]  # noqa: PLC0415 - of the peer's Python
 
+    peer: Any = importlib.import_module("tetra3rs")
     database = peer.SolverDatabase.generate_from_gaia(
         max_fov_deg=30.0, min_fov_deg=10.0, epoch_proper_motion_year=2026.5
     )

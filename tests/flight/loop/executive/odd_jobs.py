@@ -26,3 +26,8 @@ def hang(_: Any) -> Any:
 def die(_: Any) -> Any:
     """End the process."""
     os._exit(3)
+
+
+def cores(_: Any) -> list[int]:
+    """Return the cores that this process may use."""
+    return sorted(os.sched_getaffinity(0))

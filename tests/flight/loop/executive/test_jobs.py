@@ -26,9 +26,10 @@ from flight.loop.executive.lockstep import LockStepRunner
 from flight.loop.executive.messages import SLAB_BYTES, message_length, pack_message, unpack_values
 from flight.loop.executive.supervisor import ProcessRunner
 from hal.buses.clock import SystemClock
+from hal.buses.real_time import worker_cores
 from hal.interfaces.wires import SECOND_NS
 from sim_hal.clock import SimClock
-from tests.flight.loop.executive.odd_jobs import die, double, fail, hang
+from tests.flight.loop.executive.odd_jobs import cores, die, double, fail, hang
 from tests.hal.guardian.campaign import lives
 
 MS = 1_000_000
@@ -182,6 +183,7 @@ import sys, time
 from flight.loop.executive.jobs import Worker
 from flight.loop.executive.supervisor import ProcessRunner
 from hal.buses.clock import SystemClock
+from hal.buses.real_time import worker_cores
 from hal.interfaces.wires import SECOND_NS
 from tests.flight.loop.executive.odd_jobs import hang
 runner = ProcessRunner(SystemClock(), [Worker("hang", hang, 0, 10**12)])
@@ -236,3 +238,14 @@ def test_a_damaged_message_is_refused_or_read_and_nothing_else(noise: bytes, pla
         length = message_length(message)
         if length is not None:
             unpack_values(bytes(message[:length]), slab)
+
+
+def test_workers_leave_the_last_core_to_the_control_process() -> None:
+    allowed = sorted(os.sched_getaffinity(0))
+    if len(allowed) < 2:
+        pytest.skip("one core only: nothing to leave free")
+    with closing(ProcessRunner(SystemClock(), [worker("cores", cores)], worker_cores())) as runner:
+        started(runner, "cores")
+        assert runner.submit("cores", None)
+        assert wait(runner)[0].value == allowed[:-1]
+    assert sorted(os.sched_getaffinity(0)) == allowed
