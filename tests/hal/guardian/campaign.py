@@ -43,15 +43,17 @@ def hurt_in_every_way(folder: Path) -> Campaign:
     lost_ns: list[int] = []
     with live_flight(folder) as flight:
         flight.wait_for("READY=1")
-        time.sleep(_CALM_S)
+        flight.wait_until_driven()
         begin_ns = flight.do(signal.SIGSTOP)
         time.sleep(STOPPED_S)
         times.append(("SIGSTOP", begin_ns, flight.do(signal.SIGCONT)))
         time.sleep(_CALM_S)
         for name, number in (("hang, other threads alive", SLEEPS), ("hang, interpreter held", SPINS)):
+            flight.wait_until_driven()
             begin_ns = flight.do(number)
             time.sleep(HANG_S + _CALM_S)
             times.append((name, begin_ns, begin_ns + round(HANG_S * 1e9)))
+        flight.wait_until_driven()
         # What the guardian is for: without it the devices go on driving the coil.
         os.kill(flight.guardian(), signal.SIGSTOP)
         begin_ns = flight.do(signal.SIGSTOP)
@@ -66,6 +68,7 @@ def hurt_in_every_way(folder: Path) -> Campaign:
             time.sleep(2.5)
         guardians.append(flight.guardian())
         children = flight.children()
+        flight.wait_until_driven()
         times.append(("kill -9", flight.do(signal.SIGKILL), None))
         flight.process.wait()
         time.sleep(_CALM_S)

@@ -22,10 +22,12 @@ import numpy.typing as npt
 
 from flight.link.telemetry.segments import find_segments
 from ground.telemetry.reader import Run, read_run
+from ground.telemetry.scanner import scan
 from tests.scenario.flights import CONFIG
 
 ROOT = CONFIG.parents[1]
 HANG_S = 1.0
+DRIVEN_A = 1e-3
 
 SLEEPS, SPINS = signal.SIGUSR1, signal.SIGUSR2
 """Signals that hang the control thread: other threads go on; or none does, the interpreter being held."""
@@ -89,6 +91,19 @@ class LiveFlight:
                 if word in words:
                     return time.monotonic_ns()
         raise AssertionError(f"no {word} within {patience:g} s: {self.end()}")
+
+    def wait_until_driven(self, patience: float = 30.0) -> None:
+        """Wait until the log of the truth ends with a quarter of a second of current, however busy the machine."""
+        deadline = time.monotonic() + patience
+        begun = 0
+        while time.monotonic() < deadline:
+            data = b"".join(path.read_bytes() for path in find_segments(self.folder, "truth"))
+            current = np.abs(scan(data).packets["truth"]["current"][:, 0])
+            begun = begun or len(current)
+            if len(current) >= begun + 10 and np.all(current[-10:] > DRIVEN_A):
+                return
+            time.sleep(0.05)
+        raise AssertionError(f"the coil was not driven within {patience:g} s: {self.end()}")
 
     def do(self, number: signal.Signals) -> int:
         """Send the flight process a signal; return when, in monotonic ns."""

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.hal.guardian.campaign import UNGUARDED, Campaign, Hurt, hurt_in_every_way
+from tests.hal.guardian.live_flight import DRIVEN_A
 from tests.scenario.flights import event_names
 
 pytestmark = pytest.mark.slow
@@ -18,7 +19,7 @@ def campaign(tmp_path_factory: pytest.TempPathFactory) -> Campaign:
 
 def _hurt(campaign: Campaign, act: str) -> Hurt:
     (found,) = (hurt for hurt in campaign.hurts if hurt.act == act)
-    assert abs(found.current) > 1e-3, "the coil was driven when the act came"
+    assert abs(found.current) > DRIVEN_A, "the coil was driven when the act came"
     return found
 
 
