@@ -66,13 +66,23 @@ class WorkerProcess:
             [sys.executable, "-m", MODULE, *words],
             pass_fds=(line, memory),
             stdin=subprocess.DEVNULL,
-            start_new_session=True,  # Ctrl-C is for the control process, which then closes its workers
+            # Ctrl-C is for the control process, which then closes its workers. A group of this session, not a
+            # session: once the control process has died nobody in it could continue a stopped worker, and the
+            # kernel ends such a worker by SIGHUP and SIGCONT (setpgid(2)), also before Python runs in it.
+            process_group=0,
         )
 
     @property
     def process_id(self) -> int:
         """The process identifier."""
         return self._process.pid
+
+    def is_stopped(self) -> bool:
+        """Return whether a signal such as SIGSTOP has stopped the process; it may still be starting."""
+        look = os.WSTOPPED | os.WNOHANG | os.WNOWAIT  # takes nothing from who reaps it
+        with suppress(ChildProcessError):  # reaped already
+            return os.waitid(os.P_PID, self._process.pid, look) is not None
+        return False
 
     def fileno(self) -> int:
         """Return the socket's descriptor, to wait for an answer."""

@@ -31,6 +31,7 @@ from hal.interfaces.wires import SECOND_NS
 from sim_hal.clock import SimClock
 from tests.flight.loop.executive.odd_jobs import cores, die, double, fail, hang
 from tests.hal.guardian.campaign import lives
+from tests.hal.guardian.states import state, wait_until
 
 MS = 1_000_000
 
@@ -152,6 +153,19 @@ def test_a_worker_that_dies_is_reported_and_replaced_at_work_or_idle(processes: 
     assert wait(processes)[0].value == 6
 
 
+@pytest.mark.parametrize("while_it_starts", [True, False])
+def test_a_worker_that_is_stopped_is_reported_and_replaced_idle_or_starting(while_it_starts: bool) -> None:
+    with closing(ProcessRunner(SystemClock(), [worker("double", double)])) as runner:
+        stopped = started(runner, "double")
+        if not while_it_starts:
+            assert runner.submit("double", 1)
+            assert wait(runner)[0].value == 2
+        os.kill(stopped, signal.SIGSTOP)
+        assert "stopped by a signal" in hear(runner, "double", Change.DIED).text
+        hear(runner, "double", Change.READY)
+        assert started(runner, "double") != stopped
+
+
 def test_a_worker_that_cannot_start_takes_no_jobs_and_costs_the_control_thread_nothing() -> None:
     def nowhere(_: Any) -> Any: ...
 
@@ -206,6 +220,28 @@ def test_a_worker_ends_quietly_in_the_middle_of_a_job_when_its_flight_is_killed(
         # The worker inherited standard error: its end is that of the last process which had it.
         assert flight.stderr.read() == ""
     assert not lives(orphan)
+
+
+_STARTED = """
+import os, signal, time
+from flight.loop.executive.jobs import Worker
+from flight.loop.executive.processes import WorkerProcess
+from tests.flight.loop.executive.odd_jobs import hang
+process = WorkerProcess(Worker("hang", hang, 0, 10**12)).process_id
+os.kill(process, signal.SIGSTOP)
+print(process, flush=True)
+time.sleep(60.0)
+"""
+
+
+def test_a_worker_that_was_stopped_before_python_ran_does_not_outlive_its_flight() -> None:
+    words = [sys.executable, "-c", _STARTED]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, start_new_session=True) as flight:
+        assert flight.stdout is not None
+        orphan = int(flight.stdout.readline())
+        wait_until(lambda: state(orphan) == "T")
+        flight.kill()
+    wait_until(lambda: state(orphan) in {"", "Z"})
 
 
 class _Harmful:
