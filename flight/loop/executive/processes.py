@@ -21,7 +21,7 @@ from flight.loop.executive.messages import (
     LONGEST_BYTES,
     SLAB_BYTES,
     message_length,
-    pack_message,
+    pack_trusted,
     unpack_values,
 )
 
@@ -90,7 +90,7 @@ class WorkerProcess:
 
     def send(self, argument: Any) -> None:
         """Submit a job. Raises FlightError for one that cannot be sent, EOFError where the process died."""
-        message = pack_message(argument, self._slab)
+        message = pack_trusted(argument, self._slab)
         if len(message) > LONGEST_BYTES:
             raise FlightError(f"a job for {self._name} of {len(message)} bytes is too large")
         try:

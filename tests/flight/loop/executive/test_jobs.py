@@ -2,34 +2,27 @@
 
 from __future__ import annotations
 
-import mmap
 import os
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, suppress
+from contextlib import closing
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from flight.gnc.camera.lens import Lens
-from flight.gnc.errors import FlightError
-from flight.gnc.vision.streaks.streak_result import StreakStatus
 from flight.loop.executive.attempts import BUDGET, STEADY_NS, Attempts
 from flight.loop.executive.jobs import Change, JobResult, JobRunner, Worker, WorkerNews
 from flight.loop.executive.lockstep import LockStepRunner
-from flight.loop.executive.messages import SLAB_BYTES, message_length, pack_message, unpack_values
 from flight.loop.executive.supervisor import ProcessRunner
 from hal.buses.clock import SystemClock
 from hal.buses.real_time import worker_cores
 from hal.interfaces.wires import SECOND_NS
 from sim_hal.clock import SimClock
-from tests.flight.loop.executive.odd_jobs import cores, die, double, fail, hang
+from tests.flight.loop.executive.odd_jobs import cores, die, double, fail, function, hang
 from tests.hal.guardian.campaign import lives
 from tests.hal.guardian.states import state, wait_until
 
@@ -66,7 +59,8 @@ def started(runner: ProcessRunner, name: str, seconds: float = 20.0) -> int:
 @pytest.fixture(scope="module")
 def processes() -> Iterator[ProcessRunner]:
     """Return workers for all tests here: each of them leaves every worker idle, or replaced."""
-    runner = ProcessRunner(SystemClock(), [*WORKERS, worker("hang", hang), worker("die", die)])
+    more = [worker("hang", hang), worker("die", die), worker("function", function)]
+    runner = ProcessRunner(SystemClock(), [*WORKERS, *more])
     yield runner
     runner.close()
 
@@ -110,6 +104,12 @@ def test_a_process_does_the_job_and_megabytes_pass_both_ways(processes: ProcessR
     np.testing.assert_array_equal(result.value, 2 * frame)
     assert processes.submit("double", 4)
     assert wait(processes)[0].value == 8
+
+
+def test_a_result_that_cannot_be_sent_is_a_failure_and_not_a_death(processes: ProcessRunner) -> None:
+    processes.submit("function", None)
+    (result,) = wait(processes)
+    assert (result.outcome, result.error[-34:]) == ("failed", "is no value that a worker may send")
 
 
 def test_a_failure_in_a_process_names_its_reason(processes: ProcessRunner) -> None:
@@ -242,38 +242,6 @@ def test_a_worker_that_was_stopped_before_python_ran_does_not_outlive_its_flight
         wait_until(lambda: state(orphan) == "T")
         flight.kill()
     wait_until(lambda: state(orphan) in {"", "Z"})
-
-
-class _Harmful:
-    def __reduce__(self) -> tuple[Any, ...]:
-        return os.getpid, ()
-
-
-@pytest.mark.parametrize("value", [_Harmful(), os.getpid, subprocess.Popen, np.load, {"deep": [np.fromfile]}])
-def test_what_a_worker_sends_can_call_nothing(value: Any) -> None:
-    slab = mmap.mmap(-1, SLAB_BYTES)
-    with pytest.raises(FlightError, match="no class of values"):
-        unpack_values(pack_message(value, slab), slab)
-
-
-def test_what_a_worker_sends_may_be_any_value_of_ours() -> None:
-    slab = mmap.mmap(-1, SLAB_BYTES)
-    lens = Lens(1024, 768, 500.0, (511.5, 383.5))
-    value = (StreakStatus.BLACK, lens, np.float64(2.0), {"a": np.eye(3)}, frozenset({1}), None)
-    status, again, number, arrays, numbers, nothing = unpack_values(pack_message(value, slab), slab)
-    assert (status, again, number, numbers, nothing) == (StreakStatus.BLACK, lens, 2.0, {1}, None)
-    np.testing.assert_array_equal(arrays["a"], np.eye(3))
-
-
-@given(st.binary(max_size=200), st.integers(0, 400))
-def test_a_damaged_message_is_refused_or_read_and_nothing_else(noise: bytes, place: int) -> None:
-    slab = mmap.mmap(-1, SLAB_BYTES)
-    message = bytearray(pack_message(("done", Lens(1024, 768, 500.0, (511.5, 383.5)), "", 7), slab))
-    message[place : place + len(noise)] = noise
-    with suppress(FlightError):
-        length = message_length(message)
-        if length is not None:
-            unpack_values(bytes(message[:length]), slab)
 
 
 def test_workers_leave_the_last_core_to_the_control_process() -> None:
