@@ -209,6 +209,8 @@ def downlink() -> DoorTarget:
         stream, assembler, found = telemetry_stream(size), PacketAssembler(), []
         for one in stream.add(files["line"]):
             if ccitt(one) == 0:
+                if one not in made:  # one damaged frame in 65,536; the authentication is fuzzed as `link`
+                    return "a right CRC by chance"
                 header, data, _ = open_frame(one, _SPACECRAFT)
                 found += assembler.add(header, data)
         if whole and found != packets:
