@@ -18,7 +18,7 @@ from typing import Any
 from tests.hal.guardian.live_flight import ROOT, write_config
 
 LIMIT_S = 300.0
-"""Of what runs in the container, which takes a minute; of installing it first, as long: more on a busy machine."""
+"""Of what runs in the container, which takes a minute; a busy machine needs more."""
 _SHARE = "/share"
 _UNITS = "etc/systemd/system"
 _FACTS = "/run/knightcube-devices/facts.json"

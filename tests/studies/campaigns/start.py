@@ -149,9 +149,11 @@ class _Board:
         path = self._place / "trace"
         strace = ["strace", "-o", str(path), "-e", f"trace={','.join(CALLS)}"]
         begun = self._begin(strace)
-        if not self._ready(begun):
-            raise UsageError("a board does not fly even without a fault")
-        self._end(begun)
+        flies, said = self._ready(begun), self._end(begun)
+        if not flies:
+            raise UsageError(
+                f"a board does not fly even without a fault: status {begun.returncode}: {said!r}"
+            )
         calls = re.findall(r"^(\w+)\((.*)", path.read_text(errors="replace"), re.MULTILINE)
         opened = next(at for at, (_, words) in enumerate(calls) if f'/{_CONFIG}"' in words)
         return Counter(name for name, _ in calls), Counter(name for name, _ in calls[:opened])
