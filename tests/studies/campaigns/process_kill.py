@@ -19,7 +19,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import numpy as np
@@ -104,9 +104,10 @@ def _hurt_parts(flight: LiveFlight, number: int, rng: np.random.Generator) -> Co
             continue
         role = str(rng.choice(sorted(victims)))
         number_sent = signal.SIGKILL if rng.random() < 0.5 else signal.SIGSTOP
-        os.kill(victims[role], number_sent)
         hurt.add(victims[role])
-        acts[role] += 1
+        with suppress(ProcessLookupError):  # a guardian that was replaced just now
+            os.kill(victims[role], number_sent)
+            acts[role] += 1
     return acts
 
 
@@ -125,7 +126,8 @@ def _hurt_flight(flight: LiveFlight, board: Board, rng: np.random.Generator) -> 
         time.sleep(0.02)
     orphans = [child for child in children if lives(child)]
     for child in orphans:  # counted, and gone: one that is stopped would hold the flight's pipe for ever
-        os.kill(child, signal.SIGKILL)
+        with suppress(ProcessLookupError):
+            os.kill(child, signal.SIGKILL)
     return {
         "sent": sent.name,
         "current_before_a": before,
