@@ -45,7 +45,7 @@ def supervise(guardian: GuardianLine, clock: Clock, recorder: Recorder, stack: E
     coils = next(ticker for ticker in clock.tickers if ticker.name == COILS)
 
     stack.callback(gc.enable)
-    collector = clock.ticker("garbage", _COLLECT_NS, memory.collect)
+    collector = clock.ticker("garbage", _COLLECT_NS, memory.Collector())
     stack.callback(collector.stop)
 
     def settle() -> None:
