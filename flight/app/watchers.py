@@ -22,7 +22,7 @@ CONTROL_PRIORITY = 50
 """SCHED_FIFO priority of the control thread and of the coil driver's thread."""
 NEXT_PRIORITY = CONTROL_PRIORITY - 10
 """Priority of the other threads of the control process."""
-_COLLECT_NS = 60 * SECOND_NS
+_COLLECT_NS = 2 * SECOND_NS
 
 
 def start_guardian(rig: Rig, stack: ExitStack) -> GuardianLine | None:

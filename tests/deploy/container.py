@@ -103,7 +103,7 @@ def main(folder: Path) -> None:
                 "systemd-nspawn",
                 f"--directory={root}",
                 f"--bind={folder}:{_SHARE}",
-                *(f"--bind={root}{place}:{place}" for place in _mounted()),
+                *(f"--bind=/mnt/place-{number}:{place}" for number, place in enumerate(_mounted())),
                 "--register=no",
                 "--keep-unit",
                 "--private-network",
@@ -145,12 +145,14 @@ def _overlay() -> Path:
     layers = "lowerdir=/,upperdir=/mnt/upper,workdir=/mnt/work"
     _do("mount", "-t", "overlay", "overlay", "-o", layers, "/mnt/root")
     for number, place in enumerate(_mounted()):
-        upper, work = Path(f"/mnt/upper-{number}"), Path(f"/mnt/work-{number}")
-        upper.mkdir()
-        work.mkdir()
-        Path(f"/mnt/root{place}").mkdir(parents=True, exist_ok=True)
+        shown, upper, work = (Path(f"/mnt/{name}-{number}") for name in ("place", "upper", "work"))
+        for folder in (shown, upper, work):
+            folder.mkdir()
         layers = f"lowerdir={place},upperdir={upper},workdir={work}"
-        _do("mount", "-t", "overlay", "overlay", "-o", layers, f"/mnt/root{place}")
+        _do("mount", "-t", "overlay", "overlay", "-o", layers, str(shown))
+        # For the installer. At the boot the container's own mounts cover it, and nspawn mounts it again.
+        Path(f"/mnt/root{place}").mkdir(parents=True, exist_ok=True)
+        _do("mount", "--bind", str(shown), f"/mnt/root{place}")
     # nspawn keeps its own things here; they go with the mount.
     _do("mount", "-t", "tmpfs", "tmpfs", "/run/systemd")
     return Path("/mnt/root")
