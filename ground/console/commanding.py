@@ -78,7 +78,7 @@ class Commanding:
 def _words(data: bytes) -> str:
     """Return the words of a command's packet. Raises CommandError for values that are none."""
     directive = directives.unpack(data)
-    return codec.describe(codec.unpack(data)) if directive is None else str(directive)
+    return codec.unpack(data).text if directive is None else str(directive)
 
 
 def _value(name: str, field: Field, given: Any) -> Any:
