@@ -1,36 +1,13 @@
-"""Commands as values, and as the bytes of one packet each; other packets are refused with the reason."""
+"""Commands as the bytes of one packet each; other packets are refused with the reason."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
-from flight.gnc.errors import FlightError, UsageError
-from flight.gnc.guidance.three_axes.pointing_target import NUMBERS, Goal, PointingTarget
-from flight.link.commands.definitions import (
-    CLEAR,
-    DUMP_PARAMETERS,
-    LAYOUTS,
-    LOAD_PARAMETERS,
-    MODE,
-    PING,
-    POINT,
-    SAFE,
-    SLEW,
-)
-from flight.link.commands.values import (
-    ChangeMode,
-    Clear,
-    Command,
-    DumpParameters,
-    LoadParameters,
-    Ping,
-    Point,
-    Slew,
-)
-from flight.link.modes import Mode
-from flight.link.parameters import FIELDS, crc_of
+from flight.link.commands.definitions import CLEAR, LAYOUTS
+from flight.link.commands.errors import CommandError, MalformedError
+from flight.link.commands.values import MAKERS, Command
 from flight.link.telemetry.form import Packet
 from flight.link.telemetry.packets import HEADER_BYTES, Packer, TelemetryError, crc16, to_text
 
@@ -42,18 +19,10 @@ IDENTIFIERS = tuple(_BY_IDENTIFIER)
 """The first 16 bits of a command: one of these."""
 
 
-class CommandError(FlightError):
-    """Bytes or values that are no command; says why."""
-
-
-class MalformedError(CommandError):
-    """Bytes that are no packet of a command: never answered, so that two flights cannot answer each other."""
-
-
 def command_of(packet: Packet, fields: Mapping[str, Any]) -> Command:
     """Return the command of a packet's fields by name. Raises CommandError for values that are none."""
     check(packet, fields)
-    return _MAKERS[packet.name](fields)
+    return MAKERS[packet.name](fields)
 
 
 def check(packet: Packet, fields: Mapping[str, Any]) -> None:
@@ -108,34 +77,3 @@ def unpack(data: bytes) -> Command:
         for field in layout.packet.fields
     }
     return command_of(layout.packet, fields)
-
-
-def _target(number: int, numbers: list[float], roll: float) -> PointingTarget:
-    """Return the target of a packet's fields. Raises CommandError; a roll of NaN is free."""
-    goal = Goal(number)
-    try:
-        count = NUMBERS.get(goal, 0)
-        return PointingTarget(goal, tuple(numbers[:count]), None if math.isnan(roll) else roll)
-    except UsageError as error:
-        raise CommandError(str(error)) from error
-
-
-def _table(fields: Mapping[str, Any]) -> LoadParameters:
-    """Return the table in a packet's fields. Raises CommandError unless its CRC is that of its values."""
-    values = tuple(fields[field.name] for field in FIELDS)
-    if fields["crc"] != crc_of(values):
-        raise CommandError(f"crc = {fields['crc']:08x}, but that of the values is {crc_of(values):08x}")
-    return LoadParameters(fields["replaced"], values)
-
-
-_MAKERS: Mapping[str, Callable[[Mapping[str, Any]], Command]] = {
-    PING.name: lambda fields: Ping(fields["number"]),
-    SAFE.name: lambda fields: ChangeMode(Mode.SAFE, fields["reason"]),
-    MODE.name: lambda fields: ChangeMode(Mode(fields["mode"])),
-    SLEW.name: lambda fields: Slew(fields["q2"]),
-    CLEAR.name: lambda fields: Clear(fields["event"]),
-    POINT.name: lambda fields: Point(_target(fields["goal"], fields["numbers"], fields["roll"])),
-    LOAD_PARAMETERS.name: _table,
-    DUMP_PARAMETERS.name: lambda _: DumpParameters(),
-}
-"""Makes the command of a packet's fields, by the packet's name."""

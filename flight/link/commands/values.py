@@ -1,12 +1,14 @@
-"""Commands as values: each knows the packet that carries it, its fields and its words."""
+"""Commands as values: each knows the packet that carries it, its fields and words, and is made of them."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from flight.gnc.guidance.three_axes.pointing_target import PointingTarget
+from flight.gnc.errors import UsageError
+from flight.gnc.guidance.three_axes.pointing_target import NUMBERS, Goal, PointingTarget
 from flight.link.commands.definitions import (
     CLEAR,
     DUMP_PARAMETERS,
@@ -17,6 +19,7 @@ from flight.link.commands.definitions import (
     SAFE,
     SLEW,
 )
+from flight.link.commands.errors import CommandError
 from flight.link.modes import Mode
 from flight.link.parameters import FIELDS, KEYS, crc_of
 from flight.link.telemetry.form import Packet
@@ -171,3 +174,34 @@ def shown(text: str) -> str:
     """Return a text with its control characters, and others that do not print, as escapes."""
     escaped = (c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
     return "".join(escaped)
+
+
+def _target(number: int, numbers: list[float], roll: float) -> PointingTarget:
+    """Return the target of a packet's fields. Raises CommandError; a roll of NaN is free."""
+    goal = Goal(number)
+    try:
+        count = NUMBERS.get(goal, 0)
+        return PointingTarget(goal, tuple(numbers[:count]), None if math.isnan(roll) else roll)
+    except UsageError as error:
+        raise CommandError(str(error)) from error
+
+
+def _table(fields: Mapping[str, Any]) -> LoadParameters:
+    """Return the table in a packet's fields. Raises CommandError unless its CRC is that of its values."""
+    values = tuple(fields[field.name] for field in FIELDS)
+    if fields["crc"] != crc_of(values):
+        raise CommandError(f"crc = {fields['crc']:08x}, but that of the values is {crc_of(values):08x}")
+    return LoadParameters(fields["replaced"], values)
+
+
+MAKERS: Mapping[str, Callable[[Mapping[str, Any]], Command]] = {
+    PING.name: lambda fields: Ping(fields["number"]),
+    SAFE.name: lambda fields: ChangeMode(Mode.SAFE, fields["reason"]),
+    MODE.name: lambda fields: ChangeMode(Mode(fields["mode"])),
+    SLEW.name: lambda fields: Slew(fields["q2"]),
+    CLEAR.name: lambda fields: Clear(fields["event"]),
+    POINT.name: lambda fields: Point(_target(fields["goal"], fields["numbers"], fields["roll"])),
+    LOAD_PARAMETERS.name: _table,
+    DUMP_PARAMETERS.name: lambda _: DumpParameters(),
+}
+"""Makes the command of a packet's fields, by the packet's name."""

@@ -13,7 +13,8 @@ from typing import Any
 
 from flight.gnc.errors import FlightError
 from flight.link.commands import codec
-from flight.link.commands.codec import CommandError, CommandPacker
+from flight.link.commands.codec import CommandPacker
+from flight.link.commands.errors import CommandError
 from flight.link.frames import telecommand, telemetry
 from flight.link.process import directives
 from flight.link.process.archive_reader import LogFollower, stretch, time_of

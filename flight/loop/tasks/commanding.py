@@ -12,8 +12,9 @@ from typing import Any
 
 from flight.link import events
 from flight.link.commands.channel import Channel
-from flight.link.commands.codec import CommandError, MalformedError, unpack
+from flight.link.commands.codec import unpack
 from flight.link.commands.definitions import DUMP_PARAMETERS, PING
+from flight.link.commands.errors import CommandError, MalformedError
 from flight.link.commands.values import (
     ChangeMode,
     Clear,

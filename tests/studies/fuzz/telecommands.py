@@ -12,7 +12,8 @@ import numpy as np
 
 from flight.gnc.guidance.one_axis.limits import Q2_LIMIT
 from flight.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
-from flight.link.commands.codec import CommandError, CommandPacker, check, unpack
+from flight.link.commands.codec import CommandPacker, check, unpack
+from flight.link.commands.errors import CommandError
 from flight.link.commands.values import (
     ChangeMode,
     Clear,

@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 
 from flight.gnc.errors import UsageError
 from flight.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
-from flight.link.commands.codec import CommandError, CommandPacker, unpack
+from flight.link.commands.codec import CommandPacker, unpack
 from flight.link.commands.definitions import COMMANDS, LAYOUTS
+from flight.link.commands.errors import CommandError
 from flight.link.commands.values import (
     ChangeMode,
     Clear,
