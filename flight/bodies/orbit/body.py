@@ -5,7 +5,6 @@ It detumbles by its magnetometer, acquires its attitude with its coils at rest, 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 
 import numpy as np
@@ -116,8 +115,8 @@ def _planned(config: OrbitConfig) -> PlannedCraft:
 
 def fastest_rate(config: OrbitConfig) -> float:
     """Return the rate, rad/s, beyond which the body is braked again or the star camera rests."""
-    camera = config.camera.max_rate if config.camera is not None else math.inf
-    return min(config.modes.tumble_rate, camera)
+    camera = config.camera.max_rate if config.camera is not None else None
+    return config.modes.tumble_rate if camera is None else min(config.modes.tumble_rate, camera)
 
 
 def _timed(config: OrbitConfig) -> list[tuple[float, PointingTarget]]:
