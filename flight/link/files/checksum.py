@@ -21,7 +21,7 @@ class FileSum:
         self._at = self._value = 0
 
     def step(self) -> int | None:
-        """Read a portion; return the sum when all is read, else None. Raises OSError, also where bytes lack."""
+        """Read a portion; return the sum when all is read, else None. Raises OSError."""
         if self._left:
             with self._path.open("rb") as file:
                 file.seek(self._at)
@@ -35,7 +35,7 @@ class FileSum:
 
 
 def add(kind: int, value: int, data: bytes) -> int:
-    """Return the sum of what was summed to `value` and of `data`; all but the last piece are whole words."""
+    """Return the sum `value` gone on with over `data`; all pieces but the last are whole words."""
     if kind == CRC32:
         return zlib.crc32(data, value)
     words = np.frombuffer(data + bytes(-len(data) % 4), dtype=">u4")

@@ -24,7 +24,6 @@ from flight.link.files.pdu import (
     Finished,
     Metadata,
     Nak,
-    PduError,
     Status,
     Transaction,
     pack,
@@ -44,12 +43,15 @@ _MOST_REPLIES = 64
 
 
 class Origin(NamedTuple):
-    """On whose command a file is sent: SPI and counter of its frame, packet and sequence count; zeros: none."""
+    """On whose command a file is sent: SPI and counter of its frame, packet and sequence; zeros: none."""
 
     spi: int = 0
     counter: int = 0
     packet: int = 0
     sequence: int = 0
+
+
+NOBODY = Origin()
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +66,7 @@ class Progress:
     done: int
     condition: int | None = None
     said: str = ""
-    origin: Origin = Origin()
+    origin: Origin = NOBODY
 
 
 class Entity:
@@ -116,7 +118,7 @@ class Entity:
         if same is not None and (
             facts.st_mtime_ns == same.record.modified_ns or facts.st_size > same.record.size
         ):
-            same.record = msgspec.structs.replace(same.record, origin=tuple(origin))
+            same.record = msgspec.structs.replace(same.record, origin=origin)
             self._store.save(same.record)
             same.again()
             return _of_sender(same)
@@ -126,7 +128,7 @@ class Entity:
             raise FileError(f"{MOST_OPEN} files are sent already: cancel one")
         number = self._store.new_number(utc_ns)
         record = Outgoing(
-            number, destination, str(path), name, facts.st_size, facts.st_mtime_ns, kind, None, tuple(origin)
+            number, destination, str(path), name, facts.st_size, facts.st_mtime_ns, kind, None, origin
         )
         self._store.save(record)
         self._out[number] = Sender(self.number, record, self._store.save, now_ns, fresh=True)
@@ -247,7 +249,8 @@ class Entity:
             self.ended.append(_of_sender(sender))
         for key, receiver in [item for item in self._in.items() if item[1].closed]:
             assert receiver.record.finished is not None
-            self._store.add_ending(Ending(*key, *receiver.record.finished))
+            condition, complete, kept = receiver.record.finished
+            self._store.add_ending(Ending(*key, condition, complete, kept))
             receiver.close()
             del self._in[key]
             self._store.remove(receiver.record)

@@ -1,4 +1,4 @@
-"""Space packets that carry units of CFDP: header and time as every packet has them, the unit, a CRC of 16 bits.
+"""Space packets that carry units of CFDP: header and time as in every packet, the unit, a CRC of 16 bits.
 
 Their length varies, so they stand beside the tables of packets and not in them.
 """
@@ -23,7 +23,7 @@ class UnitPacker:
     """Makes the packets of one direction, and counts them."""
 
     def __init__(self, identifier: int) -> None:
-        """`identifier` is `DOWN` or `UP`."""
+        """Make packets that begin with `identifier`, `DOWN` or `UP`."""
         self._identifier = identifier
         self._count = 0
 

@@ -123,7 +123,7 @@ class Receiver:
             os.close(self._file)
         self._file = -1
 
-    def stop(self, condition: Condition, why: str) -> None:
+    def stop(self, condition: int, why: str) -> None:
         """Take no more of the file."""
         kept = Kept.REJECTED if condition == Condition.FILESTORE_REJECTION else Kept.DISCARDED
         self._conclude(condition, complete=False, kept=kept, why=why)
@@ -164,7 +164,7 @@ class Receiver:
         """Acknowledge an EOF; at the first, begin to ask for what lacks."""
         if self.record.finished is None:
             if eof.condition != Condition.NO_ERROR:
-                self.stop(Condition.CANCELLED, "the sender has cancelled it")
+                self.stop(eof.condition, "the sender has cancelled it")
             elif self.record.name is not None and eof.size != self.record.size:
                 self.stop(Condition.SIZE_ERROR, f"{eof.size} bytes instead of {self.record.size}")
             elif self.record.end is None:
@@ -203,7 +203,7 @@ class Receiver:
         elif value is not None:
             self._conclude(Condition.NO_ERROR, complete=True, kept=Kept.RETAINED, why="whole")
 
-    def _conclude(self, condition: Condition, *, complete: bool, kept: Kept, why: str) -> None:
+    def _conclude(self, condition: int, *, complete: bool, kept: Kept, why: str) -> None:
         self.said = why
         self._naks.clear()
         self._dirty = True

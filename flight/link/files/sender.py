@@ -91,7 +91,7 @@ class Sender:
                 if self._stopped is not None:
                     self.condition = self._stopped
             case Finished(condition, complete, _):
-                self.condition = condition
+                self.condition = condition if self._stopped is None else self._stopped
                 if not self.said:
                     self.said = "received whole" if complete else _words(condition)
                 return [answer_to(content)]

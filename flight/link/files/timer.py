@@ -1,4 +1,4 @@
-"""When to ask again while the other end is silent: soon at first, then ever less often, for it may be away."""
+"""When to ask again while the other end is silent: soon at first, then seldom, for it may be away."""
 
 from __future__ import annotations
 

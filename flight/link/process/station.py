@@ -14,12 +14,16 @@ from typing import Any
 from flight.gnc.errors import FlightError
 from flight.link.commands import codec
 from flight.link.commands.codec import CommandError, CommandPacker, describe
+from flight.link.files.packets import DOWN, UP, UnitPacker, is_unit
+from flight.link.files.store import files_folder
 from flight.link.frames import telecommand, telemetry
 from flight.link.process import directives
 from flight.link.process.archive_reader import LogFollower, stretch, time_of
 from flight.link.process.control_line import ControlLine
 from flight.link.process.directives import Directive, NewKey, Play, Stop
 from flight.link.process.downlink import Downlink
+from flight.link.process.file_directives import FileDirective
+from flight.link.process.filing import Filing, values_of
 from flight.link.process.key_change import change_key
 from flight.link.process.lines import Line
 from flight.link.process.scheduling import Scheduling
@@ -28,7 +32,7 @@ from flight.link.process.verification import Report, Sent, Stage, Verification, 
 from flight.link.security.associations import COMMAND_SPIS, TELEMETRY_SPIS, Vault
 from flight.link.security.gate import Admitted, Gate, Refusal, RefusedError, Sealer
 from flight.link.telemetry.form import Packet
-from flight.link.telemetry.link_definitions import LINK, VERIFICATION
+from flight.link.telemetry.link_definitions import LINK, TRANSFER, VERIFICATION
 from flight.link.telemetry.packets import Packer
 from hal.interfaces.wires import SECOND_NS, Clock
 
@@ -71,7 +75,11 @@ class Station:
         self._sealers = {
             spi: Sealer(vault, spi, telemetry.AUTHENTICATED, _RESERVED_BLOCK) for spi in TELEMETRY_SPIS
         }
-        self._downlink = Downlink(settings.spacecraft, settings.frame_bytes, settings.rate, self._seal)
+        self._downlink = Downlink(
+            settings.spacecraft, settings.frame_bytes, settings.rate, self._seal, self._next_unit
+        )
+        self._filing = Filing(files_folder(vault.folder), log.place, clock.now_ns())
+        self._units = UnitPacker(DOWN)
         self._verification = Verification()
         self._packer, self._commands = Packer(), CommandPacker()
         self._mission_ns, self._mission_at_ns = 0, clock.now_ns()
@@ -84,6 +92,11 @@ class Station:
         self._report(*self._scheduling.beginning())
         self._status()
 
+    @property
+    def transfers(self) -> int:
+        """How many files are on their way."""
+        return len(self._filing.status())
+
     def run(self, ended: Callable[[], bool], complain: Callable[[str], object]) -> None:
         """Turn until `ended` returns true; complain once of each trouble with sending."""
         due_ns, complained = self._clock.now_ns(), ""
@@ -95,6 +108,7 @@ class Station:
             due_ns = max(due_ns + pause_ns, self._clock.now_ns())
             self._clock.sleep_until_ns(due_ns)
         self._control.close()
+        self._filing.close(self._clock.now_ns())
 
     def turn(self) -> bool:
         """Take what came, send what is due; return whether anything came."""
@@ -111,6 +125,10 @@ class Station:
         if self._playback is not None and not self._downlink.playing:
             self._report(self._playback)
             self._playback = None
+        self._report(*self._filing.turn(now_ns))
+        for progress, ending in self._filing.ended():
+            self._send(TRANSFER, values_of(progress))
+            self._report(*[ending] if ending else [])
         if now_ns >= self._status_ns:
             self._status_ns = now_ns + SECOND_NS
             self._status()
@@ -134,6 +152,9 @@ class Station:
         line.trust(sender, now_ns)
         request = request_of(admitted.data)
         try:
+            if is_unit(admitted.data, UP):
+                self._filing.take(admitted.data, now_ns)
+                return
             directive = directives.unpack(admitted.data)
             if directive is not None:
                 self._obey(admitted, directive)
@@ -180,8 +201,12 @@ class Station:
         elif isinstance(directive, Stop):
             self._end_playback("stopped")
         else:
-            reports = self._scheduling.obey(directive, done, self._clock.utc_ns())
-            self._refused_commands += reports[-1].stage is Stage.FAILED
+            utc_ns = self._clock.utc_ns()
+            if isinstance(directive, FileDirective):
+                reports = self._filing.obey(directive, done, utc_ns, self._clock.now_ns())
+            else:
+                reports = self._scheduling.obey(directive, done, utc_ns)
+            self._refused_commands += any(one.stage is Stage.FAILED for one in reports)
             self._report(*reports)
             return
         self._refused_commands += bool(problem)
@@ -244,10 +269,19 @@ class Station:
             "played_ns": self._downlink.played_ns,
         }
         self._send(LINK, values)
+        for progress in self._filing.status():
+            self._send(TRANSFER, values_of(progress))
 
     def _send(self, packet: Packet, values: dict[str, Any]) -> None:
-        time_ns = self._mission_ns + self._clock.now_ns() - self._mission_at_ns
-        self._downlink.report(self._packer.pack(packet, time_ns, values))
+        self._downlink.report(self._packer.pack(packet, self._time_ns(), values))
+
+    def _next_unit(self) -> bytes | None:
+        unit = self._filing.unit(self._clock.now_ns())
+        return None if unit is None else self._units.pack(unit, self._time_ns())
+
+    def _time_ns(self) -> int:
+        """Return the mission time."""
+        return self._mission_ns + self._clock.now_ns() - self._mission_at_ns
 
 
 def _security(gate: Gate, vault: Vault) -> dict[str, Any]:

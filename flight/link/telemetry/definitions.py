@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from flight.link.telemetry.form import Packet
 from flight.link.telemetry.health_definitions import COMMAND, EVENT, HEALTH, HOUSEKEEPING, RUN
-from flight.link.telemetry.link_definitions import LINK, VERIFICATION
+from flight.link.telemetry.link_definitions import LINK, TRANSFER, VERIFICATION
 from flight.link.telemetry.motion_definitions import (
     ATTITUDE,
     CONTROL,
@@ -49,6 +49,7 @@ __all__ = [
     "STREAK",
     "TARGET",
     "TRACK",
+    "TRANSFER",
     "TRUTH",
     "VERIFICATION",
 ]
@@ -73,6 +74,7 @@ PACKETS: tuple[Packet, ...] = (
     COMMAND,
     LINK,
     VERIFICATION,
+    TRANSFER,
     TRUTH,
     ORBIT_TRUTH,
     CYCLE_TIMING,
