@@ -1,8 +1,8 @@
 """Plain packets for a ground station that holds no keys: protected frames end here, in both directions.
 
 Whoever connects on loopback gets every telemetry packet, live and played back, as a stream; a command packet
-that comes in gets its time and CRC and goes up in a protected frame. Its sequence count stays: by it the
-packets `verification` name the command.
+that comes in, or one with a unit of a file's transfer, gets its time and CRC and goes up in a protected
+frame. Its sequence count stays: by it the packets `verification` name the command.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from ipaddress import IPv4Address
 from flight.app.utc_label import utc_ns
 from flight.gnc.errors import UsageError
 from flight.link.commands.codec import CommandPacker, Ping
+from flight.link.files.packets import UP, is_unit
 from flight.link.process.lines import host_port
 from flight.link.telemetry.link_definitions import VERIFICATION
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, crc16
@@ -142,7 +143,7 @@ class Gateway:
 
     def _send(self, packet: bytes) -> None:
         layout = _COMMANDS.get(int.from_bytes(packet[:2], "big"))
-        if layout is None or len(packet) != layout.length:
+        if not is_unit(packet, UP) and (layout is None or len(packet) != layout.length):
             self._complain(f"{len(packet)} bytes that begin with {packet[:2].hex()} are no command: not sent")
             return
         self._terminal.send(finished(packet, utc_ns()))
