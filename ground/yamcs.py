@@ -23,7 +23,7 @@ from ground.xtce import EPOCH, SPACE, document
 INSTANCE = SPACE.lower()
 HTTP_PORT = 8090
 CFDP, DOWN_BUCKET, UP_BUCKET = "files", "down", "up"
-"""Yamcs's service for files, and its buckets of those that came and of those that go."""
+"""Yamcs's service for files, and its buckets, which are folders: of those that came and of those that go."""
 _LOOPBACK = "127.0.0.1"
 
 _SERVER = """\
@@ -31,7 +31,7 @@ services:
   - class: org.yamcs.http.HttpServer
     args: {{address: {host}, port: {http}}}
 instances: [{instance}]
-buckets: [{{name: {up}}}]
+buckets: [{{name: {down}, path: {folder}/{down}}}, {{name: {up}, path: {folder}/{up}}}]
 dataDir: {data}
 cacheDir: {data}/cache
 secretKey: {instance}
@@ -128,8 +128,9 @@ ArchiveRetrieval: *replay
 def files(folder: Path, gateway: str, http_port: int, epoch: str) -> Mapping[str, str]:
     """Return the content of each file by its name below `folder`."""
     host, _, port = gateway.rpartition(":")
+    buckets = {"down": DOWN_BUCKET, "up": UP_BUCKET}
     server = _SERVER.format(
-        host=_LOOPBACK, http=http_port, instance=INSTANCE, data=folder / "data", up=UP_BUCKET
+        host=_LOOPBACK, http=http_port, instance=INSTANCE, data=folder / "data", folder=folder, **buckets
     )
     instance = _INSTANCE.format(
         gateway_host=host,
@@ -162,7 +163,8 @@ def write(folder: Path, gateway: str = ADDRESS, http_port: int = HTTP_PORT, epoc
             path = folder / name
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text, encoding="utf-8")
-        (folder / "data").mkdir(exist_ok=True)
+        for name in ("data", DOWN_BUCKET, UP_BUCKET):
+            (folder / name).mkdir(exist_ok=True)
     except OSError as error:
         raise UsageError(f"{folder}: cannot be written: {error.strerror or error}") from error
 

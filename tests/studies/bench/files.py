@@ -25,6 +25,7 @@ from tests.flight.link.process.filed_ends import FiledEnds
 _LOSSES = (0.0, 0.1, 0.3)
 _RATE = 250_000.0
 """Bytes/s of frames, both ways."""
+_LONGEST_NS = 7200 * 10**9
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -60,9 +61,12 @@ def measure(place: Path, size: int, loss: float, seed: int, *, down: bool) -> di
         path.write_bytes(data)
         link.session.put(path, "release/release.whl", link.clock.now_ns())
         arrived = place / "keys" / "files" / "received" / "release" / "release.whl"
+    while not link.ended and link.clock.now_ns() - begun_ns < _LONGEST_NS:
+        link.turn(1.0)
     link.until_closed()
     link.close()
-    whole = hashlib.sha256(arrived.read_bytes()).digest() == hashlib.sha256(data).digest()
+    came = arrived.read_bytes() if arrived.exists() else b""
+    whole = hashlib.sha256(came).digest() == hashlib.sha256(data).digest()
     return {
         "direction": "down" if down else "up",
         "loss": loss,

@@ -14,12 +14,10 @@ import hashlib
 import json
 import sys
 import time
-import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 import numpy as np
 
@@ -36,7 +34,6 @@ _LONGEST_S = 1800.0
 _ASK_S = 10.0
 _RUN = "run-000001"
 _NAME = "dump.bin"
-_DOWN = f"/storage/buckets/{DOWN_BUCKET}/objects"
 
 
 def transfer(place: Path, size: int, loss: float, seed: int) -> dict[str, Any]:
@@ -50,7 +47,7 @@ def transfer(place: Path, size: int, loss: float, seed: int) -> dict[str, Any]:
         write(folder, gateway, http)
         with serving(folder, http) as server:
             _until(server.link_up, 60.0)
-            down = _down(server, hashlib.sha256(data).digest())
+            down = _down(server, place, hashlib.sha256(data).digest())
             up = _up(server, place, data)
             states = sorted(one["state"] for one in _transfers(server))
     left = sorted(path.name for path in (place / "keys" / "files" / "transfers").glob("*-*.json"))
@@ -58,7 +55,7 @@ def transfer(place: Path, size: int, loss: float, seed: int) -> dict[str, Any]:
     return {"loss": loss, "bytes": size, **down, **up, "closed": closed, "states": states, "open": left}
 
 
-def _down(server: Yamcs, wanted: bytes) -> dict[str, Any]:
+def _down(server: Yamcs, place: Path, wanted: bytes) -> dict[str, Any]:
     """Command the file down, again while nothing begins; return whether and when it is there."""
     begun = time.monotonic()
     while time.monotonic() - begun < _LONGEST_S and not any(map(_is_download, _transfers(server))):
@@ -66,19 +63,16 @@ def _down(server: Yamcs, wanted: bytes) -> dict[str, Any]:
         _until(lambda: any(map(_is_download, _transfers(server))), _ASK_S)
     _until(lambda: all(one["state"] == "COMPLETED" for one in _transfers(server)), _LONGEST_S)
     seconds = round(time.monotonic() - begun, 1)
-    _until(lambda: bool(_objects(server)), _ASK_S)  # Yamcs stores a completed file beside
-    sums = [hashlib.sha256(server.raw(f"{_DOWN}/{quote(name)}")).digest() for name in _objects(server)]
+    came = place / "yamcs" / DOWN_BUCKET
+    _until(lambda: bool(list(came.iterdir())), _ASK_S)  # Yamcs stores a completed file beside
+    sums = [hashlib.sha256(path.read_bytes()).digest() for path in came.iterdir()]
     return {"down_whole": sums == [wanted], "down_seconds": seconds}
-
-
-def _objects(server: Yamcs) -> list[str]:
-    return [str(one["name"]) for one in server.ask(_DOWN).get("objects", ())]
 
 
 def _up(server: Yamcs, place: Path, data: bytes) -> dict[str, Any]:
     """Have Yamcs send a file up; return whether and when it is there."""
     begun = time.monotonic()
-    _upload(server, "release.whl", data)
+    (place / "yamcs" / UP_BUCKET / "release.whl").write_bytes(data)
     request = {"direction": "UPLOAD", "bucket": UP_BUCKET, "objectName": "release.whl"}
     request |= {"remotePath": "release/release.whl", "source": "ground", "destination": "satellite"}
     server.ask(f"/filetransfer/{INSTANCE}/{CFDP}/transfers", {**request, "options": {"reliable": True}})
@@ -87,18 +81,6 @@ def _up(server: Yamcs, place: Path, data: bytes) -> dict[str, Any]:
     whole = arrived.exists() and arrived.read_bytes() == data
     _until(lambda: not list((place / "keys" / "files" / "transfers").glob("in-*.json")), 120.0)
     return {"up_whole": whole, "up_seconds": round(time.monotonic() - begun, 1)}
-
-
-def _upload(server: Yamcs, name: str, data: bytes) -> None:
-    """Put an object into Yamcs's bucket, as a form's file."""
-    mark = "knightcube-file"
-    head = f'--{mark}\r\nContent-Disposition: form-data; name="file"; filename="{name}"\r\n\r\n'
-    body = head.encode() + data + f"\r\n--{mark}--\r\n".encode()
-    url = f"{server.url}/storage/buckets/{UP_BUCKET}/objects/{name}"
-    request = urllib.request.Request(url, body, {"Content-Type": f"multipart/form-data; boundary={mark}"})
-    opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
-    with opener.open(request, timeout=60.0):
-        pass
 
 
 def _transfers(server: Yamcs) -> list[dict[str, Any]]:
