@@ -56,8 +56,8 @@ services:
       maxPduSize: {pdu_bytes}
       sleepBetweenPdus: 20
       inactivityTimeout: 60000
-      eofAckLimit: 20
-      finAckLimit: 20
+      eofAckLimit: 720
+      finAckLimit: 720
       immediateNak: false
       nakTimeout: 2000
       incomingBucket: {down}

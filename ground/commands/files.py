@@ -19,7 +19,7 @@ from flight.link.process.directives import Directive
 from flight.link.process.file_directives import CancelFile, DeleteFile, ListFiles, SendFile, UseFile
 from flight.link.process.filing import KINDS, LISTING
 from flight.link.process.verification import Stage
-from flight.link.security.associations import COMMAND_SPIS, Vault
+from flight.link.security.associations import COMMAND_SPIS
 from ground.link.files import FileSession, failed, sum_of
 from ground.link.options import add_link_options, terminal_of
 from ground.link.terminal import Terminal
@@ -55,7 +55,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help=f"of silence before giving up (default {_SILENCE_S:g})",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
-    words = parser.add_subparsers(required=True, metavar="WHAT", dest="what")
+    _configure_words(parser.add_subparsers(required=True, metavar="WHAT", dest="what"))
+    parser.set_defaults(command=files)
+
+
+def _configure_words(words: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     listed = words.add_parser("list", help="list the files on board")
     listed.add_argument("under", nargs="?", default="", metavar="BEGINNING", help="of their names")
     got = words.add_parser("get", help="get files down")
@@ -73,7 +77,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "source", type=int, metavar="ENTITY", help="who sends: 1 the satellite, 2 the ground"
     )
     cancelled.add_argument("number", type=int, metavar="N", help="as the packet transfer has it")
-    parser.set_defaults(command=files)
 
 
 def files(options: argparse.Namespace) -> int:
@@ -85,8 +88,7 @@ def files(options: argparse.Namespace) -> int:
     try:
         store = Store(options.folder or files_folder(options.keys))
         with store.owned(), EndingSignals() as signals:
-            vault = Vault(options.keys)
-            session = FileSession(terminal, vault, store, options.spi, options.rate, time.monotonic_ns())
+            session = FileSession(terminal, store, options.spi, options.rate, time.monotonic_ns())
             work = _Work(session, terminal, options.timeout, lambda: signals.received)
             try:
                 facts = work.obey(options)

@@ -22,8 +22,6 @@ from flight.link.frames.telecommand import HEADER
 from flight.link.process import directives
 from flight.link.process.directives import Directive
 from flight.link.process.verification import Report, Stage
-from flight.link.security.associations import Vault
-from flight.link.security.gate import Sealer
 from flight.link.security.sdls import OVERHEAD_BYTES
 from flight.link.telemetry.link_definitions import TRANSFER, VERIFICATION
 from flight.link.telemetry.packets import CRC_BYTES, LAYOUTS, to_text
@@ -47,13 +45,11 @@ class FileSession:
         heard_ns: when anything came last.
     """
 
-    def __init__(
-        self, terminal: Terminal, vault: Vault, store: Store, spi: int, rate: float, now_ns: int
-    ) -> None:
+    def __init__(self, terminal: Terminal, store: Store, spi: int, rate: float, now_ns: int) -> None:
         """`rate` is in bytes/s of frames up. Raises FlightError."""
         self._terminal = terminal
         self._rate = rate
-        self._sealer = Sealer(vault, spi, telecommand.AUTHENTICATED, _BLOCK)
+        self._sealer = terminal.sealer(spi, _BLOCK)
         self._units = UnitPacker(UP)
         self.entity = Entity(GROUND, store, _anything, LONGEST_FILE, now_ns)
         self.received = store.received

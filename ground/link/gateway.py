@@ -31,6 +31,8 @@ _COMMANDS = {layout.identifier: layout for layout in TELECOMMANDS.values()}
 _TIME = struct.Struct(">q")
 _TIME_AT = HEADER_BYTES + 1
 _UNSENT = 1 << 22
+_SPI, _BLOCK = 1, 64
+"""Counters are reserved by so many: a file is thousands of frames, a reservation two writes to the disk."""
 _PIECE = 1 << 16
 _AGAIN_S = 20.0
 """Between the gateway's own pings: by UDP the link forgets a sender after a minute."""
@@ -47,6 +49,7 @@ class Gateway:
     def __init__(self, terminal: Terminal, address: str, complain: Callable[[str], object]) -> None:
         """Listen on HOST:PORT of loopback; `complain` gets each refusal in words. Raises UsageError."""
         self._terminal = terminal
+        self._sealer = terminal.sealer(_SPI, _BLOCK)
         self._complain = complain
         self._packer = CommandPacker()
         self._asked_at: float | None = None
@@ -81,7 +84,7 @@ class Gateway:
         """Carry what there is, or comes within a time."""
         if self._asked_at is None or time.monotonic() - self._asked_at > _AGAIN_S:
             self._asked_at = time.monotonic()
-            self._own.add(self._terminal.send(self._packer.pack(Ping(), utc_ns())))
+            self._own.add(self._terminal.send_by(self._sealer, self._packer.pack(Ping(), utc_ns())))
         waiting = [line for line, (_, unsent) in self._connections.items() if unsent]
         reading: list[Terminal | socket.socket] = [self._terminal, self._listener, *self._connections]
         ready, writable, _ = select.select(reading, waiting, [], seconds)
@@ -146,7 +149,7 @@ class Gateway:
         if not is_unit(packet, UP) and (layout is None or len(packet) != layout.length):
             self._complain(f"{len(packet)} bytes that begin with {packet[:2].hex()} are no command: not sent")
             return
-        self._terminal.send(finished(packet, utc_ns()))
+        self._terminal.send_by(self._sealer, finished(packet, utc_ns()))
         self.up += 1
 
     def _accept(self) -> None:

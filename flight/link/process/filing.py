@@ -20,7 +20,7 @@ from flight.gnc.errors import UsageError
 from flight.link.commands.codec import CommandError
 from flight.link.files.checksum import CRC32, MODULAR
 from flight.link.files.entity import FOREIGN, LONGEST_FILE, SATELLITE, Entity, Origin, Progress
-from flight.link.files.packets import unit_of
+from flight.link.files.packets import DOWN, UnitPacker, unit_of
 from flight.link.files.pdu import Metadata, PduError
 from flight.link.files.store import FileError, Store, problem_of_name, write_whole
 from flight.link.process.file_directives import (
@@ -53,8 +53,8 @@ class Filing:
         self._store = Store(folder)
         self._roots = {"log": log, "received": self._store.received}
         self._checks: list[tuple[Report, Iterator[str | None]]] = []
-        self._problem = ""
-        self._said = ""
+        self._units = UnitPacker(DOWN)
+        self._problem = self._said = ""
         try:
             self._entity = Entity(SATELLITE, self._store, self._may_come, LARGEST_UP, now_ns)
         except FileError as error:
@@ -67,13 +67,14 @@ class Filing:
         except (PduError, FileError) as error:
             raise CommandError(str(error)) from error
 
-    def unit(self, now_ns: int) -> bytes | None:
-        """Return the next unit to send down, None for none now."""
+    def packet(self, now_ns: int, time_ns: int) -> bytes | None:
+        """Return the next packet of a transfer to send down, at mission time `time_ns`; None for none now."""
         try:
-            return self._entity.unit(now_ns)
+            unit = self._entity.unit(now_ns)
         except FileError as error:
             self._problem = str(error)
             return None
+        return None if unit is None else self._units.pack(unit, time_ns)
 
     def turn(self, now_ns: int) -> list[Report]:
         """Go on with what takes time; return what is to be reported of it."""

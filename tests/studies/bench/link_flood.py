@@ -27,7 +27,6 @@ from flight.link.files.store import Store
 from flight.link.process import directives
 from flight.link.process.directives import Play
 from flight.link.process.file_directives import SendFile
-from flight.link.security.associations import Vault
 from flight.link.telemetry.link_definitions import LINK
 from flight.link.telemetry.packets import LAYOUTS
 from ground.link.files import FileSession
@@ -86,7 +85,7 @@ def _listen(port: int, place: Path, flight: subprocess.Popen[bytes], play: bool)
     keys = place / "keys" / "ground"
     terminal = open_terminal(f"127.0.0.1:{port}", keys)
     store, now_ns = Store(place / "ground-files"), time.monotonic_ns()
-    session = FileSession(terminal, Vault(keys), store, 2, _UP_RATE, now_ns)
+    session = FileSession(terminal, store, 2, _UP_RATE, now_ns)
     if play:
         (place / "run" / _FILE).write_bytes(np.random.default_rng(1).bytes(_FILE_BYTES))
         session.ask(SendFile(f"log/{_FILE}"), now_ns)

@@ -37,7 +37,7 @@ class FiledEnds(BothEnds):
         """Start another link process, another terminal and another session, as after kills."""
         super().restart()
         store = Store(self.place / "ground-files")
-        self.session = FileSession(self.terminal, self.ground, store, 1, self.up_rate, self.clock.now_ns())
+        self.session = FileSession(self.terminal, store, 1, self.up_rate, self.clock.now_ns())
 
     def ask(self, directive: Directive) -> None:
         """Send a command of the session."""
