@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from flight.link.telemetry.link_definitions import LINK, VERIFICATION
+from flight.link.telemetry.link_definitions import LINK, TRANSFER, VERIFICATION
 from flight.link.telemetry.packets import LAYOUTS, Layout, PacketArray, to_text
 from flight.link.telemetry.segments import find_segments
 from flight.link.telemetry.walk import walk
@@ -49,6 +49,7 @@ _KINDS: dict[str, list[tuple[str, dict[str, Any]]]] = {
         ("schedule", {"at": "2099-01-01T00:00:00", "words": "ping 1"}),
         ("list-schedule", {}),
         ("unschedule", {"number": 0}),
+        ("list-files", {"entity": "another-ground-station", "under": ""}),
     ],
     "orbit.yaml": [
         ("point", {"goal": "sun", **{f"numbers_{i}": 0 for i in range(1, 5)}, "roll": 0.0}),
@@ -64,7 +65,7 @@ The packet is archived and its values are right; displays miss it. Counted apart
 _REFUSED = ("clear", {"event": "too-hot"})
 _FAULTS = {"step_demo.yaml": ["--fault", "coil-x: open @ 45"], "orbit.yaml": []}
 _PATIENCE_S = {"step_demo.yaml": 60.0, "orbit.yaml": 700.0}
-_LINKS_OWN = {LAYOUTS[packet.name].identifier.to_bytes(2, "big") for packet in (LINK, VERIFICATION)}
+_LINKS_OWN = {LAYOUTS[packet.name].identifier.to_bytes(2, "big") for packet in (LINK, VERIFICATION, TRANSFER)}
 """How the packets begin that the link process makes: no flight log has them."""
 _EPOCH = "2026-01-01T00:00:00"
 
