@@ -29,10 +29,7 @@ def closed(craft: SlewCraft, unit: float, along: Along, program: Program, point:
     place, count, scale = equations.layout, equations.count, equations.scale
     around = along(np.linspace(0.0, scale, 2 * _STEPS * count + 1))
     firsts = 2 * _STEPS * np.arange(count)
-    motions = [
-        Motion(craft, scale, unit, around.part(firsts + k))
-        for k in range(2 * _STEPS + 1)
-    ]
+    motions = [Motion(craft, scale, unit, around.part(firsts + k)) for k in range(2 * _STEPS + 1)]
     factors = program.factors(point)
     for _ in range(_ROUNDS):
         middles, ends = _integrated(motions, at, 1.0 / count)
