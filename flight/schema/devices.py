@@ -135,7 +135,8 @@ class Camera(Section, frozen=True, kw_only=True):
 
     A frame is late `late_after` s after the exposure that it may have waited for; vision is slow after
     `vision_slow_after` s. Beyond `max_rate` rad/s of the body, where it is given, no exposure is begun. While
-    the attitude is fine a frame is taken every `fine_period` s, without it every `period`, too.
+    the attitude is fine a frame is taken every `fine_period` s, without it every `period`, too. The newest
+    `keep_frames` frames are kept in `frames` of the run's folder.
     """
 
     device: V4l2Device | AravisDevice | None = None
@@ -163,3 +164,4 @@ class Camera(Section, frozen=True, kw_only=True):
     max_age: Positive = 12.0
     late_after: Positive = 1.0
     vision_slow_after: Positive = 1.0
+    keep_frames: Annotated[int, Meta(ge=0, le=1000)] = 0

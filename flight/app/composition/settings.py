@@ -10,6 +10,7 @@ import numpy as np
 
 from flight.gnc.tracking.tracker import TrackSettings
 from flight.gnc.vision.frame_job import TrackerSettings
+from flight.gnc.vision.kept_frames import KeptFrames
 from flight.gnc.vision.objects.sighted import SightSettings
 from flight.gnc.vision.startracker.detection import DetectionSettings
 from flight.gnc.vision.startracker.identification.lost_in_space import IdentificationSettings
@@ -35,8 +36,9 @@ def navigation_settings(config: Config) -> NavigationSettings:
     )
 
 
-def imaging_settings(camera: Camera, body: Body) -> ImagingSettings:
-    """Return the settings of imaging."""
+def imaging_settings(camera: Camera, body: Body, frames: Path | None) -> ImagingSettings:
+    """Return the settings of imaging; `frames` is the folder of frames that are kept."""
+    kept = KeptFrames(frames, camera.keep_frames) if frames is not None and camera.keep_frames else None
     return ImagingSettings(
         camera=camera_model(camera),
         exposure_ns=round(camera.exposure * SECOND_NS),
@@ -53,6 +55,7 @@ def imaging_settings(camera: Camera, body: Body) -> ImagingSettings:
         velocity=body.velocity,
         objects=None if camera.objects is None else SightSettings(faintest=camera.objects.faintest),
         knowledge=body.knowledge,
+        kept=kept,
     )
 
 
