@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from flight.link.commands.codec import CommandError
+from flight.link.commands.errors import CommandError
 from flight.link.process import file_directives
 from flight.link.process.file_directives import FILE_PACKETS, FileDirective
 from flight.link.process.timetable import LONGEST_COMMAND

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from flight.link.commands.codec import CommandError
+from flight.link.commands.errors import CommandError
 from flight.link.files.entity import FOREIGN, GROUND
 from flight.link.files.store import LONGEST_NAME
 from flight.link.telemetry.form import Field, Packet

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from flight.gnc.errors import UsageError
-from flight.link.commands.codec import CommandError
+from flight.link.commands.errors import CommandError
 from flight.link.files.checksum import CRC32, MODULAR
 from flight.link.files.entity import FOREIGN, LONGEST_FILE, SATELLITE, Entity, Origin, Progress
 from flight.link.files.packets import DOWN, UnitPacker, unit_of

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.link.commands.codec import CommandPacker, Ping
+from flight.link.commands.codec import CommandPacker
+from flight.link.commands.values import Ping
 from flight.link.files.packets import UP, UnitPacker
 from flight.link.process import directives, filing
 from flight.link.process.downlink import FILES, LIVE
