@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -46,7 +47,7 @@ def imaging_settings(camera: Camera, body: Body, frames: Path | None) -> Imaging
         max_age_ns=round(camera.max_age * SECOND_NS),
         late_ns=round(camera.late_after * SECOND_NS),
         slow_ns=round(camera.vision_slow_after * SECOND_NS),
-        max_rate=camera.max_rate,
+        max_rate=math.inf if camera.max_rate is None else camera.max_rate,
         mounting=np.array(camera.mounting),
         estimator=_estimator(camera),
         tracker=_tracker(camera),
