@@ -74,6 +74,17 @@ def linked_flight(place: Path, text: str, *words: str) -> Iterator[LinkedFlight]
         yield found
 
 
+@contextmanager
+def service(log: Path, ready: str, *words: object) -> Iterator[subprocess.Popen[bytes]]:
+    """Run `python -m flight WORDS` from the line on that says `ready`, and end it at the end."""
+    process = _started([sys.executable, "-m", "flight", *map(str, words)], log)
+    try:
+        _wait(lambda: ready in log.read_text(), str(words[0]), log)
+        yield process
+    finally:
+        _end(process)
+
+
 def _started(words: list[str], log: Path) -> subprocess.Popen[bytes]:
     with log.open("ab") as out:
         return subprocess.Popen(words, stdout=out, stderr=subprocess.STDOUT)

@@ -24,10 +24,12 @@ from typing import Any
 
 import numpy as np
 
-from flight.link.telemetry.link_definitions import LINK, VERIFICATION
+from flight.link.parameters import FIELDS, KEYS, crc_of
+from flight.link.telemetry.link_definitions import LINK, TRANSFER, VERIFICATION
 from flight.link.telemetry.packets import LAYOUTS, Layout, PacketArray, to_text
 from flight.link.telemetry.segments import find_segments
 from flight.link.telemetry.walk import walk
+from flight.schema.reader import load
 from ground.telemetry.scanner import scan
 from ground.xtce import spread
 from ground.yamcs import write
@@ -39,6 +41,16 @@ _CONFIGS = Path(__file__).resolve().parents[3] / "config"
 _BROKEN = "coil-broken"
 _DEADLINE_S = 120.0
 """For what takes a second on a machine that is not busy."""
+
+
+def _same_table(name: str) -> dict[str, Any]:
+    """Return the arguments that load the table that a configuration flies anyway."""
+    config = load(_CONFIGS / name)
+    values = [float(getattr(getattr(config, section), key)) for section, key in (k.split(".") for k in KEYS)]
+    named = {field.name: value for field, value in zip(FIELDS, values, strict=True)}
+    return {"replaced": crc_of(values), "crc": crc_of(values), **named}
+
+
 _LASTING: list[tuple[str, dict[str, Any]]] = [
     ("slew", {"q2": 0.05}),
     ("mode", {"mode": "testbed-demo"}),
@@ -52,6 +64,9 @@ _BRIEF: list[tuple[str, dict[str, Any]]] = [
     ("schedule", {"at": "2099-01-01T00:00:00", "words": "ping 1"}),
     ("list-schedule", {}),
     ("unschedule", {"number": 0}),
+    ("list-files", {"entity": "another-ground-station", "under": ""}),
+    ("dump-parameters", {}),
+    ("load-parameters", _same_table("step_demo.yaml")),
 ]
 _POINT = ("point", {"goal": "sun", **{f"numbers_{i}": 0 for i in range(1, 5)}, "roll": 0.0})
 
@@ -81,7 +96,7 @@ The packet is archived and its values are right; displays miss it. Counted apart
 _REFUSED = ("clear", {"event": "too-hot"})
 _STEADY = LAYOUTS["health"].identifier.to_bytes(2, "big")
 """How the packet begins that a flight writes each second once it steers."""
-_LINKS_OWN = {LAYOUTS[packet.name].identifier.to_bytes(2, "big") for packet in (LINK, VERIFICATION)}
+_LINKS_OWN = {LAYOUTS[packet.name].identifier.to_bytes(2, "big") for packet in (LINK, VERIFICATION, TRANSFER)}
 """How the packets begin that the link process makes: no flight log has them."""
 _EPOCH = "2026-01-01T00:00:00"
 
