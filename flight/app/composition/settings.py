@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from flight.gnc.camera.exposure import Exposures
 from flight.gnc.tracking.tracker import TrackSettings
 from flight.gnc.vision.frame_job import TrackerSettings
 from flight.gnc.vision.objects.sighted import SightSettings
@@ -38,7 +39,7 @@ def imaging_settings(camera: Camera, body: Body) -> ImagingSettings:
     """Return the settings of imaging."""
     return ImagingSettings(
         camera=camera_model(camera),
-        exposure_ns=round(camera.exposure * SECOND_NS),
+        exposures=_exposures(camera),
         # A trigger may come late, and the next on time.
         fine_rest_ns=round(((camera.fine_period or camera.period) - 0.5 * camera.period) * SECOND_NS),
         max_age_ns=round(camera.max_age * SECOND_NS),
@@ -53,6 +54,12 @@ def imaging_settings(camera: Camera, body: Body) -> ImagingSettings:
         objects=None if camera.objects is None else SightSettings(faintest=camera.objects.faintest),
         knowledge=body.knowledge,
     )
+
+
+def _exposures(camera: Camera) -> Exposures:
+    """Return the exposures of the star camera."""
+    least, most = camera.streak_exposure or (camera.exposure, camera.exposure)
+    return Exposures(camera.exposure, least, most, camera_model(camera).focal_length)
 
 
 def track_settings(section: ObjectTracking) -> TrackSettings:
