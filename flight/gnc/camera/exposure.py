@@ -1,4 +1,4 @@
-"""How long to expose: stars that streak should do so over enough pixels to tell their rate, and not too many."""
+"""How long to expose: stars that streak should do so over enough pixels to tell their rate."""
 
 from __future__ import annotations
 
