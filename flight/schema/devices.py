@@ -130,13 +130,18 @@ class AravisDevice(Section, frozen=True, kw_only=True, tag_field="kind", tag="ar
     gain: float | None = None
 
 
+ExposureTime = Annotated[float, Meta(gt=0.0, le=10.0)]
+"""s."""
+
+
 class Camera(Section, frozen=True, kw_only=True):
     """The star camera: what flight must know to read its frames; `device` is the real one.
 
     A frame is late `late_after` s after the exposure that it may have waited for; vision is slow after
     `vision_slow_after` s. Beyond `max_rate` rad/s of the body, where it is given, no exposure is begun. While
     the attitude is fine a frame is taken every `fine_period` s, without it every `period`, too. The newest
-    `keep_frames` frames are kept in `frames` of the run's folder.
+    `keep_frames` frames are kept in `frames` of the run's folder. Stars that streak are exposed for a time
+    within `streak_exposure` s that follows the rate; without it for `exposure` s as points are.
     """
 
     device: V4l2Device | AravisDevice | None = None
@@ -146,7 +151,8 @@ class Camera(Section, frozen=True, kw_only=True):
     field_of_view_deg: Annotated[float, Meta(gt=1.0, lt=120.0)] = 20.0
     lens: CameraLens | None = None
     accuracy: CameraAccuracy = CameraAccuracy()
-    exposure: Annotated[float, Meta(gt=0.0, le=10.0)] = 1.0
+    exposure: ExposureTime = 1.0
+    streak_exposure: tuple[ExposureTime, ExposureTime] | None = None
     period: Positive = 5.0
     fine_period: Positive | None = None
     bits: Annotated[int, Meta(ge=8, le=16)] = 16

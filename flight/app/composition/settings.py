@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from flight.gnc.camera.exposure import Exposures
 from flight.gnc.tracking.tracker import TrackSettings
 from flight.gnc.vision.frame_job import TrackerSettings
 from flight.gnc.vision.kept_frames import KeptFrames
@@ -41,7 +42,7 @@ def imaging_settings(camera: Camera, body: Body, frames: Path | None) -> Imaging
     kept = KeptFrames(frames, camera.keep_frames) if frames is not None and camera.keep_frames else None
     return ImagingSettings(
         camera=camera_model(camera),
-        exposure_ns=round(camera.exposure * SECOND_NS),
+        exposures=_exposures(camera),
         # A trigger may come late, and the next on time.
         fine_rest_ns=round(((camera.fine_period or camera.period) - 0.5 * camera.period) * SECOND_NS),
         max_age_ns=round(camera.max_age * SECOND_NS),
@@ -57,6 +58,12 @@ def imaging_settings(camera: Camera, body: Body, frames: Path | None) -> Imaging
         knowledge=body.knowledge,
         kept=kept,
     )
+
+
+def _exposures(camera: Camera) -> Exposures:
+    """Return the exposures of the star camera."""
+    least, most = camera.streak_exposure or (camera.exposure, camera.exposure)
+    return Exposures(camera.exposure, least, most, camera_model(camera).focal_length)
 
 
 def track_settings(section: ObjectTracking) -> TrackSettings:
