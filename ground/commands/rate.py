@@ -25,7 +25,7 @@ from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from flight.gnc.vision.streaks.streak_result import StreakResult, StreakStatus
 from flight.schema import reader as configuration
-from flight.schema.camera_model import camera_knowledge, camera_model
+from flight.schema.camera_model import camera_model, likelihood_settings
 from flight.schema.devices import Camera
 from ground.commands.options import add_field, add_output, add_picture, finite, positive, read_picture
 from ground.pictures.overlay import draw_marks
@@ -60,7 +60,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--line-time",
         type=finite,
         metavar="S",
-        help="from one row's exposure to the next's (0: global shutter)",
+        help="from one row's exposure to the next's, 0 of a global shutter (default: not known, about 0)",
     )
     parser.add_argument("--prior", type=finite, nargs=3, metavar=("X", "Y", "Z"), help="rough rate, rad/s")
     parser.add_argument(
@@ -114,15 +114,7 @@ def _geometry(options: argparse.Namespace, camera: Camera | None, pixels: Image)
 
 def _likelihood(options: argparse.Namespace, camera: Camera | None) -> LikelihoodSettings:
     """Return the settings of the fit: the options, else the configuration's, else the defaults."""
-    settings = LikelihoodSettings()
-    if camera is not None:
-        settings = LikelihoodSettings(
-            gain=camera.gain,
-            saturation=camera.saturation,
-            psf_sigma=camera.psf_sigma,
-            line_time=camera.line_time,
-            knowledge=camera_knowledge(camera),
-        )
+    settings = LikelihoodSettings() if camera is None else likelihood_settings(camera)
     if options.line_time is not None and not math.isfinite(options.line_time):
         raise UsageError(f"--line-time {options.line_time}: must be finite")
     given = {

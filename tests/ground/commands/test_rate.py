@@ -118,7 +118,7 @@ def test_a_cameras_configuration_says_how_well_it_is_known(picture: Path, tmp_pa
     def sigma(accuracy: str) -> float:
         path = tmp_path / "camera.yaml"
         lens = f"{{focal_length: {CAMERA.pinhole.focal_length}, centre: [319.5, 319.5]}}"
-        size = "columns: 640, rows: 640, bits: 12, exposure: 0.2"
+        size = "columns: 640, rows: 640, bits: 12, exposure: 0.2, line_time: 0.0"
         path.write_text(f"camera: {{{size}, lens: {lens}, accuracy: {accuracy}}}\n")
         done = command("rate", picture, "--camera", path, "--json")
         assert done.returncode == 0, done.stderr

@@ -95,7 +95,7 @@ def refit_motion(
 ) -> MotionResult | None:
     """Return `motion` refitted with all stars known; None if that fails or gives another rate."""
     # Under a rolling shutter an ambiguous rate lies between two motions: there is none to start from.
-    between = likelihood.line_time > 0.0 and motion.status is not StreakStatus.RATE
+    between = likelihood.delay_per_row > 0.0 and motion.status is not StreakStatus.RATE
     if motion.rate is None or motion.covariance is None or between:
         return None
     pinhole, exposure = solution.camera.ideal, motion.exposure
@@ -107,7 +107,7 @@ def refit_motion(
     camera = ExposedCamera(
         expose_frame(pixels, likelihood.saturation, likelihood.gain),
         pinhole,
-        Shutter(likelihood.line_time / exposure, pinhole.centre[1]),
+        Shutter(likelihood.delay_per_row / exposure, pinhole.centre[1]),
         likelihood,
         motion.rate_model == "accelerating",
     )
