@@ -49,6 +49,8 @@ _LIGHT_ERROR = 0.15
 _AT_ONCE = 25
 # Instants at which a star is tested to be in the frame.
 _INSTANTS = 9
+# Pixels that the second fit looks at, in those of the first: places of faint stars are wanted, too.
+_ROOM = 1.7
 # Chi-square of 3, exceeded by chance once in 100,000: two rates farther apart are different motions.
 _ONE_MOTION = 25.9
 # px: added to the uncertainty of the previous attitude.
@@ -113,7 +115,7 @@ def refit_motion(
     )
     scene, hidden = _scenes(camera, course, known, motion)
     camera = replace(camera, frame=_without(camera, hidden))
-    done = joint_fit(camera, scene)
+    done = joint_fit(camera, scene, _ROOM)
     if done is None:
         return None
     refit = with_rate(with_stars(motion, camera, done), camera, done, Wholeness.WHOLE)

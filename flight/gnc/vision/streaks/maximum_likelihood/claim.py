@@ -75,17 +75,18 @@ def claim(result: MotionResult, camera: ExposedCamera, last: Fit) -> Claim:
         spread *= _UNCHECKED[1]
     shaking = find_shaking(camera, last)
     end = np.hypot(
-        _spread_doubt(scene.width, settings.psf_sigma) * np.sqrt(max(result.misfit, 1.0)),
+        _spread_doubt(scene.width, settings.psf_sigma) * max(result.misfit, 1.0),
         _END_SHAKING * max(shaking.across, shaking.along),
     )
     ends = float(np.sqrt(2.0) * end / result.length)
     # What the model does not explain makes it less certain; what fits too well, no more. A fit that goes
     # to and fro, as pixels are left out and taken in, is known no better than that.
     covariance = noise * spread * (1.0 + last.restless**2)
-    of_ends = ends**2 * float(turn @ turn) * np.eye(3)
-    common = lens.described + of_ends
-    unmodelled = max(float(np.trace(part)) for part in (common, common + covariance - _BEYOND_NOISE * noise))
-    covariance = covariance + lens.added + of_ends
+    longer = ends**2 * float(turn @ turn)
+    # Ends that are alike uncertain make the turn longer or shorter; the covariance leaves room for its axis.
+    common = float(np.trace(lens.described)) + longer
+    unmodelled = max(common, common + float(np.trace(covariance - _BEYOND_NOISE * noise)))
+    covariance = covariance + lens.added + longer * np.eye(3)
     return Claim(turn, covariance, float(np.sqrt(unmodelled / (turn @ turn))), shaking)
 
 

@@ -64,7 +64,7 @@ class LikelihoodSettings:
     least_significance: float = 5.0
     worst_misfit: float = 4.0
     worst_shaking: float = 0.05
-    worst_doubt: float = 0.007
+    worst_doubt: float = 0.008
     sign_sigmas: float = 3.0
     knowledge: CameraKnowledge = _UNCALIBRATED
 
