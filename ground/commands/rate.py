@@ -41,6 +41,11 @@ _REASONS = {
 }
 
 
+_SHUTTER = (
+    "shutter:       not described, which the claim allows for: give --line-time, 0 for all rows at once\n"
+)
+
+
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of this command to the parser."""
     parser.description = (
@@ -84,9 +89,15 @@ def run(options: argparse.Namespace) -> int:
     found = _estimate(options.method, pixels, pinhole, exposure, likelihood, prior)
     objects = _objects(pixels, pinhole, found, likelihood)
     if options.json:
-        sys.stdout.write(json.dumps(_facts(found, objects, options.method), allow_nan=False) + "\n")
+        facts = {
+            **_facts(found, objects, options.method),
+            "shutter_described": not likelihood.shutter_unstated,
+        }
+        sys.stdout.write(json.dumps(facts, allow_nan=False) + "\n")
     else:
         sys.stdout.write(_text(found, objects))
+        if isinstance(found, MotionResult) and found.rate is not None and likelihood.shutter_unstated:
+            sys.stdout.write(_SHUTTER)
     if options.overlay is not None:
         ends = [item.endpoints for item in objects]
         write_picture(options.overlay, draw_marks(grey_stretch(pixels), found.endpoints, found.used, ends))

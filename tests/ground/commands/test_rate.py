@@ -126,3 +126,16 @@ def test_a_cameras_configuration_says_how_well_it_is_known(picture: Path, tmp_pa
 
     exact, usual = sigma("{centre: 0.0, distortion: 0.0}"), sigma("{}")
     assert exact < 0.8 * usual
+
+
+def test_a_shutter_that_nobody_described_widens_the_claim_and_the_command_asks_for_it(picture: Path) -> None:
+    usual = "--fov", FOV, "--exposure", "0.2"
+
+    def sigma(*more: str) -> float:
+        facts = json.loads(command("rate", picture, *usual, *more, "--json").stdout)
+        assert facts["shutter_described"] is bool(more)
+        return float(np.sqrt(np.trace(facts["covariance_rad2_s2"])))
+
+    assert sigma("--line-time", "0") < sigma()
+    assert "--line-time" in command("rate", picture, *usual).stdout
+    assert "--line-time" not in command("rate", picture, *usual, "--line-time", "0").stdout

@@ -62,7 +62,7 @@ class Binning:
         return replace(
             settings,
             psf_sigma=settings.psf_sigma / self.size,
-            line_time=settings.delay_per_row * self.size,
+            line_time=None if settings.line_time is None else settings.line_time * self.size,
             knowledge=replace(
                 settings.knowledge,
                 centre=settings.knowledge.centre / self.size,

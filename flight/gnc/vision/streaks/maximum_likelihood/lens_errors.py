@@ -65,16 +65,15 @@ def correct(
         leading = np.linalg.solve(shared, cross)
         left = own - cross.T @ leading
         error = np.linalg.solve(left, asked - leading.T @ total)
-        added = [_added(leading[:, :count], left[:count, :count], error[:count]) for count in (m, described)]
+        added, stated = (
+            _added(leading[:, :count], left[:count, :count], error[:count]) for count in (m, described)
+        )
     except np.linalg.LinAlgError:
         return None
     change = leading @ error
     seen = float((asked - leading.T @ total) @ error) > chdtri(m, _BY_CHANCE)
-    return Correction(
-        -change if seen else np.zeros_like(change),
-        *added,
-        score - np.einsum("nij,nj->ni", information, seeming @ error - change),
-    )
+    left_over = score - np.einsum("nij,nj->ni", information, seeming @ error - change)
+    return Correction(-change if seen else np.zeros_like(change), added, stated, left_over)
 
 
 def _added(leading: FloatArray, left: FloatArray, error: FloatArray) -> FloatArray:

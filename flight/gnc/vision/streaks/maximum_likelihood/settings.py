@@ -82,5 +82,5 @@ class LikelihoodSettings:
 
     @property
     def shutter_unstated(self) -> bool:
-        """Whether nobody said how the shutter works."""
-        return self.knowledge.line_time is None and self.line_time is None
+        """Whether nobody said how the shutter works, so that it may roll."""
+        return self.line_time is None and self.line_time_sigma > 0.0

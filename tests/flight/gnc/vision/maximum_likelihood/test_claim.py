@@ -84,6 +84,9 @@ def test_a_shutter_that_nobody_describes_may_roll_and_one_that_is_described_may_
     assert LikelihoodSettings().line_time_sigma == UNSTATED
     assert LikelihoodSettings(line_time=0.0).line_time_sigma == 0.0
     assert LikelihoodSettings(line_time=2e-5).line_time_sigma == 0.0
+    assert LikelihoodSettings().shutter_unstated
+    assert not LikelihoodSettings(line_time=0.0).shutter_unstated
+    assert not LikelihoodSettings(knowledge=EXACT).shutter_unstated
     known = replace(CameraKnowledge(), line_time=3e-6)
     assert LikelihoodSettings(line_time=2e-5, knowledge=known).line_time_sigma == 3e-6
 
