@@ -147,6 +147,9 @@ STATE_UNWRITTEN = EventKind(63, "state-unwritten", _WARNED, "the state cannot be
 STATE_OLD = EventKind(
     98, "state-old", _WARNED, "the kept state counts fewer boots than there were: an unclean shutdown"
 )
+PARAMETERS_LEFT = EventKind(
+    115, "parameters-left", _WARNED, "the loaded table of parameters is not flown: the one before it is"
+)
 START_WAITED = EventKind(99, "start-waited", _WARNED, "the start failed and was tried again, with the reason")
 CONFIG_DAMAGED = EventKind(
     67, "config-damaged", _WARNED, "the configuration is not the accepted one: the last that flew is flown"
@@ -195,6 +198,8 @@ STRINGS_LOST = EventKind(104, "strings-lost", _WARNED, "the solar strings give n
 STRINGS_RECOVERED = EventKind(105, "strings-recovered", _TOLD, "the solar strings give readings again")
 SUN_UNCLEAR = EventKind(106, "sun-unclear", _WARNED, "the solar strings see no Sun in the sunlight")
 SUN_CLEAR = EventKind(107, "sun-clear", _TOLD, "the solar strings see the Sun again")
+SLEW_BEGUN = EventKind(108, "slew-begun", _TOLD, "a slew of least heat to the target begins")
+SLEW_ENDED = EventKind(109, "slew-ended", _TOLD, "a slew is over: the target is pointed to from now on")
 
 OBJECT_FOUND = EventKind(120, "object-found", _TOLD, "a track of an object that is no star is confirmed")
 OBJECT_LOST = EventKind(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -20,8 +21,9 @@ from flight.loop.fdir.streams import Streams, streams_of
 from flight.loop.flight_loop import FlightLoop, LoopTasks, Supervisors, nothing
 from flight.loop.services import Devices, Services
 from flight.loop.state.content import Learned
+from flight.loop.state.keeper import StateKeeper
 from flight.loop.tasks.coil_drive import CoilDrive, CoilDriveSettings
-from flight.loop.tasks.commanding import Commanding
+from flight.loop.tasks.commanding import Commanding, Obeying
 from flight.loop.tasks.control_cycle import ControlCycle, CycleTasks
 from flight.loop.tasks.health_watch import HealthInputs, HealthWatch
 from flight.loop.tasks.housekeeping import Housekeeping, Watched
@@ -29,6 +31,7 @@ from flight.loop.tasks.imaging import Imaging
 from flight.loop.tasks.mode_control import ModeControl, ModeSettings
 from flight.loop.tasks.navigation import Navigation
 from flight.loop.tasks.object_tracking import ObjectTracking
+from flight.loop.tasks.parameters import Adopters, Parameters
 from flight.loop.tasks.performance import PerformanceObserver
 from flight.loop.tasks.positioning import Positioning
 from flight.loop.tasks.steering import Steering
@@ -45,6 +48,7 @@ class Opened:
         log_error: returns why the flight log fails, empty while it works.
         channels: sources of commands.
         feed: feeds the watchdog, called about four times a second.
+        frames: folder of the frames that are kept.
     """
 
     clock: Clock
@@ -54,6 +58,7 @@ class Opened:
     log_error: Callable[[], str]
     channels: Sequence[Channel] = ()
     feed: Callable[[], None] = nothing
+    frames: Path | None = None
 
 
 def build_loop(config: Config, opened: Opened, supervisors: Supervisors) -> FlightLoop:
@@ -70,18 +75,24 @@ def build_loop(config: Config, opened: Opened, supervisors: Supervisors) -> Flig
     def stop(reason: str) -> None:
         loop.stop(reason)
 
-    loop = FlightLoop(config, body, _tasks(config, opened, services, body, stop), services, supervisors)
+    tasks = _tasks(config, opened, services, body, keeper, stop)
+    loop = FlightLoop(config, body, tasks, services, supervisors)
     return loop
 
 
 def _tasks(
-    config: Config, opened: Opened, services: Services, body: Body, stop: Callable[[str], None]
+    config: Config,
+    opened: Opened,
+    services: Services,
+    body: Body,
+    keeper: StateKeeper | None,
+    stop: Callable[[str], None],
 ) -> LoopTasks:
     devices, timeline = opened.devices, config.commands.timeline
     navigation = Navigation(devices.unit, body, navigation_settings(config), services)
     drive = _drive(config, devices, body, services)
     steering = Steering(body, drive, services)
-    imaging = _imaging(config, devices, navigation, body, services)
+    imaging = _imaging(config, opened, navigation, body, services)
     low_rate, low_for = config.detumble.low_rate, config.detumble.low_for
     modes = ModeControl(ModeSettings(config.modes, low_rate, low_for, stop), body, steering, services)
     observer = PerformanceObserver(devices.coils, services)
@@ -92,7 +103,9 @@ def _tasks(
     )
     watched = Watched(navigation, body.planner, imaging, devices.coils, devices.power, opened.log_error)
     commanded = bool(opened.channels or timeline)
-    commanding = Commanding(modes, drive, timeline, opened.channels, services) if commanded else None
+    parameters = Parameters(config, Adopters(modes.adopt, health.adopt), keeper, services)
+    obeying = Obeying(modes, drive, parameters)
+    commanding = Commanding(obeying, timeline, opened.channels, services) if commanded else None
     positioning = _positioning(config, devices, body, services)
     sun, house = _sun(config, devices, body, services), Housekeeping(watched, services)
     return LoopTasks(
@@ -119,12 +132,12 @@ def _sun(config: Config, devices: Devices, body: Body, services: Services) -> Su
 
 
 def _imaging(
-    config: Config, devices: Devices, navigation: Navigation, body: Body, services: Services
+    config: Config, opened: Opened, navigation: Navigation, body: Body, services: Services
 ) -> Imaging | None:
-    camera, source = config.camera, devices.camera
+    camera, source = config.camera, opened.devices.camera
     if camera is None or source is None:
         return None
-    settings = imaging_settings(camera, body)
+    settings = imaging_settings(camera, body, opened.frames)
     section = camera.objects
     objects = None if section is None else ObjectTracking(track_settings(section), services)
     return Imaging(source, settings, navigation, body.view, services, objects)

@@ -8,13 +8,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from flight.bodies.orbit.paths import PointingPaths
 from flight.bodies.orbit.surroundings import Surroundings
 from flight.bodies.orbit.targets import target_of
 from flight.gnc.control.three_axes.pointing_job import PointingJob
 from flight.gnc.control.three_axes.pointing_table import PointingWeights
+from flight.gnc.control.three_axes.slew_table import SlewWish
 from flight.gnc.estimation.estimate import Estimate
 from flight.gnc.guidance.three_axes.target_law import BodyAxes
 from flight.gnc.math.arrays import FloatArray
@@ -35,13 +38,15 @@ ASTRAY = math.radians(15.0)
 class PlannedCraft:
     """What the planner believes of the craft.
 
-    `inertia` (3, 3) kg m^2, body axes; `limit` A m^2 of each coil, mean over a window of pause and action.
+    `inertia` (3, 3) kg m^2, body axes; `limit` A m^2 of each coil, mean over a window of pause and action;
+    `slew` is how slews are wanted.
     """
 
     inertia: FloatArray
     axes: BodyAxes
     weights: PointingWeights
     limit: float
+    slew: SlewWish
 
 
 class PointingPlanner:
@@ -52,11 +57,12 @@ class PointingPlanner:
         craft: PlannedCraft,
         paths: PointingPaths,
         surroundings: Surroundings,
-        sizes: Callable[[], FloatArray],
+        disturbed: Callable[[], tuple[FloatArray, FloatArray]],
         services: Services,
     ) -> None:
-        """`sizes` returns the torques estimated now, (9,) N m."""
-        self._craft, self._paths, self._surroundings, self._sizes = craft, paths, surroundings, sizes
+        """`disturbed` returns what is estimated now: torques (9,) N m and residual dipole (3,) A m^2."""
+        self._craft, self._paths, self._surroundings = craft, paths, surroundings
+        self._disturbed = disturbed
         self._jobs, self._events = services.jobs, services.events
         self._job: PointingJob | None = None
         self._wanted = False
@@ -84,13 +90,21 @@ class PointingPlanner:
 
     def serve(self, estimate: Estimate | None, target: Target, now_ns: int) -> None:
         """Submit the requested job to the worker."""
-        wanted = self._wanted or self._paths.off > ASTRAY
+        goal, astray = target_of(target), self._paths.off > ASTRAY
+        if self._paths.is_slewing(now_ns, goal) and not astray:
+            return  # the rest of a slew planned again costs many times its heat
+        if self._paths.has_arrived(now_ns):
+            text = f"{math.degrees(self._paths.off):.2f} deg off its path"
+            self._events.report(events.SLEW_ENDED, now_ns, text)
+            self._wanted = True
+        wanted = self._wanted or astray
         if estimate is None or not wanted or self._job is not None or now_ns < self._after_ns:
             return
         orbit, craft = self._surroundings.state(now_ns), self._craft
         if orbit is None:
             self._fail("no plan: the orbit is not known", now_ns)
             return
+        sizes, residual = self._disturbed()
         job = PointingJob(
             self._count + 1,
             now_ns,
@@ -98,11 +112,12 @@ class PointingPlanner:
             craft.inertia,
             craft.axes,
             craft.weights,
-            target_of(target),
+            goal,
             estimate.quaternion,
             estimate.rate,
-            self._sizes(),
+            sizes,
             craft.limit,
+            replace(craft.slew, residual=residual),
         )
         if self._jobs.submit(PLANNER, job):
             self._wanted, self._job, self._count = False, job, job.number
@@ -119,6 +134,10 @@ class PointingPlanner:
             self._fail(f"plan {job.number}: {reason}", now_ns)
         else:
             self._accepted += 1
+            if (slew := result.value.slew) is not None:
+                fastest = math.degrees(float(np.linalg.norm(slew.rate, axis=1).max()))
+                text = f"to {job.target.text} in {slew.horizon:.0f} s, {fastest:.2f} deg/s at most"
+                self._events.report(events.SLEW_BEGUN, now_ns, text)
 
     def counts(self) -> tuple[int, int]:
         """Return how many plans were accepted and refused since the start."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from flight.link.telemetry.form import Packet
 from flight.link.telemetry.health_definitions import COMMAND, EVENT, HEALTH, HOUSEKEEPING, RUN
-from flight.link.telemetry.link_definitions import LINK, VERIFICATION
+from flight.link.telemetry.link_definitions import LINK, TRANSFER, VERIFICATION
 from flight.link.telemetry.motion_definitions import (
     ATTITUDE,
     CONTROL,
@@ -21,6 +21,7 @@ from flight.link.telemetry.motion_definitions import (
     TRUTH,
 )
 from flight.link.telemetry.orbit_definitions import NAVIGATION, ORBIT_TRUTH, SPIN
+from flight.link.telemetry.parameter_definitions import PARAMETERS
 from flight.link.telemetry.performance_definitions import CYCLE_TIMING, JOB_TIMING, RATE_GROUP
 from flight.link.telemetry.vision_definitions import SIGHTINGS, STARS, STREAK, TRACK
 
@@ -40,6 +41,7 @@ __all__ = [
     "NAVIGATION",
     "ORBIT_TRUTH",
     "PACKETS",
+    "PARAMETERS",
     "PLAN",
     "RATE_GROUP",
     "RUN",
@@ -49,6 +51,7 @@ __all__ = [
     "STREAK",
     "TARGET",
     "TRACK",
+    "TRANSFER",
     "TRUTH",
     "VERIFICATION",
 ]
@@ -71,8 +74,10 @@ PACKETS: tuple[Packet, ...] = (
     HOUSEKEEPING,
     HEALTH,
     COMMAND,
+    PARAMETERS,
     LINK,
     VERIFICATION,
+    TRANSFER,
     TRUTH,
     ORBIT_TRUTH,
     CYCLE_TIMING,

@@ -15,11 +15,14 @@ from aiohttp.test_utils import TestClient, TestServer
 
 from flight.link.commands import codec
 from flight.link.commands.definitions import COMMANDS
+from flight.link.commands.values import Command
 from flight.link.modes import Mode
+from flight.link.parameters import FIELDS, crc_of
+from flight.link.telemetry.packets import LAYOUTS, PacketArray
 from ground.console.commanding import Commanding
 from ground.console.history import History
 from ground.console.server import Console, application
-from ground.console.surroundings import Surroundings
+from ground.console.surroundings import NOWHERE, Surroundings
 from ground.watch.tail import LogTail
 from tests.ground.report.synthetic import Recipe, make_run
 
@@ -139,6 +142,27 @@ def test_a_log_that_grows_is_shown_within_a_second(folder: Path, tmp_path: Path)
     assert time > first
 
 
+def test_the_links_own_packets_do_not_hide_a_flight_that_is_silent(folder: Path) -> None:
+    """A link that lives goes on to report once a second."""
+
+    class Feed:
+        silence = 0.0
+        came: tuple[str, ...] = ("link", "verification")
+
+        def new(self) -> dict[str, PacketArray]:
+            return {name: np.zeros(int(name in self.came), layout.dtype) for name, layout in LAYOUTS.items()}
+
+    with History() as history:
+        feed = Feed()
+        console = Console("link", feed, history, NOWHERE, Commanding(None))
+        heard = console.flight_heard
+        console.look()
+        assert console.flight_heard == heard
+        feed.came = ("link", "health")
+        console.look()
+        assert console.flight_heard > heard
+
+
 def commanded(folder: Path, name: str, values: Any, send: Any) -> tuple[int, Any]:
     async def ask(client: TestClient[Any, Any]) -> tuple[int, Any]:
         async with client.post("/api/command", json={"command": name, "values": values}) as answer:
@@ -149,6 +173,8 @@ def commanded(folder: Path, name: str, values: Any, send: Any) -> tuple[int, Any
 
 
 def test_each_command_of_the_table_is_packed_from_a_form_as_the_codec_reads_it(folder: Path) -> None:
+    table = [field.valid[0] for field in FIELDS if field.valid]
+    named = {field.name: value for field, value in zip(FIELDS, table, strict=True)}
     forms: dict[str, dict[str, Any]] = {
         "ping": {"number": "7"},
         "safe": {"reason": "bored"},
@@ -156,9 +182,11 @@ def test_each_command_of_the_table_is_packed_from_a_form_as_the_codec_reads_it(f
         "slew": {"q2": "0.25"},
         "clear": {"event": "coil-broken"},
         "point": {"goal": 4, "numbers": ["0.5", "0.6"], "roll": ""},
+        "load-parameters": {"replaced": 7, "crc": crc_of(table), **named},
+        "dump-parameters": {},
     }
     assert set(forms) == {packet.name for packet in COMMANDS}
-    sent: list[codec.Command] = []
+    sent: list[Command] = []
 
     def send(packet: bytes) -> dict[str, Any]:
         sent.append(codec.unpack(packet))
@@ -167,9 +195,10 @@ def test_each_command_of_the_table_is_packed_from_a_form_as_the_codec_reads_it(f
     for name, values in forms.items():
         status, answer = commanded(folder, name, values, send)
         assert (status, answer["obeyed"], answer["text"]) == (200, 1, "done")
-    words = [codec.describe(command) for command in sent]
+    words = [command.text for command in sent]
     assert words[:5] == ["ping 7", "mode safe: bored", "mode hold", "slew to q2 +0.2500", "clear coil-broken"]
     assert words[5].startswith("point ground")
+    assert words[6:] == [f"load-parameters {crc_of(table):08x} in place of 00000007", "dump-parameters"]
 
 
 @pytest.mark.parametrize(
@@ -213,5 +242,7 @@ def test_a_satellites_place_is_known_from_its_elements_and_without_a_configurati
     track = np.array(Surroundings.of(tmp_path / "config.yaml").track(noon))
     assert np.hypot(*(track - [place["latitude"], place["longitude"]]).T).min() < 0.5
     assert np.dot(place["nadir"], place["velocity"]) == pytest.approx(0.0, abs=0.01)
+    coil = Surroundings.of(tmp_path / "config.yaml").coil_dipole
+    assert coil == pytest.approx(0.648 * 0.148), "A m^2 of a coil at its limit"
     unknown = Surroundings.of(tmp_path / "nowhere")
     assert (unknown.at(noon), unknown.track(noon)) == (None, [])
