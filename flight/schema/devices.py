@@ -78,13 +78,14 @@ class CameraAccuracy(Section, frozen=True, kw_only=True):
     """How well the camera is known, standard deviations: what streaks may claim of a rate depends on it.
 
     `focal_length` as a share of itself, `centre` of the axis along x and y in px, `distortion` as the share
-    of its radius by which a corner may be displaced, `line_time` in s. Zero is exact, as an emulated camera.
+    of its radius by which a corner may be displaced, `line_time` in s. Zero is exact, as an
+    emulated camera; without a `line_time` that of the camera is exact where it is stated.
     """
 
     focal_length: NotNegative = _KNOWN.focal_length
     centre: NotNegative = _KNOWN.centre
     distortion: NotNegative = _KNOWN.distortion
-    line_time: NotNegative = _KNOWN.line_time
+    line_time: NotNegative | None = _KNOWN.line_time
 
 
 class StarTracker(Section, frozen=True, kw_only=True):
@@ -160,7 +161,7 @@ class Camera(Section, frozen=True, kw_only=True):
     read_noise: Positive = 10.0
     saturation: Positive | None = None
     psf_sigma: Positive = 1.0
-    line_time: NotNegative = 0.0
+    line_time: NotNegative | None = None
     estimator: Estimator = "likelihood"
     star_tracker: StarTracker | None = None
     objects: ObjectTracking | None = None

@@ -21,7 +21,7 @@ from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSett
 from flight.loop.body import Body
 from flight.loop.tasks.frame_measurements import ImagingSettings
 from flight.loop.tasks.navigation import NavigationSettings
-from flight.schema.camera_model import camera_knowledge, camera_model
+from flight.schema.camera_model import camera_model, likelihood_settings
 from flight.schema.devices import Camera, ObjectTracking
 from flight.schema.sections import Config
 from hal.interfaces.wires import SECOND_NS
@@ -97,12 +97,6 @@ def _estimator(camera: Camera) -> StreakSettings | LikelihoodSettings:
     """Return the settings of the configured streak estimator."""
     saturation = _saturation(camera)
     if camera.estimator == "likelihood":
-        return LikelihoodSettings(
-            gain=camera.gain,
-            saturation=saturation,
-            psf_sigma=camera.psf_sigma,
-            line_time=camera.line_time,
-            knowledge=camera_knowledge(camera),
-        )
+        return replace(likelihood_settings(camera), saturation=saturation)
     settings = StreakSettings.of(camera.estimator, saturation=saturation, gain=camera.gain)
     return settings if camera.endpoint_bias is None else replace(settings, endpoint_bias=camera.endpoint_bias)
