@@ -52,6 +52,7 @@ def imaging_settings(camera: Camera, body: Body) -> ImagingSettings:
         velocity=body.velocity,
         objects=None if camera.objects is None else SightSettings(faintest=camera.objects.faintest),
         knowledge=body.knowledge,
+        seeks=body.seeks,
     )
 
 

@@ -10,10 +10,11 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from flight.bodies.orbit.object_aim import ObjectAim
 from flight.bodies.orbit.paths import PointingPaths
 from flight.bodies.orbit.surroundings import Surroundings
 from flight.bodies.orbit.targets import target_of
-from flight.gnc.control.three_axes.pointing_job import PointingJob
+from flight.gnc.control.three_axes.pointing_job import STEADY, PointingJob
 from flight.gnc.control.three_axes.pointing_table import PointingWeights
 from flight.gnc.estimation.estimate import Estimate
 from flight.gnc.guidance.three_axes.target_law import BodyAxes
@@ -53,9 +54,11 @@ class PointingPlanner:
         paths: PointingPaths,
         surroundings: Surroundings,
         sizes: Callable[[], FloatArray],
+        objects: ObjectAim,
         services: Services,
     ) -> None:
         """`sizes` returns the torques estimated now, (9,) N m."""
+        self._objects = objects
         self._craft, self._paths, self._surroundings, self._sizes = craft, paths, surroundings, sizes
         self._jobs, self._events = services.jobs, services.events
         self._job: PointingJob | None = None
@@ -84,7 +87,8 @@ class PointingPlanner:
 
     def serve(self, estimate: Estimate | None, target: Target, now_ns: int) -> None:
         """Submit the requested job to the worker."""
-        wanted = self._wanted or self._paths.off > ASTRAY
+        self._objects.aim(target_of(target))
+        wanted = self._wanted or self._paths.off > ASTRAY or self._objects.moved
         if estimate is None or not wanted or self._job is not None or now_ns < self._after_ns:
             return
         orbit, craft = self._surroundings.state(now_ns), self._craft
@@ -104,9 +108,10 @@ class PointingPlanner:
             self._sizes(),
             craft.limit,
         )
+        job = self._objects.directed(job)
         if self._jobs.submit(PLANNER, job):
             self._wanted, self._job, self._count = False, job, job.number
-            self._after_ns = now_ns + AGAIN_NS
+            self._after_ns = now_ns + (AGAIN_NS if job.span is STEADY else 0)
 
     def finish(self, result: JobResult, now_ns: int) -> None:
         """Fly the worker's plan."""
@@ -119,6 +124,7 @@ class PointingPlanner:
             self._fail(f"plan {job.number}: {reason}", now_ns)
         else:
             self._accepted += 1
+            self._objects.judge(job, result.value, now_ns)
 
     def counts(self) -> tuple[int, int]:
         """Return how many plans were accepted and refused since the start."""

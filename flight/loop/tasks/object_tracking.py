@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -19,7 +20,11 @@ from flight.loop.services import Services
 class ObjectTracking:
     """Owns the tracks of objects."""
 
-    def __init__(self, settings: TrackSettings, services: Services) -> None:
+    def __init__(
+        self, settings: TrackSettings, sighted: Callable[[Sequence[Track], int], None], services: Services
+    ) -> None:
+        """`sighted` takes the confirmed tracks after each frame, and the time."""
+        self._sighted = sighted
         self._tracker = Tracker(settings)
         self._recorder = services.recorder
         self._events = services.events
@@ -41,6 +46,7 @@ class ObjectTracking:
             self._events.report(events.OBJECT_LOST, now_ns, text)
         for track in self._tracker.objects:
             self._record_track(track, now_ns)
+        self._sighted(self._tracker.objects, now_ns)
 
     def _record_sightings(self, sequence: int, middle_ns: int, sighted: Sighted, now_ns: int) -> None:
         x, y = np.reshape(sighted.points, (-1, 2)).T
@@ -73,6 +79,7 @@ class ObjectTracking:
             covariance=_packed(line.covariance[:3, :3]),
             rate_covariance=_packed(across @ line.covariance[3:, 3:] @ across),
             magnitude=track.magnitude,
+            magnitude_sigma=track.magnitude_sigma,
         )
 
 
