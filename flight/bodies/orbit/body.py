@@ -67,15 +67,14 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
         around = surroundings.at(estimate.time_ns)
         return np.zeros(3) if around is None else attitude_matrix(estimate.quaternion) @ around.field
 
-    def sizes() -> FloatArray:
-        return filter_.torque_sizes
-
     return Body(
         modes=frozenset(Mode) - {Mode.HOLD, Mode.SLEW, Mode.TESTBED_DEMO},
         filter=filter_,
         learned_problems=[],
         paths=paths,
-        planner=PointingPlanner(_planned(config), paths, surroundings, sizes, objects, services),
+        planner=PointingPlanner(
+            _planned(config), paths, surroundings, lambda: filter_.torque_sizes, objects, services
+        ),
         targets=PointingTargets(_timed(config), paths, config.looks_for_objects()),
         tracker=PointingTracker(filter_, surroundings, _pauses(config), limit, dipole_per_ampere),
         feed=OrbitFeed(filter_),
@@ -91,6 +90,7 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
         fix=surroundings.fix,
         sun=_sun(config, filter_, surroundings),
         sighted=objects.accept,
+        place=surroundings.state,
         seeks=lambda: objects.seeks,
     )
 

@@ -89,6 +89,9 @@ TRACK = Packet(
         Field("rate_covariance", "f8", "rad^2/s^2", "xx yy zz xy xz yz of the rate", 6),
         Field("magnitude", "f8", "mag", "V, mean over the last sightings; NaN when unknown"),
         Field("magnitude_sigma", "f8", "mag", "of that, by their scatter; NaN when unknown"),
+        Field("place", "f8", "m", "of the camera, about the Earth's centre; NaN when unknown", 3),
+        Field("velocity", "f8", "m/s", "likewise", 3),
+        Field("place_sigma", "f8", "m", "of an axis of the place"),
     ),
     version=2,
 )

@@ -13,6 +13,7 @@ from tests.studies.campaigns.failures import FAILURES
 from tests.studies.campaigns.false_horizons import FALSE_HORIZONS
 from tests.studies.campaigns.faults import FAULTS
 from tests.studies.campaigns.faults_kill import FAULTS_KILL
+from tests.studies.campaigns.first_orbits import FIRST_ORBITS
 from tests.studies.campaigns.installer_kill import INSTALLER_KILL
 from tests.studies.campaigns.lost_in_space import LOST_IN_SPACE
 from tests.studies.campaigns.mismatch import MISMATCH, VIBRATION
@@ -46,6 +47,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         RSO_SLEW,
         RSO_TRACK,
         RSO_ORBITS,
+        FIRST_ORBITS,
         CONSISTENCY,
         LOST_IN_SPACE,
         NADIR,
