@@ -147,6 +147,9 @@ STATE_UNWRITTEN = EventKind(63, "state-unwritten", _WARNED, "the state cannot be
 STATE_OLD = EventKind(
     98, "state-old", _WARNED, "the kept state counts fewer boots than there were: an unclean shutdown"
 )
+PARAMETERS_LEFT = EventKind(
+    115, "parameters-left", _WARNED, "the loaded table of parameters is not flown: the one before it is"
+)
 START_WAITED = EventKind(99, "start-waited", _WARNED, "the start failed and was tried again, with the reason")
 CONFIG_DAMAGED = EventKind(
     67, "config-damaged", _WARNED, "the configuration is not the accepted one: the last that flew is flown"

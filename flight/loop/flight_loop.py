@@ -160,6 +160,8 @@ class FlightLoop:
         for sensing in (tasks.positioning, tasks.sun):
             if sensing is not None:
                 sensing.begin(epoch_ns)
+        if tasks.commanding is not None:
+            tasks.commanding.begin(epoch_ns)
         services.streams.begin(epoch_ns)
         utc_ns = clock.utc_ns() - (clock.now_ns() - epoch_ns)
         record_run(recorder, config, label, epoch_ns, utc_ns, self._groups[0].period_ns)

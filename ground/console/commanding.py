@@ -10,6 +10,7 @@ from flight.app.utc_label import utc_ns
 from flight.gnc.errors import FlightError, UsageError
 from flight.link.commands import codec
 from flight.link.commands.definitions import LAYOUTS
+from flight.link.commands.errors import CommandError
 from flight.link.process import directives
 from flight.link.telemetry.form import Field
 from flight.link.telemetry.packets import Layout, Packer, TelemetryError
@@ -70,7 +71,7 @@ class Commanding:
         try:
             data = self._packer.pack(packet, utc_ns(), fields)
             _words(data)
-        except (TelemetryError, codec.CommandError) as error:
+        except (TelemetryError, CommandError) as error:
             raise UsageError(str(error)) from error
         return data
 
@@ -78,7 +79,7 @@ class Commanding:
 def _words(data: bytes) -> str:
     """Return the words of a command's packet. Raises CommandError for values that are none."""
     directive = directives.unpack(data)
-    return codec.describe(codec.unpack(data)) if directive is None else str(directive)
+    return codec.unpack(data).text if directive is None else str(directive)
 
 
 def _value(name: str, field: Field, given: Any) -> Any:

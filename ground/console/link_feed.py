@@ -9,7 +9,8 @@ import numpy as np
 
 from flight.app.utc_label import utc_ns
 from flight.gnc.errors import FlightError
-from flight.link.commands.codec import CommandPacker, Ping
+from flight.link.commands.codec import CommandPacker
+from flight.link.commands.values import Ping
 from flight.link.process.directives import LIST
 from flight.link.process.downlink import LIVE
 from flight.link.process.verification import Report, Stage

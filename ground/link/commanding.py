@@ -6,7 +6,8 @@ from collections.abc import Callable, Iterator
 
 from flight.app.utc_label import utc_ns
 from flight.gnc.errors import FlightError, UsageError
-from flight.link.commands.codec import CommandPacker, Ping
+from flight.link.commands.codec import CommandPacker
+from flight.link.commands.values import Ping
 from flight.link.frames import telecommand
 from flight.link.process import directives
 from flight.link.process.directives import NewKey

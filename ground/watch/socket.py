@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 from flight.app.utc_label import utc_ns
 from flight.gnc.errors import FlightError, UsageError
-from flight.link.commands.codec import CommandPacker, Ping
+from flight.link.commands.codec import CommandPacker
+from flight.link.commands.values import Ping
 from flight.link.telemetry.definitions import COMMAND, EVENT
 from flight.link.telemetry.packets import PacketArray, TelemetryError
 from ground.commands.command import exchange

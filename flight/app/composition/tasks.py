@@ -20,8 +20,9 @@ from flight.loop.fdir.streams import Streams, streams_of
 from flight.loop.flight_loop import FlightLoop, LoopTasks, Supervisors, nothing
 from flight.loop.services import Devices, Services
 from flight.loop.state.content import Learned
+from flight.loop.state.keeper import StateKeeper
 from flight.loop.tasks.coil_drive import CoilDrive, CoilDriveSettings
-from flight.loop.tasks.commanding import Commanding
+from flight.loop.tasks.commanding import Commanding, Obeying
 from flight.loop.tasks.control_cycle import ControlCycle, CycleTasks
 from flight.loop.tasks.health_watch import HealthInputs, HealthWatch
 from flight.loop.tasks.housekeeping import Housekeeping, Watched
@@ -29,6 +30,7 @@ from flight.loop.tasks.imaging import Imaging
 from flight.loop.tasks.mode_control import ModeControl, ModeSettings
 from flight.loop.tasks.navigation import Navigation
 from flight.loop.tasks.object_tracking import ObjectTracking
+from flight.loop.tasks.parameters import Adopters, Parameters
 from flight.loop.tasks.performance import PerformanceObserver
 from flight.loop.tasks.positioning import Positioning
 from flight.loop.tasks.steering import Steering
@@ -70,12 +72,18 @@ def build_loop(config: Config, opened: Opened, supervisors: Supervisors) -> Flig
     def stop(reason: str) -> None:
         loop.stop(reason)
 
-    loop = FlightLoop(config, body, _tasks(config, opened, services, body, stop), services, supervisors)
+    tasks = _tasks(config, opened, services, body, keeper, stop)
+    loop = FlightLoop(config, body, tasks, services, supervisors)
     return loop
 
 
 def _tasks(
-    config: Config, opened: Opened, services: Services, body: Body, stop: Callable[[str], None]
+    config: Config,
+    opened: Opened,
+    services: Services,
+    body: Body,
+    keeper: StateKeeper | None,
+    stop: Callable[[str], None],
 ) -> LoopTasks:
     devices, timeline = opened.devices, config.commands.timeline
     navigation = Navigation(devices.unit, body, navigation_settings(config), services)
@@ -92,7 +100,9 @@ def _tasks(
     )
     watched = Watched(navigation, body.planner, imaging, devices.coils, devices.power, opened.log_error)
     commanded = bool(opened.channels or timeline)
-    commanding = Commanding(modes, drive, timeline, opened.channels, services) if commanded else None
+    parameters = Parameters(config, Adopters(modes.adopt, health.adopt), keeper, services)
+    obeying = Obeying(modes, drive, parameters)
+    commanding = Commanding(obeying, timeline, opened.channels, services) if commanded else None
     positioning = _positioning(config, devices, body, services)
     sun, house = _sun(config, devices, body, services), Housekeeping(watched, services)
     return LoopTasks(

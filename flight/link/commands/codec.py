@@ -1,16 +1,13 @@
-"""Commands as values, and as the bytes of one packet each; other packets are refused with the reason."""
+"""Commands as the bytes of one packet each; other packets are refused with the reason."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
-from flight.gnc.errors import FlightError, UsageError
-from flight.gnc.guidance.three_axes.pointing_target import NUMBERS, Goal, PointingTarget
-from flight.link.commands.definitions import CLEAR, LAYOUTS, MODE, PING, POINT, SAFE, SLEW
-from flight.link.modes import Mode
+from flight.link.commands.definitions import CLEAR, LAYOUTS
+from flight.link.commands.errors import CommandError, MalformedError
+from flight.link.commands.values import MAKERS, Command
 from flight.link.telemetry.form import Packet
 from flight.link.telemetry.packets import HEADER_BYTES, Packer, TelemetryError, crc16, to_text
 
@@ -22,99 +19,10 @@ IDENTIFIERS = tuple(_BY_IDENTIFIER)
 """The first 16 bits of a command: one of these."""
 
 
-class CommandError(FlightError):
-    """Bytes or values that are no command; says why."""
-
-
-class MalformedError(CommandError):
-    """Bytes that are no packet of a command: never answered, so that two flights cannot answer each other."""
-
-
-@dataclass(frozen=True, slots=True)
-class Ping:
-    """Answer."""
-
-    number: int = 0
-
-
-@dataclass(frozen=True, slots=True)
-class ChangeMode:
-    """Go into a mode; `reason` is for the log."""
-
-    mode: Mode
-    reason: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class Slew:
-    """Go to an attitude."""
-
-    q2: float
-
-
-@dataclass(frozen=True, slots=True)
-class Clear:
-    """Clear a latched event, so that it can be raised again."""
-
-    event: str
-
-
-@dataclass(frozen=True, slots=True)
-class Point:
-    """Point to a goal."""
-
-    target: PointingTarget
-
-
-Command = Ping | ChangeMode | Slew | Clear | Point
-
-
-def name_of(command: Command) -> str:
-    """Return the name of the packet that carries a command."""
-    match command:
-        case Ping():
-            return PING.name
-        case ChangeMode(mode):
-            return SAFE.name if mode is Mode.SAFE else MODE.name
-        case Slew():
-            return SLEW.name
-        case Clear():
-            return CLEAR.name
-        case Point():
-            return POINT.name
-
-
-def fields_of(command: Command) -> dict[str, Any]:
-    """Return the fields of the packet that carries a command, by name."""
-    match command:
-        case Ping(number):
-            return {"number": number}
-        case ChangeMode(mode, reason):
-            return {"reason": reason} if mode is Mode.SAFE else {"mode": int(mode)}
-        case Slew(q2):
-            return {"q2": q2}
-        case Clear(event):
-            return {"event": event}
-        case Point(target):
-            return _fields(target)
-
-
 def command_of(packet: Packet, fields: Mapping[str, Any]) -> Command:
     """Return the command of a packet's fields by name. Raises CommandError for values that are none."""
     check(packet, fields)
-    match packet.name:
-        case PING.name:
-            return Ping(fields["number"])
-        case SAFE.name:
-            return ChangeMode(Mode.SAFE, fields["reason"])
-        case MODE.name:
-            return ChangeMode(Mode(fields["mode"]))
-        case SLEW.name:
-            return Slew(fields["q2"])
-        case POINT.name:
-            return Point(_target(fields["goal"], fields["numbers"], fields["roll"]))
-        case _:
-            return Clear(fields["event"])
+    return MAKERS[packet.name](fields)
 
 
 def check(packet: Packet, fields: Mapping[str, Any]) -> None:
@@ -139,10 +47,9 @@ class CommandPacker:
 
     def pack(self, command: Command, utc_ns: int) -> bytes:
         """Return the bytes of a command sent at `utc_ns`. Raises CommandError for values that are none."""
-        packet, fields = LAYOUTS[name_of(command)].packet, fields_of(command)
-        check(packet, fields)
+        check(command.packet, command.fields)
         try:
-            return self._packer.pack(packet, utc_ns, fields)
+            return self._packer.pack(command.packet, utc_ns, command.fields)
         except TelemetryError as error:
             raise CommandError(str(error)) from error
 
@@ -170,46 +77,3 @@ def unpack(data: bytes) -> Command:
         for field in layout.packet.fields
     }
     return command_of(layout.packet, fields)
-
-
-def shown(text: str) -> str:
-    """Return a text with its control characters, and others that do not print, as escapes."""
-    escaped = (c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
-    return "".join(escaped)
-
-
-def describe(command: Command) -> str:
-    """Return a command in words that print."""
-    match command:
-        case Ping(number):
-            return f"ping {number}"
-        case ChangeMode(mode, reason):
-            return f"mode {mode.label}" + (f": {shown(reason)}" if reason else "")
-        case Slew(q2):
-            return f"slew to q2 {q2:+.4f}" if math.isfinite(q2) else "slew"
-        case Clear(event):
-            return f"clear {shown(event)}"
-        case Point(target):
-            return f"point {target.text}"
-
-
-def _fields(target: PointingTarget) -> dict[str, Any]:
-    spare = 4 - len(target.numbers)
-    return {
-        "goal": int(target.goal),
-        "numbers": [*target.numbers, *[math.nan] * spare],
-        "roll": math.nan if target.roll is None else target.roll,
-    }
-
-
-def _target(number: int, numbers: list[float], roll: float) -> PointingTarget:
-    """Return the target of a packet's fields. Raises CommandError; a roll of NaN is free."""
-    goal = Goal(number)
-    try:
-        counts = NUMBERS.get(goal, (0,))
-        given = numbers[: counts[-1]]
-        if 0 in counts and all(map(math.isnan, given)):
-            given = []
-        return PointingTarget(goal, tuple(given), None if math.isnan(roll) else roll)
-    except UsageError as error:
-        raise CommandError(str(error)) from error

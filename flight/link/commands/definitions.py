@@ -10,6 +10,7 @@ from __future__ import annotations
 from flight.gnc.guidance.one_axis.limits import Q2_LIMIT
 from flight.gnc.guidance.three_axes.pointing_target import Goal
 from flight.link.modes import COMMANDABLE, Mode
+from flight.link.parameters import FIELDS as PARAMETERS
 from flight.link.telemetry.form import Field, Packet
 from flight.link.telemetry.packets import Layout, compile_layouts
 
@@ -66,7 +67,23 @@ POINT = _command(
     hazard="moves the body",
 )
 
-COMMANDS: tuple[Packet, ...] = (PING, SAFE, MODE, SLEW, CLEAR, POINT)
+LOAD_PARAMETERS = _command(
+    "load-parameters",
+    0x210,
+    "Fly another table of parameters, all of them at once",
+    Field(
+        "replaced",
+        "u4",
+        "-",
+        "CRC-32 of the table that it replaces: another one has come between, if not equal",
+    ),
+    Field("crc", "u4", "-", "CRC-32 of the values, as big-endian doubles in this order"),
+    *PARAMETERS,
+    hazard="moves the limits at which the satellite brakes, gives up or warns",
+)
+DUMP_PARAMETERS = _command("dump-parameters", 0x211, "Report the table of parameters that flies")
+
+COMMANDS: tuple[Packet, ...] = (PING, SAFE, MODE, SLEW, CLEAR, POINT, LOAD_PARAMETERS, DUMP_PARAMETERS)
 
 LAYOUTS: dict[str, Layout] = compile_layouts(COMMANDS)
 """Their bytes, by name."""

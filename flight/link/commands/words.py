@@ -9,8 +9,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from flight.link.commands.codec import Command, CommandError, command_of
+from flight.link.commands.codec import command_of
 from flight.link.commands.definitions import LAYOUTS
+from flight.link.commands.errors import CommandError
+from flight.link.commands.values import Command
 from flight.link.telemetry.form import Field
 
 

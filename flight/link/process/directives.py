@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from flight.link.commands.codec import CommandError
+from flight.link.commands.errors import CommandError
 from flight.link.process.timetable import LONGEST_COMMAND
 from flight.link.security.sdls import KEY_BYTES
 from flight.link.telemetry.form import Field, Packet

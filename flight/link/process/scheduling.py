@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from datetime import UTC, datetime
 
-from flight.link.commands.codec import CommandError
+from flight.link.commands.errors import CommandError
 from flight.link.commands.words import command_of_words
 from flight.link.modes import Mode
 from flight.link.process.directives import SCHEDULE, Deletion, Listing, Scheduled

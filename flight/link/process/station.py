@@ -13,7 +13,8 @@ from typing import Any
 
 from flight.gnc.errors import FlightError
 from flight.link.commands import codec
-from flight.link.commands.codec import CommandError, CommandPacker, describe
+from flight.link.commands.codec import CommandPacker
+from flight.link.commands.errors import CommandError
 from flight.link.frames import telecommand, telemetry
 from flight.link.process import directives
 from flight.link.process.archive_reader import LogFollower, stretch, time_of
@@ -143,7 +144,7 @@ class Station:
             self._refused_commands += 1
             self._report(Report(admitted.spi, admitted.counter, Stage.REFUSED, "", str(error), request))
             return
-        self._report(report(sent, Stage.ACCEPTED, describe(sent.command)))
+        self._report(report(sent, Stage.ACCEPTED, sent.command.text))
         self._hand_over(sent, admitted.data, now_ns)
 
     def _hand_over(self, sent: Sent, packet: bytes, now_ns: int) -> None:

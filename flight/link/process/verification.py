@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple
 
-from flight.link.commands.codec import ChangeMode, Command, Point, Slew, describe, name_of
+from flight.link.commands.values import ChangeMode, Command, Point, Slew
 from flight.link.modes import Mode
 from flight.link.telemetry.definitions import COMMAND, MODE
 from flight.link.telemetry.packets import LAYOUTS, to_text
@@ -75,7 +75,7 @@ class Report:
 
 def report(sent: Sent, stage: Stage, text: str) -> Report:
     """Return the report of a stage."""
-    return Report(sent.spi, sent.counter, stage, name_of(sent.command), text, sent.request)
+    return Report(sent.spi, sent.counter, stage, sent.command.packet.name, text, sent.request)
 
 
 def final_mode(command: Command) -> Mode | None:
@@ -109,9 +109,9 @@ class Verification:
         reports = [report(sent, Stage.STARTED, text)]
         wanted = final_mode(sent.command)
         if wanted is None:
-            return [*reports, report(sent, Stage.COMPLETED, describe(sent.command))]
+            return [*reports, report(sent, Stage.COMPLETED, sent.command.text)]
         if self._open is not None:
-            reports.append(report(self._open[0], Stage.FAILED, f"then came: {describe(sent.command)}"))
+            reports.append(report(self._open[0], Stage.FAILED, f"then came: {sent.command.text}"))
         self._open = (sent, wanted, int(row["time_ns"]))
         if int(row["mode"]) == wanted and not isinstance(sent.command, Slew):
             reports += self._close(Stage.COMPLETED, f"mode {wanted.label}")

@@ -21,6 +21,7 @@ from flight.link.telemetry.motion_definitions import (
     TRUTH,
 )
 from flight.link.telemetry.orbit_definitions import NAVIGATION, ORBIT_TRUTH, SPIN
+from flight.link.telemetry.parameter_definitions import PARAMETERS
 from flight.link.telemetry.performance_definitions import CYCLE_TIMING, JOB_TIMING, RATE_GROUP
 from flight.link.telemetry.vision_definitions import SIGHTINGS, STARS, STREAK, TRACK
 
@@ -40,6 +41,7 @@ __all__ = [
     "NAVIGATION",
     "ORBIT_TRUTH",
     "PACKETS",
+    "PARAMETERS",
     "PLAN",
     "RATE_GROUP",
     "RUN",
@@ -71,6 +73,7 @@ PACKETS: tuple[Packet, ...] = (
     HOUSEKEEPING,
     HEALTH,
     COMMAND,
+    PARAMETERS,
     LINK,
     VERIFICATION,
     TRUTH,

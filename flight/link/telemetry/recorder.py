@@ -64,6 +64,10 @@ class Recorder:
         newest = [self._newest[packet.name] for packet in _STATUS if packet.name in self._newest]
         return b"".join([*newest, *self._events])
 
+    def newest(self, packet: Packet) -> bytes:
+        """Return the newest packet of a kind, empty when none was written."""
+        return self._newest.get(packet.name, b"")
+
     def time(self, packet: Packet, time_ns: int, **values: Any) -> None:
         """Write a packet to the performance log."""
         packed = self._pack(self._performance_packer, packet, time_ns, values)

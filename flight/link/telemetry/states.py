@@ -6,6 +6,8 @@ from flight.link.events import Severity
 from flight.link.modes import Mode
 from flight.link.telemetry.form import Alarms, States
 
+TABLES: States = ((0, "configuration"), (1, "loaded"))
+"""Where the table of parameters comes from that flies."""
 NO_YES: States = ((0, "no"), (1, "yes"))
 MODES: States = tuple((int(mode), mode.label) for mode in Mode)
 SEVERITIES: States = tuple((int(severity), severity.name.lower()) for severity in Severity)

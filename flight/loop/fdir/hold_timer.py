@@ -10,6 +10,10 @@ class HoldTimer:
         self._needed_ns = round(seconds * 1e9)
         self._since_ns: int | None = None
 
+    def require(self, seconds: float) -> None:
+        """Ask for another time from now on."""
+        self._needed_ns = round(seconds * 1e9)
+
     def update(self, holds: bool, now_ns: int) -> bool:
         """Update whether the condition holds now; return whether the condition has held for long enough."""
         if not holds:

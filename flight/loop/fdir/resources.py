@@ -73,6 +73,10 @@ class ResourceMonitor:
         self._begun_ns: int | None = None
         self.state = ResourceState()
 
+    def adopt(self, settings: Health) -> None:
+        """Go on with other bounds."""
+        self._settings = settings
+
     def ingest(self, sample: ResourceSample) -> None:
         """Add a sample."""
         share = math.nan

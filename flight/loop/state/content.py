@@ -49,7 +49,22 @@ class UncleanShutdown(Kept, frozen=True):
     utc: Label
 
 
-class StoredState(Kept, frozen=True, kw_only=True):
+class KeptTable(Kept, frozen=True, kw_only=True):
+    """A table of parameters that was loaded: values by the configuration's keys.
+
+    Attributes:
+        before: the values that flew before it, empty for those of the configuration.
+        proven: whether it has flown long enough to be trusted after an unclean shutdown.
+        loads: tables loaded so far.
+    """
+
+    values: Annotated[dict[Label, float], Meta(max_length=256)] = {}
+    before: Annotated[dict[Label, float], Meta(max_length=256)] = {}
+    proven: bool = True
+    loads: Count = 0
+
+
+class StoredState(Kept, frozen=True, kw_only=True, omit_defaults=True):
     """The stored state.
 
     Attributes:
@@ -61,6 +76,7 @@ class StoredState(Kept, frozen=True, kw_only=True):
         utc: a label of the last write.
         learned: parameters by name.
         devices: digest of the configuration of the devices that the parameters belong to.
+        table: the table of parameters that an operator loaded.
     """
 
     boot_count: Count = 0
@@ -71,6 +87,7 @@ class StoredState(Kept, frozen=True, kw_only=True):
     utc: Label = ""
     learned: Annotated[dict[Label, Learned], Meta(max_length=32)] = {}
     devices: Label = ""
+    table: KeptTable = KeptTable()
 
 
 def check(state: StoredState) -> None:
@@ -79,6 +96,9 @@ def check(state: StoredState) -> None:
         math.isfinite(t) for t in (state.operated, *(shutdown.operated for shutdown in state.unclean))
     ):
         raise ValueError("an operating time is not finite")
+    tables = (state.table.values, state.table.before)
+    if not all(math.isfinite(value) for table in tables for value in table.values()):
+        raise ValueError("a parameter is not finite")
     for name, learned in state.learned.items():
         size = len(learned.values)
         if [len(row) for row in learned.covariance] != [size] * size:

@@ -11,7 +11,14 @@ from dataclasses import dataclass
 
 import msgspec
 
-from flight.loop.state.content import LONGEST_LABEL, REMEMBERED, Learned, StoredState, UncleanShutdown
+from flight.loop.state.content import (
+    LONGEST_LABEL,
+    REMEMBERED,
+    KeptTable,
+    Learned,
+    StoredState,
+    UncleanShutdown,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,10 +38,19 @@ class BootRecord:
     mode: str
 
 
+@dataclass(frozen=True, slots=True)
+class Noted:
+    """What the loop has for the next write: the mode, what it learned, and the table of parameters."""
+
+    mode: str
+    learned: Mapping[str, Learned]
+    table: KeptTable
+
+
 def begin(state: StoredState, utc: str, devices: str = "") -> StoredState:
     """Return the state of the next boot: running, and with a crash of the last boot recorded.
 
-    Parameters learned of other `devices` are discarded.
+    Parameters learned of other `devices` are discarded, and a loaded table that a crash left unproven.
     """
     unclean = state.unclean
     if state.running:
@@ -47,18 +63,25 @@ def begin(state: StoredState, utc: str, devices: str = "") -> StoredState:
         utc=utc,
         learned=state.learned if state.devices == devices else {},
         devices=devices,
+        table=_trusted(state.table) if state.running else state.table,
     )
 
 
-def go_on(
-    begun: StoredState, elapsed: float, mode: str, learned: Mapping[str, Learned], utc: str
-) -> StoredState:
+def _trusted(table: KeptTable) -> KeptTable:
+    """Return the table to fly after an unclean shutdown: the one before, where it is not proven."""
+    if table.proven:
+        return table
+    return msgspec.structs.replace(table, values=table.before, before={}, proven=True)
+
+
+def go_on(begun: StoredState, elapsed: float, noted: Noted, utc: str) -> StoredState:
     """Return the state `elapsed` s after the start `begun`; new learned parameters replace the old."""
     return msgspec.structs.replace(
         begun,
         operated=begun.operated + max(elapsed, 0.0),
-        mode=mode[:LONGEST_LABEL] or begun.mode,
-        learned={**begun.learned, **learned},
+        mode=noted.mode[:LONGEST_LABEL] or begun.mode,
+        learned={**begun.learned, **noted.learned},
+        table=noted.table,
         utc=utc,
     )
 

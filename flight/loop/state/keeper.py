@@ -9,6 +9,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Mapping
+from dataclasses import replace
 from datetime import UTC, datetime
 
 import msgspec
@@ -16,8 +17,8 @@ import msgspec
 from flight.link import events
 from flight.link.events import EventKind
 from flight.loop.state import history
-from flight.loop.state.content import Learned
-from flight.loop.state.history import BootRecord
+from flight.loop.state.content import KeptTable, Learned
+from flight.loop.state.history import BootRecord, Noted
 from flight.loop.state.store import StateStore
 from hal.interfaces.wires import Clock
 
@@ -47,6 +48,7 @@ class StateKeeper:
         record: the history of earlier boots.
         learned: what earlier boots learned, by name.
         counted: whether this boot is on disk.
+        table: the table of parameters to fly.
     """
 
     def __init__(
@@ -80,7 +82,12 @@ class StateKeeper:
             notices.report(events.LEARNED_REFUSED, text)
         self.record: BootRecord = history.boot_record(self._begun, window)
         self.learned: Mapping[str, Learned] = self._begun.learned
-        self._noted: tuple[str, Mapping[str, Learned]] = (self._begun.mode, {})
+        self.table = self._begun.table
+        if self.table.values != loaded.table.values:
+            notices.report(
+                events.PARAMETERS_LEFT, "it had just been loaded when the last boot ended uncleanly"
+            )
+        self._noted = Noted(self._begun.mode, {}, self.table)
         self._writing = threading.Lock()  # held while writing, never acquired by note()
         self._closed = False
         if self.record.after_unclean:
@@ -92,7 +99,13 @@ class StateKeeper:
 
     def note(self, mode: str, learned: Mapping[str, Learned] | None = None) -> None:
         """Set the mode and the learned parameters for the next write. Never waits."""
-        self._noted = (mode, self._noted[1] if learned is None else learned)
+        self._noted = replace(
+            self._noted, mode=mode, learned=self._noted.learned if learned is None else learned
+        )
+
+    def note_table(self, table: KeptTable) -> None:
+        """Set the table of parameters for the next write. Never waits."""
+        self._noted = replace(self._noted, table=table)
 
     def notices(self) -> list[tuple[EventKind, str]]:
         """Return the events of the state since the last call, for the event log."""
@@ -117,16 +130,16 @@ class StateKeeper:
                 self._put(ended=False)
 
     def _put(self, ended: bool) -> None:
-        mode, learned = self._noted
+        noted = self._noted
         elapsed = (self._clock.now_ns() - self._begun_ns) * 1e-9
-        state = history.go_on(self._begun, elapsed, mode, learned, self._label())
+        state = history.go_on(self._begun, elapsed, noted, self._label())
         try:
             self._store.store(history.end(state) if ended else state)
         except ValueError as error:
             # Only the learned parameters are invalid; operating time and ending must still be stored.
             self._notices.report(events.STATE_UNWRITTEN, str(error))
-            self._noted = (mode, {})
-            state = history.go_on(self._begun, elapsed, mode, {}, self._label())
+            self._noted = replace(noted, learned={})
+            state = history.go_on(self._begun, elapsed, self._noted, self._label())
             self._store.store(history.end(state) if ended else state)
 
     def _label(self) -> str:

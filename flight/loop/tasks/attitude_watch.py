@@ -28,6 +28,13 @@ class AttitudeWatch:
         self._spins = HoldTimer(settings.known_for)
         self._slow = HoldTimer(low_for)
 
+    def adopt(self, settings: Modes) -> None:
+        """Go on with other bounds."""
+        self._fast = settings.tumble_rate
+        self._lost.require(settings.lost_for)
+        for timer in (self._known, self._spins):
+            timer.require(settings.known_for)
+
     def reset(self) -> None:
         """Begin again: another mode is entered."""
         self.brakes = False

@@ -6,35 +6,45 @@ The dispatcher is one of the named containment boundaries: no command can end th
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from flight.link import events
 from flight.link.commands.channel import Channel
-from flight.link.commands.codec import (
+from flight.link.commands.codec import unpack
+from flight.link.commands.definitions import DUMP_PARAMETERS, PING
+from flight.link.commands.errors import CommandError, MalformedError
+from flight.link.commands.values import (
     ChangeMode,
     Clear,
     Command,
-    CommandError,
-    MalformedError,
+    DumpParameters,
+    LoadParameters,
     Ping,
     Point,
     Slew,
-    describe,
-    name_of,
-    unpack,
 )
-from flight.link.commands.definitions import PING
 from flight.link.modes import Mode
-from flight.link.telemetry.definitions import COMMAND
+from flight.link.telemetry.definitions import COMMAND, PARAMETERS
 from flight.link.telemetry.packets import Packer
 from flight.loop.executive.rate_group import Cycle
 from flight.loop.services import Services
 from flight.loop.tasks.coil_drive import CoilDrive
 from flight.loop.tasks.mode_control import ModeControl
+from flight.loop.tasks.parameters import Parameters
 from flight.schema.sections import CommandStep
 
 _REMEMBERED = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Obeying:
+    """The tasks that obey commands."""
+
+    modes: ModeControl
+    drive: CoilDrive
+    parameters: Parameters
 
 
 class Commanding:
@@ -42,14 +52,14 @@ class Commanding:
 
     def __init__(
         self,
-        modes: ModeControl,
-        drive: CoilDrive,
+        obeying: Obeying,
         timeline: Sequence[CommandStep],
         channels: Sequence[Channel],
         services: Services,
     ) -> None:
-        self._modes = modes
-        self._drive = drive
+        self._modes = obeying.modes
+        self._drive = obeying.drive
+        self._parameters = obeying.parameters
         self._timeline = deque(sorted(timeline, key=lambda step: step.at))
         self._channels = channels
         self._facts = services.facts
@@ -59,9 +69,14 @@ class Commanding:
         self._seen: deque[bytes] = deque(maxlen=_REMEMBERED)
         self._count = 0
 
+    def begin(self, now_ns: int) -> None:
+        """Fly the parameters that an earlier boot kept."""
+        self._parameters.begin(now_ns)
+
     def run(self, cycle: Cycle) -> None:
         """Execute the commands that are due or have arrived."""
         now_ns = cycle.start_ns
+        self._parameters.run(now_ns)
         while self._timeline and self._timeline[0].at <= (now_ns - self._recorder.epoch_ns) * 1e-9:
             self._conclude("timeline", command_of(self._timeline.popleft()), "", now_ns)
         for channel in self._channels:
@@ -73,8 +88,15 @@ class Commanding:
                 if not well_formed:
                     continue
                 mission_ns = now_ns - self._recorder.epoch_ns
-                status = self._recorder.status() if fields["obeyed"] and fields["name"] == PING.name else b""
-                channel.answer(self._answers.pack(COMMAND, mission_ns, fields) + status, sender)
+                channel.answer(self._answers.pack(COMMAND, mission_ns, fields) + self._asked(fields), sender)
+
+    def _asked(self, fields: Mapping[str, Any]) -> bytes:
+        """Return the packets that a command asked for."""
+        if fields["obeyed"] and fields["name"] == PING.name:
+            return self._recorder.status()
+        if fields["obeyed"] and fields["name"] == DUMP_PARAMETERS.name:
+            return self._recorder.newest(PARAMETERS)
+        return b""
 
     def _execute(self, source: str, data: bytes, now_ns: int) -> tuple[dict[str, Any], bool]:
         """Execute a datagram; return the fields of the answer, and whether it is a packet of a command."""
@@ -100,14 +122,14 @@ class Commanding:
                 problem = self._obey(command, now_ns)
             except Exception as error:  # noqa: BLE001 - containment boundary: the command dispatcher
                 problem = f"{type(error).__name__}: {error}"
-        text = describe(command) if command is not None else ""
+        text = command.text if command is not None else ""
         report = ": ".join(part for part in (text, problem) if part)
         self._events.report(
             events.COMMAND_REFUSED if problem else events.COMMANDED, now_ns, f"{source}: {report}"
         )
         fields = {
             "obeyed": int(not problem),
-            "name": name_of(command) if command is not None else "",
+            "name": command.packet.name if command is not None else "",
             "source": source,
             "count": self._count,
             "mode": int(self._modes.mode),
@@ -118,17 +140,23 @@ class Commanding:
 
     def _obey(self, command: Command, now_ns: int) -> str:
         """Execute a command; return why it was refused, empty when done."""
+        problem = ""
         match command:
             case Ping():
-                return ""
+                pass
             case ChangeMode(mode):
-                return self._modes.command(mode, now_ns)
+                problem = self._modes.command(mode, now_ns)
             case Slew(wanted):
-                return self._modes.command(Mode.SLEW, now_ns, wanted)
+                problem = self._modes.command(Mode.SLEW, now_ns, wanted)
             case Clear(event):
-                return self._clear(event, now_ns)
+                problem = self._clear(event, now_ns)
             case Point(target):
-                return self._modes.command(Mode.POINT, now_ns, target)
+                problem = self._modes.command(Mode.POINT, now_ns, target)
+            case LoadParameters(replaced):
+                problem = self._parameters.load(command.by_key, replaced, now_ns)
+            case DumpParameters():
+                self._parameters.dump(now_ns)
+        return problem
 
     def _clear(self, event: str, now_ns: int) -> str:
         if not self._facts.clear(event):

@@ -79,6 +79,10 @@ class HealthWatch:
 
         self._ticker = self._clock.ticker("resources", period_ns, sample)
 
+    def adopt(self, limits: Health) -> None:
+        """Go on with other bounds of resources."""
+        self._monitor.adopt(limits)
+
     def begin(self, time_ns: int) -> None:
         """Count from here."""
         self._progress.begin(time_ns)

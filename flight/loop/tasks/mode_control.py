@@ -132,6 +132,13 @@ class ModeControl:
         configured = self.flies_steps or (self.mode is Mode.POINT and self.wanted is None)
         return self._targets.configured(mission_time_ns) if configured else self.wanted
 
+    def adopt(self, modes: Modes) -> None:
+        """Go on with other bounds."""
+        self._settings = modes
+        self._arrived.require(modes.arrived_for)
+        self._pointing.adopt(modes)
+        self._attitude.adopt(modes)
+
     def begin(self, now_ns: int, unclean_recent: int) -> None:
         """Begin to boot; `unclean_recent` shutdowns shortly before were unclean."""
         self._machine.since_ns = self._seen_ns = now_ns

@@ -19,6 +19,11 @@ class PointingWatch:
         self._facts = facts_
         self._off = HoldTimer(settings.hold_patience)
 
+    def adopt(self, settings: Modes) -> None:
+        """Go on with other bounds."""
+        self._settings = settings
+        self._off.require(settings.hold_patience)
+
     def reset(self) -> None:
         """Restart the timer of the pointing error: another mode is entered."""
         self._off.reset()

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from flight.gnc.camera.knowledge import EXACT
 from flight.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
-from flight.link.commands.codec import Point
+from flight.link.commands.values import Point
 from flight.loop.tasks.commanding import command_of
 from flight.schema import reader
 from flight.schema.camera_model import camera_knowledge

@@ -12,7 +12,8 @@ from flight.gnc.earth.orientation import celestial_to_terrestrial, geodetic
 from flight.gnc.guidance.three_axes.target_law import BodyAxes, law_of
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import attitude_matrix
-from flight.link.commands.codec import CommandPacker, Point, unpack
+from flight.link.commands.codec import CommandPacker, unpack
+from flight.link.commands.values import Point
 from ground.commands import command
 from tests.flight.gnc.guidance.three_axes.orbits import JULIAN_DATE, circular
 

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from flight.gnc.errors import FlightError, UsageError
-from flight.link.commands.codec import ChangeMode, CommandPacker
+from flight.link.commands.codec import CommandPacker
+from flight.link.commands.values import ChangeMode
 from flight.link.modes import Mode
 from ground.console import link_feed
 from ground.console.commanding import Commanding

@@ -15,7 +15,9 @@ from aiohttp.test_utils import TestClient, TestServer
 
 from flight.link.commands import codec
 from flight.link.commands.definitions import COMMANDS
+from flight.link.commands.values import Command
 from flight.link.modes import Mode
+from flight.link.parameters import FIELDS, crc_of
 from ground.console.commanding import Commanding
 from ground.console.history import History
 from ground.console.server import Console, application
@@ -149,6 +151,8 @@ def commanded(folder: Path, name: str, values: Any, send: Any) -> tuple[int, Any
 
 
 def test_each_command_of_the_table_is_packed_from_a_form_as_the_codec_reads_it(folder: Path) -> None:
+    table = [field.valid[0] for field in FIELDS if field.valid]
+    named = {field.name: value for field, value in zip(FIELDS, table, strict=True)}
     forms: dict[str, dict[str, Any]] = {
         "ping": {"number": "7"},
         "safe": {"reason": "bored"},
@@ -156,9 +160,11 @@ def test_each_command_of_the_table_is_packed_from_a_form_as_the_codec_reads_it(f
         "slew": {"q2": "0.25"},
         "clear": {"event": "coil-broken"},
         "point": {"goal": 4, "numbers": ["0.5", "0.6"], "roll": ""},
+        "load-parameters": {"replaced": 7, "crc": crc_of(table), **named},
+        "dump-parameters": {},
     }
     assert set(forms) == {packet.name for packet in COMMANDS}
-    sent: list[codec.Command] = []
+    sent: list[Command] = []
 
     def send(packet: bytes) -> dict[str, Any]:
         sent.append(codec.unpack(packet))
@@ -167,9 +173,10 @@ def test_each_command_of_the_table_is_packed_from_a_form_as_the_codec_reads_it(f
     for name, values in forms.items():
         status, answer = commanded(folder, name, values, send)
         assert (status, answer["obeyed"], answer["text"]) == (200, 1, "done")
-    words = [codec.describe(command) for command in sent]
+    words = [command.text for command in sent]
     assert words[:5] == ["ping 7", "mode safe: bored", "mode hold", "slew to q2 +0.2500", "clear coil-broken"]
     assert words[5].startswith("point ground")
+    assert words[6:] == [f"load-parameters {crc_of(table):08x} in place of 00000007", "dump-parameters"]
 
 
 @pytest.mark.parametrize(

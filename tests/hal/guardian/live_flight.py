@@ -93,7 +93,7 @@ class LiveFlight:
         raise AssertionError(f"no {word} within {patience:g} s: {self.end()}")
 
     def wait_until_driven(self, patience: float = 30.0) -> None:
-        """Wait until the log of the truth ends with a quarter of a second of current, however busy the machine."""
+        """Wait until the truth ends with a quarter of a second of current, however busy the machine."""
         deadline = time.monotonic() + patience
         begun = 0
         while time.monotonic() < deadline:

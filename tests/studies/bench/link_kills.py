@@ -24,7 +24,8 @@ from pathlib import Path
 import numpy as np
 
 from flight.link.commands.channel import open_unix
-from flight.link.commands.codec import CommandPacker, Ping
+from flight.link.commands.codec import CommandPacker
+from flight.link.commands.values import Ping
 from flight.link.frames import telecommand, telemetry
 from flight.link.process.archive_reader import LogFollower
 from flight.link.process.control_line import ControlLine

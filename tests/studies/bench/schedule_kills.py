@@ -21,7 +21,8 @@ from pathlib import Path
 import numpy as np
 
 from flight.link.commands.channel import DatagramChannel, open_unix
-from flight.link.commands.codec import Ping, unpack
+from flight.link.commands.codec import unpack
+from flight.link.commands.values import Ping
 from flight.link.modes import Mode
 from flight.link.process.archive_reader import LogFollower
 from flight.link.process.control_line import ControlLine

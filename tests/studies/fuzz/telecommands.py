@@ -12,23 +12,20 @@ import numpy as np
 
 from flight.gnc.guidance.one_axis.limits import Q2_LIMIT
 from flight.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
-from flight.link.commands.codec import (
+from flight.link.commands.codec import CommandPacker, check, unpack
+from flight.link.commands.errors import CommandError
+from flight.link.commands.values import (
     ChangeMode,
     Clear,
     Command,
-    CommandError,
-    CommandPacker,
+    DumpParameters,
+    LoadParameters,
     Ping,
     Point,
     Slew,
-    check,
-    describe,
-    fields_of,
-    name_of,
-    unpack,
 )
-from flight.link.commands.definitions import LAYOUTS
 from flight.link.modes import COMMANDABLE, Mode
+from flight.link.parameters import FIELDS
 from tests.studies.fuzz.harness import Finding
 from tests.studies.fuzz.logs import ccitt, hostile
 from tests.studies.fuzz.mutation import Draw, chance, damage, integer
@@ -77,9 +74,9 @@ class Telecommands:
     def _judge(self, command: Command, data: bytes) -> Counter[str]:
         if ccitt(data) != 0:
             raise Finding("a command with a wrong CRC")
-        check(LAYOUTS[name_of(command)].packet, fields_of(command))
-        describe(command)
-        name_of(command)
+        check(command.packet, command.fields)
+        if not command.text.isprintable():
+            raise Finding(f"a command whose words do not print: {command.text!r}")
         if isinstance(command, Slew) and not -Q2_LIMIT <= command.q2 <= Q2_LIMIT:
             raise Finding(f"a slew to {command.q2}")
         if isinstance(command, ChangeMode) and command.mode not in _MODES:
@@ -92,14 +89,16 @@ class Telecommands:
 
 
 def _command(draw: Draw) -> Command:
-    kind = integer(draw, 0, 5)
-    if kind == 0:
-        return Ping(integer(draw, 0, 2**16 - 1))
-    if kind == 1:
-        mode = _MODES[integer(draw, 0, len(_MODES) - 1)]
-        return ChangeMode(mode, "by hand" if mode is Mode.SAFE and chance(draw, 0.5) else "")
-    if kind == 2:
-        return Point(PointingTarget(Goal.GROUND, (float(draw.uniform(-1.5, 1.5)), 0.3)))
-    if kind == 3:
-        return Point(PointingTarget(Goal.NADIR, roll=0.1 if chance(draw, 0.5) else None))
-    return Slew(float(draw.uniform(-Q2_LIMIT, Q2_LIMIT))) if kind == 4 else Clear("imu-silent")
+    mode = _MODES[integer(draw, 0, len(_MODES) - 1)]
+    table = tuple(float(draw.uniform(*field.valid)) for field in FIELDS if field.valid)
+    commands: tuple[Command, ...] = (
+        Ping(integer(draw, 0, 2**16 - 1)),
+        ChangeMode(mode, "by hand" if mode is Mode.SAFE and chance(draw, 0.5) else ""),
+        Point(PointingTarget(Goal.GROUND, (float(draw.uniform(-1.5, 1.5)), 0.3))),
+        Point(PointingTarget(Goal.NADIR, roll=0.1 if chance(draw, 0.5) else None)),
+        Slew(float(draw.uniform(-Q2_LIMIT, Q2_LIMIT))),
+        Clear("imu-silent"),
+        LoadParameters(integer(draw, 0, 2**32 - 1), table),
+        DumpParameters(),
+    )
+    return commands[integer(draw, 0, len(commands) - 1)]

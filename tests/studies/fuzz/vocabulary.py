@@ -31,6 +31,8 @@ RIGHT: dict[str, tuple[float, tuple[str, ...]]] = {
     "command": (0.7, tuple(f"--to {FLIGHT} {what}" for what in (
         "ping", "safe", "safe smoke", "mode hold", "mode safe --json", "slew 0.2", "--json slew -0.3",
         "--timeout 0.5 clear imu-silent"))),
+    "parameters": (0.5, (f"--to {FLIGHT}", f"--to {FLIGHT} --json modes.tumble_rate=0.3",
+                         f"--to {FLIGHT} --save new.yaml", f"--to {FLIGHT} --load whole.yaml")),
     "link": (0.3, ("good.yaml --log run", "whole.yaml --log runs", "real.yaml --log new")),
     "keys": (0.3, ("new", "empty/new", "run", "nowhere/run")),
     "check": (0.25, ("good.yaml", "good.yaml --json", "whole.yaml", "real.yaml", "real.yaml --json")),

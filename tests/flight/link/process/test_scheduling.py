@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 
 from flight.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
-from flight.link.commands.codec import ChangeMode, CommandError, Ping, Point, Slew, unpack
+from flight.link.commands.codec import unpack
+from flight.link.commands.errors import CommandError
+from flight.link.commands.values import ChangeMode, Ping, Point, Slew
 from flight.link.commands.words import command_of_words
 from flight.link.modes import Mode
 from flight.link.process import directives, timetable

@@ -7,15 +7,16 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flight.loop.state.content import REMEMBERED, Learned, StoredState
-from flight.loop.state.history import BootRecord, begin, boot_record, end, go_on
+from flight.loop.state.content import REMEMBERED, KeptTable, Learned, StoredState
+from flight.loop.state.history import BootRecord, Noted, begin, boot_record, end, go_on
 
 LABEL = "1970-01-01T00:00:00Z"
 
 
 def boot(state: StoredState, seconds: float, clean: bool, utc: str = LABEL) -> StoredState:
     """Return the state after one boot."""
-    state = go_on(begin(state, utc), seconds, "hold", {}, utc)
+    begun = begin(state, utc)
+    state = go_on(begun, seconds, Noted("hold", {}, begun.table), utc)
     return end(state) if clean else state
 
 
@@ -64,8 +65,21 @@ def test_only_the_newest_crashes_are_kept() -> None:
 
 def test_what_is_learned_again_replaces_the_old_and_the_rest_stays() -> None:
     first, second = Learned((1.0,), ((0.1,),)), Learned((2.0,), ((0.1,),))
-    state = go_on(begin(StoredState(learned={"a": first, "b": first}), LABEL), 1.0, "", {"a": second}, LABEL)
+    begun = begin(StoredState(learned={"a": first, "b": first}), LABEL)
+    state = go_on(begun, 1.0, Noted("", {"a": second}, begun.table), LABEL)
     assert state.learned == {"a": second, "b": first}
+
+
+def test_a_table_that_a_crash_left_unproven_gives_way_to_the_one_before() -> None:
+    new = KeptTable(values={"modes.known_for": 2.0}, before={"modes.known_for": 3.0}, proven=False, loads=2)
+    proven = KeptTable(values=new.values, before=new.before, proven=True, loads=2)
+    for table, clean, flown in ((new, False, 3.0), (new, True, 2.0), (proven, False, 2.0)):
+        state = begin(StoredState(running=not clean, table=table), LABEL)
+        assert state.table.values == {"modes.known_for": flown}
+        assert state.table.loads == 2
+    # The one that gave way is not tried a second time, and the one before it stays after a second crash.
+    again = begin(begin(StoredState(running=True, table=new), LABEL), LABEL)
+    assert again.table.values == new.before
 
 
 @given(st.lists(st.tuples(st.floats(0.0, 1e5), st.booleans()), max_size=20), st.floats(0.0, 1e5))

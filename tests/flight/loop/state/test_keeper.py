@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from flight.link import events
-from flight.loop.state.content import Learned, StoredState
+from flight.loop.state.content import KeptTable, Learned, StoredState
 from flight.loop.state.keeper import Notices, StateKeeper
 from flight.loop.state.store import COPIES, StateStore
 from hal.buses.clock import SystemClock
@@ -29,6 +29,21 @@ def keeper_on(disk: Disk | None, clock: Clock, folder: Path = FOLDER) -> StateKe
     return StateKeeper(
         StateStore(folder, notices.report, disk), notices, clock, window=600.0, period_ns=10 * SECOND
     )
+
+
+def test_a_table_outlives_a_clean_end_and_a_new_one_no_crash() -> None:
+    disk, clock = Disk(), ManualClock()
+    old, new = {"modes.known_for": 3.0}, {"modes.known_for": 2.0}
+    keeper = keeper_on(disk, clock)
+    keeper.note_table(KeptTable(values=old, loads=1))
+    keeper.close(clean=True)
+    keeper = keeper_on(disk, clock)
+    assert keeper.table.values == old
+    keeper.note_table(KeptTable(values=new, before=old, proven=False, loads=2))
+    clock.advance(20 * SECOND)
+    keeper = keeper_on(disk, clock)
+    assert keeper.table.values == old
+    assert events.PARAMETERS_LEFT in [kind for kind, _ in keeper.notices()]
 
 
 def on_disk(disk: Disk) -> StoredState:

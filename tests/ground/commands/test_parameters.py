@@ -1,0 +1,126 @@
+"""`flight parameters` with a flight's task of parameters at the other end of its socket."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from msgspec.structs import replace
+
+from flight.app.cli import main
+from flight.link.commands.codec import unpack
+from flight.link.commands.values import LoadParameters
+from flight.link.telemetry.definitions import COMMAND, PARAMETERS
+from flight.link.telemetry.packets import Packer
+from flight.link.telemetry.recorder import Recorder
+from flight.loop.fdir.event_log import EventLog
+from flight.loop.fdir.facts import Facts
+from flight.loop.fdir.streams import Streams
+from flight.loop.services import Services
+from flight.loop.tasks.parameters import Adopters, Parameters
+from flight.schema.sections import Health, Modes
+from tests.scenario.flights import demo_config
+
+
+class Sink:
+    """A log that keeps nothing."""
+
+    def write(self, packet: bytes) -> None:
+        pass
+
+
+class Answering:
+    """The far end: answers commands of parameters as the loop does."""
+
+    def __init__(self, path: Path) -> None:
+        self.modes: list[Modes] = []
+        self.health: list[Health] = []
+        recorder = Recorder(Sink(), Sink())
+        events = EventLog(recorder.event)
+        services = Services(None, None, recorder, events, Facts(events), Streams(()))  # type: ignore[arg-type]  # no clock, no jobs
+        adopters = Adopters(self.modes.append, self.health.append)
+        self.task = Parameters(demo_config(4.0), adopters, None, services)
+        self.task.begin(0)
+        self._recorder = recorder
+        self._line = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._line.bind(str(path))
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        packer = Packer()
+        while data := self._line.recvfrom(4096):
+            if not data[0]:
+                return
+            command = unpack(data[0])
+            problem, more = "", b""
+            if isinstance(command, LoadParameters):
+                problem = self.task.load(command.by_key, command.replaced, 1)
+            else:
+                more = self._recorder.newest(PARAMETERS)
+            fields = {"obeyed": int(not problem), "name": command.packet.name, "source": "socket", "count": 1}
+            answer = packer.pack(COMMAND, 0, {**fields, "mode": 1, "text": problem})
+            self._line.sendto(answer + more, data[1])
+
+    def close(self) -> None:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as line:
+            line.sendto(b"", self._line.getsockname())
+        self._thread.join()
+        self._line.close()
+
+
+@pytest.fixture
+def flight(tmp_path: Path) -> Iterator[Answering]:
+    answering = Answering(tmp_path / "s")
+    yield answering
+    answering.close()
+
+
+def run(tmp_path: Path, capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, dict[str, object]]:
+    """Run the command with --json."""
+    status = main(["parameters", "--to", str(tmp_path / "s"), "--json", *words])
+    return status, json.loads(capsys.readouterr().out)
+
+
+def test_a_changed_value_is_flown_with_the_others_as_they_were(
+    flight: Answering, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, shown = run(tmp_path, capsys, "modes.tumble_rate=0.25", "health.hottest=90")
+    assert (status, shown["refused"], shown["table"], shown["loads"]) == (0, "", "loaded", 1)
+    assert flight.modes[-1] == replace(demo_config(4.0).modes, tumble_rate=0.25)
+    assert flight.health[-1].hottest == 90.0
+
+
+def test_a_saved_table_is_loaded_again_as_a_whole(
+    flight: Answering, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    saved = tmp_path / "table.yaml"
+    run(tmp_path, capsys, "--save", str(saved))
+    run(tmp_path, capsys, "modes.hold_error=0.3")
+    status, shown = run(tmp_path, capsys, "--load", str(saved))
+    assert (status, shown["loads"]) == (0, 2)
+    assert flight.modes[-1] == demo_config(4.0).modes
+    saved.write_text(saved.read_text().replace("hold_error", "#"))
+    assert main(["parameters", "--to", str(tmp_path / "s"), "--load", str(saved)]) == 2
+    assert "modes.hold_error is missing: a table is loaded as a whole" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("word", "complaint"),
+    [
+        ("modes.tumble_rat=1", "modes.tumble_rat is no parameter: modes.arrived_angle,"),
+        ("modes.tumble_rate=fast", "give NAME=VALUE with a number"),
+        ("modes.tumble_rate=99", "modes.tumble_rate = 99 must lie within 0.001 to 10 rad/s"),
+        ("modes.tumble_rate=nan", "modes.tumble_rate = nan must lie within"),
+    ],
+)
+def test_a_mistake_is_named_with_what_would_be_right(
+    flight: Answering, tmp_path: Path, capsys: pytest.CaptureFixture[str], word: str, complaint: str
+) -> None:
+    assert main(["parameters", "--to", str(tmp_path / "s"), word]) == 2
+    assert complaint in capsys.readouterr().err
+    assert not flight.modes

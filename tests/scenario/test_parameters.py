@@ -1,0 +1,71 @@
+"""Parameters in flight: a table is flown as a whole, or refused as a whole."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from flight.link.commands.codec import CommandPacker
+from flight.link.commands.values import DumpParameters, LoadParameters
+from flight.link.parameters import FIELDS, KEYS, crc_of
+from flight.link.telemetry.packets import to_text
+from ground.telemetry.scanner import decode
+from tests.scenario.flights import event_names
+from tests.scenario.mode_flights import commanded
+from tests.scenario.test_commands import said
+
+SPINS = "tumbling"
+
+
+def configured() -> dict[str, float]:
+    """Return the table of the configuration."""
+    config = commanded(4.0)
+    sections = {"modes": config.modes, "health": config.health}
+    return {key: float(getattr(sections[key.partition(".")[0]], key.partition(".")[2])) for key in KEYS}
+
+
+def load(changes: dict[str, float], replaced: int | None = None) -> bytes:
+    """Return the packet that changes the configuration's table."""
+    before = configured()
+    crc = crc_of(list(before.values())) if replaced is None else replaced
+    return CommandPacker().pack(LoadParameters(crc, tuple({**before, **changes}.values())), 5)
+
+
+def test_a_loaded_limit_holds_at_once_and_the_table_is_reported(tmp_path: Path) -> None:
+    dump = CommandPacker().pack(DumpParameters(), 6)
+    run, channel = said(tmp_path, (1.0, load({"modes.tumble_rate": 0.02})), (1.5, dump))
+    assert SPINS in event_names(run), "the body is released at 0.1 rad/s"
+    tables = run["parameters"]
+    assert tables["modes_tumble_rate"].tolist() == [configured()["modes.tumble_rate"], 0.02, 0.02]
+    assert tables["loads"].tolist() == [0, 1, 1]
+    assert tables["table"].tolist() == [0, 1, 1]
+    assert not tables["kept"].any(), "this flight has no state folder"
+    (answered,) = decode(channel.answers[1])["parameters"]
+    assert answered == tables[-1]
+    quiet, _ = said(tmp_path / "quiet", (1.5, dump))
+    assert SPINS not in event_names(quiet)
+
+
+@pytest.mark.parametrize(
+    ("packet", "reason"),
+    [
+        (load({"modes.tumble_rate": 0.02}, replaced=1), "the table that flies is"),
+        (load({"modes.arrived_for": 0.2, "modes.tumble_rate": 0.02})[:-3] + b"abc", ""),
+    ],
+)
+def test_a_table_for_another_one_or_with_a_wrong_sum_changes_nothing(
+    tmp_path: Path, packet: bytes, reason: str
+) -> None:
+    run, _ = said(tmp_path, (1.0, packet))
+    assert SPINS not in event_names(run)
+    assert run["parameters"]["loads"].tolist() == [0]
+    assert reason in to_text(run["command"][-1]["text"])
+
+
+def test_the_ranges_that_may_be_commanded_lie_within_what_the_schema_takes() -> None:
+    """Each parameter is a number of the configuration that is flown where nothing is loaded."""
+    for key, value in configured().items():
+        (field,) = (field for field in FIELDS if field.name == key.replace(".", "_", 1))
+        assert field.valid is not None
+        assert field.valid[0] <= value <= field.valid[1]
