@@ -80,12 +80,13 @@ pictures: $(READY) ## the README's pictures
 	$(RUN) -m tests.studies.pictures
 
 lock: $(READY)  ## write down the versions in use, and with hashes those of a board
-	$(VENV)/bin/pip freeze --all --exclude pip --exclude-editable > requirements.lock
+	$(VENV)/bin/pip freeze --all --exclude pip --exclude-editable | LC_ALL=C sort --ignore-case > requirements.lock
 	$(PYTHON) -m venv build/lock && build/lock/bin/pip install --quiet pip-tools
+	build/lock/bin/pip-compile --quiet --generate-hashes --all-build-deps --allow-unsafe --strip-extras --no-annotate \
+	  --no-header --no-emit-options --constraint requirements.lock --output-file - pyproject.toml > build/lock/board
 	{ echo '# What a board needs, by hash: written by `make lock`, used by deploy/install.sh with --require-hashes.'; \
-	  build/lock/bin/pip-compile --quiet --generate-hashes --all-build-deps --allow-unsafe --strip-extras \
-	    --no-annotate --no-header --no-emit-options --constraint requirements.lock --output-file - pyproject.toml; \
-	} | grep -E '^(# What|[A-Za-z]|    --hash)' > deploy/requirements.lock
+	  grep -E '^([A-Za-z]|    --hash)' build/lock/board; \
+	} > deploy/requirements.lock
 
 clean:          ## forget the virtual environment and the runs
 	rm -rf $(VENV) runs build *.egg-info

@@ -46,7 +46,7 @@ def safe_dropin(config: Config) -> str:
     return _text(lines)
 
 
-def link_dropin(config: Config) -> str:
+def link_dropin(config: Config, root: Path = Path("/")) -> str:
     """Return the drop-in of the link's unit, empty where the configuration has no link."""
     link = config.link
     if link is None:
@@ -55,10 +55,19 @@ def link_dropin(config: Config) -> str:
     if peers := peer_networks(link):
         lines += _network(peers)
     if link.serial is not None:
-        lines += ["SupplementaryGroups=dialout", *allowed(link.serial.device, SERIAL)]
+        lines += ["SupplementaryGroups=dialout", *_line(link.serial.device, root)]
     else:
         lines.append("PrivateDevices=yes")
     return _text(lines)
+
+
+def _line(device: str, root: Path) -> list[str]:
+    """Return the lines that open a serial line: one on the board alone in a /dev of the unit's own.
+
+    One that is plugged in, or not there yet, may return as a new node, which such a /dev would not show.
+    """
+    opened = allowed(device, SERIAL, root)
+    return opened if len(opened) > 1 else [*opened, "PrivateDevices=yes", f"BindPaths={device}"]
 
 
 def device_unit(path: str) -> str:

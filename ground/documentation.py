@@ -89,10 +89,11 @@ def _packet(layout: Layout) -> dict[str, Any]:
 
 
 def _details(field: Field) -> dict[str, Any]:
-    """Return what only some fields have: states, limits, the number at which a counter wraps."""
+    """Return what only some fields have: states, bits, limits, the number at which a counter wraps."""
     limits = field.limits
     details: dict[str, Any] = {
         "states": [list(state) for state in field.states],
+        "bits": [list(bit) for bit in field.bits],
         "alarms": [list(alarm) for alarm in field.alarms],
         "warning_outside": list(limits.warning or ()) if limits else None,
         "fault_outside": list(limits.fault or ()) if limits else None,
@@ -103,11 +104,12 @@ def _details(field: Field) -> dict[str, Any]:
 
 
 def meaning_of(field: Field) -> str:
-    """Return the meaning of a field in words, with its states, its ranges and its end."""
+    """Return the meaning of a field in words, with its states or bits, its ranges and its end."""
     parts = [field.meaning] if field.meaning else []
-    if field.states:
-        levels = {number: f" ({level})" for number, level in field.alarms}
-        parts.append(", ".join(f"{number} {label}{levels.get(number, '')}" for number, label in field.states))
+    levels = {number: f" ({level})" for number, level in field.alarms}
+    for word, labels in (("", field.states), ("bits: ", field.bits)):
+        named = ", ".join(f"{number} {label}{levels.get(number, '')}" for number, label in labels)
+        parts += [word + named] if named else []
     ranges = {"valid": field.valid}
     if field.limits is not None:
         ranges |= {"warning outside": field.limits.warning, "fault outside": field.limits.fault}

@@ -2,7 +2,8 @@
 
 Yamcs connects to `flight gateway`, which holds the keys and hands plain packets over (`ground.link.gateway`).
 Both listen on loopback alone. Packets are archived by mission time and sequence count; commands are verified
-by the packet `verification`, whose packet identifier and sequence count are those of the command.
+by the packet `verification`, whose packet identifier and sequence count are those of the command. Files come
+and go by Yamcs's own CFDP service.
 """
 
 from __future__ import annotations
@@ -12,11 +13,17 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from flight.gnc.errors import UsageError
+from flight.link.files.entity import FOREIGN, SATELLITE
+from flight.link.files.packets import DOWN, UP, VERSION
+from flight.link.files.pdu import SEGMENT_BYTES
+from flight.link.telemetry.packets import HEADER_BYTES, SECONDARY_BYTES
 from ground.link.gateway import ADDRESS
 from ground.xtce import EPOCH, SPACE, document
 
 INSTANCE = SPACE.lower()
 HTTP_PORT = 8090
+CFDP, DOWN_BUCKET, UP_BUCKET = "files", "down", "up"
+"""Yamcs's service for files, and its buckets, which are folders: of those that came and of those that go."""
 _LOOPBACK = "127.0.0.1"
 
 _SERVER = """\
@@ -24,6 +31,7 @@ services:
   - class: org.yamcs.http.HttpServer
     args: {{address: {host}, port: {http}}}
 instances: [{instance}]
+buckets: [{{name: {down}, path: {folder}/{down}}}, {{name: {up}, path: {folder}/{up}}}]
 dataDir: {data}
 cacheDir: {data}/cache
 secretKey: {instance}
@@ -40,6 +48,22 @@ services:
   - class: org.yamcs.parameterarchive.ParameterArchive
   - class: org.yamcs.ProcessorCreatorService
     args: {{name: realtime, type: realtime}}
+  - class: org.yamcs.cfdp.CfdpService
+    name: {cfdp}
+    args:
+      entityIdLength: 2
+      sequenceNrLength: 4
+      maxPduSize: {pdu_bytes}
+      sleepBetweenPdus: 20
+      inactivityTimeout: 60000
+      eofAckLimit: 720
+      finAckLimit: 720
+      immediateNak: false
+      nakTimeout: 2000
+      incomingBucket: {down}
+      allowDownloadOverwrites: true
+      localEntities: [{{name: ground, id: {own}, bucket: {down}}}]
+      remoteEntities: [{{name: satellite, id: {satellite}}}]
 dataLinks:
   - name: gateway
     class: org.yamcs.tctm.TcpTcTmDataLink
@@ -70,6 +94,15 @@ streamConfig:
   parameterAlarm: [alarms_realtime]
   eventAlarm: [event_alarms_realtime]
   tc: [{{name: tc_realtime, processor: realtime}}]
+  sqlFile: {folder}/etc/files.sql
+"""
+
+_STREAMS = """\
+create stream cfdp_in as select substring(packet, {before}) as pdu from tm_realtime \
+where extract_short(packet, 0) = {down}
+create stream cfdp_out (gentime TIMESTAMP, entityId long, seqNum int, pdu binary)
+insert into tc_realtime select gentime, 'cfdp-service' as origin, seqNum, '/{space}/file-unit' as cmdName, \
+unhex('{header}') + pdu + unhex('0000') as binary from cfdp_out
 """
 
 _PROCESSORS = """\
@@ -95,12 +128,27 @@ ArchiveRetrieval: *replay
 def files(folder: Path, gateway: str, http_port: int, epoch: str) -> Mapping[str, str]:
     """Return the content of each file by its name below `folder`."""
     host, _, port = gateway.rpartition(":")
-    server = _SERVER.format(host=_LOOPBACK, http=http_port, instance=INSTANCE, data=folder / "data")
-    instance = _INSTANCE.format(
-        gateway_host=host, gateway_port=port, folder=folder, instance=INSTANCE, epoch=epoch
+    buckets = {"down": DOWN_BUCKET, "up": UP_BUCKET}
+    server = _SERVER.format(
+        host=_LOOPBACK, http=http_port, instance=INSTANCE, data=folder / "data", folder=folder, **buckets
     )
+    instance = _INSTANCE.format(
+        gateway_host=host,
+        gateway_port=port,
+        folder=folder,
+        instance=INSTANCE,
+        epoch=epoch,
+        cfdp=CFDP,
+        pdu_bytes=SEGMENT_BYTES,
+        own=FOREIGN,
+        satellite=SATELLITE,
+        down=DOWN_BUCKET,
+    )
+    before = HEADER_BYTES + SECONDARY_BYTES
+    header = f"{UP:04X}C0000000{VERSION:02X}" + "00" * (SECONDARY_BYTES - 1)
     return {
         "etc/yamcs.yaml": server,
+        "etc/files.sql": _STREAMS.format(before=before, down=DOWN, space=SPACE, header=header),
         f"etc/yamcs.{INSTANCE}.yaml": instance,
         "etc/processor.yaml": _PROCESSORS,
         f"{INSTANCE}.xml": document(epoch=epoch, verified=True),
@@ -115,7 +163,8 @@ def write(folder: Path, gateway: str = ADDRESS, http_port: int = HTTP_PORT, epoc
             path = folder / name
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text, encoding="utf-8")
-        (folder / "data").mkdir(exist_ok=True)
+        for name in ("data", DOWN_BUCKET, UP_BUCKET):
+            (folder / name).mkdir(exist_ok=True)
     except OSError as error:
         raise UsageError(f"{folder}: cannot be written: {error.strerror or error}") from error
 

@@ -63,7 +63,8 @@ def open_flight(
         feed, beat = supervision.feed, supervision.beat
     channels = _open_channels(config, stack)
     keeper = open_state(config, os.environ, rig.clock, after_coils, [*earlier, folder])
-    opened = Opened(rig.clock, devices, jobs, recorder, flight_log.error, channels, feed)
+    frames = folder / "frames"
+    opened = Opened(rig.clock, devices, jobs, recorder, flight_log.error, channels, feed, frames)
     board = Board(folder) if rig.realtime else None
     loop = build_loop(config, opened, Supervisors(beat, keeper, board))
     return loop, flight_log

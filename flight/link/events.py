@@ -198,6 +198,8 @@ STRINGS_LOST = EventKind(104, "strings-lost", _WARNED, "the solar strings give n
 STRINGS_RECOVERED = EventKind(105, "strings-recovered", _TOLD, "the solar strings give readings again")
 SUN_UNCLEAR = EventKind(106, "sun-unclear", _WARNED, "the solar strings see no Sun in the sunlight")
 SUN_CLEAR = EventKind(107, "sun-clear", _TOLD, "the solar strings see the Sun again")
+SLEW_BEGUN = EventKind(108, "slew-begun", _TOLD, "a slew of least heat to the target begins")
+SLEW_ENDED = EventKind(109, "slew-ended", _TOLD, "a slew is over: the target is pointed to from now on")
 
 OBJECT_FOUND = EventKind(120, "object-found", _TOLD, "a track of an object that is no star is confirmed")
 OBJECT_LOST = EventKind(

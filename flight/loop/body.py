@@ -259,7 +259,7 @@ class BodyKind:
     """A kind of body.
 
     Attributes:
-        plan: the planner worker's function: a job in, a plan out; both pickle. None without a planner.
+        plan: the planner worker's function: a job in, a plan out, as `jobs.Worker` says. None without one.
         make: builds the body of a configuration, with the parameters that an earlier boot learned.
     """
 

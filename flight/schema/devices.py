@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Annotated, Literal
 
 from msgspec import Meta
@@ -135,8 +134,9 @@ class Camera(Section, frozen=True, kw_only=True):
     """The star camera: what flight must know to read its frames; `device` is the real one.
 
     A frame is late `late_after` s after the exposure that it may have waited for; vision is slow after
-    `vision_slow_after` s. Beyond `max_rate` rad/s of the body no exposure is begun. While the attitude is
-    fine a frame is taken every `fine_period` s, without it every `period`, too.
+    `vision_slow_after` s. Beyond `max_rate` rad/s of the body, where it is given, no exposure is begun. While
+    the attitude is fine a frame is taken every `fine_period` s, without it every `period`, too. The newest
+    `keep_frames` frames are kept in `frames` of the run's folder.
     """
 
     device: V4l2Device | AravisDevice | None = None
@@ -160,7 +160,8 @@ class Camera(Section, frozen=True, kw_only=True):
     objects: ObjectTracking | None = None
     endpoint_bias: float | None = None
     mounting: Quaternion = (0.0, 0.0, 0.0, 1.0)
-    max_rate: Positive = math.inf
+    max_rate: Positive | None = None
     max_age: Positive = 12.0
     late_after: Positive = 1.0
     vision_slow_after: Positive = 1.0
+    keep_frames: Annotated[int, Meta(ge=0, le=1000)] = 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated
 
 from msgspec import Meta
@@ -15,6 +16,9 @@ from flight.schema.values import NotNegative, Positive, Section
 
 LEAST_FIELD, LARGEST_FIELD = 5e-6, 2e-4
 """T: the Earth's field in a low orbit is 1.5e-5 to 6.5e-5; acting coils add or take as much."""
+
+
+ConeAngle = Annotated[float, Meta(ge=0.0, le=90.0)]
 
 
 class Craft(Section, frozen=True, kw_only=True):
@@ -55,12 +59,26 @@ class OrbitEstimation(Estimation, frozen=True, kw_only=True):
     history: Positive = 12.0
 
 
+class ExclusionCones(Section, frozen=True, kw_only=True):
+    """How far the star camera's boresight stays from `sun` and `moon`, and from the limb of the `earth`."""
+
+    sun_deg: ConeAngle | None = None
+    earth_deg: ConeAngle | None = None
+    moon_deg: ConeAngle | None = None
+
+    def angles(self) -> dict[str, float]:
+        """Return the angles, rad, of the cones that are kept, by their bodies' names."""
+        found = {"sun": self.sun_deg, "earth": self.earth_deg, "moon": self.moon_deg}
+        return {name: math.radians(angle) for name, angle in found.items() if angle is not None}
+
+
 class PointingSection(Section, frozen=True, kw_only=True):
     """How a satellite points (`flight.gnc.control.three_axes`).
 
     `axis` of the body points; a given roll is measured from `across`, normal to it. `turn` rad, `rate` rad/s
     and `dipole` A m^2 are the errors and the dipole that cost the same. The coils act for `act` s between
-    pauses as long as those of detumbling. A plan is made again every `replan_period` s.
+    pauses as long as those of detumbling. A plan is made again every `replan_period` s. From far off a target
+    is slewed to in `slew` s, where that suffices, with the star camera outside the `cones`.
     """
 
     axis: Normal = (0.0, 0.0, 1.0)
@@ -70,6 +88,8 @@ class PointingSection(Section, frozen=True, kw_only=True):
     dipole: Positive = 1.0e-4
     act: Annotated[float, Meta(ge=0.1, le=10.0)] = 1.8
     replan_period: Annotated[float, Meta(ge=10.0, le=900.0)] = 300.0
+    slew: Annotated[float, Meta(ge=60.0, le=1500.0)] = 600.0
+    cones: ExclusionCones = ExclusionCones()
 
 
 class TargetStep(Aim, frozen=True, kw_only=True):

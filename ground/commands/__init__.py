@@ -4,6 +4,7 @@ COMMANDS = {
     "command": "send a command to a flight",
     "parameters": "show, change, save and load the parameters of a flight",
     "keys": "make the keys of an authenticated link",
+    "files": "list, get and put the files of a satellite",
     "gateway": "hand plain packets to a ground station of others, and its commands to the link",
     "watch": "show a flight in the terminal, live or as it ended",
     "console": "show a flight in the browser, live or replayed, and command it",

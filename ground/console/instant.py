@@ -11,7 +11,7 @@ from ground.console.history import History
 from ground.watch.view import printable
 
 Object = dict[str, Any]
-LISTED = ("event", "command", "verification", "streak", "stars")
+LISTED = ("event", "command", "verification", "streak", "stars", "sightings")
 """Packets of which the page lists each; of the others it shows the newest."""
 _MOST_LISTED = 500
 

@@ -14,6 +14,7 @@ from typing import Any, Protocol
 from aiohttp import WSMsgType, web
 
 from flight.gnc.errors import FlightError, UsageError
+from flight.link.telemetry.link_definitions import LINK, VERIFICATION
 from flight.link.telemetry.packets import LAYOUTS, PacketArray, TelemetryError
 from ground.console.commanding import Commanding
 from ground.console.cursor import Cursor
@@ -26,6 +27,8 @@ PAGE = Path(__file__).parent / "page"
 PUSH_S = 0.1
 _LOOK_S = 0.1
 _MOST_POINTS = 4000
+_OF_THE_LINK = frozenset({LINK.name, VERIFICATION.name})
+"""Packets that come also while the flight itself is silent."""
 _Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 _HEADERS = {
@@ -58,6 +61,7 @@ class Console:
     surroundings: Surroundings
     commanding: Commanding
     utc_ns: int | None = None
+    flight_heard: float = field(default_factory=time.monotonic)
     trouble: str = ""
     sockets: set[web.WebSocketResponse] = field(default_factory=set)
 
@@ -70,6 +74,8 @@ class Console:
             return
         self.trouble = ""
         self.history.append(packets)
+        if any(len(rows) for name, rows in packets.items() if name not in _OF_THE_LINK):
+            self.flight_heard = time.monotonic()
         if len(packets["run"]):
             self.utc_ns = int(packets["run"]["utc_ns"][-1])
 
@@ -156,6 +162,7 @@ class _Pages:
                 "commanding": console.commanding.possible,
                 "name": console.name,
                 "camera": console.surroundings.camera,
+                "coil_dipole": console.surroundings.coil_dipole,
                 "orbit": console.surroundings.elements is not None,
                 "utc_ns": console.utc_ns,
             }
@@ -227,6 +234,7 @@ class _Pages:
             "live": cursor.live,
             "speed": cursor.speed,
             "silence": console.feed.silence,
+            "flight_silence": time.monotonic() - console.flight_heard,
             "trouble": console.trouble,
             "utc_ns": utc,
             "surroundings": None if utc is None else console.surroundings.at(utc),

@@ -28,10 +28,16 @@ _TRACK_STEP, _TRACK_HALF = 60.0, 5700.0  # s: a revolution of a low orbit before
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """Of one flight. `camera` is the star camera's turn into the body (4,) and its field of view, rad."""
+    """Of one flight.
+
+    Attributes:
+        camera: the star camera's turn into the body (4,) and its field of view, rad.
+        coil_dipole: of a coil at the limit of its current, A m^2.
+    """
 
     elements: TwoLineElements | None
     camera: tuple[list[float], float] | None
+    coil_dipole: float | None = None
 
     @classmethod
     def of(cls, path: Path) -> Surroundings:
@@ -43,7 +49,7 @@ class Surroundings:
         lines = getattr(config, "elements", None)
         camera = getattr(config, "camera", None)
         sight = None if camera is None else (list(camera.mounting), math.radians(camera.field_of_view_deg))
-        return cls(TwoLineElements(*lines) if lines else None, sight)
+        return cls(TwoLineElements(*lines) if lines else None, sight, _coil_dipole(config))
 
     def at(self, utc_ns: int) -> Object | None:
         """Return place, directions (3,), ICRS, and the points below satellite and Sun, deg."""
@@ -84,6 +90,15 @@ class Surroundings:
     def _below(self, state: OrbitState) -> tuple[float, float, float]:
         longitude, latitude, height = geodetic(celestial_to_terrestrial(state.julian_date) @ state.position)
         return math.degrees(float(latitude)), math.degrees(float(longitude)), float(height)
+
+
+def _coil_dipole(config: Any) -> float | None:
+    """Return the largest dipole of a coil of either body's configuration, A m^2."""
+    if (craft := getattr(config, "craft", None)) is not None:
+        return float(craft.dipole_per_ampere * config.coils.current_limit)
+    if (plant := getattr(config, "plant", None)) is not None:
+        return float(plant.coil_turns * plant.coil_area * config.coils.current_limit)
+    return None
 
 
 NOWHERE = Surroundings(None, None)

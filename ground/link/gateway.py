@@ -1,8 +1,8 @@
 """Plain packets for a ground station that holds no keys: protected frames end here, in both directions.
 
 Whoever connects on loopback gets every telemetry packet, live and played back, as a stream; a command packet
-that comes in gets its time and CRC and goes up in a protected frame. Its sequence count stays: by it the
-packets `verification` name the command.
+that comes in, or one with a unit of a file's transfer, gets its time and CRC and goes up in a protected
+frame. Its sequence count stays: by it the packets `verification` name the command.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from flight.app.utc_label import utc_ns
 from flight.gnc.errors import UsageError
 from flight.link.commands.codec import CommandPacker
 from flight.link.commands.values import Ping
+from flight.link.files.packets import UP, is_unit
 from flight.link.process.lines import host_port
 from flight.link.telemetry.link_definitions import VERIFICATION
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, crc16
@@ -31,6 +32,8 @@ _COMMANDS = {layout.identifier: layout for layout in TELECOMMANDS.values()}
 _TIME = struct.Struct(">q")
 _TIME_AT = HEADER_BYTES + 1
 _UNSENT = 1 << 22
+_SPI, _BLOCK = 1, 64
+"""Counters are reserved by so many: a file is thousands of frames, a reservation two writes to the disk."""
 _PIECE = 1 << 16
 _AGAIN_S = 20.0
 """Between the gateway's own pings: by UDP the link forgets a sender after a minute."""
@@ -47,6 +50,7 @@ class Gateway:
     def __init__(self, terminal: Terminal, address: str, complain: Callable[[str], object]) -> None:
         """Listen on HOST:PORT of loopback; `complain` gets each refusal in words. Raises UsageError."""
         self._terminal = terminal
+        self._sealer = terminal.sealer(_SPI, _BLOCK)
         self._complain = complain
         self._packer = CommandPacker()
         self._asked_at: float | None = None
@@ -81,7 +85,7 @@ class Gateway:
         """Carry what there is, or comes within a time."""
         if self._asked_at is None or time.monotonic() - self._asked_at > _AGAIN_S:
             self._asked_at = time.monotonic()
-            self._own.add(self._terminal.send(self._packer.pack(Ping(), utc_ns())))
+            self._own.add(self._terminal.send_by(self._sealer, self._packer.pack(Ping(), utc_ns())))
         waiting = [line for line, (_, unsent) in self._connections.items() if unsent]
         reading: list[Terminal | socket.socket] = [self._terminal, self._listener, *self._connections]
         ready, writable, _ = select.select(reading, waiting, [], seconds)
@@ -143,10 +147,10 @@ class Gateway:
 
     def _send(self, packet: bytes) -> None:
         layout = _COMMANDS.get(int.from_bytes(packet[:2], "big"))
-        if layout is None or len(packet) != layout.length:
+        if not is_unit(packet, UP) and (layout is None or len(packet) != layout.length):
             self._complain(f"{len(packet)} bytes that begin with {packet[:2].hex()} are no command: not sent")
             return
-        self._terminal.send(finished(packet, utc_ns()))
+        self._terminal.send_by(self._sealer, finished(packet, utc_ns()))
         self.up += 1
 
     def _accept(self) -> None:

@@ -93,6 +93,10 @@ class Terminal:
         sealer = self._sealers.setdefault(spi, Sealer(self._vault, spi, telecommand.AUTHENTICATED))
         return self.send_by(sealer, packet)
 
+    def sealer(self, spi: int, block: int) -> Sealer:
+        """Return what protects frames to be sent by `send_by`, with `block` counters reserved at once."""
+        return Sealer(self._vault, spi, telecommand.AUTHENTICATED, block)
+
     def send_by(self, sealer: Sealer, packet: bytes) -> int:
         """Send a command packet under the key of a sealer."""
         header = telecommand.TelecommandHeader(self._settings.spacecraft, 0, self._sequence)

@@ -152,7 +152,9 @@ class GuardianLine:
                 pass_fds=(theirs.fileno(),),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
-                start_new_session=True,  # signals to the flight's process group must not reach the guardian
+                # Signals to the flight's process group must not reach the guardian. A group, not a session:
+                # one that is stopped when the flight dies is continued by the kernel (setpgid(2)), and acts.
+                process_group=0,
             )
         except OSError as error:
             ours.close()

@@ -38,9 +38,9 @@ def safe_dropin(config: Path) -> str:
     return str(board_dropin.safe_dropin(load(config)))
 
 
-def link_dropin(config: Path) -> str:
-    """Return that of the link's unit."""
-    return str(board_dropin.link_dropin(load(config)))
+def link_dropin(config: Path, root: Path = Path("/")) -> str:
+    """Return that of the link's unit, on a board whose proc and sys stand in `root`."""
+    return str(board_dropin.link_dropin(load(config), root))
 
 
 def changed_testbed(folder: Path, **sections: str) -> Path:

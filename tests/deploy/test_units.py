@@ -27,7 +27,8 @@ from tests.deploy.scripts import (
 from tests.scenario.flights import CONFIG
 
 UNITS = ("knightcube.service", "knightcube-safe.service", "knightcube-link.service")
-LINK = "{keys: /var/lib/knightcube-link/keys, udp: '192.168.7.2:5000', serial: {device: /dev/ttyS0}}"
+LINK = "{keys: /var/lib/knightcube-link/keys, udp: '192.168.7.2:5000', serial: {device: /dev/null}}"
+"""Beside the network a line that is there, and not plugged in."""
 CAMERA = "{device: {kind: v4l2, path: /dev/knightcube-camera, pixel_format: Y16}}"
 
 needs_systemd = pytest.mark.skipif(
@@ -79,12 +80,19 @@ def exposure(unit: Path) -> float:
 @needs_systemd
 @pytest.mark.parametrize("name", UNITS)
 def test_the_sandbox_leaves_an_exposure_of_at_most_1(units: Path, name: str) -> None:
-    """Wherever in the network the link's peer is; a link by network and radio at once needs more."""
-    assert exposure(units / name) <= (1.2 if name == "knightcube-link.service" else 1.0)
+    """Wherever in the network the link's peer is, also with a radio at a serial line of the board."""
+    assert exposure(units / name) <= 1.0
 
 
 @needs_systemd
-@pytest.mark.parametrize("line", ["udp: '192.168.7.2:5000'", "serial: {device: /dev/ttyS0}"])
+def test_a_radio_that_is_plugged_in_beside_a_network_costs_a_fifth(tmp_path: Path) -> None:
+    link = LINK.replace("/dev/null", "/dev/knightcube-radio")
+    config = changed_testbed(tmp_path, commands="{socket: /run/knightcube/commands}", link=link)
+    assert exposure(put_units(tmp_path, config) / "knightcube-link.service") <= 1.2
+
+
+@needs_systemd
+@pytest.mark.parametrize("line", ["udp: '192.168.7.2:5000'", "serial: {device: /dev/knightcube-radio}"])
 def test_a_link_by_one_line_is_exposed_by_at_most_1(tmp_path: Path, line: str) -> None:
     link = f"{{keys: /var/lib/knightcube-link/keys, {line}}}"
     config = changed_testbed(tmp_path, commands="{socket: /run/knightcube/commands}", link=link)
@@ -98,12 +106,6 @@ def test_a_usb3_vision_camera_beside_a_ground_link_leaves_no_more(tmp_path: Path
         tmp_path, camera=camera, commands="{socket: /run/knightcube/commands}", link=LINK
     )
     assert exposure(put_units(tmp_path, config) / UNITS[0]) <= 1.0
-
-
-@needs_systemd
-@pytest.mark.parametrize("name", UNITS[:2])
-def test_flight_and_safe_state_leave_an_exposure_of_at_most_1_0(units: Path, name: str) -> None:
-    assert exposure(units / name) <= 1.0
 
 
 def test_the_safe_state_listens_where_the_flight_does_and_starts_it_again(tmp_path: Path) -> None:
@@ -242,6 +244,16 @@ def test_what_hangs_on_usb_is_let_through_whatever_number_it_comes_back_with(tmp
     assert board_dropin.allowed("/dev/null", (), usb) == [node, "DeviceAllow=char-ttyUSB rw"]
     fixed = board(tmp_path, "pci0000:00/0000:00:1e.0/tty/ttyS4")
     assert board_dropin.allowed("/dev/null", board_dropin.SERIAL, fixed) == [node]
+
+
+def test_the_link_sees_of_all_devices_its_line_alone_unless_that_may_come_back_as_another(
+    tmp_path: Path,
+) -> None:
+    config = changed_testbed(tmp_path, commands="{socket: /run/x}", link=LINK)
+    usb = board(tmp_path, "pci0000:00/0000:00:14.0/usb1/1-3/1-3:1.0/ttyUSB0/tty/ttyUSB0")
+    assert "PrivateDevices" not in link_dropin(config, usb)
+    soldered = link_dropin(config, board(tmp_path, "pci0000:00/0000:00:1e.0/tty/ttyS4"))
+    assert "DeviceAllow=/dev/null rw\nPrivateDevices=yes\nBindPaths=/dev/null\n" in soldered
 
 
 def test_what_is_not_there_yet_is_let_through_as_what_it_may_be(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import pytest
 
 from flight.bodies.orbit.view import LEVELS
 from flight.link.commands.definitions import COMMANDS
+from flight.link.events import Severity
 from flight.link.process.directives import DIRECTIVES, NEW_KEY
 from flight.link.process.verification import Stage
 from flight.link.telemetry import states
@@ -15,6 +16,7 @@ from flight.link.telemetry.definitions import PACKETS
 from flight.link.telemetry.form import Field, Limits, Packet
 from flight.link.telemetry.packets import LAYOUTS, Packer, compile_layouts
 from flight.loop.control_output import SteeringState
+from flight.loop.fdir.facts import FACTS
 from flight.loop.fdir.streams import StreamState
 from ground import documentation
 from ground.xtce import document, main, spread
@@ -100,3 +102,7 @@ def test_the_states_of_the_table_are_those_of_the_code() -> None:
     assert streams == states.STREAMS
     assert tuple((int(stage), stage.name.lower()) for stage in Stage) == states.STAGES
     assert tuple((i, level.value) for i, level in enumerate(LEVELS)) == states.KNOWLEDGE
+    assert tuple((i, fact.name) for i, fact in enumerate(FACTS)) == states.FACTS
+    grave = {fact.name: fact.begins.severity is Severity.FAULT for fact in FACTS}
+    named = dict(states.FACTS)
+    assert {named[bit]: level == "fault" for bit, level in states.FACT_ALARMS} == grave

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from flight.gnc.tracking.tracker import TrackSettings
 from flight.gnc.vision.frame_job import TrackerSettings
+from flight.gnc.vision.kept_frames import KeptFrames
 from flight.gnc.vision.objects.sighted import SightSettings
 from flight.gnc.vision.startracker.detection import DetectionSettings
 from flight.gnc.vision.startracker.identification.lost_in_space import IdentificationSettings
@@ -34,8 +36,9 @@ def navigation_settings(config: Config) -> NavigationSettings:
     )
 
 
-def imaging_settings(camera: Camera, body: Body) -> ImagingSettings:
-    """Return the settings of imaging."""
+def imaging_settings(camera: Camera, body: Body, frames: Path | None) -> ImagingSettings:
+    """Return the settings of imaging; `frames` is the folder of frames that are kept."""
+    kept = KeptFrames(frames, camera.keep_frames) if frames is not None and camera.keep_frames else None
     return ImagingSettings(
         camera=camera_model(camera),
         exposure_ns=round(camera.exposure * SECOND_NS),
@@ -44,7 +47,7 @@ def imaging_settings(camera: Camera, body: Body) -> ImagingSettings:
         max_age_ns=round(camera.max_age * SECOND_NS),
         late_ns=round(camera.late_after * SECOND_NS),
         slow_ns=round(camera.vision_slow_after * SECOND_NS),
-        max_rate=camera.max_rate,
+        max_rate=math.inf if camera.max_rate is None else camera.max_rate,
         mounting=np.array(camera.mounting),
         estimator=_estimator(camera),
         tracker=_tracker(camera),
@@ -53,6 +56,7 @@ def imaging_settings(camera: Camera, body: Body) -> ImagingSettings:
         objects=None if camera.objects is None else SightSettings(faintest=camera.objects.faintest),
         knowledge=body.knowledge,
         seeks=body.seeks,
+        kept=kept,
     )
 
 

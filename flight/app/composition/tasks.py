@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -47,6 +48,7 @@ class Opened:
         log_error: returns why the flight log fails, empty while it works.
         channels: sources of commands.
         feed: feeds the watchdog, called about four times a second.
+        frames: folder of the frames that are kept.
     """
 
     clock: Clock
@@ -56,6 +58,7 @@ class Opened:
     log_error: Callable[[], str]
     channels: Sequence[Channel] = ()
     feed: Callable[[], None] = nothing
+    frames: Path | None = None
 
 
 def build_loop(config: Config, opened: Opened, supervisors: Supervisors) -> FlightLoop:
@@ -89,7 +92,7 @@ def _tasks(
     navigation = Navigation(devices.unit, body, navigation_settings(config), services)
     drive = _drive(config, devices, body, services)
     steering = Steering(body, drive, services)
-    imaging = _imaging(config, devices, navigation, body, services)
+    imaging = _imaging(config, opened, navigation, body, services)
     low_rate, low_for = config.detumble.low_rate, config.detumble.low_for
     modes = ModeControl(ModeSettings(config.modes, low_rate, low_for, stop), body, steering, services)
     observer = PerformanceObserver(devices.coils, services)
@@ -129,12 +132,12 @@ def _sun(config: Config, devices: Devices, body: Body, services: Services) -> Su
 
 
 def _imaging(
-    config: Config, devices: Devices, navigation: Navigation, body: Body, services: Services
+    config: Config, opened: Opened, navigation: Navigation, body: Body, services: Services
 ) -> Imaging | None:
-    camera, source = config.camera, devices.camera
+    camera, source = config.camera, opened.devices.camera
     if camera is None or source is None:
         return None
-    settings = imaging_settings(camera, body)
+    settings = imaging_settings(camera, body, opened.frames)
     section = camera.objects
     objects = None if section is None else ObjectTracking(track_settings(section), body, services)
     return Imaging(source, settings, navigation, body.view, services, objects)

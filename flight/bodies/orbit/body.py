@@ -26,6 +26,7 @@ from flight.gnc.control.detumble import WindowSchedule
 from flight.gnc.control.three_axes import pointing_job
 from flight.gnc.control.three_axes.field_detumbler import FieldBraking, FieldDetumbler
 from flight.gnc.control.three_axes.pointing_table import PointingWeights
+from flight.gnc.control.three_axes.slew_table import SlewWish
 from flight.gnc.earth.orbit_knowledge import TwoLineElements
 from flight.gnc.errors import UsageError
 from flight.gnc.estimation.estimate import Estimate
@@ -67,14 +68,15 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
         around = surroundings.at(estimate.time_ns)
         return np.zeros(3) if around is None else attitude_matrix(estimate.quaternion) @ around.field
 
+    def disturbed() -> tuple[FloatArray, FloatArray]:
+        return filter_.torque_sizes, filter_.residual_dipole
+
     return Body(
         modes=frozenset(Mode) - {Mode.HOLD, Mode.SLEW, Mode.TESTBED_DEMO},
         filter=filter_,
         learned_problems=[],
         paths=paths,
-        planner=PointingPlanner(
-            _planned(config), paths, surroundings, lambda: filter_.torque_sizes, objects, services
-        ),
+        planner=PointingPlanner(_planned(config), paths, surroundings, disturbed, objects, services),
         targets=PointingTargets(_timed(config), paths, config.looks_for_objects()),
         tracker=PointingTracker(filter_, surroundings, _pauses(config), limit, dipole_per_ampere),
         feed=OrbitFeed(filter_),
@@ -116,7 +118,15 @@ def _planned(config: OrbitConfig) -> PlannedCraft:
     weights = PointingWeights(turn=section.turn, rate=section.rate, dipole=section.dipole, fastest=fastest)
     pauses = _pauses(config)
     limit = _limit(config) * pauses.act_ns / pauses.period_ns
-    return PlannedCraft(np.diag(config.craft.inertia), axes, weights, limit)
+    return PlannedCraft(np.diag(config.craft.inertia), axes, weights, limit, _slew(config))
+
+
+def _slew(config: OrbitConfig) -> SlewWish:
+    """Return how slews are wanted; without a star camera the pointing axis keeps the cones."""
+    section, camera = config.pointing, config.camera
+    boresight = section.axis if camera is None else attitude_matrix(np.array(camera.mounting))[2]
+    heat = np.array(config.coils.resistance) / config.craft.dipole_per_ampere**2
+    return SlewWish(section.slew, heat, np.zeros(3), np.array(boresight), section.cones.angles())
 
 
 def _sensor(config: OrbitConfig) -> Sensor | None:
@@ -131,8 +141,8 @@ def _sensor(config: OrbitConfig) -> Sensor | None:
 
 def fastest_rate(config: OrbitConfig) -> float:
     """Return the rate, rad/s, beyond which the body is braked again or the star camera rests."""
-    camera = config.camera.max_rate if config.camera is not None else math.inf
-    return min(config.modes.tumble_rate, camera)
+    camera = config.camera.max_rate if config.camera is not None else None
+    return config.modes.tumble_rate if camera is None else min(config.modes.tumble_rate, camera)
 
 
 def _timed(config: OrbitConfig) -> list[tuple[float, PointingTarget]]:

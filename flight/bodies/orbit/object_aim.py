@@ -94,11 +94,13 @@ class ObjectAim:
         axes = BodyAxes(boresight, np.eye(3)[int(np.argmin(np.abs(boresight)))])
         track = self._track()
         if track is None:
-            return replace(job, axes=axes, sight=Sight(self._searched(job.quaternion), np.zeros(3), 0.0))
+            place = self._searched(job.quaternion)
+            return replace(job, axes=axes, slew=None, sight=Sight(place, np.zeros(3), 0.0))
         line = track.line
         weights = replace(job.weights, dipole=EFFORT * self._limit, roll=ROLL, rate=RATE, axis=boresight)
         since = (line.time_ns - job.origin_ns) / SECOND_NS
-        return replace(job, axes=axes, weights=weights, sight=Sight(line.direction, line.velocity, since))
+        sight = Sight(line.direction, line.velocity, since)
+        return replace(job, axes=axes, weights=weights, slew=None, sight=sight)
 
     def judge(self, job: PointingJob, table: PointingTable, now_ns: int) -> None:
         """Report an object that the path of a table does not keep in the field."""

@@ -52,6 +52,7 @@ class PointingPaths:
         self._law: PointingLaw | None = None
         self._target: PointingTarget | None = None
         self._origin_ns = 0
+        self._arrival_ns: int | None = None
         self.off = 0.0
 
     def offer(self, table: PointingTable, target: PointingTarget, origin_ns: int) -> str:
@@ -64,8 +65,21 @@ class PointingPaths:
             turn, most = np.rad2deg([speed, self._fastest])
             return f"it turns the body at {turn:.2f} deg/s, where {most:.2f} are braked or blind the camera"
         self._law, self._target, self._origin_ns = PointingLaw(table, self._limit), target, origin_ns
-        self.off = 0.0
+        self.off, self._arrival_ns = 0.0, None
+        if table.slew is not None:
+            self._arrival_ns = origin_ns + round((self._law.span[0] + table.slew.horizon) * SECOND_NS)
         return ""
+
+    def is_slewing(self, now_ns: int, target: PointingTarget) -> bool:
+        """Return whether a slew to a target is flown and not over."""
+        return self._arrival_ns is not None and now_ns < self._arrival_ns and target == self._target
+
+    def has_arrived(self, now_ns: int) -> bool:
+        """Return whether a slew is over: once for each."""
+        over = self._arrival_ns is not None and now_ns >= self._arrival_ns
+        if over:
+            self._arrival_ns = None
+        return over
 
     def sample(self, now_ns: int) -> PathPoint | None:
         """Return the path now; None without one, or after its end."""
@@ -91,4 +105,4 @@ class PointingPaths:
 
     def release(self) -> None:
         """Discard the path."""
-        self._law = self._target = None
+        self._law = self._target = self._arrival_ns = None

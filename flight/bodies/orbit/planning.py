@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from flight.bodies.orbit.object_aim import ObjectAim
 from flight.bodies.orbit.paths import PointingPaths
@@ -16,6 +18,7 @@ from flight.bodies.orbit.surroundings import Surroundings
 from flight.bodies.orbit.targets import target_of
 from flight.gnc.control.three_axes.pointing_job import STEADY, PointingJob
 from flight.gnc.control.three_axes.pointing_table import PointingWeights
+from flight.gnc.control.three_axes.slew_table import SlewWish
 from flight.gnc.estimation.estimate import Estimate
 from flight.gnc.guidance.three_axes.target_law import BodyAxes
 from flight.gnc.math.arrays import FloatArray
@@ -36,13 +39,15 @@ ASTRAY = math.radians(15.0)
 class PlannedCraft:
     """What the planner believes of the craft.
 
-    `inertia` (3, 3) kg m^2, body axes; `limit` A m^2 of each coil, mean over a window of pause and action.
+    `inertia` (3, 3) kg m^2, body axes; `limit` A m^2 of each coil, mean over a window of pause and action;
+    `slew` is how slews are wanted.
     """
 
     inertia: FloatArray
     axes: BodyAxes
     weights: PointingWeights
     limit: float
+    slew: SlewWish
 
 
 class PointingPlanner:
@@ -53,13 +58,13 @@ class PointingPlanner:
         craft: PlannedCraft,
         paths: PointingPaths,
         surroundings: Surroundings,
-        sizes: Callable[[], FloatArray],
+        disturbed: Callable[[], tuple[FloatArray, FloatArray]],
         objects: ObjectAim,
         services: Services,
     ) -> None:
-        """`sizes` returns the torques estimated now, (9,) N m."""
-        self._objects = objects
-        self._craft, self._paths, self._surroundings, self._sizes = craft, paths, surroundings, sizes
+        """`disturbed` returns what is estimated now: torques (9,) N m and residual dipole (3,) A m^2."""
+        self._craft, self._paths, self._surroundings = craft, paths, surroundings
+        self._disturbed, self._objects = disturbed, objects
         self._jobs, self._events = services.jobs, services.events
         self._job: PointingJob | None = None
         self._wanted = False
@@ -87,14 +92,22 @@ class PointingPlanner:
 
     def serve(self, estimate: Estimate | None, target: Target, now_ns: int) -> None:
         """Submit the requested job to the worker."""
-        self._objects.aim(target_of(target))
-        wanted = self._wanted or self._paths.off > ASTRAY or self._objects.moved
+        goal, astray = target_of(target), self._paths.off > ASTRAY
+        self._objects.aim(goal)
+        if self._paths.is_slewing(now_ns, goal) and not astray:
+            return  # the rest of a slew planned again costs many times its heat
+        if self._paths.has_arrived(now_ns):
+            text = f"{math.degrees(self._paths.off):.2f} deg off its path"
+            self._events.report(events.SLEW_ENDED, now_ns, text)
+            self._wanted = True
+        wanted = self._wanted or astray or self._objects.moved
         if estimate is None or not wanted or self._job is not None or now_ns < self._after_ns:
             return
         orbit, craft = self._surroundings.state(now_ns), self._craft
         if orbit is None:
             self._fail("no plan: the orbit is not known", now_ns)
             return
+        sizes, residual = self._disturbed()
         job = PointingJob(
             self._count + 1,
             now_ns,
@@ -102,11 +115,12 @@ class PointingPlanner:
             craft.inertia,
             craft.axes,
             craft.weights,
-            target_of(target),
+            goal,
             estimate.quaternion,
             estimate.rate,
-            self._sizes(),
+            sizes,
             craft.limit,
+            replace(craft.slew, residual=residual),
         )
         job = self._objects.directed(job)
         if self._jobs.submit(PLANNER, job):
@@ -125,6 +139,10 @@ class PointingPlanner:
         else:
             self._accepted += 1
             self._objects.judge(job, result.value, now_ns)
+            if (slew := result.value.slew) is not None:
+                fastest = math.degrees(float(np.linalg.norm(slew.rate, axis=1).max()))
+                text = f"to {job.target.text} in {slew.horizon:.0f} s, {fastest:.2f} deg/s at most"
+                self._events.report(events.SLEW_BEGUN, now_ns, text)
 
     def counts(self) -> tuple[int, int]:
         """Return how many plans were accepted and refused since the start."""

@@ -18,11 +18,13 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from flight.gnc.camera.lens import CameraModel
 from flight.gnc.math.arrays import Image
+from flight.gnc.vision.kept_frames import KeptFrames, keep_frame
 from flight.gnc.vision.objects.sighted import Sighted, SightSettings
 from flight.gnc.vision.startracker.detection import FrameKind, Survey, measure_areas, survey
 from flight.gnc.vision.startracker.index import sky_index
@@ -80,6 +82,7 @@ class FrameJob:
         previous_checksum: of the frame before; the same pixels again mean a frozen camera.
         motion_first: whether the motion is estimated in any case, not only where a survey shows streaks.
         objects: how objects are sighted once the stars gave the attitude; None: they are not.
+        kept: where the frame is kept; None: it is not.
     """
 
     pixels: Image
@@ -92,6 +95,7 @@ class FrameJob:
     previous_checksum: int | None = None
     motion_first: bool = True
     objects: SightSettings | None = None
+    kept: KeptFrames | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +112,29 @@ class FrameFound:
 
 def run(job: FrameJob) -> FrameFound:
     """Return attitude and rate of a frame; at the top level of a module for the worker process to import."""
+    found = _found(job)
+    if job.kept is not None:
+        keep_frame(job.kept, job.pixels, _facts(job, found))
+    return found
+
+
+def _facts(job: FrameJob, found: FrameFound) -> dict[str, Any]:
+    """Return what was found in a frame as plain values, camera axes, for its file."""
+    motion, solution = found.motion, found.solution
+    rate = motion.rate if motion.status is StreakStatus.RATE else None
+    fix = None if solution is None else solution.fix
+    return {
+        "exposure_s": job.exposure,
+        "streaks": motion.status.value,
+        "rate_rad_s": None if rate is None else rate.tolist(),
+        "stars": None if solution is None else solution.status.value,
+        "identified": 0 if solution is None else int((solution.star >= 0).sum()),
+        "attitude": None if fix is None else fix.quaternion.tolist(),
+        "objects": None if found.objects is None else len(found.objects.points),
+    }
+
+
+def _found(job: FrameJob) -> FrameFound:
     tracker = job.tracker
     if tracker is None:
         return FrameFound(_motion(job), None)

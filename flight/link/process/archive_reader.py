@@ -43,11 +43,15 @@ class _PacketStream:
 
 
 class LogFollower:
-    """Follows the newest run of an archive, or one run."""
+    """Follows the newest run of an archive, or one run.
+
+    Attributes:
+        place: folder of the archive, or of the run.
+    """
 
     def __init__(self, place: Path) -> None:
         """Begin near the end of the newest run under `place`; it may come later."""
-        self._place = place
+        self.place = place
         self._run: Path | None = None
         self._path: Path | None = None
         self._offset = 0
@@ -61,9 +65,7 @@ class LogFollower:
         """Return the folder of a run of the archive, of the newest for 0; None where there is none."""
         if number == 0:
             return self._run
-        return next(
-            (run for run in find_runs(self._place) if int(run.name.partition("-")[2]) == number), None
-        )
+        return next((run for run in find_runs(self.place) if int(run.name.partition("-")[2]) == number), None)
 
     def new(self) -> list[bytes]:
         """Return the packets that came since the last call, 64 kB of them at most."""
@@ -86,8 +88,8 @@ class LogFollower:
         self._attach()
 
     def _attach(self, *, at_end: bool = False) -> None:
-        runs = find_runs(self._place)
-        newest = runs[-1] if runs else self._place
+        runs = find_runs(self.place)
+        newest = runs[-1] if runs else self.place
         segments = find_segments(newest, _STEM)
         if newest == self._run or not segments:
             return

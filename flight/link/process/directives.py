@@ -1,4 +1,4 @@
-"""Commands that the link process executes itself: playback, new keys, and the schedule."""
+"""Commands that the link process executes itself: playback, new keys, the schedule, and those for files."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from flight.link.commands.errors import CommandError
+from flight.link.process import file_directives
+from flight.link.process.file_directives import FILE_PACKETS, FileDirective
 from flight.link.process.timetable import LONGEST_COMMAND
 from flight.link.security.sdls import KEY_BYTES
 from flight.link.telemetry.form import Field, Packet
@@ -74,7 +76,7 @@ UNSCHEDULE = Packet(
 )
 LIST = Packet("list-schedule", 0x222, "at will", "Report each scheduled command", (), telecommand=True)
 
-DIRECTIVES: tuple[Packet, ...] = (PLAY, STOP, NEW_KEY, SCHEDULE, UNSCHEDULE, LIST)
+DIRECTIVES: tuple[Packet, ...] = (PLAY, STOP, NEW_KEY, SCHEDULE, UNSCHEDULE, LIST, *FILE_PACKETS)
 LAYOUTS: dict[str, Layout] = compile_layouts(DIRECTIVES)
 _BY_IDENTIFIER = {layout.identifier: layout for layout in LAYOUTS.values()}
 
@@ -141,47 +143,47 @@ class Listing:
         return "list scheduled commands"
 
 
-Directive = Play | Stop | NewKey | Scheduled | Deletion | Listing
+Directive = Play | Stop | NewKey | Scheduled | Deletion | Listing | FileDirective
+
+
+_PACKETS: dict[type[Any], Packet] = {
+    Play: PLAY,
+    Stop: STOP,
+    NewKey: NEW_KEY,
+    Scheduled: SCHEDULE,
+    Deletion: UNSCHEDULE,
+    Listing: LIST,
+    **file_directives.PACKETS,
+}
 
 
 def name_of(directive: Directive) -> str:
     """Return the name of the packet that carries a directive."""
-    match directive:
-        case Play():
-            return PLAY.name
-        case NewKey():
-            return NEW_KEY.name
-        case Stop():
-            return STOP.name
-        case Scheduled():
-            return SCHEDULE.name
-        case Deletion():
-            return UNSCHEDULE.name
-        case Listing():
-            return LIST.name
+    return _PACKETS[type(directive)].name
 
 
 def pack(directive: Directive, utc_ns: int) -> bytes:
     """Return the packet of a directive. Raises CommandError for values that are none."""
-    packer = Packer(LAYOUTS)
     try:
-        match directive:
-            case Play(run, begin, end):
-                return packer.pack(PLAY, utc_ns, run=run, begin=begin, end=end)
-            case Stop():
-                return packer.pack(STOP, utc_ns)
-            case NewKey(spi, generation, key):
-                return packer.pack(NEW_KEY, utc_ns, spi=spi, generation=generation, key=list(key))
-            case Scheduled(at, words):
-                if len(at.encode()) >= _LONGEST_UTC or len(words.encode()) >= LONGEST_COMMAND:
-                    raise CommandError(f"{at}: {words}: too long")
-                return packer.pack(SCHEDULE, utc_ns, at=at, words=words)
-            case Deletion(number):
-                return packer.pack(UNSCHEDULE, utc_ns, number=number)
-            case Listing():
-                return packer.pack(LIST, utc_ns)
+        return Packer(LAYOUTS).pack(_PACKETS[type(directive)], utc_ns, _fields(directive))
     except TelemetryError as error:
         raise CommandError("these values fit no directive of the link") from error
+
+
+def _fields(directive: Directive) -> dict[str, Any]:
+    """Return the fields of a directive's packet. Raises CommandError."""
+    if isinstance(directive, FileDirective):
+        return file_directives.fields_of(directive)
+    fields = {name: getattr(directive, name) for name in type(directive).__slots__}
+    match directive:
+        case NewKey(key=key):
+            fields["key"] = list(key)
+        case Scheduled(at, words):
+            if len(at.encode()) >= _LONGEST_UTC or len(words.encode()) >= LONGEST_COMMAND:
+                raise CommandError(f"{at}: {words}: too long")
+        case _:
+            pass
+    return fields
 
 
 def unpack(data: bytes) -> Directive | None:
@@ -196,19 +198,22 @@ def unpack(data: bytes) -> Directive | None:
 
 def _directive_of(name: str, row: Any) -> Directive:
     """Return the directive of a packet's row. Raises CommandError."""
+    directive: Directive
     match name:
         case PLAY.name:
-            play = Play(int(row["run"]), float(row["begin"]), float(row["end"]))
-            if not play.begin <= play.end:  # NaN compares false
-                raise CommandError(f"from {play.begin:g} to {play.end:g} s is no stretch of time")
-            return play
+            directive = Play(int(row["run"]), float(row["begin"]), float(row["end"]))
+            if not directive.begin <= directive.end:  # NaN compares false
+                raise CommandError(f"from {directive.begin:g} to {directive.end:g} s is no stretch of time")
         case NEW_KEY.name:
-            return NewKey(int(row["spi"]), int(row["generation"]), bytes(row["key"].tolist()))
+            directive = NewKey(int(row["spi"]), int(row["generation"]), bytes(row["key"].tolist()))
         case SCHEDULE.name:
-            return Scheduled(to_text(row["at"]), to_text(row["words"]))
+            directive = Scheduled(to_text(row["at"]), to_text(row["words"]))
         case UNSCHEDULE.name:
-            return Deletion(int(row["number"]))
+            directive = Deletion(int(row["number"]))
         case LIST.name:
-            return Listing()
+            directive = Listing()
+        case STOP.name:
+            directive = Stop()
         case _:
-            return Stop()
+            directive = file_directives.directive_of(name, row)
+    return directive

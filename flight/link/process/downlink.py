@@ -1,13 +1,13 @@
-"""What goes down, and when: verification first, then live telemetry, then playback, within the line's rate.
+"""What goes down, and when: verification first, then live telemetry, then files and playback in turn.
 
-Live telemetry that the rate does not hold is thinned: of a periodic kind only the newest packet waits. The
-archive has them all.
+All within the line's rate. Live telemetry that it does not hold is thinned: of a periodic kind only the
+newest packet waits. The archive has them all.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from flight.link.frames.telemetry import HEADER, MasterCount, Seal, TelemetryFramer
 from flight.link.process.archive_reader import time_of
@@ -15,7 +15,7 @@ from flight.link.security.sdls import OVERHEAD_BYTES
 from flight.link.telemetry.definitions import COMMAND, EVENT, MODE, PLAN, RUN, STARS, STREAK, TARGET
 from flight.link.telemetry.packets import CRC_BYTES, LAYOUTS
 
-LIVE, PLAYBACK = 0, 1
+LIVE, PLAYBACK, FILES = 0, 1, 2
 """Virtual channels."""
 
 LEAST_FRAME = HEADER.size + OVERHEAD_BYTES + CRC_BYTES + 64
@@ -74,12 +74,20 @@ class Downlink:
         played_ns: mission time that the playback has reached.
     """
 
-    def __init__(self, spacecraft: int, frame_bytes: int, rate: float, seal: Seal) -> None:
-        """`rate` is in bytes/s of frames; `frame_bytes` is the length of each."""
+    def __init__(
+        self, spacecraft: int, frame_bytes: int, rate: float, seal: Seal, files: Callable[[], bytes | None]
+    ) -> None:
+        """`rate` is in bytes/s of frames; `frame_bytes` is the length of each.
+
+        `files` returns the next packet of a file's transfer when there is rate for it, None for none.
+        """
         room = frame_bytes - HEADER.size - OVERHEAD_BYTES - CRC_BYTES
         master = MasterCount()
         self._live = TelemetryFramer(spacecraft, LIVE, room, master, seal)
         self._replay = TelemetryFramer(spacecraft, PLAYBACK, room, master, seal)
+        self._filed = TelemetryFramer(spacecraft, FILES, room, master, seal)
+        self._files = files
+        self._files_first = True
         self._frame_bytes = frame_bytes
         self._rate = rate
         self._credit = 0.0
@@ -121,7 +129,7 @@ class Downlink:
         self._credit_ns = now_ns
         due: list[bytes] = []
         while self._credit >= self._frame_bytes:
-            made = self._next_live(now_ns) or self._next_played()
+            made = self._next_live(now_ns) or self._next_in_turn()
             if not made:
                 break
             due += made
@@ -138,6 +146,19 @@ class Downlink:
                 return made
         late = self._live.waits and now_ns - self._begun_ns >= _FLUSH_NS
         return self._live.flush() if late else []
+
+    def _next_in_turn(self) -> list[bytes]:
+        """Return frames of a file, or of the playback: each has half of what live telemetry leaves."""
+        self._files_first = not self._files_first
+        if self._files_first:
+            return self._next_filed() or self._next_played()
+        return self._next_played() or self._next_filed()
+
+    def _next_filed(self) -> list[bytes]:
+        while (packet := self._files()) is not None:
+            if made := self._filed.add(packet):
+                return made
+        return self._filed.flush() if self._filed.waits else []
 
     def _next_played(self) -> list[bytes]:
         if self._source is None:

@@ -15,21 +15,25 @@ from flight.gnc.errors import FlightError
 from flight.link.commands import codec
 from flight.link.commands.codec import CommandPacker
 from flight.link.commands.errors import CommandError
+from flight.link.files.packets import UP, is_unit
+from flight.link.files.store import files_folder
 from flight.link.frames import telecommand, telemetry
 from flight.link.process import directives
-from flight.link.process.archive_reader import LogFollower, stretch, time_of
+from flight.link.process.archive_reader import LogFollower, time_of
 from flight.link.process.control_line import ControlLine
-from flight.link.process.directives import Directive, NewKey, Play, Stop
+from flight.link.process.directives import Deletion, Directive, Listing, NewKey, Play, Scheduled, Stop
 from flight.link.process.downlink import Downlink
+from flight.link.process.filing import Filing, values_of
 from flight.link.process.key_change import change_key
 from flight.link.process.lines import Line
+from flight.link.process.playback import Playback
 from flight.link.process.scheduling import Scheduling
 from flight.link.process.timetable import Timetable
 from flight.link.process.verification import Report, Sent, Stage, Verification, report, request_of
 from flight.link.security.associations import COMMAND_SPIS, TELEMETRY_SPIS, Vault
 from flight.link.security.gate import Admitted, Gate, Refusal, RefusedError, Sealer
 from flight.link.telemetry.form import Packet
-from flight.link.telemetry.link_definitions import LINK, VERIFICATION
+from flight.link.telemetry.link_definitions import LINK, TRANSFER, VERIFICATION
 from flight.link.telemetry.packets import Packer
 from hal.interfaces.wires import SECOND_NS, Clock
 
@@ -72,18 +76,26 @@ class Station:
         self._sealers = {
             spi: Sealer(vault, spi, telemetry.AUTHENTICATED, _RESERVED_BLOCK) for spi in TELEMETRY_SPIS
         }
-        self._downlink = Downlink(settings.spacecraft, settings.frame_bytes, settings.rate, self._seal)
+        self._downlink = Downlink(
+            settings.spacecraft, settings.frame_bytes, settings.rate, self._seal, self._next_unit
+        )
+        self._filing = Filing(files_folder(vault.folder), log.place, clock.now_ns())
         self._verification = Verification()
         self._packer, self._commands = Packer(), CommandPacker()
         self._mission_ns, self._mission_at_ns = 0, clock.now_ns()
         self._status_ns = self._label_ns = clock.now_ns()
-        self._refusals: deque[int] = deque(maxlen=_REFUSALS_A_SECOND)
+        self._refusals = _Few()
         self._received = self._refused_commands = 0
         self._problem = ""
-        self._playback: Report | None = None
+        self._playback = Playback(self._downlink, log)
         self._scheduling = Scheduling(Timetable(vault.folder))
         self._report(*self._scheduling.beginning())
         self._status()
+
+    @property
+    def transfers(self) -> int:
+        """How many files are on their way."""
+        return len(self._filing.status())
 
     def run(self, ended: Callable[[], bool], complain: Callable[[str], object]) -> None:
         """Turn until `ended` returns true; complain once of each trouble with sending."""
@@ -96,6 +108,7 @@ class Station:
             due_ns = max(due_ns + pause_ns, self._clock.now_ns())
             self._clock.sleep_until_ns(due_ns)
         self._control.close()
+        self._filing.close(self._clock.now_ns())
 
     def turn(self) -> bool:
         """Take what came, send what is due; return whether anything came."""
@@ -109,9 +122,11 @@ class Station:
             self._report(*reports)
         self._follow(now_ns)
         self._execute_due(now_ns)
-        if self._playback is not None and not self._downlink.playing:
-            self._report(self._playback)
-            self._playback = None
+        self._report(*self._playback.turn())
+        self._report(*self._filing.turn(now_ns))
+        for progress, ending in self._filing.ended():
+            self._send(TRANSFER, values_of(progress))
+            self._report(*[ending] if ending else [])
         if now_ns >= self._status_ns:
             self._status_ns = now_ns + SECOND_NS
             self._status()
@@ -129,12 +144,15 @@ class Station:
         try:
             admitted = self._gate.admit(frame)
         except RefusedError as error:
-            if error.counter is not None:
-                self._report_refusal(error.spi, error.counter, str(error), now_ns)
+            if error.counter is not None and self._refusals.fits(now_ns):
+                self._report(Report(error.spi, error.counter, Stage.REFUSED, "", str(error)))
             return
         line.trust(sender, now_ns)
         request = request_of(admitted.data)
         try:
+            if is_unit(admitted.data, UP):
+                self._filing.take(admitted.data, now_ns)
+                return
             directive = directives.unpack(admitted.data)
             if directive is not None:
                 self._obey(admitted, directive)
@@ -161,53 +179,31 @@ class Station:
             else:
                 self._report(due)
 
-    def _report_refusal(self, spi: int, counter: int, text: str, now_ns: int) -> None:
-        """Report an authentic frame that was refused; few of a flood of repeated ones."""
-        if len(self._refusals) < _REFUSALS_A_SECOND or now_ns - self._refusals[0] > SECOND_NS:
-            self._refusals.append(now_ns)
-            self._report(Report(spi, counter, Stage.REFUSED, "", text))
-
     def _obey(self, admitted: Admitted, directive: Directive) -> None:
         """Execute a directive and report its stages."""
         name, text = directives.name_of(directive), str(directive)
         request = request_of(admitted.data)
         done = Report(admitted.spi, admitted.counter, Stage.COMPLETED, name, text, request)
         self._report(replace(done, stage=Stage.ACCEPTED))
-        problem = ""
-        if isinstance(directive, Play):
-            problem = self._play(directive, done)
-        elif isinstance(directive, NewKey):
-            problem = change_key(directive, self._vault, self._gate, self._sealers)
-        elif isinstance(directive, Stop):
-            self._end_playback("stopped")
-        else:
-            reports = self._scheduling.obey(directive, done, self._clock.utc_ns())
-            self._refused_commands += reports[-1].stage is Stage.FAILED
-            self._report(*reports)
-            return
-        self._refused_commands += bool(problem)
-        if problem:
-            self._report(replace(done, stage=Stage.FAILED, text=problem))
-        elif not isinstance(directive, Play):
-            self._report(done)
+        reports = self._executed(directive, done)
+        own = [one.stage for one in reports if (one.spi, one.counter) == (done.spi, done.counter)]
+        self._refused_commands += Stage.FAILED in own
+        self._report(*reports)
 
-    def _play(self, play: Play, done: Report) -> str:
-        """Begin a playback, at whose end `done` is reported; return why not, empty when it began."""
-        folder = self._log.folder(play.run)
-        if folder is None:
-            return f"there is no run {play.run}"
-        self._end_playback("another takes its place")
-        self._downlink.play(stretch(folder, play.begin, play.end))
-        self._playback = done
-        self._report(replace(done, stage=Stage.STARTED))
-        return ""
-
-    def _end_playback(self, reason: str) -> None:
-        """Report a playback that goes on as failed, and end it."""
-        if self._playback is not None:
-            self._report(replace(self._playback, stage=Stage.FAILED, text=reason))
-        self._playback = None
-        self._downlink.play(None)
+    def _executed(self, directive: Directive, done: Report) -> list[Report]:
+        """Execute a directive, of whose completion `done` is the report; return the reports of now."""
+        match directive:
+            case Play():
+                return self._playback.begin(directive, done)
+            case Stop():
+                return [*self._playback.end("stopped"), done]
+            case NewKey():
+                problem = change_key(directive, self._vault, self._gate, self._sealers)
+                return [replace(done, stage=Stage.FAILED, text=problem) if problem else done]
+            case Scheduled() | Deletion() | Listing():
+                return self._scheduling.obey(directive, done, self._clock.utc_ns())
+            case _:
+                return self._filing.obey(directive, done, self._clock.utc_ns(), self._clock.now_ns())
 
     def _follow(self, now_ns: int) -> None:
         for packet in self._log.new():
@@ -245,10 +241,32 @@ class Station:
             "played_ns": self._downlink.played_ns,
         }
         self._send(LINK, values)
+        for progress in self._filing.status():
+            self._send(TRANSFER, values_of(progress))
 
     def _send(self, packet: Packet, values: dict[str, Any]) -> None:
-        time_ns = self._mission_ns + self._clock.now_ns() - self._mission_at_ns
-        self._downlink.report(self._packer.pack(packet, time_ns, values))
+        self._downlink.report(self._packer.pack(packet, self._time_ns(), values))
+
+    def _next_unit(self) -> bytes | None:
+        return self._filing.packet(self._clock.now_ns(), self._time_ns())
+
+    def _time_ns(self) -> int:
+        """Return the mission time."""
+        return self._mission_ns + self._clock.now_ns() - self._mission_at_ns
+
+
+class _Few:
+    """Lets a few reports a second pass: of a flood of repeated frames not each is reported."""
+
+    def __init__(self) -> None:
+        self._times: deque[int] = deque(maxlen=_REFUSALS_A_SECOND)
+
+    def fits(self, now_ns: int) -> bool:
+        """Return whether one more fits into the second that ends now, and count it then."""
+        fits = len(self._times) < _REFUSALS_A_SECOND or now_ns - self._times[0] > SECOND_NS
+        if fits:
+            self._times.append(now_ns)
+        return fits
 
 
 def _security(gate: Gate, vault: Vault) -> dict[str, Any]:

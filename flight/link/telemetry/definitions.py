@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from flight.link.telemetry.form import Packet
 from flight.link.telemetry.health_definitions import COMMAND, EVENT, HEALTH, HOUSEKEEPING, RUN
-from flight.link.telemetry.link_definitions import LINK, VERIFICATION
+from flight.link.telemetry.link_definitions import LINK, TRANSFER, VERIFICATION
 from flight.link.telemetry.motion_definitions import (
     ATTITUDE,
     CONTROL,
@@ -51,6 +51,7 @@ __all__ = [
     "STREAK",
     "TARGET",
     "TRACK",
+    "TRANSFER",
     "TRUTH",
     "VERIFICATION",
 ]
@@ -76,6 +77,7 @@ PACKETS: tuple[Packet, ...] = (
     PARAMETERS,
     LINK,
     VERIFICATION,
+    TRANSFER,
     TRUTH,
     ORBIT_TRUTH,
     CYCLE_TIMING,

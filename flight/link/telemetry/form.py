@@ -7,7 +7,8 @@ from typing import Literal
 
 Range = tuple[float, float]
 States = tuple[tuple[int, str], ...]
-Alarms = tuple[tuple[int, Literal["warning", "fault"]], ...]
+Level = Literal["warning", "fault"]
+Alarms = tuple[tuple[int, Level], ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +27,8 @@ class Field:
 
     Attributes:
         states: the numbers that may stand in the field, each with its name.
-        alarms: the states that are a warning or a fault.
+        bits: the bits that may be set in the field, each with its name; several may be.
+        alarms: the states, or the bits when set, that are a warning or a fault.
         limits: when a value without states is a warning or a fault.
         valid: the range (low, high) of a command's argument.
         wraps: past its largest number the field goes on at 0, as a counter may.
@@ -42,6 +44,7 @@ class Field:
     limits: Limits | None = None
     valid: Range | None = None
     wraps: bool = False
+    bits: States = ()
 
 
 def counter(name: str, meaning: str, kind: str = "u4") -> Field:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from flight.link.telemetry.form import Field, Packet, counter
 from flight.link.telemetry.states import (
+    COILS,
+    FACT_ALARMS,
+    FACTS,
     MODES,
     NO_YES,
     SAFE_ALARM,
@@ -88,8 +91,8 @@ HEALTH = Packet(
         Field("coils", "u1", "-", "acknowledged commands of the coils", states=STREAMS, alarms=STREAM_ALARMS),
         Field("power", "u1", "-", "the current monitor", states=STREAMS, alarms=STREAM_ALARMS),
         Field("camera", "u1", "-", "the camera's frames", states=STREAMS, alarms=STREAM_ALARMS),
-        Field("facts", "u8", "-", "bit n: fact n of the table (flight.loop.fdir.facts) counts"),
-        Field("coils_in_use", "u1", "-", "bits 0, 1, 2: the coils on body x, y, z"),
+        Field("facts", "u8", "-", "what the monitors find", bits=FACTS, alarms=FACT_ALARMS),
+        Field("coils_in_use", "u1", "-", "the coils that control uses", bits=COILS),
         counter("fed", "how often the watchdog was fed"),
         counter("slips", "slots of the control group skipped since start"),
         counter("clock_steps", "how often the wall clock was set"),

@@ -48,3 +48,21 @@ VERIFICATION = Packet(
     ),
     version=2,
 )
+
+TRANSFER = Packet(
+    "transfer",
+    0x172,
+    "1 Hz of each open transfer and at its end, of the link process; not in the flight log",
+    "How a file's transfer stands",
+    (
+        Field("down", "u1", "-", "the satellite sends the file", states=NO_YES),
+        Field("source", "u2", "-", "entity that sends: 1 the satellite, 2 the ground, 3 another's ground"),
+        Field("number", "u4", "-", "of the transfer there"),
+        Field("name", "S96", "-", "of the file, empty while it is not known"),
+        Field("size", "u4", "bytes", "of the file"),
+        Field("done", "u4", "bytes", "sent and not asked for again; or received"),
+        Field("open", "u1", "-", "the transfer goes on", states=NO_YES),
+        Field("condition", "u1", "-", "why it ended, CCSDS 727.0-B condition code; 0 whole, or open"),
+        Field("text", "S64", "-", "how it ended"),
+    ),
+)

@@ -20,8 +20,9 @@ class Worker:
 
     Attributes:
         name: short name for telemetry.
-        function: runs in a process of its own in real time, so argument and result must pickle; the result
-            of plain values, arrays, and dataclasses and enumerations that the control process has imported.
+        function: runs in a process of its own in real time, so its argument must pickle, and its result be of
+            plain values, arrays of numbers, and dataclasses and enumerations of modules that the control
+            process has imported.
         latency_ns: delay of a result in lock-step simulation.
         timeout_ns: in real time, a job that runs for longer is killed.
     """

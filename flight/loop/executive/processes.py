@@ -21,7 +21,7 @@ from flight.loop.executive.messages import (
     LONGEST_BYTES,
     SLAB_BYTES,
     message_length,
-    pack_message,
+    pack_trusted,
     unpack_values,
 )
 
@@ -66,7 +66,10 @@ class WorkerProcess:
             [sys.executable, "-m", MODULE, *words],
             pass_fds=(line, memory),
             stdin=subprocess.DEVNULL,
-            start_new_session=True,  # Ctrl-C is for the control process, which then closes its workers
+            # Ctrl-C is for the control process, which then closes its workers. A group of this session, not a
+            # session: once the control process has died nobody in it could continue a stopped worker, and the
+            # kernel ends such a worker by SIGHUP and SIGCONT (setpgid(2)), also before Python runs in it.
+            process_group=0,
         )
 
     @property
@@ -74,13 +77,20 @@ class WorkerProcess:
         """The process identifier."""
         return self._process.pid
 
+    def is_stopped(self) -> bool:
+        """Return whether a signal such as SIGSTOP has stopped the process; it may still be starting."""
+        look = os.WSTOPPED | os.WNOHANG | os.WNOWAIT  # takes nothing from who reaps it
+        with suppress(ChildProcessError):  # reaped already
+            return os.waitid(os.P_PID, self._process.pid, look) is not None
+        return False
+
     def fileno(self) -> int:
         """Return the socket's descriptor, to wait for an answer."""
         return self._socket.fileno()
 
     def send(self, argument: Any) -> None:
         """Submit a job. Raises FlightError for one that cannot be sent, EOFError where the process died."""
-        message = pack_message(argument, self._slab)
+        message = pack_trusted(argument, self._slab)
         if len(message) > LONGEST_BYTES:
             raise FlightError(f"a job for {self._name} of {len(message)} bytes is too large")
         try:

@@ -85,10 +85,13 @@ class _Kept:
                 raise
             except Exception as error:  # noqa: BLE001 - containment boundary: the worker runner
                 results += self._lose("failed", f"{type(error).__name__}: {error}", now_ns)
-        self._check_times(process, now_ns)
+        self._check(process, now_ns)
         return results, news
 
-    def _check_times(self, process: WorkerProcess, now_ns: int) -> None:
+    def _check(self, process: WorkerProcess, now_ns: int) -> None:
+        """Raise TimeoutError where a worker hangs: a stopped one at once, others by their times."""
+        if process.is_stopped():
+            raise TimeoutError("stopped by a signal")
         if self.submitted_ns >= 0 and now_ns - self.submitted_ns > self.worker.timeout_ns:
             raise TimeoutError(f"no result within {self.worker.timeout_ns * 1e-9:g} s")
         if not process.ready and now_ns - self._begun_ns > START_LIMIT_NS:

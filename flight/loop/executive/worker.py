@@ -17,25 +17,35 @@ import sys
 import time
 from typing import Any
 
+from flight.gnc.errors import FlightError
 from flight.loop.executive.memory import give_back
-from flight.loop.executive.messages import SLAB_BYTES, message_length, pack_message, unpack_trusted
+from flight.loop.executive.messages import SLAB_BYTES, message_length, pack_values, unpack_trusted
 
 _PR_SET_PDEATHSIG = 1  # prctl(2)
 
 
 def serve(function: Any, line: socket.socket, slab: mmap.mmap) -> None:
     """Announce readiness, then answer each message with (outcome, value, error, execution time in ns)."""
-    line.sendall(pack_message(None, slab))
+    line.sendall(pack_values(None, slab))
     received = bytearray()
     while chunk := line.recv(1 << 20):
         received += chunk
         while (length := message_length(received)) is not None and len(received) >= length:
             argument = unpack_trusted(bytes(received[:length]), slab)
             del received[:length]
-            line.sendall(pack_message(_run(function, argument), slab))
+            line.sendall(_answer(function, argument, slab))
             del argument
             # After the result was sent, so that nothing waits for this.
             give_back()
+
+
+def _answer(function: Any, argument: Any, slab: mmap.mmap) -> bytes:
+    """Return the message of a job's result, or of its failure where the result cannot be sent."""
+    outcome = _run(function, argument)
+    try:
+        return pack_values(outcome, slab)
+    except FlightError as error:
+        return pack_values(("failed", None, str(error), outcome[3]), slab)
 
 
 def _run(function: Any, argument: Any) -> tuple[str, Any, str, int]:

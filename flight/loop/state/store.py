@@ -122,6 +122,6 @@ def decode(data: bytes) -> _Copy:
     try:
         copy = msgspec.json.decode(line, type=_Copy)
     except (msgspec.DecodeError, RecursionError) as error:
-        raise ValueError(f"holds another kind of state: {error}") from error
+        raise ValueError(f"holds another kind of state: {str(error)!r}") from error
     check(copy.state)
     return copy

@@ -14,6 +14,7 @@ from flight.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeas
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
 from flight.gnc.vision.frame_job import Found, FrameFound, FrameJob, TrackerSettings
+from flight.gnc.vision.kept_frames import KeptFrames
 from flight.gnc.vision.objects.sighted import SightSettings
 from flight.gnc.vision.startracker.mid_exposure import NODES, middle_covariance, weighting_of
 from flight.gnc.vision.startracker.solve import AttitudePrior, RatePrior
@@ -44,6 +45,7 @@ class ImagingSettings:
         mounting: (4,) body axes to camera axes.
         angular_acceleration_psd: rad^2/s^3, density of the body's white angular acceleration.
         objects: how objects are sighted; None: they are not.
+        kept: where frames are kept; None: they are not.
         velocity: returns the velocity (3,) m/s about the Sun at a time; None: as in `tracker`.
         knowledge: returns how well the attitude is known now.
     """
@@ -63,6 +65,7 @@ class ImagingSettings:
     knowledge: Callable[[], Knowledge]
     seeks: Callable[[], bool]
     objects: SightSettings | None = None
+    kept: KeptFrames | None = None
 
 
 class FrameMeasurer:
@@ -78,7 +81,7 @@ class FrameMeasurer:
 
         `spare`: whether there is time to look for objects.
         """
-        past = self._navigation.past(middle_ns(frame))
+        past, kept = self._navigation.past(middle_ns(frame)), self._settings.kept
         return FrameJob(
             frame.pixels,
             self._settings.camera,
@@ -89,6 +92,7 @@ class FrameMeasurer:
             self._attitude_prior(past) if past is not None else None,
             last_checksum,
             objects=self._settings.objects if spare else None,
+            kept=None if kept is None else replace(kept, name=f"frame-{frame.sequence:08d}"),
         )
 
     def _tracker(self, frame: Frame) -> TrackerSettings | None:

@@ -1,4 +1,4 @@
-// The body in its reference frame, drawn on a canvas: a box with its axes, and the directions that matter.
+// The body in its reference frame, drawn on a canvas: a box with its axes and coils, and the directions that matter.
 const COLOURS = { sun: "#ffd75e", nadir: "#4cc38a", velocity: "#c38bff", field: "#5aa9ff", dipole: "#ff6fb1", camera: "#9fb3c8", target: "#8794a6" };
 const AXES = ["#ff7b72", "#7ee787", "#79c0ff"];
 const FACES = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]];
@@ -33,7 +33,7 @@ export class Attitude {
     const [ca, sa, ch, sh] = [Math.cos(this.azimuth), Math.sin(this.azimuth), Math.cos(this.height), Math.sin(this.height)];
     const [right, away] = [ca * b - sa * a, ca * a + sa * b];
     const depth = ch * away + sh * up;
-    const scale = this.canvas.height * 0.3 * (4 / (4 - depth));
+    const scale = this.canvas.height * 0.28 * (4 / (4 - depth));
     return [this.canvas.width / 2 + scale * right, this.canvas.height / 2 - scale * (ch * up - sh * away), depth];
   }
 
@@ -44,10 +44,28 @@ export class Attitude {
     return b;
   }
 
-  arrow(ctx, direction, colour, name, length = 1.35, dash = []) {
-    const end = this.line(ctx, [0, 0, 0], direction.map((part) => length * part), colour, 2, dash);
-    ctx.fillStyle = colour; ctx.beginPath(); ctx.arc(end[0], end[1], 3.5, 0, 7); ctx.fill();
-    ctx.font = "12px sans-serif"; ctx.fillText(name, end[0] + 6, end[1] - 4);
+  // An arrow that points away from the reader lies behind the box; its name is always in front.
+  arrows(ctx, arrows, near) {
+    for (const { direction, colour, length } of arrows) {
+      const tip = direction.map((part) => length * part);
+      if ((this.seen(tip)[2] > 0) !== near) continue;
+      const end = this.line(ctx, [0, 0, 0], tip, colour);
+      ctx.fillStyle = colour; ctx.beginPath(); ctx.arc(end[0], end[1], 3.5, 0, 7); ctx.fill();
+    }
+  }
+
+  names(ctx, arrows) {
+    const taken = [];
+    ctx.font = "12px sans-serif";
+    for (const { direction, colour, length, name } of arrows) {
+      const [x, y] = this.seen(direction.map((part) => length * part));
+      const wide = ctx.measureText(name).width;
+      const left = Math.max(2, Math.min(this.canvas.width - wide - 2, x + 6));
+      let low = Math.max(12, Math.min(this.canvas.height - 4, y - 4));
+      while (taken.some(([a, b, w]) => Math.abs(b - low) < 13 && left < a + w && a < left + wide)) low += 13;
+      taken.push([left, low, wide]);
+      ctx.fillStyle = colour; ctx.fillText(name, left, low);
+    }
   }
 
   show(newest, state) {
@@ -56,16 +74,44 @@ export class Attitude {
     const attitude = newest.attitude;
     const known = attitude && whole(attitude.quaternion);
     const q = known ? attitude.quaternion : [0, 0, 0, 1];
+    const arrows = this.arrowsOf(newest, state.surroundings, q);
     this.frame(ctx);
-    if (state.surroundings) for (const name of ["sun", "nadir", "velocity"]) this.arrow(ctx, state.surroundings[name], COLOURS[name], name, 1.5);
-    if (newest.imu && whole(newest.imu.field) && unit(newest.imu.field)) this.arrow(ctx, turned(q, unit(newest.imu.field)), COLOURS.field, "field", 1.2);
+    this.arrows(ctx, arrows, false);
     if (attitude && whole(attitude.target)) this.axes(ctx, attitude.target, 1.0, true);
     this.box(ctx, q, known);
     this.axes(ctx, q, 0.85, false);
-    if (attitude && whole(attitude.dipole) && Math.hypot(...attitude.dipole) > 1e-7) this.arrow(ctx, turned(q, unit(attitude.dipole)), COLOURS.dipole, "dipole", 1.05);
+    if (attitude && whole(attitude.dipole)) this.coils(ctx, q, attitude.dipole);
     if (this.table.camera) this.camera(ctx, q);
+    this.arrows(ctx, arrows, true);
+    this.names(ctx, arrows);
     if (!known) { ctx.fillStyle = "#ffb454"; ctx.font = "14px sans-serif"; ctx.fillText("attitude not known", 14, 24); }
-    this.legend.textContent = words(attitude, known);
+    this.legend.textContent = [words(attitude, known), ...this.sight(q, known, state.surroundings)].join(" · ");
+  }
+
+  // The field is the model's where the place is known: what the coils make reaches the magnetometer too.
+  arrowsOf({ attitude, imu }, place, q) {
+    const arrows = [];
+    const add = (name, direction, length) => { if (direction) arrows.push({ name, direction, length, colour: COLOURS[name] }); };
+    if (place) for (const name of ["sun", "nadir", "velocity"]) add(name, place[name], 1.4);
+    if (place?.field_t) add("field", unit(place.field_t), 1.2);
+    else if (imu && whole(imu.field)) add("field", unit(imu.field) && turned(q, unit(imu.field)), 1.2);
+    if (attitude && whole(attitude.dipole) && Math.hypot(...attitude.dipole) > 1e-7) add("dipole", turned(q, unit(attitude.dipole)), 1.05);
+    return arrows;
+  }
+
+  // Each coil as a ring on its face, and its dipole as a bar: at the coil's limit as long as the body is wide.
+  coils(ctx, q, dipole) {
+    const most = this.table.coil_dipole ?? Math.max(...dipole.map(Math.abs), 1e-9);
+    for (let k = 0; k < 3; k++) {
+      const ring = [...Array(25).keys()].map((n) => {
+        const point = [0, 0, 0]; point[k] = 0.5; point[(k + 1) % 3] = 0.4 * Math.cos(n * Math.PI / 12); point[(k + 2) % 3] = 0.4 * Math.sin(n * Math.PI / 12);
+        return this.seen(turned(q, point));
+      });
+      ctx.strokeStyle = COLOURS.dipole; ctx.lineWidth = 0.8; ctx.globalAlpha = 0.45; ctx.beginPath();
+      ring.forEach(([x, y], n) => ctx[n ? "lineTo" : "moveTo"](x, y)); ctx.stroke(); ctx.globalAlpha = 1;
+      const [from, to] = [[0, 0, 0], [0, 0, 0]]; from[k] = 0.5; to[k] = 0.5 + dipole[k] / most;
+      this.line(ctx, turned(q, from), turned(q, to), COLOURS.dipole, 4);
+    }
   }
 
   frame(ctx) {
@@ -94,6 +140,16 @@ export class Attitude {
       ctx.strokeStyle = "#0b0f14"; ctx.lineWidth = 1;
       ctx.beginPath(); face.forEach((corner, n) => ctx[n ? "lineTo" : "moveTo"](seen[corner][0], seen[corner][1])); ctx.closePath(); ctx.fill(); ctx.stroke();
     }
+  }
+
+  // Where the star camera looks among the stars, and how near the Sun; a testbed's frame is not the stars'.
+  sight(q, known, place) {
+    if (!known || !place || !this.table.camera) return [];
+    const axis = turned(q, turned(this.table.camera[0], [0, 0, 1]));
+    const degrees = 180 / Math.PI;
+    const right = (Math.atan2(axis[1], axis[0]) * degrees + 360) % 360;
+    const off = Math.acos(Math.max(-1, Math.min(1, axis.reduce((sum, part, k) => sum + part * place.sun[k], 0)))) * degrees;
+    return [`camera at ${right.toFixed(1)}°, ${(Math.asin(Math.max(-1, Math.min(1, axis[2]))) * degrees).toFixed(1)}° (ICRS), ${off.toFixed(0)}° off the Sun`];
   }
 
   camera(ctx, q) {

@@ -20,6 +20,7 @@ export class CommandForms {
     const button = Object.assign(document.createElement("button"), { textContent: "send ..." });
     const result = document.createElement("p");
     result.textContent = command.meaning;
+    if (command.hazard) form.append(Object.assign(document.createElement("i"), { textContent: "!", title: `hazard: ${command.hazard}` }));
     form.append(button, result);
     this.buttons.push(button);
     form.onsubmit = async (event) => {
@@ -44,14 +45,16 @@ export class CommandForms {
   }
 
   input(form, field) {
-    const label = Object.assign(document.createElement("label"), { textContent: `${field.name} `, title: `${field.meaning} [${field.unit}]` });
+    const label = Object.assign(document.createElement("label"), { textContent: `${field.name} `, title: `${field.meaning} [${field.unit}]${field.valid ? `, ${field.valid[0]} to ${field.valid[1]}` : ""}` });
     if (field.states) {
       const choice = document.createElement("select");
       for (const [number, name] of field.states) choice.append(new Option(name, number));
       label.append(choice); form.append(label);
       return () => Number(choice.value);
     }
-    const input = Object.assign(document.createElement("input"), { type: "text", placeholder: field.count > 1 ? "a, b, ..." : field.valid ? `${field.valid[0]} to ${field.valid[1]}` : field.unit === "-" ? "" : field.unit });
+    const hint = field.count > 1 ? "a, b, ..." : field.valid ? `${rounded(field.valid[0])} to ${rounded(field.valid[1])}` : field.unit === "-" ? "" : field.unit;
+    const input = Object.assign(document.createElement("input"), { type: "text", placeholder: hint });
+    input.classList.toggle("long", field.count > 1 || field.type.startsWith("S"));
     label.append(input); form.append(label);
     if (field.type.startsWith("S")) return () => input.value;
     const numbers = () => input.value.split(/[\s,]+/).filter((word) => word !== "");
@@ -64,4 +67,5 @@ async function ask(path, body) {
     return await (await fetch(path, { method: "POST", body, headers: { "Content-Type": "application/json" } })).json();
   } catch { return { error: "the console does not answer" }; }
 }
+const rounded = (bound) => String(Number(bound.toPrecision(4)));
 function say(place, words, kind) { place.textContent = words; place.className = kind; }

@@ -41,16 +41,26 @@ export class Frames extends Rows {
     if (again) { this.clear(); this.lines = new Map(); }
     for (const frame of listed.streak ?? []) {
       const rate = frame.rate.every((part) => part !== null) ? `${(180 / Math.PI * Math.hypot(...frame.rate)).toFixed(3)} deg/s` : frame.status;
-      const line = row([seconds(frame), `${frame.used} of ${frame.streaks}`, frame.length?.toFixed(0) ?? "-", `${rate}${frame.accepted ? " ✓" : ""}`, "", ""]);
-      this.lines.set(frame.sequence, line);
-      this.add(line);
+      const line = this.line(frame);
+      line.cells[1].textContent = `${frame.used} of ${frame.streaks}`;
+      line.cells[2].textContent = frame.length?.toFixed(0) ?? "-";
+      line.cells[3].textContent = `${rate}${frame.accepted ? " ✓" : ""}`;
     }
     for (const frame of listed.stars ?? []) {
-      const line = this.lines.get(frame.sequence) ?? row([seconds(frame), "", "", "", "", ""]);
-      if (!line.isConnected) this.add(line);
+      const line = this.line(frame);
       line.cells[4].textContent = `${frame.matched} of ${frame.found}`;
       line.cells[5].textContent = `${frame.status}${frame.accepted ? " ✓" : ""}`;
     }
+    for (const frame of listed.sightings ?? []) this.line(frame).cells[6].textContent = String(frame.found);
+  }
+  // Vision's results come as a packet of each kind; those of a frame share its number and a line.
+  line(frame) {
+    const known = this.lines.get(frame.sequence);
+    if (known?.isConnected) return known;
+    const line = row([seconds(frame), "", "", "", "", "", ""]);
+    this.lines.set(frame.sequence, line);
+    this.add(line);
+    return line;
   }
 }
 

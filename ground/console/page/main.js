@@ -6,12 +6,12 @@ import { GroundTrack } from "/page/map.js";
 import { Health, Packets, beyond, fieldOf, label } from "/page/values.js";
 import { Plots } from "/page/plots.js";
 
-const DEAD_AFTER = 3; // s without telemetry, or without a word of the console itself
+const DEAD_AFTER = 2.5; // s without telemetry, or without a word of the console itself: with a look each 0.25 s within 3 s
 const byId = (name) => document.getElementById(name);
 const table = await (await fetch("/api/table")).json();
 const modes = fieldOf(table, "health", "mode");
 const newest = {};
-const state = { time: 0, span: [0, 0], live: true, speed: 1, silence: 0, surroundings: null };
+const state = { time: 0, span: [0, 0], live: true, speed: 1, silence: 0, flight_silence: 0, surroundings: null };
 let heard = 0;
 let line = null;
 let seeking = false;
@@ -44,7 +44,7 @@ function take(said) {
   heard = performance.now();
   if (said.again) for (const name of Object.keys(newest)) delete newest[name];
   Object.assign(newest, said.newest);
-  Object.assign(state, { time: said.time, span: said.span, live: said.live, speed: said.speed, silence: said.silence,
+  Object.assign(state, { time: said.time, span: said.span, live: said.live, speed: said.speed, silence: said.silence, flight_silence: said.flight_silence,
     surroundings: said.surroundings, utc_ns: said.utc_ns });
   for (const view of views) view.show(newest, state, said.listed, said.again);
   byId("trouble").hidden = !said.trouble;
@@ -56,7 +56,7 @@ function take(said) {
   byId("utc").textContent = said.utc_ns === null ? "" : new Date(said.utc_ns / 1e6).toISOString().slice(0, 19) + "Z";
   if (!seeking) byId("seek").value = String(1000 * (said.time - said.span[0]) / Math.max(said.span[1] - said.span[0], 1e-9));
   byId("live").classList.toggle("chosen", said.live);
-  byId("play").textContent = said.live || said.speed > 0 ? "pause" : "play";
+  byId("play").textContent = atEnd() ? "replay" : said.live || said.speed > 0 ? "pause" : "play";
   document.body.dataset.time = String(said.time);
 }
 
@@ -67,7 +67,8 @@ function light() {
   const [kind, words] = silent > DEAD_AFTER || line.readyState !== WebSocket.OPEN ? ["dead", "console lost"]
     : !state.live ? ["past", state.speed > 0 ? `replay ${state.speed} x` : "replay, paused"]
     : ended ? ["over", "flight ended"]
-    : state.silence > DEAD_AFTER ? ["dead", `no telemetry for ${state.silence.toFixed(0)} s`] : ["alive", "live"];
+    : state.silence > DEAD_AFTER ? ["dead", `no telemetry for ${state.silence.toFixed(0)} s`]
+    : state.flight_silence > DEAD_AFTER ? ["dead", `link alive, flight silent for ${state.flight_silence.toFixed(0)} s`] : ["alive", "live"];
   byId("light").className = `light ${kind}`;
   byId("light").textContent = words;
 }
@@ -77,7 +78,12 @@ function move(at, speed) {
 }
 const chosenSpeed = () => Number(byId("speed").value);
 byId("live").onclick = () => line.send(JSON.stringify({ live: true }));
-byId("play").onclick = () => move(state.time, state.live || state.speed > 0 ? 0 : chosenSpeed());
+// Whoever looks at the end of a flight and presses play sees it from its beginning.
+const atEnd = () => state.time > state.span[1] - 0.05 && (state.live ? newest.event?.name === "stopped" : state.speed === 0);
+byId("play").onclick = () => {
+  if (atEnd()) move(state.span[0], chosenSpeed());
+  else move(state.time, state.live || state.speed > 0 ? 0 : chosenSpeed());
+};
 byId("speed").onchange = () => { if (!state.live) move(state.time, chosenSpeed()); };
 byId("seek").oninput = () => {
   seeking = true;

@@ -39,7 +39,7 @@ export class Plots {
     this.place.append(box);
     const curves = names.flatMap((name) => {
       const count = this.fields.get(name)?.count ?? 0;
-      return [...Array(count).keys()].map((component) => ({ name, component, label: count > 1 ? `${name}[${component}]` : name }));
+      return [...Array(count).keys()].map((component) => ({ name, component, label: names.length === 1 ? (count > 1 ? `[${component}]` : "value") : count > 1 ? `${name}[${component}]` : name }));
     });
     const panel = { box, curves, plot: null };
     close.onclick = () => { panel.plot?.destroy(); box.remove(); this.panels = this.panels.filter((other) => other !== panel); };
@@ -66,14 +66,23 @@ export class Plots {
     });
     const data = uPlot.join(await Promise.all(asked));
     if (panel.plot) panel.plot.setData(data); else panel.plot = new uPlot(this.options(panel.curves), data, panel.box);
+    if (panel.plot.cursor.idx === null) panel.plot.setLegend({ idxs: data.map(newestOf) }); // nobody points at a moment
   }
 
   options(curves) {
     const short = (value) => (value === null || value === undefined ? "-" : Number(value.toPrecision(4)).toString());
+    const seconds = (value) => (value === null || value === undefined ? "-" : value.toFixed(2));
     const axis = { stroke: "#8794a6", grid: { stroke: "#222b37", width: 1 }, ticks: { stroke: "#222b37" } };
     return {
-      width: this.width(), height: 150, scales: { x: { time: false } }, axes: [axis, { ...axis, size: 72, values: (_, ticks) => ticks.map(short) }],
-      series: [{ label: "s" }, ...curves.map(({ label }, k) => ({ label, value: (_, value) => short(value), stroke: COLOURS[k % COLOURS.length], width: 1.2, spanGaps: true, points: { show: false } }))],
+      width: this.width(), height: 150, scales: { x: { time: false } }, axes: [axis, { ...axis, size: 72, space: 22, values: (_, ticks) => ticks.map(short) }],
+      series: [{ label: "s", value: (_, value) => seconds(value) }, ...curves.map(({ label }, k) => ({ label, value: (_, value) => short(value), stroke: COLOURS[k % COLOURS.length], width: 1.2, spanGaps: true, points: { show: false } }))],
     };
   }
+}
+
+// Where the newest value of a curve stands; curves of several packets have gaps at each other's times.
+function newestOf(values) {
+  let at = values.length - 1;
+  while (at > 0 && (values[at] === null || values[at] === undefined)) at -= 1;
+  return Math.max(at, 0);
 }

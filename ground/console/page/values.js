@@ -8,8 +8,12 @@ export function fieldOf(table, packet, name) {
 // The state's name of a number, the number where it has none.
 export function label(value, field) { return field?.states?.find(([number]) => number === value)?.[1] ?? String(value); }
 
+// The names of the bits that are set; a number of 64 bits is divided, for JavaScript shifts 32.
+export function bitsOf(value, field) { return (field?.bits ?? []).filter(([bit]) => Math.floor(value / 2 ** bit) % 2 === 1); }
+
 export function text(value, field) {
   if (value === null || value === undefined) return "-";
+  if (field?.bits) return bitsOf(value, field).map(([, name]) => name).join(", ") || "none";
   if (Array.isArray(value)) return value.map((part) => text(part, field)).join("  ");
   if (field?.states) return `${label(value, field)} (${value})`;
   return typeof value === "number" && !Number.isInteger(value) ? value.toPrecision(6).replace(/\.?0+(e|$)/, "$1") : String(value);
@@ -17,43 +21,93 @@ export function text(value, field) {
 
 // How poor a value is by its alarms and limits: "", "warn" or "bad".
 export function beyond(value, field) {
+  if (Array.isArray(value)) return worst(value.map((part) => beyond(part, field)));
   if (typeof value !== "number" || !field) return "";
-  const alarm = field.alarms?.find(([number]) => number === value)?.[1];
+  const level = (number) => KINDS[field.alarms?.find(([state]) => state === number)?.[1]] ?? "";
+  if (field.bits) return worst(bitsOf(value, field).map(([bit]) => level(bit)));
   const outside = (range) => range?.length && (value < range[0] || value > range[1]);
-  return KINDS[alarm] ?? (outside(field.fault_outside) ? "bad" : outside(field.warning_outside) ? "warn" : "");
+  return level(value) || (outside(field.fault_outside) ? "bad" : outside(field.warning_outside) ? "warn" : "");
 }
 
+function worst(kinds) { return kinds.includes("bad") ? "bad" : kinds.includes("warn") ? "warn" : ""; }
+
+// What is known of a field by the table, for whoever points at it.
+function meaning(field) {
+  const range = (word, bounds) => (bounds?.length ? [`${word} outside ${bounds.join(" to ")}`] : []);
+  const states = (field.states ?? []).map(([number, name]) => {
+    const level = field.alarms?.find(([state]) => state === number)?.[1];
+    return level ? `${name}: ${level}` : name;
+  });
+  return [field.meaning, ...(states.length ? [states.join(", ")] : []), ...range("warning", field.warning_outside), ...range("fault", field.fault_outside)].join("; ");
+}
+
+// Cards of what is measured, each coloured by the table; what the monitors find; and every value of any periodic
+// packet that lies beyond its limits.
 export class Health {
   constructor(place, table) {
     this.place = place;
-    const fields = table.packets.find((packet) => packet.name === "health")?.fields ?? [];
-    this.streams = fields.filter((field) => field.states?.some(([, name]) => name === "not-fitted"));
+    this.fields = new Map(table.packets.filter((packet) => packet.rate.includes("Hz")).flatMap((packet) => packet.fields.map((field) => [`${packet.name}.${field.name}`, field])));
+    this.judged = [...this.fields].filter(([, field]) => field.alarms || field.warning_outside || field.fault_outside);
+    this.streams = this.judged.filter(([key, field]) => key.startsWith("health.") && field.states?.some(([, name]) => name === "not-fitted"));
   }
+
   show(newest) {
-    const cards = [];
     const { health, housekeeping: supply, link } = newest;
-    if (health) for (const field of this.streams) {
-      const state = label(health[field.name], field);
-      if (state !== "not-fitted") cards.push([field.name, state, beyond(health[field.name], field) || "good"]);
-    }
-    if (supply) {
-      cards.push(["coil supply", `${text(supply.coil_voltage)} V`, ""], ["coil power", supply.coil_power === null ? "-" : `${(1e3 * supply.coil_power).toFixed(1)} mW`, ""]);
+    const value = (key) => { const [packet, name] = key.split("."); return newest[packet]?.[name]; };
+    const cards = [];
+    const add = (name, words, kind, field) => cards.push([name, words, kind, field ? meaning(field) : ""]);
+    const number = (name, key, scale, digits, unit) => {
+      const [found, field] = [value(key), this.fields.get(key)];
+      if (found !== null && found !== undefined) add(name, `${(scale * found).toFixed(digits)} ${unit}`, beyond(found, field), field);
+    };
+    for (const [key, field] of health ? this.streams : []) {
+      const state = label(value(key), field);
+      if (state !== "not-fitted") add(field.name, state, beyond(value(key), field) || "good", field);
     }
     if (health) {
-      cards.push(["slots lost", String(health.slips), health.slips > 0 ? "warn" : "good"]);
-      cards.push(["processor", health.cpu_share === null ? "-" : `${(100 * health.cpu_share).toFixed(0)} %`, ""]);
-      cards.push(["memory", health.resident === null ? "-" : `${(health.resident / 1048576).toFixed(0)} MiB`, ""]);
+      const field = this.fields.get("health.facts");
+      add("monitors find", bitsOf(health.facts, field).length ? text(health.facts, field) : "nothing wrong", beyond(health.facts, field) || "good");
+      const wrong = this.judged.filter(([key, each]) => key !== "health.facts" && !this.streams.some(([other]) => other === key) && beyond(value(key), each));
+      const poor = worst(wrong.map(([key, each]) => beyond(value(key), each)));
+      add("beyond limits", wrong.map(([key, each]) => `${key} ${Array.isArray(value(key)) ? text(value(key), each) : label(value(key), each)}`).join(", ") || "nothing", poor || "good");
+      add("coils in use", text(health.coils_in_use, this.fields.get("health.coils_in_use")), "", this.fields.get("health.coils_in_use"));
+      add("slots lost", String(health.slips), health.slips > 0 ? "warn" : "good", this.fields.get("health.slips"));
     }
+    if (supply) {
+      number("coil supply", "housekeeping.coil_voltage", 1, 2, "V");
+      number("coil power", "housekeeping.coil_power", 1e3, 1, "mW");
+      add("records lost", String(supply.records_lost), supply.records_lost > 0 ? "warn" : "good", this.fields.get("housekeeping.records_lost"));
+    }
+    number("processor", "health.cpu_share", 100, 0, "%");
+    number("memory", "health.resident", 1 / 1048576, 0, "MiB");
+    number("disk free", "health.disk_free", 1e-9, 1, "GB");
+    number("warmest", "health.temperature", 1, 1, "°C");
     if (link) {
       const causes = Object.entries(link).filter(([name, count]) => name.startsWith("refused_") && count > 0);
       const words = causes.map(([name, count]) => `${name.slice("refused_".length)} ${count}`).join(", ");
-      cards.push(["frames let in", String(link.admitted), ""], ["frames refused", words || "none", words ? "warn" : "good"]);
+      add("frames let in", String(link.admitted), "");
+      add("frames refused", words || "none", words ? "warn" : "good");
     }
-    this.place.replaceChildren(...cards.map(([name, value, kind]) => {
-      const card = Object.assign(document.createElement("div"), { className: "card" });
-      card.append(Object.assign(document.createElement("span"), { textContent: name }), Object.assign(document.createElement("b"), { textContent: value, className: kind }));
-      return card;
-    }));
+    this.draw(cards);
+  }
+
+  // Cards are made once: one that is made again ten times a second never shows its meaning to a pointer.
+  draw(cards) {
+    const names = cards.map(([name]) => name).join();
+    if (names !== this.drawn) {
+      this.drawn = names;
+      this.place.replaceChildren(...cards.map(([name]) => {
+        const card = Object.assign(document.createElement("div"), { className: "card" });
+        card.append(Object.assign(document.createElement("span"), { textContent: name }), document.createElement("b"));
+        return card;
+      }));
+    }
+    cards.forEach(([, words, kind, title], k) => {
+      const card = this.place.children[k];
+      card.title = title;
+      card.classList.toggle("wide", words.length > 18);
+      Object.assign(card.lastChild, { textContent: words, className: kind });
+    });
   }
 }
 

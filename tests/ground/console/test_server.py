@@ -18,10 +18,11 @@ from flight.link.commands.definitions import COMMANDS
 from flight.link.commands.values import Command
 from flight.link.modes import Mode
 from flight.link.parameters import FIELDS, crc_of
+from flight.link.telemetry.packets import LAYOUTS, PacketArray
 from ground.console.commanding import Commanding
 from ground.console.history import History
 from ground.console.server import Console, application
-from ground.console.surroundings import Surroundings
+from ground.console.surroundings import NOWHERE, Surroundings
 from ground.watch.tail import LogTail
 from tests.ground.report.synthetic import Recipe, make_run
 
@@ -141,6 +142,27 @@ def test_a_log_that_grows_is_shown_within_a_second(folder: Path, tmp_path: Path)
     assert time > first
 
 
+def test_the_links_own_packets_do_not_hide_a_flight_that_is_silent(folder: Path) -> None:
+    """A link that lives goes on to report once a second."""
+
+    class Feed:
+        silence = 0.0
+        came: tuple[str, ...] = ("link", "verification")
+
+        def new(self) -> dict[str, PacketArray]:
+            return {name: np.zeros(int(name in self.came), layout.dtype) for name, layout in LAYOUTS.items()}
+
+    with History() as history:
+        feed = Feed()
+        console = Console("link", feed, history, NOWHERE, Commanding(None))
+        heard = console.flight_heard
+        console.look()
+        assert console.flight_heard == heard
+        feed.came = ("link", "health")
+        console.look()
+        assert console.flight_heard > heard
+
+
 def commanded(folder: Path, name: str, values: Any, send: Any) -> tuple[int, Any]:
     async def ask(client: TestClient[Any, Any]) -> tuple[int, Any]:
         async with client.post("/api/command", json={"command": name, "values": values}) as answer:
@@ -220,5 +242,7 @@ def test_a_satellites_place_is_known_from_its_elements_and_without_a_configurati
     track = np.array(Surroundings.of(tmp_path / "config.yaml").track(noon))
     assert np.hypot(*(track - [place["latitude"], place["longitude"]]).T).min() < 0.5
     assert np.dot(place["nadir"], place["velocity"]) == pytest.approx(0.0, abs=0.01)
+    coil = Surroundings.of(tmp_path / "config.yaml").coil_dipole
+    assert coil == pytest.approx(0.648 * 0.148), "A m^2 of a coil at its limit"
     unknown = Surroundings.of(tmp_path / "nowhere")
     assert (unknown.at(noon), unknown.track(noon)) == (None, [])

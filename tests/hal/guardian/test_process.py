@@ -6,16 +6,20 @@ import errno
 import os
 import signal
 import socket
+import subprocess
+import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from hal.drivers.pca9685 import ALL_LED_OFF_H, FULL
 from hal.guardian.client import CoilReach, GuardianLine
+from hal.guardian.watch import FINAL_ZEROS
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.guardian import GuardianNews
+from tests.hal.guardian.states import state, wait_until
 
 ADDRESS = 0x41
 
@@ -61,13 +65,6 @@ def news_until(guardian: GuardianLine, wanted: GuardianNews, patience: float = 1
     return news
 
 
-def wait_until(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 10.0
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-
-
 def test_heartbeats_keep_it_quiet_and_silence_makes_it_act(guardian: GuardianLine, log: Path) -> None:
     begun_ns = time.monotonic_ns()
     last_ns = beat_for(guardian, 0.6)
@@ -100,7 +97,30 @@ def test_signals_that_end_a_flight_do_not_end_its_guardian(guardian: GuardianLin
         os.kill(guardian.process_id, number)
     beat_for(guardian, 0.1)
     assert guardian.tend(time.monotonic_ns()) == []
-    assert os.getsid(guardian.process_id) == guardian.process_id, "nor signals to the flight's group"
+    assert os.getpgid(guardian.process_id) == guardian.process_id, "nor signals to the flight's group"
+
+
+_FLIGHT = """
+import sys, time
+from hal.guardian.client import CoilReach, GuardianLine
+line = GuardianLine(CoilReach("tests.hal.guardian.byte_log:open_bus", sys.argv[1], int(sys.argv[2])))
+line.wait_ready(20.0)
+print(line.process_id, flush=True)
+time.sleep(60.0)
+"""
+
+
+def test_a_guardian_that_is_stopped_acts_all_the_same_when_its_flight_dies(log: Path) -> None:
+    words = [sys.executable, "-c", _FLIGHT, str(log), str(ADDRESS)]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, start_new_session=True) as flight:
+        assert flight.stdout is not None
+        guardian = int(flight.stdout.readline())
+        os.kill(guardian, signal.SIGSTOP)
+        wait_until(lambda: state(guardian) == "T")
+        killed_ns = time.monotonic_ns()
+        flight.kill()
+    wait_until(lambda: len([at for at in zeros(log) if at > killed_ns]) >= FINAL_ZEROS)
+    wait_until(lambda: state(guardian) in {"", "Z"})
 
 
 def test_a_killed_guardian_is_replaced_and_reported(guardian: GuardianLine) -> None:

@@ -1,8 +1,9 @@
 """The loop's lateness while its link is flooded: `python -m tests.studies.bench link_flood [--seconds S]`.
 
 The step demonstration flies in real time on its emulated devices beside its link process: alone, then with
-10,000 forged frames a second at the link while it plays the archive back at a megabyte a second. Stated are
-the lateness of the control cycles and what the link and its ground counted.
+10,000 forged frames a second at the link while it plays the archive back and sends a file of 50 MB down, at
+a megabyte a second together. Stated are the lateness of the control cycles, what the link and its ground
+counted, and how much of the file came.
 """
 
 from __future__ import annotations
@@ -22,10 +23,13 @@ from typing import Any
 import numpy as np
 
 from flight.app.utc_label import utc_ns
+from flight.link.files.store import Store
 from flight.link.process import directives
 from flight.link.process.directives import Play
+from flight.link.process.file_directives import SendFile
 from flight.link.telemetry.link_definitions import LINK
 from flight.link.telemetry.packets import LAYOUTS
+from ground.link.files import FileSession
 from ground.link.keys import make_keys
 from ground.link.terminal import open_terminal
 from tests.scenario.flights import CONFIG
@@ -34,6 +38,8 @@ from tests.studies.fuzz.link_frames import LinkFrames
 
 _FRAMES_A_SECOND = 10_000
 _KINDS = 500
+_FILE, _FILE_BYTES = "dump.bin", 50_000_000
+_UP_RATE = 20_000.0
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -76,21 +82,32 @@ def measure(place: Path, seconds: float, *, flooded: bool) -> dict[str, Any]:
 
 def _listen(port: int, place: Path, flight: subprocess.Popen[bytes], play: bool) -> dict[str, int]:
     """Receive telemetry until the flight is over, and have it played back again and again; return counts."""
-    terminal = open_terminal(f"127.0.0.1:{port}", place / "keys" / "ground")
+    keys = place / "keys" / "ground"
+    terminal = open_terminal(f"127.0.0.1:{port}", keys)
+    store, now_ns = Store(place / "ground-files"), time.monotonic_ns()
+    session = FileSession(terminal, store, 2, _UP_RATE, now_ns)
+    if play:
+        (place / "run" / _FILE).write_bytes(np.random.default_rng(1).bytes(_FILE_BYTES))
+        session.ask(SendFile(f"log/{_FILE}"), now_ns)
     newest, packets, asked = b"", 0, 0.0
     while flight.poll() is None:
         if time.monotonic() - asked > 1.0:
             asked = time.monotonic()
             stretch = Play(0, 0.0, 1e4 if play else 0.0)
             terminal.send(directives.pack(stretch, utc_ns()))
-        for _, packet in terminal.packets(0.2):
+        for channel, packet in terminal.packets(0.2):
             packets += 1
+            session.take([(channel, packet)], time.monotonic_ns())
             if packet[:2] == LAYOUTS[LINK.name].identifier.to_bytes(2, "big"):
                 newest = packet
+        session.go_on(time.monotonic_ns())
+    file_bytes = sum(one.done for one in (*session.entity.transfers(), *session.entity.ended))
+    session.close(time.monotonic_ns())
     terminal.close()
     (row,) = LAYOUTS[LINK.name].array(newest)
     names = ("received", "admitted", "refused_crc", "refused_mac", "refused_repeated", "sent")
-    return {**{name: int(row[name]) for name in names}, "packets_on_ground": packets}
+    counts = {name: int(row[name]) for name in names}
+    return {**counts, "packets_on_ground": packets, "file_bytes": file_bytes}
 
 
 def _flood(port: int, ended: threading.Event, forged: list[int]) -> None:

@@ -98,8 +98,11 @@ def below(parent: int) -> list[int]:
 
 
 def command(process: int) -> str:
-    """Return a process's command line."""
-    return Path(f"/proc/{process}/cmdline").read_bytes().replace(b"\0", b" ").decode()
+    """Return a process's command line; "" for one that has just ended."""
+    try:
+        return Path(f"/proc/{process}/cmdline").read_bytes().replace(b"\0", b" ").decode()
+    except (FileNotFoundError, ProcessLookupError):
+        return ""
 
 
 def unshared(processes: Mapping[str, int]) -> float:

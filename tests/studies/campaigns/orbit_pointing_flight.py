@@ -16,7 +16,7 @@ from flight.bodies.orbit.planning import ASTRAY
 from flight.gnc.control.three_axes import pointing_job
 from flight.gnc.control.three_axes.pointing import PointingLaw
 from flight.gnc.control.three_axes.pointing_job import PointingJob
-from flight.gnc.control.three_axes.pointing_table import PointingWeights
+from flight.gnc.control.three_axes.pointing_table import PointingTable, PointingWeights
 from flight.gnc.earth.disturbance import pressures
 from flight.gnc.earth.ephemeris import Ephemeris
 from flight.gnc.earth.orbit_knowledge import OrbitState
@@ -75,14 +75,16 @@ class PointingFlight:
     def __init__(self, wanted: dict[str, Any], seed: int) -> None:
         """`wanted`: craft, share of the worst disturbances, law, target, and the first turn, deg, if any."""
         self._wanted = wanted
-        self._target = TARGETS[wanted["target"]]
+        target = wanted["target"]
+        self._target = target if isinstance(target, PointingTarget) else TARGETS[target]
+        orbit = wanted.get("orbit", "sso")
         self.notes: list[list[float]] = []
         noises = Disturbances(
             drag=wanted["share"], solar_pressure=wanted["share"], principal_turn_deg=3.0 * wanted["share"]
         )
-        held = FreeFlight(wanted["craft"], seed, "sso", TipOff(rate=(0.0, 0.0, 0.0)), noises)
+        held = FreeFlight(wanted["craft"], seed, orbit, TipOff(rate=(0.0, 0.0, 0.0)), noises)
         held.advance(0)
-        self.flight = flight = FreeFlight(wanted["craft"], seed, "sso", self._release(held), noises)
+        self.flight = flight = FreeFlight(wanted["craft"], seed, orbit, self._release(held), noises)
         flight.advance(0)
         self._filter = FreeFilter(flight.inertia, FreeFilterSettings())
         gyro = self._gyro(flight.motion.rate, 1.0)
@@ -197,10 +199,18 @@ class PointingFlight:
         self.notes.append([time, *turn, known, nees, unknown, truth.sunlit, square])
 
     def _plan(self, time: float) -> None:
+        self._fly(pointing_job.run(self._job()), time)
+
+    def _fly(self, table: PointingTable, time: float) -> None:
+        self._law, self._begun = PointingLaw(table, self.flight.limit), time
+        self._turn = np.zeros(3)
+
+    def _job(self) -> PointingJob:
+        """Return the planner's job now."""
         flight, found = self.flight, self._filter
         truth, draw = flight.body.orbit_truth(), flight.generator.standard_normal
         place, velocity = truth.position + FIX_SIGMA * draw(3), truth.velocity + 0.05 * draw(3)
-        job = PointingJob(
+        return PointingJob(
             0,
             0,
             OrbitState(truth.utc, place, velocity, FIX_SIGMA),
@@ -213,8 +223,6 @@ class PointingFlight:
             found.torque_sizes * (self._wanted["law"] != "plain"),
             flight.limit * (CYCLE - PAUSE) / CYCLE,
         )
-        self._law, self._begun = PointingLaw(pointing_job.run(job), flight.limit), time
-        self._turn = np.zeros(3)
 
     def _around(self, time: float) -> Around:
         ahead, at = self._ahead, np.array([time - self._ahead_begun + 0.5 * CYCLE])

@@ -1,10 +1,14 @@
 """Campaign `start`: each system call of a board's start fails once, and the board flies all the same.
 
+A point is one call of the main thread, counted from the start of its process, and one error that strace
+injects into it. The list of points is all calls of a traced start times all errors; their number changes by
+some from start to start. The campaign flies the list in an order that its seed draws: calls after the
+configuration was opened and calls before, nearly all of which read modules, in turn while there are both.
+With as many runs as there are points it flies the whole list.
+
 A case is a board whose emulated devices live in a process of their own; its flight starts again and again,
-each time with one fault that strace injects into one call of the main thread. Half of the faults are drawn
-from all calls, most of which read modules; half from those after the configuration was opened. This campaign
-stands for the service manager: a process that ends is started again without the fault, unless its status is
-2. Then the board is grounded for good, which must not happen.
+each time with one point. This campaign stands for the service manager: a process that ends is started again
+without the fault, unless its status is 2. Then the board is grounded for good, which must not happen.
 """
 
 from __future__ import annotations
@@ -20,10 +24,11 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
-
-import numpy as np
 
 from flight.app.accepted_config import sum_file
 from flight.app.kept_configs import FlownConfig
@@ -41,39 +46,76 @@ _CONFIG = "flight.yaml"
 _MOST_RESTARTS = 5
 
 
+@dataclass(frozen=True, slots=True)
+class Point:
+    """One call that fails: the `number`th of its kind in the process, before or after the configuration."""
+
+    begun: bool
+    call: str
+    number: int
+    error: str
+
+
+def points(counts: Counter[str], before: Counter[str]) -> list[Point]:
+    """Return all points of a start with these numbers of calls, in all and before the configuration."""
+    return [
+        Point(number > before[call], call, number, error)
+        for call in CALLS
+        for number in range(1, counts[call] + 1)
+        for error in ERRORS
+    ]
+
+
+def in_turn(listed: Sequence[Point], seed: int) -> list[Point]:
+    """Return the points in the order of a seed, those after and before the configuration in turn."""
+
+    def rank(point: Point) -> bytes:
+        return hashlib.sha256(f"{seed} {point.call} {point.number} {point.error}".encode()).digest()
+
+    ordered = sorted(listed, key=rank)
+    parts = ([point for point in ordered if point.begun is begun] for begun in (True, False))
+    return [point for pair in zip_longest(*parts) for point in pair if point is not None]
+
+
 def cases(runs: int, seed: int) -> list[Case]:
-    """Return boards that come to `runs` faults together."""
-    sizes = [min(FAULTS, runs - done) for done in range(0, runs, FAULTS)]
-    return [Case(str(number), (seed, number), {"faults": size}) for number, size in enumerate(sizes)]
+    """Trace a start; return boards for the first `runs` points."""
+    with _board() as board:
+        listed = points(*board.trace())
+    chosen = [(point.call, point.number, point.error, point.begun) for point in in_turn(listed, seed)[:runs]]
+    of = {"points": len(listed), "begun": sum(point.begun for point in listed)}
+    return [
+        Case(str(number), (seed, number), {"faults": chosen[at : at + FAULTS], "of": of})
+        for number, at in enumerate(range(0, len(chosen), FAULTS))
+    ]
 
 
 def run(case: Case) -> Result:
     """Start one board's flight with one fault after the other."""
+    with _board() as board:
+        board.trace()  # leaves state and an archive behind, as any board has but a new one
+        faults = [
+            {"fault": f"{call} {number}: {error}", "begun": begun}
+            | board.start(f"{call}:error={error}:when={number}")
+            for call, number, error, begun in case.parameters["faults"]
+        ]
+    return {"faults": faults, "of": case.parameters["of"]}
+
+
+@contextmanager
+def _board() -> Iterator[_Board]:
+    """Provide a board; its devices run beside it. Raises UsageError without strace."""
     if shutil.which("strace") is None:
         raise UsageError("the campaign start needs strace")
-    rng = np.random.default_rng(case.seed)
     # The socket's name must be short.
     with tempfile.TemporaryDirectory(prefix="kc-") as name:
         place = Path(name)
         (place / "devices").mkdir()
         with devices_running(place / "devices") as facts:
             board = _Board(place, facts)
-            counts, before = board.trace()
-            faults = [_fault(board, rng, counts, before) for _ in range(case.parameters["faults"])]
-            board.close()
-    return {"faults": faults}
-
-
-def _fault(board: _Board, rng: np.random.Generator, counts: Counter[str], before: Counter[str]) -> Result:
-    """Draw one fault and start the board with it."""
-    first = before if rng.random() < 0.5 else Counter[str]()
-    drawn = {call: counts[call] - first[call] for call in CALLS if counts[call] > first[call]}
-    # A kind of call is as likely as the square root of its number: else nearly all would be of `read`.
-    weights = np.sqrt(np.array(list(drawn.values()), float))
-    call = str(rng.choice(list(drawn), p=weights / weights.sum()))
-    number = int(rng.integers(first[call], counts[call])) + 1
-    error = str(rng.choice(ERRORS))
-    return {"fault": f"{call} {number}: {error}"} | board.start(f"{call}:error={error}:when={number}")
+            try:
+                yield board
+            finally:
+                board.close()
 
 
 class _Board:
@@ -107,9 +149,11 @@ class _Board:
         path = self._place / "trace"
         strace = ["strace", "-o", str(path), "-e", f"trace={','.join(CALLS)}"]
         begun = self._begin(strace)
-        if not self._ready(begun):
-            raise UsageError("a board does not fly even without a fault")
-        self._end(begun)
+        flies, said = self._ready(begun), self._end(begun)
+        if not flies:
+            raise UsageError(
+                f"a board does not fly even without a fault: status {begun.returncode}: {said!r}"
+            )
         calls = re.findall(r"^(\w+)\((.*)", path.read_text(errors="replace"), re.MULTILINE)
         opened = next(at for at, (_, words) in enumerate(calls) if f'/{_CONFIG}"' in words)
         return Counter(name for name, _ in calls), Counter(name for name, _ in calls[:opened])
@@ -183,8 +227,10 @@ def summarise(results: Sequence[Result], _: Path) -> Summary:
     waited = sum(fault["waited"] and not fault["restarts"] for fault in flew)
     grounded = [fault for fault in faults if not fault["flies"]]
     by_call = Counter(fault["fault"].partition(" ")[0] for fault in faults)
+    begun, of = sum(fault["begun"] for fault in faults), results[0]["of"]
     lines = [
-        f"starts with one call that fails: {len(faults)}",
+        f"starts with one call that fails: {len(faults)} of {of['points']} points",
+        f"  {begun} of {of['begun']} after the configuration was opened",
         f"  of {', '.join(f'{call} {count}' for call, count in sorted(by_call.items()))}",
         f"flew at once {at_once}, waited and flew {waited}, ended and were started again "
         f"{len(flew) - at_once - waited}",
@@ -193,6 +239,8 @@ def summarise(results: Sequence[Result], _: Path) -> Summary:
     lines += [f"  {fault['fault']}: status {fault['status']}: {fault['said']}" for fault in grounded]
     facts = {
         "starts": len(faults),
+        "begun": begun,
+        "of": of,
         "at_once": at_once,
         "waited": waited,
         "started_again": len(flew) - at_once - waited,

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.studies.campaigns import installer_kill, process_kill
+from tests.studies.campaigns import installer_kill, process_kill, start
 
 KILL = {"by_time": True, "place": 0.5, "label": "1", "which": "new", "complaint": ""}
 FLIGHT = {
@@ -38,3 +39,23 @@ def test_deaths_count_as_reported_once_each_and_late_coils_and_leftovers_are_fou
     assert facts["acts"] == {"planner": 4, "guardian": 2}
     assert facts["reported"] == {"planner": 3, "guardian": 1}
     assert (facts["beyond_limit"], facts["orphans"], facts["left"]) == (1, 1, ["/dev/shm/x"])
+
+
+def test_the_list_of_a_start_has_every_call_with_every_error_and_flies_those_of_the_flight_in_turn() -> None:
+    listed = start.points(Counter(read=30, rename=2), Counter(read=27))
+    assert len(set(listed)) == 32 * len(start.ERRORS)
+    ordered = start.in_turn(listed, 1)
+    assert sorted(map(str, ordered)) == sorted(map(str, listed))
+    begun = [point.begun for point in ordered]
+    assert begun[: 2 * 20] == [True, False] * 20, "five calls came after the configuration was opened"
+    assert not any(begun[2 * 20 :])
+    assert start.in_turn(listed, 2) != ordered
+
+
+def test_a_start_that_never_flew_is_counted_and_named() -> None:
+    flew = {"flies": True, "restarts": 0, "waited": True, "status": None, "said": "", "took_s": 2.0}
+    faults = [flew | {"fault": "read 1: EIO", "begun": True}]
+    faults += [flew | {"fault": "openat 3: EACCES", "begun": False, "flies": False, "status": 2}]
+    summary = start.summarise([{"faults": faults, "of": {"points": 100, "begun": 10}}], Path())
+    assert (summary.facts["grounded"], summary.facts["waited"], summary.facts["begun"]) == (1, 1, 1)
+    assert "openat 3: EACCES: status 2" in summary.text

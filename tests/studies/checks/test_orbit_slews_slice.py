@@ -10,7 +10,7 @@ from tests.studies.campaigns.campaign import Case, Result
 
 def flown(law: str) -> Result:
     """Return the third slew of seed 1 of the KnightCube: 167 deg in 300 s."""
-    parameters = {"craft": "knightcube", "orbit": "sso", "law": law, "share": 0.0}
+    parameters = {"craft": "knightcube", "orbit": "sso", "law": law, "share": 0.0, "learn": 60.0}
     return orbit_slews.run(Case(law, (1, 2), parameters))
 
 

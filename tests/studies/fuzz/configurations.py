@@ -173,7 +173,8 @@ def _judge_any(value: Any, kinds: tuple[Any, ...], name: str) -> None:
             return judge(value, kind, name)
         except Finding as finding:
             failures.append(finding)
-    raise failures[-1]
+    # The failure inside the alternative that was meant says more than that another one is not meant.
+    raise next((failure for failure in failures if not str(failure).startswith(f"{name} = ")), failures[-1])
 
 
 def _judge_plain(value: Any, name: str) -> None:

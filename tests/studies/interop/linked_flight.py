@@ -14,7 +14,7 @@ from pathlib import Path
 
 from ground.link.keys import make_keys
 
-_START_S, _END_S, _LAST_S = 60.0, 30.0, 3.0
+_START_S, _END_S = 120.0, 30.0
 _RATE = 1_000_000
 """Bytes/s of the link: nothing is thinned, so that the archive must hold every packet of the log."""
 
@@ -35,10 +35,8 @@ class LinkedFlight:
         _wait((self.run / "flight-0001.ccsds").exists, "the flight", self._log)
 
     def end(self) -> None:
-        """End the flight, let the link carry what is left of its log, and end link and gateway."""
+        """End the flight; link and gateway carry what is left of its log."""
         _end(self.processes["flight"])
-        time.sleep(_LAST_S)
-        self.stop()
 
     def stop(self) -> None:
         """End all processes."""
@@ -74,6 +72,17 @@ def linked_flight(place: Path, text: str, *words: str) -> Iterator[LinkedFlight]
         processes["gateway"] = _started([*flight, "gateway", *way], log)
         _wait(lambda: "packets on" in log.read_text(), "the gateway", log)
         yield found
+
+
+@contextmanager
+def service(log: Path, ready: str, *words: object) -> Iterator[subprocess.Popen[bytes]]:
+    """Run `python -m flight WORDS` from the line on that says `ready`, and end it at the end."""
+    process = _started([sys.executable, "-m", "flight", *map(str, words)], log)
+    try:
+        _wait(lambda: ready in log.read_text(), str(words[0]), log)
+        yield process
+    finally:
+        _end(process)
 
 
 def _started(words: list[str], log: Path) -> subprocess.Popen[bytes]:

@@ -35,7 +35,7 @@ def missing() -> str:
     return ""
 
 
-def words(folder: Path, *options: str) -> list[str]:
+def words(folder: Path) -> list[str]:
     """Return the command that starts Yamcs on the configuration in a folder."""
     found = importlib.util.find_spec(_BUNDLE)
     assert found is not None
@@ -43,15 +43,7 @@ def words(folder: Path, *options: str) -> list[str]:
     jars = Path(found.submodule_search_locations[0]) / "lib" / "*"
     places = ["--etc-dir", str(folder / "etc"), "--data-dir", str(folder / "data")]
     flags = ["-Djava.awt.headless=true", "-Djava.net.preferIPv4Stack=true", "-XX:TieredStopAtLevel=1"]
-    return ["java", *flags, "-cp", str(jars), "org.yamcs.YamcsServer", *places, "--no-color", *options]
-
-
-def check(folder: Path) -> tuple[int, list[str]]:
-    """Let Yamcs read a configuration and its XTCE; return its exit status and its lines of trouble."""
-    done = subprocess.run(
-        words(folder, "--check"), capture_output=True, text=True, timeout=_START_S, check=False
-    )
-    return done.returncode, troubles(done.stdout + done.stderr)
+    return ["java", *flags, "-cp", str(jars), "org.yamcs.YamcsServer", *places, "--no-color"]
 
 
 def troubles(log: str) -> list[str]:

@@ -18,6 +18,7 @@ from flight.gnc.control.three_axes.pointing_table import (
     PointingWeights,
     pointing_table,
 )
+from flight.gnc.control.three_axes.slew_table import SlewBegin, SlewWish, slew, slew_table
 from flight.gnc.earth.disturbance import pressures
 from flight.gnc.earth.ephemeris import Ephemeris, predict
 from flight.gnc.earth.orbit_knowledge import OrbitState
@@ -30,7 +31,7 @@ from flight.gnc.guidance.three_axes.attitude_law import (
 from flight.gnc.guidance.three_axes.pointing_target import PointingTarget
 from flight.gnc.guidance.three_axes.target_law import BodyAxes, law_of
 from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import from_rotation_vector, multiply
+from flight.gnc.math.quaternion import angle_between, from_rotation_vector, multiply
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +47,8 @@ STEADY, PASSING = Span(7_200.0, 1_800.0, 10.0), Span(120.0, 60.0, 2.0)
 """Spans of the goals that go on, and of an object that passes."""
 LEAD = 2.0
 """s from the state to the begin of the table."""
+FAR = math.radians(15.0)
+"""rad off the law: from farther the way into it is a slew of least heat, where one is wished."""
 WAY = 4.0
 """Time scales of the law that a first guess of the way takes; the path found does not depend on it."""
 
@@ -71,8 +74,8 @@ class Sight:
 class PointingJob:
     """A job: the orbit's state, attitude (4,) and rate (3,) rad/s at `origin_ns`, ICRS and body axes.
 
-    `inertia` (3, 3) kg m^2, `sizes` (9,) N m of the torques, `limit` A m^2 of a coil in the mean. With a
-    `sight` that is pointed to, whatever the target.
+    `inertia` (3, 3) kg m^2, `sizes` (9,) N m of the torques, `limit` A m^2 of a coil in the mean. Without
+    `slew` the path is that of the weights alone. With a `sight` that is pointed to, whatever the target.
     """
 
     number: int
@@ -86,6 +89,7 @@ class PointingJob:
     rate: FloatArray
     sizes: FloatArray
     limit: float
+    slew: SlewWish | None = None
     sight: Sight | None = None
 
     @property
@@ -102,18 +106,25 @@ def run(job: PointingJob) -> PointingTable:
     span = job.span
     ahead = predict(job.orbit, span.preview + 4.0 * STEADY.step)
     times = np.arange(LEAD, span.preview, span.step)
+    kept = round(span.kept / span.step)
     quaternion = multiply(from_rotation_vector(LEAD * job.rate), job.quaternion)
     law = _law(job, quaternion, ahead)
-    field = ahead.field_at(times)
+    field, wanted = ahead.field_at(times), references(law, ahead, times)
     way = approach(law, quaternion, job.rate, LEAD, LEAD + _seconds(job, field))
     found = Ahead(
-        references(law, ahead, times),
-        references(way, ahead, times[: round(span.kept / span.step) + 1]),
+        wanted,
+        references(way, ahead, times[: kept + 1]),
         field,
         ahead.position_at(times),
         pressures(ahead, times),
         job.sizes,
     )
+    wish = job.slew
+    if wish is not None and float(angle_between(quaternion, wanted.quaternion[0])) > FAR:
+        begin = SlewBegin(quaternion, job.rate, times, kept, job.inertia, job.limit, job.sizes)
+        path = slew(begin, wish, job.target, job.axes, ahead, job.weights.fastest)
+        if path is not None:
+            return slew_table(begin, path, wish.residual, job.target, job.axes, ahead, found, job.weights)
     return pointing_table(found, job.inertia, job.limit, job.weights)
 
 

@@ -16,6 +16,7 @@ from flight.gnc.control.three_axes.pointing_sweep import Cost, ToGo, linearised,
 from flight.gnc.earth.disturbance import Pressures, shapes
 from flight.gnc.errors import UsageError
 from flight.gnc.guidance.three_axes.attitude_law import References
+from flight.gnc.guidance.three_axes.slew_path import SlewPath
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import attitude_matrix
 
@@ -51,6 +52,7 @@ class PointingTable:
         gain: (n, 3, 6), K: A m^2 by rad and by rad/s.
         torque_part: (n, 3, sizes): A m^2 by each size of the disturbance beyond `sizes`.
         sizes: (sizes,) N m, those that the path expects.
+        slew: the slew that the path begins with, where it does; its times count from the path's begin.
     """
 
     path: References
@@ -59,6 +61,7 @@ class PointingTable:
     gain: FloatArray
     torque_part: FloatArray
     sizes: FloatArray
+    slew: SlewPath | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,7 +96,7 @@ def pointing_table(
     if count < 2 or len(steps) <= count or not np.allclose(steps, steps[0], rtol=1e-6):
         raise UsageError("a pointing table needs even times, three or more, and a preview beyond them")
     dt = float(steps[0])
-    state, dipole = _prices(weights, dt)
+    state, dipole = prices(weights, dt)
     shape = shapes(ahead.pressures, attitude_matrix(ahead.wanted.quaternion))
     beyond = _beyond(ahead, count, inertia, state, dipole, shape)
     expected = Expected(
@@ -121,7 +124,7 @@ def table_along(
     have less preview.
     """
     count, dt = len(motion.times) - 1, float(motion.times[1] - motion.times[0])
-    state, dipole = _prices(weights, dt)
+    state, dipole = prices(weights, dt)
     linear = linearised(motion.until(count), inertia, field[:count], position[:count])
     affine = -np.einsum("nij,nj->ni", linear.by_torque, linear.missing)[:, :, None]
     nothing = np.zeros(affine.shape)
@@ -131,7 +134,7 @@ def table_along(
     return PointingTable(motion, motion, -steady[:, :, 0], gain, np.zeros((count, 3, 0)), np.zeros(0))
 
 
-def _prices(weights: PointingWeights, dt: float) -> tuple[FloatArray, float]:
+def prices(weights: PointingWeights, dt: float) -> tuple[FloatArray, float]:
     """Return what a step of `dt` s costs: (6, 6) of turn and rate, and of an axis of the dipole."""
     state = dt * np.diag(np.repeat([weights.turn**-2.0, weights.rate**-2.0], 3))
     if weights.roll is not None and weights.axis is not None:

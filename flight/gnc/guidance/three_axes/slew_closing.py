@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from flight.gnc.guidance.three_axes.slew_model import Along, Around, Motion, SlewCraft
+from flight.gnc.guidance.three_axes.slew_model import Along, Motion, SlewCraft
 from flight.gnc.guidance.three_axes.slew_program import Point, Program
 from flight.gnc.guidance.three_axes.slew_transcription import Trajectory
 from flight.gnc.math.arrays import FloatArray
@@ -29,10 +29,7 @@ def closed(craft: SlewCraft, unit: float, along: Along, program: Program, point:
     place, count, scale = equations.layout, equations.count, equations.scale
     around = along(np.linspace(0.0, scale, 2 * _STEPS * count + 1))
     firsts = 2 * _STEPS * np.arange(count)
-    motions = [
-        Motion(craft, scale, unit, Around(around.field[firsts + k], around.position[firsts + k]))
-        for k in range(2 * _STEPS + 1)
-    ]
+    motions = [Motion(craft, scale, unit, around.part(firsts + k)) for k in range(2 * _STEPS + 1)]
     factors = program.factors(point)
     for _ in range(_ROUNDS):
         middles, ends = _integrated(motions, at, 1.0 / count)

@@ -2,7 +2,10 @@
 
 State (7,): attitude and body rate; control (3,): the coils' dipole. With b = A(q) B and e = A(q) r:
 
-    q' = 1/2 [w, 0] q,    J w' = (m + residual) x b + 3 mu / r^3 e x J e + torque - w x J w
+    q' = 1/2 [w, 0] q,    J w' = (m + residual) x b + 3 mu / r^3 e x J e + d - w x J w
+
+where d are the torques of `flight.gnc.earth.disturbance`: one constant in body axes, and those of air and
+sunlight, c x A(q) v, which turn with the body.
 
 The torque has no part along the field: that is why only some paths can be flown. All derivatives are exact:
 A(q) v is a quadratic form of q, with Davenport's matrix as its curvature.
@@ -11,12 +14,13 @@ A(q) v is a quadratic form of q, with Davenport's matrix as its curvature.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from flight.gnc.earth.disturbance import AIR, CONSTANT, LIGHT, Pressures
 from flight.gnc.earth.figure import GRAVITATIONAL_PARAMETER
-from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.arrays import FloatArray, IntArray
 from flight.gnc.math.directions import cross_matrices
 
 _EYE3: FloatArray = np.eye(3)
@@ -32,7 +36,7 @@ class SlewCraft:
         limit: (3,) A m^2, of each coil.
         weights: (3,) W/(A m^2)^2, heat of each coil per square of its dipole.
         residual: (3,) A m^2, the craft's own dipole.
-        torque: (3,) N m, a constant disturbance.
+        torque, air, light: (3,) N m, sizes of the torques that the coils do not make.
     """
 
     inertia: FloatArray
@@ -40,14 +44,30 @@ class SlewCraft:
     weights: FloatArray
     residual: FloatArray = field(default_factory=lambda: np.zeros(3))
     torque: FloatArray = field(default_factory=lambda: np.zeros(3))
+    air: FloatArray = field(default_factory=lambda: np.zeros(3))
+    light: FloatArray = field(default_factory=lambda: np.zeros(3))
+
+    def facing(self, sizes: FloatArray) -> SlewCraft:
+        """Return the craft with torques of these sizes (9,) N m."""
+        return replace(self, torque=sizes[CONSTANT], air=sizes[AIR], light=sizes[LIGHT])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Around:
-    """What acts on the body at n times, ICRS axes: `field` (n, 3) T and `position` (n, 3) m."""
+    """What acts on the body at n times, ICRS axes: `field` (n, 3) T, `position` (n, 3) m, air and light.
+
+    Without `pressures` there is neither air nor light.
+    """
 
     field: FloatArray
     position: FloatArray
+    pressures: Pressures | None = None
+
+    def part(self, which: IntArray) -> Around:
+        """Return what acts at some of the times."""
+        found = self.pressures
+        pressed = None if found is None else Pressures(found.air[which], found.light[which])
+        return Around(self.field[which], self.position[which], pressed)
 
     def gradient(self) -> tuple[FloatArray, FloatArray]:
         """Return the directions (n, 3) of the position, and 3 mu / r^3 (n,) 1/s^2."""
@@ -98,6 +118,7 @@ class Motion:
         self._constant = np.concatenate(
             [np.zeros(4), scale**2 * np.linalg.solve(craft.inertia, craft.torque)]
         )
+        self._pushes = scale**2 * _pushes(craft, around)
         self._quadratic = _quadratic(craft.inertia)
         self._parts = np.zeros((len(down), _Z, 10))
         for part, place in ((_M, _DIPOLE), (_W, _RATE), (_Q, _ATTITUDE)):
@@ -110,12 +131,17 @@ class Motion:
     def flow(self, x: FloatArray, m: FloatArray) -> FloatArray:
         """Return x' (n, 7) at states (n, 7) and dipoles (n, 3)."""
         z, _ = self._quantities(x, m)
-        return np.asarray(0.5 * np.einsum("nij,nj->ni", self._steepness(z), z) + self._constant)
+        result = 0.5 * np.einsum("nij,nj->ni", self._steepness(z), z) + self._constant
+        q = x[:, None, :4, None]
+        result[:, 4:] += 0.5 * (x[:, None, None, :4] @ self._pushes @ q)[:, :, 0, 0]
+        return np.asarray(result)
 
     def slopes(self, x: FloatArray, m: FloatArray) -> FloatArray:
         """Return the derivatives (n, 7, 10) of x' by the state and the dipole."""
         z, turned = self._quantities(x, m)
-        return np.asarray(self._steepness(z) @ self._by_unknowns(turned))
+        result = self._steepness(z) @ self._by_unknowns(turned)
+        result[:, 4:, :4] += (self._pushes @ x[:, None, :4, None])[:, :, :, 0]
+        return np.asarray(result)
 
     def curvature(self, x: FloatArray, m: FloatArray, y: FloatArray) -> FloatArray:
         """Return the second derivative (n, 10, 10) of y . x' by state and dipole, for `y` (n, 7)."""
@@ -125,6 +151,7 @@ class Motion:
         result = parts.transpose(0, 2, 1) @ (bend @ parts)
         pull = (bend @ z[:, :, None])[:, _BE]
         result[:, :4, :4] += np.sum(pull[:, :, :, None] * self._forms, axis=1)
+        result[:, :4, :4] += np.sum(y[:, 4:, None, None] * self._pushes, axis=1)
         return np.asarray(result)
 
     def _quantities(self, x: FloatArray, m: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -148,6 +175,18 @@ class Motion:
 _Z = 16
 _M, _B, _E, _W, _Q, _BE = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 16), slice(3, 9)
 _ATTITUDE, _RATE, _DIPOLE = slice(0, 4), slice(4, 7), slice(7, 10)
+
+
+def _pushes(craft: SlewCraft, around: Around) -> FloatArray:
+    """Return the second derivatives (n, 3, 4, 4) of the acceleration by air and light, by the attitude."""
+    count = len(around.field)
+    result = np.zeros((count, 3, 4, 4))
+    if around.pressures is not None:
+        for size, pressure in ((craft.air, around.pressures.air), (craft.light, around.pressures.light)):
+            rows = np.linalg.solve(craft.inertia, cross_matrices(size[None])[0])  # by the direction
+            for row, pull in enumerate(rows):
+                result[:, row] += shown_curvature(np.broadcast_to(pull, (count, 3)), pressure)
+    return result
 
 
 def _quadratic(inertia: FloatArray) -> FloatArray:

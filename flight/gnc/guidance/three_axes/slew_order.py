@@ -116,7 +116,7 @@ def task_at(order: SlewOrder, ephemeris: Ephemeris, begin: float) -> SlewTask:
         along(ephemeris, begin),
         quaternion,
         rate,
-        _end_law(order, ephemeris, begin),
+        end_law(order.goal, order.axes, ephemeris, begin),
         order.horizon,
         order.longest,
         order.time_price,
@@ -125,9 +125,9 @@ def task_at(order: SlewOrder, ephemeris: Ephemeris, begin: float) -> SlewTask:
     )
 
 
-def _end_law(order: SlewOrder, ephemeris: Ephemeris, begin: float) -> EndLaw:
-    """Return where slews that begin at a time, s of the ephemeris, end after any duration."""
-    goal, axis = order.goal, order.axes.pointing
+def end_law(goal: PointingTarget, axes: BodyAxes, ephemeris: Ephemeris, begin: float) -> EndLaw:
+    """Return where slews to a goal that begin at a time, s of the ephemeris, end after any duration."""
+    axis = axes.pointing
     if goal.goal is not Goal.INERTIAL and goal.roll is None:
         direction, _ = directions_of(goal)
 
@@ -137,7 +137,7 @@ def _end_law(order: SlewOrder, ephemeris: Ephemeris, begin: float) -> EndLaw:
             return Boresight(axis, now, np.cross(now, after - before) / (2.0 * DIFFERENCE))
 
         return aimed
-    law = law_of(goal, order.axes, _NO_ROLL, ephemeris, begin)
+    law = law_of(goal, axes, _NO_ROLL, ephemeris, begin)
 
     def whole(horizon: float) -> End:
         quaternion, rate = _motion(law, ephemeris, begin + horizon)

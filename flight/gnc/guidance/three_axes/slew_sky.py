@@ -10,6 +10,7 @@ import math
 import erfa
 import numpy as np
 
+from flight.gnc.earth.disturbance import pressures
 from flight.gnc.earth.ephemeris import Ephemeris
 from flight.gnc.earth.figure import EARTH_RADIUS
 from flight.gnc.earth.orientation import terrestrial_time
@@ -20,10 +21,12 @@ from flight.gnc.math.arrays import FloatArray
 
 
 def along(ephemeris: Ephemeris, begin: float) -> Along:
-    """Return field and position over the time of a slew."""
+    """Return field, position, air and light over the time of a slew."""
 
     def around(times: FloatArray) -> Around:
-        return Around(ephemeris.field_at(begin + times), ephemeris.position_at(begin + times))
+        since = begin + times
+        pressed = pressures(ephemeris, since)
+        return Around(ephemeris.field_at(since), ephemeris.position_at(since), pressed)
 
     return around
 

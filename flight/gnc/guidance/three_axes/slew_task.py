@@ -57,6 +57,8 @@ def check(task: SlewTask) -> None:
         craft.weights,
         craft.residual,
         craft.torque,
+        craft.air,
+        craft.light,
         task.quaternion,
         task.rate,
     )

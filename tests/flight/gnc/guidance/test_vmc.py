@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import pickle
 import subprocess
 import sys
 
@@ -27,6 +26,7 @@ from tests.flight.gnc.guidance.problems import (
     known_optima,
     random_problems,
 )
+from tests.flight.loop.executive.passing import passed
 from tests.pace import ordinary_seconds
 
 THREAD = SingleAxisPlant(1.05e-3, 2.916e-4, 23.0, 0.148, 1e-5, 2e-6)
@@ -202,7 +202,7 @@ def test_the_same_question_has_the_same_answer_bit_for_bit() -> None:
 
 def test_a_plan_survives_the_way_to_another_process() -> None:
     found = THESIS.planned()
-    copy = pickle.loads(pickle.dumps(found))
+    copy = passed(found)
     assert copy.path == found.path
     assert copy.status == PlanStatus.STRETCHED
     np.testing.assert_array_equal(copy.nu, found.nu)

@@ -22,6 +22,7 @@ from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from flight.gnc.vision.streaks.streak_result import StreakResult, StreakStatus
 from tests.flight.gnc.vision.startracker.frames import NARROW, SkyFrame, sky, sky_frame
+from tests.flight.loop.executive.passing import passed
 
 _TRACKER = TrackerSettings(SolveSettings(), (1.0, 1.0))
 _ESTIMATORS = [LikelihoodSettings(saturation=65_535), StreakSettings()]
@@ -147,7 +148,7 @@ def test_the_stars_of_a_solved_frame_of_streaks_serve_a_second_fit() -> None:
 
 def test_a_job_and_what_it_found_pass_between_processes() -> None:
     job = pickle.loads(pickle.dumps(_job(_frame(0.0), LikelihoodSettings())))
-    found = pickle.loads(pickle.dumps(run(job)))
+    found = passed(run(job))
     _assert_right(found.solution, _frame(0.0).attitude)
 
 

@@ -117,6 +117,10 @@ class BothEnds:
                 fields |= {"mode": int(self.mode), "text": "as commanded"}
                 self.flight.answer(self.packer.pack(COMMAND, self.clock.now_ns(), fields), sender)
             self.clock.advance(TURN_NS)
+        self.collect()
+
+    def collect(self) -> None:
+        """Take what came down."""
         self.packets += self.terminal.take()
 
     def stages(self, counter: int, spi: int = 1) -> list[str]:

@@ -2,35 +2,29 @@
 
 from __future__ import annotations
 
-import mmap
 import os
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, suppress
+from contextlib import closing
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from flight.gnc.camera.lens import Lens
-from flight.gnc.errors import FlightError
-from flight.gnc.vision.streaks.streak_result import StreakStatus
 from flight.loop.executive.attempts import BUDGET, STEADY_NS, Attempts
 from flight.loop.executive.jobs import Change, JobResult, JobRunner, Worker, WorkerNews
 from flight.loop.executive.lockstep import LockStepRunner
-from flight.loop.executive.messages import SLAB_BYTES, message_length, pack_message, unpack_values
 from flight.loop.executive.supervisor import ProcessRunner
 from hal.buses.clock import SystemClock
 from hal.buses.real_time import worker_cores
 from hal.interfaces.wires import SECOND_NS
 from sim_hal.clock import SimClock
-from tests.flight.loop.executive.odd_jobs import cores, die, double, fail, hang
+from tests.flight.loop.executive.odd_jobs import cores, die, double, fail, function, hang
 from tests.hal.guardian.campaign import lives
+from tests.hal.guardian.states import state, wait_until
 
 MS = 1_000_000
 
@@ -65,7 +59,8 @@ def started(runner: ProcessRunner, name: str, seconds: float = 20.0) -> int:
 @pytest.fixture(scope="module")
 def processes() -> Iterator[ProcessRunner]:
     """Return workers for all tests here: each of them leaves every worker idle, or replaced."""
-    runner = ProcessRunner(SystemClock(), [*WORKERS, worker("hang", hang), worker("die", die)])
+    more = [worker("hang", hang), worker("die", die), worker("function", function)]
+    runner = ProcessRunner(SystemClock(), [*WORKERS, *more])
     yield runner
     runner.close()
 
@@ -111,6 +106,12 @@ def test_a_process_does_the_job_and_megabytes_pass_both_ways(processes: ProcessR
     assert wait(processes)[0].value == 8
 
 
+def test_a_result_that_cannot_be_sent_is_a_failure_and_not_a_death(processes: ProcessRunner) -> None:
+    processes.submit("function", None)
+    (result,) = wait(processes)
+    assert (result.outcome, result.error[-34:]) == ("failed", "is no value that a worker may send")
+
+
 def test_a_failure_in_a_process_names_its_reason(processes: ProcessRunner) -> None:
     processes.submit("fail", 7)
     (result,) = wait(processes)
@@ -150,6 +151,19 @@ def test_a_worker_that_dies_is_reported_and_replaced_at_work_or_idle(processes: 
     assert processes.collect() == [], "no job was lost"
     assert processes.submit("double", 3)
     assert wait(processes)[0].value == 6
+
+
+@pytest.mark.parametrize("while_it_starts", [True, False])
+def test_a_worker_that_is_stopped_is_reported_and_replaced_idle_or_starting(while_it_starts: bool) -> None:
+    with closing(ProcessRunner(SystemClock(), [worker("double", double)])) as runner:
+        stopped = started(runner, "double")
+        if not while_it_starts:
+            assert runner.submit("double", 1)
+            assert wait(runner)[0].value == 2
+        os.kill(stopped, signal.SIGSTOP)
+        assert "stopped by a signal" in hear(runner, "double", Change.DIED).text
+        hear(runner, "double", Change.READY)
+        assert started(runner, "double") != stopped
 
 
 def test_a_worker_that_cannot_start_takes_no_jobs_and_costs_the_control_thread_nothing() -> None:
@@ -208,36 +222,26 @@ def test_a_worker_ends_quietly_in_the_middle_of_a_job_when_its_flight_is_killed(
     assert not lives(orphan)
 
 
-class _Harmful:
-    def __reduce__(self) -> tuple[Any, ...]:
-        return os.getpid, ()
+_STARTED = """
+import os, signal, time
+from flight.loop.executive.jobs import Worker
+from flight.loop.executive.processes import WorkerProcess
+from tests.flight.loop.executive.odd_jobs import hang
+process = WorkerProcess(Worker("hang", hang, 0, 10**12)).process_id
+os.kill(process, signal.SIGSTOP)
+print(process, flush=True)
+time.sleep(60.0)
+"""
 
 
-@pytest.mark.parametrize("value", [_Harmful(), os.getpid, subprocess.Popen, np.load, {"deep": [np.fromfile]}])
-def test_what_a_worker_sends_can_call_nothing(value: Any) -> None:
-    slab = mmap.mmap(-1, SLAB_BYTES)
-    with pytest.raises(FlightError, match="no class of values"):
-        unpack_values(pack_message(value, slab), slab)
-
-
-def test_what_a_worker_sends_may_be_any_value_of_ours() -> None:
-    slab = mmap.mmap(-1, SLAB_BYTES)
-    lens = Lens(1024, 768, 500.0, (511.5, 383.5))
-    value = (StreakStatus.BLACK, lens, np.float64(2.0), {"a": np.eye(3)}, frozenset({1}), None)
-    status, again, number, arrays, numbers, nothing = unpack_values(pack_message(value, slab), slab)
-    assert (status, again, number, numbers, nothing) == (StreakStatus.BLACK, lens, 2.0, {1}, None)
-    np.testing.assert_array_equal(arrays["a"], np.eye(3))
-
-
-@given(st.binary(max_size=200), st.integers(0, 400))
-def test_a_damaged_message_is_refused_or_read_and_nothing_else(noise: bytes, place: int) -> None:
-    slab = mmap.mmap(-1, SLAB_BYTES)
-    message = bytearray(pack_message(("done", Lens(1024, 768, 500.0, (511.5, 383.5)), "", 7), slab))
-    message[place : place + len(noise)] = noise
-    with suppress(FlightError):
-        length = message_length(message)
-        if length is not None:
-            unpack_values(bytes(message[:length]), slab)
+def test_a_worker_that_was_stopped_before_python_ran_does_not_outlive_its_flight() -> None:
+    words = [sys.executable, "-c", _STARTED]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, start_new_session=True) as flight:
+        assert flight.stdout is not None
+        orphan = int(flight.stdout.readline())
+        wait_until(lambda: state(orphan) == "T")
+        flight.kill()
+    wait_until(lambda: state(orphan) in {"", "Z"})
 
 
 def test_workers_leave_the_last_core_to_the_control_process() -> None:

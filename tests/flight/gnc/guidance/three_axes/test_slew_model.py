@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from flight.gnc.earth.disturbance import Pressures, shapes
 from flight.gnc.guidance.three_axes.slew_model import Around, Motion, SlewCraft, shown
 from flight.gnc.math.quaternion import attitude_matrix, normalise
 
@@ -11,11 +12,11 @@ from flight.gnc.math.quaternion import attitude_matrix, normalise
 def test_slopes_and_curvature_are_those_of_central_differences() -> None:
     rng = np.random.default_rng(1)
     inertia = np.diag([0.0066, 0.0333, 0.0333]) + 1e-3
-    craft = SlewCraft(
-        inertia, np.full(3, 0.2), np.ones(3), 1e-3 * rng.normal(size=3), 1e-8 * rng.normal(size=3)
-    )
+    residual, sizes = 1e-3 * rng.normal(size=3), 1e-7 * rng.normal(size=9)
+    craft = SlewCraft(inertia, np.full(3, 0.2), np.ones(3), residual).facing(sizes)
     point, pull = rng.normal(size=(4, 10)), rng.normal(size=(4, 7))
-    around = Around(3e-5 * rng.normal(size=(4, 3)), 4e6 * rng.normal(size=(4, 3)))
+    pressures = Pressures(rng.normal(size=(4, 3)), rng.normal(size=(4, 3)))
+    around = Around(3e-5 * rng.normal(size=(4, 3)), 4e6 * rng.normal(size=(4, 3)), pressures)
     motion = Motion(craft, 300.0, 0.2, around)
 
     def flow(z: np.ndarray) -> np.ndarray:
@@ -31,6 +32,20 @@ def test_slopes_and_curvature_are_those_of_central_differences() -> None:
         np.testing.assert_allclose(slopes(point)[:, :, k], rise, rtol=1e-6, atol=1e-7)
         bend = np.einsum("ni,nij->nj", pull, slopes(point + shift) - slopes(point - shift)) / 2e-5
         np.testing.assert_allclose(curvature[:, :, k], bend, rtol=1e-6, atol=1e-6)
+
+
+def test_torques_of_air_and_light_are_those_that_the_filter_estimates() -> None:
+    rng = np.random.default_rng(3)
+    q, sizes = normalise(rng.normal(size=(5, 4))), 1e-7 * rng.normal(size=9)
+    inertia = np.diag([0.0066, 0.0333, 0.04])
+    craft = SlewCraft(inertia, np.full(3, 0.2), np.ones(3))
+    pressures = Pressures(rng.normal(size=(5, 3)), rng.normal(size=(5, 3)))
+    around = Around(3e-5 * rng.normal(size=(5, 3)), 7e6 * rng.normal(size=(5, 3)), pressures)
+    still, nothing = np.concatenate([q, np.zeros((5, 3))], axis=1), np.zeros((5, 3))
+    pushed = Motion(craft.facing(sizes), 1.0, 0.2, around).flow(still, nothing)
+    pushed = pushed - Motion(craft, 1.0, 0.2, around).flow(still, nothing)
+    expected = shapes(pressures, attitude_matrix(q)) @ sizes
+    np.testing.assert_allclose(pushed[:, 4:] @ inertia, expected, rtol=1e-9, atol=1e-18)
 
 
 def test_a_quadratic_form_shows_vectors_as_the_attitude_matrix_does() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import pickle
 
 import numpy as np
 import pytest
@@ -23,6 +22,7 @@ from tests.flight.gnc.vision.streaks.space_objects import (
     object_path,
     star_field,
 )
+from tests.flight.loop.executive.passing import passed
 
 _CAMERA = star_camera(512)
 _FOCAL = _CAMERA.pinhole.focal_length
@@ -212,7 +212,7 @@ def test_an_object_weaker_than_asked_is_not_called_one() -> None:
 
 def test_the_report_travels_between_processes() -> None:
     report, _ = _see(motion_across(_PLACE, 60.0 / _FOCAL, 2.4), 4.0)
-    copy = pickle.loads(pickle.dumps(report))
+    copy = passed(report)
     np.testing.assert_array_equal(copy.objects[0].endpoints, report.objects[0].endpoints)
 
 

@@ -1,0 +1,235 @@
+"""Protocol data units of CFDP, CCSDS 727.0-B-5, section 5: those of class 2, as values and as bytes.
+
+A header (version 1, entities of 2 bytes, transaction numbers of 4, neither CRC nor large files: the frame
+that carries it is authenticated) and file data or a directive. Identifiers of other lengths are read too.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from enum import IntEnum
+
+from flight.gnc.errors import FlightError
+
+SEGMENT_BYTES = 900
+"""Of a file in one unit: with its headers it fits into a telecommand frame."""
+MOST_REQUESTS = 100
+"""Gaps in one NAK, for the same reason."""
+HIGHEST_NUMBER = 2**32 - 1
+_ENTITY_BYTES, _NUMBER_BYTES = 2, 4
+_FIXED_BYTES = 4
+_VERSION = 0b001 << 5
+_FILE_DATA, _TO_SENDER, _UNACKNOWLEDGED, _CRC, _LARGE = 1 << 4, 1 << 3, 1 << 2, 1 << 1, 1
+_METADATA_OF_SEGMENT = 1 << 3
+_LENGTHS = (_ENTITY_BYTES - 1) << 4 | (_NUMBER_BYTES - 1)
+_FAULT_LOCATION = 6  # the type of that TLV
+_MOST_NAME_BYTES = 255
+
+
+class PduError(FlightError):
+    """Bytes that are no unit of class 2; says why."""
+
+
+class Condition(IntEnum):
+    """Condition codes, table 5-5."""
+
+    NO_ERROR = 0
+    FILESTORE_REJECTION = 4
+    CHECKSUM_FAILURE = 5
+    SIZE_ERROR = 6
+    CANCELLED = 15
+
+
+class Code(IntEnum):
+    """Directive codes, table 5-4."""
+
+    EOF = 4
+    FINISHED = 5
+    ACK = 6
+    METADATA = 7
+    NAK = 8
+
+
+class Status(IntEnum):
+    """The state of a transaction in an acknowledgement, table 5-8."""
+
+    ACTIVE = 1
+    TERMINATED = 2
+    UNRECOGNIZED = 3
+
+
+class Kept(IntEnum):
+    """What became of a file, table 5-7."""
+
+    DISCARDED = 0
+    REJECTED = 1
+    RETAINED = 2
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Transaction:
+    """What identifies a transfer: the entity that sends the file, its number there, and who receives."""
+
+    source: int
+    number: int
+    destination: int
+
+
+@dataclass(frozen=True, slots=True)
+class Metadata:
+    """What is sent: bytes, the names at both ends, and the type of checksum."""
+
+    size: int
+    source_name: str
+    name: str
+    checksum_type: int
+
+
+@dataclass(frozen=True, slots=True)
+class FileData:
+    """A piece of the file."""
+
+    offset: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Eof:
+    """All was sent once, or why no more comes."""
+
+    condition: int
+    checksum: int
+    size: int
+
+
+@dataclass(frozen=True, slots=True)
+class Nak:
+    """Gaps (begin, end); (0, 0) stands for the metadata."""
+
+    begin: int
+    end: int
+    gaps: tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Finished:
+    """The receiver has done with the file."""
+
+    condition: int
+    complete: bool
+    kept: int
+
+
+@dataclass(frozen=True, slots=True)
+class Ack:
+    """Acknowledges an EOF or a Finished."""
+
+    code: int
+    condition: int
+    status: int
+
+
+Content = Metadata | FileData | Eof | Nak | Finished | Ack
+_LONG = struct.Struct(">I")
+_PAIR = struct.Struct(">II")
+_EOF = struct.Struct(">BII")
+
+
+def pack(transaction: Transaction, content: Content) -> bytes:
+    """Return the bytes of a unit."""
+    body, kind = _body(transaction, content)
+    if isinstance(content, Nak | Finished) or (isinstance(content, Ack) and content.code == Code.EOF):
+        kind |= _TO_SENDER
+    header = struct.pack(">BHB", _VERSION | kind, len(body), _LENGTHS)
+    names = struct.pack(">HIH", transaction.source, transaction.number, transaction.destination)
+    return header + names + body
+
+
+def unpack(data: bytes) -> tuple[Transaction, Content]:
+    """Return the unit at the beginning of `data`. Raises PduError."""
+    if len(data) < _FIXED_BYTES or data[0] & 0b111 << 5 != _VERSION:
+        raise PduError("no unit of version 1 of CFDP")
+    if data[0] & (_UNACKNOWLEDGED | _CRC | _LARGE):
+        raise PduError("a unit of class 1, with a CRC, or of a large file")
+    entity, number = (data[3] >> 4 & 7) + 1, (data[3] & 7) + 1
+    begin = _FIXED_BYTES + 2 * entity + number
+    end = begin + int.from_bytes(data[1:3], "big")
+    if len(data) < end or end == begin:
+        raise PduError(f"{len(data)} bytes of a unit of {end}")
+    transaction = Transaction(
+        int.from_bytes(data[4 : 4 + entity], "big"),
+        int.from_bytes(data[4 + entity : 4 + entity + number], "big"),
+        int.from_bytes(data[begin - entity : begin], "big"),
+    )
+    if max(transaction.source, transaction.destination) >= 1 << 16 or transaction.number > HIGHEST_NUMBER:
+        raise PduError("an entity or a number beyond 2 and 4 bytes")
+    body = data[begin:end]
+    try:
+        if data[0] & _FILE_DATA:
+            if data[3] & _METADATA_OF_SEGMENT:
+                raise PduError("segments with metadata are not known")
+            return transaction, FileData(_LONG.unpack_from(body)[0], body[_LONG.size :])
+        return transaction, _directive(body)
+    except (struct.error, IndexError) as error:
+        raise PduError("it ends before its last field") from error
+
+
+def _body(transaction: Transaction, content: Content) -> tuple[bytes, int]:
+    """Return what follows the header, and the header's bit of the kind."""
+    match content:
+        case FileData(offset, data):
+            return _LONG.pack(offset) + data, _FILE_DATA
+        case Metadata(size, source_name, name, checksum_type):
+            names = b"".join(_name(text) for text in (source_name, name))
+            return struct.pack(">BBI", Code.METADATA, checksum_type, size) + names, 0
+        case Eof(condition, checksum, size):
+            fault = _fault(condition, transaction.source)
+            return bytes((Code.EOF,)) + _EOF.pack(condition << 4, checksum, size) + fault, 0
+        case Nak(begin, end, gaps):
+            return bytes((Code.NAK,)) + _PAIR.pack(begin, end) + b"".join(_PAIR.pack(*g) for g in gaps), 0
+        case Finished(condition, complete, kept):
+            flags = condition << 4 | (not complete) << 2 | kept
+            return bytes((Code.FINISHED, flags)) + _fault(condition, transaction.destination), 0
+        case Ack(code, condition, status):
+            return bytes((Code.ACK, code << 4 | (code == Code.FINISHED), condition << 4 | status)), 0
+
+
+def _directive(body: bytes) -> Content:
+    code, rest = body[0], body[1:]
+    match code:
+        case Code.METADATA:
+            size = _LONG.unpack_from(rest, 1)[0]
+            first, second = 5, 6 + rest[5]
+            end = second + 1 + rest[second]
+            if len(rest) < end:
+                raise PduError("it ends before its last name")
+            names = (rest[first + 1 : second], rest[second + 1 : end])
+            source_name, name = (raw.decode("utf-8", "replace") for raw in names)
+            return Metadata(size, source_name, name, rest[0] & 15)
+        case Code.EOF:
+            flags, checksum, size = _EOF.unpack_from(rest)
+            return Eof(flags >> 4, checksum, size)
+        case Code.NAK:
+            begin, end = _PAIR.unpack_from(rest)
+            return Nak(begin, end, tuple(_PAIR.iter_unpack(rest[8 : len(rest) // 8 * 8])))
+        case Code.FINISHED:
+            return Finished(rest[0] >> 4, not rest[0] & 4, rest[0] & 3)
+        case Code.ACK:
+            return Ack(rest[0] >> 4, rest[1] >> 4, rest[1] & 3)
+        case _:
+            raise PduError(f"directive {code} is not known")
+
+
+def _name(text: str) -> bytes:
+    raw = text.encode()
+    if len(raw) > _MOST_NAME_BYTES:
+        raise PduError(f"{text}: longer than {_MOST_NAME_BYTES} bytes")
+    return bytes((len(raw),)) + raw
+
+
+def _fault(condition: int, entity: int) -> bytes:
+    """Return the TLV that says who found the fault; none where there is none."""
+    if condition == Condition.NO_ERROR:
+        return b""
+    return bytes((_FAULT_LOCATION, _ENTITY_BYTES)) + entity.to_bytes(_ENTITY_BYTES, "big")

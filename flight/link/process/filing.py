@@ -1,0 +1,232 @@
+"""Files of the satellite: what may be sent down, what may come up, and what becomes of it.
+
+Down goes what stands under `log/` (the flight's runs) and `received/`; up comes what has a kind. A file that
+came does nothing by itself: it stays until it is chosen by a command that has its SHA-256. Then it stands as
+`chosen/KIND/NAME`, alone of its kind, for the board to take (docs/fly/files.md).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from flight.gnc.errors import UsageError
+from flight.link.commands.errors import CommandError
+from flight.link.files.checksum import CRC32, MODULAR
+from flight.link.files.entity import FOREIGN, LONGEST_FILE, SATELLITE, Entity, Origin, Progress
+from flight.link.files.packets import DOWN, UnitPacker, unit_of
+from flight.link.files.pdu import Metadata, PduError
+from flight.link.files.store import FileError, Store, problem_of_name, write_whole
+from flight.link.process.file_directives import (
+    SEND_FILE,
+    CancelFile,
+    DeleteFile,
+    FileDirective,
+    ListFiles,
+    SendFile,
+    UseFile,
+)
+from flight.link.process.verification import Report, Request, Stage
+
+KINDS = ("configuration", "elements", "catalogue", "release")
+"""Folders of the files that come up."""
+LARGEST_UP = 64 << 20
+"""Bytes of a file that comes up."""
+MOST_RECEIVED = 256 << 20
+"""Bytes of all that came up and was not deleted."""
+LISTING = "listing.json"
+_PORTION = 1 << 20
+
+
+class Filing:
+    """Executes what is commanded of files, and owns their transfers. For one thread."""
+
+    def __init__(self, folder: Path, log: Path, now_ns: int) -> None:
+        """`folder` holds transfers and received files, `log` the flight's runs. Raises UsageError."""
+        self._folder = folder
+        self._store = Store(folder)
+        self._roots = {"log": log, "received": self._store.received}
+        self._checks: list[tuple[Report, Iterator[str | None]]] = []
+        self._units = UnitPacker(DOWN)
+        self._problem = self._said = ""
+        try:
+            self._entity = Entity(SATELLITE, self._store, self._may_come, LARGEST_UP, now_ns)
+        except FileError as error:
+            raise UsageError(str(error)) from error
+
+    def take(self, packet: bytes, now_ns: int) -> None:
+        """Take a unit of a transfer. Raises CommandError for bytes that are none."""
+        try:
+            self._entity.take(unit_of(packet), now_ns)
+        except (PduError, FileError) as error:
+            raise CommandError(str(error)) from error
+
+    def packet(self, now_ns: int, time_ns: int) -> bytes | None:
+        """Return the next packet of a transfer to send down, at mission time `time_ns`; None for none now."""
+        try:
+            unit = self._entity.unit(now_ns)
+        except FileError as error:
+            self._problem = str(error)
+            return None
+        return None if unit is None else self._units.pack(unit, time_ns)
+
+    def turn(self, now_ns: int) -> list[Report]:
+        """Go on with what takes time; return what is to be reported of it."""
+        try:
+            self._entity.keep(now_ns)
+            self._problem = ""
+        except FileError as error:
+            self._problem = str(error)
+        reports = [*self._go_on_checking()]
+        if self._problem and self._problem != self._said:
+            reports.append(Report(0, 0, Stage.FAILED, SEND_FILE.name, self._problem))
+        self._said = self._problem
+        return reports
+
+    def status(self) -> list[Progress]:
+        """Return how the open transfers stand."""
+        return self._entity.transfers()
+
+    def ended(self) -> Iterator[tuple[Progress, Report | None]]:
+        """Yield each transfer that has ended, with the report of the command that began it."""
+        while self._entity.ended:
+            one = self._entity.ended.popleft()
+            report = None
+            if one.outgoing and one.origin != Origin():
+                spi, counter, packet, sequence = one.origin
+                stage = Stage.COMPLETED if one.condition == 0 else Stage.FAILED
+                text = f"{one.name}: {one.said}"
+                report = Report(spi, counter, stage, SEND_FILE.name, text, Request(packet, sequence))
+            yield one, report
+
+    def obey(self, directive: FileDirective, done: Report, utc_ns: int, now_ns: int) -> list[Report]:
+        """Execute a directive; `done` is the report of its completion. Return the reports of now."""
+        try:
+            match directive:
+                case ListFiles(entity=entity, under=under):
+                    path = self._write_listing(under)
+                    return self._send(path, LISTING, entity, done, utc_ns, now_ns)
+                case SendFile(entity=entity, name=name):
+                    return self._send(self._path(name), name, entity, done, utc_ns, now_ns)
+                case CancelFile(source, number):
+                    self._entity.cancel(source, number)
+                case DeleteFile(name):
+                    self._received(name).unlink()
+                case UseFile(name, wanted):
+                    self._checks.append((done, self._choosing(self._received(name), name, wanted)))
+                    return []
+        except (FileError, OSError) as error:
+            return [replace(done, stage=Stage.FAILED, text=str(error))]
+        return [done]
+
+    def close(self, now_ns: int) -> None:
+        """Keep what came. Raises FileError."""
+        self._entity.close(now_ns)
+
+    def _send(
+        self, path: Path, name: str, entity: int, done: Report, utc_ns: int, now_ns: int
+    ) -> list[Report]:
+        origin = Origin(done.spi, done.counter, *done.request)
+        kind = MODULAR if entity == FOREIGN else CRC32  # all know the first, the second finds more
+        one = self._entity.send(path, name, entity, kind, utc_ns, now_ns, origin)
+        text = f"{name}: {one.size} bytes, transfer {one.number}"
+        return [replace(done, stage=Stage.STARTED, text=text)]
+
+    def _path(self, name: str) -> Path:
+        """Return the file of a name. Raises FileError; neither name nor link leads out of the two folders."""
+        root, _, rest = name.partition("/")
+        if (problem := problem_of_name(name)) or root not in self._roots:
+            raise FileError(problem or f"{name}: names begin with {' or '.join(self._roots)}")
+        place = self._roots[root].resolve()
+        path = (place / rest).resolve()
+        if not path.is_relative_to(place) or not path.is_file():
+            raise FileError(f"{name}: there is no such file")
+        return path
+
+    def _received(self, name: str) -> Path:
+        if not name.startswith("received/"):
+            raise FileError(f"{name}: no received file; their names begin with received/")
+        return self._path(name)
+
+    def _may_come(self, metadata: Metadata) -> str:
+        """Return why a file must not come up, empty when it may."""
+        kind, _, rest = metadata.name.partition("/")
+        if kind not in KINDS or not rest or "/" in rest:
+            return f"{metadata.name}: names are KIND/NAME, KIND one of {', '.join(KINDS)}"
+        taken = sum(path.stat().st_size for path in self._store.received.rglob("*") if path.is_file())
+        if taken + metadata.size > MOST_RECEIVED:
+            return f"{taken} of {MOST_RECEIVED} bytes are taken: delete what is not needed"
+        return ""
+
+    def _write_listing(self, under: str) -> Path:
+        """Write the list of files, by name. Raises FileError."""
+        files = []
+        for name, root in self._roots.items():
+            for path in root.rglob("*"):
+                full = f"{name}/{path.relative_to(root).as_posix()}"
+                if full.startswith(under) and path.is_file() and not problem_of_name(full):
+                    facts = path.stat()
+                    files.append({"name": full, "bytes": facts.st_size, "modified": round(facts.st_mtime)})
+        files = sorted((file for file in files if int(str(file["bytes"])) <= LONGEST_FILE), key=_name_of)
+        free = shutil.disk_usage(self._folder).free
+        path = self._folder / LISTING
+        write_whole(path, json.dumps({"free": free, "files": files}).encode())
+        return path
+
+    def _choosing(self, path: Path, name: str, wanted: bytes) -> Iterator[str | None]:
+        """Check a file in portions and choose it: yields None until the end, then why not, or empty."""
+        digest = hashlib.sha256()
+        kind, _, own = name.removeprefix("received/").partition("/")
+        with path.open("rb") as file:
+            while data := file.read(_PORTION):
+                digest.update(data)
+                yield None
+        if digest.digest() != wanted:
+            yield f"{name}: its SHA-256 is {digest.hexdigest()}"
+            return
+        folder = self._folder / "chosen" / kind
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        beside = folder.with_name(f"{kind}~")
+        beside.unlink(missing_ok=True)
+        os.link(path, beside)
+        os.replace(beside, folder / own)
+        for other in folder.iterdir():
+            if other.name != own:
+                other.unlink()
+        yield ""
+
+    def _go_on_checking(self) -> Iterator[Report]:
+        for check in list(self._checks):
+            done, steps = check
+            try:
+                problem = next(steps)
+            except OSError as error:
+                problem = str(error)
+            if problem is not None:
+                self._checks.remove(check)
+                yield replace(done, stage=Stage.FAILED, text=problem) if problem else done
+
+
+def _name_of(file: dict[str, Any]) -> str:
+    return str(file["name"])
+
+
+def values_of(progress: Progress) -> dict[str, Any]:
+    """Return the fields of the packet `transfer`."""
+    return {
+        "down": int(progress.outgoing),
+        "source": progress.source,
+        "number": progress.number,
+        "name": progress.name,
+        "size": progress.size,
+        "done": progress.done,
+        "open": int(progress.condition is None),
+        "condition": progress.condition or 0,
+        "text": progress.said,
+    }

@@ -1,0 +1,92 @@
+"""`flight files` over a real line: list, get, put, use, delete, each as the page has it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from flight.app.cli import main
+from ground.link.keys import make_keys
+from tests.scenario.flights import CONFIG
+from tests.studies.bench.flooded_flight import free_port
+from tests.studies.interop.linked_flight import service
+
+LOG = "log/run-000001/flight-0001.ccsds"
+
+
+@pytest.fixture(scope="module")
+def way(tmp_path_factory: pytest.TempPathFactory) -> Iterator[list[str]]:
+    """Return the words that reach a link, whose archive holds a file."""
+    place = tmp_path_factory.mktemp("files")
+    satellite, ground = make_keys(place / "keys")
+    address = f"127.0.0.1:{free_port()}"
+    (place / "runs" / "run-000001").mkdir(parents=True)
+    (place / "runs" / "run-000001" / "flight-0001.ccsds").write_bytes(bytes(range(256)) * 40)
+    commands, link = {"socket": str(place / "commands")}, {"keys": str(satellite), "udp": address}
+    config = place / "flight.yaml"
+    config.write_text(f"{CONFIG.read_text()}\ncommands: {json.dumps(commands)}\nlink: {json.dumps(link)}\n")
+    with service(place / "log", "link open", "link", config, "--log", place / "runs"):
+        folder = ["--folder", str(place / "ground"), "--timeout", "30"]
+        yield ["files", "--link", address, "--keys", str(ground), *folder]
+
+
+def test_files_come_down_and_go_up_by_the_command(
+    way: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*way, "--json", "get", LOG]) == 0
+    (got,) = json.loads(capsys.readouterr().out)["files"]
+    assert Path(got["path"]).read_bytes() == bytes(range(256)) * 40
+    path = tmp_path / "flight.yaml"
+    path.write_text("name: x\n")
+    assert main([*way, "put", "configuration", str(path)]) == 0
+    assert "received/configuration/flight.yaml" in capsys.readouterr().out
+    assert main([*way, "list"]) == 0
+    listed = capsys.readouterr().out
+    assert LOG in listed
+    assert "8 received/configuration/flight.yaml" in listed
+    assert main([*way, "use", "configuration", str(path)]) == 0
+    assert main([*way, "delete", "received/configuration/flight.yaml"]) == 0
+    capsys.readouterr()
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["get", "log/none"], "no such file"),
+        (["get", "../keys"], "no name"),
+        (["delete", LOG], "no received file"),
+        (["cancel", "1", "7"], "no transfer 7"),
+    ],
+)
+def test_what_cannot_be_is_said_in_one_line(
+    way: list[str], words: list[str], reason: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*way, *words]) == 1
+    error = capsys.readouterr().err
+    assert reason in error
+    assert error.count("\n") == 1
+
+
+def test_ctrl_c_keeps_what_came_and_a_second_call_has_the_folder_to_itself(
+    way: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [sys.executable, "-m", "flight", *way, "--rate", "2000", "put", "release", str(Path(__file__))]
+    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        assert "bytes" in process.stderr.readline()
+        assert main([*way, "list"]) == 2
+        assert "another process" in capsys.readouterr().err
+        process.send_signal(2)
+        assert "the same command goes on" in process.stderr.read()
+    assert process.returncode == 1
+
+
+def test_wrong_values_are_refused(way: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*way, "--rate", "0", "list"]) == 2
+    assert main([*way, "put", "configuration", "/none"]) == 1
+    assert "No such file" in capsys.readouterr().err

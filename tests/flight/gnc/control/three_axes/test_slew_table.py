@@ -1,0 +1,98 @@
+"""A slew flown by the pointing law ends in its target and stays there, under torques known ahead."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flight.gnc.control.three_axes.pointing import PointingLaw
+from flight.gnc.control.three_axes.pointing_table import Ahead, PointingTable
+from flight.gnc.control.three_axes.slew_table import FINE, SlewBegin, SlewWish, slew, slew_table
+from flight.gnc.earth.disturbance import pressures
+from flight.gnc.guidance.three_axes.attitude_law import references
+from flight.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from flight.gnc.guidance.three_axes.target_law import BodyAxes
+from flight.gnc.math.quaternion import angle_between, attitude_matrix, from_rotation_vector, multiply
+from tests.flight.gnc.control.three_axes.test_pointing import (
+    INERTIA,
+    LAW,
+    LIMIT,
+    ORBIT,
+    RESIDUAL,
+    SIZE,
+    STEP,
+    WEIGHTS,
+    X,
+    Y,
+    Z,
+    pushed,
+)
+
+NADIR = PointingTarget(Goal.NADIR, roll=0.0)
+AXES = BodyAxes(Z, X)
+WISH = SlewWish(700.0, np.full(3, 5.0), RESIDUAL, -Y)
+TIMES = np.arange(STEP, 5_000.0, STEP)
+WANTED = references(LAW, ORBIT, TIMES)
+BEGIN = SlewBegin(
+    multiply(from_rotation_vector(np.radians([0.0, 60.0, 0.0])), WANTED.quaternion[0]),
+    np.zeros(3),
+    TIMES,
+    100,
+    INERTIA,
+    LIMIT,
+    SIZE,
+)
+
+
+@pytest.fixture(scope="module")
+def table() -> PointingTable:
+    path = slew(BEGIN, WISH, NADIR, AXES, ORBIT, np.inf)
+    assert path is not None
+    field, position = ORBIT.field_at(TIMES), ORBIT.position_at(TIMES)
+    expected = Ahead(WANTED, WANTED, field, position, pressures(ORBIT, TIMES), SIZE)
+    return slew_table(BEGIN, path, RESIDUAL, NADIR, AXES, ORBIT, expected, WEIGHTS)
+
+
+def test_flown_under_torques_and_a_dipole_it_ends_in_its_target_and_stays(table: PointingTable) -> None:
+    assert table.slew is not None
+    law, step = PointingLaw(table, LIMIT), STEP / FINE
+    q, w = BEGIN.quaternion, BEGIN.rate
+    off = []
+    for time in table.path.times[:-1].tolist():
+        at = np.array([time])
+        field = attitude_matrix(q) @ ORBIT.field_at(at)[0]
+        dipole = law.command(time, q, w, field, RESIDUAL, SIZE).dipole
+        for part in range(2):
+            at = np.array([time + 0.5 * step * part])
+            q, w = pushed(q, w, attitude_matrix(q), at, dipole + RESIDUAL, 0.5 * step)
+        off.append(np.degrees(angle_between(q, law.wanted(time + step).quaternion)))
+    arrived = round(table.slew.horizon / step)
+    assert off[0] > 50.0
+    assert off[arrived] < 0.3
+    assert max(off[arrived : arrived + 30]) < 1.0
+
+
+def test_path_and_gains_go_on_after_the_slew_without_a_jump(table: PointingTable) -> None:
+    steps = np.degrees(angle_between(table.path.quaternion[1:], table.path.quaternion[:-1]))
+    assert steps.max() < 2.5
+    assert len(table.gain) == len(table.dipole) == len(table.path.times) - 1 == FINE * BEGIN.kept
+    assert table.slew is not None
+    count = round(table.slew.horizon / (STEP / FINE))
+    np.testing.assert_allclose(table.path.rate[count - 1], table.path.rate[count], atol=1e-4)
+
+
+def test_a_body_that_would_turn_too_fast_slews_for_longer() -> None:
+    free = slew(BEGIN, WISH, NADIR, AXES, ORBIT, np.inf)
+    assert free is not None
+    limit = 0.8 * float(np.linalg.norm(free.rate, axis=1).max())
+    slow = slew(BEGIN, WISH, NADIR, AXES, ORBIT, limit)
+    assert slow is not None
+    assert slow.horizon > free.horizon
+    assert float(np.linalg.norm(slow.rate, axis=1).max()) < limit
+
+
+def test_a_body_within_a_cone_slews_out_of_it() -> None:
+    q = BEGIN.quaternion
+    sun = attitude_matrix(q) @ ORBIT.sun_at(TIMES[:1])[0]
+    inside = SlewWish(700.0, WISH.heat, RESIDUAL, sun, {"sun": 0.3})
+    assert slew(BEGIN, inside, NADIR, AXES, ORBIT, np.inf) is not None

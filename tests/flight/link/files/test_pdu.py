@@ -1,0 +1,177 @@
+"""Units of CFDP against another's codec, the CFDP part of `spacepackets`, both ways."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from spacepackets.cfdp import (  # type: ignore[import-untyped]  # it ships no py.typed
+    ChecksumType,
+    ConditionCode,
+    DirectiveType,
+    EntityIdTlv,
+    PduConfig,
+    TransmissionMode,
+)
+from spacepackets.cfdp.pdu import (  # type: ignore[import-untyped]
+    AckPdu,
+    DeliveryCode,
+    EofPdu,
+    FileDataPdu,
+    FileStatus,
+    FinishedParams,
+    FinishedPdu,
+    MetadataParams,
+    MetadataPdu,
+    NakPdu,
+    TransactionStatus,
+)
+from spacepackets.cfdp.pdu.file_data import FileDataParams  # type: ignore[import-untyped]
+from spacepackets.util import ByteFieldU16, ByteFieldU32  # type: ignore[import-untyped]
+
+from flight.link.files.checksum import CRC32, MODULAR, FileSum
+from flight.link.files.pdu import (
+    MOST_REQUESTS,
+    SEGMENT_BYTES,
+    Ack,
+    Code,
+    Condition,
+    Content,
+    Eof,
+    FileData,
+    Finished,
+    Kept,
+    Metadata,
+    Nak,
+    PduError,
+    Status,
+    Transaction,
+    pack,
+    unpack,
+)
+from flight.link.frames.telecommand import HEADER, LONGEST_FRAME
+from flight.link.security.sdls import OVERHEAD_BYTES
+from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, SECONDARY_BYTES
+
+TRANSACTION = Transaction(1, 0x01020304, 2)
+FAULT = EntityIdTlv(b"\0\1")
+FAULT_OF_RECEIVER = EntityIdTlv(b"\0\2")
+
+
+def config() -> PduConfig:
+    return PduConfig(
+        source_entity_id=ByteFieldU16(1),
+        dest_entity_id=ByteFieldU16(2),
+        transaction_seq_num=ByteFieldU32(0x01020304),
+        trans_mode=TransmissionMode.ACKNOWLEDGED,
+    )
+
+
+def metadata() -> MetadataPdu:
+    params = MetadataParams(False, ChecksumType.CRC_32, 10_000_000, "log/a", "log/b")
+    return MetadataPdu(config(), params)
+
+
+def finished(condition: ConditionCode, delivery: DeliveryCode, status: FileStatus) -> FinishedPdu:
+    fault = None if condition == ConditionCode.NO_ERROR else FAULT_OF_RECEIVER
+    return FinishedPdu(config(), FinishedParams(condition, delivery, status, fault_location=fault))
+
+
+CASES: list[tuple[Content, bytes]] = [
+    (Metadata(10_000_000, "log/a", "log/b", CRC32), bytes(metadata().pack())),
+    (FileData(900, b"abc"), bytes(FileDataPdu(config(), FileDataParams(b"abc", 900)).pack())),
+    (Eof(0, 0x01020304, 99), bytes(EofPdu(config(), b"\1\2\3\4", 99).pack())),
+    (
+        Eof(15, 7, 99),
+        bytes(EofPdu(config(), b"\0\0\0\7", 99, FAULT, ConditionCode.CANCEL_REQUEST_RECEIVED).pack()),
+    ),
+    (Nak(0, 99, ((0, 0), (5, 9))), bytes(NakPdu(config(), 0, 99, [(0, 0), (5, 9)]).pack())),
+    (
+        Ack(Code.EOF, 0, Status.ACTIVE),
+        bytes(
+            AckPdu(config(), DirectiveType.EOF_PDU, ConditionCode.NO_ERROR, TransactionStatus.ACTIVE).pack()
+        ),
+    ),
+    (
+        Ack(Code.FINISHED, 5, Status.TERMINATED),
+        bytes(
+            AckPdu(
+                config(),
+                DirectiveType.FINISHED_PDU,
+                ConditionCode.FILE_CHECKSUM_FAILURE,
+                TransactionStatus.TERMINATED,
+            ).pack()
+        ),
+    ),
+    (
+        Finished(0, True, Kept.RETAINED),
+        bytes(finished(ConditionCode.NO_ERROR, DeliveryCode.DATA_COMPLETE, FileStatus.FILE_RETAINED).pack()),
+    ),
+    (
+        Finished(Condition.FILESTORE_REJECTION, False, Kept.REJECTED),
+        bytes(
+            finished(
+                ConditionCode.FILESTORE_REJECTION,
+                DeliveryCode.DATA_INCOMPLETE,
+                FileStatus.DISCARDED_FILESTORE_REJECTION,
+            ).pack()
+        ),
+    ),
+]
+
+
+@pytest.mark.parametrize(("content", "theirs"), CASES, ids=lambda case: type(case).__name__)
+def test_units_are_those_of_another_codec(content: Content, theirs: bytes) -> None:
+    assert pack(TRANSACTION, content) == theirs
+    assert unpack(theirs) == (TRANSACTION, content)
+
+
+def test_identifiers_of_other_lengths_are_read() -> None:
+    short = bytes((0x20, 0, 10, 0x00, 1, 4, 2)) + bytes((4, 0)) + bytes(8)
+    assert unpack(short) == (Transaction(1, 4, 2), Eof(0, 0, 0))
+
+
+@given(st.binary(max_size=60), st.integers(0, 8), st.integers(0, 255))
+def test_damaged_units_are_refused_and_nothing_else_happens(noise: bytes, case: int, at: int) -> None:
+    good = CASES[case][1]
+    for data in (noise, good[: at % len(good)], good[: at % len(good)] + noise, b"\x20" + noise):
+        try:
+            transaction, content = unpack(data)
+        except PduError:
+            continue
+        assert transaction.number < 1 << 32
+        assert isinstance(content, Content)
+
+
+@pytest.mark.parametrize("kind", [0x24, 0x22, 0x21, 0x00, 0x40])
+def test_units_of_class_1_with_a_crc_of_large_files_and_other_versions_are_refused(kind: int) -> None:
+    with pytest.raises(PduError):
+        unpack(bytes((kind,)) + pack(TRANSACTION, Eof(0, 0, 0))[1:])
+
+
+def test_the_longest_units_fit_into_a_telecommand_frame() -> None:
+    around = HEADER.size + OVERHEAD_BYTES + CRC_BYTES + HEADER_BYTES + SECONDARY_BYTES + CRC_BYTES
+    for content in (FileData(0, bytes(SEGMENT_BYTES)), Nak(0, 1, ((0, 1),) * MOST_REQUESTS)):
+        assert len(pack(TRANSACTION, content)) + around <= LONGEST_FRAME
+
+
+@pytest.mark.parametrize("size", [0, 1, 7, (1 << 20) + 3])
+def test_checksums_are_those_of_the_standard(tmp_path: Path, size: int) -> None:
+    """Sum up words by hand, CCSDS 727.0-B-5 4.2.5; CRC-32 of "123456789" is the published check value."""
+    data = bytes(i * 37 % 256 for i in range(size))
+    path = tmp_path / "file"
+    path.write_bytes(data)
+    padded = data + bytes(-size % 4)
+    words = (int.from_bytes(padded[i : i + 4], "big") for i in range(0, len(padded), 4))
+    assert summed(path, MODULAR, size) == sum(words) % 2**32
+    path.write_bytes(b"123456789")
+    assert summed(path, CRC32, 9) == 0xCBF43926
+
+
+def summed(path: Path, kind: int, size: int) -> int:
+    work = FileSum(path, kind, size)
+    while (value := work.step()) is None:
+        pass
+    return value

@@ -1,0 +1,223 @@
+"""Transfers over a lossy channel, with ends killed and files that must not come."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flight.link.files.checksum import CRC32, MODULAR
+from flight.link.files.entity import GROUND, MOST_OPEN, SATELLITE
+from flight.link.files.pdu import Eof, FileData, Finished, Metadata, Transaction, pack, unpack
+from flight.link.files.ranges import Ranges
+from flight.link.files.store import FileError, Store, problem_of_name
+from tests.flight.link.files.lossy import MOST, Pair
+
+SIZE = 200_001
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "file"
+    path.write_bytes(np.random.default_rng(5).bytes(SIZE))
+    return path
+
+
+@pytest.mark.parametrize("kind", [MODULAR, CRC32])
+@pytest.mark.parametrize("source", [SATELLITE, GROUND])
+@pytest.mark.parametrize("loss", [0.0, 0.1, 0.3])
+def test_a_file_comes_whole_and_is_closed_at_both_ends(
+    tmp_path: Path, file: Path, loss: float, source: int, kind: int
+) -> None:
+    pair = Pair(tmp_path, loss, seed=7)
+    pair.send(source, file, "a/b.bin", kind)
+    pair.until_closed()
+    assert pair.received(SATELLITE + GROUND - source, "a/b.bin") == file.read_bytes()
+    assert [[one.condition for one in pair.ended[end]] for end in (SATELLITE, GROUND)] == [[0], [0]]
+    if not loss:
+        assert pair.carried < SIZE / 900 + 10, "something was sent twice over a channel without loss"
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_ends_that_are_killed_go_on(tmp_path: Path, file: Path, seed: int) -> None:
+    pair, draw = Pair(tmp_path, 0.2, seed), np.random.default_rng(seed)
+    pair.send(SATELLITE, file, "down")
+    pair.send(GROUND, file, "up")
+    for _ in range(30):
+        for _ in range(int(draw.integers(1, 8))):
+            pair.turn(units=4)
+        pair.kill(int(draw.integers(SATELLITE, GROUND + 1)))
+    pair.until_closed()
+    assert pair.received(GROUND, "down") == pair.received(SATELLITE, "up") == file.read_bytes()
+
+
+def test_a_killed_end_asks_again_for_a_second_at_most(tmp_path: Path, file: Path) -> None:
+    pair = Pair(tmp_path, 0.0)
+    pair.send(SATELLITE, file, "down")
+    for _ in range(60):  # 1.2 s
+        pair.turn(units=3)
+    pair.kill(GROUND)
+    (progress,) = pair.ends[GROUND].transfers()
+    assert progress.done >= 45 * 3 * 900
+    before = pair.carried
+    pair.until_closed()
+    assert pair.carried - before < (SIZE - progress.done) / 900 + 20
+
+
+@pytest.mark.parametrize("point", range(2))
+def test_killed_while_a_whole_file_is_placed_it_is_placed_after(
+    tmp_path: Path, file: Path, point: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pair = Pair(tmp_path, 0.0)
+    pair.send(SATELLITE, file, "down")
+    calls = iter(range(point))
+
+    def replace(one: Path, other: Path) -> None:
+        if pair.ends[GROUND].transfers() and "in-" in one.name and next(calls, None) is None:
+            raise KeyboardInterrupt
+        os.rename(one, other)
+
+    monkeypatch.setattr(os, "replace", replace)
+    with pytest.raises(KeyboardInterrupt):
+        pair.until_closed()
+    monkeypatch.undo()
+    pair.kill(GROUND)
+    pair.until_closed()
+    assert pair.received(GROUND, "down") == file.read_bytes()
+
+
+def test_an_eof_that_comes_again_is_acknowledged_again_also_after_the_end(tmp_path: Path, file: Path) -> None:
+    pair = Pair(tmp_path, 0.0)
+    number = pair.send(SATELLITE, file, "down").number
+    pair.until_closed()
+    transaction = Transaction(SATELLITE, number, GROUND)
+    pair.kill(GROUND)
+    pair.ends[GROUND].take(pack(transaction, Eof(0, 1, 2)), 0)
+    answers = [unpack(unit)[1] for unit in iter(lambda: pair.ends[GROUND].unit(0), None)]
+    assert answers[1] == Finished(0, True, 2)
+    assert pair.ends[SATELLITE].unit(0) is None
+    pair.ends[SATELLITE].take(pack(transaction, Finished(0, True, 2)), 0)
+    assert pair.ends[SATELLITE].unit(0) is not None, "a late Finished is not acknowledged"
+
+
+def test_numbers_outlive_a_restart_and_the_loss_of_their_record(tmp_path: Path, file: Path) -> None:
+    one = Store(tmp_path / "s")
+    given = [one.new_number(5 * 10**9), one.new_number(5 * 10**9)]
+    given.append(Store(tmp_path / "s").new_number(0))
+    assert given == [5, 6, 7]
+    (tmp_path / "s" / "transfers" / "numbers.json").write_bytes(b"{")
+    assert Store(tmp_path / "s").new_number(60 * 10**9) == 60
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "",
+        "..",
+        "../a",
+        "a/../b",
+        "/etc/passwd",
+        "a//b",
+        "a\0b",
+        ".bashrc",
+        "a/.b",
+        "a b",
+        "a\n",
+        "x" * 96,
+        "a/b/c/d/e",
+    ],
+)
+def test_names_that_could_leave_the_folder_are_refused(tmp_path: Path, file: Path, name: str) -> None:
+    assert problem_of_name(name)
+    pair = Pair(tmp_path, 0.0)
+    with pytest.raises(FileError):
+        pair.send(GROUND, file, name)
+    transaction = Transaction(GROUND, 9, SATELLITE)
+    pair.ends[SATELLITE].take(pack(transaction, Metadata(3, name, name, CRC32)), 0)
+    pair.ends[SATELLITE].take(pack(transaction, FileData(0, b"abc")), 0)
+    answer = pair.ends[SATELLITE].unit(0)
+    assert answer is not None
+    assert unpack(answer)[1] == Finished(4, False, 1)
+    assert not [path for path in (tmp_path / str(SATELLITE) / "received").rglob("*")]
+
+
+@pytest.mark.parametrize(
+    ("unit", "condition"),
+    [
+        (Metadata(MOST + 1, "a", "a", CRC32), 4),
+        (Metadata(10, "a", "a", 9), 4),
+        (FileData(8, b"abc"), 6),
+        (Eof(0, 0, 11), 6),
+        (Eof(15, 0, 0), 15),
+    ],
+)
+def test_what_is_wrong_with_a_file_ends_its_transfer(
+    tmp_path: Path, unit: Metadata | FileData | Eof, condition: int
+) -> None:
+    pair, transaction = Pair(tmp_path, 0.0), Transaction(GROUND, 9, SATELLITE)
+    end = pair.ends[SATELLITE]
+    if not isinstance(unit, Metadata):
+        end.take(pack(transaction, Metadata(10, "a", "a", CRC32)), 0)
+    end.take(pack(transaction, unit), 0)
+    answers = [unpack(answer)[1] for answer in iter(lambda: end.unit(0), None)]
+    assert [one.condition for one in answers if isinstance(one, Finished)] == [condition]
+
+
+def test_a_wrong_checksum_and_a_full_disk_are_reported_and_nothing_is_kept(
+    tmp_path: Path, file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pair = Pair(tmp_path, 0.0)
+    pair.send(SATELLITE, file, "down")
+    pair.turn(units=50)
+    file.write_bytes(bytes(SIZE))
+    pair.until_closed()
+    assert [one.condition for one in pair.ended[SATELLITE]] == [5]
+    monkeypatch.setattr(Store, "room", lambda _: SIZE - 1)
+    pair.send(SATELLITE, file, "again")
+    pair.until_closed()
+    assert [one.condition for one in pair.ended[GROUND]] == [5, 4]
+    folder = pair.store(GROUND)
+    assert not folder.incoming()
+    assert not [path for path in folder.received.rglob("*") if path.is_file()]
+
+
+def test_a_file_that_shrinks_or_is_cancelled_ends_at_both_ends(tmp_path: Path, file: Path) -> None:
+    pair = Pair(tmp_path, 0.3, seed=1)
+    pair.send(SATELLITE, file, "shrinks")
+    cancelled = pair.send(GROUND, file, "cancelled")
+    pair.turn()
+    os.truncate(file, 10_000)
+    pair.ends[SATELLITE].cancel(GROUND, cancelled.number)
+    pair.until_closed()
+    assert {one.name: one.condition for one in pair.ended[SATELLITE]} == {"shrinks": 4, "cancelled": 15}
+    assert {one.name: one.condition for one in pair.ended[GROUND]} == {"shrinks": 4, "cancelled": 15}
+    with pytest.raises(FileError, match="no transfer"):
+        pair.ends[SATELLITE].cancel(1, 1)
+
+
+def test_the_same_file_asked_for_again_goes_on_and_a_ninth_is_refused(tmp_path: Path, file: Path) -> None:
+    pair = Pair(tmp_path, 0.0)
+    first = pair.send(SATELLITE, file, "a")
+    assert pair.send(SATELLITE, file, "a").number == first.number
+    for i in range(MOST_OPEN - 1):
+        pair.send(SATELLITE, file, f"a{i}")
+    with pytest.raises(FileError, match="cancel one"):
+        pair.send(SATELLITE, file, "b")
+
+
+def test_ranges_against_a_set_of_bytes() -> None:
+    draw = np.random.default_rng(1)
+    for _ in range(50):
+        ranges, known = Ranges(), set[int]()
+        for begin, length in draw.integers(0, 20, (12, 2)).tolist():
+            ranges.add(begin, begin + length)
+            known |= set(range(begin, begin + length))
+            assert ranges.total == len(known)
+            missing = {n for pair in ranges.gaps(25) for n in range(*pair)}
+            assert missing == set(range(25)) - known
+        taken = set[int]()
+        while ranges:
+            taken |= set(range(*ranges.take(3)))
+        assert taken == known

@@ -1,0 +1,156 @@
+"""Files through the whole link: commanded, sent in protected frames both ways, chosen by their SHA-256."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flight.link.commands.codec import CommandPacker
+from flight.link.commands.values import Ping
+from flight.link.files.packets import UP, UnitPacker
+from flight.link.process import directives, filing
+from flight.link.process.downlink import FILES, LIVE
+from flight.link.process.file_directives import CancelFile, DeleteFile, ListFiles, SendFile, UseFile
+from flight.link.process.filing import LISTING
+from flight.link.telemetry.link_definitions import TRANSFER
+from flight.link.telemetry.packets import LAYOUTS
+from tests.flight.link.process.filed_ends import FiledEnds
+from tests.flight.link.telemetry.samples import timing_packets
+
+
+@pytest.fixture
+def link(tmp_path: Path) -> Iterator[FiledEnds]:
+    both = FiledEnds(tmp_path)
+    yield both
+    both.close()
+
+
+def config(link: FiledEnds, data: bytes = b"name: x\n") -> Path:
+    path = link.place / "flight.yaml"
+    path.write_bytes(data)
+    return path
+
+
+def test_the_log_comes_down_by_the_name_that_the_list_has(link: FiledEnds) -> None:
+    link.record(*timing_packets(500))
+    link.ask(ListFiles())
+    link.until_closed()
+    listing = json.loads((link.session.received / LISTING).read_bytes())
+    (name,) = (file["name"] for file in listing["files"])
+    assert name == "log/run-000001/flight-0001.ccsds"
+    link.ask(SendFile(name))
+    link.until_closed()
+    log = link.place / "runs" / "run-000001" / "flight-0001.ccsds"
+    assert (link.session.received / name).read_bytes() == log.read_bytes()
+    assert [report.stage.name for report in link.session.reports()][-3:] == [
+        "ACCEPTED",
+        "STARTED",
+        "COMPLETED",
+    ]
+    (row,) = LAYOUTS[TRANSFER.name].array(link.of(TRANSFER.name)[-1])
+    assert (row["down"], row["open"], row["condition"], row["done"]) == (1, 0, 0, row["size"])
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.3])
+def test_a_file_goes_up_through_losses_and_restarts_and_waits_to_be_chosen(
+    tmp_path: Path, loss: float
+) -> None:
+    link = FiledEnds(tmp_path, loss=loss)
+    path = config(link, np.random.default_rng(2).bytes(60_000))
+    link.session.put(path, "configuration/flight.yaml", link.clock.now_ns())
+    for _ in range(4):
+        link.turn(0.2)
+        link.restart()
+    link.until_closed()
+    came = link.place / "keys" / "files" / "received" / "configuration" / "flight.yaml"
+    chosen = link.place / "keys" / "files" / "chosen" / "configuration"
+    assert came.read_bytes() == path.read_bytes()
+    assert not chosen.exists(), "a file was chosen by its arrival"
+    assert link.obeyed == []
+    name = "received/configuration/flight.yaml"
+    assert "SHA-256" in link.command(UseFile(name, bytes(32)))
+    assert link.command(UseFile(name, hashlib.sha256(path.read_bytes()).digest())) == "completed"
+    assert [one.read_bytes() for one in chosen.iterdir()] == [path.read_bytes()]
+    assert link.command(DeleteFile(name)) == "completed"
+    assert not came.exists()
+    assert (chosen / "flight.yaml").exists()
+    link.close()
+
+
+def test_the_last_chosen_of_a_kind_stands_alone(link: FiledEnds) -> None:
+    folder = link.place / "keys" / "files"
+    for name in ("a.tle", "b.tle"):
+        (folder / "received" / "elements").mkdir(exist_ok=True)
+        (folder / "received" / "elements" / name).write_bytes(name.encode())
+        wanted = hashlib.sha256(name.encode()).digest()
+        assert link.command(UseFile(f"received/elements/{name}", wanted)) == "completed"
+    assert [path.name for path in (folder / "chosen" / "elements").iterdir()] == ["b.tle"]
+    assert [path.name for path in (folder / "received" / "elements").iterdir()] != ["b.tle"]
+
+
+@pytest.mark.parametrize(
+    "name", ["log/../../keys/satellite/1.a", "keys/1.a", "/etc/passwd", "log/link", "log", "received/none"]
+)
+def test_nothing_outside_the_two_folders_comes_down_or_is_deleted(link: FiledEnds, name: str) -> None:
+    (link.place / "secret").write_text("x")
+    (link.place / "runs" / "link").symlink_to(link.place / "secret")
+    assert "such file" in (said := link.command(SendFile(name))) or "name" in said
+    assert link.command(DeleteFile(name)) != "completed"
+    assert (link.place / "secret").exists()
+
+
+@pytest.mark.parametrize("name", ["flight.yaml", "secret/x", "configuration/a/b", "configuration"])
+def test_only_known_kinds_come_up(link: FiledEnds, name: str) -> None:
+    link.session.put(config(link), name, link.clock.now_ns())
+    link.until_closed()
+    (ended,) = link.ended
+    assert ended.condition == 4
+    assert "KIND/NAME" in link.session.said_of(ended)
+
+
+def test_what_came_has_a_limit(link: FiledEnds, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(filing, "MOST_RECEIVED", 5)
+    link.session.put(config(link), "configuration/a", link.clock.now_ns())
+    link.until_closed()
+    assert "delete what is not needed" in link.session.said_of(link.ended[0])
+
+
+def test_wrong_units_are_refused_in_words_and_unknown_transfers_reported(link: FiledEnds) -> None:
+    counter = link.terminal.send(UnitPacker(UP).pack(b"no unit", 1))
+    link.turn()
+    assert link.stages(counter) == ["refused"]
+    assert "no transfer 7" in link.command(CancelFile(1, 7))
+
+
+def test_verification_and_live_telemetry_come_before_a_file(tmp_path: Path) -> None:
+    link = FiledEnds(tmp_path, rate=6000.0)
+    link.record(*timing_packets(2000))
+    link.turn(5.0)
+    link.ask(SendFile("log/run-000001/flight-0001.ccsds"))
+    link.turn(2.0)
+    before = len(link.packets)
+    sent = timing_packets(100)
+    link.record(*sent[:50])
+    counter = link.terminal.send(CommandPacker().pack(Ping(1), link.clock.utc_ns()))
+    link.turn(2.0)
+    newer = link.packets[before:]
+    assert link.stages(counter) == ["accepted", "started", "completed"]
+    assert [one for channel, one in newer if channel == LIVE and one in sent] == sent[:50]
+    assert sum(channel == FILES for channel, _ in newer) > 3, "the file stands still"
+    link.close()
+
+
+def test_directives_survive_their_bytes() -> None:
+    for directive in (
+        ListFiles("log/"),
+        SendFile("log/a", 3),
+        CancelFile(2, 7),
+        UseFile("received/a/b", bytes(range(32))),
+        DeleteFile("received/a/b"),
+    ):
+        assert directives.unpack(directives.pack(directive, 1)) == directive

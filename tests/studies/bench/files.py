@@ -1,0 +1,82 @@
+"""A file through the link at losses: `python -m tests.studies.bench files [--megabytes M] [--seed S]`.
+
+Link process and ground in one process, in protected frames, on a clock that is moved; frames are lost at
+random in both directions alike. Stated are for each loss and direction whether the file came whole and both
+ends closed, and seconds of that clock and of the processor.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flight.link.process.file_directives import SendFile
+from tests.flight.link.process.filed_ends import FiledEnds
+
+_LOSSES = (0.0, 0.1, 0.3)
+_RATE = 250_000.0
+"""Bytes/s of frames, both ways."""
+_LONGEST_NS = 7200 * 10**9
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Transfer all, print; return 0 when all came whole."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--megabytes", type=float, default=10.0, metavar="M", help="of the file (default 10)")
+    parser.add_argument("--seed", type=int, default=1, metavar="S")
+    options = parser.parse_args(arguments)
+    sound = True
+    for loss in _LOSSES:
+        for down in (True, False):
+            with tempfile.TemporaryDirectory(prefix="knightcube-") as place:
+                size = round(options.megabytes * 1e6)
+                facts = measure(Path(place), size, loss, options.seed, down=down)
+            sound &= facts["whole"] and facts["closed"]
+            sys.stdout.write(json.dumps(facts) + "\n")
+            sys.stdout.flush()
+    return 0 if sound else 1
+
+
+def measure(place: Path, size: int, loss: float, seed: int, *, down: bool) -> dict[str, Any]:
+    """Transfer one file; return what came of it."""
+    data = np.random.default_rng(seed).bytes(size)
+    link = FiledEnds(place, rate=_RATE, loss=loss, up_rate=_RATE, seed=seed)
+    begun, begun_ns = time.process_time(), link.clock.now_ns()
+    if down:
+        name = "log/run-000001/dump.bin"
+        (place / "runs" / "run-000001" / "dump.bin").write_bytes(data)
+        link.ask(SendFile(name))
+        arrived = link.session.received / name
+    else:
+        path = place / "release.whl"
+        path.write_bytes(data)
+        link.session.put(path, "release/release.whl", link.clock.now_ns())
+        arrived = place / "keys" / "files" / "received" / "release" / "release.whl"
+    while not link.ended and link.clock.now_ns() - begun_ns < _LONGEST_NS:
+        link.turn(1.0)
+    link.until_closed()
+    link.close()
+    came = arrived.read_bytes() if arrived.exists() else b""
+    whole = hashlib.sha256(came).digest() == hashlib.sha256(data).digest()
+    return {
+        "direction": "down" if down else "up",
+        "loss": loss,
+        "bytes": size,
+        "whole": whole,
+        "closed": [one.condition for one in link.ended] == [0] and not link.station.transfers,
+        "seconds": round((link.clock.now_ns() - begun_ns) * 1e-9, 1),
+        "processor_seconds": round(time.process_time() - begun, 1),
+    }
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,142 @@
+"""Files between Yamcs's CFDP service and the satellite, through link and gateway, at losses.
+
+`python -m tests.studies.interop.files FOLDER [--megabytes M] [--loss P ...] [--seed S]` opens link, gateway
+and Yamcs, each a process of its own, with a relay between link and gateway that loses frames of both
+directions. A file is commanded down and another is sent up by Yamcs. One JSON line of each loss: whether both
+came whole by SHA-256 and were closed at both ends, and seconds. Exit status 1 where not. Skips loudly without
+Java or the bundle.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ground.link.keys import make_keys
+from ground.yamcs import CFDP, DOWN_BUCKET, INSTANCE, UP_BUCKET, write
+from tests.studies.bench.flooded_flight import free_port as free_udp_port
+from tests.studies.interop.linked_flight import free_port, service
+from tests.studies.interop.lossy_relay import lossy_relay
+from tests.studies.interop.yamcs_server import Yamcs, missing, serving
+
+_CONFIG = Path(__file__).resolve().parents[3] / "config" / "step_demo.yaml"
+_RATE = 200_000
+_LONGEST_S = 1800.0
+_ASK_S = 10.0
+_RUN = "run-000001"
+_NAME = "dump.bin"
+
+
+def transfer(place: Path, size: int, loss: float, seed: int) -> dict[str, Any]:
+    """Transfer a file each way; return what came of it."""
+    data = np.random.default_rng(seed).bytes(size)
+    (place / "runs" / _RUN).mkdir(parents=True)
+    (place / "runs" / _RUN / _NAME).write_bytes(data)
+    http = free_port()
+    with _opened(place, loss, seed) as gateway:
+        folder = place / "yamcs"
+        write(folder, gateway, http)
+        with serving(folder, http) as server:
+            _until(server.link_up, 60.0)
+            down = _down(server, place, hashlib.sha256(data).digest())
+            up = _up(server, place, data)
+            states = sorted(one["state"] for one in _transfers(server))
+    left = sorted(path.name for path in (place / "keys" / "files" / "transfers").glob("*-*.json"))
+    closed = states == ["COMPLETED", "COMPLETED"] and not left
+    return {"loss": loss, "bytes": size, **down, **up, "closed": closed, "states": states, "open": left}
+
+
+def _down(server: Yamcs, place: Path, wanted: bytes) -> dict[str, Any]:
+    """Command the file down, again while nothing begins; return whether and when it is there."""
+    begun = time.monotonic()
+    while time.monotonic() - begun < _LONGEST_S and not any(map(_is_download, _transfers(server))):
+        server.command("send-file", {"entity": "another-ground-station", "name": f"log/{_RUN}/{_NAME}"})
+        _until(lambda: any(map(_is_download, _transfers(server))), _ASK_S)
+    _until(lambda: all(one["state"] == "COMPLETED" for one in _transfers(server)), _LONGEST_S)
+    seconds = round(time.monotonic() - begun, 1)
+    came = place / "yamcs" / DOWN_BUCKET
+    _until(lambda: bool(list(came.iterdir())), _ASK_S)  # Yamcs stores a completed file beside
+    sums = [hashlib.sha256(path.read_bytes()).digest() for path in came.iterdir()]
+    return {"down_whole": sums == [wanted], "down_seconds": seconds}
+
+
+def _up(server: Yamcs, place: Path, data: bytes) -> dict[str, Any]:
+    """Have Yamcs send a file up; return whether and when it is there."""
+    begun = time.monotonic()
+    (place / "yamcs" / UP_BUCKET / "release.whl").write_bytes(data)
+    request = {"direction": "UPLOAD", "bucket": UP_BUCKET, "objectName": "release.whl"}
+    request |= {"remotePath": "release/release.whl", "source": "ground", "destination": "satellite"}
+    server.ask(f"/filetransfer/{INSTANCE}/{CFDP}/transfers", {**request, "options": {"reliable": True}})
+    _until(lambda: all(one["state"] in {"COMPLETED", "FAILED"} for one in _transfers(server)), _LONGEST_S)
+    arrived = place / "keys" / "files" / "received" / "release" / "release.whl"
+    whole = arrived.exists() and arrived.read_bytes() == data
+    _until(lambda: not list((place / "keys" / "files" / "transfers").glob("in-*.json")), 120.0)
+    return {"up_whole": whole, "up_seconds": round(time.monotonic() - begun, 1)}
+
+
+def _transfers(server: Yamcs) -> list[dict[str, Any]]:
+    found = server.ask(f"/filetransfer/{INSTANCE}/{CFDP}/transfers")
+    return list(found.get("transfers", []))
+
+
+def _is_download(one: dict[str, Any]) -> bool:
+    return bool(one["direction"] == "DOWNLOAD")
+
+
+@contextmanager
+def _opened(place: Path, loss: float, seed: int) -> Iterator[str]:
+    """Open link, relay and gateway; yield the gateway's address."""
+    satellite, ground = make_keys(place / "keys")
+    port, gateway = free_udp_port(), f"127.0.0.1:{free_port()}"
+    section = {"keys": str(satellite), "udp": f"127.0.0.1:{port}", "rate": _RATE}
+    config = place / "flight.yaml"
+    commands = json.dumps({"socket": str(place / "commands")})
+    config.write_text(f"{_CONFIG.read_text()}\ncommands: {commands}\nlink: {json.dumps(section)}\n")
+    log = place / "log"
+    with ExitStack() as stack:
+        stack.enter_context(service(log, "link open", "link", config, "--log", place / "runs"))
+        way = stack.enter_context(lossy_relay(f"127.0.0.1:{port}", loss, seed))
+        words = ["gateway", "--link", way, "--keys", ground, "--serve", gateway]
+        stack.enter_context(service(log, "packets on", *words))
+        yield gateway
+
+
+def _until(done: Callable[[], bool], seconds: float) -> None:
+    until = time.monotonic() + seconds
+    while not done() and time.monotonic() < until:
+        time.sleep(0.3)
+
+
+def main() -> int:
+    """Transfer at each loss, print."""
+    parser = argparse.ArgumentParser(prog="python -m tests.studies.interop.files", description=__doc__)
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="for all that is written; new")
+    parser.add_argument("--megabytes", type=float, default=10.0, metavar="M", help="of each file")
+    parser.add_argument("--loss", type=float, nargs="+", default=[0.0, 0.1, 0.3], metavar="P")
+    parser.add_argument("--seed", type=int, default=1, metavar="S")
+    options = parser.parse_args()
+    if problem := missing():
+        sys.stdout.write(f"SKIPPED: {problem}\n")
+        return 0
+    sound = True
+    for loss in options.loss:
+        place = options.folder.absolute() / f"loss-{loss:g}"
+        place.mkdir(parents=True)
+        facts = transfer(place, round(options.megabytes * 1e6), loss, options.seed)
+        sys.stdout.write(json.dumps(facts) + "\n")
+        sys.stdout.flush()
+        sound &= facts["down_whole"] and facts["up_whole"] and facts["closed"]
+    return 0 if sound else 1
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
