@@ -73,6 +73,8 @@ def _check_orbit(config: OrbitConfig, refuse: Refuse) -> None:
     _check_order("targets", times, refuse)
     for index, step in enumerate(config.targets):
         check_aim(f"targets[{index}]", step, step.point, refuse)
+        if step.point == "object" and not config.looks_for_objects():
+            refuse(f"targets[{index}].point", "is object: needs `camera` with `star_tracker` and `objects`")
     axes = (config.pointing.axis, config.pointing.across)
     for name, axis in zip(("axis", "across"), axes, strict=True):
         if abs(math.hypot(*axis) - 1.0) > 1e-6:

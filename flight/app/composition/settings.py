@@ -56,6 +56,7 @@ def imaging_settings(camera: Camera, body: Body, frames: Path | None) -> Imaging
         velocity=body.velocity,
         objects=None if camera.objects is None else SightSettings(faintest=camera.objects.faintest),
         knowledge=body.knowledge,
+        seeks=body.seeks,
         kept=kept,
     )
 

@@ -40,7 +40,8 @@ class ImagingSettings:
 
     Attributes:
         exposures: how long to expose at a rate.
-        fine_rest_ns: while the attitude is fine no exposure begins sooner after the last.
+        fine_rest_ns: while the attitude is fine no exposure begins sooner after the last, but where
+        seeks: returns that an object is looked for.
         late_ns: age after the exposure from which a frame is late.
         max_rate: rad/s of the body, beyond which no exposure is begun.
         slow_ns: processing time from which vision is slow.
@@ -65,6 +66,7 @@ class ImagingSettings:
     angular_acceleration_psd: float
     velocity: Callable[[int], FloatArray | None]
     knowledge: Callable[[], Knowledge]
+    seeks: Callable[[], bool]
     objects: SightSettings | None = None
     kept: KeptFrames | None = None
 

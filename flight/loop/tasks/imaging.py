@@ -83,7 +83,8 @@ class Imaging:
             self._streams.note("camera", cycle.start_ns)  # it rests on purpose
             return
         rested_ns = cycle.start_ns - self._triggered_ns
-        if rested_ns < self._settings.fine_rest_ns and self._settings.knowledge() is Knowledge.FINE:
+        fine = self._settings.knowledge() is Knowledge.FINE and not self._settings.seeks()
+        if rested_ns < self._settings.fine_rest_ns and fine:
             return
         self._triggered_ns = cycle.start_ns
         exposure_ns = self._measurer.exposure_ns(cycle.start_ns)
