@@ -7,7 +7,7 @@ TESTS  := $(RUN) -m pytest -n auto
 # The tests start hundreds of processes: without kept bytecode each would compile every module again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo orbit orbit-3u console quick test test-container lint types arrows docs house unit fast slow-list pictures lock clean help
+.PHONY: demo orbit orbit-3u object console quick test test-container lint types arrows docs house unit fast slow-list pictures lock clean help
 
 help:           ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
@@ -32,6 +32,11 @@ orbit-3u: $(READY) ## the same with a 3U, for two and a half hours of flight
 	@rm -rf runs/orbit_3u
 	$(RUN) -m flight run config/orbit_3u.yaml --out runs/orbit_3u
 	$(RUN) -m flight report runs/orbit_3u
+
+object: $(READY) ## a 3U finds an object that passes, follows it, and determines its orbit: two and a half minutes of flight
+	@rm -rf runs/object
+	$(RUN) -m flight run config/orbit_object.yaml --out runs/object
+	$(RUN) -m flight orbit runs/object --opm runs/object/orbits
 
 console: $(READY) ## the demonstration flying in real time in the browser, with forms to command it
 	@rm -rf runs/console

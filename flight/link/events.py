@@ -206,6 +206,11 @@ OBJECT_LOST = EventKind(
     121, "object-lost", _TOLD, "the track of an object ended: it was not seen for too long"
 )
 
+OBJECT_FOLLOWED = EventKind(122, "object-followed", _TOLD, "the star camera's boresight follows an object")
+OBJECT_ESCAPES = EventKind(
+    123, "object-escapes", _WARNED, "the coils' torque does not suffice to keep an object in the field"
+)
+
 EVENTS: tuple[EventKind, ...] = tuple(
     value for value in dict(vars()).values() if isinstance(value, EventKind)
 )

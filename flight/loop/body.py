@@ -11,10 +11,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from flight.gnc.earth.orbit_knowledge import OrbitState
 from flight.gnc.estimation.estimate import Estimate, Knowledge
 from flight.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement, Measurement
 from flight.gnc.guidance.three_axes.pointing_target import PointingTarget
 from flight.gnc.math.arrays import FloatArray, IntArray
+from flight.gnc.tracking.tracker import Track
 from flight.link.modes import Mode
 from flight.loop.control_output import CoilCommand, ControlOutput, Target
 from flight.loop.executive.jobs import JobResult
@@ -221,6 +223,9 @@ class Body:
         velocity: returns the velocity (3,) m/s about the Sun at a time, reference axes, by which starlight is
             aberrated; None where the configured one holds.
         fix: accepts a valid GPS reading; returns whether the body uses it.
+        sighted: accepts the confirmed tracks of objects after each frame that was searched, at a time.
+        place: returns the orbit's state at a time, None while it is not known.
+        seeks: returns whether an object is looked for or followed, so that no frame is left out.
         sun: accepts a reading of the solar strings; returns why it shows no Sun, empty where it does, None
             where it is not judged.
     """
@@ -244,6 +249,9 @@ class Body:
     velocity: Callable[[int], FloatArray | None] = lambda _: None
     fix: Callable[[GpsReading], bool] = lambda _: False
     sun: Callable[[StringReading], str | None] = lambda _: None
+    sighted: Callable[[Sequence[Track], int], None] = lambda _tracks, _now_ns: None
+    place: Callable[[int], OrbitState | None] = lambda _: None
+    seeks: Callable[[], bool] = lambda: False
 
 
 @dataclass(frozen=True, slots=True)

@@ -73,6 +73,8 @@ def _check_orbit(config: OrbitConfig, refuse: Refuse) -> None:
     _check_order("targets", times, refuse)
     for index, step in enumerate(config.targets):
         check_aim(f"targets[{index}]", step, step.point, refuse)
+        if step.point == "object" and not config.looks_for_objects():
+            refuse(f"targets[{index}].point", "is object: needs `camera` with `star_tracker` and `objects`")
     axes = (config.pointing.axis, config.pointing.across)
     for name, axis in zip(("axis", "across"), axes, strict=True):
         if abs(math.hypot(*axis) - 1.0) > 1e-6:
@@ -162,6 +164,10 @@ def _check_link(link: Link, commands: Commands, refuse: Refuse) -> None:
 def _check_camera(camera: Camera, refuse: Refuse) -> None:
     if camera.exposure >= camera.period:
         refuse("camera.exposure", "must be shorter than `camera.period`")
+    if camera.streak_exposure is not None:
+        least, most = camera.streak_exposure
+        if not least <= most < camera.period:
+            refuse("camera.streak_exposure", "must rise, and stay below `camera.period`")
     if camera.objects is not None:
         if camera.star_tracker is None:
             refuse(

@@ -128,6 +128,11 @@ class OrbitConfig(Config, frozen=True, kw_only=True):
     targets: Annotated[tuple[TargetStep, ...], Meta(min_length=1)] = (TargetStep(at=0.0, point="nadir"),)
     requirements: Requirements = Requirements()
 
+    def looks_for_objects(self) -> bool:
+        """Return whether the star camera finds moving objects."""
+        camera = self.camera
+        return camera is not None and camera.star_tracker is not None and camera.objects is not None
+
     def field_range(self) -> tuple[float, float]:
         """Return the smallest and the largest strength of a valid magnetometer reading, T."""
         return LEAST_FIELD, LARGEST_FIELD

@@ -10,6 +10,7 @@ COMMANDS = {
     "console": "show a flight in the browser, live or replayed, and command it",
     "report": "report the performance of a run",
     "export": "write a run's packets as CSV, Parquet or SQLite",
+    "orbit": "determine first orbits of the objects that a flight tracked",
     "plan": "plan a single slew",
     "identify": "identify the body's constants from a short flight",
     "rate": "estimate the body rate from a picture of star streaks",

@@ -83,10 +83,13 @@ def _add_argument(parser: argparse.ArgumentParser, field: Field, optional: bool)
 def _configure_point(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Point to nadir, velocity or sun; to inertial QX QY QZ QW, an attitude ICRS into body, scalar last; "
-        f"or to ground LAT LON, degrees. Hazard: {POINT.hazard}."
+        "to ground LAT LON, degrees; or to object, the moving object that the star camera finds where it "
+        f"looks, or near RA DEC, degrees. Hazard: {POINT.hazard}."
     )
     parser.add_argument("goal", choices=[goal.label for goal in Goal])
-    parser.add_argument("numbers", type=float, nargs="*", metavar="NUMBER", help="of inertial and ground")
+    parser.add_argument(
+        "numbers", type=float, nargs="*", metavar="NUMBER", help="of inertial, ground and object"
+    )
     parser.add_argument("--roll", type=float, metavar="DEG", help="about the pointing axis (default free)")
 
 
@@ -233,5 +236,5 @@ def _command_of(options: argparse.Namespace) -> Command:
 def _target_of(options: argparse.Namespace) -> PointingTarget:
     """Return the target of the words of `point`. Raises UsageError."""
     goal = Goal.named(options.goal)
-    numbers = options.numbers if goal is not Goal.GROUND else map(math.radians, options.numbers)
+    numbers = options.numbers if goal is Goal.INERTIAL else map(math.radians, options.numbers)
     return PointingTarget(goal, tuple(numbers), None if options.roll is None else math.radians(options.roll))

@@ -154,7 +154,9 @@ def _target(option: str, text: str) -> PointingTarget:
     words = text.split()
     try:
         goal = Goal.named(words[0] if words else "")
-        split = 1 + NUMBERS.get(goal, 0)
+        if goal is Goal.OBJECT:
+            raise UsageError("an object is found in flight: no slew can be planned to it")
+        split = 1 + NUMBERS.get(goal, (0,))[-1]
         numbers, rest = [finite(word) for word in words[1:split]], words[split:]
         roll = math.radians(finite(rest[1])) if len(rest) == 2 and rest[0] == "roll" else None
         if rest and roll is None:

@@ -18,7 +18,7 @@ from flight.link.telemetry.packets import PacketArray
 from ground.telemetry.reader import Run
 
 _ARCSECONDS = math.degrees(3600.0)
-_ORIGINATOR = "KNIGHTCUBE"
+ORIGINATOR = "KNIGHTCUBE"
 _SECOND_NS = 1_000_000_000
 
 
@@ -34,8 +34,8 @@ def write_tracking_data(run: Run, path: Path, now: datetime | None = None) -> li
     start_ns = int(run["run"]["utc_ns"][-1])
     lines = [
         "CCSDS_TDM_VERS = 2.0",
-        f"CREATION_DATE = {_date(round((now or datetime.now(UTC)).timestamp() * 1e9))}",
-        f"ORIGINATOR = {_ORIGINATOR}",
+        f"CREATION_DATE = {ccsds_date(round((now or datetime.now(UTC)).timestamp() * 1e9))}",
+        f"ORIGINATOR = {ORIGINATOR}",
     ]
     for number in sorted(set(measured["number"].tolist())):
         lines += _segment(number, measured[measured["number"] == number], start_ns)
@@ -49,7 +49,7 @@ def write_tracking_data(run: Run, path: Path, now: datetime | None = None) -> li
 
 def _segment(number: int, track: PacketArray, start_ns: int) -> list[str]:
     """Return the lines of one object's segment."""
-    dates = [_date(start_ns + int(time)) for time in track["middle_ns"]]
+    dates = [ccsds_date(start_ns + int(time)) for time in track["middle_ns"]]
     sigma = track["measured_sigma"] * _ARCSECONDS
     lines = [
         "",
@@ -60,7 +60,7 @@ def _segment(number: int, track: PacketArray, start_ns: int) -> list[str]:
         "TIME_SYSTEM = UTC",
         f"START_TIME = {dates[0]}",
         f"STOP_TIME = {dates[-1]}",
-        f"PARTICIPANT_1 = {_ORIGINATOR}",
+        f"PARTICIPANT_1 = {ORIGINATOR}",
         f"PARTICIPANT_2 = OBJECT-{number}",
         "MODE = SEQUENTIAL",
         "PATH = 2,1",
@@ -80,7 +80,7 @@ def _segment(number: int, track: PacketArray, start_ns: int) -> list[str]:
     return [*lines, "DATA_STOP"]
 
 
-def _date(utc_ns: int) -> str:
+def ccsds_date(utc_ns: int) -> str:
     """Return a time in ns since 1970 as CCSDS writes it, to the microsecond."""
     seconds, rest = divmod(utc_ns, _SECOND_NS)
     return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{rest // 1000:06d}"

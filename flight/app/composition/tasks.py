@@ -139,5 +139,5 @@ def _imaging(
         return None
     settings = imaging_settings(camera, body, opened.frames)
     section = camera.objects
-    objects = None if section is None else ObjectTracking(track_settings(section), services)
+    objects = None if section is None else ObjectTracking(track_settings(section), body, services)
     return Imaging(source, settings, navigation, body.view, services, objects)

@@ -5,6 +5,7 @@ It detumbles by its magnetometer, acquires its attitude with its coils at rest, 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 
 import numpy as np
@@ -13,6 +14,7 @@ from flight.bodies.orbit.brake import FieldBrake
 from flight.bodies.orbit.coarse_sun import CoarseSunFeed
 from flight.bodies.orbit.feed import OrbitFeed
 from flight.bodies.orbit.filter import OrbitFilter
+from flight.bodies.orbit.object_aim import ObjectAim, Sensor
 from flight.bodies.orbit.paths import PointingPaths
 from flight.bodies.orbit.planning import PlannedCraft, PointingPlanner
 from flight.bodies.orbit.replay import OrbitFilterSettings
@@ -41,6 +43,7 @@ from flight.loop.fdir.coils.response import ResponseSettings
 from flight.loop.fdir.coils.watch import CoilWatch, CoilWatchSettings
 from flight.loop.services import Services
 from flight.loop.state.content import Learned
+from flight.schema.camera_model import camera_model
 from flight.schema.errors import ConfigError
 from flight.schema.orbit import OrbitConfig, as_orbit
 from flight.schema.sections import Config
@@ -59,6 +62,7 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
     limit, dipole_per_ampere = _limit(config), config.craft.dipole_per_ampere
     brake = FieldBrake(_detumbler(config), dipole_per_ampere)
     paths = PointingPaths(limit, fastest_rate(config))
+    objects = ObjectAim(_sensor(config), _limit(config), services.events)
 
     def field(estimate: Estimate) -> FloatArray:
         around = surroundings.at(estimate.time_ns)
@@ -72,8 +76,8 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
         filter=filter_,
         learned_problems=[],
         paths=paths,
-        planner=PointingPlanner(_planned(config), paths, surroundings, disturbed, services),
-        targets=PointingTargets(_timed(config), paths),
+        planner=PointingPlanner(_planned(config), paths, surroundings, disturbed, objects, services),
+        targets=PointingTargets(_timed(config), paths, config.looks_for_objects()),
         tracker=PointingTracker(filter_, surroundings, _pauses(config), limit, dipole_per_ampere),
         feed=OrbitFeed(filter_),
         brake=brake,
@@ -87,6 +91,9 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
         velocity=surroundings.velocity,
         fix=surroundings.fix,
         sun=_sun(config, filter_, surroundings),
+        sighted=objects.accept,
+        place=surroundings.state,
+        seeks=lambda: objects.seeks,
     )
 
 
@@ -120,6 +127,16 @@ def _slew(config: OrbitConfig) -> SlewWish:
     boresight = section.axis if camera is None else attitude_matrix(np.array(camera.mounting))[2]
     heat = np.array(config.coils.resistance) / config.craft.dipole_per_ampere**2
     return SlewWish(section.slew, heat, np.zeros(3), np.array(boresight), section.cones.angles())
+
+
+def _sensor(config: OrbitConfig) -> Sensor | None:
+    """Return boresight and field of the star camera, None without one that looks for objects."""
+    camera = config.camera
+    if camera is None or not config.looks_for_objects():
+        return None
+    model = camera_model(camera)
+    half = math.atan(0.5 * min(camera.columns, camera.rows) / model.focal_length)
+    return Sensor(attitude_matrix(np.array(camera.mounting))[2], half)
 
 
 def fastest_rate(config: OrbitConfig) -> float:

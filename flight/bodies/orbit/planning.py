@@ -12,10 +12,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from flight.bodies.orbit.object_aim import ObjectAim
 from flight.bodies.orbit.paths import PointingPaths
 from flight.bodies.orbit.surroundings import Surroundings
 from flight.bodies.orbit.targets import target_of
-from flight.gnc.control.three_axes.pointing_job import PointingJob
+from flight.gnc.control.three_axes.pointing_job import STEADY, PointingJob
 from flight.gnc.control.three_axes.pointing_table import PointingWeights
 from flight.gnc.control.three_axes.slew_table import SlewWish
 from flight.gnc.estimation.estimate import Estimate
@@ -58,11 +59,12 @@ class PointingPlanner:
         paths: PointingPaths,
         surroundings: Surroundings,
         disturbed: Callable[[], tuple[FloatArray, FloatArray]],
+        objects: ObjectAim,
         services: Services,
     ) -> None:
         """`disturbed` returns what is estimated now: torques (9,) N m and residual dipole (3,) A m^2."""
         self._craft, self._paths, self._surroundings = craft, paths, surroundings
-        self._disturbed = disturbed
+        self._disturbed, self._objects = disturbed, objects
         self._jobs, self._events = services.jobs, services.events
         self._job: PointingJob | None = None
         self._wanted = False
@@ -91,13 +93,14 @@ class PointingPlanner:
     def serve(self, estimate: Estimate | None, target: Target, now_ns: int) -> None:
         """Submit the requested job to the worker."""
         goal, astray = target_of(target), self._paths.off > ASTRAY
+        self._objects.aim(goal)
         if self._paths.is_slewing(now_ns, goal) and not astray:
             return  # the rest of a slew planned again costs many times its heat
         if self._paths.has_arrived(now_ns):
             text = f"{math.degrees(self._paths.off):.2f} deg off its path"
             self._events.report(events.SLEW_ENDED, now_ns, text)
             self._wanted = True
-        wanted = self._wanted or astray
+        wanted = self._wanted or astray or self._objects.moved
         if estimate is None or not wanted or self._job is not None or now_ns < self._after_ns:
             return
         orbit, craft = self._surroundings.state(now_ns), self._craft
@@ -119,9 +122,10 @@ class PointingPlanner:
             craft.limit,
             replace(craft.slew, residual=residual),
         )
+        job = self._objects.directed(job)
         if self._jobs.submit(PLANNER, job):
             self._wanted, self._job, self._count = False, job, job.number
-            self._after_ns = now_ns + AGAIN_NS
+            self._after_ns = now_ns + (AGAIN_NS if job.span is STEADY else 0)
 
     def finish(self, result: JobResult, now_ns: int) -> None:
         """Fly the worker's plan."""
@@ -134,6 +138,7 @@ class PointingPlanner:
             self._fail(f"plan {job.number}: {reason}", now_ns)
         else:
             self._accepted += 1
+            self._objects.judge(job, result.value, now_ns)
             if (slew := result.value.slew) is not None:
                 fastest = math.degrees(float(np.linalg.norm(slew.rate, axis=1).max()))
                 text = f"to {job.target.text} in {slew.horizon:.0f} s, {fastest:.2f} deg/s at most"

@@ -45,8 +45,11 @@ def target_of(target: Target) -> PointingTarget:
 class PointingTargets:
     """Implements `flight.loop.body.Targets`."""
 
-    def __init__(self, timed: Sequence[tuple[float, PointingTarget]], paths: PointingPaths) -> None:
+    def __init__(
+        self, timed: Sequence[tuple[float, PointingTarget]], paths: PointingPaths, looks_for_objects: bool
+    ) -> None:
         """Take the configured targets, each with its mission time in s, in order; the first is at 0."""
+        self._looks_for_objects = looks_for_objects
         self._paths = paths
         self._times = [round(at * 1e9) for at, _ in timed]
         self._steps = [Target(k, PointingLawOf(target, paths)) for k, (_, target) in enumerate(timed)]
@@ -59,6 +62,8 @@ class PointingTargets:
         """Return the target of command `number`. Raises UsageError for a q2."""
         if not isinstance(wanted, PointingTarget):
             raise UsageError("a satellite points to a goal, not to a q2")
+        if wanted.goal is Goal.OBJECT and not self._looks_for_objects:
+            raise UsageError("no star camera looks for objects: `camera: {star_tracker: {}, objects: {}}`")
         return Target(COMMANDED + number, PointingLawOf(wanted, self._paths))
 
     def hold_here(self, estimate: Estimate, now_ns: int) -> Target:

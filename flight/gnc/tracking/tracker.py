@@ -60,7 +60,9 @@ class Track:
         line: of sight, at the newest frame.
         seen_ns: time of the last sighting.
         sightings: how many; `frames` since the start.
-        magnitude: mean of the sightings', NaN when unknown.
+        magnitude: mean of the last sightings', NaN when unknown.
+        magnitude_sigma: of that mean, by their scatter; NaN before the second. The stars' colours, by which
+            the frames' magnitudes are off together, are not in it.
         history: one bit a frame, the newest lowest: seen or not.
         measured: (3,) direction of the newest frame's sighting, NaN where it has none.
         measured_sigma: rad along an axis, of that, the attitude's share included.
@@ -77,6 +79,7 @@ class Track:
     measured: FloatArray
     measured_sigma: float
     chi_square: float = 0.0
+    magnitude_sigma: float = math.nan
 
     @property
     def confirmed(self) -> bool:
@@ -166,19 +169,14 @@ class Tracker:
     def _seen(self, track: Track, frame: Sightings, number: int, spread: FloatArray) -> Track:
         seen = compare(track.line, frame.directions[number], spread[number])
         count = track.sightings + 1
-        magnitude = float(frame.magnitudes[number])
-        if not math.isfinite(magnitude):
-            mean = track.magnitude
-        elif not math.isfinite(track.magnitude):
-            mean = magnitude
-        else:
-            mean = track.magnitude + (magnitude - track.magnitude) / min(count, self._settings.within)
+        mean, sigma = _brightness(track, float(frame.magnitudes[number]), min(count, self._settings.within))
         return replace(
             track,
             line=update(track.line, frame.directions[number], spread[number]),
             seen_ns=frame.time_ns,
             sightings=count,
             magnitude=mean,
+            magnitude_sigma=sigma,
             measured=frame.directions[number],
             measured_sigma=_sigma(spread[number]),
             chi_square=track.chi_square + seen.chi_square,
@@ -232,6 +230,19 @@ class Tracker:
             )
             for number in free[: max(room, 0)]
         ]
+
+
+def _brightness(track: Track, magnitude: float, count: int) -> tuple[float, float]:
+    """Return mean and its standard deviation with a sighting's magnitude, the newest of `count`."""
+    if not math.isfinite(magnitude):
+        return track.magnitude, track.magnitude_sigma
+    if not math.isfinite(track.magnitude):
+        return magnitude, math.nan
+    before = 0.0 if math.isnan(track.magnitude_sigma) else track.magnitude_sigma
+    change = magnitude - track.magnitude
+    # The variance of the mean of n is the scatter over n (n - 1): carried on as if the last n - 1 were all.
+    scatter = before**2 * (count - 1) * max(count - 2, 0) + change**2 * (count - 1) / count
+    return track.magnitude + change / count, math.sqrt(scatter / (count * (count - 1)))
 
 
 def _sigma(covariance: FloatArray) -> float:

@@ -15,6 +15,10 @@ from flight.link.telemetry.form import Field, Packet
 from flight.link.telemetry.packets import Layout, compile_layouts
 
 _MODES = tuple((int(mode), mode.label) for mode in COMMANDABLE if mode is not Mode.SLEW)
+_NUMBERS = (
+    "inertial: quaternion, ICRS into body; ground: latitude, longitude, rad; object: right ascension, "
+    "declination, rad, where it is looked for, NaN: where the camera looks"
+)
 _GOALS = tuple((int(goal), goal.label) for goal in Goal)
 
 
@@ -58,7 +62,7 @@ POINT = _command(
     0x206,
     "Point a satellite to a goal",
     Field("goal", "u1", "-", "where to point", states=_GOALS),
-    Field("numbers", "f8", "-", "inertial: quaternion, ICRS into body; ground: latitude, longitude, rad", 4),
+    Field("numbers", "f8", "-", _NUMBERS, 4),
     Field("roll", "f8", "rad", "about the pointing axis, NaN: free"),
     hazard="moves the body",
 )

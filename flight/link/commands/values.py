@@ -180,8 +180,11 @@ def _target(number: int, numbers: list[float], roll: float) -> PointingTarget:
     """Return the target of a packet's fields. Raises CommandError; a roll of NaN is free."""
     goal = Goal(number)
     try:
-        count = NUMBERS.get(goal, 0)
-        return PointingTarget(goal, tuple(numbers[:count]), None if math.isnan(roll) else roll)
+        counts = NUMBERS.get(goal, (0,))
+        given = numbers[: counts[-1]]
+        if 0 in counts and all(map(math.isnan, given)):
+            given = []
+        return PointingTarget(goal, tuple(given), None if math.isnan(roll) else roll)
     except UsageError as error:
         raise CommandError(str(error)) from error
 

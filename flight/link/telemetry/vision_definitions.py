@@ -87,6 +87,11 @@ TRACK = Packet(
         Field("acceleration", "f8", "rad/s^2", "change of the rate, at right angles to the direction", 3),
         Field("covariance", "f8", "rad^2", "xx yy zz xy xz yz of the direction", 6),
         Field("rate_covariance", "f8", "rad^2/s^2", "xx yy zz xy xz yz of the rate", 6),
-        Field("magnitude", "f8", "mag", "V, mean over sightings; NaN when unknown"),
+        Field("magnitude", "f8", "mag", "V, mean over the last sightings; NaN when unknown"),
+        Field("magnitude_sigma", "f8", "mag", "of that, by their scatter; NaN when unknown"),
+        Field("place", "f8", "m", "of the camera, about the Earth's centre; NaN when unknown", 3),
+        Field("velocity", "f8", "m/s", "likewise", 3),
+        Field("place_sigma", "f8", "m", "of an axis of the place"),
     ),
+    version=2,
 )

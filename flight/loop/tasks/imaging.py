@@ -83,17 +83,19 @@ class Imaging:
             self._streams.note("camera", cycle.start_ns)  # it rests on purpose
             return
         rested_ns = cycle.start_ns - self._triggered_ns
-        if rested_ns < self._settings.fine_rest_ns and self._settings.knowledge() is Knowledge.FINE:
+        fine = self._settings.knowledge() is Knowledge.FINE and not self._settings.seeks()
+        if rested_ns < self._settings.fine_rest_ns and fine:
             return
         self._triggered_ns = cycle.start_ns
+        exposure_ns = self._measurer.exposure_ns(cycle.start_ns)
         try:
-            self._camera.trigger(self._settings.exposure_ns)
+            self._camera.trigger(exposure_ns)
         except DeviceError as error:
             self._facts.update(facts.CAMERA_LOST, True, cycle.start_ns, str(error))
             return
         if self._due_ns is None:
             # A free-running camera first completes the exposure in progress.
-            patience_ns = 2 * self._settings.exposure_ns + self._settings.late_ns
+            patience_ns = 2 * exposure_ns + self._settings.late_ns
             self._due_ns = cycle.start_ns + patience_ns
 
     def serve(self, now_ns: int) -> None:

@@ -13,13 +13,17 @@ from flight.gnc.vision.objects.sighted import Sighted
 from flight.link import events
 from flight.link.telemetry.definitions import SIGHTINGS, TRACK
 from flight.link.telemetry.vision_definitions import MOST_SIGHTINGS
+from flight.loop.body import Body
 from flight.loop.services import Services
+
+_UNKNOWN = [math.nan] * 3
 
 
 class ObjectTracking:
     """Owns the tracks of objects."""
 
-    def __init__(self, settings: TrackSettings, services: Services) -> None:
+    def __init__(self, settings: TrackSettings, body: Body, services: Services) -> None:
+        self._body = body
         self._tracker = Tracker(settings)
         self._recorder = services.recorder
         self._events = services.events
@@ -41,6 +45,7 @@ class ObjectTracking:
             self._events.report(events.OBJECT_LOST, now_ns, text)
         for track in self._tracker.objects:
             self._record_track(track, now_ns)
+        self._body.sighted(self._tracker.objects, now_ns)
 
     def _record_sightings(self, sequence: int, middle_ns: int, sighted: Sighted, now_ns: int) -> None:
         x, y = np.reshape(sighted.points, (-1, 2)).T
@@ -58,6 +63,7 @@ class ObjectTracking:
     def _record_track(self, track: Track, now_ns: int) -> None:
         line = track.line
         across = np.eye(3) - np.outer(line.direction, line.direction)
+        orbit = self._body.place(line.time_ns)
         self._recorder.record(
             TRACK,
             now_ns,
@@ -73,6 +79,10 @@ class ObjectTracking:
             covariance=_packed(line.covariance[:3, :3]),
             rate_covariance=_packed(across @ line.covariance[3:, 3:] @ across),
             magnitude=track.magnitude,
+            magnitude_sigma=track.magnitude_sigma,
+            place=_UNKNOWN if orbit is None else orbit.position.tolist(),
+            velocity=_UNKNOWN if orbit is None else orbit.velocity.tolist(),
+            place_sigma=math.nan if orbit is None else orbit.sigma,
         )
 
 

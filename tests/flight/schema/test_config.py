@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import re
 from pathlib import Path
 
 import pytest
@@ -125,6 +126,11 @@ def test_a_mistake_gets_one_line_with_its_place_and_its_cure(right: str, wrong: 
         ("{at: 0.0, point: sun}", "{at: 1.0, point: sun}", r":\d+: `targets\[0\].at` .* must be given at 0"),
         (f"{{at: {SECOND_TARGET},", "{at: 0.0,", r"`targets\[1\].at` is 0.0: .* in order of time"),
         ("fine_period: 10.0", "fine_period: 3.0", "`camera.fine_period` is 3: from `camera.period`, 5"),
+        (
+            "period: 5.0  ",
+            "streak_exposure: [1.0, 0.1]\n  period: 5.0  ",
+            "`camera.streak_exposure`.*must rise",
+        ),
         ("point: sun}", "point: moon}", r"`targets\[0\].point` is 'moon'.*nadir"),
         (
             "point: sun}",
@@ -161,6 +167,24 @@ def test_a_time_line_points_a_satellite_and_never_the_testbed() -> None:
     assert command_of(step) == Point(PointingTarget(Goal.GROUND, (math.radians(45.0), math.radians(9.0))))
     with pytest.raises(ConfigError, match=r"`commands.timeline\[0\].point` is of a satellite"):
         reader.parse(DEMO.replace("duration:", line, 1), "demo.yaml")
+
+
+def test_a_satellite_that_follows_an_object_needs_eyes_and_both_angles() -> None:
+    place = "point: object, right_ascension_deg: 90, declination_deg: -30"
+    own = ORBIT.replace("star_tracker: {}", "star_tracker: {}\n  objects: {}", 1)
+    line = f"commands: {{timeline: [{{at: 9.0, {place}}}]}}\nduration:"
+    step = reader.parse(own.replace("duration:", line, 1), "orbit.yaml").commands.timeline[0]
+    assert command_of(step) == Point(PointingTarget(Goal.OBJECT, (math.radians(90.0), math.radians(-30.0))))
+    for text, complaint in (
+        (line.replace(", declination_deg: -30", ""), r"is object: needs `declination_deg`"),
+        (line.replace("declination_deg: -30", "roll_deg: 3, declination_deg: -30"), "free roll"),
+        (line.replace("object", "sun"), "belongs to `point: object`"),
+    ):
+        with pytest.raises(ConfigError, match=complaint):
+            reader.parse(own.replace("duration:", text, 1), "orbit.yaml")
+    blind = re.sub(r"targets:\n  - .*", "targets:\n  - {at: 0.0, point: object}", ORBIT, count=1)
+    with pytest.raises(ConfigError, match=r"`targets\[0\].point` is object: needs `camera`"):
+        reader.parse(blind, "orbit.yaml")
 
 
 def test_mistakes_in_the_simulation_section_are_reported_with_their_place_too() -> None:

@@ -13,10 +13,12 @@ from tests.studies.campaigns.failures import FAILURES
 from tests.studies.campaigns.false_horizons import FALSE_HORIZONS
 from tests.studies.campaigns.faults import FAULTS
 from tests.studies.campaigns.faults_kill import FAULTS_KILL
+from tests.studies.campaigns.first_orbits import FIRST_ORBITS
 from tests.studies.campaigns.installer_kill import INSTALLER_KILL
 from tests.studies.campaigns.lost_in_space import LOST_IN_SPACE
 from tests.studies.campaigns.mismatch import MISMATCH, VIBRATION
 from tests.studies.campaigns.nadir import NADIR
+from tests.studies.campaigns.object_passes import OBJECT_PASSES
 from tests.studies.campaigns.orbit_attitude import ORBIT_ATTITUDE
 from tests.studies.campaigns.orbit_pointing import ORBIT_POINTING
 from tests.studies.campaigns.orbit_slews import ORBIT_SLEWS
@@ -46,6 +48,8 @@ CAMPAIGNS: dict[str, Campaign] = {
         RSO_SLEW,
         RSO_TRACK,
         RSO_ORBITS,
+        FIRST_ORBITS,
+        OBJECT_PASSES,
         CONSISTENCY,
         LOST_IN_SPACE,
         NADIR,

@@ -1,7 +1,8 @@
 """The planner's job of a satellite: from an orbit, an attitude and a target to a table of the pointing law.
 
 The field and the torques are predicted along the orbit for a revolution and a quarter, which the last gains
-that are kept need as preview; a third of a revolution is kept.
+that are kept need as preview; a third of a revolution is kept. An object that passes is gone within minutes:
+its tables are short and fine, and made again with each sighting.
 """
 
 from __future__ import annotations
@@ -19,16 +20,31 @@ from flight.gnc.control.three_axes.pointing_table import (
 )
 from flight.gnc.control.three_axes.slew_table import SlewBegin, SlewWish, slew, slew_table
 from flight.gnc.earth.disturbance import pressures
-from flight.gnc.earth.ephemeris import predict
+from flight.gnc.earth.ephemeris import Ephemeris, predict
 from flight.gnc.earth.orbit_knowledge import OrbitState
-from flight.gnc.guidance.three_axes.attitude_law import approach, references
+from flight.gnc.guidance.three_axes.attitude_law import (
+    Attitudes,
+    approach,
+    following,
+    references,
+)
 from flight.gnc.guidance.three_axes.pointing_target import PointingTarget
 from flight.gnc.guidance.three_axes.target_law import BodyAxes, law_of
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import angle_between, from_rotation_vector, multiply
 
-PREVIEW, KEPT, STEP = 7_200.0, 1_800.0, 10.0
-"""s: how far is predicted, how much of the table is kept, and its step."""
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """How far is predicted, how much of the table is kept, and its step, s."""
+
+    preview: float
+    kept: float
+    step: float
+
+
+STEADY, PASSING = Span(7_200.0, 1_800.0, 10.0), Span(120.0, 60.0, 2.0)
+"""Spans of the goals that go on, and of an object that passes."""
 LEAD = 2.0
 """s from the state to the begin of the table."""
 FAR = math.radians(15.0)
@@ -38,11 +54,28 @@ WAY = 4.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Sight:
+    """An object's `direction` (3,) at `since` s after a job's origin, ICRS.
+
+    `velocity` (3,) 1/s: of its place relative to ours, over its distance; zero for a place to look at.
+    """
+
+    direction: FloatArray
+    velocity: FloatArray
+    since: float
+
+    @property
+    def span(self) -> Span:
+        """The span of its tables."""
+        return PASSING if self.velocity.any() else STEADY
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class PointingJob:
     """A job: the orbit's state, attitude (4,) and rate (3,) rad/s at `origin_ns`, ICRS and body axes.
 
     `inertia` (3, 3) kg m^2, `sizes` (9,) N m of the torques, `limit` A m^2 of a coil in the mean. Without
-    `slew` the path is that of the weights alone.
+    `slew` the path is that of the weights alone. With a `sight` that is pointed to, whatever the target.
     """
 
     number: int
@@ -57,6 +90,12 @@ class PointingJob:
     sizes: FloatArray
     limit: float
     slew: SlewWish | None = None
+    sight: Sight | None = None
+
+    @property
+    def span(self) -> Span:
+        """The span of the table."""
+        return STEADY if self.sight is None else self.sight.span
 
 
 def run(job: PointingJob) -> PointingTable:
@@ -64,11 +103,12 @@ def run(job: PointingJob) -> PointingTable:
 
     Raises FlightError where the field is not known, UsageError where the law has no attitude.
     """
-    ahead = predict(job.orbit, PREVIEW + 4.0 * STEP)
-    times = np.arange(LEAD, PREVIEW, STEP)
-    kept = round(KEPT / STEP)
+    span = job.span
+    ahead = predict(job.orbit, span.preview + 4.0 * STEADY.step)
+    times = np.arange(LEAD, span.preview, span.step)
+    kept = round(span.kept / span.step)
     quaternion = multiply(from_rotation_vector(LEAD * job.rate), job.quaternion)
-    law = law_of(job.target, job.axes, quaternion, ahead, LEAD)
+    law = _law(job, quaternion, ahead)
     field, wanted = ahead.field_at(times), references(law, ahead, times)
     way = approach(law, quaternion, job.rate, LEAD, LEAD + _seconds(job, field))
     found = Ahead(
@@ -88,8 +128,16 @@ def run(job: PointingJob) -> PointingTable:
     return pointing_table(found, job.inertia, job.limit, job.weights)
 
 
+def _law(job: PointingJob, quaternion: FloatArray, ahead: Ephemeris) -> Attitudes:
+    """Return the law of a job from an attitude (4,) on."""
+    sight, axis = job.sight, job.axes.pointing
+    if sight is None:
+        return law_of(job.target, job.axes, quaternion, ahead, LEAD)
+    return following(axis, sight.direction, sight.velocity, sight.since, quaternion).attitudes
+
+
 def _seconds(job: PointingJob, field: FloatArray) -> float:
     """Return how long a first guess of the way takes, s: WAY of the time scale that the weights give."""
     strength, inertia = float(np.mean(np.linalg.norm(field, axis=1))), float(np.diag(job.inertia).max())
     square = strength * job.weights.dipole / (inertia * job.weights.turn)
-    return min(max(WAY / math.sqrt(square), 10.0 * STEP), KEPT)
+    return min(max(WAY / math.sqrt(square), 10.0 * job.span.step), job.span.kept)

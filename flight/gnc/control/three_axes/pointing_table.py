@@ -21,7 +21,7 @@ from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import attitude_matrix
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PointingWeights:
     """What errors cost: each attribute is the value that costs one.
 
@@ -30,12 +30,15 @@ class PointingWeights:
         rate: rad/s, of an axis.
         dipole: A m^2, of an axis.
         fastest: rad/s, the rate of a body on its way; more is dear (`pointing_path.EXCESS`).
+        roll: rad about the unit vector `axis` (3,), where that is cheaper than another turn.
     """
 
     turn: float
     rate: float
     dipole: float
     fastest: float = math.inf
+    roll: float | None = None
+    axis: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,6 +137,8 @@ def table_along(
 def prices(weights: PointingWeights, dt: float) -> tuple[FloatArray, float]:
     """Return what a step of `dt` s costs: (6, 6) of turn and rate, and of an axis of the dipole."""
     state = dt * np.diag(np.repeat([weights.turn**-2.0, weights.rate**-2.0], 3))
+    if weights.roll is not None and weights.axis is not None:
+        state[:3, :3] -= dt * (weights.turn**-2.0 - weights.roll**-2.0) * np.outer(weights.axis, weights.axis)
     return state, dt * weights.dipole**-2.0
 
 

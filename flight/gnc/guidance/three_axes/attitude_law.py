@@ -192,6 +192,34 @@ def free_roll(
     return AttitudeLaw(axis, first, across, orbital(_orbital_axes(ephemeris, when)[0] @ shown))
 
 
+def passing(direction: FloatArray, velocity: FloatArray, since: float) -> Direction:
+    """Return the law of an object in `direction` (3,) at `since` s that moves on a straight line.
+
+    `velocity` (3,) 1/s is that of its place relative to ours, over its distance; zero: it stands still.
+    """
+
+    def at(_: Ephemeris, times: FloatArray) -> FloatArray:
+        return _unit(direction + (np.asarray(times) - since)[:, None] * velocity)
+
+    return at
+
+
+def following(
+    axis: FloatArray, direction: FloatArray, velocity: FloatArray, since: float, quaternion: FloatArray
+) -> AttitudeLaw:
+    """Return the law that turns `axis` (3,) to a `passing` object, and turns nothing about `axis`.
+
+    Its roll is that of the attitude (4,) after the shortest turn to `direction`.
+    """
+    shown = attitude_matrix(quaternion)
+    normal = np.cross(direction, velocity)
+    size = float(np.linalg.norm(normal))
+    now = shown.T @ axis
+    normal = normal / size if size > 1e-9 else _turned(now, direction, shown.T @ _any_across(axis))
+    across = shown @ _turned(direction, now, normal)
+    return AttitudeLaw(axis, passing(direction, velocity, since), across, inertial(normal))
+
+
 def approach(
     attitudes: Attitudes, quaternion: FloatArray, rate: FloatArray, begin: float, end: float
 ) -> Attitudes:

@@ -17,7 +17,7 @@ class SightSettings:
         faintest: V; the catalogue has nearly all stars so bright, and half a magnitude of what is fainter.
         significance: least counts of an area over the noise of its pixels.
         clearance: px from the nearest catalogue star, beside half the area's own length.
-        floor: px, standard deviation along an axis that no brightness betters.
+        floor: px, standard deviation along an axis that no brightness betters (campaign `object-passes`).
         streak_sigma: px, of the middle of an object's streak among streaks, along an axis.
         most: sightings of a frame, the brightest.
     """
@@ -26,7 +26,7 @@ class SightSettings:
     faintest: float = 7.0
     significance: float = 25.0
     clearance: float = 4.0
-    floor: float = 0.1
+    floor: float = 0.02
     streak_sigma: float = 0.1
     most: int = 16
 

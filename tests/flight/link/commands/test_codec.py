@@ -41,6 +41,8 @@ TARGETS = st.one_of(
     ),
     st.builds(PointingTarget, st.just(Goal.GROUND), st.tuples(st.floats(-1.57, 1.57), st.floats(-3.2, 3.2))),
     st.just(PointingTarget(Goal.INERTIAL, (0.6, 0.0, 0.0, 0.8))),
+    st.just(PointingTarget(Goal.OBJECT)),
+    st.builds(PointingTarget, st.just(Goal.OBJECT), st.tuples(st.floats(-6.3, 6.3), st.floats(-1.57, 1.57))),
 )
 
 ANY: st.SearchStrategy[Command] = st.one_of(
@@ -144,6 +146,9 @@ def test_random_bytes_are_never_a_command_and_never_anything_worse() -> None:
         (Goal.INERTIAL, (1.0, 1.0, 0.0, 0.0), None, "length 1"),
         (Goal.INERTIAL, (0.6, 0.0, 0.0, 0.8), 0.1, "its roll in its quaternion"),
         (Goal.SUN, (), math.inf, "finite"),
+        (Goal.OBJECT, (1.0,), None, "takes 0 or 2 numbers"),
+        (Goal.OBJECT, (0.0, 2.0), None, "beyond a pole"),
+        (Goal.OBJECT, (), 0.5, "free roll"),
     ],
 )
 def test_a_target_that_nothing_can_point_to_is_refused(

@@ -1,0 +1,1 @@
+"""First orbits of the objects that a flight tracked."""
