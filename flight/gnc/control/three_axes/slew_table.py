@@ -153,12 +153,6 @@ def slew_table(
     stop = count + round(TAIL / step)
     tracked = _joined(flown, wanted.until(stop + 1))
     gain, torque_part = _tracking(tracked, ahead, dipole, begin, weights)
-    rest = [held.path.at(float(time)) for time in times[count:]]
-    motion = (
-        np.array([part.quaternion for part in rest]),
-        np.array([part.rate for part in rest]),
-        np.array([part.acceleration for part in rest]),
-    )
     dipoles, gains, torque_parts = (
         np.concatenate([slewed, np.repeat(kept, FINE, axis=0)])
         for slewed, kept in (
@@ -167,13 +161,20 @@ def slew_table(
             (torque_part, held.torque_part),
         )
     )
-    whole = _joined(flown, References(times, *(_after(part, count) for part in motion)))
+    whole = _joined(flown, _finer(held.path, times, count))
     return PointingTable(whole, wanted, dipoles, gains, torque_parts, begin.sizes, path)
 
 
-def _after(part: FloatArray, count: int) -> FloatArray:
-    """Return values with `count` rows before them, which are not looked at."""
-    return np.concatenate([np.zeros((count, part.shape[1])), part])
+def _finer(path: References, times: FloatArray, count: int) -> References:
+    """Return a path at `times` (n,) s from the instant `count` on; those before are not looked at."""
+    rest = [path.at(float(time)) for time in times[count:]]
+    whole = [*[rest[0]] * count, *rest]
+    return References(
+        times,
+        np.array([part.quaternion for part in whole]),
+        np.array([part.rate for part in whole]),
+        np.array([part.acceleration for part in whole]),
+    )
 
 
 def _joined(first: References, then: References) -> References:
