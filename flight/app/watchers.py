@@ -22,7 +22,7 @@ CONTROL_PRIORITY = 50
 """SCHED_FIFO priority of the control thread and of the coil driver's thread."""
 NEXT_PRIORITY = CONTROL_PRIORITY - 10
 """Priority of the other threads of the control process."""
-_COLLECT_NS = 60 * SECOND_NS
+_COLLECT_NS = 2 * SECOND_NS
 
 
 def start_guardian(rig: Rig, stack: ExitStack) -> GuardianLine | None:
@@ -45,7 +45,7 @@ def supervise(guardian: GuardianLine, clock: Clock, recorder: Recorder, stack: E
     coils = next(ticker for ticker in clock.tickers if ticker.name == COILS)
 
     stack.callback(gc.enable)
-    collector = clock.ticker("garbage", _COLLECT_NS, memory.collect)
+    collector = clock.ticker("garbage", _COLLECT_NS, memory.Collector())
     stack.callback(collector.stop)
 
     def settle() -> None:

@@ -1,4 +1,4 @@
-"""The geometry of the camera that a configuration describes."""
+"""The camera that a configuration describes: its geometry, and how streaks in its frames are fitted."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import math
 from flight.gnc.camera.knowledge import CameraKnowledge
 from flight.gnc.camera.lens import CameraModel, Lens
 from flight.gnc.camera.pinhole import Pinhole
+from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from flight.schema.devices import Camera
 
 
@@ -34,4 +35,18 @@ def camera_knowledge(camera: Camera) -> CameraKnowledge:
         square = math.hypot(*middle) ** 2 / lens.focal_length**2
         centre = math.hypot(centre, math.dist(lens.centre, middle))
         distortion = math.hypot(distortion, square * (lens.k1 + square * lens.k2))
-    return CameraKnowledge(accuracy.focal_length, centre, distortion, accuracy.line_time)
+    line_time = accuracy.line_time
+    if line_time is None and camera.line_time is not None:
+        line_time = 0.0
+    return CameraKnowledge(accuracy.focal_length, centre, distortion, line_time)
+
+
+def likelihood_settings(camera: Camera) -> LikelihoodSettings:
+    """Return the settings of the fit of streaks in the camera's frames."""
+    return LikelihoodSettings(
+        gain=camera.gain,
+        saturation=camera.saturation,
+        psf_sigma=camera.psf_sigma,
+        line_time=camera.line_time,
+        knowledge=camera_knowledge(camera),
+    )

@@ -164,6 +164,10 @@ def _check_link(link: Link, commands: Commands, refuse: Refuse) -> None:
 def _check_camera(camera: Camera, refuse: Refuse) -> None:
     if camera.exposure >= camera.period:
         refuse("camera.exposure", "must be shorter than `camera.period`")
+    if camera.streak_exposure is not None:
+        least, most = camera.streak_exposure
+        if not least <= most < camera.period:
+            refuse("camera.streak_exposure", "must rise, and stay below `camera.period`")
     if camera.objects is not None:
         if camera.star_tracker is None:
             refuse(

@@ -78,13 +78,14 @@ class CameraAccuracy(Section, frozen=True, kw_only=True):
     """How well the camera is known, standard deviations: what streaks may claim of a rate depends on it.
 
     `focal_length` as a share of itself, `centre` of the axis along x and y in px, `distortion` as the share
-    of its radius by which a corner may be displaced, `line_time` in s. Zero is exact, as an emulated camera.
+    of its radius by which a corner may be displaced, `line_time` in s. Zero is exact, as an
+    emulated camera; without a `line_time` that of the camera is exact where it is stated.
     """
 
     focal_length: NotNegative = _KNOWN.focal_length
     centre: NotNegative = _KNOWN.centre
     distortion: NotNegative = _KNOWN.distortion
-    line_time: NotNegative = _KNOWN.line_time
+    line_time: NotNegative | None = _KNOWN.line_time
 
 
 class StarTracker(Section, frozen=True, kw_only=True):
@@ -130,13 +131,18 @@ class AravisDevice(Section, frozen=True, kw_only=True, tag_field="kind", tag="ar
     gain: float | None = None
 
 
+ExposureTime = Annotated[float, Meta(gt=0.0, le=10.0)]
+"""s."""
+
+
 class Camera(Section, frozen=True, kw_only=True):
     """The star camera: what flight must know to read its frames; `device` is the real one.
 
     A frame is late `late_after` s after the exposure that it may have waited for; vision is slow after
     `vision_slow_after` s. Beyond `max_rate` rad/s of the body, where it is given, no exposure is begun. While
     the attitude is fine a frame is taken every `fine_period` s, without it every `period`, too. The newest
-    `keep_frames` frames are kept in `frames` of the run's folder.
+    `keep_frames` frames are kept in `frames` of the run's folder. Stars that streak are exposed for a time
+    within `streak_exposure` s that follows the rate; without it for `exposure` s as points are.
     """
 
     device: V4l2Device | AravisDevice | None = None
@@ -146,7 +152,8 @@ class Camera(Section, frozen=True, kw_only=True):
     field_of_view_deg: Annotated[float, Meta(gt=1.0, lt=120.0)] = 20.0
     lens: CameraLens | None = None
     accuracy: CameraAccuracy = CameraAccuracy()
-    exposure: Annotated[float, Meta(gt=0.0, le=10.0)] = 1.0
+    exposure: ExposureTime = 1.0
+    streak_exposure: tuple[ExposureTime, ExposureTime] | None = None
     period: Positive = 5.0
     fine_period: Positive | None = None
     bits: Annotated[int, Meta(ge=8, le=16)] = 16
@@ -154,7 +161,7 @@ class Camera(Section, frozen=True, kw_only=True):
     read_noise: Positive = 10.0
     saturation: Positive | None = None
     psf_sigma: Positive = 1.0
-    line_time: NotNegative = 0.0
+    line_time: NotNegative | None = None
     estimator: Estimator = "likelihood"
     star_tracker: StarTracker | None = None
     objects: ObjectTracking | None = None

@@ -25,7 +25,7 @@ from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from flight.gnc.vision.streaks.streak_result import StreakResult, StreakStatus
 from flight.schema import reader as configuration
-from flight.schema.camera_model import camera_knowledge, camera_model
+from flight.schema.camera_model import camera_model, likelihood_settings
 from flight.schema.devices import Camera
 from ground.commands.options import add_field, add_output, add_picture, finite, positive, read_picture
 from ground.pictures.overlay import draw_marks
@@ -39,6 +39,11 @@ _REASONS = {
     StreakStatus.BLACK: "the frame is of one value: it shows no scene",
     StreakStatus.SATURATED: "the frame is overexposed",
 }
+
+
+_SHUTTER = (
+    "shutter:       not described, which the claim allows for: give --line-time, 0 for all rows at once\n"
+)
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -60,7 +65,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--line-time",
         type=finite,
         metavar="S",
-        help="from one row's exposure to the next's (0: global shutter)",
+        help="from one row's exposure to the next's, 0 of a global shutter (default: not known, about 0)",
     )
     parser.add_argument("--prior", type=finite, nargs=3, metavar=("X", "Y", "Z"), help="rough rate, rad/s")
     parser.add_argument(
@@ -84,9 +89,15 @@ def run(options: argparse.Namespace) -> int:
     found = _estimate(options.method, pixels, pinhole, exposure, likelihood, prior)
     objects = _objects(pixels, pinhole, found, likelihood)
     if options.json:
-        sys.stdout.write(json.dumps(_facts(found, objects, options.method), allow_nan=False) + "\n")
+        facts = {
+            **_facts(found, objects, options.method),
+            "shutter_described": not likelihood.shutter_unstated,
+        }
+        sys.stdout.write(json.dumps(facts, allow_nan=False) + "\n")
     else:
         sys.stdout.write(_text(found, objects))
+        if isinstance(found, MotionResult) and found.rate is not None and likelihood.shutter_unstated:
+            sys.stdout.write(_SHUTTER)
     if options.overlay is not None:
         ends = [item.endpoints for item in objects]
         write_picture(options.overlay, draw_marks(grey_stretch(pixels), found.endpoints, found.used, ends))
@@ -114,15 +125,7 @@ def _geometry(options: argparse.Namespace, camera: Camera | None, pixels: Image)
 
 def _likelihood(options: argparse.Namespace, camera: Camera | None) -> LikelihoodSettings:
     """Return the settings of the fit: the options, else the configuration's, else the defaults."""
-    settings = LikelihoodSettings()
-    if camera is not None:
-        settings = LikelihoodSettings(
-            gain=camera.gain,
-            saturation=camera.saturation,
-            psf_sigma=camera.psf_sigma,
-            line_time=camera.line_time,
-            knowledge=camera_knowledge(camera),
-        )
+    settings = LikelihoodSettings() if camera is None else likelihood_settings(camera)
     if options.line_time is not None and not math.isfinite(options.line_time):
         raise UsageError(f"--line-time {options.line_time}: must be finite")
     given = {

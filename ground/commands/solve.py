@@ -30,10 +30,9 @@ from flight.gnc.vision.startracker.index.sky_index import SkyIndex
 from flight.gnc.vision.startracker.pointing import Pointing
 from flight.gnc.vision.startracker.solution import FrameSolution
 from flight.gnc.vision.startracker.solve import RatePrior, SolveSettings
-from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from flight.gnc.vision.streaks.streak_result import StreakStatus
 from flight.schema import reader as configuration
-from flight.schema.camera_model import camera_model
+from flight.schema.camera_model import camera_model, likelihood_settings
 from flight.schema.devices import Camera
 from ground.commands.options import (
     add_field,
@@ -171,19 +170,13 @@ def calibrated(
         scale = 1.0, 1.0
     else:
         _, scale = lens_of_field(fov, error_deg, (camera.rows, camera.columns))
-    saturation = camera.saturation
     return (
         model,
         scale,
         exposure or camera.exposure,
         SolveSettings(
-            detection=DetectionSettings(saturation=saturation),
-            likelihood=LikelihoodSettings(
-                gain=camera.gain,
-                saturation=saturation,
-                psf_sigma=camera.psf_sigma,
-                line_time=camera.line_time,
-            ),
+            detection=DetectionSettings(saturation=camera.saturation),
+            likelihood=likelihood_settings(camera),
         ),
     )
 

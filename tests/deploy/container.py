@@ -48,9 +48,6 @@ def why_not() -> str:
         return f"{', '.join(missing)} missing: install systemd-container"
     if "overlay" not in Path("/proc/filesystems").read_text(encoding="ascii"):
         return "the kernel has no overlay file system"
-    hidden = [why_not_visible(place) for place in (ROOT, Path(sys.prefix), Path(sys.base_prefix))]
-    if any(hidden):
-        return "; ".join(filter(None, hidden))
     return _why_no_cgroup()
 
 
@@ -66,14 +63,18 @@ def _why_no_cgroup() -> str:
     return ""
 
 
-def why_not_visible(place: Path) -> str:
-    """Return why the container would not see a folder of this machine, "" where it would."""
+def needs_mount(place: Path) -> bool:
+    """Return whether a folder of this machine is not in the overlay of /, or is covered in the container."""
     real = place.resolve()
-    if any(real.is_relative_to(hidden) for hidden in _HIDDEN):
-        return f"{place} is hidden in the container, which mounts {', '.join(map(str, _HIDDEN))} itself"
-    if real.stat().st_dev != Path("/").stat().st_dev:
-        return f"{place} is on a file system of its own, which the container's overlay of / leaves out"
-    return ""
+    covered = any(real.is_relative_to(hidden) for hidden in _HIDDEN)
+    return covered or real.stat().st_dev != Path("/").stat().st_dev
+
+
+def _mounted() -> list[Path]:
+    """Return the folders that the container needs and must be given by mounts of their own."""
+    needed = {place.resolve() for place in (ROOT, Path(sys.prefix), Path(sys.base_prefix))}
+    wanted = [place for place in needed if needs_mount(place)]
+    return [place for place in wanted if not any(other in place.parents for other in wanted)]
 
 
 def boot(folder: Path) -> dict[str, Any]:
@@ -102,6 +103,7 @@ def main(folder: Path) -> None:
                 "systemd-nspawn",
                 f"--directory={root}",
                 f"--bind={folder}:{_SHARE}",
+                *(f"--bind=/mnt/place-{number}:{place}" for number, place in enumerate(_mounted())),
                 "--register=no",
                 "--keep-unit",
                 "--private-network",
@@ -142,6 +144,15 @@ def _overlay() -> Path:
         Path("/mnt", name).mkdir()
     layers = "lowerdir=/,upperdir=/mnt/upper,workdir=/mnt/work"
     _do("mount", "-t", "overlay", "overlay", "-o", layers, "/mnt/root")
+    for number, place in enumerate(_mounted()):
+        shown, upper, work = (Path(f"/mnt/{name}-{number}") for name in ("place", "upper", "work"))
+        for folder in (shown, upper, work):
+            folder.mkdir()
+        layers = f"lowerdir={place},upperdir={upper},workdir={work}"
+        _do("mount", "-t", "overlay", "overlay", "-o", layers, str(shown))
+        # For the installer. At the boot the container's own mounts cover it, and nspawn mounts it again.
+        Path(f"/mnt/root{place}").mkdir(parents=True, exist_ok=True)
+        _do("mount", "--bind", str(shown), f"/mnt/root{place}")
     # nspawn keeps its own things here; they go with the mount.
     _do("mount", "-t", "tmpfs", "tmpfs", "/run/systemd")
     return Path("/mnt/root")
@@ -176,14 +187,14 @@ ExecStart={sys.prefix}/bin/python -m sim_hal serve /etc/knightcube/flight.yaml \
         encoding="utf-8",
     )
     (units / "knightcube.service.d/test.conf").write_text(
-        f"""{_OPENED}
+        f"""{_opened()}
 ExecStart=
 ExecStart=/opt/knightcube/bin/fly /etc/knightcube/flight.yaml --archive /var/lib/knightcube/runs \
     --realtime --devices {_FACTS}
 """,
         encoding="utf-8",
     )
-    (units / "knightcube-safe.service.d/test.conf").write_text(f"{_OPENED}\n", encoding="utf-8")
+    (units / "knightcube-safe.service.d/test.conf").write_text(f"{_opened()}\n", encoding="utf-8")
     (units / "scenario.service").write_text(
         f"""[Unit]
 DefaultDependencies=no
@@ -198,6 +209,11 @@ ExecStopPost=/bin/sh -c 'journalctl --no-pager > /share/journal.txt; systemctl -
         encoding="utf-8",
     )
     _write_i2cset(folder)
+
+
+def _opened() -> str:
+    """Return what the services' sandbox lets through, with what a /tmp of their own would cover."""
+    return "\n".join([_OPENED, *(f"BindReadOnlyPaths={place}" for place in _mounted())])
 
 
 def _write_i2cset(folder: Path) -> None:

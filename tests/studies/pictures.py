@@ -96,7 +96,7 @@ def _draw_frame(path: Path) -> None:
         pixels,
         camera_model(camera).ideal,
         camera.exposure,
-        LikelihoodSettings(gain=camera.gain, saturation=camera.saturation),
+        LikelihoodSettings(gain=camera.gain, saturation=camera.saturation, line_time=0.0),
         np.array([0.0, RATE, 0.0]),
         1e-3,
     )

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from flight.gnc.camera.exposure import Exposures
 from flight.gnc.tracking.tracker import TrackSettings
 from flight.gnc.vision.frame_job import TrackerSettings
 from flight.gnc.vision.kept_frames import KeptFrames
@@ -20,7 +21,7 @@ from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSett
 from flight.loop.body import Body
 from flight.loop.tasks.frame_measurements import ImagingSettings
 from flight.loop.tasks.navigation import NavigationSettings
-from flight.schema.camera_model import camera_knowledge, camera_model
+from flight.schema.camera_model import camera_model, likelihood_settings
 from flight.schema.devices import Camera, ObjectTracking
 from flight.schema.sections import Config
 from hal.interfaces.wires import SECOND_NS
@@ -41,7 +42,7 @@ def imaging_settings(camera: Camera, body: Body, frames: Path | None) -> Imaging
     kept = KeptFrames(frames, camera.keep_frames) if frames is not None and camera.keep_frames else None
     return ImagingSettings(
         camera=camera_model(camera),
-        exposure_ns=round(camera.exposure * SECOND_NS),
+        exposures=_exposures(camera),
         # A trigger may come late, and the next on time.
         fine_rest_ns=round(((camera.fine_period or camera.period) - 0.5 * camera.period) * SECOND_NS),
         max_age_ns=round(camera.max_age * SECOND_NS),
@@ -58,6 +59,12 @@ def imaging_settings(camera: Camera, body: Body, frames: Path | None) -> Imaging
         seeks=body.seeks,
         kept=kept,
     )
+
+
+def _exposures(camera: Camera) -> Exposures:
+    """Return the exposures of the star camera."""
+    least, most = camera.streak_exposure or (camera.exposure, camera.exposure)
+    return Exposures(camera.exposure, least, most, camera_model(camera).focal_length)
 
 
 def track_settings(section: ObjectTracking) -> TrackSettings:
@@ -91,12 +98,6 @@ def _estimator(camera: Camera) -> StreakSettings | LikelihoodSettings:
     """Return the settings of the configured streak estimator."""
     saturation = _saturation(camera)
     if camera.estimator == "likelihood":
-        return LikelihoodSettings(
-            gain=camera.gain,
-            saturation=saturation,
-            psf_sigma=camera.psf_sigma,
-            line_time=camera.line_time,
-            knowledge=camera_knowledge(camera),
-        )
+        return replace(likelihood_settings(camera), saturation=saturation)
     settings = StreakSettings.of(camera.estimator, saturation=saturation, gain=camera.gain)
     return settings if camera.endpoint_bias is None else replace(settings, endpoint_bias=camera.endpoint_bias)

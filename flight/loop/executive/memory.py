@@ -20,7 +20,7 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # malloc.h
 def settle() -> None:
     """Set the thresholds, exempt all present objects from garbage collection, and stop collecting by itself.
 
-    Call when all is built, and `collect` now and then: the flight makes no garbage that only a collection
+    Call when all is built, and a `Collector` now and then: the flight makes no garbage that only a collection
     finds, but a failure may. Collections come at a known time then, and look at what the flight has made
     since, not at modules and tasks, which would take tens of ms of a control cycle.
     """
@@ -33,9 +33,22 @@ def settle() -> None:
     gc.disable()
 
 
-def collect() -> None:
-    """Collect the garbage that was made since `settle`: in flight 0.5 ms, without any to be found."""
-    gc.collect()
+class Collector:
+    """Collects the garbage that was made since its last call, and exempts what is left from later calls.
+
+    Call it every few seconds: windows of measurements hold tens of thousands of objects a minute old or less,
+    and looking at all of them takes 2 ms. The first call only exempts what the flight's start has made.
+    """
+
+    def __init__(self) -> None:
+        self._begun = False
+
+    def __call__(self) -> None:
+        """Collect."""
+        if self._begun:
+            gc.collect()
+        self._begun = True
+        gc.freeze()
 
 
 def give_back() -> None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from flight.gnc.camera.exposure import Exposures
 from flight.gnc.camera.lens import CameraModel
 from flight.gnc.estimation.estimate import RATE, TURN, Estimate, Knowledge
 from flight.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement
@@ -24,6 +25,7 @@ from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSett
 from flight.gnc.vision.streaks.streak_result import StreakStatus
 from flight.loop.tasks.navigation import Navigation
 from hal.interfaces.readings import Frame
+from hal.interfaces.wires import SECOND_NS
 
 # rad, of the mounting between the camera and the inertial unit that the estimate is of.
 _LEAST_PRIOR_SIGMA = 5e-4
@@ -37,6 +39,7 @@ class ImagingSettings:
     """Properties and time limits of the camera, and the settings of vision.
 
     Attributes:
+        exposures: how long to expose at a rate.
         fine_rest_ns: while the attitude is fine no exposure begins sooner after the last, but where
         seeks: returns that an object is looked for.
         late_ns: age after the exposure from which a frame is late.
@@ -51,7 +54,7 @@ class ImagingSettings:
     """
 
     camera: CameraModel
-    exposure_ns: int
+    exposures: Exposures
     fine_rest_ns: int
     max_age_ns: int
     late_ns: int
@@ -94,6 +97,14 @@ class FrameMeasurer:
             objects=self._settings.objects if spare else None,
             kept=None if kept is None else replace(kept, name=f"frame-{frame.sequence:08d}"),
         )
+
+    def exposure_ns(self, now_ns: int) -> int:
+        """Return how long to expose from now on: by the estimated rate across the boresight."""
+        exposures, estimate = self._settings.exposures, self._navigation.estimate(now_ns)
+        if estimate is None:
+            return round(exposures.usual * SECOND_NS)
+        x, y, _ = (self._body_to_camera @ estimate.rate).tolist()
+        return round(exposures.at(math.hypot(x, y)) * SECOND_NS)
 
     def _tracker(self, frame: Frame) -> TrackerSettings | None:
         tracker, velocity = self._settings.tracker, self._settings.velocity(middle_ns(frame))

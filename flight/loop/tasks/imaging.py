@@ -87,14 +87,15 @@ class Imaging:
         if rested_ns < self._settings.fine_rest_ns and fine:
             return
         self._triggered_ns = cycle.start_ns
+        exposure_ns = self._measurer.exposure_ns(cycle.start_ns)
         try:
-            self._camera.trigger(self._settings.exposure_ns)
+            self._camera.trigger(exposure_ns)
         except DeviceError as error:
             self._facts.update(facts.CAMERA_LOST, True, cycle.start_ns, str(error))
             return
         if self._due_ns is None:
             # A free-running camera first completes the exposure in progress.
-            patience_ns = 2 * self._settings.exposure_ns + self._settings.late_ns
+            patience_ns = 2 * exposure_ns + self._settings.late_ns
             self._due_ns = cycle.start_ns + patience_ns
 
     def serve(self, now_ns: int) -> None:

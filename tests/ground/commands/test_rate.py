@@ -118,7 +118,7 @@ def test_a_cameras_configuration_says_how_well_it_is_known(picture: Path, tmp_pa
     def sigma(accuracy: str) -> float:
         path = tmp_path / "camera.yaml"
         lens = f"{{focal_length: {CAMERA.pinhole.focal_length}, centre: [319.5, 319.5]}}"
-        size = "columns: 640, rows: 640, bits: 12, exposure: 0.2"
+        size = "columns: 640, rows: 640, bits: 12, exposure: 0.2, line_time: 0.0"
         path.write_text(f"camera: {{{size}, lens: {lens}, accuracy: {accuracy}}}\n")
         done = command("rate", picture, "--camera", path, "--json")
         assert done.returncode == 0, done.stderr
@@ -126,3 +126,16 @@ def test_a_cameras_configuration_says_how_well_it_is_known(picture: Path, tmp_pa
 
     exact, usual = sigma("{centre: 0.0, distortion: 0.0}"), sigma("{}")
     assert exact < 0.8 * usual
+
+
+def test_a_shutter_that_nobody_described_widens_the_claim_and_the_command_asks_for_it(picture: Path) -> None:
+    usual = "--fov", FOV, "--exposure", "0.2"
+
+    def sigma(*more: str) -> float:
+        facts = json.loads(command("rate", picture, *usual, *more, "--json").stdout)
+        assert facts["shutter_described"] is bool(more)
+        return float(np.sqrt(np.trace(facts["covariance_rad2_s2"])))
+
+    assert sigma("--line-time", "0") < sigma()
+    assert "--line-time" in command("rate", picture, *usual).stdout
+    assert "--line-time" not in command("rate", picture, *usual, "--line-time", "0").stdout

@@ -26,7 +26,7 @@ from tests.scenario.flights import CONFIG
 from tests.studies.bench.flooded_flight import free_port
 from tests.studies.interop.linked_flight import service
 
-_RATE = 6e5
+_RATE = 1.5e5
 _START_S, _LATEST_S = 1.0, 3.0
 """What a process needs to start, and within what time then it is killed."""
 _PATIENCE_S = 120.0
@@ -36,14 +36,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Transfer, kill, print; return 0 when all came whole and were closed."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=20, metavar="N", help="of each side (default 20)")
-    parser.add_argument("--megabytes", type=float, default=3.0, metavar="M", help="of the file (default 3)")
+    parser.add_argument("--megabytes", type=float, default=1.0, metavar="M", help="of the file (default 1)")
     parser.add_argument("--seed", type=int, default=1, metavar="S")
     options = parser.parse_args(arguments)
     draw = np.random.default_rng(options.seed)
     with tempfile.TemporaryDirectory(prefix="knightcube-") as folder:
         place = Path(folder)
         bench = _Bench(place, draw.bytes(round(options.megabytes * 1e6)), draw)
-        facts = [bench.transfer(number) for number in range(options.kills)]
+        facts = []
+        for number in range(options.kills):
+            facts.append(bench.transfer(number))
+            sys.stdout.write(json.dumps({"transfer": number, **facts[-1]}) + "\n")
+            sys.stdout.flush()
     whole, closed = (sum(fact[name] for fact in facts) for name in ("whole", "closed"))
     middle = sum(fact["in_the_middle"] for fact in facts)
     found = {"transfers": len(facts), "kills": 2 * len(facts), "in_the_middle": middle}

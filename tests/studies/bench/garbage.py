@@ -1,6 +1,6 @@
 """Pauses of the garbage collector in flight: `python -m tests.studies.bench garbage [--minutes M]`.
 
-The full load of `bench executive` is flown. A flight collects by itself never, and once a minute when it says
+The full load of `bench executive` is flown. A flight collects by itself never, and every 2 s when it says
 so (`flight.loop.executive.memory`): printed is how long each collection held the interpreter, in processor
 time and on the clock, and what it found. Exit status 1 where one took 1 ms of processor time or more.
 """
@@ -48,7 +48,7 @@ def main(arguments: Sequence[str]) -> int:
         finally:
             live_flight.FLIGHT = whole
         if not place.exists():
-            raise UsageError("no collection within the flight: give it more than a minute")
+            raise UsageError("no collection within the flight: give it more than 4 s")
         pauses = np.loadtxt(place, ndmin=2)
     spent_ms, passed_ms, found = pauses.T * np.array([[1e-6], [1e-6], [1.0]])
     sys.stdout.write(

@@ -38,7 +38,7 @@ from tests.sim_hal.star_camera.scenes import at_pixels, turning
 from tests.studies.streak_bound import endpoint_bound
 
 _SEED = 31_415
-_SETTINGS = LikelihoodSettings(saturation=SATURATION)
+_SETTINGS = LikelihoodSettings(saturation=SATURATION, line_time=0.0)
 _BRIGHT = 8
 
 

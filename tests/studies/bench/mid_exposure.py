@@ -194,7 +194,7 @@ def tracked(
 ) -> tuple[FrameSolution, FrameSolution]:
     """Return what the star tracker makes of the fit, and of a second one with all stars known."""
     settings = SolveSettings(
-        likelihood=LikelihoodSettings(saturation=float(camera.highest_count), gain=camera.gain)
+        likelihood=LikelihoodSettings(saturation=float(camera.highest_count), gain=camera.gain, line_time=0.0)
     )
     prior = AttitudePrior(multiply(from_rotation_vector(_PRIOR_ERROR), truth), _PRIOR_SIGMA)
     first = solve_motion(found, camera.pinhole, (1.0, 1.0), default_index(), settings, prior)

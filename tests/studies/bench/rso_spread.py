@@ -114,7 +114,7 @@ def with_one(
 
 def _detect(pixels: Image, rotation: FloatArray, settings: StreakSettings) -> ObjectReport | None:
     """Return the report by the rotation that the likelihood finds, the true one deciding its sign."""
-    likelihood = LikelihoodSettings(saturation=settings.saturation, gain=settings.gain)
+    likelihood = LikelihoodSettings(saturation=settings.saturation, gain=settings.gain, line_time=0.0)
     motion = estimate_motion(pixels, _CAMERA.pinhole, _EXPOSURE, likelihood, rotation, 0.0)
     if motion.rate is None:
         return None

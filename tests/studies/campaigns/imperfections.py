@@ -1,6 +1,7 @@
 """The imperfections that the campaign `mismatch` flies: how each changes optics, light or counts.
 
-An imperfection is untold unless its name says `told`: the estimator is given the ideal camera.
+An imperfection is untold unless its name says `told`: the estimator is given the ideal camera, with a global
+shutter; that of `rolling untold` is not known, which is stated.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from flight.gnc.camera.knowledge import CameraKnowledge
+from flight.gnc.camera.knowledge import UNSTATED, CameraKnowledge
 from flight.gnc.math.arrays import FloatArray, Image
 from tests.studies.supersampled import Optics, coma, disc, gaussian, halo, moffat
 
@@ -216,7 +217,7 @@ IMPERFECTIONS: dict[str, Imperfection] = {
     "distortion 0.2 %": Imperfection(Optics(distortion=0.002)),
     "distortion 1 %": Imperfection(Optics(distortion=0.01)),
     "axis 5 px off": Imperfection(Optics(offset=(4.0, -3.0))),
-    "rolling untold": Imperfection(line_time=20e-6, known={"knowledge": CameraKnowledge(line_time=10e-6)}),
+    "rolling untold": Imperfection(line_time=20e-6, known={"knowledge": CameraKnowledge(line_time=UNSTATED)}),
     "rolling told": Imperfection(line_time=20e-6, known={"line_time": 20e-6}),
     "sigma 3 px told": Imperfection(Optics((gaussian(3.0),), radius=18.0), known={"psf_sigma": 3.0}),
 }

@@ -185,7 +185,12 @@ def judge(case: Case, pixels: Image, rate: FloatArray, imperfection: Imperfectio
     """Return status, errors and time of the estimator on a frame; `rate` (3,) is true and the prior."""
     camera = StarCameraModel(field_of_view=FIELD)
     settings = LikelihoodSettings(
-        **{"gain": camera.gain, "saturation": imperfection.top, **imperfection.known}
+        **{
+            "gain": camera.gain,
+            "saturation": imperfection.top,
+            "line_time": 0.0,
+            **imperfection.known,
+        }
     )
     begun = time.process_time()
     found = estimate_motion(pixels, camera.pinhole, case.parameters["exposure"], settings, rate, 0.0)

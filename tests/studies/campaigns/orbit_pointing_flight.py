@@ -202,6 +202,11 @@ class PointingFlight:
         self._fly(pointing_job.run(self._job()), time)
 
     def _fly(self, table: PointingTable, time: float) -> None:
+        """Fly a table from now on if it is finite, as the flight does. Raises LookupError without any."""
+        if not np.isfinite(table.dipole).all():
+            if self._law is None:
+                raise LookupError("the path to the target is not finite")
+            return
         self._law, self._begun = PointingLaw(table, self.flight.limit), time
         self._turn = np.zeros(3)
 

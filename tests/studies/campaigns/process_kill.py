@@ -44,7 +44,8 @@ _NOTICED_S = 8.0
 """A death is noticed within a second or two, and is on disk a second later, on a busy machine too."""
 _HARDWARE = 70
 """SCHED_FIFO priority of what stands for hardware, above the flight's."""
-_GONE_S = 3.0
+_GONE_S = 30.0
+"""By then every process of a flight has ended by itself; one that is starting must get so far first."""
 _SHARED = Path("/dev/shm")
 
 
@@ -124,6 +125,7 @@ def _hurt_flight(flight: LiveFlight, board: Board, rng: np.random.Generator) -> 
     deadline = time.monotonic() + _GONE_S
     while any(map(lives, children)) and time.monotonic() < deadline:
         time.sleep(0.02)
+    gone_after = _GONE_S - (deadline - time.monotonic())
     orphans = [child for child in children if lives(child)]
     for child in orphans:  # counted, and gone: one that is stopped would hold the flight's pipe for ever
         with suppress(ProcessLookupError):
@@ -132,6 +134,7 @@ def _hurt_flight(flight: LiveFlight, board: Board, rng: np.random.Generator) -> 
         "sent": sent.name,
         "current_before_a": before,
         "zero_after_s": zero_after,
+        "gone_after_s": gone_after,
         "orphans": len(orphans),
     }
 
@@ -165,6 +168,7 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
         "driven": len(driven),
         "worst_zero_after_s": worst,
         "beyond_limit": sum(result["zero_after_s"] > LIMIT_S for result in driven),
+        "longest_gone_after_s": max(result["gone_after_s"] for result in results),
         "orphans": sum(result["orphans"] for result in results),
         "left": [path for result in results for path in result["left"]],
     }
@@ -173,7 +177,8 @@ def summarise(results: Sequence[Result], folder: Path) -> Summary:
         f"{acts.total() + len(results)} acts in {len(results)} flights; reported: {parts}\n"
         f"flight itself killed or stopped {len(results)} times, {len(driven)} with current: coils at zero "
         f"within {worst:.3f} s (limit {LIMIT_S:g} s, beyond it {facts['beyond_limit']})\n"
-        f"orphans {facts['orphans']}, files left {len(facts['left'])}\n"
+        f"all processes gone within {facts['longest_gone_after_s']:.1f} s, orphans {facts['orphans']}, "
+        f"files left {len(facts['left'])}\n"
     )
     return Summary(text, facts)
 

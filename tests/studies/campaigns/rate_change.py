@@ -80,7 +80,7 @@ def run(case: Case) -> Result:
         return np.asarray((times + 0.5 * given["change"] * times**2 / exposure)[:, None] * rate)
 
     scene = row_scene(camera, turns, exposure, generator)
-    settings = LikelihoodSettings(saturation=float(camera.highest_count), gain=camera.gain)
+    settings = LikelihoodSettings(saturation=float(camera.highest_count), gain=camera.gain, line_time=0.0)
     found = estimate_motion(scene.pixels, camera.pinhole, exposure, settings, rate, 0.0)
     result: Result = {**given, "status": found.status.value, "nees": None}
     if found.rate is not None and found.covariance is not None:

@@ -141,7 +141,7 @@ def look(pixels: Image, camera: StarCameraModel, rate: FloatArray) -> tuple[Obje
     """Return the report on a frame, by the likelihood's rotation, and the processor seconds of both."""
     settings = StreakSettings(saturation=float(camera.highest_count), gain=camera.gain)
     begun = time.process_time()
-    likelihood = LikelihoodSettings(saturation=settings.saturation, gain=settings.gain)
+    likelihood = LikelihoodSettings(saturation=settings.saturation, gain=settings.gain, line_time=0.0)
     motion = estimate_motion(pixels, camera.pinhole, EXPOSURE, likelihood, rate, 0.0)
     if motion.rate is None:
         return None, time.process_time() - begun

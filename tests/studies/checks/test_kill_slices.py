@@ -18,6 +18,7 @@ FLIGHT = {
     "sent": "SIGKILL",
     "current_before_a": 0.1,
     "zero_after_s": 0.01,
+    "gone_after_s": 0.1,
     "orphans": 0,
 }
 

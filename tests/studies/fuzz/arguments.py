@@ -49,7 +49,7 @@ from tests.studies.fuzz.vocabulary import FLIGHT, NUMBERS, PATHS, RIGHT, WORDS
 _COMMANDS = {
     name: purpose
     for name, purpose in (cli.COMMANDS | GROUND_COMMANDS).items()
-    if name not in {"console", "gateway"}  # they serve until they are ended
+    if name not in {"console", "files", "gateway"}  # they serve, or wait for a link, until they are ended
 }
 _DRAWN_EVERY = 200
 _FLOWN_S = 0.075

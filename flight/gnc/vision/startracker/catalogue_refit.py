@@ -49,6 +49,8 @@ _LIGHT_ERROR = 0.15
 _AT_ONCE = 25
 # Instants at which a star is tested to be in the frame.
 _INSTANTS = 9
+# Pixels that the second fit looks at, in those of the first: places of faint stars are wanted, too.
+_ROOM = 1.7
 # Chi-square of 3, exceeded by chance once in 100,000: two rates farther apart are different motions.
 _ONE_MOTION = 25.9
 # px: added to the uncertainty of the previous attitude.
@@ -95,7 +97,7 @@ def refit_motion(
 ) -> MotionResult | None:
     """Return `motion` refitted with all stars known; None if that fails or gives another rate."""
     # Under a rolling shutter an ambiguous rate lies between two motions: there is none to start from.
-    between = likelihood.line_time > 0.0 and motion.status is not StreakStatus.RATE
+    between = likelihood.delay_per_row > 0.0 and motion.status is not StreakStatus.RATE
     if motion.rate is None or motion.covariance is None or between:
         return None
     pinhole, exposure = solution.camera.ideal, motion.exposure
@@ -107,13 +109,13 @@ def refit_motion(
     camera = ExposedCamera(
         expose_frame(pixels, likelihood.saturation, likelihood.gain),
         pinhole,
-        Shutter(likelihood.line_time / exposure, pinhole.centre[1]),
+        Shutter(likelihood.delay_per_row / exposure, pinhole.centre[1]),
         likelihood,
         motion.rate_model == "accelerating",
     )
     scene, hidden = _scenes(camera, course, known, motion)
     camera = replace(camera, frame=_without(camera, hidden))
-    done = joint_fit(camera, scene)
+    done = joint_fit(camera, scene, _ROOM)
     if done is None:
         return None
     refit = with_rate(with_stars(motion, camera, done), camera, done, Wholeness.WHOLE)

@@ -52,6 +52,25 @@ sys.stdout.write(str(frames()))
 """
 
 
+_LOOPS = """
+import gc, sys, weakref
+from flight.loop.executive import memory
+
+class Loop:
+    def __init__(self):
+        self.me = self
+
+memory.settle()
+collect = memory.Collector()
+kept = [Loop() for _ in range(1000)]
+collect()
+frozen = gc.get_freeze_count()
+lost = weakref.ref(Loop())
+collect()
+sys.stdout.write(f"{frozen > 1000} {lost() is None} {gc.get_count()[0] < 100} {gc.isenabled()}")
+"""
+
+
 def _said(code: str, *words: str) -> str:
     done = subprocess.run([sys.executable, "-c", code, *words], check=True, capture_output=True, text=True)
     return done.stdout
@@ -69,3 +88,7 @@ def test_a_worker_holds_the_estimators_before_its_first_job() -> None:
 def test_arrays_of_megabytes_do_not_stretch_the_heap_of_a_settled_process() -> None:
     assert int(_said(_FRAMES, "as it comes")) > 10_000
     assert int(_said(_FRAMES, "settled")) < 1_000
+
+
+def test_garbage_that_a_failure_made_is_found_and_what_stays_is_looked_at_once() -> None:
+    assert _said(_LOOPS) == "True True True False"

@@ -62,8 +62,12 @@ class Binning:
         return replace(
             settings,
             psf_sigma=settings.psf_sigma / self.size,
-            line_time=settings.line_time * self.size,
-            knowledge=replace(settings.knowledge, centre=settings.knowledge.centre / self.size),
+            line_time=None if settings.line_time is None else settings.line_time * self.size,
+            knowledge=replace(
+                settings.knowledge,
+                centre=settings.knowledge.centre / self.size,
+                line_time=settings.line_time_sigma * self.size,
+            ),
         )
 
     def in_pixels(self, result: MotionResult) -> MotionResult:

@@ -47,8 +47,8 @@ class Claim:
     Attributes:
         turn: (3,) rad, corrected for the camera's errors where the stars show them.
         covariance: (3, 3) rad^2.
-        doubt: share of the turn to which errors of the model leave it uncertain: common to all stars or
-            not.
+        doubt: share of the turn to which errors of the model leave it uncertain, as a vector: common to all
+            stars or not. A shutter that nobody described is not counted: the covariance says all of it.
         shaking: of the body.
     """
 
@@ -63,54 +63,73 @@ def claim(result: MotionResult, camera: ExposedCamera, last: Fit) -> Claim:
     scene, settings = last.scene, camera.settings
     exact = turn_covariance(last.evaluation, last.free, _CONJUGATE)
     noise = last.solution.covariance[:3, :3] if exact is None else exact
-    turn, added, spread = scene.motion.whole, np.zeros((3, 3)), 1.0
+    lens = _Lens(np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3)), 1.0)
     equations = own_equations(last.evaluation, last.free)
     if equations is not None:
-        step, added, spread = _with_lens(camera, last, equations, result.exposure)
-        turn = turn + step
+        lens = _with_lens(camera, last, equations, result.exposure)
+    turn = scene.motion.whole + lens.step
     # What made others disagree is as likely to hide, less of it, in the light of those that agree.
     asked = min(settings.most_stars, len(scene.trusted))
-    spread = max(result.misfit, spread, 1.0) * asked / max(int(np.count_nonzero(scene.trusted)), 1)
+    spread = max(result.misfit, lens.spread, 1.0) * asked / max(int(np.count_nonzero(scene.trusted)), 1)
     if np.count_nonzero(scene.trusted) <= _UNCHECKED[0]:
         spread *= _UNCHECKED[1]
     shaking = find_shaking(camera, last)
     end = np.hypot(
-        _spread_doubt(scene.width, settings.psf_sigma), _END_SHAKING * max(shaking.across, shaking.along)
+        _spread_doubt(scene.width, settings.psf_sigma) * max(result.misfit, 1.0),
+        _END_SHAKING * max(shaking.across, shaking.along),
     )
     ends = float(np.sqrt(2.0) * end / result.length)
     # What the model does not explain makes it less certain; what fits too well, no more. A fit that goes
     # to and fro, as pixels are left out and taken in, is known no better than that.
     covariance = noise * spread * (1.0 + last.restless**2)
-    common = added + ends**2 * float(turn @ turn) * np.eye(3)
-    covariance = covariance + common
-    unmodelled = max(np.linalg.eigvalsh(part)[-1] for part in (common, covariance - _BEYOND_NOISE * noise))
+    longer = ends**2 * float(turn @ turn)
+    # Ends that are alike uncertain make the turn longer or shorter; the covariance leaves room for its axis.
+    common = float(np.trace(lens.described)) + longer
+    unmodelled = max(common, common + float(np.trace(covariance - _BEYOND_NOISE * noise)))
+    covariance = covariance + lens.added + longer * np.eye(3)
     return Claim(turn, covariance, float(np.sqrt(unmodelled / (turn @ turn))), shaking)
 
 
-def _with_lens(
-    camera: ExposedCamera, last: Fit, equations: OwnEquations, exposure: float
-) -> tuple[FloatArray, FloatArray, float]:
-    """Return the turn's correction (3,), covariance (3, 3) for the camera's errors, and the stars' spread."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Lens:
+    """What errors of the camera's description make of the turn.
+
+    Attributes:
+        step: (3,), its correction; added, described: (3, 3), as of `Correction`.
+        spread: of the stars, in that of the noise.
+    """
+
+    step: FloatArray
+    added: FloatArray
+    described: FloatArray
+    spread: float
+
+
+def _with_lens(camera: ExposedCamera, last: Fit, equations: OwnEquations, exposure: float) -> _Lens:
+    """Return what errors of the camera's description make of the turn."""
     trusted = np.flatnonzero(last.scene.trusted)
     scene = last.scene.select(trusted)
     equations = OwnEquations(equations.kept, equations.information[trusted], equations.score[trusted])
     seeming = seeming_turns(camera, scene, exposure)
     everyone: BoolArray = np.ones(len(trusted), dtype=np.bool_)
     spread = disagreement(estimates_of(equations, scene), everyone)
+    exact = _Lens(np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3)), spread)
     if not seeming.shape[2]:
-        return np.zeros(3), np.zeros((3, 3)), spread
+        return exact
+    described = seeming.shape[2] - int(camera.settings.shutter_unstated)
     shared = np.zeros((len(trusted), len(equations.kept), seeming.shape[2]))
     shared[:, :3] = seeming
     corrected, before = None, 1.0
     # The part of the disagreement that the camera's errors explain is not counted as noise.
     for _ in range(2):
-        corrected = correct(equations.information, equations.score, shared, before)
+        corrected = correct(equations.information, equations.score, shared, before, described)
         if corrected is None:
-            return np.zeros(3), np.zeros((3, 3)), spread
+            return exact
         left = replace(equations, score=corrected.score)
         before = max(1.0, min(spread, disagreement(estimates_of(left, scene), everyone)))
     assert corrected is not None
-    return corrected.step[:3], corrected.added[:3, :3], before if corrected.step.any() else spread
+    added, stated = corrected.added[:3, :3], corrected.described[:3, :3]
+    return _Lens(corrected.step[:3], added, stated, before if corrected.step.any() else spread)
 
 
 def _spread_doubt(width: float, sigma: float) -> float:

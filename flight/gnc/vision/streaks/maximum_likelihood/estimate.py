@@ -231,7 +231,7 @@ def _misfits(camera: ExposedCamera, last: Fit) -> Misfits:
 
 
 def _shutter(pinhole: Pinhole, exposure: float, settings: LikelihoodSettings) -> Shutter:
-    return Shutter(settings.line_time / exposure, pinhole.centre[1])
+    return Shutter(settings.delay_per_row / exposure, pinhole.centre[1])
 
 
 def _resting(blobs: Blobs) -> bool:

@@ -22,10 +22,10 @@ from flight.gnc.vision.streaks.maximum_likelihood.work import Work
 
 _LONGEST_STEP = 3.0
 # An end so far, px, from where its window was cut has left the window's middle.
-_DRIFT = 1.5
+_DRIFT = 2.0
 # Ends of untrusted stars may be farther from it; after the first round in fresh windows by any distance: all
 # windows are not cut again for those whose light hardly fixes their place.
-_FAINT_DRIFT = 2.5
+_FAINT_DRIFT = 3.2
 # The growth may change by this part of the turn before that.
 _GROWN = 0.1
 # Converged: no shared parameter moves by more than this part of its standard deviation. The step is
@@ -68,7 +68,7 @@ class Rounds:
 
 
 FIRST = Rounds(6, clipped=False, tolerance=0.1, settled=SETTLED, conjugate=4, patience=2)
-ROUGH = Rounds(3, clipped=True, tolerance=0.003, settled=1.5, conjugate=12, patience=3)
+ROUGH = Rounds(3, clipped=True, tolerance=0.003, settled=1.5, conjugate=6, patience=3)
 LAST = Rounds(7, clipped=True, tolerance=0.003, settled=SETTLED, conjugate=12, patience=4)
 
 

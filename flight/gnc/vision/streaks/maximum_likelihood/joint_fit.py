@@ -41,7 +41,7 @@ _MOST_REPEATS = 2
 _DOUBT = 0.35
 # Pixels of all windows that a fit looks at, those that stars share once for each: what a crowd of long
 # streaks needs of memory and time is bounded so, and the brightest stars hold most of the information.
-_MOST_PIXELS = 100_000
+_MOST_PIXELS = 60_000
 # This many stars' light is taken out at a time.
 _AT_ONCE = 16
 
@@ -121,13 +121,13 @@ def _fit_from(camera: ExposedCamera, first: Fit) -> tuple[Fit | None, FaintStars
     return done, FaintStars(faint.stars[rest], faint.light[rest], faint.significance[rest])
 
 
-def joint_fit(camera: ExposedCamera, scene: Scene) -> Fit | None:
+def joint_fit(camera: ExposedCamera, scene: Scene, room: float = 1.0) -> Fit | None:
     """Return the fit of `scene` by the stars that agree, under the rate's model that the pixels ask for.
 
-    Of the untrusted stars the brightest are fitted, as far as there is room; the others' light is taken
-    out as it is known. None where the fit fails.
+    Of the untrusted stars the brightest are fitted, as far as there is room, `room` times as much as usual;
+    the others' light is taken out as it is known. None where the fit fails.
     """
-    fitted = _affordable(camera, scene)
+    fitted = _affordable(camera, scene, room)
     camera, scene = _accounted(camera, scene.select(~fitted)), scene.select(fitted)
     done = iterate(camera, scene, camera.free, ROUGH)
     if done is not None and camera.undecided and done.grows():
@@ -169,13 +169,13 @@ def _trusted(camera: ExposedCamera, rough: Fit) -> BoolArray:
     return after
 
 
-def _affordable(camera: ExposedCamera, scene: Scene) -> BoolArray:
+def _affordable(camera: ExposedCamera, scene: Scene, more: float) -> BoolArray:
     """Return which stars (n,) the fit has room for: the trusted, of the others the brightest."""
     room = window_areas(camera.pinhole, scene, camera.settings.reach)
     order = np.lexsort((-scene.light, ~scene.trusted))
     needed = np.empty(len(room))
     needed[order] = np.cumsum(room[order])
-    return np.asarray(scene.trusted | (needed <= _MOST_PIXELS))
+    return np.asarray(scene.trusted | (needed <= more * _MOST_PIXELS))
 
 
 def _accounted(camera: ExposedCamera, others: Scene) -> ExposedCamera:

@@ -14,10 +14,14 @@ from scipy.special import chdtri
 
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.vision.streaks.maximum_likelihood.iteration import ExposedCamera
-from flight.gnc.vision.streaks.maximum_likelihood.motion import paths, positions, sensitivities
+from flight.gnc.vision.streaks.maximum_likelihood.motion import paths, sensitivities
 from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene
 
-_ENDS = (-0.5, 0.5)
+# Instants at which a path is compared with where an error puts it: the ends and between.
+_INSTANTS = np.linspace(-0.5, 0.5, 9)
+_SLOWEST = 1e-3
+# Turn and the star's own place among the sensitivities.
+_TURN_AND_PLACE = np.array([0, 1, 2, 6, 7])
 # Probability of a camera that is as described being taken for another.
 _BY_CHANCE = 1e-5
 
@@ -29,23 +33,25 @@ class Correction:
     Attributes:
         step: (k,) of the shared parameters, to where they are without these errors; 0 where chance explains
             what the stars say of them.
-        added: (k, k), covariance beside that of an exact camera.
+        added: (k, k), covariance beside that of an exact camera; described: that of the errors alone whose
+            size the description gives.
         score: (n, k) of each star after these errors.
     """
 
     step: FloatArray
     added: FloatArray
+    described: FloatArray
     score: FloatArray
 
 
 def correct(
-    information: FloatArray, score: FloatArray, seeming: FloatArray, spread: float
+    information: FloatArray, score: FloatArray, seeming: FloatArray, spread: float, described: int
 ) -> Correction | None:
     """Return the joint solution of the shared parameters and of the camera's errors; None without one.
 
     `information` (n, k, k) and `score` (n, k) are each star's, its own numbers eliminated; `seeming`
-    (n, k, m) the change of the parameters that m errors, each of one standard deviation, seem to be;
-    `spread` the variance of what is left over, in that of the noise.
+    (n, k, m) the change of the parameters that m errors, each of one standard deviation, seem to be, those
+    first whose size is `described`; `spread` the variance of what is left over, in that of the noise.
     """
     m = seeming.shape[2]
     known = information / spread
@@ -57,41 +63,49 @@ def correct(
     total = score.sum(axis=0) / spread
     try:
         leading = np.linalg.solve(shared, cross)
-        rest = np.linalg.inv(own - cross.T @ leading)
+        left = own - cross.T @ leading
+        error = np.linalg.solve(left, asked - leading.T @ total)
+        added, stated = (
+            _added(leading[:, :count], left[:count, :count], error[:count]) for count in (m, described)
+        )
     except np.linalg.LinAlgError:
         return None
-    asked -= leading.T @ total
-    error = rest @ asked
     change = leading @ error
-    left = score - np.einsum("nij,nj->ni", information, seeming @ error - change)
-    added = leading @ rest @ leading.T
-    if float(asked @ error) > chdtri(m, _BY_CHANCE):
-        return Correction(-change, added, left)
-    return Correction(np.zeros_like(change), added + np.outer(change, change), left)
+    seen = float((asked - leading.T @ total) @ error) > chdtri(m, _BY_CHANCE)
+    left_over = score - np.einsum("nij,nj->ni", information, seeming @ error - change)
+    return Correction(-change if seen else np.zeros_like(change), added, stated, left_over)
+
+
+def _added(leading: FloatArray, left: FloatArray, error: FloatArray) -> FloatArray:
+    """Return the covariance (k, k) by errors of which the stars leave the information `left` (m, m).
+
+    Streaks displaced by much of their width ask for too little: a correction is known to its own size.
+    """
+    change = leading @ error
+    return np.asarray(leading @ np.linalg.inv(left) @ leading.T + np.outer(change, change))
 
 
 def seeming_turns(camera: ExposedCamera, scene: Scene, exposure: float) -> FloatArray:
     """Return the turn (n, 3, m), rad, that one standard deviation of each error seems to be to each star.
 
-    Errors that cannot be, being known exactly, are left out.
+    Errors that cannot be, being known exactly, are left out; that of the shutter is the last. A streak shows
+    where its path lies all along and, by its ends, how far it goes: an error that only lengthens the path is
+    no other curvature.
     """
-    displaced = [_displacements(camera, scene, exposure, at) for at in (*_ENDS, 0.0)]
-    n, m = len(scene.stars), displaced[0].shape[2]
-    out = np.empty((n, 3, m))
-    first, last = (
-        sensitivities(camera.pinhole, scene.motion, scene.stars, np.full(n, at), growing=False)[:, :, :3]
-        for at in _ENDS
-    )
-    opening = np.linalg.pinv(last - first)
-    for k in range(m):
-        middle = scene.stars + displaced[2][:, :, k]
-        moved = []
-        for at, shift in zip(_ENDS, displaced, strict=False):
-            time = np.full(n, at)
-            true = positions(camera.pinhole, scene.motion, scene.stars, time) + shift[:, :, k]
-            moved.append(true - positions(camera.pinhole, scene.motion, middle, time))
-        out[:, :, k] = np.einsum("nij,nj->ni", opening, moved[1] - moved[0])
-    return out
+    n = len(scene.stars)
+    change, moved = [], []
+    for at in _INSTANTS:
+        time = np.full(n, at)
+        path = paths(camera.pinhole, scene.motion, scene.stars, time)
+        speed = np.maximum(np.linalg.norm(path.velocity, axis=1, keepdims=True), _SLOWEST)
+        tangent = path.velocity / speed
+        normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+        sensitive = sensitivities(camera.pinhole, scene.motion, scene.stars, time, growing=False)
+        shift = _displacements(camera, scene, exposure, at)
+        for way in (normal, tangent) if abs(at) == 0.5 else (normal,):
+            change.append(np.einsum("ni,nij->nj", way, sensitive[:, :, _TURN_AND_PLACE]))
+            moved.append(np.einsum("ni,nim->nm", way, shift))
+    return np.asarray((np.linalg.pinv(np.stack(change, axis=1)) @ np.stack(moved, axis=1))[:, :3])
 
 
 def _displacements(camera: ExposedCamera, scene: Scene, exposure: float, at: float) -> FloatArray:
@@ -108,7 +122,7 @@ def _displacements(camera: ExposedCamera, scene: Scene, exposure: float, at: flo
         (known.centre, np.stack([nothing + 1.0, nothing], axis=1)),
         (known.centre, np.stack([nothing, nothing + 1.0], axis=1)),
         (known.distortion, cubic),
-        (known.line_time, late),
+        (camera.settings.line_time_sigma, late),
     ]
     chosen = [sigma * move for sigma, move in moves if sigma > 0.0]
     return np.stack(chosen, axis=-1) if chosen else np.empty((len(away), 2, 0))

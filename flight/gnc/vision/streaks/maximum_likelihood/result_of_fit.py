@@ -115,8 +115,9 @@ def _why_not(result: MotionResult, camera: ExposedCamera, last: Fit, whole: Whol
         ),
         (
             known.doubt > settings.worst_doubt,
-            f"uncertain by {100.0 * known.doubt:.1f} %: streaks disagree, the lens is not known well enough,"
-            f" or the point spread, {result.psf_sigma / settings.psf_sigma:.2f} times as wide as described",
+            f"uncertain by {100.0 * known.doubt:.1f} %: streaks disagree, lens or shutter are not known well "
+            f"enough, or the point spread, {result.psf_sigma / settings.psf_sigma:.2f} times as wide as "
+            "described",
         ),
     )
     reason = next((reason for failed, reason in checks if failed), "")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from flight.gnc.camera.knowledge import CameraKnowledge
+from flight.gnc.camera.knowledge import UNSTATED, CameraKnowledge
 
 _UNCALIBRATED = CameraKnowledge()
 
@@ -24,7 +24,8 @@ class LikelihoodSettings:
         psf_sigma: px, where the fit of the point spread starts; from 2 on, pixels are summed (`Binning`).
         rate_model: `constant`; `accelerating`: the rate's change over the exposure is fitted too; `auto`: the
             pixels decide.
-        line_time: s from the start of one row's exposure to the next's (rolling shutter); 0 is global.
+        line_time: s from the start of one row's exposure to the next's (rolling shutter); 0 is global. None,
+            not stated, is fitted as 0 and not believed to be.
         threshold_sigmas: of the 3 x 3 sum, for the first guess.
         most_stars: the brightest are fitted, no more: they hold most of the information.
         most_neighbours: faint stars on the bright ones' pixels that are fitted with them.
@@ -50,7 +51,7 @@ class LikelihoodSettings:
     saturated_fraction: float = 0.25
     psf_sigma: float = 1.0
     rate_model: RateModel = "auto"
-    line_time: float = 0.0
+    line_time: float | None = None
     threshold_sigmas: float = 4.5
     most_stars: int = 24
     most_neighbours: int = 80
@@ -63,6 +64,23 @@ class LikelihoodSettings:
     least_significance: float = 5.0
     worst_misfit: float = 4.0
     worst_shaking: float = 0.05
-    worst_doubt: float = 0.01
+    worst_doubt: float = 0.008
     sign_sigmas: float = 3.0
     knowledge: CameraKnowledge = _UNCALIBRATED
+
+    @property
+    def delay_per_row(self) -> float:
+        """The line time that is fitted, s."""
+        return 0.0 if self.line_time is None else self.line_time
+
+    @property
+    def line_time_sigma(self) -> float:
+        """By how much the line time may differ from that, one standard deviation, s."""
+        if self.knowledge.line_time is not None:
+            return self.knowledge.line_time
+        return UNSTATED if self.line_time is None else 0.0
+
+    @property
+    def shutter_unstated(self) -> bool:
+        """Whether nobody said how the shutter works, so that it may roll."""
+        return self.line_time is None and self.line_time_sigma > 0.0

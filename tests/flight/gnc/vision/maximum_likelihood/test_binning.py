@@ -60,3 +60,12 @@ def test_a_point_spread_of_three_pixels_gives_a_rate_within_its_covariance() -> 
     # The stars used are those of the sky, in pixels of the frame.
     apart = np.linalg.norm(found.stars[found.used][:, None] - scene.stars, axis=2).min(axis=1)
     assert np.median(apart) < 0.5
+
+
+def test_a_summed_row_takes_as_many_times_as_long_to_the_next_whether_it_is_stated_or_not() -> None:
+    binning = Binning.suited(Pinhole(1024, 768, 3000.0), 3.0)
+    nobody, stated = LikelihoodSettings(), LikelihoodSettings(line_time=1e-5)
+    assert binning.settings(nobody).line_time_sigma == pytest.approx(3.0 * nobody.line_time_sigma)
+    assert binning.settings(nobody).shutter_unstated
+    assert binning.settings(stated).line_time == pytest.approx(3e-5)
+    assert binning.settings(stated).line_time_sigma == 0.0

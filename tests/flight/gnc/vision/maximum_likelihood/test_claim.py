@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from flight.gnc.camera.knowledge import EXACT, CameraKnowledge
+from flight.gnc.camera.knowledge import EXACT, UNSTATED, CameraKnowledge
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import from_rotation_vector, multiply
 from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion
@@ -22,12 +24,12 @@ from tests.flight.gnc.vision.maximum_likelihood.scenes import CAMERA, SATURATION
 _TURN = np.array([0.02, 0.03, 0.0])
 
 
-def _seeming(knowledge: CameraKnowledge) -> tuple[FloatArray, FloatArray]:
+def _seeming(knowledge: CameraKnowledge, turn: FloatArray = _TURN) -> tuple[FloatArray, FloatArray]:
     """Return each star's seeming turns (n, 3, m), and its information (n, 3, 3) when ends alone count."""
     x, y = np.meshgrid(np.linspace(150.0, 870.0, 5), np.linspace(150.0, 870.0, 5))
     stars = np.stack([x.ravel(), y.ravel()], axis=1)
     ones = np.ones(len(stars))
-    scene = Scene(Motion.steady(_TURN), 1.04, stars, ones, ones, ones > 0.0)
+    scene = Scene(Motion.steady(turn), 1.04, stars, ones, ones, ones > 0.0)
     frame = expose_frame(np.zeros((1024, 1024), np.uint16), SATURATION, 1.0)
     camera = ExposedCamera(frame, CAMERA.pinhole, Shutter(), LikelihoodSettings(knowledge=knowledge))
     half = np.full(len(stars), 0.5)
@@ -54,7 +56,7 @@ def test_a_wrong_axis_seems_to_be_a_turned_camera() -> None:
     changes as well, takes back that of the other. Of stars on a square that counts for half.
     """
     focal = CAMERA.pinhole.focal_length
-    found = _together(*_seeming(CameraKnowledge(centre=5.0, distortion=0.0)))
+    found = _together(*_seeming(replace(EXACT, centre=5.0)))
     about_y, about_x = np.array([0.0, 5.0 / focal, 0.0]), np.array([-5.0 / focal, 0.0, 0.0])
     expected = 0.5 * np.stack([np.cross(about_y, _TURN), np.cross(about_x, _TURN)], axis=1)
     assert np.linalg.norm(found - expected) < 0.01 * np.linalg.norm(expected)
@@ -62,25 +64,45 @@ def test_a_wrong_axis_seems_to_be_a_turned_camera() -> None:
 
 def test_a_wrong_focal_length_seems_to_be_another_rate_and_a_wrong_line_time_too() -> None:
     """Across the boresight a rate is a length over the focal length; rows make it longer by their delay."""
-    found = _together(*_seeming(CameraKnowledge(focal_length=0.01, centre=0.0, distortion=0.0)))
+    found = _together(*_seeming(replace(EXACT, focal_length=0.01)))
     assert found[:, 0] == pytest.approx(0.01 * _TURN, abs=0.1 * 0.01 * float(np.linalg.norm(_TURN)))
-    late = _together(*_seeming(CameraKnowledge(centre=0.0, distortion=0.0, line_time=1e-5)))
+    late = _together(*_seeming(replace(EXACT, line_time=1e-5)))
     rows_crossed = CAMERA.pinhole.focal_length * _TURN[0] / 0.2 * 1e-5
     assert abs(late[:, 0] @ _TURN) / (_TURN @ _TURN) == pytest.approx(rows_crossed, rel=0.1)
 
 
+def test_an_untold_shutter_seems_to_be_more_of_the_same_turn_to_each_star() -> None:
+    """It lengthens paths and bends them no more: long ones about a near axis show their curvature well."""
+    turn = np.array([0.07, 0.05, -0.05])
+    late, _ = _seeming(replace(EXACT, line_time=1e-5), turn)
+    size = float(np.linalg.norm(turn))
+    along = late[:, :, 0] @ turn / size
+    assert np.linalg.norm(late[:, :, 0] - along[:, None] * turn / size) < 0.05 * np.linalg.norm(along)
+
+
+def test_a_shutter_that_nobody_describes_may_roll_and_one_that_is_described_may_not() -> None:
+    assert LikelihoodSettings().line_time_sigma == UNSTATED
+    assert LikelihoodSettings(line_time=0.0).line_time_sigma == 0.0
+    assert LikelihoodSettings(line_time=2e-5).line_time_sigma == 0.0
+    assert LikelihoodSettings().shutter_unstated
+    assert not LikelihoodSettings(line_time=0.0).shutter_unstated
+    assert not LikelihoodSettings(knowledge=EXACT).shutter_unstated
+    known = replace(CameraKnowledge(), line_time=3e-6)
+    assert LikelihoodSettings(line_time=2e-5, knowledge=known).line_time_sigma == 3e-6
+
+
 def test_stars_that_show_the_cameras_error_correct_it_and_others_widen_the_covariance() -> None:
     """Distortion of 1 % is seen a hundred times beyond the noise; one of chance is left alone."""
-    seeming, information = _seeming(CameraKnowledge(centre=0.0, distortion=0.01))
+    seeming, information = _seeming(replace(EXACT, distortion=0.01))
     precise = 1e4 * information
     score = np.einsum("nij,njk->ni", precise, seeming)
     mean = np.linalg.solve(precise.sum(axis=0), score.sum(axis=0))
-    done = correct(precise, score - np.einsum("nij,j->ni", precise, mean), seeming, 1.0)
+    done = correct(precise, score - np.einsum("nij,j->ni", precise, mean), seeming, 1.0, 1)
     assert done is not None
     assert done.step == pytest.approx(-mean, rel=0.05)
     assert np.abs(done.score).max() < 0.05 * np.abs(score).max()
     vague = 1e-6 * information
-    done = correct(vague, np.zeros((25, 3)), seeming, 1.0)
+    done = correct(vague, np.zeros((25, 3)), seeming, 1.0, 1)
     assert done is not None
     assert not done.step.any()
     assert np.trace(done.added) == pytest.approx(float(mean @ mean), rel=0.05)

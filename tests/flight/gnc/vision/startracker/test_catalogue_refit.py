@@ -19,7 +19,7 @@ from sim_hal.star_camera import StarCameraModel
 from tests.flight.gnc.vision.startracker.frames import SkyFrame, sky, sky_frame
 
 _CAMERA = StarCameraModel(field_of_view=float(np.deg2rad(20.0)))
-_LIKELIHOOD = LikelihoodSettings(saturation=float(_CAMERA.highest_count), gain=_CAMERA.gain)
+_LIKELIHOOD = LikelihoodSettings(saturation=float(_CAMERA.highest_count), gain=_CAMERA.gain, line_time=0.0)
 _SETTINGS = SolveSettings(likelihood=_LIKELIHOOD)
 _STREAK_PX, _EXPOSURE = 450.0, 0.2
 _SEEDS = (5, 6, 8)
