@@ -58,11 +58,10 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
     """Return the satellite of a configuration; parameters that an earlier boot learned are not used yet."""
     config = as_orbit(config)
     surroundings = Surroundings(_elements(config), services.clock)
-    filter_ = _filter(config, surroundings)
     limit, dipole_per_ampere = _limit(config), config.craft.dipole_per_ampere
-    brake = FieldBrake(_detumbler(config), dipole_per_ampere)
+    filter_, brake = _filter(config, surroundings), FieldBrake(_detumbler(config), dipole_per_ampere)
     paths = PointingPaths(limit, fastest_rate(config))
-    objects = ObjectAim(_sensor(config), _limit(config), services.events)
+    objects = ObjectAim(_sensor(config), limit, services.events)
 
     def field(estimate: Estimate) -> FloatArray:
         around = surroundings.at(estimate.time_ns)
