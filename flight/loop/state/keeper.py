@@ -17,7 +17,7 @@ import msgspec
 from flight.link import events
 from flight.link.events import EventKind
 from flight.loop.state import history
-from flight.loop.state.content import KeptTable, Learned
+from flight.loop.state.content import KeptTable, Learned, StoredState
 from flight.loop.state.history import BootRecord, Noted
 from flight.loop.state.store import StateStore
 from hal.interfaces.wires import Clock
@@ -77,25 +77,30 @@ class StateKeeper:
             notices.report(events.STATE_OLD, f"of boot {loaded.boot_count}, but boot {boots} was noted")
             loaded = msgspec.structs.replace(loaded, boot_count=boots, running=True)
         self._begun = history.begin(loaded, self._label(), devices)
-        if loaded.learned and not self._begun.learned:
-            text = f"learned of the devices {loaded.devices or 'of an older version'}, these are {devices}"
-            notices.report(events.LEARNED_REFUSED, text)
         self.record: BootRecord = history.boot_record(self._begun, window)
         self.learned: Mapping[str, Learned] = self._begun.learned
         self.table = self._begun.table
-        if self.table.values != loaded.table.values:
-            notices.report(
-                events.PARAMETERS_LEFT, "it had just been loaded when the last boot ended uncleanly"
-            )
         self._noted = Noted(self._begun.mode, {}, self.table)
         self._writing = threading.Lock()  # held while writing, never acquired by note()
         self._closed = False
-        if self.record.after_unclean:
-            last = self._begun.unclean[-1]
-            text = f"boot {last.boot}, last heard of {last.utc}: {self.record.unclean_recent} of late"
-            notices.report(events.UNCLEAN_SHUTDOWN, text)
+        self._report_changes(loaded)
         self.counted = store.store(self._begun)
         self._ticker = clock.ticker("state", period_ns, self._write)
+
+    def _report_changes(self, loaded: StoredState) -> None:
+        """Report what the begin of this boot made of the state that the last one left."""
+        begun, report = self._begun, self._notices.report
+        if loaded.learned and not begun.learned:
+            text = (
+                f"learned of the devices {loaded.devices or 'of an older version'}, these are {begun.devices}"
+            )
+            report(events.LEARNED_REFUSED, text)
+        if begun.table.values != loaded.table.values:
+            report(events.PARAMETERS_LEFT, "it had just been loaded when the last boot ended uncleanly")
+        if self.record.after_unclean:
+            last = begun.unclean[-1]
+            text = f"boot {last.boot}, last heard of {last.utc}: {self.record.unclean_recent} recently"
+            report(events.UNCLEAN_SHUTDOWN, text)
 
     def note(self, mode: str, learned: Mapping[str, Learned] | None = None) -> None:
         """Set the mode and the learned parameters for the next write. Never waits."""
