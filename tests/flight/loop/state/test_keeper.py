@@ -75,7 +75,7 @@ def test_an_end_that_was_not_clean_is_reported_at_the_next_start(closed: bool) -
     assert second.record.mode == "hold"
     ((kind, text),) = second.notices()
     assert kind is events.UNCLEAN_SHUTDOWN
-    assert text == "boot 1, last heard of 1970-01-01T00:00:21Z: 1 of late"
+    assert text == "boot 1, last heard of 1970-01-01T00:00:21Z: 1 recently"
     assert not second.notices(), "reported once"
 
 
