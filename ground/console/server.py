@@ -53,7 +53,10 @@ class Feed(Protocol):
 
 @dataclass(slots=True)
 class Console:
-    """One flight on the page: its telemetry, the packets so far, its surroundings, a way to command it."""
+    """One flight on the page: its telemetry, the packets so far, its surroundings, a way to command it.
+
+    `settled_ns` is the newest time of which all packets have come: what the page shows live.
+    """
 
     name: str
     feed: Feed
@@ -63,6 +66,7 @@ class Console:
     utc_ns: int | None = None
     flight_heard: float = field(default_factory=time.monotonic)
     trouble: str = ""
+    settled_ns: int = 0
     sockets: set[web.WebSocketResponse] = field(default_factory=set)
 
     def look(self) -> None:
@@ -73,7 +77,11 @@ class Console:
             self.trouble = str(error)
             return
         self.trouble = ""
+        newest_ns = self.history.span_ns[1]
         self.history.append(packets)
+        # The packets of an instant may come in two looks: what the look before had is whole now.
+        more = newest_ns > 0 and any(len(rows) for rows in packets.values())
+        self.settled_ns = newest_ns if more else self.history.span_ns[1]
         if any(len(rows) for name, rows in packets.items() if name not in _OF_THE_LINK):
             self.flight_heard = time.monotonic()
         if len(packets["run"]):
@@ -225,7 +233,7 @@ class _Pages:
 
     def _state(self, cursor: Cursor, instant: Instant) -> dict[str, Any]:
         console = self._console
-        span = console.history.span_ns
+        span = console.history.span_ns[0], console.settled_ns
         at_ns = cursor.at_ns(span, time.monotonic())
         utc = self._utc(at_ns * 1e-9)
         return {

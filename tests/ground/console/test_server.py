@@ -163,6 +163,30 @@ def test_the_links_own_packets_do_not_hide_a_flight_that_is_silent(folder: Path)
         assert console.flight_heard > heard
 
 
+def test_what_is_shown_live_is_whole(folder: Path) -> None:
+    """Packets of one instant may come in two looks: live stands at the instant before until the next look."""
+
+    class Feed:
+        silence = 0.0
+        came: tuple[tuple[str, int], ...] = ()
+
+        def new(self) -> dict[str, PacketArray]:
+            arrays: dict[str, PacketArray] = {n: np.zeros(0, layout.dtype) for n, layout in LAYOUTS.items()}
+            for name, time_ns in self.came:
+                arrays[name] = np.zeros(1, LAYOUTS[name].dtype)
+                arrays[name]["time_ns"] = time_ns
+            return arrays
+
+    with History() as history:
+        feed, settled = Feed(), []
+        console = Console("run", feed, history, NOWHERE, Commanding(None))
+        for came in ((("control", 100),), (("health", 100), ("control", 125)), (("health", 125),), ()):
+            feed.came = came
+            console.look()
+            settled.append(console.settled_ns)
+    assert settled == [100, 100, 125, 125]
+
+
 def commanded(folder: Path, name: str, values: Any, send: Any) -> tuple[int, Any]:
     async def ask(client: TestClient[Any, Any]) -> tuple[int, Any]:
         async with client.post("/api/command", json={"command": name, "values": values}) as answer:
