@@ -12,6 +12,7 @@ from flight.app.composition.workers import workers
 from flight.app.devices import open_devices
 from flight.app.run_folder import open_log
 from flight.app.watchers import start_guardian, supervise
+from flight.gnc.vision import kept_frames
 from flight.gnc.vision.startracker.index.build import ensure_default_index
 from flight.link.commands.channel import Channel, open_udp, open_unix
 from flight.link.telemetry.log import FlightLog
@@ -63,7 +64,7 @@ def open_flight(
         feed, beat = supervision.feed, supervision.beat
     channels = _open_channels(config, stack)
     keeper = open_state(config, os.environ, rig.clock, after_coils, [*earlier, folder])
-    frames = folder / "frames"
+    frames = folder / kept_frames.FOLDER
     opened = Opened(rig.clock, devices, jobs, recorder, flight_log.error, channels, feed, frames)
     board = Board(folder) if rig.realtime else None
     loop = build_loop(config, opened, Supervisors(beat, keeper, board))

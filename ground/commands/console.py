@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flight.gnc.errors import FlightError, UsageError
+from flight.gnc.vision import kept_frames
 from flight.link.telemetry.archive import find_runs
 from ground.link.options import add_link_options, terminal_of
 from ground.watch.tail import LogTail
@@ -45,6 +46,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_link_options(parser, way)
     parser.add_argument(
         "--config", metavar="CONFIG", type=Path, help="with --link: what is flown, for the map"
+    )
+    parser.add_argument(
+        "--frames",
+        metavar="FOLDER",
+        type=Path,
+        help="kept frames of the camera (default those of RUN; with --link as `flight files` got them)",
     )
     parser.add_argument("--port", type=int, default=PORT, metavar="N", help=f"0: any (default {PORT})")
     parser.add_argument("--open", action="store_true", help="open the page in the browser")
@@ -81,6 +88,7 @@ def _shown(options: argparse.Namespace, stack: ExitStack) -> Console:
     from ground.console.commanding import Commanding, by_socket  # noqa: PLC0415
     from ground.console.flying import flying  # noqa: PLC0415
     from ground.console.history import History  # noqa: PLC0415
+    from ground.console.kept_frames import FrameFolder  # noqa: PLC0415
     from ground.console.link_feed import LinkFeed  # noqa: PLC0415
     from ground.console.server import Console  # noqa: PLC0415
     from ground.console.surroundings import NOWHERE, Surroundings  # noqa: PLC0415
@@ -91,7 +99,8 @@ def _shown(options: argparse.Namespace, stack: ExitStack) -> Console:
         feed = LinkFeed(terminal_of(options))
         stack.callback(feed.close)
         place = NOWHERE if options.config is None else Surroundings.of(options.config)
-        return Console(options.link, feed, history, place, Commanding(feed.send, TELECOMMANDS))
+        by_link = Commanding(feed.send, TELECOMMANDS)
+        return Console(options.link, feed, history, place, by_link, frames=FrameFolder(options.frames))
     to = options.to
     if options.fly is not None:
         to = stack.enter_context(flying(options.fly, options.run))
@@ -100,7 +109,8 @@ def _shown(options: argparse.Namespace, stack: ExitStack) -> Console:
     folder = runs[-1] if runs else folder
     commanding = Commanding(by_socket(to) if to else None)
     place = Surroundings.of(folder / "config.yaml")
-    return Console(folder.name, LogTail(folder), history, place, commanding)
+    frames = FrameFolder(options.frames or folder / kept_frames.FOLDER)
+    return Console(folder.name, LogTail(folder), history, place, commanding, frames=frames)
 
 
 def _listening(port: int) -> socket.socket:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import signal
 import subprocess
 import sys
@@ -18,6 +19,10 @@ from flight.schema.reader import parse
 from flight.schema.sections import Commands
 
 _START_S, _END_S = 60.0, 15.0
+_FRAMES = 60
+"""That the flight keeps for the page."""
+_CAMERA = re.compile(r"(?m)^(camera:[^\n]*)$(?!(?:\n[ #][^\n]*)*?\n  keep_frames:)(?=\n  )")
+"""The head of a camera's section that does not say how many."""
 
 
 @contextlib.contextmanager
@@ -35,6 +40,7 @@ def flying(config: Path, out: Path) -> Iterator[str]:
         if parsed.commands != Commands():
             raise UsageError(f"{config}: has `commands`; start it by itself, and give the console --to")
         own = Path(place) / config.name
+        text = _CAMERA.sub(rf"\1\n  keep_frames: {_FRAMES}", text)
         own.write_text(f"{text}\ncommands: {{socket: {socket}}}\n", encoding="utf-8")
         words = [sys.executable, "-m", "flight", "run", str(own), "--realtime", "--out", str(out)]
         flight = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)

@@ -20,6 +20,7 @@ from ground.console.commanding import Commanding
 from ground.console.cursor import Cursor
 from ground.console.history import History
 from ground.console.instant import Instant
+from ground.console.kept_frames import FrameFolder
 from ground.console.surroundings import Surroundings
 from ground.documentation import command_table, database
 
@@ -65,6 +66,7 @@ class Console:
     commanding: Commanding
     utc_ns: int | None = None
     flight_heard: float = field(default_factory=time.monotonic)
+    frames: FrameFolder = field(default_factory=lambda: FrameFolder(None))
     trouble: str = ""
     settled_ns: int = 0
     sockets: set[web.WebSocketResponse] = field(default_factory=set)
@@ -99,6 +101,8 @@ def application(console: Console) -> web.Application:
             web.get("/api/series", pages.series),
             web.get("/api/track", pages.track),
             web.get("/api/live", pages.live),
+            web.get("/api/frame", pages.frame),
+            web.get("/api/frame.png", pages.picture),
             web.post("/api/words", pages.words),
             web.post("/api/command", pages.command),
             web.static("/page", PAGE),
@@ -198,6 +202,18 @@ class _Pages:
         utc = self._utc(_real(request, "at"))
         track = [] if utc is None else await asyncio.to_thread(self._console.surroundings.track, utc)
         return web.json_response({"track": track})
+
+    async def frame(self, request: web.Request) -> web.StreamResponse:
+        """Answer with what was found in a frame that was kept: ?sequence=; null where it was not."""
+        sequence = _whole(request, "sequence", 0)
+        return web.json_response(await asyncio.to_thread(self._console.frames.facts, sequence))
+
+    async def picture(self, request: web.Request) -> web.StreamResponse:
+        """Answer with the picture of a frame that was kept: ?sequence=."""
+        found = await asyncio.to_thread(self._console.frames.picture, _whole(request, "sequence", 0))
+        if found is None:
+            raise web.HTTPNotFound(text="that frame was not kept")
+        return web.Response(body=found, content_type="image/png")
 
     async def words(self, request: web.Request) -> web.StreamResponse:
         """Answer with a command in words, before it is sent."""

@@ -83,7 +83,16 @@ def test_every_integer_of_the_testbed_may_pass_its_end(
         demo_config(7.0), commands=Commands(timeline=(CommandStep(at=1.0, slew=0.1),))
     )
     run = fly(config, tmp_path)
-    elsewhere = {"spin", "navigation", "truth", "orbit_truth", "link", "verification", *_OF_OBJECTS}
+    elsewhere = {
+        "spin",
+        "navigation",
+        "truth",
+        "orbit_truth",
+        "link",
+        "verification",
+        "transfer",
+        *_OF_OBJECTS,
+    }
     assert_survived(run, driven, {packet.name for packet in PACKETS} - elsewhere)
 
 

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from flight.gnc.camera.lens import CameraModel
-from flight.gnc.math.arrays import Image
+from flight.gnc.math.arrays import FloatArray, Image
 from flight.gnc.vision.kept_frames import KeptFrames, keep_frame
 from flight.gnc.vision.objects.sighted import Sighted, SightSettings
 from flight.gnc.vision.startracker.detection import FrameKind, Survey, measure_areas, survey
@@ -131,7 +131,14 @@ def _facts(job: FrameJob, found: FrameFound) -> dict[str, Any]:
         "identified": 0 if solution is None else int((solution.star >= 0).sum()),
         "attitude": None if fix is None else fix.quaternion.tolist(),
         "objects": None if found.objects is None else len(found.objects.points),
+        "star_points": [] if solution is None else _places(solution.points[solution.star >= 0]),
+        "object_points": [] if found.objects is None else _places(found.objects.points),
     }
+
+
+def _places(points: FloatArray) -> list[list[float]]:
+    """Return points (n, 2) px in tenths of a pixel: enough to mark them."""
+    return [[round(x, 1), round(y, 1)] for x, y in points.tolist()]
 
 
 def _found(job: FrameJob) -> FrameFound:

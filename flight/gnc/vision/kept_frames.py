@@ -16,6 +16,9 @@ import numpy as np
 
 from flight.gnc.math.arrays import Image
 
+FOLDER = "frames"
+"""Of a run's folder."""
+
 
 @dataclass(frozen=True, slots=True)
 class KeptFrames:

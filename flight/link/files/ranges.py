@@ -28,6 +28,11 @@ class Ranges:
         """How many bytes are in it."""
         return sum(self._ends) - sum(self._begins)
 
+    @property
+    def end(self) -> int:
+        """The end of the last stretch, 0 of none."""
+        return self._ends[-1] if self._ends else 0
+
     def add(self, begin: int, end: int) -> None:
         """Add a stretch; what it touches becomes one with it."""
         if begin >= end:

@@ -188,6 +188,10 @@ class Receiver:
     def _go_on_checking(self) -> None:
         assert self.record.end is not None
         checksum, size = self.record.end
+        # Of what came before the metadata nobody knew yet where the file ends.
+        if size != self.record.size or self._ranges.end > size:
+            self.stop(Condition.SIZE_ERROR, f"bytes up to {self._ranges.end}, {size} by its end")
+            return
         if self._sum is None:
             self._naks.clear()
             with suppress(OSError):

@@ -58,6 +58,7 @@ export class Frames extends Rows {
     const known = this.lines.get(frame.sequence);
     if (known?.isConnected) return known;
     const line = row([seconds(frame), "", "", "", "", "", ""]);
+    line.dataset.sequence = frame.sequence;
     this.lines.set(frame.sequence, line);
     this.add(line);
     return line;

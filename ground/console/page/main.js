@@ -1,6 +1,7 @@
 // Holds the connection, the newest values and the time line; each other module draws one thing of them.
 import { Attitude } from "/page/attitude.js";
 import { CommandForms } from "/page/commands.js";
+import { KeptFrame } from "/page/frames.js";
 import { Events, Frames, History } from "/page/lists.js";
 import { GroundTrack } from "/page/map.js";
 import { Health, Packets, beyond, fieldOf, label } from "/page/values.js";
@@ -24,6 +25,7 @@ const views = [
   new Packets(byId("packets"), byId("all"), table),
   new Events(byId("events"), byId("severity"), byId("filter"), fieldOf(table, "event", "severity")),
   new Frames(byId("frames")),
+  new KeptFrame(byId("frame"), byId("frames")),
   new History(byId("commands"), fieldOf(table, "verification", "stage")),
   new CommandForms(byId("forms"), byId("looking"), byId("confirm"), table),
 ];

@@ -31,6 +31,7 @@ TARGETS = {
     "i2c": "tests.studies.fuzz.wires:Parts",
     "uplink": "tests.studies.fuzz.wires:uplink",
     "downlink": "tests.studies.fuzz.wires:downlink",
+    "files": "tests.studies.fuzz.units:Units",
     "workers": "tests.studies.fuzz.wires:workers",
 }
 

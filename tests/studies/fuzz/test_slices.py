@@ -24,6 +24,7 @@ SLICES = {
     "link": 800,
     "cli": 60,
     "flown": 30,
+    "files": 30,
     "releases": 60,
 }
 OTHERS = 250

@@ -40,6 +40,7 @@ RIGHT: dict[str, tuple[float, tuple[str, ...]]] = {
                      "run --figures new", "run flown", "flown run --json", "run flown --figures new")),
     "watch": (0.6, ("run", "run --once", "run --json", "flown", "flown --every 3 --plain", "runs --once",
                     f"{FLIGHT} --json", f"{FLIGHT} --once --patience 0.2", "run --patience 0.1")),
+    "orbit": (0.3, ("run", "run --json", "flown", "flown --opm new", "run --opm new --json")),
     "export": (0.4, ("run", "run --json", "run --out new", "run --format parquet --out new",
                      "run --format sqlite --out new.sqlite", "flown --format sqlite")),
     "samples": (0.3, ("", "--out new", "--out new --seed 3 --json")),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -163,6 +164,18 @@ def test_what_is_wrong_with_a_file_ends_its_transfer(
     end.take(pack(transaction, unit), 0)
     answers = [unpack(answer)[1] for answer in iter(lambda: end.unit(0), None)]
     assert [one.condition for one in answers if isinstance(one, Finished)] == [condition]
+
+
+def test_bytes_beyond_the_end_that_came_before_the_metadata_are_no_part_of_the_file(tmp_path: Path) -> None:
+    """CCSDS 727.0-B-5, 4.6.1.2: a file size error, whichever came first."""
+    pair, transaction = Pair(tmp_path, 0.0), Transaction(GROUND, 9, SATELLITE)
+    end = pair.ends[SATELLITE]
+    checksum = zlib.crc32(b"abc")
+    for unit in (FileData(0, b"abcdef"), Eof(0, checksum, 3), Metadata(3, "a", "a", CRC32)):
+        end.take(pack(transaction, unit), 0)
+    answers = [unpack(answer)[1] for answer in (end.unit(0) for _ in range(4)) if answer is not None]
+    assert [one.condition for one in answers if isinstance(one, Finished)] == [6]
+    assert not (tmp_path / str(SATELLITE) / "received" / "a").exists()
 
 
 def test_a_wrong_checksum_and_a_full_disk_are_reported_and_nothing_is_kept(
