@@ -9,8 +9,10 @@ from typing import Any
 from flight.app.utc_label import utc_ns
 from flight.gnc.errors import FlightError, UsageError
 from flight.link.commands import codec
-from flight.link.commands.definitions import LAYOUTS
+from flight.link.commands.definitions import LAYOUTS, LOAD_PARAMETERS
 from flight.link.commands.errors import CommandError
+from flight.link.parameters import FIELDS as PARAMETERS
+from flight.link.parameters import crc_of
 from flight.link.process import directives
 from flight.link.telemetry.form import Field
 from flight.link.telemetry.packets import Layout, Packer, TelemetryError
@@ -67,6 +69,8 @@ class Commanding:
         unknown = sorted(set(given) - {field.name for field in packet.fields})
         if unknown:
             raise UsageError(f"{name}: no such value: {', '.join(unknown)}")
+        if name == LOAD_PARAMETERS.name and not given.get("crc"):
+            given = {**given, "crc": _crc(given)}
         fields = {field.name: _value(name, field, given.get(field.name)) for field in packet.fields}
         try:
             data = self._packer.pack(packet, utc_ns(), fields)
@@ -80,6 +84,11 @@ def _words(data: bytes) -> str:
     """Return the words of a command's packet. Raises CommandError for values that are none."""
     directive = directives.unpack(data)
     return codec.unpack(data).text if directive is None else str(directive)
+
+
+def _crc(given: Object) -> int:
+    """Return the CRC of the parameters in a form, which no operator reckons by hand."""
+    return crc_of([float(_value(LOAD_PARAMETERS.name, field, given.get(field.name))) for field in PARAMETERS])
 
 
 def _value(name: str, field: Field, given: Any) -> Any:

@@ -31,8 +31,8 @@ class FrameFolder:
         if data is None:
             return None
         try:
-            pixels = pixels_of(data)
-            return {**facts_of(data), "columns": pixels.shape[1], "rows": pixels.shape[0]}
+            rows, columns = pixels_of(data).shape
+            return {**facts_of(data), "columns": columns, "rows": rows}
         except ValueError:
             return None
 
@@ -56,7 +56,7 @@ class FrameFolder:
 
 
 def pixels_of(data: bytes) -> Image:
-    """Return the pixels (rows, columns) of a kept frame's file. Raises ValueError for another one."""
+    """Return the pixels (rows, columns) of a kept frame, not copied. Raises ValueError for another file."""
     parts = data.split(b"\n", 4)
     if len(parts) != 5 or parts[0] != b"P5":
         raise ValueError("no kept frame")
@@ -64,7 +64,7 @@ def pixels_of(data: bytes) -> Image:
     kind = np.dtype(">u2") if int(parts[3]) > 255 else np.dtype(np.uint8)
     if columns < 1 or rows < 1 or len(parts[4]) != rows * columns * kind.itemsize:
         raise ValueError(f"{len(parts[4])} bytes are no frame of {columns} x {rows}")
-    return np.frombuffer(parts[4], kind).reshape(rows, columns).astype(np.float64)
+    return np.frombuffer(parts[4], kind).reshape(rows, columns)
 
 
 def binned(pixels: Image) -> Image:
@@ -72,7 +72,7 @@ def binned(pixels: Image) -> Image:
     step = -(-max(pixels.shape) // _LARGEST)
     rows, columns = (side // step for side in pixels.shape)
     squares = pixels[: rows * step, : columns * step].reshape(rows, step, columns, step)
-    return np.asarray(squares.mean(axis=(1, 3)))
+    return np.asarray(squares.mean(axis=(1, 3), dtype=np.float32))
 
 
 def stretched(pixels: Image) -> npt.NDArray[np.uint8]:

@@ -7,14 +7,15 @@ import contextlib
 import json
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 from aiohttp import WSMsgType, web
 
 from flight.gnc.errors import FlightError, UsageError
-from flight.link.telemetry.link_definitions import LINK, VERIFICATION
+from flight.link.telemetry.link_definitions import LINK, TRANSFER, VERIFICATION
 from flight.link.telemetry.packets import LAYOUTS, PacketArray, TelemetryError
 from ground.console.commanding import Commanding
 from ground.console.cursor import Cursor
@@ -28,8 +29,9 @@ PAGE = Path(__file__).parent / "page"
 PUSH_S = 0.1
 _LOOK_S = 0.1
 _MOST_POINTS = 4000
-_OF_THE_LINK = frozenset({LINK.name, VERIFICATION.name})
+_OF_THE_LINK = frozenset({LINK.name, VERIFICATION.name, TRANSFER.name})
 """Packets that come also while the flight itself is silent."""
+_T = TypeVar("_T")
 _Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 _HEADERS = {
@@ -160,6 +162,8 @@ class _Pages:
 
     def __init__(self, console: Console) -> None:
         self._console = console
+        # One thread for pictures: each thread that makes one holds on to the memory of it.
+        self._drawing = ThreadPoolExecutor(1)
 
     async def index(self, _: web.Request) -> web.StreamResponse:
         return web.FileResponse(PAGE / "index.html")
@@ -206,14 +210,18 @@ class _Pages:
     async def frame(self, request: web.Request) -> web.StreamResponse:
         """Answer with what was found in a frame that was kept: ?sequence=; null where it was not."""
         sequence = _whole(request, "sequence", 0)
-        return web.json_response(await asyncio.to_thread(self._console.frames.facts, sequence))
+        facts = await self._drawn(self._console.frames.facts, sequence)
+        return web.json_response(facts)
 
     async def picture(self, request: web.Request) -> web.StreamResponse:
         """Answer with the picture of a frame that was kept: ?sequence=."""
-        found = await asyncio.to_thread(self._console.frames.picture, _whole(request, "sequence", 0))
+        found = await self._drawn(self._console.frames.picture, _whole(request, "sequence", 0))
         if found is None:
             raise web.HTTPNotFound(text="that frame was not kept")
         return web.Response(body=found, content_type="image/png")
+
+    async def _drawn(self, make: Callable[[int], _T], sequence: int) -> _T:
+        return await asyncio.get_running_loop().run_in_executor(self._drawing, make, sequence)
 
     async def words(self, request: web.Request) -> web.StreamResponse:
         """Answer with a command in words, before it is sent."""

@@ -1,14 +1,15 @@
 // Forms made from the command table; nothing is sent before its words were confirmed.
 export class CommandForms {
   constructor(place, note, dialog, table) {
-    this.buttons = []; this.possible = table.commanding; this.note = note;
+    this.buttons = []; this.tables = []; this.possible = table.commanding; this.note = note;
     note.textContent = table.commanding ? "" : "This console only looks. Start it with --to SOCKET to command.";
     if (!table.commanding) return;
     for (const command of table.commands) place.append(this.form(command, dialog, table.name));
   }
 
   // The past cannot be commanded, and who looks at it should not try.
-  show(_, state) {
+  show(newest, state) {
+    for (const fill of this.tables) fill(newest);
     for (const button of this.buttons) button.disabled = !state.live;
     if (this.possible) this.note.textContent = state.live ? "" : "You look at the past: press live to command.";
   }
@@ -16,7 +17,11 @@ export class CommandForms {
   form(command, dialog, flight) {
     const form = Object.assign(document.createElement("form"), { className: "command" });
     form.append(Object.assign(document.createElement("b"), { textContent: command.name }));
-    const inputs = command.fields.map((field) => this.input(form, field));
+    const table = command.name === "load-parameters";
+    const place = table ? form.appendChild(document.createElement("details")) : form;
+    if (table) place.append(Object.assign(document.createElement("summary"), { textContent: "the table that flies, to be changed" }));
+    const inputs = command.fields.map((field) => this.input(place, field));
+    if (table) this.tables.push(filling(command.fields, [...place.querySelectorAll("input")]));
     const button = Object.assign(document.createElement("button"), { textContent: "send ..." });
     const result = document.createElement("p");
     result.textContent = command.meaning;
@@ -60,6 +65,18 @@ export class CommandForms {
     const numbers = () => input.value.split(/[\s,]+/).filter((word) => word !== "");
     return () => (field.count > 1 ? numbers() : numbers()[0] ?? null);
   }
+}
+
+// Fills the form of the parameters with the table that flies, whenever another one does; the console reckons the CRC.
+function filling(fields, inputs) {
+  let filled = null;
+  fields.forEach((field, k) => { inputs[k].parentElement.hidden = field.name === "crc" || field.name === "replaced"; });
+  return (newest) => {
+    const flown = newest.parameters;
+    if (!flown || flown.crc === filled) return;
+    filled = flown.crc;
+    fields.forEach((field, k) => { inputs[k].value = field.name === "replaced" ? flown.crc : field.name === "crc" ? "" : flown[field.name]; });
+  };
 }
 
 async function ask(path, body) {

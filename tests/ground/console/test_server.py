@@ -206,7 +206,7 @@ def test_each_command_of_the_table_is_packed_from_a_form_as_the_codec_reads_it(f
         "slew": {"q2": "0.25"},
         "clear": {"event": "coil-broken"},
         "point": {"goal": 4, "numbers": ["0.5", "0.6"], "roll": ""},
-        "load-parameters": {"replaced": 7, "crc": crc_of(table), **named},
+        "load-parameters": {"replaced": 7, "crc": "", **named},
         "dump-parameters": {},
     }
     assert set(forms) == {packet.name for packet in COMMANDS}
