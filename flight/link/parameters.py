@@ -32,7 +32,7 @@ FIELDS: tuple[Field, ...] = (
     _parameter("health.cpu_share", "-", 0.01, 64.0, "of one core: the control process takes more"),
     _parameter("health.memory", "B", 1e6, 1e12, "the flight processes take more memory"),
     _parameter("health.memory_slope", "B/h", 1e3, 1e12, "it grows faster"),
-    _parameter("health.disk_free", "B", 0.0, 1e13, "the disk has less left"),
+    _parameter("health.disk_free", "B", 1.0, 1e13, "the disk has less left"),
     _parameter("health.temperature", "degree C", -40.0, 150.0, "the board is warm beyond it"),
     _parameter("health.hottest", "degree C", -40.0, 150.0, "and too hot beyond it"),
 )

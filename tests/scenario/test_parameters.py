@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from flight.link.commands.codec import CommandPacker
@@ -64,8 +65,13 @@ def test_a_table_for_another_one_or_with_a_wrong_sum_changes_nothing(
 
 
 def test_the_ranges_that_may_be_commanded_lie_within_what_the_schema_takes() -> None:
-    """Each parameter is a number of the configuration that is flown where nothing is loaded."""
-    for key, value in configured().items():
-        (field,) = (field for field in FIELDS if field.name == key.replace(".", "_", 1))
+    """And the configuration's own value lies within them: it flies where nothing is loaded."""
+    config = commanded(4.0)
+    for (key, value), field in zip(configured().items(), FIELDS, strict=True):
         assert field.valid is not None
         assert field.valid[0] <= value <= field.valid[1]
+        section, _, name = key.partition(".")
+        flown = getattr(config, section)
+        for bound in field.valid:
+            taken = msgspec.convert({**msgspec.to_builtins(flown), name: bound}, type(flown))
+            assert getattr(taken, name) == bound

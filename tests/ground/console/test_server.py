@@ -163,6 +163,12 @@ def test_the_links_own_packets_do_not_hide_a_flight_that_is_silent(folder: Path)
         assert console.flight_heard > heard
 
 
+def test_a_frame_that_was_not_kept_is_null_and_has_no_picture(folder: Path) -> None:
+    assert get(folder, "/api/frame?sequence=7") == (200, None)
+    assert get(folder, "/api/frame.png?sequence=7") == (404, "that frame was not kept")
+    assert get(folder, "/api/frame?sequence=x")[0] == 400
+
+
 def test_what_is_shown_live_is_whole(folder: Path) -> None:
     """Packets of one instant may come in two looks: live stands at the instant before until the next look."""
 
