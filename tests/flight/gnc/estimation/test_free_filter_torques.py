@@ -53,7 +53,7 @@ class Craft:
         return np.asarray(np.mean(rates, axis=0) + BIAS + GYRO_SIGMA * self.rng.standard_normal(3))
 
     def _acceleration(self, rate: FloatArray, torque: FloatArray) -> FloatArray:
-        return np.linalg.solve(self._inertia, torque - np.cross(rate, self._inertia @ rate))
+        return np.asarray(np.linalg.solve(self._inertia, torque - np.cross(rate, self._inertia @ rate)))
 
     def seen(self, sigma: float) -> FloatArray:
         """Return the attitude with an error of `sigma` rad an axis."""
