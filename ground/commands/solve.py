@@ -86,6 +86,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--wcs", type=Path, metavar="FITS", help="write a header of world coordinates (TAN-SIP) here"
     )
     parser.add_argument("--index", type=Path, metavar="FILE", help="another sky index")
+    _add_methods(parser)
+    add_output(parser, run)
+
+
+def _add_methods(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--method",
         choices=tuple(METHODS),
@@ -106,7 +111,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="of points: psf fits the point spread (default), window is the centre of mass, the others weigh "
         "its pixels otherwise",
     )
-    add_output(parser, run)
 
 
 def run(options: argparse.Namespace) -> int:
