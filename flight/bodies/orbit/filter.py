@@ -52,7 +52,7 @@ class OrbitFilter:
         self._last_field: list[float] = []
         self._same_fields = 0
         self._refused_attitudes = 0
-        self._contradicted = 0  # steps in a row whose gyro contradicted the commanded dipole
+        self._contradicted = 0  # steps with a dipole, in a row, whose gyro contradicted it
         self.restarts = 0
 
     @property
@@ -241,9 +241,11 @@ class OrbitFilter:
 
         What the coils did otherwise may have begun in the step before: its gyro shows only half of it.
         """
-        refused = self._replay.refused_gyros > 0
-        self._contradicted = self._contradicted + 1 if refused else 0
-        steps = self._steps
+        refused, steps = self._replay.refused_gyros > 0, self._steps
+        if refused:
+            self._contradicted += 1
+        elif steps[-1].dipole.any():  # a pause between two commands says nothing of them
+            self._contradicted = 0
         if refused and not steps[-1].doubt:
             first = max(len(steps) - 2, 0)
             for k in range(first, len(steps)):
