@@ -16,6 +16,7 @@ from ground.report.signals import seconds
 from ground.telemetry.reader import Run
 from sim_hal.faults.kinds import FaultKind
 from tests.studies.campaigns.campaign import Result
+from tests.studies.campaigns.fault_judgement import GAIN_ERROR, OFF_SURELY
 from tests.studies.campaigns.fault_table import OWN, own_events, part_of
 from tests.studies.campaigns.orbit_fault_flights import DURATION
 
@@ -28,6 +29,10 @@ ZERO, DRIVEN = 1e-3, 6e-3
 """A: a coil that is off carries less; a coil that drives carries more."""
 SIGMAS, FINE_AT_MOST = 5.0, np.radians(0.1)
 """Of its claims, and rad: an attitude that is further off than both is false."""
+DIPOLE_PER_AMPERE = 0.648
+"""m^2, of config/orbit.yaml."""
+LOOKED, FEW = 3.0, 3
+"""s after an upset in which its trace is looked for; samples of the unit that may lack."""
 LAST = 12.0
 """s at the end of a flight, in which the body must do again what its mode is for."""
 ACTS, RATE_OFF = 2e-3, 0.0175
@@ -84,25 +89,34 @@ def is_own(kind: FaultKind, name: str, text: str) -> bool:
 def is_exercised(flown: Run, kind: FaultKind, mode: str, at: float, end: float) -> bool:
     """Return whether the part was in use while its fault lasted."""
     inside = _within(flown, "attitude", at, end)
-    asked = np.abs(flown["attitude"]["dipole"][inside]) / 0.648
-    part = part_of(kind)
-    if part in {"coil", "bridge"}:
-        return kind.kind.endswith("high") or _long(_driven(flown, kind, asked, inside))
-    if part in {"pwm", "monitor"}:
-        always = {"off", "nack", "slow", "intermittent", "brown-out", "garbage"}
-        return kind.kind in always or (kind.kind != "upset" and _long((asked > 2 * DRIVEN).any(axis=1)))
-    if part == "camera":
-        return mode not in SPINS and end - at > 6.0
-    if part in {"planner", "vision"}:
-        jobs = flown["job_timing"]
-        when = seconds(jobs)
-        mine = np.array([to_text(name) == kind.device for name in jobs["name"]], dtype=bool)
-        return bool((mine & (when > at + 0.3) & (when < end)).any())
-    if kind.name == "strings: dead":
-        return _is_string_lit(flown, at, end)
-    return True
+    asked = np.abs(flown["attitude"]["dipole"][inside]) / DIPOLE_PER_AMPERE
+    found = True
+    match part_of(kind):
+        case "coil" | "bridge":
+            found = kind.kind.endswith("high") or _long(_driven(flown, kind, asked, inside))
+        case part if kind.kind == "upset":  # a bit that matters is told, or the unit's samples lack
+            came = int(_within(flown, "imu", at, at + LOOKED).sum())
+            found = part == "imu" and abs(came - round(LOOKED / CYCLE)) > FEW
+        case "monitor" if kind.kind == "delayed":
+            found = _is_behind(flown, kind, inside)
+        case "pwm" | "monitor":
+            found = kind.kind in ALWAYS or _long((asked > 2 * DRIVEN).any(axis=1))
+        case "camera":
+            found = mode not in SPINS and end - at > 6.0
+        case "planner" | "vision":
+            jobs = flown["job_timing"]
+            when = seconds(jobs)
+            mine = np.array([to_text(name) == kind.device for name in jobs["name"]], dtype=bool)
+            found = bool((mine & (when > at + 0.3) & (when < end)).any())
+        case "strings" if kind.kind == "dead":
+            found = _is_string_lit(flown, at, end)
+        case _:
+            pass
+    return found
 
 
+ALWAYS = {"off", "nack", "slow", "intermittent", "brown-out", "garbage"}
+"""Faults of a part that it shows whatever is asked of it."""
 SPINS = ("detumble", "safe")
 """Modes in which the body turns too fast for the camera at first."""
 
@@ -113,6 +127,15 @@ def _driven(flown: Run, kind: FaultKind, asked: np.ndarray, inside: BoolArray) -
     signed = flown["attitude"]["dipole"][inside][:, axis]
     wanted = {"a-low": signed > 0.0, "b-low": signed < 0.0}.get(kind.kind, np.ones(len(signed), dtype=bool))
     return np.asarray(wanted & (asked[:, axis] > 2 * DRIVEN))
+
+
+def _is_behind(flown: Run, kind: FaultKind, inside: BoolArray) -> bool:
+    """Return whether the commands, ten a second, differed from those of an old answer for a second."""
+    asked = np.abs(flown["attitude"]["dipole"]).sum(axis=1) / DIPOLE_PER_AMPERE
+    behind = round(10.0 * (kind.parameters["delay"].default or 0.0))
+    before = np.concatenate([np.full(behind, asked[0]), asked[:-behind]])
+    differs = np.abs(asked - before) > OFF_SURELY + GAIN_ERROR * np.maximum(asked, before)
+    return bool((differs & inside).sum() > 10)
 
 
 def _long(driven: BoolArray) -> bool:
