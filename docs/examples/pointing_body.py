@@ -269,6 +269,7 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
     filter_, problems = attitude_filter(config, plant, learned)
     tracker = CrossProductTracker(config, surrounding_field(config))
     direct = Direct()
+    density = angular_acceleration_psd_of(config, plant) * np.eye(3)
     return Body(
         modes=frozenset(Mode) - ORBITAL,
         filter=filter_,
@@ -284,7 +285,7 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
         field=tracker.field,
         free_axis=np.array([0.0, 1.0, 0.0]),
         dipole_per_ampere=dipole_per_ampere(config),
-        angular_acceleration_psd=angular_acceleration_psd_of(config, plant),
+        angular_acceleration_psd=lambda _: density,
     )
 
 

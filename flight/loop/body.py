@@ -221,7 +221,8 @@ class Body:
         coil_watch: compares commanded currents with supply and motion.
         feed: gives the filter the readings of the inertial unit.
         brake: brakes a tumble by the magnetometer alone.
-        angular_acceleration_psd: rad^2/s^3, density of the body's white angular acceleration.
+        angular_acceleration_psd: returns the density (3, 3) rad^2/s^3 of the body's white angular
+            acceleration at a time, body axes.
         knowledge: returns how well the attitude is known now, where there is an estimate.
         velocity: returns the velocity (3,) m/s about the Sun at a time, reference axes, by which starlight is
             aberrated; None where the configured one holds.
@@ -247,7 +248,7 @@ class Body:
     field: Callable[[Estimate], FloatArray]
     free_axis: FloatArray | None
     dipole_per_ampere: float
-    angular_acceleration_psd: float
+    angular_acceleration_psd: Callable[[int], FloatArray]
     knowledge: Callable[[], Knowledge] = lambda: Knowledge.FINE
     velocity: Callable[[int], FloatArray | None] = lambda _: None
     fix: Callable[[GpsReading], bool] = lambda _: False

@@ -67,6 +67,10 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
         around = surroundings.at(estimate.time_ns)
         return np.zeros(3) if around is None else attitude_matrix(estimate.quaternion) @ around.field
 
+    def acceleration_psd(time_ns: int) -> FloatArray:
+        density = filter_.acceleration_psd(time_ns)
+        return config.detumble.torque_noise**2 * np.eye(3) if density is None else density
+
     def disturbed() -> tuple[FloatArray, FloatArray]:
         return filter_.torque_sizes, filter_.residual_dipole
 
@@ -85,7 +89,7 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
         field=field,
         free_axis=None,
         dipole_per_ampere=dipole_per_ampere,
-        angular_acceleration_psd=(config.detumble.torque_noise) ** 2,
+        angular_acceleration_psd=acceleration_psd,
         knowledge=lambda: filter_.knowledge,
         velocity=surroundings.velocity,
         fix=surroundings.fix,
@@ -150,6 +154,7 @@ def _timed(config: OrbitConfig) -> list[tuple[float, PointingTarget]]:
 
 def _filter(config: OrbitConfig, surroundings: Surroundings) -> OrbitFilter:
     craft, section, unit = config.craft, config.estimation, config.inertial_unit
+    rate_hz = config.executive.control_rate_hz
     settings = OrbitFilterSettings(
         inertia=np.diag(craft.inertia),
         dipole_per_ampere=craft.dipole_per_ampere,
@@ -159,7 +164,11 @@ def _filter(config: OrbitConfig, surroundings: Surroundings) -> OrbitFilter:
         field_error=section.field_error,
         settle_ns=round(config.detumble.settle * SECOND_NS),
         history_ns=round(section.history * SECOND_NS),
-        free=FreeFilterSettings(gyro=(section.bias_start, section.bias_walk), gate_sigma=section.gate_sigma),
+        free=FreeFilterSettings(
+            gyro=(section.bias_start, section.bias_walk),
+            coil_noise=section.current_noise * craft.dipole_per_ampere / math.sqrt(rate_hz),
+            gate_sigma=section.gate_sigma,
+        ),
     )
     return OrbitFilter(settings, surroundings.at)
 

@@ -106,9 +106,10 @@ class CoarseSunFeed:
         """Start the filter from an attitude, or feed it the turn about the field."""
         then = self._filter.past(time_ns) if self._filter.runs else None
         if then is None or self._against >= CONTRADICTED:
-            self._against = 0
+            doubted, self._against = self._against >= CONTRADICTED, 0
             if fix.about <= START_SIGMA:
-                self._filter.begin(AttitudeMeasurement(time_ns, fix.quaternion, fix.covariance))
+                attitude = AttitudeMeasurement(time_ns, fix.quaternion, fix.covariance)
+                self._filter.begin(attitude, doubted=doubted)
             return
         claim = then.covariance[TURN, TURN]
         off = to_rotation_vector(multiply(fix.quaternion, conjugate(then.quaternion)))

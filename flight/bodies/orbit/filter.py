@@ -150,14 +150,17 @@ class OrbitFilter:
             self._close()
         return self.started and not self.doubts_commands
 
-    def begin(self, attitude: AttitudeMeasurement) -> bool:
-        """Start from an attitude; return False where no step was taken at its time."""
+    def begin(self, attitude: AttitudeMeasurement, *, doubted: bool = False) -> bool:
+        """Start from an attitude; return False where no step was taken at its time.
+
+        `doubted`: the estimate was contradicted, so what it claims to have learned is not that well known.
+        """
         self._close()
         place = self._replay.place(attitude.time_ns)
         if place is None:
             return False
         self.restarts += self._free.started
-        self._replay.start(attitude, place)
+        self._replay.start(attitude, place, doubted)
         self._refused_attitudes = 0
         return True
 
@@ -215,6 +218,14 @@ class OrbitFilter:
         times = [step.begin_ns for step in inside]
         return np.array([*times, last.time_ns], dtype=np.int64), np.array([*rates, last.rate])
 
+    def acceleration_psd(self, time_ns: int) -> FloatArray | None:
+        """Return the density (3, 3) rad^2/s^3 of the acceleration's noise then, None beyond the history."""
+        place = self._replay.place(time_ns) if self._free.started else None
+        if place is None:
+            return None
+        step = self._steps[place]
+        return self._free.rate_noise(step.dipole, step.around, step.doubt)
+
     def _acts(self) -> bool:
         return self._dipoles.at_rest_since() is None
 
@@ -257,4 +268,4 @@ class OrbitFilter:
         self._refused_attitudes = 0 if used else self._refused_attitudes + 1
         patience = REFUSALS_TO_RESTART if self.knowledge is Knowledge.FINE else 1
         if self._refused_attitudes >= patience:
-            self.begin(attitude)
+            self.begin(attitude, doubted=True)

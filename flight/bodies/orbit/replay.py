@@ -76,10 +76,13 @@ class StepReplay:
         if self.free.started:
             self.take_on(len(self.steps) - 1)
 
-    def start(self, attitude: AttitudeMeasurement, place: int) -> None:
-        """Start from an attitude in step number `place`; the estimates before it are forgotten."""
+    def start(self, attitude: AttitudeMeasurement, place: int, doubted: bool) -> None:
+        """Start from an attitude in step number `place`; the estimates before it are forgotten.
+
+        `doubted`: they were contradicted.
+        """
         first = self.steps[place]
-        self.free.start(attitude.quaternion, attitude.covariance, first.gyro)
+        self.free.start(attitude.quaternion, attitude.covariance, first.gyro, doubted=doubted)
         for k in range(place + 1):
             self.steps[k].before = None
             self.steps[k].late.clear()
@@ -161,7 +164,7 @@ class StepReplay:
         uneven = np.cross(step.impulse - since * step.dipole, shown)
         change = since * free.acceleration + free.motion.inverse @ uneven
         spread = settings.free.coil_error**2 * float(change @ change) + settings.gyro_noise**2 / step.samples
-        refused = not free.gyro(step.gyro, spread * _EYE, change)
+        refused = not free.gyro(step.gyro, spread * _EYE, change, since)
         self.refused_gyros = self.refused_gyros + 1 if refused else 0
         if step.field is not None:
             turn = free.rate * ((step.end_ns - step.field_ns) / SECOND_NS)

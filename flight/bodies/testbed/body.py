@@ -63,6 +63,7 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
         angle = reader.read(estimate).angle
         return np.asarray(attitude_matrix(about_axis_y(angle)) @ reference_field)
 
+    density = angular_acceleration_psd_of(config, plant) * np.eye(3)
     return Body(
         modes=frozenset(Mode) - ORBITAL,
         filter=filter_,
@@ -78,7 +79,7 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
         field=field,
         free_axis=_THREAD_AXIS,
         dipole_per_ampere=dipole,
-        angular_acceleration_psd=angular_acceleration_psd_of(config, plant),
+        angular_acceleration_psd=lambda _: density,
     )
 
 

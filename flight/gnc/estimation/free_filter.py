@@ -8,7 +8,8 @@ the seconds in which a body slow enough for star images turns evenly. One step w
 ms.
 
 The residual dipole has a constant part and a part that comes and goes with sunlight. The other torques have
-the shapes of `flight.gnc.earth.disturbance`; their sizes are states.
+the shapes of `flight.gnc.earth.disturbance`; their sizes are states, and so is a small turn of the principal
+axes from those believed: while a body tumbles its gyroscopic torque would else pass for a bias of the gyros.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import numpy as np
 from flight.gnc.earth.disturbance import SIZES
 from flight.gnc.estimation.estimate import Knowledge
 from flight.gnc.estimation.free_motion import (
+    AXES,
     DIPOLE,
     GYRO,
     MAGNET,
@@ -46,6 +48,8 @@ from flight.gnc.math.quaternion import (
 
 LARGEST_TURN = 0.1
 """rad, of a step of integration."""
+LASTING = 20.0
+"""s, for which an error of the coils or of the inertia keeps its sign: as white noise it has this density."""
 _EYE: FloatArray = np.eye(3)
 
 
@@ -59,7 +63,10 @@ class FreeFilterSettings:
         magnet: T, of the magnetometer.
         torque: N m, of each size.
         torque_noise: N m sqrt(s), white, of what has no shape.
-        coil_error: share of the coils' torque that is uncertain for tens of seconds.
+        coil_error: share of the coils' dipole that is uncertain for tens of seconds, in any direction.
+        coil_noise: A m^2 sqrt(s), white, of each coil while the coils are driven.
+        axes: rad, of the principal axes.
+        inertia_error: share of the gyroscopic torque that no turn of the axes explains.
         rate_start: rad/s, of the first rate.
         fine, coarse: rad, largest sigma of the worst axis that is called so.
         gate_sigma: a measurement less likely than this many sigma of one component is refused.
@@ -71,7 +78,10 @@ class FreeFilterSettings:
     magnet: tuple[float, float] = (3e-7, 1e-9)
     torque: tuple[float, float] = (3e-9, 5e-12)
     torque_noise: float = 3e-9
-    coil_error: float = 0.03
+    coil_error: float = 0.04
+    coil_noise: float = 0.0
+    axes: tuple[float, float] = (0.03, 0.0)
+    inertia_error: float = 0.003
     rate_start: float = 1e-3
     fine: float = math.radians(0.1)
     coarse: float = math.radians(5.0)
@@ -96,7 +106,7 @@ class FreeFilter:
         quaternion: (4,) ICRS into body.
         rate: (3,) rad/s, body axes.
         acceleration: (3,) rad/s^2, body axes, of the last step.
-        covariance: (27, 27) of the errors (TURN, RATE, ...).
+        covariance: (30, 30) of the errors (TURN, RATE, ...).
         knowledge: how well the attitude is known.
         changes: counts the changes of the estimate.
     """
@@ -106,9 +116,11 @@ class FreeFilter:
         self.motion = FreeMotion(inertia)
         self._settings = settings
         tail = math.erfc(settings.gate_sigma / math.sqrt(2.0))
+        self._walks = self._of_slow(1) ** 2
         self._gates = {n: chi_square.bound(tail, n) for n in (1, 2, 3)}
         self._constants: FloatArray = np.zeros(STATES)
         self.acceleration: FloatArray = np.zeros(3)
+        self._slope: FloatArray = np.zeros((3, STATES))  # of the acceleration, by the states
         self.started = False
         self.refused = 0
         self.changes = 0
@@ -116,20 +128,21 @@ class FreeFilter:
         self.rate: FloatArray = np.zeros(3)
         self.covariance: FloatArray = np.zeros((STATES, STATES))
 
-    def start(self, quaternion: FloatArray, covariance: FloatArray, gyro: FloatArray) -> None:
-        """Start from an attitude (4,) with covariance (3, 3) rad^2, body axes, and a gyro's rate (3,) rad/s.
+    def start(
+        self, quaternion: FloatArray, covariance: FloatArray, gyro: FloatArray, *, doubted: bool = False
+    ) -> None:
+        """Start from an attitude (4,), covariance (3, 3) rad^2, body axes, and a gyro's rate (3,) rad/s.
 
-        What was learned of the slow states is kept.
+        What was learned of the slow states is kept; `doubted`: the estimate was contradicted, so how well
+        they are claimed to be known is not.
         """
-        s = self._settings
         self.changes += 1
-        if not self.started:
-            starts = [s.gyro[0], s.dipole[0], s.sunlit[0], s.magnet[0], *[s.torque[0]] * (SIZES // 3)]
-            self.covariance[6:, 6:] = np.diag(np.repeat(starts, 3) ** 2)
+        if doubted or not self.started:
+            self.covariance[6:, 6:] = np.diag(self._of_slow(0) ** 2)
         self.covariance[:6] = self.covariance[:, :6] = 0.0
         self.covariance[TURN, TURN] = covariance
         bias = self.covariance[GYRO, GYRO]
-        self.covariance[RATE, RATE] = bias + s.rate_start**2 * _EYE
+        self.covariance[RATE, RATE] = bias + self._settings.rate_start**2 * _EYE
         # The gyro measures the sum of rate and bias, so their errors are opposite.
         self.covariance[RATE, GYRO] = self.covariance[GYRO, RATE] = -bias
         self.quaternion, self.rate = quaternion, gyro - self._constants[GYRO]
@@ -172,6 +185,11 @@ class FreeFilter:
         """The sizes (9,) N m of the torques."""
         return self._constants[TORQUES].copy()
 
+    @property
+    def axes_turn(self) -> FloatArray:
+        """The turn (3,) rad of the principal axes from those believed, body axes."""
+        return self._constants[AXES].copy()
+
     def residual_dipole(self, sunlit: float) -> FloatArray:
         """Return the residual dipole (3,) A m^2 in a share of sunlight, body axes."""
         return np.asarray(self._constants[DIPOLE] + sunlit * self._constants[SUNLIT])
@@ -186,13 +204,17 @@ class FreeFilter:
         for _ in range(steps):
             self._step(seconds / steps, dipole, around, doubt)
 
-    def gyro(self, rate: FloatArray, covariance: FloatArray, change: FloatArray | None = None) -> bool:
+    def gyro(
+        self, rate: FloatArray, covariance: FloatArray, change: FloatArray | None = None, since: float = 0.0
+    ) -> bool:
         """Accept a gyro's rate (3,) rad/s and its covariance (3, 3).
 
-        Of a mean over the past, `change` (3,) is by how much the rate has changed since its middle.
+        Of a mean over the past, `change` (3,) is by how much the rate has changed since its middle, `since` s
+        ago, by the last step's acceleration.
         """
-        rows = np.zeros((3, STATES))
-        rows[:, RATE] = rows[:, GYRO] = _EYE
+        rows = -since * self._slope
+        rows[:, RATE] += _EYE
+        rows[:, GYRO] += _EYE
         value = rate - self.rate - self._constants[GYRO]
         return self._update(value if change is None else value + change, rows, covariance)
 
@@ -233,6 +255,7 @@ class FreeFilter:
         """Take one step of the midpoint rule, with its covariance."""
         self.changes += 1
         motion = self.motion
+        motion.turn_axes(self._constants[AXES])
         middle = multiply(from_rotation_vector(0.5 * dt * self.rate), self.quaternion)
         whole = dipole + self.residual_dipole(around.sunlit)
         torque, flow = motion.torque(middle, whole, self._constants[TORQUES], around)
@@ -240,6 +263,8 @@ class FreeFilter:
         acceleration = motion.acceleration(half, torque)
         flow[0:3, TURN], flow[0:3, RATE] = -crossed(half), _EYE
         flow[3:6, RATE] = motion.stiffness(half)
+        flow[3:6, AXES] += motion.by_axes(half, acceleration)
+        self._slope = flow[3:6].copy()
         turn = from_rotation_vector(dt * (self.rate + 0.5 * dt * acceleration))
         self.quaternion = multiply(turn, self.quaternion)
         self.acceleration = acceleration
@@ -254,25 +279,37 @@ class FreeFilter:
 
     def rate_noise(self, dipole: FloatArray, around: Around, doubt: float = 0.0) -> FloatArray:
         """Return the density (3, 3) rad^2/s^3 of the acceleration's noise under the coils' dipole (3,)."""
+        s, motion = self._settings, self.motion
+        square = float(dipole @ dipole)
+        coils = LASTING * (s.coil_error**2 * square / 3.0 + doubt**2) + (s.coil_noise**2 if square else 0.0)
+        # The gyroscopic error turns with the body: on each side it lasts for the time of a radian.
+        speed = math.sqrt(float(self.rate @ self.rate))
+        gyroscopic = speed**2 * s.inertia_error * motion.largest_difference
+        lasting = LASTING if LASTING * speed < 2.0 else 2.0 / speed
+        density = (s.torque_noise**2 + lasting * gyroscopic**2) * motion.by_torque
+        if coils:
+            across = motion.inverse @ crossed(attitude_matrix(self.quaternion) @ around.field)
+            density = density + coils * (across @ across.T)
+        return np.asarray(density)
+
+    def _of_slow(self, which: int) -> FloatArray:
+        """Return the deviations at the start (0), or the walks (1), of the states (24,) after the rate."""
         s = self._settings
-        unknown = s.coil_error**2 * float(dipole @ dipole) + doubt**2
-        coils = 20.0 * unknown * float(around.field @ around.field)
-        return np.asarray((s.torque_noise**2 + coils) * self.motion.by_torque)
+        pairs = [s.gyro, s.dipole, s.sunlit, s.magnet, *[s.torque] * (SIZES // 3), s.axes]
+        return np.repeat([pair[which] for pair in pairs], 3)
 
     def _add_noise(self, dt: float, dipole: FloatArray, around: Around, doubt: float) -> None:
-        s = self._settings
         density = dt * self.rate_noise(dipole, around, doubt)
         covariance = self.covariance
         covariance[RATE, RATE] += density
         covariance[TURN, TURN] += dt * dt / 3.0 * density
         covariance[TURN, RATE] += 0.5 * dt * density
         covariance[RATE, TURN] += 0.5 * dt * density
-        walks = [s.gyro[1], s.dipole[1], s.sunlit[1], s.magnet[1], *[s.torque[1]] * (SIZES // 3)]
         diagonal = covariance.reshape(-1)[:: STATES + 1]
-        diagonal[6:] += dt * np.repeat(walks, 3) ** 2
+        diagonal[6:] += dt * self._walks
 
     def _update(self, value: FloatArray, rows: FloatArray, noise: FloatArray) -> bool:
-        """Correct by an innovation (k,), derivative (k, 27) and noise (k, k); return whether it was used."""
+        """Correct by an innovation (k,), derivative (k, 30) and noise (k, k); return whether it was used."""
         cross = self.covariance @ rows.T
         weight = np.linalg.inv(rows @ cross + noise)
         if not 0.0 <= float(value @ weight @ value) <= self._gates[len(value)]:  # a NaN does not pass

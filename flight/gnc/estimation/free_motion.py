@@ -1,6 +1,7 @@
 """The motion of a free satellite: Euler's equation with coils and the torques of an orbit, and its flow.
 
-The gravity gradient is of the believed inertia; the other torques have the shapes of
+The principal axes may be turned a little from those believed: at a fast spin of a long body the gyroscopic
+torque of that turn is the largest that is not known. The other torques have the shapes of
 `flight.gnc.earth.disturbance`.
 """
 
@@ -14,11 +15,12 @@ import numpy as np
 from flight.gnc.earth.disturbance import SIZES, Pressures, shapes
 from flight.gnc.earth.figure import GRAVITATIONAL_PARAMETER
 from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import attitude_matrix
+from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector
 
 TURN, RATE, GYRO, DIPOLE, SUNLIT, MAGNET = (slice(3 * k, 3 * k + 3) for k in range(6))
 TORQUES = slice(18, 18 + SIZES)
-STATES = 18 + SIZES
+AXES = slice(18 + SIZES, 21 + SIZES)
+STATES = 21 + SIZES
 """Where the parts of the error stand in the covariance of `free_filter`."""
 
 
@@ -36,12 +38,28 @@ class Around:
 
 
 class FreeMotion:
-    """The equations of one inertia."""
+    """The equations of one inertia, whose principal axes may be turned."""
 
     def __init__(self, inertia: FloatArray) -> None:
         """`inertia` (3, 3) kg m^2, body axes."""
-        self.inertia = np.asarray(inertia, dtype=float)
-        self.inverse: FloatArray = np.linalg.inv(self.inertia)
+        self._believed: FloatArray = np.asarray(inertia, dtype=float)
+        moments = np.linalg.eigvalsh(self._believed)
+        self.largest_difference = float(moments[-1] - moments[0])
+        """kg m^2, of the principal moments: what a turn of their axes acts by."""
+        self._turn: FloatArray = np.zeros(3)
+        self._take(self._believed)
+
+    def turn_axes(self, turn: FloatArray) -> None:
+        """Turn the principal axes from those believed by a rotation vector (3,) rad, body axes."""
+        if np.array_equal(turn, self._turn):
+            return
+        self._turn = turn.copy()
+        back = attitude_matrix(from_rotation_vector(turn))
+        self._take(np.asarray(back.T @ self._believed @ back, dtype=float))
+
+    def _take(self, inertia: FloatArray) -> None:
+        self.inertia: FloatArray = inertia
+        self.inverse: FloatArray = np.asarray(np.linalg.inv(inertia), dtype=float)
         self.by_torque: FloatArray = self.inverse @ self.inverse
         """(3, 3), the covariance of the acceleration by a variance of the torque."""
 
@@ -56,7 +74,7 @@ class FreeMotion:
     def torque(
         self, quaternion: FloatArray, dipole: FloatArray, sizes: FloatArray, around: Around
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the torque (3,) N m, and the flow (6, 27) with what all but the rate do to the rate.
+        """Return the torque (3,) N m, and the flow (6, 30) with what all but rate and axes do to the rate.
 
         The `dipole` (3,) A m^2 is the coils' and the residual one, `sizes` (9,) N m are of the other torques.
         """
@@ -75,7 +93,16 @@ class FreeMotion:
         flow[3:6, DIPOLE] = -self.inverse @ across
         flow[3:6, SUNLIT] = around.sunlit * flow[3:6, DIPOLE]
         flow[3:6, TORQUES] = self.inverse @ shape
+        flow[3:6, AXES] = strength * self.inverse @ upright @ self._turned(up)
         return torque, flow
+
+    def by_axes(self, rate: FloatArray, acceleration: FloatArray) -> FloatArray:
+        """Return the derivative (3, 3) of the acceleration (3,) by a turn of the axes, gravity left out."""
+        return np.asarray(-self.inverse @ (crossed(rate) @ self._turned(rate) + self._turned(acceleration)))
+
+    def _turned(self, vector: FloatArray) -> FloatArray:
+        """Return the derivative (3, 3) of J v by a small turn d of J: d x J v - J (d x v)."""
+        return np.asarray(self.inertia @ crossed(vector) - crossed(self.inertia @ vector))
 
 
 def crossed(vector: FloatArray) -> FloatArray:

@@ -46,7 +46,8 @@ class ImagingSettings:
         max_rate: rad/s of the body, beyond which no exposure is begun.
         slow_ns: processing time from which vision is slow.
         mounting: (4,) body axes to camera axes.
-        angular_acceleration_psd: rad^2/s^3, density of the body's white angular acceleration.
+        angular_acceleration_psd: returns the density (3, 3) rad^2/s^3 of the body's white angular
+            acceleration at a time.
         objects: how objects are sighted; None: they are not.
         kept: where frames are kept; None: they are not.
         velocity: returns the velocity (3,) m/s about the Sun at a time; None: as in `tracker`.
@@ -63,7 +64,7 @@ class ImagingSettings:
     mounting: FloatArray
     estimator: StreakSettings | LikelihoodSettings
     tracker: TrackerSettings | None
-    angular_acceleration_psd: float
+    angular_acceleration_psd: Callable[[int], FloatArray]
     velocity: Callable[[int], FloatArray | None]
     knowledge: Callable[[], Knowledge]
     seeks: Callable[[], bool]
@@ -175,9 +176,8 @@ class FrameMeasurer:
                 past = self._navigation.past(frame.exposure_start_ns + round(part * frame.exposure_ns))
                 if past is not None:
                     turns[number] = to_rotation_vector(multiply(past.quaternion, back))
-        return middle_covariance(
-            weighting_of(motion), turns, self._settings.angular_acceleration_psd, frame.exposure_ns * 1e-9
-        )
+        density = self._settings.angular_acceleration_psd(middle_ns(frame))
+        return middle_covariance(weighting_of(motion), turns, density, frame.exposure_ns * 1e-9)
 
 
 def middle_ns(frame: Frame) -> int:

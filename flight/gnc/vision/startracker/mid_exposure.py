@@ -51,18 +51,18 @@ def weighting_of(motion: StreakResult | MotionResult) -> Weighting:
 
 
 def middle_covariance(
-    weighting: Weighting, turns: FloatArray, angular_acceleration_psd: float, exposure: float
+    weighting: Weighting, turns: FloatArray, angular_acceleration_psd: FloatArray, exposure: float
 ) -> FloatArray:
     """Return the covariance (3, 3) rad^2 of the measured attitude about that of mid-exposure.
 
     Args:
         weighting: of the frame.
         turns: (4, 3) rad, by the estimate, from mid-exposure to each of `NODES`.
-        angular_acceleration_psd: rad^2/s^3, density of unmodelled white angular acceleration.
+        angular_acceleration_psd: (3, 3) rad^2/s^3, density of unmodelled white angular acceleration.
         exposure: s.
     """
     known = np.asarray(weighting.weights) @ turns
-    return np.outer(known, known) + np.eye(3) * angular_acceleration_psd * weighting.noise_share * exposure**3
+    return np.outer(known, known) + angular_acceleration_psd * weighting.noise_share * exposure**3
 
 
 def timing_covariance(motion: MotionResult) -> FloatArray:

@@ -42,14 +42,14 @@ def test_a_steady_acceleration_draws_the_attitude_off_as_the_integral_says(
 ) -> None:
     """Of a t^2 / 2 the mean over T is a T^2 / 24, the ends are at a T^2 / 8, a parabola fitted at nothing."""
     acceleration = 0.3
-    off = middle_covariance(weighting, _turns(0.0, 0.5 * acceleration), 0.0, _EXPOSURE)
+    off = middle_covariance(weighting, _turns(0.0, 0.5 * acceleration), np.zeros((3, 3)), _EXPOSURE)
     assert off[0, 0] == pytest.approx((acceleration * _EXPOSURE**2 / part) ** 2, abs=1e-30)
     assert np.count_nonzero(off) == np.count_nonzero(off[0, 0])
 
 
 @pytest.mark.parametrize("weighting", [MEAN, ENDS, MIDDLE])
 def test_a_steady_rate_leaves_no_doubt_nor_does_what_is_odd_in_time(weighting: Weighting) -> None:
-    assert middle_covariance(weighting, _turns(0.7, 0.0, 0.4), 0.0, _EXPOSURE).max() < 1e-30
+    assert middle_covariance(weighting, _turns(0.7, 0.0, 0.4), np.zeros((3, 3)), _EXPOSURE).max() < 1e-30
 
 
 @pytest.mark.parametrize("name", list(_WEIGHTS))
@@ -57,7 +57,7 @@ def test_the_nodes_stand_for_the_whole_exposure(name: str) -> None:
     """To the fourth power of time they give what the fine weights do."""
     weighting, fine = _WEIGHTS[name]
     time = 0.5 * _EXPOSURE * _EVEN
-    off = middle_covariance(weighting, _turns(0.0, 0.2, 0.0, 0.9), 0.0, _EXPOSURE)
+    off = middle_covariance(weighting, _turns(0.0, 0.2, 0.0, 0.9), np.zeros((3, 3)), _EXPOSURE)
     assert np.sqrt(off[0, 0]) == pytest.approx(abs(fine @ (0.2 * time**2 + 0.9 * time**4)), rel=0.05)
 
 
@@ -72,7 +72,7 @@ def test_white_acceleration_scatters_the_attitude_as_much_as_is_said(name: str) 
     angle = np.cumsum(rate, axis=2) * step
     away = np.concatenate([angle[0, :, ::-1], np.zeros((trials, 1)), angle[1]], axis=1)
     found = np.var(away @ fine)
-    said = middle_covariance(weighting, np.zeros((4, 3)), density, _EXPOSURE)
+    said = middle_covariance(weighting, np.zeros((4, 3)), density * np.eye(3), _EXPOSURE)
     assert found == pytest.approx(said[0, 0], rel=0.1)
     np.testing.assert_array_equal(said, said[0, 0] * np.eye(3))
 
