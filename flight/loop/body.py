@@ -103,6 +103,9 @@ class Brake(Protocol):
     def command(self, now_ns: int) -> CoilCommand:
         """Return the command now: zero while the field is measured or the rate is not known."""
 
+    def sent(self, currents: FloatArray) -> None:
+        """Take what went to the coils (3,) A instead of the command, where one of them is left out."""
+
     def field(self, now_ns: int) -> FloatArray | None:
         """Return the field (3,) T in body axes now; None before it is known."""
 

@@ -209,5 +209,17 @@ def _detumbler(config: OrbitConfig) -> FieldDetumbler:
 def _coil_watch(config: OrbitConfig) -> CoilWatch:
     x, y, z = (config.coils.supply_voltage / resistance for resistance in config.coils.resistance)
     inertia, dipole = np.diag(config.craft.inertia), config.craft.dipole_per_ampere
-    response = ResponseSettings(inertia, dipole, config.inertial_unit.rate_noise)
+    settle_ns = round(config.detumble.settle * SECOND_NS)
+    # A sixteenth of the testbed's field: the same torque takes longer to be felt.
+    response = ResponseSettings(
+        inertia,
+        dipole,
+        config.inertial_unit.rate_noise,
+        bin_samples=16,
+        bins=40,
+        model_error=2.0e-4,
+        torsion=1e-6,
+        damping=1e-4,
+        settle_ns=settle_ns,
+    )
     return CoilWatch(CoilWatchSettings((x, y, z), response=response))

@@ -28,6 +28,10 @@ class FieldBrake:
         dipole = self.detumbler.dipole(now_ns)
         return CoilCommand(dipole, dipole / self._dipole_per_ampere)
 
+    def sent(self, currents: FloatArray) -> None:
+        """Let the rate follow the currents (3,) A that flow: a coil that is left out turns nothing."""
+        self.detumbler.acts(currents * self._dipole_per_ampere)
+
     def field(self, now_ns: int) -> FloatArray | None:
         """Return the field (3,) T in body axes at the last command; None before it is known."""
         return self.detumbler.field

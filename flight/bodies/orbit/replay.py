@@ -58,6 +58,7 @@ class StepReplay:
     Attributes:
         free: the estimate at the end of the newest step.
         refused_gyros: how many steps in a row had a gyro that contradicts the motion.
+        refused_fields: how many fields in a row contradicted the estimate.
     """
 
     def __init__(self, settings: OrbitFilterSettings) -> None:
@@ -65,6 +66,7 @@ class StepReplay:
         self.free = FreeFilter(settings.inertia, settings.free)
         self.steps: deque[Step] = deque()
         self.refused_gyros = 0
+        self.refused_fields = 0
 
     def add(self, step: Step) -> None:
         """Add the newest step and forget those beyond the history; take it if there is an estimate."""
@@ -168,7 +170,9 @@ class StepReplay:
             turn = free.rate * ((step.end_ns - step.field_ns) / SECOND_NS)
             now = attitude_matrix(from_rotation_vector(turn)) @ step.field
             model = settings.field_error**2 * 2.0 * FIELD_MEMORY / step.field_span
-            free.field(now, step.around.field, (settings.field_noise**2 / step.fields + model) * _EYE)
+            noise = (settings.field_noise**2 / step.fields + model) * _EYE
+            used = free.field(now, step.around.field, noise)
+            self.refused_fields = 0 if used else self.refused_fields + 1
 
     def _apply(self, measurement: Measurement, step: Step) -> bool:
         """Apply a measurement to the estimate of its time; return whether it passed the gate."""

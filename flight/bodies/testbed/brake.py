@@ -28,6 +28,9 @@ class BdotBrake:
         currents = self._detumbler.current(now_ns)
         return CoilCommand(currents * self._dipole_per_ampere, currents)
 
+    def sent(self, currents: FloatArray) -> None:
+        """Do nothing: B-dot needs no model of the motion."""
+
     def field(self, now_ns: int) -> FloatArray | None:
         """Return the field (3,) T in body axes now; None before it is known."""
         return self._detumbler.field(now_ns)

@@ -75,6 +75,7 @@ class Steering:
             state, wanted = SteeringState.BRAKING, brake.command(now_ns)
             dipole = wanted.dipole
             self._drive.send(wanted.currents, lambda: brake.field(now_ns))
+            brake.sent(self._drive.command)
         else:
             self._release()
         return self._steered(state, now_ns, None, dipole)

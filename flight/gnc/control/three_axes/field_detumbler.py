@@ -99,6 +99,10 @@ class FieldDetumbler:
         self._dipole = self._braking_dipole(now_ns) if acting and self.trusted else _NO_DIPOLE
         return self._dipole
 
+    def acts(self, dipole: FloatArray) -> None:
+        """Take a dipole (3,) A m^2 that acts instead of the commanded one until the next command."""
+        self._dipole = dipole
+
     @property
     def trusted(self) -> bool:
         """Whether enough samples agreed."""
