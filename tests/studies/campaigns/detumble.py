@@ -2,7 +2,8 @@
 
 Two craft, each in a Sun-synchronous and an ISS-like orbit, by one law: `magnetometer` knows the magnetometer
 alone, `attitude` also a gyro with its bias, a coarse attitude and the orbit. The coils pause a tenth of each
-two seconds, as the magnetometer needs. Coils are commanded as often as the body turns by 0.3 rad.
+two seconds, as the magnetometer needs. Coils are commanded each quarter of a second, and as often as the body
+turns by 0.3 rad.
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ SAMPLES_NS = range(SCHEDULE.settle_ns, SCHEDULE.settle_ns + SCHEDULE.measure_ns,
 LAWS = ("magnetometer", "attitude")
 LONGEST = 6000.0
 """s: a body that is not slow by then is lost."""
+LEAST_CYCLES = 8
+"""Commands in a window; the flight gives 72."""
 HORIZON = {"knightcube": 1500.0, "cubesat_3u": 3000.0}
 """s that a plan looks ahead."""
 ATTITUDE_SIGMA = np.radians(1.0)
@@ -75,7 +78,7 @@ def run(case: Case) -> Result:
             law.sample()
         acting_ns = start_ns + SCHEDULE.settle_ns + SCHEDULE.measure_ns
         speed = float(np.linalg.norm(flight.motion.rate))
-        cycles = max(1, int(np.ceil(speed * SCHEDULE.act_ns / SECOND / 0.3)))
+        cycles = max(LEAST_CYCLES, int(np.ceil(speed * SCHEDULE.act_ns / SECOND / 0.3)))
         for cycle in range(cycles):
             flight.advance(acting_ns + SCHEDULE.act_ns * cycle // cycles)
             flight.act(law.dipole())

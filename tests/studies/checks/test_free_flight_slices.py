@@ -15,7 +15,7 @@ CASE = {"craft": "knightcube", "orbit": "sso"}
 def test_a_tumbling_knightcube_stops_and_the_table_says_when(tmp_path: Path) -> None:
     result = detumble.run(Case("a", (20_261_123, 0), {**CASE, "law": "attitude", "speed": 0.014}))
     assert not result["lost"]
-    assert result["seconds"] < 300.0
+    assert result["seconds"] < 400.0
     assert result["fastest_deg"] < 1.05 * np.degrees(0.014), "a slow body is never made faster"
     found = detumble.summarise([result], tmp_path)
     assert found.facts["knightcube/attitude"]["worst"] == result["seconds"]
