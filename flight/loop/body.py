@@ -92,13 +92,16 @@ class Feed(Protocol):
 
 
 class Brake(Protocol):
-    """Brakes a tumble by the magnetometer alone, in windows in which the coils pause."""
+    """Brakes a tumble by magnetometer and gyro, in windows in which the coils pause."""
 
     def begin(self, now_ns: int) -> None:
         """Begin with no knowledge of the field."""
 
-    def sample(self, time_ns: int, field: FloatArray) -> None:
-        """Accept a field (3,) T measured at `time_ns`; ignored unless the coils were off and settled."""
+    def sample(self, time_ns: int, field: FloatArray, rate: FloatArray) -> None:
+        """Accept a field (3,) T and a gyro's rate (3,) rad/s measured at `time_ns`.
+
+        Ignored unless the coils were off and settled.
+        """
 
     def command(self, now_ns: int) -> CoilCommand:
         """Return the command now: zero while the field is measured or the rate is not known."""
