@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from flight.bodies.orbit.carried import CarriedOn
+from flight.bodies.orbit.field_doubt import FieldDoubt
 from flight.bodies.orbit.replay import FIELD_MEMORY, OrbitFilterSettings, StepReplay
 from flight.bodies.orbit.steps import DipoleHistory, OpenStep
 from flight.gnc.estimation.estimate import Estimate, Knowledge
@@ -29,8 +30,6 @@ from hal.interfaces.wires import SECOND_NS
 
 REFUSALS_TO_RESTART = 3
 """Attitudes in a row that contradict the estimate: the estimate is wrong."""
-STUCK, CONTRADICTED_FIELDS = 20, 4
-"""Readings in a row with the same field, whose noise never repeats; fields that contradict the estimate."""
 
 
 class OrbitFilter:
@@ -52,10 +51,8 @@ class OrbitFilter:
         self._dipoles = DipoleHistory(settings.history_ns)
         self._open: OpenStep | None = None
         self._field_ns = 0
-        self._last_field: list[float] = []
-        self._same_fields = 0
+        self._doubt = FieldDoubt()
         self._refused_attitudes = 0
-        self._contradicted = 0  # steps with a dipole, in a row, whose gyro contradicted it
         self.restarts = 0
 
     @property
@@ -96,7 +93,7 @@ class OrbitFilter:
     @property
     def doubts_commands(self) -> bool:
         """Whether the gyro contradicts the motion that the commanded dipoles make."""
-        return self._contradicted >= 2
+        return self._replay.contradicted >= 2
 
     @property
     def refused(self) -> int:
@@ -106,10 +103,7 @@ class OrbitFilter:
     @property
     def field_doubt(self) -> str:
         """Why the magnetometer is not believed; empty while it is."""
-        if self._same_fields >= STUCK:
-            return "the magnetometer gives the same field in every reading"
-        fields = self._replay.refused_fields
-        return f"{fields} fields in a row contradict the estimate" if fields >= CONTRADICTED_FIELDS else ""
+        return self._doubt.text(self._replay.refused_fields)
 
     @property
     def torque_sizes(self) -> FloatArray:
@@ -147,13 +141,10 @@ class OrbitFilter:
             return False
         if reading.time_ns <= self._open.end_ns:
             return False
-        field = reading.field.tolist()
-        self._same_fields = self._same_fields + 1 if field == self._last_field else 0
-        self._last_field = field
+        usable = self._doubt.sees(reading.field)
         rest_ns = self._dipoles.at_rest_since()
         settled = rest_ns is not None and reading.time_ns - rest_ns >= self._settings.settle_ns
-        listens = settled and self._same_fields < STUCK
-        self._open.add(reading, self._dipoles.total(reading.time_ns), listens)
+        self._open.add(reading, self._dipoles.total(reading.time_ns), settled and usable)
         if self._open.is_over(self._acts(), self._settings.step_ns):
             self._close()
         return self.started and not self.doubts_commands
@@ -253,23 +244,7 @@ class OrbitFilter:
             step.field_span = min((end_ns - self._field_ns) / SECOND_NS, FIELD_MEMORY)
             self._field_ns = end_ns
         self._replay.add(step)
-        self._follow_gyro()
-
-    def _follow_gyro(self) -> None:
-        """Take the last steps again with unknown dipoles where the gyro contradicts the commanded ones.
-
-        What the coils did otherwise may have begun in the step before: its gyro shows only half of it.
-        """
-        refused, steps = self._replay.refused_gyros > 0, self._steps
-        if refused:
-            self._contradicted += 1
-        elif steps[-1].dipole.any():  # a pause between two commands says nothing of them
-            self._contradicted = 0
-        if refused and not steps[-1].doubt:
-            first = max(len(steps) - 2, 0)
-            for k in range(first, len(steps)):
-                steps[k].doubt = self._settings.dipole_limit
-            self._replay.take_again(first)
+        self._replay.follow_gyro()
 
     def _judge(self, attitude: AttitudeMeasurement, used: bool) -> None:
         """Begin again after too many attitudes that contradict the estimate; a coarse one yields at once."""

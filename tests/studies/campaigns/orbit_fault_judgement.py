@@ -44,6 +44,7 @@ ORBIT_OWN: Mapping[str, frozenset[str]] = {
     "magnetometer": frozenset({"imu-refused", "sun-unclear", "field-refused"}),
     "gps": frozenset({"gps-lost", "gps-refused"}),
     "strings": frozenset({"strings-lost", "sun-unclear"}),
+    "clock": OWN["clock"] | {"clock-off"},
     "elements": frozenset({"gps-refused", "gps-lost"}),
 }
 """Events that report a fault of a device in orbit, beside those of its stream."""
@@ -196,7 +197,7 @@ def blind_current(flown: Run, kind: FaultKind, mode: str, at: float, end: float)
     newest = np.concatenate([[0.0], np.maximum.accumulate(sampled)])
     heard = newest[np.searchsorted(came, times, side="right")]
     blind = times - heard > BLIND_GRACE + 2 * CYCLE
-    if mode in {"detumble", "safe"} and part_of(kind) == "magnetometer":
+    if mode in {"detumble", "safe"} and kind.name in {"magnetometer: stuck", "magnetometer: saturated"}:
         blind |= (times > at + FIELD_GRACE) & (times < end)
     known = flown["navigation"]
     if mode not in {"detumble", "safe"} and len(known):

@@ -37,18 +37,17 @@ BEYOND = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """A flight that begins wrong: its element set, and faults from the start on for `span` s."""
+    """A flight that begins wrong: its element set, and faults from the start on."""
 
     elements: str
     faults: tuple[str, ...]
-    span: float
 
 
 CONDITIONS: Mapping[str, Condition] = {
-    "elements: a week old": Condition("old", (), 0.0),
-    "elements: a week old, no receiver": Condition("old", ("gps: no-fix",), DURATION),
-    "elements: none, no receiver": Condition("none", ("gps: no-fix",), 20.0),
-    "clock: 5 min wrong, no receiver": Condition("", ("clock: stepped (by=300)", "gps: no-fix"), 20.0),
+    "elements: a week old": Condition("old", ()),
+    "elements: a week old, no receiver": Condition("old", ("gps: no-fix",)),
+    "elements: none, no receiver": Condition("none", ("gps: no-fix for 20",)),
+    "clock: 5 min wrong, late receiver": Condition("", ("clock: stepped (by=300)", "gps: no-fix for 20")),
 }
 
 
@@ -103,7 +102,7 @@ def _when(name: str, mode: str, rng: np.random.Generator) -> tuple[FaultKind, fl
     condition = CONDITIONS.get(name)
     if condition is not None:
         device, _, kind = name.partition(": ")
-        return FaultKind(device, kind, name, None), 0.0, condition.span
+        return FaultKind(device, kind, name, None), 0.0, None
     known = CATALOGUE[name]
     if known.device == "planner":
         at = float(rng.uniform(0.5, 3.0))
