@@ -92,6 +92,7 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
         sighted=objects.accept,
         place=surroundings.state,
         seeks=lambda: objects.seeks,
+        calm=_pauses(config).calm,
     )
 
 
