@@ -198,6 +198,13 @@ STRINGS_LOST = EventKind(104, "strings-lost", _WARNED, "the solar strings give n
 STRINGS_RECOVERED = EventKind(105, "strings-recovered", _TOLD, "the solar strings give readings again")
 SUN_UNCLEAR = EventKind(106, "sun-unclear", _WARNED, "the solar strings see no Sun in the sunlight")
 SUN_CLEAR = EventKind(107, "sun-clear", _TOLD, "the solar strings see the Sun again")
+CLOCK_OFF = EventKind(
+    130, "clock-off", _WARNED, "the wall clock differs from the receiver's time, by which the place is known"
+)
+FIELD_REFUSED = EventKind(
+    131, "field-refused", _WARNED, "the magnetometer repeats its value, or contradicts the estimate: left out"
+)
+FIELD_TRUSTED = EventKind(132, "field-trusted", _TOLD, "the magnetometer agrees with the estimate again")
 SLEW_BEGUN = EventKind(108, "slew-begun", _TOLD, "a slew of least heat to the target begins")
 SLEW_ENDED = EventKind(109, "slew-ended", _TOLD, "a slew is over: the target is pointed to from now on")
 WIDE_LOST = EventKind(110, "wide-lost", _WARNED, "a wide camera gives no frames")

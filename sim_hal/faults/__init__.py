@@ -1,4 +1,4 @@
-"""Fault injection at device level: 88 fault types; faults that would have no effect are rejected.
+"""Fault injection at device level; faults that would have no effect are rejected.
 
 `catalogue` lists them, `grammar` parses them, `schedule` checks them and puts them on the `timeline`. `bench`
 holds the hardware that they act on; `serial`, `parts`, `circuit`, `imaging` and `machine` implement them.

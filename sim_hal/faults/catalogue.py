@@ -8,12 +8,13 @@ from sim_hal.faults.kinds import FaultKind, Parameter, Where
 from sim_hal.faults.machine import MACHINE
 from sim_hal.faults.orbit import GPS, STRINGS, WIDE
 from sim_hal.faults.parts import BUS, MONITOR, PWM
-from sim_hal.faults.serial import IMU
+from sim_hal.faults.serial import IMU, MAGNETOMETER
 from sim_hal.faults.upsets import IMU_UPSET, MONITOR_UPSET, PWM_UPSET
 
 _ALL = (
     *IMU,
     IMU_UPSET,
+    *MAGNETOMETER,
     *PWM,
     PWM_UPSET,
     *MONITOR,

@@ -117,5 +117,5 @@ class FaultKind:
 
     @property
     def thing(self) -> str:
-        """The affected part; a coil and its bridge count as one, since they share one condition."""
-        return self.device.replace("bridge-", "coil-")
+        """The affected part: coil and bridge share one condition, as do unit and magnetometer."""
+        return self.device.replace("bridge-", "coil-").replace("magnetometer", "imu")

@@ -1,4 +1,4 @@
-"""Faults of the inertial unit and its line."""
+"""Faults of the inertial unit, its line and its magnetometer."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from flight.gnc.math.quaternion import from_rotation_vector, multiply
 from sim_hal.emulators.serial_line import LineFaults
 from sim_hal.emulators.vn100_registers import BAUD_RATES, UnitError
-from sim_hal.emulators.vn100_sensors import Measured
+from sim_hal.emulators.vn100_sensors import GAUSS_PER_TESLA, Measured
 from sim_hal.faults.bench import Bench, Lift, held, no_lift
 from sim_hal.faults.kinds import CHANCE, TURNS, Begin, FaultKind, Parameter, Parameters, delay, intermittently
 
@@ -140,4 +140,43 @@ IMU = (
     ),
     FaultKind("imu", "reset", "restarts from its saved settings", _reset, momentary=True),
     FaultKind("imu", "baud", "its baud rate changes", _baud, {"rate": _RATE}, momentary=True),
+)
+
+
+# The unit's magnetometer: attitude and rates stay right.
+
+
+def _stuck_field(bench: Bench, _: Parameters) -> Lift:
+    kept: list[Measured] = []
+
+    def same(measured: Measured) -> Measured:
+        kept.append(measured)
+        return replace(measured, mag=kept[0].mag)
+
+    return _measuring(bench, same)
+
+
+def _saturated_field(bench: Bench, _: Parameters) -> Lift:
+    return _measuring(bench, lambda seen: replace(seen, mag=np.copysign(FULL_SCALE, seen.mag)))
+
+
+def _false_field(bench: Bench, given: Parameters) -> Lift:
+    direction = bench.generator.standard_normal(3)
+    false = GAUSS_PER_TESLA * given["field"] * direction / np.linalg.norm(direction)
+    return _measuring(bench, lambda seen: replace(seen, mag=seen.mag + false))
+
+
+FULL_SCALE = 2.5
+"""Gauss of an axis [VN-100 data sheet]."""
+
+MAGNETOMETER = (
+    FaultKind("magnetometer", "stuck", "the same field for ever", _stuck_field),
+    FaultKind("magnetometer", "saturated", "all axes at full scale", _saturated_field),
+    FaultKind(
+        "magnetometer",
+        "false",
+        "a constant field is added, T",
+        _false_field,
+        {"field": Parameter(2e-5, 1e-8, 1e-3, "T")},
+    ),
 )

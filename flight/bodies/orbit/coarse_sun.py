@@ -33,6 +33,8 @@ OVERHEAD_ALBEDO = 0.2
 CLOUDS = 0.5
 """By which share the Earth's light varies."""
 LEAST_ALBEDO = 0.02
+STUCK = 3
+"""Readings in a row that are the same to the last bit: their noise never is."""
 SUNLIT = 0.99
 """Share of the Sun's disc from which the strings are expected to see it."""
 CONTRADICTED, GATE = 3, 30.7
@@ -59,6 +61,8 @@ class CoarseSunFeed:
         self._surroundings = surroundings
         self._judged_ns = -PERIOD_NS
         self._against = 0
+        self._last: list[float] = []
+        self._same = 0
 
     def accept(self, reading: StringReading) -> str | None:
         """Take a reading; return what it shows to be wrong, empty for nothing, None where not judged."""
@@ -67,6 +71,10 @@ class CoarseSunFeed:
         around, sun = self._surroundings.at(time_ns), self._surroundings.sun(time_ns)
         if around is None or sun is None or around.sunlit < SUNLIT:
             return None
+        currents = reading.currents.tolist()
+        self._same, self._last = (self._same + 1 if currents == self._last else 0), currents
+        if self._same >= STUCK:
+            return "the strings give the same currents in every reading"
         if time_ns - self._judged_ns < PERIOD_NS:
             return None
         heard = self._filter.heard_field()

@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from flight.bodies.orbit.carried import CarriedOn
+from flight.bodies.orbit.field_doubt import FieldDoubt
 from flight.bodies.orbit.replay import FIELD_MEMORY, OrbitFilterSettings, StepReplay
 from flight.bodies.orbit.steps import DipoleHistory, OpenStep
 from flight.gnc.estimation.estimate import Estimate, Knowledge
@@ -50,6 +51,7 @@ class OrbitFilter:
         self._dipoles = DipoleHistory(settings.history_ns)
         self._open: OpenStep | None = None
         self._field_ns = 0
+        self._doubt = FieldDoubt()
         self._refused_attitudes = 0
         self.restarts = 0
 
@@ -91,12 +93,17 @@ class OrbitFilter:
     @property
     def doubts_commands(self) -> bool:
         """Whether the gyro contradicts the motion that the commanded dipoles make."""
-        return self._replay.refused_gyros >= 2
+        return self._replay.contradicted >= 2
 
     @property
     def refused(self) -> int:
         """The number of measurements that did not pass their gate, replays included."""
         return self._free.refused
+
+    @property
+    def field_doubt(self) -> str:
+        """Why the magnetometer is not believed; empty while it is."""
+        return self._doubt.text(self._replay.refused_fields)
 
     @property
     def torque_sizes(self) -> FloatArray:
@@ -134,9 +141,10 @@ class OrbitFilter:
             return False
         if reading.time_ns <= self._open.end_ns:
             return False
+        usable = self._doubt.sees(reading.field)
         rest_ns = self._dipoles.at_rest_since()
-        listens = rest_ns is not None and reading.time_ns - rest_ns >= self._settings.settle_ns
-        self._open.add(reading, self._dipoles.total(reading.time_ns), listens)
+        settled = rest_ns is not None and reading.time_ns - rest_ns >= self._settings.settle_ns
+        self._open.add(reading, self._dipoles.total(reading.time_ns), settled and usable)
         if self._open.is_over(self._acts(), self._settings.step_ns):
             self._close()
         return self.started and not self.doubts_commands
@@ -230,13 +238,13 @@ class OrbitFilter:
         around = self._around((begin_ns + end_ns) // 2)
         if around is None:
             return
-        doubtful = self._dipoles.unknown_ns >= begin_ns or self.doubts_commands
-        doubt = self._settings.dipole_limit if doubtful else 0.0
+        doubt = self._settings.dipole_limit if self._dipoles.unknown_ns >= begin_ns else 0.0
         step = gathered.close(self._dipoles.mean(begin_ns, end_ns), doubt, around)
         if step.fields:
             step.field_span = min((end_ns - self._field_ns) / SECOND_NS, FIELD_MEMORY)
             self._field_ns = end_ns
         self._replay.add(step)
+        self._replay.follow_gyro()
 
     def _judge(self, attitude: AttitudeMeasurement, used: bool) -> None:
         """Begin again after too many attitudes that contradict the estimate; a coarse one yields at once."""

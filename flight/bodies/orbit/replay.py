@@ -61,6 +61,8 @@ class StepReplay:
     Attributes:
         free: the estimate at the end of the newest step.
         refused_gyros: how many steps in a row had a gyro that contradicts the motion.
+        contradicted: how many steps with a dipole, in a row, had a gyro that contradicts it.
+        refused_fields: how many fields in a row contradicted the estimate.
     """
 
     def __init__(self, settings: OrbitFilterSettings) -> None:
@@ -68,6 +70,8 @@ class StepReplay:
         self.free = FreeFilter(settings.inertia, settings.free)
         self.steps: deque[Step] = deque()
         self.refused_gyros = 0
+        self.refused_fields = 0
+        self.contradicted = 0
 
     def add(self, step: Step) -> None:
         """Add the newest step and forget those beyond the history; take it if there is an estimate."""
@@ -76,6 +80,22 @@ class StepReplay:
             self.steps.popleft()
         if self.free.started:
             self.take_on(len(self.steps) - 1)
+
+    def follow_gyro(self) -> None:
+        """Take the last steps again with unknown dipoles where the gyro contradicts the commanded ones.
+
+        What the coils did otherwise may have begun in the step before: its gyro shows only half of it.
+        """
+        steps, refused = self.steps, self.refused_gyros > 0
+        if refused:
+            self.contradicted += 1
+        elif steps[-1].dipole.any():  # a pause between two commands says nothing of them
+            self.contradicted = 0
+        if refused and not steps[-1].doubt:
+            first = max(len(steps) - 2, 0)
+            for k in range(first, len(steps)):
+                steps[k].doubt = self._settings.dipole_limit
+            self.take_again(first)
 
     def start(self, attitude: AttitudeMeasurement, place: int, doubted: bool) -> None:
         """Start from an attitude in step number `place`; the estimates before it are forgotten.
@@ -171,7 +191,9 @@ class StepReplay:
             turn = free.rate * ((step.end_ns - step.field_ns) / SECOND_NS)
             now = attitude_matrix(from_rotation_vector(turn)) @ step.field
             model = settings.field_error**2 * 2.0 * FIELD_MEMORY / step.field_span
-            free.field(now, step.around.field, (settings.field_noise**2 / step.fields + model) * _EYE)
+            noise = (settings.field_noise**2 / step.fields + model) * _EYE
+            used = free.field(now, step.around.field, noise)
+            self.refused_fields = 0 if used else self.refused_fields + 1
 
     def _apply(self, measurement: Measurement, step: Step) -> bool:
         """Apply a measurement to the estimate of its time; return whether it passed the gate."""

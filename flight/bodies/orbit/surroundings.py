@@ -30,6 +30,8 @@ GATE, LEAST_GATE = 5.0, 5e3
 """Sigmas by which a fix may differ from what is known, and m that are always allowed."""
 CONTRADICTED = 30
 """Fixes in a row that contradict the last accepted one: then that one was wrong."""
+TIME_GATE_NS = SECOND_NS // 2
+"""By which the receiver's time may go on otherwise than the clock: the craft flies 4 km meanwhile."""
 _UNIX_EPOCH = 2_440_587.5
 _SHORTEST = 1.0
 
@@ -43,6 +45,7 @@ class Surroundings:
         self._clock = clock
         self._fix: GpsFix | None = None
         self._utc_offset_ns: int | None = None
+        self._heard_offset_ns: int | None = None  # of the newest fix, used or not
         self._near: Ephemeris | None = None
         self._refused_in_a_row = 0
         self.refused = 0
@@ -64,9 +67,10 @@ class Surroundings:
         if not reading.valid:
             return False
         date = _UNIX_EPOCH + reading.utc_ns / (DAY * SECOND_NS)
+        offset_ns = reading.utc_ns + GPS_DELAY_NS - reading.time_ns
         try:
             fix = GpsFix(date, reading.position, reading.velocity, reading.sigma, reading.velocity_sigma)
-            contradicts = self._contradicts(fix)
+            contradicts = self._is_out_of_time(offset_ns) or self._contradicts(fix)
         except OrbitError:
             contradicts = True
         if contradicts:
@@ -75,7 +79,7 @@ class Surroundings:
             return False
         self._refused_in_a_row = 0
         self._fix = fix
-        self._utc_offset_ns = reading.utc_ns + GPS_DELAY_NS - reading.time_ns
+        self._utc_offset_ns = offset_ns
         return True
 
     def state(self, now_ns: int) -> OrbitState | None:
@@ -138,6 +142,15 @@ class Surroundings:
             near = self._near = None if state is None else _predicted(state, BEHIND + AHEAD)
             seconds = BEHIND if near is None else self.seconds_into(near, now_ns)
         return near, np.array([seconds])
+
+    def _is_out_of_time(self, offset_ns: int) -> bool:
+        """Return whether the receiver's time stands or jumps; a lasting jump is believed after a while."""
+        heard, self._heard_offset_ns = self._heard_offset_ns, offset_ns
+        if heard is not None and abs(offset_ns - heard) > TIME_GATE_NS:
+            return True
+        known = self._utc_offset_ns
+        jumped = known is not None and abs(offset_ns - known) > TIME_GATE_NS
+        return jumped and self._refused_in_a_row < CONTRADICTED
 
     def _contradicts(self, fix: GpsFix) -> bool:
         """Return whether a fix is too far from the elements, or from the last fix."""

@@ -16,6 +16,7 @@ from flight.link import events
 from flight.link.modes import Mode
 from flight.link.telemetry.orbit_definitions import NAVIGATION, SPIN
 from flight.loop.control_output import ControlOutput, Target
+from flight.loop.fdir import facts
 from flight.loop.services import Services
 
 SPIN_EVERY = 10
@@ -36,6 +37,7 @@ class OrbitView:
         self._filter = filter_
         self._surroundings = surroundings
         self._events = services.events
+        self._facts = services.facts
         self._knowledge = Knowledge.LOST
         self._detumbler = brake.detumbler
         self._recorder = services.recorder
@@ -68,6 +70,10 @@ class OrbitView:
             self._knowledge = known
         if output.cycle.slot % NAVIGATION_EVERY:
             return
+        doubt = found.field_doubt
+        self._facts.update(
+            facts.FIELD_REFUSED, bool(doubt), now_ns, doubt or "the magnetometer agrees with the estimate"
+        )
         self._recorder.record(
             NAVIGATION,
             now_ns,

@@ -68,6 +68,8 @@ _FACTS: tuple[tuple[str, Level], ...] = (
     ("gps-poor", "warning"),
     ("strings-lost", "warning"),
     ("sun-unclear", "warning"),
+    ("clock-off", "warning"),
+    ("field-refused", "warning"),
     ("wide-lost", "warning"),
 )
 """The facts that monitors keep, in the order of `flight.loop.fdir.facts`, as grave as their events."""

@@ -12,6 +12,7 @@ from enum import IntEnum
 
 from flight.loop.fdir import facts
 from flight.loop.fdir.facts import Fact
+from flight.schema.devices import Camera
 from flight.schema.sections import Config
 
 LEAST_RATE = 0.8
@@ -62,10 +63,17 @@ def streams_of(config: Config) -> tuple[Stream, ...]:
         rows.append(Stream("power", 1.0, 3.0, facts.POWER_POOR, -0.1 * most, most))
     if config.camera is not None:
         camera = config.camera
-        rows.append(Stream("camera", 1.0 / camera.period, camera.max_age, facts.CAMERA_POOR))
+        rows.append(Stream("camera", 1.0 / _seldom(camera), camera.max_age, facts.CAMERA_POOR))
     if config.gps is not None:
         rows.append(Stream("gps", 1.0 / config.gps.period, config.gps.max_age, facts.GPS_POOR))
     return tuple(rows)
+
+
+def _seldom(camera: Camera) -> float:
+    """Return the longest time, s, between two frames; exposures that follow the rate shift them."""
+    if camera.fine_period is None:
+        return camera.period
+    return max(camera.period, camera.fine_period) + max(camera.streak_exposure or (camera.exposure,))
 
 
 class StreamWatch:

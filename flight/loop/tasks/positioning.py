@@ -10,6 +10,10 @@ from flight.loop.services import Services
 from hal.interfaces.devices import GpsReceiver
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.readings import GpsReading
+from hal.interfaces.wires import SECOND_NS
+
+CLOCK_OFF_NS = SECOND_NS
+"""By which the wall clock may differ from the receiver's time."""
 
 
 class Positioning:
@@ -29,6 +33,7 @@ class Positioning:
         self._events = services.events
         self._facts = services.facts
         self._streams = services.streams
+        self._clock = services.clock
         self._fixed_ns = 0
 
     def begin(self, time_ns: int) -> None:
@@ -48,9 +53,17 @@ class Positioning:
             self._streams.note("gps", reading.time_ns)
             if self._accept(reading):
                 self._fixed_ns = reading.time_ns
+                self._compare_clock(reading, now_ns)
             else:
                 self._events.report(events.GPS_REFUSED, now_ns, f"{reading.satellites} satellites")
         age_ns = now_ns - self._fixed_ns
         text = error or f"no fix of use for {age_ns * 1e-9:.0f} s"
         lost_now = bool(error) or age_ns > self._max_age_ns
         self._facts.update(facts.GPS_LOST, lost_now, now_ns, text if lost_now else "fixes come again")
+
+    def _compare_clock(self, reading: GpsReading, now_ns: int) -> None:
+        """Report a wall clock that is wrong: before the first fix the place was found by it."""
+        clock = self._clock
+        off_ns = clock.utc_ns() - (clock.now_ns() - reading.time_ns) - reading.utc_ns
+        text = f"the wall clock is {off_ns * 1e-9:+.1f} s off the receiver's time"
+        self._facts.update(facts.CLOCK_OFF, abs(off_ns) > CLOCK_OFF_NS, now_ns, text)

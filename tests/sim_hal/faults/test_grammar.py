@@ -19,6 +19,7 @@ from tests.scenario.flights import CONFIG, TEXT, demo_config
 
 DEVICES = {
     "imu",
+    "magnetometer",
     "pwm",
     "monitor",
     "bus",

@@ -19,8 +19,10 @@ from tests.studies.campaigns.installer_kill import INSTALLER_KILL
 from tests.studies.campaigns.lost_in_space import LOST_IN_SPACE
 from tests.studies.campaigns.mismatch import MISMATCH, VIBRATION
 from tests.studies.campaigns.nadir import NADIR
+from tests.studies.campaigns.object_flights import OBJECT_FLIGHTS
 from tests.studies.campaigns.object_passes import OBJECT_PASSES
 from tests.studies.campaigns.orbit_attitude import ORBIT_ATTITUDE
+from tests.studies.campaigns.orbit_faults import ORBIT_FAULTS
 from tests.studies.campaigns.orbit_pointing import ORBIT_POINTING
 from tests.studies.campaigns.orbit_slews import ORBIT_SLEWS
 from tests.studies.campaigns.planner_edge import PLANNER_EDGE
@@ -51,6 +53,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         RSO_ORBITS,
         FIRST_ORBITS,
         OBJECT_PASSES,
+        OBJECT_FLIGHTS,
         CONSISTENCY,
         LOST_IN_SPACE,
         NADIR,
@@ -71,6 +74,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         ORBIT_ATTITUDE,
         DETUMBLE,
         WORLD_COMPARISON,
+        ORBIT_FAULTS,
         ORBIT_POINTING,
         ORBIT_SLEWS,
         ACQUISITION,

@@ -4,6 +4,8 @@ Rate and commanded rate change (the integral of J^-1 (m x B)) are averaged over 
 neighbouring bins are accelerations. Least squares over the last bins estimates each coil's gain, with a
 constant disturbance, a torsion and a damping of each free axis. Gain 1 is healthy, 0 is without torque, -1 is
 reversed. When the commands vary too little, the gain's standard deviation is large and no axis is judged.
+Of a free body the gyroscopic acceleration is taken off. Where the coils' field at the magnetometer is as
+large as the Earth's, the field of their last pause is turned with the body.
 
 The residual accelerations, with all coils assumed healthy, are kept longer: whether they changed when the
 supply current did distinguishes a broken coil from a wrong monitor (`observed_share`).
@@ -32,11 +34,14 @@ class ResponseSettings:
         free: (3,) whether the body can turn about each axis; on a thread only about y.
         bin_samples: samples of the rate in a bin.
         bins: differences of bins in the fit.
+        model_error: rad/s^2 of a bin, by the delay between command and current, and its uncertainty.
         torsion, damping: 1/s^2 and 1/s, prior standard deviations about each free axis (thread or drag).
         sure: standard deviation below which a gain is used.
         persistence: fits in a row that must agree.
         lowest_sound, highest_reversed: bounds of a healthy and of a reversed coil's gain.
         memory_ns: how long the residual accelerations are kept.
+        settle_ns: how long the coils must have been at rest for the field to be the Earth's; None where
+            theirs is small beside it.
     """
 
     inertia: FloatArray
@@ -45,6 +50,7 @@ class ResponseSettings:
     free: tuple[bool, bool, bool] = (True, True, True)
     bin_samples: int = 8
     bins: int = 15
+    model_error: float = 8.0e-4
     torsion: float = 0.03
     damping: float = 5.0e-3
     sure: float = 0.25
@@ -52,13 +58,12 @@ class ResponseSettings:
     lowest_sound: float = 0.6
     highest_reversed: float = -0.5
     memory_ns: int = 20_000_000_000
+    settle_ns: int | None = None
 
 
 _STALE_NS = 200_000_000
 _REACH_NS = 3_000_000_000
 """For how long commands are kept: after a stall of the loop, samples arrive late and in a burst."""
-_MODEL_ERROR = 8.0e-4
-"""rad/s^2: error of a bin due to the delay between command and current, and its uncertainty."""
 _LEAST_CHANGE = 4.0e-3
 """rad/s^2: smaller changes cannot be detected."""
 _GAIN_PRIOR = 10.0
@@ -97,6 +102,8 @@ class CoilResponse:
         self._samples: list[tuple[int, float, FloatArray, FloatArray, tuple[float, ...]]] = []
         self._previous: tuple[float, FloatArray, FloatArray] | None = None
         self._turned: FloatArray = np.zeros(3)
+        self._spun: FloatArray = np.zeros(3)  # rad/s, the integral of the gyroscopic acceleration
+        self._quiet_field: FloatArray | None = None
         # Of each free axis (f, 6): accelerations by the coils (3), observed, mean rate and angle of the bin.
         self._rows: deque[FloatArray] = deque(maxlen=self._settings.bins)
         # Time; commanded accelerations of each coil and those per ampere (3, 3); residual (3,).
@@ -127,8 +134,27 @@ class CoilResponse:
         if not 0 < since_ns < _STALE_NS:
             self.reset()
             return False
+        if self._settings.settle_ns is not None:
+            heard = self._field_without_coils(time_ns, since_ns * 1e-9, rate, field)
+            if heard is None:
+                return False
+            field = heard
         self._samples.append((time_ns, since_ns * 1e-9, rate, field, self._command_at(time_ns)))
         return len(self._samples) >= self._settings.bin_samples and self._close_bin()
+
+    def _field_without_coils(
+        self, time_ns: int, span: float, rate: FloatArray, field: FloatArray
+    ) -> FloatArray | None:
+        """Return the Earth's field of the pause, or of the last one turned with the body; None before one."""
+        since_ns, currents = self._commands[-1]
+        settle_ns = self._settings.settle_ns or 0
+        if not any(currents) and time_ns - since_ns >= settle_ns:
+            self._quiet_field = field
+        elif self._quiet_field is not None:
+            (x, y, z), (wx, wy, wz) = self._quiet_field.tolist(), (span * rate).tolist()
+            turned = (x + y * wz - z * wy, y + z * wx - x * wz, z + x * wy - y * wx)
+            self._quiet_field = np.array(turned)
+        return self._quiet_field
 
     def _command_at(self, time_ns: int) -> tuple[float, ...]:
         for since_ns, currents in reversed(self._commands):
@@ -177,7 +203,10 @@ class CoilResponse:
         integral = np.cumsum(steps, axis=0)
         self._asked = integral[-1]
         middle = sum(times) / count * 1e-9
-        rate, asked = np.array(rates).sum(axis=0) / count, integral.sum(axis=0) / count
+        turning = np.array(rates)
+        rate, asked = turning.sum(axis=0) / count, integral.sum(axis=0) / count
+        if len(self._free) == 3:
+            rate = rate - self._gyroscopic(turning, spans)
         before, self._previous = self._previous, (middle, rate, asked)
         if before is None:
             return False
@@ -198,6 +227,15 @@ class CoilResponse:
         self._fit(span)
         return True
 
+    def _gyroscopic(self, rates: FloatArray, spans: tuple[float, ...]) -> FloatArray:
+        """Return the mean (3,) over a bin of the rate that the free body's spin has made since the reset."""
+        momentum = rates @ self._settings.inertia
+        made = np.cross(momentum, rates) @ np.linalg.inv(self._settings.inertia) * np.array(spans)[:, None]
+        made[0] += self._spun
+        integral = np.cumsum(made, axis=0)
+        self._spun = integral[-1]
+        return np.asarray(integral.sum(axis=0) / len(spans))
+
     def _fit(self, span: float) -> None:
         rows = np.array(self._rows)
         # A constant disturbance about each free axis drops out with the means.
@@ -210,7 +248,7 @@ class CoilResponse:
             inputs[:, place, 3 + count + place] = -rows[:, place, 4]
         matrix, outputs = inputs.reshape(-1, 3 + 2 * count), rows[:, :, 3].reshape(-1)
         settings = self._settings
-        floor = settings.rate_noise * np.sqrt(2.0 / settings.bin_samples) / span + _MODEL_ERROR
+        floor = settings.rate_noise * np.sqrt(2.0 / settings.bin_samples) / span + settings.model_error
         weight = 1.0 / floor**2
         covariance = np.linalg.inv(matrix.T @ matrix * weight + self._prior)
         found = covariance @ (matrix.T @ outputs * weight + self._expected)

@@ -145,3 +145,13 @@ def test_in_the_shadow_the_strings_are_not_asked_for_a_sun() -> None:
     lit.fly(4)
     assert set(lit.wrong) == {None}
     assert not lit.filter.runs
+
+
+def test_strings_that_repeat_their_currents_in_the_sunlight_are_reported() -> None:
+    lit, stuck = Lit(1), np.array([0.3, 0.0, 0.2, 0.0, 0.25, 0.0])
+    lit.fly(12)
+    told = [lit.feed.accept(StringReading(k * SECOND_NS, stuck)) for k in range(12, 18)]
+    assert told[-1] is not None
+    assert "the same currents" in told[-1]
+    dark = Lit(1, sunlit=0.0)
+    assert [dark.feed.accept(StringReading(k * SECOND_NS, 0.0 * stuck)) for k in range(6)] == [None] * 6

@@ -17,8 +17,10 @@ from flight.gnc.math.quaternion import (
     IDENTITY,
     angle_between,
     attitude_matrix,
+    conjugate,
     from_rotation_vector,
     multiply,
+    to_rotation_vector,
 )
 from hal.interfaces.readings import ImuReading
 from hal.interfaces.wires import SECOND_NS
@@ -59,6 +61,9 @@ class Flown:
         self.attitude, self.rate, self.time_ns = IDENTITY, SPIN, 0
         self.attitudes = {0: IDENTITY}
         self._pulses = pulses
+        self.broken = False  # no coil carries what it is told
+        self.field: FloatArray | None = None  # what the magnetometer repeats
+        self.magnet: FloatArray = np.zeros(3)  # T, added to the field
 
     def fly(self, seconds: float) -> None:
         """Fly on; with pulses the coils act for 0.8 s of each second."""
@@ -68,7 +73,8 @@ class Flown:
             self.filter.command(self.time_ns, dipole)
             for _ in range(5):
                 shown = attitude_matrix(self.attitude) @ FIELD
-                torque = np.cross(dipole, shown) - np.cross(self.rate, INERTIA @ self.rate)
+                carried = np.zeros(3) if self.broken else dipole
+                torque = np.cross(carried, shown) - np.cross(self.rate, INERTIA @ self.rate)
                 change = np.linalg.solve(INERTIA, torque) * 5e-3
                 turn = 5e-3 * (self.rate + 0.5 * change)
                 self.attitude = multiply(from_rotation_vector(turn), self.attitude)
@@ -95,7 +101,8 @@ class Flown:
 
     def _reading(self) -> ImuReading:
         noise = self.generator.standard_normal(6)
-        field = attitude_matrix(self.attitude) @ FIELD + 1e-7 * noise[3:]
+        field = attitude_matrix(self.attitude) @ FIELD + 1e-7 * noise[3:] + self.magnet
+        field = field if self.field is None else self.field
         rate, nothing = self.rate + BIAS + 1e-4 * noise[:3], np.zeros(3)
         return ImuReading(self.time_ns, self.time_ns, self.time_ns, IDENTITY, rate, field, nothing)
 
@@ -179,3 +186,31 @@ def test_the_mean_dipole_is_that_on_the_wire() -> None:
     history.record(3 * SECOND_NS, (0.0, 0.0, 0.0), True)
     assert history.mean(SECOND_NS, 5 * SECOND_NS) == pytest.approx([0.025, 0.0, 0.0])
     assert history.at_rest_since() == 3 * SECOND_NS
+
+
+def test_where_the_coils_do_otherwise_than_told_the_attitude_stays_within_its_claim() -> None:
+    """A coil carries nothing from the middle of a step on; the gyro tells."""
+    flown = acquired(pulses=True)
+    flown.broken = True
+    flown.fly(7.5)
+    found = flown.filter.at(flown.time_ns)
+
+    error = to_rotation_vector(multiply(found.quaternion, conjugate(flown.attitude)))
+    assert (np.abs(error) < 5.0 * np.sqrt(np.diag(found.covariance)[TURN])).all()
+
+
+def test_a_magnetometer_that_repeats_its_value_or_is_false_is_doubted_and_left_out() -> None:
+    flown = acquired()
+    assert flown.filter.field_doubt == ""
+    flown.field = np.array([3e-5, 1e-5, 2e-5])
+    flown.fly(1.0)
+    assert "the same field" in flown.filter.field_doubt
+    flown.fly(10.0)
+    assert flown.filter.knowledge is Knowledge.FINE
+    assert flown.error() < 5e-4
+    flown.field, flown.magnet = None, np.array([2e-5, 0.0, 0.0])
+    flown.fly(6.0)
+    assert "contradict the estimate" in flown.filter.field_doubt
+    flown.magnet = np.zeros(3)
+    flown.fly(3.0)
+    assert flown.filter.field_doubt == ""

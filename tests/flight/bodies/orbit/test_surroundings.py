@@ -100,3 +100,23 @@ def test_a_long_prediction_has_the_times_of_the_clock(elements: TwoLineElements)
     found = known.at(45 * SECOND_NS)
     assert found is not None
     assert ahead.position_at(np.array([40.0]))[0] == pytest.approx(found.position, abs=5.0)
+
+
+def test_a_receiver_whose_time_stands_is_refused_for_as_long_as_it_does(elements: TwoLineElements) -> None:
+    known, frozen = Surroundings(elements, SimClock(UTC_NS)), reading(elements, 10 * SECOND_NS)
+    assert known.fix(frozen)
+    for seconds in range(11, 60):
+        time_ns = seconds * SECOND_NS + GPS_DELAY_NS
+        assert not known.fix(replace(frozen, time_ns=time_ns, arrival_ns=time_ns))
+    date = UNIX_EPOCH + (UTC_NS + 60 * SECOND_NS) / (DAY * SECOND_NS)
+    assert known.julian_date(60 * SECOND_NS) == pytest.approx(date, abs=1e-8), "the time goes on"
+
+
+def test_a_receiver_whose_bytes_come_late_is_believed_only_after_a_while(elements: TwoLineElements) -> None:
+    known, late_ns = Surroundings(elements, SimClock(UTC_NS)), 2 * SECOND_NS
+    assert known.fix(reading(elements, 10 * SECOND_NS))
+    used = []
+    for seconds in range(11, 60):
+        sent = reading(elements, seconds * SECOND_NS)
+        used.append(known.fix(replace(sent, time_ns=sent.time_ns + late_ns)))
+    assert used.index(True) == CONTRADICTED

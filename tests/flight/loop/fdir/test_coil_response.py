@@ -1,11 +1,13 @@
-"""The gain of a coil, estimated across stalls of the loop."""
+"""The gain of a coil, estimated across stalls of the loop, and on a free body in its coils' own field."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
+import pytest
 
+from flight.gnc.math.arrays import FloatArray
 from flight.loop.fdir.coils.response import CoilResponse, ResponseSettings
 
 FIELD = np.array([0.0, 0.0, 60e-6])
@@ -67,3 +69,51 @@ def test_samples_that_come_in_a_burst_are_those_of_the_commands_of_their_time() 
     assert wrong == 0
     assert len(gains) > 100
     assert np.abs(np.array(gains) - 1.0).max() < 0.1
+
+
+class Orbiting:
+    """A tumbling 1U in 37 uT with coils on and off; at the magnetometer their field is twice the Earth's."""
+
+    def __init__(self, signs: FloatArray) -> None:
+        self.signs, self.rate = signs, np.array([0.08, -0.1, 0.07])
+        self.response = CoilResponse(
+            ResponseSettings(
+                INERTIAS, 0.65, 2.8e-4, bin_samples=16, bins=40, model_error=2e-4, torsion=1e-6, damping=1e-4,
+                settle_ns=100_000_000,
+            )
+        )  # fmt: skip
+        self._noise = np.random.default_rng(4)
+        self._field: FloatArray = np.array([1e-5, -2e-5, 3e-5])
+
+    def fly(self, seconds: float) -> None:
+        """Fly with coils that pause for 0.2 s of each second."""
+        for cycle in range(round(40 * seconds)):
+            now_ns, within = cycle * TICK_NS, cycle % 40
+            wanted = 0.14 * np.sign([math.sin(0.7 * cycle / 40), math.cos(0.5 * cycle / 40), 1.0])
+            currents = wanted if within >= 8 else np.zeros(3)
+            self.response.commanded(now_ns, tuple(currents.tolist()))
+            for _ in range(5):
+                torque = np.cross(0.65 * self.signs * currents, self._field)
+                self.rate = self.rate + 5e-3 * np.linalg.solve(
+                    INERTIAS, torque - np.cross(self.rate, INERTIAS @ self.rate)
+                )
+                self._field = self._field - 5e-3 * np.cross(self.rate, self._field)
+            seen = self._field + 5e-4 * self.signs * currents
+            noise = 2.8e-4 * self._noise.standard_normal(3)
+            self.response.observe_motion(now_ns + TICK_NS, self.rate + noise, seen)
+
+
+INERTIAS = np.diag([1.10e-3, 1.05e-3, 0.99e-3])
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_of_a_free_body_a_reversed_coil_is_found_though_its_field_swamps_the_magnetometer(axis: int) -> None:
+    sound = Orbiting(np.ones(3))
+    sound.fly(60.0)
+    assert sound.response.reversed_axes() == []
+    assert np.abs(sound.response.gain - 1.0).max() < 0.3
+    signs = np.ones(3)
+    signs[axis] = -1.0
+    broken = Orbiting(signs)
+    broken.fly(60.0)
+    assert broken.response.reversed_axes() == [axis]

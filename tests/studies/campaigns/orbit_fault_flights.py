@@ -1,0 +1,160 @@
+"""The flights of campaign `orbit-faults`: the loop of config/orbit.yaml for 70 s in each of its modes.
+
+The world has no release of 10 deg/s to be braked first: each flight begins near its mode. Cameras, receiver
+and planner are asked more often than in a real flight, so that a fault of a few seconds meets them.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from typing import Any
+
+import numpy as np
+from sgp4.api import WGS72, Satrec
+from sgp4.exporter import export_tle
+
+from flight.gnc.earth.orbit_knowledge import TwoLineElements
+from flight.gnc.math import quaternion
+from flight.gnc.math.arrays import FloatArray
+from flight.schema import reader as configuration
+from flight.schema.orbit import OrbitConfig, TargetStep, as_orbit
+from sim_hal.settings import FaultEntry, Simulation
+from sim_hal.worlds.free_body.body import FreeBody
+from sim_hal.worlds.surroundings import Surroundings
+from tests.scenario.flights import CONFIG
+
+MODES = ("detumble", "acquire", "sun", "point", "slew", "safe")
+DURATION = 70.0
+"""s, of each flight."""
+SPEEDS = {"detumble": 0.15, "acquire": 0.004, "safe": 0.08}
+"""rad/s at the release, 0.001 in the other modes; SAFE brakes a spin."""
+SLEWED = math.radians(60.0)
+FRAME_PERIOD = 2.5
+OLD_DAYS, OLD_OFF = 7.0, 4.0
+"""Days of the old element set, and s by which it is off along the orbit: 30 km [assumed, of a week]."""
+ORBIT = CONFIG.parent / "orbit.yaml"
+TEXT = ORBIT.read_text(encoding="utf-8")
+_JULIAN = 2_440_587.5
+
+
+def config_for(mode: str, elements: str = "", replans: bool = False) -> OrbitConfig:
+    """Return the configuration of a flight; `elements` is "old", "none", or empty for those of the orbit."""
+    config = _orbit()
+    assert config.camera is not None
+    assert config.gps is not None
+    camera = configuration.replace(
+        config.camera, period=FRAME_PERIOD, fine_period=2.0 * FRAME_PERIOD, max_age=12.0
+    )
+    modes: dict[str, Any] = {"initial": "safe" if mode == "safe" else "detumble"}
+    if mode in {"acquire", "sun"}:
+        modes["acquired"] = mode
+    slow = {} if mode in {"detumble", "safe"} else {"low_rate": 0.0175, "low_for": 0.5}
+    pointing = {"replan_period": 10.0} if replans else {}
+    lines = {"old": old_elements(), "none": None}.get(elements, config.elements)
+    return configuration.replace(
+        config,
+        duration=DURATION,
+        camera=camera,
+        gps=configuration.replace(config.gps, max_age=6.0),
+        modes=configuration.replace(config.modes, **modes),
+        detumble=configuration.replace(config.detumble, **slow),
+        pointing=configuration.replace(config.pointing, **pointing),
+        executive=configuration.replace(config.executive, planner_timeout=8.0, vision_timeout=5.0),
+        elements=lines,
+        targets=_targets(mode),
+    )
+
+
+def world_for(mode: str, seed: int, faults: tuple[FaultEntry, ...]) -> Simulation:
+    """Return the world of a flight: the attitude of its release is the one that the mode wants."""
+    section = _world()
+    assert section.free_body is not None
+    speed = SPEEDS.get(mode, 0.001)
+    release = configuration.replace(section.free_body.release, speed=speed, attitude=release_attitude())
+    body = configuration.replace(section.free_body, release=release)
+    return configuration.replace(section, seed=seed, free_body=body, faults=faults)
+
+
+def _targets(mode: str) -> tuple[TargetStep, ...]:
+    """Return one inertial target: the attitude of the release, or one that must be slewed to."""
+    x, y, z, w = release_attitude()
+    if mode == "slew":
+        turn = quaternion.from_rotation_vector(np.array([0.0, SLEWED, 0.0]))
+        x, y, z, w = quaternion.multiply(turn, np.array([x, y, z, w])).tolist()
+    return (TargetStep(at=0.0, point="inertial", quaternion=(x, y, z, w)),)
+
+
+@cache
+def release_attitude() -> tuple[float, float, float, float]:
+    """Return the attitude with +z to the Sun and the star camera, -y, as far from the Earth as may be."""
+    around = _at_release()
+    sun, up = np.array(around.sun), np.array(around.position)
+    camera = up - sun * float(sun @ up)
+    camera = camera / np.linalg.norm(camera)
+    x, y, z, w = quaternion.from_matrix(np.stack([np.cross(-camera, sun), -camera, sun])).tolist()
+    return x, y, z, w
+
+
+@cache
+def old_elements() -> tuple[str, str]:
+    """Return the configured elements as a set of a week before, `OLD_OFF` s off along the orbit by now."""
+    config = _orbit()
+    assert config.elements is not None
+    known = Satrec.twoline2rv(*config.elements)
+    wanted = TwoLineElements(*config.elements).at(_begin() + OLD_OFF / 86_400.0)
+    node = known.nodeo - known.nodedot * OLD_DAYS * 1440.0
+    perigee = known.argpo - known.argpdot * OLD_DAYS * 1440.0
+    anomaly = known.mo - known.mdot * OLD_DAYS * 1440.0
+    epoch = known.jdsatepoch + known.jdsatepochF - 2_433_281.5 - OLD_DAYS
+
+    def lines(shift: float) -> tuple[str, str]:
+        made = Satrec()
+        angles = (part % (2.0 * math.pi) for part in (perigee, anomaly + shift, node))
+        argument, mean, ascending = angles
+        made.sgp4init(
+            WGS72, "i", 99999, epoch, known.bstar, known.ndot, known.nddot, known.ecco,
+            argument, known.inclo, mean, known.no_kozai, ascending,
+        )  # fmt: skip
+        first, second = export_tle(made)
+        return first, second
+
+    shift = 0.0
+    for _ in range(3):  # the anomaly that brings it there, whatever the secular rates leave
+        found = TwoLineElements(*lines(shift)).at(_begin())
+        ahead = np.cross(found.position, found.velocity)
+        ahead = np.cross(ahead / np.linalg.norm(ahead), found.position)
+        behind = wanted.position - found.position
+        shift += float(behind @ ahead) / float(ahead @ ahead)
+    return lines(shift)
+
+
+@cache
+def _orbit() -> OrbitConfig:
+    return as_orbit(configuration.load(ORBIT))
+
+
+@cache
+def _world() -> Simulation:
+    section = configuration.simulation_section(TEXT, str(ORBIT), Simulation)
+    assert section is not None
+    return section
+
+
+def _body() -> FreeBody:
+    section = _world()
+    assert section.free_body is not None
+
+    def no_currents() -> FloatArray:
+        return np.zeros(3)
+
+    return FreeBody(section.free_body, no_currents, seed=section.seed, utc=section.utc)
+
+
+def _at_release() -> Surroundings:
+    return _body().surroundings()
+
+
+def _begin() -> float:
+    """Return the Julian date UTC of the release."""
+    return _JULIAN + _body().utc_ns() * 1e-9 / 86_400.0

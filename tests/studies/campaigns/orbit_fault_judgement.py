@@ -1,0 +1,228 @@
+"""Judges a flight of campaign `orbit-faults` by its log and by the truth beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from flight.gnc.math.arrays import BoolArray
+from flight.gnc.math.quaternion import attitude_matrix
+from flight.link.events import EVENTS, EventKind, Severity
+from flight.link.modes import POINTING, Mode
+from flight.link.telemetry.packets import to_text
+from ground.report.knowledge import FINE, LOST, attitude_errors
+from ground.report.signals import seconds
+from ground.telemetry.reader import Run
+from sim_hal.faults.kinds import FaultKind
+from tests.studies.campaigns.campaign import Result
+from tests.studies.campaigns.fault_judgement import GAIN_ERROR, OFF_SURELY
+from tests.studies.campaigns.fault_table import OWN, own_events, part_of
+from tests.studies.campaigns.orbit_fault_flights import DURATION
+
+CYCLE = 0.025
+REPORTED_WITHIN = 20.0
+"""s after the end of a fault: later events have another cause."""
+BLIND_GRACE, FIELD_GRACE, LOST_GRACE = 0.1, 5.0, 1.0
+"""s within which the coils are at zero: after the last reading, the last good field, the loss of attitude."""
+ZERO, DRIVEN = 1e-3, 6e-3
+"""A: a coil that is off carries less; a coil that drives carries more."""
+SIGMAS, FINE_AT_MOST = 5.0, np.radians(0.1)
+"""Of its claims, and rad: an attitude that is further off than both is false."""
+DIPOLE_PER_AMPERE = 0.648
+"""m^2, of config/orbit.yaml."""
+LOOKED, FEW = 3.0, 3
+"""s after an upset in which its trace is looked for; samples of the unit that may lack."""
+LAST = 12.0
+"""s at the end of a flight, in which the body must do again what its mode is for."""
+ACTS, RATE_OFF = 2e-3, 0.0175
+"""A: of coils that steer with little torque; rad/s, of the rate by the magnetometer."""
+
+ORBIT_OWN: Mapping[str, frozenset[str]] = {
+    **OWN,
+    "imu": OWN["imu"] | {"commands-doubted", "control-lost"},
+    "magnetometer": frozenset({"imu-refused", "sun-unclear", "field-refused"}),
+    "gps": frozenset({"gps-lost", "gps-refused"}),
+    "strings": frozenset({"strings-lost", "sun-unclear"}),
+    "clock": OWN["clock"] | {"clock-off"},
+    "elements": frozenset({"gps-refused", "gps-lost"}),
+}
+"""Events that report a fault of a device in orbit, beside those of its stream."""
+_STREAMS = {"imu": ("imu", "field"), "magnetometer": ("field",), "gps": ("gps",), "camera": ("camera",)}
+_KINDS: dict[str, EventKind] = {kind.name: kind for kind in EVENTS}
+_AT_ZERO_COMMAND = ("bridge", "coil", "pwm", "bus")
+"""Faults with which a coil may carry current though none is commanded."""
+
+
+def judge(flown: Run, kind: FaultKind, mode: str, at: float, end: float) -> Result:
+    """Return the judgement of a fault from `at` to `end` s."""
+    reported = [(float(e["time_ns"]) * 1e-9, to_text(e["name"]), to_text(e["text"])) for e in flown["event"]]
+    warned = [
+        (time, name, text)
+        for time, name, text in reported
+        if at - 1e-6 <= time < min(end + REPORTED_WITHIN, DURATION - CYCLE)
+        and _KINDS[name].severity is not Severity.INFORMATION
+    ]
+    own = [(time, name) for time, name, text in warned if is_own(kind, name, text)]
+    return {
+        "at": at,
+        "end": end,
+        "exercised": bool(own) or is_exercised(flown, kind, mode, at, end),
+        "told_s": own[0][0] - at if own else None,
+        "event": own[0][1] if own else None,
+        "reported": list(dict.fromkeys(name for _, name, _ in warned)),
+        "works": works(flown, mode),
+        "blind_current_a": blind_current(flown, kind, mode, at, end),
+        "beyond_s": beyond(flown),
+        "task_failed": any(name in {"task-failed", "service-failing"} for _, name, _ in reported),
+        "log_intact": all(log.intact for log in flown.logs.values()),
+    }
+
+
+def is_own(kind: FaultKind, name: str, text: str) -> bool:
+    """Return whether an event reports a fault by its part's name."""
+    part = part_of(kind)
+    if name == "stream-poor":
+        return text.startswith(tuple(f"{stream}:" for stream in _STREAMS.get(part, ("none",))))
+    return name in ORBIT_OWN[part] or (part in OWN and name in own_events(kind))
+
+
+def is_exercised(flown: Run, kind: FaultKind, mode: str, at: float, end: float) -> bool:
+    """Return whether the part was in use while its fault lasted."""
+    inside = _within(flown, "attitude", at, end)
+    asked = np.abs(flown["attitude"]["dipole"][inside]) / DIPOLE_PER_AMPERE
+    found = True
+    match part_of(kind):
+        case "coil" | "bridge":
+            found = kind.kind.endswith("high") or _long(_driven(flown, kind, asked, inside))
+        case part if kind.kind == "upset":  # a bit that matters is told, or the unit's samples lack
+            came = int(_within(flown, "imu", at, at + LOOKED).sum())
+            found = part == "imu" and abs(came - round(LOOKED / CYCLE)) > FEW
+        case "monitor" if kind.kind == "delayed":
+            found = _is_behind(flown, kind, inside)
+        case "pwm" | "monitor":
+            found = kind.kind in ALWAYS or _long((asked > 2 * DRIVEN).any(axis=1))
+        case "camera":
+            found = mode not in SPINS and end - at > 6.0
+        case "planner" | "vision":
+            jobs = flown["job_timing"]
+            when = seconds(jobs)
+            mine = np.array([to_text(name) == kind.device for name in jobs["name"]], dtype=bool)
+            found = bool((mine & (when > at + 0.3) & (when < end)).any())
+        case "strings" if kind.kind == "dead":
+            found = _is_string_lit(flown, at, end)
+        case _:
+            pass
+    return found
+
+
+ALWAYS = {"off", "nack", "slow", "intermittent", "brown-out", "garbage"}
+"""Faults of a part that it shows whatever is asked of it."""
+SPINS = ("detumble", "safe")
+"""Modes in which the body turns too fast for the camera at first."""
+
+
+def _driven(flown: Run, kind: FaultKind, asked: np.ndarray, inside: BoolArray) -> BoolArray:
+    """Return when a broken axis was to be driven in the direction that its fault concerns."""
+    axis = "xyz".index(kind.device[-1])
+    signed = flown["attitude"]["dipole"][inside][:, axis]
+    wanted = {"a-low": signed > 0.0, "b-low": signed < 0.0}.get(kind.kind, np.ones(len(signed), dtype=bool))
+    return np.asarray(wanted & (asked[:, axis] > 2 * DRIVEN))
+
+
+def _is_behind(flown: Run, kind: FaultKind, inside: BoolArray) -> bool:
+    """Return whether the commands, ten a second, differed from those of an old answer for a second."""
+    asked = np.abs(flown["attitude"]["dipole"]).sum(axis=1) / DIPOLE_PER_AMPERE
+    behind = round(10.0 * (kind.parameters["delay"].default or 0.0))
+    before = np.concatenate([np.full(behind, asked[0]), asked[:-behind]])
+    differs = np.abs(asked - before) > OFF_SURELY + GAIN_ERROR * np.maximum(asked, before)
+    return bool((differs & inside).sum() > 10)
+
+
+def _long(driven: BoolArray) -> bool:
+    """Return whether a command of the attitude packets, ten a second, lasted for 2.5 s in all."""
+    return bool(driven.sum() > 25)
+
+
+def _within(flown: Run, packet: str, at: float, end: float) -> BoolArray:
+    times = seconds(flown[packet])
+    return np.asarray((times >= at) & (times < max(end, at + 1.0)))
+
+
+def _is_string_lit(flown: Run, at: float, end: float) -> bool:
+    """Return whether the first string, on +x, would see the Sun within 60 deg of its normal."""
+    around = flown["orbit_truth"]
+    if not len(around):
+        return False
+    truth = flown["truth"][_within(flown, "truth", at, end)]
+    seen = attitude_matrix(truth["quaternion"].astype(float)) @ around["sun"][0]
+    return bool((seen[:, 0] > 0.5).mean() > 0.3)
+
+
+def works(flown: Run, mode: str) -> bool:
+    """Return whether at the flight's end the body does what its mode is for.
+
+    It brakes, and where the spin packet tells knows its rate; or it is fine and, where it points, steers.
+    """
+    truth, known = flown["truth"], flown["navigation"]["knowledge"]
+    last = seconds(truth) > DURATION - LAST
+    acts = bool((np.abs(truth["current"][last]) > ACTS).any())
+    if mode == "safe":
+        return acts
+    if mode == "detumble":
+        return acts and _rate_off(flown) < RATE_OFF
+    fine = bool(known[-1] == FINE)
+    if mode == "acquire":
+        return fine
+    return fine and acts and Mode(int(flown["mode"]["mode"][-1])) in POINTING
+
+
+def _rate_off(flown: Run) -> float:
+    """Return by how much, rad/s, the rate by the magnetometer was off in the last seconds, in the median."""
+    spin, truth = flown["spin"], flown["truth"]
+    spin = spin[(seconds(spin) > DURATION - LAST) & (spin["known"] == 1)]
+    if not len(spin):
+        return float("inf")
+    place = np.minimum(np.searchsorted(truth["time_ns"], spin["time_ns"]), len(truth) - 1)
+    return float(np.median(np.linalg.norm(spin["rate"] - truth["rate"][place], axis=1)))
+
+
+def blind_current(flown: Run, kind: FaultKind, mode: str, at: float, end: float) -> float:
+    """Return the largest current A of a coil that was driven blind, sensor by sensor."""
+    if part_of(kind) in _AT_ZERO_COMMAND:
+        return 0.0
+    truth = flown["truth"]
+    times, current = seconds(truth), np.abs(truth["current"]).max(axis=1)
+    came, sampled = seconds(flown["imu"]), flown["imu"]["sample_time_ns"] * 1e-9
+    newest = np.concatenate([[0.0], np.maximum.accumulate(sampled)])
+    heard = newest[np.searchsorted(came, times, side="right")]
+    blind = times - heard > BLIND_GRACE + 2 * CYCLE
+    if mode in {"detumble", "safe"} and kind.name in {"magnetometer: stuck", "magnetometer: saturated"}:
+        blind |= (times > at + FIELD_GRACE) & (times < end)
+    known = flown["navigation"]
+    if mode not in {"detumble", "safe"} and len(known):
+        place = np.searchsorted(seconds(known), times, side="right") - 1
+        lost = known["knowledge"] == LOST
+        both = lost & np.roll(lost, 1)
+        blind |= (place > 0) & both[np.maximum(place, 0)] & _points(flown, times)
+    return float(np.max(current[blind], initial=0.0))
+
+
+def _points(flown: Run, times: np.ndarray) -> BoolArray:
+    modes = flown["mode"]
+    place = np.searchsorted(seconds(modes), times, side="right") - 1
+    now = modes["mode"][np.maximum(place, 0)]
+    return np.isin(now, [int(mode) for mode in POINTING])
+
+
+def beyond(flown: Run) -> float:
+    """Return for how long, s, the coils were driven by an attitude that was false."""
+    errors = attitude_errors(flown)
+    if not len(errors.times):
+        return 0.0
+    bound = np.maximum(SIGMAS * errors.sigma, FINE_AT_MOST)
+    off = (np.abs(errors.error) > bound).any(axis=1)
+    truth = flown["truth"]
+    place = np.minimum(np.searchsorted(seconds(truth), errors.times), len(truth) - 1)
+    driven = np.abs(truth["current"][place]).max(axis=1) > DRIVEN
+    return float((off & driven & _points(flown, errors.times)).sum() * 0.1)

@@ -1,0 +1,184 @@
+"""Campaign `orbit-faults`: every fault of an orbit's devices in every mode of the satellite, in lock-step.
+
+Each run flies the loop of config/orbit.yaml for 70 s in one mode, with all disturbances, and breaks one thing
+at a random time for a random span (coils and bridges to the end), at the wire. Beside the catalogue there are
+conditions: an element set a week old, none at all, a wall clock wrong from the start on. Judged are: whether
+an event of its own told of the fault; whether at the end the body does again what its mode is for; the
+current of coils that were driven blind, sensor by sensor (readings, field, attitude); and for how long they
+were driven by an attitude that was further off than five of its claimed deviations and 0.1 deg. A fault of
+an unused part (a coil that is not driven, a camera that rests) is not exercised. `refly(seed, number)` flies
+one flight again.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sim_hal.faults.catalogue import CATALOGUE
+from sim_hal.faults.kinds import FaultKind, Where
+from sim_hal.faults.schedule import fitted
+from sim_hal.settings import FaultEntry
+from tests.scenario.flights import fly
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.orbit_fault_flights import DURATION, MODES, config_for, world_for
+from tests.studies.campaigns.orbit_fault_judgement import judge
+
+LASTING = ("coil", "bridge")
+ZERO = 1e-3
+BEYOND = 1.0
+"""s, for which an attitude may be beyond its claim while coils act."""
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """A flight that begins wrong: its element set, and faults from the start on."""
+
+    elements: str
+    faults: tuple[str, ...]
+
+
+CONDITIONS: Mapping[str, Condition] = {
+    "elements: a week old": Condition("old", ()),
+    "elements: a week old, no receiver": Condition("old", ("gps: no-fix",)),
+    "elements: none, no receiver": Condition("none", ("gps: no-fix for 20",)),
+    "clock: 5 min wrong, late receiver": Condition("", ("clock: stepped (by=300)", "gps: no-fix for 20")),
+}
+
+
+def faults() -> list[str]:
+    """Return the faults that make sense in orbit, and the conditions, by name."""
+    config = config_for("point")
+    both = [kind for kind in CATALOGUE.values() if kind.where is Where.BOTH]
+    return [kind.name for kind in both if fitted(kind.device, config)] + list(CONDITIONS)
+
+
+def cases(runs: int, seed: int) -> list[Case]:
+    """Return `runs` flights: fault by fault, mode by mode, over and over."""
+    names = faults()
+    found = []
+    for number in range(runs):
+        lap, place = divmod(number, len(names))
+        name, mode = names[place], MODES[(lap + place) % len(MODES)]
+        found.append(Case(f"{number} {name} {mode}", (seed, number), {"fault": name, "mode": mode}))
+    return found
+
+
+def run(case: Case) -> Result:
+    """Fly one case and return its judgement."""
+    name, mode = case.parameters["fault"], case.parameters["mode"]
+    rng = np.random.default_rng(case.seed)
+    kind, at, span = _when(name, mode, rng)
+    entries = tuple(FaultEntry(fault=text, at=at, span=span) for text in _texts(name))
+    facts = fly_with(kind, mode, entries, int(rng.integers(1, 2**31)), _elements(name))
+    return {"number": case.seed[-1], "fault": name, "mode": mode, **facts}
+
+
+def refly(seed: int, number: int) -> Result:
+    """Fly one flight of the campaign of this seed again."""
+    return run(cases(number + 1, seed)[number])
+
+
+def fly_with(
+    kind: FaultKind, mode: str, entries: tuple[FaultEntry, ...], seed: int, elements: str = ""
+) -> Result:
+    """Fly 70 s with faults of one begin and end, judged as of `kind`."""
+    config = config_for(mode, elements, replans=kind.device == "planner")
+    at = entries[0].at or 0.0 if entries else 0.0
+    span = entries[0].span if entries else None
+    end = at if kind.momentary else min(at + (span or DURATION), DURATION)
+    with tempfile.TemporaryDirectory(prefix="orbit-faults-") as place:
+        flown = fly(config, Path(place), section=world_for(mode, seed, entries))
+        return judge(flown, kind, mode, at, end)
+
+
+def _when(name: str, mode: str, rng: np.random.Generator) -> tuple[FaultKind, float, float | None]:
+    """Return the kind that judges, and begin and span, s: before the first plan, attitude, or after both."""
+    condition = CONDITIONS.get(name)
+    if condition is not None:
+        device, _, kind = name.partition(": ")
+        return FaultKind(device, kind, name, None), 0.0, None
+    known = CATALOGUE[name]
+    if known.device == "planner":
+        at = float(rng.uniform(0.5, 3.0))
+    else:
+        at = float(rng.uniform(*(0.05, 0.6) if mode == "acquire" else (18.0, 26.0)))
+    lasting = known.device.startswith(LASTING) or known.momentary
+    return known, at, None if lasting else float(rng.uniform(9.0, 16.0))
+
+
+def _texts(name: str) -> tuple[str, ...]:
+    condition = CONDITIONS.get(name)
+    return (name,) if condition is None else condition.faults
+
+
+def _elements(name: str) -> str:
+    condition = CONDITIONS.get(name)
+    return "" if condition is None else condition.elements
+
+
+def summarise(results: Sequence[Result], folder: Path) -> Summary:
+    """Return a row for each fault with a cell for each mode, and all defects found."""
+    del folder
+    by_cell: dict[str, dict[str, list[Result]]] = {}
+    for result in results:
+        by_cell.setdefault(result["fault"], {}).setdefault(result["mode"], []).append(result)
+    lines = [
+        f"{len(results)} flights of {DURATION:g} s; a cell is the worst delay, s, until the fault was told,",
+        "- where it was not exercised, ! where it was not told",
+        f"{'fault':36}" + "".join(f"{mode:>10}" for mode in MODES) + "  events",
+    ]
+    for name, row in by_cell.items():
+        told = sorted({r["event"] for cell in row.values() for r in cell if r["event"]})
+        cells = "".join(f"{_cell(row.get(mode, [])):>10}" for mode in MODES)
+        lines.append(f"{name:36}{cells}  {', '.join(told)[:44]}")
+    exercised = [r for r in results if r["exercised"]]
+    defects = {
+        "not told": [r for r in exercised if r["told_s"] is None and not r["fault"].startswith("elements")],
+        "not working again at the end": [r for r in results if not r["works"]],
+        "current while blind": [r for r in results if r["blind_current_a"] > ZERO],
+        "driven by a false attitude": [r for r in results if r["beyond_s"] > BEYOND],
+        "an exception": [r for r in results if r["task_failed"]],
+        "a log not whole": [r for r in results if not r["log_intact"]],
+    }
+    facts: dict[str, Any] = {"runs": len(results), "exercised": len(exercised)}
+    facts["told"] = sum(r["told_s"] is not None for r in exercised)
+    facts["defects"] = {name: [_named(r) for r in found] for name, found in defects.items()}
+    lines.append(f"told {facts['told']} of {facts['exercised']} exercised faults")
+    for name, found in facts["defects"].items():
+        lines += [f"{name}: {len(found)}", *(f"  {text}" for text in found)]
+    return Summary("\n".join(lines) + "\n", facts)
+
+
+def _cell(own: Sequence[Result]) -> str:
+    exercised = [r for r in own if r["exercised"]]
+    if not exercised:
+        return "-" if own else ""
+    if any(r["told_s"] is None for r in exercised):
+        return "!"
+    return f"{max(r['told_s'] for r in exercised):.2f}"
+
+
+def _named(result: Result) -> str:
+    """Return a flight with all that is needed to fly it again."""
+    span = f"{result['at']:.2f} to {result['end']:.2f} s"
+    figures = f"blind {1e3 * result['blind_current_a']:.0f} mA, beyond {result['beyond_s']:.1f} s"
+    said = ", ".join(result["reported"]) or "nothing"
+    return (
+        f"{result['fault']}, {result['mode']}, {span}, number {result['number']}; {figures}; reported: {said}"
+    )
+
+
+ORBIT_FAULTS = Campaign(
+    "orbit-faults",
+    "every fault of an orbit's devices in every mode of the satellite",
+    cases,
+    run,
+    summarise,
+    default_runs=500,
+)

@@ -1,0 +1,100 @@
+"""A slice of campaign `orbit-faults`: two faults of an orbit are told, and a blind current is found out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from flight.gnc.earth.orbit_knowledge import TwoLineElements
+from flight.link.events import EVENTS, Severity
+from flight.schema import reader as configuration
+from ground.telemetry.reader import Run
+from sim_hal.faults.catalogue import CATALOGUE
+from sim_hal.settings import FaultEntry
+from tests.scenario.flights import fly
+from tests.studies.campaigns import orbit_fault_judgement as judgement
+from tests.studies.campaigns import orbit_faults
+from tests.studies.campaigns.fault_table import part_of
+from tests.studies.campaigns.orbit_fault_flights import (
+    MODES,
+    config_for,
+    old_elements,
+    world_for,
+)
+
+BRIEF, LAST = 34.0, 6.0
+"""s, of a flight, and at its end in which the body must do again what it is for."""
+AT, SPAN = 12.0, 10.0
+
+
+@pytest.fixture(autouse=True)
+def brief(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(judgement, "DURATION", BRIEF)
+    monkeypatch.setattr(judgement, "LAST", LAST)
+
+
+def flown(fault: str, mode: str, folder: Path) -> Run:
+    entry = FaultEntry(fault=fault, at=AT, span=SPAN)
+    config = configuration.replace(config_for(mode), duration=BRIEF)
+    return fly(config, folder, section=world_for(mode, 3, (entry,)))
+
+
+def test_a_receiver_that_repeats_its_fix_is_told_and_the_body_points_on(tmp_path: Path) -> None:
+    run = flown("gps: stuck", "sun", tmp_path)
+    found = judgement.judge(run, CATALOGUE["gps: stuck"], "sun", AT, AT + SPAN)
+    assert found["event"] == "gps-refused"
+    assert found["told_s"] < 4.0
+    assert (found["works"], found["blind_current_a"], found["beyond_s"]) == (True, 0.0, 0.0)
+    assert not found["task_failed"]
+    assert found["log_intact"]
+
+
+class Doctored(dict[str, Any]):
+    """Packets that can be written to, in a run's place."""
+
+    logs: Any
+
+
+def test_a_stuck_magnetometer_ends_the_braking_and_current_in_spite_of_it_is_found_out(
+    tmp_path: Path,
+) -> None:
+    run, kind = flown("magnetometer: stuck", "detumble", tmp_path), CATALOGUE["magnetometer: stuck"]
+    found = judgement.judge(run, kind, "detumble", AT, AT + SPAN)
+    assert found["event"] == "field-refused"
+    assert found["told_s"] < 2.0
+    assert found["blind_current_a"] < 1e-3
+    assert found["works"]
+    names = ("truth", "imu", "navigation", "mode", "attitude")
+    doctored = Doctored({name: run[name].copy() for name in names})
+    late = np.abs(run["truth"]["time_ns"] * 1e-9 - (AT + 8.0)) < 0.1
+    doctored["truth"]["current"][late] = 0.05
+    blind = judgement.blind_current(cast("Run", doctored), kind, "detumble", AT, AT + SPAN)
+    assert blind == pytest.approx(0.05)
+
+
+def test_each_fault_has_events_of_its_own_that_exist() -> None:
+    names = {event.name: event for event in EVENTS}
+    for fault in orbit_faults.faults():
+        part = part_of(CATALOGUE[fault]) if fault in CATALOGUE else fault.partition(":")[0]
+        own = judgement.ORBIT_OWN[part]
+        assert own, fault
+        assert all(names[name].severity is not Severity.INFORMATION for name in own)
+
+
+def test_the_campaign_meets_every_fault_in_every_mode() -> None:
+    drawn = orbit_faults.cases(len(MODES) * len(orbit_faults.faults()), seed=1)
+    met = {(case.parameters["fault"], case.parameters["mode"]) for case in drawn}
+    assert len(met) == len(drawn)
+
+
+def test_elements_of_a_week_ago_are_as_far_off_as_told() -> None:
+    config = config_for("point")
+    assert config.elements is not None
+    known, old = TwoLineElements(*config.elements), TwoLineElements(*old_elements())
+    date = 2_461_120.0
+    off = np.linalg.norm(known.at(date).position - old.at(date).position)
+    assert off == pytest.approx(4.0 * 7.6e3, rel=0.05)
+    assert old.at(date).sigma == pytest.approx(1500.0 + 7.0 * 1500.0, rel=0.05)
