@@ -7,7 +7,7 @@ TESTS  := $(RUN) -m pytest -n auto
 # The tests start hundreds of processes: without kept bytecode each would compile every module again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo orbit orbit-3u object console quick test test-container lint types arrows docs house unit fast slow-list pictures lock clean help
+.PHONY: demo cage orbit orbit-3u object console quick test test-container lint types arrows docs house unit fast slow-list pictures lock clean help
 
 help:           ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
@@ -22,6 +22,11 @@ demo: $(READY)  ## fly the 700 s step demonstration on simulated hardware and pr
 	@rm -rf runs/demo
 	$(RUN) -m flight run config/step_demo.yaml --out runs/demo
 	$(RUN) -m flight report runs/demo
+
+cage: $(READY)  ## fly the testbed in a Helmholtz cage that plays an orbit's field, for a revolution; report and pictures
+	@rm -rf runs/cage
+	$(RUN) -m flight run config/cage.yaml --out runs/cage
+	$(RUN) -m flight report runs/cage --figures runs/cage/figures
 
 orbit: $(READY) ## fly a KnightCube for an orbit: detumble from 10 deg/s, point to the Sun, then nadir; print the report
 	@rm -rf runs/orbit

@@ -96,6 +96,7 @@ def wide_model(camera: WideCamera, seed: int = 0) -> EarthCameraModel:
         bits=camera.bits,
         response=camera.response,
         decades=camera.decades,
+        pedestal=camera.pedestal,
         seed=seed,
     )
 

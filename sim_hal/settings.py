@@ -12,7 +12,7 @@ import msgspec
 from msgspec import Meta
 
 from flight.schema.values import NotNegative, Positive, Section
-from sim_hal.worlds.free_body.section import FreeBodySection
+from sim_hal.worlds.free_body.section import FreeBodySection, OrbitSection
 
 Row = tuple[float, float, float]
 
@@ -60,6 +60,17 @@ class Truth(Section, frozen=True, kw_only=True):
     field: Positive | None = None
     resistance: tuple[Positive, Positive, Positive] | None = None
     supply_voltage: Positive | None = None
+
+
+class CageTruth(Section, frozen=True, kw_only=True):
+    """What the simulated cage plays: the orbit at the simulation's time zero.
+
+    `gain` is what its coils make of the field that is asked of them; `ring_current` a multiple of 20 nT.
+    """
+
+    orbit: OrbitSection = OrbitSection()
+    gain: Positive = 1.0
+    ring_current: NotNegative = 1.0
 
 
 class Sky(Section, frozen=True, kw_only=True):
@@ -163,6 +174,7 @@ class Simulation(Section, frozen=True, kw_only=True):
     objects: Annotated[tuple[SkyObject, ...], Meta(max_length=32)] = ()
     truth: Truth = Truth()
     free_body: FreeBodySection | None = None
+    cage: CageTruth | None = None
     orbit_devices: OrbitDeviceTruth = OrbitDeviceTruth()
     latency: Latency = Latency()
     faults: tuple[FaultEntry, ...] = ()

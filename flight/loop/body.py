@@ -17,6 +17,7 @@ from flight.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeas
 from flight.gnc.guidance.three_axes.pointing_target import PointingTarget
 from flight.gnc.math.arrays import FloatArray, IntArray
 from flight.gnc.tracking.tracker import Track
+from flight.gnc.vision.wide_job import WideFound, WideJob
 from flight.link.modes import Mode
 from flight.loop.control_output import CoilCommand, ControlOutput, Target
 from flight.loop.executive.jobs import JobResult
@@ -25,7 +26,7 @@ from flight.loop.fdir.coils.watch import CoilWatch
 from flight.loop.services import Services
 from flight.loop.state.content import Learned
 from flight.schema.sections import Config
-from hal.interfaces.readings import GpsReading, ImuReading, StringReading
+from hal.interfaces.readings import Frame, GpsReading, ImuReading, StringReading
 
 PLANNER = "planner"
 """The planner worker's name."""
@@ -208,6 +209,20 @@ class BodyView(Protocol):
         """Return target and attitude as text, for the progress line."""
 
 
+class WideSight(Protocol):
+    """What a body does with the frames of its wide cameras."""
+
+    @property
+    def needed(self) -> bool:
+        """Whether the cameras are to be read often, as little else tells the attitude."""
+
+    def job(self, frames: Mapping[int, Frame]) -> WideJob:
+        """Return the worker's job for frames by their cameras' numbers."""
+
+    def accept(self, time_ns: int, found: WideFound) -> tuple[bool, bool]:
+        """Accept Sun and nadir of a time; return whether each of them was used."""
+
+
 @dataclass(frozen=True, slots=True)
 class Body:
     """A body ready to fly.
@@ -230,6 +245,7 @@ class Body:
         sighted: accepts the confirmed tracks of objects after each frame that was searched, at a time.
         place: returns the orbit's state at a time, None while it is not known.
         seeks: returns whether an object is looked for or followed, so that no frame is left out.
+        wide: makes jobs of the wide cameras' frames and accepts what was found; None: it does not use them.
         sun: accepts a reading of the solar strings; returns why it shows no Sun, empty where it does, None
             where it is not judged.
     """
@@ -253,6 +269,7 @@ class Body:
     velocity: Callable[[int], FloatArray | None] = lambda _: None
     fix: Callable[[GpsReading], bool] = lambda _: False
     sun: Callable[[StringReading], str | None] = lambda _: None
+    wide: WideSight | None = None
     sighted: Callable[[Sequence[Track], int], None] = lambda _tracks, _now_ns: None
     place: Callable[[int], OrbitState | None] = lambda _: None
     seeks: Callable[[], bool] = lambda: False

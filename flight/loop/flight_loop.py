@@ -33,6 +33,7 @@ from flight.loop.tasks.navigation import Navigation
 from flight.loop.tasks.performance import PerformanceObserver
 from flight.loop.tasks.positioning import Positioning
 from flight.loop.tasks.sun_sensing import SunSensing
+from flight.loop.tasks.wide_imaging import WideImaging
 from flight.schema.sections import Config
 from hal.interfaces.wires import SECOND_NS
 
@@ -67,6 +68,7 @@ class LoopTasks:
     imaging: Imaging | None
     positioning: Positioning | None
     sun: SunSensing | None
+    wide: WideImaging | None
     modes: ModeControl
     control: ControlCycle
     observer: PerformanceObserver
@@ -157,7 +159,7 @@ class FlightLoop:
         tasks.navigation.begin(epoch_ns)
         if tasks.imaging is not None:
             tasks.imaging.begin(epoch_ns)
-        for sensing in (tasks.positioning, tasks.sun):
+        for sensing in (tasks.positioning, tasks.sun, tasks.wide):
             if sensing is not None:
                 sensing.begin(epoch_ns)
         if tasks.commanding is not None:
@@ -200,7 +202,7 @@ class FlightLoop:
     def _keep_house(self, cycle: Cycle) -> None:
         now_ns, output = cycle.start_ns, self._output
         state = output.steered.state if output is not None else SteeringState.OFF
-        for sensing in (self._tasks.positioning, self._tasks.sun):
+        for sensing in (self._tasks.positioning, self._tasks.sun, self._tasks.wide):
             if sensing is not None:
                 sensing.run(now_ns)
         self._tasks.housekeeping.run(cycle, state)

@@ -9,9 +9,10 @@ from flight.gnc.camera.lens import CameraModel, Lens
 from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from flight.schema.devices import Camera
+from flight.schema.orbit_devices import WideCamera
 
 
-def camera_model(camera: Camera) -> CameraModel:
+def camera_model(camera: Camera | WideCamera) -> CameraModel:
     """Return the calibrated camera where the configuration has a lens, else the pinhole of its field.
 
     Raises LensError for a lens that cannot be.

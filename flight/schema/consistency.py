@@ -55,6 +55,13 @@ def check_consistency(config: Config, document: Document) -> None:
     _check_length("inertial_unit.mounting", config.inertial_unit.mounting, refuse)
     for index, camera in enumerate(config.wide_cameras):
         _check_length(f"wide_cameras[{index}].mounting", camera.mounting, refuse)
+        first = config.wide_cameras[0]
+        for name in ("response", "decades", "bits", "pedestal"):
+            if (value := getattr(camera, name)) != (wanted := getattr(first, name)):
+                refuse(
+                    f"wide_cameras[{index}].{name}",
+                    f"is {value!r}: all respond alike, the first has {wanted!r}",
+                )
     if config.solar_strings is not None:
         _check_strings(config, config.solar_strings, refuse)
 

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from flight.schema.devices import AravisDevice, CameraLens, V4l2Device
-from flight.schema.values import Address, Positive, Quaternion, Section
+from flight.schema.values import Address, NotNegative, Positive, Quaternion, Section
 
 Normal = tuple[float, float, float]
 
@@ -46,9 +46,12 @@ class SolarStrings(Section, frozen=True, kw_only=True):
 class WideCamera(Section, frozen=True, kw_only=True):
     """A wide camera for Sun and horizon.
 
-    `response` is logarithmic over `decades` of light, or linear. With 384 x 384 pixels over 67 deg a frame is
+    `response` is logarithmic over `decades` of light from `pedestal` counts on, or linear; all
+    cameras respond alike. With 384 x 384 pixels over 67 deg a frame is
     simulated in 30 to 46 ms and the Sun is found as with 512 x 512, which take 52 to 72; with 256 x 256 it
-    is missed in one of three.
+    is missed in one of three. All are triggered together, as often as the shortest `period`, and
+    `fine_period` while the attitude is known to 0.05 deg. `lens_error_deg` is what calibration leaves of lens
+    and mounting.
     """
 
     device: V4l2Device | AravisDevice | None = None
@@ -59,7 +62,14 @@ class WideCamera(Section, frozen=True, kw_only=True):
     response: Literal["logarithmic", "linear"] = "logarithmic"
     decades: Annotated[float, Meta(ge=1.0, le=12.0)] = 6.0
     bits: Annotated[int, Meta(ge=8, le=16)] = 8
+    pedestal: Annotated[float, Meta(ge=0.0, le=200.0)] = 8.0
     exposure: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.005
-    period: Positive = 10.0
+    period: Annotated[float, Meta(ge=2.0)] = 5.0
+    fine_period: Annotated[float, Meta(ge=2.0)] = 60.0
     max_age: Positive = 30.0
+    lens_error_deg: NotNegative = 0.02
     mounting: Quaternion = (0.0, 0.0, 0.0, 1.0)
+
+    def counts_per_decade(self) -> float:
+        """Return how many counts ten times the light adds with a logarithmic response."""
+        return float((1 << self.bits) - 1 - self.pedestal) / self.decades

@@ -108,6 +108,17 @@ class Step(Section, frozen=True, kw_only=True):
     rate: Annotated[float, Meta(ge=-0.1, le=0.1)] = 0.0
 
 
+class Cage(Section, frozen=True, kw_only=True):
+    """A Helmholtz cage that plays an orbit's field (`bodies.testbed.cage`), by UTC.
+
+    `elements` are the two lines of that orbit, `scale` how many times as strong the cage makes its field.
+    `plant.field` is then the weakest field that plans count on.
+    """
+
+    elements: tuple[str, str]
+    scale: Annotated[float, Meta(gt=0.0, le=100.0)] = 10.0
+
+
 class TestbedConfig(Config, frozen=True, kw_only=True):
     """The testbed's configuration."""
 
@@ -120,6 +131,7 @@ class TestbedConfig(Config, frozen=True, kw_only=True):
     control: Control = Control()
     identification: Identification = Identification()
     steps: Annotated[tuple[Step, ...], Meta(min_length=1)]
+    cage: Cage | None = None
 
     def field_range(self) -> tuple[float, float]:
         """Return the smallest and the largest strength of a valid magnetometer reading, T."""

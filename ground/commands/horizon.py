@@ -22,6 +22,7 @@ from flight.gnc.vision.horizon.settings import EdgeSettings, HorizonSettings
 from flight.gnc.vision.horizon.solution import HorizonSolution, NadirMeasurement
 from flight.schema import reader as configuration
 from flight.schema.camera_model import camera_model
+from ground.commands import paper_horizon
 from ground.commands.options import add_field, add_output, add_picture, positive, read_picture
 from ground.pictures.horizon import draw_horizon
 
@@ -57,17 +58,21 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar=("PEDESTAL", "COUNTS"),
         help="of a logarithmic detector: dark counts, and counts per decade of light",
     )
+    paper_horizon.add_arguments(parser)
     add_output(parser, run)
 
 
 def run(options: argparse.Namespace) -> int:
     """Find the horizon, print, draw; exit status 1 when none is found."""
+    paper_horizon.check(options)
     pixels = read_picture(options)
     camera = _camera(options, pixels)
     altitude = None if options.altitude is None else 1e3 * options.altitude
     if altitude is not None and altitude < LEAST_ALTITUDE:
         least = f"{1e-3 * LEAST_ALTITUDE:g} km"
         raise UsageError(f"--altitude {options.altitude:g}: the limb is seen as one from {least} up")
+    if options.method != "default":
+        return paper_horizon.run_paper(options, pixels, camera)
     response = None if options.log_response is None else LogarithmicResponse(*options.log_response)
     least, most = (1e3 * bound for bound in options.altitudes)
     settings = HorizonSettings(edges=EdgeSettings(response=response), altitudes=(least, most))

@@ -7,23 +7,24 @@ import json
 import math
 import sys
 import time
-from dataclasses import dataclass, replace
-from datetime import UTC, datetime
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from flight.gnc.attitude.solvers import SOLVERS
 from flight.gnc.camera.images import grey_stretch, write_picture
 from flight.gnc.camera.lens import CameraModel
 from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.catalogue.names import PROPER_NAMES
-from flight.gnc.earth.sun import DAY, J2000, earth_velocity
+from flight.gnc.earth.sun import earth_velocity
 from flight.gnc.errors import UsageError
 from flight.gnc.math.arrays import Image
 from flight.gnc.vision.frame_job import solve_frame
 from flight.gnc.vision.startracker.classical.methods import DEFAULT_METHOD, METHODS, method_of
 from flight.gnc.vision.startracker.detection import DetectionSettings
+from flight.gnc.vision.startracker.detection.settings import CENTROIDS
 from flight.gnc.vision.startracker.index import sky_index
 from flight.gnc.vision.startracker.index.build import default_index
 from flight.gnc.vision.startracker.index.sky_index import SkyIndex
@@ -34,6 +35,7 @@ from flight.gnc.vision.streaks.streak_result import StreakStatus
 from flight.schema import reader as configuration
 from flight.schema.camera_model import camera_model, likelihood_settings
 from flight.schema.devices import Camera
+from ground.commands.date import date
 from ground.commands.options import (
     add_field,
     add_output,
@@ -52,6 +54,8 @@ ARCSECONDS = math.degrees(1.0) * 3600.0
 UNKNOWN_DEG = 4.0, 60.0
 """Fields of view that are searched when none is given."""
 _FOV_TOLERANCE = 0.05
+IMAGE = "image"
+"""The attitude by the fit in the image."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -74,7 +78,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--prior", type=finite, nargs=3, metavar=("X", "Y", "Z"), help="rough rate, rad/s")
     parser.add_argument(
         "--date",
-        type=_date,
+        type=date,
         metavar="UTC",
         help="when, such as 2026-11-21: proper motion, aberration, planets",
     )
@@ -82,13 +86,31 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--wcs", type=Path, metavar="FITS", help="write a header of world coordinates (TAN-SIP) here"
     )
     parser.add_argument("--index", type=Path, metavar="FILE", help="another sky index")
+    _add_methods(parser)
+    add_output(parser, run)
+
+
+def _add_methods(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--method",
         choices=tuple(METHODS),
         default=DEFAULT_METHOD,
         help="of identification; all but the default need the field to 1.8 %%: see --fov-error",
     )
-    add_output(parser, run)
+    parser.add_argument(
+        "--attitude",
+        choices=(IMAGE, *SOLVERS),
+        default=IMAGE,
+        help="image: the fit in the image, each star with its own covariance (default); else a solver of "
+        "directions",
+    )
+    parser.add_argument(
+        "--centroid",
+        choices=CENTROIDS,
+        default=CENTROIDS[0],
+        help="of points: psf fits the point spread (default), window is the centre of mass, the others weigh "
+        "its pixels otherwise",
+    )
 
 
 def run(options: argparse.Namespace) -> int:
@@ -105,6 +127,9 @@ def run(options: argparse.Namespace) -> int:
         if options.fov is None and options.camera is None:
             raise UsageError(f"--method {options.method}: it needs the field of view: give --fov or --camera")
         settings = replace(settings, method=method_of(options.method))
+    if options.attitude != IMAGE:
+        settings = replace(settings, attitude=SOLVERS[options.attitude])
+    settings = replace(settings, detection=replace(settings.detection, method=options.centroid))
     prior = None if options.prior is None else RatePrior(np.array(options.prior), 0.0)
     begin = time.perf_counter()
     solution = solve_frame(pixels, camera, scale, exposure or 1.0, sky, settings, rate_prior=prior)
@@ -113,7 +138,8 @@ def run(options: argparse.Namespace) -> int:
     if sky_map is not None and options.date is not None:
         bodies = bodies_in(sky_map, options.date.julian_date)
     if options.json:
-        values = facts(solution, sky, exposure, seconds) | sky_facts(sky_map, bodies)
+        values = {"attitude_method": options.attitude, "centroid_method": options.centroid}
+        values |= facts(solution, sky, exposure, seconds) | sky_facts(sky_map, bodies)
         sys.stdout.write(json.dumps(values, allow_nan=False) + "\n")
     else:
         sys.stdout.write(_text(solution, sky, exposure, seconds) + sky_text(sky_map, bodies))
@@ -124,24 +150,6 @@ def run(options: argparse.Namespace) -> int:
         if not options.json:
             sys.stdout.write(f"picture:          {options.overlay}\n")
     return 0 if solution.fix is not None else 1
-
-
-@dataclass(frozen=True, slots=True)
-class Date:
-    """An instant, as the Julian year of a catalogue's epoch and as a Julian date."""
-
-    year: float
-    julian_date: float
-
-
-def _date(text: str) -> Date:
-    try:
-        instant = datetime.fromisoformat(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(f"{text!r}: give a date such as 2026-11-21T20:15:00") from error
-    instant = instant.replace(tzinfo=UTC) if instant.tzinfo is None else instant
-    julian_date = J2000 + (instant - datetime(2000, 1, 1, 12, tzinfo=UTC)).total_seconds() / DAY
-    return Date(2000.0 + (julian_date - J2000) / 365.25, julian_date)
 
 
 def _belief(

@@ -9,6 +9,7 @@ from flight.gnc.camera.lens import CameraModel
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.vision.horizon.illumination import limb_rays
 from flight.gnc.vision.horizon.limb_equation import View
+from flight.gnc.vision.horizon.scanned_circle import ScannedHorizon
 from flight.gnc.vision.horizon.solution import HorizonSolution
 from ground.pictures.overlay import STREAK, UNUSED, draw_ring, outlined
 
@@ -36,4 +37,19 @@ def draw_horizon(
         draw_ring(drawn, point, _DOT, STREAK)
     for point, used in zip(solution.points, solution.on_horizon, strict=True):
         draw_ring(drawn, point, _RADIUS, STREAK if used else UNUSED)
+    return outlined(picture, drawn)
+
+
+def draw_circle(
+    picture: npt.NDArray[np.uint8], seen: ScannedHorizon, camera: CameraModel
+) -> npt.NDArray[np.uint8]:
+    """Return `picture` (rows, columns, 3) with the paper's circle and its edges, in orange."""
+    drawn = picture.copy()
+    angle = np.arange(8 * (camera.columns + camera.rows)) * (0.25 * np.pi / (camera.columns + camera.rows))
+    ring = seen.circle.centre + seen.circle.radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    points = camera.project(camera.ideal.unit_vectors(ring))
+    for point in points[camera.contains(points)]:
+        draw_ring(drawn, point, _DOT, STREAK)
+    for point in seen.points:
+        draw_ring(drawn, point, _RADIUS, STREAK)
     return outlined(picture, drawn)

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 
 from flight.link.telemetry.packets import to_text
 from ground.report import panels
+from ground.report.cage_figure import cage_figure
 from ground.report.knowledge_figure import knowledge_figure
 from ground.report.orbit_figure import orbit_figure
 from ground.report.scene import Scene
@@ -41,6 +42,7 @@ def draw_figures(run: Run, folder: Path) -> list[Path]:
         "cycle_times": _cycle_times,
         "rate": _rate,
         "overview": _overview,
+        "cage": cage_figure,
         "spin": lambda scene: spin_figure(scene.run),
         "knowledge": lambda scene: knowledge_figure(scene.run),
         "pointing": orbit_figure,

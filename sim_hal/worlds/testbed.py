@@ -16,7 +16,8 @@ import numpy as np
 
 from flight.gnc.math.arrays import FloatArray
 from flight.schema.errors import ConfigError
-from flight.schema.testbed import as_testbed
+from flight.schema.testbed import TestbedConfig, as_testbed
+from sim_hal.settings import Simulation
 from sim_hal.worlds.motion import Motion, about_thread
 from sim_hal.worlds.world import WorldInputs, WorldTruth
 
@@ -128,11 +129,16 @@ class Testbed:
 
 
 def make(inputs: WorldInputs) -> Testbed:
-    """Return the testbed of a configuration; values of its `simulation` section take precedence.
+    """Return the testbed of a configuration. Raises ConfigError without a release."""
+    model, angle, rate = model_of(as_testbed(inputs.config), inputs.section)
+    return Testbed(model, angle, rate, inputs.currents, inputs.start_ns)
+
+
+def model_of(config: TestbedConfig, section: Simulation) -> tuple[TestbedModel, float, float]:
+    """Return the true constants, and angle and rate of the release; `section` takes precedence.
 
     Raises ConfigError without a release.
     """
-    config, section = as_testbed(inputs.config), inputs.section
     release = section.release
     if release is None:
         raise ConfigError("simulation.release", "is missing: the world testbed needs it")
@@ -146,5 +152,4 @@ def make(inputs: WorldInputs) -> Testbed:
         resistance=truth.resistance or config.coils.resistance,
         supply_voltage=truth.supply_voltage or config.coils.supply_voltage,
     )
-    angle = 2.0 * float(np.arcsin(release.q2))
-    return Testbed(model, angle, release.rate, inputs.currents, inputs.start_ns)
+    return model, 2.0 * float(np.arcsin(release.q2)), release.rate

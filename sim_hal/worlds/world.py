@@ -19,6 +19,7 @@ from sim_hal.worlds.motion import Motion
 
 WORLDS = {
     "testbed": "sim_hal.worlds.testbed:make",
+    "cage": "sim_hal.worlds.cage:make",
     "free_body": "sim_hal.worlds.free_body.body:make",
 }
 

@@ -31,7 +31,8 @@ SILENT, MUTE = 20.0, 1.0
 
 
 def orbit_config(duration: float, **modes: object) -> OrbitConfig:
-    config = as_orbit(configuration.load(ORBIT))
+    """Return the configuration without its wide cameras, which `test_wide_cameras` flies."""
+    config = configuration.replace(as_orbit(configuration.load(ORBIT)), wide_cameras=())
     section = configuration.replace(config.modes, **modes)
     return configuration.replace(config, duration=duration, modes=section)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,8 +22,10 @@ from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSett
 from flight.loop.body import Body
 from flight.loop.tasks.frame_measurements import ImagingSettings
 from flight.loop.tasks.navigation import NavigationSettings
+from flight.loop.tasks.wide_imaging import WideSettings
 from flight.schema.camera_model import camera_model, likelihood_settings
 from flight.schema.devices import Camera, ObjectTracking
+from flight.schema.orbit_devices import WideCamera
 from flight.schema.sections import Config
 from hal.interfaces.wires import SECOND_NS
 
@@ -58,6 +61,19 @@ def imaging_settings(camera: Camera, body: Body, frames: Path | None) -> Imaging
         knowledge=body.knowledge,
         seeks=body.seeks,
         kept=kept,
+    )
+
+
+def wide_settings(cameras: Sequence[WideCamera]) -> WideSettings:
+    """Return the times of the wide cameras, those of the most frequent one for all."""
+    fine_ns = round(min(camera.fine_period for camera in cameras) * SECOND_NS)
+    period_ns = min(round(min(camera.period for camera in cameras) * SECOND_NS), fine_ns)
+    return WideSettings(
+        [round(camera.exposure * SECOND_NS) for camera in cameras],
+        period_ns - SECOND_NS // 2,  # run once a second, which may come late
+        fine_ns - SECOND_NS // 2,
+        min(2 * SECOND_NS, period_ns),
+        max(round(max(camera.max_age for camera in cameras) * SECOND_NS), 2 * fine_ns),
     )
 
 

@@ -9,7 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from flight.app.composition.bodies import body_kind
-from flight.app.composition.settings import imaging_settings, navigation_settings, track_settings
+from flight.app.composition.settings import (
+    imaging_settings,
+    navigation_settings,
+    track_settings,
+    wide_settings,
+)
 from flight.app.composition.workers import worker_watches
 from flight.link.commands.channel import Channel
 from flight.link.telemetry.recorder import Recorder
@@ -36,6 +41,7 @@ from flight.loop.tasks.performance import PerformanceObserver
 from flight.loop.tasks.positioning import Positioning
 from flight.loop.tasks.steering import Steering
 from flight.loop.tasks.sun_sensing import SunSensing
+from flight.loop.tasks.wide_imaging import WideImaging
 from flight.schema.sections import Config
 from hal.interfaces.wires import SECOND_NS, Clock
 
@@ -93,11 +99,14 @@ def _tasks(
     drive = _drive(config, devices, body, services)
     steering = Steering(body, drive, services)
     imaging = _imaging(config, opened, navigation, body, services)
+    wide = _wide(config, devices, body, services)
     low_rate, low_for = config.detumble.low_rate, config.detumble.low_for
     modes = ModeControl(ModeSettings(config.modes, low_rate, low_for, stop), body, steering, services)
     observer = PerformanceObserver(devices.coils, services)
-    control = ControlCycle(CycleTasks(navigation, modes, steering, drive, imaging), body, observer, services)
-    watches = worker_watches(config.executive, body.planner, imaging)
+    control = ControlCycle(
+        CycleTasks(navigation, modes, steering, drive, imaging, wide), body, observer, services
+    )
+    watches = worker_watches(config.executive, body.planner, imaging, wide)
     health = HealthWatch(
         HealthInputs(modes, drive, devices.power, watches), config.health, opened.feed, services
     )
@@ -109,7 +118,7 @@ def _tasks(
     positioning = _positioning(config, devices, body, services)
     sun, house = _sun(config, devices, body, services), Housekeeping(watched, services)
     return LoopTasks(
-        navigation, imaging, positioning, sun, modes, control, observer, health, house, commanding
+        navigation, imaging, positioning, sun, wide, modes, control, observer, health, house, commanding
     )
 
 
@@ -129,6 +138,12 @@ def _sun(config: Config, devices: Devices, body: Body, services: Services) -> Su
     if config.solar_strings is None or devices.strings is None:
         return None
     return SunSensing(devices.strings, body.sun, round(config.solar_strings.max_age * SECOND_NS), services)
+
+
+def _wide(config: Config, devices: Devices, body: Body, services: Services) -> WideImaging | None:
+    if not config.wide_cameras or not devices.wide or body.wide is None:
+        return None
+    return WideImaging(devices.wide, body.wide, wide_settings(config.wide_cameras), services)
 
 
 def _imaging(

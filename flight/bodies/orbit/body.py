@@ -6,7 +6,7 @@ It detumbles by its magnetometer, acquires its attitude with its coils at rest, 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from flight.bodies.orbit.surroundings import Surroundings
 from flight.bodies.orbit.targets import PointingTargets
 from flight.bodies.orbit.tracker import PointingTracker
 from flight.bodies.orbit.view import OrbitView
+from flight.bodies.orbit.wide_feed import wide_feed_of
 from flight.gnc.control.detumble import WindowSchedule
 from flight.gnc.control.three_axes import pointing_job
 from flight.gnc.control.three_axes.field_detumbler import FieldBraking, FieldDetumbler
@@ -31,7 +32,7 @@ from flight.gnc.earth.orbit_knowledge import TwoLineElements
 from flight.gnc.errors import UsageError
 from flight.gnc.estimation.estimate import Estimate
 from flight.gnc.estimation.field_rate import FieldRateSettings
-from flight.gnc.estimation.free_filter import FreeFilterSettings
+from flight.gnc.estimation.free_settings import FreeFilterSettings
 from flight.gnc.guidance.three_axes.pointing_target import PointingTarget
 from flight.gnc.guidance.three_axes.target_law import BodyAxes
 from flight.gnc.math.arrays import FloatArray
@@ -47,7 +48,6 @@ from flight.schema.camera_model import camera_model
 from flight.schema.errors import ConfigError
 from flight.schema.orbit import OrbitConfig, as_orbit
 from flight.schema.sections import Config
-from hal.interfaces.readings import StringReading
 from hal.interfaces.wires import SECOND_NS
 
 _BELOW = 0.8
@@ -61,15 +61,8 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
     limit, dipole_per_ampere = _limit(config), config.craft.dipole_per_ampere
     filter_, brake = _filter(config, surroundings), FieldBrake(_detumbler(config), dipole_per_ampere)
     paths = PointingPaths(limit, fastest_rate(config))
+    sun = _sun(config, filter_, surroundings)
     objects = ObjectAim(_sensor(config), limit, services.events)
-
-    def field(estimate: Estimate) -> FloatArray:
-        around = surroundings.at(estimate.time_ns)
-        return np.zeros(3) if around is None else attitude_matrix(estimate.quaternion) @ around.field
-
-    def acceleration_psd(time_ns: int) -> FloatArray:
-        density = filter_.acceleration_psd(time_ns)
-        return config.detumble.torque_noise**2 * np.eye(3) if density is None else density
 
     def disturbed() -> tuple[FloatArray, FloatArray]:
         return filter_.torque_sizes, filter_.residual_dipole
@@ -86,14 +79,15 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
         brake=brake,
         coil_watch=_coil_watch(config),
         view=OrbitView(brake, filter_, surroundings, services),
-        field=field,
+        field=lambda estimate: _field(surroundings, estimate),
         free_axis=None,
         dipole_per_ampere=dipole_per_ampere,
-        angular_acceleration_psd=acceleration_psd,
+        angular_acceleration_psd=filter_.acceleration_psd,
         knowledge=lambda: filter_.knowledge,
         velocity=surroundings.velocity,
         fix=surroundings.fix,
-        sun=_sun(config, filter_, surroundings),
+        sun=(lambda _: None) if sun is None else sun.accept,
+        wide=wide_feed_of(config.wide_cameras, filter_, surroundings, sun) if config.wide_cameras else None,
         sighted=objects.accept,
         place=surroundings.state,
         seeks=lambda: objects.seeks,
@@ -101,6 +95,12 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
 
 
 ORBIT = BodyKind(pointing_job.run, make)
+
+
+def _field(surroundings: Surroundings, estimate: Estimate) -> FloatArray:
+    """Return the magnetic field (3,) T at an estimate, body axes; zero while the orbit is not known."""
+    around = surroundings.at(estimate.time_ns)
+    return np.zeros(3) if around is None else attitude_matrix(estimate.quaternion) @ around.field
 
 
 def _limit(config: OrbitConfig) -> float:
@@ -162,6 +162,7 @@ def _filter(config: OrbitConfig, surroundings: Surroundings) -> OrbitFilter:
         gyro_noise=unit.rate_noise,
         field_noise=section.field_noise,
         field_error=section.field_error,
+        unknown_psd=config.detumble.torque_noise**2,
         settle_ns=round(config.detumble.settle * SECOND_NS),
         history_ns=round(section.history * SECOND_NS),
         free=FreeFilterSettings(
@@ -173,15 +174,13 @@ def _filter(config: OrbitConfig, surroundings: Surroundings) -> OrbitFilter:
     return OrbitFilter(settings, surroundings.at)
 
 
-def _sun(
-    config: OrbitConfig, filter_: OrbitFilter, surroundings: Surroundings
-) -> Callable[[StringReading], str | None]:
+def _sun(config: OrbitConfig, filter_: OrbitFilter, surroundings: Surroundings) -> CoarseSunFeed | None:
     section = config.solar_strings
     if section is None:
-        return lambda _: None
+        return None
     normals = np.array([string.normal for string in section.strings])
     strings = SolarStrings(normals, np.array([string.peak for string in section.strings]))
-    return CoarseSunFeed(strings, round(section.period * SECOND_NS), filter_, surroundings).accept
+    return CoarseSunFeed(strings, round(section.period * SECOND_NS), filter_, surroundings)
 
 
 def _elements(config: OrbitConfig) -> TwoLineElements | None:

@@ -53,6 +53,8 @@ class CoarseSunFeed:
         self, strings: SolarStrings, period_ns: int, filter_: OrbitFilter, surroundings: Surroundings
     ) -> None:
         """`period_ns`: of a round of readings, which are not of one instant."""
+        self.strings = strings
+        self.newest: StringReading | None = None
         self._turns = FieldAndStrings(strings)
         self._period_ns = period_ns
         self._filter = filter_
@@ -64,6 +66,7 @@ class CoarseSunFeed:
 
     def accept(self, reading: StringReading) -> str | None:
         """Take a reading; return what it shows to be wrong, empty for nothing, None where not judged."""
+        self.newest = reading
         time_ns = reading.time_ns - self._period_ns // 2
         around, sun = self._surroundings.at(time_ns), self._surroundings.sun(time_ns)
         if around is None or sun is None or around.sunlit < SUNLIT:

@@ -8,6 +8,7 @@ again.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -34,7 +35,7 @@ REFUSALS_TO_RESTART = 3
 class OrbitFilter:
     """Implements `flight.loop.body.Filter`; `begin` starts it.
 
-    Longer than 200 lines because it is the whole of what the loop asks of a filter.
+    More than 200 lines: one short method for each thing that loop, feeds and telemetry ask of a filter.
 
     Attributes:
         restarts: how often an estimate was discarded for a new one.
@@ -58,6 +59,11 @@ class OrbitFilter:
     def knowledge(self) -> Knowledge:
         """How well the attitude is known."""
         return self._free.knowledge
+
+    @property
+    def worst_sigma(self) -> float:
+        """The attitude's standard deviation about its worst axis, rad; infinite before a start."""
+        return self._free.worst_sigma if self._free.started else math.inf
 
     @property
     def started(self) -> bool:
@@ -211,11 +217,11 @@ class OrbitFilter:
         times = [step.begin_ns for step in inside]
         return np.array([*times, last.time_ns], dtype=np.int64), np.array([*rates, last.rate])
 
-    def acceleration_psd(self, time_ns: int) -> FloatArray | None:
-        """Return the density (3, 3) rad^2/s^3 of the acceleration's noise then, None beyond the history."""
+    def acceleration_psd(self, time_ns: int) -> FloatArray:
+        """Return the density (3, 3) rad^2/s^3 of the acceleration's noise then."""
         place = self._replay.place(time_ns) if self._free.started else None
         if place is None:
-            return None
+            return self._settings.unknown_psd * np.eye(3)
         step = self._steps[place]
         return self._free.rate_noise(step.dipole, step.around, step.doubt)
 

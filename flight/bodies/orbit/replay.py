@@ -9,7 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from flight.bodies.orbit.steps import Step
-from flight.gnc.estimation.free_filter import FreeFilter, FreeFilterSettings
+from flight.gnc.estimation.free_filter import FreeFilter
+from flight.gnc.estimation.free_settings import FreeFilterSettings
 from flight.gnc.estimation.measurements import (
     AttitudeMeasurement,
     DirectionMeasurement,
@@ -35,6 +36,7 @@ class OrbitFilterSettings:
         inertia: (3, 3) kg m^2. dipole_per_ampere: m^2. dipole_limit: A m^2 of each coil.
         gyro_noise: rad/s of an axis of a sample. field_noise: T, likewise.
         field_error: T of an axis, of the field's model.
+        unknown_psd: rad^2/s^3, density of the body's acceleration where no estimate has one.
         settle_ns: after the coils have come to rest, until the magnetometer is free of their field.
         history_ns: how old a measurement may be.
         step_ns: the longest step.
@@ -46,6 +48,7 @@ class OrbitFilterSettings:
     gyro_noise: float
     field_noise: float
     field_error: float
+    unknown_psd: float
     settle_ns: int
     history_ns: int
     step_ns: int = SECOND_NS

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from flight.bodies.testbed.brake import BdotBrake
+from flight.bodies.testbed.cage import CageField, CageFilter, CageTracker
 from flight.bodies.testbed.feed import UnitFeed
 from flight.bodies.testbed.planning import Planning, PlanningSettings, Strategy
 from flight.bodies.testbed.plant_model import angular_acceleration_psd_of, plant_of
@@ -30,7 +31,7 @@ from flight.gnc.guidance.one_axis.vmc import NODES
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import about_axis_y, attitude_matrix
 from flight.link.modes import ORBITAL, Mode
-from flight.loop.body import Body, BodyKind
+from flight.loop.body import Body, BodyKind, Tracker
 from flight.loop.fdir.coils.response import ResponseSettings
 from flight.loop.fdir.coils.watch import CoilWatch, CoilWatchSettings
 from flight.loop.services import Services
@@ -47,20 +48,20 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
     """Return the testbed of a configuration, with the parameters that an earlier boot learned."""
     config = as_testbed(config)
     plant = plant_of(config)
-    filter_, problems = attitude_filter(config, plant, learned)
+    cage = None if config.cage is None else CageField(config.cage, config.plant.field, services.clock)
+    filter_, problems = attitude_filter(config, plant, learned, cage)
     reader = ThreadReader(Parameters(plant.stiffness / plant.inertia, plant.damping / plant.inertia))
     settings = planning_settings(config)
     rules = AcceptanceRules(late_after=config.guidance.late_after)
     guidance = Guidance(plant, rules, arrives=settings.strategy is not Strategy.RECEDING)
     planning = Planning(plant, settings, guidance, reader, services)
     steps = [TimedStep(step.at, step.q2, step.rate) for step in config.steps]
-    period = 1.0 / config.executive.control_rate_hz
-    controller = controller_of(config.control, plant, period, config.identification)
     dipole = dipole_per_ampere(config)
-    reference_field = surrounding_field(config)
+    fixed = surrounding_field(config)
 
     def field(estimate: Estimate) -> FloatArray:
         angle = reader.read(estimate).angle
+        reference_field = fixed if cage is None else cage.at(estimate.time_ns)
         return np.asarray(attitude_matrix(about_axis_y(angle)) @ reference_field)
 
     density = angular_acceleration_psd_of(config, plant) * np.eye(3)
@@ -71,7 +72,7 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
         paths=guidance,
         planner=planning,
         targets=ThreadTargets(steps, reader, guidance, planning),
-        tracker=ThreadTracker(controller, reader, dipole),
+        tracker=_tracker(config, plant, reader, cage),
         feed=UnitFeed(filter_, config.inertial_unit),
         brake=brake_of(config, plant),
         coil_watch=coil_watch(config, plant),
@@ -81,6 +82,16 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
         dipole_per_ampere=dipole,
         angular_acceleration_psd=lambda _: density,
     )
+
+
+def _tracker(
+    config: TestbedConfig, plant: SingleAxisPlant, reader: ThreadReader, cage: CageField | None
+) -> Tracker:
+    """Return the tracker: of the coil on body x, in a cage of those on x and z."""
+    period, dipole = 1.0 / config.executive.control_rate_hz, dipole_per_ampere(config)
+    controller = controller_of(config.control, plant, period, config.identification)
+    tracker = ThreadTracker(controller, reader, dipole)
+    return tracker if cage is None else CageTracker(tracker, reader, plant, cage, dipole)
 
 
 TESTBED = BodyKind(plan_job.run, make)
@@ -97,7 +108,10 @@ def dipole_per_ampere(config: TestbedConfig) -> float:
 
 
 def attitude_filter(
-    config: TestbedConfig, plant: SingleAxisPlant, learned: Mapping[str, Learned]
+    config: TestbedConfig,
+    plant: SingleAxisPlant,
+    learned: Mapping[str, Learned],
+    cage: CageField | None = None,
 ) -> tuple[AttitudeFilter, list[str]]:
     """Return the filter of a body on the thread, and why `learned` parameters were rejected."""
     section = config.estimation
@@ -124,7 +138,9 @@ def attitude_filter(
         history_ns=round(section.history * SECOND_NS),
     )
     prior, problems = start_from(learned, slow_prior(body, settings), section.changed)
-    return AttitudeFilter(body, settings, prior), problems
+    if cage is None:
+        return AttitudeFilter(body, settings, prior), problems
+    return CageFilter(cage, body, settings, prior), problems
 
 
 def brake_of(config: TestbedConfig, plant: SingleAxisPlant) -> BdotBrake:

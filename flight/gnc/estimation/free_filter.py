@@ -19,7 +19,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.earth.disturbance import SIZES
 from flight.gnc.estimation.estimate import Knowledge
 from flight.gnc.estimation.free_motion import (
     AXES,
@@ -35,6 +34,7 @@ from flight.gnc.estimation.free_motion import (
     FreeMotion,
     crossed,
 )
+from flight.gnc.estimation.free_settings import FreeFilterSettings, acceleration_noise
 from flight.gnc.math import chi_square
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.directions import tangent_basis
@@ -48,44 +48,7 @@ from flight.gnc.math.quaternion import (
 
 LARGEST_TURN = 0.1
 """rad, of a step of integration."""
-LASTING = 20.0
-"""s, for which an error of the coils or of the inertia keeps its sign: as white noise it has this density."""
 _EYE: FloatArray = np.eye(3)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FreeFilterSettings:
-    """Noise and limits; a pair is the standard deviation at the start and the random walk per sqrt(s).
-
-    Attributes:
-        gyro: rad/s.
-        dipole, sunlit: A m^2, of the residual dipole's parts.
-        magnet: T, of the magnetometer.
-        torque: N m, of each size.
-        torque_noise: N m sqrt(s), white, of what has no shape.
-        coil_error: share of the coils' dipole that is uncertain for tens of seconds, in any direction.
-        coil_noise: A m^2 sqrt(s), white, of each coil while the coils are driven.
-        axes: rad, of the principal axes.
-        inertia_error: share of the gyroscopic torque that no turn of the axes explains.
-        rate_start: rad/s, of the first rate.
-        fine, coarse: rad, largest sigma of the worst axis that is called so.
-        gate_sigma: a measurement less likely than this many sigma of one component is refused.
-    """
-
-    gyro: tuple[float, float] = (1e-3, 2e-6)
-    dipole: tuple[float, float] = (1e-3, 1.5e-6)
-    sunlit: tuple[float, float] = (3e-4, 2e-7)
-    magnet: tuple[float, float] = (3e-7, 1e-9)
-    torque: tuple[float, float] = (3e-9, 5e-12)
-    torque_noise: float = 3e-9
-    coil_error: float = 0.04
-    coil_noise: float = 0.0
-    axes: tuple[float, float] = (0.03, 0.0)
-    inertia_error: float = 0.003
-    rate_start: float = 1e-3
-    fine: float = math.radians(0.1)
-    coarse: float = math.radians(5.0)
-    gate_sigma: float = 5.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,6 +65,8 @@ class FreeMemory:
 class FreeFilter:
     """Owns the estimate. `refused` counts the measurements that did not pass their gate.
 
+    More than 200 lines: a method for each kind of measurement, and a property for each thing estimated.
+
     Attributes:
         quaternion: (4,) ICRS into body.
         rate: (3,) rad/s, body axes.
@@ -116,7 +81,7 @@ class FreeFilter:
         self.motion = FreeMotion(inertia)
         self._settings = settings
         tail = math.erfc(settings.gate_sigma / math.sqrt(2.0))
-        self._walks = self._of_slow(1) ** 2
+        self._walks = settings.of_slow(1) ** 2
         self._gates = {n: chi_square.bound(tail, n) for n in (1, 2, 3)}
         self._constants: FloatArray = np.zeros(STATES)
         self.acceleration: FloatArray = np.zeros(3)
@@ -138,7 +103,7 @@ class FreeFilter:
         """
         self.changes += 1
         if doubted or not self.started:
-            self.covariance[6:, 6:] = np.diag(self._of_slow(0) ** 2)
+            self.covariance[6:, 6:] = np.diag(self._settings.of_slow(0) ** 2)
         self.covariance[:6] = self.covariance[:, :6] = 0.0
         self.covariance[TURN, TURN] = covariance
         bias = self.covariance[GYRO, GYRO]
@@ -151,13 +116,15 @@ class FreeFilter:
     @property
     def knowledge(self) -> Knowledge:
         """How well the attitude is known."""
-        if not self.started:
-            return Knowledge.LOST
-        covariance = self.covariance
-        sigma = math.sqrt(max(covariance[0, 0], covariance[1, 1], covariance[2, 2]))
-        if sigma > self._settings.coarse:
+        if not self.started or (sigma := self.worst_sigma) > self._settings.coarse:
             return Knowledge.LOST
         return Knowledge.FINE if sigma <= self._settings.fine else Knowledge.COARSE
+
+    @property
+    def worst_sigma(self) -> float:
+        """The attitude's standard deviation about its worst axis, rad."""
+        covariance = self.covariance
+        return math.sqrt(max(covariance[0, 0], covariance[1, 1], covariance[2, 2]))
 
     def memory(self) -> FreeMemory:
         """Return the estimate as it stands, for `recall`."""
@@ -279,24 +246,8 @@ class FreeFilter:
 
     def rate_noise(self, dipole: FloatArray, around: Around, doubt: float = 0.0) -> FloatArray:
         """Return the density (3, 3) rad^2/s^3 of the acceleration's noise under the coils' dipole (3,)."""
-        s, motion = self._settings, self.motion
-        square = float(dipole @ dipole)
-        coils = LASTING * (s.coil_error**2 * square / 3.0 + doubt**2) + (s.coil_noise**2 if square else 0.0)
-        # The gyroscopic error turns with the body: on each side it lasts for the time of a radian.
-        speed = math.sqrt(float(self.rate @ self.rate))
-        gyroscopic = speed**2 * s.inertia_error * motion.largest_difference
-        lasting = LASTING if LASTING * speed < 2.0 else 2.0 / speed
-        density = (s.torque_noise**2 + lasting * gyroscopic**2) * motion.by_torque
-        if coils:
-            across = motion.inverse @ crossed(attitude_matrix(self.quaternion) @ around.field)
-            density = density + coils * (across @ across.T)
-        return np.asarray(density)
-
-    def _of_slow(self, which: int) -> FloatArray:
-        """Return the deviations at the start (0), or the walks (1), of the states (24,) after the rate."""
-        s = self._settings
-        pairs = [s.gyro, s.dipole, s.sunlit, s.magnet, *[s.torque] * (SIZES // 3), s.axes]
-        return np.repeat([pair[which] for pair in pairs], 3)
+        field = attitude_matrix(self.quaternion) @ around.field
+        return acceleration_noise(self._settings, self.motion, self.rate, field, dipole, doubt)
 
     def _add_noise(self, dt: float, dipole: FloatArray, around: Around, doubt: float) -> None:
         density = dt * self.rate_noise(dipole, around, doubt)

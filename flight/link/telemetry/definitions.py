@@ -20,7 +20,7 @@ from flight.link.telemetry.motion_definitions import (
     TARGET,
     TRUTH,
 )
-from flight.link.telemetry.orbit_definitions import NAVIGATION, ORBIT_TRUTH, SPIN
+from flight.link.telemetry.orbit_definitions import DIRECTIONS, NAVIGATION, ORBIT_TRUTH, SPIN
 from flight.link.telemetry.parameter_definitions import PARAMETERS
 from flight.link.telemetry.performance_definitions import CYCLE_TIMING, JOB_TIMING, RATE_GROUP
 from flight.link.telemetry.vision_definitions import SIGHTINGS, STARS, STREAK, TRACK
@@ -30,6 +30,7 @@ __all__ = [
     "COMMAND",
     "CONTROL",
     "CYCLE_TIMING",
+    "DIRECTIONS",
     "EVENT",
     "HEALTH",
     "HOUSEKEEPING",
@@ -63,6 +64,7 @@ PACKETS: tuple[Packet, ...] = (
     ATTITUDE,
     SPIN,
     NAVIGATION,
+    DIRECTIONS,
     TARGET,
     MODE,
     PLAN,

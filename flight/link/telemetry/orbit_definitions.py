@@ -37,6 +37,27 @@ NAVIGATION = Packet(
     ),
 )
 
+DIRECTIONS = Packet(
+    "directions",
+    0x117,
+    "each round of the wide cameras",
+    "The Sun and nadir that the wide cameras show, of a satellite in orbit",
+    (
+        Field("middle_ns", "i8", "ns", "mission time of the exposures' middle"),
+        Field("frames", "u1", "-", "cameras whose frames were read, by bits"),
+        Field("sun", "f8", "-", "direction of the Sun, body axes; NaN when none", 3),
+        Field("sun_sigma", "f4", "rad", "standard deviation of an axis; NaN when none"),
+        Field(
+            "sun_cameras", "u1", "-", "the camera that shows it, by bits; none: the solar strings stand in"
+        ),
+        Field("sun_used", "u1", "-", "entered the estimate", states=NO_YES),
+        Field("nadir", "f8", "-", "direction of nadir, body axes; NaN when none", 3),
+        Field("nadir_sigma", "f4", "rad", "standard deviation of an axis; NaN when none"),
+        Field("nadir_cameras", "u1", "-", "those whose limb gave it, by bits; none: the light in all frames"),
+        Field("nadir_used", "u1", "-", "entered the estimate", states=NO_YES),
+    ),
+)
+
 ORBIT_TRUTH = Packet(
     "orbit_truth",
     0x141,

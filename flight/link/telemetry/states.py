@@ -68,6 +68,7 @@ _FACTS: tuple[tuple[str, Level], ...] = (
     ("gps-poor", "warning"),
     ("strings-lost", "warning"),
     ("sun-unclear", "warning"),
+    ("wide-lost", "warning"),
     ("clock-off", "warning"),
     ("field-refused", "warning"),
 )

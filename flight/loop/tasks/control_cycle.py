@@ -18,12 +18,14 @@ from flight.loop.executive.rate_group import Cycle
 from flight.loop.fdir.coils.knowledge import CoilKnowledge
 from flight.loop.services import Services
 from flight.loop.tasks import imaging as imaging_task
+from flight.loop.tasks import wide_imaging as wide_task
 from flight.loop.tasks.coil_drive import CoilDrive
 from flight.loop.tasks.imaging import Imaging
 from flight.loop.tasks.mode_control import ModeControl
 from flight.loop.tasks.navigation import Navigation
 from flight.loop.tasks.performance import PerformanceObserver
 from flight.loop.tasks.steering import Steering
+from flight.loop.tasks.wide_imaging import WideImaging
 from hal.interfaces.readings import ImuReading
 
 ATTITUDE_EVERY = 4
@@ -41,6 +43,7 @@ class CycleTasks:
     steering: Steering
     drive: CoilDrive
     imaging: Imaging | None
+    wide: WideImaging | None
 
 
 class ControlCycle:
@@ -149,6 +152,9 @@ class ControlCycle:
             self._body.planner.finish(result, now_ns)
         elif result.worker == imaging_task.WORKER and self._tasks.imaging is not None:
             self._tasks.imaging.finish(result, now_ns)
+            return True
+        elif result.worker == wide_task.WORKER and self._tasks.wide is not None:
+            self._tasks.wide.finish(result, now_ns)
             return True
         return False
 

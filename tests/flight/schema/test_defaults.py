@@ -16,7 +16,7 @@ import numpy as np
 import flight
 import hal
 import sim_hal
-from flight.schema import devices, orbit, sections, testbed
+from flight.schema import devices, orbit, orbit_devices, sections, testbed
 from hal.interfaces.wires import SECOND_NS
 
 OF_CAMERA = (devices.Camera, devices.StarTracker)
@@ -44,6 +44,7 @@ SERVES: dict[str, tuple[type[msgspec.Struct], ...]] = {
     "TrackerSettings": OF_CAMERA,
     "V4l2Settings": (devices.V4l2Device, devices.Camera),
     "Vn100Settings": (devices.InertialUnit,),
+    "WideSettings": (orbit_devices.WideCamera,),
 }
 """The sections that a flight fills each settings class from."""
 

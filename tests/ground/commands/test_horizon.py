@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,8 @@ import pytest
 
 pillow = pytest.importorskip("PIL.Image", reason="needs the extra `images`")
 
-from sim_hal.earth_camera import nadir, render  # noqa: E402
+from flight.gnc.math.quaternion import from_rotation_vector, multiply  # noqa: E402
+from sim_hal.earth_camera import EarthCameraModel, nadir, render  # noqa: E402
 from tests.ground.commands.in_process import command  # noqa: E402
 from tests.sim_hal.earth_camera.scenes import limb_scene  # noqa: E402
 from tests.studies.campaigns.nadir import camera_model  # noqa: E402
@@ -66,6 +68,71 @@ def test_a_picture_without_a_horizon_says_so_with_exit_status_1(folder: Path) ->
     assert json.loads(done.stdout)["status"] == "no-horizon"
 
 
+LEVEL = limb_scene(
+    zenith=np.array([1.0, 0.0, 0.1]),
+    sun=np.array([1.0, 0.6, 0.5]),
+    dip=float(np.arcsin(6_378.137 / 6_978.137) - 0.5 * np.pi),
+)
+"""The boresight level, the limb 24 deg below."""
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, np.ndarray]]:
+    """Return a folder with a level camera's picture, of one to its right, and of the first a little later."""
+    folder = tmp_path_factory.mktemp("paper")
+    model = EarthCameraModel.fuga15d(seed=1)
+    turns = {"first": (0.0, 0.0, 0.0), "right": (0.0, 1.0, 0.0), "later": (0.02, 0.0, 0.0)}
+    downs = {}
+    for name, turn in turns.items():
+        attitude = multiply(from_rotation_vector(np.array(turn)), LEVEL.attitude)
+        scene = replace(LEVEL, attitude=attitude)
+        pillow.fromarray(render(model, scene, np.random.default_rng(2))).save(folder / f"{name}.png")
+        downs[name] = nadir(scene)
+    return folder, downs
+
+
+@pytest.mark.parametrize(
+    ("picture", "words"),
+    [
+        ("first", ("--method", "circle", "--altitude", "600")),
+        ("first", ("--method", "circle", "--altitude", "600", "--lines", "32")),
+        ("first", ("--method", "graphic", "--altitude", "600", "--second", "right", "--turned", "57.29578")),
+        ("later", ("--method", "vector", "--altitude", "600", "--second", "first")),
+        ("later", ("--method", "vector", "--second", "first", "--nadir")),
+    ],
+)
+def test_the_papers_methods_find_nadir_of_a_level_sunlit_limb_to_a_degree(
+    picture: str, words: tuple[str, ...], pictures: tuple[Path, dict[str, np.ndarray]]
+) -> None:
+    folder, downs = pictures
+    said = [f"{folder / word}.png" if word in downs else word for word in words]
+    if words[-1] == "--nadir":
+        said += [f"{part:.6f}" for part in downs["first"]]
+    done = command("horizon", folder / f"{picture}.png", "--fov", "67", *said, "--json")
+    assert done.returncode == 0, done.stderr
+    facts = json.loads(done.stdout)
+    assert facts["method"] == words[1]
+    off = np.degrees(np.arccos(min(1.0, np.array(facts["nadir_camera"]) @ downs[picture])))
+    assert off < 1.0
+    # A turn of 1.1 deg that is not seen would leave it.
+    assert picture == "first" or off < 0.6
+
+
+def test_the_papers_circle_is_drawn_and_a_dark_picture_has_none(
+    folder: Path, pictures: tuple[Path, dict[str, np.ndarray]]
+) -> None:
+    drawn = pictures[0] / "drawn.png"
+    words = ("--fov", "67", "--altitude", "600", "--method", "circle")
+    done = command("horizon", pictures[0] / "first.png", *words, "--overlay", drawn)
+    assert done.returncode == 0, done.stderr
+    assert "1 sigma:          the method circle gives none" in done.stdout
+    image = np.asarray(pillow.open(drawn)).astype(int)
+    assert np.count_nonzero(np.all(np.abs(image - [230, 159, 0]) < 2, axis=2)) > 400
+    dark = command("horizon", folder / "sky.png", *words, "--json")
+    assert dark.returncode == 1
+    assert json.loads(dark.stdout)["status"] == "no-horizon"
+
+
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
@@ -77,6 +144,19 @@ def test_a_picture_without_a_horizon_says_so_with_exit_status_1(folder: Path) ->
         ([], "--fov --camera"),
         (["--camera", "config/step_demo.yaml"], "512 x 512 pixels, but the camera of"),
         (["--fov", "67", "--camera", "config/step_demo.yaml"], "not allowed with"),
+        (["--fov", "67", "--method", "circle"], "--method circle: it needs --altitude"),
+        (["--fov", "67", "--method", "vector", "--altitude", "600"], "give the other picture with --second"),
+        (
+            ["--fov", "67", "--method", "graphic", "--altitude", "600", "--second", "limb.png"],
+            "say with --turned how far to the right",
+        ),
+        (["--fov", "67", "--turned", "60"], "--turned: only with --method graphic"),
+        (["--fov", "67", "--lines", "9"], "--lines: only with --method circle, graphic, vector"),
+        (["--fov", "67", "--method", "circle", "--altitude", "600", "--lines", "2"], "--lines 2: give 3 to"),
+        (
+            ["--fov", "67", "--method", "circle", "--altitude", "600", "--log-response", "8", "41"],
+            "works on the counts themselves",
+        ),
     ],
 )
 def test_a_mistake_is_reported_with_exit_status_2(words: list[str], complaint: str, folder: Path) -> None:

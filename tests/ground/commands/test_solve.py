@@ -11,7 +11,14 @@ import pytest
 
 pillow = pytest.importorskip("PIL.Image", reason="needs the extra `images`")
 
-from flight.gnc.math.quaternion import angle_between  # noqa: E402
+from flight.gnc.attitude.solvers import SOLVERS  # noqa: E402
+from flight.gnc.math.quaternion import (  # noqa: E402
+    angle_between,
+    conjugate,
+    multiply,
+    to_rotation_vector,
+)
+from flight.gnc.vision.startracker.detection.settings import CENTROIDS  # noqa: E402
 from flight.gnc.vision.startracker.pointing import Pointing  # noqa: E402
 from tests.flight.gnc.vision.startracker.frames import SkyFrame, sky_frame  # noqa: E402
 from tests.ground.commands.in_process import command  # noqa: E402
@@ -68,6 +75,38 @@ def test_the_date_takes_aberration_off(picture: Path) -> None:
     facts = json.loads(with_it.stdout)
     moved = np.degrees(angle_between(np.array(facts["quaternion"]), np.array(without["quaternion"]))) * 3600.0
     assert 2.0 < moved < 21.0
+
+
+@pytest.mark.parametrize("method", sorted(SOLVERS))
+def test_each_attitude_solver_finds_the_same_place(method: str, resting: SkyFrame, picture: Path) -> None:
+    """TRIAD takes two of the stars: its answer is the widest, and says so."""
+    words = ("--fov", "12", "--fov-error", "0.1", "--attitude", method)
+    done = command("solve", picture, *words, "--json")
+    assert done.returncode == 0, done.stderr
+    facts = json.loads(done.stdout)
+    assert (facts["attitude_method"], facts["centroid_method"]) == (method, "psf")
+    turn = to_rotation_vector(multiply(np.array(facts["quaternion"]), conjugate(resting.attitude)))
+    sigma = np.sqrt(np.diag(np.array(facts["covariance_rad2"])))
+    assert np.all(np.abs(turn) < 4.0 * sigma)
+    assert np.linalg.norm(turn[:2]) < np.radians(15.0 / 3600.0)
+    assert sigma[:2].max() < np.radians(15.0 / 3600.0)
+
+
+@pytest.mark.parametrize("method", CENTROIDS)
+def test_each_centroid_finds_the_same_place(method: str, resting: SkyFrame, picture: Path) -> None:
+    words = ("--fov", "12", "--fov-error", "0.1", "--centroid", method)
+    done = command("solve", picture, *words, "--json")
+    assert done.returncode == 0, done.stderr
+    facts = json.loads(done.stdout)
+    assert facts["centroid_method"] == method
+    assert angle_between(np.array(facts["quaternion"]), resting.attitude) < np.radians(20.0 / 3600.0)
+    places = np.array([star["point_px"] for star in facts["stars"]])
+    # The methods are different ones: their places differ.
+    other = "psf" if method != "psf" else "window"
+    again = command("solve", picture, *words[:-1], other, "--json")
+    others = np.array([star["point_px"] for star in json.loads(again.stdout)["stars"]])
+    nearest = np.linalg.norm(places[:, None] - others, axis=2).min(axis=1)
+    assert 1e-4 < np.median(nearest) < 0.2
 
 
 def test_a_classical_method_finds_the_same_place(picture: Path) -> None:

@@ -20,7 +20,7 @@ from scipy.special import ndtr
 
 from flight.gnc.math.arrays import FloatArray, Image, IntArray
 from flight.gnc.vision.startracker.detection import Detections, DetectionSettings, detect, measure_near
-from flight.gnc.vision.startracker.detection.settings import Method
+from flight.gnc.vision.startracker.detection.settings import CENTROIDS, Method
 from sim_hal.star_camera import StarCameraModel, render
 from tests.sim_hal.star_camera.scenes import at_pixels, still
 
@@ -28,7 +28,6 @@ _SEED = 27_182
 _EXPOSURE = 0.2
 _GRID = 7
 _MATCHED = 1.5
-_METHODS: tuple[Method, ...] = ("window", "psf")
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,18 +152,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
             f"{options.frames} frames of 40 stars a row, seed {options.seed}; px; CPU ms a frame\n"
         )
         sys.stdout.write(
-            "PSF  mag method    found      false  rms     bias +-          ratio  NEES  detect  track 30\n"
+            "PSF  mag method      found      false  rms     bias +-          ratio  NEES  detect  track 30\n"
         )
     for psf_sigma in options.psf_sigma:
         camera = StarCameraModel(psf_sigma=psf_sigma)
         for magnitude in options.magnitudes:
-            for method in _METHODS:
+            for method in CENTROIDS:
                 row = compare(camera, magnitude, method, options.frames, options.seed)
                 rows.append(row)
                 if options.json:
                     continue
                 sys.stdout.write(
-                    f"{row.psf_sigma:.1f} {row.magnitude:4.1f} {row.method:7} {row.found:5d}/{row.stars:<5d}"
+                    f"{row.psf_sigma:.1f} {row.magnitude:4.1f} {row.method:9} {row.found:5d}/{row.stars:<5d}"
                     f" {row.false:4d}  {row.rms:.4f}  {row.bias:.4f} +- {row.bias_error:.4f}"
                     f" {row.ratio:7.2f} {row.nees:6.2f} {row.detect_ms:6.1f} {row.track_ms:6.1f}\n"
                 )

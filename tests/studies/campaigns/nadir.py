@@ -72,13 +72,14 @@ def coarse_knowledge(scene: EarthScene, generator: np.random.Generator) -> Horiz
     """Return what a satellite in that scene would know, its coarse sensors' errors drawn."""
     sun, field = scene.sun / np.linalg.norm(scene.sun), random_direction(generator)
     sensed = tuple(
-        SensedDirection(_misread(scene.camera_matrix @ true, sigma, generator), true, sigma)
+        SensedDirection(misread(scene.camera_matrix @ true, sigma, generator), true, sigma)
         for true, sigma in ((sun, SUN_SIGMA), (field, FIELD_SIGMA))
     )
     return HorizonKnowledge(position=scene.position, sun=sun, pole=scene.pole, sensed=sensed)
 
 
-def _misread(direction: FloatArray, sigma: float, generator: np.random.Generator) -> FloatArray:
+def misread(direction: FloatArray, sigma: float, generator: np.random.Generator) -> FloatArray:
+    """Return a direction (3,) as a coarse sensor of `sigma` rad an axis shows it."""
     error = from_rotation_vector(sigma * generator.standard_normal(3))
     return np.asarray(attitude_matrix(error) @ direction)
 

@@ -20,8 +20,9 @@ from flight.gnc.control.three_axes.pointing_table import PointingTable, Pointing
 from flight.gnc.earth.disturbance import pressures
 from flight.gnc.earth.ephemeris import Ephemeris
 from flight.gnc.earth.orbit_knowledge import OrbitState
-from flight.gnc.estimation.free_filter import FreeFilter, FreeFilterSettings
+from flight.gnc.estimation.free_filter import FreeFilter
 from flight.gnc.estimation.free_motion import GYRO, TURN, Around
+from flight.gnc.estimation.free_settings import FreeFilterSettings
 from flight.gnc.guidance.three_axes.attitude_law import references
 from flight.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 from flight.gnc.guidance.three_axes.target_law import BodyAxes, law_of

@@ -14,6 +14,7 @@ from tests.studies.campaigns.false_horizons import FALSE_HORIZONS
 from tests.studies.campaigns.faults import FAULTS
 from tests.studies.campaigns.faults_kill import FAULTS_KILL
 from tests.studies.campaigns.first_orbits import FIRST_ORBITS
+from tests.studies.campaigns.horizon_methods import HORIZON_METHODS
 from tests.studies.campaigns.installer_kill import INSTALLER_KILL
 from tests.studies.campaigns.lost_in_space import LOST_IN_SPACE
 from tests.studies.campaigns.mismatch import MISMATCH, VIBRATION
@@ -55,6 +56,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         LOST_IN_SPACE,
         NADIR,
         FALSE_HORIZONS,
+        HORIZON_METHODS,
         CONTROLLERS_CAMPAIGN,
         STEP_ROBUST,
         ROBUST_CONTROLLERS,

@@ -56,6 +56,7 @@ class Hypothesis:
     Attributes:
         fit: the limb.
         members: (n,) the picture's edges that lie on it.
+        limb: those edges, where the fit places them.
         residual: px rms normal to the limb, of the members.
         guess: start of the fit.
         lighting: how the picture agrees with it.
@@ -71,6 +72,7 @@ class Hypothesis:
 
     fit: FittedLimb
     members: BoolArray
+    limb: LimbPoints
     residual: float
     guess: InitialGuess
     lighting: Agreement
@@ -113,6 +115,7 @@ def examine(
     return Hypothesis(
         fit,
         used,
+        limb.chosen(fit.used),
         float(np.sqrt(np.mean((fit.residuals / limb.pixel)[fit.used] ** 2))),
         guess,
         agreement(fit.view, sun, seen.samples),

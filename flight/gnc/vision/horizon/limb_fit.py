@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.math.arrays import BoolArray, FloatArray
+from flight.gnc.math.arrays import BoolArray, FloatArray, IntArray
 from flight.gnc.math.directions import tangent_basis
 from flight.gnc.vision.horizon.limb_equation import (
     ALTITUDE,
@@ -110,6 +110,22 @@ def fit_limb(start: View, rays: FloatArray, sigma: FloatArray, prior: Prior) -> 
         return None
     cost = float(weights @ residuals**2 + moved @ information @ moved)
     return FittedLimb(view, covariance, residuals, used, spread, cost)
+
+
+def shared_error(
+    fit: FittedLimb, rays: FloatArray, sigma: FloatArray, prior: Prior, groups: IntArray, error: FloatArray
+) -> FloatArray:
+    """Return the covariance (5, 5) that errors shared by all points of a group add to a fit's.
+
+    `groups` (n,) are the numbers of the rays' groups from 0, `error` (groups,) rad the standard deviation of
+    each: the fit weighs its points as if none were shared.
+    """
+    _, gradients = limb_gradients(fit.view, rays)
+    weighted = gradients * _weights(fit.residuals, sigma)[0][:, None]
+    inverse = _solved(weighted.T @ gradients + _information(fit.view, prior), np.eye(PARAMETERS))
+    assert inverse is not None  # the fit has solved these equations
+    moved = np.array([inverse @ weighted[groups == k].sum(axis=0) for k in range(len(error))])
+    return np.asarray((moved * (error**2)[:, None]).T @ moved)
 
 
 def stepped(

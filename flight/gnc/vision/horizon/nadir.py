@@ -121,6 +121,8 @@ class _Look:
             tuple(_measurement(each) for each in (hypotheses[1:] if found else hypotheses)),
             points,
             best.members,
+            best.limb.rays,
+            best.limb.sigma,
             best.fit.view,
             self.read,
         )

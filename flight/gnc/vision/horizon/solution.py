@@ -69,6 +69,8 @@ class HorizonSolution:
         candidates: the horizons that were not chosen; all of them if ambiguous.
         points: (n, 2) px, every edge from dark to bright that was found.
         on_horizon: (n,) whether the fit used them.
+        limb: (k, 3) unit vectors in camera axes, where the fit places those edges.
+        limb_sigma: (k,) rad, of each normal to the limb.
         view: the camera's place and attitude by the best fit, accepted or not; see `limb_in_picture`.
         pixels_read: number of pixels read.
     """
@@ -79,5 +81,7 @@ class HorizonSolution:
     candidates: tuple[NadirMeasurement, ...] = ()
     points: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     on_horizon: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    limb: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    limb_sigma: FloatArray = field(default_factory=lambda: np.zeros(0))
     view: View | None = None
     pixels_read: int = 0

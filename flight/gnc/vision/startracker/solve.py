@@ -13,12 +13,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from flight.gnc.attitude.wahba import AttitudeError
+from flight.gnc.attitude.wahba import AttitudeError, Solver
 from flight.gnc.camera.lens import CameraModel, Lens, LensError
 from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.math.arrays import FloatArray, Image
 from flight.gnc.math.quaternion import attitude_matrix
 from flight.gnc.vision.startracker.aberration import apparent
+from flight.gnc.vision.startracker.by_directions import attitude_by
 from flight.gnc.vision.startracker.detection import (
     Detections,
     DetectionSettings,
@@ -67,6 +68,7 @@ class SolveSettings:
         likelihood: settings for the streaks of a picture; a flight's job names its own estimator.
         identification: settings of the default method.
         method: another method of identification.
+        attitude: a solver of directions for the attitude; None takes it from the fit in the image.
         velocity: (3,) m/s of the camera about the Sun, for aberration; None: no correction.
         untold_lens: whether a lens of uncertain focal length may have its axis off the middle and distort;
             else the focal length is all that is uncertain.
@@ -76,6 +78,7 @@ class SolveSettings:
     likelihood: LikelihoodSettings = field(default_factory=LikelihoodSettings)
     identification: IdentificationSettings = field(default_factory=IdentificationSettings)
     method: Callable[[StarField, SkyIndex], Identification] | None = None
+    attitude: Solver | None = None
     velocity: FloatArray | None = None
     untold_lens: bool = True
 
@@ -273,10 +276,12 @@ def _with_attitude(
             free_scale,
             free_lens,
         )
+        fix = fit.fix
+        if settings.attitude is not None:
+            fix = attitude_by(settings.attitude, seen.points[chosen], covariance, reference, camera, fit)
     except AttitudeError as error:
         return replace(seen, status=SolveStatus.AMBIGUOUS, reason=str(error))
     camera = camera.rescaled(1.0 / fit.scale)
-    fix = fit.fix
     if found.from_lens is not None:
         fix = replace(fix, covariance=fix.covariance + found.from_lens)
     if free_lens:

@@ -7,8 +7,9 @@ import pytest
 
 from flight.gnc.earth.disturbance import Pressures
 from flight.gnc.estimation.estimate import Knowledge
-from flight.gnc.estimation.free_filter import FreeFilter, FreeFilterSettings
+from flight.gnc.estimation.free_filter import FreeFilter
 from flight.gnc.estimation.free_motion import DIPOLE, GYRO, RATE, STATES, TURN, Around
+from flight.gnc.estimation.free_settings import FreeFilterSettings
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import (
     IDENTITY,

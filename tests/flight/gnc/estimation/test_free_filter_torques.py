@@ -7,8 +7,9 @@ import dataclasses
 import numpy as np
 
 from flight.gnc.earth.disturbance import Pressures
-from flight.gnc.estimation.free_filter import FreeFilter, FreeFilterSettings
+from flight.gnc.estimation.free_filter import FreeFilter
 from flight.gnc.estimation.free_motion import AXES, GYRO, RATE, TURN, Around
+from flight.gnc.estimation.free_settings import FreeFilterSettings
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import (
     IDENTITY,

@@ -59,8 +59,8 @@ def measure(targets: Targets, shapes: Shapes, spread: FrameSpread, settings: Det
         some, before = targets.select(chosen), shapes.fitted.select(np.flatnonzero(chosen))
         if saturated:
             part = _fitted(some, before, spread, _half_of(some, spread), free_width=True)
-        elif settings.method == "window":
-            part = _centred(some, spread, settings.window // 2)
+        elif settings.method != "psf":
+            part = _centred(some, spread, settings)
         else:
             part = _fitted(some, before, spread, spread.half, free_width=False)
         for name in Measured.__slots__:
@@ -137,7 +137,8 @@ def _flux_sigma(found: PsfFit, windows: Windows, noise: NoiseModel) -> FloatArra
     return np.asarray(np.sum(seen * seen / counted, axis=(1, 2)) + 1e-30) ** -0.5
 
 
-def _centred(targets: Targets, spread: FrameSpread, half: int) -> Measured:
+def _centred(targets: Targets, spread: FrameSpread, settings: DetectionSettings) -> Measured:
+    half = settings.window // 2
     windows = targets.windows(half)
     # The window stands about the brightest pixel (text before eq. 12), not about the smoothed peak.
     core = windows.light[:, half - 1 : half + 2, half - 1 : half + 2].reshape(len(windows), 9)
@@ -145,7 +146,7 @@ def _centred(targets: Targets, spread: FrameSpread, half: int) -> Measured:
     limits = np.array(targets.pixels.shape)[::-1] - 1
     middle = np.clip(targets.middle + np.stack([column, row], axis=-1) - 1, 0, limits)
     windows = targets.windows(half, middle)
-    found = centre_of_mass(windows, spread.noise, spread.psf_sigma)
+    found = centre_of_mass(windows, spread.noise, spread.psf_sigma, settings.method)
     covariance = (found.variance * targets.correlation**2 + _FLOOR**2)[:, None, None] * np.eye(2)
     flux_sigma = np.sqrt(found.flux_variance) * targets.correlation
     pairs = neighbours(middle + found.offset, found.flux, spread.psf_sigma, half)

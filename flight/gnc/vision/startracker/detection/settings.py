@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, get_args
 
-Method = Literal["psf", "window"]
+Method = Literal["psf", "window", "weighted", "gaussian", "iterative"]
+
+
+CENTROIDS: tuple[Method, ...] = get_args(Method)
 
 
 @dataclass(frozen=True, slots=True)
@@ -13,7 +16,8 @@ class DetectionSettings:
     """How stars are found and measured.
 
     Attributes:
-        method: `psf` fits the point spread, `window` takes the centre of mass of eq. 12-21.
+        method: `psf` fits the point spread, `window` takes the centre of mass of eq. 12-21, the others weigh
+            its pixels otherwise (`centroids`).
         threshold_sigmas: least height of a peak of the smoothed frame, over that frame's measured noise.
         most_stars: the brightest are kept, no more; no sixteenth of the frame gives more than its share
             (`selection`).
@@ -35,8 +39,8 @@ class DetectionSettings:
     search_radius: float = 4.0
 
     def __post_init__(self) -> None:
-        if self.method not in ("psf", "window"):
-            raise ValueError(f"method = {self.method!r}: use 'psf' or 'window'")
+        if self.method not in CENTROIDS:
+            raise ValueError(f"method = {self.method!r}: use {', '.join(CENTROIDS)}")
         for name, low, high in (
             ("threshold_sigmas", 1.0, 100.0),
             ("most_stars", 1, 10_000),

@@ -2,7 +2,8 @@
 
 The window is a x a pixels about the brightest one. 14 and 15 as printed end it one pixel too far for the
 divisor 4 (a - 1) of 16e, which counts the border of a x a pixels: here it ends at x_start + a - 1. (20) is
-y_CM with j (errata). The outermost pixels are the border, the centre of mass is taken of those within.
+y_CM with j (errata). The outermost pixels are the border, the centre of mass is taken of those within; other
+centroids (`centroids`) begin there.
 """
 
 from __future__ import annotations
@@ -12,11 +13,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from flight.gnc.math.arrays import FloatArray
+from flight.gnc.vision.startracker.detection.centroids import METHODS, Centroid
 from flight.gnc.vision.startracker.detection.noise_model import NoiseModel
 from flight.gnc.vision.startracker.detection.point_spread import light
+from flight.gnc.vision.startracker.detection.settings import Method
 from flight.gnc.vision.startracker.detection.windows import Windows
 
 _PHASES = np.linspace(-0.45, 0.45, 10)
+_FAINTEST = 1e-3
+"""Noise of a pixel, of the star's light, by which a method without noise still leaves pixels out."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,28 +42,43 @@ class WindowCentroids:
     flux_variance: FloatArray
 
 
-def centre_of_mass(windows: Windows, noise: NoiseModel, psf_sigma: float) -> WindowCentroids:
-    """Return the centres of mass of `windows` (eq. 12-20); those cut by the edge are of the pixels there."""
+def centre_of_mass(
+    windows: Windows, noise: NoiseModel, psf_sigma: float, method: Method = "window"
+) -> WindowCentroids:
+    """Return the centres of mass of `windows` (eq. 12-20); those cut by the edge are of the pixels there.
+
+    Another `method` replaces the place by that of `centroids`.
+    """
     half = windows.half
     offset, flux, sky = _moments(windows.light)
-    step = np.arange(1 - half, half)
     inner = windows.light[:, 1:-1, 1:-1]
-    clean = inner - sky[:, None, None]
-    variance = noise.variance(clean, windows.noise)
-    dx, dy = step - offset[:, :1], step - offset[:, 1:]
-    whole = np.maximum(flux, 1e-30) ** 2
-    both = 0.5 * np.sum(variance * (dx[:, None, :] ** 2 + dy[:, :, None] ** 2), axis=(1, 2)) / whole
+    variance = noise.variance(inner - sky[:, None, None], windows.noise)
+    offset, slopes = _places(windows.light, variance, psf_sigma, method)
+    both = 0.5 * np.sum(variance[:, None] * slopes**2, axis=(1, 2, 3))
     # The border's mean is off by its noise, and pulls the centre of mass towards the window's middle.
     border = windows.noise**2 / (8.0 * half)
     area = float(inner[0].size) if len(inner) else 1.0
-    both += 0.5 * np.sum(offset**2, axis=1) * area**2 * border / whole
+    both += 0.5 * np.sum(slopes.sum(axis=(2, 3)) ** 2, axis=1) * border
     return WindowCentroids(
         offset,
         flux,
         sky,
-        both + _cut_off(half, psf_sigma) ** 2,
+        both + _cut_off(half, psf_sigma, method) ** 2,
         np.sum(variance, axis=(1, 2)) + area**2 * border,
     )
+
+
+def _places(window: FloatArray, variance: FloatArray, psf_sigma: float, method: Method) -> Centroid:
+    """Return the centroids of a method and their slopes by the pixels within the border."""
+    offset, flux, sky = _moments(window)
+    clean = window[:, 1:-1, 1:-1] - sky[:, None, None]
+    half = window.shape[1] // 2
+    step = np.arange(1 - half, half)
+    whole = np.maximum(flux, 1e-30)[:, None, None]
+    across = np.broadcast_to((step - offset[:, :1])[:, None, :], clean.shape) / whole
+    down = np.broadcast_to((step - offset[:, 1:])[:, :, None], clean.shape) / whole
+    plain = offset, np.stack([across, down], axis=1)
+    return METHODS[method](clean, variance, plain, psf_sigma) if method in METHODS else plain
 
 
 def _moments(window: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -74,8 +94,9 @@ def _moments(window: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     return np.clip(np.stack([x, y], axis=-1), 1 - half, half - 1), flux, sky
 
 
-def _cut_off(half: int, psf_sigma: float) -> float:
-    """Return the rms error in px that the window's edge and border make, over places within a pixel."""
+def _cut_off(half: int, psf_sigma: float, method: Method) -> float:
+    """Return the rms error in px of window, border and method over a pixel's places, without noise."""
     place = np.stack([_PHASES, np.zeros_like(_PHASES)], axis=-1)
     stars = light(place, np.full(len(_PHASES), psf_sigma), half)
-    return float(np.sqrt(np.mean((_moments(stars)[0][:, 0] - _PHASES) ** 2)))
+    places, _ = _places(stars, np.full_like(stars[:, 1:-1, 1:-1], _FAINTEST**2), psf_sigma, method)
+    return float(np.sqrt(np.mean((places[:, 0] - _PHASES) ** 2)))

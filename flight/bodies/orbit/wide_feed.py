@@ -1,0 +1,219 @@
+"""Sun and nadir of the wide cameras: they start the filter without a star, and feed it where they say more.
+
+What a camera gets wrong stays: the errors of its lens, the height of the limb. A direction is therefore used
+only where it says more than the filter, so that repetition never narrows the filter's claim. Two directions
+that contradict an estimate which no stars made fine, several times in a row, start it again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from flight.bodies.orbit.coarse_sun import CoarseSunFeed
+from flight.bodies.orbit.filter import OrbitFilter
+from flight.bodies.orbit.surroundings import Surroundings
+from flight.gnc.attitude.determination.single_frame import Sight, field_sight, optimum
+from flight.gnc.attitude.wahba import AttitudeError
+from flight.gnc.camera.mounted import MountedCamera
+from flight.gnc.estimation.estimate import TURN, Knowledge
+from flight.gnc.estimation.measurements import AttitudeMeasurement, DirectionMeasurement
+from flight.gnc.math import chi_square
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.directions import tangent_basis
+from flight.gnc.math.quaternion import attitude_matrix
+from flight.gnc.vision.horizon.knowledge import HorizonKnowledge, RoughAttitude, SensedDirection
+from flight.gnc.vision.horizon.response import LogarithmicResponse
+from flight.gnc.vision.sun_sensor.strings import SolarStrings
+from flight.gnc.vision.wide_job import Sighted, WideFound, WideJob
+from flight.schema.camera_model import camera_model
+from flight.schema.orbit_devices import WideCamera
+from hal.interfaces.readings import Frame
+from hal.interfaces.wires import SECOND_NS
+
+START_SIGMA = math.radians(15.0)
+"""rad, of the worst axis, to which an attitude starts the filter: less says where the Earth is, no more."""
+NEEDED_SIGMA = math.radians(0.05)
+"""rad, of the worst axis, beyond which directions of 0.01 to 0.04 deg are worth their work."""
+ROUGH_SIGMA = 0.3
+"""rad, to which an estimate helps to find the horizon."""
+IMPROBABLE = 1e-6
+"""Chance by which directions do not make one attitude."""
+CONTRADICTED = 3
+"""Rounds in a row that contradict an estimate that is not fine."""
+STRINGS_AGE_NS = 2 * SECOND_NS
+FIELD_SIGMA = 0.03
+"""rad, at least, of the field's direction where the horizon is looked for."""
+
+
+class WideFeed:
+    """Implements `flight.loop.body.WideSight`."""
+
+    def __init__(
+        self,
+        cameras: Sequence[MountedCamera],
+        lens_error: float,
+        filter_: OrbitFilter,
+        surroundings: Surroundings,
+        sun: CoarseSunFeed | None,
+        response: LogarithmicResponse | None,
+    ) -> None:
+        """`lens_error` rad an axis is what calibration leaves; `sun` has the strings' newest reading.
+
+        `response` of all cameras to light; None: linear.
+        """
+        self._cameras = tuple(cameras)
+        self._lens = lens_error**2 * np.eye(3)
+        self._filter = filter_
+        self._surroundings = surroundings
+        self._sun = sun
+        self._response = response
+        self._against = 0
+
+    @property
+    def needed(self) -> bool:
+        """Whether the cameras are to be read often."""
+        return self._filter.worst_sigma > NEEDED_SIGMA
+
+    def job(self, frames: Mapping[int, Frame]) -> WideJob:
+        """Return the worker's job for frames of one instant, with what is known of their time."""
+        times = [frame.exposure_start_ns + frame.exposure_ns // 2 for frame in frames.values()]
+        time_ns = sum(times) // len(times)
+        pixels = {number: frame.pixels for number, frame in frames.items()}
+        return WideJob(pixels, self._cameras, self._known(time_ns), self._strings(time_ns), self._response)
+
+    def accept(self, time_ns: int, found: WideFound) -> tuple[bool, bool]:
+        """Start the filter from Sun, nadir and field, or feed it; return whether Sun and nadir were used."""
+        around, sun = self._surroundings.at(time_ns), self._surroundings.sun(time_ns)
+        if around is None or sun is None:
+            return False, False
+        down = -around.position / np.linalg.norm(around.position)
+        seen = [
+            None if one is None else Sight(one.direction, reference, one.covariance + self._lens)
+            for one, reference in ((found.sun, sun), (found.nadir, down))
+        ]
+        if not self._filter.runs or self._against >= CONTRADICTED:
+            began = self._begin(time_ns, [one for one in seen if one is not None])
+            return began and seen[0] is not None, began and seen[1] is not None
+        then = self._filter.past(time_ns)
+        if then is None:
+            return False, False
+        # The strings' own Sun reaches the filter with the field (`coarse_sun`).
+        mine = [None if _is_of_strings(found.sun) else seen[0], seen[1]]
+        claim, turn = then.covariance[TURN, TURN], attitude_matrix(then.quaternion)
+        refused = [one is not None and _contradicts(one, turn, claim) for one in mine]
+        self._judge(mine, refused)
+        sun_used, nadir_used = (
+            one is not None and not against and _says_more(one, claim) and self._use(time_ns, one)
+            for one, against in zip(mine, refused, strict=True)
+        )
+        return sun_used, nadir_used
+
+    def _judge(self, seen: Sequence[Sight | None], refused: Sequence[bool]) -> None:
+        """Count the rounds in a row that contradict an estimate that no stars made fine."""
+        if self._filter.knowledge is Knowledge.FINE:
+            self._against = 0
+        elif any(one is not None for one in seen):
+            self._against = self._against + 1 if any(refused) else 0
+
+    def _begin(self, time_ns: int, seen: list[Sight]) -> bool:
+        """Start the filter from the attitude of all directions, where they fix one and agree."""
+        field = self._field_sight(time_ns)
+        sights = seen if field is None else [*seen, field]
+        if not seen or len(sights) < 2:
+            return False
+        try:
+            fix = optimum(sights)
+        except (AttitudeError, np.linalg.LinAlgError):
+            return False
+        if 2.0 * fix.loss > chi_square.bound(IMPROBABLE, 2 * len(sights) - 3):
+            return False
+        if math.sqrt(float(np.linalg.eigvalsh(fix.covariance)[-1])) > START_SIGMA:
+            return False
+        doubted, self._against = self._against >= CONTRADICTED, 0
+        attitude = AttitudeMeasurement(time_ns, fix.quaternion, fix.covariance)
+        return self._filter.begin(attitude, doubted=doubted)
+
+    def _use(self, time_ns: int, sight: Sight) -> bool:
+        measured = DirectionMeasurement(time_ns, sight.observed, sight.reference, sight.covariance)
+        taken: list[bool] = []
+        self._filter.measure_late([measured], taken.extend)
+        return any(taken)
+
+    def _field_sight(self, time_ns: int) -> Sight | None:
+        """Return the direction of the magnetic field at a time, None without a recent one."""
+        heard = self._filter.heard_field()
+        turned = None if heard is None else self._filter.turned(heard[0].time_ns, time_ns)
+        around = self._surroundings.at(time_ns)
+        if heard is None or turned is None or around is None:
+            return None
+        try:
+            return field_sight(attitude_matrix(turned) @ heard[0].field, around.field, heard[0].covariance)
+        except AttitudeError:
+            return None
+
+    def _known(self, time_ns: int) -> HorizonKnowledge:
+        """Return what is known of place, Sun, field and attitude at a time, in body axes."""
+        around, sun = self._surroundings.at(time_ns), self._surroundings.sun(time_ns)
+        if around is None or sun is None:
+            return HorizonKnowledge()
+        field = self._field_sight(time_ns)
+        sensed: tuple[SensedDirection, ...] = ()
+        if field is not None:
+            sensed = (SensedDirection(field.observed, field.reference, math.hypot(field.sigma, FIELD_SIGMA)),)
+        then, rough = self._filter.past(time_ns) if self._filter.runs else None, None
+        if then is not None:
+            sigma = math.sqrt(max(float(np.linalg.eigvalsh(then.covariance[TURN, TURN])[-1]), 0.0))
+            rough = RoughAttitude(then.quaternion, sigma) if sigma < ROUGH_SIGMA else None
+        return HorizonKnowledge(position=around.position, sun=sun, attitude=rough, sensed=sensed)
+
+    def _strings(self, time_ns: int) -> tuple[SolarStrings, FloatArray] | None:
+        newest = None if self._sun is None else self._sun.newest
+        if self._sun is None or newest is None or abs(newest.time_ns - time_ns) > STRINGS_AGE_NS:
+            return None
+        return self._sun.strings, newest.currents
+
+
+def wide_feed_of(
+    sections: Sequence[WideCamera],
+    filter_: OrbitFilter,
+    surroundings: Surroundings,
+    sun: CoarseSunFeed | None,
+) -> WideFeed:
+    """Return the feed of configured cameras."""
+    cameras = [MountedCamera(camera_model(one), np.array(one.mounting)) for one in sections]
+    error = math.radians(max(one.lens_error_deg for one in sections))
+    first, response = sections[0], None
+    if first.response == "logarithmic":
+        response = LogarithmicResponse(first.pedestal, first.counts_per_decade())
+    return WideFeed(cameras, error, filter_, surroundings, sun, response)
+
+
+def _is_of_strings(sun: Sighted | None) -> bool:
+    return sun is not None and not sun.cameras
+
+
+def _spread(sight: Sight, turn: FloatArray, claim: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return a direction's departure (2,) from an attitude (3, 3), its covariance and the claim's (2, 2)."""
+    expected = turn @ sight.reference
+    across = tangent_basis(expected)
+    # A turn e moves the direction d by d x e.
+    rows = across @ np.cross(expected, np.eye(3)).T
+    return across @ sight.observed, across @ sight.covariance @ across.T, rows @ claim @ rows.T
+
+
+def _contradicts(sight: Sight, turn: FloatArray, claim: FloatArray) -> bool:
+    """Return whether a direction and an attitude with its claim (3, 3) exclude one another."""
+    off, own, known = _spread(sight, turn, claim)
+    behind = float(sight.observed @ turn @ sight.reference) < 0.0
+    return behind or float(off @ np.linalg.solve(own + known, off)) > chi_square.bound(IMPROBABLE, 2)
+
+
+def _says_more(sight: Sight, claim: FloatArray) -> bool:
+    """Return whether a direction is known better across some axis than the claim (3, 3) has it."""
+    across = tangent_basis(sight.observed)
+    rows = across @ np.cross(sight.observed, np.eye(3)).T
+    known, own = rows @ claim @ rows.T, across @ sight.covariance @ across.T
+    return float(np.linalg.eigvals(np.linalg.solve(own, known)).real.max()) > 1.0

@@ -1,0 +1,96 @@
+"""The testbed's body on its thread in a Helmholtz cage that plays the field of an orbit.
+
+The truth beside the flight's belief (`flight.bodies.testbed.cage`): IGRF-14 with a ring current along an
+orbit under J2, in the local frame whose y is the thread's axis; the components normal to the thread, times
+the cage's scale and the gain of its coils.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from flight.gnc.math.arrays import FloatArray
+from flight.schema.errors import ConfigError
+from flight.schema.testbed import as_testbed
+from sim_hal.settings import CageTruth
+from sim_hal.worlds.free_body.body import elements, julian_date
+from sim_hal.worlds.free_body.environment import Environment
+from sim_hal.worlds.motion import Motion
+from sim_hal.worlds.testbed import Testbed, TestbedModel, model_of
+from sim_hal.worlds.world import WorldInputs
+
+_STREAM = 0xCA6E
+
+
+class OrbitField:
+    """The field that the cage makes, reference axes."""
+
+    def __init__(self, section: CageTruth, scale: float, utc: str, seed: int) -> None:
+        date = julian_date(utc)
+        generator = np.random.default_rng([seed, _STREAM])
+        self._around = Environment(elements(section.orbit, date), date, generator, section.ring_current)
+        self._scale = scale * section.gain
+
+    def at(self, seconds: float) -> tuple[float, float]:
+        """Return the components along x and z, T, at a time since the start."""
+        there = self._around.at(seconds)
+        position, velocity, field = (np.array(each) for each in there[:3])
+        down = -position / np.linalg.norm(position)
+        across = np.cross(velocity, position)
+        ahead = np.cross(across / np.linalg.norm(across), down)
+        return self._scale * float(field @ ahead), self._scale * float(field @ down)
+
+
+class CagedTestbed(Testbed):
+    """The testbed with the field of the cage in place of the fixed one."""
+
+    def __init__(
+        self,
+        model: TestbedModel,
+        angle: float,
+        release_rate: float,
+        currents: Callable[[], FloatArray],
+        field: OrbitField,
+        start_ns: int = 0,
+    ) -> None:
+        """Hold the body at `angle` rad until it is released with `release_rate` rad/s."""
+        super().__init__(model, angle, release_rate, currents, start_ns)
+        self._orbit, self._start_ns = field, start_ns
+        self._bx, self._bz = field.at(0.0)
+
+    def advance_to(self, time_ns: int) -> None:
+        """Advance the state to `time_ns`; the field stands still for the few ms of an advance."""
+        if time_ns > self.time_ns:
+            self._bx, self._bz = self._orbit.at((time_ns - self._start_ns) * 1e-9)
+        super().advance_to(time_ns)
+
+    def motion(self, time_ns: int) -> Motion:
+        """Advance to `time_ns` and return the motion there."""
+        motion = super().motion(time_ns)
+        bx, bz = self._in_body(self.angle)
+        return replace(motion, field_body=np.array([bx, 0.0, bz]))
+
+    def _in_body(self, angle: float) -> tuple[float, float]:
+        sine, cosine = math.sin(angle), math.cos(angle)
+        return self._bx * cosine - self._bz * sine, self._bx * sine + self._bz * cosine
+
+    def _acceleration(self, angle: float, rate: float, ix: float, iz: float) -> float:
+        m = self._model
+        bx, bz = self._in_body(angle)
+        torque = m.dipole_per_ampere * (iz * bx - ix * bz)
+        return (torque - m.stiffness * angle - m.damping * rate) / m.inertia
+
+
+def make(inputs: WorldInputs) -> CagedTestbed:
+    """Return the caged testbed of a configuration. Raises ConfigError without its sections."""
+    config, section = as_testbed(inputs.config), inputs.section
+    if config.cage is None or section.cage is None:
+        missing = "cage" if config.cage is None else "simulation.cage"
+        raise ConfigError(missing, "is missing: the world cage needs it")
+    model, angle, rate = model_of(config, section)
+    field = OrbitField(section.cage, config.cage.scale, section.utc, section.seed)
+    return CagedTestbed(model, angle, rate, inputs.currents, field, inputs.start_ns)

@@ -1,0 +1,58 @@
+"""A slew in the cage: the field stands almost along body x, where the coil on x alone makes no torque."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flight.schema import reader as configuration
+from flight.schema.carried import config_path
+from flight.schema.errors import ConfigError
+from flight.schema.sections import Config
+from ground.report.signals import true_attitude
+from ground.telemetry.reader import Run
+from sim_hal.settings import Simulation
+from tests.scenario.flights import event_names, fly
+
+TEXT = config_path("cage").read_text(encoding="utf-8")
+
+
+def _cage() -> tuple[Config, Simulation]:
+    section = configuration.simulation_section(TEXT, "cage", Simulation)
+    assert section is not None
+    return configuration.parse(TEXT).shortened(40.0), section
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """Return the first 40 s: released at q2 = 0.2 with -0.1 rad/s, to -0.3."""
+    config, section = _cage()
+    return fly(config, tmp_path_factory.mktemp("cage"), section=section)
+
+
+def test_the_slew_ends_where_it_should_by_both_coils(flown: Run) -> None:
+    attitude = true_attitude(flown)
+    assert attitude is not None
+    end = attitude.time > 30.0
+    assert np.degrees(np.abs(2.0 * np.arcsin(attitude.q2[end]) - 2.0 * np.arcsin(-0.3))).max() < 0.2
+    currents = np.abs(flown["control"]["current_written"]).max(axis=0)
+    assert currents[2] > 0.02
+    assert currents[1] == 0.0
+    assert set(event_names(flown)) <= {"started", "target", "stopped"}
+
+
+def test_the_magnetometer_sees_the_cages_field_turned_by_the_body(flown: Run) -> None:
+    """67 deg from -z and 0.225 mT at the start, by the table of `OrbitField`; the body held at 23 deg."""
+    field = flown["imu"]["field"][0].astype(float)
+    assert np.hypot(field[0], field[2]) == pytest.approx(2.25e-4, rel=0.05)
+    # The body turned by +angle sees a field of the testbed's axes turned by as much.
+    towards = np.degrees(np.arctan2(field[0], -field[2]))
+    assert towards == pytest.approx(67.0 + np.degrees(2.0 * np.arcsin(0.2)), abs=3.0)
+
+
+def test_the_world_cage_needs_its_sections(tmp_path: Path) -> None:
+    config, section = _cage()
+    with pytest.raises(ConfigError, match=r"simulation.cage.*is missing"):
+        fly(config, tmp_path, section=configuration.replace(section, cage=None))

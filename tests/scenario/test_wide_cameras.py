@@ -1,0 +1,42 @@
+"""Wide cameras in the loop: lost in space without a star camera, Sun and limb make the attitude fine."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flight.schema import reader as configuration
+from flight.schema.orbit import as_orbit
+from ground.report.knowledge import COARSE, attitude_errors
+from ground.telemetry.reader import Run
+from tests.scenario.flights import CONFIG, event_names, fly
+from tests.scenario.test_orbit import orbit_config, world
+
+DURATION, SETTLED = 30.0, 15.0
+"""s."""
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    whole = as_orbit(configuration.load(CONFIG.parent / "orbit.yaml"))
+    often = tuple(configuration.replace(camera, period=4.0) for camera in whole.wide_cameras)
+    config = configuration.replace(orbit_config(DURATION), camera=None, wide_cameras=often)
+    return fly(config, tmp_path_factory.mktemp("wide"), section=world(0.005))
+
+
+def test_sun_and_horizon_are_found_and_used(flown: Run) -> None:
+    packets = flown["directions"]
+    assert len(packets) >= 4
+    assert (packets["frames"] == 0b1111).all()
+    assert packets["sun_used"].any() or packets["nadir_used"].any()
+    assert np.isfinite(packets["nadir"][packets["nadir_cameras"] > 0]).all()
+    assert "wide-lost" not in event_names(flown)
+
+
+def test_the_attitude_is_better_than_strings_make_it_and_within_its_claim(flown: Run) -> None:
+    assert (flown["navigation"]["knowledge"][4:] >= COARSE).all()
+    errors = attitude_errors(flown)
+    later = errors.times > SETTLED
+    assert later.any()
+    assert (np.abs(errors.error[later]) < 4.5 * errors.sigma[later]).all()
+    assert np.degrees(np.linalg.norm(errors.error[later], axis=1)).max() < 0.5

@@ -1,0 +1,251 @@
+"""Campaign `horizon-methods`: the paper's ways to nadir beside the default ones, on the same frames.
+
+The evaluation that Meller et al. leave open (chapter 5). Three level cameras at 120 deg (VT) see the Earth
+from 380 to 800 km in random light, their lenses known to all methods, the air to none. Attitudes: `level`
+within 2 deg, `tilted` within 15 (as far as the paper's cameras keep the horizon), `any`. Light: `sunlit` in
+the first two cameras, or `terminator` in the first. The default method and the cameras together know what a
+flight knows (as in the campaign `nadir`); the paper's methods know the altitude, `graphic` also where the
+cameras look, and `vector` the true nadir half a second before, at up to 2 deg/s. Wrong is an answer more than
+half a degree off, far wrong more than five.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flight.gnc.camera.mounted import MountedCamera
+from flight.gnc.earth.figure import SEMI_MAJOR_AXIS
+from flight.gnc.earth.sun import ASTRONOMICAL_UNIT
+from flight.gnc.math.arrays import FloatArray, Image
+from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector, multiply
+from flight.gnc.vision.horizon.ellipsoid import MEAN_RADIUS
+from flight.gnc.vision.horizon.graphic_method import GraphicMethodError, LevelCamera, graphic_nadir
+from flight.gnc.vision.horizon.knowledge import HorizonKnowledge, SensedDirection
+from flight.gnc.vision.horizon.nadir import find_nadir
+from flight.gnc.vision.horizon.scanned_circle import NoHorizonError, circle_nadir, scan_horizon
+from flight.gnc.vision.horizon.several_cameras import nadir_of_cameras
+from flight.gnc.vision.horizon.vector_method import carried_nadir
+from sim_hal.earth_camera import EarthCameraModel, EarthScene, limb_truth, render
+from tests.sim_hal.earth_camera.scenes import DAY, NIGHT, pointing, random_direction
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.nadir import (
+    FIELD_SIGMA,
+    SUN_SIGMA,
+    WRONG_DEG,
+    camera_model,
+    finder_settings,
+    misread,
+    random_air,
+)
+from tests.studies.campaigns.orbit_geometry import suite
+
+ATTITUDES = {"level": np.radians(2.0), "tilted": np.radians(15.0), "any": np.pi}
+LIGHTS = ("sunlit", "terminator")
+METHODS = (
+    "default",
+    "several cameras",
+    "circle, 3 lines",
+    "circle, 32 lines",
+    "graphic, 3 lines",
+    "graphic, 32 lines",
+    "vector, 32 lines",
+)
+FAR_DEG = 5.0
+ALTITUDES = 380e3, 800e3
+STEP, FASTEST = 0.5, np.radians(2.0)
+_LEAST_POINTS = 60
+_MOST_DRAWS = 20_000
+
+
+def cases(runs: int, seed: int) -> list[Case]:
+    """Return `runs` instants of each attitude in each light."""
+    return [
+        Case(f"{attitude}-{light}-{run}", (seed, number, place, run), {"attitude": attitude, "light": light})
+        for number, attitude in enumerate(ATTITUDES)
+        for place, light in enumerate(LIGHTS)
+        for run in range(runs)
+    ]
+
+
+def run(case: Case) -> Result:
+    """Answer one instant by all methods."""
+    generator = np.random.default_rng(case.seed)
+    model, cameras = camera_model(), _cameras()
+    instant = _draw(case, generator, model, cameras)
+    turn = from_rotation_vector(-STEP * FASTEST * generator.uniform() * random_direction(generator))
+    before = _scene(instant, multiply(turn, instant["attitude"]), cameras[0])
+    frames = [render(model, _scene(instant, instant["attitude"], one), generator) for one in cameras]
+    earlier = render(model, before, generator)
+    body = attitude_matrix(instant["attitude"])
+    position, sun, field = instant["position"], instant["sun"], random_direction(generator)
+    knowledge = HorizonKnowledge(
+        position=position,
+        sun=sun,
+        sensed=tuple(
+            SensedDirection(misread(body @ true, sigma, generator), true, sigma)
+            for true, sigma in ((sun, SUN_SIGMA), (field, FIELD_SIGMA))
+        ),
+    )
+    truth = body @ (-position / np.linalg.norm(position))
+    known = before.camera_matrix @ (-position / np.linalg.norm(position))
+    answers = {}
+    for name, ask in _methods(model, cameras, frames, earlier, knowledge, known).items():
+        begun = time.process_time()
+        found = ask()
+        spent = 1e3 * (time.process_time() - begun)
+        off = None if found is None else float(np.degrees(np.arccos(np.clip(found @ truth, -1.0, 1.0))))
+        answers[name] = {"error_deg": off, "milliseconds": spent}
+    return {**case.parameters, "seed": list(case.seed), "answers": answers}
+
+
+def _cameras() -> list[MountedCamera]:
+    lens = camera_model().lens
+    return [MountedCamera(lens, np.array(one.mounting)) for one in suite("vt").cameras]
+
+
+def _draw(
+    case: Case, generator: np.random.Generator, model: EarthCameraModel, cameras: Sequence[MountedCamera]
+) -> dict[str, Any]:
+    """Return an instant whose first camera, and in daylight the second too, has the limb in that light."""
+    air, widest = random_air(generator), ATTITUDES[case.parameters["attitude"]]
+    for _ in range(_MOST_DRAWS):
+        position = (SEMI_MAJOR_AXIS + generator.uniform(*ALTITUDES)) * random_direction(generator)
+        down = -position / np.linalg.norm(position)
+        tilt = generator.uniform() * widest if widest < np.pi else np.arccos(generator.uniform(-1.0, 1.0))
+        aside = np.cross(down, random_direction(generator))
+        axis = np.cos(tilt) * down + np.sin(tilt) * aside / np.linalg.norm(aside)
+        drawn: dict[str, Any] = {
+            "position": position,
+            "sun": random_direction(generator),
+            "attitude": pointing(axis, random_direction(generator)),
+            "rotation": generator.uniform(0.0, 2.0 * np.pi),
+            "air": air,
+        }
+        sunlit = case.parameters["light"] == "sunlit"
+        if all(_fits(_scene(drawn, drawn["attitude"], one), model, sunlit) for one in cameras[: 1 + sunlit]):
+            return drawn
+    raise RuntimeError(f"no instant for {case.key} in {_MOST_DRAWS} draws")
+
+
+def _fits(scene: EarthScene, model: EarthCameraModel, sunlit: bool) -> bool:
+    cosines = limb_truth(scene, model, count=720).solar_cosines
+    if len(cosines) < _LEAST_POINTS:
+        return False
+    low, high = float(cosines.min()), float(cosines.max())
+    return low > DAY if sunlit else low < NIGHT and high > DAY
+
+
+def _scene(instant: dict[str, Any], attitude: FloatArray, camera: MountedCamera) -> EarthScene:
+    return EarthScene(
+        instant["position"],
+        multiply(camera.mounting, attitude),
+        ASTRONOMICAL_UNIT * instant["sun"],
+        rotation=instant["rotation"],
+        atmosphere=instant["air"],
+    )
+
+
+def _methods(
+    model: EarthCameraModel,
+    cameras: Sequence[MountedCamera],
+    frames: Sequence[Image],
+    earlier: Image,
+    knowledge: HorizonKnowledge,
+    known: FloatArray,
+) -> dict[str, Callable[[], FloatArray | None]]:
+    """Return each method as a call that gives nadir (3,) in body axes, or None."""
+    settings, first, lens = finder_settings(model), cameras[0], model.lens
+    assert knowledge.position is not None
+    altitude = float(np.linalg.norm(knowledge.position)) - MEAN_RADIUS
+    seen = tuple(SensedDirection(first.seen(one.camera), one.inertial, one.sigma) for one in knowledge.sensed)
+    alone = HorizonKnowledge(position=knowledge.position, sun=knowledge.sun, sensed=seen)
+
+    def default() -> FloatArray | None:
+        found = find_nadir(frames[0], lens, alone, settings).nadir
+        return None if found is None else first.in_body(found.direction)
+
+    def several() -> FloatArray | None:
+        found = nadir_of_cameras(dict(enumerate(frames)), cameras, knowledge, settings).nadir
+        return None if found is None else found.direction
+
+    def circle(lines: int) -> FloatArray | None:
+        try:
+            found = scan_horizon(frames[0], lens, lines)
+        except NoHorizonError:
+            return None
+        return first.in_body(circle_nadir(found.circle, lens, altitude))
+
+    def graphic(lines: int) -> FloatArray | None:
+        # The camera's x axis in the body is to the right, its y axis down the body's z.
+        level = [LevelCamera(one.to_camera[0, :2], lens.ideal.centre) for one in cameras[:2]]
+        try:
+            one, other = (scan_horizon(frame, lens, lines).circle for frame in frames[:2])
+            return graphic_nadir((level[0], level[1]), (one, other), altitude)
+        except (NoHorizonError, GraphicMethodError):
+            return None
+
+    def vector(lines: int) -> FloatArray | None:
+        try:
+            before, after = (scan_horizon(frame, lens, lines).middle for frame in (earlier, frames[0]))
+        except NoHorizonError:
+            return None
+        return first.in_body(carried_nadir(known, before, after))
+
+    return {
+        "default": default,
+        "several cameras": several,
+        "circle, 3 lines": lambda: circle(3),
+        "circle, 32 lines": lambda: circle(32),
+        "graphic, 3 lines": lambda: graphic(3),
+        "graphic, 32 lines": lambda: graphic(32),
+        "vector, 32 lines": lambda: vector(32),
+    }
+
+
+def summarise(results: Sequence[Result], _: Path) -> Summary:
+    """Return the table: each method in each light and attitude."""
+    facts: dict[str, Any] = {}
+    lines = [
+        f"{'':36}answers   wrong     far   error, deg: median      95 %    ms",
+    ]
+    for attitude in ATTITUDES:
+        for light in LIGHTS:
+            mine = [r for r in results if (r["attitude"], r["light"]) == (attitude, light)]
+            for method in METHODS if mine else ():
+                row = _row([result["answers"][method] for result in mine])
+                facts[f"{attitude}/{light}/{method}"] = row
+                lines.append(
+                    f"{attitude:7}{light:11}{method:18}{row['answers']:4d} of {row['frames']:<4d}"
+                    f"{row['wrong']:4d}{row['far']:8d}{row['median_deg'] or np.nan:18.3f}"
+                    f"{row['most_deg'] or np.nan:10.3f}{row['milliseconds']:6.1f}"
+                )
+    lines.append(f"wrong: more than {WRONG_DEG:g} deg off, far: more than {FAR_DEG:g}; errors of all answers")
+    return Summary("\n".join(lines) + "\n", facts)
+
+
+def _row(answers: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    errors = np.array([one["error_deg"] for one in answers if one["error_deg"] is not None])
+    return {
+        "frames": len(answers),
+        "answers": len(errors),
+        "wrong": int(np.count_nonzero(errors > WRONG_DEG)),
+        "far": int(np.count_nonzero(errors > FAR_DEG)),
+        "median_deg": float(np.median(errors)) if len(errors) else None,
+        "most_deg": float(np.percentile(errors, 95.0)) if len(errors) else None,
+        "milliseconds": float(np.median([one["milliseconds"] for one in answers])),
+    }
+
+
+HORIZON_METHODS = Campaign(
+    "horizon-methods",
+    "nadir by the default method, several cameras, and Meller's circle, Graphic and Vector Methods",
+    cases,
+    run,
+    summarise,
+    50,
+)
