@@ -93,13 +93,16 @@ class Feed(Protocol):
 
 
 class Brake(Protocol):
-    """Brakes a tumble by the magnetometer alone, in windows in which the coils pause."""
+    """Brakes a tumble by magnetometer and gyro, in windows in which the coils pause."""
 
     def begin(self, now_ns: int) -> None:
         """Begin with no knowledge of the field."""
 
-    def sample(self, time_ns: int, field: FloatArray) -> None:
-        """Accept a field (3,) T measured at `time_ns`; ignored unless the coils were off and settled."""
+    def sample(self, time_ns: int, field: FloatArray, rate: FloatArray) -> None:
+        """Accept a field (3,) T and a gyro's rate (3,) rad/s measured at `time_ns`.
+
+        Ignored unless the coils were off and settled.
+        """
 
     def command(self, now_ns: int) -> CoilCommand:
         """Return the command now: zero while the field is measured or the rate is not known."""
@@ -246,6 +249,7 @@ class Body:
         place: returns the orbit's state at a time, None while it is not known.
         seeks: returns whether an object is looked for or followed, so that no frame is left out.
         wide: makes jobs of the wide cameras' frames and accepts what was found; None: it does not use them.
+        calm: returns when, from a time on, an exposure of a length begins that meets no step of the coils.
         sun: accepts a reading of the solar strings; returns why it shows no Sun, empty where it does, None
             where it is not judged.
     """
@@ -273,6 +277,7 @@ class Body:
     sighted: Callable[[Sequence[Track], int], None] = lambda _tracks, _now_ns: None
     place: Callable[[int], OrbitState | None] = lambda _: None
     seeks: Callable[[], bool] = lambda: False
+    calm: Callable[[int, int], int] = lambda begin_ns, _: begin_ns
 
 
 @dataclass(frozen=True, slots=True)

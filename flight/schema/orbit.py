@@ -36,13 +36,16 @@ class FieldDetumble(Detumble, frozen=True, kw_only=True):
 
     `field_noise` T of an axis of a sample, constant errors of the magnetometer included; `torque_noise`
     rad/s per sqrt(s), from torques that are not modelled. Times in s: the plan looks `horizon` ahead and is
-    made again every `replan`.
+    made again every `replan`. A body that turned by less than `gentle` rad/s when its braking began is never
+    made faster than then, a faster one up to `spin_up` times its first rate.
     """
 
     field_noise: Positive = 5.0e-7
     torque_noise: Positive = 1.0e-5
     horizon: Positive = 1500.0
     replan: Annotated[float, Meta(ge=1.0)] = 5.0
+    gentle: Positive = 0.052
+    spin_up: Annotated[float, Meta(ge=1.0)] = 2.0
 
 
 class OrbitEstimation(Estimation, frozen=True, kw_only=True):

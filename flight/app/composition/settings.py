@@ -60,6 +60,7 @@ def imaging_settings(camera: Camera, body: Body, frames: Path | None) -> Imaging
         objects=None if camera.objects is None else SightSettings(faintest=camera.objects.faintest),
         knowledge=body.knowledge,
         seeks=body.seeks,
+        calm=body.calm,
         kept=kept,
     )
 

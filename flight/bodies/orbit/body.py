@@ -1,6 +1,6 @@
 """A satellite in orbit with three coils. `ORBIT` builds it from the configuration.
 
-It detumbles by its magnetometer, acquires its attitude with its coils at rest, and points.
+It detumbles by magnetometer and gyro, acquires its attitude with its coils at rest, and points.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from flight.bodies.orbit.brake import FieldBrake
+from flight.bodies.orbit.brake import FieldBrake, expected_field
 from flight.bodies.orbit.coarse_sun import CoarseSunFeed
 from flight.bodies.orbit.feed import OrbitFeed
 from flight.bodies.orbit.filter import OrbitFilter
@@ -59,7 +59,8 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
     config = as_orbit(config)
     surroundings = Surroundings(_elements(config), services.clock)
     limit, dipole_per_ampere = _limit(config), config.craft.dipole_per_ampere
-    filter_, brake = _filter(config, surroundings), FieldBrake(_detumbler(config), dipole_per_ampere)
+    filter_ = _filter(config, surroundings)
+    brake = FieldBrake(_detumbler(config, filter_, surroundings), dipole_per_ampere)
     paths = PointingPaths(limit, fastest_rate(config))
     sun = _sun(config, filter_, surroundings)
     objects = ObjectAim(_sensor(config), limit, services.events)
@@ -91,6 +92,7 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
         sighted=objects.accept,
         place=surroundings.state,
         seeks=lambda: objects.seeks,
+        calm=_pauses(config).calm,
     )
 
 
@@ -193,16 +195,26 @@ def _elements(config: OrbitConfig) -> TwoLineElements | None:
         raise ConfigError("elements", f"are no two-line elements: {error}") from error
 
 
-def _detumbler(config: OrbitConfig) -> FieldDetumbler:
+def _detumbler(config: OrbitConfig, filter_: OrbitFilter, surroundings: Surroundings) -> FieldDetumbler:
     section, craft = config.detumble, config.craft
     settle_ns, measure_ns, act_ns = (
         round(seconds * SECOND_NS) for seconds in (section.settle, section.measure, section.act)
     )
     settings = FieldRateSettings(
-        inertia=np.diag(craft.inertia), field_sigma=section.field_noise, torque_walk=section.torque_noise
+        inertia=np.diag(craft.inertia),
+        field_sigma=section.field_noise,
+        torque_walk=section.torque_noise,
+        gyro_sigma=config.estimation.bias_start,
     )
-    braking = FieldBraking(limit=_limit(config), horizon=section.horizon, replan=section.replan)
-    return FieldDetumbler(WindowSchedule(settle_ns, measure_ns, act_ns), braking, settings)
+    braking = FieldBraking(
+        limit=_limit(config),
+        horizon=section.horizon,
+        replan=section.replan,
+        gentle=section.gentle,
+        spin_up=section.spin_up,
+    )
+    expected = expected_field(filter_, surroundings, braking.instants)
+    return FieldDetumbler(WindowSchedule(settle_ns, measure_ns, act_ns), braking, settings, expected)
 
 
 def _coil_watch(config: OrbitConfig) -> CoilWatch:

@@ -1,9 +1,17 @@
-"""The brake of a satellite in orbit: the momentum plan in the measured field."""
+"""The brake of a satellite in orbit: the momentum plan in the measured field, or in that expected ahead."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+import numpy as np
+
+from flight.bodies.orbit.filter import OrbitFilter
+from flight.bodies.orbit.surroundings import Surroundings
 from flight.gnc.control.three_axes.field_detumbler import FieldDetumbler
+from flight.gnc.earth.dipole_field import dipole_field_ahead
 from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import attitude_matrix
 from flight.loop.control_output import CoilCommand
 
 
@@ -19,9 +27,9 @@ class FieldBrake:
         """Begin with no knowledge of the field."""
         self.detumbler.begin(now_ns)
 
-    def sample(self, time_ns: int, field: FloatArray) -> None:
-        """Accept a field (3,) T measured at `time_ns`."""
-        self.detumbler.sample(time_ns, field)
+    def sample(self, time_ns: int, field: FloatArray, rate: FloatArray) -> None:
+        """Accept a field (3,) T and the gyro's rate (3,) rad/s measured at `time_ns`."""
+        self.detumbler.sample(time_ns, field, rate)
 
     def command(self, now_ns: int) -> CoilCommand:
         """Return the command now."""
@@ -35,3 +43,21 @@ class FieldBrake:
     def field(self, now_ns: int) -> FloatArray | None:
         """Return the field (3,) T in body axes at the last command; None before it is known."""
         return self.detumbler.field
+
+
+def expected_field(
+    filter_: OrbitFilter, surroundings: Surroundings, instants: FloatArray
+) -> Callable[[int], FloatArray | None]:
+    """Return what gives the field (n, 3) T at `instants` (n,) s after a time, in the body axes of then.
+
+    It gives None while attitude or orbit are not known.
+    """
+
+    def expected(now_ns: int) -> FloatArray | None:
+        state, around = surroundings.state(now_ns), surroundings.at(now_ns)
+        if state is None or around is None or not filter_.started:
+            return None
+        ahead = dipole_field_ahead(state, around.field, instants)
+        return np.asarray(ahead @ attitude_matrix(filter_.at(now_ns).quaternion).T)
+
+    return expected

@@ -19,8 +19,8 @@ class BdotBrake:
         """Begin with no knowledge of the field."""
         self._detumbler.begin(now_ns)
 
-    def sample(self, time_ns: int, field: FloatArray) -> None:
-        """Accept a field (3,) T measured at `time_ns`."""
+    def sample(self, time_ns: int, field: FloatArray, rate: FloatArray) -> None:
+        """Accept a field (3,) T measured at `time_ns`; the law needs no rate of the gyro."""
         self._detumbler.sample(time_ns, field)
 
     def command(self, now_ns: int) -> CoilCommand:

@@ -24,6 +24,8 @@ from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector
 
 MOST_SHARE = 0.5
 _SECOND = 1e-9
+_REACHED_NS = 50_000_000
+"""Two control cycles: so late a command may reach the coils."""
 _NO_CURRENT: FloatArray = np.zeros(3)
 
 
@@ -44,6 +46,20 @@ class WindowSchedule:
     def period_ns(self) -> int:
         """Time from window to window, ns."""
         return self.settle_ns + self.measure_ns + self.act_ns
+
+    def calm(self, begin_ns: int, length_ns: int) -> int:
+        """Return when, from `begin_ns` on, the coils leave so long a time without a step.
+
+        Windows are counted from time zero. It is `begin_ns` where neither pause nor action is long enough.
+        """
+        phase_ns, pause_ns = begin_ns % self.period_ns, self.settle_ns + self.measure_ns
+        later_ns = self.period_ns + pause_ns
+        parts = (0, pause_ns), (pause_ns, self.period_ns), (self.period_ns, later_ns)
+        for first_ns, last_ns in (*parts, (later_ns, 2 * self.period_ns)):
+            from_ns = max(phase_ns, first_ns + _REACHED_NS)
+            if from_ns + length_ns <= last_ns:
+                return begin_ns - phase_ns + from_ns
+        return begin_ns
 
 
 @dataclass(frozen=True, slots=True)

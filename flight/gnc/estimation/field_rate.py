@@ -1,11 +1,11 @@
-"""The body's rate from the magnetometer alone: an extended Kalman filter of rate, field and its change.
+"""The body's rate from the magnetometer: an extended Kalman filter of rate, field and its change.
 
 A body that turns in a field sees the field turn on a cone about its rate, so the field's direction over time
 gives all three components, the one along the field too; only a spin exactly along the field shows nothing,
-until the field has turned (by about two turns an orbit). The states are in body axes: rate w, field B, and
-the field's change v with respect to the stars; and a small turn a of the principal axes from those of the
-believed inertia, because at a fast spin of a long body the gyroscopic torque of 2 deg is the model's largest
-error:
+until the field has turned (by about two turns an orbit). A gyro, where there is one, shows it at once. The
+states are in body axes: rate w, field B, and the field's change v with respect to the stars; and a small turn
+a of the principal axes from those of the believed inertia, because at a fast spin of a long body the
+gyroscopic torque of 2 deg is the model's largest error:
 
     J(a) w' = m x B - w x J(a) w,    B' = v - w x B,    v' = -w x v,    a' = 0.
 
@@ -58,7 +58,8 @@ class FieldRateSettings:
         axes_sigma: rad, by which the principal axes are turned from those of `inertia`, at the start.
         inertia_error: share of the gyroscopic torque that stays unmodelled.
         gate_sigma: a measurement less likely than this many sigma of one component is refused.
-        refusals: this many in a row, and the filter starts again.
+        refusals: this many in a row, and the filter starts again; of a gyro, and it is not asked again.
+        gyro_sigma: rad/s of an axis, the bound of a gyro's bias.
         longest_gap: s, between the samples that start it: longer gaps hide fast spins.
     """
 
@@ -73,6 +74,7 @@ class FieldRateSettings:
     gate_sigma: float = 5.0
     refusals: int = 5
     longest_gap: float = 0.2
+    gyro_sigma: float = 1e-3
 
 
 def rate_across(before: FloatArray, after: FloatArray, seconds: float) -> FloatArray:
@@ -107,7 +109,8 @@ class FieldRate:
         """Forget all but how often the predictions failed."""
         self._waiting: list[tuple[float, FloatArray]] = []
         self._since = 0.0
-        self._refused = 0
+        self._refused = self._gyro_refused = 0
+        self._gyro_used = False
         self._turn: Quaternion = (0.0, 0.0, 0.0, 1.0)
         self._rate: Vector | None = None
         self._field = self._change = _NONE
@@ -138,6 +141,11 @@ class FieldRate:
     def turn(self) -> FloatArray:
         """The rotation (4,) since the start, from the body's axes then into those of now."""
         return np.array(self._turn)
+
+    @property
+    def inverse(self) -> FloatArray:
+        """The inverse (3, 3) of the inertia about the principal axes as they are estimated."""
+        return self._inverse
 
     @property
     def momentum(self) -> FloatArray:
@@ -174,18 +182,45 @@ class FieldRate:
         if not float(innovation @ np.linalg.solve(spread, innovation)) <= self._gate:
             self._refused += 1
             if self._refused >= self._settings.refusals:
+                misled = self._gyro_used or self._gyro_refused >= self._settings.refusals
                 self.restart()
+                self._gyro_refused = self._settings.refusals if misled else 0
                 self.restarts += 1
             return False
         self._refused = 0
+        self._correct(np.asarray(gain), innovation, FIELD)
+        return True
+
+    def measure_rate(self, rate: FloatArray) -> None:
+        """Accept a gyro's rate (3,) rad/s of now where it says more than the filter knows.
+
+        Its error is a bias: used more often it would narrow the filter's claim to less than that bias. One
+        that contradicts the field several times in a row, or after which the field's predictions failed, is
+        not used again before `restart`.
+        """
+        settings, covariance = self._settings, self._covariance
+        if self._rate is None or self._gyro_refused >= settings.refusals or not np.all(np.isfinite(rate)):
+            return
+        if float(covariance.diagonal()[RATE].max()) <= settings.gyro_sigma**2:
+            return
+        spread = covariance[RATE, RATE] + settings.gyro_sigma**2 * np.eye(3)
+        innovation = rate - np.array(self._rate)
+        if not float(innovation @ np.linalg.solve(spread, innovation)) <= self._gate:
+            self._gyro_refused += 1
+            return
+        self._gyro_refused, self._gyro_used = 0, True
+        self._correct(np.asarray(np.linalg.solve(spread, covariance[RATE]).T), innovation, RATE)
+
+    def _correct(self, gain: FloatArray, innovation: FloatArray, measured: slice) -> None:
+        """Correct the state by a gain (12, 3) and an innovation (3,) of the states `measured`."""
+        assert self._rate is not None
         change = (gain @ innovation).tolist()
         self._rate = _sum(self._rate, change[RATE])
         self._field = _sum(self._field, change[FIELD])
         self._change = _sum(self._change, change[CHANGE])
         self._turn_axes(self._inertia, change[AXES])
-        covariance = covariance - gain @ covariance[FIELD]
+        covariance = self._covariance - gain @ self._covariance[measured]
         self._covariance = 0.5 * (covariance + covariance.T)
-        return True
 
     def _start(self, field: FloatArray) -> None:
         """Begin with the rate across the field from three samples in a row that agree; else wait for more."""

@@ -68,9 +68,9 @@ _FACTS: tuple[tuple[str, Level], ...] = (
     ("gps-poor", "warning"),
     ("strings-lost", "warning"),
     ("sun-unclear", "warning"),
-    ("wide-lost", "warning"),
     ("clock-off", "warning"),
     ("field-refused", "warning"),
+    ("wide-lost", "warning"),
 )
 """The facts that monitors keep, in the order of `flight.loop.fdir.facts`, as grave as their events."""
 FACTS: States = tuple((bit, name) for bit, (name, _) in enumerate(_FACTS))

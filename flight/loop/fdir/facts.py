@@ -83,9 +83,9 @@ GPS_LOST = Fact("gps-lost", events.GPS_LOST, events.GPS_RECOVERED)
 GPS_POOR = Fact("gps-poor", events.STREAM_POOR, events.STREAM_GOOD, after=4, mended_after=8)
 STRINGS_LOST = Fact("strings-lost", events.STRINGS_LOST, events.STRINGS_RECOVERED)
 SUN_UNCLEAR = Fact("sun-unclear", events.SUN_UNCLEAR, events.SUN_CLEAR, after=3, mended_after=3)
-WIDE_LOST = Fact("wide-lost", events.WIDE_LOST, events.WIDE_RECOVERED)
 CLOCK_OFF = Fact("clock-off", events.CLOCK_OFF, after=2)
 FIELD_REFUSED = Fact("field-refused", events.FIELD_REFUSED, events.FIELD_TRUSTED)
+WIDE_LOST = Fact("wide-lost", events.WIDE_LOST, events.WIDE_RECOVERED)
 
 FACTS: tuple[Fact, ...] = tuple(value for value in dict(vars()).values() if isinstance(value, Fact))
 

@@ -42,6 +42,7 @@ class ImagingSettings:
         exposures: how long to expose at a rate.
         fine_rest_ns: while the attitude is fine no exposure begins sooner after the last, but where
         seeks: returns that an object is looked for.
+        calm: returns when, from a time on, an exposure of a length begins that meets no step of the coils.
         late_ns: age after the exposure from which a frame is late.
         max_rate: rad/s of the body, beyond which no exposure is begun.
         slow_ns: processing time from which vision is slow.
@@ -68,6 +69,7 @@ class ImagingSettings:
     velocity: Callable[[int], FloatArray | None]
     knowledge: Callable[[], Knowledge]
     seeks: Callable[[], bool]
+    calm: Callable[[int, int], int]
     objects: SightSettings | None = None
     kept: KeptFrames | None = None
 

@@ -54,6 +54,7 @@ class Imaging:
         self._last_checksum: int | None = None
         self._last_frame_ns = 0
         self._triggered_ns = -settings.fine_rest_ns
+        self._ordered: tuple[int, int] | None = None  # the begin and the length, ns, of an exposure to come
         self._due_ns: int | None = None  # when the frame of the oldest open trigger is due
         self._rows = RepeatedRows()
         self._busy_since_ns = 0
@@ -74,9 +75,10 @@ class Imaging:
         self._last_frame_ns = time_ns
 
     def trigger(self, cycle: Cycle) -> None:
-        """Start an exposure: the task of the camera's rate group.
+        """Order an exposure: the task of the camera's rate group.
 
-        Not while the body turns too fast for one, and seldom while the attitude is fine.
+        Not while the body turns too fast for one, and seldom while the attitude is fine. It begins where no
+        step of the coils falls within: a rate is one rate then.
         """
         if self._navigation.speed > self._settings.max_rate:
             self._last_frame_ns = cycle.start_ns
@@ -86,20 +88,28 @@ class Imaging:
         fine = self._settings.knowledge() is Knowledge.FINE and not self._settings.seeks()
         if rested_ns < self._settings.fine_rest_ns and fine:
             return
-        self._triggered_ns = cycle.start_ns
-        exposure_ns = self._measurer.exposure_ns(cycle.start_ns)
+        self._triggered_ns = now_ns = cycle.start_ns
+        exposure_ns = self._measurer.exposure_ns(now_ns)
+        self._ordered = self._settings.calm(now_ns, exposure_ns), exposure_ns
+        self._expose(now_ns)
+
+    def _expose(self, now_ns: int) -> None:
+        """Start the exposure that is ordered, when its time has come."""
+        if self._ordered is None or now_ns < self._ordered[0]:
+            return
+        (_, exposure_ns), self._ordered = self._ordered, None
         try:
             self._camera.trigger(exposure_ns)
         except DeviceError as error:
-            self._facts.update(facts.CAMERA_LOST, True, cycle.start_ns, str(error))
+            self._facts.update(facts.CAMERA_LOST, True, now_ns, str(error))
             return
         if self._due_ns is None:
             # A free-running camera first completes the exposure in progress.
-            patience_ns = 2 * exposure_ns + self._settings.late_ns
-            self._due_ns = cycle.start_ns + patience_ns
+            self._due_ns = now_ns + 2 * exposure_ns + self._settings.late_ns
 
     def serve(self, now_ns: int) -> None:
-        """Check the camera; pass a new frame to the worker."""
+        """Start what is ordered and due; check the camera; pass a new frame to the worker."""
+        self._expose(now_ns)
         self._look_at_worker(now_ns)
         frame = self._poll(now_ns)
         age_ns = now_ns - self._last_frame_ns

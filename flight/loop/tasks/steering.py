@@ -63,10 +63,10 @@ class Steering:
         self._body.brake.begin(now_ns)
 
     def brake(self, readings: Sequence[ImuReading], heard: bool, now_ns: int) -> Steered:
-        """Detumble in this cycle, by the magnetometer alone; `heard`: its newest reading is fresh enough."""
+        """Detumble in this cycle; `heard`: its newest reading is fresh enough."""
         brake = self._body.brake
         for reading in readings:
-            brake.sample(reading.time_ns, reading.field)
+            brake.sample(reading.time_ns, reading.field, reading.rate)
         text = "braking again" if heard else "no reading fresh enough to brake by: coils to zero"
         self._facts.update(facts.CONTROL_LOST, not heard, now_ns, text)
         state, dipole = SteeringState.OFF, _NO_DIPOLE

@@ -100,20 +100,20 @@ def _row(arc: float, results: list[Result]) -> Result:
 def _pass(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
     """Return the states (6,) of observer and object in the middle of a pass."""
     while True:
-        own = _circular(rng, rng.normal(size=3), float(rng.uniform(6.75e6, 7.6e6)), 1.0)
+        own = circular(rng, rng.normal(size=3), float(rng.uniform(6.75e6, 7.6e6)), 1.0)
         direction = rng.normal(size=3)
         direction /= np.linalg.norm(direction)
         away = 10.0 ** rng.uniform(5.0, 6.48)
         place = own[:3] + away * direction
         radius = float(np.linalg.norm(place))
-        other = _circular(rng, place, radius, float(rng.uniform(0.985, 1.02)))
+        other = circular(rng, place, radius, float(rng.uniform(0.985, 1.02)))
         relative = other[3:] - own[3:]
         rate = np.degrees(np.linalg.norm(np.cross(direction, relative))) / away
         if 6.7e6 < radius < 9e6 and 0.05 < rate < 0.6:
             return own, other
 
 
-def _circular(rng: np.random.Generator, place: FloatArray, radius: float, speed: float) -> FloatArray:
+def circular(rng: np.random.Generator, place: FloatArray, radius: float, speed: float) -> FloatArray:
     """Return a state over `place`, across it, at a speed over the circular one."""
     up = place / np.linalg.norm(place)
     ahead = np.cross(up, rng.normal(size=3))
@@ -126,13 +126,13 @@ def _flown(state: FloatArray, times: FloatArray, middle: int) -> FloatArray:
     parts = []
     for sense in (times[middle::-1], times[middle:]):
         found = solve_ivp(
-            _flow, (sense[0], sense[-1]), state, t_eval=sense, method="DOP853", rtol=1e-12, atol=1e-6
+            flow, (sense[0], sense[-1]), state, t_eval=sense, method="DOP853", rtol=1e-12, atol=1e-6
         )
         parts.append(found.y.T)
     return np.concatenate([parts[0][:0:-1], parts[1]])
 
 
-def _flow(_: float, state: FloatArray) -> FloatArray:
+def flow(_: float, state: FloatArray) -> FloatArray:
     x, y, z = state[:3]
     square = x * x + y * y + z * z
     flat = 1.5 * FLATTENING * EQUATOR**2 / square

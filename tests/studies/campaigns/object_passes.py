@@ -177,7 +177,9 @@ def _nees(line: LineOfSight, true: FloatArray, velocity: FloatArray) -> list[flo
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
     """Return a row for each magnitude."""
-    lines = ["V      found/passes  frames seen   error, claim, bound px (rms)   NEES of 2: direction, rate"]
+    lines = [
+        "V      found/passes  frames seen   error, claim, bound px (rms)   NEES of 2: place, direction, rate"
+    ]
     rows = []
     for magnitude in MAGNITUDES:
         own = [result for result in results if result["magnitude"] == magnitude]
@@ -188,10 +190,12 @@ def summarise(results: Sequence[Result], _: Path) -> Summary:
         for name in ("error", "claim", "bound"):
             row[name] = math.sqrt(float(np.mean([frame[name] ** 2 for frame in seen]))) if seen else None
         row["nees"] = np.mean(made, axis=0).tolist() if made else None
+        off = [2.0 * (frame["error"] / frame["claim"]) ** 2 for frame in seen]
+        row["sighting_nees"] = float(np.mean(off)) if off else None
         rows.append(row)
         if seen and made:
             figures = ", ".join(f"{row[name]:.3f}" for name in ("error", "claim", "bound"))
-            nees = ", ".join(f"{value:.2f}" for value in row["nees"])
+            nees = ", ".join(f"{value:.2f}" for value in (row["sighting_nees"], *row["nees"]))
             share = f"{row['seen']}/{row['frames']}"
             lines.append(f"{magnitude:3.1f}    {len(made)}/{len(own)}    {share:>10}    {figures}    {nees}")
     empty = [result for result in results if result["magnitude"] is None]

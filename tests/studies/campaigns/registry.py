@@ -19,6 +19,7 @@ from tests.studies.campaigns.installer_kill import INSTALLER_KILL
 from tests.studies.campaigns.lost_in_space import LOST_IN_SPACE
 from tests.studies.campaigns.mismatch import MISMATCH, VIBRATION
 from tests.studies.campaigns.nadir import NADIR
+from tests.studies.campaigns.object_flights import OBJECT_FLIGHTS
 from tests.studies.campaigns.object_passes import OBJECT_PASSES
 from tests.studies.campaigns.orbit_attitude import ORBIT_ATTITUDE
 from tests.studies.campaigns.orbit_faults import ORBIT_FAULTS
@@ -52,6 +53,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         RSO_ORBITS,
         FIRST_ORBITS,
         OBJECT_PASSES,
+        OBJECT_FLIGHTS,
         CONSISTENCY,
         LOST_IN_SPACE,
         NADIR,

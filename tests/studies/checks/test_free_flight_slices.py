@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from tests.studies.campaigns import detumble, orbit_pointing
 from tests.studies.campaigns.campaign import Case
 
@@ -13,7 +15,8 @@ CASE = {"craft": "knightcube", "orbit": "sso"}
 def test_a_tumbling_knightcube_stops_and_the_table_says_when(tmp_path: Path) -> None:
     result = detumble.run(Case("a", (20_261_123, 0), {**CASE, "law": "attitude", "speed": 0.014}))
     assert not result["lost"]
-    assert result["seconds"] < 200.0
+    assert result["seconds"] < 400.0
+    assert result["fastest_deg"] < 1.05 * np.degrees(0.014), "a slow body is never made faster"
     found = detumble.summarise([result], tmp_path)
     assert found.facts["knightcube/attitude"]["worst"] == result["seconds"]
     assert "knightcube" in found.text
@@ -24,7 +27,7 @@ def test_the_magnetometer_alone_knows_the_rate_that_the_coils_brake() -> None:
     result = detumble.run(Case("m", (20_261_123, 1), wanted))
     assert result["lost"], "40 s are too short"
     assert result["square"] > 0.0
-    assert result["rate"] < 0.2
+    assert result["rate"] < 0.25, "what lies along the field is first spun up across it"
 
 
 def test_a_body_that_did_not_stop_is_counted_as_lost(tmp_path: Path) -> None:

@@ -1,22 +1,34 @@
-"""Detumbling of a free satellite by its magnetometer alone.
+"""Detumbling of a free satellite by its magnetometer, with gyro and attitude where they are known.
 
 The coils' own field swamps the magnetometer, so the coils pause: off to settle, off to measure, then on. From
 the samples of the pauses a filter follows the body's whole rate and how the field turns among the stars
-(`flight.gnc.estimation.field_rate`), and the momentum plan brakes with the field turned ahead at that speed.
-Unlike B-dot the law cannot get stuck with the spin along the field: the plan holds what lies along the field
-until the field has turned. One sample starts nothing: the coils wait until `TRUSTED` samples in a row agree
-with the filter's prediction.
+(`flight.gnc.estimation.field_rate`); a gyro tells it the rate along the field at once. The momentum plan
+brakes in the field expected ahead: that of the orbit where the attitude is known, else the measured one,
+turned on at its present speed. Unlike B-dot the law cannot get stuck with the spin along the field: the plan
+holds what lies along the field until the field has turned. One sample starts nothing: the coils wait until
+`TRUSTED` samples in a row agree with the filter's prediction.
+
+In the least time a spin along the field is first made faster, across the field. `gentle` and `spin_up` bound
+that: at the bound no dipole is commanded that makes the body faster. A bound at the rate of the begin costs
+time: such a spin is then stopped only once the field has turned by a right angle.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from flight.gnc.control.detumble import WindowSchedule
-from flight.gnc.control.three_axes.momentum import MomentumPlan, braking_dipole, momentum_plan, turning_field
+from flight.gnc.control.three_axes.momentum import (
+    MomentumPlan,
+    braking_dipole,
+    momentum_plan,
+    turning_field,
+    without_gain,
+)
 from flight.gnc.errors import UsageError
 from flight.gnc.estimation.field_rate import RATE, FieldRate, FieldRateSettings
 from flight.gnc.math.arrays import FloatArray
@@ -25,6 +37,8 @@ from flight.gnc.math.quaternion import attitude_matrix, conjugate, multiply
 TRUSTED = 4
 """Samples in a row that agree, before the coils act."""
 INSTANTS = 150
+KNOWN = 2e-3
+"""rad/s, standard deviation of the rate's worst axis from which on it is bounded."""
 _SECOND = 1e-9
 _NO_DIPOLE: FloatArray = np.zeros(3)
 
@@ -37,26 +51,46 @@ class FieldBraking:
         limit: A m^2 of each coil.
         horizon: s, how far the field is turned ahead; a quarter of an orbit.
         replan: s, between plans.
+        gentle: rad/s; a body braked from below is never made faster than it was when the braking began.
+        spin_up: times its first rate that a faster body may reach.
     """
 
     limit: float
     horizon: float = 1500.0
     replan: float = 5.0
+    gentle: float = 0.052
+    spin_up: float = 2.0
 
     def __post_init__(self) -> None:
         """Raise UsageError for constants that do not brake."""
-        for name in ("limit", "horizon", "replan"):
+        for name in ("limit", "horizon", "replan", "gentle", "spin_up"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
                 raise UsageError(f"detumbling {name} is {value}: it must be finite and positive")
+
+    @property
+    def instants(self) -> FloatArray:
+        """The times (n,) s from a plan on at which it needs the field."""
+        return np.asarray(self.horizon / INSTANTS * np.arange(INSTANTS), dtype=float)
 
 
 class FieldDetumbler:
     """Runs the pauses: takes each magnetometer sample and returns the dipole each cycle, in order of time."""
 
-    def __init__(self, schedule: WindowSchedule, braking: FieldBraking, settings: FieldRateSettings) -> None:
+    def __init__(
+        self,
+        schedule: WindowSchedule,
+        braking: FieldBraking,
+        settings: FieldRateSettings,
+        expected: Callable[[int], FloatArray | None] = lambda _: None,
+    ) -> None:
+        """Take the law's constants, and `expected`, the field (n, 3) T at `braking.instants` after a time.
+
+        It is in the body axes of that time; None while attitude or orbit are not known.
+        """
         self._schedule = schedule
         self._braking = braking
+        self._expected = expected
         self._filter = FieldRate(settings)
         self.begin(0)
 
@@ -68,6 +102,7 @@ class FieldDetumbler:
         self._planned_ns = now_ns
         self._planned_turn = _NO_DIPOLE
         self._trusted = 0
+        self._fastest = math.inf
         self._filter.restart()
 
     def listens(self, time_ns: int) -> bool:
@@ -77,8 +112,11 @@ class FieldDetumbler:
         inside = schedule.settle_ns <= phase_ns < schedule.settle_ns + schedule.measure_ns
         return time_ns >= self._begun_ns and inside
 
-    def sample(self, time_ns: int, field: FloatArray) -> None:
-        """Accept a field (3,) T measured at `time_ns`; ignored unless the coils were off and settled."""
+    def sample(self, time_ns: int, field: FloatArray, rate: FloatArray | None = None) -> None:
+        """Accept a field (3,) T measured at `time_ns`; ignored unless the coils were off and settled.
+
+        `rate` (3,) rad/s is a gyro's of the same time.
+        """
         if not self.listens(time_ns) or time_ns < self._time_ns:
             return
         self._advance(time_ns)
@@ -86,6 +124,8 @@ class FieldDetumbler:
         accepted = self._filter.measure(field)
         if accepted and self._filter.started:
             self._trusted += 1
+            if rate is not None and self.trusted:
+                self._filter.measure_rate(rate)
         elif not accepted and (self._trusted < TRUSTED or self._filter.restarts != starts):
             self._trusted = 0
             self._plan = None
@@ -139,9 +179,16 @@ class FieldDetumbler:
         if self._plan is None or (now_ns - self._planned_ns) * _SECOND >= braking.replan:
             share = self._schedule.act_ns / self._schedule.period_ns
             step = braking.horizon / INSTANTS
-            ahead = turning_field(found.field, found.change, step, INSTANTS)
+            ahead = self._expected(now_ns)
+            if ahead is None:
+                ahead = turning_field(found.field, found.change, step, INSTANTS)
             self._plan = momentum_plan(found.momentum, ahead, step, share * braking.limit)
             self._planned_ns, self._planned_turn = now_ns, found.turn
         # The plan is fixed among the stars: into the body's axes of now.
         since = attitude_matrix(multiply(found.turn, conjugate(self._planned_turn)))
-        return braking_dipole(since @ self._plan.costate, found.field, braking.limit)
+        dipole = braking_dipole(since @ self._plan.braking, found.field, braking.limit)
+        rate = found.rate
+        speed = math.sqrt(float(rate @ rate))
+        if math.isinf(self._fastest) and self.rate_sigma < KNOWN:
+            self._fastest = speed * (braking.spin_up if speed > braking.gentle else 1.0)
+        return without_gain(dipole, found.field, rate, found.inverse) if speed >= self._fastest else dipole

@@ -22,18 +22,29 @@ from flight.gnc.math.arrays import FloatArray
 ITERATIONS = 12
 MISSING = 0.04
 """A plan may leave this share of the momentum: it is made again long before its end."""
-LIMIT_GAIN = 1.25
+LIMIT_GAIN = 1.4
 """Mean reach of three coils over the limit of one, in a body that turns; were all saturated, 1.5."""
+STEEP = 4.0
+"""Raises the dipole of a long plan before it is cut: the least time takes coils at their limits."""
 FINENESS = 30
 """The horizon is found within a thirtieth."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MomentumPlan:
-    """A plan: `costate` (3,) A m^2/T, inertial axes, and the `horizon`, s, at whose end the body stands."""
+    """A plan: `costate` (3,) A m^2/T, inertial axes, and the `horizon`, s, at whose end the body stands.
+
+    `ends`: whether the horizon is the shortest there is, so that the coils need not be at their limits.
+    """
 
     costate: FloatArray
     horizon: float
+    ends: bool = False
+
+    @property
+    def braking(self) -> FloatArray:
+        """The costate (3,) to brake by now."""
+        return self.costate if self.ends else STEEP * self.costate
 
 
 def momentum_plan(momentum: FloatArray, field: FloatArray, step: float, limit: float) -> MomentumPlan:
@@ -57,7 +68,7 @@ def momentum_plan(momentum: FloatArray, field: FloatArray, step: float, limit: f
             costate, long = found, middle
         else:
             short = middle
-    return MomentumPlan(costate, long * step)
+    return MomentumPlan(costate, long * step, long <= 3)
 
 
 def braking_dipole(costate: FloatArray, field: FloatArray, limit: float) -> FloatArray:
@@ -66,6 +77,20 @@ def braking_dipole(costate: FloatArray, field: FloatArray, limit: float) -> Floa
     Cutting each coil alone takes nothing from the others: each removes momentum by itself.
     """
     return np.clip(-cross_product(field, costate), -limit, limit)
+
+
+def without_gain(dipole: FloatArray, field: FloatArray, rate: FloatArray, inverse: FloatArray) -> FloatArray:
+    """Return the dipole (3,) without the part whose torque makes a body faster.
+
+    `rate` (3,) rad/s, `inverse` (3, 3) of the inertia, body axes. No coil gets more than the largest had.
+    """
+    grows = cross_product(field, inverse @ rate)  # of |rate|^2 / 2 by A m^2
+    gained, square = float(dipole @ grows), float(grows @ grows)
+    if gained <= 0.0 or square == 0.0:
+        return dipole
+    left = dipole - grows * (gained / square)
+    largest, before = float(np.abs(left).max()), float(np.abs(dipole).max())
+    return left if largest <= before else left * (before / largest)
 
 
 def turning_field(field: FloatArray, change: FloatArray, step: float, instants: int) -> FloatArray:

@@ -37,9 +37,10 @@ class Kept:
     That cosine is a quadratic form of the attitude.
     """
 
-    def __init__(self, cones: tuple[Cone, ...], margin: float, times: FloatArray) -> None:
-        """`margin` rad is added to each cone, for the way between the `times` (n,) s."""
-        self._limits = np.cos([min(max(cone.angle + margin, 0.0), np.pi) for cone in cones])
+    def __init__(self, cones: tuple[Cone, ...], margin: FloatArray, times: FloatArray) -> None:
+        """`margin` rad, of all or (cones, n), is added for the way between the `times` (n,) s."""
+        angles = np.array([cone.angle for cone in cones]).reshape(-1, 1) + margin
+        self._limits = np.cos(np.clip(angles, 0.0, np.pi))
         self.count, size = len(cones), len(times)
         found = [
             -shown_curvature(np.broadcast_to(cone.axis, (size, 3)), cone.direction(times)) for cone in cones
@@ -49,7 +50,7 @@ class Kept:
 
     def values(self, q: FloatArray) -> FloatArray:
         """Return g (cones, n) at attitudes (n, 4)."""
-        return np.asarray(self._limits[:, None] + 0.5 * np.sum(self.slopes(q) * q, axis=2))
+        return np.asarray(self._limits + 0.5 * np.sum(self.slopes(q) * q, axis=2))
 
     def slopes(self, q: FloatArray) -> FloatArray:
         """Return the derivative (cones, n, 4) by the attitude."""

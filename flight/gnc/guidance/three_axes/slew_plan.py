@@ -8,7 +8,7 @@ heat, J. Pure and deterministic.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -19,6 +19,10 @@ from flight.gnc.guidance.three_axes.slew_path import SlewPath
 from flight.gnc.guidance.three_axes.slew_search import Search
 from flight.gnc.guidance.three_axes.slew_solver import Found
 from flight.gnc.guidance.three_axes.slew_task import SlewTask, check
+from flight.gnc.math.arrays import FloatArray
+
+_DENSE = 8
+"""Places between two of a path's nodes and midpoints where cones are looked at."""
 
 
 class SlewStatus(StrEnum):
@@ -54,30 +58,54 @@ def plan_slew(task: SlewTask) -> SlewPlan:
     """Return the best plan found. Raises PlanningError with the reason when there is none."""
     check(task)
     search = Search(task)
-    found = search.best()
-    while found is not None:
-        plan = _plan(task, search, found)
-        if all(clear >= 0.0 for clear in plan.clearance):
-            return plan
-        found = search.widened(found, -min(plan.clearance))
-    raise PlanningError(
-        f"no slew within the dipole's limit{' and outside the cones' * bool(task.cones)} was found over "
-        f"{task.horizon:g} to {task.longest:g} s, from {search.tried} guesses"
-    )
+    plan = _first(task, search)
+    if plan is None:
+        raise PlanningError(_refusal(task, search.tried))
+    return plan
 
 
-def _plan(task: SlewTask, search: Search, found: Found) -> SlewPlan:
-    """Return the plan that flies a path. Raises PlanningError when the path is not finite."""
+def _first(task: SlewTask, search: Search) -> SlewPlan | None:
+    """Return the plan of the first path that keeps the cones between the nodes, too; None without one."""
+    for path in search.paths():
+        found: Found | None = path
+        while found is not None:
+            plan = _plan(task, search, found)
+            if plan is None:
+                break
+            if all(clear >= 0.0 for clear in plan.clearance):
+                return plan
+            found = search.widened(found, _depths(task, plan.path))
+    return None
+
+
+def _refusal(task: SlewTask, tried: int) -> str:
+    """Return why a task is refused: which cone is in the way, where it is one, and what may help."""
+    text = f"no slew within the dipole's limit{' and outside the cones' * bool(task.cones)} was found"
+    barring = []
+    for cone in task.cones:
+        without = replace(task, cones=tuple(other for other in task.cones if other is not cone))
+        if _first(without, Search(without)) is not None:
+            barring.append(f"the cone of the {cone.name}")
+    if barring:
+        text += f" ({' or '.join(barring)} is in the way: one is found without)"
+    text += f" over {task.horizon:g} to {task.longest:g} s, from {tried} guesses"
+    return f"{text}: a longer time or another begin may do"
+
+
+def _plan(task: SlewTask, search: Search, found: Found) -> SlewPlan | None:
+    """Return the plan that flies a path; None where an integrator does not lead along it."""
     equations, scale = found.equations, found.equations.scale
-    at = closed(task.craft, search.solver.unit, task.along, found.program, found.point)
+    try:
+        at = closed(task.craft, search.solver.unit, task.along, found.program, found.point)
+    except PlanningError:
+        return None
     flow = equations.motion.flow(at.states, at.all_dipoles())
     q = at.states[:, :4] / np.linalg.norm(at.states[:, :4], axis=1, keepdims=True)
     dipole = search.solver.unit * at.all_dipoles()
     path = SlewPath(equations.times, q, at.states[:, 4:] / scale, flow[:, 4:] / scale**2, dipole)
     if not all(np.isfinite(part).all() for part in (path.quaternion, path.rate, path.dipole)):
-        raise PlanningError("the optimiser returned a path that is not finite")
-    dense = np.linspace(0.0, path.horizon, 16 * task.nodes + 1)
-    shown = path.references(dense).quaternion
+        return None
+    clear = _clearances(task, path)
     kept = task.time_price is not None or path.horizon <= task.horizon * (1.0 + 1e-6)
     return SlewPlan(
         path,
@@ -86,6 +114,19 @@ def _plan(task: SlewTask, search: Search, found: Found) -> SlewPlan:
         path.horizon,
         search.solver.energy(found),
         float((np.abs(path.dipole) / task.craft.limit).max()),
-        tuple(float(cone.clearance(shown, dense).min()) for cone in task.cones),
+        tuple(clear.min(axis=1).tolist()),
         search.solver.steps,
     )
+
+
+def _clearances(task: SlewTask, path: SlewPath) -> FloatArray:
+    """Return how far outside each cone (cones, n) rad a path is, `_DENSE` times between two points."""
+    dense = np.linspace(0.0, path.horizon, 2 * _DENSE * task.nodes + 1)
+    shown = path.references(dense).quaternion
+    return np.array([cone.clearance(shown, dense) for cone in task.cones]).reshape(-1, len(dense))
+
+
+def _depths(task: SlewTask, path: SlewPath) -> FloatArray:
+    """Return how deep within each cone (cones, 2 nodes) rad a path is between each two points."""
+    inside = np.maximum(-_clearances(task, path), 0.0)
+    return np.asarray(inside[:, 1:].reshape(len(inside), -1, _DENSE).max(axis=2))

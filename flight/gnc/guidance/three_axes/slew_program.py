@@ -28,6 +28,7 @@ _HEAVIER = 1.2
 _FAR = 0.03
 """Sum of all equations' violations beyond which their curvature is left out."""
 _CONVEX = 1e-3, 1e4
+_FIRST_BARRIER = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,52 +77,28 @@ class Program:
         self._primal = np.concatenate([place.states.ravel(), place.dipoles.ravel()])
         self.steps = 0
 
-    def minimise(
-        self,
-        guess: Trajectory,
-        price: FloatArray | None = None,
-        barrier: float = 1e-3,
-        last: float = 1e-8,
-        most: int = 60,
-    ) -> Point | None:
-        """Return the optimum found from a guess within `most` steps, None when there is none.
-
-        Barriers fall from `barrier` to `last`. Costs should be about one. `price` (size,) are multipliers of
-        the equations.
-        """
-        values = self._limits.values(guess)
-        slack = np.maximum(values, 1e-2)
-        price = np.zeros(self.equations.layout.size) if price is None else price
-        point = self._point(guess, price, slack, barrier / slack)
-        barrier, convex = (barrier if slack.size else 0.0), 0.0
-        for _ in range(most):
-            error = self._error(point, barrier)
-            while error < 10.0 * barrier and barrier > last:
-                barrier = max(last, min(0.2 * barrier, barrier**1.5))
-                error = self._error(point, barrier)
-            if error < max(_TOLERANCE, 10.0 * last):
-                return point
-            self.steps += 1
-            try:
-                moved, convex = self._moved(point, barrier, convex, error)
-            except PlanningError:
-                return None
-            if moved is None:
-                return None
-            point = moved
-        return None
-
     def factors(self, point: Point) -> Factors:
         """Return the factors of the equations of optimality at a point. Raises PlanningError."""
         stiff = self._limits.stiffness(point.at, point.dual / point.slack, point.dual)
         return Factors(self.equations.band(point.linear, point.price, *stiff))
+
+    def begin(self, guess: Trajectory, price: FloatArray | None, barrier: float) -> Point:
+        """Return a guess as an iterate of Newton's method."""
+        slack = np.maximum(self._limits.values(guess), 1e-2)
+        price = np.zeros(self.equations.layout.size) if price is None else price
+        return self._point(guess, price, slack, barrier / slack)
+
+    def lack(self, point: Point) -> tuple[float, float]:
+        """Return the sum of all equations' violations, and of what the limits' slacks are off."""
+        off = self._limits.values(point.at) - point.slack
+        return float(np.abs(point.slope[self._equal]).sum()), float(np.abs(off).sum())
 
     def _point(self, at: Trajectory, price: FloatArray, slack: FloatArray, dual: FloatArray) -> Point:
         equations = self.equations
         linear = equations.linear(at)
         return Point(linear, price, slack, dual, equations.slope(linear, price))
 
-    def _error(self, point: Point, barrier: float) -> float:
+    def error(self, point: Point, barrier: float) -> float:
         """Return the largest remainder of the equations of optimality at a barrier."""
         worst = float(np.abs(point.slope - self._limits.pull(point.at, point.dual)).max())
         if point.slack.size:
@@ -129,9 +106,9 @@ class Program:
             worst = max(worst, float(np.abs(point.slack * point.dual - barrier).max()))
         return worst
 
-    def _moved(self, point: Point, barrier: float, convex: float, error: float) -> tuple[Point | None, float]:
+    def moved(self, point: Point, barrier: float, convex: float, error: float) -> tuple[Point | None, float]:
         """Return the next iterate, None without one, and the convexity that it took."""
-        is_far = float(np.abs(point.slope[self._equal]).sum()) > _FAR
+        is_far = self.lack(point)[0] > _FAR
         bent = np.zeros_like(point.dual) if is_far else point.dual
         stiffness = self._limits.stiffness(point.at, point.dual / point.slack, bent)
         price = np.zeros_like(point.price) if is_far else point.price
@@ -192,7 +169,7 @@ class Program:
                     price = point.price.copy()
                     price[equal] += size * step.change[equal]
                     moved = self._point(there, price, slack, dual)
-                    if lowered or self._error(moved, barrier) < 0.9 * error:
+                    if lowered or self.error(moved, barrier) < 0.9 * error:
                         return moved
             size *= 0.5
         return None
@@ -213,6 +190,52 @@ class Program:
         """Return cost and barriers plus `weight` times the violation of all equations."""
         violation = float(np.abs(missed).sum() + np.abs(self._limits.values(at) - slack).sum())
         return self.equations.cost(at) + weight * violation - barrier * float(np.log(slack).sum())
+
+
+class Descent:
+    """Newton's method under way from a guess: it can be left and gone on with.
+
+    Attributes:
+        point: the newest iterate.
+        is_over: there is an optimum, or no way on.
+    """
+
+    def __init__(
+        self, program: Program, guess: Trajectory, price: FloatArray | None = None, last: float = 1e-8
+    ) -> None:
+        """Costs should be about one. `price` (size,) multiplies the equations; barriers fall to `last`."""
+        self.program, self._last, self.is_over = program, last, False
+        self.point = program.begin(guess, price, _FIRST_BARRIER)
+        self._barrier, self._convex = (_FIRST_BARRIER if self.point.slack.size else 0.0), 0.0
+
+    @property
+    def lack(self) -> float:
+        """The sum of all violations; zero from where the barriers have begun to fall."""
+        return 0.0 if 0.0 < self._barrier < _FIRST_BARRIER else sum(self.program.lack(self.point))
+
+    def run(self, most: int) -> Point | None:
+        """Return the optimum found within `most` more steps, None when there is none."""
+        if self.is_over:
+            return None
+        program, last = self.program, self._last
+        for _ in range(most):
+            error = program.error(self.point, self._barrier)
+            while error < 10.0 * self._barrier and self._barrier > last:
+                self._barrier = max(last, min(0.2 * self._barrier, self._barrier**1.5))
+                error = program.error(self.point, self._barrier)
+            self.is_over = error < max(_TOLERANCE, 10.0 * last)
+            if self.is_over:
+                return self.point
+            program.steps += 1
+            try:
+                moved, self._convex = program.moved(self.point, self._barrier, self._convex, error)
+            except PlanningError:
+                moved = None
+            if moved is None:
+                self.is_over = True
+                return None
+            self.point = moved
+        return None
 
 
 def _share(values: FloatArray, change: FloatArray) -> float:

@@ -18,7 +18,8 @@ class SightSettings:
         significance: least counts of an area over the noise of its pixels.
         clearance: px from the nearest catalogue star, beside half the area's own length.
         floor: px, standard deviation along an axis that no brightness betters (campaign `object-passes`).
-        streak_sigma: px, of the middle of an object's streak among streaks, along an axis.
+        centre_sigma: px, the same of a centre of light, where the pixels could not be fitted.
+        streak_sigma: px, of the middle of an object's streak by its ends, likewise.
         most: sightings of a frame, the brightest.
     """
 
@@ -26,7 +27,8 @@ class SightSettings:
     faintest: float = 7.0
     significance: float = 25.0
     clearance: float = 4.0
-    floor: float = 0.02
+    floor: float = 0.002
+    centre_sigma: float = 0.05
     streak_sigma: float = 0.1
     most: int = 16
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -28,20 +29,34 @@ def detumbler() -> FieldDetumbler:
     return FieldDetumbler(SCHEDULE, FieldBraking(limit=LIMIT), noise)
 
 
-def fly(rate: FloatArray, seconds: float, spikes: float = 0.0) -> float:
-    """Return the speed (rad/s) at the end."""
+def fly(
+    rate: FloatArray,
+    seconds: float,
+    spikes: float = 0.0,
+    gyro: Callable[[FloatArray], FloatArray] | None = None,
+    sooner: float = 1.0,
+) -> FloatArray:
+    """Return the speed (n,) rad/s of each cycle; `gyro` makes its reading of the rate.
+
+    The field turns by `sooner` times what it does in orbit.
+    """
     law, rng = detumbler(), np.random.default_rng(4)
+    speeds = []
     law.begin(0)
     attitude, dipole = IDENTITY, np.zeros(3)
     dt = 1e-9 * CYCLE_NS
     for cycle in range(round(seconds / dt)):
         now_ns = cycle * CYCLE_NS
-        field = attitude_matrix(attitude) @ attitude_matrix(from_rotation_vector(TURN * cycle * dt)).T @ FIELD
+        field = (
+            attitude_matrix(attitude)
+            @ attitude_matrix(from_rotation_vector(sooner * TURN * cycle * dt)).T
+            @ FIELD
+        )
         sample = field + OWN_FIELD * dipole + 1e-7 * rng.standard_normal(3)
         if rng.uniform() < spikes:
             sample = sample + 1e-4 * rng.standard_normal(3)
         law.dipole(now_ns)
-        law.sample(now_ns, sample)
+        law.sample(now_ns, sample, None if gyro is None else gyro(rate))
         dipole = law.dipole(now_ns)
         assert np.abs(dipole).max() <= LIMIT * (1.0 + 1e-12)
         momentum = INERTIA @ rate
@@ -51,12 +66,41 @@ def fly(rate: FloatArray, seconds: float, spikes: float = 0.0) -> float:
         torque = np.cross(dipole, field) - np.cross(middle, INERTIA @ middle)
         rate = rate + dt * np.linalg.solve(INERTIA, torque)
         attitude = multiply(from_rotation_vector(dt * middle), attitude)
-    return float(np.linalg.norm(rate))
+        speeds.append(float(np.linalg.norm(rate)))
+    return np.array(speeds)
 
 
 def test_a_spin_along_the_field_is_braked_as_the_field_turns_and_spiked_samples_do_not_mislead() -> None:
     """B-dot takes 2,000 s and more. The plan makes the momentum cross the field, so the speed grows first."""
-    assert fly(np.array([0.0, 0.0, 0.03]), 250.0, spikes=0.1) < math.radians(1.0)
+    assert fly(np.array([0.0, 0.0, 0.03]), 250.0, spikes=0.1)[-1] < math.radians(1.0)
+
+
+BIAS = np.array([4e-4, -3e-4, 5e-4])
+"""rad/s, of the gyro."""
+
+
+def test_with_a_gyro_a_slow_spin_along_the_field_is_never_made_faster() -> None:
+    """The field turns by a right angle in 178 s; in the least time the body would be spun up five times."""
+    speeds = fly(np.array([0.001, 0.0, 0.02]), 260.0, sooner=4.0, gyro=lambda rate: rate + BIAS)
+    assert speeds.max() < 1.1 * speeds[0]
+    assert speeds[-1] < math.radians(0.5)
+
+
+def test_with_a_gyro_a_fast_spin_along_the_field_is_stopped_soon_at_twice_its_rate() -> None:
+    speeds = fly(np.array([0.0, 0.0, 0.1]), 380.0, gyro=lambda rate: rate + BIAS)
+    assert 1.5 * speeds[0] < speeds.max() < 2.1 * speeds[0]
+    assert speeds[-1] < math.radians(0.5)
+
+
+def test_a_gyro_that_is_stuck_does_not_mislead() -> None:
+    speeds = fly(np.array([0.1, 0.05, 0.03]), 200.0, gyro=lambda _: np.zeros(3))
+    assert speeds[-1] < 0.5 * speeds[0]
+
+
+def test_a_spin_of_a_turn_in_two_seconds_is_braked() -> None:
+    """Half a turn from pause to pause, where B-dot brakes no more: the samples of one pause show the rate."""
+    speeds = fly(np.array([2.0, -2.4, 0.3]), 60.0)
+    assert speeds[-1] < 0.95 * speeds[0]
 
 
 def test_no_dipole_in_the_pause_nor_before_enough_samples_agree() -> None:

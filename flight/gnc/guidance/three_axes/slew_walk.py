@@ -1,0 +1,169 @@
+"""From a slew's path without limits to one within them: cones that grow, and walks to shorter horizons."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import numpy as np
+
+from flight.gnc.guidance.three_axes.slew_solver import LAST_BARRIER, WALK_BARRIER, Found, Solver, transferred
+from flight.gnc.guidance.three_axes.slew_task import SlewTask
+from flight.gnc.math.arrays import FloatArray
+
+ENOUGH = 3
+"""Paths without limits of which the best is taken."""
+LONGER = 1.0, 1.4, 2.0, 2.8
+"""Times a horizon that does not suffice."""
+_FIRST_STEP, _COARSE_STEP, _LAST_STEP = 1.2, 1.02, 1.004
+"""Ratios of horizons on the walk to a shorter one; from the second on the grid is the fine one."""
+_CROSSED = 1.3
+"""Times the depth to which a path crosses a cone between the points, the cone is widened there."""
+_BEYOND = math.radians(0.02)
+"""rad, by which it is widened besides."""
+_GROWING = 0.25, 1.5, 0.06
+"""Share of the depth to which a path crosses a cone, by which that cone grows at first; the ratio to the next
+share; the least one."""
+_DEEP = math.radians(5.0)
+"""rad within a cone: from deeper the cones grow first."""
+_BETWEEN = 16
+"""Intervals of a path from which the fine grid is reached where it is not from the coarse one."""
+_PEAK = 0.9
+"""Of the limit: the dipole of the slew at which the walk begins."""
+
+
+class Walker:
+    """Walks of one task."""
+
+    def __init__(self, task: SlewTask, solver: Solver) -> None:
+        self._task, self._solver = task, solver
+
+    def within(self, start: Found) -> Found | None:
+        """Return the path within the limits, on the fine grid, near a coarse one without."""
+        solver, nodes, time = self._solver, self._task.nodes, start.horizon
+        if solver.is_kept(start):
+            equations = solver.equations(time, nodes)
+            fine = solver.free(equations, transferred(start, equations))
+            if fine is not None and solver.is_kept(fine):
+                return fine
+        coarse = self._led(start, time)
+        return None if coarse is None else self._finer(coarse, time, LAST_BARRIER)
+
+    def shortened(self, relaxed: list[Found], least: float, price: float) -> Found | None:
+        """Return the best path on walks to shorter horizons, as long as `price` W makes them cheaper.
+
+        A walk begins where a path without limits just keeps the dipoles', with the path that needs the least
+        time for that.
+        """
+        best: Found | None = None
+        for start in sorted(self.distinct(relaxed), key=self._fastest)[:ENOUGH]:
+            times = self._begins(start, least)
+            ways = (self._led(start, time) for time in times)
+            begun = next(filter(None, ways), None)
+            if begun is None:
+                continue
+            if self._task.cones:
+                begun = self._finer(begun, begun.horizon, WALK_BARRIER) or begun
+            ended = self._walked(begun, least, price, _COARSE_STEP)
+            if best is None or self._value(ended, price) < self._value(best, price):
+                best = ended
+            if best.horizon <= least:
+                break
+        return None if best is None else self._refined(best, least, price)
+
+    def distinct(self, relaxed: list[Found]) -> list[Found]:
+        """Return paths without limits, the cheapest first, each once."""
+        ordered = sorted(relaxed, key=self._solver.energy)
+        costs = [(found.horizon, self._solver.energy(found)) for found in ordered]
+        return ordered[:1] + [
+            found
+            for found, (before, cost) in zip(ordered[1:], pairwise(costs), strict=True)
+            if not np.allclose(cost, before, rtol=1e-4, atol=0.0)
+        ]
+
+    def widened(self, found: Found, depths: FloatArray) -> Found | None:
+        """Return a path near one that crosses cones between the points, None without one.
+
+        `depths` (cones, 2 nodes) rad are those between each two points. The last point stays where it is.
+        """
+        wider = np.where(depths > 0.0, _CROSSED * depths + _BEYOND, 0.0)
+        both = wider.copy()
+        both[:, :-1] = np.maximum(wider[:, :-1], wider[:, 1:])
+        both[:, -1] = 0.0
+        self._solver.extra = self._solver.extra + both
+        return self._solver.limited(found, found.equations.count, found.horizon, LAST_BARRIER)
+
+    def _led(self, start: Found, time: float) -> Found | None:
+        """Return the path within the limits over `time` s that one without limits leads to."""
+        times, q = start.equations.times, start.at.states[:, :4]
+        depth = -min((float(cone.clearance(q, times).min()) for cone in self._task.cones), default=0.0)
+        if depth > _DEEP:
+            return self._grown(start, time, depth) or self._over(start, time)
+        found = self._over(start, time)
+        return self._grown(start, time, depth) if found is None and depth > 0.0 else found
+
+    def _grown(self, start: Found, time: float, depth: float) -> Found | None:
+        """Return the path within the limits as cones grow, from `start`, which is `depth` rad within one."""
+        near, share, wanted = start, 0.0, self._solver.margin
+        step, ratio, least = _GROWING
+        while share < 1.0 and step >= least:
+            tried = min(share + step, 1.0)
+            self._solver.margin = wanted - (1.0 - tried) * depth
+            further = self._over(near, time)
+            if further is None:
+                step *= 0.4
+            else:
+                near, share, step = further, tried, ratio * step
+        self._solver.margin = wanted
+        return near if share == 1.0 else None
+
+    def _refined(self, best: Found, least: float, price: float) -> Found | None:
+        """Return the best path on the fine grid, by a walk that begins with a coarse one."""
+        times = best.horizon * np.array([1.0, _COARSE_STEP, _COARSE_STEP**5])
+        longer = (self._finer(best, float(time), WALK_BARRIER) for time in times)
+        fine = next(filter(None, longer), None)
+        if fine is None:
+            return None
+        fine = self._walked(fine, least, price, _LAST_STEP)
+        return self._solver.limited(fine, self._task.nodes, fine.horizon, LAST_BARRIER) or fine
+
+    def _finer(self, coarse: Found, time: float, last: float) -> Found | None:
+        """Return a coarse path on the fine grid, over `time` s."""
+        nodes, solver = self._task.nodes, self._solver
+        fine = solver.limited(coarse, nodes, time, last)
+        if fine is None and nodes > _BETWEEN:
+            middle = solver.limited(coarse, _BETWEEN, time, WALK_BARRIER)
+            fine = None if middle is None else solver.limited(middle, nodes, time, last)
+        return fine
+
+    def _walked(self, best: Found, least: float, price: float, last: float) -> Found:
+        """Return the best path on a walk to shorter horizons, to a ratio `last` of one without a better."""
+        failed = 0.0
+        while best.horizon > max(least, last * failed):
+            time = max(best.horizon / _FIRST_STEP, least, math.sqrt(best.horizon * failed))
+            further = self._over(best, time)
+            if further is not None and self._value(further, price) < self._value(best, price):
+                best = further
+            else:
+                failed = time
+        return best
+
+    def _fastest(self, found: Found) -> float:
+        """Return about which horizon a path without limits takes for its dipoles to keep theirs, s."""
+        return found.horizon * math.sqrt(self._solver.peak(found) / _PEAK)
+
+    def _begins(self, start: Found, least: float) -> list[float]:
+        """Return horizons at which a walk may begin from a path without limits, s, the shortest first."""
+        time = max(self._fastest(start), least)
+        times = [time, start.horizon] if time < start.horizon else [longer * time for longer in LONGER]
+        if start.horizon == self._task.horizon and self._task.time_price is None and start.horizon in times:
+            times.remove(start.horizon)  # it was tried
+        return [each for each in times if each <= self._task.longest]
+
+    def _value(self, found: Found, price: float) -> float:
+        """Return what a path costs, J; s where time alone counts."""
+        return found.horizon if math.isinf(price) else self._solver.energy(found) + price * found.horizon
+
+    def _over(self, start: Found, time: float) -> Found | None:
+        """Return the path of least energy within the limits over `time` s, from one over another horizon."""
+        return self._solver.limited(start, start.equations.count, time, WALK_BARRIER)

@@ -1,0 +1,117 @@
+"""Rates from streaks during a slew: `python -m tests.studies.bench slew_frames [--as-they-come]`.
+
+The 3U of `config/orbit_3u.yaml` is released near rest, holds its attitude and slews by 100 deg in 300 s or
+more, a frame every 5 s, through the whole loop. Exposures keep clear of the coils' steps, or begin whenever
+the camera's turn comes. Rates are compared with the truth's mean over their exposures.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from flight.bodies.orbit.body import ORBIT
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import from_rotation_vector, multiply
+from flight.link.telemetry.packets import to_text
+from flight.loop.body import Body, BodyKind
+from flight.loop.services import Services
+from flight.loop.state.content import Learned
+from flight.schema import reader as configuration
+from flight.schema.orbit import OrbitConfig, TargetStep, as_orbit
+from flight.schema.sections import Config
+from ground.telemetry.reader import Run
+from sim_hal.settings import Simulation
+from tests.scenario.flights import fly
+from tests.scenario.test_orbit_navigation import skyward
+
+CONFIG = Path(__file__).resolve().parents[3] / "config" / "orbit_3u.yaml"
+SPEED = 5e-4
+"""rad/s, at the release."""
+BEGIN, SLEW, TURN = 60.0, 300.0, np.radians(100.0)
+"""s and s and rad, of the slew."""
+
+
+def _as_they_come(config: Config, services: Services, learned: Mapping[str, Learned]) -> Body:
+    """Return the satellite with exposures whenever the camera's turn comes."""
+    return replace(ORBIT.make(config, services, learned), calm=lambda begin_ns, _: begin_ns)
+
+
+AS_THEY_COME = BodyKind(ORBIT.plan, _as_they_come)
+
+
+def flight(body: str, seed: int) -> tuple[OrbitConfig, Simulation]:
+    """Return the configuration and the world of a flight."""
+    text = CONFIG.read_text(encoding="utf-8")
+    config = as_orbit(configuration.parse(text))
+    section = configuration.simulation_section(text, CONFIG.name, Simulation)
+    assert section is not None
+    assert section.free_body is not None
+    assert config.camera is not None
+    away = skyward().free_body
+    assert away is not None
+    assert away.release.attitude is not None
+    start = away.release.attitude
+    rng = np.random.default_rng(seed)
+    axis = rng.normal(size=3)
+    end = multiply(from_rotation_vector(TURN * axis / np.linalg.norm(axis)), np.array(start))
+    x, y, z, w = end.tolist()
+    release = configuration.replace(section.free_body.release, attitude=start, speed=SPEED)
+    world = configuration.replace(
+        section, seed=seed, free_body=configuration.replace(section.free_body, release=release)
+    )
+    return configuration.replace(
+        config,
+        body=body,
+        duration=BEGIN + SLEW + 10.0,
+        camera=configuration.replace(config.camera, fine_period=None),
+        detumble=configuration.replace(config.detumble, low_rate=0.0175, low_for=0.5),
+        pointing=configuration.replace(config.pointing, slew=SLEW),
+        targets=(
+            TargetStep(at=0.0, point="inertial", quaternion=start),
+            TargetStep(at=BEGIN, point="inertial", quaternion=(x, y, z, w)),
+        ),
+    ), world
+
+
+def compared(run: Run) -> tuple[int, int, int, FloatArray]:
+    """Return how many frames the slew had, with a rate, used; and the rates' NEES of an axis (n,)."""
+    frames, truth = run["streak"], run["truth"]
+    times, rates = truth["time_ns"] * 1e-9, truth["rate"].astype(float)
+    began = frames["exposure_start_ns"] * 1e-9
+    within = (began > BEGIN + 5.0) & (began < BEGIN + SLEW)
+    found = []
+    for frame in frames[within]:
+        if to_text(frame["status"]) != "rate":
+            continue
+        begin = float(frame["exposure_start_ns"]) * 1e-9
+        at = np.linspace(begin, begin + float(frame["exposure"]), 201)
+        mean = np.mean([np.interp(at, times, part) for part in rates.T], axis=1)
+        xx, yy, zz, xy, xz, yz = frame["covariance"].astype(float)
+        covariance = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        error = frame["rate"].astype(float) - mean
+        found.append(error @ np.linalg.solve(covariance, error) / 3.0)
+    return int(within.sum()), len(found), int(frames["accepted"][within].sum()), np.array(found)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print the figures; return the exit status."""
+    parser = argparse.ArgumentParser(prog="python -m tests.studies.bench slew_frames", description=__doc__)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--as-they-come", action="store_true", help="exposures may meet the coils' steps")
+    options = parser.parse_args(arguments)
+    body = f"{__name__}:AS_THEY_COME" if options.as_they_come else "orbit"
+    with tempfile.TemporaryDirectory() as folder:
+        config, world = flight(body, options.seed)
+        count, rated, used, nees = compared(fly(config, Path(folder), section=world))
+    sys.stdout.write(
+        f"{count} frames, {rated} with a rate, {used} used; NEES of an axis: "
+        f"mean {np.mean(nees):.2f}, median {np.median(nees):.2f}, largest {np.max(nees):.1f}\n"
+    )
+    return 0

@@ -1,0 +1,209 @@
+"""One flight of campaign `object-flights`: a craft that looks for an object and follows it.
+
+The flight is that of `orbit_pointing_flight`: filter, planner's job and pointing law. What is pointed to is
+decided by the flight's own `ObjectAim` from the flight's own `Tracker`. A frame each two seconds gives an
+attitude of the stars and a sighting, two seconds late, as is the planner's table; the sightings are drawn
+with the errors and the share that rendered frames have (campaign `object-passes`). The object falls on an
+orbit of its own, integrated by DOP853.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from flight.bodies.orbit.object_aim import ObjectAim, Sensor
+from flight.gnc.control.three_axes import pointing_job
+from flight.gnc.control.three_axes.pointing_job import PointingJob
+from flight.gnc.control.three_axes.pointing_table import PointingTable
+from flight.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.directions import tangent_basis
+from flight.gnc.math.quaternion import attitude_matrix, from_matrix, from_rotation_vector
+from flight.gnc.tracking.sightings import Sightings
+from flight.gnc.tracking.tracker import Tracker, TrackSettings
+from flight.link.events import EventKind
+from flight.loop.fdir.event_log import EventLog
+from sim_hal.worlds.free_body.section import TipOff
+from tests.studies.campaigns.first_orbits import circular, flow
+from tests.studies.campaigns.free_flight import FreeFlight
+from tests.studies.campaigns.orbit_pointing_flight import CYCLE, STAR_SIGMA, PointingFlight
+
+NEAREST, END = 120.0, 210.0
+"""s: when the object turns the line of sight by the rate that was drawn, and when the flight ends."""
+FIELD = np.radians(10.0)
+"""rad from the boresight to the nearest edge, of 512 px over 20 deg."""
+PIXEL = 2.0 * FIELD / 512
+FASTEST, DEAR = np.radians(1.0), 0.8
+"""rad/s of no path that is flown (`fastest_rate` of orbit_object.yaml), and the part of it that is dear."""
+SIGHTING = {
+    2.0: (0.027, 0.020, 0.9),
+    3.0: (0.017, 0.020, 0.9),
+    4.0: (0.007, 0.020, 0.9),
+    5.0: (0.014, 0.021, 0.9),
+    6.0: (0.033, 0.025, 0.9),
+}
+"""By magnitude: px of error and claim, and the share of frames that show the object (`object-passes`)."""
+GAP = 10.0
+"""s without the object, in the flights that have it."""
+BORESIGHT: FloatArray = np.array([0.0, -1.0, 0.0])
+
+
+class ObjectChase(PointingFlight):
+    """A flight after an object.
+
+    Attributes:
+        told: names of the events; `refused`: how many tables turned the body too fast to be flown.
+        notes: each cycle the time, rad from the boresight to the object, the body's rate about the boresight
+            and its whole rate, rad/s, the number of the followed track, and whether the frame showed it.
+        shown, directions, fields: boresight (3,), true direction (3,) and field (3,) T, of each cycle, ICRS.
+    """
+
+    def __init__(self, wanted: dict[str, Any], seed: int) -> None:
+        """`wanted`: craft, orbit, share of the worst disturbances, rate_deg, magnitude, gap (s or None)."""
+        self._draw = np.random.default_rng([seed, 23])
+        super().__init__({**wanted, "law": "whole", "target": PointingTarget(Goal.OBJECT)}, seed)
+        self.told: list[str] = []
+        self.refused = 0
+        self.shown: list[FloatArray] = []
+        self.directions: list[FloatArray] = []
+        self.fields: list[FloatArray] = []
+        self._aim = ObjectAim(Sensor(BORESIGHT, FIELD), self.flight.limit, EventLog(self._tell))
+        self._aim.aim(PointingTarget(Goal.OBJECT))
+        self._tracker = Tracker(TrackSettings())
+        self._frame: Sightings | None = None
+        self._table: tuple[PointingTable, PointingJob, float] | None = None
+
+    def fly(self) -> None:
+        """Fly to the end."""
+        for k in range(round(END / CYCLE)):
+            self.cycle(k * CYCLE)
+
+    def direction(self, time: float) -> FloatArray:
+        """Return the true direction (3,) of the object now, `time` s."""
+        place = self._state(time)[:3] - self.flight.body.orbit_truth().position
+        return np.asarray(place / np.linalg.norm(place))
+
+    def _state(self, time: float) -> FloatArray:
+        """Return the object's state (6,) m and m/s at a time."""
+        return np.asarray((self._before if time < NEAREST else self._after)(time))
+
+    def _release(self, held: FreeFlight) -> TipOff:
+        """Return the release at rest, the boresight where the object will pass."""
+        ahead, near = held.ephemeris(END), np.array([NEAREST])
+        own = np.concatenate([ahead.position_at(near)[0], ahead.velocity_at(near)[0]])
+        other = self._passing(own)
+        spans = (NEAREST, 0.0), (NEAREST, END)
+        back, on = (
+            solve_ivp(flow, span, other, method="DOP853", rtol=1e-11, atol=1e-4, dense_output=True).sol
+            for span in spans
+        )
+        self._before, self._after = back, on
+        early = NEAREST - self._draw.uniform(30.0, 60.0)
+        place = self._state(early)[:3] - ahead.position_at(np.array([early]))[0]
+        place = place / np.linalg.norm(place)
+        aside = np.radians(self._draw.uniform(-4.0, 4.0, 2)) @ tangent_basis(place)
+        place = (place + aside) / np.linalg.norm(place + aside)
+        rolled = attitude_matrix(from_rotation_vector(self._draw.uniform(0.0, 2.0 * np.pi) * BORESIGHT))
+        x, z = tangent_basis(place)
+        y = -place
+        sense = np.sign(np.dot(np.cross(x, y), z))
+        qx, qy, qz, qw = from_matrix(rolled @ np.array([x, y, sense * z])).tolist()
+        return TipOff(rate=(0.0, 0.0, 0.0), attitude=(qx, qy, qz, qw))
+
+    def _passing(self, own: FloatArray) -> FloatArray:
+        """Return the state (6,) of an object at its nearest whose line of sight turns by the wanted rate."""
+        rng, wanted = self._draw, self._wanted["rate_deg"]
+        while True:
+            direction = rng.normal(size=3)
+            direction /= np.linalg.norm(direction)
+            away = 10.0 ** rng.uniform(5.0, 6.48)
+            place = own[:3] + away * direction
+            radius = float(np.linalg.norm(place))
+            other = circular(rng, place, radius, float(rng.uniform(0.985, 1.02)))
+            relative = (other[3:] - own[3:]) / away
+            rate, closing = np.linalg.norm(np.cross(direction, relative)), abs(direction @ relative)
+            if 6.7e6 < radius < 9e6 and abs(np.degrees(rate) / wanted - 1.0) < 0.05 and closing < 0.2 * rate:
+                return other
+
+    def cycle(self, time: float) -> None:
+        """Fly one cycle: what the frame and the planner of the last one gave comes first."""
+        if self._frame is not None:
+            self._tracker.ingest(self._frame)
+            self._aim.accept(self._tracker.objects, self.flight.time_ns)
+        if self._table is not None:
+            table, job, begun = self._table
+            self._table = None
+            if np.linalg.norm(table.path.rate, axis=1).max() < FASTEST:
+                self._aim.judge(job, table, self.flight.time_ns)
+                self._fly(table, begun)
+            else:
+                self.refused += 1
+        if self._law is not None and self._aim.moved:
+            self._plan(time)
+        super().cycle(time)
+
+    def _plan(self, time: float) -> None:
+        job = self._aim.directed(self._job())
+        table = pointing_job.run(job)
+        if self._law is None:
+            self._fly(table, time)
+        else:
+            self._table = table, job, time
+
+    def _job(self) -> PointingJob:
+        job = super()._job()
+        weights = replace(job.weights, fastest=DEAR * FASTEST)
+        return replace(job, origin_ns=self.flight.time_ns, weights=weights)
+
+    def _note(self, time: float, square: float) -> None:
+        """Leave the notes to the frames."""
+
+    def _see_stars(self, time: float) -> None:
+        """Give the filter the attitude of the frame of a cycle ago; expose the next frame."""
+        if self._stars is not None:
+            self._filter.attitude(self._stars, STAR_SIGMA**2 * np.eye(3), CYCLE)
+        self._stars = self.flight.attitude(STAR_SIGMA)
+        motion, true = self.flight.motion, self.direction(time)
+        place = attitude_matrix(motion.quaternion) @ true
+        shown = attitude_matrix(motion.quaternion).T @ BORESIGHT
+        _, claim, share = SIGHTING[self._wanted["magnitude"]]
+        gap = self._wanted["gap"]
+        hidden = gap is not None and gap <= time < gap + GAP
+        # The square field, its rows along x.
+        inside = place @ BORESIGHT > 0.0 and np.abs(place[[0, 2]]).max() < np.tan(FIELD) * (place @ BORESIGHT)
+        seen = bool(inside and not hidden and self._draw.random() < share)
+        self._frame = self._sightings(true, claim, seen)
+        off = float(np.arccos(np.clip(shown @ true, -1.0, 1.0)))
+        rate = motion.rate
+        followed = next((track.number for track in self._tracker.objects), 0)
+        self.shown.append(shown)
+        self.directions.append(true)
+        self.fields.append(attitude_matrix(motion.quaternion).T @ motion.field_body)
+        self.notes.append(
+            [time, off, float(rate @ BORESIGHT), float(np.linalg.norm(rate)), followed, float(seen)]
+        )
+
+    def _sightings(self, true: FloatArray, claim: float, seen: bool) -> Sightings:
+        """Return a frame with the object, or without."""
+        draw, magnitude = self._draw, self._wanted["magnitude"]
+        basis, error = tangent_basis(true), SIGHTING[magnitude][0]
+        off = PIXEL * error * draw.normal(size=2) @ basis
+        turn = np.cross(STAR_SIGMA * draw.normal(size=3), true)
+        direction = true + off + turn
+        direction /= np.linalg.norm(direction)
+        spread = (PIXEL * claim) ** 2 * basis.T @ basis
+        shown = slice(0, 1 if seen else 0)
+        return Sightings(
+            self.flight.time_ns,
+            direction[None][shown],
+            spread[None][shown],
+            np.array([magnitude + 0.05 * draw.normal()])[shown],
+            STAR_SIGMA**2 * np.eye(3),
+        )
+
+    def _tell(self, kind: EventKind, _time_ns: int, _held: int, _text: str) -> None:
+        self.told.append(kind.name)

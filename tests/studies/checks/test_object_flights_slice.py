@@ -1,0 +1,44 @@
+"""A slice of the campaign of flights after objects: the bound by hand, and a flight kept in the field."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.studies.campaigns.campaign import Case
+from tests.studies.campaigns.object_authority import least_deviation
+from tests.studies.campaigns.object_flights import OBJECT_FLIGHTS, cases, run
+
+
+@pytest.mark.parametrize("lean", [0.0, np.radians(30.0)])
+def test_the_bound_is_that_of_a_catch_up_by_hand(lean: float) -> None:
+    """An object passes at w = 0.3 deg/s; a body at rest with a = 0.012 deg/s^2 falls behind by w^2 / 2 a.
+
+    It begins 1 deg before the boresight, which gains that. A field that leans to the axis of the turn leaves
+    the cosine of the authority.
+    """
+    rate, authority, step = np.radians(0.3), np.radians(0.012), 0.5
+    times = np.arange(0.0, 60.0, step)
+    angle = rate * times - np.radians(1.0)
+    directions = np.stack([np.cos(angle), np.sin(angle), np.zeros(len(times))], axis=1)
+    field = np.tile([np.cos(lean), 0.0, np.sin(lean)], (len(times), 1))
+    least = least_deviation(step, directions, np.array([1.0, 0.0, 0.0]), field, authority, np.radians(5.0))
+    # About z by torques across a field in the plane of x and z.
+    expected = rate**2 / (2.0 * authority * np.cos(lean)) - np.radians(1.0)
+    assert least == pytest.approx(max(expected, np.radians(1.0)), rel=0.06)
+
+
+def test_a_slow_object_is_kept_through_ten_seconds_without_it(tmp_path: Path) -> None:
+    wanted = {"craft": "cubesat_3u", "orbit": "sso", "share": 0.3, "band": 0, "magnitude": 4.0, "gap": 60.0}
+    found = run(Case("slow", (5, 0, 0), wanted))
+    assert found["found"] <= 20.0
+    assert found["could"]
+    assert found["kept"]
+    assert found["same"]
+    assert found["end"] < 0.5
+    assert found["most"] >= found["least"] - 0.1
+    json.dumps(OBJECT_FLIGHTS.summarise([found], tmp_path).facts, allow_nan=False)
+    assert len({case.key for case in cases(2, 1)}) == 16
