@@ -207,8 +207,8 @@ FIELD_REFUSED = EventKind(
 FIELD_TRUSTED = EventKind(132, "field-trusted", _TOLD, "the magnetometer agrees with the estimate again")
 SLEW_BEGUN = EventKind(108, "slew-begun", _TOLD, "a slew of least heat to the target begins")
 SLEW_ENDED = EventKind(109, "slew-ended", _TOLD, "a slew is over: the target is pointed to from now on")
-WIDE_LOST = EventKind(110, "wide-lost", _WARNED, "a wide camera gives no frames")
-WIDE_RECOVERED = EventKind(111, "wide-recovered", _TOLD, "all wide cameras give frames again")
+WIDE_LOST = EventKind(133, "wide-lost", _WARNED, "a wide camera gives no frames")
+WIDE_RECOVERED = EventKind(134, "wide-recovered", _TOLD, "all wide cameras give frames again")
 
 OBJECT_FOUND = EventKind(120, "object-found", _TOLD, "a track of an object that is no star is confirmed")
 OBJECT_LOST = EventKind(

@@ -44,6 +44,7 @@ ORBIT_OWN: Mapping[str, frozenset[str]] = {
     "magnetometer": frozenset({"imu-refused", "sun-unclear", "field-refused"}),
     "gps": frozenset({"gps-lost", "gps-refused"}),
     "strings": frozenset({"strings-lost", "sun-unclear"}),
+    "wide": frozenset({"wide-lost"}),
     "clock": OWN["clock"] | {"clock-off"},
     "elements": frozenset({"gps-refused", "gps-lost"}),
 }
