@@ -63,10 +63,6 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
     paths = PointingPaths(limit, fastest_rate(config))
     objects = ObjectAim(_sensor(config), limit, services.events)
 
-    def field(estimate: Estimate) -> FloatArray:
-        around = surroundings.at(estimate.time_ns)
-        return np.zeros(3) if around is None else attitude_matrix(estimate.quaternion) @ around.field
-
     def disturbed() -> tuple[FloatArray, FloatArray]:
         return filter_.torque_sizes, filter_.residual_dipole
 
@@ -82,7 +78,7 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
         brake=brake,
         coil_watch=_coil_watch(config),
         view=OrbitView(brake, filter_, surroundings, services),
-        field=field,
+        field=_field(surroundings),
         free_axis=None,
         dipole_per_ampere=dipole_per_ampere,
         angular_acceleration_psd=(config.detumble.torque_noise) ** 2,
@@ -98,6 +94,16 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
 
 
 ORBIT = BodyKind(pointing_job.run, make)
+
+
+def _field(surroundings: Surroundings) -> Callable[[Estimate], FloatArray]:
+    """Return what tells the field (3,) T in body axes at an estimate; zero while the place is not known."""
+
+    def field(estimate: Estimate) -> FloatArray:
+        around = surroundings.at(estimate.time_ns)
+        return np.zeros(3) if around is None else attitude_matrix(estimate.quaternion) @ around.field
+
+    return field
 
 
 def _limit(config: OrbitConfig) -> float:
