@@ -71,3 +71,17 @@ def test_the_coils_act_and_pause_for_the_magnetometer(flown: Run) -> None:
     inside = (time > entered(flown, Mode.POINT) + 4.0) & (time < DURATION)
     currents = np.abs(truth["current"][inside]).max(axis=1)
     assert np.mean(currents < 1e-3) == pytest.approx(0.1, abs=0.06)
+
+
+def test_no_step_of_the_coils_falls_into_an_exposure_while_it_points(flown: Run) -> None:
+    packets = flown["attitude"]
+    times, dipoles = packets["time_ns"].astype(np.int64), packets["dipole"]
+    changed = np.abs(np.diff(dipoles, axis=0)).max(axis=1) > 0.0
+    after = times[1:][changed]  # the first packets after steps, a tenth of a second apart
+    frames = flown["streak"][flown["streak"]["exposure_start_ns"] > entered(flown, Mode.POINT) * 1e9]
+    assert len(frames) >= 3
+    assert len(after) > 30
+    for frame in frames:
+        begin = int(frame["exposure_start_ns"])
+        end = begin + round(float(frame["exposure"]) * 1e9)
+        assert not ((after - 100_000_000 >= begin) & (after <= end)).any()

@@ -109,7 +109,6 @@ class Imaging:
 
     def serve(self, now_ns: int) -> None:
         """Start what is ordered and due; check the camera; pass a new frame to the worker."""
-        self._expose(now_ns)
         self._look_at_worker(now_ns)
         frame = self._poll(now_ns)
         age_ns = now_ns - self._last_frame_ns
@@ -207,6 +206,8 @@ class Imaging:
         self._facts.update(facts.VISION_SLOW, taken_ns > self._settings.slow_ns, now_ns, text)
 
     def _poll(self, now_ns: int) -> Frame | None:
+        """Start an exposure that is due; return a frame that has come."""
+        self._expose(now_ns)
         try:
             return self._camera.poll()
         except DeviceError as error:

@@ -142,7 +142,7 @@ def _random(runs: int, seed: int, with_cones: bool) -> int:
             sys.stdout.write(f"{name}: {error}\n")
         else:
             taken.append(time.process_time() - begin)
-            nearest = min(nearest, _clearance(task, found[-1]))
+            nearest = min(nearest, clearance(task, found[-1]))
     stretched = sum(plan.status is SlewStatus.STRETCHED for plan in found)
     sys.stdout.write(f"{len(found)} of {runs} planned, {stretched} of them stretched, {failed} failed\n")
     sys.stdout.write(f"{np.median(taken):.2f} s in the median, {max(taken):.2f} s at most\n")
@@ -153,7 +153,7 @@ def _random(runs: int, seed: int, with_cones: bool) -> int:
     return 0
 
 
-def _clearance(task: SlewTask, plan: SlewPlan) -> float:
+def clearance(task: SlewTask, plan: SlewPlan) -> float:
     """Return how far outside the cones the path stays, rad, sampled twice a second by the bench."""
     times = np.linspace(0.0, plan.horizon, 2 * int(plan.horizon) + 2)
     turned = np.array([matrix(q) for q in plan.path.references(times).quaternion])

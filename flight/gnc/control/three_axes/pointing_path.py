@@ -18,6 +18,7 @@ import numpy as np
 from flight.gnc.control.three_axes.pointing_sweep import Cost, ToGo, linearised, sweep
 from flight.gnc.earth.disturbance import Pressures
 from flight.gnc.earth.figure import GRAVITATIONAL_PARAMETER
+from flight.gnc.errors import PlanningError
 from flight.gnc.guidance.three_axes.attitude_law import References
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.directions import cross_matrices
@@ -161,10 +162,11 @@ class Gains:
 def best_path(expected: Expected, begun: References, criterion: Criterion) -> tuple[Motion, Gains]:
     """Return the path from the begin of `begun` (n + 1,) and its gains; `begun` leads into the law.
 
-    Coils need not manage `begun`. Takes 0.3 ms an instant and sweep.
+    Coils need not manage `begun`. Takes 0.3 ms an instant and sweep. Raises PlanningError where the body
+    turns by too much in a step to be followed.
     """
     rest = Motion(begun.quaternion, begun.rate, np.zeros((len(begun.times) - 1, 4)))
-    first = fly(expected, rest, _swept(expected, rest, criterion, 1.0, given=True), 1.0)
+    first = _first(expected, rest, _swept(expected, rest, criterion, 1.0, given=True))
     near = float(np.abs(_off(expected.wanted, first)[:, :3]).max()) < NEAR
     best, least = first, math.inf
     for rise in RISES:
@@ -179,6 +181,22 @@ def best_path(expected: Expected, begun: References, criterion: Criterion) -> tu
         if near or float(np.abs(off).max()) < SETTLED:
             break
     return best, _swept(expected, best, criterion, PROHIBITIVE)
+
+
+def _first(expected: Expected, rest: Motion, gains: Gains) -> Motion:
+    """Return the motion that the sweeps begin with: under gains, or without control where those drive it out.
+
+    The torque along the field has no limit, so that far from `rest` the gains may turn the body by several
+    revolutions in a step.
+    """
+    nothing = Gains(np.zeros_like(gains.gain), np.zeros_like(gains.steady))
+    with np.errstate(over="ignore", invalid="ignore"):
+        for tried in (gains, nothing):
+            first = fly(expected, rest, tried, 1.0)
+            if np.isfinite(first.rate).all() and np.isfinite(first.quaternion).all():
+                return first
+    fastest = math.degrees(float(np.linalg.norm(rest.rate[0])))
+    raise PlanningError(f"no path: from {fastest:.1f} deg/s on the body turns by too much in a step")
 
 
 def _bettered(expected: Expected, motion: Motion, criterion: Criterion, price: float) -> Motion:

@@ -8,6 +8,7 @@ heat, J. Pure and deterministic.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -58,15 +59,24 @@ def plan_slew(task: SlewTask) -> SlewPlan:
     """Return the best plan found. Raises PlanningError with the reason when there is none."""
     check(task)
     search = Search(task)
-    plan = _first(task, search)
+    plan = _first(task, search, search.paths())
+    barring: list[str] = []
+    for cone in task.cones if plan is None else ():
+        without = Search(replace(task, cones=tuple(other for other in task.cones if other is not cone)))
+        start = next(without.paths(), None)
+        if start is not None:
+            barring.append(f"the cone of the {cone.name}")
+            plan = _first(task, search, search.around(start))
+        if plan is not None:
+            break
     if plan is None:
-        raise PlanningError(_refusal(task, search.tried))
+        raise PlanningError(_refusal(task, search.tried, barring))
     return plan
 
 
-def _first(task: SlewTask, search: Search) -> SlewPlan | None:
+def _first(task: SlewTask, search: Search, paths: Iterator[Found]) -> SlewPlan | None:
     """Return the plan of the first path that keeps the cones between the nodes, too; None without one."""
-    for path in search.paths():
+    for path in paths:
         found: Found | None = path
         while found is not None:
             plan = _plan(task, search, found)
@@ -78,14 +88,9 @@ def _first(task: SlewTask, search: Search) -> SlewPlan | None:
     return None
 
 
-def _refusal(task: SlewTask, tried: int) -> str:
-    """Return why a task is refused: which cone is in the way, where it is one, and what may help."""
+def _refusal(task: SlewTask, tried: int, barring: list[str]) -> str:
+    """Return why a task is refused: which cones are in the way, and what may help."""
     text = f"no slew within the dipole's limit{' and outside the cones' * bool(task.cones)} was found"
-    barring = []
-    for cone in task.cones:
-        without = replace(task, cones=tuple(other for other in task.cones if other is not cone))
-        if _first(without, Search(without)) is not None:
-            barring.append(f"the cone of the {cone.name}")
     if barring:
         text += f" ({' or '.join(barring)} is in the way: one is found without)"
     text += f" over {task.horizon:g} to {task.longest:g} s, from {tried} guesses"
@@ -96,7 +101,8 @@ def _plan(task: SlewTask, search: Search, found: Found) -> SlewPlan | None:
     """Return the plan that flies a path; None where an integrator does not lead along it."""
     equations, scale = found.equations, found.equations.scale
     try:
-        at = closed(task.craft, search.solver.unit, task.along, found.program, found.point)
+        with np.errstate(over="ignore", invalid="ignore"):  # where it leads astray
+            at = closed(task.craft, search.solver.unit, task.along, found.program, found.point)
     except PlanningError:
         return None
     flow = equations.motion.flow(at.states, at.all_dipoles())

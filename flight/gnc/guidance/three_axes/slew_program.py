@@ -217,6 +217,10 @@ class Descent:
         """Return the optimum found within `most` more steps, None when there is none."""
         if self.is_over:
             return None
+        with np.errstate(over="ignore", invalid="ignore"):  # a step too long is shortened
+            return self._run(most)
+
+    def _run(self, most: int) -> Point | None:
         program, last = self.program, self._last
         for _ in range(most):
             error = program.error(self.point, self._barrier)

@@ -30,8 +30,8 @@ _LOOK, _PROMISING = 8, 1.5
 path lack less, three of four that do not lack more (320 guesses, seed 41 of the bench `orbit_slews`)."""
 _PATIENCE = 120
 """Newton steps without a path, after which the other guesses over a horizon are put off."""
-_BUDGET = 1500
-"""Newton steps, about two seconds, after which no other horizon or path without limits is begun with."""
+_BUDGET = 1000
+"""Newton steps, about a second and a half, after which nothing else is begun with."""
 _WIDENED = 4
 """Times at most that cones are widened for a path."""
 
@@ -63,6 +63,13 @@ class Search:
                 continue
             if (found := self._walker.shortened(relaxed, self._task.horizon, LEAST_TIME)) is not None:
                 yield self._fresh(found)
+
+    def around(self, start: Found) -> Iterator[Found]:
+        """Yield the path within all limits near one that keeps all but one cone, where there is one."""
+        self.solver.extra = np.zeros_like(self.solver.extra)
+        led = self._walker.led(start, start.horizon)
+        if led is not None:
+            yield self._fresh(led)
 
     def widened(self, found: Found, depths: FloatArray) -> Found | None:
         """Return a path near one that crosses cones by `depths` (cones, 2 nodes) rad between the points.

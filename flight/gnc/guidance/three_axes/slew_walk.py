@@ -46,7 +46,7 @@ class Walker:
             fine = solver.free(equations, transferred(start, equations))
             if fine is not None and solver.is_kept(fine):
                 return fine
-        coarse = self._led(start, time)
+        coarse = self.led(start, time)
         return None if coarse is None else self._finer(coarse, time, LAST_BARRIER)
 
     def shortened(self, relaxed: list[Found], least: float, price: float) -> Found | None:
@@ -58,7 +58,7 @@ class Walker:
         best: Found | None = None
         for start in sorted(self.distinct(relaxed), key=self._fastest)[:ENOUGH]:
             times = self._begins(start, least)
-            ways = (self._led(start, time) for time in times)
+            ways = (self.led(start, time) for time in times)
             begun = next(filter(None, ways), None)
             if begun is None:
                 continue
@@ -93,7 +93,7 @@ class Walker:
         self._solver.extra = self._solver.extra + both
         return self._solver.limited(found, found.equations.count, found.horizon, LAST_BARRIER)
 
-    def _led(self, start: Found, time: float) -> Found | None:
+    def led(self, start: Found, time: float) -> Found | None:
         """Return the path within the limits over `time` s that one without limits leads to."""
         times, q = start.equations.times, start.at.states[:, :4]
         depth = -min((float(cone.clearance(q, times).min()) for cone in self._task.cones), default=0.0)

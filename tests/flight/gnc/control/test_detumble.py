@@ -187,3 +187,16 @@ def test_a_share_that_does_not_brake_is_refused(share: float) -> None:
 def test_a_window_without_time_to_measure_is_refused() -> None:
     with pytest.raises(UsageError, match="need time"):
         WindowSchedule(0, 0, 1)
+
+
+@pytest.mark.parametrize("length_ms", [20, 40, 100, 99, 300])
+def test_an_exposure_waits_until_no_step_of_the_coils_falls_within(length_ms: int) -> None:
+    """The coils rest for 100 of 250 ms; a command may reach them 50 ms late."""
+    steps = np.arange(0, 2_000, 250)[:, None] + np.array([0, 100])
+    for begin_ms in range(0, 500, 10):
+        found = SCHEDULE.calm(begin_ms * 1_000_000, length_ms * 1_000_000) // 1_000_000
+        if length_ms > 100:
+            assert found == begin_ms  # it cannot be kept clear
+            continue
+        assert begin_ms <= found < begin_ms + 400
+        assert not ((steps + 50 > found) & (steps < found + length_ms)).any()

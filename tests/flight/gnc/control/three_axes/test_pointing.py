@@ -9,7 +9,7 @@ from flight.gnc.control.three_axes.pointing import PointingLaw
 from flight.gnc.control.three_axes.pointing_table import Ahead, PointingTable, PointingWeights, pointing_table
 from flight.gnc.earth.disturbance import AIR, CONSTANT, SIZES, pressures, shapes
 from flight.gnc.earth.figure import GRAVITATIONAL_PARAMETER
-from flight.gnc.errors import UsageError
+from flight.gnc.errors import PlanningError, UsageError
 from flight.gnc.guidance.three_axes.attitude_law import AttitudeLaw, approach, nadir, references, velocity
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import (
@@ -148,3 +148,8 @@ def test_uneven_times_and_a_path_without_preview_are_refused() -> None:
         ahead = Ahead(wanted, begun, field, position, pressed, SIZE)
         with pytest.raises(UsageError, match="even"):
             pointing_table(ahead, INERTIA, LIMIT, WEIGHTS)
+
+
+def test_a_body_that_no_step_can_follow_is_refused_and_gives_no_path_that_is_not_finite() -> None:
+    with pytest.raises(PlanningError, match="too much in a step"):
+        table_from(np.zeros(3), np.array([0.5, 0.4, 0.0]), 30, until=1_000.0)

@@ -12,7 +12,7 @@ from flight.gnc.guidance.three_axes.slew_cones import Cone
 from flight.gnc.guidance.three_axes.slew_ends import Boresight
 from flight.gnc.guidance.three_axes.slew_plan import SlewStatus, plan_slew
 from tests.flight.gnc.guidance.three_axes.recorded_slews import flown, matrix, off_degrees, problem, task_of
-from tests.studies.bench.orbit_slews import slews
+from tests.studies.bench.orbit_slews import clearance, slews
 
 
 @pytest.mark.parametrize(
@@ -62,6 +62,15 @@ def test_a_boresight_with_a_free_roll_reaches_its_direction_and_keeps_out_of_a_c
     around = plan_slew(replace(task, cones=(cone,)))
     assert around.clearance[0] >= 0.0
     assert around.energy > free.energy
+
+
+def test_a_slew_that_the_first_ways_take_through_cones_is_led_around_them() -> None:
+    """Case 0 of `bench orbit_slews --cones --seed 43`: without limits every path goes through one."""
+    (_, task), *_ = slews(1, 43, True)
+    plan = plan_slew(task)
+    assert plan.status is SlewStatus.OPTIMAL
+    assert plan.peak <= 1.001
+    assert clearance(task, plan) >= 0.0
 
 
 def test_tasks_that_no_path_can_fulfil_are_refused_with_the_reason() -> None:
