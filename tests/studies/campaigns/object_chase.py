@@ -47,7 +47,7 @@ SIGHTING = {
 }
 """By magnitude: px of error and claim, and the share of frames that show the object.
 
-Those of centres of light, as rendered frames had them (`object-passes --seed 17`); fitted sightings are closer.
+Those of centres of light, as rendered frames had them (`object-passes --seed 17`); fits are closer.
 """
 GAP = 10.0
 """s without the object, in the flights that have it."""
