@@ -2,7 +2,8 @@
 
 One segment an object: right ascension and declination as measured in each frame that shows it, in ICRS at
 mid-exposure, as stars at rest there would be seen: the camera's aberration is taken off, the object's light
-time is not. The message has no keyword for a standard deviation: a comment gives it.
+time is not. The message has no keyword for a standard deviation, neither of angles nor of MAG: comments give
+them. A frame's MAG is the mean of the last sightings.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from flight.gnc.errors import UsageError
+from flight.gnc.math.arrays import FloatArray
 from flight.link.telemetry.packets import PacketArray
 from ground.telemetry.reader import Run
 
@@ -56,6 +58,7 @@ def _segment(number: int, track: PacketArray, start_ns: int) -> list[str]:
         "META_START",
         f"COMMENT Standard deviation of each angle on the sky {np.median(sigma):.2f} arcsec in the median,",
         f"COMMENT {sigma.min():.2f} to {sigma.max():.2f} arcsec, the attitude's included.",
+        *_of_magnitudes(track["magnitude_sigma"]),
         "COMMENT Stellar aberration of the camera removed, light time not.",
         "TIME_SYSTEM = UTC",
         f"START_TIME = {dates[0]}",
@@ -78,6 +81,17 @@ def _segment(number: int, track: PacketArray, start_ns: int) -> list[str]:
         if math.isfinite(magnitude):
             lines.append(f"MAG = {date} {magnitude:.3f}")
     return [*lines, "DATA_STOP"]
+
+
+def _of_magnitudes(sigma: FloatArray) -> list[str]:
+    """Return the comment on MAG, of standard deviations (n,); none where none is known."""
+    known = sigma[np.isfinite(sigma)]
+    if not len(known):
+        return []
+    return [
+        f"COMMENT Standard deviation of MAG {np.median(known):.3f} in the median, {known.max():.3f} at most:",
+        "COMMENT the scatter of the sightings; what colours of the stars shift all by is not in it.",
+    ]
 
 
 def ccsds_date(utc_ns: int) -> str:

@@ -134,6 +134,29 @@ def _nearest_line(segment: str, zero: datetime) -> int:
     return own
 
 
+def test_the_message_is_read_by_a_reader_of_other_authors(tracked: Run, tmp_path: Path) -> None:
+    """`ccsds-ndm` builds its objects from the schema of the standard, which refuses what is not in it."""
+    reader = pytest.importorskip("ccsds_ndm.ndm_io").NdmIo()
+    (path,) = write_tracking_data(tracked, tmp_path / "track.tdm")
+    segments = reader.from_path(path).body.segment
+    tracks = tracked["track"]
+    measured = tracks[np.all(np.isfinite(tracks["measured"]), axis=1)]
+    assert len(segments) == 2
+    for number, segment in enumerate(segments, 1):
+        own = measured[measured["number"] == number]
+        read = {
+            name: [getattr(one, name).value for one in segment.data.observation if getattr(one, name)]
+            for name in ("angle_1", "angle_2")
+        }
+        right, up = (np.radians(np.array(read[name], dtype=float)) for name in ("angle_1", "angle_2"))
+        seen = np.stack([np.cos(up) * np.cos(right), np.cos(up) * np.sin(right), np.sin(up)], axis=1)
+        np.testing.assert_allclose(seen, own["measured"], atol=1e-9)
+        magnitudes = [float(one.mag) for one in segment.data.observation if one.mag is not None]
+        np.testing.assert_allclose(magnitudes, own["magnitude"], atol=6e-4)
+        told = " ".join(segment.metadata.comment)
+        assert "Standard deviation of MAG" in told
+
+
 def test_a_run_without_a_track_has_no_message(tmp_path: Path) -> None:
     run = fly(demo_config(1.0, camera=False), tmp_path)
     with pytest.raises(UsageError, match="no object was tracked"):

@@ -2,9 +2,8 @@
 
 The flight is that of `orbit_pointing_flight`: filter, planner's job and pointing law. What is pointed to is
 decided by the flight's own `ObjectAim` from the flight's own `Tracker`. A frame each two seconds gives an
-attitude of the stars and a sighting, two seconds late, as is the planner's table; the sightings are drawn
-with the errors and the share that rendered frames have (campaign `object-passes`). The object falls on an
-orbit of its own, integrated by DOP853.
+attitude of the stars and a sighting, two seconds late, as is the planner's table; the sightings are drawn.
+The object falls on an orbit of its own, integrated by DOP853.
 """
 
 from __future__ import annotations
@@ -46,7 +45,10 @@ SIGHTING = {
     5.0: (0.014, 0.021, 0.9),
     6.0: (0.033, 0.025, 0.9),
 }
-"""By magnitude: px of error and claim, and the share of frames that show the object (`object-passes`)."""
+"""By magnitude: px of error and claim, and the share of frames that show the object.
+
+Those of centres of light, as rendered frames had them (`object-passes --seed 17`); fits are closer.
+"""
 GAP = 10.0
 """s without the object, in the flights that have it."""
 BORESIGHT: FloatArray = np.array([0.0, -1.0, 0.0])

@@ -49,13 +49,17 @@ class Shot:
         likelihood = LikelihoodSettings(gain=CAMERA.gain, saturation=top, psf_sigma=CAMERA.psf_sigma)
         tracker = TrackerSettings(SolveSettings(detection=detection), (1.0, 1.0))
         off = from_rotation_vector(np.array([1e-4, -1e-4, 1e-4]))
-        priors = (
-            (RatePrior(self.turn, 1e-4), AttitudePrior(multiply(off, HELD), 1e-4))
-            if self.knows
-            else (None, None)
-        )
+        rate = RatePrior(self.turn, 1e-4) if self.knows else None
+        attitude = AttitudePrior(multiply(off, HELD), 1e-4) if self.knows else None
         job = FrameJob(
-            pixels, CAMERA.pinhole, EXPOSURE, likelihood, tracker, *priors, objects=SightSettings()
+            pixels,
+            CAMERA.pinhole,
+            EXPOSURE,
+            likelihood,
+            tracker,
+            rate,
+            attitude,
+            objects=SightSettings(),
         )
         return run(job)
 
