@@ -155,7 +155,7 @@ class _Flight:
         if report.estimate is None:
             self._notes.append((seconds, float(self._truth.sunlit[k]), *[np.nan] * 7, 0.0))
             return
-        turn, nees = _errors(report.estimate, self._truth.attitudes[k], self._said.gyro_bias[k])
+        turn, nees = errors_of(report.estimate, self._truth.attitudes[k], self._said.gyro_bias[k])
         self._notes.append(
             (
                 seconds,
@@ -180,7 +180,7 @@ class _Flight:
         }
 
 
-def _errors(estimate: Estimate, attitude: FloatArray, bias: FloatArray) -> tuple[FloatArray, float]:
+def errors_of(estimate: Estimate, attitude: FloatArray, bias: FloatArray) -> tuple[FloatArray, float]:
     """Return the attitude's error (3,) rad about the body's axes, and error^T P^-1 error of both."""
     turn = rotation_vector(multiply(attitude, conjugate(estimate.quaternion)))
     error = np.concatenate([turn, bias - estimate.bias])

@@ -23,6 +23,7 @@ from tests.studies.campaigns.object_flights import OBJECT_FLIGHTS
 from tests.studies.campaigns.object_passes import OBJECT_PASSES
 from tests.studies.campaigns.orbit_attitude import ORBIT_ATTITUDE
 from tests.studies.campaigns.orbit_faults import ORBIT_FAULTS
+from tests.studies.campaigns.orbit_frames import ORBIT_FRAMES
 from tests.studies.campaigns.orbit_pointing import ORBIT_POINTING
 from tests.studies.campaigns.orbit_slews import ORBIT_SLEWS
 from tests.studies.campaigns.planner_edge import PLANNER_EDGE
@@ -72,6 +73,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         START,
         COVERAGE,
         ORBIT_ATTITUDE,
+        ORBIT_FRAMES,
         DETUMBLE,
         WORLD_COMPARISON,
         ORBIT_FAULTS,

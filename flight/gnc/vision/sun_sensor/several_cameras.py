@@ -25,6 +25,9 @@ from flight.gnc.vision.sun_sensor.strings import CoarseSun
 _CONTRADICTED = 5.0
 """Standard deviations of the strings by which a camera's Sun may lie off theirs."""
 
+_CUT = np.radians(0.05)
+"""rad an axis, added for a disc that the frame's edge cuts: it is off by the same in frame after frame."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SunOfCameras:
@@ -82,7 +85,9 @@ def sun_of_cameras(
 
 
 def _in_body(sun: SunMeasurement, camera: MountedCamera) -> FloatArray:
-    return np.asarray(camera.to_camera.T @ sun.covariance @ camera.to_camera)
+    across = np.eye(3) - np.outer(sun.direction, sun.direction)
+    covariance = sun.covariance + (_CUT**2 * across if sun.cut else 0.0)
+    return np.asarray(camera.to_camera.T @ covariance @ camera.to_camera)
 
 
 def _contradicts(direction: FloatArray, strings: CoarseSun) -> bool:
