@@ -220,7 +220,7 @@ class Body:
         free_axis: (3,) the only axis about which the body can turn; None for a free body.
         coil_watch: compares commanded currents with supply and motion.
         feed: gives the filter the readings of the inertial unit.
-        brake: brakes a tumble by the magnetometer alone.
+        brake: brakes a tumble by magnetometer and gyro.
         angular_acceleration_psd: rad^2/s^3, density of the body's white angular acceleration.
         knowledge: returns how well the attitude is known now, where there is an estimate.
         velocity: returns the velocity (3,) m/s about the Sun at a time, reference axes, by which starlight is
@@ -229,6 +229,7 @@ class Body:
         sighted: accepts the confirmed tracks of objects after each frame that was searched, at a time.
         place: returns the orbit's state at a time, None while it is not known.
         seeks: returns whether an object is looked for or followed, so that no frame is left out.
+        seeker: turns the body to the Sun without an attitude, in SAFE; None where nothing does.
         sun: accepts a reading of the solar strings; returns why it shows no Sun, empty where it does, None
             where it is not judged.
     """
@@ -255,6 +256,7 @@ class Body:
     sighted: Callable[[Sequence[Track], int], None] = lambda _tracks, _now_ns: None
     place: Callable[[int], OrbitState | None] = lambda _: None
     seeks: Callable[[], bool] = lambda: False
+    seeker: Brake | None = None
 
 
 @dataclass(frozen=True, slots=True)
