@@ -220,6 +220,12 @@ OBJECT_ESCAPES = EventKind(
     123, "object-escapes", _WARNED, "the coils' torque does not suffice to keep an object in the field"
 )
 
+SUN_FOUND = EventKind(140, "sun-found", _TOLD, "in safe mode the Sun is seen, and the body turns to it")
+SUN_MISSED = EventKind(141, "sun-missed", _WARNED, "in safe mode no Sun is seen: the body is only held still")
+ASTRAY = EventKind(
+    142, "astray", _WARNED, "far off its path the body is held still until it is slow, then planned for"
+)
+
 EVENTS: tuple[EventKind, ...] = tuple(
     value for value in dict(vars()).values() if isinstance(value, EventKind)
 )

@@ -11,7 +11,7 @@ class Mode(IntEnum):
     BOOT = 0
     """Coils at zero until the devices give good data."""
     SAFE = 1
-    """Coils at zero, listening."""
+    """Listening, coils at zero; a satellite is braked and turns to the Sun by its solar strings."""
     DETUMBLE = 2
     """The magnetometer's B-dot takes the rate out."""
     HOLD = 3

@@ -238,7 +238,7 @@ class Body:
         free_axis: (3,) the only axis about which the body can turn; None for a free body.
         coil_watch: compares commanded currents with supply and motion.
         feed: gives the filter the readings of the inertial unit.
-        brake: brakes a tumble by the magnetometer alone.
+        brake: brakes a tumble by magnetometer and gyro.
         angular_acceleration_psd: returns the density (3, 3) rad^2/s^3 of the body's white angular
             acceleration at a time, body axes.
         knowledge: returns how well the attitude is known now, where there is an estimate.
@@ -250,6 +250,7 @@ class Body:
         seeks: returns whether an object is looked for or followed, so that no frame is left out.
         wide: makes jobs of the wide cameras' frames and accepts what was found; None: it does not use them.
         calm: returns when, from a time on, an exposure of a length begins that meets no step of the coils.
+        seeker: turns the body to the Sun without an attitude, in SAFE; None where nothing does.
         sun: accepts a reading of the solar strings; returns why it shows no Sun, empty where it does, None
             where it is not judged.
     """
@@ -278,6 +279,7 @@ class Body:
     place: Callable[[int], OrbitState | None] = lambda _: None
     seeks: Callable[[], bool] = lambda: False
     calm: Callable[[int, int], int] = lambda begin_ns, _: begin_ns
+    seeker: Brake | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -52,7 +52,9 @@ class OrbitEstimation(Estimation, frozen=True, kw_only=True):
     """The filter of a satellite in orbit (`flight.gnc.estimation.free_filter`).
 
     `bias_walk` rad/s per sqrt(s), of the gyro's bias; `field_noise` T of an axis of a sample of the
-    magnetometer; `field_error` T of an axis of the field's model.
+    magnetometer; `field_error` T of an axis of the field's model. `torque_start` N m, of each shape of the
+    torques of drag, sunlight and what is constant, before any is learned; `torque_walk` N m per sqrt(s). Of a
+    light craft they are smaller: what is taken for a torque along the field is planned for an hour ahead.
     """
 
     bias_walk: NotNegative = 2.0e-6
@@ -60,6 +62,8 @@ class OrbitEstimation(Estimation, frozen=True, kw_only=True):
     field_error: Positive = 5.0e-8
     gate_sigma: Annotated[float, Meta(ge=3.0)] = 5.0
     history: Positive = 12.0
+    torque_start: Positive = 3.0e-9
+    torque_walk: Positive = 5.0e-12
 
 
 class ExclusionCones(Section, frozen=True, kw_only=True):

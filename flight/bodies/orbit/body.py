@@ -18,6 +18,7 @@ from flight.bodies.orbit.object_aim import ObjectAim, Sensor
 from flight.bodies.orbit.paths import PointingPaths
 from flight.bodies.orbit.planning import PlannedCraft, PointingPlanner
 from flight.bodies.orbit.replay import OrbitFilterSettings
+from flight.bodies.orbit.seeker import StringSeeker
 from flight.bodies.orbit.surroundings import Surroundings
 from flight.bodies.orbit.targets import PointingTargets
 from flight.bodies.orbit.tracker import PointingTracker
@@ -28,6 +29,7 @@ from flight.gnc.control.three_axes import pointing_job
 from flight.gnc.control.three_axes.field_detumbler import FieldBraking, FieldDetumbler
 from flight.gnc.control.three_axes.pointing_table import PointingWeights
 from flight.gnc.control.three_axes.slew_table import SlewWish
+from flight.gnc.control.three_axes.sun_seeker import Seeking, SunSeeker
 from flight.gnc.earth.orbit_knowledge import TwoLineElements
 from flight.gnc.errors import UsageError
 from flight.gnc.estimation.estimate import Estimate
@@ -47,7 +49,9 @@ from flight.loop.state.content import Learned
 from flight.schema.camera_model import camera_model
 from flight.schema.errors import ConfigError
 from flight.schema.orbit import OrbitConfig, as_orbit
+from flight.schema.orbit_devices import SolarStrings as StringsSection
 from flight.schema.sections import Config
+from hal.interfaces.readings import StringReading
 from hal.interfaces.wires import SECOND_NS
 
 _BELOW = 0.8
@@ -61,6 +65,7 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
     limit, dipole_per_ampere = _limit(config), config.craft.dipole_per_ampere
     filter_ = _filter(config, surroundings)
     brake = FieldBrake(_detumbler(config, filter_, surroundings), dipole_per_ampere)
+    seeker = _seeker(config, services)
     paths = PointingPaths(limit, fastest_rate(config))
     sun = _sun(config, filter_, surroundings)
     objects = ObjectAim(_sensor(config), limit, services.events)
@@ -75,19 +80,20 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
         paths=paths,
         planner=PointingPlanner(_planned(config), paths, surroundings, disturbed, objects, services),
         targets=PointingTargets(_timed(config), paths, config.looks_for_objects()),
-        tracker=PointingTracker(filter_, surroundings, _pauses(config), limit, dipole_per_ampere),
+        tracker=_tracker(config, filter_, surroundings),
         feed=OrbitFeed(filter_),
         brake=brake,
         coil_watch=_coil_watch(config),
         view=OrbitView(brake, filter_, surroundings, services),
-        field=lambda estimate: _field(surroundings, estimate),
+        field=lambda estimate: _field(estimate, surroundings),
         free_axis=None,
         dipole_per_ampere=dipole_per_ampere,
         angular_acceleration_psd=filter_.acceleration_psd,
         knowledge=lambda: filter_.knowledge,
         velocity=surroundings.velocity,
         fix=surroundings.fix,
-        sun=(lambda _: None) if sun is None else sun.accept,
+        sun=_read_by(sun, seeker),
+        seeker=seeker,
         wide=wide_feed_of(config.wide_cameras, filter_, surroundings, sun) if config.wide_cameras else None,
         sighted=objects.accept,
         place=surroundings.state,
@@ -99,8 +105,8 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
 ORBIT = BodyKind(pointing_job.run, make)
 
 
-def _field(surroundings: Surroundings, estimate: Estimate) -> FloatArray:
-    """Return the magnetic field (3,) T at an estimate, body axes; zero while the orbit is not known."""
+def _field(estimate: Estimate, surroundings: Surroundings) -> FloatArray:
+    """Return the expected field (3,) T in body axes at an estimate; zero where it is not known."""
     around = surroundings.at(estimate.time_ns)
     return np.zeros(3) if around is None else attitude_matrix(estimate.quaternion) @ around.field
 
@@ -114,6 +120,12 @@ def _pauses(config: OrbitConfig) -> WindowSchedule:
     """Return the windows of pointing: the pauses of detumbling, and longer times to act."""
     settle, measure, act = config.detumble.settle, config.detumble.measure, config.pointing.act
     return WindowSchedule(*(round(seconds * SECOND_NS) for seconds in (settle, measure, act)))
+
+
+def _tracker(config: OrbitConfig, filter_: OrbitFilter, surroundings: Surroundings) -> PointingTracker:
+    craft, pauses = config.craft, _pauses(config)
+    inertia = np.array(craft.inertia)
+    return PointingTracker(filter_, surroundings, pauses, _limit(config), craft.dipole_per_ampere, inertia)
 
 
 def _planned(config: OrbitConfig) -> PlannedCraft:
@@ -170,19 +182,46 @@ def _filter(config: OrbitConfig, surroundings: Surroundings) -> OrbitFilter:
         free=FreeFilterSettings(
             gyro=(section.bias_start, section.bias_walk),
             coil_noise=section.current_noise * craft.dipole_per_ampere / math.sqrt(rate_hz),
+            torque=(section.torque_start, section.torque_walk),
             gate_sigma=section.gate_sigma,
         ),
     )
     return OrbitFilter(settings, surroundings.at)
 
 
+def _strings(section: StringsSection) -> SolarStrings:
+    normals = np.array([string.normal for string in section.strings])
+    return SolarStrings(normals, np.array([string.peak for string in section.strings]))
+
+
 def _sun(config: OrbitConfig, filter_: OrbitFilter, surroundings: Surroundings) -> CoarseSunFeed | None:
     section = config.solar_strings
     if section is None:
         return None
-    normals = np.array([string.normal for string in section.strings])
-    strings = SolarStrings(normals, np.array([string.peak for string in section.strings]))
-    return CoarseSunFeed(strings, round(section.period * SECOND_NS), filter_, surroundings)
+    return CoarseSunFeed(_strings(section), round(section.period * SECOND_NS), filter_, surroundings)
+
+
+def _read_by(sun: CoarseSunFeed | None, seeker: StringSeeker | None) -> Callable[[StringReading], str | None]:
+    """Return what hands the strings' readings to the estimate and to what turns to the Sun in SAFE."""
+    if sun is None or seeker is None:
+        return lambda _: None
+
+    def accept(reading: StringReading) -> str | None:
+        seeker.see(reading)
+        return sun.accept(reading)
+
+    return accept
+
+
+def _seeker(config: OrbitConfig, services: Services) -> StringSeeker | None:
+    """Return what turns the pointing axis to the Sun in SAFE; None without strings."""
+    section, craft = config.solar_strings, config.craft
+    if section is None:
+        return None
+    axis = np.array(config.pointing.axis)
+    seeking = Seeking(inertia=np.array(craft.inertia), axis=axis, limit=_limit(config))
+    seeker = SunSeeker(_pauses(config), seeking)
+    return StringSeeker(seeker, _strings(section), craft.dipole_per_ampere, services.events)
 
 
 def _elements(config: OrbitConfig) -> TwoLineElements | None:

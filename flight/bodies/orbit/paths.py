@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flight.gnc.control.three_axes.astray import Astray
 from flight.gnc.control.three_axes.pointing import PointingLaw
 from flight.gnc.control.three_axes.pointing_table import PointingTable
 from flight.gnc.guidance.three_axes.attitude_law import Reference
@@ -44,6 +45,7 @@ class PointingPaths:
 
     Attributes:
         off: rad, how far the body was off the path at the last command; zero for a new path.
+        astray: whether it is held still because of that.
     """
 
     def __init__(self, limit: float, fastest: float) -> None:
@@ -54,6 +56,7 @@ class PointingPaths:
         self._origin_ns = 0
         self._arrival_ns: int | None = None
         self.off = 0.0
+        self.astray = Astray()
 
     def offer(self, table: PointingTable, target: PointingTarget, origin_ns: int) -> str:
         """Fly a table from now on; return why it is refused, empty when it is flown."""
@@ -66,9 +69,16 @@ class PointingPaths:
             return f"it turns the body at {turn:.2f} deg/s, where {most:.2f} are braked or blind the camera"
         self._law, self._target, self._origin_ns = PointingLaw(table, self._limit), target, origin_ns
         self.off, self._arrival_ns = 0.0, None
+        self.astray.planned()
         if table.slew is not None:
             self._arrival_ns = origin_ns + round((self._law.span[0] + table.slew.horizon) * SECOND_NS)
         return ""
+
+    def led(self, turn: FloatArray, rate: FloatArray, now_ns: int) -> bool:
+        """Take the turn (3,) off the path and the rate (3,); return whether it is flown: not while astray."""
+        self.off = float(np.linalg.norm(turn))
+        self.astray.see(self.off, float(np.linalg.norm(rate)), now_ns / SECOND_NS)
+        return self.astray.since is None
 
     def is_slewing(self, now_ns: int, target: PointingTarget) -> bool:
         """Return whether a slew to a target is flown and not over."""
@@ -106,3 +116,4 @@ class PointingPaths:
     def release(self) -> None:
         """Discard the path."""
         self._law = self._target = self._arrival_ns = None
+        self.astray.planned()

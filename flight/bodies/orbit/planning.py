@@ -31,8 +31,6 @@ from flight.loop.services import Services
 
 AGAIN_NS = 10_000_000_000
 """After a plan that failed, or while no orbit is known, the next is asked for after this time."""
-ASTRAY = math.radians(15.0)
-"""rad off the path: a new one is planned from where the body is."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,7 +65,7 @@ class PointingPlanner:
         self._disturbed, self._objects = disturbed, objects
         self._jobs, self._events = services.jobs, services.events
         self._job: PointingJob | None = None
-        self._wanted = False
+        self._wanted = self._held = False
         self._after_ns = 0
         self._count = self._accepted = self._refused = 0
 
@@ -92,15 +90,19 @@ class PointingPlanner:
 
     def serve(self, estimate: Estimate | None, target: Target, now_ns: int) -> None:
         """Submit the requested job to the worker."""
-        goal, astray = target_of(target), self._paths.off > ASTRAY
+        goal, astray = target_of(target), self._paths.astray
         self._objects.aim(goal)
-        if self._paths.is_slewing(now_ns, goal) and not astray:
+        if astray.since is not None:
+            self._hold_still(now_ns)
+            if not astray.ready:
+                return
+        elif self._paths.is_slewing(now_ns, goal):
             return  # the rest of a slew planned again costs many times its heat
         if self._paths.has_arrived(now_ns):
             text = f"{math.degrees(self._paths.off):.2f} deg off its path"
             self._events.report(events.SLEW_ENDED, now_ns, text)
             self._wanted = True
-        wanted = self._wanted or astray or self._objects.moved
+        wanted = self._wanted or astray.ready or self._objects.moved
         if estimate is None or not wanted or self._job is not None or now_ns < self._after_ns:
             return
         orbit, craft = self._surroundings.state(now_ns), self._craft
@@ -127,6 +129,13 @@ class PointingPlanner:
             self._wanted, self._job, self._count = False, job, job.number
             self._after_ns = now_ns + (AGAIN_NS if job.span is STEADY else 0)
 
+    def _hold_still(self, now_ns: int) -> None:
+        """Report once that the body is held still."""
+        if not self._held:
+            text = f"{math.degrees(self._paths.off):.0f} deg off its path: held still, then planned for"
+            self._events.report(events.ASTRAY, now_ns, text)
+        self._held = True
+
     def finish(self, result: JobResult, now_ns: int) -> None:
         """Fly the worker's plan."""
         job, self._job = self._job, None
@@ -134,10 +143,12 @@ class PointingPlanner:
             return
         if result.outcome != "done":
             self._fail(f"plan {job.number}: {result.outcome}: {result.error}", now_ns)
+        elif self._paths.astray.since is not None and not self._paths.astray.ready:
+            self._wanted = True  # planned before the body went astray: another one once it is slow
         elif reason := self._paths.offer(result.value, job.target, job.origin_ns):
             self._fail(f"plan {job.number}: {reason}", now_ns)
         else:
-            self._accepted += 1
+            self._accepted, self._held = self._accepted + 1, False
             self._objects.judge(job, result.value, now_ns)
             if (slew := result.value.slew) is not None:
                 fastest = math.degrees(float(np.linalg.norm(slew.rate, axis=1).max()))

@@ -1,5 +1,7 @@
 """The tracker of a satellite: the pointing law along its path, and the pauses of the coils.
 
+Far off its path the body is held still instead (`flight.gnc.control.three_axes.astray`).
+
 The coils pause at the begin of each window, so that the magnetometer is read without their field; then one
 dipole, computed at the pause's end, is held. It is raised by what the pause takes from its mean.
 """
@@ -12,6 +14,7 @@ from flight.bodies.orbit.filter import OrbitFilter
 from flight.bodies.orbit.paths import PathPoint
 from flight.bodies.orbit.surroundings import Surroundings
 from flight.gnc.control.detumble import WindowSchedule
+from flight.gnc.control.three_axes.astray import damping_dipole
 from flight.gnc.estimation.estimate import Estimate
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import attitude_matrix
@@ -30,8 +33,10 @@ class PointingTracker:
         pauses: WindowSchedule,
         limit: float,
         dipole_per_ampere: float,
+        inertia: FloatArray,
     ) -> None:
-        """`limit` A m^2 and `dipole_per_ampere` m^2 of each coil."""
+        """`limit` A m^2 and `dipole_per_ampere` m^2 of each coil; `inertia` (3,) kg m^2 of the body axes."""
+        self._inertia = inertia
         self._filter, self._surroundings = filter_, surroundings
         self._pauses, self._limit, self._dipole_per_ampere = pauses, limit, dipole_per_ampere
         self._held = CoilCommand(_NOTHING, _NOTHING)
@@ -61,8 +66,9 @@ class PointingTracker:
         found = reference.law.command(
             reference.seconds, quaternion, rate, field, residual, self._filter.torque_sizes
         )
-        reference.paths.off = float(np.linalg.norm(found.turn))
         dipole = found.dipole
+        if not reference.paths.led(found.turn, rate, reference.time_ns):
+            dipole = damping_dipole(self._inertia, rate, field) - residual
         # The mean over the window is what was asked for.
         dipole = dipole * (self._pauses.period_ns / self._pauses.act_ns)
         largest = float(np.abs(dipole).max())

@@ -91,7 +91,10 @@ def rate_across(before: FloatArray, after: FloatArray, seconds: float) -> FloatA
 
 
 class FieldRate:
-    """The filter; `restarts` counts how often it began again because its predictions failed."""
+    """The filter; `restarts` counts how often it began again because its predictions failed.
+
+    Longer than 200 lines because start, steps and both measurements act on the one state.
+    """
 
     def __init__(self, settings: FieldRateSettings) -> None:
         self._settings = settings

@@ -16,12 +16,13 @@ class AttitudeWatch:
     Attributes:
         follows: the mode that follows the acquisition; None where the body rests.
         brakes: whether a body in SAFE is being braked.
+        seeks: whether a body in SAFE turns to the Sun.
     """
 
     def __init__(self, settings: Modes, low_rate: float, low_for: float) -> None:
         """`low_rate` rad/s for `low_for` s ends the braking."""
         self.follows = None if settings.acquired == Mode.ACQUIRE.label else Mode.named(settings.acquired)
-        self.brakes = False
+        self.brakes = self.seeks = False
         self._fast, self._low = settings.tumble_rate, low_rate
         self._known = HoldTimer(settings.known_for)
         self._lost = HoldTimer(settings.lost_for)
@@ -37,7 +38,7 @@ class AttitudeWatch:
 
     def reset(self) -> None:
         """Begin again: another mode is entered."""
-        self.brakes = False
+        self.brakes = self.seeks = False
         for timer in (self._known, self._lost, self._spins, self._slow):
             timer.reset()
 
@@ -49,14 +50,25 @@ class AttitudeWatch:
             return Trigger.LOST
         return None
 
-    def watch_spin(self, rate: float, barred: bool, begin: Callable[[int], None], now_ns: int) -> None:
-        """Brake a body in SAFE that turns fast until it is slow; never while `barred` by a latched fault.
+    def watch_safe(
+        self,
+        rate: float,
+        barred: bool,
+        brake: Callable[[int], None],
+        seek: Callable[[int], None],
+        now_ns: int,
+    ) -> None:
+        """Brake a body in SAFE that turns fast until it is slow, else have it seek the Sun.
 
-        `begin` is called when braking begins.
+        Neither while `barred` by a latched fault. `brake` and `seek` are called when either begins.
         """
         if self.brakes:
             self.brakes = not (barred or self._slow.update(rate < self._low, now_ns))
         elif self._spins.update(rate > self._fast and not barred, now_ns):
             self._slow.reset()
             self.brakes = True
-            begin(now_ns)
+            brake(now_ns)
+        seeks = not (barred or self.brakes)
+        if seeks and not self.seeks:
+            seek(now_ns)
+        self.seeks = seeks

@@ -124,6 +124,8 @@ class ControlCycle:
             return steering.run(estimate, now_ns, self._ever_started)
         if self._tasks.modes.brakes:
             return steering.brake(readings, self._tasks.navigation.is_heard(now_ns), now_ns)
+        if self._tasks.modes.seeks:
+            return steering.seek(readings, self._tasks.navigation.is_heard(now_ns), now_ns)
         return steering.rest(now_ns)
 
     def _aim(self, now_ns: int) -> None:

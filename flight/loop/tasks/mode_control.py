@@ -127,6 +127,11 @@ class ModeControl:
         """Whether the body is to be braked: in DETUMBLE, and in SAFE while it spins."""
         return self.mode is Mode.DETUMBLE or self._attitude.brakes
 
+    @property
+    def seeks(self) -> bool:
+        """Whether the body is to turn to the Sun without an attitude: in SAFE, once it is slow."""
+        return self._attitude.seeks
+
     def target(self, mission_time_ns: int) -> Target | None:
         """Return the target in force at a mission time; None in a mode without one."""
         configured = self.flies_steps or (self.mode is Mode.POINT and self.wanted is None)
@@ -173,8 +178,8 @@ class ModeControl:
         elif self.mode in ORBITAL and rate is not None:
             self._pointing.watch_rate(rate, now_ns)
         elif self.mode is Mode.SAFE and rate is not None and Mode.ACQUIRE in self._modes:
-            barred = bool(_barred(self._facts))
-            self._attitude.watch_spin(rate, barred, self._steering.begin_braking, now_ns)
+            barred, steering = bool(_barred(self._facts)), self._steering
+            self._attitude.watch_safe(rate, barred, steering.begin_braking, steering.begin_seeking, now_ns)
         if (trigger := self._attitude.trigger(self.mode, estimate is not None, now_ns)) is not None:
             self._fire(trigger, "", now_ns)
         if estimate is not None and self.mode in {Mode.HOLD, Mode.SLEW}:

@@ -9,7 +9,7 @@ import numpy as np
 
 from flight.gnc.estimation.estimate import Estimate
 from flight.gnc.math.arrays import FloatArray
-from flight.loop.body import Body
+from flight.loop.body import Body, Brake
 from flight.loop.control_output import CoilCommand, Steered, SteeringState
 from flight.loop.fdir import facts
 from flight.loop.services import Services
@@ -62,9 +62,25 @@ class Steering:
         """Begin the measuring and acting windows of detumbling."""
         self._body.brake.begin(now_ns)
 
+    def begin_seeking(self, now_ns: int) -> None:
+        """Begin the windows of turning to the Sun, where the body can."""
+        if self._body.seeker is not None:
+            self._body.seeker.begin(now_ns)
+
     def brake(self, readings: Sequence[ImuReading], heard: bool, now_ns: int) -> Steered:
         """Detumble in this cycle; `heard`: its newest reading is fresh enough."""
-        brake = self._body.brake
+        return self._drive_by(self._body.brake, SteeringState.BRAKING, readings, heard, now_ns)
+
+    def seek(self, readings: Sequence[ImuReading], heard: bool, now_ns: int) -> Steered:
+        """Turn to the Sun in this cycle, without an attitude; rest where nothing does that."""
+        if self._body.seeker is None:
+            return self.rest(now_ns)
+        return self._drive_by(self._body.seeker, SteeringState.BRAKING, readings, heard, now_ns)
+
+    def _drive_by(
+        self, brake: Brake, acting: SteeringState, readings: Sequence[ImuReading], heard: bool, now_ns: int
+    ) -> Steered:
+        """Command what needs no estimate."""
         for reading in readings:
             brake.sample(reading.time_ns, reading.field, reading.rate)
         text = "braking again" if heard else "no reading fresh enough to brake by: coils to zero"
@@ -72,7 +88,7 @@ class Steering:
         state, dipole = SteeringState.OFF, _NO_DIPOLE
         if heard:
             self._body.tracker.reset()
-            state, wanted = SteeringState.BRAKING, brake.command(now_ns)
+            state, wanted = acting, brake.command(now_ns)
             dipole = wanted.dipole
             self._drive.send(wanted.currents, lambda: brake.field(now_ns))
             brake.sent(self._drive.command)

@@ -1,9 +1,10 @@
 """One flight of campaign `orbit-pointing`: a craft with its filter, its planner's job and its law.
 
-The tables are those of the planner worker (`pointing_job`), made again each REPLAN s, and 10 s after the body
-was more than 15 deg off its path. The coils pause a tenth of each two seconds for the magnetometer; star
-attitudes come each 10 s, two seconds late. Beside the law stands the magnetic proportional-derivative law:
-what of the torque -J (w^2 turn + 2 w rate) lies across the field (Lovera & Astolfi 2004, Automatica 40(8)).
+The tables are those of the planner worker (`pointing_job`), made again each REPLAN s, and where the body was
+astray and has been held still (`flight.gnc.control.three_axes.astray`). The coils pause a tenth of each two
+seconds for the magnetometer; star attitudes come each 10 s, two seconds late. Beside the law stands the
+magnetic proportional-derivative law: what of the torque -J (w^2 turn + 2 w rate) lies across the field
+(Lovera & Astolfi 2004, Automatica 40(8)).
 """
 
 from __future__ import annotations
@@ -12,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from flight.bodies.orbit.planning import ASTRAY
 from flight.gnc.control.three_axes import pointing_job
+from flight.gnc.control.three_axes.astray import Astray, damping_dipole
 from flight.gnc.control.three_axes.pointing import PointingLaw
 from flight.gnc.control.three_axes.pointing_job import PointingJob
 from flight.gnc.control.three_axes.pointing_table import PointingTable, PointingWeights
@@ -61,6 +62,8 @@ WEIGHTS = {
     "knightcube": PointingWeights(turn=np.radians(1.0), rate=1.0, dipole=3e-4),
     "cubesat_3u": PointingWeights(turn=np.radians(1.0), rate=1.0, dipole=1.5e-3),
 }
+TORQUE = {"knightcube": (1e-9, 2e-12), "cubesat_3u": (3e-9, 5e-12)}
+"""N m and N m per sqrt(s), as the configurations have them: what the filter expects of each shape."""
 BANDWIDTH = {"knightcube": 4e-3, "cubesat_3u": 4e-3}
 """rad/s of the magnetic proportional-derivative law."""
 
@@ -87,13 +90,14 @@ class PointingFlight:
         held.advance(0)
         self.flight = flight = FreeFlight(wanted["craft"], seed, orbit, self._release(held), noises)
         flight.advance(0)
-        self._filter = FreeFilter(flight.inertia, FreeFilterSettings())
+        self._filter = FreeFilter(flight.inertia, FreeFilterSettings(torque=TORQUE[wanted["craft"]]))
         gyro = self._gyro(flight.motion.rate, 1.0)
         self._filter.start(flight.attitude(STAR_SIGMA), STAR_SIGMA**2 * np.eye(3), gyro)
         self._law: PointingLaw | None = None
         self._begun, self._ahead_begun = 0.0, -AHEAD
         self._ahead: Ephemeris = held.ephemeris(0.0)
         self._stars: FloatArray | None = None
+        self._astray = Astray()
         self._rate_then, self._turn = np.zeros(3), np.zeros(3)
 
     def _release(self, held: FreeFlight) -> TipOff:
@@ -117,7 +121,8 @@ class PointingFlight:
         flight, found = self.flight, self._filter
         if time - self._ahead_begun >= AHEAD:
             self._ahead, self._ahead_begun = flight.ephemeris(AHEAD + 60.0), time
-        astray = float(np.linalg.norm(self._turn)) > ASTRAY and time - self._begun >= AGAIN
+        self._astray.see(float(np.linalg.norm(self._turn)), float(np.linalg.norm(found.rate)), time)
+        astray = self._astray.ready and time - self._begun >= AGAIN
         if (
             self._wanted["law"] != "pd"
             and time >= COAST
@@ -161,6 +166,8 @@ class PointingFlight:
             since = time - self._begun
             command = self._law.command(since, found.quaternion, found.rate, field, residual, sizes)
             self._turn, dipole = command.turn, command.dipole
+            if self._astray.since is not None:
+                dipole = damping_dipole(np.diag(flight.inertia), found.rate, field) - residual
         dipole = dipole * CYCLE / (CYCLE - PAUSE)
         dipole = dipole * min(1.0, flight.limit / float(np.abs(dipole).max()))
         if round(time / CYCLE) % 5 == 0:
@@ -210,6 +217,7 @@ class PointingFlight:
             return
         self._law, self._begun = PointingLaw(table, self.flight.limit), time
         self._turn = np.zeros(3)
+        self._astray.planned()
 
     def _job(self) -> PointingJob:
         """Return the planner's job now."""

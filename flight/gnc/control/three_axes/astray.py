@@ -1,0 +1,54 @@
+"""A body that is far off its path is held still until it is slow, and then planned for again.
+
+The law is linear in small turns. Led back from far off, coils at their limits chase the path, which makes a
+light body turn faster than before. Damping alone can not: its torque is what of -2 w J rate lies across the
+field, which takes energy from the body in any attitude.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from flight.gnc.control.three_axes.momentum import cross_product
+from flight.gnc.math.arrays import FloatArray
+
+FAR = math.radians(15.0)
+"""rad off the path, from which on a body is held still."""
+SLOW = math.radians(0.1)
+"""rad/s, below which a body is slow; an orbit's own is 0.06 deg/s."""
+PATIENCE = 180.0
+"""s after which it is planned for though not slow: what lies along the field takes a quarter of an orbit."""
+DAMPING = 0.01
+"""rad/s, w."""
+
+
+class Astray:
+    """Decides between path and damping; `since` is when damping began, s, None while the path is flown.
+
+    Attributes:
+        ready: whether the body may be planned for.
+    """
+
+    def __init__(self) -> None:
+        self.since: float | None = None
+        self.ready = False
+
+    def see(self, off: float, speed: float, now: float) -> None:
+        """Take the turn off the path, rad, and the rate, rad/s, at a time, s."""
+        if self.since is None and off > FAR:
+            self.since = now
+        self.ready = self.since is not None and (speed < SLOW or now - self.since > PATIENCE)
+
+    def planned(self) -> None:
+        """Fly a path again."""
+        self.since, self.ready = None, False
+
+
+def damping_dipole(inertia: FloatArray, rate: FloatArray, field: FloatArray) -> FloatArray:
+    """Return the dipole (3,) A m^2 that takes a rate (3,) rad/s as the field (3,) T allows, body axes.
+
+    `inertia` (3,) kg m^2 of the body axes.
+    """
+    return np.asarray(cross_product(field, -2.0 * DAMPING * inertia * rate) / float(field @ field))
