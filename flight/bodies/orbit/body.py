@@ -6,7 +6,7 @@ It detumbles by magnetometer and gyro, acquires its attitude with its coils at r
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
