@@ -70,15 +70,14 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
     sun = _sun(config, filter_, surroundings)
     objects = ObjectAim(_sensor(config), limit, services.events)
 
-    def disturbed() -> tuple[FloatArray, FloatArray]:
-        return filter_.torque_sizes, filter_.residual_dipole
-
     return Body(
         modes=frozenset(Mode) - {Mode.HOLD, Mode.SLEW, Mode.TESTBED_DEMO},
         filter=filter_,
         learned_problems=[],
         paths=paths,
-        planner=PointingPlanner(_planned(config), paths, surroundings, disturbed, objects, services),
+        planner=PointingPlanner(
+            _planned(config), paths, surroundings, _disturbed(filter_), objects, services
+        ),
         targets=PointingTargets(_timed(config), paths, config.looks_for_objects()),
         tracker=_tracker(config, filter_, surroundings),
         feed=OrbitFeed(filter_),
@@ -109,6 +108,11 @@ def _field(estimate: Estimate, surroundings: Surroundings) -> FloatArray:
     """Return the expected field (3,) T in body axes at an estimate; zero where it is not known."""
     around = surroundings.at(estimate.time_ns)
     return np.zeros(3) if around is None else attitude_matrix(estimate.quaternion) @ around.field
+
+
+def _disturbed(filter_: OrbitFilter) -> Callable[[], tuple[FloatArray, FloatArray]]:
+    """Return what gives the estimated sizes (9,) N m of the torques and the residual dipole (3,) A m^2."""
+    return lambda: (filter_.torque_sizes, filter_.residual_dipole)
 
 
 def _limit(config: OrbitConfig) -> float:
