@@ -118,6 +118,8 @@ def refit_motion(
     done = joint_fit(camera, scene, _ROOM)
     if done is None:
         return None
+    # What there was no room for is known from the catalogue: no fit of fewer streaks is better for it.
+    done = replace(done, hidden=None)
     refit = with_rate(with_stars(motion, camera, done), camera, done, Wholeness.WHOLE)
     if refit.status is not StreakStatus.AMBIGUOUS or refit.rate is None or refit.covariance is None:
         return None

@@ -22,6 +22,8 @@ _MEDIAN = 1.25
 
 # A star with less than this part of the best one's information is ignored.
 _NOTHING = 1e-9
+# Of what a star knows a direction that has less than this part of its best known one's is ignored.
+_KNOWN = 1e-4
 # Stars of unequal weight count as fewer equal ones; fewer than this have no spread.
 _LEAST_EFFECTIVE = 2.0
 
@@ -131,3 +133,21 @@ def disagreement(estimates: OwnEstimates, which: BoolArray) -> float:
     found = np.sum(weight**2 * (change - mean) ** 2, axis=0) / total * effective / (effective - 1.0)
     # The largest of several is larger than one, by about a standard deviation.
     return float(np.max(found / (1.0 + np.sqrt(2.0 / (effective - 1.0)))))
+
+
+def contradiction(alone: OwnEquations) -> float:
+    """Return by how much all that the stars say contradicts itself: chi-square per degree of freedom.
+
+    Unlike `disagreement` it counts every direction that a star knows of, each star by its own noise.
+    """
+    total = alone.information.sum(axis=0)
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(total), 1e-300))
+    information = alone.information * np.outer(scale, scale)
+    step = np.linalg.lstsq(information.sum(axis=0), alone.score.sum(axis=0) * scale, rcond=None)[0]
+    values, vectors = np.linalg.eigh(information)
+    left = np.einsum("nji,nj->ni", vectors, alone.score * scale - information @ step)
+    known = values > _KNOWN * np.maximum(values.max(axis=1, keepdims=True), 1e-300)
+    freedom = int(np.count_nonzero(known)) - len(step)
+    if freedom < 1:
+        return 1.0
+    return float(np.sum(left[known] ** 2 / values[known])) / freedom

@@ -15,15 +15,17 @@ import numpy as np
 from flight.gnc.math.arrays import BoolArray, FloatArray
 from flight.gnc.vision.streaks.maximum_likelihood.agreement import (
     OwnEquations,
+    contradiction,
     disagreement,
     estimates_of,
     own_equations,
 )
 from flight.gnc.vision.streaks.maximum_likelihood.equation_solver import turn_covariance
 from flight.gnc.vision.streaks.maximum_likelihood.iteration import ExposedCamera, Fit
+from flight.gnc.vision.streaks.maximum_likelihood.joint_fit import bared_fit
 from flight.gnc.vision.streaks.maximum_likelihood.lens_errors import correct, seeming_turns
 from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
-from flight.gnc.vision.streaks.maximum_likelihood.scene import PIXEL_VARIANCE
+from flight.gnc.vision.streaks.maximum_likelihood.scene import PIXEL_VARIANCE, Scene
 from flight.gnc.vision.streaks.maximum_likelihood.shaking import Shaking, find_shaking
 
 # Rounds of conjugate gradients for the covariance.
@@ -58,8 +60,13 @@ class Claim:
     shaking: Shaking
 
 
-def claim(result: MotionResult, camera: ExposedCamera, last: Fit) -> Claim:
-    """Return what a fit may claim of its turn; `result` has its stars."""
+def claim(result: MotionResult, camera: ExposedCamera, whole: Fit) -> Claim:
+    """Return what the `whole` fit may claim of its turn; `result` has its stars.
+
+    Where stars are hidden in the streaks, the turn is that of the brightest, fitted with those.
+    """
+    bared = bared_fit(camera, whole)
+    last = whole if bared is None else bared
     scene, settings = last.scene, camera.settings
     exact = turn_covariance(last.evaluation, last.free, _CONJUGATE)
     noise = last.solution.covariance[:3, :3] if exact is None else exact
@@ -69,11 +76,12 @@ def claim(result: MotionResult, camera: ExposedCamera, last: Fit) -> Claim:
         lens = _with_lens(camera, last, equations, result.exposure)
     turn = scene.motion.whole + lens.step
     # What made others disagree is as likely to hide, less of it, in the light of those that agree.
-    asked = min(settings.most_stars, len(scene.trusted))
-    spread = max(result.misfit, lens.spread, 1.0) * asked / max(int(np.count_nonzero(scene.trusted)), 1)
-    if np.count_nonzero(scene.trusted) <= _UNCHECKED[0]:
+    agreed = int(np.count_nonzero(scene.trusted))
+    asked = int(np.count_nonzero(scene.light >= scene.light[scene.trusted].min(initial=np.inf)))
+    spread = max(result.misfit, lens.spread, 1.0) * max(asked / max(agreed, 1), 1.0)
+    if agreed <= _UNCHECKED[0]:
         spread *= _UNCHECKED[1]
-    shaking = find_shaking(camera, last)
+    shaking = find_shaking(camera, whole)
     end = np.hypot(
         _spread_doubt(scene.width, settings.psf_sigma) * max(result.misfit, 1.0),
         _END_SHAKING * max(shaking.across, shaking.along),
@@ -111,8 +119,7 @@ def _with_lens(camera: ExposedCamera, last: Fit, equations: OwnEquations, exposu
     scene = last.scene.select(trusted)
     equations = OwnEquations(equations.kept, equations.information[trusted], equations.score[trusted])
     seeming = seeming_turns(camera, scene, exposure)
-    everyone: BoolArray = np.ones(len(trusted), dtype=np.bool_)
-    spread = disagreement(estimates_of(equations, scene), everyone)
+    spread = _spread(equations, scene)
     exact = _Lens(np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3)), spread)
     if not seeming.shape[2]:
         return exact
@@ -126,10 +133,16 @@ def _with_lens(camera: ExposedCamera, last: Fit, equations: OwnEquations, exposu
         if corrected is None:
             return exact
         left = replace(equations, score=corrected.score)
-        before = max(1.0, min(spread, disagreement(estimates_of(left, scene), everyone)))
+        before = max(1.0, min(spread, _spread(left, scene)))
     assert corrected is not None
     added, stated = corrected.added[:3, :3], corrected.described[:3, :3]
     return _Lens(corrected.step[:3], added, stated, before if corrected.step.any() else spread)
+
+
+def _spread(equations: OwnEquations, scene: Scene) -> float:
+    """Return by how much the stars contradict each other, in the variance of their noise."""
+    everyone: BoolArray = np.ones(len(scene.light), dtype=np.bool_)
+    return max(disagreement(estimates_of(equations, scene), everyone), contradiction(equations))
 
 
 def _spread_doubt(width: float, sigma: float) -> float:

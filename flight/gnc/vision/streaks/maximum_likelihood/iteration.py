@@ -120,6 +120,7 @@ class Fit:
     Attributes:
         windows: its pixels; free: (SHARED,) which shared parameters were fitted.
         restless: the last step of the shared parameters, in standard deviations; 0 when the fit has settled.
+        hidden: stars on its pixels that were not fitted, but taken out as they were known; None without.
     """
 
     scene: Scene
@@ -128,6 +129,7 @@ class Fit:
     restless: float
     windows: Windows
     free: BoolArray
+    hidden: Scene | None = None
 
     def grows(self) -> bool:
         """Return whether the pixels show that the rate changes: a score test of the constant one.

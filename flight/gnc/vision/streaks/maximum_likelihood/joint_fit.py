@@ -42,6 +42,11 @@ _DOUBT = 0.35
 # Pixels of all windows that a fit looks at, those that stars share once for each: what a crowd of long
 # streaks needs of memory and time is bounded so, and the brightest stars hold most of the information.
 _MOST_PIXELS = 60_000
+# Streaks that are fitted anew with all on their pixels take this part of that, but are so many at least.
+_BARED_SHARE = 0.5
+_LEAST_BARED = 10
+# Stars that share a bright one's pixels are sought down to this significance: what they hide moves its ends.
+_HIDDEN_SIGMAS = 4.5
 # This many stars' light is taken out at a time.
 _AT_ONCE = 16
 
@@ -90,18 +95,7 @@ def _fit_from(camera: ExposedCamera, first: Fit) -> tuple[Fit | None, FaintStars
     settings, before = camera.settings, first.scene
     if not before.motion.constant:
         camera = replace(camera, growing=True)
-    camera.work.passed(camera.frame.signal.size)
-    light = light_of(camera.pinhole, camera.shutter, before, first.windows)
-    faint = find_faint(
-        camera.frame,
-        (first.windows.pixels, light),
-        camera.pinhole,
-        before.motion,
-        settings.faint_sigmas,
-        settings.most_faint,
-    )
-    stars = mid_exposure(camera.pinhole, before.motion, camera.shutter, faint.stars)
-    faint = replace(faint, stars=stars)
+    faint = _found_along(camera, first)
     whole = before.with_stars(faint.stars, faint.light)
     order = np.argsort(-whole.light, kind="stable")
     bright, rest = order[: settings.most_stars], order[settings.most_stars :]
@@ -114,11 +108,30 @@ def _fit_from(camera: ExposedCamera, first: Fit) -> tuple[Fit | None, FaintStars
     )
     fitted = others.select(near[: settings.most_neighbours])
     scene = scene.with_stars(fitted.stars, fitted.light)
-    accounted = _accounted(camera, others.select(near[settings.most_neighbours :]))
-    done = joint_fit(accounted, scene)
+    beyond = others.select(near[settings.most_neighbours :])
+    done = joint_fit(_accounted(camera, beyond), scene)
+    if done is not None and done.hidden is not None:
+        done = replace(done, hidden=done.hidden.with_stars(beyond.stars, beyond.light))
     rest = np.delete(rest, near[: settings.most_neighbours])
     rest = rest[rest >= len(before.light)] - len(before.light)
+    rest = rest[faint.significance[rest] >= settings.faint_sigmas]
     return done, FaintStars(faint.stars[rest], faint.light[rest], faint.significance[rest])
+
+
+def _found_along(camera: ExposedCamera, first: Fit) -> FaintStars:
+    """Return the streaks along the motion of `first`, less its own, by their places at mid-exposure."""
+    settings, motion = camera.settings, first.scene.motion
+    camera.work.passed(camera.frame.signal.size)
+    light = light_of(camera.pinhole, camera.shutter, first.scene, first.windows)
+    faint = find_faint(
+        camera.frame,
+        (first.windows.pixels, light),
+        camera.pinhole,
+        motion,
+        min(_HIDDEN_SIGMAS, settings.faint_sigmas),
+        settings.most_faint,
+    )
+    return replace(faint, stars=mid_exposure(camera.pinhole, motion, camera.shutter, faint.stars))
 
 
 def joint_fit(camera: ExposedCamera, scene: Scene, room: float = 1.0) -> Fit | None:
@@ -128,7 +141,8 @@ def joint_fit(camera: ExposedCamera, scene: Scene, room: float = 1.0) -> Fit | N
     the others' light is taken out as it is known. None where the fit fails.
     """
     fitted = _affordable(camera, scene, room)
-    camera, scene = _accounted(camera, scene.select(~fitted)), scene.select(fitted)
+    hidden = scene.select(~fitted)
+    camera, scene = _accounted(camera, hidden), scene.select(fitted)
     done = iterate(camera, scene, camera.free, ROUGH)
     if done is not None and camera.undecided and done.grows():
         camera = replace(camera, growing=True)
@@ -140,7 +154,32 @@ def joint_fit(camera: ExposedCamera, scene: Scene, room: float = 1.0) -> Fit | N
     done = iterate(camera, scene, camera.free, LAST, windows.pop())
     if done is not None and camera.undecided and done.grows():
         done = iterate(replace(camera, growing=True), done.scene, GROWING, LAST, done.windows)
-    return None if done is None or _beyond(done.scene.motion) else done
+    return None if done is None or _beyond(done.scene.motion) else replace(done, hidden=hidden)
+
+
+def bared_fit(camera: ExposedCamera, last: Fit) -> Fit | None:
+    """Return a fit of the brightest streaks of `last` and all that lies on their pixels.
+
+    Stars that are hidden in a streak move its ends: where the joint fit had no room for them, fewer streaks
+    with all of those know the motion better. None where it had room, and where the fit fails or goes astray.
+    """
+    others, scene = last.hidden, last.scene
+    if others is None or not len(others.light):
+        return None
+    camera = replace(camera, growing=bool(last.free[3]))
+    order = np.argsort(-scene.light * scene.trusted, kind="stable")[: np.count_nonzero(scene.trusted)]
+    areas = np.cumsum(window_areas(camera.pinhole, scene.select(order), camera.settings.reach))
+    leading = order[: max(_LEAST_BARED, int(np.count_nonzero(areas < _BARED_SHARE * _MOST_PIXELS)))]
+    first, rest = scene.select(leading), scene.select(np.setdiff1d(np.arange(len(scene.light)), leading))
+    stars, light = (np.concatenate(both) for both in ((rest.stars, others.stars), (rest.light, others.light)))
+    distance = _NEAR * camera.settings.reach * scene.width
+    near = close_by(camera.pinhole, scene.motion, stars, first.stars, distance)
+    whole = first.with_stars(stars[near], light[near])
+    fitted = _affordable(camera, whole, 1.0)
+    camera = _accounted(camera, whole.select(~fitted))
+    done = iterate(camera, whole.select(fitted), last.free, LAST)
+    lost = done is None or _beyond(done.scene.motion) or _far(camera, scene, done.scene)
+    return None if lost else done
 
 
 def _beyond(motion: Motion) -> bool:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from flight.gnc.camera.knowledge import EXACT, UNSTATED, CameraKnowledge
 from flight.gnc.math.arrays import FloatArray
@@ -13,13 +14,16 @@ from flight.gnc.math.quaternion import from_rotation_vector, multiply
 from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion
 from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import expose_frame
 from flight.gnc.vision.streaks.maximum_likelihood.iteration import ExposedCamera
+from flight.gnc.vision.streaks.maximum_likelihood.joint_fit import bared_fit
 from flight.gnc.vision.streaks.maximum_likelihood.lens_errors import correct, seeming_turns
 from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion, sensitivities
 from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from flight.gnc.vision.streaks.maximum_likelihood.shutter import Shutter
-from sim_hal.star_camera import render
+from sim_hal.star_camera import StarCameraModel, render
 from tests.flight.gnc.vision.maximum_likelihood.scenes import CAMERA, SATURATION, real_sky, turn_of
+from tests.studies.campaigns import failures
+from tests.studies.campaigns.scenes import FIELD
 
 _TURN = np.array([0.02, 0.03, 0.0])
 
@@ -151,3 +155,26 @@ def test_two_stars_fix_a_rate_with_a_covariance_that_says_so() -> None:
     error = found.rate - turn / 0.2
     assert error @ np.linalg.solve(found.covariance, error) < 16.3
     assert np.linalg.norm(error) < 0.01 * np.linalg.norm(turn / 0.2)
+
+
+def test_what_is_hidden_in_streaks_does_not_move_their_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Crowded frames of `failures`: the brightest streaks, fitted with all on their pixels, know more."""
+    camera = StarCameraModel(field_of_view=FIELD)
+    settings = LikelihoodSettings(saturation=SATURATION, gain=camera.gain, knowledge=EXACT)
+    errors = []
+    for case in np.array(failures.cases(100, 1999), dtype=object)[[21, 67, 96]]:
+        scene, _ = failures.expose(case, camera)
+        for bared in (bared_fit, lambda *_: None):
+            with monkeypatch.context() as patch:
+                patch.setattr("flight.gnc.vision.streaks.maximum_likelihood.claim.bared_fit", bared)
+                found = estimate_motion(
+                    scene.pixels, camera.pinhole, scene.exposure, settings, scene.rate, 0.0
+                )
+            assert found.rate is not None
+            assert found.covariance is not None
+            error = found.rate - scene.rate
+            size = np.linalg.norm(error) / np.linalg.norm(scene.rate)
+            errors.append([size, error @ np.linalg.solve(found.covariance, error)])
+    after, before = np.array(errors[::2]), np.array(errors[1::2])
+    assert after[:, 0].mean() < 0.5 * before[:, 0].mean()
+    assert after[:, 1].max() < chi2.isf(1e-3, 3)

@@ -1,0 +1,61 @@
+"""The FITS header of `flight solve --wcs`, read by astropy: another library's pixel to sky, against stars."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from flight.gnc.camera.lens import Lens
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import attitude_matrix, normalise
+from flight.gnc.vision.startracker.sky_map import SkyMap
+from ground.sky.world_coordinates import header_text
+from tests.studies.campaigns.scenes import catalogue
+
+fits = pytest.importorskip("astropy.io.fits", reason="astropy is of the extra `test`")
+wcs = pytest.importorskip("astropy.wcs", reason="astropy is of the extra `test`")
+
+# A header without a picture, as other solvers write it.
+pytestmark = pytest.mark.filterwarnings("ignore:The WCS transformation has more axes")
+
+_LENS = Lens(1280, 960, 4000.0, (655.0, 470.0), k1=-0.3, k2=0.4)
+_ARCSECONDS = 3600.0
+
+
+def _sky(seed: int) -> SkyMap:
+    return SkyMap(_LENS, normalise(np.random.default_rng(seed).normal(size=4)))
+
+
+def _stars(sky: SkyMap) -> tuple[FloatArray, FloatArray]:
+    """Return right ascension and declination (n, 2), deg, of stars in the picture, and their pixels.
+
+    Pixels are by the camera's projection of each star, which the header's maker does not use.
+    """
+    _, directions = catalogue(8.5)
+    place = _LENS.project(directions @ attitude_matrix(sky.quaternion).T)
+    inside = _LENS.contains(place)
+    x, y, z = directions[inside].T
+    return np.degrees(np.stack([np.arctan2(y, x) % (2.0 * np.pi), np.arcsin(z)], axis=1)), place[inside]
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_astropy_finds_the_stars_where_they_are(seed: int) -> None:
+    """Within 0.1" and 0.01 px over the whole distorted picture, pixel to sky and back."""
+    sky = _sky(seed)
+    header = fits.Header.fromstring(header_text(sky))
+    frame = wcs.WCS(header)
+    radec, place = _stars(sky)
+    assert len(place) > 20
+    found = frame.all_pix2world(place, 0)
+    turned = (found[:, 0] - radec[:, 0] + 180.0) % 360.0 - 180.0
+    off = np.stack([turned * np.cos(np.radians(radec[:, 1])), found[:, 1] - radec[:, 1]])
+    assert np.abs(off).max() * _ARCSECONDS < 0.1
+    assert np.abs(frame.all_world2pix(radec, 0) - place).max() < 0.01
+
+
+def test_a_lens_told_without_its_distortion_is_noticed() -> None:
+    """The bounds above are of the distortion's making: without SIP the corners are px off."""
+    sky = _sky(1)
+    plain = wcs.WCS(fits.Header.fromstring(header_text(sky)))
+    radec, place = _stars(sky)
+    assert np.abs(plain.wcs_world2pix(radec, 0) - place).max() > 1.0
