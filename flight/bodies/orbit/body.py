@@ -68,16 +68,14 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
     seeker = _seeker(config, services)
     paths = PointingPaths(limit, fastest_rate(config))
     sun = _sun(config, filter_, surroundings)
-    objects = ObjectAim(_sensor(config), limit, services.events)
+    disturbed, objects = _disturbed(filter_), ObjectAim(_sensor(config), limit, services.events)
 
     return Body(
         modes=frozenset(Mode) - {Mode.HOLD, Mode.SLEW, Mode.TESTBED_DEMO},
         filter=filter_,
         learned_problems=[],
         paths=paths,
-        planner=PointingPlanner(
-            _planned(config), paths, surroundings, _disturbed(filter_), objects, services
-        ),
+        planner=PointingPlanner(_planned(config), paths, surroundings, disturbed, objects, services),
         targets=PointingTargets(_timed(config), paths, config.looks_for_objects()),
         tracker=_tracker(config, filter_, surroundings),
         feed=OrbitFeed(filter_),
