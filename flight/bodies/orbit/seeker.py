@@ -51,6 +51,9 @@ class StringSeeker:
         dipole = self._seeker.dipole(now_ns)
         return CoilCommand(dipole, dipole / self._dipole_per_ampere)
 
+    def sent(self, currents: FloatArray) -> None:
+        """Take what went to the coils (3,) A; nothing follows from it, as the gyro tells the rate."""
+
     def field(self, now_ns: int) -> FloatArray | None:
         """Return the field (3,) T in body axes at the last reading; None before it is known."""
         return self._seeker.field

@@ -8,6 +8,7 @@ heat, J. Pure and deterministic.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -24,6 +25,8 @@ from flight.gnc.math.arrays import FloatArray
 
 _DENSE = 8
 """Places between two of a path's nodes and midpoints where cones are looked at."""
+_ROOM = math.radians(0.002)
+"""rad, that a path keeps off a cone at those places: between them it comes nearer by less."""
 
 
 class SlewStatus(StrEnum):
@@ -82,9 +85,10 @@ def _first(task: SlewTask, search: Search, paths: Iterator[Found]) -> SlewPlan |
             plan = _plan(task, search, found)
             if plan is None:
                 break
-            if all(clear >= 0.0 for clear in plan.clearance):
+            depths = _depths(task, plan.path)
+            if not depths.any():
                 return plan
-            found = search.widened(found, _depths(task, plan.path))
+            found = search.widened(found, depths)
     return None
 
 
@@ -133,6 +137,11 @@ def _clearances(task: SlewTask, path: SlewPath) -> FloatArray:
 
 
 def _depths(task: SlewTask, path: SlewPath) -> FloatArray:
-    """Return how deep within each cone (cones, 2 nodes) rad a path is between each two points."""
-    inside = np.maximum(-_clearances(task, path), 0.0)
-    return np.asarray(inside[:, 1:].reshape(len(inside), -1, _DENSE).max(axis=2))
+    """Return how far from clear of each cone (cones, 2 nodes) rad a path is between each two points.
+
+    Clear is `_ROOM` off the cone, or as near as begin or end are to it.
+    """
+    clear = _clearances(task, path)
+    room = np.clip(np.minimum(clear[:, :1], clear[:, -1:]), 0.0, _ROOM)
+    inside = np.maximum(room - clear, 0.0)
+    return np.asarray(inside[:, 1:].reshape(len(inside), 2 * task.nodes, _DENSE).max(axis=2))
