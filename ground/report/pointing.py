@@ -19,7 +19,7 @@ from ground.telemetry.reader import Run
 
 Object = dict[str, Any]
 SETTLED_AFTER = 600.0
-"""s after the first moment on a target, from which on its error is judged."""
+"""s after the first moment on a target, from which on its error is judged, or from its first slew's end."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,7 +60,8 @@ def across(error: FloatArray, axis: npt.ArrayLike) -> FloatArray:
 def pointing(run: Run, axis: npt.ArrayLike, power: CoilPower | None) -> Object | None:
     """Return the figures of each target that was pointed to; None for a run that never pointed.
 
-    A target is judged from `SETTLED_AFTER` on; `axis` (3,) of the body is the one that points.
+    A target is judged from `SETTLED_AFTER` on, or from the end of its first slew where that is later; `axis`
+    (3,) of the body is the one that points.
     """
     found = pointing_errors(run)
     if not len(found.times):
@@ -72,16 +73,27 @@ def pointing(run: Run, axis: npt.ArrayLike, power: CoilPower | None) -> Object |
         inside = (found.times >= begin) & (found.times < end)
         if not inside.any():
             continue
-        rows.append({"target": text, **_figures(found, inside, axis, power)})
+        rows.append({"target": text, **_figures(found, inside, axis, power, _slewed(run, begin, end))})
     return {"source": found.source, "settled_after_s": SETTLED_AFTER, "targets": rows}
 
 
+def _slewed(run: Run, begin: float, end: float) -> float:
+    """Return when the first slew ended between two times, s; minus infinity without one."""
+    happened = run["event"]
+    ended = seconds(happened[happened["code"] == events.SLEW_ENDED.code])
+    return float(min(ended[(ended >= begin) & (ended < end)], default=-math.inf))
+
+
 def _figures(
-    found: PointingErrors, inside: npt.NDArray[np.bool_], axis: npt.ArrayLike, power: CoilPower | None
+    found: PointingErrors,
+    inside: npt.NDArray[np.bool_],
+    axis: npt.ArrayLike,
+    power: CoilPower | None,
+    slewed: float,
 ) -> Object:
     times = found.times[inside]
     begin, end = float(times[0]), float(times[-1])
-    settled = inside & (found.times >= begin + SETTLED_AFTER)
+    settled = inside & (found.times >= max(begin + SETTLED_AFTER, slewed))
     off = across(found.error[settled], axis)
     return {
         "begin_s": begin,

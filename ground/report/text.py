@@ -160,7 +160,7 @@ def _pointing(found: Object | None) -> list[str]:
     return [
         f"Pointing, {'true' if found['source'] == 'truth' else 'estimated'} attitude",
         *table(head, rows),
-        f"  errors from {number(found['settled_after_s'], 0)} s after the begin on",
+        f"  errors from {number(found['settled_after_s'], 0)} s after the begin on, or the first slew's end",
     ]
 
 

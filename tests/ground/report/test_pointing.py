@@ -21,7 +21,7 @@ from tests.manual_clock import ManualClock
 from tests.scenario.flights import CONFIG
 
 NAN3 = (math.nan,) * 3
-PERIOD_S, SECOND_AIM_S, DURATION_S = 10, 1000, 2000
+PERIOD_S, SECOND_AIM_S, SLEWED_S, DURATION_S = 10, 1000, 1700, 2000
 OFF_DEG = (3.0, 4.0, 12.0)
 """About x, y, z once settled; ten times as much before."""
 LIMITS = "requirements: {slow_within: 100.0, knowledge_deg: 0.1, pointing_deg: %s}"
@@ -44,7 +44,10 @@ def flown(folder: Path, limit_deg: float) -> Path:
         if at % SECOND_AIM_S == 0:
             event = {"code": events.TARGET.code, "name": "target", "severity": 0, "suppressed": 0}
             flight.write(packer.pack(table.EVENT, stamp, **event, text="sun" if at == 0 else "nadir"))
-        settled = at % SECOND_AIM_S >= 600
+        if at == SLEWED_S:
+            ended = {"code": events.SLEW_ENDED.code, "name": "slew-ended", "severity": 0, "suppressed": 0}
+            flight.write(packer.pack(table.EVENT, stamp, **ended, text=""))
+        settled = at % SECOND_AIM_S >= (600 if at < SECOND_AIM_S else SLEWED_S - SECOND_AIM_S)
         off = np.radians(OFF_DEG) * (1.0 if settled else 10.0)
         true = multiply(from_rotation_vector(off), target).tolist()
         wanted = {"wanted": [math.nan] * 4, "wanted_rate": NAN3, "target": target.tolist(), "dipole": NAN3}

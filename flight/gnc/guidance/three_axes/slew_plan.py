@@ -104,15 +104,15 @@ def _refusal(task: SlewTask, tried: int, barring: list[str]) -> str:
 def _plan(task: SlewTask, search: Search, found: Found) -> SlewPlan | None:
     """Return the plan that flies a path; None where an integrator does not lead along it."""
     equations, scale = found.equations, found.equations.scale
-    try:
-        with np.errstate(over="ignore", invalid="ignore"):  # where it leads astray
+    with np.errstate(over="ignore", invalid="ignore"):  # where an integrator is led astray
+        try:
             at = closed(task.craft, search.solver.unit, task.along, found.program, found.point)
-    except PlanningError:
-        return None
-    flow = equations.motion.flow(at.states, at.all_dipoles())
-    q = at.states[:, :4] / np.linalg.norm(at.states[:, :4], axis=1, keepdims=True)
-    dipole = search.solver.unit * at.all_dipoles()
-    path = SlewPath(equations.times, q, at.states[:, 4:] / scale, flow[:, 4:] / scale**2, dipole)
+        except PlanningError:
+            return None
+        flow = equations.motion.flow(at.states, at.all_dipoles())
+        q = at.states[:, :4] / np.linalg.norm(at.states[:, :4], axis=1, keepdims=True)
+        dipole = search.solver.unit * at.all_dipoles()
+        path = SlewPath(equations.times, q, at.states[:, 4:] / scale, flow[:, 4:] / scale**2, dipole)
     if not all(np.isfinite(part).all() for part in (path.quaternion, path.rate, path.dipole)):
         return None
     clear = _clearances(task, path)
