@@ -110,6 +110,8 @@ class PointingPlanner:
             self._fail("no plan: the orbit is not known", now_ns)
             return
         sizes, residual = self._disturbed()
+        # A path leaves its target for a time where it meets torques along the field: no reason for a slew.
+        on_path = astray.since is None and self._paths.attitude(goal, now_ns) is not None
         job = PointingJob(
             self._count + 1,
             now_ns,
@@ -122,7 +124,7 @@ class PointingPlanner:
             estimate.rate,
             sizes,
             craft.limit,
-            replace(craft.slew, residual=residual),
+            None if on_path else replace(craft.slew, residual=residual),
         )
         job = self._objects.directed(job)
         if self._jobs.submit(PLANNER, job):

@@ -1,0 +1,77 @@
+"""When a slew is planned: for a new target and for a body astray, not for one on a path."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from flight.bodies.orbit.object_aim import ObjectAim
+from flight.bodies.orbit.paths import PointingPaths
+from flight.bodies.orbit.planning import PlannedCraft, PointingPlanner
+from flight.bodies.orbit.targets import PointingLawOf
+from flight.gnc.control.three_axes.pointing_job import PointingJob
+from flight.gnc.control.three_axes.slew_table import SlewWish
+from flight.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from flight.gnc.guidance.three_axes.target_law import BodyAxes
+from flight.loop.control_output import Target
+from hal.interfaces.wires import SECOND_NS
+from tests.flight.bodies.orbit.test_astray_body import AWAY, NADIR, STILL, table
+from tests.flight.gnc.control.three_axes.test_pointing import INERTIA, LIMIT, ORBIT, WEIGHTS, X, Z
+
+assert table  # a fixture
+RESIDUAL = np.array([1e-3, 0.0, 0.0])
+WISH = SlewWish(300.0, np.ones(3), np.zeros(3), Z)
+SUN = PointingTarget(Goal.SUN)
+
+
+@pytest.fixture
+def paths() -> PointingPaths:
+    return PointingPaths(LIMIT, 0.1)
+
+
+def planned(paths: PointingPaths, goal: PointingTarget, now_ns: int) -> PointingJob:
+    """Return the job that a planner submits for a goal."""
+    jobs: list[PointingJob] = []
+
+    def submit(_: str, job: PointingJob) -> bool:
+        jobs.append(job)
+        return True
+
+    services = SimpleNamespace(
+        jobs=SimpleNamespace(submit=submit),
+        events=SimpleNamespace(report=lambda *_: None),
+    )
+    craft = PlannedCraft(INERTIA, BodyAxes(Z, X), WEIGHTS, LIMIT, WISH)
+    planner = PointingPlanner(
+        craft,
+        paths,
+        cast(Any, SimpleNamespace(state=lambda _: ORBIT)),
+        lambda: (np.zeros(9), RESIDUAL),
+        ObjectAim(None, LIMIT, cast(Any, services.events)),
+        cast(Any, services),
+    )
+    planner.request(now_ns)
+    estimate = SimpleNamespace(quaternion=np.array([0.0, 0.0, 0.0, 1.0]), rate=np.zeros(3))
+    planner.serve(cast(Any, estimate), Target(0, PointingLawOf(goal, paths)), now_ns)
+    (job,) = jobs
+    return job
+
+
+def test_a_path_that_leaves_its_target_for_a_time_is_no_reason_for_a_slew(
+    table: Any, paths: PointingPaths
+) -> None:
+    before = planned(paths, NADIR, 0).slew
+    assert before is not None
+    assert before.residual is RESIDUAL
+    paths.offer(table, NADIR, 0)
+    assert planned(paths, NADIR, SECOND_NS).slew is None
+    assert planned(paths, SUN, SECOND_NS).slew is not None
+
+
+def test_a_body_astray_is_slewed_back(table: Any, paths: PointingPaths) -> None:
+    paths.offer(table, NADIR, 0)
+    paths.led(AWAY, STILL, SECOND_NS)
+    assert planned(paths, NADIR, 2 * SECOND_NS).slew is not None
