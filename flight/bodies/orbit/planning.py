@@ -20,6 +20,7 @@ from flight.gnc.control.three_axes.pointing_job import STEADY, PointingJob
 from flight.gnc.control.three_axes.pointing_table import PointingWeights
 from flight.gnc.control.three_axes.slew_table import SlewWish
 from flight.gnc.estimation.estimate import Estimate
+from flight.gnc.guidance.three_axes.pointing_target import PointingTarget
 from flight.gnc.guidance.three_axes.target_law import BodyAxes
 from flight.gnc.math.arrays import FloatArray
 from flight.link import events
@@ -110,8 +111,6 @@ class PointingPlanner:
             self._fail("no plan: the orbit is not known", now_ns)
             return
         sizes, residual = self._disturbed()
-        # A path leaves its target for a time where it meets torques along the field: no reason for a slew.
-        on_path = astray.since is None and self._paths.attitude(goal, now_ns) is not None
         job = PointingJob(
             self._count + 1,
             now_ns,
@@ -124,12 +123,20 @@ class PointingPlanner:
             estimate.rate,
             sizes,
             craft.limit,
-            None if on_path else replace(craft.slew, residual=residual),
+            self._slew(goal, residual, now_ns),
         )
         job = self._objects.directed(job)
         if self._jobs.submit(PLANNER, job):
             self._wanted, self._job, self._count = False, job, job.number
             self._after_ns = now_ns + (AGAIN_NS if job.span is STEADY else 0)
+
+    def _slew(self, goal: PointingTarget, residual: FloatArray, now_ns: int) -> SlewWish | None:
+        """Return how a slew to a goal is wanted; None for a body on a path to it.
+
+        A path leaves its goal for a time where it meets torques along the field: no reason for a slew.
+        """
+        on_path = self._paths.astray.since is None and self._paths.attitude(goal, now_ns) is not None
+        return None if on_path else replace(self._craft.slew, residual=residual)
 
     def _hold_still(self, now_ns: int) -> None:
         """Report once that the body is held still."""
