@@ -18,7 +18,7 @@ import numpy as np
 from flight.gnc.errors import PlanningError
 from flight.gnc.guidance.three_axes.slew_closing import closed
 from flight.gnc.guidance.three_axes.slew_path import SlewPath
-from flight.gnc.guidance.three_axes.slew_search import Search
+from flight.gnc.guidance.three_axes.slew_search import GRIDS, GRIDS_WITH_CONES, Search
 from flight.gnc.guidance.three_axes.slew_solver import Found
 from flight.gnc.guidance.three_axes.slew_task import SlewTask, check
 from flight.gnc.math.arrays import FloatArray
@@ -61,20 +61,14 @@ class SlewPlan:
 def plan_slew(task: SlewTask) -> SlewPlan:
     """Return the best plan found. Raises PlanningError with the reason when there is none."""
     check(task)
-    search = Search(task)
-    plan = _first(task, search, search.paths())
-    barring: list[str] = []
-    for cone in task.cones if plan is None else ():
-        without = Search(replace(task, cones=tuple(other for other in task.cones if other is not cone)))
-        start = next(without.paths(), None)
-        if start is not None:
-            barring.append(f"the cone of the {cone.name}")
-            plan = _first(task, search, search.around(start))
+    tried = 0
+    for coarse, budget in GRIDS_WITH_CONES if task.cones else GRIDS:
+        search = Search(task, coarse, budget)
+        plan = _first(task, search, search.paths())
         if plan is not None:
-            break
-    if plan is None:
-        raise PlanningError(_refusal(task, search.tried, barring))
-    return plan
+            return plan
+        tried += search.tried
+    raise PlanningError(_refusal(task, tried))
 
 
 def _first(task: SlewTask, search: Search, paths: Iterator[Found]) -> SlewPlan | None:
@@ -92,11 +86,9 @@ def _first(task: SlewTask, search: Search, paths: Iterator[Found]) -> SlewPlan |
     return None
 
 
-def _refusal(task: SlewTask, tried: int, barring: list[str]) -> str:
+def _refusal(task: SlewTask, tried: int) -> str:
     """Return why a task is refused: which cones are in the way, and what may help."""
     text = f"no slew within the dipole's limit{' and outside the cones' * bool(task.cones)} was found"
-    if barring:
-        text += f" ({' or '.join(barring)} is in the way: one is found without)"
     text += f" over {task.horizon:g} to {task.longest:g} s, from {tried} guesses"
     return f"{text}: a longer time or another begin may do"
 
@@ -113,7 +105,7 @@ def _plan(task: SlewTask, search: Search, found: Found) -> SlewPlan | None:
         q = at.states[:, :4] / np.linalg.norm(at.states[:, :4], axis=1, keepdims=True)
         dipole = search.solver.unit * at.all_dipoles()
         path = SlewPath(equations.times, q, at.states[:, 4:] / scale, flow[:, 4:] / scale**2, dipole)
-    if not all(np.isfinite(part).all() for part in (path.quaternion, path.rate, path.dipole)):
+    if not all(np.isfinite(part).all() for part in (path.quaternion, path.rate, path.acceleration, path.dipole)):
         return None
     clear = _clearances(task, path)
     kept = task.time_price is not None or path.horizon <= task.horizon * (1.0 + 1e-6)

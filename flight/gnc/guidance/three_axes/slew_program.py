@@ -27,8 +27,10 @@ _HEAVIER = 1.2
 """The merit's weight of the equations over their largest multiplier."""
 _FAR = 0.03
 """Sum of all equations' violations beyond which their curvature is left out."""
+_DAMPED = 3e-3
+"""Of that sum up to one, the convexity that such a step has at least: without it the step is too long."""
 _CONVEX = 1e-3, 1e4
-_FIRST_BARRIER = 1e-3
+FIRST_BARRIER = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,7 +86,7 @@ class Program:
 
     def begin(self, guess: Trajectory, price: FloatArray | None, barrier: float) -> Point:
         """Return a guess as an iterate of Newton's method."""
-        slack = np.maximum(self._limits.values(guess), 1e-2)
+        slack = np.maximum(self._limits.values(guess), min(1e-2, 10.0 * barrier))
         price = np.zeros(self.equations.layout.size) if price is None else price
         return self._point(guess, price, slack, barrier / slack)
 
@@ -108,19 +110,22 @@ class Program:
 
     def moved(self, point: Point, barrier: float, convex: float, error: float) -> tuple[Point | None, float]:
         """Return the next iterate, None without one, and the convexity that it took."""
-        is_far = self.lack(point)[0] > _FAR
+        lack = self.lack(point)[0]
+        is_far = lack > _FAR
+        least = _DAMPED * min(1.0, lack) if is_far else 0.0
         bent = np.zeros_like(point.dual) if is_far else point.dual
         stiffness = self._limits.stiffness(point.at, point.dual / point.slack, bent)
         price = np.zeros_like(point.price) if is_far else point.price
+        states, heavy = stiffness
         for _ in range(10):
-            states, heavy = stiffness
-            stiff = states + convex * _EYE7, heavy + convex
-            step = self._newton(point, barrier, convex, self.equations.band(point.linear, price, *stiff))
+            more = max(convex, least)
+            stiff = states + more * _EYE7, heavy + more
+            step = self._newton(point, barrier, more, self.equations.band(point.linear, price, *stiff))
             if step is not None:
                 moved = self._searched(point, step, barrier, error)
                 if moved is not None:
                     return moved, (0.25 * convex if convex > _CONVEX[0] else 0.0)
-            convex = max(5.0 * convex, _CONVEX[0])
+            convex = max(5.0 * more, _CONVEX[0])
             if convex > _CONVEX[1]:
                 break
         return None, convex
@@ -201,17 +206,22 @@ class Descent:
     """
 
     def __init__(
-        self, program: Program, guess: Trajectory, price: FloatArray | None = None, last: float = 1e-8
+        self,
+        program: Program,
+        guess: Trajectory,
+        price: FloatArray | None = None,
+        first: float = FIRST_BARRIER,
+        last: float = 1e-8,
     ) -> None:
         """Costs should be about one. `price` (size,) multiplies the equations; barriers fall to `last`."""
-        self.program, self._last, self.is_over = program, last, False
-        self.point = program.begin(guess, price, _FIRST_BARRIER)
-        self._barrier, self._convex = (_FIRST_BARRIER if self.point.slack.size else 0.0), 0.0
+        self.program, self._first, self._last, self.is_over = program, first, last, False
+        self.point = program.begin(guess, price, first)
+        self._barrier, self._convex = (first if self.point.slack.size else 0.0), 0.0
 
     @property
     def lack(self) -> float:
         """The sum of all violations; zero from where the barriers have begun to fall."""
-        return 0.0 if 0.0 < self._barrier < _FIRST_BARRIER else sum(self.program.lack(self.point))
+        return 0.0 if 0.0 < self._barrier < self._first else sum(self.program.lack(self.point))
 
     def run(self, most: int) -> Point | None:
         """Return the optimum found within `most` more steps, None when there is none."""

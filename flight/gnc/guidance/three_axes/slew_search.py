@@ -15,23 +15,26 @@ import numpy as np
 
 from flight.gnc.guidance.three_axes.slew_prey import guesses
 from flight.gnc.guidance.three_axes.slew_program import Descent
-from flight.gnc.guidance.three_axes.slew_solver import STEPS_FREE, Found, Solver
+from flight.gnc.guidance.three_axes.slew_solver import Found, Solver
 from flight.gnc.guidance.three_axes.slew_task import HORIZON_RANGE, LEAST_TIME, SlewTask
 from flight.gnc.guidance.three_axes.slew_transcription import Trajectory, Transcription
 from flight.gnc.guidance.three_axes.slew_walk import ENOUGH, LONGER, Walker
 from flight.gnc.math.arrays import FloatArray
 
-_COARSE, _COARSE_WITH_CONES = 10, 16
-"""Intervals of the search. On ten, what goes round cones is far from what does on the fine grid."""
+GRIDS, GRIDS_WITH_CONES = ((10, 1000),), ((12, 600), (16, 500))
+"""Searches, one after the other: intervals, and Newton steps after which nothing else is begun with.
+
+A thousand steps take about a second and a half. On ten intervals, what goes round cones is far from what does on
+the fine grid; half of the slews with cones for which twelve lead to none are found on sixteen.
+"""
 _MOST_TRIED = 16
 """Guesses over one horizon."""
-_LOOK, _PROMISING = 8, 1.5
+_LOOK = 8
+_FURTHER, _FURTHER_WITH_CONES = ((17, 1.5),), ((12, 1.0), (30, 0.6))
 """Newton steps after which a guess is put off whose equations lack more in all: four of five that lead to a
 path lack less, three of four that do not lack more (320 guesses, seed 41 of the bench `orbit_slews`)."""
 _PATIENCE = 120
 """Newton steps without a path, after which the other guesses over a horizon are put off."""
-_BUDGET = 1000
-"""Newton steps, about a second and a half, after which nothing else is begun with."""
 _WIDENED = 4
 """Times at most that cones are widened for a path."""
 
@@ -39,11 +42,13 @@ _WIDENED = 4
 class Search:
     """The search of one task; `tried` guesses."""
 
-    def __init__(self, task: SlewTask) -> None:
-        self._task = task
+    def __init__(self, task: SlewTask, coarse: int, budget: int) -> None:
+        """Search on `coarse` intervals; after `budget` Newton steps nothing else is begun with."""
+        self._task, self._budget = task, budget
         self.solver = Solver(task)
-        self._walker = Walker(task, self.solver)
-        self._coarse = min(task.nodes, _COARSE_WITH_CONES if task.cones else _COARSE)
+        self._walker = Walker(task, self.solver, budget)
+        self._coarse = min(task.nodes, coarse)
+        self._further = _FURTHER_WITH_CONES if task.cones else _FURTHER
         self._widened = 0
         self._known: list[float] = []  # heats, J, of paths without limits that were looked at
         self.tried = 0
@@ -63,13 +68,6 @@ class Search:
                 continue
             if (found := self._walker.shortened(relaxed, self._task.horizon, LEAST_TIME)) is not None:
                 yield self._fresh(found)
-
-    def around(self, start: Found) -> Iterator[Found]:
-        """Yield the path within all limits near one that keeps all but one cone, where there is one."""
-        self.solver.extra = np.zeros_like(self.solver.extra)
-        led = self._walker.led(start, start.horizon)
-        if led is not None:
-            yield self._fresh(led)
 
     def widened(self, found: Found, depths: FloatArray) -> Found | None:
         """Return a path near one that crosses cones by `depths` (cones, 2 nodes) rad between the points.
@@ -93,7 +91,7 @@ class Search:
         put_off: list[Descent] = []
         for longer in LONGER:
             horizon = min(longer * self._task.horizon, self._task.longest)
-            if self.solver.steps < _BUDGET:
+            if self.solver.steps < self._budget:
                 yield self._relaxed(horizon, put_off)
             if horizon == self._task.longest:
                 break
@@ -110,8 +108,9 @@ class Search:
                 put_off.append(descent)
                 continue
             found = solver.found(descent, _LOOK)
-            if found is None and descent.lack < _PROMISING:
-                found = solver.found(descent, STEPS_FREE - _LOOK)
+            for steps, lack in self._further:
+                if found is None and descent.lack < lack:
+                    found = solver.found(descent, steps)
             if found is not None:
                 batch.append(found)
             elif not descent.is_over:
@@ -125,9 +124,9 @@ class Search:
     def _late(self, put_off: list[Descent]) -> Iterator[list[Found]]:
         """Yield paths without limits from guesses that were put off, those that lack least first."""
         for descent in sorted(put_off, key=lambda descent: descent.lack):
-            if self.solver.steps > _BUDGET:
+            if self.solver.steps > self._budget:
                 break
-            found = self.solver.found(descent, STEPS_FREE)
+            found = self.solver.found(descent, self._further[-1][0])
             if found is not None:
                 yield [found]
 
@@ -146,7 +145,7 @@ class Search:
         kept: list[Found] = []
         energy = self.solver.energy
         for start in self._walker.distinct([start for start in batch if start.horizon <= self._task.horizon]):
-            if (kept and energy(start) >= min(map(energy, kept))) or self.solver.steps > _BUDGET:
+            if (kept and energy(start) >= min(map(energy, kept))) or self.solver.steps > self._budget:
                 break
             if any(math.isclose(energy(start), known, rel_tol=1e-4) for known in self._known):
                 continue  # it led nowhere before

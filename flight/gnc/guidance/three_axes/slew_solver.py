@@ -9,14 +9,14 @@ from scipy.interpolate import CubicHermiteSpline
 
 from flight.gnc.guidance.three_axes.slew_cones import Kept
 from flight.gnc.guidance.three_axes.slew_limits import Limits
-from flight.gnc.guidance.three_axes.slew_program import Descent, Point, Program
+from flight.gnc.guidance.three_axes.slew_program import FIRST_BARRIER, Descent, Point, Program
 from flight.gnc.guidance.three_axes.slew_task import SlewTask
 from flight.gnc.guidance.three_axes.slew_transcription import Trajectory, Transcription
 
 WALK_BARRIER, LAST_BARRIER = 1e-5, 1e-8
 """Of a path that others begin from, and of one that is flown."""
-STEPS_FREE = 25
-"""Newton steps of a path without limits."""
+STEPS_FREE, STEPS_WITH_CONES = 25, 50
+"""Newton steps of a path without the dipoles' limit."""
 _STEPS_LIMITED = 60
 _LOOK, _HOPEFUL = 20, 0.4
 """Newton steps within limits after which a way is left that still lacks more in all: half of those that lead
@@ -83,14 +83,13 @@ class Solver:
         return Transcription(task.craft, self.unit, task.along, start, task.end, count, scale, self._full)
 
     def free(self, equations: Transcription, guess: Trajectory) -> Found | None:
-        """Return the path without limits from a guess."""
-        return self.found(self.descent(equations, guess), STEPS_FREE)
+        """Return the path that is flown, without the dipoles' limit, from a guess."""
+        return self.found(self.descent(equations, guess, LAST_BARRIER), STEPS_FREE)
 
-    def descent(self, equations: Transcription, guess: Trajectory) -> Descent:
-        """Return the way from a guess to a path without limits."""
+    def descent(self, equations: Transcription, guess: Trajectory, last: float = WALK_BARRIER) -> Descent:
+        """Return the way from a guess to a path that keeps the cones, without the dipoles' limit."""
         equations.weights = self._full / max(equations.cost(guess), 1e-9)
-        limits = Limits(equations, None, Kept((), np.zeros((0, 1)), equations.times[1:]))
-        return Descent(Program(equations, limits), guess)
+        return Descent(Program(equations, Limits(equations, None, self._kept(equations))), guess, last=last)
 
     def limited(self, start: Found, count: int, time: float, last: float) -> Found | None:
         """Return the path within all limits on `count` intervals over `time` s, from one near it."""
@@ -99,10 +98,11 @@ class Solver:
         equations.weights = self._full / max(equations.cost(at), 1e-9)
         same = count == start.equations.count
         price = start.point.price * float(equations.weights[0] / before[0]) if same else None
-        if last == LAST_BARRIER or self.peak(start) > 1.0:
+        near = same and time == start.horizon and self.peak(start) < 1.0
+        if not near and (last == LAST_BARRIER or self.peak(start) > 1.0):
             at = Trajectory(at.states, np.clip(at.dipoles, -0.98 * self._limit, 0.98 * self._limit))
         program = Program(equations, Limits(equations, self._limit, self._kept(equations)))
-        descent = Descent(program, at, price, last)
+        descent = Descent(program, at, price, WALK_BARRIER if near else FIRST_BARRIER, last)
         found = self.found(descent, _LOOK)
         if found is None and descent.lack < _HOPEFUL:
             found = self.found(descent, _STEPS_LIMITED - _LOOK)

@@ -35,8 +35,9 @@ _PEAK = 0.9
 class Walker:
     """Walks of one task."""
 
-    def __init__(self, task: SlewTask, solver: Solver) -> None:
-        self._task, self._solver = task, solver
+    def __init__(self, task: SlewTask, solver: Solver, budget: int) -> None:
+        """After `budget` Newton steps no other walk is begun."""
+        self._task, self._solver, self._budget = task, solver, budget
 
     def within(self, start: Found) -> Found | None:
         """Return the path within the limits, on the fine grid, near a coarse one without."""
@@ -46,7 +47,7 @@ class Walker:
             fine = solver.free(equations, transferred(start, equations))
             if fine is not None and solver.is_kept(fine):
                 return fine
-        coarse = self.led(start, time)
+        coarse = self._over(start, time)
         return None if coarse is None else self._finer(coarse, time, LAST_BARRIER)
 
     def shortened(self, relaxed: list[Found], least: float, price: float) -> Found | None:
@@ -58,7 +59,7 @@ class Walker:
         best: Found | None = None
         for start in sorted(self.distinct(relaxed), key=self._fastest)[:ENOUGH]:
             times = self._begins(start, least)
-            ways = (self.led(start, time) for time in times)
+            ways = (self._over(start, time) for time in times)
             begun = next(filter(None, ways), None)
             if begun is None:
                 continue
@@ -67,7 +68,7 @@ class Walker:
             ended = self._walked(begun, least, price, _COARSE_STEP)
             if best is None or self._value(ended, price) < self._value(best, price):
                 best = ended
-            if best.horizon <= least:
+            if best.horizon <= least or self._solver.steps > self._budget:
                 break
         return None if best is None else self._refined(best, least, price)
 
@@ -92,30 +93,6 @@ class Walker:
         both[:, -1] = 0.0
         self._solver.extra = self._solver.extra + both
         return self._solver.limited(found, found.equations.count, found.horizon, LAST_BARRIER)
-
-    def led(self, start: Found, time: float) -> Found | None:
-        """Return the path within the limits over `time` s that one without limits leads to."""
-        times, q = start.equations.times, start.at.states[:, :4]
-        depth = -min((float(cone.clearance(q, times).min()) for cone in self._task.cones), default=0.0)
-        if depth > _DEEP:
-            return self._grown(start, time, depth) or self._over(start, time)
-        found = self._over(start, time)
-        return self._grown(start, time, depth) if found is None and depth > 0.0 else found
-
-    def _grown(self, start: Found, time: float, depth: float) -> Found | None:
-        """Return the path within the limits as cones grow, from `start`, which is `depth` rad within one."""
-        near, share, wanted = start, 0.0, self._solver.margin
-        step, ratio, least = _GROWING
-        while share < 1.0 and step >= least:
-            tried = min(share + step, 1.0)
-            self._solver.margin = wanted - (1.0 - tried) * depth
-            further = self._over(near, time)
-            if further is None:
-                step *= 0.4
-            else:
-                near, share, step = further, tried, ratio * step
-        self._solver.margin = wanted
-        return near if share == 1.0 else None
 
     def _refined(self, best: Found, least: float, price: float) -> Found | None:
         """Return the best path on the fine grid, by a walk that begins with a coarse one."""
