@@ -9,6 +9,7 @@ magnetic proportional-derivative law: what of the torque -J (w^2 turn + 2 w rate
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -48,6 +49,8 @@ CYCLE, PAUSE = 2.0, 0.2
 """s."""
 STARS_EVERY, REPLAN, AGAIN, AHEAD = 10.0, 600.0, 10.0, 900.0
 """s."""
+OFF = math.radians(5.0)
+"""rad off the path, as `flight.bodies.orbit.planning` has it."""
 COAST = 12.0
 """s with the coils at rest, while the attitude is made sure of."""
 STAR_SIGMA = 5e-5
@@ -59,7 +62,9 @@ TARGETS = {
     "inertial": PointingTarget(Goal.INERTIAL, (0.0, 0.0, 0.0, 1.0)),
 }
 WEIGHTS = {
-    "knightcube": PointingWeights(turn=np.radians(1.0), rate=1.0, dipole=3e-4),
+    "knightcube": PointingWeights(
+        turn=np.radians(1.0), rate=1.0, dipole=3e-4, roll=np.radians(10.0), axis=AXES.pointing
+    ),
     "cubesat_3u": PointingWeights(turn=np.radians(1.0), rate=1.0, dipole=1.5e-3),
 }
 TORQUE = {"knightcube": (1e-9, 2e-12), "cubesat_3u": (3e-9, 5e-12)}
@@ -122,7 +127,8 @@ class PointingFlight:
         if time - self._ahead_begun >= AHEAD:
             self._ahead, self._ahead_begun = flight.ephemeris(AHEAD + 60.0), time
         self._astray.see(float(np.linalg.norm(self._turn)), float(np.linalg.norm(found.rate)), time)
-        astray = self._astray.ready and time - self._begun >= AGAIN
+        off = self._astray.since is None and float(np.linalg.norm(self._turn)) > OFF
+        astray = (self._astray.ready or off) and time - self._begun >= AGAIN
         if (
             self._wanted["law"] != "pd"
             and time >= COAST
