@@ -31,8 +31,8 @@ STEPS = 20
 FARTHEST = math.radians(30.0)
 """rad that a step may turn the motion at any instant; a larger one is scaled as a whole."""
 SLOW, SHARE, LEAST = 0.7, 0.7, 0.3
-"""Whole steps may overshoot: after a step that turned the motion by more than SLOW of the one before, SHARE as
-much of a step is taken, LEAST at least, and more again after others."""
+"""Whole steps may overshoot: after a step that turned the motion by more than SLOW of the one before, SHARE
+as much of a step is taken, LEAST at least, and more again after others."""
 DONE = math.radians(0.05)
 """rad: a step that turns the motion by less is the last."""
 ENOUGH = math.radians(1.5)

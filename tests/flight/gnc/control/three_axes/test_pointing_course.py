@@ -1,4 +1,4 @@
-"""The course of a revolution: one that the body flies, and that turns about its axis where that spares the goal."""
+"""The course of a revolution: one that the body flies, rolling where that keeps its axis on the goal."""
 
 from __future__ import annotations
 
@@ -59,7 +59,8 @@ def off_axis(motion: Motion) -> FloatArray:
     """Return the angles (n,) deg between the pointing axis and nadir."""
     wanted = expected().wanted.quaternion
     axes = [attitude_matrix(q).transpose(0, 2, 1) @ Z for q in (motion.quaternion, wanted)]
-    return np.degrees(np.arccos(np.clip(np.sum(axes[0] * axes[1], axis=1), -1.0, 1.0)))
+    cosine = np.sum(axes[0] * axes[1], axis=1)
+    return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 
 def test_a_cheap_turn_about_the_axis_takes_torques_along_the_field_from_the_goal() -> None:
