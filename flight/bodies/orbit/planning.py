@@ -33,9 +33,6 @@ from flight.loop.services import Services
 AGAIN_NS = 10_000_000_000
 """After a plan that failed, or while no orbit is known, the next is asked for after this time."""
 
-OFF = math.radians(5.0)
-"""rad off its path, from which on a body is planned for again, where torques are not as expected."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlannedCraft:
@@ -106,8 +103,7 @@ class PointingPlanner:
             text = f"{math.degrees(self._paths.off):.2f} deg off its path"
             self._events.report(events.SLEW_ENDED, now_ns, text)
             self._wanted = True
-        off = astray.since is None and self._paths.off > OFF
-        wanted = self._wanted or astray.ready or self._objects.moved or off
+        wanted = self._wanted or astray.ready or astray.leaving or self._objects.moved
         if estimate is None or not wanted or self._job is not None or now_ns < self._after_ns:
             return
         orbit, craft = self._surroundings.state(now_ns), self._craft

@@ -1,15 +1,14 @@
 """One flight of campaign `orbit-pointing`: a craft with its filter, its planner's job and its law.
 
-The tables are those of the planner worker (`pointing_job`), made again each REPLAN s, and where the body was
-astray and has been held still (`flight.gnc.control.three_axes.astray`). The coils pause a tenth of each two
-seconds for the magnetometer; star attitudes come each 10 s, two seconds late. Beside the law stands the
-magnetic proportional-derivative law: what of the torque -J (w^2 turn + 2 w rate) lies across the field
-(Lovera & Astolfi 2004, Automatica 40(8)).
+The tables are those of the planner worker (`pointing_job`), made again each REPLAN s, where the body leaves
+its path, and where it was astray and has been held still (`flight.gnc.control.three_axes.astray`). The coils
+pause a tenth of each two seconds for the magnetometer; star attitudes come each 10 s, two seconds late.
+Beside the law stands the magnetic proportional-derivative law: what of the torque -J (w^2 turn + 2 w rate)
+lies across the field (Lovera & Astolfi 2004, Automatica 40(8)).
 """
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -49,8 +48,6 @@ CYCLE, PAUSE = 2.0, 0.2
 """s."""
 STARS_EVERY, REPLAN, AGAIN, AHEAD = 10.0, 600.0, 10.0, 900.0
 """s."""
-OFF = math.radians(5.0)
-"""rad off the path, as `flight.bodies.orbit.planning` has it."""
 COAST = 12.0
 """s with the coils at rest, while the attitude is made sure of."""
 STAR_SIGMA = 5e-5
@@ -127,8 +124,7 @@ class PointingFlight:
         if time - self._ahead_begun >= AHEAD:
             self._ahead, self._ahead_begun = flight.ephemeris(AHEAD + 60.0), time
         self._astray.see(float(np.linalg.norm(self._turn)), float(np.linalg.norm(found.rate)), time)
-        off = self._astray.since is None and float(np.linalg.norm(self._turn)) > OFF
-        astray = (self._astray.ready or off) and time - self._begun >= AGAIN
+        astray = (self._astray.ready or self._astray.leaving) and time - self._begun >= AGAIN
         if (
             self._wanted["law"] != "pd"
             and time >= COAST
