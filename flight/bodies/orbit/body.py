@@ -134,7 +134,14 @@ def _planned(config: OrbitConfig) -> PlannedCraft:
     section = config.pointing
     axes = BodyAxes(np.array(section.axis), np.array(section.across))
     fastest = _BELOW * fastest_rate(config)
-    weights = PointingWeights(turn=section.turn, rate=section.rate, dipole=section.dipole, fastest=fastest)
+    weights = PointingWeights(
+        turn=section.turn,
+        rate=section.rate,
+        dipole=section.dipole,
+        fastest=fastest,
+        roll=section.roll,
+        axis=axes.pointing,
+    )
     pauses = _pauses(config)
     limit = _limit(config) * pauses.act_ns / pauses.period_ns
     return PlannedCraft(np.diag(config.craft.inertia), axes, weights, limit, _slew(config))

@@ -1,7 +1,7 @@
 """Planning of a satellite: requests tables of the pointing law from the planner worker.
 
-A table is made when a target is set, when the attitude is known again, and periodically: the orbit's
-prediction ages, and a free roll follows the body's own.
+A table is made when a target is set, when the attitude is known again, where the body leaves its path, and
+periodically: the orbit's prediction ages, and a free roll follows the body's own.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ class PointingPlanner:
             text = f"{math.degrees(self._paths.off):.2f} deg off its path"
             self._events.report(events.SLEW_ENDED, now_ns, text)
             self._wanted = True
-        wanted = self._wanted or astray.ready or self._objects.moved
+        wanted = self._wanted or astray.ready or astray.leaving or self._objects.moved
         if estimate is None or not wanted or self._job is not None or now_ns < self._after_ns:
             return
         orbit, craft = self._surroundings.state(now_ns), self._craft

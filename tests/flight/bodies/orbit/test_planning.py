@@ -1,4 +1,4 @@
-"""When a slew is planned: for a new target and for a body astray, not for one on a path."""
+"""What is planned when: slews for new targets and bodies astray, a path again where a body leaves it."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from flight.bodies.orbit.object_aim import ObjectAim
 from flight.bodies.orbit.paths import PointingPaths
 from flight.bodies.orbit.planning import PlannedCraft, PointingPlanner
 from flight.bodies.orbit.targets import PointingLawOf
+from flight.gnc.control.three_axes.astray import LEAVING
 from flight.gnc.control.three_axes.pointing_job import PointingJob
 from flight.gnc.control.three_axes.slew_table import SlewWish
 from flight.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
@@ -33,7 +34,15 @@ def paths() -> PointingPaths:
 
 
 def planned(paths: PointingPaths, goal: PointingTarget, now_ns: int) -> PointingJob:
-    """Return the job that a planner submits for a goal."""
+    """Return the job that a planner submits for a goal when asked for a plan."""
+    (job,) = submitted(paths, goal, now_ns, requested=True)
+    return job
+
+
+def submitted(
+    paths: PointingPaths, goal: PointingTarget, now_ns: int, *, requested: bool
+) -> list[PointingJob]:
+    """Return the jobs that a planner submits for a goal."""
     jobs: list[PointingJob] = []
 
     def submit(_: str, job: PointingJob) -> bool:
@@ -53,11 +62,11 @@ def planned(paths: PointingPaths, goal: PointingTarget, now_ns: int) -> Pointing
         ObjectAim(None, LIMIT, cast(Any, services.events)),
         cast(Any, services),
     )
-    planner.request(now_ns)
+    if requested:
+        planner.request(now_ns)
     estimate = SimpleNamespace(quaternion=np.array([0.0, 0.0, 0.0, 1.0]), rate=np.zeros(3))
     planner.serve(cast(Any, estimate), Target(0, PointingLawOf(goal, paths)), now_ns)
-    (job,) = jobs
-    return job
+    return jobs
 
 
 def test_a_path_that_leaves_its_target_for_a_time_is_no_reason_for_a_slew(
@@ -75,3 +84,12 @@ def test_a_body_astray_is_slewed_back(table: Any, paths: PointingPaths) -> None:
     paths.offer(table, NADIR, 0)
     paths.led(AWAY, STILL, SECOND_NS)
     assert planned(paths, NADIR, 2 * SECOND_NS).slew is not None
+
+
+def test_a_body_that_leaves_its_path_is_planned_for_again(table: Any, paths: PointingPaths) -> None:
+    paths.offer(table, NADIR, 0)
+    paths.led(0.9 * LEAVING * X, STILL, SECOND_NS)
+    assert not submitted(paths, NADIR, 2 * SECOND_NS, requested=False)
+    paths.led(1.1 * LEAVING * X, STILL, 3 * SECOND_NS)
+    (job,) = submitted(paths, NADIR, 4 * SECOND_NS, requested=False)
+    assert job.slew is None
