@@ -155,7 +155,7 @@ class PointingPlanner:
         elif self._paths.astray.since is not None and not self._paths.astray.ready:
             self._wanted = True  # planned before the body went astray: another one once it is slow
         elif reason := self._paths.offer(result.value, job.target, job.origin_ns):
-            self._fail(f"plan {job.number}: {reason}", now_ns)
+            self._fail(f"plan {job.number}: {reason}", now_ns, AGAIN_NS if job.span is STEADY else 0)
         else:
             self._accepted, self._held = self._accepted + 1, False
             self._objects.judge(job, result.value, now_ns)
@@ -168,8 +168,8 @@ class PointingPlanner:
         """Return how many plans were accepted and refused since the start."""
         return self._accepted, self._refused
 
-    def _fail(self, text: str, now_ns: int) -> None:
-        """Report a plan that is not flown, and ask for another one later."""
+    def _fail(self, text: str, now_ns: int, wait_ns: int = AGAIN_NS) -> None:
+        """Report a plan that is not flown, and ask for another one after `wait_ns`; an object does not wait."""
         self._refused += 1
-        self._wanted, self._after_ns = True, now_ns + AGAIN_NS
+        self._wanted, self._after_ns = True, now_ns + wait_ns
         self._events.report(events.PLANNER_FAILED, now_ns, text)

@@ -139,9 +139,10 @@ class ObjectChase(PointingFlight):
         if self._table is not None:
             table, job, begun = self._table
             self._table = None
-            if np.linalg.norm(table.path.rate, axis=1).max() < FASTEST:
+            flown = table.below(FASTEST)
+            if flown is not None:
                 self._aim.judge(job, table, self.flight.time_ns)
-                self._fly(table, begun)
+                self._fly(flown, begun)
             else:
                 self.refused += 1
         if self._law is not None and self._aim.moved:

@@ -284,12 +284,14 @@ def _swept(
         state_slope[:, :, 0] = np.einsum("nij,nj->ni", turned[:-1] @ state, astray[:-1])
         control_slope[:, :, 0] = control * motion.control
     states = turned[:-1] @ state @ bent[:-1]
-    steep, curved = _haste(motion.rate[:-1], criterion.fastest, expected.step)
-    state_slope[:, 3:, 0] += steep
-    states[:, 3:, 3:] += curved
-    slope = turned[-1] @ end.slope
+    steep, curved = _haste(motion.rate, criterion.fastest, expected.step)
+    state_slope[:, 3:, 0] += steep[:-1]
+    states[:, 3:, 3:] += curved[:-1]
+    slope, square = turned[-1] @ end.slope, turned[-1] @ end.square @ bent[-1]
     slope[:, 0] += turned[-1] @ end.square @ astray[-1]
-    last = ToGo(turned[-1] @ end.square @ bent[-1], slope)
+    slope[3:, 0] += steep[-1]
+    square[3:, 3:] += curved[-1]
+    last = ToGo(square, slope)
     cost = Cost(states, control, state_slope, control_slope)
     gain, steady, _ = sweep(linear, affine, cost, last)
     return Gains(gain, steady)
@@ -302,7 +304,7 @@ def _cost(expected: Expected, motion: Motion, criterion: Criterion, price: float
     squares = np.einsum("ni,ij,nj->", astray[:-1], criterion.state, astray[:-1])
     squares += criterion.dipole * np.sum(motion.control[:, :3] ** 2)
     squares += criterion.dipole * price * np.sum((motion.control[:, 3] / strength) ** 2)
-    excess = np.maximum(np.linalg.norm(motion.rate[:-1], axis=1) - criterion.fastest, 0.0)
+    excess = np.maximum(np.linalg.norm(motion.rate, axis=1) - criterion.fastest, 0.0)
     squares += expected.step * np.sum((excess / EXCESS) ** 2)
     return float(0.5 * squares + astray[-1] @ (0.5 * end.square @ astray[-1] + end.slope[:, 0]))
 

@@ -7,7 +7,7 @@ the end would cost (`pointing_sweep`).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,6 +20,9 @@ from flight.gnc.guidance.three_axes.attitude_law import References
 from flight.gnc.guidance.three_axes.slew_path import SlewPath
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import attitude_matrix
+
+LEAST_PART = 1.0 / 3.0
+"""Of a table: a shorter part that the body can fly is not worth leaving the last table for."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -63,6 +66,32 @@ class PointingTable:
     torque_part: FloatArray
     sizes: FloatArray
     slew: SlewPath | None = None
+
+    @property
+    def fastest(self) -> float:
+        """The largest rate of the path, rad/s."""
+        return float(np.linalg.norm(self.path.rate, axis=1).max())
+
+    def below(self, fastest: float) -> PointingTable | None:
+        """Return the part before the body turns at `fastest` rad/s; None where that is less than `LEAST_PART`.
+
+        A slew is flown whole or not at all.
+        """
+        over = np.flatnonzero(np.linalg.norm(self.path.rate, axis=1) >= fastest)
+        if not len(over):
+            return self
+        count = int(over[0])
+        if self.slew is not None or count < max(LEAST_PART * len(self.dipole), 2.0):
+            return None
+        held = slice(count - 1)
+        return replace(
+            self,
+            path=self.path.until(count),
+            wanted=self.wanted.until(count),
+            dipole=self.dipole[held],
+            gain=self.gain[held],
+            torque_part=self.torque_part[held],
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,7 +1,8 @@
-"""What is planned when: slews for new targets and bodies astray, a path again where a body leaves it."""
+"""What is planned when: slews for new targets and bodies astray, a path again; and which part of it is flown."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -15,6 +16,7 @@ from flight.bodies.orbit.targets import PointingLawOf
 from flight.gnc.control.three_axes.astray import LEAVING
 from flight.gnc.control.three_axes.pointing_job import PointingJob
 from flight.gnc.control.three_axes.slew_table import SlewWish
+from flight.gnc.guidance.three_axes.attitude_law import References
 from flight.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 from flight.gnc.guidance.three_axes.target_law import BodyAxes
 from flight.loop.control_output import Target
@@ -93,3 +95,23 @@ def test_a_body_that_leaves_its_path_is_planned_for_again(table: Any, paths: Poi
     paths.led(1.1 * LEAVING * X, STILL, 3 * SECOND_NS)
     (job,) = submitted(paths, NADIR, 4 * SECOND_NS, requested=False)
     assert job.slew is None
+
+
+def test_the_slow_part_of_a_path_is_flown_that_turns_too_fast_later(table: Any, paths: PointingPaths) -> None:
+    count = len(table.dipole)
+    late, soon = (replace(table, path=_fast_from(table.path, part * count // 10)) for part in (6, 2))
+    assert paths.offer(late, NADIR, 0) == ""
+    sample = paths.sample(SECOND_NS)
+    assert sample is not None
+    first, last = sample.law.span
+    assert first == table.path.times[0]
+    assert last == table.path.times[6 * count // 10 - 1]
+    assert "braked" in paths.offer(soon, NADIR, 0)
+    assert sample.law is paths.sample(SECOND_NS).law  # type: ignore[union-attr] # it was not replaced
+
+
+def _fast_from(path: References, place: int) -> References:
+    """Return a path that turns at 0.2 rad/s from an instant on."""
+    rate = path.rate.copy()
+    rate[place:] = [0.2, 0.0, 0.0]
+    return replace(path, rate=rate)

@@ -242,7 +242,8 @@ def _resting(blobs: Blobs) -> bool:
 def _without_rate(seen: MotionResult, camera: ExposedCamera, blobs: Blobs) -> MotionResult:
     """Return `seen` for a frame without an agreed motion: stars at rest, or a failure."""
     length = float(np.median(blobs.length))
-    if length >= _AT_REST:
+    # Of a crowded sky at rest the faint regions run together, but not the brightest.
+    if length >= _AT_REST and not _resting(blobs):
         return replace(seen, status=StreakStatus.FAILED, length=length, reason=_NO_MOTION)
     resting = still_fit(camera, blobs)
     if resting is None:
