@@ -23,6 +23,12 @@ from flight.gnc.vision.streaks.maximum_likelihood.agreement import (
 from flight.gnc.vision.streaks.maximum_likelihood.equation_solver import turn_covariance
 from flight.gnc.vision.streaks.maximum_likelihood.iteration import ExposedCamera, Fit
 from flight.gnc.vision.streaks.maximum_likelihood.joint_fit import bared_fit
+from flight.gnc.vision.streaks.maximum_likelihood.left_over import (
+    LeftOver,
+    displaced_ends,
+    displaced_sides,
+    left_over,
+)
 from flight.gnc.vision.streaks.maximum_likelihood.lens_errors import correct, seeming_turns
 from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
 from flight.gnc.vision.streaks.maximum_likelihood.scene import PIXEL_VARIANCE, Scene
@@ -34,8 +40,13 @@ _CONJUGATE = 12
 _UNCHECKED = (2, 4.0)
 # Fitted and described point spread are the same when their variances differ by this part.
 _SAME_SPREAD = 0.05
-# Ends are uncertain by this part of the square root of the difference of the variances.
+# Ends are uncertain by this part of the square root of the difference of the variances; where streaks show them,
+# by no more than so many px for that,
 _END_SHARE = 0.6
+_END_FLOOR = 0.12
+# but by these parts of the displacement that the light left over about them would be, and might be.
+_END_SHOWN = 1.5
+_END_CHANCE = 0.5
 # Px by which ends are uncertain for each px, or unit of brightness, that all streaks waver in common.
 _END_SHAKING = 25.0
 # A covariance beyond this many times that of noise is by errors of the model: three deviations.
@@ -52,12 +63,14 @@ class Claim:
         doubt: share of the turn to which errors of the model leave it uncertain, as a vector: common to all
             stars or not. A shutter that nobody described is not counted: the covariance says all of it.
         shaking: of the body.
+        aside: px across the streaks, what the model leaves over there as a displacement.
     """
 
     turn: FloatArray
     covariance: FloatArray
     doubt: float
     shaking: Shaking
+    aside: float
 
 
 def claim(result: MotionResult, camera: ExposedCamera, whole: Fit) -> Claim:
@@ -81,9 +94,10 @@ def claim(result: MotionResult, camera: ExposedCamera, whole: Fit) -> Claim:
     spread = max(result.misfit, lens.spread, 1.0) * max(asked / max(agreed, 1), 1.0)
     if agreed <= _UNCHECKED[0]:
         spread *= _UNCHECKED[1]
-    shaking = find_shaking(camera, whole)
+    left = left_over(camera, whole)
+    shaking = find_shaking(camera, whole.scene, left)
     end = np.hypot(
-        _spread_doubt(scene.width, settings.psf_sigma) * max(result.misfit, 1.0),
+        _spread_doubt(left, whole.scene, settings.psf_sigma, result.misfit),
         _END_SHAKING * max(shaking.across, shaking.along),
     )
     ends = float(np.sqrt(2.0) * end / result.length)
@@ -95,7 +109,9 @@ def claim(result: MotionResult, camera: ExposedCamera, whole: Fit) -> Claim:
     common = float(np.trace(lens.described)) + longer
     unmodelled = max(common, common + float(np.trace(covariance - _BEYOND_NOISE * noise)))
     covariance = covariance + lens.added + longer * np.eye(3)
-    return Claim(turn, covariance, float(np.sqrt(unmodelled / (turn @ turn))), shaking)
+    return Claim(
+        turn, covariance, float(np.sqrt(unmodelled / (turn @ turn))), shaking, _aside(left, whole.scene)
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,8 +161,25 @@ def _spread(equations: OwnEquations, scene: Scene) -> float:
     return max(disagreement(estimates_of(equations, scene), everyone), contradiction(equations))
 
 
-def _spread_doubt(width: float, sigma: float) -> float:
-    """Return by how many px the ends of streaks of a fitted `width` are uncertain; `sigma` is described."""
+def _spread_doubt(left: LeftOver, scene: Scene, sigma: float, misfit: float) -> float:
+    """Return by how many px the ends of streaks are uncertain by a point spread other than `sigma` px.
+
+    Where the fit leaves nothing over about the ends the point spread is as wide along the streaks as across
+    them, and of the model's shape, however wide. What is left over there may be another shape, or the light of
+    a body that shakes too fast to be seen, whose ends are farther off than they seem.
+    """
     described = sigma**2 + PIXEL_VARIANCE
-    beyond = abs(width**2 - described) - _SAME_SPREAD * described
-    return _END_SHARE * float(np.sqrt(max(beyond, 0.0)))
+    beyond = abs(scene.width**2 - described) - _SAME_SPREAD * described
+    if beyond <= 0.0:
+        return 0.0
+    another = _END_SHARE * float(np.sqrt(beyond)) * max(misfit, 1.0)
+    ends = displaced_ends(left, scene)
+    if ends is None:
+        return another
+    seen = np.hypot(_END_SHOWN * ends.shown, _END_CHANCE * ends.chance)
+    return float(np.hypot(min(another, _END_FLOOR), seen))
+
+
+def _aside(left: LeftOver, scene: Scene) -> float:
+    sides = displaced_sides(left, scene)
+    return 0.0 if sides is None else sides.shown
