@@ -22,14 +22,14 @@ from flight.gnc.vision.streaks.maximum_likelihood.agreement import (
 )
 from flight.gnc.vision.streaks.maximum_likelihood.equation_solver import turn_covariance
 from flight.gnc.vision.streaks.maximum_likelihood.iteration import ExposedCamera, Fit
-from flight.gnc.vision.streaks.maximum_likelihood.joint_fit import bared_fit
+from flight.gnc.vision.streaks.maximum_likelihood.joint_fit import bared_fit, refit
 from flight.gnc.vision.streaks.maximum_likelihood.left_over import (
     LeftOver,
     displaced_ends,
     displaced_sides,
     left_over,
 )
-from flight.gnc.vision.streaks.maximum_likelihood.lens_errors import correct, seeming_turns
+from flight.gnc.vision.streaks.maximum_likelihood.lens_errors import bent_camera, correct, seeming_turns
 from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
 from flight.gnc.vision.streaks.maximum_likelihood.scene import PIXEL_VARIANCE, Scene
 from flight.gnc.vision.streaks.maximum_likelihood.shaking import Shaking, find_shaking
@@ -49,6 +49,9 @@ _END_SHOWN = 1.5
 _END_CHANCE = 0.5
 # Px by which ends are uncertain for each px, or unit of brightness, that all streaks waver in common.
 _END_SHAKING = 25.0
+# The lens is corrected so often at most, as long as an error of it is more than this part of its deviation.
+_MOST_LENSES = 3
+_SMALL_ERROR = 0.05
 # A covariance beyond this many times that of noise is by errors of the model: three deviations.
 _BEYOND_NOISE = 9.0
 
@@ -78,15 +81,13 @@ def claim(result: MotionResult, camera: ExposedCamera, whole: Fit) -> Claim:
 
     Where stars are hidden in the streaks, the turn is that of the brightest, fitted with those.
     """
+    camera, whole, error = _straightened(camera, whole, result.exposure)
     bared = bared_fit(camera, whole)
     last = whole if bared is None else bared
     scene, settings = last.scene, camera.settings
     exact = turn_covariance(last.evaluation, last.free, _CONJUGATE)
     noise = last.solution.covariance[:3, :3] if exact is None else exact
-    lens = _Lens(np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3)), 1.0)
-    equations = own_equations(last.evaluation, last.free)
-    if equations is not None:
-        lens = _with_lens(camera, last, equations, result.exposure)
+    lens = _with_lens(camera, last, result.exposure, error)
     turn = scene.motion.whole + lens.step
     # What made others disagree is as likely to hide, less of it, in the light of those that agree.
     agreed = int(np.count_nonzero(scene.trusted))
@@ -121,22 +122,50 @@ class _Lens:
     Attributes:
         step: (3,), its correction; added, described: (3, 3), as of `Correction`.
         spread: of the stars, in that of the noise.
+        error: (m,) as of `Correction`, beside what the fit knew.
     """
 
     step: FloatArray
     added: FloatArray
     described: FloatArray
     spread: float
+    error: FloatArray
 
 
-def _with_lens(camera: ExposedCamera, last: Fit, equations: OwnEquations, exposure: float) -> _Lens:
-    """Return what errors of the camera's description make of the turn."""
+def _straightened(
+    camera: ExposedCamera, whole: Fit, exposure: float
+) -> tuple[ExposedCamera, Fit, FloatArray | None]:
+    """Return camera and fit with the errors of the lens that the streaks show, and those, None without.
+
+    Streaks that are displaced by much of their width ask for too small a correction: the fit goes on through
+    the lens that they ask for, until they ask no more.
+    """
+    through, fit, error = camera, whole, None
+    for _ in range(_MOST_LENSES):
+        lens = _with_lens(through, fit, exposure, error)
+        if not np.any(np.abs(lens.error) > _SMALL_ERROR) or camera.work.exhausted:
+            break
+        error = lens.error if error is None else error + lens.error
+        through = bent_camera(replace(camera, growing=bool(whole.free[3])), error)
+        again = refit(through, fit)
+        if again is None:
+            return camera, whole, None
+        fit = again
+    return through, fit, error
+
+
+def _with_lens(camera: ExposedCamera, last: Fit, exposure: float, counted: FloatArray | None) -> _Lens:
+    """Return what errors of the camera's description make of the turn, beside those `counted` (m,)."""
+    nothing = np.zeros((3, 3))
+    equations = own_equations(last.evaluation, last.free)
+    if equations is None:
+        return _Lens(np.zeros(3), nothing, nothing, 1.0, np.zeros(0))
     trusted = np.flatnonzero(last.scene.trusted)
     scene = last.scene.select(trusted)
     equations = OwnEquations(equations.kept, equations.information[trusted], equations.score[trusted])
     seeming = seeming_turns(camera, scene, exposure)
     spread = _spread(equations, scene)
-    exact = _Lens(np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3)), spread)
+    exact = _Lens(np.zeros(3), nothing, nothing, spread, np.zeros(0))
     if not seeming.shape[2]:
         return exact
     described = seeming.shape[2] - int(camera.settings.shutter_unstated)
@@ -145,14 +174,15 @@ def _with_lens(camera: ExposedCamera, last: Fit, equations: OwnEquations, exposu
     corrected, before = None, 1.0
     # The part of the disagreement that the camera's errors explain is not counted as noise.
     for _ in range(2):
-        corrected = correct(equations.information, equations.score, shared, before, described)
+        corrected = correct(equations.information, equations.score, shared, before, described, counted)
         if corrected is None:
             return exact
         left = replace(equations, score=corrected.score)
         before = max(1.0, min(spread, _spread(left, scene)))
     assert corrected is not None
     added, stated = corrected.added[:3, :3], corrected.described[:3, :3]
-    return _Lens(corrected.step[:3], added, stated, before if corrected.step.any() else spread)
+    seen = bool(corrected.step.any()) or counted is not None
+    return _Lens(corrected.step[:3], added, stated, before if seen else spread, corrected.error)
 
 
 def _spread(equations: OwnEquations, scene: Scene) -> float:

@@ -92,7 +92,10 @@ def estimate_motion(
     reported by the status.
     """
     validate(pixels, pinhole, exposure, prior_rate, prior_sigma)
-    saturation = settings.saturation if settings.saturation is not None else saturation_count(pixels)
+    saturation = saturation_count(pixels)
+    if settings.saturation is not None:
+        # A frame may clip below where the camera says it does, never above.
+        saturation = min(saturation, settings.saturation)
     checksum, unusable = admit(pixels, previous_checksum, saturation, settings.saturated_fraction)
     if unusable is not None:
         return MotionResult(unusable, checksum, exposure)

@@ -7,12 +7,13 @@ camera differs; what they cannot say widens the covariance by what is not known 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import chdtri
 
 from flight.gnc.math.arrays import FloatArray
+from flight.gnc.vision.streaks.maximum_likelihood.bent_pinhole import BentPinhole
 from flight.gnc.vision.streaks.maximum_likelihood.iteration import ExposedCamera
 from flight.gnc.vision.streaks.maximum_likelihood.motion import paths, sensitivities
 from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene
@@ -36,22 +37,30 @@ class Correction:
         added: (k, k), covariance beside that of an exact camera; described: that of the errors alone whose
             size the description gives.
         score: (n, k) of each star after these errors.
+        error: (m,), the errors that the stars show, in standard deviations; 0 as the step.
     """
 
     step: FloatArray
     added: FloatArray
     described: FloatArray
     score: FloatArray
+    error: FloatArray
 
 
 def correct(
-    information: FloatArray, score: FloatArray, seeming: FloatArray, spread: float, described: int
+    information: FloatArray,
+    score: FloatArray,
+    seeming: FloatArray,
+    spread: float,
+    described: int,
+    counted: FloatArray | None = None,
 ) -> Correction | None:
     """Return the joint solution of the shared parameters and of the camera's errors; None without one.
 
     `information` (n, k, k) and `score` (n, k) are each star's, its own numbers eliminated; `seeming`
     (n, k, m) the change of the parameters that m errors, each of one standard deviation, seem to be, those
-    first whose size is `described`; `spread` the variance of what is left over, in that of the noise.
+    first whose size is `described`; `spread` the variance of what is left over, in that of the noise; `counted`
+    (m,) what the fit knows of the errors already, beside which the correction is.
     """
     m = seeming.shape[2]
     known = information / spread
@@ -60,6 +69,8 @@ def correct(
     cross = weighted.sum(axis=0)
     own = np.sum(seeming.swapaxes(1, 2) @ weighted, axis=0) + np.eye(m)
     asked = np.einsum("nkm,nk->m", seeming, score) / spread
+    if counted is not None:
+        asked = asked - counted
     total = score.sum(axis=0) / spread
     try:
         leading = np.linalg.solve(shared, cross)
@@ -73,7 +84,7 @@ def correct(
     change = leading @ error
     seen = float((asked - leading.T @ total) @ error) > chdtri(m, _BY_CHANCE)
     left_over = score - np.einsum("nij,nj->ni", information, seeming @ error - change)
-    return Correction(-change if seen else np.zeros_like(change), added, stated, left_over)
+    return Correction(seen * -change, added, stated, left_over, seen * error)
 
 
 def _added(leading: FloatArray, left: FloatArray, error: FloatArray) -> FloatArray:
@@ -126,3 +137,15 @@ def _displacements(camera: ExposedCamera, scene: Scene, exposure: float, at: flo
     ]
     chosen = [sigma * move for sigma, move in moves if sigma > 0.0]
     return np.stack(chosen, axis=-1) if chosen else np.empty((len(away), 2, 0))
+
+
+def bent_camera(camera: ExposedCamera, error: FloatArray) -> ExposedCamera:
+    """Return the camera with a lens of these errors, in their deviations and in the order of `seeming_turns`."""
+    known, sizes = camera.settings.knowledge, iter(error)
+    scale, x, y, cubic = (
+        sigma * float(next(sizes)) if sigma > 0.0 else 0.0
+        for sigma in (known.focal_length, known.centre, known.centre, known.distortion)
+    )
+    pinhole = camera.pinhole
+    lens = BentPinhole(pinhole.columns, pinhole.rows, pinhole.focal_length, (x, y), scale, cubic)
+    return replace(camera, pinhole=lens)
