@@ -15,7 +15,7 @@ _ROUNDS = 6
 
 @dataclass(frozen=True, slots=True)
 class BentPinhole(Pinhole):
-    """A pinhole whose picture is displaced by `shift` px, `scale` of the radius, and `cubic` of it at the corner.
+    """A pinhole whose picture is displaced: by `shift` px, `scale` of the radius, `cubic` of a corner's.
 
     Directions and projections of the base class stay those of the pinhole; `paths` of stars are bent.
     """

@@ -40,18 +40,20 @@ _CONJUGATE = 12
 _UNCHECKED = (2, 4.0)
 # Fitted and described point spread are the same when their variances differ by this part.
 _SAME_SPREAD = 0.05
-# Ends are uncertain by this part of the square root of the difference of the variances; where streaks show them,
-# by no more than so many px for that,
+# Ends are uncertain by this part of the square root of the difference of the variances;
 _END_SHARE = 0.6
+# where streaks show them, by no more than so many px and these parts of the displacement that the light left
+# over about them would be, and might be.
 _END_FLOOR = 0.12
-# but by these parts of the displacement that the light left over about them would be, and might be.
 _END_SHOWN = 1.5
 _END_CHANCE = 0.5
 # Px by which ends are uncertain for each px, or unit of brightness, that all streaks waver in common.
 _END_SHAKING = 25.0
-# The lens is corrected so often at most, as long as an error of it is more than this part of its deviation.
+# The lens is corrected so often at most, as long as an error of it is more than this part of its deviation,
+# where it leaves the turn uncertain by this part of it, unless the stars show it.
 _MOST_LENSES = 3
-_SMALL_ERROR = 0.05
+_SMALL_ERROR = 0.2
+_WORTH = 0.002
 # A covariance beyond this many times that of noise is by errors of the model: three deviations.
 _BEYOND_NOISE = 9.0
 
@@ -81,13 +83,14 @@ def claim(result: MotionResult, camera: ExposedCamera, whole: Fit) -> Claim:
 
     Where stars are hidden in the streaks, the turn is that of the brightest, fitted with those.
     """
-    camera, whole, error = _straightened(camera, whole, result.exposure)
+    camera, whole, lens = _straightened(camera, whole, result.exposure)
     bared = bared_fit(camera, whole)
     last = whole if bared is None else bared
     scene, settings = last.scene, camera.settings
     exact = turn_covariance(last.evaluation, last.free, _CONJUGATE)
     noise = last.solution.covariance[:3, :3] if exact is None else exact
-    lens = _with_lens(camera, last, result.exposure, error)
+    if bared is not None:
+        lens = _with_lens(camera, bared, result.exposure, lens.counted)
     turn = scene.motion.whole + lens.step
     # What made others disagree is as likely to hide, less of it, in the light of those that agree.
     agreed = int(np.count_nonzero(scene.trusted))
@@ -122,7 +125,8 @@ class _Lens:
     Attributes:
         step: (3,), its correction; added, described: (3, 3), as of `Correction`.
         spread: of the stars, in that of the noise.
-        error: (m,) as of `Correction`, beside what the fit knew.
+        error: (m,) as of `Correction`, beside those that the fit knew, `counted` (m,), None without; seen:
+            whether the stars show them.
     """
 
     step: FloatArray
@@ -130,28 +134,32 @@ class _Lens:
     described: FloatArray
     spread: float
     error: FloatArray
+    counted: FloatArray | None
+    seen: bool
 
 
-def _straightened(
-    camera: ExposedCamera, whole: Fit, exposure: float
-) -> tuple[ExposedCamera, Fit, FloatArray | None]:
-    """Return camera and fit with the errors of the lens that the streaks show, and those, None without.
+def _straightened(camera: ExposedCamera, whole: Fit, exposure: float) -> tuple[ExposedCamera, Fit, _Lens]:
+    """Return camera and fit with the likeliest errors of the lens, and what is left of them in the turn.
 
     Streaks that are displaced by much of their width ask for too small a correction: the fit goes on through
-    the lens that they ask for, until they ask no more.
+    the lens that they ask for, until they ask no more. It is worth its time where the stars show that the
+    lens is another, and where not to know it is most of the doubt.
     """
-    through, fit, error = camera, whole, None
+    first = lens = _with_lens(camera, whole, exposure, None)
+    if not lens.seen and np.trace(lens.described) < _WORTH**2 * np.sum(whole.scene.motion.whole**2):
+        return camera, whole, lens
+    through, fit, error = camera, whole, np.zeros(len(lens.error))
     for _ in range(_MOST_LENSES):
-        lens = _with_lens(through, fit, exposure, error)
         if not np.any(np.abs(lens.error) > _SMALL_ERROR) or camera.work.exhausted:
             break
-        error = lens.error if error is None else error + lens.error
+        error = error + lens.error
         through = bent_camera(replace(camera, growing=bool(whole.free[3])), error)
         again = refit(through, fit)
         if again is None:
-            return camera, whole, None
+            return camera, whole, first
         fit = again
-    return through, fit, error
+        lens = _with_lens(through, fit, exposure, error)
+    return through, fit, lens
 
 
 def _with_lens(camera: ExposedCamera, last: Fit, exposure: float, counted: FloatArray | None) -> _Lens:
@@ -159,13 +167,13 @@ def _with_lens(camera: ExposedCamera, last: Fit, exposure: float, counted: Float
     nothing = np.zeros((3, 3))
     equations = own_equations(last.evaluation, last.free)
     if equations is None:
-        return _Lens(np.zeros(3), nothing, nothing, 1.0, np.zeros(0))
+        return _Lens(np.zeros(3), nothing, nothing, 1.0, np.zeros(0), counted, False)
     trusted = np.flatnonzero(last.scene.trusted)
     scene = last.scene.select(trusted)
     equations = OwnEquations(equations.kept, equations.information[trusted], equations.score[trusted])
     seeming = seeming_turns(camera, scene, exposure)
     spread = _spread(equations, scene)
-    exact = _Lens(np.zeros(3), nothing, nothing, spread, np.zeros(0))
+    exact = _Lens(np.zeros(3), nothing, nothing, spread, np.zeros(0), counted, False)
     if not seeming.shape[2]:
         return exact
     described = seeming.shape[2] - int(camera.settings.shutter_unstated)
@@ -181,8 +189,10 @@ def _with_lens(camera: ExposedCamera, last: Fit, exposure: float, counted: Float
         before = max(1.0, min(spread, _spread(left, scene)))
     assert corrected is not None
     added, stated = corrected.added[:3, :3], corrected.described[:3, :3]
-    seen = bool(corrected.step.any()) or counted is not None
-    return _Lens(corrected.step[:3], added, stated, before if seen else spread, corrected.error)
+    seen = bool(corrected.step.any())
+    return _Lens(
+        corrected.step[:3], added, stated, before if seen else spread, corrected.error, counted, seen
+    )
 
 
 def _spread(equations: OwnEquations, scene: Scene) -> float:
@@ -195,8 +205,8 @@ def _spread_doubt(left: LeftOver, scene: Scene, sigma: float, misfit: float) -> 
     """Return by how many px the ends of streaks are uncertain by a point spread other than `sigma` px.
 
     Where the fit leaves nothing over about the ends the point spread is as wide along the streaks as across
-    them, and of the model's shape, however wide. What is left over there may be another shape, or the light of
-    a body that shakes too fast to be seen, whose ends are farther off than they seem.
+    them, and of the model's shape, however wide. What is left over there may be another shape, or the light
+    of a body that shakes too fast to be seen, whose ends are farther off than they seem.
     """
     described = sigma**2 + PIXEL_VARIANCE
     beyond = abs(scene.width**2 - described) - _SAME_SPREAD * described
@@ -207,7 +217,7 @@ def _spread_doubt(left: LeftOver, scene: Scene, sigma: float, misfit: float) -> 
     if ends is None:
         return another
     seen = np.hypot(_END_SHOWN * ends.shown, _END_CHANCE * ends.chance)
-    return float(np.hypot(min(another, _END_FLOOR), seen))
+    return min(another, float(np.hypot(_END_FLOOR, seen)))
 
 
 def _aside(left: LeftOver, scene: Scene) -> float:

@@ -1,7 +1,7 @@
-"""Light that is no streak: a limb, a planet's night side, a reflection, as far as the background leaves it over.
+"""Light that is no streak: a limb, a reflection, as far as the background leaves it over.
 
-Regions that are broad for their length are of no star. Their pixels, and those about them, where the background
-follows the light no better, are left out like hot ones.
+Regions that are broad for their length are of no star. Their pixels, and those about them, where the
+background follows the light no better, are left out like hot ones.
 """
 
 from __future__ import annotations

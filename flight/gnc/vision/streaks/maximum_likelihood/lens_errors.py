@@ -37,7 +37,7 @@ class Correction:
         added: (k, k), covariance beside that of an exact camera; described: that of the errors alone whose
             size the description gives.
         score: (n, k) of each star after these errors.
-        error: (m,), the errors that the stars show, in standard deviations; 0 as the step.
+        error: (m,), the likeliest errors, in standard deviations.
     """
 
     step: FloatArray
@@ -59,8 +59,8 @@ def correct(
 
     `information` (n, k, k) and `score` (n, k) are each star's, its own numbers eliminated; `seeming`
     (n, k, m) the change of the parameters that m errors, each of one standard deviation, seem to be, those
-    first whose size is `described`; `spread` the variance of what is left over, in that of the noise; `counted`
-    (m,) what the fit knows of the errors already, beside which the correction is.
+    first whose size is `described`; `spread` the variance of what is left over, in that of the noise;
+    `counted` (m,) what the fit knows of the errors already, beside which the correction is.
     """
     m = seeming.shape[2]
     known = information / spread
@@ -82,9 +82,9 @@ def correct(
     except np.linalg.LinAlgError:
         return None
     change = leading @ error
-    seen = float((asked - leading.T @ total) @ error) > chdtri(m, _BY_CHANCE)
+    seen = counted is not None or float((asked - leading.T @ total) @ error) > chdtri(m, _BY_CHANCE)
     left_over = score - np.einsum("nij,nj->ni", information, seeming @ error - change)
-    return Correction(seen * -change, added, stated, left_over, seen * error)
+    return Correction(seen * -change, added, stated, left_over, error)
 
 
 def _added(leading: FloatArray, left: FloatArray, error: FloatArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""A colour camera's raw frame: pixels in turn behind filters of other colours, each with a response of its own.
+"""A colour camera's raw frame: pixels in turn behind filters of other colours, of unlike responses.
 
 What the four pixels of a cell of two by two respond to the stars, on the whole, the bright regions say: each
 has about the same light on all four. Divided by it a frame is as the fit expects it; what is left is that
@@ -40,7 +40,7 @@ def without_mosaic(frame: ExposedFrame, blobs: Blobs) -> ExposedFrame | None:
         frame,
         signal=signal.reshape(-1),
         sums=box_sum(signal).reshape(-1),
-        floor=frame.floor / np.square(each).reshape(-1),
+        floor=(frame.floor / np.square(each).reshape(-1)).astype(np.float32),
     )
 
 
