@@ -21,6 +21,7 @@ from flight.gnc.vision.streaks.maximum_likelihood.blobs import Blobs, find_blobs
 from flight.gnc.vision.streaks.maximum_likelihood.course import Course
 from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import ExposedFrame, expose_frame
 from flight.gnc.vision.streaks.maximum_likelihood.first_guess import guess_axis
+from flight.gnc.vision.streaks.maximum_likelihood.glare import without_glare
 from flight.gnc.vision.streaks.maximum_likelihood.hypotheses import (
     SAME_ANGLE,
     alike,
@@ -31,10 +32,12 @@ from flight.gnc.vision.streaks.maximum_likelihood.hypotheses import (
 )
 from flight.gnc.vision.streaks.maximum_likelihood.iteration import ExposedCamera, Fit
 from flight.gnc.vision.streaks.maximum_likelihood.joint_fit import last_fit
+from flight.gnc.vision.streaks.maximum_likelihood.mosaic import without_mosaic
 from flight.gnc.vision.streaks.maximum_likelihood.motion import positions
 from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
 from flight.gnc.vision.streaks.maximum_likelihood.result_of_fit import with_faint, with_rate, with_stars
 from flight.gnc.vision.streaks.maximum_likelihood.scene import window_times
+from flight.gnc.vision.streaks.maximum_likelihood.seen_spread import seen_sigma
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from flight.gnc.vision.streaks.maximum_likelihood.shutter import Shutter
 from flight.gnc.vision.streaks.maximum_likelihood.shutter_direction import (
@@ -54,6 +57,10 @@ _AT_REST = 4.0
 # The same of the brightest regions, below which no streak of the least length can be among them.
 _SPOT = 2.2
 _BRIGHTEST = 12
+# A point spread that the frame shows to be so wide, px, and so many times as wide as described, is believed:
+# pixels are summed for it.
+_WIDE = 2.2
+_WIDER = 1.5
 # Why there is no rate where a motion was fitted, and where none was.
 _NONE = "light and ends of the streaks bear out no motion"
 _NO_MOTION = "the bright areas agree on no motion"
@@ -85,15 +92,20 @@ def estimate_motion(
     reported by the status.
     """
     validate(pixels, pinhole, exposure, prior_rate, prior_sigma)
-    saturation = settings.saturation if settings.saturation is not None else saturation_count(pixels)
+    saturation = saturation_count(pixels)
+    if settings.saturation is not None:
+        # A frame may clip below where the camera says it does, never above.
+        saturation = min(saturation, settings.saturation)
     checksum, unusable = admit(pixels, previous_checksum, saturation, settings.saturated_fraction)
     if unusable is not None:
         return MotionResult(unusable, checksum, exposure)
-    binning = Binning.suited(pinhole, settings.psf_sigma)
+    read = _read(pixels, pinhole, saturation, settings, settings.psf_sigma)
+    wide = _wider(read, settings)
+    if wide is not None:
+        read = _read(pixels, pinhole, saturation, settings, wide)
+    binning, frame, blobs = read.binning, read.frame, read.blobs
     settings = binning.settings(settings)
-    frame = expose_frame(*binning.frame(pixels, saturation), settings.gain)
-    camera = _exposed_camera(frame, binning.pinhole, exposure, settings, prior_course)
-    blobs = find_blobs(frame, settings.threshold_sigmas, _MOST_BLOBS)
+    camera = _exposed_camera(read, exposure, settings, prior_course)
     seen = MotionResult(StreakStatus.FAILED, checksum, exposure, hot_pixels=frame.hot_pixels)
     if len(blobs) < settings.least_stars:
         return replace(seen, status=StreakStatus.TOO_FEW)
@@ -101,16 +113,46 @@ def estimate_motion(
     return binning.in_pixels(_without_rate(seen, camera, blobs) if answer is None else answer)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Read:
+    """A frame in the pixels that suit a point spread of `sigma` px of these, and its bright regions."""
+
+    binning: Binning
+    frame: ExposedFrame
+    blobs: Blobs
+    sigma: float
+
+
+def _read(
+    pixels: Image, pinhole: Pinhole, saturation: float, settings: LikelihoodSettings, sigma: float
+) -> _Read:
+    """Return a frame as it is read for a point spread of `sigma` px."""
+    binning = Binning.suited(pinhole, sigma)
+    frame = expose_frame(*binning.frame(pixels, saturation), binning.settings(settings).gain)
+    blobs = find_blobs(frame, settings.threshold_sigmas, _MOST_BLOBS)
+    for without in (without_mosaic, without_glare):
+        clear = without(frame, blobs)
+        if clear is not None:
+            frame, blobs = clear, find_blobs(clear, settings.threshold_sigmas, _MOST_BLOBS)
+    return _Read(binning, frame, blobs, sigma / binning.size)
+
+
+def _wider(read: _Read, settings: LikelihoodSettings) -> float | None:
+    """Return the point spread, px, that the frame shows where it is so much wider than described."""
+    if read.binning.size > 1:
+        return None
+    sigma = seen_sigma(read.frame, read.blobs)
+    return sigma if sigma is not None and sigma > max(_WIDE, _WIDER * settings.psf_sigma) else None
+
+
 def _exposed_camera(
-    frame: ExposedFrame,
-    pinhole: Pinhole,
-    exposure: float,
-    settings: LikelihoodSettings,
-    course: Course | None,
+    read: _Read, exposure: float, settings: LikelihoodSettings, course: Course | None
 ) -> ExposedCamera:
     """Return the frame with its camera, its shutter and the known course, where the rate may change."""
     growing = settings.rate_model == "accelerating"
-    camera = ExposedCamera(frame, pinhole, _shutter(pinhole, exposure, settings), settings, growing)
+    pinhole = read.binning.pinhole
+    shutter = _shutter(pinhole, exposure, settings)
+    camera = ExposedCamera(read.frame, pinhole, shutter, settings, read.sigma, growing)
     if course is None or settings.rate_model == "constant":
         return camera
     return replace(camera, course=course.motion(pinhole.focal_length))

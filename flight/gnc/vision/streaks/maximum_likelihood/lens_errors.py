@@ -7,13 +7,14 @@ camera differs; what they cannot say widens the covariance by what is not known 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import chdtri
 
 from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.math.arrays import FloatArray
+from flight.gnc.vision.streaks.maximum_likelihood.bent_pinhole import BentPinhole
 from flight.gnc.vision.streaks.maximum_likelihood.iteration import ExposedCamera
 from flight.gnc.vision.streaks.maximum_likelihood.motion import moving, positions
 from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene
@@ -37,22 +38,30 @@ class Correction:
         added: (k, k), covariance beside that of an exact camera; described: that of the errors alone whose
             size the description gives.
         score: (n, k) of each star after these errors.
+        error: (m,), the likeliest errors, in standard deviations.
     """
 
     step: FloatArray
     added: FloatArray
     described: FloatArray
     score: FloatArray
+    error: FloatArray
 
 
 def correct(
-    information: FloatArray, score: FloatArray, seeming: FloatArray, spread: float, described: int
+    information: FloatArray,
+    score: FloatArray,
+    seeming: FloatArray,
+    spread: float,
+    described: int,
+    counted: FloatArray | None = None,
 ) -> Correction | None:
     """Return the joint solution of the shared parameters and of the camera's errors; None without one.
 
     `information` (n, k, k) and `score` (n, k) are each star's, its own numbers eliminated; `seeming`
     (n, k, m) the change of the parameters that m errors, each of one standard deviation, seem to be, those
-    first whose size is `described`; `spread` the variance of what is left over, in that of the noise.
+    first whose size is `described`; `spread` the variance of what is left over, in that of the noise;
+    `counted` (m,) what the fit knows of the errors already, beside which the correction is.
     """
     m = seeming.shape[2]
     known = information / spread
@@ -61,6 +70,8 @@ def correct(
     cross = weighted.sum(axis=0)
     own = np.sum(seeming.swapaxes(1, 2) @ weighted, axis=0) + np.eye(m)
     asked = np.einsum("nkm,nk->m", seeming, score) / spread
+    if counted is not None:
+        asked = asked - counted
     total = score.sum(axis=0) / spread
     try:
         leading = np.linalg.solve(shared, cross)
@@ -72,9 +83,9 @@ def correct(
     except np.linalg.LinAlgError:
         return None
     change = leading @ error
-    seen = float((asked - leading.T @ total) @ error) > chdtri(m, _BY_CHANCE)
+    seen = counted is not None or float((asked - leading.T @ total) @ error) > chdtri(m, _BY_CHANCE)
     left_over = score - np.einsum("nij,nj->ni", information, seeming @ error - change)
-    return Correction(-change if seen else np.zeros_like(change), added, stated, left_over)
+    return Correction(seen * -change, added, stated, left_over, error)
 
 
 def _added(leading: FloatArray, left: FloatArray, error: FloatArray) -> FloatArray:
@@ -146,3 +157,15 @@ def _displacements(
     return np.stack(
         [np.broadcast_to(sigma * moves[error], away.shape) for error, sigma in errors.items()], axis=-1
     )
+
+
+def bent_camera(camera: ExposedCamera, error: FloatArray) -> ExposedCamera:
+    """Return the camera with a lens of these errors, in their deviations and in the order of `seeming_turns`."""
+    sizes = zip(_errors(camera).items(), error, strict=False)  # the shutter's, which is none of the lens
+    found = {name: sigma * float(by) for (name, sigma), by in sizes}
+    scale, x, y, cubic = (
+        found.get(name, 0.0) for name in ("focal length", "centre x", "centre y", "distortion")
+    )
+    pinhole = camera.pinhole
+    lens = BentPinhole(pinhole.columns, pinhole.rows, pinhole.focal_length, (x, y), scale, cubic)
+    return replace(camera, pinhole=lens)

@@ -35,7 +35,7 @@ def _seeming(knowledge: CameraKnowledge, turn: FloatArray = _TURN) -> tuple[Floa
     ones = np.ones(len(stars))
     scene = Scene(Motion.steady(turn), 1.04, stars, ones, ones, ones > 0.0)
     frame = expose_frame(np.zeros((1024, 1024), np.uint16), SATURATION, 1.0)
-    camera = ExposedCamera(frame, CAMERA.pinhole, Shutter(), LikelihoodSettings(knowledge=knowledge))
+    camera = ExposedCamera(frame, CAMERA.pinhole, Shutter(), LikelihoodSettings(knowledge=knowledge), 1.0)
     half = np.full(len(stars), 0.5)
     opening = (
         sensitivities(CAMERA.pinhole, scene.motion, stars, half)
