@@ -35,7 +35,6 @@ from flight.gnc.earth.orbit_knowledge import TwoLineElements
 from flight.gnc.errors import UsageError
 from flight.gnc.estimation.estimate import Estimate
 from flight.gnc.estimation.field_rate import FieldRateSettings
-from flight.gnc.estimation.free_filter import SlowStates
 from flight.gnc.estimation.free_settings import FreeFilterSettings
 from flight.gnc.guidance.three_axes.pointing_target import PointingTarget
 from flight.gnc.guidance.three_axes.target_law import BodyAxes
@@ -64,10 +63,8 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
     """Return the satellite of a configuration, with what an earlier boot learned."""
     config = as_orbit(config)
     surroundings = Surroundings(_elements(config), services.clock)
-    utc = services.clock.utc_ns
-    slow, problems = start_from(learned, _free(config), config.estimation.changed, utc() / SECOND_NS)
     limit, dipole_per_ampere = _limit(config), config.craft.dipole_per_ampere
-    filter_ = _filter(config, surroundings, slow)
+    filter_, problems = _filter(config, surroundings, learned, _utc(services))
     brake = FieldBrake(_detumbler(config, filter_, surroundings), dipole_per_ampere)
     seeker = _seeker(config, services)
     paths = PointingPaths(limit, fastest_rate(config))
@@ -78,7 +75,7 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
         modes=frozenset(Mode) - {Mode.HOLD, Mode.SLEW, Mode.TESTBED_DEMO},
         filter=filter_,
         learned_problems=problems,
-        learned=lambda _: learned_of(filter_.slow, utc() / SECOND_NS),
+        learned=lambda _: learned_of(filter_.slow, _utc(services)),
         paths=paths,
         planner=PointingPlanner(_planned(config), paths, surroundings, disturbed, objects, services),
         targets=PointingTargets(_timed(config), paths, config.looks_for_objects()),
@@ -173,7 +170,8 @@ def _timed(config: OrbitConfig) -> list[tuple[float, PointingTarget]]:
     return [(step.at, step.target()) for step in config.targets]
 
 
-def _free(config: OrbitConfig) -> FreeFilterSettings:
+def filter_settings(config: OrbitConfig) -> FreeFilterSettings:
+    """Return what the configuration says of the noises of the filter's states."""
     section, rate_hz = config.estimation, config.executive.control_rate_hz
     return FreeFilterSettings(
         gyro=(section.bias_start, section.bias_walk),
@@ -183,8 +181,17 @@ def _free(config: OrbitConfig) -> FreeFilterSettings:
     )
 
 
-def _filter(config: OrbitConfig, surroundings: Surroundings, slow: SlowStates) -> OrbitFilter:
+def _utc(services: Services) -> float:
+    """Return UTC, s, as the host has it: with it what was learned ages."""
+    return services.clock.utc_ns() / SECOND_NS
+
+
+def _filter(
+    config: OrbitConfig, surroundings: Surroundings, learned: Mapping[str, Learned], utc: float
+) -> tuple[OrbitFilter, list[str]]:
+    """Return the filter, and why parts of what was learned were rejected."""
     craft, section, unit = config.craft, config.estimation, config.inertial_unit
+    slow, problems = start_from(learned, filter_settings(config), section.changed, utc)
     settings = OrbitFilterSettings(
         inertia=np.diag(craft.inertia),
         dipole_per_ampere=craft.dipole_per_ampere,
@@ -196,9 +203,9 @@ def _filter(config: OrbitConfig, surroundings: Surroundings, slow: SlowStates) -
         settle_ns=round(config.detumble.settle * SECOND_NS),
         history_ns=round(section.history * SECOND_NS),
         slow=slow,
-        free=_free(config),
+        free=filter_settings(config),
     )
-    return OrbitFilter(settings, surroundings.at)
+    return OrbitFilter(settings, surroundings.at), problems
 
 
 def _strings(section: StringsSection) -> SolarStrings:
