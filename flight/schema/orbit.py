@@ -55,6 +55,7 @@ class OrbitEstimation(Estimation, frozen=True, kw_only=True):
     magnetometer; `field_error` T of an axis of the field's model. `torque_start` N m, of each shape of the
     torques of drag, sunlight and what is constant, before any is learned; `torque_walk` N m per sqrt(s). Of a
     light craft they are smaller: what is taken for a torque along the field is planned for an hour ahead.
+    Since the last boot the gyro's bias may have `changed` by 10 deg/h, the dipole by a twentieth.
     """
 
     bias_walk: NotNegative = 2.0e-6
@@ -62,6 +63,7 @@ class OrbitEstimation(Estimation, frozen=True, kw_only=True):
     field_error: Positive = 5.0e-8
     gate_sigma: Annotated[float, Meta(ge=3.0)] = 5.0
     history: Positive = 12.0
+    changed: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.05
     torque_start: Positive = 3.0e-9
     torque_walk: Positive = 5.0e-12
 

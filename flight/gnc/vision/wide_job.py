@@ -24,6 +24,8 @@ SUNLIT_COUNTS = 30.0
 """Of a pixel that the sunlit Earth lights, beyond what its scattered light gives beside it."""
 LIT_SIGMA = 0.3
 """rad: a rough attitude that is worse does not tell where the Sun is from the body."""
+EARTHLIGHT_SIGMA = 0.1
+"""rad: a rough attitude that is worse does not say which strings the Earth lights."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,12 +91,20 @@ def _sun(job: WideJob) -> tuple[Sighted | None, str]:
 
     coarse = CoarseSun(CoarseSunStatus.UNCERTAIN, reason="the strings give no readings")
     if job.strings is not None:
-        coarse = coarse_sun(job.strings[1], job.strings[0])
+        coarse = coarse_sun(job.strings[1], job.strings[0], _expected_nadir(job.knowledge))
     found = sun_of_cameras(job.frames, job.cameras, coarse, LINEAR if job.response is None else SunSettings())
     if found.direction is None or found.covariance is None:
         return None, found.reason
     cameras = () if found.camera is None else (found.camera,)
     return Sighted(found.direction, found.covariance, cameras), found.reason
+
+
+def _expected_nadir(knowledge: HorizonKnowledge) -> FloatArray | None:
+    """Return nadir (3,) in body axes by a rough attitude, from where the Earth shines on the strings."""
+    rough, position = knowledge.attitude, knowledge.position
+    if rough is None or rough.sigma > EARTHLIGHT_SIGMA or position is None:
+        return None
+    return np.asarray(attitude_matrix(rough.quaternion) @ (-position / np.linalg.norm(position)))
 
 
 def _nadir(job: WideJob, knowledge: HorizonKnowledge, sun: Sighted | None) -> tuple[Sighted | None, str]:

@@ -9,6 +9,7 @@ from tests.studies.campaigns.consistency import CONSISTENCY
 from tests.studies.campaigns.controllers import CONTROLLERS_CAMPAIGN
 from tests.studies.campaigns.coverage import COVERAGE
 from tests.studies.campaigns.detumble import DETUMBLE
+from tests.studies.campaigns.eclipse import ECLIPSE
 from tests.studies.campaigns.failures import FAILURES
 from tests.studies.campaigns.false_horizons import FALSE_HORIZONS
 from tests.studies.campaigns.faults import FAULTS
@@ -80,5 +81,6 @@ CAMPAIGNS: dict[str, Campaign] = {
         ORBIT_POINTING,
         ORBIT_SLEWS,
         ACQUISITION,
+        ECLIPSE,
     )
 }
