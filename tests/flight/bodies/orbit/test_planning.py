@@ -1,4 +1,4 @@
-"""What is planned when: slews for new targets and bodies astray, a path again; and which part of it is flown."""
+"""What is planned when: slews for new targets and bodies astray, a path again; which part of it is flown."""
 
 from __future__ import annotations
 

@@ -126,7 +126,9 @@ def test_objects_as_bright_as_each_other_that_cross_keep_their_numbers() -> None
             near = np.linalg.norm(both[0] - both[1]) < 3.0 * PIXEL
             seen, magnitudes = (middle[None], np.array([3.25])) if near else (both, np.full(2, 4.0))
             tracker.ingest(sightings(rng, time, seen, _SIGMA, _ATTITUDE, magnitudes))
-            off = {track.number: np.linalg.norm(both - track.line.direction, axis=1) for track in tracker.objects}
+            off = {
+                track.number: np.linalg.norm(both - track.line.direction, axis=1) for track in tracker.objects
+            }
             own.append({number: int(np.argmin(away)) for number, away in off.items()})
         assert set(own[10]) == {1, 2}
         assert own[10] == own[-1]

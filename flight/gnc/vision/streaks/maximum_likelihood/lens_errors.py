@@ -160,7 +160,7 @@ def _displacements(
 
 
 def bent_camera(camera: ExposedCamera, error: FloatArray) -> ExposedCamera:
-    """Return the camera with a lens of these errors, in their deviations and in the order of `seeming_turns`."""
+    """Return the camera with a lens of these errors, in deviations and in the order of `seeming_turns`."""
     sizes = zip(_errors(camera).items(), error, strict=False)  # the shutter's, which is none of the lens
     found = {name: sigma * float(by) for (name, sigma), by in sizes}
     scale, x, y, cubic = (
