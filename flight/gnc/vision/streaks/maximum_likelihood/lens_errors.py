@@ -140,7 +140,7 @@ def _displacements(camera: ExposedCamera, scene: Scene, exposure: float, at: flo
 
 
 def bent_camera(camera: ExposedCamera, error: FloatArray) -> ExposedCamera:
-    """Return the camera with a lens of these errors, in their deviations and in the order of `seeming_turns`."""
+    """Return the camera with a lens of these errors, in deviations, in the order of `seeming_turns`."""
     known, sizes = camera.settings.knowledge, iter(error)
     scale, x, y, cubic = (
         sigma * float(next(sizes)) if sigma > 0.0 else 0.0
