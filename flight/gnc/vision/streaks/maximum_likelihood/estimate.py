@@ -16,12 +16,9 @@ from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.math.arrays import FloatArray, Image
 from flight.gnc.vision.frame.saturation import saturation_count
 from flight.gnc.vision.streaks.admission import admit, in_time, validate
-from flight.gnc.vision.streaks.maximum_likelihood.binning import Binning
-from flight.gnc.vision.streaks.maximum_likelihood.blobs import Blobs, find_blobs
+from flight.gnc.vision.streaks.maximum_likelihood.blobs import Blobs
 from flight.gnc.vision.streaks.maximum_likelihood.course import Course
-from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import ExposedFrame, expose_frame
 from flight.gnc.vision.streaks.maximum_likelihood.first_guess import guess_axis
-from flight.gnc.vision.streaks.maximum_likelihood.glare import without_glare
 from flight.gnc.vision.streaks.maximum_likelihood.hypotheses import (
     SAME_ANGLE,
     alike,
@@ -32,12 +29,11 @@ from flight.gnc.vision.streaks.maximum_likelihood.hypotheses import (
 )
 from flight.gnc.vision.streaks.maximum_likelihood.iteration import ExposedCamera, Fit
 from flight.gnc.vision.streaks.maximum_likelihood.joint_fit import last_fit
-from flight.gnc.vision.streaks.maximum_likelihood.mosaic import without_mosaic
 from flight.gnc.vision.streaks.maximum_likelihood.motion import positions
+from flight.gnc.vision.streaks.maximum_likelihood.reading import Reading, read_frame
 from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
 from flight.gnc.vision.streaks.maximum_likelihood.result_of_fit import with_faint, with_rate, with_stars
 from flight.gnc.vision.streaks.maximum_likelihood.scene import window_times
-from flight.gnc.vision.streaks.maximum_likelihood.seen_spread import seen_sigma
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from flight.gnc.vision.streaks.maximum_likelihood.shutter import Shutter
 from flight.gnc.vision.streaks.maximum_likelihood.shutter_direction import (
@@ -49,7 +45,6 @@ from flight.gnc.vision.streaks.maximum_likelihood.wholeness import Wholeness, wh
 from flight.gnc.vision.streaks.maximum_likelihood.work import Work
 from flight.gnc.vision.streaks.streak_result import StreakStatus
 
-_MOST_BLOBS = 48
 # This many motions are fitted in full before the frame is given up.
 _MOST_MOTIONS = 2
 # Median length, px, of regions below which a frame without an agreed motion is one of stars at rest.
@@ -57,10 +52,6 @@ _AT_REST = 4.0
 # The same of the brightest regions, below which no streak of the least length can be among them.
 _SPOT = 2.2
 _BRIGHTEST = 12
-# A point spread that the frame shows to be so wide, px, and so many times as wide as described, is believed:
-# pixels are summed for it.
-_WIDE = 2.2
-_WIDER = 1.5
 # Why there is no rate where a motion was fitted, and where none was.
 _NONE = "light and ends of the streaks bear out no motion"
 _NO_MOTION = "the bright areas agree on no motion"
@@ -92,61 +83,25 @@ def estimate_motion(
     reported by the status.
     """
     validate(pixels, pinhole, exposure, prior_rate, prior_sigma)
-    saturation = saturation_count(pixels)
-    if settings.saturation is not None:
-        # A frame may clip below where the camera says it does, never above.
-        saturation = min(saturation, settings.saturation)
+    # A frame may clip below where the camera says it does, never above.
+    given = np.inf if settings.saturation is None else settings.saturation
+    saturation = min(saturation_count(pixels), given)
     checksum, unusable = admit(pixels, previous_checksum, saturation, settings.saturated_fraction)
     if unusable is not None:
         return MotionResult(unusable, checksum, exposure)
-    read = _read(pixels, pinhole, saturation, settings, settings.psf_sigma)
-    wide = _wider(read, settings)
-    if wide is not None:
-        read = _read(pixels, pinhole, saturation, settings, wide)
-    binning, frame, blobs = read.binning, read.frame, read.blobs
+    read = read_frame(pixels, pinhole, saturation, settings)
+    binning, blobs = read.binning, read.blobs
     settings = binning.settings(settings)
     camera = _exposed_camera(read, exposure, settings, prior_course)
-    seen = MotionResult(StreakStatus.FAILED, checksum, exposure, hot_pixels=frame.hot_pixels)
+    seen = MotionResult(StreakStatus.FAILED, checksum, exposure, hot_pixels=read.frame.hot_pixels)
     if len(blobs) < settings.least_stars:
         return replace(seen, status=StreakStatus.TOO_FEW)
     answer = None if _resting(blobs) else _in_time(camera, seen, blobs, prior_rate, prior_sigma, prior_course)
     return binning.in_pixels(_without_rate(seen, camera, blobs) if answer is None else answer)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Read:
-    """A frame in the pixels that suit a point spread of `sigma` px of these, and its bright regions."""
-
-    binning: Binning
-    frame: ExposedFrame
-    blobs: Blobs
-    sigma: float
-
-
-def _read(
-    pixels: Image, pinhole: Pinhole, saturation: float, settings: LikelihoodSettings, sigma: float
-) -> _Read:
-    """Return a frame as it is read for a point spread of `sigma` px."""
-    binning = Binning.suited(pinhole, sigma)
-    frame = expose_frame(*binning.frame(pixels, saturation), binning.settings(settings).gain)
-    blobs = find_blobs(frame, settings.threshold_sigmas, _MOST_BLOBS)
-    for without in (without_mosaic, without_glare):
-        clear = without(frame, blobs)
-        if clear is not None:
-            frame, blobs = clear, find_blobs(clear, settings.threshold_sigmas, _MOST_BLOBS)
-    return _Read(binning, frame, blobs, sigma / binning.size)
-
-
-def _wider(read: _Read, settings: LikelihoodSettings) -> float | None:
-    """Return the point spread, px, that the frame shows where it is so much wider than described."""
-    if read.binning.size > 1:
-        return None
-    sigma = seen_sigma(read.frame, read.blobs)
-    return sigma if sigma is not None and sigma > max(_WIDE, _WIDER * settings.psf_sigma) else None
-
-
 def _exposed_camera(
-    read: _Read, exposure: float, settings: LikelihoodSettings, course: Course | None
+    read: Reading, exposure: float, settings: LikelihoodSettings, course: Course | None
 ) -> ExposedCamera:
     """Return the frame with its camera, its shutter and the known course, where the rate may change."""
     growing = settings.rate_model == "accelerating"

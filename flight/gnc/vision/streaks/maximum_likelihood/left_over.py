@@ -1,8 +1,8 @@
 """What a fit leaves over on its trusted streaks' pixels, and by how much their ends may be displaced for it.
 
 A point spread that is not the model's, wider along the streak than across it or of another shape, leaves
-light over at the ends of all streaks alike, and moves them alike. How much it moves them is not seen; were all
-that is left over a displacement, it would be so many px.
+light over at the ends of all streaks alike, and moves them alike. How much it moves them is not seen; were
+all that is left over a displacement, it would be so many px.
 """
 
 from __future__ import annotations
