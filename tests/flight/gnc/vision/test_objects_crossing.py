@@ -50,7 +50,10 @@ def test_two_objects_as_bright_as_each_other_cross_in_the_frame_and_keep_their_t
         frame = sighted.directions, sighted.covariance, sighted.magnitudes, sighted.attitude
         tracker.ingest(Sightings(second * 1_000_000_000, *frame))
         true = CAMERA.pinhole.unit_vectors(_places(np.array([second - 7.0]))[0]) @ attitude_matrix(HELD)
-        away = {track.number: focal * np.linalg.norm(true - track.line.direction, axis=1) for track in tracker.objects}
+        away = {
+            track.number: focal * np.linalg.norm(true - track.line.direction, axis=1)
+            for track in tracker.objects
+        }
         own[second] = {number: int(off.argmin()) for number, off in away.items()}
         assert all(off.min() < 1.0 for off in away.values())
     assert own[14] == own[5]
