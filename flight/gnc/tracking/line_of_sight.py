@@ -10,8 +10,9 @@ Both fall about the Earth: the gravity gradient at the observer's place, where t
 acceleration of one against the other but for terms of the distance over the orbit's radius.
 
 Process noise: the tides of two low orbits, or what the gradient leaves of them, which turn with the line, are
-taken for white accelerations of density `Motion.wander`. The range's part also follows what is no straight line, as an object on a great
-circle at a constant rate, whose s would change by rate^2: a density of (`Motion.bend` rate^2)^2 / rate.
+taken for white accelerations of density `Motion.wander`. The range's part also follows what is no straight
+line, as an object on a great circle at a constant rate, whose s would change by rate^2: a density of
+(`Motion.bend` rate^2)^2 / rate.
 """
 
 from __future__ import annotations
