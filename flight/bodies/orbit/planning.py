@@ -169,7 +169,7 @@ class PointingPlanner:
         return self._accepted, self._refused
 
     def _fail(self, text: str, now_ns: int, wait_ns: int = AGAIN_NS) -> None:
-        """Report a plan that is not flown, and ask for another one after `wait_ns`; an object does not wait."""
+        """Report a plan that is not flown, and ask for another one after `wait_ns`: none for an object."""
         self._refused += 1
         self._wanted, self._after_ns = True, now_ns + wait_ns
         self._events.report(events.PLANNER_FAILED, now_ns, text)

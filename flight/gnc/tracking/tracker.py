@@ -19,7 +19,7 @@ import numpy as np
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.chi_square import bound
 from flight.gnc.math.directions import cross_matrices
-from flight.gnc.tracking.line_of_sight import LineOfSight, Motion, begin, compare, predict, update
+from flight.gnc.tracking.line_of_sight import LineOfSight, Motion, begin, compare, predict, tides, update
 from flight.gnc.tracking.sightings import Sightings
 
 _UNSEEN = np.full(3, np.nan)
@@ -126,8 +126,9 @@ class Tracker:
         A frame older than the last raises ValueError.
         """
         motion = self._settings.motion
+        tide = None if frame.observer is None else tides(frame.observer)
         tracks = [
-            replace(track, line=predict(track.line, frame.time_ns, motion), frames=track.frames + 1)
+            replace(track, line=predict(track.line, frame.time_ns, motion, tide), frames=track.frames + 1)
             for track in self._tracks
         ]
         spread = _with_attitude(frame)

@@ -297,7 +297,7 @@ def _no_motion(job: FrameJob) -> MotionResult:
 
 
 def _shows_no_motion(job: FrameJob, motion: Found) -> bool:
-    """Return whether a frame's stars are at rest, or move so little, by the priors, that it shows no motion."""
+    """Return whether stars are at rest, or move so little, by the priors, that a frame shows no motion."""
     failed = motion.status is StreakStatus.FAILED and job.rate_prior is not None
     return motion.status in _AT_REST or (failed and _predicted_within(job, _SHORT_PX))
 

@@ -45,7 +45,7 @@ def test_a_slow_object_is_kept_through_ten_seconds_without_it(tmp_path: Path) ->
 
 
 def test_a_followed_object_is_kept_by_rolling_no_faster_than_the_body_may_turn() -> None:
-    """A pass of seed 5 that was lost while paths could turn too fast at their last instant, and were refused."""
+    """A pass of seed 5, lost while paths turned too fast at their last instant, and were refused."""
     (case,) = (case for case in cases(1, 5) if case.key == "knightcube/0.2/0")
     found = run(case)
     assert found["refused"] == 0

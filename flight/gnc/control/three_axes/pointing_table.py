@@ -73,7 +73,7 @@ class PointingTable:
         return float(np.linalg.norm(self.path.rate, axis=1).max())
 
     def below(self, fastest: float) -> PointingTable | None:
-        """Return the part before the body turns at `fastest` rad/s; None where that is less than `LEAST_PART`.
+        """Return the part before the body turns at `fastest` rad/s; None for one shorter than `LEAST_PART`.
 
         A slew is flown whole or not at all.
         """

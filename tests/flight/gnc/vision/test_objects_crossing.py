@@ -1,4 +1,4 @@
-"""Objects that cross in the frame, from pixels to tracks; and a crowded sky at rest, which has an attitude."""
+"""Objects that cross in the frame, from pixels to tracks; and a crowded sky at rest has an attitude."""
 
 from __future__ import annotations
 
