@@ -67,10 +67,10 @@ class FieldRateSettings:
     field_sigma: float
     rate_start: float = 0.3
     change_start: float = 8e-8
-    change_walk: float = 4e-9
+    change_walk: float = 2e-9
     torque_walk: float
     axes_sigma: float = 0.03
-    inertia_error: float = 0.01
+    inertia_error: float = 0.003
     gate_sigma: float = 5.0
     refusals: int = 5
     longest_gap: float = 0.2
@@ -103,7 +103,7 @@ class FieldRate:
         self._inertia_rows, self._inverse_rows = _rows(inertia), _rows(self._inverse)
         # As rare as `gate_sigma` of one component, by the tail's exponential part.
         moments = np.linalg.eigvalsh(inertia)
-        self._gyroscopic = settings.axes_sigma * float(moments[-1] - moments[0]) / np.diag(inertia)
+        self._gyroscopic = settings.inertia_error * float(moments[-1] - moments[0]) / np.diag(inertia)
         self._gate = (settings.gate_sigma + 1.0) ** 2
         self.restarts = 0
         self.restart()
