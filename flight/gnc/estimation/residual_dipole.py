@@ -1,8 +1,9 @@
 """A body's residual dipole, from what the gyro sees beside the coils' torque in a measured field.
 
-A Luenberger observer: the rate that coils and residual dipole would give is drawn to the measured one, and the
-rest is taken for a dipole across the field. What lies along the field shows once the field has turned in body
-axes. Gravity's and the air's torques across the field are taken for a dipole, too, which is right for holding.
+A Luenberger observer: the rate that coils and residual dipole would give is drawn to the measured one, and
+the rest is taken for a dipole across the field. What lies along the field shows once the field has turned in
+body axes. Gravity's and the air's torques across the field are taken for a dipole, too: whoever cancels the
+dipole cancels them.
 """
 
 from __future__ import annotations
@@ -32,7 +33,10 @@ class ResidualDipole:
         self._rate = None
 
     def follow(self, seconds: float, rate: FloatArray, field: FloatArray, coils: FloatArray) -> None:
-        """Take the rate (3,) rad/s, `seconds` after the last, in a field (3,) T under the coils' dipole (3,)."""
+        """Take a rate (3,) rad/s, `seconds` after the last.
+
+        Meanwhile the dipole `coils` (3,) A m^2 acted in the field (3,) T.
+        """
         square = float(field @ field)
         if self._rate is None or seconds > LONGEST or square == 0.0:
             self._rate = rate

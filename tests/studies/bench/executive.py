@@ -1,13 +1,13 @@
 """The 40 Hz loop with everything running: `python -m tests.studies.bench executive [--minutes M] [--orbit]`.
 
 The step demonstration flies in real time on emulated devices in processes of their own, as a board flies on
-its devices: planner and vision have work without pause, the guardian watches. With `--orbit` the KnightCube of
-`config/orbit.yaml` flies in its place, at nadir from the begin; its planner has the shortest
-period that the configuration allows, 10 s, and the wide cameras work as they fly. Beside it a bare absolute-sleep
-loop at the same rate (`tests.studies.bench.bare_loop`) measures the machine's own stalls, and the
-kernel the time that a virtual machine's host takes; a working loop meets such stalls more often than a
-sleeping loop. Where SCHED_FIFO is allowed the flight is flown twice, with it and without. Run it alone on two
-cores. The slope of memory needs flights of 16 minutes or longer.
+its devices: planner and vision have work without pause, the guardian watches. With `--orbit` the KnightCube
+of `config/orbit.yaml` flies in its place, at nadir from the begin; its planner has the shortest period that
+the configuration allows, 10 s, and the wide cameras work as they fly. Beside it a bare absolute-sleep loop at
+the same rate (`tests.studies.bench.bare_loop`) measures the machine's own stalls, and the kernel the time
+that a virtual machine's host takes; a working loop meets such stalls more often than a sleeping loop. Where
+SCHED_FIFO is allowed the flight is flown twice, with it and without. Run it alone on two cores. The slope of
+memory needs flights of 16 minutes or longer.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ ORBIT = ROOT / "config" / "orbit.yaml"
 SHORTEST_REPLAN = 10.0
 """s between the pointing's plans: the least that the schema allows."""
 AT_NADIR = {"attitude": [0.096, 0.701, 0.185, -0.682], "rate": [0.0, -1.1e-3, 0.0]}
-"""The release: at nadir along the flight, the star camera at the sky, so that all work from the first minute."""
+"""The release: along the flight, the star camera at the sky, so that all work from the first minute on."""
 
 _PR_CAPBSET_READ, _PR_CAPBSET_DROP, _CAP_SYS_NICE = 23, 24, 23  # linux/prctl.h, linux/capability.h
 _NO_BYTECODE, _BYTECODE = "PYTHONDONTWRITEBYTECODE", "PYTHONPYCACHEPREFIX"

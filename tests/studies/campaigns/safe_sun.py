@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from flight.gnc.control.three_axes.sun_seeker import Seeking, SunSeeker
 
+from flight.gnc.control.three_axes.sun_seeker import Seeking, SunSeeker
 from flight.gnc.earth.shadow import sunlit_share
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import attitude_matrix
@@ -34,8 +34,6 @@ SECONDS, SETTLED = 11_600.0, 1_800.0
 NEAR = 20.0
 """deg."""
 SHARES = (0.3, 1.0)
-WANTED = {0.3: 20.0, 1.0: None}
-"""deg rms in sunlight."""
 CYCLES = 6
 """Commands in a window; the flight gives 72."""
 GAIN_ERROR, STRING_NOISE = 0.02, 2e-3
@@ -141,3 +139,51 @@ def judged(notes: FloatArray, settled: float) -> Result:
 
 def _rms(values: FloatArray) -> float | None:
     return float(np.sqrt(np.mean(values**2))) if len(values) else None
+
+
+def summarise(results: Sequence[Result], _: Path) -> Summary:
+    """Return how the axis was held, by craft and share."""
+    facts: dict[str, Any] = {}
+    heads = ("runs", "held", "median", "95 %", "worst", "dark", "found", "again", "deg/s")
+    lines = [f"{'craft':12}{'share':>6}" + "".join(f"{head:>9}" for head in heads)]
+    for craft in CRAFT:
+        for share in SHARES:
+            mine = [result for result in results if (result["craft"], result["share"]) == (craft, share)]
+            if not mine:
+                continue
+            found = facts[f"{craft}/{share}"] = _figures(mine)
+            cells = [f"{value:9.1f}" for value in list(found.values())[2:]]
+            lines.append(f"{craft:12}{share:6.1f}{found['runs']:9d}{found['held']:9d}" + "".join(cells))
+    lines += [
+        f"deg rms off the Sun in sunlight (held: {NEAR:g} at most), and in eclipse the median;",
+        f"s at most until first within {NEAR:g} deg, and from an eclipse's end on; fastest",
+    ]
+    return Summary("\n".join(lines) + "\n", facts)
+
+
+def _figures(mine: Sequence[Result]) -> dict[str, Any]:
+    """Return the figures of one cell."""
+    lit = np.array([result["rms"] for result in mine if result["rms"] is not None])
+    dark = [result["rms_dark"] for result in mine if result["rms_dark"] is not None]
+    found = [math.inf if result["found"] is None else result["found"] for result in mine]
+    return {
+        "runs": len(mine),
+        "held": int(np.sum(lit <= NEAR)),
+        "median": float(np.median(lit)),
+        "p95": float(np.percentile(lit, 95.0)),
+        "worst": float(lit.max()),
+        "dark": float(np.median(dark)) if dark else math.nan,
+        "found": max(found),
+        "again": max((result["again"] for result in mine if result["again"] is not None), default=math.nan),
+        "fastest_deg": max(result["fastest_deg"] for result in mine),
+    }
+
+
+SAFE_SUN = Campaign(
+    "safe-sun",
+    "SAFE turns to the Sun by solar strings, gyro and magnetometer alone, and holds it",
+    cases,
+    run,
+    summarise,
+    20,
+)

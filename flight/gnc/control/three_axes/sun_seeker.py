@@ -4,12 +4,12 @@ In body axes the Sun's direction s and the field B are measured, and carried on 
 gyro. The wanted torque J (w^2 e - 2 z w rate), e the turn from the axis to the Sun, can be made only across
 the field (Lovera & Astolfi 2004, Automatica 40(8)). So the part along the field is taken from it by a torque
 about the Sun, which turns the axis off the Sun least: wherever the field is not normal to the Sun, both axes
-that matter are steered at once, and the body rolls. The roll is bounded: the faster it is, the less is asked of it.
+that matter are steered at once, and the body rolls. The faster the roll, the less is asked of it.
 
 A Sun that is not seen is carried on through an eclipse (`flight.gnc.estimation.carried_sun`); without one the
 body is only held still. The residual dipole, a light body's largest torque, is learned and cancelled
-(`flight.gnc.estimation.residual_dipole`). The coils pause while the field is measured. One field starts nothing: two pauses in a row
-must agree.
+(`flight.gnc.estimation.residual_dipole`). The coils pause while the field is measured. One field starts
+nothing: two pauses in a row must agree.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ AGREES = 0.2
 ROLL = 150.0
 """By how much a torque about the Sun is cheaper than another."""
 FASTEST, FASTEST_ACROSS = 0.0165, 0.010
-"""rad/s in all, and across the Sun: a faster body is only braked, below the rate at which the mode brakes it."""
+"""rad/s in all, and across the Sun: a faster body is only held still; less than what the mode brakes."""
 FASTEST_ROLL = 0.0105
 """rad/s about the Sun, from which on it is not cheaper."""
 BANDWIDTH, DAMPING, SHARE = 0.0105, 0.65, 0.6
@@ -164,7 +164,7 @@ class SunSeeker:
 
 
 def _turn(axis: FloatArray, sun: FloatArray) -> FloatArray:
-    """Return the rotation vector (3,) that turns a body's axis to the Sun, both unit vectors; a radian at most."""
+    """Return the rotation vector (3,), a radian at most, that turns an axis to the Sun, both unit vectors."""
     across = cross_product(axis, sun)
     sine = math.sqrt(float(across @ across))
     cosine = float(axis @ sun)
