@@ -23,6 +23,10 @@ JUMP = 0.5
 """Sine of a turn from which on a direction replaces the one that was carried on, and shows no bias."""
 LARGEST_BIAS = 3e-3
 """rad/s of an axis."""
+SHORTLY = 0.5
+"""s since the last turn, within which the carried direction is compared with the measured one."""
+LONGEST_GAP = 3.0
+"""s without a turn: the body may since have turned anywhere, as it does while nobody carries the direction."""
 _SECOND = 1e-9
 
 
@@ -31,7 +35,7 @@ class CarriedSun:
 
     def __init__(self) -> None:
         self._direction: FloatArray | None = None
-        self._seen_ns = 0
+        self._seen_ns = self._turned_ns = 0
         self.bias: FloatArray = np.zeros(3)
         """Of the gyro, (3,) rad/s."""
 
@@ -43,12 +47,16 @@ class CarriedSun:
     def turn(self, time_ns: int, turned: FloatArray) -> None:
         """Carry the direction on to `time_ns`; the body has `turned` (3, 3) since the last reading."""
         if self._direction is not None:
-            known = (time_ns - self._seen_ns) * _SECOND <= MEMORY
+            gap = (time_ns - max(self._turned_ns, self._seen_ns)) * _SECOND
+            known = gap <= LONGEST_GAP and (time_ns - self._seen_ns) * _SECOND <= MEMORY
             self._direction = turned @ self._direction if known else None
+        self._turned_ns = time_ns
 
     def see(self, time_ns: int, sun: FloatArray) -> None:
         """Accept the direction (3,) of the Sun, body axes, of a time just past."""
         carried, since = self._direction, (time_ns - self._seen_ns) * _SECOND
+        if (time_ns - self._turned_ns) * _SECOND > SHORTLY:
+            carried = None
         self._seen_ns = time_ns
         off = np.zeros(3) if carried is None else np.array(cross(sun.tolist(), carried.tolist()))
         if carried is None or float(sun @ carried) <= 0.0 or float(off @ off) > JUMP**2:

@@ -52,15 +52,29 @@ def test_the_drift_of_the_sun_shows_the_bias_so_that_an_eclipse_is_bridged() -> 
 def test_a_sun_is_forgotten_after_the_longest_eclipse() -> None:
     carried = CarriedSun()
     carried.see(0, SUN)
-    carried.turn(int(MEMORY) * SECOND_NS, np.eye(3))
+    for second in range(int(MEMORY) + 1):
+        carried.turn(second * SECOND_NS, np.eye(3))
     assert carried.direction == pytest.approx(SUN)
     carried.turn(int(MEMORY + 1.0) * SECOND_NS, np.eye(3))
+    assert carried.direction is None
+
+
+def test_while_nobody_carries_it_no_bias_is_learned_and_an_old_direction_is_not_taken_up() -> None:
+    """In other modes than SAFE the strings are read, too, but the body turns unheard."""
+    carried = CarriedSun()
+    for second in range(100):
+        carried.see(second * SECOND_NS, attitude_matrix(from_rotation_vector(second * BIAS)) @ SUN)
+    np.testing.assert_array_equal(carried.bias, np.zeros(3))
+    carried.turn(101 * SECOND_NS, np.eye(3))
+    assert carried.direction is not None
+    carried.turn(110 * SECOND_NS, np.eye(3))
     assert carried.direction is None
 
 
 def test_a_sun_far_from_the_carried_one_replaces_it_and_shows_no_bias() -> None:
     carried = CarriedSun()
     carried.see(0, SUN)
+    carried.turn(SECOND_NS, np.eye(3))
     for other in (-SUN, np.array([0.8, 0.6, 0.0])):
         carried.see(SECOND_NS, other)
         assert carried.direction == pytest.approx(other)
