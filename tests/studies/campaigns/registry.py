@@ -34,6 +34,7 @@ from tests.studies.campaigns.robust_controllers import ROBUST_CONTROLLERS
 from tests.studies.campaigns.rolling_shutter import ROLLING_SHUTTER
 from tests.studies.campaigns.rso import RSO_SLEW, RSO_TRACK
 from tests.studies.campaigns.rso_orbits import RSO_ORBITS
+from tests.studies.campaigns.safe_sun import SAFE_SUN
 from tests.studies.campaigns.soak import SOAK
 from tests.studies.campaigns.start import START
 from tests.studies.campaigns.step_robust import STEP_ROBUST
@@ -76,6 +77,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         ORBIT_ATTITUDE,
         ORBIT_FRAMES,
         DETUMBLE,
+        SAFE_SUN,
         WORLD_COMPARISON,
         ORBIT_FAULTS,
         ORBIT_POINTING,
