@@ -3,11 +3,12 @@
 A 3U and the KnightCube. Cells `hold` start at nadir along the flight with nothing learned and fly two
 revolutions and more; the first one teaches the filter the residual dipole and the torques and is not judged.
 Cells `turn` start 30 to 180 deg off nadir, Sun or an inertial attitude, turning at 0.3 deg/s, and fly 100
-min: `arrived` counts bodies that come within ARRIVED deg and stay there for the rest, half a revolution at
-least; `lost` is farther than LOST deg off at the end. `share` multiplies the torques that the coils can not
-cancel at once: drag, sunlight, and the turn of the principal axes; the residual dipole is always whole. Laws:
-`whole`; `plain` without feed-forward; `pd`, the magnetic proportional-derivative law
-(`orbit_pointing_flight`).
+min: `arrived` counts bodies whose pointing axis comes within ARRIVED deg and stays there for the rest, half a
+revolution at least; `lost` is farther than LOST deg off at the end. The KnightCube's turn about that axis is
+cheap (WEIGHTS of `orbit_pointing_flight`), so only the error of three axes has it. `share` multiplies the
+torques that the coils can not cancel at once: drag, sunlight, and the turn of the principal axes; the
+residual dipole is always whole. Laws: `whole`; `plain` without feed-forward; `pd`, the magnetic
+proportional-derivative law (`orbit_pointing_flight`).
 """
 
 from __future__ import annotations
@@ -111,8 +112,8 @@ def off_goal(turns: FloatArray) -> FloatArray:
 
 
 def _arrival(wanted: dict[str, Any], notes: FloatArray) -> Result:
-    """Return when the body arrived to stay, s, None where it did not, and the error at the end, deg."""
-    off = np.degrees(np.linalg.norm(notes[:, 1:4], axis=1))
+    """Return when the axis arrived to stay, s, None where it did not, and its error at the end, deg."""
+    off = off_goal(notes[:, 1:4])
     near = ARRIVED[wanted["craft"]]
     beyond = np.nonzero(off > near)[0]
     at = float(notes[beyond[-1], 0]) if len(beyond) else 0.0
@@ -203,14 +204,14 @@ def _turns(results: Sequence[Result], facts: dict[str, Any]) -> list[str]:
             "runs": len(mine),
             "lost": sum(r["lost"] for r in mine),
             "arrived": len(times),
-            "median": float(np.median(times)) if times else float("nan"),
-            "worst": max(times, default=float("nan")),
+            "median": float(np.median(times)) if times else None,
+            "worst": max(times, default=None),
             "end": float(np.median([r["end_rms"] for r in mine])),
             "milliwatts": 1e3 * WATTS[cell[0]] * float(np.median([r["mean_square"] for r in mine])),
         }
         craft, share, law = cell
         facts[f"turn/{craft}/{share}/{law}"] = found
-        row = [f"{found[name]:10.3g}" for name in list(found)[3:]]
+        row = [f"{'':>10}" if value is None else f"{value:10.3g}" for value in list(found.values())[3:]]
         counts = "".join(f"{found[name]:10d}" for name in ("runs", "lost", "arrived"))
         lines.append(f"{f'{craft}, {share}, {law}':26}" + counts + "".join(row))
     within = ", ".join(f"{name} {angle:g} deg" for name, angle in ARRIVED.items())

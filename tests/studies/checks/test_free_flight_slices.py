@@ -54,5 +54,6 @@ def test_a_satellite_that_starts_with_nothing_learned_turns_to_its_target(tmp_pa
     }
     found = orbit_pointing.summarise([hold, turn], tmp_path)
     assert found.facts["hold/knightcube/0.1/whole"]["runs"] == 1
+    assert found.facts["turn/knightcube/0.1/whole"]["median"] is None
     assert found.facts["turn/knightcube/0.1/whole"]["arrived"] == 0, "a flight of two minutes shows no stay"
     assert "turn: craft, share, law" in found.text

@@ -1,7 +1,8 @@
 """The table of the pointing law: a path, and gains along it.
 
-Beyond the path's end the law itself is the path: a sweep over a revolution of preview gives what an error at
-the end would cost (`pointing_sweep`).
+The path is the begin of the best course of the whole revolution (`pointing_course`). Where none is found, or
+the coils do not suffice for it, it is the best path (`pointing_path`), beyond whose end the law itself is the
+path: a sweep over a revolution of preview gives what an error at the end would cost (`pointing_sweep`).
 """
 
 from __future__ import annotations
