@@ -26,7 +26,7 @@ LARGEST_BIAS = 3e-3
 SHORTLY = 0.5
 """s since the last turn, within which the carried direction is compared with the measured one."""
 LONGEST_GAP = 3.0
-"""s without a turn: the body may since have turned anywhere, as it does while nobody carries the direction."""
+"""s without a turn: the body may since have turned anywhere, as while nobody carries the direction."""
 _SECOND = 1e-9
 
 

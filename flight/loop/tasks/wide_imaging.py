@@ -11,8 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from zlib import crc32
 
-import numpy as np
-
 from flight.gnc.vision.wide_job import WideFound
 from flight.link import events
 from flight.link.telemetry.orbit_definitions import DIRECTIONS
@@ -123,7 +121,7 @@ class WideImaging:
             if frame is None or frame.sequence <= self._sequences[number]:
                 continue  # a frame that comes again does not reset the age
             self._sequences[number] = frame.sequence
-            before, self._pictures[number] = self._pictures[number], crc32(np.ascontiguousarray(frame.pixels))
+            before, self._pictures[number] = self._pictures[number], crc32(frame.pixels.tobytes())
             if self._pictures[number] == before:
                 self._errors[number] = "its picture is the last one, to the pixel"
                 continue

@@ -68,7 +68,8 @@ class Bench:
         self.task.begin(0)
 
     def _update(self, fact: object, holds: bool, *_: object) -> None:
-        {facts.WIDE_LOST: self.said, facts.WIDE_FALSE: self.false}[fact].append(holds)
+        assert fact in {facts.WIDE_LOST, facts.WIDE_FALSE}
+        (self.said if fact is facts.WIDE_LOST else self.false).append(holds)
 
     def job(self, frames: Mapping[int, Frame]) -> WideJob:
         self.jobs.append(frames)

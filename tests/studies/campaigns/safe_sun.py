@@ -123,16 +123,19 @@ def judged(notes: FloatArray, settled: float) -> Result:
     near, sunlit = off <= NEAR, lit > 0.5
     later = times > settled
     dawns = np.nonzero(sunlit[1:] & ~sunlit[:-1])[0] + 1
-    again = []
-    for dawn in dawns:
-        after = np.nonzero(near[dawn:])[0]
-        again.append(float(times[dawn + after[0]] if len(after) else math.inf) - float(times[dawn]))
+    returns = [np.nonzero(near[dawn:])[0] for dawn in dawns]
+    again = [
+        float(times[dawn + after[0]] - times[dawn])
+        for dawn, after in zip(dawns, returns, strict=True)
+        if len(after)
+    ]
     return {
         "found": float(times[near][0]) if near.any() else None,
         "rms": _rms(off[later & sunlit]),
         "rms_dark": _rms(off[later & ~sunlit]),
         "worst": float(off[later & sunlit].max()) if (later & sunlit).any() else None,
         "again": max(again, default=None),
+        "missed": int(not near.any()) + len(returns) - len(again),
         "fastest_deg": float(rate.max()),
     }
 
@@ -144,7 +147,7 @@ def _rms(values: FloatArray) -> float | None:
 def summarise(results: Sequence[Result], _: Path) -> Summary:
     """Return how the axis was held, by craft and share."""
     facts: dict[str, Any] = {}
-    heads = ("runs", "held", "median", "95 %", "worst", "dark", "found", "again", "deg/s")
+    heads = ("runs", "held", "missed", "median", "95 %", "worst", "dark", "found", "again", "deg/s")
     lines = [f"{'craft':12}{'share':>6}" + "".join(f"{head:>9}" for head in heads)]
     for craft in CRAFT:
         for share in SHARES:
@@ -152,11 +155,15 @@ def summarise(results: Sequence[Result], _: Path) -> Summary:
             if not mine:
                 continue
             found = facts[f"{craft}/{share}"] = _figures(mine)
-            cells = [f"{value:9.1f}" for value in list(found.values())[2:]]
-            lines.append(f"{craft:12}{share:6.1f}{found['runs']:9d}{found['held']:9d}" + "".join(cells))
+            counts = "".join(f"{value:9d}" for value in list(found.values())[:3])
+            cells = [
+                f"{'-' if value is None else format(value, '.1f'):>9}" for value in list(found.values())[3:]
+            ]
+            lines.append(f"{craft:12}{share:6.1f}" + counts + "".join(cells))
     lines += [
         f"deg rms off the Sun in sunlight (held: {NEAR:g} at most), and in eclipse the median;",
-        f"s at most until first within {NEAR:g} deg, and from an eclipse's end on; fastest",
+        f"s at most until first within {NEAR:g} deg, and from an eclipse's end on; fastest;",
+        "missed: how often the flight ended before either",
     ]
     return Summary("\n".join(lines) + "\n", facts)
 
@@ -165,16 +172,16 @@ def _figures(mine: Sequence[Result]) -> dict[str, Any]:
     """Return the figures of one cell."""
     lit = np.array([result["rms"] for result in mine if result["rms"] is not None])
     dark = [result["rms_dark"] for result in mine if result["rms_dark"] is not None]
-    found = [math.inf if result["found"] is None else result["found"] for result in mine]
     return {
         "runs": len(mine),
         "held": int(np.sum(lit <= NEAR)),
+        "missed": sum(result["missed"] for result in mine),
         "median": float(np.median(lit)),
         "p95": float(np.percentile(lit, 95.0)),
         "worst": float(lit.max()),
-        "dark": float(np.median(dark)) if dark else math.nan,
-        "found": max(found),
-        "again": max((result["again"] for result in mine if result["again"] is not None), default=math.nan),
+        "dark": float(np.median(dark)) if dark else None,
+        "found": max((result["found"] for result in mine if result["found"] is not None), default=None),
+        "again": max((result["again"] for result in mine if result["again"] is not None), default=None),
         "fastest_deg": max(result["fastest_deg"] for result in mine),
     }
 

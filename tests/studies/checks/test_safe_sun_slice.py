@@ -28,9 +28,10 @@ def test_time_after_an_eclipse_counts_and_so_does_a_sun_that_is_never_found() ->
     lit = np.array([1.0, 1, 1, 0, 0, 1, 1, 1, 1, 1])
     off = np.array([90.0, 10, 10, 50, 50, 30, 30, 10, 10, 10])
     found = safe_sun.judged(np.column_stack([times, off, lit, np.ones(10)]), 0.5)
-    assert (found["found"], found["again"], found["worst"]) == (1.0, 2.0, 30.0)
+    assert (found["found"], found["again"], found["worst"], found["missed"]) == (1.0, 2.0, 30.0, 0)
     assert found["rms"] == pytest.approx(math.sqrt((5 * 100.0 + 2 * 900.0) / 7.0))
     assert found["rms_dark"] == pytest.approx(50.0)
     never = safe_sun.judged(np.column_stack([times, np.full(10, 90.0), lit, np.ones(10)]), 0.5)
     assert never["found"] is None
-    assert never["again"] == math.inf
+    assert never["again"] is None
+    assert never["missed"] == 2

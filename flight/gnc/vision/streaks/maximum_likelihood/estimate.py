@@ -84,8 +84,7 @@ def estimate_motion(
     """
     validate(pixels, pinhole, exposure, prior_rate, prior_sigma)
     # A frame may clip below where the camera says it does, never above.
-    given = np.inf if settings.saturation is None else settings.saturation
-    saturation = min(saturation_count(pixels), given)
+    saturation = min(saturation_count(pixels), settings.saturation or np.inf)
     checksum, unusable = admit(pixels, previous_checksum, saturation, settings.saturated_fraction)
     if unusable is not None:
         return MotionResult(unusable, checksum, exposure)
