@@ -209,6 +209,12 @@ SLEW_BEGUN = EventKind(108, "slew-begun", _TOLD, "a slew of least heat to the ta
 SLEW_ENDED = EventKind(109, "slew-ended", _TOLD, "a slew is over: the target is pointed to from now on")
 WIDE_LOST = EventKind(133, "wide-lost", _WARNED, "a wide camera gives no frames")
 WIDE_RECOVERED = EventKind(134, "wide-recovered", _TOLD, "all wide cameras give frames again")
+WIDE_FALSE = EventKind(
+    135, "wide-false", _WARNED, "a wide camera's pictures are not of what it must see by a fine attitude"
+)
+WIDE_TRUSTED = EventKind(
+    136, "wide-trusted", _TOLD, "the wide cameras' pictures are of what they must see again"
+)
 
 OBJECT_FOUND = EventKind(120, "object-found", _TOLD, "a track of an object that is no star is confirmed")
 OBJECT_LOST = EventKind(

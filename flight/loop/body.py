@@ -25,6 +25,7 @@ from flight.loop.executive.rate_group import Cycle
 from flight.loop.fdir.coils.watch import CoilWatch
 from flight.loop.services import Services
 from flight.loop.state.content import Learned
+from flight.loop.state.learning import learned_of
 from flight.schema.sections import Config
 from hal.interfaces.readings import Frame, GpsReading, ImuReading, StringReading
 
@@ -234,6 +235,7 @@ class Body:
         modes: the modes that this body has.
         filter: estimates attitude, rate and the body's parameters.
         learned_problems: why parameters that an earlier boot learned were rejected.
+        learned: returns what the next boot is to start from, at an estimate.
         field: returns the magnetic field (3,) T in body axes at an estimate, for reallocation of currents.
         free_axis: (3,) the only axis about which the body can turn; None for a free body.
         coil_watch: compares commanded currents with supply and motion.
@@ -278,6 +280,7 @@ class Body:
     sighted: Callable[[Sequence[Track], int], None] = lambda _tracks, _now_ns: None
     place: Callable[[int], OrbitState | None] = lambda _: None
     seeks: Callable[[], bool] = lambda: False
+    learned: Callable[[Estimate], Mapping[str, Learned]] = learned_of
     calm: Callable[[int, int], int] = lambda begin_ns, _: begin_ns
     seeker: Brake | None = None
 

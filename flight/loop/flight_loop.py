@@ -22,7 +22,6 @@ from flight.loop.rate_groups import GroupTasks, Periods, rate_groups
 from flight.loop.run_label import RunLabel, record_run
 from flight.loop.services import Services
 from flight.loop.state.keeper import StateKeeper
-from flight.loop.state.learning import learned_of
 from flight.loop.tasks.commanding import Commanding
 from flight.loop.tasks.control_cycle import ControlCycle
 from flight.loop.tasks.health_watch import HealthWatch
@@ -232,7 +231,7 @@ class FlightLoop:
         for kind, text in keeper.notices():
             self._services.events.report(kind, now_ns, text)
         estimate = self._tasks.navigation.estimate(now_ns)
-        keeper.note(self._tasks.modes.mode.label, learned_of(estimate) if estimate else None)
+        keeper.note(self._tasks.modes.mode.label, self._body.learned(estimate) if estimate else None)
 
     def _record_performance(self, now_ns: int) -> None:
         for group in self._groups:

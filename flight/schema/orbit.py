@@ -55,6 +55,7 @@ class OrbitEstimation(Estimation, frozen=True, kw_only=True):
     magnetometer; `field_error` T of an axis of the field's model. `torque_start` N m, of each shape of the
     torques of drag, sunlight and what is constant, before any is learned; `torque_walk` N m per sqrt(s). Of a
     light craft they are smaller: what is taken for a torque along the field is planned for an hour ahead.
+    Since the last boot the gyro's bias may have `changed` by 10 deg/h, the dipole by a twentieth.
     """
 
     bias_walk: NotNegative = 2.0e-6
@@ -62,6 +63,7 @@ class OrbitEstimation(Estimation, frozen=True, kw_only=True):
     field_error: Positive = 5.0e-8
     gate_sigma: Annotated[float, Meta(ge=3.0)] = 5.0
     history: Positive = 12.0
+    changed: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.05
     torque_start: Positive = 3.0e-9
     torque_walk: Positive = 5.0e-12
 
@@ -83,7 +85,8 @@ class PointingSection(Section, frozen=True, kw_only=True):
     """How a satellite points (`flight.gnc.control.three_axes`).
 
     `axis` of the body points; a given roll is measured from `across`, normal to it. `turn` rad, `rate` rad/s
-    and `dipole` A m^2 are the errors and the dipole that cost the same. The coils act for `act` s between
+    and `dipole` A m^2 are the errors and the dipole that cost the same, as does `roll` rad of a turn about
+    `axis`; without it that costs as any other turn. The coils act for `act` s between
     pauses as long as those of detumbling. A plan is made again every `replan_period` s. From far off a target
     is slewed to in `slew` s, where that suffices, with the star camera outside the `cones`.
     """
@@ -93,6 +96,7 @@ class PointingSection(Section, frozen=True, kw_only=True):
     turn: Positive = 0.0175
     rate: Positive = 1.0
     dipole: Positive = 1.0e-4
+    roll: Positive | None = None
     act: Annotated[float, Meta(ge=0.1, le=10.0)] = 1.8
     replan_period: Annotated[float, Meta(ge=10.0, le=900.0)] = 300.0
     slew: Annotated[float, Meta(ge=60.0, le=1500.0)] = 600.0

@@ -19,6 +19,10 @@ LOST, COARSE, FINE = 0, 1, 2
 WITH_STARS = 10.0
 """s after an accepted attitude of the stars for which the estimate is one with stars."""
 
+LIT, JUDGED, LEAST_DIPOLE = 0.99, 600, 1e-9
+"""Share of the Sun's disc from which the satellite is in sunlight; navigation packets, one a second, in which
+the residual dipole is judged; A m^2, below which there is none."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AttitudeErrors:
@@ -68,7 +72,28 @@ def knowledge(run: Run) -> Object | None:
         "refused": int(last["refused"]),
         "fixes_refused": int(last["fixes_refused"]),
         "restarts": int(last["restarts"]),
+        "dipole_error_share": dipole_errors(run),
     }
+
+
+def dipole_errors(run: Run) -> dict[str, float]:
+    """Return the error of the residual dipole over its size, rms, in sunlight and in shadow.
+
+    Of the last ten minutes in either; NaN without an estimate or a truth of it.
+    """
+    packets, truth = run["navigation"], run["orbit_truth"]
+    packets = packets[np.isfinite(packets["residual_dipole"][:, 0])]
+    found = {"sunlight": math.nan, "shadow": math.nan}
+    if not len(packets) or not len(truth):
+        return found
+    at = np.clip(np.searchsorted(seconds(truth), seconds(packets)), 0, len(truth) - 1)
+    true, lit = truth["residual_dipole"][at].astype(float), truth["sunlit"][at]
+    off = packets["residual_dipole"].astype(float) - true
+    for name, inside in (("sunlight", lit > LIT), ("shadow", lit < 1.0 - LIT)):
+        last = np.flatnonzero(inside)[-JUDGED:]
+        if len(last):
+            found[name] = _size(off[last]) / max(_size(true[last]), LEAST_DIPOLE)
+    return found
 
 
 def _since_stars(run: Run, times: FloatArray) -> FloatArray:
@@ -76,6 +101,11 @@ def _since_stars(run: Run, times: FloatArray) -> FloatArray:
     stars = run["stars"]
     used = np.concatenate([[-math.inf], seconds(stars[stars["accepted"] == 1])])
     return np.asarray(times - used[np.searchsorted(used, times, side="right") - 1])
+
+
+def _size(vectors: FloatArray) -> float:
+    """Return the root of the sum of the squares of vectors (n, 3)."""
+    return float(np.sqrt(np.sum(vectors**2)))
 
 
 def _rms(error: FloatArray) -> float:

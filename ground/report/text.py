@@ -128,6 +128,7 @@ def _knowledge(found: Object | None) -> list[str]:
         return []
     degrees = 180.0 / math.pi
     share = ", ".join(f"{name} {number(part, 1, 100.0)} %" for name, part in found["share"].items())
+    dipole = found["dipole_error_share"]
     return [
         "Attitude knowledge",
         f"  {share}; fine first at {number(found['fine_after_s'], 1)} s",
@@ -136,6 +137,8 @@ def _knowledge(found: Object | None) -> list[str]:
         f"at most {number(found['fine_error_worst_rad'], 4, degrees)}; "
         f"{number(found['worst_sigmas'], 1)} sigma of an axis at most, "
         f"NEES of an axis {number(found['nees_per_axis'], 2)}",
+        f"  residual dipole known to {number(dipole['sunlight'], 0, 100.0)} % in the last ten minutes of "
+        f"sunlight, {number(dipole['shadow'], 0, 100.0)} % in those of shadow",
         f"  refused {found['refused']} measurements and {found['fixes_refused']} fixes, "
         f"{found['restarts']} new starts",
     ]

@@ -14,6 +14,7 @@ from flight.bodies.orbit.brake import FieldBrake, expected_field
 from flight.bodies.orbit.coarse_sun import CoarseSunFeed
 from flight.bodies.orbit.feed import OrbitFeed
 from flight.bodies.orbit.filter import OrbitFilter
+from flight.bodies.orbit.learned import learned_of, start_from
 from flight.bodies.orbit.object_aim import ObjectAim, Sensor
 from flight.bodies.orbit.paths import PointingPaths
 from flight.bodies.orbit.planning import PlannedCraft, PointingPlanner
@@ -59,11 +60,11 @@ _BELOW = 0.8
 
 
 def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> Body:
-    """Return the satellite of a configuration; parameters that an earlier boot learned are not used yet."""
+    """Return the satellite of a configuration, with what an earlier boot learned."""
     config = as_orbit(config)
     surroundings = Surroundings(_elements(config), services.clock)
     limit, dipole_per_ampere = _limit(config), config.craft.dipole_per_ampere
-    filter_ = _filter(config, surroundings)
+    filter_, problems = _filter(config, surroundings, learned, _utc(services))
     brake = FieldBrake(_detumbler(config, filter_, surroundings), dipole_per_ampere)
     seeker = _seeker(config, services)
     paths = PointingPaths(limit, fastest_rate(config))
@@ -73,7 +74,8 @@ def make(config: Config, services: Services, learned: Mapping[str, Learned]) -> 
     return Body(
         modes=frozenset(Mode) - {Mode.HOLD, Mode.SLEW, Mode.TESTBED_DEMO},
         filter=filter_,
-        learned_problems=[],
+        learned_problems=problems,
+        learned=lambda _: learned_of(filter_.slow, _utc(services)),
         paths=paths,
         planner=PointingPlanner(_planned(config), paths, surroundings, disturbed, objects, services),
         targets=PointingTargets(_timed(config), paths, config.looks_for_objects()),
@@ -134,7 +136,14 @@ def _planned(config: OrbitConfig) -> PlannedCraft:
     section = config.pointing
     axes = BodyAxes(np.array(section.axis), np.array(section.across))
     fastest = _BELOW * fastest_rate(config)
-    weights = PointingWeights(turn=section.turn, rate=section.rate, dipole=section.dipole, fastest=fastest)
+    weights = PointingWeights(
+        turn=section.turn,
+        rate=section.rate,
+        dipole=section.dipole,
+        fastest=fastest,
+        roll=section.roll,
+        axis=axes.pointing,
+    )
     pauses = _pauses(config)
     limit = _limit(config) * pauses.act_ns / pauses.period_ns
     return PlannedCraft(np.diag(config.craft.inertia), axes, weights, limit, _slew(config))
@@ -168,9 +177,28 @@ def _timed(config: OrbitConfig) -> list[tuple[float, PointingTarget]]:
     return [(step.at, step.target()) for step in config.targets]
 
 
-def _filter(config: OrbitConfig, surroundings: Surroundings) -> OrbitFilter:
+def filter_settings(config: OrbitConfig) -> FreeFilterSettings:
+    """Return what the configuration says of the noises of the filter's states."""
+    section, rate_hz = config.estimation, config.executive.control_rate_hz
+    return FreeFilterSettings(
+        gyro=(section.bias_start, section.bias_walk),
+        coil_noise=section.current_noise * config.craft.dipole_per_ampere / math.sqrt(rate_hz),
+        torque=(section.torque_start, section.torque_walk),
+        gate_sigma=section.gate_sigma,
+    )
+
+
+def _utc(services: Services) -> float:
+    """Return UTC, s, as the host has it: with it what was learned ages."""
+    return services.clock.utc_ns() / SECOND_NS
+
+
+def _filter(
+    config: OrbitConfig, surroundings: Surroundings, learned: Mapping[str, Learned], utc: float
+) -> tuple[OrbitFilter, list[str]]:
+    """Return the filter, and why parts of what was learned were rejected."""
     craft, section, unit = config.craft, config.estimation, config.inertial_unit
-    rate_hz = config.executive.control_rate_hz
+    slow, problems = start_from(learned, filter_settings(config), section.changed, utc)
     settings = OrbitFilterSettings(
         inertia=np.diag(craft.inertia),
         dipole_per_ampere=craft.dipole_per_ampere,
@@ -181,14 +209,10 @@ def _filter(config: OrbitConfig, surroundings: Surroundings) -> OrbitFilter:
         unknown_psd=config.detumble.torque_noise**2,
         settle_ns=round(config.detumble.settle * SECOND_NS),
         history_ns=round(section.history * SECOND_NS),
-        free=FreeFilterSettings(
-            gyro=(section.bias_start, section.bias_walk),
-            coil_noise=section.current_noise * craft.dipole_per_ampere / math.sqrt(rate_hz),
-            torque=(section.torque_start, section.torque_walk),
-            gate_sigma=section.gate_sigma,
-        ),
+        slow=slow,
+        free=filter_settings(config),
     )
-    return OrbitFilter(settings, surroundings.at)
+    return OrbitFilter(settings, surroundings.at), problems
 
 
 def _strings(section: StringsSection) -> SolarStrings:

@@ -18,6 +18,7 @@ from flight.bodies.orbit.field_doubt import FieldDoubt
 from flight.bodies.orbit.replay import FIELD_MEMORY, OrbitFilterSettings, StepReplay
 from flight.bodies.orbit.steps import DipoleHistory, OpenStep
 from flight.gnc.estimation.estimate import Estimate, Knowledge
+from flight.gnc.estimation.free_filter import SlowStates
 from flight.gnc.estimation.free_motion import Around
 from flight.gnc.estimation.measurements import (
     AttitudeMeasurement,
@@ -115,6 +116,11 @@ class OrbitFilter:
         """The residual dipole (3,) A m^2 in the present light, body axes."""
         lit = self._steps[-1].around.sunlit if self._steps else 0.0
         return self._free.residual_dipole(lit)
+
+    @property
+    def slow(self) -> SlowStates:
+        """What is known of biases, dipole, torques and axes."""
+        return self._free.slow
 
     @property
     def magnet_bias(self) -> FloatArray:

@@ -59,15 +59,15 @@ class PointingPaths:
         self.astray = Astray()
 
     def offer(self, table: PointingTable, target: PointingTarget, origin_ns: int) -> str:
-        """Fly a table from now on; return why it is refused, empty when it is flown."""
+        """Fly a table, or its part that is slow enough; return why it is refused, empty when it is flown."""
         parts = (table.gain, table.dipole, table.torque_part, table.path.quaternion)
         if not all(np.isfinite(part).all() for part in parts):
             return "it holds values that are not finite"
-        speed = float(np.linalg.norm(table.path.rate, axis=1).max())
-        if speed >= self._fastest:
-            turn, most = np.rad2deg([speed, self._fastest])
+        flown = table.below(self._fastest)
+        if flown is None:
+            turn, most = np.rad2deg([table.fastest, self._fastest])
             return f"it turns the body at {turn:.2f} deg/s, where {most:.2f} are braked or blind the camera"
-        self._law, self._target, self._origin_ns = PointingLaw(table, self._limit), target, origin_ns
+        self._law, self._target, self._origin_ns = PointingLaw(flown, self._limit), target, origin_ns
         self.off, self._arrival_ns = 0.0, None
         self.astray.planned()
         if table.slew is not None:

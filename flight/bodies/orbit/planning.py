@@ -1,7 +1,7 @@
 """Planning of a satellite: requests tables of the pointing law from the planner worker.
 
-A table is made when a target is set, when the attitude is known again, and periodically: the orbit's
-prediction ages, and a free roll follows the body's own.
+A table is made when a target is set, when the attitude is known again, where the body leaves its path, and
+periodically: the orbit's prediction ages, and a free roll follows the body's own.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ class PointingPlanner:
             text = f"{math.degrees(self._paths.off):.2f} deg off its path"
             self._events.report(events.SLEW_ENDED, now_ns, text)
             self._wanted = True
-        wanted = self._wanted or astray.ready or self._objects.moved
+        wanted = self._wanted or astray.ready or astray.leaving or self._objects.moved
         if estimate is None or not wanted or self._job is not None or now_ns < self._after_ns:
             return
         orbit, craft = self._surroundings.state(now_ns), self._craft
@@ -155,7 +155,7 @@ class PointingPlanner:
         elif self._paths.astray.since is not None and not self._paths.astray.ready:
             self._wanted = True  # planned before the body went astray: another one once it is slow
         elif reason := self._paths.offer(result.value, job.target, job.origin_ns):
-            self._fail(f"plan {job.number}: {reason}", now_ns)
+            self._fail(f"plan {job.number}: {reason}", now_ns, AGAIN_NS if job.span is STEADY else 0)
         else:
             self._accepted, self._held = self._accepted + 1, False
             self._objects.judge(job, result.value, now_ns)
@@ -168,8 +168,8 @@ class PointingPlanner:
         """Return how many plans were accepted and refused since the start."""
         return self._accepted, self._refused
 
-    def _fail(self, text: str, now_ns: int) -> None:
-        """Report a plan that is not flown, and ask for another one later."""
+    def _fail(self, text: str, now_ns: int, wait_ns: int = AGAIN_NS) -> None:
+        """Report a plan that is not flown, and ask for another one after `wait_ns`: none for an object."""
         self._refused += 1
-        self._wanted, self._after_ns = True, now_ns + AGAIN_NS
+        self._wanted, self._after_ns = True, now_ns + wait_ns
         self._events.report(events.PLANNER_FAILED, now_ns, text)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from flight.bodies.orbit.steps import Step
-from flight.gnc.estimation.free_filter import FreeFilter
+from flight.gnc.estimation.free_filter import FreeFilter, SlowStates
 from flight.gnc.estimation.free_settings import FreeFilterSettings
 from flight.gnc.estimation.measurements import (
     AttitudeMeasurement,
@@ -40,6 +40,7 @@ class OrbitFilterSettings:
         settle_ns: after the coils have come to rest, until the magnetometer is free of their field.
         history_ns: how old a measurement may be.
         step_ns: the longest step.
+        slow: what an earlier boot learned of the slow states.
     """
 
     inertia: FloatArray
@@ -52,6 +53,7 @@ class OrbitFilterSettings:
     settle_ns: int
     history_ns: int
     step_ns: int = SECOND_NS
+    slow: SlowStates | None = None
     free: FreeFilterSettings = field(default_factory=FreeFilterSettings)
 
 
@@ -67,7 +69,7 @@ class StepReplay:
 
     def __init__(self, settings: OrbitFilterSettings) -> None:
         self._settings = settings
-        self.free = FreeFilter(settings.inertia, settings.free)
+        self.free = FreeFilter(settings.inertia, settings.free, settings.slow)
         self.steps: deque[Step] = deque()
         self.refused_gyros = 0
         self.refused_fields = 0

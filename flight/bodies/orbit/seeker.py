@@ -52,7 +52,8 @@ class StringSeeker:
         return CoilCommand(dipole, dipole / self._dipole_per_ampere)
 
     def sent(self, currents: FloatArray) -> None:
-        """Take what went to the coils (3,) A; nothing follows from it, as the gyro tells the rate."""
+        """Take what went to the coils (3,) A."""
+        self._seeker.acts(currents * self._dipole_per_ampere)
 
     def field(self, now_ns: int) -> FloatArray | None:
         """Return the field (3,) T in body axes at the last reading; None before it is known."""

@@ -74,8 +74,12 @@ class WideFeed:
 
     @property
     def needed(self) -> bool:
-        """Whether the cameras are to be read often."""
-        return self._filter.worst_sigma > NEEDED_SIGMA
+        """Whether the cameras are to be read often: in the shadow only while the attitude is lost."""
+        if self._filter.worst_sigma <= NEEDED_SIGMA:
+            return False
+        around = self._surroundings.at(self._filter.measured_ns)
+        dark = around is not None and around.sunlit <= 0.0
+        return not dark or self._filter.knowledge is Knowledge.LOST
 
     def job(self, frames: Mapping[int, Frame]) -> WideJob:
         """Return the worker's job for frames of one instant, with what is known of their time."""

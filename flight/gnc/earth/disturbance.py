@@ -35,6 +35,10 @@ class Pressures:
     air: FloatArray
     light: FloatArray
 
+    def until(self, count: int) -> Pressures:
+        """Return those of the first `count` instants."""
+        return Pressures(self.air[:count], self.light[:count])
+
 
 def pressures(ephemeris: Ephemeris, times: FloatArray) -> Pressures:
     """Return the shapes at times (n,) s: the air's about one in the mean, light's one in full sunlight."""

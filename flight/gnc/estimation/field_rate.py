@@ -56,7 +56,7 @@ class FieldRateSettings:
         change_walk: T/s per sqrt(s), its random walk.
         torque_walk: rad/s per sqrt(s) of an axis, from torques that are not modelled.
         axes_sigma: rad, by which the principal axes are turned from those of `inertia`, at the start.
-        inertia_error: share of the gyroscopic torque that stays unmodelled.
+        inertia_error: share of the gyroscopic torque that no turn of the axes explains, once that is known.
         gate_sigma: a measurement less likely than this many sigma of one component is refused.
         refusals: this many in a row, and the filter starts again; of a gyro, and it is not asked again.
         gyro_sigma: rad/s of an axis, the bound of a gyro's bias.
@@ -70,7 +70,7 @@ class FieldRateSettings:
     change_walk: float = 4e-9
     torque_walk: float
     axes_sigma: float = 0.03
-    inertia_error: float = 0.01
+    inertia_error: float = 0.003
     gate_sigma: float = 5.0
     refusals: int = 5
     longest_gap: float = 0.2
@@ -101,9 +101,9 @@ class FieldRate:
         inertia = np.asarray(settings.inertia, dtype=float)
         self._inverse = np.linalg.inv(inertia)
         self._inertia_rows, self._inverse_rows = _rows(inertia), _rows(self._inverse)
-        # As rare as `gate_sigma` of one component, by the tail's exponential part.
         moments = np.linalg.eigvalsh(inertia)
-        self._gyroscopic = settings.axes_sigma * float(moments[-1] - moments[0]) / np.diag(inertia)
+        self._differences = float(moments[-1] - moments[0]) / np.diag(inertia)
+        # As rare as `gate_sigma` of one component, by the tail's exponential part.
         self._gate = (settings.gate_sigma + 1.0) ** 2
         self.restarts = 0
         self.restart()
@@ -224,6 +224,16 @@ class FieldRate:
         self._turn_axes(self._inertia, change[AXES])
         covariance = self._covariance - gain @ self._covariance[measured]
         self._covariance = 0.5 * (covariance + covariance.T)
+        self._look_at_axes()
+
+    def _look_at_axes(self) -> None:
+        """Take for unexplained, of the gyroscopic torque, the doubt of the axes that can be seen.
+
+        The filter is linear: what it takes from turns that it hardly knows it would believe too firmly. The
+        axes' worst direction is left out, as a turn about a symmetric body's axis shows nothing.
+        """
+        unknown = float(np.linalg.eigvalsh(self._covariance[AXES, AXES])[1])
+        self._unexplained = max(self._settings.inertia_error, math.sqrt(unknown))
 
     def _start(self, field: FloatArray) -> None:
         """Begin with the rate across the field from three samples in a row that agree; else wait for more."""
@@ -263,6 +273,7 @@ class FieldRate:
         self._covariance[FIELD, FIELD] = settings.field_sigma**2 * np.eye(3)
         self._covariance[CHANGE, CHANGE] = settings.change_start**2 * np.eye(3)
         self._covariance[AXES, AXES] = settings.axes_sigma**2 * np.eye(3)
+        self._look_at_axes()
 
     def _turn_axes(self, inertia: FloatArray, turn: Sequence[float]) -> None:
         """Turn the principal axes of `inertia` by a rotation vector (3,) rad."""
@@ -294,7 +305,8 @@ class FieldRate:
         # The gyroscopic error turns with the body: it lasts for the time of a radian.
         speed = math.sqrt(middle[0] ** 2 + middle[1] ** 2 + middle[2] ** 2)
         walks = covariance.reshape(-1)[:: SIZE + 1]
-        walks[RATE] += dt * (settings.torque_walk**2 + speed**3 * self._gyroscopic**2)
+        gyroscopic = self._unexplained * self._differences
+        walks[RATE] += dt * (settings.torque_walk**2 + speed**3 * gyroscopic**2)
         walks[CHANGE] += dt * settings.change_walk**2
         self._covariance = covariance
 

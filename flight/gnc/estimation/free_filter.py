@@ -52,6 +52,14 @@ _EYE: FloatArray = np.eye(3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class SlowStates:
+    """The states after the rate: `values` (24,) and their covariance (24, 24)."""
+
+    values: FloatArray
+    covariance: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class FreeMemory:
     """An estimate of the filter: its attributes of these names."""
 
@@ -76,8 +84,10 @@ class FreeFilter:
         changes: counts the changes of the estimate.
     """
 
-    def __init__(self, inertia: FloatArray, settings: FreeFilterSettings) -> None:
-        """`inertia` (3, 3) kg m^2, body axes."""
+    def __init__(
+        self, inertia: FloatArray, settings: FreeFilterSettings, slow: SlowStates | None = None
+    ) -> None:
+        """`inertia` (3, 3) kg m^2, body axes; `slow` is what is known of the slow states before the start."""
         self.motion = FreeMotion(inertia)
         self._settings = settings
         tail = math.erfc(settings.gate_sigma / math.sqrt(2.0))
@@ -92,6 +102,9 @@ class FreeFilter:
         self.quaternion: FloatArray = np.array([0.0, 0.0, 0.0, 1.0])
         self.rate: FloatArray = np.zeros(3)
         self.covariance: FloatArray = np.zeros((STATES, STATES))
+        self.covariance[6:, 6:] = np.diag(settings.of_slow(0) ** 2)
+        if slow is not None:
+            self._constants[6:], self.covariance[6:, 6:] = slow.values, slow.covariance
 
     def start(
         self, quaternion: FloatArray, covariance: FloatArray, gyro: FloatArray, *, doubted: bool = False
@@ -102,7 +115,7 @@ class FreeFilter:
         they are claimed to be known is not.
         """
         self.changes += 1
-        if doubted or not self.started:
+        if doubted:
             self.covariance[6:, 6:] = np.diag(self._settings.of_slow(0) ** 2)
         self.covariance[:6] = self.covariance[:, :6] = 0.0
         self.covariance[TURN, TURN] = covariance
@@ -125,6 +138,11 @@ class FreeFilter:
         """The attitude's standard deviation about its worst axis, rad."""
         covariance = self.covariance
         return math.sqrt(max(covariance[0, 0], covariance[1, 1], covariance[2, 2]))
+
+    @property
+    def slow(self) -> SlowStates:
+        """What is known of the states after the rate."""
+        return SlowStates(self._constants[6:].copy(), self.covariance[6:, 6:].copy())
 
     def memory(self) -> FreeMemory:
         """Return the estimate as it stands, for `recall`."""

@@ -6,9 +6,13 @@ the range divides out and is renewed to one after each step. These are the modif
 Aidala and Hammel (IEEE Trans. Automatic Control 28, 1983) in vectors. The part of z across the line is the
 angular rate v, the part along it s = (range rate) / range, and the angular acceleration is -2 s v.
 
-Process noise: the tides of two low orbits, which turn with the line, are taken for white accelerations of
-density `Motion.wander`. The range's part also follows what is no straight line, as an object on a great
-circle at a constant rate, whose s would change by rate^2: a density of (`Motion.bend` rate^2)^2 / rate.
+Both fall about the Earth: the gravity gradient at the observer's place, where that is known, gives the
+acceleration of one against the other but for terms of the distance over the orbit's radius.
+
+Process noise: the tides of two low orbits, or what the gradient leaves of them, which turn with the line, are
+taken for white accelerations of density `Motion.wander`. The range's part also follows what is no straight
+line, as an object on a great circle at a constant rate, whose s would change by rate^2: a density of
+(`Motion.bend` rate^2)^2 / rate.
 """
 
 from __future__ import annotations
@@ -17,6 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flight.gnc.earth.figure import GRAVITATIONAL_PARAMETER
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.directions import tangent_basis
 
@@ -87,8 +92,18 @@ def begin(time_ns: int, direction: FloatArray, covariance: FloatArray, motion: M
     return LineOfSight(time_ns, direction, np.zeros(3), start)
 
 
-def predict(state: LineOfSight, time_ns: int, motion: Motion) -> LineOfSight:
-    """Return the line of sight at another time, not before its own."""
+def tides(observer: FloatArray) -> FloatArray:
+    """Return the gravity gradient (3, 3) 1/s^2 at an observer's place (3,) m from the Earth's centre, ICRS.
+
+    What falls beside the observer is accelerated against it by this times its place, to first order.
+    """
+    distance = float(np.linalg.norm(observer))
+    up = observer / distance
+    return np.asarray(GRAVITATIONAL_PARAMETER / distance**3 * (3.0 * np.outer(up, up) - np.eye(3)))
+
+
+def predict(state: LineOfSight, time_ns: int, motion: Motion, tide: FloatArray | None = None) -> LineOfSight:
+    """Return the line of sight at another time, not before its own; `tide` (3, 3) 1/s^2 where it is known."""
     step = (time_ns - state.time_ns) * 1e-9
     if step == 0.0:
         return state
@@ -96,8 +111,12 @@ def predict(state: LineOfSight, time_ns: int, motion: Motion) -> LineOfSight:
         raise ValueError(f"time_ns = {time_ns}: give one from {state.time_ns} on")
     transition = np.eye(6)
     transition[:3, 3:] = step * np.eye(3)
+    if tide is not None:
+        transition[:3, :3] += 0.5 * step**2 * tide
+        transition[3:, :3] = step * tide
     spread = transition @ state.covariance @ transition.T + _noise(state, step, motion)
-    return _at_unit_range(time_ns, state.direction + step * state.velocity, state.velocity, spread)
+    moved = transition @ np.concatenate([state.direction, state.velocity])
+    return _at_unit_range(time_ns, moved[:3], moved[3:], spread)
 
 
 def compare(state: LineOfSight, direction: FloatArray, covariance: FloatArray) -> Innovation:

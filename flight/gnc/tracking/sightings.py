@@ -17,6 +17,7 @@ class Sightings:
         covariance: (n, 3, 3) rad^2 of the places in the image, ICRS axes; without the attitude's.
         magnitudes: (n,) by the frame's stars; NaN when unknown.
         attitude: (3, 3) rad^2, of the small turn, ICRS axes, that is common to all directions of the frame.
+        observer: (3,) m from the Earth's centre, ICRS; None on the ground, or where it is not known.
     """
 
     time_ns: int
@@ -24,3 +25,4 @@ class Sightings:
     covariance: FloatArray
     magnitudes: FloatArray
     attitude: FloatArray
+    observer: FloatArray | None = None

@@ -19,10 +19,13 @@ import numpy as np
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.chi_square import bound
 from flight.gnc.math.directions import cross_matrices
-from flight.gnc.tracking.line_of_sight import LineOfSight, Motion, begin, compare, predict, update
+from flight.gnc.tracking.line_of_sight import LineOfSight, Motion, begin, compare, predict, tides, update
 from flight.gnc.tracking.sightings import Sightings
 
 _UNSEEN = np.full(3, np.nan)
+_ALIKE = 2.0
+"""Standard deviations of the brightness, of a sighting of a tentative track at most. Where a confirmed one
+shows itself is known closely: there an object that flashes may differ by more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +41,7 @@ class TrackSettings:
         least_rate: rad/s, below which nothing is told from a star that no catalogue has.
         coast: s that a confirmed track lasts without a sighting.
         most_tracks: tentative ones included.
-        brightness: magnitudes, deviation between sightings of one object within which they may be its.
+        brightness: magnitudes, standard deviation between sightings of one object.
     """
 
     motion: Motion = field(default_factory=Motion)
@@ -49,7 +52,7 @@ class TrackSettings:
     least_rate: float = 1e-4
     coast: float = 15.0
     most_tracks: int = 32
-    brightness: float = 1.5
+    brightness: float = 0.75
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,8 +126,9 @@ class Tracker:
         A frame older than the last raises ValueError.
         """
         motion = self._settings.motion
+        tide = None if frame.observer is None else tides(frame.observer)
         tracks = [
-            replace(track, line=predict(track.line, frame.time_ns, motion), frames=track.frames + 1)
+            replace(track, line=predict(track.line, frame.time_ns, motion, tide), frames=track.frames + 1)
             for track in self._tracks
         ]
         spread = _with_attitude(frame)
@@ -150,13 +154,14 @@ class Tracker:
         for index, track in enumerate(tracks):
             near = frame.directions @ track.line.direction > 0.5
             for number in np.flatnonzero(near).tolist():
-                change = frame.magnitudes[number] - track.magnitude
-                if abs(change) > self._settings.brightness:
+                change = float(np.nan_to_num(frame.magnitudes[number] - track.magnitude))
+                unlike = (change / self._settings.brightness) ** 2
+                if unlike > _ALIKE**2 and not track.confirmed:
                     continue
                 seen = compare(track.line, frame.directions[number], spread[number])
-                if seen.chi_square <= self._gate:
+                if seen.chi_square + unlike <= self._gate:
                     # A wide gate must not win by its width: the likelihood, with its normalisation.
-                    cost = seen.chi_square + math.log(float(np.linalg.det(seen.covariance)))
+                    cost = seen.chi_square + unlike + math.log(float(np.linalg.det(seen.covariance)))
                     pairs.append((not track.confirmed, cost, index, number))
         taken: dict[int, int] = {}
         used: set[int] = set()

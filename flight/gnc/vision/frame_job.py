@@ -54,6 +54,9 @@ _AT_REST = {StreakStatus.TOO_SHORT, StreakStatus.TOO_FEW}
 _SCALE_TOLERANCE = 0.01
 # A star that moves by less over the exposure is a point.
 _POINT_PX = 1.0
+# Streaks predicted to be shorter are found like points where the frame itself agrees on no motion: in a
+# crowded sky regions run together and look longer than they are.
+_SHORT_PX = 4.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,7 +199,7 @@ def solve_frame(
 def attitude_and_rate(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) -> FrameFound:
     """Return attitude and rate of a frame: the decision tree."""
     motion = _motion(job) if job.motion_first else None
-    rests = _predicted_at_rest(job) if motion is None else motion.status in _AT_REST
+    rests = _predicted_within(job, _POINT_PX) if motion is None else _shows_no_motion(job, motion)
     if rests and job.attitude_prior is not None:
         near = solve_near(job.pixels, job.camera, tracker.scale, sky, tracker.solve, job.attitude_prior)
         if near is not None:
@@ -293,11 +296,17 @@ def _no_motion(job: FrameJob) -> MotionResult:
     return MotionResult(StreakStatus.TOO_SHORT, 0, job.exposure)
 
 
-def _predicted_at_rest(job: FrameJob) -> bool:
-    """Return whether the priors predict stars at rest; without a rate prior they do."""
+def _shows_no_motion(job: FrameJob, motion: Found) -> bool:
+    """Return whether stars are at rest, or move so little, by the priors, that a frame shows no motion."""
+    failed = motion.status is StreakStatus.FAILED and job.rate_prior is not None
+    return motion.status in _AT_REST or (failed and _predicted_within(job, _SHORT_PX))
+
+
+def _predicted_within(job: FrameJob, length: float) -> bool:
+    """Return whether the priors predict streaks shorter than a length, px; without a rate prior they do."""
     if job.attitude_prior is None:
         return False
     if job.rate_prior is None:
         return True
     most = float(np.linalg.norm(job.rate_prior.rate)) + PRIOR_SIGMAS * job.rate_prior.sigma
-    return most * job.exposure * job.camera.focal_length < _POINT_PX
+    return most * job.exposure * job.camera.focal_length < length

@@ -9,7 +9,7 @@ done, as the control process does not need them.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -24,6 +24,11 @@ SUNLIT_COUNTS = 30.0
 """Of a pixel that the sunlit Earth lights, beyond what its scattered light gives beside it."""
 LIT_SIGMA = 0.3
 """rad: a rough attitude that is worse does not tell where the Sun is from the body."""
+EARTHLIGHT_SIGMA = 0.1
+"""rad: a rough attitude that is worse does not say which strings the Earth lights."""
+
+JUDGING_SIGMA = 0.005
+"""rad: an attitude that is worse does not say what a camera must see."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,12 +68,19 @@ class Sighted:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WideFound:
-    """Sun and nadir, None where there is none, and why."""
+    """Sun and nadir, None where there is none, and why.
+
+    Attributes:
+        false: why a camera's picture is not of what it must see, for those that a fine attitude denies.
+        judged: the cameras whose pictures were compared with a fine attitude.
+    """
 
     sun: Sighted | None
     nadir: Sighted | None
     sun_reason: str = ""
     nadir_reason: str = ""
+    false: Mapping[int, str] = field(default_factory=dict)
+    judged: frozenset[int] = frozenset()
 
 
 def run(job: WideJob) -> WideFound:
@@ -79,7 +91,9 @@ def run(job: WideJob) -> WideFound:
         known = SensedDirection(sun.direction, knowledge.sun, sun.sigma)
         knowledge = replace(knowledge, sensed=(*knowledge.sensed, known))
     nadir, nadir_reason = _nadir(job, knowledge, sun)
-    return WideFound(sun, nadir, sun_reason, nadir_reason)
+    judged = _judged(job)
+    false = {number: reason for number, reason in judged.items() if reason}
+    return WideFound(sun, nadir, sun_reason, nadir_reason, false, frozenset(judged))
 
 
 def _sun(job: WideJob) -> tuple[Sighted | None, str]:
@@ -89,12 +103,35 @@ def _sun(job: WideJob) -> tuple[Sighted | None, str]:
 
     coarse = CoarseSun(CoarseSunStatus.UNCERTAIN, reason="the strings give no readings")
     if job.strings is not None:
-        coarse = coarse_sun(job.strings[1], job.strings[0])
+        coarse = coarse_sun(job.strings[1], job.strings[0], _expected_nadir(job.knowledge))
     found = sun_of_cameras(job.frames, job.cameras, coarse, LINEAR if job.response is None else SunSettings())
     if found.direction is None or found.covariance is None:
         return None, found.reason
     cameras = () if found.camera is None else (found.camera,)
     return Sighted(found.direction, found.covariance, cameras), found.reason
+
+
+def _expected_nadir(knowledge: HorizonKnowledge) -> FloatArray | None:
+    """Return nadir (3,) in body axes by a rough attitude, from where the Earth shines on the strings."""
+    rough, position = knowledge.attitude, knowledge.position
+    if rough is None or rough.sigma > EARTHLIGHT_SIGMA or position is None:
+        return None
+    return np.asarray(attitude_matrix(rough.quaternion) @ (-position / np.linalg.norm(position)))
+
+
+def _judged(job: WideJob) -> dict[int, str]:
+    """Return why a picture is not of what a fine attitude puts before its camera, empty where it may be."""
+    from flight.gnc.vision.horizon.ellipsoid import MEAN_RADIUS  # noqa: PLC0415 - see the top
+    from flight.gnc.vision.horizon.false_picture import why_false  # noqa: PLC0415
+    from flight.gnc.vision.horizon.filled_camera import light_seen  # noqa: PLC0415
+
+    rough, position, sun = job.knowledge.attitude, job.knowledge.position, job.knowledge.sun
+    if rough is None or rough.sigma > JUDGING_SIGMA or position is None or sun is None:
+        return {}
+    distance, turn = float(np.linalg.norm(position)), attitude_matrix(rough.quaternion)
+    nadir, sunward = turn @ (-position / distance), turn @ (sun / np.linalg.norm(sun))
+    looks = {n: light_seen(frame, job.cameras[n], SUNLIT_COUNTS) for n, frame in job.frames.items()}
+    return {n: why_false(look, nadir, distance - MEAN_RADIUS, sunward) for n, look in looks.items()}
 
 
 def _nadir(job: WideJob, knowledge: HorizonKnowledge, sun: Sighted | None) -> tuple[Sighted | None, str]:

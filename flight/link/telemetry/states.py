@@ -71,6 +71,7 @@ _FACTS: tuple[tuple[str, Level], ...] = (
     ("clock-off", "warning"),
     ("field-refused", "warning"),
     ("wide-lost", "warning"),
+    ("wide-false", "warning"),
 )
 """The facts that monitors keep, in the order of `flight.loop.fdir.facts`, as grave as their events."""
 FACTS: States = tuple((bit, name) for bit, (name, _) in enumerate(_FACTS))

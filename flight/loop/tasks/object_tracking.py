@@ -31,8 +31,14 @@ class ObjectTracking:
     def ingest(self, sequence: int, middle_ns: int, sighted: Sighted, now_ns: int) -> None:
         """Accept the sightings of frame number `sequence`, exposed about `middle_ns`."""
         self._record_sightings(sequence, middle_ns, sighted, now_ns)
+        orbit = self._body.place(middle_ns)
         frame = Sightings(
-            middle_ns, sighted.directions, sighted.covariance, sighted.magnitudes, sighted.attitude
+            middle_ns,
+            sighted.directions,
+            sighted.covariance,
+            sighted.magnitudes,
+            sighted.attitude,
+            None if orbit is None else orbit.position,
         )
         confirmed, ended = self._tracker.ingest(frame)
         for track in confirmed:

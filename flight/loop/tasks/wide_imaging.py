@@ -1,6 +1,7 @@
 """Wide imaging: passes the frames of the wide cameras to a worker, and what it found to the body.
 
-All are triggered together, and more often while the body needs them. This runs once a second,
+All are triggered together, and more often while the body needs them. Cameras that give no frame, or the same
+picture again, or pictures that a fine attitude denies, are reported. This runs once a second,
 beside the control cycle: a frame is used at its own time.
 """
 
@@ -8,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from zlib import crc32
 
 from flight.gnc.vision.wide_job import WideFound
 from flight.link import events
@@ -21,6 +23,8 @@ from hal.interfaces.errors import DeviceError
 from hal.interfaces.readings import Frame
 
 WORKER = "wide"
+FALSE_ROUNDS = 3
+"""In a row in which a camera's picture is not of what it must see: then it is reported."""
 _NONE = [float("nan")] * 3
 
 
@@ -59,6 +63,8 @@ class WideImaging:
         self._seen_ns = [0] * len(cameras)
         self._sequences = [-1] * len(cameras)
         self._errors = [""] * len(cameras)
+        self._pictures = [0] * len(cameras)
+        self._false = [0] * len(cameras)
         self._job: tuple[int, int, int] | None = None  # time, frames and submission of that in process
 
     def begin(self, time_ns: int) -> None:
@@ -90,6 +96,7 @@ class WideImaging:
             self._services.events.report(events.VISION_FAILED, now_ns, text)
             return
         found: WideFound = result.value
+        self._judge(found, now_ns)
         used = self._sight.accept(job[0], found)
         self._record(now_ns, job, found, used)
 
@@ -114,6 +121,10 @@ class WideImaging:
             if frame is None or frame.sequence <= self._sequences[number]:
                 continue  # a frame that comes again does not reset the age
             self._sequences[number] = frame.sequence
+            before, self._pictures[number] = self._pictures[number], crc32(frame.pixels.tobytes())
+            if self._pictures[number] == before:
+                self._errors[number] = "its picture is the last one, to the pixel"
+                continue
             if frame.exposure_start_ns < self._triggered_ns:
                 continue  # of an earlier round
             self._frames[number], self._seen_ns[number], self._errors[number] = frame, now_ns, ""
@@ -142,6 +153,18 @@ class WideImaging:
             text = f"no frame of camera {names} for {(now_ns - self._seen_ns[old[0]]) * 1e-9:.0f} s"
             text = f"{text}: {error}" if error else text
         self._services.facts.update(facts.WIDE_LOST, bool(old), now_ns, text)
+
+    def _judge(self, found: WideFound, now_ns: int) -> None:
+        """Report cameras whose pictures are not of what they must see, several rounds in a row."""
+        for number in found.judged:
+            self._false[number] = self._false[number] + 1 if number in found.false else 0
+        false = [number for number, rounds in enumerate(self._false) if rounds >= FALSE_ROUNDS]
+        text = "all pictures are of what they must be"
+        if false:
+            names = ", ".join(str(number + 1) for number in false)
+            reason = next((found.false[number] for number in false if number in found.false), "")
+            text = f"pictures of camera {names} are false: {reason}" if reason else f"camera {names}"
+        self._services.facts.update(facts.WIDE_FALSE, bool(false), now_ns, text)
 
     def _record(
         self, now_ns: int, job: tuple[int, int, int], found: WideFound, used: tuple[bool, bool]

@@ -26,6 +26,7 @@ class Camera:
 
     def __init__(self, bench: Bench) -> None:
         self.bench, self.triggers, self.dead, self.pending = bench, 0, False, False
+        self.frozen = False
 
     def trigger(self, _: int) -> None:
         if self.dead:
@@ -36,7 +37,7 @@ class Camera:
         if not self.pending or self.bench.now_ns == self.begun_ns:
             return None
         self.pending = False
-        pixels = np.zeros((4, 4), np.uint8)
+        pixels = np.full((4, 4), 7 if self.frozen else self.triggers % 256, np.uint8)
         return Frame(self.triggers, self.begun_ns, 5_000_000, self.bench.now_ns, pixels)
 
     def close(self) -> None:
@@ -53,6 +54,8 @@ class Bench:
         self.records: list[dict[str, Any]] = []
         self.reports: list[events.EventKind] = []
         self.said: list[bool] = []
+        self.false: list[bool] = []
+        self.denied: dict[int, str] = {}
         self.cameras = [Camera(self), Camera(self)]
         recorder = SimpleNamespace(epoch_ns=0, record=lambda *_, **fields: self.records.append(fields))
         services = SimpleNamespace(
@@ -65,8 +68,8 @@ class Bench:
         self.task.begin(0)
 
     def _update(self, fact: object, holds: bool, *_: object) -> None:
-        assert fact is facts.WIDE_LOST
-        self.said.append(holds)
+        assert fact in {facts.WIDE_LOST, facts.WIDE_FALSE}
+        (self.said if fact is facts.WIDE_LOST else self.false).append(holds)
 
     def job(self, frames: Mapping[int, Frame]) -> WideJob:
         self.jobs.append(frames)
@@ -78,7 +81,8 @@ class Bench:
 
     def fly(self, seconds: int) -> None:
         """Run once a second; the worker answers within the next."""
-        found = WideFound(Sighted(np.array([1.0, 0.0, 0.0]), 1e-6 * np.eye(3), (1,)), None)
+        sun = Sighted(np.array([1.0, 0.0, 0.0]), 1e-6 * np.eye(3), (1,))
+        found = WideFound(sun, None, false=self.denied, judged=frozenset({0, 1}))
         for _ in range(seconds):
             if self.task.busy_since_ns() is not None:
                 self.task.finish(JobResult(WORKER, "done", found, "", 0, 0, 0), self.now_ns)
@@ -118,3 +122,24 @@ def test_a_worker_that_is_not_there_is_reported_and_the_next_round_comes() -> No
     bench.busy = False
     bench.fly(10)
     assert bench.accepted
+
+
+def test_a_camera_that_repeats_its_picture_gives_no_frames() -> None:
+    bench = Bench()
+    bench.fly(10)
+    bench.cameras[1].frozen = True
+    bench.fly(150)
+    assert set(bench.jobs[-1]) == {0}
+    assert bench.said[-1]
+
+
+def test_pictures_that_the_attitude_denies_three_times_in_a_row_are_reported_until_one_is_not() -> None:
+    bench = Bench()
+    bench.denied = {1: "it is dark where the sunlit Earth is"}
+    bench.fly(11)
+    assert not any(bench.false), "two rounds"
+    bench.fly(5)
+    assert bench.false[-1]
+    bench.denied = {}
+    bench.fly(6)
+    assert not bench.false[-1]

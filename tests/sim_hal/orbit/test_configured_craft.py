@@ -14,7 +14,7 @@ from sim_hal.worlds.free_body.craft import CRAFTS
 FOLDER = Path(__file__).resolve().parents[3] / "config"
 
 
-@pytest.mark.parametrize("name", ["orbit.yaml", "orbit_3u.yaml", "orbit_object.yaml"])
+@pytest.mark.parametrize("name", ["orbit.yaml", "orbit_3u.yaml", "orbit_object.yaml", "orbit_object_1u.yaml"])
 def test_the_believed_coils_and_inertia_are_the_true_ones(name: str) -> None:
     """Errors of a few per cent are drawn by the seed; other coils than believed are a wrong configuration."""
     believed = as_orbit(reader.load(FOLDER / name)).craft

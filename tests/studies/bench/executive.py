@@ -1,11 +1,13 @@
-"""The 40 Hz loop with everything running: `python -m tests.studies.bench executive [--minutes M]`.
+"""The 40 Hz loop with everything running: `python -m tests.studies.bench executive [--minutes M] [--orbit]`.
 
 The step demonstration flies in real time on emulated devices in processes of their own, as a board flies on
-its devices: planner and vision have work without pause, the guardian watches. Beside it a bare absolute-sleep
-loop at the same rate (`tests.studies.bench.bare_loop`) measures the machine's own stalls, and the
-kernel the time that a virtual machine's host takes; a working loop meets such stalls more often than a
-sleeping loop. Where SCHED_FIFO is allowed the flight is flown twice, with it and without. Run it alone on two
-cores. The slope of memory needs flights of 16 minutes or longer.
+its devices: planner and vision have work without pause, the guardian watches. With `--orbit` the KnightCube
+of `config/orbit.yaml` flies in its place, at nadir from the begin; its planner has the shortest period that
+the configuration allows, 10 s, and the wide cameras work as they fly. Beside it a bare absolute-sleep loop at
+the same rate (`tests.studies.bench.bare_loop`) measures the machine's own stalls, and the kernel the time
+that a virtual machine's host takes; a working loop meets such stalls more often than a sleeping loop. Where
+SCHED_FIFO is allowed the flight is flown twice, with it and without. Run it alone on two cores. The slope of
+memory needs flights of 16 minutes or longer.
 """
 
 from __future__ import annotations
@@ -49,6 +51,12 @@ from tests.studies.bench.process_watch import ProcessWatch, answering
 PRIORITY = 50
 """Of the bare loop under SCHED_FIFO: that of the flight's control thread."""
 
+ORBIT = ROOT / "config" / "orbit.yaml"
+SHORTEST_REPLAN = 10.0
+"""s between the pointing's plans: the least that the schema allows."""
+AT_NADIR = {"attitude": [0.096, 0.701, 0.185, -0.682], "rate": [0.0, -1.1e-3, 0.0]}
+"""The release: along the flight, the star camera at the sky, so that all work from the first minute on."""
+
 _PR_CAPBSET_READ, _PR_CAPBSET_DROP, _CAP_SYS_NICE = 23, 24, 23  # linux/prctl.h, linux/capability.h
 _NO_BYTECODE, _BYTECODE = "PYTHONDONTWRITEBYTECODE", "PYTHONPYCACHEPREFIX"
 _IMPORTED = (
@@ -61,20 +69,23 @@ _IMPORTED = (
 )
 _ROLES = {
     "flight.gnc.guidance.one_axis.job": "planner",
+    "flight.gnc.control.three_axes.pointing_job": "planner",
     "flight.gnc.vision.frame_job": "vision",
+    "flight.gnc.vision.wide_job": "wide",
     "hal.guardian": "guardian",
 }
 
 
 @dataclass(frozen=True)
 class Load:
-    """How long to fly, how often frames and plans are wanted, and how long to warm up; all in s."""
+    """How long to fly, how often frames and plans are wanted, and how long to warm up, s; and what flies."""
 
     duration: float
     camera_period: float = 0.4
     replan_period: float = 0.025
     warm_up: float = 60.0
     look_period: float = 0.5
+    orbit: bool = False
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -117,6 +128,7 @@ def _load(arguments: Sequence[str]) -> tuple[Load, argparse.Namespace]:
     parser.add_argument(
         "--scheduling", choices=["fifo", "ordinary", "both"], default="both", help="default %(default)s"
     )
+    parser.add_argument("--orbit", action="store_true", help="fly the satellite, not the step demonstration")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write executive.json and lateness.png")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args(arguments)
@@ -129,7 +141,8 @@ def _load(arguments: Sequence[str]) -> tuple[Load, argparse.Namespace]:
     for name, period in (("camera", options.camera_period), ("replan", options.replan_period)):
         if not 0.0 < period < 10.0:
             parser.error(f"--{name}-period {period:g}: must lie between 0 and 10 s")
-    return Load(duration, options.camera_period, options.replan_period, warm_up), options
+    load = Load(duration, options.camera_period, options.replan_period, warm_up, orbit=options.orbit)
+    return load, options
 
 
 def _schedulings(wanted: str) -> list[str]:
@@ -158,12 +171,22 @@ def fifo_allowed() -> bool:
 
 
 def full_load(load: Load) -> str:
-    """Return the step demonstration's configuration with planner and vision at work without pause.
+    """Return the configuration with planner and vision at work without pause.
 
-    The receding strategy plans at every replanning, where the goal strategy rests once a step is over.
+    In the step demonstration the receding strategy plans at every replanning, where the goal strategy rests
+    once a step is over.
     """
-    tree = yaml.safe_load(TEXT)
     period = load.camera_period
+    if load.orbit:
+        tree = yaml.safe_load(ORBIT.read_text(encoding="utf-8"))
+        longest = 0.75 * period
+        exposures = {"exposure": min(0.2, longest), "streak_exposure": [0.25 * longest, longest]}
+        tree["camera"] |= {"period": period, "fine_period": period, **exposures}
+        tree["pointing"]["replan_period"] = SHORTEST_REPLAN
+        tree["targets"] = [{"at": 0.0, "point": "nadir", "roll_deg": 0.0}]
+        tree["simulation"]["free_body"]["release"] = AT_NADIR
+        return yaml.safe_dump(tree, sort_keys=False)
+    tree = yaml.safe_load(TEXT)
     tree["camera"] |= {"period": period, "exposure": min(tree["camera"]["exposure"], 0.75 * period)}
     tree["guidance"] |= {"replan_period": load.replan_period, "strategy": "receding"}
     return yaml.safe_dump(tree, sort_keys=False)

@@ -71,9 +71,13 @@ class FreeFlight:
         """A^2 m^4 s: the integral of the commanded dipole squared."""
         self.hard_iron = HARD_IRON * self.generator.standard_normal(3)
         self.gyro_bias = GYRO_BIAS * self.generator.standard_normal(3)
+        self.coil_noise = 0.0
+        """A m^2, of an axis of a dipole that is commanded."""
 
     def act(self, dipole: FloatArray) -> None:
         """Command a dipole (3,) A m^2 from now on."""
+        if self.coil_noise and dipole.any():
+            dipole = dipole + self.coil_noise * self.generator.standard_normal(3)
         self._currents = dipole / self._dipole_per_ampere
 
     def advance(self, time_ns: int) -> None:

@@ -79,12 +79,16 @@ def run(case: Case) -> Result:
             seen = sighted.directions, sighted.covariance, sighted.magnitudes, sighted.attitude
             tracker.ingest(Sightings(second * 1_000_000_000, *seen))
     true = sky.direction(0.0)
-    own = [track for track in tracker.objects if np.linalg.norm(track.line.direction - true) < 0.01]
+    # A frame without an attitude leaves the tracks where they were before it.
+    lines = [tracker.predicted(track.number, second * 1_000_000_000) for track in tracker.objects]
+    own = [n for n, line in enumerate(lines) if line and np.linalg.norm(line.direction - true) < 0.01]
     result = {**case.parameters, "rate_deg": math.degrees(rate), "frames": frames}
-    result["false_tracks"] = len(tracker.objects) - (len(own[:1]) if magnitude is not None else 0)
-    if magnitude is None or not own:
+    result["false_tracks"] = len(lines) - (len(own[:1]) if magnitude is not None else 0)
+    line = lines[own[0]] if own else None
+    if magnitude is None or line is None:
         return result | {"nees": None}
-    return result | {"nees": _nees(own[0].line, true, sky.velocity()), "brightness": own[0].magnitude}
+    brightness = tracker.objects[own[0]].magnitude
+    return result | {"nees": _nees(line, true, sky.velocity()), "brightness": brightness}
 
 
 class _Frame:
@@ -201,8 +205,12 @@ def summarise(results: Sequence[Result], _: Path) -> Summary:
     empty = [result for result in results if result["magnitude"] is None]
     frames = sum(frame["solved"] for result in empty for frame in result["frames"])
     false = sum(result["false_tracks"] for result in results)
+    every = sum(frame["solved"] for result in results for frame in result["frames"])
+    taken = sum(len(result["frames"]) for result in results)
     lines.append(f"false tracks: {false} in all passes; frames without an object searched: {frames}")
-    return Summary("\n".join(lines) + "\n", {"rows": rows, "false_tracks": false, "empty_frames": frames})
+    lines.append(f"frames with an attitude: {every} of {taken}")
+    facts = {"rows": rows, "false_tracks": false, "empty_frames": frames, "solved": every, "taken": taken}
+    return Summary("\n".join(lines) + "\n", facts)
 
 
 OBJECT_PASSES = Campaign(

@@ -31,6 +31,7 @@ SPEEDS = {"detumble": 0.15, "acquire": 0.004, "safe": 0.08}
 """rad/s at the release, 0.001 in the other modes; SAFE brakes a spin."""
 SLEWED = math.radians(60.0)
 FRAME_PERIOD = 2.5
+WIDE_OFTEN = {"period": 2.0, "fine_period": 2.0, "max_age": 4.5}
 OLD_DAYS, OLD_OFF = 7.0, 4.0
 """Days of the old element set, and s by which it is off along the orbit: 30 km [assumed, of a week]."""
 ORBIT = CONFIG.parent / "orbit.yaml"
@@ -38,8 +39,11 @@ TEXT = ORBIT.read_text(encoding="utf-8")
 _JULIAN = 2_440_587.5
 
 
-def config_for(mode: str, elements: str = "", replans: bool = False) -> OrbitConfig:
-    """Return the configuration of a flight; `elements` is "old", "none", or empty for those of the orbit."""
+def config_for(mode: str, elements: str = "", replans: bool = False, wide_often: bool = False) -> OrbitConfig:
+    """Return the configuration of a flight; `elements` is "old", "none", or empty for those of the orbit.
+
+    `wide_often`: the wide cameras take a round each 2 s, whether it is needed or not.
+    """
     config = _orbit()
     assert config.camera is not None
     assert config.gps is not None
@@ -51,11 +55,13 @@ def config_for(mode: str, elements: str = "", replans: bool = False) -> OrbitCon
         modes["acquired"] = mode
     slow = {} if mode in {"detumble", "safe"} else {"low_rate": 0.0175, "low_for": 0.5}
     pointing = {"replan_period": 10.0} if replans else {}
+    wide = tuple(configuration.replace(one, **WIDE_OFTEN) for one in config.wide_cameras)
     lines = {"old": old_elements(), "none": None}.get(elements, config.elements)
     return configuration.replace(
         config,
         duration=DURATION,
         camera=camera,
+        wide_cameras=wide if wide_often else config.wide_cameras,
         gps=configuration.replace(config.gps, max_age=6.0),
         modes=configuration.replace(config.modes, **modes),
         detumble=configuration.replace(config.detumble, **slow),

@@ -44,7 +44,7 @@ ORBIT_OWN: Mapping[str, frozenset[str]] = {
     "magnetometer": frozenset({"imu-refused", "sun-unclear", "field-refused"}),
     "gps": frozenset({"gps-lost", "gps-refused"}),
     "strings": frozenset({"strings-lost", "sun-unclear"}),
-    "wide": frozenset({"wide-lost"}),
+    "wide": frozenset({"wide-lost", "wide-false"}),
     "clock": OWN["clock"] | {"clock-off"},
     "elements": frozenset({"gps-refused", "gps-lost"}),
 }
@@ -112,6 +112,10 @@ def is_exercised(flown: Run, kind: FaultKind, mode: str, at: float, end: float) 
             found = bool((mine & (when > at + 0.3) & (when < end)).any())
         case "strings" if kind.kind == "dead":
             found = _is_string_lit(flown, at, end)
+        case "wide":  # pictures upside down may look as they must; an outage of 3 s costs a round
+            found = kind.kind not in {"wrong", "intermittent"} and (
+                kind.kind not in {"garbage", "blinded"} or _is_fine(flown, at, end)
+            )
         case _:
             pass
     return found
@@ -121,6 +125,13 @@ ALWAYS = {"off", "nack", "slow", "intermittent", "brown-out", "garbage"}
 """Faults of a part that it shows whatever is asked of it."""
 SPINS = ("detumble", "safe")
 """Modes in which the body turns too fast for the camera at first."""
+
+
+def _is_fine(flown: Run, at: float, end: float) -> bool:
+    """Return whether the attitude was fine all the while."""
+    packets = flown["navigation"]
+    inside = _within(flown, "navigation", at, end)
+    return bool(inside.any() and (packets["knowledge"][inside] >= FINE).all())
 
 
 def _driven(flown: Run, kind: FaultKind, asked: np.ndarray, inside: BoolArray) -> BoolArray:

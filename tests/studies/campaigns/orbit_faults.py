@@ -88,7 +88,7 @@ def fly_with(
     kind: FaultKind, mode: str, entries: tuple[FaultEntry, ...], seed: int, elements: str = ""
 ) -> Result:
     """Fly 70 s with faults of one begin and end, judged as of `kind`."""
-    config = config_for(mode, elements, replans=kind.device == "planner")
+    config = config_for(mode, elements, replans=kind.device == "planner", wide_often=kind.device == "wide")
     at = entries[0].at or 0.0 if entries else 0.0
     span = entries[0].span if entries else None
     end = at if kind.momentary else min(at + (span or DURATION), DURATION)

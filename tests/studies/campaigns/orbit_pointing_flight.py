@@ -1,10 +1,10 @@
 """One flight of campaign `orbit-pointing`: a craft with its filter, its planner's job and its law.
 
-The tables are those of the planner worker (`pointing_job`), made again each REPLAN s, and where the body was
-astray and has been held still (`flight.gnc.control.three_axes.astray`). The coils pause a tenth of each two
-seconds for the magnetometer; star attitudes come each 10 s, two seconds late. Beside the law stands the
-magnetic proportional-derivative law: what of the torque -J (w^2 turn + 2 w rate) lies across the field
-(Lovera & Astolfi 2004, Automatica 40(8)).
+The tables are those of the planner worker (`pointing_job`), made again each REPLAN s, where the body leaves
+its path, and where it was astray and has been held still (`flight.gnc.control.three_axes.astray`). The coils
+pause a tenth of each two seconds for the magnetometer; star attitudes come each 10 s, two seconds late.
+Beside the law stands the magnetic proportional-derivative law: what of the torque -J (w^2 turn + 2 w rate)
+lies across the field (Lovera & Astolfi 2004, Automatica 40(8)).
 """
 
 from __future__ import annotations
@@ -59,7 +59,9 @@ TARGETS = {
     "inertial": PointingTarget(Goal.INERTIAL, (0.0, 0.0, 0.0, 1.0)),
 }
 WEIGHTS = {
-    "knightcube": PointingWeights(turn=np.radians(1.0), rate=1.0, dipole=3e-4),
+    "knightcube": PointingWeights(
+        turn=np.radians(1.0), rate=1.0, dipole=3e-4, roll=np.radians(10.0), axis=AXES.pointing
+    ),
     "cubesat_3u": PointingWeights(turn=np.radians(1.0), rate=1.0, dipole=1.5e-3),
 }
 TORQUE = {"knightcube": (1e-9, 2e-12), "cubesat_3u": (3e-9, 5e-12)}
@@ -122,7 +124,7 @@ class PointingFlight:
         if time - self._ahead_begun >= AHEAD:
             self._ahead, self._ahead_begun = flight.ephemeris(AHEAD + 60.0), time
         self._astray.see(float(np.linalg.norm(self._turn)), float(np.linalg.norm(found.rate)), time)
-        astray = self._astray.ready and time - self._begun >= AGAIN
+        astray = (self._astray.ready or self._astray.leaving) and time - self._begun >= AGAIN
         if (
             self._wanted["law"] != "pd"
             and time >= COAST

@@ -9,6 +9,7 @@ from tests.studies.campaigns.consistency import CONSISTENCY
 from tests.studies.campaigns.controllers import CONTROLLERS_CAMPAIGN
 from tests.studies.campaigns.coverage import COVERAGE
 from tests.studies.campaigns.detumble import DETUMBLE
+from tests.studies.campaigns.eclipse import ECLIPSE
 from tests.studies.campaigns.failures import FAILURES
 from tests.studies.campaigns.false_horizons import FALSE_HORIZONS
 from tests.studies.campaigns.faults import FAULTS
@@ -33,6 +34,7 @@ from tests.studies.campaigns.robust_controllers import ROBUST_CONTROLLERS
 from tests.studies.campaigns.rolling_shutter import ROLLING_SHUTTER
 from tests.studies.campaigns.rso import RSO_SLEW, RSO_TRACK
 from tests.studies.campaigns.rso_orbits import RSO_ORBITS
+from tests.studies.campaigns.safe_sun import SAFE_SUN
 from tests.studies.campaigns.soak import SOAK
 from tests.studies.campaigns.start import START
 from tests.studies.campaigns.step_robust import STEP_ROBUST
@@ -75,10 +77,12 @@ CAMPAIGNS: dict[str, Campaign] = {
         ORBIT_ATTITUDE,
         ORBIT_FRAMES,
         DETUMBLE,
+        SAFE_SUN,
         WORLD_COMPARISON,
         ORBIT_FAULTS,
         ORBIT_POINTING,
         ORBIT_SLEWS,
         ACQUISITION,
+        ECLIPSE,
     )
 }

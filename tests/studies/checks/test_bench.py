@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 import tests.studies.bench
+from flight.schema import reader as configuration
 from sim_hal.star_camera import StarCameraModel
 from tests.studies.bench import __main__ as bench
 from tests.studies.bench import streaks
+from tests.studies.bench.executive import Load, full_load
 from tests.studies.bench.mid_exposure import FITS, SOLUTIONS, Seen, attitude_row
 from tests.studies.bench.stage_clock import REST, WHOLE, clocked
 from tests.studies.campaigns.scenes import FIELD, slew
@@ -152,3 +154,12 @@ def test_opencv_finds_a_drawn_streak_to_about_a_pixel(detector: str) -> None:
     found = found[np.argsort(found[:, 0])]
     true = np.array([[40.0, 60.0], [40.0 + 100.0 / np.sqrt(2.0), 60.0 + 100.0 / np.sqrt(2.0)]])
     assert np.abs(found - true).max() < 3.0
+
+
+def test_the_executive_flies_testbed_and_satellite_with_workers_that_hardly_rest() -> None:
+    for orbit in (False, True):
+        config = configuration.parse(full_load(Load(600.0, camera_period=0.4, orbit=orbit)))
+        assert config.body == ("orbit" if orbit else "testbed")
+        assert config.camera is not None
+        assert config.camera.period == 0.4
+        assert config.replan_period() == (10.0 if orbit else 0.025)

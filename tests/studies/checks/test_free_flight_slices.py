@@ -45,8 +45,15 @@ def test_a_satellite_that_starts_with_nothing_learned_turns_to_its_target(tmp_pa
     assert not turn["lost"]
     assert turn["end_rms"] < 55.0
     hold = {**parameters, "hours": 4.0, "lost": False, "rms": 0.5, "nadir_rms": 0.3, "worst": 1.0}
-    hold |= {"knowledge_rms": 0.004, "nees": 1.0, "dipole_missing": [1e-4, None], "mean_square": 1e-6}
+    hold |= {
+        "nadir_worst": 0.8,
+        "knowledge_rms": 0.004,
+        "nees": 1.0,
+        "dipole_missing": [1e-4, None],
+        "mean_square": 1e-6,
+    }
     found = orbit_pointing.summarise([hold, turn], tmp_path)
     assert found.facts["hold/knightcube/0.1/whole"]["runs"] == 1
+    assert found.facts["turn/knightcube/0.1/whole"]["median"] is None
     assert found.facts["turn/knightcube/0.1/whole"]["arrived"] == 0, "a flight of two minutes shows no stay"
     assert "turn: craft, share, law" in found.text

@@ -94,6 +94,24 @@ def test_an_axis_5_px_off_is_within_what_is_claimed_unless_the_lens_is_called_ex
 
 
 @pytest.mark.slow
+def test_a_distortion_that_nobody_described_is_fitted_and_hardly_left_in_the_rate() -> None:
+    """1 % at the corner, where a correction after the fit left up to 1.5 % of the rate."""
+    for run in range(3):
+        case = next(c for c in mismatch.mismatch_cases(run + 1, _SEED) if c.key == f"distortion 1 % 30 {run}")
+        result = mismatch.run_mismatch(case)
+        assert result["nees"] < mismatch.WRONG_SIGMAS**2
+        assert result["share"] < 0.004
+        assert result["claimed"] < 0.004
+
+
+@pytest.mark.slow
+def test_an_elongated_point_spread_that_nobody_described_is_refused_on_short_streaks() -> None:
+    """A body that shakes along one axis, faster than is seen, draws the same streaks, and ends elsewhere."""
+    result = mismatch.run_mismatch(_case("ellipse 1:2 turned", 0))
+    assert result["nees"] is None
+
+
+@pytest.mark.slow
 def test_a_body_that_shakes_is_refused_or_within_what_is_claimed() -> None:
     shaking = {"row": "0.2 s", "percent": 10.0, "exposure": 0.2, "theta": 70.0, "frequency": 20.0}
     result = mismatch.run_vibration(Case("a", (_SEED, 1), {**shaking, "amplitude": 2.0}))

@@ -42,3 +42,12 @@ def test_a_slow_object_is_kept_through_ten_seconds_without_it(tmp_path: Path) ->
     assert found["most"] >= found["least"] - 0.1
     json.dumps(OBJECT_FLIGHTS.summarise([found], tmp_path).facts, allow_nan=False)
     assert len({case.key for case in cases(2, 1)}) == 16
+
+
+def test_a_followed_object_is_kept_by_rolling_no_faster_than_the_body_may_turn() -> None:
+    """A pass of seed 5, lost while paths turned too fast at their last instant, and were refused."""
+    (case,) = (case for case in cases(1, 5) if case.key == "knightcube/0.2/0")
+    found = run(case)
+    assert found["refused"] == 0
+    assert found["rate"] < 1.0, "deg/s, from which it would be braked"
+    assert found["most"] < found["least"] + 0.2

@@ -1,4 +1,4 @@
-"""A body that is far off its path is held still until it is slow, and then planned for again.
+"""A body that leaves its path is planned for again; far off it is held still until it is slow before.
 
 The law is linear in small turns. Led back from far off, coils at their limits chase the path, which makes a
 light body turn faster than before. Damping alone can not: its torque is what of -2 w J rate lies across the
@@ -16,6 +16,8 @@ from flight.gnc.math.arrays import FloatArray
 
 FAR = math.radians(15.0)
 """rad off the path, from which on a body is held still."""
+LEAVING = math.radians(5.0)
+"""rad off the path, from which on a body that flies it is planned for again: torques are not as expected."""
 SLOW = math.radians(0.1)
 """rad/s, below which a body is slow; an orbit's own is 0.06 deg/s."""
 PATIENCE = 180.0
@@ -29,21 +31,23 @@ class Astray:
 
     Attributes:
         ready: whether the body may be planned for.
+        leaving: whether it should be, though the path is flown.
     """
 
     def __init__(self) -> None:
         self.since: float | None = None
-        self.ready = False
+        self.ready = self.leaving = False
 
     def see(self, off: float, speed: float, now: float) -> None:
         """Take the turn off the path, rad, and the rate, rad/s, at a time, s."""
         if self.since is None and off > FAR:
             self.since = now
+        self.leaving = self.since is None and off > LEAVING
         self.ready = self.since is not None and (speed < SLOW or now - self.since > PATIENCE)
 
     def planned(self) -> None:
         """Fly a path again."""
-        self.since, self.ready = None, False
+        self.since, self.ready, self.leaving = None, False, False
 
 
 def damping_dipole(inertia: FloatArray, rate: FloatArray, field: FloatArray) -> FloatArray:

@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 
 from flight.gnc.control.three_axes.pointing_sweep import Cost, ToGo, linearised, sweep
-from flight.gnc.earth.disturbance import Pressures
+from flight.gnc.earth.disturbance import AIR, LIGHT, Pressures, shapes
 from flight.gnc.earth.figure import GRAVITATIONAL_PARAMETER
 from flight.gnc.errors import PlanningError
 from flight.gnc.guidance.three_axes.attitude_law import References
@@ -85,6 +85,18 @@ class Expected:
         found[:3, :3] = found[3:, 3:] = self.inertia
         return found
 
+    def pressed(self, count: int) -> list[tuple[FloatArray, FloatArray]]:
+        """Return what makes torques that change with the attitude, `linearised`, at the first instants."""
+        air, light = self.pressures.air[:count], self.pressures.light[:count]
+        return [(self.sizes[AIR], air), (self.sizes[LIGHT], light)]
+
+    def until(self, count: int) -> Expected:
+        """Return what is expected at the first `count` instants."""
+        field, position, pressures = self.field[:count], self.position[:count], self.pressures.until(count)
+        return replace(
+            self, wanted=self.wanted.until(count), field=field, position=position, pressures=pressures
+        )
+
     @property
     def step(self) -> float:
         """The time between instants, s."""
@@ -112,6 +124,17 @@ class Expected:
             + ux * ay - uy * ax + vx * ly - vy * lx - wx * hy + wy * hx,
         )  # fmt: skip
         return np.asarray(self.inverse @ np.array(torque))
+
+    def accelerations(self, quaternion: FloatArray, rate: FloatArray, dipole: FloatArray) -> FloatArray:
+        """Return the accelerations (n, 3) of attitudes (n, 4) after the first n instants under dipoles."""
+        count = len(quaternion)
+        shown = attitude_matrix(quaternion)
+        field = np.einsum("nij,nj->ni", shown, self.field[:count])
+        up = np.einsum("nij,nj->ni", shown, self.position[:count])
+        pull = 3.0 * GRAVITATIONAL_PARAMETER / np.linalg.norm(up, axis=1) ** 5
+        torque = np.cross(dipole, field) + pull[:, None] * np.cross(up, up @ self.inertia.T)
+        torque += shapes(self.pressures.until(count), shown) @ self.sizes
+        return np.asarray((torque - np.cross(rate, rate @ self.inertia.T)) @ self.inverse.T)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -167,7 +190,7 @@ def best_path(expected: Expected, begun: References, criterion: Criterion) -> tu
     """
     rest = Motion(begun.quaternion, begun.rate, np.zeros((len(begun.times) - 1, 4)))
     first = _first(expected, rest, _swept(expected, rest, criterion, 1.0, given=True))
-    near = float(np.abs(_off(expected.wanted, first)[:, :3]).max()) < NEAR
+    near = float(_counted(expected.wanted, first, criterion).max()) < NEAR
     best, least = first, math.inf
     for rise in RISES:
         motion, price = first, PROHIBITIVE if near else 1.0
@@ -177,8 +200,8 @@ def best_path(expected: Expected, begun: References, criterion: Criterion) -> tu
         cost = _cost(expected, motion, criterion, PROHIBITIVE)
         if cost < least:
             best, least = motion, cost
-        off = _off(expected.wanted, motion)[len(first.control) // 2 :, :3]
-        if near or float(np.abs(off).max()) < SETTLED:
+        later = _counted(expected.wanted, motion, criterion)[len(first.control) // 2 :]
+        if near or float(later.max()) < SETTLED:
             break
     return best, _swept(expected, best, criterion, PROHIBITIVE)
 
@@ -241,14 +264,15 @@ def _swept(
     count, state, end = len(motion.control), criterion.state, criterion.end
     first = motion.references(expected.wanted.times).until(count)
     field = expected.field[:count]
-    linear = linearised(first, expected.inertia, field, expected.position[:count], motion.control[:, :3])
+    pressed, position = expected.pressed(count), expected.position[:count]
+    linear = linearised(first, expected.inertia, field, position, motion.control[:, :3], pressed)
     strength = np.linalg.norm(linear.field, axis=1)
     along = linear.by_torque @ (linear.field / strength[:, None])[:, :, None]
     linear = replace(linear, by_control=np.concatenate([linear.by_control, along], axis=2))
     control = np.full((count, 4), criterion.dipole)
     control[:, 3] *= price / strength**2
-    off, bends = _off(expected.wanted, motion), _bends(expected.wanted, motion)
-    turned = np.swapaxes(bends, 1, 2)
+    astray, bent = off(expected.wanted, motion), bends(expected.wanted, motion)
+    turned = np.swapaxes(bent, 1, 2)
     columns = end.slope.shape[1]
     affine, state_slope = np.zeros((2, count, 6, columns))
     control_slope = np.zeros((count, 4, columns))
@@ -257,15 +281,17 @@ def _swept(
         missing = criterion.shape[:count] @ expected.sizes - linear.missing
         affine[:, :, 0] = np.einsum("nij,nj->ni", linear.by_torque, missing)
     else:
-        state_slope[:, :, 0] = np.einsum("nij,nj->ni", turned[:-1] @ state, off[:-1])
+        state_slope[:, :, 0] = np.einsum("nij,nj->ni", turned[:-1] @ state, astray[:-1])
         control_slope[:, :, 0] = control * motion.control
-    states = turned[:-1] @ state @ bends[:-1]
-    steep, curved = _haste(motion.rate[:-1], criterion.fastest, expected.step)
-    state_slope[:, 3:, 0] += steep
-    states[:, 3:, 3:] += curved
-    slope = turned[-1] @ end.slope
-    slope[:, 0] += turned[-1] @ end.square @ off[-1]
-    last = ToGo(turned[-1] @ end.square @ bends[-1], slope)
+    states = turned[:-1] @ state @ bent[:-1]
+    steep, curved = _haste(motion.rate, criterion.fastest, expected.step)
+    state_slope[:, 3:, 0] += steep[:-1]
+    states[:, 3:, 3:] += curved[:-1]
+    slope, square = turned[-1] @ end.slope, turned[-1] @ end.square @ bent[-1]
+    slope[:, 0] += turned[-1] @ end.square @ astray[-1]
+    slope[3:, 0] += steep[-1]
+    square[3:, 3:] += curved[-1]
+    last = ToGo(square, slope)
     cost = Cost(states, control, state_slope, control_slope)
     gain, steady, _ = sweep(linear, affine, cost, last)
     return Gains(gain, steady)
@@ -273,14 +299,14 @@ def _swept(
 
 def _cost(expected: Expected, motion: Motion, criterion: Criterion, price: float) -> float:
     """Return what a motion costs, with the cost-to-go after it."""
-    off, end = _off(expected.wanted, motion), criterion.end
+    astray, end = off(expected.wanted, motion), criterion.end
     strength = np.linalg.norm(expected.field[:-1], axis=1)
-    squares = np.einsum("ni,ij,nj->", off[:-1], criterion.state, off[:-1])
+    squares = np.einsum("ni,ij,nj->", astray[:-1], criterion.state, astray[:-1])
     squares += criterion.dipole * np.sum(motion.control[:, :3] ** 2)
     squares += criterion.dipole * price * np.sum((motion.control[:, 3] / strength) ** 2)
-    excess = np.maximum(np.linalg.norm(motion.rate[:-1], axis=1) - criterion.fastest, 0.0)
+    excess = np.maximum(np.linalg.norm(motion.rate, axis=1) - criterion.fastest, 0.0)
     squares += expected.step * np.sum((excess / EXCESS) ** 2)
-    return float(0.5 * squares + off[-1] @ (0.5 * end.square @ off[-1] + end.slope[:, 0]))
+    return float(0.5 * squares + astray[-1] @ (0.5 * end.square @ astray[-1] + end.slope[:, 0]))
 
 
 def _haste(rate: FloatArray, fastest: float, step: float) -> tuple[FloatArray, FloatArray]:
@@ -294,13 +320,20 @@ def _haste(rate: FloatArray, fastest: float, step: float) -> tuple[FloatArray, F
     return price * excess[:, None] * along, price * curved
 
 
-def _off(wanted: References, motion: Motion) -> FloatArray:
+def off(wanted: References, motion: Motion) -> FloatArray:
     """Return the turn and the rate (n + 1, 6) of a motion against the law."""
     turn = to_rotation_vector(multiply(motion.quaternion, conjugate(wanted.quaternion)))
     return np.concatenate([turn, motion.rate - wanted.rate], axis=1)
 
 
-def _bends(wanted: References, motion: Motion) -> FloatArray:
+def _counted(wanted: References, motion: Motion, criterion: Criterion) -> FloatArray:
+    """Return the turn (n + 1,) rad against the law as it counts: one about a cheap axis by its price."""
+    turn, price = off(wanted, motion)[:, :3], criterion.state[:3, :3]
+    squares = np.einsum("ni,ij,nj->n", turn, price, turn)
+    return np.asarray(np.sqrt(squares / np.linalg.eigvalsh(price)[-1]))
+
+
+def bends(wanted: References, motion: Motion) -> FloatArray:
     """Return how the turn against the law changes with a small turn of the body, (n + 1, 6, 6).
 
     The inverse of the left Jacobian of the rotation group, with the signs of this house's quaternions.
@@ -310,6 +343,6 @@ def _bends(wanted: References, motion: Motion) -> FloatArray:
     safe = np.where(angle < 1e-2, 1.0, angle)
     second = np.where(angle < 1e-2, 1.0 / 12.0, (1.0 - 0.5 * safe / np.tan(0.5 * safe)) / safe**2)
     across = cross_matrices(turn)
-    bends = np.broadcast_to(np.eye(6), (len(turn), 6, 6)).copy()
-    bends[:, :3, :3] += 0.5 * across + second[:, None, None] * (across @ across)
-    return bends
+    bent = np.broadcast_to(np.eye(6), (len(turn), 6, 6)).copy()
+    bent[:, :3, :3] += 0.5 * across + second[:, None, None] * (across @ across)
+    return bent

@@ -13,6 +13,7 @@ a step. Each affine part has columns of its own: k is linear in them. There may 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,10 +77,13 @@ def linearised(
     field: FloatArray,
     position: FloatArray,
     dipole: FloatArray | None = None,
+    pressed: Sequence[tuple[FloatArray, FloatArray]] = (),
 ) -> Linear:
     """Return the motion of the errors about references; `field` (n, 3) T, `position` (n, 3) m, ICRS.
 
-    `dipole` (n, 3) A m^2 is held in body axes meanwhile: an error turns the field that it acts on.
+    `dipole` (n, 3) A m^2 is held in body axes meanwhile: an error turns the field that it acts on. Likewise
+    of each `pressed`: a constant (3,) of the body, N m, and the direction (n, 3) ICRS, with which it makes a
+    torque.
     """
     turned = attitude_matrix(references.quaternion)
     shown = np.einsum("nij,nj->ni", turned, field)
@@ -87,6 +91,9 @@ def linearised(
     inverse = np.linalg.inv(inertia)
     if dipole is not None:
         flow[:, 3:, :3] += inverse @ cross_matrices(dipole) @ cross_matrices(shown)
+    for constant, direction in pressed:
+        met = cross_matrices(np.einsum("nij,nj->ni", turned, direction))
+        flow[:, 3:, :3] += inverse @ cross_matrices(constant[None]) @ met
     dt = float(references.times[1] - references.times[0])
     transition, pushed = _discrete(flow, dt)
     by_torque = pushed @ inverse

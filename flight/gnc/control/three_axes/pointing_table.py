@@ -1,24 +1,29 @@
 """The table of the pointing law: a path, and gains along it.
 
-Beyond the path's end the law itself is the path: a sweep over a revolution of preview gives what an error at
-the end would cost (`pointing_sweep`).
+The path is the begin of the best course of the whole revolution (`pointing_course`). Where none is found, or
+the coils do not suffice for it, it is the best path (`pointing_path`), beyond whose end the law itself is the
+path: a sweep over a revolution of preview gives what an error at the end would cost (`pointing_sweep`).
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from flight.gnc.control.three_axes.pointing_course import best_course
 from flight.gnc.control.three_axes.pointing_path import Criterion, Expected, best_path
 from flight.gnc.control.three_axes.pointing_sweep import Cost, ToGo, linearised, sweep
-from flight.gnc.earth.disturbance import Pressures, shapes
+from flight.gnc.earth.disturbance import AIR, LIGHT, Pressures, shapes
 from flight.gnc.errors import UsageError
 from flight.gnc.guidance.three_axes.attitude_law import References
 from flight.gnc.guidance.three_axes.slew_path import SlewPath
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import attitude_matrix
+
+LEAST_PART = 1.0 / 3.0
+"""Of a table: a shorter part that the body can fly is not worth leaving the last table for."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -63,6 +68,32 @@ class PointingTable:
     sizes: FloatArray
     slew: SlewPath | None = None
 
+    @property
+    def fastest(self) -> float:
+        """The largest rate of the path, rad/s."""
+        return float(np.linalg.norm(self.path.rate, axis=1).max())
+
+    def below(self, fastest: float) -> PointingTable | None:
+        """Return the part before the body turns at `fastest` rad/s; None for one shorter than `LEAST_PART`.
+
+        A slew is flown whole or not at all.
+        """
+        over = np.flatnonzero(np.linalg.norm(self.path.rate, axis=1) >= fastest)
+        if not len(over):
+            return self
+        count = int(over[0])
+        if self.slew is not None or count < max(LEAST_PART * len(self.dipole), 2.0):
+            return None
+        held = slice(count - 1)
+        return replace(
+            self,
+            path=self.path.until(count),
+            wanted=self.wanted.until(count),
+            dipole=self.dipole[held],
+            gain=self.gain[held],
+            torque_part=self.torque_part[held],
+        )
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ahead:
@@ -98,21 +129,20 @@ def pointing_table(
     dt = float(steps[0])
     state, dipole = prices(weights, dt)
     shape = shapes(ahead.pressures, attitude_matrix(ahead.wanted.quaternion))
-    beyond = _beyond(ahead, count, inertia, state, dipole, shape)
-    expected = Expected(
-        ahead.wanted.until(count + 1),
-        ahead.field[: count + 1],
-        ahead.position[: count + 1],
-        Pressures(ahead.pressures.air[: count + 1], ahead.pressures.light[: count + 1]),
-        ahead.sizes,
-        inertia,
-        np.asarray(np.linalg.inv(inertia)),
-        limit,
+    inverse = np.asarray(np.linalg.inv(inertia))
+    whole = Expected(
+        ahead.wanted, ahead.field, ahead.position, ahead.pressures, ahead.sizes, inertia, inverse, limit
     )
-    motion, gains = best_path(expected, ahead.begun, Criterion(state, dipole, beyond, shape, weights.fastest))
-    path = motion.references(expected.wanted.times)
-    gain, torque_part = gains.gain[:, :3], gains.steady[:, :3, 1:]
-    return PointingTable(path, expected.wanted, motion.control[:, :3], gain, torque_part, ahead.sizes)
+    course = best_course(whole, ahead.begun, state, dipole, weights.fastest)
+    if course is None:
+        beyond = _beyond(ahead, count, inertia, state, dipole, shape)
+        criterion = Criterion(state, dipole, beyond, shape, weights.fastest)
+        course = best_path(whole.until(count + 1), ahead.begun, criterion)
+    motion, gains = course
+    path = motion.references(ahead.wanted.times[: len(motion.rate)]).until(count + 1)
+    wanted = ahead.wanted.until(count + 1)
+    gain, torque_part = gains.gain[:count, :3], gains.steady[:count, :3, 1:]
+    return PointingTable(path, wanted, motion.control[:count, :3], gain, torque_part, ahead.sizes)
 
 
 def table_along(
@@ -146,7 +176,10 @@ def _beyond(
     ahead: Ahead, begin: int, inertia: FloatArray, state: FloatArray, dipole: float, shape: FloatArray
 ) -> ToGo:
     """Return the cost-to-go of the law from instant `begin` on; the first column has the expected torques."""
-    law = linearised(ahead.wanted.since(begin), inertia, ahead.field[begin:], ahead.position[begin:])
+    air, light = ahead.pressures.air[begin:], ahead.pressures.light[begin:]
+    pressed = [(ahead.sizes[AIR], air), (ahead.sizes[LIGHT], light)]
+    field, position = ahead.field[begin:], ahead.position[begin:]
+    law = linearised(ahead.wanted.since(begin), inertia, field, position, pressed=pressed)
     by_size = law.by_torque @ shape[begin:]
     own = by_size @ ahead.sizes - np.einsum("nij,nj->ni", law.by_torque, law.missing)
     affine = np.concatenate([own[:, :, None], by_size], axis=2)

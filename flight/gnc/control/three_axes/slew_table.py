@@ -208,7 +208,7 @@ def _tracking(
     )
     shape = shapes(pressures(ahead, times), attitude_matrix(tracked.quaternion[:steps]))
     affine = linear.by_torque @ shape
-    state, price = prices(weights, step)
+    state, price = prices(replace(weights, roll=None), step)
     control = np.full((steps, 3), price / STIFFER**2)
     nothing = np.zeros(affine.shape)
     cost = Cost(np.broadcast_to(state, (steps, 6, 6)), control, nothing, nothing[:, :3])

@@ -21,6 +21,9 @@ from flight.gnc.vision.horizon.vector_method import shortest_turn
 
 MOST_MISMATCH = 4.0
 """Standard deviations by which a coarse sensor may disagree."""
+GUESS_SIGMA = math.radians(0.2)
+"""rad, of a nadir by the cone through the edges, before a limb is fitted: a Sun to 0.005 deg is no such
+measure of it (0.07 to 0.3 deg off in frames of flights)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,7 +33,8 @@ class Orientation:
     Attributes:
         rotation: (3, 3), inertial into camera axes; nadir exactly as assumed.
         sigma: rad, of the turn about nadir; infinite if unknown.
-        mismatch: the worst disagreement of a known direction with this nadir, in its own standard deviations.
+        mismatch: the worst disagreement of a known direction with this nadir, in standard deviations of the
+            direction and of a guessed nadir.
         share: of all nadirs, those that the known directions leave.
     """
 
@@ -47,14 +51,14 @@ def orientation(nadir: FloatArray, inertial_nadir: FloatArray, knowledge: Horizo
     vote, weight, mismatch = 0.0 + 0.0j, 0.0, 0.0
     known = _known(knowledge, inertial_nadir)
     # Each leaves a ring of the sphere; two rings cross, a third adds little.
-    narrowest = sorted(sigma for _, _, sigma in known)[:2]
+    narrowest = sorted(math.hypot(sigma, GUESS_SIGMA) for _, _, sigma in known)[:2]
     share = math.prod(min(1.0, MOST_MISMATCH * sigma) for sigma in narrowest)
     for camera, inertial, sigma in known:
         seen, expected = _unit(camera), _unit(base @ inertial)
         below, assumed = _dot(down, seen), _dot(down, expected)
         across = _length(_cross(down, expected))
         apart = math.atan2(_length(_cross(down, seen)), below) - math.atan2(across, assumed)
-        mismatch = max(mismatch, abs(apart) / sigma)
+        mismatch = max(mismatch, abs(apart) / math.hypot(sigma, GUESS_SIGMA))
         if across > 0.05:
             angle = math.atan2(_dot(down, _cross(expected, seen)), _dot(seen, expected) - below * assumed)
             precision = (across / sigma) ** 2

@@ -124,12 +124,20 @@ def _expected(tried: FloatArray, rays: FloatArray, altitude: float, sun: FloatAr
     inside = cosine > math.sqrt(1.0 - distance**-2)
     if sun is None:
         return np.where(inside, 0.5, _STRAY)
-    depth = np.sqrt(np.maximum(1.0 - distance**2 * (1.0 - cosine**2), 0.0))
-    # Sine of the Sun's height where the ray meets the ground: the place from the centre times the Sun.
-    sine = (distance * cosine - depth) * (rays @ sun) - distance * (tried @ sun)[:, None]
+    sine = sun_over_ground(cosine, rays @ sun, (tried @ sun)[:, None], distance)
     low, high = math.sin(-TWILIGHT), math.sin(DAYLIGHT)
     day = np.clip((sine - low) / (high - low), 0.0, 1.0)
     return np.where(inside, _STRAY + (1.0 - 2.0 * _STRAY) * day, _STRAY)
+
+
+def sun_over_ground(cosine: FloatArray, ahead: FloatArray, below: FloatArray, distance: float) -> FloatArray:
+    """Return the sine of the Sun's height where rays meet the ground: the place in radii times the Sun.
+
+    `cosine` is of a ray's angle from nadir, `ahead` of the Sun's from the ray, `below` of the Sun's from
+    nadir, of any shapes that fit together; `distance` from the Earth's centre is in its radii.
+    """
+    depth = np.sqrt(np.maximum(1.0 - distance**2 * (1.0 - cosine**2), 0.0))
+    return np.asarray((distance * cosine - depth) * ahead - distance * below)
 
 
 def _places(size: int) -> IntArray:

@@ -28,6 +28,8 @@ from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
 
 _OFF_PLACE, _TOO_BRIGHT = 0.25, 0.2
 """px and magnitudes by which a star's light is off the catalogue where something else may be in it."""
+_SAME = 1.0
+"""px between two fits that are of the same light."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,9 +90,16 @@ def _on_sky(sky: SkyMap, points: FloatArray, covariance: FloatArray) -> FloatArr
 
 
 def _found(fits: list[tuple[Fitted, float]], settings: SightSettings) -> Found:
-    """Return fitted objects, each with the magnitude of a count."""
+    """Return fitted objects, each with the magnitude of a count.
+
+    Fits of two areas may lead to one place, where one object's light is the brighter: it is one sighting.
+    """
     if not fits:
         return _NOTHING
+    middles = np.array([fit.middle for fit, _ in fits])
+    away = np.linalg.norm(middles[:, None] - middles, axis=2)
+    again = np.any(np.tril(away < _SAME, -1), axis=1)
+    fits = [fit for fit, repeated in zip(fits, again, strict=True) if not repeated]
     floor = settings.floor**2 * np.eye(2)
     return Found(
         np.array([fit.middle for fit, _ in fits]),

@@ -111,6 +111,7 @@ def refit_motion(
         pinhole,
         Shutter(likelihood.delay_per_row / exposure, pinhole.centre[1]),
         likelihood,
+        motion.psf_sigma,
         motion.rate_model == "accelerating",
     )
     scene, hidden = _scenes(camera, course, known, motion)

@@ -9,6 +9,7 @@ partly cut off.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,6 +41,12 @@ class _Disc:
     def axis(self) -> FloatArray:
         """The circle's middle as a unit vector (3,)."""
         return self.rim.direction(self.circle.centre)
+
+    @property
+    def stretch(self) -> float:
+        """The root of by how much the lens draws a disc out there: its blur, which is round, as much less."""
+        widest, narrowest = np.linalg.svd(self.scale, compute_uv=False)
+        return math.sqrt(float(widest / narrowest))
 
     @property
     def pixels_per_radian(self) -> float:
@@ -125,7 +132,7 @@ def _flaw(disc: _Disc, settings: SunSettings) -> str:
     if used * 2.0 * np.pi / SPOKES < settings.least_arc:
         return f"too short an arc of a rim, {used * 360 // SPOKES} deg,"
     residual = circle.residual * disc.pixels_per_radian
-    if residual > settings.tolerance:
+    if residual > settings.tolerance * disc.stretch:
         return f"a rim {residual:.2f} px rms off a circle"
     return ""
 

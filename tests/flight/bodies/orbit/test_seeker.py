@@ -6,7 +6,8 @@ import numpy as np
 
 from flight.bodies.orbit.seeker import StringSeeker
 from flight.gnc.control.detumble import WindowSchedule
-from flight.gnc.control.three_axes.sun_seeker import MEMORY, Seeking, SunSeeker
+from flight.gnc.control.three_axes.sun_seeker import Seeking, SunSeeker
+from flight.gnc.estimation.carried_sun import MEMORY
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.vision.sun_sensor.strings import SolarStrings
 from flight.link.events import EventKind

@@ -55,10 +55,11 @@ class Still:
         self.filter = OrbitFilter(settings, self.at)
         self.feed = WideFeed([CAMERA], LENS, self.filter, cast(Surroundings, self), None, None)
         self.now_ns = 0
+        self.sunlit = 1.0
 
     def at(self, _: int) -> Around:
         nothing = Pressures(np.zeros((1, 3)), np.zeros((1, 3)))
-        return Around(FIELD, POSITION, nothing, 1.0)
+        return Around(FIELD, POSITION, nothing, self.sunlit)
 
     def sun(self, _: int) -> FloatArray:
         return SUN
@@ -116,6 +117,17 @@ def test_a_direction_is_used_only_where_it_says_more_so_that_repetition_does_not
         used.append(craft.look(craft.seen(3e-3)))
     assert not all(sun for sun, _ in used[30:])
     assert craft.filter.worst_sigma > 0.4 * 3e-3, "sixty that count would make it a quarter"
+
+
+def test_in_the_shadow_the_cameras_are_read_often_only_while_the_attitude_is_lost() -> None:
+    for sunlit, often in ((1.0, True), (0.0, False)):
+        craft = Still(7)
+        craft.sunlit = sunlit
+        craft.rest(3)
+        assert craft.feed.needed
+        craft.look(craft.seen(0.01))
+        assert craft.filter.knowledge is Knowledge.COARSE
+        assert craft.feed.needed is often
 
 
 def test_one_false_horizon_is_refused_and_three_in_a_row_start_a_coarse_estimate_again() -> None:

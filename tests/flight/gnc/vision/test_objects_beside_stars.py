@@ -9,20 +9,15 @@ import pytest
 
 from flight.gnc import catalogue
 from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import angle_between, attitude_matrix, from_rotation_vector, multiply
-from flight.gnc.vision.frame_job import FrameFound, FrameJob, TrackerSettings, run
-from flight.gnc.vision.objects.sighted import Sighted, SightSettings
-from flight.gnc.vision.startracker.detection import DetectionSettings
+from flight.gnc.math.quaternion import angle_between, attitude_matrix
+from flight.gnc.vision.frame_job import FrameFound, run
+from flight.gnc.vision.objects.sighted import Sighted
 from flight.gnc.vision.startracker.index.build import default_index
-from flight.gnc.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings
-from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
-from sim_hal.star_camera import SourceTrack, StarCameraModel, render
+from sim_hal.star_camera import SourceTrack
+from tests.flight.gnc.vision.satellite_frames import CAMERA, EXPOSURE, TIMES, frame_job
 from tests.studies.campaigns.scenes import catalogue as sky_to
 
-CAMERA = StarCameraModel(columns=512, rows=512)
 HELD: FloatArray = np.array([0.5, -0.1, 0.3, np.sqrt(0.65)])
-EXPOSURE = 0.2
-TIMES = np.linspace(-0.1, 0.1, 9)
 
 
 @dataclass(frozen=True)
@@ -37,31 +32,9 @@ class Shot:
 
     def found(self) -> FrameFound:
         """Return what the flight's vision finds."""
-        rng = np.random.default_rng(11)
-        attitudes = np.array([multiply(from_rotation_vector(self.turn * t), HELD) for t in TIMES])
         ways = self.place + np.outer(TIMES / EXPOSURE, self.motion)
         seen = CAMERA.pinhole.unit_vectors(ways) @ attitude_matrix(HELD)
-        stars, directions = sky_to(8.5)
-        extra = [SourceTrack(TIMES, seen, self.magnitude)]
-        pixels = render(CAMERA, directions, stars.magnitude, TIMES, attitudes, rng, extra)
-        top = float(CAMERA.highest_count)
-        detection = DetectionSettings(psf_sigma=CAMERA.psf_sigma, gain=CAMERA.gain, saturation=top)
-        likelihood = LikelihoodSettings(gain=CAMERA.gain, saturation=top, psf_sigma=CAMERA.psf_sigma)
-        tracker = TrackerSettings(SolveSettings(detection=detection), (1.0, 1.0))
-        off = from_rotation_vector(np.array([1e-4, -1e-4, 1e-4]))
-        rate = RatePrior(self.turn, 1e-4) if self.knows else None
-        attitude = AttitudePrior(multiply(off, HELD), 1e-4) if self.knows else None
-        job = FrameJob(
-            pixels,
-            CAMERA.pinhole,
-            EXPOSURE,
-            likelihood,
-            tracker,
-            rate,
-            attitude,
-            objects=SightSettings(),
-        )
-        return run(job)
+        return run(frame_job(HELD, self.turn, [SourceTrack(TIMES, seen, self.magnitude)], self.knows))
 
     def sighting(self, sighted: Sighted | None) -> int | None:
         """Return which sighting is within a pixel of it."""

@@ -3,8 +3,11 @@
 The modules in the order of the computation (`estimate` runs it; `settings` and `result` are its ends):
 
     pixels
+      |  reading              the frame in the pixels that suit it
       |  exposed_frame        light above the background, its noise, pixels to leave out
       |  blobs                bright regions with their moments
+      |  seen_spread          how wide the point spread is, by these;  binning  pixels summed for it
+      |  glare, mosaic        light that is no streak left out, pixels of unlike responses evened
       v
     first motion
       |  first_guess          the axis by the regions' orientations, the angle by their lengths
@@ -30,6 +33,9 @@ The modules in the order of the computation (`estimate` runs it; `settings` and 
       |  chains               streaks that are pieces of longer ones
       |  wholeness            whole, doubtful or broken
       |  shutter_direction    either direction of the turn, where a rolling shutter distinguishes them
+      |  claim                what is known of the motion, the lens allowed for
+      |  lens_errors          how a lens other than described shows;  bent_pinhole  the fit through it
+      |  left_over            what the fit leaves over, at the ends and beside;  shaking  what of it is common
       |  result_of_fit        the stars and the rate, or why there is none
 
 Throughout, `work` counts what was done: beyond its limit no rival motion is begun. `course` is how the camera

@@ -16,10 +16,8 @@ from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.math.arrays import FloatArray, Image
 from flight.gnc.vision.frame.saturation import saturation_count
 from flight.gnc.vision.streaks.admission import admit, in_time, validate
-from flight.gnc.vision.streaks.maximum_likelihood.binning import Binning
-from flight.gnc.vision.streaks.maximum_likelihood.blobs import Blobs, find_blobs
+from flight.gnc.vision.streaks.maximum_likelihood.blobs import Blobs
 from flight.gnc.vision.streaks.maximum_likelihood.course import Course
-from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import ExposedFrame, expose_frame
 from flight.gnc.vision.streaks.maximum_likelihood.first_guess import guess_axis
 from flight.gnc.vision.streaks.maximum_likelihood.hypotheses import (
     SAME_ANGLE,
@@ -32,6 +30,7 @@ from flight.gnc.vision.streaks.maximum_likelihood.hypotheses import (
 from flight.gnc.vision.streaks.maximum_likelihood.iteration import ExposedCamera, Fit
 from flight.gnc.vision.streaks.maximum_likelihood.joint_fit import last_fit
 from flight.gnc.vision.streaks.maximum_likelihood.motion import positions
+from flight.gnc.vision.streaks.maximum_likelihood.reading import Reading, read_frame
 from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
 from flight.gnc.vision.streaks.maximum_likelihood.result_of_fit import with_faint, with_rate, with_stars
 from flight.gnc.vision.streaks.maximum_likelihood.scene import window_times
@@ -46,7 +45,6 @@ from flight.gnc.vision.streaks.maximum_likelihood.wholeness import Wholeness, wh
 from flight.gnc.vision.streaks.maximum_likelihood.work import Work
 from flight.gnc.vision.streaks.streak_result import StreakStatus
 
-_MOST_BLOBS = 48
 # This many motions are fitted in full before the frame is given up.
 _MOST_MOTIONS = 2
 # Median length, px, of regions below which a frame without an agreed motion is one of stars at rest.
@@ -85,16 +83,16 @@ def estimate_motion(
     reported by the status.
     """
     validate(pixels, pinhole, exposure, prior_rate, prior_sigma)
-    saturation = settings.saturation if settings.saturation is not None else saturation_count(pixels)
+    # A frame may clip below where the camera says it does, never above.
+    saturation = min(saturation_count(pixels), settings.saturation or np.inf)
     checksum, unusable = admit(pixels, previous_checksum, saturation, settings.saturated_fraction)
     if unusable is not None:
         return MotionResult(unusable, checksum, exposure)
-    binning = Binning.suited(pinhole, settings.psf_sigma)
+    read = read_frame(pixels, pinhole, saturation, settings)
+    binning, blobs = read.binning, read.blobs
     settings = binning.settings(settings)
-    frame = expose_frame(*binning.frame(pixels, saturation), settings.gain)
-    camera = _exposed_camera(frame, binning.pinhole, exposure, settings, prior_course)
-    blobs = find_blobs(frame, settings.threshold_sigmas, _MOST_BLOBS)
-    seen = MotionResult(StreakStatus.FAILED, checksum, exposure, hot_pixels=frame.hot_pixels)
+    camera = _exposed_camera(read, exposure, settings, prior_course)
+    seen = MotionResult(StreakStatus.FAILED, checksum, exposure, hot_pixels=read.frame.hot_pixels)
     if len(blobs) < settings.least_stars:
         return replace(seen, status=StreakStatus.TOO_FEW)
     answer = None if _resting(blobs) else _in_time(camera, seen, blobs, prior_rate, prior_sigma, prior_course)
@@ -102,15 +100,13 @@ def estimate_motion(
 
 
 def _exposed_camera(
-    frame: ExposedFrame,
-    pinhole: Pinhole,
-    exposure: float,
-    settings: LikelihoodSettings,
-    course: Course | None,
+    read: Reading, exposure: float, settings: LikelihoodSettings, course: Course | None
 ) -> ExposedCamera:
     """Return the frame with its camera, its shutter and the known course, where the rate may change."""
     growing = settings.rate_model == "accelerating"
-    camera = ExposedCamera(frame, pinhole, _shutter(pinhole, exposure, settings), settings, growing)
+    pinhole = read.binning.pinhole
+    shutter = _shutter(pinhole, exposure, settings)
+    camera = ExposedCamera(read.frame, pinhole, shutter, settings, read.sigma, growing)
     if course is None or settings.rate_model == "constant":
         return camera
     return replace(camera, course=course.motion(pinhole.focal_length))
@@ -242,7 +238,8 @@ def _resting(blobs: Blobs) -> bool:
 def _without_rate(seen: MotionResult, camera: ExposedCamera, blobs: Blobs) -> MotionResult:
     """Return `seen` for a frame without an agreed motion: stars at rest, or a failure."""
     length = float(np.median(blobs.length))
-    if length >= _AT_REST:
+    # Of a crowded sky at rest the faint regions run together, but not the brightest.
+    if length >= _AT_REST and not _resting(blobs):
         return replace(seen, status=StreakStatus.FAILED, length=length, reason=_NO_MOTION)
     resting = still_fit(camera, blobs)
     if resting is None:

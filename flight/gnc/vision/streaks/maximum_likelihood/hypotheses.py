@@ -199,7 +199,7 @@ def _tried(camera: ExposedCamera, guess: Guess) -> tuple[float, bool, Fit] | Non
     """Return how much light a guess explains once fitted, whether that convinces, and the fit."""
     count = len(guess.light)
     everyone = np.ones(count, dtype=np.bool_)
-    width = float(np.hypot(camera.settings.psf_sigma, 0.29))
+    width = float(np.hypot(camera.sigma, 0.29))
     motion = guess.motion if camera.course is None else camera.course.scaled_to(guess.motion.whole)
     motion = motion if camera.sense is None else motion.along(camera.sense)
     stars = mid_exposure(camera.pinhole, motion, camera.shutter, guess.stars)
@@ -218,7 +218,7 @@ def _tried(camera: ExposedCamera, guess: Guess) -> tuple[float, bool, Fit] | Non
 def still_fit(camera: ExposedCamera, blobs: Blobs) -> Fit | None:
     """Return the stars of a camera at rest: their centroids, and the width of the point spread."""
     count = min(len(blobs), camera.settings.most_stars)
-    width = float(np.hypot(camera.settings.psf_sigma, 0.29))
+    width = float(np.hypot(camera.sigma, 0.29))
     everyone = np.ones(count, dtype=np.bool_)
     still = Motion.steady(np.zeros(3))
     scene = Scene(still, width, blobs.centre[:count], blobs.flux[:count], np.zeros(count), everyone)

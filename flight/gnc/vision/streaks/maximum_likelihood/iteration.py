@@ -80,6 +80,7 @@ class ExposedCamera:
         growing: whether the rate may change.
         course: the motion as it is known from elsewhere; None where unknown, or as good as constant.
         work: that was done on the frame.
+        sigma: px, of the point spread, where the fit of its width starts.
         sense: (3,) a vector along which the camera turns, not against it; None where either will do.
     """
 
@@ -87,6 +88,7 @@ class ExposedCamera:
     pinhole: Pinhole
     shutter: Shutter
     settings: LikelihoodSettings
+    sigma: float
     growing: bool = False
     sense: FloatArray | None = None
     course: Motion | None = None

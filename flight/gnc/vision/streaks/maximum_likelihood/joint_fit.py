@@ -157,6 +157,18 @@ def joint_fit(camera: ExposedCamera, scene: Scene, room: float = 1.0) -> Fit | N
     return None if done is None or _beyond(done.scene.motion) else replace(done, hidden=hidden)
 
 
+def refit(camera: ExposedCamera, last: Fit) -> Fit | None:
+    """Return the joint fit anew from where `last` came to, all its brightest stars trusted again.
+
+    `camera` differs from that of `last` in how it draws paths.
+    """
+    scene = last.scene
+    leading = np.arange(len(scene.light)) < max(camera.settings.most_stars, 1)
+    scene = replace(scene, trusted=scene.trusted | leading)
+    hidden = last.hidden
+    return joint_fit(camera, scene if hidden is None else scene.with_stars(hidden.stars, hidden.light))
+
+
 def bared_fit(camera: ExposedCamera, last: Fit) -> Fit | None:
     """Return a fit of the brightest streaks of `last` and all that lies on their pixels.
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.math.arrays import FloatArray
+from flight.gnc.vision.streaks.maximum_likelihood.bent_pinhole import BentPinhole
 
 _TINY = 1e-12
 
@@ -128,13 +129,15 @@ def paths(pinhole: Pinhole, motion: Motion, stars: FloatArray, time: FloatArray)
     there = v[:2] * inverse
     pace = (velocity[:2] - there * velocity[2]) * inverse
     bent = (acceleration[:2] - there * acceleration[2] - 2.0 * pace * velocity[2]) * inverse
-    return Paths(_pixels(pinhole, there), (focal * pace).T, (focal * bent).T)
+    drawn = Paths(_pixels(pinhole, there), (focal * pace).T, (focal * bent).T)
+    return _through(pinhole, drawn) if isinstance(pinhole, BentPinhole) else drawn
 
 
 def positions(pinhole: Pinhole, motion: Motion, stars: FloatArray, time: FloatArray) -> FloatArray:
     """Return the positions (m, 2) of `paths`, and nothing else."""
     v = _rotated(_turning(motion, time), _directions(pinhole, stars))
-    return _pixels(pinhole, v[:2] / v[2])
+    places = _pixels(pinhole, v[:2] / v[2])
+    return pinhole.bent(places) if isinstance(pinhole, BentPinhole) else places
 
 
 def image_flow(pinhole: Pinhole, points: FloatArray) -> FloatArray:
@@ -182,7 +185,23 @@ def moving(
         beside = _rotated(turning, unit)
         out[:, column] = (beside[:2] - there * beside[2]) / v[2]
     velocity = np.sum(flow * _rate(motion, time), axis=1)
-    return out.transpose(2, 0, 1), velocity.T
+    change, pace = out.transpose(2, 0, 1), velocity.T
+    if isinstance(pinhole, BentPinhole):
+        slopes = pinhole.slopes(_pixels(pinhole, there))
+        change, pace = slopes @ change, (slopes @ pace[..., None])[..., 0]
+        # The star's own pixel is one of the lens' picture.
+        change[..., 6:] = change[..., 6:] @ np.linalg.inv(pinhole.slopes(pinhole.straight(stars)))
+    return change, pace
+
+
+def _through(pinhole: BentPinhole, drawn: Paths) -> Paths:
+    """Return the paths that a lens makes of those that a pinhole would draw."""
+    slopes = pinhole.slopes(drawn.position)
+    velocity, acceleration = (
+        (slopes @ each[..., None])[..., 0] for each in (drawn.velocity, drawn.acceleration)
+    )
+    acceleration += pinhole.curving(drawn.position, drawn.velocity)
+    return Paths(pinhole.bent(drawn.position), velocity, acceleration)
 
 
 # Below, vectors are (..., 3, m), components before points: they then lie together in memory. What is returned
@@ -202,6 +221,8 @@ def _flow(pinhole: Pinhole, there: FloatArray) -> FloatArray:
 
 def _directions(pinhole: Pinhole, stars: FloatArray) -> FloatArray:
     """Return directions (3, m), not normalised (z is 1), of pixels (m, 2)."""
+    if isinstance(pinhole, BentPinhole):
+        stars = pinhole.straight(stars)
     out = np.ones((3, len(stars)))
     out[:2] = stars.T
     out[:2] -= np.array(pinhole.centre)[:, None]

@@ -100,7 +100,7 @@ def _why_not(result: MotionResult, camera: ExposedCamera, last: Fit, whole: Whol
     checks = (
         (last.restless > _RESTLESS, "the fit does not settle"),
         (
-            not result.misfit < settings.worst_misfit,
+            not result.misfit < settings.worst_misfit and not known.aside < settings.worst_aside,
             f"the streaks are unlike the model: misfit {result.misfit:.1f}",
         ),
         (whole is Wholeness.BROKEN, "the motion makes pieces of streaks, or joins several"),

@@ -37,7 +37,8 @@ class LikelihoodSettings:
         least_stars: fewer fix no rate; two do, though none contradicts them.
         least_length: px, median path below which no rate is given.
         least_significance: of the rate in its standard deviations, below which no rate is given.
-        worst_misfit: chi-square per degree of freedom above which the motion is not believed.
+        worst_misfit: chi-square per degree of freedom above which the motion is not believed, where what is
+            left over is as much as a displacement of the streaks by `worst_aside` px.
         worst_shaking: px of displacement, or share of brightness, that all streaks waver in common, above
             which the motion is not smooth.
         worst_doubt: share of the rate to which errors of the model may leave it uncertain, one deviation.
@@ -63,6 +64,7 @@ class LikelihoodSettings:
     least_length: float = 3.0
     least_significance: float = 5.0
     worst_misfit: float = 4.0
+    worst_aside: float = 0.45
     worst_shaking: float = 0.05
     worst_doubt: float = 0.008
     sign_sigmas: float = 3.0

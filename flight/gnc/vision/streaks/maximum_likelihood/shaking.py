@@ -13,16 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from flight.gnc.math.arrays import FloatArray, IntArray
-from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import Float32Array
-from flight.gnc.vision.streaks.maximum_likelihood.iteration import ExposedCamera, Fit
+from flight.gnc.vision.streaks.maximum_likelihood.iteration import ExposedCamera
+from flight.gnc.vision.streaks.maximum_likelihood.left_over import LeftOver
 from flight.gnc.vision.streaks.maximum_likelihood.motion import paths
-from flight.gnc.vision.streaks.maximum_likelihood.normal_equations import shapes
+from flight.gnc.vision.streaks.maximum_likelihood.scene import Scene
 from flight.gnc.vision.streaks.maximum_likelihood.strips import LINES
 
 _BINS = 48
-# Residuals beyond this many sigmas and this part of their line's brightest pixel are another's light.
-_FOREIGN_SIGMAS = 5.0
-_FOREIGN_SHARE = 0.6
 # What is common must exceed chance by this many deviations to be believed.
 _SIGNIFICANT = 4.0
 
@@ -40,47 +37,26 @@ class Shaking:
     along: float = 0.0
 
 
-def find_shaking(camera: ExposedCamera, fit: Fit) -> Shaking:
+def find_shaking(camera: ExposedCamera, scene: Scene, left: LeftOver) -> Shaking:
     """Return what the trusted streaks of a fit have in common; nothing where none is long."""
-    windows, scene = fit.windows, fit.scene
-    strips = windows.strips
-    chosen = np.flatnonzero(scene.trusted[windows.long[strips.star]])
-    if not len(chosen):
+    if not len(left.star):
         return Shaking()
-    images, weight, residual = _left_over(camera, fit)
-    images, weight, residual = images[chosen], weight[chosen], residual[chosen]
-    time, star = strips.time[chosen], strips.star[chosen]
-    stars = scene.stars[windows.long[star]]
+    time, star = left.time, left.star
+    stars = scene.stars[star]
     velocity = paths(camera.pinhole, scene.motion, np.repeat(stars, LINES, axis=0), time.reshape(-1)).velocity
     tangent = velocity / np.maximum(np.linalg.norm(velocity, axis=1, keepdims=True), 1e-9)
     normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
-    light = scene.light[windows.long[star], None]
+    light = scene.light[star, None]
     place = np.clip(((time + 0.5) * _BINS).astype(np.int64), 0, _BINS - 1).reshape(-1)
     within = (np.abs(time) < 0.5).reshape(-1)
     owner = np.repeat(star, LINES)
     found = []
-    for image, way in ((images[:, 1], normal), (images[:, 0], tangent)):
-        score = (light * np.sum(weight * residual * image, axis=2)).reshape(-1)
-        information = (light**2 * np.sum(weight * image * image, axis=2)).reshape(-1)
+    for image, way in ((left.images[:, 1], normal), (left.images[:, 0], tangent)):
+        score = (light * np.sum(left.weight * left.residual * image, axis=2)).reshape(-1)
+        information = (light**2 * np.sum(left.weight * image * image, axis=2)).reshape(-1)
         cell = (owner * _BINS + place)[within]
         found.append(_common(cell, score[within, None] * way[within], information[within]))
     return Shaking(*found)
-
-
-def _left_over(camera: ExposedCamera, fit: Fit) -> tuple[Float32Array, Float32Array, Float32Array]:
-    """Return the strips' images, and weights and residuals (b, LINES, k) of their pixels."""
-    scene, windows = fit.scene, fit.windows
-    images, spots, _ = shapes(camera.pinhole, camera.shutter, scene, windows)
-    of_block = windows.long[windows.strips.star]
-    light = images[:, 0] * scene.light[of_block, None, None].astype(np.float32)
-    peak = light.max(axis=2, keepdims=True)
-    light += scene.sky[of_block, None, None].astype(np.float32)
-    spot_light = spots * scene.light[windows.spot, None, None] + scene.sky[windows.spot, None, None]
-    weight, residual = windows.on_strips.residual(windows.total(light, spot_light), 0.0)
-    with np.errstate(divide="ignore"):
-        foreign = np.abs(residual) > _FOREIGN_SIGMAS / np.sqrt(weight) + _FOREIGN_SHARE * peak
-    weight[foreign] = 0.0
-    return images, weight, residual
 
 
 def _common(cell: IntArray, score: FloatArray, information: FloatArray) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from flight.gnc.control.three_axes.astray import FAR, PATIENCE, SLOW, Astray, damping_dipole
+from flight.gnc.control.three_axes.astray import FAR, LEAVING, PATIENCE, SLOW, Astray, damping_dipole
 
 
 def test_damping_takes_energy_from_any_rate_in_any_field() -> None:
@@ -40,3 +40,14 @@ def test_a_spin_along_the_field_is_not_waited_for() -> None:
     astray.see(2.0 * FAR, 5.0 * SLOW, 0.0)
     assert not seen(astray, 2.0 * FAR, 5.0 * SLOW, PATIENCE - 1.0)[1]
     assert seen(astray, 2.0 * FAR, 5.0 * SLOW, PATIENCE + 1.0)[1]
+
+
+def test_a_body_that_leaves_its_path_is_planned_for_again_while_it_flies_it() -> None:
+    astray = Astray()
+    for off, leaving in ((0.9 * LEAVING, False), (1.1 * LEAVING, True), (1.1 * FAR, False)):
+        astray.see(off, SLOW, 0.0)
+        assert astray.leaving == leaving
+    astray.planned()
+    astray.see(1.1 * LEAVING, SLOW, 1.0)
+    astray.planned()
+    assert not astray.leaving

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from flight.gnc.control.detumble import WindowSchedule
-from flight.gnc.control.three_axes.sun_seeker import MEMORY, Seeking, SunSeeker
+from flight.gnc.control.three_axes.sun_seeker import Seeking, SunSeeker
+from flight.gnc.estimation.carried_sun import MEMORY
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import IDENTITY, attitude_matrix, from_rotation_vector, multiply
 

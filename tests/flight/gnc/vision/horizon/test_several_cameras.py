@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from flight.gnc.math.directions import tangent_basis
 from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
 from flight.gnc.vision.horizon.cameras import cameras_by_limb
 from flight.gnc.vision.horizon.filled_camera import coarse_nadir, light_seen
-from flight.gnc.vision.horizon.knowledge import HorizonKnowledge, RoughAttitude
+from flight.gnc.vision.horizon.knowledge import HorizonKnowledge, RoughAttitude, SensedDirection
 from flight.gnc.vision.horizon.limb_profile import UNIT_DEPTH_HEIGHT
 from flight.gnc.vision.horizon.several_cameras import JointNadir, nadir_of_cameras
 from flight.gnc.vision.horizon.solution import HorizonStatus
@@ -93,6 +93,19 @@ def test_the_cameras_together_know_nadir_better_than_any_one(level: Instant) -> 
     off = tangent_basis(level.nadir) @ found.nadir.direction
     assert error_deg(found, level.nadir) < 0.03
     assert float(np.linalg.norm(off)) < 4.0 * found.nadir.sigma
+
+
+def test_a_sun_that_is_known_exactly_refuses_no_true_limb(level: Instant) -> None:
+    """A cone through the edges is 0.1 to 0.3 deg off nadir before the limb is fitted; the Sun is not."""
+    rough = level.knowledge()
+    for sigma in (np.radians(0.005), np.radians(1.0)):
+        seen = replace(rough, sensed=(SensedDirection(level.sun_in_body, level.sun, sigma),))
+        found = nadir_of_cameras(level.frames, UW, seen, SETTINGS)
+        assert found.status is HorizonStatus.FOUND, found.reason
+        assert sorted(found.cameras) == [0, 1, 2]
+    elsewhere = attitude_matrix(from_rotation_vector(np.array([0.0, 0.05, 0.0]))) @ level.sun_in_body
+    false = replace(rough, sensed=(SensedDirection(elsewhere, level.sun, np.radians(0.005)),))
+    assert nadir_of_cameras(level.frames, UW, false, SETTINGS).status is not HorizonStatus.FOUND
 
 
 def test_air_higher_than_believed_shifts_one_cameras_nadir_but_not_that_of_three(level: Instant) -> None:

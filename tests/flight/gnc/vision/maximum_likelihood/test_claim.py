@@ -35,7 +35,7 @@ def _seeming(knowledge: CameraKnowledge, turn: FloatArray = _TURN) -> tuple[Floa
     ones = np.ones(len(stars))
     scene = Scene(Motion.steady(turn), 1.04, stars, ones, ones, ones > 0.0)
     frame = expose_frame(np.zeros((1024, 1024), np.uint16), SATURATION, 1.0)
-    camera = ExposedCamera(frame, CAMERA.pinhole, Shutter(), LikelihoodSettings(knowledge=knowledge))
+    camera = ExposedCamera(frame, CAMERA.pinhole, Shutter(), LikelihoodSettings(knowledge=knowledge), 1.0)
     half = np.full(len(stars), 0.5)
     opening = (
         sensitivities(CAMERA.pinhole, scene.motion, stars, half)
@@ -131,12 +131,12 @@ def test_what_is_not_known_of_the_camera_widens_the_claim_and_leaves_the_rate() 
     assert np.trace(doubted) > 10.0 * np.trace(exact)
 
 
-def test_a_point_spread_far_from_the_one_described_is_refused_with_a_reason() -> None:
-    scene = real_sky(12, np.radians(70.0), 51.0, 0.2)
-    settings = LikelihoodSettings(saturation=SATURATION, psf_sigma=2.0)
+def test_short_streaks_of_another_point_spread_are_refused_with_a_reason() -> None:
+    scene = real_sky(12, np.radians(70.0), 12.0, 0.2, replace(CAMERA, psf_sigma=1.5))
+    settings = LikelihoodSettings(saturation=SATURATION, line_time=0.0)
     result = estimate_motion(scene.pixels, CAMERA.pinhole, 0.2, settings, scene.rate, 0.0)
     assert result.rate is None
-    assert "point spread, 0.5" in result.reason
+    assert "point spread, 1.4" in result.reason
 
 
 def test_two_stars_fix_a_rate_with_a_covariance_that_says_so() -> None:

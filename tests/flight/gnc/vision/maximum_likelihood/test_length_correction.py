@@ -24,7 +24,7 @@ def _seen(theta: float, length: float, turned: float) -> tuple[ExposedCamera, Sc
     """Return a frame, its brightest stars under `turned` times the true motion, and that motion."""
     sky = real_sky(21, np.radians(theta), length, 0.2)
     frame = expose_frame(sky.pixels, SATURATION, CAMERA.gain)
-    camera = ExposedCamera(frame, CAMERA.pinhole, Shutter(), LikelihoodSettings())
+    camera = ExposedCamera(frame, CAMERA.pinhole, Shutter(), LikelihoodSettings(), 1.0)
     order = np.argsort(-sky.electrons, kind="stable")[:_STARS]
     true = Motion.steady(sky.rate * sky.exposure)
     motion = Motion.steady(turned * true.turn)

@@ -26,7 +26,7 @@ def _taken(theta: float, length: float) -> tuple[ExposedCamera, Scene]:
     """Return a frame and its brightest stars as they are, the first of them with a say."""
     sky = real_sky(7, np.radians(theta), length, 1.0)
     frame = expose_frame(sky.pixels, SATURATION, CAMERA.gain)
-    camera = ExposedCamera(frame, CAMERA.pinhole, Shutter(), LikelihoodSettings())
+    camera = ExposedCamera(frame, CAMERA.pinhole, Shutter(), LikelihoodSettings(), 1.0)
     order = np.argsort(-sky.electrons, kind="stable")[:_STARS]
     width = float(np.sqrt(CAMERA.psf_sigma**2 + 1.0 / 12.0))
     trusted = np.arange(len(order)) < _TRUSTED

@@ -16,7 +16,9 @@ from flight.gnc.math.arrays import FloatArray, Image
 from flight.gnc.vision.sun_sensor.direction import find_sun
 from flight.gnc.vision.sun_sensor.settings import LINEAR, SunSettings
 from flight.gnc.vision.sun_sensor.solution import SunStatus
+from flight.schema.orbit_devices import WideCamera
 from sim_hal.earth_camera import EarthCameraModel, EarthScene, render, sun_direction
+from sim_hal.orbit_assembly import wide_model
 from tests.sim_hal.earth_camera.scenes import LOW, pointing
 from tests.studies.bench.sun import CAMERAS, Outcome, frames_with_sun, frames_without_sun
 
@@ -83,6 +85,20 @@ def test_a_sun_cut_by_the_edge_is_found_with_a_covariance_that_grows_across_the_
         off = solution.sun.basis @ truth
         assert off @ np.linalg.solve(solution.sun.tangent_covariance, off) < 14.0  # one in a thousand
         assert np.degrees(np.hypot(*off)) < 0.06
+
+
+def test_the_corners_of_a_field_of_92_deg_show_it_too() -> None:
+    """There a pinhole draws the disc out to 1.7 times its width, but not the blur about it."""
+    model = wide_model(WideCamera(columns=512, rows=512, field_of_view_deg=92.0))
+    for number, (x, y) in enumerate(
+        [(36.0, 40.0), (51.0, 479.0), (470.0, 38.5), (466.2, 470.7), (256.0, 30.0)]
+    ):
+        frame, sun = _frame_at(x, y, model, seed=number)
+        found = find_sun(ArrayPixels(frame), model.lens, SETTINGS).sun
+        assert found is not None
+        off = found.basis @ sun
+        assert np.degrees(np.linalg.norm(off)) < 0.02
+        assert off @ np.linalg.solve(found.tangent_covariance, off) < 20.0
 
 
 def test_the_same_sun_is_found_in_twelve_bits() -> None:

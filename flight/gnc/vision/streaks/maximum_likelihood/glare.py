@@ -1,0 +1,53 @@
+"""Light that is no streak: a limb, a reflection, as far as the background leaves it over.
+
+A bright region that is solid over more px than any star's light is wide is of no star. Its pixels, and those
+about them, where the background follows the light no better, are left out like hot ones. A net of
+streaks that cross is not solid.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from flight.gnc.math.arrays import BoolArray
+from flight.gnc.vision.frame.box_sums import box_sum
+from flight.gnc.vision.streaks.maximum_likelihood.blobs import Blobs
+from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import ExposedFrame
+
+# A region can be solid only when its area is that of so many px across all its length: bright stars have half
+# of it.
+_BROAD = 25.0
+_LEAST_LENGTH = 40.0
+# It is where a square of so many px finds room in it.
+_SOLID = 31
+# So many px about it are left out too.
+_ABOUT = 12
+
+
+def without_glare(frame: ExposedFrame, blobs: Blobs) -> ExposedFrame | None:
+    """Return `frame` without the solid ones of its regions; None when none is solid."""
+    area = np.bincount(blobs.owner, minlength=len(blobs))
+    broad = area > _BROAD * np.maximum(blobs.length, _LEAST_LENGTH)
+    if not broad.any():
+        return None
+    from scipy import ndimage  # noqa: PLC0415 - few frames need it
+
+    # What lies beyond the frame's border is as what lies at it.
+    room = ndimage.minimum_filter(_drawn(frame, blobs, broad), _SOLID)
+    solid = np.bincount(blobs.owner, room[blobs.row, blobs.column], len(blobs)) > 0.0
+    if not solid.any():
+        return None
+    out = ndimage.maximum_filter(_drawn(frame, blobs, solid), 2 * _ABOUT + 1).reshape(-1)
+    signal = np.where(out, np.float32(0.0), frame.signal)
+    sums = box_sum(signal.reshape(frame.shape)).reshape(-1)
+    return replace(frame, signal=signal, sums=sums, bad=frame.bad | out)
+
+
+def _drawn(frame: ExposedFrame, blobs: Blobs, which: BoolArray) -> BoolArray:
+    """Return on which pixels (rows, columns) the regions `which` (n,) lie."""
+    within = which[blobs.owner]
+    mask = np.zeros(frame.shape, dtype=np.bool_)
+    mask[blobs.row[within], blobs.column[within]] = True
+    return mask

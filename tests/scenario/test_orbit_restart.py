@@ -1,0 +1,56 @@
+"""A satellite that is killed starts again from what its filter had learned."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+
+from flight.schema import reader as configuration
+from flight.schema.orbit import OrbitConfig
+from ground.telemetry.reader import Run
+from sim_hal.settings import Simulation
+from tests.scenario.flights import Rigged, event_names, fly
+from tests.scenario.test_orbit_navigation import GYRO_BIAS, navigating, skyward
+
+KILLED, AGAIN = 40.0, 16.0
+"""s of the first flight after which it is killed, and of the second."""
+LATER = "2026-03-20T12:10:00Z"
+
+
+def _config(state: Path, duration: float) -> OrbitConfig:
+    section = configuration.replace(navigating().state, folder=str(state), period=1.0)
+    return configuration.replace(navigating(), state=section, elements=None, duration=duration)
+
+
+def _world(utc: str | None = None) -> Simulation:
+    section = skyward() if utc is None else configuration.replace(skyward(), utc=utc)
+    receiver = configuration.replace(section.orbit_devices, gps_start=1.0)
+    return configuration.replace(section, orbit_devices=receiver)
+
+
+def _first_error(run: Run) -> float:
+    """Return by how much the first estimate of the gyro's bias is off, rad/s."""
+    bias = run["navigation"]["gyro_bias"]
+    known = bias[np.isfinite(bias[:, 0])]
+    return float(np.linalg.norm(known[0] - GYRO_BIAS))
+
+
+def test_the_gyro_bias_is_known_at_once_after_a_kill(tmp_path: Path) -> None:
+    """What stands on the disk at an instant of a flight is what a kill leaves."""
+    disk, left = tmp_path / "disk", tmp_path / "left"
+
+    def kill(rigged: Rigged) -> None:
+        def copy() -> None:
+            shutil.copytree(disk, left)
+
+        rigged.at(KILLED, copy)
+
+    first = fly(_config(disk, KILLED + 2.0), tmp_path / "first", kill, section=_world())
+    again = fly(_config(left, AGAIN), tmp_path / "again", section=_world(LATER))
+    assert _first_error(first) > 4e-4, "nothing was known of it"
+    assert _first_error(again) < 1e-4
+    assert "unclean-shutdown" in event_names(again)
+    assert "learned-refused" not in event_names(again)
+    assert np.isfinite(again["navigation"]["gyro_bias"][-1]).all()

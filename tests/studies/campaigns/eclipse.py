@@ -1,0 +1,204 @@
+"""Campaign `eclipse`: what the satellite's filter knows of the attitude through an eclipse without stars.
+
+Cells `filter`: the loop's filter (`FreeFilter`, with the noises of the configurations) on a craft that points
+to nadir in a world whose gyro walks as the filter believes. Stars each 10 s teach it the gyro's bias, for
+LEARNED s at least; from the begin of a shadow on it has gyro and magnetometer alone. Orbits without a shadow
+of SHORTEST s are drawn again. Cells `loop`, a tenth as many: the whole loop (`eclipse_loop`), whose emulated
+gyro keeps its bias.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flight.bodies.orbit.body import filter_settings
+from flight.bodies.orbit.replay import FIELD_MEMORY
+from flight.gnc.estimation.free_filter import FreeFilter
+from flight.gnc.estimation.free_motion import TURN
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import conjugate, multiply, to_rotation_vector
+from flight.schema import reader as configuration
+from flight.schema.orbit import OrbitConfig, as_orbit
+from tests.scenario.flights import CONFIG
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.eclipse_loop import CRAFT, LAST, SETTLED, fly_loop, judged
+from tests.studies.campaigns.orbit_pointing_flight import CYCLE, PAUSE, STAR_SIGMA, PointingFlight
+
+LEARNED, SHORTEST, LONGEST = 3_800.0, 1_900.0, 12_000.0
+"""s: with stars at least, so that a revolution has passed at the shadow's end; of a shadow at least, and of a
+flight."""
+NOTED = 10.0
+"""s between the errors that are noted."""
+SHARE = 0.3
+"""Of the worst torques, as in the configurations."""
+SAMPLES = 4
+"""Of the magnetometer in a pause of the coils."""
+WANTED = {"stars": 0.01, "sunlit": 0.05, "eclipse": 0.3}
+"""deg rms of three axes (issue 19)."""
+
+
+def cases(runs: int, seed: int) -> list[Case]:
+    """Return `runs` flights of each craft, and a tenth as many in the loop."""
+    return [
+        Case(f"{kind}/{craft}/{run}", (seed, run), {"kind": kind, "craft": craft})
+        for kind, flown in (("filter", runs), ("loop", math.ceil(0.1 * runs)))
+        for craft in CRAFT
+        for run in range(flown)
+    ]
+
+
+def run(case: Case) -> Result:
+    """Fly the case; its parameters may shorten it."""
+    given = case.parameters
+    facts = fly_loop(given, case.seed) if given["kind"] == "loop" else _fly_filter(given, case.seed)
+    return {"kind": given["kind"], "craft": given["craft"], **facts}
+
+
+class LoopFilter(FreeFilter):
+    """The filter with the noises of a configuration, and of a field each two seconds as the loop has it."""
+
+    def __init__(self, inertia: FloatArray, config: OrbitConfig) -> None:
+        super().__init__(inertia, filter_settings(config))
+        section = config.estimation
+        model = section.field_error**2 * 2.0 * FIELD_MEMORY / CYCLE
+        self._of_field: FloatArray = (section.field_noise**2 / SAMPLES + model) * np.eye(3)
+
+    def field(self, measured: FloatArray, reference: FloatArray, _: FloatArray) -> bool:
+        """Accept the field (3,) T of now in body axes, the model's (3,) T, ICRS."""
+        return super().field(measured, reference, self._of_field)
+
+
+class DarkFlight(PointingFlight):
+    """A flight at nadir whose star camera is silent from `dark` s on; `end` s is that of the shadow."""
+
+    dark, end = math.inf, 0.0
+
+    def __init__(self, craft: str, seed: int) -> None:
+        super().__init__({"craft": craft, "share": SHARE, "law": "whole", "target": "nadir"}, seed)
+        config = as_orbit(configuration.load(CONFIG.parent / CRAFT[craft]))
+        noise = filter_settings(config).coil_noise / math.sqrt(CYCLE - PAUSE)
+        self.flight.coil_noise = noise
+        first, self._filter = self._filter, LoopFilter(self.flight.inertia, config)
+        gyro = self._gyro(self.flight.motion.rate, 1.0)
+        self._filter.start(first.quaternion, STAR_SIGMA**2 * np.eye(3), gyro)
+
+    def find_shadow(self, learned: float, shortest: float) -> bool:
+        """Set the begin and end of the first shadow after `learned` s; return whether it is long enough."""
+        times = np.arange(0.0, LONGEST)
+        dark = self.flight.ephemeris(LONGEST + 1.0).sunlit_at(times) < 0.5
+        begins = np.flatnonzero(dark[1:] & ~dark[:-1] & (times[1:] > learned)) + 1
+        ends = np.flatnonzero(~dark[1:] & dark[:-1]) + 1
+        if not len(begins) or not len(later := ends[ends > begins[0]]):
+            return False
+        self.dark, self.end = float(times[begins[0]]), float(times[later[0]])
+        return self.end - self.dark >= shortest
+
+    def error(self) -> tuple[FloatArray, FloatArray, float]:
+        """Return error and claim of the attitude (3,) rad, and the share of the dipole that is not known."""
+        found, truth = self._filter, self.flight.body.orbit_truth()
+        off = to_rotation_vector(multiply(self.flight.motion.quaternion, conjugate(found.quaternion)))
+        missing = truth.residual_dipole - found.residual_dipole(truth.sunlit)
+        share = float(np.linalg.norm(missing) / np.linalg.norm(truth.residual_dipole))
+        return off, np.sqrt(np.diag(found.covariance[TURN, TURN])), share
+
+    def _see_stars(self, time: float) -> None:
+        if time < self.dark:
+            super()._see_stars(time)
+
+
+def _fly_filter(given: dict[str, Any], seed: tuple[int, ...]) -> Result:
+    """Fly the filter alone; `learned`, `shortest`, `settled`, `last` and `seconds` shorten it."""
+    number = seed[0] * 100_003 + seed[1]
+    flight = DarkFlight(given["craft"], number)
+    while not flight.find_shadow(given.get("learned", LEARNED), given.get("shortest", SHORTEST)):
+        number += 1_000_003
+        flight = DarkFlight(given["craft"], number)
+    end = min(flight.end, flight.dark + given.get("seconds", math.inf))
+    settled, last = given.get("settled", SETTLED), given.get("last", LAST)
+    times, errors, sigmas, shares = [], [], [], []
+    for cycle in range(round(end / CYCLE)):
+        flight.cycle(cycle * CYCLE)
+        if cycle * CYCLE % NOTED == 0.0:
+            off, claim, missing = flight.error()
+            times.append(cycle * CYCLE)
+            errors.append(off)
+            sigmas.append(claim)
+            shares.append(missing)
+    at, error, sigma, share = np.array(times), np.array(errors), np.array(sigmas), np.array(shares)
+    stars, late = (at > settled) & (at < flight.dark), at > end - last
+    lit = (at > flight.dark - 5.0 * last) & (at < flight.dark)
+    return {
+        "shadow_s": end - flight.dark,
+        "learned_s": flight.dark,
+        "stars": judged(error[stars], sigma[stars]),
+        "sunlit": None,
+        "eclipse": judged(error[late], sigma[late]),
+        "dipole": {"sunlight": _rms(share[lit]), "shadow": _rms(share[at > end - 5.0 * last])},
+    }
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else math.nan
+
+
+def summarise(results: Sequence[Result], _: Path) -> Summary:
+    """Return errors and claims by kind, craft and part of the flight."""
+    facts: dict[str, Any] = {}
+    heads = ("flights", "deg rms", "median", "worst", "claim", "sigmas", "NEES", "wanted")
+    lines = [f"{'':28}" + "".join(f"{head:>10}" for head in heads)]
+    cells = list(dict.fromkeys((r["kind"], r["craft"]) for r in results))
+    for kind, craft in cells:
+        mine = [r for r in results if (r["kind"], r["craft"]) == (kind, craft)]
+        for part, wanted in WANTED.items():
+            if not (parts := [r[part] for r in mine if r[part] is not None]):
+                continue
+            facts[f"{kind}/{craft}/{part}"] = row = _row(parts)
+            numbers = "".join(f"{value:>10.3g}" for value in row.values())
+            lines.append(f"{f'{kind}, {craft}, {part}':28}{numbers}{wanted:>10}")
+        facts[f"{kind}/{craft}/dipole"] = dipole = _dipole(mine)
+        text = ", ".join(f"{light} {share:.0%} and {worst:.0%}" for light, (share, worst) in dipole.items())
+        lines.append(f"{kind}, {craft}: residual dipole not known, median and worst: {text}")
+    lines += [
+        "with stars; the last two minutes of sunlight, and of the shadow, without: deg rms of three axes of",
+        "all flights, of the median and the worst, the claim, the largest error in sigmas of its axis, NEES",
+        "of an axis (1 is honest); the dipole of the last ten minutes of either light, of its size",
+    ]
+    return Summary("\n".join(lines) + "\n", facts)
+
+
+def _dipole(results: Sequence[Result]) -> dict[str, tuple[float, float]]:
+    """Return median and largest share of the residual dipole that is not known, by the light."""
+    found = {}
+    for light in ("sunlight", "shadow"):
+        shares = [r["dipole"][light] for r in results if math.isfinite(r["dipole"][light])]
+        if shares:
+            found[light] = float(np.median(shares)), max(shares)
+    return found
+
+
+def _row(parts: Sequence[Result]) -> dict[str, float]:
+    rms = np.array([r["rms_deg"] for r in parts])
+    return {
+        "flights": float(len(parts)),
+        "rms": _rms(rms),
+        "median": float(np.median(rms)),
+        "worst": float(rms.max()),
+        "claim": _rms(np.array([r["claim_deg"] for r in parts])),
+        "sigmas": max(r["sigmas"] for r in parts),
+        "nees": float(np.mean([r["nees"] for r in parts])),
+    }
+
+
+ECLIPSE = Campaign(
+    "eclipse",
+    "the attitude through an eclipse without stars, by gyro and magnetometer",
+    cases,
+    run,
+    summarise,
+    20,
+)

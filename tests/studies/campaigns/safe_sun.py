@@ -1,0 +1,196 @@
+"""Campaign `safe-sun`: SAFE's way to the Sun by solar strings, gyro and magnetometer alone, and its hold.
+
+Both craft, by turns in two orbits, any attitude and a turn of 0.5 deg/s as the brake leaves it, two
+revolutions of 97 min. Drag, sunlight and the turn of the principal axes are `share` of the worst; gravity
+gradient and residual dipole are whole. The strings have gain errors and see the sunlit Earth. `found` is when
+the axis first comes within NEAR deg; `rms` is of the axis off the Sun in sunlight from SETTLED s on, the time
+after each eclipse included; `again` is the longest time from an eclipse's end to within NEAR deg.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flight.gnc.control.three_axes.sun_seeker import Seeking, SunSeeker
+from flight.gnc.earth.shadow import sunlit_share
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import attitude_matrix
+from flight.gnc.vision.sun_sensor.strings import SolarStrings, coarse_sun
+from sim_hal.worlds import sun
+from sim_hal.worlds.free_body.section import Disturbances, TipOff
+from sim_hal.worlds.solar_strings import SolarStringsModel
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.detumble import SAMPLES_NS, SCHEDULE, hash_of
+from tests.studies.campaigns.free_flight import CRAFT, GYRO_NOISE, ORBITS, SECOND, FreeFlight
+
+AXIS = np.array([0.0, 0.0, 1.0])
+SPEED = math.radians(0.5)
+SECONDS, SETTLED = 11_600.0, 1_800.0
+NEAR = 20.0
+"""deg."""
+SHARES = (0.3, 1.0)
+CYCLES = 6
+"""Commands in a window; the flight gives 72."""
+GAIN_ERROR, STRING_NOISE = 0.02, 2e-3
+"""Of the strings: relative, and A of a peak of one."""
+_STREAM = 0x5AFE
+
+
+def cases(runs: int, seed: int) -> list[Case]:
+    """Return `runs` flights of each craft and share, in the two orbits by turns."""
+    orbits = list(ORBITS)
+    return [
+        Case(
+            f"{craft}/{share}/{run}", (seed, run), {"craft": craft, "share": share, "orbit": orbits[run % 2]}
+        )
+        for run in range(runs)
+        for craft in CRAFT
+        for share in SHARES
+    ]
+
+
+class SafeFlight:
+    """One craft with its seeker; `notes`: each window's time, angle off the Sun, deg, light and deg/s."""
+
+    def __init__(self, wanted: dict[str, Any], seed: int) -> None:
+        """`wanted`: craft, share of the worst disturbances, orbit."""
+        share = wanted["share"]
+        disturbances = Disturbances(drag=share, solar_pressure=share, principal_turn_deg=3.0 * share)
+        release = TipOff(speed=wanted.get("speed", SPEED))
+        self._flight = FreeFlight(wanted["craft"], seed, wanted["orbit"], release, disturbances)
+        self._draws = np.random.default_rng([seed, _STREAM])
+        self._strings = SolarStrings()
+        gains = GAIN_ERROR * self._draws.standard_normal(len(self._strings.peaks))
+        self._light = SolarStringsModel(self._strings.normals, self._strings.peaks, gains, noise=STRING_NOISE)
+        seeking = Seeking(inertia=np.diag(self._flight.inertia), axis=AXIS, limit=self._flight.limit)
+        self.law = SunSeeker(SCHEDULE, seeking)
+        self.notes: list[tuple[float, float, float, float]] = []
+
+    def window(self, seconds: float) -> None:
+        """Fly one window of the coils' pauses from `seconds` on."""
+        flight, start_ns = self._flight, round(seconds * SECOND)
+        flight.act(np.zeros(3))
+        for phase_ns in SAMPLES_NS:
+            self._sample(start_ns + phase_ns)
+        acting_ns = start_ns + SCHEDULE.settle_ns + SCHEDULE.measure_ns
+        for cycle in range(CYCLES):
+            self._sample(acting_ns + SCHEDULE.act_ns * cycle // CYCLES)
+            flight.act(self.law.dipole(flight.time_ns))
+        self._see()
+
+    def _sample(self, time_ns: int) -> None:
+        flight = self._flight
+        flight.advance(time_ns)
+        noise = GYRO_NOISE * math.sqrt(20.0) * flight.generator.standard_normal(3)
+        self.law.sample(time_ns, flight.field(), flight.motion.rate + flight.gyro_bias + noise)
+
+    def _see(self) -> None:
+        """Give the seeker what the strings show, and note the truth."""
+        flight = self._flight
+        truth = flight.body.orbit_truth()
+        body = attitude_matrix(truth.quaternion)
+        place = sun.position(truth.utc)
+        currents = self._light.currents(truth.position, place, body, self._draws)
+        found = coarse_sun(currents, self._strings)
+        if found.direction is not None:
+            self.law.see(flight.time_ns, found.direction)
+        to_sun = place - truth.position
+        cosine = float(AXIS @ body @ to_sun) / float(np.linalg.norm(to_sun))
+        lit = float(sunlit_share(truth.position, place))
+        off = math.degrees(math.acos(max(-1.0, min(1.0, cosine))))
+        rate = math.degrees(float(np.linalg.norm(truth.rate)))
+        self.notes.append((flight.time_ns / SECOND, off, lit, rate))
+
+
+def run(case: Case) -> Result:
+    """Fly the case."""
+    flight = SafeFlight(case.parameters, hash_of(case))
+    seconds = case.parameters.get("seconds", SECONDS)
+    window = SCHEDULE.period_ns / SECOND
+    for number in range(round(seconds / window)):
+        flight.window(number * window)
+    return {**case.parameters, **judged(np.array(flight.notes), min(SETTLED, 0.5 * seconds))}
+
+
+def judged(notes: FloatArray, settled: float) -> Result:
+    """Return the figures of notes (n, 4); those of a light that was not met are None."""
+    times, off, lit, rate = notes.T
+    near, sunlit = off <= NEAR, lit > 0.5
+    later = times > settled
+    dawns = np.nonzero(sunlit[1:] & ~sunlit[:-1])[0] + 1
+    returns = [np.nonzero(near[dawn:])[0] for dawn in dawns]
+    again = [
+        float(times[dawn + after[0]] - times[dawn])
+        for dawn, after in zip(dawns, returns, strict=True)
+        if len(after)
+    ]
+    return {
+        "found": float(times[near][0]) if near.any() else None,
+        "rms": _rms(off[later & sunlit]),
+        "rms_dark": _rms(off[later & ~sunlit]),
+        "worst": float(off[later & sunlit].max()) if (later & sunlit).any() else None,
+        "again": max(again, default=None),
+        "missed": int(not near.any()) + len(returns) - len(again),
+        "fastest_deg": float(rate.max()),
+    }
+
+
+def _rms(values: FloatArray) -> float | None:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else None
+
+
+def summarise(results: Sequence[Result], _: Path) -> Summary:
+    """Return how the axis was held, by craft and share."""
+    facts: dict[str, Any] = {}
+    heads = ("runs", "held", "missed", "median", "95 %", "worst", "dark", "found", "again", "deg/s")
+    lines = [f"{'craft':12}{'share':>6}" + "".join(f"{head:>9}" for head in heads)]
+    for craft in CRAFT:
+        for share in SHARES:
+            mine = [result for result in results if (result["craft"], result["share"]) == (craft, share)]
+            if not mine:
+                continue
+            found = facts[f"{craft}/{share}"] = _figures(mine)
+            counts = "".join(f"{value:9d}" for value in list(found.values())[:3])
+            cells = [
+                f"{'-' if value is None else format(value, '.1f'):>9}" for value in list(found.values())[3:]
+            ]
+            lines.append(f"{craft:12}{share:6.1f}" + counts + "".join(cells))
+    lines += [
+        f"deg rms off the Sun in sunlight (held: {NEAR:g} at most), and in eclipse the median;",
+        f"s at most until first within {NEAR:g} deg, and from an eclipse's end on; fastest;",
+        "missed: how often the flight ended before either",
+    ]
+    return Summary("\n".join(lines) + "\n", facts)
+
+
+def _figures(mine: Sequence[Result]) -> dict[str, Any]:
+    """Return the figures of one cell."""
+    lit = np.array([result["rms"] for result in mine if result["rms"] is not None])
+    dark = [result["rms_dark"] for result in mine if result["rms_dark"] is not None]
+    return {
+        "runs": len(mine),
+        "held": int(np.sum(lit <= NEAR)),
+        "missed": sum(result["missed"] for result in mine),
+        "median": float(np.median(lit)),
+        "p95": float(np.percentile(lit, 95.0)),
+        "worst": float(lit.max()),
+        "dark": float(np.median(dark)) if dark else None,
+        "found": max((result["found"] for result in mine if result["found"] is not None), default=None),
+        "again": max((result["again"] for result in mine if result["again"] is not None), default=None),
+        "fastest_deg": max(result["fastest_deg"] for result in mine),
+    }
+
+
+SAFE_SUN = Campaign(
+    "safe-sun",
+    "SAFE turns to the Sun by solar strings, gyro and magnetometer alone, and holds it",
+    cases,
+    run,
+    summarise,
+    20,
+)
