@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
@@ -87,7 +87,7 @@ def _first(task: SlewTask, search: Search, paths: Iterator[Found]) -> SlewPlan |
 
 
 def _refusal(task: SlewTask, tried: int) -> str:
-    """Return why a task is refused: which cones are in the way, and what may help."""
+    """Return why a task is refused, and what may help."""
     text = f"no slew within the dipole's limit{' and outside the cones' * bool(task.cones)} was found"
     text += f" over {task.horizon:g} to {task.longest:g} s, from {tried} guesses"
     return f"{text}: a longer time or another begin may do"
@@ -105,7 +105,8 @@ def _plan(task: SlewTask, search: Search, found: Found) -> SlewPlan | None:
         q = at.states[:, :4] / np.linalg.norm(at.states[:, :4], axis=1, keepdims=True)
         dipole = search.solver.unit * at.all_dipoles()
         path = SlewPath(equations.times, q, at.states[:, 4:] / scale, flow[:, 4:] / scale**2, dipole)
-    if not all(np.isfinite(part).all() for part in (path.quaternion, path.rate, path.acceleration, path.dipole)):
+    parts = (path.quaternion, path.rate, path.acceleration, path.dipole)
+    if not all(np.isfinite(part).all() for part in parts):
         return None
     clear = _clearances(task, path)
     kept = task.time_price is not None or path.horizon <= task.horizon * (1.0 + 1e-6)

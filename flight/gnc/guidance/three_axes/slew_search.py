@@ -1,8 +1,9 @@
 """The search for a slew's path: guesses on a coarse grid, the promising ones within the limits, then refined.
 
-Without limits a path is found from most guesses in a dozen Newton steps; its heat is a lower bound of that
-within the limits. A guess that lacks much after some steps is put off: most of those lead nowhere. Where the
-asked horizon does not suffice, or none of its guesses leads to a path, a longer slew is shortened.
+Without the dipoles' limit a path that keeps the cones is found from most guesses in a dozen Newton steps;
+its heat is a lower bound of that within the limit. A guess that lacks much after some steps is put off: most
+of those lead nowhere. Where the asked horizon does not suffice, or none of its guesses leads to a path, a
+longer slew is shortened.
 """
 
 from __future__ import annotations
@@ -24,15 +25,17 @@ from flight.gnc.math.arrays import FloatArray
 GRIDS, GRIDS_WITH_CONES = ((10, 1000),), ((12, 600), (16, 500))
 """Searches, one after the other: intervals, and Newton steps after which nothing else is begun with.
 
-A thousand steps take about a second and a half. On ten intervals, what goes round cones is far from what does on
-the fine grid; half of the slews with cones for which twelve lead to none are found on sixteen.
+A thousand steps take about a second and a half. On ten intervals, what goes round cones is far from what
+does on the fine grid; half of the slews with cones for which twelve lead to none are found on sixteen.
 """
 _MOST_TRIED = 16
 """Guesses over one horizon."""
 _LOOK = 8
+"""Newton steps of every guess."""
 _FURTHER, _FURTHER_WITH_CONES = ((17, 1.5),), ((12, 1.0), (30, 0.6))
-"""Newton steps after which a guess is put off whose equations lack more in all: four of five that lead to a
-path lack less, three of four that do not lack more (320 guesses, seed 41 of the bench `orbit_slews`)."""
+"""How many more it is given, one after the other, where its equations lack less in all; else it is put off.
+Four of five that lead to a path lack less than 1.5 after eight, three of four that do not lack more (320
+guesses, seed 41 of the bench `orbit_slews`)."""
 _PATIENCE = 120
 """Newton steps without a path, after which the other guesses over a horizon are put off."""
 _WIDENED = 4

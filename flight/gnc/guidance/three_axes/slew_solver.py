@@ -15,7 +15,7 @@ from flight.gnc.guidance.three_axes.slew_transcription import Trajectory, Transc
 
 WALK_BARRIER, LAST_BARRIER = 1e-5, 1e-8
 """Of a path that others begin from, and of one that is flown."""
-STEPS_FREE, STEPS_WITH_CONES = 25, 50
+STEPS_FREE = 25
 """Newton steps of a path without the dipoles' limit."""
 _STEPS_LIMITED = 60
 _LOOK, _HOPEFUL = 20, 0.4

@@ -1,4 +1,4 @@
-"""From a slew's path without limits to one within them: cones that grow, and walks to shorter horizons."""
+"""From a slew's path without the dipoles' limit to one within it; walks to shorter horizons; wider cones."""
 
 from __future__ import annotations
 
@@ -21,11 +21,6 @@ _CROSSED = 1.3
 """Times the depth to which a path crosses a cone between the points, the cone is widened there."""
 _BEYOND = math.radians(0.02)
 """rad, by which it is widened besides."""
-_GROWING = 0.25, 1.5, 0.06
-"""Share of the depth to which a path crosses a cone, by which that cone grows at first; the ratio to the next
-share; the least one."""
-_DEEP = math.radians(5.0)
-"""rad within a cone: from deeper the cones grow first."""
 _BETWEEN = 16
 """Intervals of a path from which the fine grid is reached where it is not from the coarse one."""
 _PEAK = 0.9
