@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.control.three_axes.momentum import cross_product
 from flight.gnc.estimation import estimate as form
 from flight.gnc.estimation import free_motion as states
 from flight.gnc.estimation.estimate import FIELD_BIAS, Estimate
@@ -14,6 +13,7 @@ from flight.gnc.estimation.free_filter import FreeFilter, FreeMemory
 from flight.gnc.estimation.free_motion import Around
 from flight.gnc.estimation.rigid_body import Parameters
 from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.directions import cross_product
 from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector, multiply
 
 _FROM = np.r_[states.TURN, states.RATE, states.GYRO, states.MAGNET]

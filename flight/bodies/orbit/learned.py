@@ -15,15 +15,13 @@ import numpy as np
 
 from flight.gnc.estimation.free_filter import SlowStates
 from flight.gnc.estimation.free_motion import AXES, DIPOLE, GYRO, MAGNET, SUNLIT, TORQUES
-from flight.gnc.estimation.free_settings import FreeFilterSettings
+from flight.gnc.estimation.free_settings import BELIEVED, FreeFilterSettings
 from flight.gnc.math.arrays import IntArray
 from flight.loop.state.content import Learned
 
 ERRORS, SOURCES, LEARNED_AT = "attitude-errors", "attitude-torques", "learned-at"
 UNKNOWN_AGE = 86_400.0
 """s: taken for an age that a clock that was put back denies, and the longest: then little is left anyway."""
-_BELIEVED = 4.0
-"""Deviations at the start: what lies farther off is not believed."""
 
 
 def _places(*parts: slice) -> IntArray:
@@ -60,8 +58,8 @@ def start_from(
         if name not in learned:
             continue
         values, covariance = learned[name].arrays()
-        if values.shape != at.shape or np.any(np.abs(values) > _BELIEVED * start[at]):
-            problems.append(f"{name} {values.tolist()}: not within {_BELIEVED:g} sigma of what is expected")
+        if values.shape != at.shape or not settings.believes(values, at).all():
+            problems.append(f"{name} {values.tolist()}: not within {BELIEVED:g} sigma of what is expected")
             continue
         prior.values[at] = values
         prior.covariance[np.ix_(at, at)] = covariance + np.diag(grown[at])

@@ -12,8 +12,8 @@ import math
 
 import numpy as np
 
-from flight.gnc.estimation.turn import cross
 from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.directions import cross_product
 
 MEMORY = 2400.0
 """s for which a direction is carried on: the longest eclipse of a low orbit, and some minutes."""
@@ -58,7 +58,7 @@ class CarriedSun:
         if (time_ns - self._turned_ns) * _SECOND > SHORTLY:
             carried = None
         self._seen_ns = time_ns
-        off = np.zeros(3) if carried is None else np.array(cross(sun.tolist(), carried.tolist()))
+        off = np.zeros(3) if carried is None else cross_product(sun, carried)
         if carried is None or float(sun @ carried) <= 0.0 or float(off @ off) > JUMP**2:
             self._direction = sun
             return

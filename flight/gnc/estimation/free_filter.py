@@ -112,11 +112,13 @@ class FreeFilter:
         """Start from an attitude (4,), covariance (3, 3) rad^2, body axes, and a gyro's rate (3,) rad/s.
 
         What was learned of the slow states is kept; `doubted`: the estimate was contradicted, so how well
-        they are claimed to be known is not.
+        they are claimed to be known is not, nor what is farther off than is believed of a start.
         """
         self.changes += 1
         if doubted:
-            self.covariance[6:, 6:] = np.diag(self._settings.of_slow(0) ** 2)
+            slow, known = self._constants[6:], self._settings.of_slow(0)
+            slow[~self._settings.believes(slow)] = 0.0
+            self.covariance[6:, 6:] = np.diag(known**2)
         self.covariance[:6] = self.covariance[:, :6] = 0.0
         self.covariance[TURN, TURN] = covariance
         bias = self.covariance[GYRO, GYRO]

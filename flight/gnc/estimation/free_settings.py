@@ -9,10 +9,12 @@ import numpy as np
 
 from flight.gnc.earth.disturbance import SIZES
 from flight.gnc.estimation.free_motion import FreeMotion, crossed
-from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.arrays import BoolArray, FloatArray, IntArray
 
 LASTING = 20.0
 """s, for which an error of the coils or of the inertia keeps its sign: as white noise it has this density."""
+BELIEVED = 4.0
+"""Deviations at the start: a slow state that lies farther off is not believed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,6 +55,10 @@ class FreeFilterSettings:
         """Return the deviations at the start (0), or the walks (1), of the states (24,) after the rate."""
         pairs = [self.gyro, self.dipole, self.sunlit, self.magnet, *[self.torque] * (SIZES // 3), self.axes]
         return np.repeat([pair[which] for pair in pairs], 3)
+
+    def believes(self, values: FloatArray, at: IntArray | slice = slice(None)) -> BoolArray:
+        """Return which `values` (k,) of the slow states `at` these places, all by default, may be true."""
+        return np.asarray(np.abs(values) <= BELIEVED * self.of_slow(0)[at])
 
 
 def acceleration_noise(

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from flight.gnc.estimation.turn import cross
 from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.directions import cross_product
 
 DRAWN, LEARNED = 0.1, 8e-4
 """1/s and 1/s^2: time constants of ten seconds and two minutes."""
@@ -42,11 +42,7 @@ class ResidualDipole:
             self._rate = rate
             return
         missed = rate - self._rate
-        shown = _cross(field, self._inertia * missed) / square
+        shown = cross_product(field, self._inertia * missed) / square
         self.dipole = np.clip(self.dipole + (LEARNED * seconds) * shown, -self._bound, self._bound)
-        torque = _cross(coils + self.dipole, field) - _cross(rate, self._inertia * rate)
+        torque = cross_product(coils + self.dipole, field) - cross_product(rate, self._inertia * rate)
         self._rate = self._rate + min(1.0, DRAWN * seconds) * missed + seconds * torque / self._inertia
-
-
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    return np.array(cross(a.tolist(), b.tolist()))

@@ -9,7 +9,7 @@ done, as the control process does not need them.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,7 +26,6 @@ LIT_SIGMA = 0.3
 """rad: a rough attitude that is worse does not tell where the Sun is from the body."""
 EARTHLIGHT_SIGMA = 0.1
 """rad: a rough attitude that is worse does not say which strings the Earth lights."""
-
 JUDGING_SIGMA = 0.005
 """rad: an attitude that is worse does not say what a camera must see."""
 
@@ -71,16 +70,15 @@ class WideFound:
     """Sun and nadir, None where there is none, and why.
 
     Attributes:
-        false: why a camera's picture is not of what it must see, for those that a fine attitude denies.
-        judged: the cameras whose pictures were compared with a fine attitude.
+        false: why pictures are not of what their cameras must see, of those that a fine attitude denies; None
+            where no attitude judged.
     """
 
     sun: Sighted | None
     nadir: Sighted | None
     sun_reason: str = ""
     nadir_reason: str = ""
-    false: Mapping[int, str] = field(default_factory=dict)
-    judged: frozenset[int] = frozenset()
+    false: Mapping[int, str] | None = None
 
 
 def run(job: WideJob) -> WideFound:
@@ -91,9 +89,7 @@ def run(job: WideJob) -> WideFound:
         known = SensedDirection(sun.direction, knowledge.sun, sun.sigma)
         knowledge = replace(knowledge, sensed=(*knowledge.sensed, known))
     nadir, nadir_reason = _nadir(job, knowledge, sun)
-    judged = _judged(job)
-    false = {number: reason for number, reason in judged.items() if reason}
-    return WideFound(sun, nadir, sun_reason, nadir_reason, false, frozenset(judged))
+    return WideFound(sun, nadir, sun_reason, nadir_reason, _false(job))
 
 
 def _sun(job: WideJob) -> tuple[Sighted | None, str]:
@@ -119,19 +115,20 @@ def _expected_nadir(knowledge: HorizonKnowledge) -> FloatArray | None:
     return np.asarray(attitude_matrix(rough.quaternion) @ (-position / np.linalg.norm(position)))
 
 
-def _judged(job: WideJob) -> dict[int, str]:
-    """Return why a picture is not of what a fine attitude puts before its camera, empty where it may be."""
+def _false(job: WideJob) -> dict[int, str] | None:
+    """Return why pictures are not of what a fine attitude puts before their cameras; None without one."""
     from flight.gnc.vision.horizon.ellipsoid import MEAN_RADIUS  # noqa: PLC0415 - see the top
     from flight.gnc.vision.horizon.false_picture import why_false  # noqa: PLC0415
     from flight.gnc.vision.horizon.filled_camera import light_seen  # noqa: PLC0415
 
-    rough, position, sun = job.knowledge.attitude, job.knowledge.position, job.knowledge.sun
-    if rough is None or rough.sigma > JUDGING_SIGMA or position is None or sun is None:
-        return {}
-    distance, turn = float(np.linalg.norm(position)), attitude_matrix(rough.quaternion)
-    nadir, sunward = turn @ (-position / distance), turn @ (sun / np.linalg.norm(sun))
+    rough, position = job.knowledge.attitude, job.knowledge.position
+    nadir, sun = _expected_nadir(job.knowledge), _lit_from(job.knowledge, None)
+    if rough is None or rough.sigma > JUDGING_SIGMA or position is None or nadir is None or sun is None:
+        return None
+    altitude = float(np.linalg.norm(position)) - MEAN_RADIUS
     looks = {n: light_seen(frame, job.cameras[n], SUNLIT_COUNTS) for n, frame in job.frames.items()}
-    return {n: why_false(look, nadir, distance - MEAN_RADIUS, sunward) for n, look in looks.items()}
+    reasons = {n: why_false(look, nadir, altitude, sun) for n, look in looks.items()}
+    return {n: reason for n, reason in reasons.items() if reason}
 
 
 def _nadir(job: WideJob, knowledge: HorizonKnowledge, sun: Sighted | None) -> tuple[Sighted | None, str]:

@@ -86,7 +86,7 @@ SUN_UNCLEAR = Fact("sun-unclear", events.SUN_UNCLEAR, events.SUN_CLEAR, after=3,
 CLOCK_OFF = Fact("clock-off", events.CLOCK_OFF, after=2)
 FIELD_REFUSED = Fact("field-refused", events.FIELD_REFUSED, events.FIELD_TRUSTED)
 WIDE_LOST = Fact("wide-lost", events.WIDE_LOST, events.WIDE_RECOVERED)
-WIDE_FALSE = Fact("wide-false", events.WIDE_FALSE, events.WIDE_TRUSTED)
+WIDE_FALSE = Fact("wide-false", events.WIDE_FALSE, events.WIDE_TRUSTED, after=3)
 
 FACTS: tuple[Fact, ...] = tuple(value for value in dict(vars()).values() if isinstance(value, Fact))
 

@@ -98,3 +98,15 @@ def test_elements_of_a_week_ago_are_as_far_off_as_told() -> None:
     off = np.linalg.norm(known.at(date).position - old.at(date).position)
     assert off == pytest.approx(4.0 * 7.6e3, rel=0.05)
     assert old.at(date).sigma == pytest.approx(1500.0 + 7.0 * 1500.0, rel=0.05)
+
+
+def test_false_pictures_from_the_start_do_not_lead_the_estimate_astray_for_good(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Number 97 of seed 3: they taught a bias of 0.5 deg/s, from which each attitude began again in vain."""
+    monkeypatch.undo()
+    found = orbit_faults.refly(3, 97)
+    assert found["fault"] == "wide: wrong"
+    assert found["event"] == "wide-false"
+    assert found["works"]
+    assert found["beyond_s"] == 0.0

@@ -11,8 +11,8 @@ import math
 
 import numpy as np
 
-from flight.gnc.control.three_axes.momentum import cross_product
 from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.directions import cross_product
 
 FAR = math.radians(15.0)
 """rad off the path, from which on a body is held still."""

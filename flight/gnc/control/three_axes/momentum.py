@@ -18,6 +18,7 @@ import numpy as np
 
 from flight.gnc.errors import UsageError
 from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.directions import cross_product
 
 ITERATIONS = 12
 MISSING = 0.04
@@ -127,10 +128,3 @@ def _solved(matrix: FloatArray, vector: FloatArray) -> FloatArray:
     """Return the solution; what lies along a field that hardly turns is out of reach and stays finite."""
     least = 1e-6 * float(np.trace(matrix))
     return np.asarray(np.linalg.solve(matrix + least * np.eye(3), vector))
-
-
-def cross_product(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return a x b of vectors (3,), ten times as fast as numpy does."""
-    ax, ay, az = a.tolist()
-    bx, by, bz = b.tolist()
-    return np.array((ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx))

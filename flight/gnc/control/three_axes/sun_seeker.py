@@ -20,10 +20,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from flight.gnc.control.detumble import WindowSchedule
-from flight.gnc.control.three_axes.momentum import cross_product
 from flight.gnc.estimation.carried_sun import CarriedSun
 from flight.gnc.estimation.residual_dipole import ResidualDipole
 from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.directions import cross_product
 from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector
 
 AGREES = 0.2

@@ -53,7 +53,7 @@ class Search:
         self._coarse = min(task.nodes, coarse)
         self._further = _FURTHER_WITH_CONES if task.cones else _FURTHER
         self._widened = 0
-        self._known: list[float] = []  # heats, J, of paths without limits that were looked at
+        self._known: list[float] = []  # heats, J, of relaxed paths that were looked at
         self.tried = 0
 
     def paths(self) -> Iterator[Found]:
@@ -87,7 +87,7 @@ class Search:
         return found
 
     def _rungs(self) -> Iterator[Iterator[list[Found]]]:
-        """Yield paths without limits over the asked horizon, longer ones, and at last from what was put off.
+        """Yield relaxed paths over the asked horizon, longer ones, and at last from what was put off.
 
         The longer a slew, the more the field turns under way, and the nearer a guess is to a path.
         """
@@ -101,7 +101,7 @@ class Search:
         yield self._late(put_off)
 
     def _relaxed(self, horizon: float, put_off: list[Descent]) -> Iterator[list[Found]]:
-        """Yield paths without limits over a horizon, a few at a time; add to what is put off."""
+        """Yield relaxed paths over a horizon, a few at a time; add to what is put off."""
         batch: list[Found] = []
         solver, least = self.solver, self.solver.steps + _PATIENCE
         for guess in self._guesses(solver.equations(horizon, self._coarse))[:_MOST_TRIED]:
@@ -125,7 +125,7 @@ class Search:
             yield batch
 
     def _late(self, put_off: list[Descent]) -> Iterator[list[Found]]:
-        """Yield paths without limits from guesses that were put off, those that lack least first."""
+        """Yield relaxed paths from guesses that were put off, those that lack least first."""
         for descent in sorted(put_off, key=lambda descent: descent.lack):
             if self.solver.steps > self._budget:
                 break

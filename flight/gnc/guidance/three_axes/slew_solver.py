@@ -1,4 +1,4 @@
-"""One path of a slew solved: without limits from a guess, or within all limits from a path near it."""
+"""Solves for one path of a slew: a relaxed one, without the dipoles' limit, from a guess, or one within."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from flight.gnc.guidance.three_axes.slew_transcription import Trajectory, Transc
 
 WALK_BARRIER, LAST_BARRIER = 1e-5, 1e-8
 """Of a path that others begin from, and of one that is flown."""
-STEPS_FREE = 25
+_STEPS_FREE = 25
 """Newton steps of a path without the dipoles' limit."""
 _STEPS_LIMITED = 60
 _LOOK, _HOPEFUL = 20, 0.4
@@ -49,7 +49,7 @@ class Found:
 class Solver:
     """Solves for one task; `unit` A m^2 is that of its dipoles.
 
-    `margin` rad is added to its cones, and `extra` (cones, 2 nodes) at the points of the fine grid.
+    `extra` (cones, 2 nodes) rad is added to its cones at the points of the fine grid.
     """
 
     def __init__(self, task: SlewTask) -> None:
@@ -57,7 +57,6 @@ class Solver:
         self.unit = float(np.mean(task.craft.limit))
         self._limit = task.craft.limit / self.unit
         self._full = task.craft.weights / float(task.craft.weights @ self._limit**2)
-        self.margin = 0.0
         self.extra = np.zeros((len(task.cones), 2 * task.nodes))
         self.steps = 0
 
@@ -72,7 +71,7 @@ class Solver:
         return float((np.abs(found.at.dipoles) / self._limit).max())
 
     def is_kept(self, found: Found) -> bool:
-        """Return whether a path without limits keeps all of them."""
+        """Return whether a relaxed path keeps it."""
         kept = self._kept(found.equations).values(found.at.states[1:, :4])
         return self.peak(found) <= 1.0 and bool(np.all(kept >= 0.0))
 
@@ -84,7 +83,7 @@ class Solver:
 
     def free(self, equations: Transcription, guess: Trajectory) -> Found | None:
         """Return the path that is flown, without the dipoles' limit, from a guess."""
-        return self.found(self.descent(equations, guess, LAST_BARRIER), STEPS_FREE)
+        return self.found(self.descent(equations, guess, LAST_BARRIER), _STEPS_FREE)
 
     def descent(self, equations: Transcription, guess: Trajectory, last: float = WALK_BARRIER) -> Descent:
         """Return the way from a guess to a path that keeps the cones, without the dipoles' limit."""
@@ -119,7 +118,7 @@ class Solver:
 
     def _kept(self, equations: Transcription) -> Kept:
         wider = self.extra if self.extra.shape[1] == 2 * equations.count else 0.0
-        return Kept(self._task.cones, np.asarray(self.margin + wider), equations.times[1:])
+        return Kept(self._task.cones, np.asarray(wider), equations.times[1:])
 
 
 def transferred(start: Found, equations: Transcription) -> Trajectory:

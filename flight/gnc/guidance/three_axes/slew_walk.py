@@ -12,7 +12,7 @@ from flight.gnc.guidance.three_axes.slew_task import SlewTask
 from flight.gnc.math.arrays import FloatArray
 
 ENOUGH = 3
-"""Paths without limits of which the best is taken."""
+"""Relaxed paths of which the best is taken."""
 LONGER = 1.0, 1.4, 2.0, 2.8
 """Times a horizon that does not suffice."""
 _FIRST_STEP, _COARSE_STEP, _LAST_STEP = 1.2, 1.02, 1.004
@@ -48,7 +48,7 @@ class Walker:
     def shortened(self, relaxed: list[Found], least: float, price: float) -> Found | None:
         """Return the best path on walks to shorter horizons, as long as `price` W makes them cheaper.
 
-        A walk begins where a path without limits just keeps the dipoles', with the path that needs the least
+        A walk begins where a relaxed path just keeps the dipoles', with the path that needs the least
         time for that.
         """
         best: Found | None = None
@@ -68,7 +68,7 @@ class Walker:
         return None if best is None else self._refined(best, least, price)
 
     def distinct(self, relaxed: list[Found]) -> list[Found]:
-        """Return paths without limits, the cheapest first, each once."""
+        """Return relaxed paths, the cheapest first, each once."""
         ordered = sorted(relaxed, key=self._solver.energy)
         costs = [(found.horizon, self._solver.energy(found)) for found in ordered]
         return ordered[:1] + [
@@ -121,11 +121,11 @@ class Walker:
         return best
 
     def _fastest(self, found: Found) -> float:
-        """Return about which horizon a path without limits takes for its dipoles to keep theirs, s."""
+        """Return about which horizon a relaxed path takes for its dipoles to keep theirs, s."""
         return found.horizon * math.sqrt(self._solver.peak(found) / _PEAK)
 
     def _begins(self, start: Found, least: float) -> list[float]:
-        """Return horizons at which a walk may begin from a path without limits, s, the shortest first."""
+        """Return horizons at which a walk may begin from a relaxed path, s, the shortest first."""
         time = max(self._fastest(start), least)
         times = [time, start.horizon] if time < start.horizon else [longer * time for longer in LONGER]
         if start.horizon == self._task.horizon and self._task.time_price is None and start.horizon in times:

@@ -7,9 +7,9 @@ import dataclasses
 import numpy as np
 
 from flight.gnc.earth.disturbance import Pressures
-from flight.gnc.estimation.free_filter import FreeFilter
+from flight.gnc.estimation.free_filter import FreeFilter, SlowStates
 from flight.gnc.estimation.free_motion import AXES, GYRO, RATE, TURN, Around
-from flight.gnc.estimation.free_settings import FreeFilterSettings
+from flight.gnc.estimation.free_settings import BELIEVED, FreeFilterSettings
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import (
     IDENTITY,
@@ -128,3 +128,19 @@ def test_what_a_contradicted_estimate_has_learned_is_not_claimed_any_more() -> N
     found.start(craft.quaternion, STAR**2 * np.eye(3), craft.rate + BIAS, doubted=True)
     assert np.allclose(np.sqrt(np.diag(found.covariance))[GYRO], 1e-3)
     assert np.allclose(found.gyro_bias, bias)
+
+
+def test_a_contradicted_estimate_forgets_a_bias_that_no_gyro_has() -> None:
+    """False directions had taught it. Kept as a guess, it led each new start astray until the next star."""
+    craft, settings = Craft(np.zeros(3), np.zeros(3), 4), FreeFilterSettings()
+    taught, known = np.zeros(24), np.diag(settings.of_slow(0) ** 2)
+    taught[0], known[0, 0] = 2.0 * BELIEVED * settings.gyro[0], 1e-12
+    found = FreeFilter(INERTIA, settings, SlowStates(taught, known))
+    found.start(craft.quaternion, STAR**2 * np.eye(3), craft.rate + BIAS)
+    fly(craft, found, 10, np.zeros(3), 0.0)
+    assert found.refused, "the next star contradicts it"
+    found.start(craft.quaternion, STAR**2 * np.eye(3), craft.rate + BIAS, doubted=True)
+    found.refused = 0
+    fly(craft, found, 30, np.zeros(3), 0.0)
+    assert found.refused == 0
+    assert np.abs(found.gyro_bias - BIAS).max() < 3e-5

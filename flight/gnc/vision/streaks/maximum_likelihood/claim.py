@@ -42,8 +42,8 @@ _UNCHECKED = (2, 4.0)
 _SAME_SPREAD = 0.05
 # Ends are uncertain by this part of the square root of the difference of the variances;
 _END_SHARE = 0.6
-# where streaks show them, by no more than so many px and these parts of the displacement that the light left
-# over about them would be, and might be.
+# where streaks show them, at most by this floor, px, and by these shares of the displacement that the light
+# left over about them amounts to: beyond chance, and with it.
 _END_FLOOR = 0.12
 _END_SHOWN = 1.5
 _END_CHANCE = 0.5

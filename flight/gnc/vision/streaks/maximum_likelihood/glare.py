@@ -1,8 +1,8 @@
-"""Light that is no streak: a limb, a reflection, as far as the background leaves it over.
+"""Light of no star, as a limb or a reflection, where the background does not follow it.
 
-A bright region that is solid over more px than any star's light is wide is of no star. Its pixels, and those
-about them, where the background follows the light no better, are left out like hot ones. A net of
-streaks that cross is not solid.
+A bright region that is solid over more px than any star's light is wide is no star's. Its pixels, and those
+about them, where the background follows the light as badly, are left out like hot pixels. A net of streaks
+that cross is not solid.
 """
 
 from __future__ import annotations
@@ -16,13 +16,12 @@ from flight.gnc.vision.frame.box_sums import box_sum
 from flight.gnc.vision.streaks.maximum_likelihood.blobs import Blobs
 from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import ExposedFrame
 
-# A region can be solid only when its area is that of so many px across all its length: bright stars have half
-# of it.
+# Mean width, px, from which on a region may be solid: the brightest stars have half of it.
 _BROAD = 25.0
 _LEAST_LENGTH = 40.0
-# It is where a square of so many px finds room in it.
+# Side, px, of the square that must find room in a solid region.
 _SOLID = 31
-# So many px about it are left out too.
+# px about a solid region that are left out, too.
 _ABOUT = 12
 
 

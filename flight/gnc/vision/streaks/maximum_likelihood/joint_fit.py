@@ -158,7 +158,7 @@ def joint_fit(camera: ExposedCamera, scene: Scene, room: float = 1.0) -> Fit | N
 
 
 def refit(camera: ExposedCamera, last: Fit) -> Fit | None:
-    """Return the joint fit anew from where `last` came to, all its brightest stars trusted again.
+    """Return the joint fit again, from the result `last` on, with all its brightest stars trusted.
 
     `camera` differs from that of `last` in how it draws paths.
     """

@@ -2,7 +2,7 @@
 
 A point spread that is not the model's, wider along the streak than across it or of another shape, leaves
 light over at the ends of all streaks alike, and moves them alike. How much it moves them is not seen; were
-all that is left over a displacement, it would be so many px.
+all that is left over a displacement, its size in px is what this module gives.
 """
 
 from __future__ import annotations

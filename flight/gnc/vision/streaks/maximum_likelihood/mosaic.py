@@ -16,10 +16,10 @@ from flight.gnc.vision.frame.box_sums import box_sum
 from flight.gnc.vision.streaks.maximum_likelihood.blobs import Blobs
 from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import ExposedFrame
 
-# The brightest regions are asked; so many at least must answer.
+# Brightest regions by which the responses are measured, at most and at least.
 _MOST = 24
 _LEAST = 6
-# A response this far from the mean, and so many of its deviations, is one of its own.
+# A response differs from the mean where it is this far off it, by this number of its deviations.
 _UNEVEN = 0.06
 _SURE = 8.0
 # Deviation of a normal distribution in its quartiles' distance; error of a median over that of a mean.

@@ -15,8 +15,8 @@ from flight.gnc.vision.streaks.maximum_likelihood.seen_spread import seen_sigma
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 
 _MOST_BLOBS = 48
-# A point spread that the frame shows to be so wide, px, and so many times as wide as described, is believed:
-# pixels are summed for it.
+# Least width, px, and least ratio to the described width, of a point spread that the frame shows and that is
+# believed: pixels are summed for it.
 _WIDE = 2.2
 _WIDER = 1.5
 

@@ -15,7 +15,7 @@ from flight.gnc.vision.streaks.maximum_likelihood.exposed_frame import ExposedFr
 from flight.gnc.vision.streaks.maximum_likelihood.scene import PIXEL_VARIANCE
 
 _NEAR, _FAR = 1, 3
-# The brightest regions are asked; so many at least must answer.
+# Brightest regions by which the width is measured, at most and at least.
 _MOST = 12
 _LEAST = 3
 
