@@ -171,13 +171,19 @@ class FieldRate:
         for _ in range(steps):
             self._step((mx, my, mz), seconds / steps)
 
-    def measure(self, field: FloatArray) -> bool:
-        """Accept the field (3,) T measured now with the coils off; return whether it was plausible."""
+    def measure(self, field: FloatArray, age: float = 0.0) -> bool:
+        """Accept the field (3,) T measured `age` s ago with the coils off; return whether it was plausible.
+
+        The body's rate carries it on to now.
+        """
         if not np.all(np.isfinite(field)):
             return False
         if self._rate is None:
             self._start(field)
             return True
+        if age:
+            x, y, z = self._rate
+            field = np.array(matrix(exponential(age * x, age * y, age * z))) @ field
         covariance = self._covariance
         spread = covariance[FIELD, FIELD] + self._settings.field_sigma**2 * np.eye(3)
         gain = np.linalg.solve(spread, covariance[FIELD]).T

@@ -110,3 +110,16 @@ def test_false_pictures_from_the_start_do_not_lead_the_estimate_astray_for_good(
     assert found["event"] == "wide-false"
     assert found["works"]
     assert found["beyond_s"] == 0.0
+
+
+def test_the_brake_goes_on_by_a_unit_that_began_anew_at_another_phase(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Number 0 of seed 4: its samples came a millisecond before the commands.
+
+    The brake took none of them, and braked half a minute by what it predicted, 2.5 deg/s off.
+    """
+    monkeypatch.undo()
+    found = orbit_faults.refly(4, 0)
+    assert found["fault"] == "imu: off"
+    assert found["works"]

@@ -85,21 +85,27 @@ MEAN = Sampling(0.02, 0.25)
 
 @dataclass(frozen=True, slots=True)
 class Predicted:
-    """A reading in A, and the prediction of each axis (rows) under each variant: mean and slack (3, v) A."""
+    """A reading in A, and the prediction of each axis (rows) under each variant: mean and slack (3, v) A.
+
+    A `clipped` reading may be smaller than the current.
+    """
 
     current: float
     mean: FloatArray
     slack: FloatArray
     scatter: float
+    clipped: bool = False
 
 
-def predict(current: float, commands: FloatArray, bounds: Bounds, sampling: Sampling) -> Predicted:
+def predict(
+    current: float, commands: FloatArray, bounds: Bounds, sampling: Sampling, clipped: bool = False
+) -> Predicted:
     """Predict the current of each variant under the commands (k, 3) A of a reading's window."""
     drawn = supply_currents(commands.T, np.array(bounds.full_current)[:, None])
     count = len(commands)
     slack = bounds.uncertainty * ((drawn != 0.0).sum(axis=2) / count)
     slack += sampling.range_share * (drawn.max(axis=2) - drawn.min(axis=2))
-    return Predicted(current, drawn.sum(axis=2) / count, slack, sampling.scatter)
+    return Predicted(current, drawn.sum(axis=2) / count, slack, sampling.scatter, clipped)
 
 
 def supply_currents(commands: FloatArray, full: FloatArray) -> FloatArray:
@@ -149,7 +155,8 @@ def fits(
     if own.any():
         explained = explained + _SHORTED_FACTORS * own
         spare = slack + scatter * explained + _SHORTED_SLACK * _SHORTED_FACTORS * own
-    inside = (current >= explained - spare) & (current <= explained + spare + free)
+    clipped = np.array([one.clipped for one in evidence])
+    inside = (clipped | (current >= explained - spare)) & (current <= explained + spare + free)
     misses = len(evidence) - int(inside.sum(axis=2).max())
     return misses <= _OUTLIERS * len(evidence)
 

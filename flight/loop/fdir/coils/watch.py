@@ -231,7 +231,13 @@ class CoilWatch:
         if begin_ns >= self._unmixed_ns:
             windows.append((reading.current, begin_ns, MEAN))
         return [
-            predict(current, self._commands.window(since_ns, reading.time_ns), self._bounds, sampling)
+            predict(
+                current,
+                self._commands.window(since_ns, reading.time_ns),
+                self._bounds,
+                sampling,
+                reading.clipped,
+            )
             for current, since_ns, sampling in windows
         ]
 
