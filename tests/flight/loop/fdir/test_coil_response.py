@@ -134,7 +134,7 @@ def test_a_coil_that_makes_no_torque_is_suspected_at_currents_too_small_for_the_
     signs = np.ones(3)
     signs[axis] = gain
     broken = Orbiting(signs, speed=0.02)
-    broken.fly(80.0, weak=True)
+    broken.fly(110.0, weak=True)
     told = broken.watch.suspicion or broken.watch.verdicts[0].text
     assert told.startswith(f"coil {'xyz'[axis]}")
 
