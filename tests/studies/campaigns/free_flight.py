@@ -91,9 +91,9 @@ class FreeFlight:
         self.motion = self.body.motion(time_ns)
         self.time_ns = time_ns
 
-    def field(self) -> FloatArray:
-        """Return a sample (3,) T of the magnetometer now; the coils must be off."""
-        noise = FIELD_NOISE * self.generator.standard_normal(3)
+    def field(self, samples: int = 1) -> FloatArray:
+        """Return the mean (3,) T of samples of the magnetometer now; the coils must be off."""
+        noise = FIELD_NOISE / np.sqrt(samples) * self.generator.standard_normal(3)
         return np.asarray(self.motion.field_body + self.hard_iron + noise)
 
     def attitude(self, sigma: float) -> FloatArray:
