@@ -44,6 +44,7 @@ from tests.studies.campaigns.free_flight import (
     FIX_SIGMA,
     GYRO_NOISE,
     SECOND,
+    STILL,
     WATTS,
     FreeFlight,
 )
@@ -96,8 +97,12 @@ class PointingFlight:
         self._target = target if isinstance(target, PointingTarget) else TARGETS[target]
         orbit = wanted.get("orbit", "sso")
         self.notes: list[list[float]] = []
+        share = wanted["share"]
         noises = Disturbances(
-            drag=wanted["share"], solar_pressure=wanted["share"], principal_turn_deg=3.0 * wanted["share"]
+            drag=share,
+            solar_pressure=share,
+            principal_turn_deg=3.0 * share,
+            **(STILL if wanted.get("still") else {}),
         )
         held = FreeFlight(wanted["craft"], seed, orbit, TipOff(rate=(0.0, 0.0, 0.0)), noises)
         held.advance(0)
