@@ -136,7 +136,7 @@ class FieldDetumbler:
             self._trusted += 1
             if rate is not None and self.trusted:
                 self._filter.measure_rate(rate)
-        elif not accepted and (self._trusted < TRUSTED or self._filter.restarts != starts):
+        if self._filter.restarts != starts or (not accepted and not self.trusted):
             self._distrust()
 
     def dipole(self, now_ns: int) -> FloatArray:

@@ -69,6 +69,8 @@ _REACH_NS = 3_000_000_000
 _LEAST_CHANGE = 4.0e-3
 """rad/s^2: smaller changes cannot be detected."""
 _GAIN_PRIOR = 10.0
+_FELT, _SIGMAS = 0.7, 2.5
+"""A coil without torque has a gain that is lower than this by so many deviations."""
 
 
 class CoilResponse:
@@ -268,9 +270,8 @@ class CoilResponse:
         pairs = zip(self.gain.tolist(), self.sigma.tolist(), strict=True)
         for number, (gain, sigma) in enumerate(pairs):
             wrong = gain + 3.0 * sigma < 0.0 and gain < settings.highest_reversed
-            feeble = wrong or (
-                sigma < settings.sure and gain < min(settings.highest_feeble, 0.7 - 2.5 * sigma)
-            )
+            unfelt = gain + _SIGMAS * sigma < _FELT and gain < settings.highest_feeble
+            feeble = wrong or (sigma < settings.sure and unfelt)
             self._wrong_for[number] = self._wrong_for[number] + 1 if wrong else 0
             self._feeble_for[number] = self._feeble_for[number] + 1 if feeble else 0
             sound = sigma < settings.sure and gain > settings.lowest_sound
