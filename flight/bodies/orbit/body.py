@@ -184,6 +184,7 @@ def filter_settings(config: OrbitConfig) -> FreeFilterSettings:
         gyro=(section.bias_start, section.bias_walk),
         coil_noise=section.current_noise * config.craft.dipole_per_ampere / math.sqrt(rate_hz),
         torque=(section.torque_start, section.torque_walk),
+        field=section.field_error,
         gate_sigma=section.gate_sigma,
     )
 
@@ -205,7 +206,6 @@ def _filter(
         dipole_limit=config.coils.current_limit * craft.dipole_per_ampere,
         gyro_noise=unit.rate_noise,
         field_noise=section.field_noise,
-        field_error=section.field_error,
         unknown_psd=config.detumble.torque_noise**2,
         settle_ns=round(config.detumble.settle * SECOND_NS),
         history_ns=round(section.history * SECOND_NS),

@@ -46,6 +46,9 @@ from tests.studies.campaigns.free_flight import (
 
 CYCLE, PAUSE = 2.0, 0.2
 """s."""
+SAMPLES = 4
+"""Of the magnetometer in a pause of the coils."""
+COIL_ERROR = FreeFilterSettings().coil_error
 STARS_EVERY, REPLAN, AGAIN, AHEAD = 10.0, 600.0, 10.0, 900.0
 """s."""
 COAST = 12.0
@@ -100,7 +103,7 @@ class PointingFlight:
         self._ahead: Ephemeris = held.ephemeris(0.0)
         self._stars: FloatArray | None = None
         self._astray = Astray()
-        self._rate_then, self._turn = np.zeros(3), np.zeros(3)
+        self._turn: FloatArray = np.zeros(3)
 
     def _release(self, held: FreeFlight) -> TipOff:
         """Return the release: at the law's attitude and rate, or turned and turning at random."""
@@ -136,25 +139,23 @@ class PointingFlight:
         before = flight.motion.rate
         flight.advance(round((time + PAUSE) * SECOND))
         found.advance(PAUSE, np.zeros(3), around)
-        noise = (FIELD_NOISE**2 + (3e-8) ** 2) * np.eye(3)
-        found.field(flight.field(), around.field, noise)
+        rest = found.acceleration
+        found.field(flight.field(SAMPLES), self._field_at(time + PAUSE), FIELD_NOISE**2 / SAMPLES * np.eye(3))
         dipole = self._command(time + PAUSE, around)
         flight.act(dipole)
-        acting = flight.motion.rate
+        acting, began = flight.motion.rate, found.rate
         flight.advance(round((time + CYCLE) * SECOND))
         found.advance(CYCLE - PAUSE, dipole, around)
         # The mean over the cycle, compared with the rate at its end.
-        mean = 0.5 * PAUSE / CYCLE * (before + acting) + 0.5 * (1.0 - PAUSE / CYCLE) * (
-            acting + flight.motion.rate
-        )
-        slope = (found.rate - self._rate_then) / CYCLE
-        found.gyro(self._gyro(mean, CYCLE), GYRO_NOISE**2 / CYCLE * np.eye(3), 0.5 * CYCLE * slope)
+        mean = _mean(before, acting, flight.motion.rate)
+        change = found.rate - _mean(began - PAUSE * rest, began, found.rate)
+        spread = COIL_ERROR**2 * float(change @ change) + GYRO_NOISE**2 / CYCLE
+        found.gyro(self._gyro(mean, CYCLE), spread * np.eye(3), change, 0.5 * CYCLE)
         self._see_stars(time + CYCLE)
 
     def _command(self, time: float, around: Around) -> FloatArray:
         """Return the dipole (3,) A m^2 until the end of the cycle."""
         found, flight = self._filter, self.flight
-        self._rate_then = found.rate
         law = self._wanted["law"]
         if time < COAST:
             return np.zeros(3)
@@ -245,6 +246,10 @@ class PointingFlight:
         lit = float(ahead.sunlit_at(at)[0])
         return Around(ahead.field_at(at)[0], ahead.position_at(at)[0], pressures(ahead, at), lit)
 
+    def _field_at(self, time: float) -> FloatArray:
+        """Return the model's field (3,) T of a time, ICRS."""
+        return np.asarray(self._ahead.field_at(np.array([time - self._ahead_begun]))[0])
+
     def _see_stars(self, time: float) -> None:
         """Give the filter the attitude that was exposed a cycle ago; expose the next."""
         if self._stars is not None and time % STARS_EVERY < CYCLE:
@@ -255,3 +260,9 @@ class PointingFlight:
         flight = self.flight
         noise = GYRO_NOISE / np.sqrt(seconds) * flight.generator.standard_normal(3)
         return np.asarray(rate + flight.gyro_bias + noise)
+
+
+def _mean(before: FloatArray, acting: FloatArray, after: FloatArray) -> FloatArray:
+    """Return the mean rate (3,) of a cycle from those at begin, end of the pause, and end."""
+    pause = 0.5 * PAUSE / CYCLE
+    return np.asarray(pause * (before + acting) + (0.5 - pause) * (acting + after))

@@ -140,7 +140,6 @@ class SlewFlight(PointingFlight):
             return super()._command(time, around)
         assert self._about is not None
         found, flight = self._filter, self.flight
-        self._rate_then = found.rate
         now, pace = self._about.at(time - self._from[0]), BANDWIDTH / self.horizon
         field, inertia = attitude_matrix(found.quaternion) @ around.field, flight.inertia
         turn = to_rotation_vector(multiply(found.quaternion, conjugate(now.quaternion)))

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from flight.gnc.estimation.free_motion import Around
+from flight.gnc.math.arrays import FloatArray
 from tests.studies.campaigns import eclipse
 from tests.studies.campaigns.campaign import Case
+from tests.studies.campaigns.orbit_pointing_flight import CYCLE
 
 LIT, BLIND, SECONDS = 90.0, 40.0, 130.0
 
@@ -42,3 +46,36 @@ def test_the_filter_is_judged_with_stars_and_at_the_end_of_the_shadow(tmp_path: 
     assert found["flights"] == 2
     assert found["worst"] == pytest.approx(max(r["eclipse"]["rms_deg"] for r in results))
     assert "filter/knightcube/sunlit" not in table.facts
+
+
+class Driven(eclipse.DarkFlight):
+    """Its coils give nearly all they can, about one axis after another, there and back."""
+
+    def _plan(self, time: float) -> None:
+        pass
+
+    def _command(self, time: float, around: Around) -> FloatArray:
+        axis, back = divmod(int(time / CYCLE) // 2 % 6, 2)
+        dipole = np.zeros(3)
+        dipole[axis] = (0.09, -0.09)[back]
+        return dipole
+
+
+def test_a_body_that_is_driven_hard_is_known_within_its_claim() -> None:
+    """The gyro's mean over pause and act is compared with the filter's over the same."""
+    flight, off, speeds = Driven("knightcube", 5), [], []
+    for cycle in range(60):
+        flight.cycle(cycle * CYCLE)
+        error, claim, _ = flight.error()
+        off.append(error / claim)
+        speeds.append(float(np.linalg.norm(flight.flight.motion.rate)))
+    assert max(speeds) > np.radians(0.5)
+    assert np.abs(off).max() < 4.0
+    assert np.mean(np.square(off)) < 1.8
+
+
+def test_a_storm_is_added_to_the_field_that_is_measured() -> None:
+    storm, calm = (eclipse.DarkFlight("knightcube", 5, size) for size in (5e-8, 0.0))
+    added = np.linalg.norm(storm.flight.field_error)
+    assert 1e-8 < added < 2e-7
+    assert np.linalg.norm(storm.flight.field() - calm.flight.field()) == pytest.approx(added)
