@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flight.gnc.earth.ephemeris import Ephemeris
+from flight.gnc.earth.figure import EARTH_RADIUS
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.directions import cross_matrices
 
@@ -27,8 +28,8 @@ _NIGHT, _DAY = 0.4, 1.6
 _LAG = math.radians(30.0)
 _THINNEST = 0.02
 """Least square of a box's side, of the largest moment by a twelfth of the mass."""
-_SCALE_HEIGHT = 65e3
-"""m, at 500 km."""
+_HEIGHT, _SCALE_HEIGHT = EARTH_RADIUS + 500e3, 65e3
+"""m from the Earth's centre, and m there."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,7 +53,7 @@ class Pressures:
 
 
 def pressures(ephemeris: Ephemeris, times: FloatArray) -> Pressures:
-    """Return the shapes at times (n,) s: the air's about one in the mean, light's one in full sunlight."""
+    """Return the shapes at times (n,) s: the air's about one at 500 km, light's one in full sunlight."""
     position, velocity = ephemeris.position_at(times), ephemeris.velocity_at(times)
     sun = ephemeris.sun_at(times)
     distance = np.linalg.norm(position, axis=1)
@@ -60,9 +61,8 @@ def pressures(ephemeris: Ephemeris, times: FloatArray) -> Pressures:
     x, y, z = sun.T
     apex = np.stack([cosine * x - sine * y, sine * x + cosine * y, z], axis=-1)
     facing = np.sum(position * apex, axis=1) / distance
-    mean = float(np.mean(np.linalg.norm(ephemeris.position, axis=1)))
     density = (_NIGHT + (_DAY - _NIGHT) * (0.5 + 0.5 * facing) ** 2) * np.exp(
-        (mean - distance) / _SCALE_HEIGHT
+        (_HEIGHT - distance) / _SCALE_HEIGHT
     )
     flight = velocity / np.linalg.norm(velocity, axis=1, keepdims=True)
     return Pressures(density[:, None] * flight, ephemeris.sunlit_at(times)[:, None] * sun)
