@@ -10,9 +10,8 @@ import numpy as np
 from flight.gnc.estimation.free_motion import FreeMotion, crossed
 from flight.gnc.math.arrays import BoolArray, FloatArray, IntArray
 
-LASTING = 60.0
-"""s, for which an error of the coils or of the inertia keeps its sign, while body and field turn by part of a
-radian: as white noise it has this density. With 20 s a slew taught torques that were none."""
+LASTING = 20.0
+"""s, for which an error of the coils or of the inertia keeps its sign: as white noise it has this density."""
 CONSTANT_SHARE, AIR_SHARE, LIGHT_SHARE = 0.03, 1.0, 0.5
 """Of the size that is expected of the air's torque, by shape. What is constant in body axes is next to nothing,
 as the principal axes have a turn of their own; a body held at one attitude can not tell the shapes apart, and
