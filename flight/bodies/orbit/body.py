@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -298,4 +299,5 @@ def _coil_watch(config: OrbitConfig) -> CoilWatch:
         damping=1e-4,
         settle_ns=settle_ns,
     )
-    return CoilWatch(CoilWatchSettings((x, y, z), response=response))
+    slow = replace(response, bin_samples=80, bins=20, model_error=3.0e-5)
+    return CoilWatch(CoilWatchSettings((x, y, z), response=response, slow=slow))

@@ -30,6 +30,8 @@ GYRO_NOISE, GYRO_BIAS, GYRO_BIAS_WALK = 6.1e-5, 5e-4, 2e-6
 """rad/s per sqrt(Hz); rad/s; rad/s per sqrt(s): a VN-100's noise, and its bias with its in-run change."""
 FIX_SIGMA, FIX_VELOCITY_SIGMA = 10.0, 0.05
 """m, m/s."""
+STILL = {"ring_current": 0.0, "day_bulge": 0.0, "walks": 0.0}
+"""Disturbances without those that other simulators lack."""
 _STREAM = 0xF11
 
 
