@@ -13,9 +13,9 @@ from flight.gnc.math.arrays import BoolArray, FloatArray, IntArray
 LASTING = 20.0
 """s, for which an error of the coils or of the inertia keeps its sign: as white noise it has this density."""
 CONSTANT_SHARE, AIR_SHARE, LIGHT_SHARE = 0.03, 1.0, 0.5
-"""Of the size that is expected of the air's torque, by shape. What is constant in body axes is next to nothing,
-as the principal axes have a turn of their own; a body held at one attitude can not tell the shapes apart, and
-a torque of the air that passes for a constant one is wrong in every other attitude."""
+"""Of the size that is expected of the air's torque, by shape. What is constant in body axes is next to
+nothing, as the principal axes have a turn of their own; a body held at one attitude can not tell the shapes
+apart, and a torque of the air that passes for a constant one is wrong in every other attitude."""
 BELIEVED = 4.0
 """Deviations at the start: a slow state that lies farther off is not believed."""
 
