@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.earth.disturbance import SIZES, Pressures, shapes
+from flight.gnc.earth.disturbance import SIZES, Pressures, box_areas, shapes
 from flight.gnc.earth.figure import GRAVITATIONAL_PARAMETER
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector
@@ -48,6 +48,7 @@ class FreeMotion:
         moments = np.linalg.eigvalsh(self._believed)
         self.largest_difference = float(moments[-1] - moments[0])
         """kg m^2, of the principal moments: what a turn of their axes acts by."""
+        self._areas = box_areas(self._believed)
         self._turn: FloatArray = np.zeros(3)
         self._take(self._believed)
 
@@ -86,7 +87,7 @@ class FreeMotion:
         up = position / radius
         stiff = self.inertia @ up
         strength = 3.0 * GRAVITATIONAL_PARAMETER / radius**3
-        shape = shapes(around.pressures, turned[None])[0]
+        shape = shapes(around.pressures.facing(self._areas, turned[None]), turned[None])[0]
         across, upright = crossed(field), crossed(up)
         torque = -across @ dipole + strength * upright @ stiff + shape @ sizes
         flow = np.zeros((6, STATES))

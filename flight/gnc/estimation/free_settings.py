@@ -7,12 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.earth.disturbance import SIZES
 from flight.gnc.estimation.free_motion import FreeMotion, crossed
 from flight.gnc.math.arrays import BoolArray, FloatArray, IntArray
 
 LASTING = 20.0
 """s, for which an error of the coils or of the inertia keeps its sign: as white noise it has this density."""
+CONSTANT_SHARE, AIR_SHARE, LIGHT_SHARE = 0.03, 1.0, 0.5
+"""Of the size that is expected of the air's torque, by shape. What is constant in body axes is next to
+nothing, as the principal axes have a turn of their own; a body held at one attitude can not tell the shapes
+apart, and a torque of the air that passes for a constant one is wrong in every other attitude."""
 BELIEVED = 4.0
 """Deviations at the start: a slow state that lies farther off is not believed."""
 
@@ -27,7 +30,7 @@ class FreeFilterSettings:
         magnet: T, of the magnetometer.
         field: T of an axis, of the field's model before its error is learned.
         field_memory: s, for which that error keeps its sign.
-        torque: N m, of each size.
+        torque: N m, of the air's size; of the others by their shares at the start.
         torque_noise: N m sqrt(s), white, of what has no shape.
         coil_error: share of the coils' dipole that is uncertain for tens of seconds, in any direction.
         coil_noise: A m^2 sqrt(s), white, of each coil while the coils are driven.
@@ -45,7 +48,7 @@ class FreeFilterSettings:
     field: float = 5e-8
     field_memory: float = 600.0
     torque: tuple[float, float] = (3e-9, 5e-12)
-    torque_noise: float = 3e-9
+    torque_noise: float = 1e-9
     coil_error: float = 0.04
     coil_noise: float = 0.0
     axes: tuple[float, float] = (0.03, 0.0)
@@ -57,7 +60,9 @@ class FreeFilterSettings:
 
     def of_slow(self, which: int) -> FloatArray:
         """Return the deviations at the start (0), or the walks (1), of the states (24,) after the rate."""
-        pairs = [self.gyro, self.dipole, self.sunlit, self.magnet, *[self.torque] * (SIZES // 3), self.axes]
+        start, walk = self.torque
+        torques = [(share * start, walk) for share in (CONSTANT_SHARE, AIR_SHARE, LIGHT_SHARE)]
+        pairs = [self.gyro, self.dipole, self.sunlit, self.magnet, *torques, self.axes]
         return np.repeat([pair[which] for pair in pairs], 3)
 
     def believes(self, values: FloatArray, at: IntArray | slice = slice(None)) -> BoolArray:

@@ -19,7 +19,7 @@ from flight.gnc.control.three_axes.pointing_table import (
     pointing_table,
 )
 from flight.gnc.control.three_axes.slew_table import SlewBegin, SlewWish, slew, slew_table
-from flight.gnc.earth.disturbance import pressures
+from flight.gnc.earth.disturbance import box_areas, pressures
 from flight.gnc.earth.ephemeris import Ephemeris, predict
 from flight.gnc.earth.orbit_knowledge import OrbitState
 from flight.gnc.guidance.three_axes.attitude_law import (
@@ -31,7 +31,7 @@ from flight.gnc.guidance.three_axes.attitude_law import (
 from flight.gnc.guidance.three_axes.pointing_target import PointingTarget
 from flight.gnc.guidance.three_axes.target_law import BodyAxes, law_of
 from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import angle_between, from_rotation_vector, multiply
+from flight.gnc.math.quaternion import angle_between, attitude_matrix, from_rotation_vector, multiply
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +116,7 @@ def run(job: PointingJob) -> PointingTable:
         references(way, ahead, times[: kept + 1]),
         field,
         ahead.position_at(times),
-        pressures(ahead, times),
+        pressures(ahead, times).facing(box_areas(job.inertia), attitude_matrix(wanted.quaternion)),
         job.sizes,
     )
     wish = job.slew

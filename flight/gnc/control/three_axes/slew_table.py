@@ -21,7 +21,7 @@ from flight.gnc.control.three_axes.pointing_table import (
     pointing_table,
     prices,
 )
-from flight.gnc.earth.disturbance import Pressures, pressures, shapes
+from flight.gnc.earth.disturbance import Pressures, box_areas, pressures, shapes
 from flight.gnc.earth.ephemeris import Ephemeris
 from flight.gnc.errors import PlanningError
 from flight.gnc.guidance.three_axes.attitude_law import References, references
@@ -105,7 +105,14 @@ def slew(
         cones=cones(ahead, first, wish.camera, **wish.angles),
     )
     found = _slow_enough(task, fastest)
-    return _slow_enough(replace(task, cones=()), fastest) if found is None and task.cones else found
+    if found is None and task.cones:
+        task = replace(task, cones=())
+        found = _slow_enough(task, fastest)
+    if found is None or not begin.sizes.any():
+        return found
+    # What presses on the body depends on the areas that it shows along the path.
+    pressed = along(ahead, first, box_areas(begin.inertia), found)
+    return _slow_enough(replace(task, along=pressed, horizon=found.horizon), fastest) or found
 
 
 def _slow_enough(task: SlewTask, fastest: float) -> SlewPath | None:
@@ -206,7 +213,8 @@ def _tracking(
     linear = linearised(
         tracked.until(steps), begin.inertia, ahead.field_at(times), ahead.position_at(times), planned
     )
-    shape = shapes(pressures(ahead, times), attitude_matrix(tracked.quaternion[:steps]))
+    to_body = attitude_matrix(tracked.quaternion[:steps])
+    shape = shapes(pressures(ahead, times).facing(box_areas(begin.inertia), to_body), to_body)
     affine = linear.by_torque @ shape
     state, price = prices(replace(weights, roll=None), step)
     control = np.full((steps, 3), price / STIFFER**2)

@@ -17,15 +17,24 @@ from flight.gnc.earth.orientation import terrestrial_time
 from flight.gnc.earth.sun import ASTRONOMICAL_UNIT
 from flight.gnc.guidance.three_axes.slew_cones import Cone
 from flight.gnc.guidance.three_axes.slew_model import Along, Around
+from flight.gnc.guidance.three_axes.slew_path import SlewPath
 from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import attitude_matrix
 
 
-def along(ephemeris: Ephemeris, begin: float) -> Along:
-    """Return field, position, air and light over the time of a slew."""
+def along(
+    ephemeris: Ephemeris, begin: float, areas: FloatArray | None = None, path: SlewPath | None = None
+) -> Along:
+    """Return field, position, air and light over the time of a slew.
+
+    Air and light press by the `areas` (3,) that a body on `path` shows to them.
+    """
 
     def around(times: FloatArray) -> Around:
         since = begin + times
         pressed = pressures(ephemeris, since)
+        if areas is not None and path is not None:
+            pressed = pressed.facing(areas, attitude_matrix(path.references(times).quaternion))
         return Around(ephemeris.field_at(since), ephemeris.position_at(since), pressed)
 
     return around

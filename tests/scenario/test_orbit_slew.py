@@ -1,0 +1,129 @@
+"""A slew in the loop: handed over to pointing without a jump, and broken off where the body leaves its path."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flight.gnc.control.three_axes import astray
+from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.quaternion import angle_between, from_rotation_vector, multiply
+from flight.link.modes import Mode
+from flight.link.telemetry.packets import to_text
+from flight.schema import reader as configuration
+from flight.schema.orbit import OrbitConfig, TargetStep
+from ground.telemetry.reader import Run
+from sim_hal.settings import FaultEntry, Simulation
+from tests.scenario.flights import event_names, fly
+from tests.scenario.mode_flights import modes_of
+from tests.scenario.test_orbit_navigation import navigating, skyward
+
+BEGIN, SLEW, TURN = 20.0, 150.0, np.radians([10.0, 20.0, -10.0])
+"""s; s and rad of the slew."""
+BROKEN = 22.0
+"""s, when two of the three coils break: what is left does not keep the body on the path."""
+PATIENCE = 15.0
+"""s that the body is held still before it is planned for though not slow: 180 in flight."""
+
+
+def slewing(duration: float, *faults: FaultEntry) -> tuple[OrbitConfig, Simulation]:
+    """Return a KnightCube near rest that slews by 24 deg."""
+    section = skyward()
+    assert section.free_body is not None
+    attitude = section.free_body.release.attitude
+    assert attitude is not None
+    release = configuration.replace(section.free_body.release, speed=1e-3)
+    body = configuration.replace(section.free_body, release=release)
+    x, y, z, w = multiply(from_rotation_vector(TURN), np.array(attitude)).tolist()
+    config = navigating()
+    config = configuration.replace(
+        config,
+        duration=duration,
+        pointing=configuration.replace(config.pointing, slew=SLEW),
+        targets=(
+            TargetStep(at=0.0, point="inertial", quaternion=attitude),
+            TargetStep(at=BEGIN, point="inertial", quaternion=(x, y, z, w)),
+        ),
+    )
+    return config, configuration.replace(section, free_body=body, faults=faults)
+
+
+@pytest.fixture(scope="module")
+def slewed(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    config, section = slewing(BEGIN + SLEW + 30.0)
+    return fly(config, tmp_path_factory.mktemp("slewed"), section=section)
+
+
+@pytest.fixture(scope="module")
+def crippled(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    faults = [FaultEntry(fault=f"coil-{axis}: open", at=BROKEN) for axis in "yz"]
+    config, section = slewing(105.0, *faults)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(astray, "PATIENCE", PATIENCE)
+        return fly(config, tmp_path_factory.mktemp("crippled"), section=section)
+
+
+def at(run: Run, name: str) -> list[float]:
+    """Return the times, s, of an event."""
+    return [float(event["time_ns"]) * 1e-9 for event in run["event"] if to_text(event["name"]) == name]
+
+
+def part(run: Run, since: float, until: float) -> FloatArray:
+    """Return the attitude packets of an interval."""
+    packets = run["attitude"]
+    times = packets["time_ns"] * 1e-9
+    return np.asarray(packets[(times >= since) & (times < until)])
+
+
+def test_a_slew_is_handed_over_to_pointing_without_a_jump(slewed: Run) -> None:
+    begun, ended = at(slewed, "slew-begun"), at(slewed, "slew-ended")
+    assert len(begun) == len(ended) == 1
+    assert SLEW - 5.0 < ended[0] - begun[0] < SLEW + 5.0
+    assert not {"astray", "planner-failed", "tumbling"} & set(event_names(slewed))
+    assert modes_of(slewed)[-1] is Mode.POINT
+    before = part(slewed, begun[0] - 1.0, begun[0] + 1.0)
+    assert np.degrees(angle_between(before["quaternion"][-1], before["target"][-1])) > 20.0
+    last, over = part(slewed, ended[0] - 1.0, ended[0])[-1], part(slewed, ended[0] + 0.1, ended[0] + 30.0)
+    left = np.degrees(angle_between(over["quaternion"], over["wanted"]))
+    new = int(np.flatnonzero(left < 0.1)[0])
+    handed = over[new]
+    assert float(handed["time_ns"]) * 1e-9 < ended[0] + 3.0, "the path of pointing begins where the body is"
+    turning = np.degrees(np.linalg.norm(handed["wanted_rate"] - handed["rate"]))
+    assert turning < 0.03, "and turns as the body does"
+    assert left[new:].max() < 0.5
+    assert np.abs(np.diff(over["dipole"], axis=0)).max() < 0.05 * 0.0959
+    arrived, there = (
+        np.degrees(angle_between(found["quaternion"], found["target"])) for found in (last, over)
+    )
+    assert arrived < 2.0
+    assert there.max() < 2.0
+
+
+def test_a_body_that_leaves_its_path_is_held_still_and_planned_for_again(crippled: Run) -> None:
+    begun, lost = at(crippled, "slew-begun"), at(crippled, "astray")
+    assert len(begun) == len(lost) == 1
+    assert BROKEN < lost[0] < begun[0] + SLEW
+    before, held = (part(crippled, lost[0] + since, lost[0] + since + 1.0) for since in (-3.0, 2.0))
+    off = [np.degrees(angle_between(found["quaternion"], found["wanted"])) for found in (before, held)]
+    assert off[0].max() < 15.0 < off[1].min()
+    again = lost[0] + PATIENCE
+    later = part(crippled, again + 3.0, again + 8.0)
+    assert np.degrees(angle_between(later["quaternion"], later["wanted"])).max() < 2.0
+    still = part(crippled, again - 2.0, again - 0.5)
+    assert np.degrees(angle_between(still["quaternion"], still["wanted"])).min() > 15.0
+    assert modes_of(crippled)[-1] is Mode.POINT, "it is not braked: what is wanted has not changed"
+
+
+def test_while_it_is_held_still_its_coils_only_take_energy(crippled: Run) -> None:
+    """Along the path before they gave some, too."""
+    lost = at(crippled, "astray")[0]
+    around, truth = crippled["orbit_truth"], crippled["truth"]
+    times, since = around["time_ns"] * 1e-9, truth["time_ns"] * 1e-9
+    rates = np.stack([np.interp(times, since, rate) for rate in truth["rate"].T], axis=1)
+    power = np.einsum("ni,ni->n", around["coil_torque"], rates)
+    assert power[(times > BEGIN + 2.0) & (times < lost)].max() > 1e-10
+    held = power[(times > lost + 2.0) & (times < lost + PATIENCE - 1.0)]
+    assert held.min() < -1e-11
+    assert held.max() <= 1e-13
