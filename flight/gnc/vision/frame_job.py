@@ -57,6 +57,8 @@ _POINT_PX = 1.0
 # Streaks predicted to be shorter are found like points where the frame itself agrees on no motion: in a
 # crowded sky regions run together and look longer than they are.
 _SHORT_PX = 4.0
+# A trail known to this, px, is in the model of a star's light.
+_KNOWN_PX = 0.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,10 +202,9 @@ def attitude_and_rate(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) ->
     """Return attitude and rate of a frame: the decision tree."""
     motion = _motion(job) if job.motion_first else None
     rests = _predicted_within(job, _POINT_PX) if motion is None else _shows_no_motion(job, motion)
-    if rests and job.attitude_prior is not None:
-        near = solve_near(job.pixels, job.camera, tracker.scale, sky, tracker.solve, job.attitude_prior)
-        if near is not None:
-            return FrameFound(motion or _no_motion(job), near)
+    near = _near(job, tracker, sky) if rests else None
+    if near is not None:
+        return FrameFound(motion or _no_motion(job), near)
     if motion is None:
         return _of_picture(job, tracker, sky)
     if rests:
@@ -211,7 +212,19 @@ def attitude_and_rate(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) ->
         return FrameFound(motion, _from_points(job, tracker, sky, seen))
     if motion.status not in MOVED:
         return FrameFound(motion, None)
-    return _from_motion(job, tracker, sky, motion)
+    found = _from_motion(job, tracker, sky, motion)
+    if found.solution is not None and found.solution.status is not SolveStatus.SOLVED:
+        # Of short streaks few are fitted, too few to know the sky by; all stars have their predicted places.
+        near = _near(job, tracker, sky) if _predicted_within(job, _SHORT_PX) else None
+    return found if near is None else replace(found, solution=near)
+
+
+def _near(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) -> FrameSolution | None:
+    """Return the attitude from stars near their predicted places, None without a prior or where they fail."""
+    prior = job.attitude_prior
+    if prior is None:
+        return None
+    return solve_near(job.pixels, job.camera, tracker.scale, sky, tracker.solve, prior, _known_turn(job))
 
 
 def _from_motion(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, motion: Found) -> FrameFound:
@@ -300,6 +313,14 @@ def _shows_no_motion(job: FrameJob, motion: Found) -> bool:
     """Return whether stars are at rest, or move so little, by the priors, that a frame shows no motion."""
     failed = motion.status is StreakStatus.FAILED and job.rate_prior is not None
     return motion.status in _AT_REST or (failed and _predicted_within(job, _SHORT_PX))
+
+
+def _known_turn(job: FrameJob) -> FloatArray | None:
+    """Return the camera's turn (3,) rad over the exposure where it is known to a fraction of a pixel."""
+    prior = job.rate_prior
+    if prior is None or prior.sigma * job.exposure * job.camera.focal_length > _KNOWN_PX:
+        return None
+    return prior.rate * job.exposure
 
 
 def _predicted_within(job: FrameJob, length: float) -> bool:

@@ -165,9 +165,17 @@ def solve_motion(
 
 
 def points_near(
-    pixels: Image, camera: CameraModel, sky: SkyIndex, settings: SolveSettings, prior: AttitudePrior
+    pixels: Image,
+    camera: CameraModel,
+    sky: SkyIndex,
+    settings: SolveSettings,
+    prior: AttitudePrior,
+    turn: FloatArray | None = None,
 ) -> Detections:
-    """Return the stars found near the predicted places of the brightest; none for too uncertain a prior."""
+    """Return the stars found near the predicted places of the brightest; none for too uncertain a prior.
+
+    `turn` (3,) rad, camera axes: over the exposure, where it is known and moves the stars by a few px.
+    """
     radius = PRIOR_SIGMAS * prior.sigma * camera.focal_length + _LEAST_RADIUS_PX
     if radius > _MOST_RADIUS_PX:
         return Detections.none()
@@ -175,7 +183,14 @@ def points_near(
     half_width = 0.5 * camera.columns / camera.focal_length, 0.5 * camera.rows / camera.focal_length
     expected = expected_stars(sky, matrix, half_width, _LOOKED_FOR)
     places = camera.project(sky.stars.direction[expected] @ matrix.T)
-    return measure_near(pixels, places, replace(settings.detection, search_radius=radius)).stars()
+    trail = None if turn is None else _trails(camera, sky.stars.direction[expected] @ matrix.T, turn)
+    return measure_near(pixels, places, replace(settings.detection, search_radius=radius), trail).stars()
+
+
+def _trails(camera: CameraModel, direction: FloatArray, turn: FloatArray) -> FloatArray:
+    """Return by how much stars at `direction` (n, 3), camera axes, move over a small `turn`: (n, 2) px."""
+    moved = 0.5 * np.cross(direction, turn)
+    return np.nan_to_num(camera.project(direction + moved) - camera.project(direction - moved))
 
 
 def solve_near(
@@ -185,9 +200,13 @@ def solve_near(
     sky: SkyIndex,
     settings: SolveSettings,
     prior: AttitudePrior,
+    turn: FloatArray | None = None,
 ) -> FrameSolution | None:
-    """Return the attitude from stars near their predicted places alone; None if they do not agree."""
-    found = points_near(pixels, camera, sky, settings, prior)
+    """Return the attitude from stars near their predicted places alone; None if they do not agree.
+
+    `turn`: as of `points_near`.
+    """
+    found = points_near(pixels, camera, sky, settings, prior, turn)
     if not len(found):
         return None
     seen = FrameSolution(

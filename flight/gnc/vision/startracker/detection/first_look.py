@@ -20,6 +20,9 @@ LEAST_HALF, MOST_HALF = 3, 9
 REACH = 2.7
 """Half a window, in sigmas of the point spread, and its least and greatest, px."""
 _FIRST_NOISE = NoiseModel(0.0, 0.1)
+# Of a shape that is nearly found: under the first noise bright stars are fitted by their wings alone, which
+# leaves as much of their cores as if the shape were wrong.
+_NEXT_MISMATCH = 0.02
 # Of the shape, where no star shows it.
 _UNKNOWN_MISMATCH = 0.02
 _MOST_OF_CELL = 4
@@ -54,12 +57,15 @@ class FrameSpread:
         return int(np.clip(np.ceil(REACH * self.psf_sigma), LEAST_HALF, MOST_HALF))
 
 
-def first_look(targets: Targets) -> Shapes:
-    """Return the shapes of stars whose point spread is not known yet."""
+def first_look(targets: Targets, gain: float | None = None) -> Shapes:
+    """Return the shapes of stars whose point spread is not known yet; `gain` electrons a count if known."""
     windows = targets.windows(_HALF_OF_FIRST)
     offset, flux = start(windows)
     width = np.full(len(windows), FIRST_WIDTH)
     fitted = fit(windows, offset, flux, width, _FIRST_NOISE, free_width=True, steps=4)
+    if gain is not None:
+        noise = NoiseModel(1.0 / gain, _NEXT_MISMATCH)
+        fitted = fit(windows, fitted.offset, fitted.flux, fitted.width, noise, free_width=True, steps=1)
     error = np.sqrt(np.maximum(fitted.covariance[:, WIDTH, WIDTH], 0.0))
     return Shapes(fitted.width, error, single_pixels(windows), fitted, windows)
 
