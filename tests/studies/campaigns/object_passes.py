@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from flight.gnc.camera.knowledge import EXACT
 from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.directions import tangent_basis
@@ -129,7 +130,7 @@ class _Frame:
         saturation = float(CAMERA.highest_count)
         detection = DetectionSettings(psf_sigma=CAMERA.psf_sigma, gain=CAMERA.gain, saturation=saturation)
         likelihood = LikelihoodSettings(gain=CAMERA.gain, saturation=saturation, psf_sigma=CAMERA.psf_sigma)
-        tracker = TrackerSettings(SolveSettings(detection=detection), (1.0, 1.0))
+        tracker = TrackerSettings(SolveSettings(detection=detection, lens=EXACT), (1.0, 1.0))
         off = from_rotation_vector(rng.normal(scale=1e-4, size=3))
         priors = RatePrior(self._turn, 1e-4), AttitudePrior(multiply(off, self._quaternion), 1e-4)
         job = FrameJob(

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from flight.gnc.attitude.wahba import AttitudeError, Solver
+from flight.gnc.camera.knowledge import CameraKnowledge
 from flight.gnc.camera.lens import CameraModel, Lens, LensError
 from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.math.arrays import FloatArray, Image
@@ -33,6 +34,7 @@ from flight.gnc.vision.startracker.identification.tracking import track
 from flight.gnc.vision.startracker.identification.verification import expected_stars
 from flight.gnc.vision.startracker.image_fit import fit_in_image
 from flight.gnc.vision.startracker.index.sky_index import SkyIndex
+from flight.gnc.vision.startracker.lens_bend import known_bend, usual_bend
 from flight.gnc.vision.startracker.mid_exposure import timing_covariance
 from flight.gnc.vision.startracker.sky_map import SkyMap
 from flight.gnc.vision.startracker.solution import FrameSolution, SolveStatus
@@ -42,6 +44,8 @@ from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSett
 
 # px: error of a place from unknown distortion of the lens or the star's colour.
 _LEAST_SIGMA_PX = 0.005
+# px: the same of a lens that is stated to be exact.
+_COLOUR_PX = 0.002
 # px: the same of a lens that is not calibrated, for identification. Tried second: most pictures need only
 # the room of their places' errors, in which fewer stars agree by chance.
 _UNTOLD_SIGMA_PX = 0.3
@@ -70,6 +74,7 @@ class SolveSettings:
         method: another method of identification.
         attitude: a solver of directions for the attitude; None takes it from the fit in the image.
         velocity: (3,) m/s of the camera about the Sun, for aberration; None: no correction.
+        lens: how well a lens of certain focal length is known; None: exactly.
         untold_lens: whether a lens of uncertain focal length may have its axis off the middle and distort;
             else the focal length is all that is uncertain.
     """
@@ -80,6 +85,7 @@ class SolveSettings:
     method: Callable[[StarField, SkyIndex], Identification] | None = None
     attitude: Solver | None = None
     velocity: FloatArray | None = None
+    lens: CameraKnowledge | None = None
     untold_lens: bool = True
 
 
@@ -284,7 +290,9 @@ def _with_attitude(
     reference = sky.stars.direction[found.star[chosen]]
     if settings.velocity is not None:
         reference = apparent(reference, settings.velocity)
-    covariance = seen.covariance[chosen] + _LEAST_SIGMA_PX**2 * np.eye(2)
+    known = _known_bend(camera, settings, free_scale, free_lens)
+    least = _COLOUR_PX if settings.lens is not None and not len(known) else _LEAST_SIGMA_PX
+    covariance = seen.covariance[chosen] + least**2 * np.eye(2)
     try:
         fit = fit_in_image(
             seen.points[chosen],
@@ -293,7 +301,7 @@ def _with_attitude(
             camera,
             found.fix.quaternion,
             free_scale,
-            free_lens,
+            known,
         )
         fix = fit.fix
         if settings.attitude is not None:
@@ -319,6 +327,15 @@ def _with_attitude(
         bend=fit.bend,
         log10_false_alarm=found.log10_false_alarm,
     )
+
+
+def _known_bend(
+    camera: CameraModel, settings: SolveSettings, free_scale: bool, free_lens: bool
+) -> FloatArray:
+    """Return the information (6,) about the lens's bend before the stars are seen, (0,) where it has none."""
+    if free_lens:
+        return usual_bend(camera)
+    return np.zeros(0) if free_scale or settings.lens is None else known_bend(camera, settings.lens)
 
 
 def _camera_found(camera: CameraModel, found: Identification) -> CameraModel:
