@@ -31,6 +31,7 @@ from flight.gnc.vision.startracker.index import sky_index
 from flight.gnc.vision.startracker.index.build import default_index
 from flight.gnc.vision.startracker.index.sky_index import SkyIndex
 from flight.gnc.vision.startracker.mid_exposure import MOVED
+from flight.gnc.vision.startracker.short_trails import ShortTrails
 from flight.gnc.vision.startracker.solution import FrameSolution, SolveStatus
 from flight.gnc.vision.startracker.solve import (
     PRIOR_SIGMAS,
@@ -224,7 +225,7 @@ def _near(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) -> FrameSoluti
     prior = job.attitude_prior
     if prior is None:
         return None
-    return solve_near(job.pixels, job.camera, tracker.scale, sky, tracker.solve, prior, _known_turn(job))
+    return solve_near(job.pixels, job.camera, tracker.scale, sky, tracker.solve, prior, _short_trails(job))
 
 
 def _from_motion(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, motion: Found) -> FrameFound:
@@ -315,12 +316,16 @@ def _shows_no_motion(job: FrameJob, motion: Found) -> bool:
     return motion.status in _AT_REST or (failed and _predicted_within(job, _SHORT_PX))
 
 
-def _known_turn(job: FrameJob) -> FloatArray | None:
-    """Return the camera's turn (3,) rad over the exposure where it is known to a fraction of a pixel."""
-    prior = job.rate_prior
+def _short_trails(job: FrameJob) -> ShortTrails | None:
+    """Return how stars move over the exposure where that is known to a fraction of a pixel."""
+    prior, estimator = job.rate_prior, job.estimator
     if prior is None or prior.sigma * job.exposure * job.camera.focal_length > _KNOWN_PX:
         return None
-    return prior.rate * job.exposure
+    turn = prior.rate * job.exposure
+    if not isinstance(estimator, LikelihoodSettings):
+        return ShortTrails(turn)
+    delay, doubt = estimator.delay_per_row / job.exposure, estimator.line_time_sigma / job.exposure
+    return ShortTrails(turn, delay, doubt)
 
 
 def _predicted_within(job: FrameJob, length: float) -> bool:

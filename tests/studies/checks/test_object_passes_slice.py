@@ -12,9 +12,9 @@ SEED = 16
 
 
 def test_an_object_is_sighted_near_the_bound_and_an_empty_sky_shows_none(tmp_path: Path) -> None:
-    few = {"still": 3, "turning": 3}
-    shown = run(Case("0/3.0", (SEED, 0, 1), {"magnitude": 3.0, **few}))
-    empty = run(Case("0/None", (SEED, 0, 5), {"magnitude": None, "still": 1, "turning": 1}))
+    few = {"length": "short", "still": 3, "turning": 3}
+    shown = run(Case("short/0/3.0", (SEED, 0, 1), {"magnitude": 3.0, **few}))
+    empty = run(Case("short/0/None", (SEED, 0, 5), {"magnitude": None, **few, "still": 1, "turning": 1}))
     seen = [frame for frame in shown["frames"] if "error" in frame]
     assert len(seen) >= 4
     for frame in seen:

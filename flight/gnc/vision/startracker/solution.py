@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
@@ -69,6 +69,12 @@ class FrameSolution:
     def matched(self) -> IntArray:
         """Which of the points (m,) are guide stars."""
         return np.flatnonzero(self.star >= 0)
+
+    def wider(self, by: FloatArray) -> FrameSolution:
+        """Return the solution with a covariance (3, 3) rad^2 added to its attitude's, where it has one."""
+        if self.fix is None:
+            return self
+        return replace(self, fix=replace(self.fix, covariance=self.fix.covariance + by))
 
     def sky_map(self, velocity: FloatArray | None = None) -> SkyMap | None:
         """Return the way from pixels to the sky and back; None when not solved.

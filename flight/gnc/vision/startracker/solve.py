@@ -18,7 +18,7 @@ from flight.gnc.camera.knowledge import CameraKnowledge
 from flight.gnc.camera.lens import CameraModel, Lens, LensError
 from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.math.arrays import FloatArray, Image
-from flight.gnc.math.quaternion import attitude_matrix
+from flight.gnc.math.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
 from flight.gnc.vision.startracker.aberration import apparent
 from flight.gnc.vision.startracker.by_directions import attitude_by
 from flight.gnc.vision.startracker.detection import (
@@ -36,6 +36,7 @@ from flight.gnc.vision.startracker.image_fit import fit_in_image
 from flight.gnc.vision.startracker.index.sky_index import SkyIndex
 from flight.gnc.vision.startracker.lens_bend import known_bend, usual_bend
 from flight.gnc.vision.startracker.mid_exposure import timing_covariance
+from flight.gnc.vision.startracker.short_trails import ShortTrails
 from flight.gnc.vision.startracker.sky_map import SkyMap
 from flight.gnc.vision.startracker.solution import FrameSolution, SolveStatus
 from flight.gnc.vision.streaks.maximum_likelihood.course import Course
@@ -46,6 +47,8 @@ from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSett
 _LEAST_SIGMA_PX = 0.005
 # px: the same of a lens that is stated to be exact.
 _COLOUR_PX = 0.002
+# Of what the stars are wider than described: how far the middle of all may be off (campaign `resting`).
+_SHAPE_DOUBT = 0.05
 # px: the same of a lens that is not calibrated, for identification. Tried second: most pictures need only
 # the room of their places' errors, in which fewer stars agree by chance.
 _UNTOLD_SIGMA_PX = 0.3
@@ -118,9 +121,10 @@ def solve_points(
     prior: AttitudePrior | None = None,
 ) -> FrameSolution:
     """Return the attitude of a frame of detected points."""
-    return solve_places(
+    solution = solve_places(
         found.points, found.covariance, FrameKind.POINTS, camera, scale, sky, settings, prior, found.flux
     )
+    return _shape_unknown(solution, found)
 
 
 def solve_places(
@@ -176,11 +180,11 @@ def points_near(
     sky: SkyIndex,
     settings: SolveSettings,
     prior: AttitudePrior,
-    turn: FloatArray | None = None,
+    trails: ShortTrails | None = None,
 ) -> Detections:
     """Return the stars found near the predicted places of the brightest; none for too uncertain a prior.
 
-    `turn` (3,) rad, camera axes: over the exposure, where it is known and moves the stars by a few px.
+    `trails`: how they move over the exposure, where that is known and a few px.
     """
     radius = PRIOR_SIGMAS * prior.sigma * camera.focal_length + _LEAST_RADIUS_PX
     if radius > _MOST_RADIUS_PX:
@@ -189,14 +193,8 @@ def points_near(
     half_width = 0.5 * camera.columns / camera.focal_length, 0.5 * camera.rows / camera.focal_length
     expected = expected_stars(sky, matrix, half_width, _LOOKED_FOR)
     places = camera.project(sky.stars.direction[expected] @ matrix.T)
-    trail = None if turn is None else _trails(camera, sky.stars.direction[expected] @ matrix.T, turn)
+    trail = None if trails is None else trails.of(camera, sky.stars.direction[expected] @ matrix.T)
     return measure_near(pixels, places, replace(settings.detection, search_radius=radius), trail).stars()
-
-
-def _trails(camera: CameraModel, direction: FloatArray, turn: FloatArray) -> FloatArray:
-    """Return by how much stars at `direction` (n, 3), camera axes, move over a small `turn`: (n, 2) px."""
-    moved = 0.5 * np.cross(direction, turn)
-    return np.nan_to_num(camera.project(direction + moved) - camera.project(direction - moved))
 
 
 def solve_near(
@@ -206,20 +204,49 @@ def solve_near(
     sky: SkyIndex,
     settings: SolveSettings,
     prior: AttitudePrior,
-    turn: FloatArray | None = None,
+    trails: ShortTrails | None = None,
 ) -> FrameSolution | None:
     """Return the attitude from stars near their predicted places alone; None if they do not agree.
 
-    `turn`: as of `points_near`.
+    `trails`: as of `points_near`.
     """
-    found = points_near(pixels, camera, sky, settings, prior, turn)
+    found = points_near(pixels, camera, sky, settings, prior, trails)
     if not len(found):
         return None
+    late = np.zeros((len(found), 2)) if trails is None else trails.late(camera, found.points)
+    points = found.points if trails is None else found.points - trails.delay * late
     seen = FrameSolution(
-        SolveStatus.NO_STARS, "", FrameKind.POINTS, camera, found.points, found.covariance, tracked=True
+        SolveStatus.NO_STARS, "", FrameKind.POINTS, camera, points, found.covariance, tracked=True
     )
     near = track(star_field(seen, found.flux, scale), sky, prior.quaternion, prior.sigma)
-    return _with_attitude(seen, near, sky, settings) if near.status is Status.IDENTIFIED else None
+    if near.status is not Status.IDENTIFIED:
+        return None
+    solution = _shape_unknown(_with_attitude(seen, near, sky, settings), found)
+    if trails is None or not trails.delay_sigma or not late.any():
+        return solution
+    other = _with_attitude(replace(seen, points=points + trails.delay_sigma * late), near, sky, settings)
+    return _with_doubt(solution, other)
+
+
+def _with_doubt(solution: FrameSolution, other: FrameSolution) -> FrameSolution:
+    """Return a solution that may as well be `other`, of places that are a standard deviation off alike."""
+    if solution.fix is None or other.fix is None:
+        return solution
+    off = to_rotation_vector(multiply(other.fix.quaternion, conjugate(solution.fix.quaternion)))
+    return solution.wider(np.outer(off, off))
+
+
+def _shape_unknown(solution: FrameSolution, found: Detections) -> FrameSolution:
+    """Return a solution that claims no more than the shape of the stars allows.
+
+    Where they are wider than described, by a tail of the lens or light astray, their middle is a matter of
+    which light is weighed: all places are off alike.
+    """
+    width = found.width[np.isfinite(found.width)]
+    if solution.fix is None or not len(width):
+        return solution
+    doubt = _SHAPE_DOUBT * abs(float(np.median(width)) - found.psf_sigma) / solution.camera.focal_length
+    return solution.wider(np.diag([doubt**2, doubt**2, 0.0]))
 
 
 def _identify(

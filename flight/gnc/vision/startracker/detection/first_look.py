@@ -91,6 +91,8 @@ def frame_spread(shapes: Shapes, plain: BoolArray, settings: DetectionSettings) 
     width, error = shapes.width[telling], shapes.error[telling]
     psf_sigma = given or _weighted_median(width, share / ((error / width) ** 2 + 0.1**2))
     alike = telling[np.abs(width - psf_sigma) < np.maximum(3.0 * error, 0.25 * psf_sigma)]
+    # Where most stars have another width than is given, the few that have it by chance say nothing of them.
+    alike = alike if 2 * len(alike) >= len(telling) else telling
     part, windows = fitted.select(alike), shapes.windows.select(alike)
     noise = _noise_of(part, windows, settings)
     # A given point spread needs no second look, which is half of a tracking frame's time.
