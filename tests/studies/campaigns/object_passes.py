@@ -49,6 +49,10 @@ LONG, LONG_PERIOD = (180.0, 360.0), 5.0
 MAGNITUDES = (2.0, 3.0, 4.0, 5.0, 6.0)
 SLOWEST, FASTEST = 0.05, 0.6
 """deg/s."""
+JUDGED = 8
+"""Frames from one judgement of a track to the next."""
+OWN_TRACK = 0.01
+"""rad: a track nearer to the object than this is its."""
 OWN_PX = 3.0
 """A sighting nearer to the object than this is its."""
 CAMERA = StarCameraModel(columns=512, rows=512)
@@ -76,23 +80,23 @@ def run(case: Case) -> Result:
     times = _times(case, rng)
     flown = a_pass(rng, rate, times, rng.uniform(0.0, times[-1]))
     tracker = Tracker(TrackSettings())
-    frames = []
-    for frame in _frames(flown, case.parameters["still"], rng):
+    frames, nees = [], []
+    for number, frame in enumerate(_frames(flown, case.parameters["still"], rng)):
         sighted = frame.sighted(magnitude, rng)
         frames.append(frame.judged(sighted, magnitude))
         if sighted is not None:
             seen = sighted.directions, sighted.covariance, sighted.magnitudes, sighted.attitude
             tracker.ingest(Sightings(round(frame.time * 1e9), *seen, observer=frame.observer))
+            if number % JUDGED == JUDGED - 1:
+                nees += [_nees(track.line, frame) for track in tracker.objects if _is_own(track.line, frame)]
     # A frame without an attitude leaves the tracks where they were before it.
     lines = [tracker.predicted(track.number, round(times[-1] * 1e9)) for track in tracker.objects]
-    own = [n for n, line in enumerate(lines) if line and np.linalg.norm(line.direction - frame.place) < 0.01]
+    own = [n for n, line in enumerate(lines) if line and _is_own(line, frame)]
     result = {**case.parameters, "rate_deg": math.degrees(rate), "frames": frames}
     result["false_tracks"] = len(lines) - (len(own[:1]) if magnitude is not None else 0)
-    line = lines[own[0]] if own else None
-    if magnitude is None or line is None:
+    if magnitude is None or not own:
         return result | {"nees": None}
-    brightness = tracker.objects[own[0]].magnitude
-    return result | {"nees": _nees(line, frame.place, frame.motion), "brightness": brightness}
+    return result | {"nees": nees, "brightness": tracker.objects[own[0]].magnitude}
 
 
 def _times(case: Case, rng: np.random.Generator) -> FloatArray:
@@ -195,11 +199,19 @@ class _Frame:
         return math.sqrt(0.5 * float(np.trace(np.linalg.inv(known[4:, 4:])[:2, :2])))
 
 
-def _nees(line: LineOfSight, true: FloatArray, velocity: FloatArray) -> list[float]:
+def _is_own(line: LineOfSight, frame: _Frame) -> bool:
+    """Return whether a track is the object's."""
+    return bool(np.linalg.norm(line.direction - frame.place) < OWN_TRACK)
+
+
+def _nees(line: LineOfSight, frame: _Frame) -> list[float]:
     """Return the squared errors of direction and rate over their covariance, two degrees of freedom each."""
     basis = tangent_basis(line.direction)
     found = []
-    for error, part in ((true - line.direction, slice(0, 3)), (velocity - line.rate, slice(3, 6))):
+    for error, part in (
+        (frame.place - line.direction, slice(0, 3)),
+        (frame.motion - line.rate, slice(3, 6)),
+    ):
         across = basis @ error
         found.append(float(across @ np.linalg.solve(basis @ line.covariance[part, part] @ basis.T, across)))
     return found
@@ -209,7 +221,7 @@ def summarise(results: Sequence[Result], _: Path) -> Summary:
     """Return a row for each length and magnitude."""
     lines = [
         "pass   V      found/passes  frames seen   error, claim, bound px (rms)   "
-        "NEES of 2: place, direction, rate"
+        "NEES of 2: place, direction, rate; tracks judged"
     ]
     rows = []
     for length in ("short", "long"):
@@ -220,8 +232,10 @@ def summarise(results: Sequence[Result], _: Path) -> Summary:
             if row["seen"] and row["nees"] is not None:
                 figures = ", ".join(f"{row[name]:.3f}" for name in ("error", "claim", "bound"))
                 nees = ", ".join(f"{value:.2f}" for value in (row["sighting_nees"], *row["nees"]))
-                found, share = f"{row['found']}/{row['passes']}", f"{row['seen']}/{row['frames']}"
-                lines.append(f"{length:5}  {magnitude:3.1f}    {found}    {share:>10}    {figures}    {nees}")
+                share = f"{row['found']}/{row['passes']}    {row['seen']}/{row['frames']:>4}"
+                lines.append(
+                    f"{length:5}  {magnitude:3.1f}    {share}    {figures}    {nees}; {row['judged']}"
+                )
     empty = [result for result in results if result["magnitude"] is None]
     frames = sum(frame["solved"] for result in empty for frame in result["frames"])
     false = sum(result["false_tracks"] for result in results)
@@ -236,8 +250,9 @@ def summarise(results: Sequence[Result], _: Path) -> Summary:
 def _row(own: Sequence[Result]) -> Result:
     """Return the figures of passes of one length and magnitude."""
     seen = [frame for result in own for frame in result["frames"] if "error" in frame]
-    made = [result["nees"] for result in own if result["nees"] is not None]
-    row: Result = {"passes": len(own), "found": len(made)}
+    found = [result["nees"] for result in own if result["nees"] is not None]
+    made = [nees for track in found for nees in track]
+    row: Result = {"passes": len(own), "found": len(found), "judged": len(made)}
     row |= {"frames": sum(len(result["frames"]) for result in own), "seen": len(seen)}
     for name in ("error", "claim", "bound"):
         row[name] = math.sqrt(float(np.mean([frame[name] ** 2 for frame in seen]))) if seen else None
