@@ -38,8 +38,7 @@ def objects_figure(run: Run) -> Figure | None:
     panels.style(way, "declination, deg", "Ways among the stars, from the dot on", "right ascension, deg")
     panels.style(rate, "deg/s", "Angular rate")
     panels.style(light, "V", "Brightness, mean of the last sightings")
-    for axes in (way, rate, light):
-        panels.legend(axes)
+    way.legend(loc="best", fontsize=9)
     return figure
 
 
@@ -87,4 +86,5 @@ def _speed(packets: Any) -> FloatArray:
 def _sky(direction: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return right ascension, without a jump at a whole turn, and declination (n,), deg."""
     right = np.unwrap(np.arctan2(direction[:, 1], direction[:, 0]))
+    right = right - 2.0 * np.pi * np.floor(right[0] / (2.0 * np.pi))
     return np.degrees(right), np.degrees(np.arcsin(np.clip(direction[:, 2], -1.0, 1.0)))
