@@ -45,7 +45,7 @@ class ImageFit:
         fix: the attitude by the stars that agree; its covariance is widened if they scatter beyond theirs.
         scale: factor of the tangents x/z, y/z; 1 when it was held.
         scale_sigma: relative standard deviation of the scale; 0 when it was held.
-        bend: (6,) of the lens (`lens_bend`); zeros when it was held.
+        bend: (6,) of the lens (`lens_bend`); zeros when it has none.
         squares: (n,) squared error of each star over its covariance, of two degrees of freedom.
         agree: (n,) whether the star was used.
     """

@@ -1,4 +1,4 @@
-"""What a lens that nobody calibrated does beyond a wrong focal length, seen from the picture's middle.
+"""What a lens that is not exactly known does beyond a wrong focal length, seen from the picture's middle.
 
 Its axis is not in the middle, and it distorts: tangents u are off by (u . a) u + |u|^2 b + k |u|^2 u + l
 |u|^4 u, with tilt a, decentring b and distortion k, l (Brown 1966): the bend (6,) is (a, b, k, l).

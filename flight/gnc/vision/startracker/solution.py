@@ -41,7 +41,7 @@ class FrameSolution:
         expected: (n, 2) px, where the attitude puts the guide star; NaN for none.
         fix: attitude, ICRS to camera, and its covariance; the smaller scalar part is not negative.
         scale_sigma: relative standard deviation of the focal length; 0 where it was given.
-        bend: (6,) of a lens that was not given (`lens_bend`), else zeros.
+        bend: (6,) of a lens that is not exact, as the stars show it (`lens_bend`), else zeros.
         log10_false_alarm: of the probability that a frame of random points would have been solved.
         tracked: whether the stars were found near the prior attitude.
         motion: from the streaks, camera frame; None for points.

@@ -124,7 +124,7 @@ def solve_points(
     solution = solve_places(
         found.points, found.covariance, FrameKind.POINTS, camera, scale, sky, settings, prior, found.flux
     )
-    return _shape_unknown(solution, found)
+    return _shape_unknown(solution, found, settings)
 
 
 def solve_places(
@@ -221,7 +221,7 @@ def solve_near(
     near = track(star_field(seen, found.flux, scale), sky, prior.quaternion, prior.sigma)
     if near.status is not Status.IDENTIFIED:
         return None
-    solution = _shape_unknown(_with_attitude(seen, near, sky, settings), found)
+    solution = _shape_unknown(_with_attitude(seen, near, sky, settings), found, settings)
     if trails is None or not trails.delay_sigma or not late.any():
         return solution
     other = _with_attitude(replace(seen, points=points + trails.delay_sigma * late), near, sky, settings)
@@ -236,16 +236,16 @@ def _with_doubt(solution: FrameSolution, other: FrameSolution) -> FrameSolution:
     return solution.wider(np.outer(off, off))
 
 
-def _shape_unknown(solution: FrameSolution, found: Detections) -> FrameSolution:
+def _shape_unknown(solution: FrameSolution, found: Detections, settings: SolveSettings) -> FrameSolution:
     """Return a solution that claims no more than the shape of the stars allows.
 
     Where they are wider than described, by a tail of the lens or light astray, their middle is a matter of
     which light is weighed: all places are off alike.
     """
-    width = found.width[np.isfinite(found.width)]
-    if solution.fix is None or not len(width):
+    width, given = found.width[np.isfinite(found.width)], settings.detection.psf_sigma
+    if solution.fix is None or given is None or not len(width):
         return solution
-    doubt = _SHAPE_DOUBT * abs(float(np.median(width)) - found.psf_sigma) / solution.camera.focal_length
+    doubt = _SHAPE_DOUBT * abs(float(np.median(width)) - given) / solution.camera.focal_length
     return solution.wider(np.diag([doubt**2, doubt**2, 0.0]))
 
 

@@ -26,6 +26,8 @@ _NEXT_MISMATCH = 0.02
 # Of the shape, where no star shows it.
 _UNKNOWN_MISMATCH = 0.02
 _MOST_OF_CELL = 4
+# Of a given width, by which the stars' own is off where it is not believed.
+_CONTRADICTED = 0.25
 _LEAST_LONE = 3
 # Of a pixel's noise: fainter ones are not called hot.
 _LEAST_HOT = 10.0
@@ -63,18 +65,19 @@ def first_look(targets: Targets, gain: float | None = None) -> Shapes:
     offset, flux = start(windows)
     width = np.full(len(windows), FIRST_WIDTH)
     fitted = fit(windows, offset, flux, width, _FIRST_NOISE, free_width=True, steps=4)
+    width, error = fitted.width, np.sqrt(np.maximum(fitted.covariance[:, WIDTH, WIDTH], 0.0))
     if gain is not None:
         noise = NoiseModel(1.0 / gain, _NEXT_MISMATCH)
-        fitted = fit(windows, fitted.offset, fitted.flux, fitted.width, noise, free_width=True, steps=1)
-    error = np.sqrt(np.maximum(fitted.covariance[:, WIDTH, WIDTH], 0.0))
-    return Shapes(fitted.width, error, single_pixels(windows), fitted, windows)
+        fitted = fit(windows, fitted.offset, fitted.flux, width, noise, free_width=True, steps=1)
+    # Widths are judged by the first noise, which forgives an unlike shape.
+    return Shapes(width, error, single_pixels(windows), fitted, windows)
 
 
 def frame_spread(shapes: Shapes, plain: BoolArray, settings: DetectionSettings) -> FrameSpread:
     """Return the point spread and noise that the stars `plain` (n,), the brightest first, show.
 
-    Settings that are given are kept. Without a usable star the width is 1 px and no photon noise is
-    known.
+    Settings that are given are kept, but for a width that most stars contradict. Without a usable star the
+    width is 1 px and no photon noise is known.
     """
     fitted = shapes.fitted
     certain = fitted.flux > 8.0 * np.sqrt(fitted.covariance[:, FLUX, FLUX])
@@ -89,10 +92,10 @@ def frame_spread(shapes: Shapes, plain: BoolArray, settings: DetectionSettings) 
         )
     telling, share = _evenly_spread(shapes.windows.middle, telling)
     width, error = shapes.width[telling], shapes.error[telling]
-    psf_sigma = given or _weighted_median(width, share / ((error / width) ** 2 + 0.1**2))
+    psf_sigma = _weighted_median(width, share / ((error / width) ** 2 + 0.1**2))
+    if given is not None and abs(psf_sigma - given) < _CONTRADICTED * given:
+        psf_sigma = given
     alike = telling[np.abs(width - psf_sigma) < np.maximum(3.0 * error, 0.25 * psf_sigma)]
-    # Where most stars have another width than is given, the few that have it by chance say nothing of them.
-    alike = alike if 2 * len(alike) >= len(telling) else telling
     part, windows = fitted.select(alike), shapes.windows.select(alike)
     noise = _noise_of(part, windows, settings)
     # A given point spread needs no second look, which is half of a tracking frame's time.

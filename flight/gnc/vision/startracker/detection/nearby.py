@@ -14,7 +14,7 @@ from flight.gnc.vision.startracker.detection.detections import Detections
 from flight.gnc.vision.startracker.detection.first_look import first_look, frame_spread
 from flight.gnc.vision.startracker.detection.measurement import measure
 from flight.gnc.vision.startracker.detection.settings import DetectionSettings
-from flight.gnc.vision.startracker.detection.sky import CUT_OFF, KERNEL_NORM, correlation_of, in_counts
+from flight.gnc.vision.startracker.detection.sky import KERNEL_NORM, correlation_of, in_counts, one_sided
 from flight.gnc.vision.startracker.detection.targets import Targets
 from flight.gnc.vision.startracker.detection.windows import Windows, cut, smoothed
 
@@ -108,7 +108,7 @@ def _sky_of(windows: Windows, radius: float) -> tuple[FloatArray, FloatArray, Fl
     light = np.where(windows.good, windows.light - mean[:, None, None], 0.0)
     smooth = smoothed(light)[:, 1:-1, 1:-1][:, rim[1:-1, 1:-1]]
     tail = max(0.5 * _reach(smooth), KERNEL_NORM * common)
-    cut_off = _reach(-light[:, rim]) < 2.0 * CUT_OFF * common
+    cut_off = one_sided(np.array(_reach(-light[:, rim])), np.array(common))
     spread = tail if cut_off else float(np.sqrt(np.median(_clipped(smooth)[1])))
     noise = np.full(len(windows), common)
     return mean, noise, np.full(len(windows), tail), correlation_of(spread, common)

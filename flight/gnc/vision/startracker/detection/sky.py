@@ -35,7 +35,9 @@ _TAIL_PART = 0.97725
 # Correlations below this are chance, and the light of the faintest stars.
 _CORRELATED = 1.05
 # Noise that reaches less than this part of its two deviations downwards is cut off at zero counts.
-CUT_OFF = 0.8
+_CUT_OFF = 0.8
+# Noise below this, counts, is hidden by the steps of the counts, which may be of many.
+_HIDDEN = 0.5
 _ROUNDING = 12.0**-0.5
 
 
@@ -157,6 +159,14 @@ def correlation_of(smooth: float, single: float) -> float:
     return ratio if ratio > _CORRELATED else 1.0
 
 
+def one_sided(reach: FloatArray, noise: FloatArray) -> BoolArray:
+    """Return where a noise (n,) is cut off at zero counts or hidden by their steps: only its tail shows it.
+
+    `reach` (n,) counts is how far its lower 2.3 % reach down.
+    """
+    return np.asarray((reach < 2.0 * _CUT_OFF * noise) | (noise < _HIDDEN))
+
+
 def without_hot_pixels(pixels: Image, most: int) -> Image:
     """Return `pixels` (rows, columns) with the hot ones replaced, if there are more of them than `most`.
 
@@ -242,5 +252,5 @@ def _tails(sample: Float32Array, level: FloatArray, noise: FloatArray) -> tuple[
     high = min(last, int(_TAIL_PART * values.shape[-1]))
     ordered = np.partition(values, (last - high, high), axis=-1)
     tail = np.maximum(1.0, 0.5 * ordered[..., high])
-    cut_off = ndimage.median_filter(-0.5 * ordered[..., last - high], size=3, mode="nearest") < CUT_OFF
-    return np.asarray(ndimage.median_filter(tail, size=3, mode="nearest")), np.asarray(cut_off)
+    reach = ndimage.median_filter(-ordered[..., last - high], size=3, mode="nearest")
+    return np.asarray(ndimage.median_filter(tail, size=3, mode="nearest")), one_sided(reach * noise, noise)
