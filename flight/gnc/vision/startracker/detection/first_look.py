@@ -26,8 +26,8 @@ _NEXT_MISMATCH = 0.02
 # Of the shape, where no star shows it.
 _UNKNOWN_MISMATCH = 0.02
 _MOST_OF_CELL = 4
-# Of a given width, by which the stars' own is off where it is not believed.
-_CONTRADICTED = 0.25
+# Stars that show the width themselves, so that a given one is not needed.
+_MANY = 8
 _LEAST_LONE = 3
 # Of a pixel's noise: fainter ones are not called hot.
 _LEAST_HOT = 10.0
@@ -76,8 +76,8 @@ def first_look(targets: Targets, gain: float | None = None) -> Shapes:
 def frame_spread(shapes: Shapes, plain: BoolArray, settings: DetectionSettings) -> FrameSpread:
     """Return the point spread and noise that the stars `plain` (n,), the brightest first, show.
 
-    Settings that are given are kept, but for a width that most stars contradict. Without a usable star the
-    width is 1 px and no photon noise is known.
+    Settings that are given are kept, but for a width of which many stars show their own. Without a usable
+    star the width is 1 px and no photon noise is known.
     """
     fitted = shapes.fitted
     certain = fitted.flux > 8.0 * np.sqrt(fitted.covariance[:, FLUX, FLUX])
@@ -92,9 +92,9 @@ def frame_spread(shapes: Shapes, plain: BoolArray, settings: DetectionSettings) 
         )
     telling, share = _evenly_spread(shapes.windows.middle, telling)
     width, error = shapes.width[telling], shapes.error[telling]
-    psf_sigma = _weighted_median(width, share / ((error / width) ** 2 + 0.1**2))
-    if given is not None and abs(psf_sigma - given) < _CONTRADICTED * given:
-        psf_sigma = given
+    psf_sigma = given or 0.0
+    if given is None or len(telling) >= _MANY:
+        psf_sigma = _weighted_median(width, share / ((error / width) ** 2 + 0.1**2))
     alike = telling[np.abs(width - psf_sigma) < np.maximum(3.0 * error, 0.25 * psf_sigma)]
     part, windows = fitted.select(alike), shapes.windows.select(alike)
     noise = _noise_of(part, windows, settings)
