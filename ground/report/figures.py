@@ -16,7 +16,7 @@ from flight.link.telemetry.packets import to_text
 from ground.report import panels
 from ground.report.cage_figure import cage_figure
 from ground.report.knowledge_figure import knowledge_figure
-from ground.report.objects import objects_figure
+from ground.report.objects_figure import objects_figure
 from ground.report.orbit_figure import orbit_figure
 from ground.report.scene import Scene
 from ground.report.signals import seconds

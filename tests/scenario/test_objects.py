@@ -14,7 +14,8 @@ from flight.gnc.math.quaternion import attitude_matrix
 from flight.schema import reader as configuration
 from flight.schema.devices import ObjectTracking
 from ground.export.tracking_data import write_tracking_data
-from ground.report.objects import objects, objects_figure
+from ground.report.objects import objects
+from ground.report.objects_figure import objects_figure
 from ground.report.summary import summarise
 from ground.report.text import format_report
 from ground.telemetry.reader import Run

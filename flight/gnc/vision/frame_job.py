@@ -203,7 +203,8 @@ def attitude_and_rate(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) ->
     """Return attitude and rate of a frame: the decision tree."""
     motion = _motion(job) if job.motion_first else None
     rests = _predicted_within(job, _POINT_PX) if motion is None else _shows_no_motion(job, motion)
-    near = _near(job, tracker, sky) if rests else None
+    # Of short streaks few are fitted, and may be taken for their reverse; all stars have predicted places.
+    near = _near(job, tracker, sky) if rests or _known_to_be_short(job) else None
     if near is not None:
         return FrameFound(motion or _no_motion(job), near)
     if motion is None:
@@ -213,11 +214,7 @@ def attitude_and_rate(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) ->
         return FrameFound(motion, _from_points(job, tracker, sky, seen))
     if motion.status not in MOVED:
         return FrameFound(motion, None)
-    found = _from_motion(job, tracker, sky, motion)
-    if found.solution is not None and found.solution.status is not SolveStatus.SOLVED:
-        # Of short streaks few are fitted, too few to know the sky by; all stars have their predicted places.
-        near = _near(job, tracker, sky) if _predicted_within(job, _SHORT_PX) else None
-    return found if near is None else replace(found, solution=near)
+    return _from_motion(job, tracker, sky, motion)
 
 
 def _near(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) -> FrameSolution | None:
@@ -326,6 +323,11 @@ def _short_trails(job: FrameJob) -> ShortTrails | None:
         return ShortTrails(turn)
     delay, doubt = estimator.delay_per_row / job.exposure, estimator.line_time_sigma / job.exposure
     return ShortTrails(turn, delay, doubt)
+
+
+def _known_to_be_short(job: FrameJob) -> bool:
+    """Return whether streaks are known to be so short that they are measured as points with trails."""
+    return _short_trails(job) is not None and _predicted_within(job, _SHORT_PX)
 
 
 def _predicted_within(job: FrameJob, length: float) -> bool:
