@@ -6,7 +6,8 @@ the samples of the pauses a filter follows the body's whole rate and how the fie
 brakes in the field expected ahead: that of the orbit where the attitude is known, else the measured one,
 turned on at its present speed. Unlike B-dot the law cannot get stuck with the spin along the field: the plan
 holds what lies along the field until the field has turned. One sample starts nothing: the coils wait until
-`TRUSTED` samples in a row agree with the filter's prediction.
+`TRUSTED` samples in a row agree with the filter's prediction. They wait again where none was accepted for
+`UNHEARD` periods: a unit that began anew may be heard, and yet none of its fields be of use.
 
 In the least time a spin along the field is first made faster, across the field. `gentle` and `spin_up` bound
 that: at the bound no dipole is commanded that makes the body faster. A bound at the rate of the begin costs
@@ -36,6 +37,10 @@ from flight.gnc.math.quaternion import attitude_matrix, conjugate, multiply
 
 TRUSTED = 4
 """Samples in a row that agree, before the coils act."""
+UNHEARD = 2
+"""Periods without an accepted sample, after which the coils wait for samples that agree."""
+OLDEST_NS = 100_000_000
+"""Of a sample, behind the last command: the body's rate carries its field on to that."""
 INSTANTS = 150
 KNOWN = 2e-3
 """rad/s, standard deviation of the rate's worst axis from which on it is bounded."""
@@ -102,6 +107,7 @@ class FieldDetumbler:
         self._planned_ns = now_ns
         self._planned_turn = _NO_DIPOLE
         self._trusted = 0
+        self._heard_ns = now_ns
         self._fastest = math.inf
         self._filter.restart()
 
@@ -115,25 +121,31 @@ class FieldDetumbler:
     def sample(self, time_ns: int, field: FloatArray, rate: FloatArray | None = None) -> None:
         """Accept a field (3,) T measured at `time_ns`; ignored unless the coils were off and settled.
 
-        `rate` (3,) rad/s is a gyro's of the same time.
+        `rate` (3,) rad/s is a gyro's of the same time. A command may have been given since.
         """
-        if not self.listens(time_ns) or time_ns < self._time_ns:
+        age_ns = self._time_ns - time_ns
+        if not self.listens(time_ns) or age_ns > OLDEST_NS:
             return
-        self._advance(time_ns)
+        if age_ns < 0:
+            self._advance(time_ns)
         starts = self._filter.restarts
-        accepted = self._filter.measure(field)
+        accepted = self._filter.measure(field, max(age_ns, 0) * _SECOND)
+        if accepted:
+            self._heard_ns = time_ns
         if accepted and self._filter.started:
             self._trusted += 1
             if rate is not None and self.trusted:
                 self._filter.measure_rate(rate)
-        elif not accepted and (self._trusted < TRUSTED or self._filter.restarts != starts):
-            self._trusted = 0
-            self._plan = None
+        if self._filter.restarts != starts or (not accepted and not self.trusted):
+            self._distrust()
 
     def dipole(self, now_ns: int) -> FloatArray:
         """Return the dipole (3,) A m^2 now: zero while the field is measured or the rate is not known."""
-        self._advance(max(now_ns, self._time_ns))
         schedule = self._schedule
+        if self._filter.started:  # before that, time passes from sample to sample
+            self._advance(max(now_ns, self._time_ns))
+        if self.trusted and now_ns - self._heard_ns > UNHEARD * schedule.period_ns:
+            self._distrust()
         phase_ns = (now_ns - self._begun_ns) % schedule.period_ns
         acting = phase_ns >= schedule.settle_ns + schedule.measure_ns
         self._dipole = self._braking_dipole(now_ns) if acting and self.trusted else _NO_DIPOLE
@@ -169,6 +181,11 @@ class FieldDetumbler:
     def restarts(self) -> int:
         """How often samples contradicted the filter until it began again: a spin beyond the sampling does."""
         return self._filter.restarts
+
+    def _distrust(self) -> None:
+        """Let the coils wait until samples agree."""
+        self._trusted = 0
+        self._plan = None
 
     def _advance(self, time_ns: int) -> None:
         self._filter.advance(self._dipole, (time_ns - self._time_ns) * _SECOND)
