@@ -16,6 +16,7 @@ from flight.link.telemetry.packets import to_text
 from ground.report import panels
 from ground.report.cage_figure import cage_figure
 from ground.report.knowledge_figure import knowledge_figure
+from ground.report.objects_figure import objects_figure
 from ground.report.orbit_figure import orbit_figure
 from ground.report.scene import Scene
 from ground.report.signals import seconds
@@ -28,7 +29,7 @@ WIDE = (11.0, 5.2)
 TALL = (11.0, 7.6)
 OVERVIEW = (10.9, 12.7)
 PATH_WINDOW_S = 20.0
-_IN_ORBIT = ("power", "cycle_times", "spin", "knowledge", "pointing", "track")
+_IN_ORBIT = ("power", "cycle_times", "spin", "knowledge", "pointing", "track", "objects")
 
 
 def draw_figures(run: Run, folder: Path) -> list[Path]:
@@ -47,6 +48,7 @@ def draw_figures(run: Run, folder: Path) -> list[Path]:
         "knowledge": lambda scene: knowledge_figure(scene.run),
         "pointing": orbit_figure,
         "track": lambda scene: track_figure(scene.run),
+        "objects": lambda scene: objects_figure(scene.run),
     }
     if len(run["spin"]):  # a satellite in orbit has no q2
         pictures = {name: pictures[name] for name in _IN_ORBIT}

@@ -18,6 +18,7 @@ from flight.schema.orbit import OrbitConfig, as_orbit
 from ground.report import performance as limits
 from ground.report.detumbling import detumbling
 from ground.report.knowledge import knowledge
+from ground.report.objects import objects
 from ground.report.operations import (
     cycles,
     events,
@@ -69,6 +70,7 @@ def summarise(run: Run) -> Object:
         "streaks": streaks(run),
         "stars": star_attitudes(run),
         "failed_frames": failed_frames(run),
+        "objects": objects(run),
         "modes": modes(run["mode"]),
         "health": health(run["health"]),
         "events": events(run["event"]),

@@ -29,6 +29,7 @@ def format_report(summary: Object) -> str:
         _loop(summary),
         _planner(summary),
         _sensing(summary),
+        _objects(summary["objects"]),
         _modes(summary["modes"]),
         _health(summary["health"]),
         _events(summary["events"]),
@@ -165,6 +166,27 @@ def _pointing(found: Object | None) -> list[str]:
         *table(head, rows),
         f"  errors from {number(found['settled_after_s'], 0)} s after the begin on, or the first slew's end",
     ]
+
+
+def _objects(found: list[Object]) -> list[str]:
+    if not found:
+        return []
+    degrees = 180.0 / math.pi
+    rows = [
+        [
+            str(row["number"]),
+            number(row["first_s"], 1),
+            number(row["last_s"], 1),
+            f"{row['seen']} of {row['frames']}",
+            number(row["rate_least_rad_s"], 3, degrees),
+            number(row["rate_most_rad_s"], 3, degrees),
+            number(row["magnitude"], 1),
+            number(row["sighting_sigma_rad"], 2, ARCSECONDS),
+        ]
+        for row in found
+    ]
+    head = ["object", "from s", "to s", "seen in", "deg/s least", "most", "V", "sigma of a sighting, arcsec"]
+    return ["Objects among the stars", *table(head, rows)]
 
 
 def _bounds(title: str, bound: str, judged: list[Object]) -> list[str]:

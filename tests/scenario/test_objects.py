@@ -14,6 +14,10 @@ from flight.gnc.math.quaternion import attitude_matrix
 from flight.schema import reader as configuration
 from flight.schema.devices import ObjectTracking
 from ground.export.tracking_data import write_tracking_data
+from ground.report.objects import objects
+from ground.report.objects_figure import objects_figure
+from ground.report.summary import summarise
+from ground.report.text import format_report
 from ground.telemetry.reader import Run
 from sim_hal.settings import LineOfSight, SkyObject
 from tests.scenario.flights import demo_config, demo_world, event_names, fly
@@ -91,6 +95,19 @@ def test_two_objects_are_found_and_tracked_to_a_fraction_of_a_pixel(tracked: Run
         assert abs(rate - _LINES[own].rate_deg) < 0.01
         assert abs(track["magnitude"][-1] - _BRIGHTNESS[own]) < 0.3
         assert track["seen"].all()
+
+
+def test_the_report_lists_and_draws_them(tracked: Run) -> None:
+    rows = objects(tracked)
+    assert len(rows) == 2
+    for row, magnitude, line in zip(
+        sorted(rows, key=lambda row: row["magnitude"]), _BRIGHTNESS, _LINES, strict=True
+    ):
+        assert row["magnitude"] == pytest.approx(magnitude, abs=0.4)
+        assert np.degrees(row["rate_most_rad_s"]) == pytest.approx(line.rate_deg, rel=0.05)
+        assert 3 < row["seen"] <= row["frames"]
+    assert "Objects among the stars" in format_report(summarise(tracked))
+    assert objects_figure(tracked) is not None
 
 
 def test_a_sky_without_objects_has_no_track(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from flight.gnc.camera.exposure import Exposures
+from flight.gnc.camera.knowledge import CameraKnowledge
 from flight.gnc.tracking.tracker import TrackSettings
 from flight.gnc.vision.frame_job import TrackerSettings
 from flight.gnc.vision.kept_frames import KeptFrames
@@ -103,7 +104,9 @@ def _tracker(camera: Camera) -> TrackerSettings | None:
     velocity = None if section.velocity is None else np.array(section.velocity)
     # The camera is known on board: no mirror is in its path, and its focal length is as good as configured.
     identification = IdentificationSettings(mirror=False, hint_error=1.0)
-    solve = SolveSettings(detection=detection, identification=identification, velocity=velocity)
+    accuracy = camera.accuracy
+    lens = CameraKnowledge(accuracy.focal_length, accuracy.centre, accuracy.distortion)
+    solve = SolveSettings(detection=detection, identification=identification, velocity=velocity, lens=lens)
     return TrackerSettings(solve, scale, index)
 
 

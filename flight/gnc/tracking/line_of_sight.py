@@ -9,10 +9,10 @@ angular rate v, the part along it s = (range rate) / range, and the angular acce
 Both fall about the Earth: the gravity gradient at the observer's place, where that is known, gives the
 acceleration of one against the other but for terms of the distance over the orbit's radius.
 
-Process noise: the tides of two low orbits, or what the gradient leaves of them, which turn with the line, are
-taken for white accelerations of density `Motion.wander`. The range's part also follows what is no straight
-line, as an object on a great circle at a constant rate, whose s would change by rate^2: a density of
-(`Motion.bend` rate^2)^2 / rate.
+Process noise: the tides of two low orbits, which turn with the line, are taken for white accelerations of
+density `Motion.wander`, and what the gradient leaves of them for those of `Motion.left`. The range's part
+also follows what is no straight line, as an object on a great circle at a constant rate, whose s would change
+by rate^2: a density of (`Motion.bend` rate^2)^2 / rate.
 """
 
 from __future__ import annotations
@@ -36,12 +36,14 @@ class Motion:
         wander: 1/s^3, density of scaled accelerations. Tides in low orbit reach 1.5 n^2 = 1.8e-6 1/s^2; the
             density is the one whose errors of place and rate are as large as their covariance says in passes
             of 0.05 to 0.6 deg/s at up to 5,000 km.
+        left: 1/s^3, the same where the gravity gradient is known, from the same passes.
         bend: part of rate^2 by which the closing rate changes otherwise than on a straight line.
     """
 
     rate: float = 0.01
     closing: float = 0.01
     wander: float = 1.6e-12
+    left: float = 4e-13
     bend: float = 0.3
 
 
@@ -114,7 +116,7 @@ def predict(state: LineOfSight, time_ns: int, motion: Motion, tide: FloatArray |
     if tide is not None:
         transition[:3, :3] += 0.5 * step**2 * tide
         transition[3:, :3] = step * tide
-    spread = transition @ state.covariance @ transition.T + _noise(state, step, motion)
+    spread = transition @ state.covariance @ transition.T + _noise(state, step, motion, tide is not None)
     moved = transition @ np.concatenate([state.direction, state.velocity])
     return _at_unit_range(time_ns, moved[:3], moved[3:], spread)
 
@@ -155,11 +157,12 @@ def _at_unit_range(
     return LineOfSight(time_ns, direction, scaled, 0.5 * (spread + spread.T))
 
 
-def _noise(state: LineOfSight, step: float, motion: Motion) -> FloatArray:
-    """Return the covariance (6, 6) of white accelerations over `step` s."""
+def _noise(state: LineOfSight, step: float, motion: Motion, known: bool) -> FloatArray:
+    """Return the covariance (6, 6) of white accelerations over `step` s; `known`: the gradient is."""
     along = np.outer(state.direction, state.direction)
     rate = float(np.linalg.norm(state.rate))
-    density = motion.wander * np.eye(3) + motion.bend**2 * rate**3 * along
+    wander = motion.left if known else motion.wander
+    density = wander * np.eye(3) + motion.bend**2 * rate**3 * along
     return np.block(
         [[density * step**3 / 3.0, density * step**2 / 2.0], [density * step**2 / 2.0, density * step]]
     )

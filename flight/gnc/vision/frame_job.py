@@ -31,6 +31,7 @@ from flight.gnc.vision.startracker.index import sky_index
 from flight.gnc.vision.startracker.index.build import default_index
 from flight.gnc.vision.startracker.index.sky_index import SkyIndex
 from flight.gnc.vision.startracker.mid_exposure import MOVED
+from flight.gnc.vision.startracker.short_trails import ShortTrails
 from flight.gnc.vision.startracker.solution import FrameSolution, SolveStatus
 from flight.gnc.vision.startracker.solve import (
     PRIOR_SIGMAS,
@@ -57,6 +58,8 @@ _POINT_PX = 1.0
 # Streaks predicted to be shorter are found like points where the frame itself agrees on no motion: in a
 # crowded sky regions run together and look longer than they are.
 _SHORT_PX = 4.0
+# A trail known to this, px, is in the model of a star's light.
+_KNOWN_PX = 0.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,10 +203,10 @@ def attitude_and_rate(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) ->
     """Return attitude and rate of a frame: the decision tree."""
     motion = _motion(job) if job.motion_first else None
     rests = _predicted_within(job, _POINT_PX) if motion is None else _shows_no_motion(job, motion)
-    if rests and job.attitude_prior is not None:
-        near = solve_near(job.pixels, job.camera, tracker.scale, sky, tracker.solve, job.attitude_prior)
-        if near is not None:
-            return FrameFound(motion or _no_motion(job), near)
+    # Of short streaks few are fitted, and may be taken for their reverse; all stars have predicted places.
+    near = _near(job, tracker, sky) if rests or _known_to_be_short(job) else None
+    if near is not None:
+        return FrameFound(motion or _no_motion(job), near)
     if motion is None:
         return _of_picture(job, tracker, sky)
     if rests:
@@ -212,6 +215,14 @@ def attitude_and_rate(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) ->
     if motion.status not in MOVED:
         return FrameFound(motion, None)
     return _from_motion(job, tracker, sky, motion)
+
+
+def _near(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex) -> FrameSolution | None:
+    """Return the attitude from stars near their predicted places, None without a prior or where they fail."""
+    prior = job.attitude_prior
+    if prior is None:
+        return None
+    return solve_near(job.pixels, job.camera, tracker.scale, sky, tracker.solve, prior, _short_trails(job))
 
 
 def _from_motion(job: FrameJob, tracker: TrackerSettings, sky: SkyIndex, motion: Found) -> FrameFound:
@@ -300,6 +311,23 @@ def _shows_no_motion(job: FrameJob, motion: Found) -> bool:
     """Return whether stars are at rest, or move so little, by the priors, that a frame shows no motion."""
     failed = motion.status is StreakStatus.FAILED and job.rate_prior is not None
     return motion.status in _AT_REST or (failed and _predicted_within(job, _SHORT_PX))
+
+
+def _short_trails(job: FrameJob) -> ShortTrails | None:
+    """Return how stars move over the exposure where that is known to a fraction of a pixel."""
+    prior, estimator = job.rate_prior, job.estimator
+    if prior is None or prior.sigma * job.exposure * job.camera.focal_length > _KNOWN_PX:
+        return None
+    turn = prior.rate * job.exposure
+    if not isinstance(estimator, LikelihoodSettings):
+        return ShortTrails(turn)
+    delay, doubt = estimator.delay_per_row / job.exposure, estimator.line_time_sigma / job.exposure
+    return ShortTrails(turn, delay, doubt)
+
+
+def _known_to_be_short(job: FrameJob) -> bool:
+    """Return whether streaks are known to be so short that they are measured as points with trails."""
+    return _short_trails(job) is not None and _predicted_within(job, _SHORT_PX)
 
 
 def _predicted_within(job: FrameJob, length: float) -> bool:

@@ -71,9 +71,9 @@ def streams_of(config: Config) -> tuple[Stream, ...]:
 
 def _seldom(camera: Camera) -> float:
     """Return the longest time, s, between two frames; exposures that follow the rate shift them."""
-    if camera.fine_period is None:
+    if camera.fine_period is None and camera.streak_exposure is None:
         return camera.period
-    return max(camera.period, camera.fine_period) + max(camera.streak_exposure or (camera.exposure,))
+    return max(camera.period, camera.fine_period or 0.0) + max(camera.streak_exposure or (camera.exposure,))
 
 
 class StreamWatch:

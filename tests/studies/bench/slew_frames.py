@@ -46,8 +46,8 @@ def _as_they_come(config: Config, services: Services, learned: Mapping[str, Lear
 AS_THEY_COME = BodyKind(ORBIT.plan, _as_they_come)
 
 
-def flight(body: str, seed: int) -> tuple[OrbitConfig, Simulation]:
-    """Return the configuration and the world of a flight."""
+def flight(body: str, seed: int, about: FloatArray | None = None) -> tuple[OrbitConfig, Simulation]:
+    """Return the configuration and the world of a flight; it slews `about` (3,), body axes, or any axis."""
     text = CONFIG.read_text(encoding="utf-8")
     config = as_orbit(configuration.parse(text))
     section = configuration.simulation_section(text, CONFIG.name, Simulation)
@@ -59,7 +59,7 @@ def flight(body: str, seed: int) -> tuple[OrbitConfig, Simulation]:
     assert away.release.attitude is not None
     start = away.release.attitude
     rng = np.random.default_rng(seed)
-    axis = rng.normal(size=3)
+    axis = rng.normal(size=3) if about is None else about
     end = multiply(from_rotation_vector(TURN * axis / np.linalg.norm(axis)), np.array(start))
     x, y, z, w = end.tolist()
     release = configuration.replace(section.free_body.release, attitude=start, speed=SPEED)
@@ -80,12 +80,17 @@ def flight(body: str, seed: int) -> tuple[OrbitConfig, Simulation]:
     ), world
 
 
-def compared(run: Run) -> tuple[int, int, int, FloatArray]:
-    """Return how many frames the slew had, with a rate, used; and the rates' NEES of an axis (n,)."""
+def compared(
+    run: Run, first: float = BEGIN + 5.0, last: float = BEGIN + SLEW
+) -> tuple[int, int, int, FloatArray]:
+    """Return how many frames the slew had, with a rate, used; and the rates' NEES of an axis (n,).
+
+    It is judged from `first` to `last` s.
+    """
     frames, truth = run["streak"], run["truth"]
     times, rates = truth["time_ns"] * 1e-9, truth["rate"].astype(float)
     began = frames["exposure_start_ns"] * 1e-9
-    within = (began > BEGIN + 5.0) & (began < BEGIN + SLEW)
+    within = (began > first) & (began < last)
     found = []
     for frame in frames[within]:
         if to_text(frame["status"]) != "rate":

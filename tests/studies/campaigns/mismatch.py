@@ -133,7 +133,7 @@ def expose(case: Case, imperfection: Imperfection) -> tuple[Image, FloatArray]:
         imperfection.line_time / exposure,
         rng,
     )
-    return _detected(electrons, imperfection, camera, exposure, rng), np.asarray(rate)
+    return detected(electrons, imperfection, camera, exposure, rng), np.asarray(rate)
 
 
 def _seen(camera: StarCameraModel, sky: Sky, attitudes: Attitudes, exposure: float) -> tuple[IntArray, int]:
@@ -149,7 +149,7 @@ def _seen(camera: StarCameraModel, sky: Sky, attitudes: Attitudes, exposure: flo
     return near, int(np.count_nonzero(inside & (sky.electrons[near] > _SIGNIFICANCE * noise)))
 
 
-def _detected(
+def detected(
     electrons: FloatArray,
     imperfection: Imperfection,
     camera: StarCameraModel,

@@ -1,23 +1,32 @@
 """Campaign `object-passes`: passes of an object in rendered frames, through star tracker, sighting and track.
 
-The camera stands still for six frames, in which the object leaves a streak, and then turns with it for ten,
-in which the stars do. A frame of 0.2 s each second, 512 x 512 px over 20 deg. Each case without an object has
-as many frames of the same motion: what is tracked there is false. A sighting's error is beside the Cramer-Rao
-bound of a point under that motion in that frame.
+Craft and object fall about the Earth; the object turns by 0.05 to 0.6 deg/s where it is nearest. The camera
+stands still for six frames, in which the object leaves a streak, and then turns with it, when the stars do:
+ten frames of a `short` pass, one each second, or a frame each 5 s for 3 to 6 min of a `long` one. A frame of
+0.2 s, 512 x 512 px over 20 deg. Each case without an object has as many frames of the same motion: what is
+tracked there is false. A sighting's error is beside the Cramer-Rao bound of a point under that motion in that
+frame.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from flight.gnc.camera.knowledge import EXACT
 from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.directions import tangent_basis
-from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
+from flight.gnc.math.quaternion import (
+    attitude_matrix,
+    from_matrix,
+    from_rotation_vector,
+    multiply,
+)
 from flight.gnc.tracking.line_of_sight import LineOfSight
 from flight.gnc.tracking.sightings import Sightings
 from flight.gnc.tracking.tracker import Tracker, TrackSettings
@@ -29,27 +38,35 @@ from flight.gnc.vision.startracker.solve import AttitudePrior, RatePrior, SolveS
 from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion
 from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from sim_hal.star_camera import SourceTrack, StarCameraModel, render
+from tests.flight.gnc.tracking.passes import Pass, a_pass
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.scenes import catalogue
 from tests.studies.streak_bound import star_information
 
 EXPOSURE, STILL, TURNING = 0.2, 6, 10
+LONG, LONG_PERIOD = (180.0, 360.0), 5.0
+"""s: how long a long pass lasts, and from frame to frame."""
 MAGNITUDES = (2.0, 3.0, 4.0, 5.0, 6.0)
 SLOWEST, FASTEST = 0.05, 0.6
 """deg/s."""
+JUDGED = 8
+"""Frames from one judgement of a track to the next."""
+OWN_TRACK = 0.01
+"""rad: a track nearer to the object than this is its."""
 OWN_PX = 3.0
 """A sighting nearer to the object than this is its."""
 CAMERA = StarCameraModel(columns=512, rows=512)
 
 
 def cases(runs: int, seed: int) -> list[Case]:
-    """Return `runs` passes at each magnitude, and as many without an object."""
+    """Return `runs` passes of each length at each magnitude, and as many without an object."""
     return [
         Case(
-            f"{run}/{magnitude}",
+            f"{length}/{run}/{magnitude}",
             (seed, run, number),
-            {"magnitude": magnitude, "still": STILL, "turning": TURNING},
+            {"length": length, "magnitude": magnitude, "still": STILL, "turning": TURNING},
         )
+        for length in ("short", "long")
         for run in range(runs)
         for number, magnitude in enumerate((*MAGNITUDES, None))
     ]
@@ -60,78 +77,90 @@ def run(case: Case) -> Result:
     rng = np.random.default_rng(case.seed)
     magnitude: float | None = case.parameters["magnitude"]
     rate = math.radians(float(np.exp(rng.uniform(math.log(SLOWEST), math.log(FASTEST)))))
-    start = normalise(rng.normal(size=4))
+    times = _times(case, rng)
+    flown = a_pass(rng, rate, times, rng.uniform(0.0, times[-1]))
+    tracker = Tracker(TrackSettings())
+    frames, nees = [], []
+    for number, frame in enumerate(_frames(flown, case.parameters["still"], rng)):
+        sighted = frame.sighted(magnitude, rng)
+        frames.append(frame.judged(sighted, magnitude))
+        if sighted is not None:
+            seen = sighted.directions, sighted.covariance, sighted.magnitudes, sighted.attitude
+            tracker.ingest(Sightings(round(frame.time * 1e9), *seen, observer=frame.observer))
+            if number % JUDGED == JUDGED - 1:
+                nees += [_nees(track.line, frame) for track in tracker.objects if _is_own(track.line, frame)]
+    # A frame without an attitude leaves the tracks where they were before it.
+    lines = [tracker.predicted(track.number, round(times[-1] * 1e9)) for track in tracker.objects]
+    own = [n for n, line in enumerate(lines) if line and _is_own(line, frame)]
+    result = {**case.parameters, "rate_deg": math.degrees(rate), "frames": frames}
+    result["false_tracks"] = len(lines) - (len(own[:1]) if magnitude is not None else 0)
+    if magnitude is None or not own:
+        return result | {"nees": None}
+    return result | {"nees": nees, "brightness": tracker.objects[own[0]].magnitude}
+
+
+def _times(case: Case, rng: np.random.Generator) -> FloatArray:
+    """Return the times of the frames (n,), s."""
+    still, turning, period = case.parameters["still"], case.parameters["turning"], 1.0
+    if case.parameters["length"] == "long":
+        turning, period = int(rng.uniform(*LONG) / LONG_PERIOD), LONG_PERIOD
+    return np.concatenate([np.arange(still) * 1.0, still - 1.0 + period * np.arange(1, turning + 1)])
+
+
+def _frames(flown: Pass, still: int, rng: np.random.Generator) -> list[_Frame]:
+    """Return the frames of a pass: the camera stands for `still` of them and then turns with the object."""
     # Towards the boresight and past it, in camera axes; the turn that follows it is about `axis`.
     towards = rng.uniform(0.0, 2.0 * np.pi)
     axis = np.array([np.cos(towards), np.sin(towards), 0.0])
-    begin = from_rotation_vector(axis * math.radians(2.0))
-    first = attitude_matrix(begin)[2]
-    tracker = Tracker(TrackSettings())
-    frames = []
-    still, turning = case.parameters["still"], case.parameters["turning"]
-    for second in range(still + turning):
-        turn = axis * rate if second >= still else np.zeros(3)
-        quaternion = multiply(from_rotation_vector(turn * (second - still)), start)
-        sky = _Frame(quaternion, turn, first, axis * rate, second, start)
-        sighted = sky.sighted(magnitude, rng)
-        frames.append(sky.judged(sighted, magnitude))
-        if sighted is not None:
-            seen = sighted.directions, sighted.covariance, sighted.magnitudes, sighted.attitude
-            tracker.ingest(Sightings(second * 1_000_000_000, *seen))
-    true = sky.direction(0.0)
-    # A frame without an attitude leaves the tracks where they were before it.
-    lines = [tracker.predicted(track.number, second * 1_000_000_000) for track in tracker.objects]
-    own = [n for n, line in enumerate(lines) if line and np.linalg.norm(line.direction - true) < 0.01]
-    result = {**case.parameters, "rate_deg": math.degrees(rate), "frames": frames}
-    result["false_tracks"] = len(lines) - (len(own[:1]) if magnitude is not None else 0)
-    line = lines[own[0]] if own else None
-    if magnitude is None or line is None:
-        return result | {"nees": None}
-    brightness = tracker.objects[own[0]].magnitude
-    return result | {"nees": _nees(line, true, sky.velocity()), "brightness": brightness}
+    first = attitude_matrix(from_rotation_vector(axis * math.radians(2.0)))[2]
+    places, motions, frames = flown.directions, flown.rates, []
+    about = np.cross(places[0], motions[0]) / np.linalg.norm(motions[0])
+    in_sky = np.array([places[0], about, np.cross(places[0], about)])
+    held = from_matrix(np.array([first, axis, np.cross(first, axis)]).T @ in_sky)
+    for number, time in enumerate(flown.times):
+        turn = np.zeros(3)
+        if number >= still:
+            turned = np.cross(places[number - 1], places[number])
+            angle = math.asin(float(np.linalg.norm(turned)))
+            held = multiply(
+                from_rotation_vector(attitude_matrix(held) @ turned * angle / math.sin(angle)), held
+            )
+            turn = attitude_matrix(held) @ np.cross(places[number], motions[number])
+        frames.append(_Frame(time, held, turn, places[number], motions[number], flown.observer[number]))
+    return frames
 
 
+@dataclass(frozen=True, slots=True, eq=False)
 class _Frame:
-    """One frame: the camera at `quaternion` turns by `turn` rad/s; the object is where its motion has it."""
+    """One frame: the camera at `quaternion` turns by `turn` (3,) rad/s.
 
-    def __init__(
-        self,
-        quaternion: FloatArray,
-        turn: FloatArray,
-        first: FloatArray,
-        motion: FloatArray,
-        second: int,
-        start: FloatArray,
-    ) -> None:
-        self._quaternion, self._turn, self._first, self._motion = quaternion, turn, first, motion
-        self._second, self._start = second, start
+    At mid-exposure the object is at `place` (3,), ICRS, with a `motion` (3,) rad/s, the `observer` (3,) m.
+    """
 
-    def direction(self, since: float) -> FloatArray:
-        """Return where the object is, ICRS, so long after the middle."""
-        angle = self._motion * (self._second + since)
-        seen = attitude_matrix(from_rotation_vector(-angle)) @ self._first
-        return np.asarray(attitude_matrix(self._start).T @ seen)
-
-    def velocity(self) -> FloatArray:
-        """Return how the direction changes, rad/s."""
-        return np.asarray((self.direction(0.5) - self.direction(-0.5)) / 1.0)
+    time: float
+    quaternion: FloatArray
+    turn: FloatArray
+    place: FloatArray
+    motion: FloatArray
+    observer: FloatArray
 
     def sighted(self, magnitude: float | None, rng: np.random.Generator) -> Sighted | None:
         """Return what the frame shows, by the flight's own vision."""
         times = np.linspace(-0.5 * EXPOSURE, 0.5 * EXPOSURE, 9)
-        attitudes = np.array(
-            [multiply(from_rotation_vector(self._turn * t), self._quaternion) for t in times]
-        )
-        places = np.array([self.direction(t) for t in times])
+        attitudes = np.array([multiply(from_rotation_vector(self.turn * t), self.quaternion) for t in times])
+        places = self.place + times[:, None] * self.motion
+        places /= np.linalg.norm(places, axis=1, keepdims=True)
         extra = [] if magnitude is None else [SourceTrack(times, places, magnitude)]
         stars, directions = catalogue(8.5)
         pixels = render(CAMERA, directions, stars.magnitude, times, attitudes, rng, extra)
         saturation = float(CAMERA.highest_count)
         detection = DetectionSettings(psf_sigma=CAMERA.psf_sigma, gain=CAMERA.gain, saturation=saturation)
-        likelihood = LikelihoodSettings(gain=CAMERA.gain, saturation=saturation, psf_sigma=CAMERA.psf_sigma)
-        tracker = TrackerSettings(SolveSettings(detection=detection), (1.0, 1.0))
+        likelihood = LikelihoodSettings(
+            gain=CAMERA.gain, saturation=saturation, psf_sigma=CAMERA.psf_sigma, line_time=0.0
+        )
+        tracker = TrackerSettings(SolveSettings(detection=detection, lens=EXACT), (1.0, 1.0))
         off = from_rotation_vector(rng.normal(scale=1e-4, size=3))
-        priors = RatePrior(self._turn, 1e-4), AttitudePrior(multiply(off, self._quaternion), 1e-4)
+        priors = RatePrior(self.turn, 1e-4), AttitudePrior(multiply(off, self.quaternion), 1e-4)
         job = FrameJob(
             pixels, CAMERA.pinhole, EXPOSURE, likelihood, tracker, *priors, objects=SightSettings()
         )
@@ -143,14 +172,14 @@ class _Frame:
             return {"solved": False, "others": 0}
         if magnitude is None:
             return {"solved": True, "others": len(sighted.points)}
-        place = CAMERA.pinhole.project((attitude_matrix(self._quaternion) @ self.direction(0.0))[None])[0]
+        place = CAMERA.pinhole.project((attitude_matrix(self.quaternion) @ self.place)[None])[0]
         away = np.linalg.norm(sighted.points - place, axis=1)
         own = int(np.argmin(away)) if len(away) else -1
         result = {"solved": True, "others": len(away), "bound": self._bound(place, magnitude)}
         if own < 0 or away[own] > OWN_PX:
             return result
         basis = tangent_basis(sighted.directions[own])
-        error = basis @ self.direction(0.0) * CAMERA.pinhole.focal_length
+        error = basis @ self.place * CAMERA.pinhole.focal_length
         spread = basis @ sighted.covariance[own] @ basis.T * CAMERA.pinhole.focal_length**2
         return result | {
             "others": len(away) - 1,
@@ -161,47 +190,52 @@ class _Frame:
 
     def _bound(self, place: FloatArray, magnitude: float) -> float:
         """Return the bound on the object's place, px of an axis, in the middle of the exposure."""
-        relative = (self._turn - self._motion) * EXPOSURE
+        own = attitude_matrix(self.quaternion) @ np.cross(self.place, self.motion)
         light = float(CAMERA.electrons([magnitude], EXPOSURE)[0])
         floor = CAMERA.read_noise**2 + CAMERA.dark_current * EXPOSURE + CAMERA.gain**2 / 12.0
         pinhole: Pinhole = CAMERA.pinhole
-        known = star_information(pinhole, Motion.steady(relative), place, light, CAMERA.psf_sigma, floor)
+        relative = Motion.steady((self.turn - own) * EXPOSURE)
+        known = star_information(pinhole, relative, place, light, CAMERA.psf_sigma, floor)
         return math.sqrt(0.5 * float(np.trace(np.linalg.inv(known[4:, 4:])[:2, :2])))
 
 
-def _nees(line: LineOfSight, true: FloatArray, velocity: FloatArray) -> list[float]:
+def _is_own(line: LineOfSight, frame: _Frame) -> bool:
+    """Return whether a track is the object's."""
+    return bool(np.linalg.norm(line.direction - frame.place) < OWN_TRACK)
+
+
+def _nees(line: LineOfSight, frame: _Frame) -> list[float]:
     """Return the squared errors of direction and rate over their covariance, two degrees of freedom each."""
     basis = tangent_basis(line.direction)
     found = []
-    for error, part in ((true - line.direction, slice(0, 3)), (velocity - line.rate, slice(3, 6))):
+    for error, part in (
+        (frame.place - line.direction, slice(0, 3)),
+        (frame.motion - line.rate, slice(3, 6)),
+    ):
         across = basis @ error
         found.append(float(across @ np.linalg.solve(basis @ line.covariance[part, part] @ basis.T, across)))
     return found
 
 
 def summarise(results: Sequence[Result], _: Path) -> Summary:
-    """Return a row for each magnitude."""
+    """Return a row for each length and magnitude."""
     lines = [
-        "V      found/passes  frames seen   error, claim, bound px (rms)   NEES of 2: place, direction, rate"
+        "pass   V      found/passes  frames seen   error, claim, bound px (rms)   "
+        "NEES of 2: place, direction, rate; tracks judged"
     ]
     rows = []
-    for magnitude in MAGNITUDES:
-        own = [result for result in results if result["magnitude"] == magnitude]
-        seen = [frame for result in own for frame in result["frames"] if "error" in frame]
-        made = [result["nees"] for result in own if result["nees"] is not None]
-        row: Result = {"magnitude": magnitude, "passes": len(own), "found": len(made)}
-        row |= {"frames": sum(len(result["frames"]) for result in own), "seen": len(seen)}
-        for name in ("error", "claim", "bound"):
-            row[name] = math.sqrt(float(np.mean([frame[name] ** 2 for frame in seen]))) if seen else None
-        row["nees"] = np.mean(made, axis=0).tolist() if made else None
-        off = [2.0 * (frame["error"] / frame["claim"]) ** 2 for frame in seen]
-        row["sighting_nees"] = float(np.mean(off)) if off else None
-        rows.append(row)
-        if seen and made:
-            figures = ", ".join(f"{row[name]:.3f}" for name in ("error", "claim", "bound"))
-            nees = ", ".join(f"{value:.2f}" for value in (row["sighting_nees"], *row["nees"]))
-            share = f"{row['seen']}/{row['frames']}"
-            lines.append(f"{magnitude:3.1f}    {len(made)}/{len(own)}    {share:>10}    {figures}    {nees}")
+    for length in ("short", "long"):
+        for magnitude in MAGNITUDES:
+            own = [r for r in results if (r["length"], r["magnitude"]) == (length, magnitude)]
+            row = _row(own)
+            rows.append({"length": length, "magnitude": magnitude, **row})
+            if row["seen"] and row["nees"] is not None:
+                figures = ", ".join(f"{row[name]:.3f}" for name in ("error", "claim", "bound"))
+                nees = ", ".join(f"{value:.2f}" for value in (row["sighting_nees"], *row["nees"]))
+                share = f"{row['found']}/{row['passes']}    {row['seen']}/{row['frames']:>4}"
+                lines.append(
+                    f"{length:5}  {magnitude:3.1f}    {share}    {figures}    {nees}; {row['judged']}"
+                )
     empty = [result for result in results if result["magnitude"] is None]
     frames = sum(frame["solved"] for result in empty for frame in result["frames"])
     false = sum(result["false_tracks"] for result in results)
@@ -211,6 +245,20 @@ def summarise(results: Sequence[Result], _: Path) -> Summary:
     lines.append(f"frames with an attitude: {every} of {taken}")
     facts = {"rows": rows, "false_tracks": false, "empty_frames": frames, "solved": every, "taken": taken}
     return Summary("\n".join(lines) + "\n", facts)
+
+
+def _row(own: Sequence[Result]) -> Result:
+    """Return the figures of passes of one length and magnitude."""
+    seen = [frame for result in own for frame in result["frames"] if "error" in frame]
+    found = [result["nees"] for result in own if result["nees"] is not None]
+    made = [nees for track in found for nees in track]
+    row: Result = {"passes": len(own), "found": len(found), "judged": len(made)}
+    row |= {"frames": sum(len(result["frames"]) for result in own), "seen": len(seen)}
+    for name in ("error", "claim", "bound"):
+        row[name] = math.sqrt(float(np.mean([frame[name] ** 2 for frame in seen]))) if seen else None
+    row["nees"] = np.mean(made, axis=0).tolist() if made else None
+    off = [2.0 * (frame["error"] / frame["claim"]) ** 2 for frame in seen]
+    return row | {"sighting_nees": float(np.mean(off)) if off else None}
 
 
 OBJECT_PASSES = Campaign(

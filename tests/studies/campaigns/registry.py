@@ -30,6 +30,7 @@ from tests.studies.campaigns.orbit_slews import ORBIT_SLEWS
 from tests.studies.campaigns.planner_edge import PLANNER_EDGE
 from tests.studies.campaigns.process_kill import PROCESS_KILL
 from tests.studies.campaigns.rate_change import RATE_CHANGE
+from tests.studies.campaigns.resting import RESTING
 from tests.studies.campaigns.robust_controllers import ROBUST_CONTROLLERS
 from tests.studies.campaigns.rolling_shutter import ROLLING_SHUTTER
 from tests.studies.campaigns.rso import RSO_SLEW, RSO_TRACK
@@ -49,6 +50,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         FAILURES,
         MISMATCH,
         VIBRATION,
+        RESTING,
         RATE_CHANGE,
         ROLLING_SHUTTER,
         RSO_SLEW,

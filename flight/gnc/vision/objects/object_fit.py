@@ -108,7 +108,9 @@ def fit_object(
         misfit = float(np.sum(weight * off**2)) / spare
         if np.abs(step[:2]).max() < _SETTLED:
             break
-    covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64) * max(misfit, 1.0)
+    # As of the stars (`inflation`), three deviations of chi-square are left to chance.
+    excess = misfit if misfit > 1.0 + 3.0 * (2.0 / spare) ** 0.5 else 1.0
+    covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64) * excess
     away = np.abs(unknowns[:2] - middle).max()
     if not np.isfinite(unknowns).all() or unknowns[4] <= 0.0 or away > reach_of(half, patch.psf):
         return None

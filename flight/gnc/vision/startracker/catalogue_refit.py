@@ -19,6 +19,7 @@ from flight.gnc.math.arrays import BoolArray, FloatArray, Image, IntArray
 from flight.gnc.math.quaternion import attitude_matrix
 from flight.gnc.vision.startracker.aberration import apparent
 from flight.gnc.vision.startracker.index.sky_index import SkyIndex
+from flight.gnc.vision.startracker.sky_map import SkyMap
 from flight.gnc.vision.startracker.solution import FrameSolution, SolveStatus
 from flight.gnc.vision.startracker.solve import AttitudePrior, SolveSettings, solve_motion
 from flight.gnc.vision.streaks.maximum_likelihood.chains import apart, circles, close_by
@@ -209,7 +210,7 @@ def _known_stars(
     direction = sky.stars.direction[near]
     if settings.velocity is not None:
         direction = apparent(direction, settings.velocity)
-    places = solution.camera.project(direction @ matrix.T)
+    places = SkyMap(solution.camera, solution.fix.quaternion, solution.bend).pixels(direction)
     return _Known.seen(pinhole, course, places, 10.0 ** (float(zero) - 0.4 * magnitude[near]), most)
 
 

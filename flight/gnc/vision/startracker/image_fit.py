@@ -6,8 +6,8 @@ the maximum likelihood for Gaussian errors. Light of another star in a streak sh
 disagree by more than chance allows, given the scatter of the majority, are found under Huber's weights, which
 bound the pull of any star, and are excluded.
 
-The tilt, decentring and distortion of a lens that is not calibrated are fitted too, held by what is usual of
-lenses (`lens_bend`): what the stars leave open of them is in the attitude's covariance.
+The tilt, decentring and distortion of a lens that is not exact are fitted too, held by what is known of it or
+is usual of lenses (`lens_bend`): what the stars leave open of them is in the attitude's covariance.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ import numpy as np
 
 from flight.gnc.attitude.wahba import AttitudeError, AttitudeFix
 from flight.gnc.camera.lens import CameraModel
-from flight.gnc.math.arrays import BoolArray, FloatArray
+from flight.gnc.math.arrays import BoolArray, FloatArray, IntArray
 from flight.gnc.math.directions import cross_matrices
 from flight.gnc.math.quaternion import attitude_matrix, from_matrix
 from flight.gnc.vision.startracker.identification.refinement import inflation, scale_slope, stretched, turned
-from flight.gnc.vision.startracker.lens_bend import BENDS, bend_slope, bent, usual_bend
+from flight.gnc.vision.startracker.lens_bend import BENDS, bend_slope, bent
 
 _MOST_STEPS = 8
 _SETTLED = 1e-11
@@ -34,8 +34,6 @@ _MEDIAN = 2.0 * float(np.log(2.0))
 # Deviations beyond which a star's pull is bounded while outliers are searched for.
 _PULL = 1.5
 _HUBER_ROUNDS = 10
-# Their places among the parameters: after the turn and ln scale.
-_LENS = np.arange(4, 4 + BENDS)
 _LEAST_AGREEING = 4
 
 
@@ -47,7 +45,7 @@ class ImageFit:
         fix: the attitude by the stars that agree; its covariance is widened if they scatter beyond theirs.
         scale: factor of the tangents x/z, y/z; 1 when it was held.
         scale_sigma: relative standard deviation of the scale; 0 when it was held.
-        bend: (6,) of the lens (`lens_bend`); zeros when it was held.
+        bend: (6,) of the lens (`lens_bend`); zeros when it has none.
         squares: (n,) squared error of each star over its covariance, of two degrees of freedom.
         agree: (n,) whether the star was used.
     """
@@ -67,7 +65,7 @@ def fit_in_image(
     camera: CameraModel,
     start: FloatArray,
     free_scale: bool = False,
-    free_lens: bool = False,
+    known: FloatArray | None = None,
 ) -> ImageFit:
     """Return the attitude that puts stars at `reference` (n, 3) to `points` (n, 2) px.
 
@@ -78,19 +76,19 @@ def fit_in_image(
         camera: with its lens.
         start: (4,) an attitude near the answer, reference into camera.
         free_scale: whether the focal length may be wrong.
-        free_lens: whether tilt, decentring and distortion are free as well, as of a lens not calibrated.
+        known: (6,) information about the lens's bend, which is fitted too; (0,) or None: it has none.
 
     Raises AttitudeError when the stars do not determine the parameters.
     """
     observed = camera.unit_vectors(points)
-    usual = usual_bend(camera) if free_scale and free_lens else np.zeros(0)
-    seen = _Seen(observed, _whitener(points, observed, covariance, camera), reference, free_scale, usual)
+    held = np.zeros(0) if known is None else known
+    seen = _Seen(observed, _whitener(points, observed, covariance, camera), reference, free_scale, held)
     pose = seen.fitted(_Pose(attitude_matrix(start), 1.0), np.ones(len(points)))
     squares, agree = seen.squares(pose), np.ones(len(points), dtype=np.bool_)
     if squares.max() > _FARTHEST:
         pose, agree = _without_outliers(seen, pose, squares)
         squares = seen.squares(pose)
-    inverse = pose.covariance * inflation(squares[agree], len(pose.covariance))
+    inverse = pose.covariance * inflation(squares[agree], seen.parameters(pose))
     turn = np.ascontiguousarray(inverse[:3, :3], dtype=np.float64)
     fix = AttitudeFix(from_matrix(pose.matrix), turn, 0.5 * float(squares[agree].sum()))
     return ImageFit(
@@ -112,14 +110,24 @@ class _Pose:
 class _Seen:
     """Stars seen at `observed` (n, 3) with `whitener` (n, 2, 3), at `reference` (n, 3) in the sky.
 
-    `usual` (6,): information about the lens's bend before any star is seen; (0,): the lens has none.
+    `known` (6,): information about the lens's bend before any star is seen; (0,): the lens has none.
     """
 
     observed: FloatArray
     whitener: FloatArray
     reference: FloatArray
     free_scale: bool
-    usual: FloatArray
+    known: FloatArray
+
+    @property
+    def lens(self) -> IntArray:
+        """The places of the lens's bend among the parameters, after the turn and ln scale."""
+        return 3 + int(self.free_scale) + np.arange(len(self.known))
+
+    def parameters(self, pose: _Pose) -> float:
+        """Return how many parameters the stars gave: of the bend only as much as was not known before."""
+        before = self.known * np.diagonal(pose.covariance)[self.lens]
+        return len(pose.covariance) - float(before.sum())
 
     def fitted(self, start: _Pose, weight: FloatArray) -> _Pose:
         """Return the least of the squares times `weight` (n,)."""
@@ -130,29 +138,28 @@ class _Seen:
             residual = np.einsum("nij,nj->ni", whitener, seen - predicted).ravel()
             flat = self._slope(whitener, seen, predicted)
             normal, gradient = flat.T @ flat, flat.T @ residual
-            if len(self.usual):
-                normal[_LENS, _LENS] += self.usual
-                gradient[4:] += self.usual * bend
+            normal[self.lens, self.lens] += self.known
+            gradient[self.lens] += self.known * bend[: len(self.known)]
             try:
                 inverse = np.linalg.inv(normal)
             except np.linalg.LinAlgError as error:
                 raise AttitudeError(f"{len(weight)} stars in one place fix no attitude") from error
             step = -inverse @ gradient
-            if not np.all(np.abs(step[:4]) < 1.0):
+            if not np.all(np.abs(step[: 3 + int(self.free_scale)]) < 1.0):
                 raise AttitudeError(f"{len(weight)} stars do not agree on an attitude")
             matrix = turned(matrix, step[:3])
             scale *= float(np.exp(step[3])) if self.free_scale else 1.0
-            bend = bend + step[4:] if len(self.usual) else bend
+            bend = bend + step[self.lens] if len(self.known) else bend
             if np.abs(step).max() < _SETTLED:
                 break
         return _Pose(matrix, scale, bend, np.asarray(inverse, dtype=np.float64))
 
     def _slope(self, whitener: FloatArray, seen: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Return d(whitened residuals)/d(turn, ln scale, bend), (2n, 3, 4 or 10)."""
+        """Return d(whitened residuals)/d(turn, ln scale, bend), (2n, 3 to 10)."""
         slopes = [-whitener @ cross_matrices(predicted)]
         if self.free_scale:
             slopes.append(whitener @ scale_slope(seen)[:, :, None])
-        if len(self.usual):
+        if len(self.known):
             slopes.append(whitener @ bend_slope(seen))
         return np.concatenate(slopes, axis=2).reshape(2 * len(seen), -1)
 

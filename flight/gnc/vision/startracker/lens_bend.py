@@ -1,4 +1,4 @@
-"""What a lens that nobody calibrated does beyond a wrong focal length, seen from the picture's middle.
+"""What a lens that is not exactly known does beyond a wrong focal length, seen from the picture's middle.
 
 Its axis is not in the middle, and it distorts: tangents u are off by (u . a) u + |u|^2 b + k |u|^2 u + l
 |u|^4 u, with tilt a, decentring b and distortion k, l (Brown 1966): the bend (6,) is (a, b, k, l).
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from flight.gnc.camera.knowledge import CameraKnowledge
 from flight.gnc.camera.lens import CameraModel
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.vision.startracker.identification.refinement import scale_slope
@@ -17,6 +18,9 @@ BENDS = 6
 # there by its two terms: 20 px of 1024, 3 and 1 %. The decentring is the product of tilt and distortion.
 _TILT, _DISTORTION = 0.03, (0.03, 0.01)
 
+# px, and a share of the radius: what is known better is taken to be known so well.
+_LEAST_CENTRE, _LEAST_DISTORTION = 1e-3, 1e-6
+
 
 def usual_bend(camera: CameraModel) -> FloatArray:
     """Return the information (6,) about the bend that is usual of lenses."""
@@ -24,6 +28,20 @@ def usual_bend(camera: CameraModel) -> FloatArray:
     first, second = _DISTORTION
     off = [_TILT * corner] * 2 + [_TILT * first / corner] * 2
     return np.array([*off, first / corner**2, second / corner**4]) ** -2.0
+
+
+def known_bend(camera: CameraModel, lens: CameraKnowledge) -> FloatArray:
+    """Return the information (6,) about the bend of a lens known so well; (0,) of one that is exact.
+
+    An axis that is off the described one turns all stars alike, which is the mounting's, and tilts the lens.
+    """
+    if lens.centre == lens.distortion == 0.0:
+        return np.zeros(0)
+    corner = float(np.tan(camera.half_diagonal))
+    tilt = max(lens.centre, _LEAST_CENTRE) / camera.focal_length
+    first = max(lens.distortion, _LEAST_DISTORTION) / corner**2
+    off = [tilt] * 2 + [tilt * first] * 2
+    return np.array([*off, first, _DISTORTION[1] / _DISTORTION[0] * first / corner**2]) ** -2.0
 
 
 def bent(direction: FloatArray, bend: FloatArray) -> FloatArray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
@@ -41,7 +41,7 @@ class FrameSolution:
         expected: (n, 2) px, where the attitude puts the guide star; NaN for none.
         fix: attitude, ICRS to camera, and its covariance; the smaller scalar part is not negative.
         scale_sigma: relative standard deviation of the focal length; 0 where it was given.
-        bend: (6,) of a lens that was not given (`lens_bend`), else zeros.
+        bend: (6,) of a lens that is not exact, as the stars show it (`lens_bend`), else zeros.
         log10_false_alarm: of the probability that a frame of random points would have been solved.
         tracked: whether the stars were found near the prior attitude.
         motion: from the streaks, camera frame; None for points.
@@ -69,6 +69,12 @@ class FrameSolution:
     def matched(self) -> IntArray:
         """Which of the points (m,) are guide stars."""
         return np.flatnonzero(self.star >= 0)
+
+    def wider(self, by: FloatArray) -> FrameSolution:
+        """Return the solution with a covariance (3, 3) rad^2 added to its attitude's, where it has one."""
+        if self.fix is None:
+            return self
+        return replace(self, fix=replace(self.fix, covariance=self.fix.covariance + by))
 
     def sky_map(self, velocity: FloatArray | None = None) -> SkyMap | None:
         """Return the way from pixels to the sky and back; None when not solved.

@@ -14,10 +14,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from flight.gnc.attitude.wahba import AttitudeError, Solver
+from flight.gnc.camera.knowledge import CameraKnowledge
 from flight.gnc.camera.lens import CameraModel, Lens, LensError
 from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.math.arrays import FloatArray, Image
-from flight.gnc.math.quaternion import attitude_matrix
+from flight.gnc.math.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
 from flight.gnc.vision.startracker.aberration import apparent
 from flight.gnc.vision.startracker.by_directions import attitude_by
 from flight.gnc.vision.startracker.detection import (
@@ -33,7 +34,9 @@ from flight.gnc.vision.startracker.identification.tracking import track
 from flight.gnc.vision.startracker.identification.verification import expected_stars
 from flight.gnc.vision.startracker.image_fit import fit_in_image
 from flight.gnc.vision.startracker.index.sky_index import SkyIndex
+from flight.gnc.vision.startracker.lens_bend import known_bend, usual_bend
 from flight.gnc.vision.startracker.mid_exposure import timing_covariance
+from flight.gnc.vision.startracker.short_trails import ShortTrails
 from flight.gnc.vision.startracker.sky_map import SkyMap
 from flight.gnc.vision.startracker.solution import FrameSolution, SolveStatus
 from flight.gnc.vision.streaks.maximum_likelihood.course import Course
@@ -42,6 +45,10 @@ from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSett
 
 # px: error of a place from unknown distortion of the lens or the star's colour.
 _LEAST_SIGMA_PX = 0.005
+# px: the same of a lens that is stated to be exact.
+_COLOUR_PX = 0.002
+# Of what the stars are wider than described: how far the middle of all may be off (campaign `resting`).
+_SHAPE_DOUBT = 0.05
 # px: the same of a lens that is not calibrated, for identification. Tried second: most pictures need only
 # the room of their places' errors, in which fewer stars agree by chance.
 _UNTOLD_SIGMA_PX = 0.3
@@ -70,6 +77,7 @@ class SolveSettings:
         method: another method of identification.
         attitude: a solver of directions for the attitude; None takes it from the fit in the image.
         velocity: (3,) m/s of the camera about the Sun, for aberration; None: no correction.
+        lens: how well a lens of certain focal length is known; None: exactly.
         untold_lens: whether a lens of uncertain focal length may have its axis off the middle and distort;
             else the focal length is all that is uncertain.
     """
@@ -80,6 +88,7 @@ class SolveSettings:
     method: Callable[[StarField, SkyIndex], Identification] | None = None
     attitude: Solver | None = None
     velocity: FloatArray | None = None
+    lens: CameraKnowledge | None = None
     untold_lens: bool = True
 
 
@@ -112,9 +121,10 @@ def solve_points(
     prior: AttitudePrior | None = None,
 ) -> FrameSolution:
     """Return the attitude of a frame of detected points."""
-    return solve_places(
+    solution = solve_places(
         found.points, found.covariance, FrameKind.POINTS, camera, scale, sky, settings, prior, found.flux
     )
+    return _shape_unknown(solution, found, settings)
 
 
 def solve_places(
@@ -165,9 +175,17 @@ def solve_motion(
 
 
 def points_near(
-    pixels: Image, camera: CameraModel, sky: SkyIndex, settings: SolveSettings, prior: AttitudePrior
+    pixels: Image,
+    camera: CameraModel,
+    sky: SkyIndex,
+    settings: SolveSettings,
+    prior: AttitudePrior,
+    trails: ShortTrails | None = None,
 ) -> Detections:
-    """Return the stars found near the predicted places of the brightest; none for too uncertain a prior."""
+    """Return the stars found near the predicted places of the brightest; none for too uncertain a prior.
+
+    `trails`: how they move over the exposure, where that is known and a few px.
+    """
     radius = PRIOR_SIGMAS * prior.sigma * camera.focal_length + _LEAST_RADIUS_PX
     if radius > _MOST_RADIUS_PX:
         return Detections.none()
@@ -175,7 +193,8 @@ def points_near(
     half_width = 0.5 * camera.columns / camera.focal_length, 0.5 * camera.rows / camera.focal_length
     expected = expected_stars(sky, matrix, half_width, _LOOKED_FOR)
     places = camera.project(sky.stars.direction[expected] @ matrix.T)
-    return measure_near(pixels, places, replace(settings.detection, search_radius=radius)).stars()
+    trail = None if trails is None else trails.of(camera, sky.stars.direction[expected] @ matrix.T)
+    return measure_near(pixels, places, replace(settings.detection, search_radius=radius), trail).stars()
 
 
 def solve_near(
@@ -185,16 +204,49 @@ def solve_near(
     sky: SkyIndex,
     settings: SolveSettings,
     prior: AttitudePrior,
+    trails: ShortTrails | None = None,
 ) -> FrameSolution | None:
-    """Return the attitude from stars near their predicted places alone; None if they do not agree."""
-    found = points_near(pixels, camera, sky, settings, prior)
+    """Return the attitude from stars near their predicted places alone; None if they do not agree.
+
+    `trails`: as of `points_near`.
+    """
+    found = points_near(pixels, camera, sky, settings, prior, trails)
     if not len(found):
         return None
+    late = np.zeros((len(found), 2)) if trails is None else trails.late(camera, found.points)
+    points = found.points if trails is None else found.points - trails.delay * late
     seen = FrameSolution(
-        SolveStatus.NO_STARS, "", FrameKind.POINTS, camera, found.points, found.covariance, tracked=True
+        SolveStatus.NO_STARS, "", FrameKind.POINTS, camera, points, found.covariance, tracked=True
     )
     near = track(star_field(seen, found.flux, scale), sky, prior.quaternion, prior.sigma)
-    return _with_attitude(seen, near, sky, settings) if near.status is Status.IDENTIFIED else None
+    if near.status is not Status.IDENTIFIED:
+        return None
+    solution = _shape_unknown(_with_attitude(seen, near, sky, settings), found, settings)
+    if trails is None or not trails.delay_sigma or not late.any():
+        return solution
+    other = _with_attitude(replace(seen, points=points + trails.delay_sigma * late), near, sky, settings)
+    return _with_doubt(solution, other)
+
+
+def _with_doubt(solution: FrameSolution, other: FrameSolution) -> FrameSolution:
+    """Return a solution that may as well be `other`, of places that are a standard deviation off alike."""
+    if solution.fix is None or other.fix is None:
+        return solution
+    off = to_rotation_vector(multiply(other.fix.quaternion, conjugate(solution.fix.quaternion)))
+    return solution.wider(np.outer(off, off))
+
+
+def _shape_unknown(solution: FrameSolution, found: Detections, settings: SolveSettings) -> FrameSolution:
+    """Return a solution that claims no more than the shape of the stars allows.
+
+    Where they are wider than described, by a tail of the lens or light astray, their middle is a matter of
+    which light is weighed: all places are off alike.
+    """
+    width, given = found.width[np.isfinite(found.width)], settings.detection.psf_sigma
+    if solution.fix is None or given is None or not len(width):
+        return solution
+    doubt = _SHAPE_DOUBT * abs(float(np.median(width)) - given) / solution.camera.focal_length
+    return solution.wider(np.diag([doubt**2, doubt**2, 0.0]))
 
 
 def _identify(
@@ -265,7 +317,9 @@ def _with_attitude(
     reference = sky.stars.direction[found.star[chosen]]
     if settings.velocity is not None:
         reference = apparent(reference, settings.velocity)
-    covariance = seen.covariance[chosen] + _LEAST_SIGMA_PX**2 * np.eye(2)
+    known = _known_bend(camera, settings, free_scale, free_lens)
+    least = _COLOUR_PX if settings.lens is not None and not len(known) else _LEAST_SIGMA_PX
+    covariance = seen.covariance[chosen] + least**2 * np.eye(2)
     try:
         fit = fit_in_image(
             seen.points[chosen],
@@ -274,7 +328,7 @@ def _with_attitude(
             camera,
             found.fix.quaternion,
             free_scale,
-            free_lens,
+            known,
         )
         fix = fit.fix
         if settings.attitude is not None:
@@ -300,6 +354,15 @@ def _with_attitude(
         bend=fit.bend,
         log10_false_alarm=found.log10_false_alarm,
     )
+
+
+def _known_bend(
+    camera: CameraModel, settings: SolveSettings, free_scale: bool, free_lens: bool
+) -> FloatArray:
+    """Return the information (6,) about the lens's bend before the stars are seen, (0,) where it has none."""
+    if free_lens:
+        return usual_bend(camera)
+    return np.zeros(0) if free_scale or settings.lens is None else known_bend(camera, settings.lens)
 
 
 def _camera_found(camera: CameraModel, found: Identification) -> CameraModel:

@@ -15,19 +15,24 @@ _SIGMA, _ATTITUDE = 0.1 * PIXEL, 0.05 * PIXEL
 _PERIOD = 1.0
 
 
-def _nees(flown: Pass, rng: np.random.Generator, motion: Motion) -> tuple[FloatArray, FloatArray]:
-    """Return the squared error over its covariance of direction and of rate, two degrees each, a frame."""
+def _nees(flown: Pass, rng: np.random.Generator, sigma: float, known: bool) -> tuple[FloatArray, FloatArray]:
+    """Return the squared error over its covariance of direction and of rate, two degrees each, a frame.
+
+    `sigma` rad of a sighting, and half of it of the attitude; `known`: the gravity gradient is.
+    """
+    motion = Motion()
     state = None
     places: list[float] = []
     rates: list[float] = []
     basis = np.zeros((2, 3))
     for index, time in enumerate(flown.times):
-        frame = sightings(rng, time, flown.directions[index : index + 1], _SIGMA, _ATTITUDE)
+        frame = sightings(rng, time, flown.directions[index : index + 1], sigma, 0.5 * sigma)
         spread = frame.covariance[0] + frame.attitude
         if state is None:
             state = begin(frame.time_ns, frame.directions[0], spread, motion)
             continue
-        state = update(predict(state, frame.time_ns, motion), frame.directions[0], spread)
+        tide = tides(flown.observer[index]) if known else None
+        state = update(predict(state, frame.time_ns, motion, tide), frame.directions[0], spread)
         basis = np.linalg.svd(state.direction[None])[2][1:]
         for kept, error, block in (
             (places, flown.directions[index] - state.direction, slice(0, 3)),
@@ -39,14 +44,15 @@ def _nees(flown: Pass, rng: np.random.Generator, motion: Motion) -> tuple[FloatA
     return np.array(places[8:]), np.array(rates[8:])
 
 
-def test_the_errors_are_as_large_as_the_covariance_says() -> None:
+@pytest.mark.parametrize("known", [False, True])
+def test_the_errors_are_as_large_as_the_covariance_says(known: bool) -> None:
     """Chi-square of the normalised errors of 60 passes, each taken at its end: 120 degrees of freedom."""
     rng = np.random.default_rng(16)
     times = np.arange(0.0, 24.0, _PERIOD)
     place, rate = [], []
     for rate_deg in np.geomspace(0.05, 0.6, 60):
         flown = a_pass(rng, np.radians(rate_deg), times, rng.uniform(0.0, 24.0))
-        places, rates = _nees(flown, rng, Motion())
+        places, rates = _nees(flown, rng, _SIGMA, known)
         place.append(places[-1])
         rate.append(rates[-1])
     # 99 % and more of chi-square(120) / 60 lies within 1.25 and 2.9.

@@ -8,6 +8,7 @@ import numpy as np
 
 from flight.gnc.math.arrays import FloatArray, IntArray
 from flight.gnc.vision.startracker.detection.point_spread import light
+from flight.gnc.vision.startracker.detection.windows import Windows
 
 # A neighbour farther than this many sigmas of the point spread beyond the window gives it nothing.
 _BEYOND = 3.0
@@ -43,15 +44,15 @@ def neighbours(points: FloatArray, flux: FloatArray, psf_sigma: float, half: int
 
 
 def neighbour_light(
-    pairs: Pairs, middle: IntArray, offset: FloatArray, flux: FloatArray, width: FloatArray, half: int
+    pairs: Pairs, windows: Windows, middle: IntArray, offset: FloatArray, flux: FloatArray, width: FloatArray
 ) -> FloatArray:
     """Return the light (n, k, k) of all neighbours in each star's window about `middle` (n, 2).
 
     The stars are at `offset` (n, 2) px from there, of `flux` (n,) and `width` (n,) px.
     """
-    size = 2 * half + 1
+    size = 2 * windows.half + 1
     out = np.zeros((len(middle), size, size))
     place = (middle + offset)[pairs.second] - middle[pairs.first]
-    share = light(place, width[pairs.second], half)
+    share = light(place, width[pairs.second], windows.half, windows.trail[pairs.second])
     np.add.at(out, pairs.first, share * np.maximum(flux, 0.0)[pairs.second, None, None])
     return out

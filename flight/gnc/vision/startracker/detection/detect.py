@@ -53,7 +53,7 @@ def measure_areas(seen: Survey) -> Detections:
     chosen = worth_measuring(peaks, open_sky, pixels.shape, int(_MEASURED_FOR_ONE * settings.most_stars))
     peaks, flags = peaks.select(chosen), flags[chosen]
     targets = _targets(pixels, seen.sky, areas, peaks)
-    shapes = first_look(targets)
+    shapes = first_look(targets, settings.gain)
     spread = frame_spread(shapes, plain_ones(flags == 0, targets), settings)
     found = measure(targets, shapes, spread, settings)
     quality = flags | quality_of(found, shapes, spread, targets)
@@ -138,8 +138,9 @@ def assemble(
 
 def _targets(pixels: Image, sky: Sky, areas: Areas, peaks: Peaks) -> Targets:
     column, row = peaks.place.T
-    level, noise = sky.level.at(column, row), sky.noise.at(column, row)
-    return Targets(pixels, peaks.place, level, noise, areas.ceiling, peaks.core, sky.correlation)
+    level, noise = sky.level.at(column, row), sky.pixel_noise.at(column, row)
+    still = np.zeros((len(peaks.place), 2))
+    return Targets(pixels, peaks.place, level, noise, areas.ceiling, peaks.core, still, sky.correlation)
 
 
 def _flags_of_areas(sky: Sky, areas: Areas, peaks: Peaks) -> IntArray:

@@ -20,9 +20,14 @@ LEAST_HALF, MOST_HALF = 3, 9
 REACH = 2.7
 """Half a window, in sigmas of the point spread, and its least and greatest, px."""
 _FIRST_NOISE = NoiseModel(0.0, 0.1)
+# Of a shape that is nearly found: under the first noise bright stars are fitted by their wings alone, which
+# leaves as much of their cores as if the shape were wrong.
+_NEXT_MISMATCH = 0.02
 # Of the shape, where no star shows it.
 _UNKNOWN_MISMATCH = 0.02
 _MOST_OF_CELL = 4
+# Stars that show the width themselves, so that a given one is not needed.
+_MANY = 8
 _LEAST_LONE = 3
 # Of a pixel's noise: fainter ones are not called hot.
 _LEAST_HOT = 10.0
@@ -54,21 +59,25 @@ class FrameSpread:
         return int(np.clip(np.ceil(REACH * self.psf_sigma), LEAST_HALF, MOST_HALF))
 
 
-def first_look(targets: Targets) -> Shapes:
-    """Return the shapes of stars whose point spread is not known yet."""
+def first_look(targets: Targets, gain: float | None = None) -> Shapes:
+    """Return the shapes of stars whose point spread is not known yet; `gain` electrons a count if known."""
     windows = targets.windows(_HALF_OF_FIRST)
     offset, flux = start(windows)
     width = np.full(len(windows), FIRST_WIDTH)
     fitted = fit(windows, offset, flux, width, _FIRST_NOISE, free_width=True, steps=4)
-    error = np.sqrt(np.maximum(fitted.covariance[:, WIDTH, WIDTH], 0.0))
-    return Shapes(fitted.width, error, single_pixels(windows), fitted, windows)
+    width, error = fitted.width, np.sqrt(np.maximum(fitted.covariance[:, WIDTH, WIDTH], 0.0))
+    if gain is not None:
+        noise = NoiseModel(1.0 / gain, _NEXT_MISMATCH)
+        fitted = fit(windows, fitted.offset, fitted.flux, width, noise, free_width=True, steps=1)
+    # Widths are judged by the first noise, which forgives an unlike shape.
+    return Shapes(width, error, single_pixels(windows), fitted, windows)
 
 
 def frame_spread(shapes: Shapes, plain: BoolArray, settings: DetectionSettings) -> FrameSpread:
     """Return the point spread and noise that the stars `plain` (n,), the brightest first, show.
 
-    Settings that are given are kept. Without a usable star the width is 1 px and no photon noise is
-    known.
+    Settings that are given are kept, but for a width of which many stars show their own. Without a usable
+    star the width is 1 px and no photon noise is known.
     """
     fitted = shapes.fitted
     certain = fitted.flux > 8.0 * np.sqrt(fitted.covariance[:, FLUX, FLUX])
@@ -83,7 +92,9 @@ def frame_spread(shapes: Shapes, plain: BoolArray, settings: DetectionSettings) 
         )
     telling, share = _evenly_spread(shapes.windows.middle, telling)
     width, error = shapes.width[telling], shapes.error[telling]
-    psf_sigma = given or _weighted_median(width, share / ((error / width) ** 2 + 0.1**2))
+    psf_sigma = given or 0.0
+    if given is None or len(telling) >= _MANY:
+        psf_sigma = _weighted_median(width, share / ((error / width) ** 2 + 0.1**2))
     alike = telling[np.abs(width - psf_sigma) < np.maximum(3.0 * error, 0.25 * psf_sigma)]
     part, windows = fitted.select(alike), shapes.windows.select(alike)
     noise = _noise_of(part, windows, settings)

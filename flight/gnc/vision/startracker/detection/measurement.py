@@ -123,7 +123,7 @@ def _shared(
     offset[some], flux[some] = begin[0][some], begin[1][some]
     part = found.select(some)
     for _ in range(_BLEND_ROUNDS):
-        foreign = neighbour_light(pairs, middle, offset, flux, width, windows.half)[some]
+        foreign = neighbour_light(pairs, windows, middle, offset, flux, width)[some]
         part = fit(own.without(foreign), offset[some], flux[some], width[some], noise, free_width, 2)
         offset[some], flux[some] = part.offset, part.flux
     return found.replaced(some, part)

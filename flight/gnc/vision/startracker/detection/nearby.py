@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from flight.gnc.math.arrays import BoolArray, FloatArray, Image, IntArray
@@ -12,7 +14,7 @@ from flight.gnc.vision.startracker.detection.detections import Detections
 from flight.gnc.vision.startracker.detection.first_look import first_look, frame_spread
 from flight.gnc.vision.startracker.detection.measurement import measure
 from flight.gnc.vision.startracker.detection.settings import DetectionSettings
-from flight.gnc.vision.startracker.detection.sky import KERNEL_NORM, in_counts
+from flight.gnc.vision.startracker.detection.sky import KERNEL_NORM, correlation_of, in_counts, one_sided
 from flight.gnc.vision.startracker.detection.targets import Targets
 from flight.gnc.vision.startracker.detection.windows import Windows, cut, smoothed
 
@@ -24,9 +26,14 @@ _SAME_STAR = 1.5
 
 
 def measure_near(
-    pixels: Image, predicted: FloatArray, settings: DetectionSettings | None = None
+    pixels: Image,
+    predicted: FloatArray,
+    settings: DetectionSettings | None = None,
+    trail: FloatArray | None = None,
 ) -> Detections:
     """Return the stars found near `predicted` (m, 2) px, brightest first; `prediction` says of which.
+
+    `trail` (m, 2) px is by how much each moves over the exposure, a few px at most; None: not at all.
 
     Only windows about the predictions are read. Nothing is reported where no peak within the settings'
     search radius exceeds the threshold, and one star is given to the nearest prediction only. Raises
@@ -46,10 +53,12 @@ def measure_near(
     whole = np.zeros(len(asked))
     # Saturated pixels are light too in the search for the peak.
     windows = cut(pixels, np.rint(predicted[asked]).astype(np.int64), half, whole, whole, np.inf)
+    if trail is not None:
+        windows = replace(windows, trail=trail[asked])
     targets, number = _peaks_near(pixels, windows, predicted[asked], ceiling, settings)
     if not len(targets):
         return Detections.none(settings.psf_sigma or np.nan)
-    shapes = first_look(targets)
+    shapes = first_look(targets, settings.gain)
     spread = frame_spread(shapes, plain_ones(np.ones(len(targets), dtype=bool), targets), settings)
     found = measure(targets, shapes, spread, settings)
     quality = quality_of(found, shapes, spread, targets)
@@ -63,7 +72,7 @@ def _peaks_near(
     pixels: Image, windows: Windows, predicted: FloatArray, ceiling: float, settings: DetectionSettings
 ) -> tuple[Targets, IntArray]:
     """Return the highest peaks within the search radius that exceed the threshold, and whose they are."""
-    level, noise, tail = _sky_of(windows, settings.search_radius)
+    level, noise, tail, correlation = _sky_of(windows, settings.search_radius)
     light = np.where(windows.good, windows.light - level[:, None, None], 0.0)
     smooth = smoothed(light)
     step = np.arange(-windows.half, windows.half + 1)
@@ -78,35 +87,48 @@ def _peaks_near(
     saturated = np.count_nonzero(windows.good & (windows.light >= ceiling), axis=(1, 2))
     at_core = pixels[np.clip(middle[:, 1], 0, None), np.clip(middle[:, 0], 0, None)] >= ceiling
     core = np.where(at_core, np.sqrt(saturated / np.pi), 0.0)
-    white = KERNEL_NORM * noise
-    correlation = max(1.0, float(np.median(tail / white)))
-    targets = Targets(pixels, middle, level, noise, ceiling, core, correlation)
+    targets = Targets(pixels, middle, level, noise, ceiling, core, windows.trail, correlation)
     apart = np.linalg.norm(middle - predicted, axis=1)
     number = np.flatnonzero(bright)
     number = number[_nearest(middle[number], apart[number])]
     return targets.select(number), number
 
 
-def _sky_of(windows: Windows, radius: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return level (n,), noise (n,) of single pixels and of smoothed ones, from the windows' rims."""
+def _sky_of(windows: Windows, radius: float) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+    """Return the sky's level (n,), its noise (n,) of single pixels and of smoothed ones, and its correlation.
+
+    From the windows' rims. The smoothed noise has the light of faint stars in it, which the threshold of the
+    search needs; the correlation is how much more noisy a sum of pixels is than independent ones.
+    """
     step = np.abs(np.arange(-windows.half, windows.half + 1))
     rim = np.maximum(step[:, None], step) > radius + 1.0
-    values = np.where(windows.good, windows.light, np.inf)[:, rim]
+    mean, variance = _clipped(np.where(windows.good, windows.light, np.inf)[:, rim])
+    # Other stars and a rim of few counts widen or narrow single windows: they are taken together.
+    common = float(np.sqrt(np.median(variance) + _ROUNDING**2))
+    light = np.where(windows.good, windows.light - mean[:, None, None], 0.0)
+    smooth = smoothed(light)[:, 1:-1, 1:-1][:, rim[1:-1, 1:-1]]
+    tail = max(0.5 * _reach(smooth), KERNEL_NORM * common)
+    cut_off = one_sided(np.array(_reach(-light[:, rim])), np.array(common))
+    spread = tail if cut_off else float(np.sqrt(np.median(_clipped(smooth)[1])))
+    noise = np.full(len(windows), common)
+    return mean, noise, np.full(len(windows), tail), correlation_of(spread, common)
+
+
+def _reach(values: FloatArray) -> float:
+    """Return how far 2.3 % of each line of `values` (n, k) reach upwards, of a typical line."""
+    place = int(_TAIL_PART * values.shape[1])
+    return float(np.median(np.partition(values, place, axis=1)[:, place]))
+
+
+def _clipped(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return mean and variance (n,) of each line of `values` (n, k), inf for nothing, without its tails."""
     level = _median(values)
     apart = np.abs(values - level[:, None])
-    # Other stars and a rim of few counts widen or narrow single windows: they are taken together.
     kept = apart <= 3.0 * np.maximum(MAD_TO_SIGMA * _median(apart), 0.5)[:, None]
     count = np.maximum(kept.sum(axis=1), 1)
     mean = np.where(kept, values, 0.0).sum(axis=1) / count
-    variance = np.where(kept, values - mean[:, None], 0.0)
-    common = float(np.sqrt(np.median((variance**2).sum(axis=1) / count) + _ROUNDING**2))
-    light = np.where(windows.good, windows.light - mean[:, None, None], 0.0)
-    smooth = smoothed(light)[:, 1:-1, 1:-1][:, rim[1:-1, 1:-1]]
-    place = int(_TAIL_PART * smooth.shape[1])
-    upper = 0.5 * np.partition(smooth, place, axis=1)[:, place]
-    tail = max(float(np.median(upper)), KERNEL_NORM * common)
-    noise = np.full(len(windows), common)
-    return mean, noise, np.full(len(windows), tail)
+    square = np.where(kept, values - mean[:, None], 0.0) ** 2
+    return mean, square.sum(axis=1) / count
 
 
 def _median(values: FloatArray) -> FloatArray:

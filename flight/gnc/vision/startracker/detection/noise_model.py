@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.arrays import BoolArray, FloatArray
 
 # Residuals allowed before they are another thing's light, as part of the star's light in the pixel.
 _TOLERATED = 0.25
@@ -52,27 +52,52 @@ def measure_noise(
     given = 0.0 if gain is None else 1.0 / gain
     if np.count_nonzero(used) < _LEAST_PIXELS:
         return NoiseModel(given, 0.0)
+    if gain is not None:
+        return NoiseModel(given, _shared_mismatch(residual, leverage, light, noise, used, given))
     m = light[used]
     floor = np.broadcast_to((noise**2)[:, None, None], light.shape)[used]
     excess = residual[used] ** 2 / (1.0 - leverage[used]) - floor
-    photon, square = given, 0.0
+    photon, square = 0.0, 0.0
     for _ in range(_ROUNDS):
         expected = floor + photon * m + square * m * m
         weight = 1.0 / expected**2
         # Residuals beyond 5 sigma of the present model are let go: neighbours and hot pixels.
         weight = np.where(excess < 25.0 * expected, weight, 0.0) if square or photon else weight
-        photon, square = _non_negative(m, excess, weight, given if gain is not None else None)
+        photon, square = _non_negative(m, excess, weight)
     return NoiseModel(photon, float(np.sqrt(square)))
 
 
-def _non_negative(
-    m: FloatArray, excess: FloatArray, weight: FloatArray, photon: float | None
-) -> tuple[float, float]:
+def _shared_mismatch(
+    residual: FloatArray,
+    leverage: FloatArray,
+    light: FloatArray,
+    noise: FloatArray,
+    used: BoolArray,
+    photon: float,
+) -> float:
+    """Return the mismatch that stars of a known photon noise share: the median of theirs, by their weight.
+
+    A wrong shape is the same in all of them; a neighbour's light, which is none, is in a few.
+    """
+    m = np.where(used, light, 0.0)
+    floor = np.broadcast_to((noise**2)[:, None, None], light.shape)
+    excess = np.where(used, residual**2 / np.where(used, 1.0 - leverage, 1.0) - floor - photon * m, 0.0)
+    square = 0.0
+    for _ in range(_ROUNDS):
+        weight = (m / (floor + photon * m + square * m * m)) ** 2
+        own, least = np.sum(weight * excess, axis=(1, 2)), np.sum(weight * m * m, axis=(1, 2))
+        seen = least > 0.0
+        ratio, share = own[seen] / least[seen], least[seen]
+        order = np.argsort(ratio)
+        whole = np.cumsum(share[order])
+        square = max(0.0, float(ratio[order][np.searchsorted(whole, 0.5 * whole[-1])]))
+    return float(np.sqrt(square))
+
+
+def _non_negative(m: FloatArray, excess: FloatArray, weight: FloatArray) -> tuple[float, float]:
     """Return the parts of `excess` that go with m and with m^2, neither below zero."""
     first, second, third = (float(np.sum(weight * m**power)) for power in (2, 3, 4))
     along, square = float(np.sum(weight * excess * m)), float(np.sum(weight * excess * m * m))
-    if photon is not None:
-        return photon, max(0.0, (square - photon * second) / third)
     determinant = first * third - second**2
     if determinant > 1e-12 * first * third:
         both = (

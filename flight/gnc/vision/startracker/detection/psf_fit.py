@@ -14,7 +14,7 @@ import numpy as np
 from flight.gnc.math.arrays import BoolArray, FloatArray, IntArray
 from flight.gnc.vision.records import select
 from flight.gnc.vision.startracker.detection.noise_model import NoiseModel
-from flight.gnc.vision.startracker.detection.point_spread import profile
+from flight.gnc.vision.startracker.detection.point_spread import path, profile
 from flight.gnc.vision.startracker.detection.windows import Windows
 
 X, Y, FLUX, SKY, WIDTH = range(5)
@@ -79,7 +79,7 @@ def fit(
     count = 5 if free_width else 4
     values = np.concatenate([offset, flux[:, None], np.zeros((len(flux), 1)), width[:, None]], axis=1)
     for step in range(steps + 1):
-        star, jacobian = _jacobian(values, windows.half, count)
+        star, jacobian = _jacobian(values, windows, count)
         residual = windows.light - star - values[:, SKY, None, None]
         variance = noise.variance(star, windows.noise)
         good = windows.good
@@ -108,10 +108,21 @@ def fit(
     )
 
 
-def _jacobian(values: FloatArray, half: int, count: int) -> tuple[FloatArray, FloatArray]:
+def _jacobian(values: FloatArray, windows: Windows, count: int) -> tuple[FloatArray, FloatArray]:
     """Return the light (n, k, k) of the stars and its derivatives (n, count, k k)."""
-    across, across_x, across_w = profile(values[:, X], values[:, WIDTH], half)
-    down, down_y, down_w = profile(values[:, Y], values[:, WIDTH], half)
+    out: FloatArray | None = None
+    for shift, share in path(windows.trail):
+        part = _derivatives(values, shift, windows.half, count)
+        out = share * part if out is None else out + share * part
+    assert out is not None  # a path has places
+    star = values[:, FLUX, None, None] * out[:, FLUX]
+    return star, out.reshape(len(values), count, -1)
+
+
+def _derivatives(values: FloatArray, shift: FloatArray, half: int, count: int) -> FloatArray:
+    """Return the derivatives (n, count, k, k) of the light of stars that stand `shift` (n, 2) px off."""
+    across, across_x, across_w = profile(values[:, X] + shift[:, 0], values[:, WIDTH], half)
+    down, down_y, down_w = profile(values[:, Y] + shift[:, 1], values[:, WIDTH], half)
     flux = values[:, FLUX, None]
     size = 2 * half + 1
     out = np.empty((len(values), count, size, size))
@@ -122,8 +133,7 @@ def _jacobian(values: FloatArray, half: int, count: int) -> tuple[FloatArray, Fl
     if count > WIDTH:
         out[:, WIDTH] = (flux * down)[:, :, None] * across_w[:, None, :]
         out[:, WIDTH] += (flux * down_w)[:, :, None] * across[:, None, :]
-    star = flux[:, :, None] * out[:, FLUX]
-    return star, out.reshape(len(values), count, -1)
+    return out
 
 
 def _foreign(residual: FloatArray, variance: FloatArray) -> BoolArray:

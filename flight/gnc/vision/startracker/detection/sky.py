@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from flight.gnc.math.arrays import FloatArray, Image, IntArray
+from flight.gnc.math.arrays import BoolArray, FloatArray, Image, IntArray
 from flight.gnc.vision.frame.background import (
     MAD_TO_SIGMA,
     estimate_background,
@@ -32,6 +32,12 @@ _FLOATING_NOISE = 16.0
 _BAND = 32
 _BLOCK, _STRIDE, _SINGLE_STRIDE = 64, 4, 8
 _TAIL_PART = 0.97725
+# Correlations below this are chance, and the light of the faintest stars.
+_CORRELATED = 1.05
+# Noise that reaches less than this part of its two deviations downwards is cut off at zero counts.
+_CUT_OFF = 0.8
+# Noise below this, counts, is hidden by the steps of the counts, which may be of many.
+_HIDDEN = 0.5
 _ROUNDING = 12.0**-0.5
 
 
@@ -68,20 +74,18 @@ class Sky:
     """The sky of a frame between its stars.
 
     Attributes:
-        level, noise: counts of single pixels.
-        smooth_level, smooth_noise: of the smoothed frame (kernel of sum 16).
+        level, noise: counts of single pixels; the light of faint stars is in the noise.
+        pixel_noise: counts of single pixels, what a pixel without a star scatters by.
+        smooth_level, smooth_noise: of the smoothed frame (kernel of sum 16), faint stars included.
+        correlation: how much more noisy a sum of pixels is than independent pixels would make it; 1 or more.
     """
 
     level: Surface
     noise: Surface
+    pixel_noise: Surface
     smooth_level: Surface
     smooth_noise: Surface
-
-    @property
-    def correlation(self) -> float:
-        """How much more noisy a sum of pixels is than independent pixels would make it; 1 or more."""
-        white = KERNEL_NORM * np.median(self.noise.values)
-        return max(1.0, float(np.median(self.smooth_noise.values) / white))
+    correlation: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,12 +134,37 @@ def measure_sky(pixels: Image) -> Sky:
     # Rounding to whole counts is noise, even of a sky that is zero everywhere.
     smooth_noise = np.maximum(smooth.noise, KERNEL_NORM * _ROUNDING)
     lone = pixels[2::_STRIDE, 2::_STRIDE].astype(np.float32)
+    tail, cut_off = _tails(lone, single.level, single.noise)
+    smooth_tail, _ = _tails(sample, smooth.level, smooth_noise)
+    noise, smooth_noise_up = single.noise * tail, smooth_noise * smooth_tail
+    # The light of faint stars reaches upwards too, and a sum of pixels has more of it: no noise of a star's
+    # place. Only where the noise is cut off below do the tails say how large it is.
+    own, own_smooth = np.where(cut_off, noise, single.noise), np.where(cut_off, smooth_noise_up, smooth_noise)
     return Sky(
         level,
-        Surface(single.noise * _tail(lone, single.level, single.noise), shape),
+        Surface(noise, shape),
+        Surface(own, shape),
         Surface(smooth.level, shape),
-        Surface(smooth_noise * _tail(sample, smooth.level, smooth_noise), shape),
+        Surface(smooth_noise_up, shape),
+        correlation_of(float(np.median(own_smooth)), float(np.median(own))),
     )
+
+
+def correlation_of(smooth: float, single: float) -> float:
+    """Return how much more noisy sums of pixels are than independent pixels would make them, 1 or more.
+
+    `smooth` is the noise of the smoothed frame, `single` that of its pixels.
+    """
+    ratio = smooth / (KERNEL_NORM * single)
+    return ratio if ratio > _CORRELATED else 1.0
+
+
+def one_sided(reach: FloatArray, noise: FloatArray) -> BoolArray:
+    """Return where a noise (n,) is cut off at zero counts or hidden by their steps: only its tail shows it.
+
+    `reach` (n,) counts is how far its lower 2.3 % reach down.
+    """
+    return np.asarray((reach < 2.0 * _CUT_OFF * noise) | (noise < _HIDDEN))
 
 
 def without_hot_pixels(pixels: Image, most: int) -> Image:
@@ -203,12 +232,13 @@ def _smoothed_at(pixels: Image, row: IntArray, column: IntArray) -> Float32Array
     return total
 
 
-def _tail(sample: Float32Array, level: FloatArray, noise: FloatArray) -> FloatArray:
-    """Return how much farther the noise of each block reaches upwards than a normal one; 1 or more.
+def _tails(sample: Float32Array, level: FloatArray, noise: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Return how much farther each block's noise reaches upwards than a normal one, and where it is cut off.
 
-    2.3 % of a block should stand above twice its noise. A sky cut off at zero counts has noise on one side
-    only, whose clipped moments underestimate it. A foreground's texture reaches far, its neighbours' sky does
-    not: each block takes the median of the 3 x 3 about it, which a few stars hardly move.
+    2.3 % of a block should stand above twice its noise, and as much below. A sky cut off at zero counts has
+    noise on one side only, whose clipped moments underestimate it. A foreground's texture reaches far, its
+    neighbours' sky does not: each block takes the median of the 3 x 3 about it, which a few stars hardly
+    move. The reach is 1 or more.
     """
     from scipy import ndimage  # noqa: PLC0415 - a process that only names the estimators need not hold it
 
@@ -218,6 +248,9 @@ def _tail(sample: Float32Array, level: FloatArray, noise: FloatArray) -> FloatAr
     height, width = rows // down, columns // across
     blocks = relative[: down * height, : across * width].reshape(down, height, across, width)
     values = blocks.transpose(0, 2, 1, 3).reshape(down, across, -1)
-    place = min(values.shape[-1] - 1, int(_TAIL_PART * values.shape[-1]))
-    tail = np.maximum(1.0, 0.5 * np.partition(values, place, axis=-1)[..., place])
-    return np.asarray(ndimage.median_filter(tail, size=3, mode="nearest"))
+    last = values.shape[-1] - 1
+    high = min(last, int(_TAIL_PART * values.shape[-1]))
+    ordered = np.partition(values, (last - high, high), axis=-1)
+    tail = np.maximum(1.0, 0.5 * ordered[..., high])
+    reach = ndimage.median_filter(-ordered[..., last - high], size=3, mode="nearest")
+    return np.asarray(ndimage.median_filter(tail, size=3, mode="nearest")), one_sided(reach * noise, noise)

@@ -19,6 +19,7 @@ class Targets:
         level, noise: (n,) counts of a pixel without a star.
         ceiling: counts at which pixels saturate.
         core: (n,) px, radius of the saturated disc.
+        trail: (n, 2) px, from the begin to the end of a star's path over the exposure.
         correlation: how much more noisy sums of pixels are than of independent ones.
     """
 
@@ -28,12 +29,13 @@ class Targets:
     noise: FloatArray
     ceiling: float
     core: FloatArray
+    trail: FloatArray
     correlation: float
 
     def windows(self, half: int, middle: IntArray | None = None) -> Windows:
         """Return the windows about all targets, or about `middle` (n, 2) beside them."""
         about = self.middle if middle is None else middle
-        return cut(self.pixels, about, half, self.level, self.noise, self.ceiling)
+        return cut(self.pixels, about, half, self.level, self.noise, self.ceiling, self.trail)
 
     def select(self, chosen: BoolArray | IntArray) -> Targets:
         """Return the targets that `chosen` picks."""

@@ -20,6 +20,7 @@ class Windows:
         light: (n, k, k) counts above the sky, 0 where there is no pixel; saturated ones as they are.
         good: (n, k, k) which pixels exist and are usable.
         noise: (n,) counts, of a pixel without a star.
+        trail: (n, 2) px, from the begin to the end of a star's path over the exposure.
     """
 
     middle: IntArray
@@ -27,6 +28,7 @@ class Windows:
     light: FloatArray
     good: BoolArray
     noise: FloatArray
+    trail: FloatArray
 
     def select(self, chosen: BoolArray | IntArray) -> Windows:
         """Return the windows that `chosen` picks."""
@@ -41,12 +43,18 @@ class Windows:
 
 
 def cut(
-    pixels: Image, middle: IntArray, half: int, level: FloatArray, noise: FloatArray, ceiling: float
+    pixels: Image,
+    middle: IntArray,
+    half: int,
+    level: FloatArray,
+    noise: FloatArray,
+    ceiling: float,
+    trail: FloatArray | None = None,
 ) -> Windows:
     """Return the windows of `pixels` (rows, columns) about the pixels `middle` (n, 2), which are inside.
 
     `level` (n,) is the sky's, `noise` (n,) its noise; pixels at `ceiling` counts or above are saturated and
-    not used.
+    not used. Without `trail` (n, 2) the stars stand still.
     """
     rows, columns = pixels.shape
     step = np.arange(-half, half + 1)
@@ -55,7 +63,8 @@ def cut(
     row, column = np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)
     counts = pixels[row[:, :, None], column[:, None, :]].astype(np.float64)
     light = np.where(good, counts - level[:, None, None], 0.0)
-    return Windows(middle, half, light, good & (counts < ceiling), noise)
+    path = np.zeros((len(middle), 2)) if trail is None else trail
+    return Windows(middle, half, light, good & (counts < ceiling), noise, path)
 
 
 def smoothed(light: FloatArray) -> FloatArray:

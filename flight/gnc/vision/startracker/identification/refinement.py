@@ -80,7 +80,7 @@ def scale_slope(direction: FloatArray) -> FloatArray:
     return np.asarray(slope)
 
 
-def inflation(squares: FloatArray, parameters: int) -> float:
+def inflation(squares: FloatArray, parameters: float) -> float:
     """Return by how much the residuals say that the variances are too small; 1 where that may be chance.
 
     `squares` (n,), each |e|^2 / sigma^2 of two components, together are a chi-square of 2n - `parameters`

@@ -1,0 +1,196 @@
+"""Campaign `resting`: attitudes from frames whose stars hardly move, of cameras unlike the model.
+
+Each of `imperfections.IMPERFECTIONS` with trails of 0, 1 and 3 px, an exposure of 0.2 s and the priors of a
+flight; frames are drawn by `supersampled`. An attitude is judged by its error in its own standard deviations
+(the square root of its NEES): more than 6 is confidently wrong. An optical axis off the middle, or a point
+spread whose light has its middle elsewhere, turns all attitudes alike. A flight calibrates that turn, its
+mounting, with the same stars: of these rows (`SHIFTED`) the mean error is taken off. The row `none` states an
+exact lens, all others the default doubt of one that nobody calibrated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flight.gnc.camera.knowledge import EXACT, CameraKnowledge
+from flight.gnc.math.arrays import FloatArray, Image
+from flight.gnc.math.quaternion import (
+    attitude_matrix,
+    conjugate,
+    from_rotation_vector,
+    multiply,
+    normalise,
+    to_rotation_vector,
+)
+from flight.gnc.vision.frame_job import FrameJob, TrackerSettings
+from flight.gnc.vision.frame_job import run as look
+from flight.gnc.vision.startracker.detection import DetectionSettings
+from flight.gnc.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings
+from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from sim_hal.star_camera import StarCameraModel
+from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
+from tests.studies.campaigns.imperfections import IMPERFECTIONS, Imperfection
+from tests.studies.campaigns.mismatch import WRONG_SIGMAS, detected
+from tests.studies.campaigns.scenes import FIELD, catalogue
+from tests.studies.supersampled import Sky, light
+
+EXPOSURE = 0.2
+TRAILS = (0.0, 1.0, 3.0)
+"""px."""
+_PRIOR = 1e-4
+"""rad and rad/s: of the attitude and of the rate that navigation predicts."""
+SHIFTED = ("coma", "axis 5 px off")
+CAMERA = StarCameraModel(columns=512, rows=512, field_of_view=FIELD)
+
+
+def cases(runs: int, seed: int) -> list[Case]:
+    """Return `runs` frames of each imperfection and trail."""
+    return [
+        Case(f"{name} {trail:g} {run}", (seed, cell, run), {"row": name, "trail": trail})
+        for cell, (name, trail) in enumerate((name, trail) for name in IMPERFECTIONS for trail in TRAILS)
+        for run in range(runs)
+    ]
+
+
+def run(case: Case) -> Result:
+    """Solve one frame of an imperfect camera and judge its attitude."""
+    imperfection, rng = IMPERFECTIONS[case.parameters["row"]], np.random.default_rng(case.seed)
+    middle, way = normalise(rng.normal(size=4)), rng.uniform(0.0, 2.0 * np.pi)
+    across = np.array([np.cos(way), np.sin(way), 0.0]) / CAMERA.pinhole.focal_length
+    pixels = expose(imperfection, middle, across * case.parameters["trail"], rng)
+    found = look(job(pixels, imperfection, middle, across * case.parameters["trail"], rng))
+    result: Result = {**case.parameters, "kind": None, "error": None}
+    solution = found.solution
+    if solution is None or solution.fix is None:
+        return result
+    error = to_rotation_vector(multiply(solution.fix.quaternion, conjugate(middle)))
+    return result | {
+        "kind": solution.kind.value,
+        "stars": len(solution.matched),
+        "error": error.tolist(),
+        "covariance": solution.fix.covariance.tolist(),
+    }
+
+
+def expose(
+    imperfection: Imperfection, middle: FloatArray, turn: FloatArray, rng: np.random.Generator
+) -> Image:
+    """Return a frame about the attitude `middle` (4,), turning by `turn` (3,) rad over the exposure."""
+    stars, directions = catalogue(8.5)
+    near = np.flatnonzero(
+        directions @ attitude_matrix(middle)[2] > np.cos(CAMERA.pinhole.half_diagonal + 0.02)
+    )
+    sky = Sky(directions[near], CAMERA.electrons(stars.magnitude[near], EXPOSURE))
+    electrons = light(
+        CAMERA.pinhole,
+        imperfection.optics,
+        sky,
+        lambda times: multiply(from_rotation_vector(times[:, None] * turn), middle),
+        4.0,
+        imperfection.line_time / EXPOSURE,
+        rng,
+    )
+    return detected(electrons, imperfection, CAMERA, EXPOSURE, rng)
+
+
+def job(
+    pixels: Image, imperfection: Imperfection, middle: FloatArray, turn: FloatArray, rng: np.random.Generator
+) -> FrameJob:
+    """Return a flight's job: its camera is the model's, its priors are off by their deviations."""
+    known: dict[str, Any] = {"gain": CAMERA.gain, "psf_sigma": CAMERA.psf_sigma, "line_time": 0.0}
+    known |= {"saturation": imperfection.top} | imperfection.known
+    detection = DetectionSettings(
+        psf_sigma=known["psf_sigma"], gain=known["gain"], saturation=imperfection.top
+    )
+    lens = EXACT if imperfection is IMPERFECTIONS["none"] else CameraKnowledge()
+    off, faster = rng.normal(scale=_PRIOR, size=(2, 3))
+    return FrameJob(
+        pixels,
+        CAMERA.pinhole,
+        EXPOSURE,
+        LikelihoodSettings(**known),
+        TrackerSettings(SolveSettings(detection=detection, lens=lens), (1.0, 1.0)),
+        RatePrior(turn / EXPOSURE + faster, _PRIOR),
+        AttitudePrior(multiply(from_rotation_vector(off), middle), _PRIOR),
+    )
+
+
+def summarise(results: Sequence[Result], _: Path) -> Summary:
+    """Return attitudes and errors of each row, and of all."""
+    judged = [judged for row in IMPERFECTIONS for judged in _judged([r for r in results if r["row"] == row])]
+    rows = list(dict.fromkeys((result["row"], result["trail"]) for result in judged))
+    table = [
+        {
+            "row": row,
+            "trail": trail,
+            **_figures([r for r in judged if (r["row"], r["trail"]) == (row, trail)]),
+        }
+        for row, trail in rows
+    ]
+    total = _figures(judged)
+    lines = [
+        f"{'imperfection':20} {'trail':>5} {'attitudes':>9} {'NEES':>7} {'worst sigma':>11}  error, claim px"
+    ]
+    lines += [_line(row) for row in [*table, {"row": "all", "trail": -1.0, **total}]]
+    lines.append(f"beyond {WRONG_SIGMAS:.0f} sigma: {total['beyond']} of {total['attitudes']}")
+    return Summary("\n".join(lines) + "\n", {"rows": table, "all": total})
+
+
+def _judged(results: Sequence[Result]) -> list[Result]:
+    """Return the results of a row with NEES, and error and claim across the boresight, px of an axis."""
+    errors = np.array([result["error"] for result in results if result["error"] is not None])
+    shift = np.zeros(3)
+    if len(errors) and results[0]["row"] in SHIFTED:
+        shift = errors.mean(axis=0)
+    judged = []
+    for result in results:
+        figures: Result = {"nees": None}
+        if result["error"] is not None:
+            off, covariance = np.array(result["error"]) - shift, np.array(result["covariance"])
+            across = CAMERA.pinhole.focal_length / np.sqrt(2.0)
+            figures = {
+                "nees": float(off @ np.linalg.solve(covariance, off)),
+                "off": float(np.linalg.norm(off[:2])) * across,
+                "claim": float(np.sqrt(np.trace(covariance[:2, :2]))) * across,
+            }
+        judged.append({"row": result["row"], "trail": result["trail"], **figures})
+    return judged
+
+
+def _figures(results: Sequence[Result]) -> Result:
+    answers = [result for result in results if result["nees"] is not None]
+    nees = np.array([result["nees"] for result in answers])
+    some = len(answers) > 0
+    rms = {
+        name: float(np.sqrt(np.mean([result[name] ** 2 for result in answers]))) if some else None
+        for name in ("off", "claim")
+    }
+    return {
+        "frames": len(results),
+        "attitudes": len(answers),
+        "nees": float(nees.mean()) if some else None,
+        "worst": float(np.sqrt(nees.max())) if some else None,
+        "beyond": int(np.count_nonzero(nees > WRONG_SIGMAS**2)),
+        **rms,
+    }
+
+
+def _line(row: Result) -> str:
+    start = f"{row['row']:20} {row['trail']:5g} {row['attitudes']:4} /{row['frames']:3}"
+    if not row["attitudes"]:
+        return start
+    return f"{start} {row['nees']:7.2f} {row['worst']:11.1f}  {row['off']:.4f}, {row['claim']:.4f}"
+
+
+RESTING = Campaign(
+    "resting",
+    "attitudes of frames whose stars hardly move: claims of cameras like and unlike the model",
+    cases,
+    run,
+    summarise,
+    10,
+)

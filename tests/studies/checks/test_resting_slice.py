@@ -1,0 +1,39 @@
+"""A small slice of the campaign of frames at rest: claims as large as the errors, of unlike cameras too."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from flight.gnc.math.chi_square import bound
+from tests.studies.campaigns.campaign import Case
+from tests.studies.campaigns.resting import RESTING, TRAILS, run
+
+SEED = 17
+
+
+def _flown(row: str, trail: float, runs: int) -> list[dict[str, object]]:
+    return [run(Case(f"{row} {trail:g} {n}", (SEED, n), {"row": row, "trail": trail})) for n in range(runs)]
+
+
+def test_attitudes_of_the_model_s_own_camera_are_known_as_well_as_they_claim(tmp_path: Path) -> None:
+    results = [result for trail in TRAILS for result in _flown("none", trail, 4)]
+    facts = RESTING.summarise(results, tmp_path).facts
+    json.dumps(facts, allow_nan=False)
+    own = facts["all"]
+    assert own["attitudes"] == own["frames"] == 12
+    # 99.9 % and more of chi-square(36) / 12 lies within 1.1 and 5.9; claims were six times as wide once.
+    assert 1.1 < own["nees"] < 5.9
+    assert own["worst"] < np.sqrt(bound(1e-4, 3))
+    assert own["claim"] < 0.004
+
+
+def test_attitudes_of_unlike_cameras_are_within_their_claims(tmp_path: Path) -> None:
+    """Of a lens that is bent otherwise, and of a rolling shutter, stated and not."""
+    for row, trail in (("distortion 0.2 %", 0.0), ("rolling told", 3.0), ("rolling untold", 1.0)):
+        own = RESTING.summarise(_flown(row, trail, 2), tmp_path).facts["all"]
+        assert own["attitudes"] == 2
+        assert own["worst"] < 4.5
+        assert own["claim"] < 0.02
