@@ -2,7 +2,7 @@
 
 Two craft, each in a Sun-synchronous and an ISS-like orbit, by one law: `magnetometer` knows the magnetometer
 alone, `attitude` also a gyro with its bias, a coarse attitude and the orbit. The coils pause a tenth of each
-two seconds, as the magnetometer needs. Coils are commanded each quarter of a second, and as often as the body
+two seconds, as the magnetometer needs, and before they act at all. Coils are commanded each quarter of a second, and as often as the body
 turns by 0.3 rad.
 """
 
@@ -77,12 +77,17 @@ def run(case: Case) -> Result:
             flight.advance(start_ns + phase_ns)
             law.sample()
         acting_ns = start_ns + SCHEDULE.settle_ns + SCHEDULE.measure_ns
-        speed = float(np.linalg.norm(flight.motion.rate))
-        cycles = max(LEAST_CYCLES, int(np.ceil(speed * SCHEDULE.act_ns / SECOND / 0.3)))
-        for cycle in range(cycles):
-            flight.advance(acting_ns + SCHEDULE.act_ns * cycle // cycles)
-            flight.act(law.dipole())
         seconds += SCHEDULE.period_ns // SECOND
+        while not law.trusted and acting_ns < seconds * SECOND - SAMPLES_NS.step:
+            flight.advance(acting_ns)
+            law.sample()
+            acting_ns += SAMPLES_NS.step
+        act_ns = seconds * SECOND - acting_ns
+        speed = float(np.linalg.norm(flight.motion.rate))
+        cycles = max(LEAST_CYCLES, int(np.ceil(speed * act_ns / SECOND / 0.3)))
+        for cycle in range(cycles):
+            flight.advance(acting_ns + act_ns * cycle // cycles)
+            flight.act(law.dipole())
         flight.advance(seconds * SECOND)
         law.dipole()
         fastest = max(fastest, float(np.linalg.norm(flight.motion.rate)))
@@ -128,6 +133,10 @@ class _Law:
         noise = GYRO_NOISE * np.sqrt(40.0) * flight.generator.standard_normal(3)
         gyro = flight.motion.rate + flight.gyro_bias + noise
         self._law.sample(flight.time_ns, field, gyro if self._knows else None)
+
+    @property
+    def trusted(self) -> bool:
+        return self._law.trusted
 
     def dipole(self) -> FloatArray:
         return self._law.dipole(self._flight.time_ns)

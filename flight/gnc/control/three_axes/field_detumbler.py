@@ -6,7 +6,8 @@ the samples of the pauses a filter follows the body's whole rate and how the fie
 brakes in the field expected ahead: that of the orbit where the attitude is known, else the measured one,
 turned on at its present speed. Unlike B-dot the law cannot get stuck with the spin along the field: the plan
 holds what lies along the field until the field has turned. One sample starts nothing: the coils wait until
-`TRUSTED` samples in a row agree with the filter's prediction.
+`TRUSTED` samples in a row agree with the filter's prediction and the rate across the field is known to
+`BOUNDED`. Until then the coils are off, so that no pause is waited for.
 
 In the least time a spin along the field is first made faster, across the field. `gentle` and `spin_up` bound
 that: at the bound no dipole is commanded that makes the body faster. A bound at the rate of the begin costs
@@ -36,6 +37,8 @@ from flight.gnc.math.quaternion import attitude_matrix, conjugate, multiply
 
 TRUSTED = 4
 """Samples in a row that agree, before the coils act."""
+BOUNDED = 0.02
+"""rad/s, standard deviation of the rate across the field, the worst direction, from which on the coils act."""
 INSTANTS = 150
 KNOWN = 2e-3
 """rad/s, standard deviation of the rate's worst axis from which on it is bounded."""
@@ -101,13 +104,17 @@ class FieldDetumbler:
         self._plan: MomentumPlan | None = None
         self._planned_ns = now_ns
         self._planned_turn = _NO_DIPOLE
-        self._trusted = 0
+        self._agreed = 0
+        self._bounded = False
+        self._driven_ns = now_ns  # until now another mode may have driven the coils
         self._fastest = math.inf
         self._filter.restart()
 
     def listens(self, time_ns: int) -> bool:
-        """Return whether the coils were off and settled at `time_ns`."""
+        """Return whether the coils were off and settled at `time_ns`: in a pause, or until all is trusted."""
         schedule = self._schedule
+        if not self.trusted and time_ns - self._driven_ns >= schedule.settle_ns:
+            return True
         phase_ns = (time_ns - self._begun_ns) % schedule.period_ns
         inside = schedule.settle_ns <= phase_ns < schedule.settle_ns + schedule.measure_ns
         return time_ns >= self._begun_ns and inside
@@ -123,11 +130,13 @@ class FieldDetumbler:
         starts = self._filter.restarts
         accepted = self._filter.measure(field)
         if accepted and self._filter.started:
-            self._trusted += 1
-            if rate is not None and self.trusted:
+            self._agreed += 1
+            if rate is not None and self._agreed >= TRUSTED:
                 self._filter.measure_rate(rate)
-        elif not accepted and (self._trusted < TRUSTED or self._filter.restarts != starts):
-            self._trusted = 0
+            if not self._bounded:
+                self._bounded = self._agreed >= TRUSTED and self._sigma_across() < BOUNDED
+        elif not accepted and (not self.trusted or self._filter.restarts != starts):
+            self._agreed, self._bounded = 0, False
             self._plan = None
 
     def dipole(self, now_ns: int) -> FloatArray:
@@ -136,17 +145,19 @@ class FieldDetumbler:
         schedule = self._schedule
         phase_ns = (now_ns - self._begun_ns) % schedule.period_ns
         acting = phase_ns >= schedule.settle_ns + schedule.measure_ns
-        self._dipole = self._braking_dipole(now_ns) if acting and self.trusted else _NO_DIPOLE
+        self.acts(self._braking_dipole(now_ns) if acting and self.trusted else _NO_DIPOLE)
         return self._dipole
 
     def acts(self, dipole: FloatArray) -> None:
         """Take a dipole (3,) A m^2 that acts instead of the commanded one until the next command."""
+        if self._dipole.any() or dipole.any():
+            self._driven_ns = self._time_ns
         self._dipole = dipole
 
     @property
     def trusted(self) -> bool:
-        """Whether enough samples agreed."""
-        return self._trusted >= TRUSTED
+        """Whether enough samples agreed, and the rate is bounded."""
+        return self._bounded
 
     @property
     def rate(self) -> FloatArray | None:
@@ -169,6 +180,13 @@ class FieldDetumbler:
     def restarts(self) -> int:
         """How often samples contradicted the filter until it began again: a spin beyond the sampling does."""
         return self._filter.restarts
+
+    def _sigma_across(self) -> float:
+        """Return the standard deviation of the rate across the field, the worst direction, rad/s."""
+        field = self._filter.field
+        across = np.eye(3) - np.outer(field, field) / float(field @ field)
+        spread = across @ self._filter.covariance[RATE, RATE] @ across
+        return math.sqrt(float(np.linalg.eigvalsh(spread)[-1]))
 
     def _advance(self, time_ns: int) -> None:
         self._filter.advance(self._dipole, (time_ns - self._time_ns) * _SECOND)

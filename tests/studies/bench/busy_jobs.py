@@ -1,0 +1,90 @@
+"""Workers that are never idle: each does its last job again and again until the next one comes.
+
+For `python -m tests.studies.bench executive --busy`: a satellite plans every 10 s at most, and to emulate a
+camera's frame costs more than to work on it. What is repeated is the flight's own work on its own jobs; the
+results are dropped. A new job waits for the repetition that runs. Imports are made late, as these functions
+are the workers'.
+"""
+
+from __future__ import annotations
+
+import copy
+import importlib
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from flight.loop.executive.jobs import Worker
+
+
+class _Again:
+    """Runs the job of one module, and the last one again while there is no other."""
+
+    def __init__(self) -> None:
+        self._turn = threading.Lock()
+        self._goes = threading.Event()
+        self._last: Any = None
+
+    def __call__(self, module: str, argument: Any) -> Any:
+        run = importlib.import_module(module).run
+        self._goes.clear()
+        with self._turn:
+            result = run(argument)
+            # What the job holds may be overwritten once its result is sent.
+            begun, self._last = self._last is not None, copy.deepcopy(argument)
+        self._goes.set()
+        if not begun:
+            threading.Thread(target=self._repeat, args=(run,), daemon=True).start()
+        return result
+
+    def _repeat(self, run: Callable[[Any], Any]) -> None:
+        while self._goes.wait():
+            with self._turn, suppress(Exception):
+                run(self._last)
+
+
+_again = _Again()
+
+
+def plan_testbed(job: Any) -> Any:
+    """Plan for the testbed."""
+    return _again("flight.gnc.guidance.one_axis.job", job)
+
+
+def plan_orbit(job: Any) -> Any:
+    """Plan for the satellite."""
+    return _again("flight.gnc.control.three_axes.pointing_job", job)
+
+
+def see(job: Any) -> Any:
+    """Work on a star camera's frame."""
+    return _again("flight.gnc.vision.frame_job", job)
+
+
+def see_wide(job: Any) -> Any:
+    """Work on the wide cameras' frames."""
+    return _again("flight.gnc.vision.wide_job", job)
+
+
+BUSY: dict[str, Callable[[Any], Any]] = {
+    "flight.gnc.guidance.one_axis.job": plan_testbed,
+    "flight.gnc.control.three_axes.pointing_job": plan_orbit,
+    "flight.gnc.vision.frame_job": see,
+    "flight.gnc.vision.wide_job": see_wide,
+}
+"""By the module of the job that is done again."""
+
+
+def keep_busy() -> None:
+    """Have the flight that this process opens keep its workers busy."""
+    from flight.app import opening  # noqa: PLC0415 - see the top
+
+    made = opening.workers
+
+    def workers(*arguments: Any) -> list[Worker]:
+        return [replace(worker, function=BUSY[worker.function.__module__]) for worker in made(*arguments)]
+
+    opening.workers = workers
