@@ -27,6 +27,7 @@ from flight.gnc.control.three_axes.momentum import (
     MomentumPlan,
     braking_dipole,
     momentum_plan,
+    turned_to,
     turning_field,
     without_gain,
 )
@@ -40,6 +41,10 @@ TRUSTED = 4
 BOUNDED = 0.02
 """rad/s, standard deviation of the rate across the field, the worst direction, from which on the coils act."""
 INSTANTS = 150
+DENSER = 1.5
+"""Power of the instants: of 1,500 s the first step is a second, the last 15."""
+LEFT = 0.4
+"""Of a slow body's momentum, about the axis of the smallest inertia, that a plan may leave."""
 KNOWN = 2e-3
 """rad/s, standard deviation of the rate's worst axis from which on it is bounded."""
 _SECOND = 1e-9
@@ -56,6 +61,7 @@ class FieldBraking:
         replan: s, between plans.
         gentle: rad/s; a body braked from below is never made faster than it was when the braking began.
         spin_up: times its first rate that a faster body may reach.
+        slow: rad/s, the rate from which on the body is slow.
     """
 
     limit: float
@@ -63,18 +69,19 @@ class FieldBraking:
     replan: float = 5.0
     gentle: float = 0.052
     spin_up: float = 2.0
+    slow: float = 8.7e-3
 
     def __post_init__(self) -> None:
         """Raise UsageError for constants that do not brake."""
-        for name in ("limit", "horizon", "replan", "gentle", "spin_up"):
+        for name in ("limit", "horizon", "replan", "gentle", "spin_up", "slow"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
                 raise UsageError(f"detumbling {name} is {value}: it must be finite and positive")
 
     @property
     def instants(self) -> FloatArray:
-        """The times (n,) s from a plan on at which it needs the field."""
-        return np.asarray(self.horizon / INSTANTS * np.arange(INSTANTS), dtype=float)
+        """The times (n,) s from a plan on at which it needs the field: denser at the begin."""
+        return np.asarray(self.horizon * (np.arange(INSTANTS) / INSTANTS) ** DENSER, dtype=float)
 
 
 class FieldDetumbler:
@@ -95,6 +102,7 @@ class FieldDetumbler:
         self._braking = braking
         self._expected = expected
         self._filter = FieldRate(settings)
+        self._rest = LEFT * braking.slow * float(np.linalg.eigvalsh(settings.inertia)[0])
         self.begin(0)
 
     def begin(self, now_ns: int) -> None:
@@ -196,11 +204,12 @@ class FieldDetumbler:
         found, braking = self._filter, self._braking
         if self._plan is None or (now_ns - self._planned_ns) * _SECOND >= braking.replan:
             share = self._schedule.act_ns / self._schedule.period_ns
-            step = braking.horizon / INSTANTS
-            ahead = self._expected(now_ns)
-            if ahead is None:
-                ahead = turning_field(found.field, found.change, step, INSTANTS)
-            self._plan = momentum_plan(found.momentum, ahead, step, share * braking.limit)
+            times, expected = braking.instants, self._expected(now_ns)
+            if expected is None:
+                ahead = turning_field(found.field, found.change, times)
+            else:
+                ahead = turned_to(expected, found.field)
+            self._plan = momentum_plan(found.momentum, ahead, times, share * braking.limit, self._rest)
             self._planned_ns, self._planned_turn = now_ns, found.turn
         # The plan is fixed among the stars: into the body's axes of now.
         since = attitude_matrix(multiply(found.turn, conjugate(self._planned_turn)))

@@ -48,28 +48,31 @@ class MomentumPlan:
         return self.costate if self.ends else STEEP * self.costate
 
 
-def momentum_plan(momentum: FloatArray, field: FloatArray, step: float, limit: float) -> MomentumPlan:
-    """Return the plan that removes `momentum` (3,) N m s in the least time.
+def momentum_plan(
+    momentum: FloatArray, field: FloatArray, times: FloatArray, limit: float, rest: float
+) -> MomentumPlan:
+    """Return the plan that removes `momentum` (3,) N m s but for `rest` N m s in the least time.
 
-    `field` (n, 3) T is the predicted field from now on, every `step` s, both in inertial axes; `limit` A m^2
-    is of each coil. When n steps do not suffice, the plan removes what it can and its horizon is n steps.
+    `field` (n, 3) T is the predicted field at `times` (n,) s from now on, both in inertial axes; `limit` A m^2
+    is of each coil. When all times do not suffice, the plan removes what it can and its horizon is their span.
     Raises UsageError for a field of fewer than three instants.
     """
     if len(field) < 3:
         raise UsageError(f"a momentum plan needs the field at three instants, not {len(field)}")
+    spans = np.diff(times, append=2.0 * times[-1] - times[-2])
     square = np.einsum("ni,ni->n", field, field)
-    effect = (square[:, None, None] * np.eye(3) - field[:, :, None] * field[:, None, :]) * step
+    effect = (square[:, None, None] * np.eye(3) - field[:, :, None] * field[:, None, :]) * spans[:, None, None]
     reach = LIMIT_GAIN * limit
     short, long = 2, len(field)
-    costate, _ = _cut_plan(momentum, field, effect, reach)
-    while long - short > max(1, short // FINENESS):
+    costate, _ = _cut_plan(momentum, field, effect, reach, rest)
+    while long - short > 1 and times[long - 1] - times[short - 1] > times[short - 1] / FINENESS:
         middle = (short + long) // 2
-        found, missing = _cut_plan(momentum, field[:middle], effect[:middle], reach)
+        found, missing = _cut_plan(momentum, field[:middle], effect[:middle], reach, rest)
         if missing < MISSING:
             costate, long = found, middle
         else:
             short = middle
-    return MomentumPlan(costate, long * step, long <= 3)
+    return MomentumPlan(costate, float(times[long - 1] + spans[long - 1]), long <= 3)
 
 
 def braking_dipole(costate: FloatArray, field: FloatArray, limit: float) -> FloatArray:
@@ -94,8 +97,8 @@ def without_gain(dipole: FloatArray, field: FloatArray, rate: FloatArray, invers
     return left if largest <= before else left * (before / largest)
 
 
-def turning_field(field: FloatArray, change: FloatArray, step: float, instants: int) -> FloatArray:
-    """Return the field (n, 3) T, every `step` s from now on, that turns as it does now.
+def turning_field(field: FloatArray, change: FloatArray, times: FloatArray) -> FloatArray:
+    """Return the field (n, 3) T at `times` (n,) s from now on, that turns as it does now.
 
     `field` (3,) T and its `change` (3,) T/s with respect to the stars; its strength is kept.
     """
@@ -104,27 +107,47 @@ def turning_field(field: FloatArray, change: FloatArray, step: float, instants: 
     across = change - along * float(along @ change)
     speed = math.sqrt(float(across @ across)) / strength
     if speed == 0.0:
-        return np.broadcast_to(field, (instants, 3)).copy()
-    angle = (speed * step) * np.arange(instants)[:, None]
+        return np.broadcast_to(field, (len(times), 3)).copy()
+    angle = speed * times[:, None]
     return np.asarray(strength * np.cos(angle) * along + np.sin(angle) * across / speed)
 
 
+def turned_to(fields: FloatArray, field: FloatArray) -> FloatArray:
+    """Return `fields` (n, 3) turned by the least angle that brings the first to the direction of `field` (3,).
+
+    What is measured now is better known than what is predicted by a coarse attitude.
+    """
+    first = fields[0] / math.sqrt(float(fields[0] @ fields[0]))
+    wanted = field / math.sqrt(float(field @ field))
+    middle = first + wanted
+    square = float(middle @ middle)
+    if square < 1.0:  # by more than 120 deg: no such prediction is worth to be turned
+        return fields
+    # Two reflections: across the middle, which swaps the two, and back across `wanted`.
+    halves = 2.0 * np.outer(middle, middle) / square - np.eye(3)
+    back = 2.0 * np.outer(wanted, wanted) - np.eye(3)
+    return np.asarray(fields @ (back @ halves).T)
+
+
 def _cut_plan(
-    momentum: FloatArray, field: FloatArray, effect: FloatArray, limit: float
+    momentum: FloatArray, field: FloatArray, effect: FloatArray, limit: float, rest: float
 ) -> tuple[FloatArray, float]:
-    """Return the costate over one horizon, and the share of the momentum that it leaves."""
+    """Return the costate over one horizon, and the share of the momentum that it leaves beside the rest.
+
+    What is left lies along the costate, as the plan of least effort to within a rest has it. Without a rest,
+    what lies along a field that hardly turns would take all of the effort.
+    """
     weight = np.ones(len(field))
-    costate = np.zeros(3)
+    size = math.sqrt(float(momentum @ momentum))
+    if size <= rest:
+        return np.zeros(3), 0.0
+    costate = momentum / float(np.trace(np.sum(effect, axis=0)))
     for _ in range(ITERATIONS):
-        costate = _solved(np.tensordot(weight, effect, 1), momentum)
+        length = math.sqrt(float(costate @ costate))
+        matrix = np.tensordot(weight, effect, 1)
+        least = max(rest / length, 1e-6 * float(np.trace(matrix)))
+        costate = np.linalg.solve(matrix + least * np.eye(3), momentum)
         wanted = np.cross(field, costate)
         weight = 1.0 / np.maximum(1.0, np.sqrt(np.einsum("ni,ni->n", wanted, wanted)) / limit)
     left = np.tensordot(weight, effect, 1) @ costate - momentum
-    size = float(momentum @ momentum)
-    return costate, math.sqrt(float(left @ left) / size) if size > 0.0 else 0.0
-
-
-def _solved(matrix: FloatArray, vector: FloatArray) -> FloatArray:
-    """Return the solution; what lies along a field that hardly turns is out of reach and stays finite."""
-    least = 1e-6 * float(np.trace(matrix))
-    return np.asarray(np.linalg.solve(matrix + least * np.eye(3), vector))
+    return costate, max(0.0, math.sqrt(float(left @ left)) - rest) / size
