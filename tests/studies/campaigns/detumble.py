@@ -17,8 +17,7 @@ import numpy as np
 
 from flight.gnc.control.detumble import WindowSchedule
 from flight.gnc.control.three_axes.field_detumbler import FieldBraking, FieldDetumbler
-from flight.gnc.earth.dipole_field import dipole_field_ahead
-from flight.gnc.earth.ephemeris import predict
+from flight.gnc.earth.field_ahead import FieldAhead
 from flight.gnc.earth.orbit_knowledge import OrbitState
 from flight.gnc.estimation.field_rate import FieldRateSettings
 from flight.gnc.math.arrays import FloatArray
@@ -122,6 +121,7 @@ class _Law:
         )
         braking = FieldBraking(limit=flight.limit, horizon=HORIZON[craft])
         self._instants = braking.instants
+        self._field = FieldAhead()
         self._law = FieldDetumbler(SCHEDULE, braking, noise, self._expected)
 
     def sample(self) -> None:
@@ -149,7 +149,7 @@ class _Law:
         truth, draw = flight.body.orbit_truth(), flight.generator.standard_normal
         place, velocity = truth.position + FIX_SIGMA * draw(3), truth.velocity + 0.05 * draw(3)
         state = OrbitState(truth.utc, place, velocity, FIX_SIGMA)
-        ahead = dipole_field_ahead(state, predict(state, 0.0).field[0], self._instants)
+        ahead = self._field.along(state, self._instants)
         return np.asarray(ahead @ attitude_matrix(flight.attitude(ATTITUDE_SIGMA)).T)
 
 

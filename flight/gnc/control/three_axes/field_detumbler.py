@@ -24,6 +24,7 @@ import numpy as np
 
 from flight.gnc.control.detumble import WindowSchedule
 from flight.gnc.control.three_axes.momentum import (
+    STEEP,
     MomentumPlan,
     braking_dipole,
     momentum_plan,
@@ -43,7 +44,9 @@ BOUNDED = 0.02
 INSTANTS = 150
 DENSER = 1.5
 """Power of the instants: of 1,500 s the first step is a second, the last 15."""
-LEFT = 0.4
+FEW = 4.0
+SOON = 5.0
+LEFT = 0.7
 """Of a slow body's momentum, about the axis of the smallest inertia, that a plan may leave."""
 KNOWN = 2e-3
 """rad/s, standard deviation of the rate's worst axis from which on it is bounded."""
@@ -102,7 +105,7 @@ class FieldDetumbler:
         self._braking = braking
         self._expected = expected
         self._filter = FieldRate(settings)
-        self._rest = LEFT * braking.slow * float(np.linalg.eigvalsh(settings.inertia)[0])
+        self._rest = LEFT * braking.slow * float(np.mean(np.linalg.eigvalsh(settings.inertia) ** -2.0)) ** -0.5
         self.begin(0)
 
     def begin(self, now_ns: int) -> None:
@@ -211,9 +214,17 @@ class FieldDetumbler:
                 ahead = turned_to(expected, found.field)
             self._plan = momentum_plan(found.momentum, ahead, times, share * braking.limit, self._rest)
             self._planned_ns, self._planned_turn = now_ns, found.turn
-        # The plan is fixed among the stars: into the body's axes of now.
-        since = attitude_matrix(multiply(found.turn, conjugate(self._planned_turn)))
-        dipole = braking_dipole(since @ self._plan.braking, found.field, braking.limit)
+        field, momentum = found.field, found.momentum
+        square = float(field @ field)
+        along = float(momentum @ field) / math.sqrt(square)
+        size = math.sqrt(float(momentum @ momentum))
+        if size <= FEW * self._rest and abs(along) <= self._rest:
+            costate = momentum / (square * SOON)
+        else:
+            # The plan is fixed among the stars: into the body's axes of now.
+            since = attitude_matrix(multiply(found.turn, conjugate(self._planned_turn)))
+            costate = since @ self._plan.costate * STEEP
+        dipole = braking_dipole(costate, field, braking.limit)
         rate = found.rate
         speed = math.sqrt(float(rate @ rate))
         if math.isinf(self._fastest) and self.rate_sigma < KNOWN:

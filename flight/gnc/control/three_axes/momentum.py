@@ -21,31 +21,23 @@ from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.directions import cross_product
 
 ITERATIONS = 12
-MISSING = 0.04
-"""A plan may leave this share of the momentum: it is made again long before its end."""
 LIMIT_GAIN = 1.4
 """Mean reach of three coils over the limit of one, in a body that turns; were all saturated, 1.5."""
-STEEP = 4.0
-"""Raises the dipole of a long plan before it is cut: the least time takes coils at their limits."""
-FINENESS = 30
-"""The horizon is found within a thirtieth."""
+STEEP = 12.0
+FLAT = 0.02
+FINENESS = 60
+"""The horizon is found within a sixtieth."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MomentumPlan:
     """A plan: `costate` (3,) A m^2/T, inertial axes, and the `horizon`, s, at whose end the body stands.
 
-    `ends`: whether the horizon is the shortest there is, so that the coils need not be at their limits.
+    The costate's dipole has the limit's length in the mean over the plan.
     """
 
     costate: FloatArray
     horizon: float
-    ends: bool = False
-
-    @property
-    def braking(self) -> FloatArray:
-        """The costate (3,) to brake by now."""
-        return self.costate if self.ends else STEEP * self.costate
 
 
 def momentum_plan(
@@ -62,17 +54,22 @@ def momentum_plan(
     spans = np.diff(times, append=2.0 * times[-1] - times[-2])
     square = np.einsum("ni,ni->n", field, field)
     effect = (square[:, None, None] * np.eye(3) - field[:, :, None] * field[:, None, :]) * spans[:, None, None]
-    reach = LIMIT_GAIN * limit
+    effect *= LIMIT_GAIN * limit
+    size = math.sqrt(float(momentum @ momentum))
+    if size <= rest:
+        return MomentumPlan(np.zeros(3), 0.0)
     short, long = 2, len(field)
-    costate, _ = _cut_plan(momentum, field, effect, reach, rest)
+    costate, _ = _costate(momentum, field, effect, rest, momentum / size)
     while long - short > 1 and times[long - 1] - times[short - 1] > times[short - 1] / FINENESS:
         middle = (short + long) // 2
-        found, missing = _cut_plan(momentum, field[:middle], effect[:middle], reach, rest)
-        if missing < MISSING:
-            costate, long = found, middle
-        else:
+        found, lacks = _costate(momentum, field[:middle], effect[:middle], rest, costate)
+        if lacks:
             short = middle
-    return MomentumPlan(costate, float(times[long - 1] + spans[long - 1]), long <= 3)
+        else:
+            costate, long = found, middle
+    across = np.cross(field[:long], costate)
+    mean = float(np.sqrt(np.einsum("ni,ni->n", across, across)) @ spans[:long] / spans[:long].sum())
+    return MomentumPlan(costate * (limit / mean), float(times[long - 1] + spans[long - 1]))
 
 
 def braking_dipole(costate: FloatArray, field: FloatArray, limit: float) -> FloatArray:
@@ -129,25 +126,19 @@ def turned_to(fields: FloatArray, field: FloatArray) -> FloatArray:
     return np.asarray(fields @ (back @ halves).T)
 
 
-def _cut_plan(
-    momentum: FloatArray, field: FloatArray, effect: FloatArray, limit: float, rest: float
-) -> tuple[FloatArray, float]:
-    """Return the costate over one horizon, and the share of the momentum that it leaves beside the rest.
-
-    What is left lies along the costate, as the plan of least effort to within a rest has it. Without a rest,
-    what lies along a field that hardly turns would take all of the effort.
-    """
-    weight = np.ones(len(field))
-    size = math.sqrt(float(momentum @ momentum))
-    if size <= rest:
-        return np.zeros(3), 0.0
-    costate = momentum / float(np.trace(np.sum(effect, axis=0)))
+def _costate(
+    momentum: FloatArray, field: FloatArray, effect: FloatArray, rest: float, guess: FloatArray
+) -> tuple[FloatArray, bool]:
+    y = guess
     for _ in range(ITERATIONS):
-        length = math.sqrt(float(costate @ costate))
-        matrix = np.tensordot(weight, effect, 1)
-        least = max(rest / length, 1e-6 * float(np.trace(matrix)))
-        costate = np.linalg.solve(matrix + least * np.eye(3), momentum)
-        wanted = np.cross(field, costate)
-        weight = 1.0 / np.maximum(1.0, np.sqrt(np.einsum("ni,ni->n", wanted, wanted)) / limit)
-    left = np.tensordot(weight, effect, 1) @ costate - momentum
-    return costate, max(0.0, math.sqrt(float(left @ left)) - rest) / size
+        across = np.cross(field, y)
+        size = np.sqrt(np.einsum("ni,ni->n", across, across))
+        weight = 1.0 / np.maximum(size, FLAT * float(size.max()))
+        matrix = np.tensordot(weight, effect, 1) + rest * np.eye(3)
+        y = np.linalg.solve(matrix, momentum)
+        y = y / math.sqrt(float(y @ y))
+    across = np.cross(field, y)
+    size = np.sqrt(np.einsum("ni,ni->n", across, across))
+    weight = 1.0 / np.maximum(size, FLAT * float(size.max()))
+    matrix = np.tensordot(weight, effect, 1) + rest * np.eye(3)
+    return y, float(momentum @ y) > float(y @ matrix @ y)
