@@ -150,7 +150,9 @@ def _turns(process: int) -> tuple[float, float]:
     """Return how long the main thread was on a processor, and waited for one, s; NaN where not counted."""
     try:
         words = Path(f"/proc/{process}/task/{process}/schedstat").read_text().split()
-    except FileNotFoundError:  # a kernel without CONFIG_SCHED_INFO, or a process that has ended: found by others
+    except (
+        FileNotFoundError
+    ):  # a kernel without CONFIG_SCHED_INFO, or a process that has ended: found by others
         return math.nan, math.nan
     return 1e-9 * int(words[0]), 1e-9 * int(words[1])
 

@@ -24,7 +24,6 @@ import numpy as np
 
 from flight.gnc.control.detumble import WindowSchedule
 from flight.gnc.control.three_axes.momentum import (
-    STEEP,
     MomentumPlan,
     braking_dipole,
     momentum_plan,
@@ -44,10 +43,10 @@ BOUNDED = 0.02
 INSTANTS = 150
 DENSER = 1.5
 """Power of the instants: of 1,500 s the first step is a second, the last 15."""
-FEW = 4.0
-SOON = 5.0
 LEFT = 0.7
-"""Of a slow body's momentum, about the axis of the smallest inertia, that a plan may leave."""
+"""Of a slow body's momentum that a plan may leave."""
+FEW, SOON = 4.0, 5.0
+"""Within so many times that, where no more than that lies along the field, the rest is braked in so many s."""
 KNOWN = 2e-3
 """rad/s, standard deviation of the rate's worst axis from which on it is bounded."""
 _SECOND = 1e-9
@@ -64,7 +63,7 @@ class FieldBraking:
         replan: s, between plans.
         gentle: rad/s; a body braked from below is never made faster than it was when the braking began.
         spin_up: times its first rate that a faster body may reach.
-        slow: rad/s, the rate from which on the body is slow.
+        slow: rad/s; a body that turns by less is slow, and the braking over.
     """
 
     limit: float
@@ -105,7 +104,9 @@ class FieldDetumbler:
         self._braking = braking
         self._expected = expected
         self._filter = FieldRate(settings)
-        self._rest = LEFT * braking.slow * float(np.mean(np.linalg.eigvalsh(settings.inertia) ** -2.0)) ** -0.5
+        self._rest = (
+            LEFT * braking.slow * float(np.mean(np.linalg.eigvalsh(settings.inertia) ** -2.0)) ** -0.5
+        )
         self.begin(0)
 
     def begin(self, now_ns: int) -> None:
@@ -205,28 +206,36 @@ class FieldDetumbler:
 
     def _braking_dipole(self, now_ns: int) -> FloatArray:
         found, braking = self._filter, self._braking
-        if self._plan is None or (now_ns - self._planned_ns) * _SECOND >= braking.replan:
-            share = self._schedule.act_ns / self._schedule.period_ns
-            times, expected = braking.instants, self._expected(now_ns)
-            if expected is None:
-                ahead = turning_field(found.field, found.change, times)
-            else:
-                ahead = turned_to(expected, found.field)
-            self._plan = momentum_plan(found.momentum, ahead, times, share * braking.limit, self._rest)
-            self._planned_ns, self._planned_turn = now_ns, found.turn
-        field, momentum = found.field, found.momentum
-        square = float(field @ field)
-        along = float(momentum @ field) / math.sqrt(square)
-        size = math.sqrt(float(momentum @ momentum))
-        if size <= FEW * self._rest and abs(along) <= self._rest:
-            costate = momentum / (square * SOON)
-        else:
-            # The plan is fixed among the stars: into the body's axes of now.
-            since = attitude_matrix(multiply(found.turn, conjugate(self._planned_turn)))
-            costate = since @ self._plan.costate * STEEP
-        dipole = braking_dipole(costate, field, braking.limit)
+        dipole = braking_dipole(self._costate(now_ns), found.field, braking.limit)
         rate = found.rate
         speed = math.sqrt(float(rate @ rate))
         if math.isinf(self._fastest) and self.rate_sigma < KNOWN:
             self._fastest = speed * (braking.spin_up if speed > braking.gentle else 1.0)
         return without_gain(dipole, found.field, rate, found.inverse) if speed >= self._fastest else dipole
+
+    def _costate(self, now_ns: int) -> FloatArray:
+        """Return the costate (3,) A m^2/T to brake by now, in body axes."""
+        found = self._filter
+        field, momentum = found.field, found.momentum
+        square = float(field @ field)
+        if (
+            momentum @ momentum <= (FEW * self._rest) ** 2
+            and (momentum @ field) ** 2 <= square * self._rest**2
+        ):
+            return momentum / (square * SOON)
+        if self._plan is None or (now_ns - self._planned_ns) * _SECOND >= self._braking.replan:
+            self._plan, self._planned_ns, self._planned_turn = self._planned(now_ns), now_ns, found.turn
+        # The plan is fixed among the stars: into the body's axes of now.
+        since = attitude_matrix(multiply(found.turn, conjugate(self._planned_turn)))
+        return np.asarray(since @ self._plan.costate)
+
+    def _planned(self, now_ns: int) -> MomentumPlan:
+        """Return a plan in the body's axes of now."""
+        found, times = self._filter, self._braking.instants
+        expected = self._expected(now_ns)
+        if expected is None:
+            ahead = turning_field(found.field, found.change, times)
+        else:
+            ahead = turned_to(expected, found.field)
+        share = self._schedule.act_ns / self._schedule.period_ns
+        return momentum_plan(found.momentum, ahead, times, share * self._braking.limit, self._rest)

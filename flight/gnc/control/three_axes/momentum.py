@@ -1,12 +1,16 @@
 """The momentum plan: the dipole that stops a body in the least time, with the field predicted ahead.
 
 In inertial axes the angular momentum obeys h' = m x B: the body's inertia and attitude do not enter. By
-Pontryagin's principle the dipole of least time has its limit's length and the direction of -B x y with one
-constant vector y; with a smooth limit it is m = -B x y, cut at the limit. Over a horizon it removes W y, W
-the integral of the weighted B^2 I - B B^T, where the weight of an instant is the share of -B x y that the
-limit lets pass. Weight and y follow from each other by iteration; the horizon is the shortest whose plan
-removes h. A field that keeps its direction cannot remove the momentum along itself: the plan then waits for
-the field to turn, and uses how it turns.
+Pontryagin's principle the dipole of least time has its limit's length L and the direction of -B x y with one
+constant vector y. A time T suffices for all but a rest r of the momentum exactly where, for every y,
+
+    h . y <= L integral of |B x y| over T + r |y|,
+
+so T is the least time at which the worst y meets it, and that y is the plan. The worst y solves A(y) y ~ h, A
+the integral of L (B^2 I - B B^T) / |B x y| plus r / |y|, and is found by iterating that (iteratively reweighted
+least squares). A field that keeps its direction cannot remove the momentum along itself: the plan then makes
+momentum across it, which the field's turn carries along. Without a rest the last of what lies along a field
+that hardly turns would take all of the time.
 """
 
 from __future__ import annotations
@@ -24,16 +28,19 @@ ITERATIONS = 12
 LIMIT_GAIN = 1.4
 """Mean reach of three coils over the limit of one, in a body that turns; were all saturated, 1.5."""
 STEEP = 12.0
+"""Times the mean of |B x y| at which a coil is at its limit: least time takes all at theirs, but noise in B
+would switch them where B x y is small."""
 FLAT = 0.02
+"""Of the largest |B x y|, what the smaller ones count as: the weights stay finite."""
 FINENESS = 60
 """The horizon is found within a sixtieth."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MomentumPlan:
-    """A plan: `costate` (3,) A m^2/T, inertial axes, and the `horizon`, s, at whose end the body stands.
+    """A plan: `costate` (3,) A m^2/T, inertial axes, and the `horizon`, s, at whose end the body is at rest.
 
-    The costate's dipole has the limit's length in the mean over the plan.
+    The dipole -B x costate has the coils' limit at a small part of its mean over the plan; zero at rest.
     """
 
     costate: FloatArray
@@ -51,25 +58,24 @@ def momentum_plan(
     """
     if len(field) < 3:
         raise UsageError(f"a momentum plan needs the field at three instants, not {len(field)}")
-    spans = np.diff(times, append=2.0 * times[-1] - times[-2])
-    square = np.einsum("ni,ni->n", field, field)
-    effect = (square[:, None, None] * np.eye(3) - field[:, :, None] * field[:, None, :]) * spans[:, None, None]
-    effect *= LIMIT_GAIN * limit
     size = math.sqrt(float(momentum @ momentum))
     if size <= rest:
         return MomentumPlan(np.zeros(3), 0.0)
+    spans = np.diff(times, append=2.0 * times[-1] - times[-2])
+    square = np.einsum("ni,ni->n", field, field)
+    effect = square[:, None, None] * np.eye(3) - field[:, :, None] * field[:, None, :]
+    ahead = _Ahead(field, effect * spans[:, None, None], LIMIT_GAIN * limit, rest)
     short, long = 2, len(field)
-    costate, _ = _costate(momentum, field, effect, rest, momentum / size)
+    costate = ahead.worst(momentum, long, momentum / size)
     while long - short > 1 and times[long - 1] - times[short - 1] > times[short - 1] / FINENESS:
         middle = (short + long) // 2
-        found, lacks = _costate(momentum, field[:middle], effect[:middle], rest, costate)
-        if lacks:
+        found = ahead.worst(momentum, middle, costate)
+        if float(momentum @ found) > float(found @ ahead.matrix(found, middle) @ found):
             short = middle
         else:
             costate, long = found, middle
-    across = np.cross(field[:long], costate)
-    mean = float(np.sqrt(np.einsum("ni,ni->n", across, across)) @ spans[:long] / spans[:long].sum())
-    return MomentumPlan(costate * (limit / mean), float(times[long - 1] + spans[long - 1]))
+    mean = float(ahead.across(costate, long) @ spans[:long]) / float(spans[:long].sum())
+    return MomentumPlan(costate * (STEEP * limit / mean), float(times[long - 1] + spans[long - 1]))
 
 
 def braking_dipole(costate: FloatArray, field: FloatArray, limit: float) -> FloatArray:
@@ -126,19 +132,31 @@ def turned_to(fields: FloatArray, field: FloatArray) -> FloatArray:
     return np.asarray(fields @ (back @ halves).T)
 
 
-def _costate(
-    momentum: FloatArray, field: FloatArray, effect: FloatArray, rest: float, guess: FloatArray
-) -> tuple[FloatArray, bool]:
-    y = guess
-    for _ in range(ITERATIONS):
-        across = np.cross(field, y)
-        size = np.sqrt(np.einsum("ni,ni->n", across, across))
-        weight = 1.0 / np.maximum(size, FLAT * float(size.max()))
-        matrix = np.tensordot(weight, effect, 1) + rest * np.eye(3)
-        y = np.linalg.solve(matrix, momentum)
-        y = y / math.sqrt(float(y @ y))
-    across = np.cross(field, y)
-    size = np.sqrt(np.einsum("ni,ni->n", across, across))
-    weight = 1.0 / np.maximum(size, FLAT * float(size.max()))
-    matrix = np.tensordot(weight, effect, 1) + rest * np.eye(3)
-    return y, float(momentum @ y) > float(y @ matrix @ y)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Ahead:
+    """The field (n, 3) and its `effect` (n, 3, 3) on the momentum; the dipole's reach, and the rest."""
+
+    field: FloatArray
+    effect: FloatArray
+    reach: float
+    rest: float
+
+    def across(self, y: FloatArray, count: int) -> FloatArray:
+        """Return |B x y| (count,), nowhere zero."""
+        found = np.cross(self.field[:count], y)
+        across = np.sqrt(np.einsum("ni,ni->n", found, found))
+        strength = math.sqrt(float(self.field[0] @ self.field[0]))
+        return np.asarray(np.maximum(across, FLAT * max(float(across.max()), FLAT * strength)))
+
+    def matrix(self, y: FloatArray, count: int) -> FloatArray:
+        """Return A(y) (3, 3) of `count` instants and a unit vector."""
+        weight = self.reach / self.across(y, count)
+        return np.asarray(np.tensordot(weight, self.effect[:count], 1) + self.rest * np.eye(3))
+
+    def worst(self, momentum: FloatArray, count: int, guess: FloatArray) -> FloatArray:
+        """Return the unit vector (3,) whose momentum is the hardest to remove in `count` instants."""
+        y = guess
+        for _ in range(ITERATIONS):
+            y = np.linalg.solve(self.matrix(y, count), momentum)
+            y = y / math.sqrt(float(y @ y))
+        return y
