@@ -52,7 +52,6 @@ def expected_field(
 
     It gives None while attitude or orbit are not known.
     """
-
     field = FieldAhead()
 
     def expected(now_ns: int) -> FloatArray | None:

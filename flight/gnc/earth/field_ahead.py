@@ -60,7 +60,7 @@ class FieldAhead:
         return STEP * (len(self._fields) - 1)
 
     def _restart(self, state: OrbitState) -> float:
-        """Return the time since the first knot, s; the knots are forgotten where they do not fit, or are past."""
+        """Return the time since the first knot, s; knots that are past or do not fit are forgotten."""
         since = (state.julian_date - self._begin) * DAY
         if not (0.0 <= since <= self._span and self._fits(state, since)):
             self._begin = state.julian_date

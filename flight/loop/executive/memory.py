@@ -16,9 +16,7 @@ LARGE_BYTES = 256 * 1024
 SPARE_BYTES = 4 * 1024 * 1024
 """Free memory kept at the heap's top, so that cycles do not call the kernel each time."""
 
-_SELDOM = frozenset(
-    {"char", "core", "ctypeslib", "f2py", "ma", "polynomial", "rec", "strings", "test", "testing"}
-)
+_SELDOM = {"char", "core", "ctypeslib", "f2py", "ma", "polynomial", "rec", "strings", "test", "testing"}
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # malloc.h
 

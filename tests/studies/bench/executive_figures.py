@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from flight.gnc.math.arrays import FloatArray
 from flight.link.telemetry.packets import to_text
 from ground.telemetry.reader import Run
 from tests.hal.guardian.live_flight import CoilTruth
@@ -180,7 +180,7 @@ def judged_slope(seconds: list[float], levels: list[float]) -> tuple[float, floa
     return slope_per_hour(seconds, levels)
 
 
-def waits(looks: list[Look], starts: FloatArray, execution: FloatArray) -> Figures:
+def waits(looks: list[Look], starts: npt.NDArray[Any], execution: npt.NDArray[Any]) -> Figures:
     """Return for how much of the time the control thread waited, from the first look to the last.
 
     `queued`: ready, but the machine gave it no processor. `blocked`: in a cycle, with neither processor nor
@@ -239,7 +239,7 @@ def table(figures: Figures, name: str) -> str:
         f"{figures['lost_with_bare_loop']} with the bare loop, which lost {figures['lost_by_bare_loop']}, "
         f"{figures['lost_while_stolen']} while the host took what makes a slot lost, from whichever core; "
         f"{figures['lost_unexplained']} with neither",
-        f"control thread ready without a processor {figures['queued']:.1%} of the time, blocked within cycles "
+        f"control thread ready without a processor {figures['queued']:.1%} of the time, blocked in cycles "
         f"{figures['blocked']:.1%}; cycles {1e3 * figures['closest_s']:.1f} ms apart at least",
         f"overruns {figures['overruns']}; taken by the host {figures['stolen_s']:.1f} s, as much as makes a "
         f"slot lost in {figures['slots_stolen_from']} slots",

@@ -27,8 +27,8 @@ _TICKS = os.sysconf("SC_CLK_TCK")
 class Look:
     """One look: monotonic time in s; by name, processor seconds since start and proportional set in bytes.
 
-    `own` is the part of that which is no file's: other processes that come and go do not change it. `turns` is
-    of each main thread since its start: on a processor, and ready but waiting for one, s.
+    `own` is the part of that which is no file's: other processes that come and go do not change it. `turns`
+    is of each main thread since its start: on a processor, and ready but waiting for one, s.
     """
 
     time: float
@@ -150,9 +150,7 @@ def _turns(process: int) -> tuple[float, float]:
     """Return how long the main thread was on a processor, and waited for one, s; NaN where not counted."""
     try:
         words = Path(f"/proc/{process}/task/{process}/schedstat").read_text().split()
-    except (
-        FileNotFoundError
-    ):  # a kernel without CONFIG_SCHED_INFO, or a process that has ended: found by others
+    except FileNotFoundError:  # a kernel that does not count it
         return math.nan, math.nan
     return 1e-9 * int(words[0]), 1e-9 * int(words[1])
 

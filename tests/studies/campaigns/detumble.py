@@ -2,8 +2,8 @@
 
 Two craft, each in a Sun-synchronous and an ISS-like orbit, by one law: `magnetometer` knows the magnetometer
 alone, `attitude` also a gyro with its bias, a coarse attitude and the orbit. The coils pause a tenth of each
-two seconds, as the magnetometer needs, and before they act at all. Coils are commanded each quarter of a second, and as often as the body
-turns by 0.3 rad.
+two seconds, as the magnetometer needs, and before they act at all. Coils are commanded each quarter of a
+second, and as often as the body turns by 0.3 rad.
 """
 
 from __future__ import annotations

@@ -39,14 +39,14 @@ from flight.gnc.math.quaternion import attitude_matrix, conjugate, multiply
 TRUSTED = 4
 """Samples in a row that agree, before the coils act."""
 BOUNDED = 0.02
-"""rad/s, standard deviation of the rate across the field, the worst direction, from which on the coils act."""
+"""rad/s, largest standard deviation of the rate across the field with which the coils begin to act."""
 INSTANTS = 150
 DENSER = 1.5
 """Power of the instants: of 1,500 s the first step is a second, the last 15."""
 LEFT = 0.7
 """Of a slow body's momentum that a plan may leave."""
 FEW, SOON = 4.0, 5.0
-"""Within so many times that, where no more than that lies along the field, the rest is braked in so many s."""
+"""Times that, and s: so little, of which no more than that lies along the field, is braked in this time."""
 KNOWN = 2e-3
 """rad/s, standard deviation of the rate's worst axis from which on it is bounded."""
 _SECOND = 1e-9
@@ -104,9 +104,9 @@ class FieldDetumbler:
         self._braking = braking
         self._expected = expected
         self._filter = FieldRate(settings)
-        self._rest = (
-            LEFT * braking.slow * float(np.mean(np.linalg.eigvalsh(settings.inertia) ** -2.0)) ** -0.5
-        )
+        # What is left may lie along any axis.
+        moment = float(np.mean(np.linalg.eigvalsh(settings.inertia) ** -2.0)) ** -0.5
+        self._rest = LEFT * braking.slow * moment
         self.begin(0)
 
     def begin(self, now_ns: int) -> None:
@@ -217,12 +217,10 @@ class FieldDetumbler:
         """Return the costate (3,) A m^2/T to brake by now, in body axes."""
         found = self._filter
         field, momentum = found.field, found.momentum
-        square = float(field @ field)
-        if (
-            momentum @ momentum <= (FEW * self._rest) ** 2
-            and (momentum @ field) ** 2 <= square * self._rest**2
-        ):
-            return momentum / (square * SOON)
+        square, along = float(field @ field), float(momentum @ field)
+        little = float(momentum @ momentum) <= (FEW * self._rest) ** 2
+        if little and along * along <= square * self._rest**2:
+            return np.asarray(momentum / (square * SOON))
         if self._plan is None or (now_ns - self._planned_ns) * _SECOND >= self._braking.replan:
             self._plan, self._planned_ns, self._planned_turn = self._planned(now_ns), now_ns, found.turn
         # The plan is fixed among the stars: into the body's axes of now.

@@ -6,9 +6,9 @@ constant vector y. A time T suffices for all but a rest r of the momentum exactl
 
     h . y <= L integral of |B x y| over T + r |y|,
 
-so T is the least time at which the worst y meets it, and that y is the plan. The worst y solves A(y) y ~ h, A
-the integral of L (B^2 I - B B^T) / |B x y| plus r / |y|, and is found by iterating that (iteratively reweighted
-least squares). A field that keeps its direction cannot remove the momentum along itself: the plan then makes
+so T is the least time at which the worst y meets it, and that y is the plan. The worst y has A(y) y along h,
+A the integral of L (B^2 I - B B^T) / |B x y| plus r / |y|, and is found by iterating that: least squares,
+reweighted. A field that keeps its direction cannot remove the momentum along itself: the plan then makes
 momentum across it, which the field's turn carries along. Without a rest the last of what lies along a field
 that hardly turns would take all of the time.
 """
@@ -52,8 +52,9 @@ def momentum_plan(
 ) -> MomentumPlan:
     """Return the plan that removes `momentum` (3,) N m s but for `rest` N m s in the least time.
 
-    `field` (n, 3) T is the predicted field at `times` (n,) s from now on, both in inertial axes; `limit` A m^2
-    is of each coil. When all times do not suffice, the plan removes what it can and its horizon is their span.
+    `field` (n, 3) T is the predicted field at `times` (n,) s from now on, in the momentum's inertial axes;
+    `limit` A m^2 is of each coil. When all times do not suffice, the plan removes what it can and its
+    horizon is their span.
     Raises UsageError for a field of fewer than three instants.
     """
     if len(field) < 3:
@@ -116,7 +117,7 @@ def turning_field(field: FloatArray, change: FloatArray, times: FloatArray) -> F
 
 
 def turned_to(fields: FloatArray, field: FloatArray) -> FloatArray:
-    """Return `fields` (n, 3) turned by the least angle that brings the first to the direction of `field` (3,).
+    """Return `fields` (n, 3) turned by the least angle that brings the first to where `field` (3,) points.
 
     What is measured now is better known than what is predicted by a coarse attitude.
     """
@@ -157,6 +158,6 @@ class _Ahead:
         """Return the unit vector (3,) whose momentum is the hardest to remove in `count` instants."""
         y = guess
         for _ in range(ITERATIONS):
-            y = np.linalg.solve(self.matrix(y, count), momentum)
-            y = y / math.sqrt(float(y @ y))
+            found = np.linalg.solve(self.matrix(y, count), momentum)
+            y = np.asarray(found / math.sqrt(float(found @ found)))
         return y

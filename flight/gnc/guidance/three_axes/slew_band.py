@@ -2,8 +2,8 @@
 
 Each interval has the state (7) and the dipole (3) of its first node, the equation of its midpoint (7), the
 midpoint's state (7) and the equation of its end (7); the start's equations stand before all, the end's after
-all. So each equation touches its neighbours only, and LAPACK factors the band: imported where that is done, as
-the control process names the job but does not need it.
+all. So each equation touches its neighbours only, and LAPACK factors the band. It is imported where that is
+done, as the control process names the job but does not need it.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flight.gnc.earth import field_ahead
+from flight.gnc.earth import field_ahead, geomagnetism
 from flight.gnc.earth.ephemeris import predict
 from flight.gnc.earth.field_ahead import FieldAhead
 from flight.gnc.earth.orbit_knowledge import OrbitState
@@ -54,7 +54,7 @@ def test_an_orbit_that_is_known_otherwise_begins_again() -> None:
 
 def test_no_call_makes_more_knots_than_the_loop_has_time_for(monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[float] = []
-    whole = field_ahead.field
+    whole = geomagnetism.field
 
     def counted(date: float, place: FloatArray) -> FloatArray:
         made.append(date)

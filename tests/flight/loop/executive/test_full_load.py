@@ -38,7 +38,7 @@ from tests.studies.bench.process_watch import MIB, Look
 
 FIRST = 1000
 CALM = 0.05
-"""Share of the time that the control thread is ready without a processor: from there on the machine is busy."""
+"""Share of the time that the control thread is ready without a processor; beyond it the machine is busy."""
 _IN_TIME = np.full(12, 100_000)
 _kept: list[npt.NDArray[np.float64]] = []
 

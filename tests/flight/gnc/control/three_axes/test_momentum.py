@@ -17,7 +17,7 @@ from flight.gnc.errors import UsageError
 from flight.gnc.math.arrays import FloatArray
 
 STEP, LIMIT, REST = 5.0, 0.1, 1e-5
-TIMES = STEP * np.arange(400)
+TIMES = np.arange(0.0, 400.0 * STEP, STEP)
 FIELD = turning_field(np.array([0.0, 0.0, 4e-5]), np.array([4e-5 * 0.0022, 0.0, 0.0]), TIMES)
 """T: it turns by two turns in 95 min, as in a polar orbit."""
 
