@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from flight.loop.executive.jobs import Worker
 
 
-class _Again:
+class Again:
     """Runs the job of one module, and the last one again while there is no other."""
 
     def __init__(self) -> None:
@@ -40,13 +40,17 @@ class _Again:
             threading.Thread(target=self._repeat, args=(run,), daemon=True).start()
         return result
 
+    def rest(self) -> None:
+        """Do nothing again until the next job."""
+        self._goes.clear()
+
     def _repeat(self, run: Callable[[Any], Any]) -> None:
         while self._goes.wait():
             with self._turn, suppress(Exception):
                 run(self._last)
 
 
-_again = _Again()
+_again = Again()
 
 
 def plan_testbed(job: Any) -> Any:

@@ -19,10 +19,14 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from flight.app import opening
+from flight.app.composition.workers import workers
 from flight.loop.executive.jobs import Worker
 from flight.loop.executive.supervisor import ProcessRunner
+from flight.schema import reader as configuration
 from hal.buses.clock import SystemClock
-from tests.studies.bench import bare_loop, process_watch
+from tests.hal.guardian.live_flight import ROOT
+from tests.studies.bench import bare_loop, busy_jobs, process_watch
 from tests.studies.bench.executive import Load, fly
 from tests.studies.bench.executive_figures import (
     ASKED,
@@ -200,6 +204,47 @@ def test_a_worker_gives_back_what_a_job_took_once_its_result_is_sent() -> None:
             time.sleep(0.01)
             rest = process_watch.look({"filler": process}).memory["filler"]
     assert rest <= held - 40 * MIB
+
+
+runs: list[Any] = []
+
+
+def run(job: Any) -> int:
+    """Note a job: this module stands for a worker's."""
+    runs.append(job)
+    time.sleep(0.001)
+    return len(runs)
+
+
+def test_a_busy_worker_does_its_last_job_again_until_the_next_one_comes() -> None:
+    runs.clear()
+    again = busy_jobs.Again()
+    assert again(__name__, "first") == 1
+    deadline = time.monotonic() + 20.0
+    while runs.count("first") < 3 and time.monotonic() < deadline:
+        time.sleep(0.005)
+    again(__name__, "second")
+    while runs[-1] != "second" and time.monotonic() < deadline:
+        time.sleep(0.005)
+    begun = runs.index("second")
+    while runs.count("second") < 3 and time.monotonic() < deadline:
+        time.sleep(0.005)
+    again.rest()
+    assert begun >= 3
+    assert set(runs[begun:]) == {"second"}
+    assert runs.count("second") >= 3
+
+
+@pytest.mark.parametrize("name", ["orbit.yaml", "step_demo.yaml"])
+def test_every_worker_of_a_flight_is_kept_busy(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("flight.app.opening.workers", workers)  # restores it at the end
+    busy_jobs.keep_busy()
+    config = configuration.load(ROOT / "config" / name)
+    made, plain = opening.workers(config), workers(config)  # type: ignore[attr-defined]  # one of its imports
+    assert [worker.name for worker in made] == [worker.name for worker in plain]
+    assert len(made) >= 2
+    for busy, worker in zip(made, plain, strict=True):
+        assert busy.function is busy_jobs.BUSY[worker.function.__module__]
 
 
 @pytest.mark.slow
