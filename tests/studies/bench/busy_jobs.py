@@ -9,6 +9,7 @@ are the workers'.
 from __future__ import annotations
 
 import copy
+import ctypes
 import importlib
 import threading
 from collections.abc import Callable
@@ -16,8 +17,12 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from flight.loop.executive.memory import give_back
+
 if TYPE_CHECKING:
     from flight.loop.executive.jobs import Worker
+
+_M_ARENA_MAX = -8  # malloc.h
 
 
 class Again:
@@ -30,6 +35,7 @@ class Again:
 
     def __call__(self, module: str, argument: Any) -> Any:
         run = importlib.import_module(module).run
+        _one_heap()
         self._goes.clear()
         with self._turn:
             result = run(argument)
@@ -48,6 +54,14 @@ class Again:
         while self._goes.wait():
             with self._turn, suppress(Exception):
                 run(self._last)
+            give_back()  # as a worker does
+
+
+def _one_heap() -> None:
+    """Have all threads of this process use one heap, as a worker's only thread does."""
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:
+        mallopt(_M_ARENA_MAX, 1)
 
 
 _again = Again()
