@@ -2,7 +2,8 @@
 
 The current is shunt voltage over shunt resistance; the chip's Calibration register, which a brown-out clears,
 is not used. Each conversion averages 128 samples in 68 ms, not a whole number of the 20 ms PWM periods, so it
-may be 18 % off; the mean of five may be 7 % off (a test computes both).
+may be 18 % off; the mean of five may be 7 % off (a test computes both). A current beyond the range is given
+as the range's end and marked: it is at least that.
 """
 
 from __future__ import annotations
@@ -79,7 +80,7 @@ class Ina219:
         self._range_bits = range_for(maximum_current, shunt_ohm)
         self._config = config_for(self._range_bits)
         self._lock = threading.Lock()
-        self._conversions: deque[tuple[float, float]] = deque(maxlen=averaged)
+        self._conversions: deque[tuple[float, float, bool]] = deque(maxlen=averaged)
         self._latest: PowerReading | None = None
         self._error = ""
         self._set_up_before = False
@@ -114,19 +115,21 @@ class Ina219:
             return
         self._conversions.append(conversion)
         count = len(self._conversions)
-        voltage = math.fsum(volts for volts, _ in self._conversions) / count
-        current = math.fsum(amps for _, amps in self._conversions) / count
+        volts, amps, clipped = zip(*self._conversions, strict=True)
+        voltage, current = math.fsum(volts) / count, math.fsum(amps) / count
         now_ns = self._clock.now_ns()
         newest, since_ns = conversion[1], now_ns - _REACH_NS
         with self._lock:
-            self._latest = PowerReading(now_ns, voltage, current, voltage * current, newest, since_ns)
+            self._latest = PowerReading(
+                now_ns, voltage, current, voltage * current, newest, since_ns, any(clipped)
+            )
             # A failure is reported until the mean is complete again: a reader once per second must not miss
             # it.
             if count == self._conversions.maxlen:
                 self._error = ""
 
-    def _convert(self) -> tuple[float, float] | None:
-        """Return bus voltage in V and current in A of a new conversion, None without one."""
+    def _convert(self) -> tuple[float, float, bool] | None:
+        """Return bus voltage V and current A of a new conversion, and whether it is clipped; None without."""
         if self._read(CONFIG) != self._config:
             self._set_up()
             return None
@@ -145,11 +148,11 @@ class Ina219:
         self._heard_ns = self._clock.now_ns()
         signed = shunt - 0x10000 if shunt & 0x8000 else shunt
         full_scale = _SHUNT_RANGES_V[self._range_bits]
-        if bus & OVERFLOW or abs(signed) >= round(full_scale / SHUNT_STEP_V):
+        current, clipped = signed * SHUNT_STEP_V / self._ohm, abs(signed) >= round(full_scale / SHUNT_STEP_V)
+        if bus & OVERFLOW and not clipped:  # of Current and Power: another has written Calibration
             bound = full_scale / self._ohm
-            current = signed * SHUNT_STEP_V / self._ohm
             raise OutOfRange(self.name, "overflow: coil current", current, -bound, bound, "A")
-        return (bus >> 3) * BUS_STEP_V, signed * SHUNT_STEP_V / self._ohm
+        return (bus >> 3) * BUS_STEP_V, current, clipped
 
     def _set_up(self) -> None:
         self._write(CONFIG, self._config)

@@ -126,7 +126,8 @@ class PowerReading:
     """A measurement of bus voltage (V), total current of the coils (A) and power (W).
 
     The values are means over about a second; `newest` (A) is the current of the last conversion alone, whose
-    window lies between `newest_since_ns` and `time_ns`.
+    window lies between `newest_since_ns` and `time_ns`. `clipped`: a conversion was beyond the monitor's
+    range, so the currents are at least these.
     """
 
     time_ns: int
@@ -135,6 +136,7 @@ class PowerReading:
     power: float
     newest: float
     newest_since_ns: int
+    clipped: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,6 +19,7 @@ from flight.schema.testbed import as_testbed
 from sim_hal.settings import CageTruth
 from sim_hal.worlds.free_body.body import elements, julian_date
 from sim_hal.worlds.free_body.environment import Environment
+from sim_hal.worlds.free_body.section import Disturbances
 from sim_hal.worlds.motion import Motion
 from sim_hal.worlds.testbed import Testbed, TestbedModel, model_of
 from sim_hal.worlds.world import WorldInputs
@@ -32,7 +33,8 @@ class OrbitField:
     def __init__(self, section: CageTruth, scale: float, utc: str, seed: int) -> None:
         date = julian_date(utc)
         generator = np.random.default_rng([seed, _STREAM])
-        self._around = Environment(elements(section.orbit, date), date, generator, section.ring_current)
+        multiples = Disturbances(ring_current=section.ring_current)
+        self._around = Environment(elements(section.orbit, date), date, generator, multiples)
         self._scale = scale * section.gain
 
     def at(self, seconds: float) -> tuple[float, float]:

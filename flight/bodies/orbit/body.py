@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -184,6 +185,7 @@ def filter_settings(config: OrbitConfig) -> FreeFilterSettings:
         gyro=(section.bias_start, section.bias_walk),
         coil_noise=section.current_noise * config.craft.dipole_per_ampere / math.sqrt(rate_hz),
         torque=(section.torque_start, section.torque_walk),
+        field=section.field_error,
         gate_sigma=section.gate_sigma,
     )
 
@@ -205,7 +207,6 @@ def _filter(
         dipole_limit=config.coils.current_limit * craft.dipole_per_ampere,
         gyro_noise=unit.rate_noise,
         field_noise=section.field_noise,
-        field_error=section.field_error,
         unknown_psd=config.detumble.torque_noise**2,
         settle_ns=round(config.detumble.settle * SECOND_NS),
         history_ns=round(section.history * SECOND_NS),
@@ -299,4 +300,5 @@ def _coil_watch(config: OrbitConfig) -> CoilWatch:
         damping=1e-4,
         settle_ns=settle_ns,
     )
-    return CoilWatch(CoilWatchSettings((x, y, z), response=response))
+    slow = replace(response, bin_samples=80, bins=20, model_error=3.0e-5)
+    return CoilWatch(CoilWatchSettings((x, y, z), response=response, slow=slow))

@@ -107,12 +107,14 @@ class CoarseSunFeed:
 
     def _use(self, time_ns: int, fix: StringFix, sun: FloatArray) -> None:
         """Start the filter from an attitude, or feed it the turn about the field."""
-        then = self._filter.past(time_ns) if self._filter.runs else None
-        if then is None or self._against >= CONTRADICTED:
+        if not self._filter.runs or self._against >= CONTRADICTED:
             doubted, self._against = self._against >= CONTRADICTED, 0
             if fix.about <= START_SIGMA:
                 attitude = AttitudeMeasurement(time_ns, fix.quaternion, fix.covariance)
                 self._filter.begin(attitude, doubted=doubted)
+            return
+        then = self._filter.past(time_ns)
+        if then is None:  # the filter began after this reading
             return
         claim = then.covariance[TURN, TURN]
         off = to_rotation_vector(multiply(fix.quaternion, conjugate(then.quaternion)))

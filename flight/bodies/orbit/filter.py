@@ -15,7 +15,7 @@ import numpy as np
 
 from flight.bodies.orbit.carried import CarriedOn
 from flight.bodies.orbit.field_doubt import FieldDoubt
-from flight.bodies.orbit.replay import FIELD_MEMORY, OrbitFilterSettings, StepReplay
+from flight.bodies.orbit.replay import OrbitFilterSettings, StepReplay
 from flight.bodies.orbit.steps import DipoleHistory, OpenStep
 from flight.gnc.estimation.estimate import Estimate, Knowledge
 from flight.gnc.estimation.free_filter import SlowStates
@@ -51,7 +51,6 @@ class OrbitFilter:
         self._carried = CarriedOn(self._free)
         self._dipoles = DipoleHistory(settings.history_ns)
         self._open: OpenStep | None = None
-        self._field_ns = 0
         self._doubt = FieldDoubt()
         self._refused_attitudes = 0
         self.restarts = 0
@@ -246,9 +245,6 @@ class OrbitFilter:
             return
         doubt = self._settings.dipole_limit if self._dipoles.unknown_ns >= begin_ns else 0.0
         step = gathered.close(self._dipoles.mean(begin_ns, end_ns), doubt, around)
-        if step.fields:
-            step.field_span = min((end_ns - self._field_ns) / SECOND_NS, FIELD_MEMORY)
-            self._field_ns = end_ns
         self._replay.add(step)
         self._replay.follow_gyro()
 

@@ -22,8 +22,6 @@ from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import attitude_matrix, conjugate, from_rotation_vector, multiply
 from hal.interfaces.wires import SECOND_NS
 
-FIELD_MEMORY = 300.0
-"""s, for which the error of the field's model keeps its sign."""
 _LONGEST = 2.0
 _EYE: FloatArray = np.eye(3)
 
@@ -35,7 +33,6 @@ class OrbitFilterSettings:
     Attributes:
         inertia: (3, 3) kg m^2. dipole_per_ampere: m^2. dipole_limit: A m^2 of each coil.
         gyro_noise: rad/s of an axis of a sample. field_noise: T, likewise.
-        field_error: T of an axis, of the field's model.
         unknown_psd: rad^2/s^3, density of the body's acceleration where no estimate has one.
         settle_ns: after the coils have come to rest, until the magnetometer is free of their field.
         history_ns: how old a measurement may be.
@@ -48,7 +45,6 @@ class OrbitFilterSettings:
     dipole_limit: float
     gyro_noise: float
     field_noise: float
-    field_error: float
     unknown_psd: float
     settle_ns: int
     history_ns: int
@@ -190,11 +186,10 @@ class StepReplay:
         refused = not free.gyro(step.gyro, spread * _EYE, change, since)
         self.refused_gyros = self.refused_gyros + 1 if refused else 0
         if step.field is not None:
-            turn = free.rate * ((step.end_ns - step.field_ns) / SECOND_NS)
+            ago = (step.end_ns - step.field_ns) / SECOND_NS
+            turn = ago * (free.rate - 0.5 * ago * free.acceleration)
             now = attitude_matrix(from_rotation_vector(turn)) @ step.field
-            model = settings.field_error**2 * 2.0 * FIELD_MEMORY / step.field_span
-            noise = (settings.field_noise**2 / step.fields + model) * _EYE
-            used = free.field(now, step.around.field, noise)
+            used = free.field(now, step.around.field, settings.field_noise**2 / step.fields * _EYE)
             self.refused_fields = 0 if used else self.refused_fields + 1
 
     def _apply(self, measurement: Measurement, step: Step) -> bool:

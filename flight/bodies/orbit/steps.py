@@ -81,8 +81,7 @@ class Step:
         dipole: (3,) A m^2, the mean on the wire; `doubt` A m^2 by which an axis may differ where not known.
         gyro: (3,) rad/s, the mean of `samples` readings, whose mean time is `gyro_ns`.
         impulse: (3,) A m^2 s, of the dipole after a sample, in the mean of the samples.
-        field: (3,) T, the mean of `fields` readings about `field_ns`; None without one. `field_span` is the
-            time, s, since the last one.
+        field: (3,) T, the mean of `fields` readings about `field_ns`; None without one.
         late: the measurements of times within the step, in their order.
         before: the estimate at its beginning; None before there was one.
     """
@@ -99,7 +98,6 @@ class Step:
     field: FloatArray | None
     field_ns: int
     fields: int
-    field_span: float = 1.0
     late: list[Measurement] = dataclasses.field(default_factory=list)
     before: FreeMemory | None = None
 

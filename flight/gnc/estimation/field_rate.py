@@ -171,13 +171,19 @@ class FieldRate:
         for _ in range(steps):
             self._step((mx, my, mz), seconds / steps)
 
-    def measure(self, field: FloatArray) -> bool:
-        """Accept the field (3,) T measured now with the coils off; return whether it was plausible."""
+    def measure(self, field: FloatArray, age: float = 0.0) -> bool:
+        """Accept the field (3,) T measured `age` s ago with the coils off; return whether it was plausible.
+
+        The body's rate carries it on to now.
+        """
         if not np.all(np.isfinite(field)):
             return False
         if self._rate is None:
             self._start(field)
             return True
+        if age:
+            x, y, z = self._rate
+            field = np.array(matrix(exponential(age * x, age * y, age * z))) @ field
         covariance = self._covariance
         spread = covariance[FIELD, FIELD] + self._settings.field_sigma**2 * np.eye(3)
         gain = np.linalg.solve(spread, covariance[FIELD]).T
@@ -185,10 +191,7 @@ class FieldRate:
         if not float(innovation @ np.linalg.solve(spread, innovation)) <= self._gate:
             self._refused += 1
             if self._refused >= self._settings.refusals:
-                misled = self._gyro_used or self._gyro_refused >= self._settings.refusals
-                self.restart()
-                self._gyro_refused = self._settings.refusals if misled else 0
-                self.restarts += 1
+                self._begin_again(self._gyro_used or self._gyro_refused >= self._settings.refusals)
             return False
         self._refused = 0
         self._correct(np.asarray(gain), innovation, FIELD)
@@ -198,21 +201,29 @@ class FieldRate:
         """Accept a gyro's rate (3,) rad/s of now where it says more than the filter knows.
 
         Its error is a bias: used more often it would narrow the filter's claim to less than that bias. One
-        that contradicts the field several times in a row, or after which the field's predictions failed, is
-        not used again before `restart`.
+        that contradicts the filter several times in a row, or after which the field's predictions failed, is
+        not used again before `restart`. Where it contradicts what it has taught, the filter begins again.
         """
         settings, covariance = self._settings, self._covariance
         if self._rate is None or self._gyro_refused >= settings.refusals or not np.all(np.isfinite(rate)):
-            return
-        if float(covariance.diagonal()[RATE].max()) <= settings.gyro_sigma**2:
             return
         spread = covariance[RATE, RATE] + settings.gyro_sigma**2 * np.eye(3)
         innovation = rate - np.array(self._rate)
         if not float(innovation @ np.linalg.solve(spread, innovation)) <= self._gate:
             self._gyro_refused += 1
+            if self._gyro_used and self._gyro_refused >= settings.refusals:
+                self._begin_again(misled=True)
             return
-        self._gyro_refused, self._gyro_used = 0, True
-        self._correct(np.asarray(np.linalg.solve(spread, covariance[RATE]).T), innovation, RATE)
+        self._gyro_refused = 0
+        if float(covariance.diagonal()[RATE].max()) > settings.gyro_sigma**2:
+            self._gyro_used = True
+            self._correct(np.asarray(np.linalg.solve(spread, covariance[RATE]).T), innovation, RATE)
+
+    def _begin_again(self, misled: bool) -> None:
+        """Begin again, and count it; `misled`: by the gyro, which is not asked again."""
+        self.restart()
+        self._gyro_refused = self._settings.refusals if misled else 0
+        self.restarts += 1
 
     def _correct(self, gain: FloatArray, innovation: FloatArray, measured: slice) -> None:
         """Correct the state by a gain (12, 3) and an innovation (3,) of the states `measured`."""

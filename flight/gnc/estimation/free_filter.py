@@ -10,6 +10,11 @@ ms.
 The residual dipole has a constant part and a part that comes and goes with sunlight. The other torques have
 the shapes of `flight.gnc.earth.disturbance`; their sizes are states, and so is a small turn of the principal
 axes from those believed: while a body tumbles its gyroscopic torque would else pass for a bias of the gyros.
+
+The field is off its model by a vector that keeps its sign for minutes: a Gauss-Markov process of first order
+in body axes. How large it is, is learned as in expectation maximisation (Dempster, Laird & Rubin 1977):
+its variance follows the square of the estimate and the estimate's own variance, which tell nothing where
+the attitude is not known.
 """
 
 from __future__ import annotations
@@ -23,9 +28,11 @@ from flight.gnc.estimation.estimate import Knowledge
 from flight.gnc.estimation.free_motion import (
     AXES,
     DIPOLE,
+    FIELD,
     GYRO,
     MAGNET,
     RATE,
+    SLOW,
     STATES,
     SUNLIT,
     TORQUES,
@@ -48,7 +55,14 @@ from flight.gnc.math.quaternion import (
 
 LARGEST_TURN = 0.1
 """rad, of a step of integration."""
+FIELD_LEARNED = 2_000.0
+"""s over which the size of the field's error is averaged."""
+LEAST_FIELD = 1e-8
+"""T, of an axis of that error at least: a magnetometer's own errors change as much."""
+CURRENTS = 1e-7
+"""T of an axis: of currents in the aurora, which change from field to field; it is not refused over them."""
 _EYE: FloatArray = np.eye(3)
+_FIELD_DIAGONAL = slice(FIELD.start * (STATES + 1), None, STATES + 1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,6 +82,7 @@ class FreeMemory:
     acceleration: FloatArray
     constants: FloatArray
     covariance: FloatArray
+    field_error: float
 
 
 class FreeFilter:
@@ -79,7 +94,8 @@ class FreeFilter:
         quaternion: (4,) ICRS into body.
         rate: (3,) rad/s, body axes.
         acceleration: (3,) rad/s^2, body axes, of the last step.
-        covariance: (30, 30) of the errors (TURN, RATE, ...).
+        covariance: (33, 33) of the errors (TURN, RATE, ...).
+        field_error: T of an axis, of the field's model.
         knowledge: how well the attitude is known.
         changes: counts the changes of the estimate.
     """
@@ -102,9 +118,11 @@ class FreeFilter:
         self.quaternion: FloatArray = np.array([0.0, 0.0, 0.0, 1.0])
         self.rate: FloatArray = np.zeros(3)
         self.covariance: FloatArray = np.zeros((STATES, STATES))
-        self.covariance[6:, 6:] = np.diag(settings.of_slow(0) ** 2)
+        self.covariance[SLOW, SLOW] = np.diag(settings.of_slow(0) ** 2)
+        self.field_error = settings.field
+        self._doubt_field()
         if slow is not None:
-            self._constants[6:], self.covariance[6:, 6:] = slow.values, slow.covariance
+            self._constants[SLOW], self.covariance[SLOW, SLOW] = slow.values, slow.covariance
 
     def start(
         self, quaternion: FloatArray, covariance: FloatArray, gyro: FloatArray, *, doubted: bool = False
@@ -116,9 +134,11 @@ class FreeFilter:
         """
         self.changes += 1
         if doubted:
-            slow, known = self._constants[6:], self._settings.of_slow(0)
+            slow, known = self._constants[SLOW], self._settings.of_slow(0)
             slow[~self._settings.believes(slow)] = 0.0
-            self.covariance[6:, 6:] = np.diag(known**2)
+            self.covariance[SLOW, SLOW] = np.diag(known**2)
+            self.field_error = max(self.field_error, self._settings.field)
+            self._doubt_field()
         self.covariance[:6] = self.covariance[:, :6] = 0.0
         self.covariance[TURN, TURN] = covariance
         bias = self.covariance[GYRO, GYRO]
@@ -143,19 +163,22 @@ class FreeFilter:
 
     @property
     def slow(self) -> SlowStates:
-        """What is known of the states after the rate."""
-        return SlowStates(self._constants[6:].copy(), self.covariance[6:, 6:].copy())
+        """What is known of the states that change slowly or not at all."""
+        return SlowStates(self._constants[SLOW].copy(), self.covariance[SLOW, SLOW].copy())
 
     def memory(self) -> FreeMemory:
         """Return the estimate as it stands, for `recall`."""
         constants, covariance = self._constants.copy(), self.covariance.copy()
-        return FreeMemory(self.quaternion, self.rate, self.acceleration, constants, covariance)
+        return FreeMemory(
+            self.quaternion, self.rate, self.acceleration, constants, covariance, self.field_error
+        )
 
     def recall(self, then: FreeMemory) -> None:
         """Return to an earlier estimate."""
         self.changes += 1
         self.quaternion, self.rate, self.acceleration = then.quaternion, then.rate, then.acceleration
         self._constants, self.covariance = then.constants.copy(), then.covariance.copy()
+        self.field_error = then.field_error
 
     @property
     def gyro_bias(self) -> FloatArray:
@@ -235,8 +258,28 @@ class FreeFilter:
         """Accept the field (3,) T of now in body axes, the model's (3,) T, ICRS; covariance (3, 3) T^2."""
         expected = attitude_matrix(self.quaternion) @ reference
         rows = np.zeros((3, STATES))
-        rows[:, TURN], rows[:, MAGNET] = crossed(expected), _EYE
-        return self._update(measured - expected - self._constants[MAGNET], rows, covariance)
+        rows[:, TURN], rows[:, MAGNET], rows[:, FIELD] = crossed(expected), _EYE, _EYE
+        wrong = self._constants[MAGNET] + self._constants[FIELD]
+        return self._update(measured - expected - wrong, rows, covariance + CURRENTS**2 * _EYE)
+
+    def _doubt_field(self) -> None:
+        """Know nothing of the field's error but its size."""
+        self._constants[FIELD] = 0.0
+        self.covariance[FIELD] = self.covariance[:, FIELD] = 0.0
+        self.covariance[FIELD, FIELD] = self.field_error**2 * _EYE
+
+    def _age_field(self, dt: float) -> None:
+        """Let the field's error fade, and learn its size where the attitude is fine."""
+        covariance, error = self.covariance, self._constants[FIELD]
+        if self.worst_sigma <= self._settings.fine:
+            square = (float(error @ error) + float(covariance[FIELD, FIELD].trace())) / 3.0
+            variance = self.field_error**2 + dt / FIELD_LEARNED * (square - self.field_error**2)
+            self.field_error = max(math.sqrt(variance), LEAST_FIELD)
+        kept = math.exp(-dt / self._settings.field_memory)
+        error *= kept
+        covariance[FIELD] *= kept
+        covariance[:, FIELD] *= kept
+        covariance.reshape(-1)[_FIELD_DIAGONAL] += (1.0 - kept**2) * self.field_error**2
 
     def _step(self, dt: float, dipole: FloatArray, around: Around, doubt: float) -> None:
         """Take one step of the midpoint rule, with its covariance."""
@@ -277,10 +320,11 @@ class FreeFilter:
         covariance[TURN, RATE] += 0.5 * dt * density
         covariance[RATE, TURN] += 0.5 * dt * density
         diagonal = covariance.reshape(-1)[:: STATES + 1]
-        diagonal[6:] += dt * self._walks
+        diagonal[SLOW] += dt * self._walks
+        self._age_field(dt)
 
     def _update(self, value: FloatArray, rows: FloatArray, noise: FloatArray) -> bool:
-        """Correct by an innovation (k,), derivative (k, 30) and noise (k, k); return whether it was used."""
+        """Correct by an innovation (k,), derivative (k, 33) and noise (k, k); return whether it was used."""
         cross = self.covariance @ rows.T
         weight = np.linalg.inv(rows @ cross + noise)
         if not 0.0 <= float(value @ weight @ value) <= self._gates[len(value)]:  # a NaN does not pass

@@ -20,8 +20,10 @@ from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector
 TURN, RATE, GYRO, DIPOLE, SUNLIT, MAGNET = (slice(3 * k, 3 * k + 3) for k in range(6))
 TORQUES = slice(18, 18 + SIZES)
 AXES = slice(18 + SIZES, 21 + SIZES)
-STATES = 21 + SIZES
-"""Where the parts of the error stand in the covariance of `free_filter`."""
+SLOW = slice(GYRO.start, AXES.stop)
+FIELD = slice(21 + SIZES, 24 + SIZES)
+STATES = 24 + SIZES
+"""Where the parts of the error stand in the covariance of `free_filter`; SLOW are those that are learned."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,7 +76,7 @@ class FreeMotion:
     def torque(
         self, quaternion: FloatArray, dipole: FloatArray, sizes: FloatArray, around: Around
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the torque (3,) N m, and the flow (6, 30) with what all but rate and axes do to the rate.
+        """Return the torque (3,) N m, and the flow (6, 33) with what all but rate and axes do to the rate.
 
         The `dipole` (3,) A m^2 is the coils' and the residual one, `sizes` (9,) N m are of the other torques.
         """

@@ -25,6 +25,8 @@ class FreeFilterSettings:
         gyro: rad/s.
         dipole, sunlit: A m^2, of the residual dipole's parts.
         magnet: T, of the magnetometer.
+        field: T of an axis, of the field's model before its error is learned.
+        field_memory: s, for which that error keeps its sign.
         torque: N m, of each size.
         torque_noise: N m sqrt(s), white, of what has no shape.
         coil_error: share of the coils' dipole that is uncertain for tens of seconds, in any direction.
@@ -39,7 +41,9 @@ class FreeFilterSettings:
     gyro: tuple[float, float] = (1e-3, 2e-6)
     dipole: tuple[float, float] = (1e-3, 1.5e-6)
     sunlit: tuple[float, float] = (3e-4, 2e-7)
-    magnet: tuple[float, float] = (3e-7, 1e-9)
+    magnet: tuple[float, float] = (3e-7, 3e-10)
+    field: float = 5e-8
+    field_memory: float = 600.0
     torque: tuple[float, float] = (3e-9, 5e-12)
     torque_noise: float = 3e-9
     coil_error: float = 0.04

@@ -33,15 +33,21 @@ _PROFILE = np.array(
 )
 """Height in m, density in kg/m^3."""
 _NIGHT, _DAY = 0.4, 1.6
+_MEAN = _NIGHT + (_DAY - _NIGHT) / 3.0
+"""Over all sides."""
 _LAG = math.radians(30.0)
 
 
-def log_density(position: FloatArray, sun: FloatArray) -> FloatArray:
-    """Return the logarithm (n,) of the density in kg/m^3 at positions (n, 3) m, the Sun at (n, 3) m, ICRS."""
+def log_density(position: FloatArray, sun: FloatArray, day_bulge: float = 1.0) -> FloatArray:
+    """Return the logarithm (n,) of the density in kg/m^3 at positions (n, 3) m, the Sun at (n, 3) m, ICRS.
+
+    `day_bulge` is a share of the bulge: zero is its mean on all sides.
+    """
     distance = np.linalg.norm(position, axis=-1)
     profile = np.interp(distance - EARTH_RADIUS, _PROFILE[:, 0], np.log(_PROFILE[:, 1]))
     cosine, sine = math.cos(_LAG), math.sin(_LAG)
     x, y = sun[..., 0], sun[..., 1]
     apex = np.stack([cosine * x - sine * y, sine * x + cosine * y, sun[..., 2]], axis=-1)
     facing = np.sum(position * apex, axis=-1) / (distance * np.linalg.norm(apex, axis=-1))
-    return np.asarray(profile + np.log(_NIGHT + (_DAY - _NIGHT) * (0.5 + 0.5 * facing) ** 2))
+    bulge = _NIGHT + (_DAY - _NIGHT) * (0.5 + 0.5 * facing) ** 2
+    return np.asarray(profile + np.log(_MEAN + day_bulge * (bulge - _MEAN)))

@@ -79,7 +79,7 @@ class FreeBody:
         self.utc_start = julian_date(utc)
         self._utc_start_ns = round(datetime.fromisoformat(utc).timestamp()) * SECOND_NS - start_ns
         orbit = elements(section.orbit, self.utc_start)
-        self.environment = Environment(orbit, self.utc_start, weather, multiples.ring_current)
+        self.environment = Environment(orbit, self.utc_start, weather, multiples)
         self._loads = LoadModel(self.craft, multiples)
         self._rotation = Rotation(self.craft.inertia)
         self._currents, self._power = currents, power

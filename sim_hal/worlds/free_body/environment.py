@@ -20,6 +20,7 @@ from flight.gnc.earth.sun import ASTRONOMICAL_UNIT, DAY
 from flight.gnc.math.arrays import FloatArray
 from sim_hal.worlds import geomagnetism, sun
 from sim_hal.worlds.free_body.atmosphere import log_density
+from sim_hal.worlds.free_body.section import Disturbances
 from sim_hal.worlds.orbit import KeplerianElements, Orbit, propagate
 from sim_hal.worlds.surroundings import Floats, Surroundings
 
@@ -53,13 +54,14 @@ class Environment:
         elements: KeplerianElements,
         julian_date: float,
         generator: np.random.Generator,
-        ring_current: float = 1.0,
+        multiples: Disturbances | None = None,
     ) -> None:
-        """Start at a Julian date UTC; `ring_current` is a multiple of 20 nT."""
+        """Start at a Julian date UTC; `multiples` of ring current, bulge and walks, by default the whole."""
+        self._multiples = multiples = multiples or Disturbances()
         self._elements = elements
         self._julian_date = julian_date
         self._generator = generator
-        self._storm = ring_current * RING_CURRENT
+        self._storm = multiples.ring_current * RING_CURRENT
         self._phases = generator.uniform(0.0, 2.0 * math.pi, 3)
         self._noise: FloatArray = generator.standard_normal(4)
         self._orbit: Orbit = propagate(elements, _FIRST_ORBIT)
@@ -127,8 +129,8 @@ class Environment:
         date = self._julian_date + times / DAY
         position = self._orbit.positions_at(times)
         sun_there = sun.position(date)
-        noise = self._walks()
-        density = log_density(position, sun_there) + _TURBULENCE * noise[:, 0]
+        noise = self._multiples.walks * self._walks()
+        density = log_density(position, sun_there, self._multiples.day_bulge) + _TURBULENCE * noise[:, 0]
         field = geomagnetism.field(date, position) + self._ring_current(times, date)
         knots = np.column_stack([position, field, sun_there, density, noise[:, 1:]])
         spline = CubicSpline(times, knots)

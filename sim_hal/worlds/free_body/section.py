@@ -56,10 +56,11 @@ class TipOff(Section, frozen=True, kw_only=True):
 class Disturbances(Section, frozen=True, kw_only=True):
     """Multiples of the worst cases, and the errors of the coils.
 
-    `drag` and `solar_pressure` of a centre of pressure 2 cm beside the centre of mass; `residual_dipole` of
-    1e-3 A m^2 that stays, 3e-4 A m^2 in sunlight and a walk of 5e-5 A m^2; `ring_current` of 20 nT, changing
-    by hours. `principal_turn_deg` bounds the turn of the principal axes, drawn between a third of it and the
-    whole. `coil_scale` and `coil_tilt_deg` are standard deviations.
+    `drag` and `solar_pressure` of a centre of pressure 2 cm beside the centre of mass; `residual_dipole`
+    of 1e-3 A m^2 that stays, 3e-4 A m^2 in sunlight and a walk of 5e-5 A m^2; `ring_current` of 20 nT,
+    changing by hours; `day_bulge` of the air about its mean, and `walks` of air and dipole.
+    `principal_turn_deg` bounds the turn of the principal axes, drawn between a third of it and the whole.
+    `coil_scale` and `coil_tilt_deg` are standard deviations.
     """
 
     gravity_gradient: NotNegative = 1.0
@@ -67,6 +68,8 @@ class Disturbances(Section, frozen=True, kw_only=True):
     solar_pressure: NotNegative = 1.0
     residual_dipole: NotNegative = 1.0
     ring_current: NotNegative = 1.0
+    day_bulge: Annotated[float, Meta(ge=0.0, le=1.0)] = 1.0
+    walks: NotNegative = 1.0
     principal_turn_deg: Annotated[float, Meta(ge=0.0, le=45.0)] = 3.0
     coil_scale: Annotated[float, Meta(ge=0.0, le=0.3)] = 0.03
     coil_tilt_deg: Annotated[float, Meta(ge=0.0, le=30.0)] = 1.0

@@ -35,6 +35,7 @@ BOUNDS = Bounds((FULL, FULL, FULL), 3.5e-3, 0.2, 1.5e-3)
     [
         ("coil-x: open", {"OPEN", "UNCERTAIN"}, 3.5),
         ("coil-x: shorted", {"SHORTED"}, 4.0),
+        ("coil-x: shorted (ohm=1)", {"SHORTED"}, 4.0),  # beyond the range of the monitor
         ("coil-x: reversed", {"REVERSED"}, 6.0),
         ("bridge-x: a-low", {"A_LOW", "UNCERTAIN"}, 3.5),
         ("bridge-x: a-high", {"HIGH"}, 4.0),

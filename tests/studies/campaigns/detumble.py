@@ -24,10 +24,18 @@ from flight.gnc.earth.orbit_knowledge import OrbitState
 from flight.gnc.estimation.field_rate import FieldRateSettings
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import attitude_matrix
-from sim_hal.worlds.free_body.section import TipOff
+from sim_hal.worlds.free_body.section import Disturbances, TipOff
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.detumble_bound import SATURATED, least_time
-from tests.studies.campaigns.free_flight import CRAFT, FIX_SIGMA, GYRO_NOISE, ORBITS, SECOND, FreeFlight
+from tests.studies.campaigns.free_flight import (
+    CRAFT,
+    FIX_SIGMA,
+    GYRO_NOISE,
+    ORBITS,
+    SECOND,
+    STILL,
+    FreeFlight,
+)
 
 SPEED, SLOW = math.radians(10.0), math.radians(0.5)
 SCHEDULE = WindowSchedule(100_000_000, 100_000_000, 1_800_000_000)
@@ -69,7 +77,8 @@ def run(case: Case) -> Result:
     """Fly until the body is slow, or lost."""
     wanted = case.parameters
     release = TipOff(speed=wanted.get("speed") or SPEED)
-    flight = FreeFlight(wanted["craft"], hash_of(case), wanted["orbit"], release)
+    noises = Disturbances(**(STILL if wanted.get("still") else {}))
+    flight = FreeFlight(wanted["craft"], hash_of(case), wanted["orbit"], release, noises)
     law = _Law(flight, wanted)
     least = _least(flight)
     fastest = 0.0

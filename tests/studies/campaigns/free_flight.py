@@ -11,7 +11,7 @@ import numpy as np
 from flight.gnc.earth.ephemeris import Ephemeris, predict
 from flight.gnc.earth.orbit_knowledge import OrbitState
 from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import from_rotation_vector, multiply
+from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector, multiply
 from sim_hal.worlds.free_body.body import FreeBody
 from sim_hal.worlds.free_body.craft import CRAFTS
 from sim_hal.worlds.free_body.section import Disturbances, FreeBodySection, OrbitSection, TipOff
@@ -30,6 +30,8 @@ GYRO_NOISE, GYRO_BIAS, GYRO_BIAS_WALK = 6.1e-5, 5e-4, 2e-6
 """rad/s per sqrt(Hz); rad/s; rad/s per sqrt(s): a VN-100's noise, and its bias with its in-run change."""
 FIX_SIGMA, FIX_VELOCITY_SIGMA = 10.0, 0.05
 """m, m/s."""
+STILL = {"ring_current": 0.0, "day_bulge": 0.0, "walks": 0.0}
+"""Disturbances without those that other simulators lack."""
 _STREAM = 0xF11
 
 
@@ -71,6 +73,8 @@ class FreeFlight:
         """A^2 m^4 s: the integral of the commanded dipole squared."""
         self.hard_iron = HARD_IRON * self.generator.standard_normal(3)
         self.gyro_bias = GYRO_BIAS * self.generator.standard_normal(3)
+        self.field_error: FloatArray = np.zeros(3)
+        """T, ICRS, of the field beside that of the world."""
         self.coil_noise = 0.0
         """A m^2, of an axis of a dipole that is commanded."""
 
@@ -91,10 +95,11 @@ class FreeFlight:
         self.motion = self.body.motion(time_ns)
         self.time_ns = time_ns
 
-    def field(self) -> FloatArray:
-        """Return a sample (3,) T of the magnetometer now; the coils must be off."""
-        noise = FIELD_NOISE * self.generator.standard_normal(3)
-        return np.asarray(self.motion.field_body + self.hard_iron + noise)
+    def field(self, samples: int = 1) -> FloatArray:
+        """Return the mean (3,) T of samples of the magnetometer now; the coils must be off."""
+        noise = FIELD_NOISE / np.sqrt(samples) * self.generator.standard_normal(3)
+        astray = attitude_matrix(self.motion.quaternion) @ self.field_error
+        return np.asarray(self.motion.field_body + self.hard_iron + astray + noise)
 
     def attitude(self, sigma: float) -> FloatArray:
         """Return the attitude (4,) with an error of `sigma` rad an axis."""

@@ -1,4 +1,4 @@
-"""The flights of campaign `orbit-faults`: the loop of config/orbit.yaml for 70 s in each of its modes.
+"""The flights of campaign `orbit-faults`: the loop of config/orbit.yaml for 100 s in each of its modes.
 
 The world has no release of 10 deg/s to be braked first: each flight begins near its mode. Cameras, receiver
 and planner are asked more often than in a real flight, so that a fault of a few seconds meets them.
@@ -25,7 +25,7 @@ from sim_hal.worlds.surroundings import Surroundings
 from tests.scenario.flights import CONFIG
 
 MODES = ("detumble", "acquire", "sun", "point", "slew", "safe")
-DURATION = 70.0
+DURATION = 100.0
 """s, of each flight."""
 SPEEDS = {"detumble": 0.15, "acquire": 0.004, "safe": 0.08}
 """rad/s at the release, 0.001 in the other modes; SAFE brakes a spin."""

@@ -35,6 +35,8 @@ LOOKED, FEW = 3.0, 3
 """s after an upset in which its trace is looked for; samples of the unit that may lack."""
 LAST = 12.0
 """s at the end of a flight, in which the body must do again what its mode is for."""
+SET_UP = 0.53
+"""s: by then the PWM chip is set up; what it loses before is not missed."""
 ACTS, RATE_OFF = 2e-3, 0.0175
 """A: of coils that steer with little torque; rad/s, of the rate by the magnetometer."""
 
@@ -98,13 +100,17 @@ def is_exercised(flown: Run, kind: FaultKind, mode: str, at: float, end: float) 
             found = kind.kind.endswith("high") or _long(_driven(flown, kind, asked, inside))
         case part if kind.kind == "upset":  # a bit that matters is told, or the unit's samples lack
             came = int(_within(flown, "imu", at, at + LOOKED).sum())
-            found = part == "imu" and abs(came - round(LOOKED / CYCLE)) > FEW
+            found = part == "imu" and round(LOOKED / CYCLE) - came > FEW
         case "monitor" if kind.kind == "delayed":
             found = _is_behind(flown, kind, inside)
+        case "pwm" if kind.kind == "brown-out":
+            found = at > SET_UP
         case "pwm" | "monitor":
             found = kind.kind in ALWAYS or _long((asked > 2 * DRIVEN).any(axis=1))
         case "camera":
             found = mode not in SPINS and end - at > 6.0
+        case "planner" if kind.kind == "slow":
+            found = False  # 1.5 s of the 8 that a plan is given
         case "planner" | "vision":
             jobs = flown["job_timing"]
             when = seconds(jobs)
@@ -112,6 +118,8 @@ def is_exercised(flown: Run, kind: FaultKind, mode: str, at: float, end: float) 
             found = bool((mine & (when > at + 0.3) & (when < end)).any())
         case "strings" if kind.kind == "dead":
             found = _is_string_lit(flown, at, end)
+        case "strings" if kind.kind == "wrong":  # a fine attitude needs none
+            found = mode == "safe" or not _is_fine(flown, at, end)
         case "wide":  # pictures upside down may look as they must; an outage of 3 s costs a round
             found = kind.kind not in {"wrong", "intermittent"} and (
                 kind.kind not in {"garbage", "blinded"} or _is_fine(flown, at, end)
@@ -121,7 +129,7 @@ def is_exercised(flown: Run, kind: FaultKind, mode: str, at: float, end: float) 
     return found
 
 
-ALWAYS = {"off", "nack", "slow", "intermittent", "brown-out", "garbage"}
+ALWAYS = {"off", "nack", "slow", "intermittent", "garbage"}
 """Faults of a part that it shows whatever is asked of it."""
 SPINS = ("detumble", "safe")
 """Modes in which the body turns too fast for the camera at first."""

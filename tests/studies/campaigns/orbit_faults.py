@@ -1,13 +1,13 @@
 """Campaign `orbit-faults`: every fault of an orbit's devices in every mode of the satellite, in lock-step.
 
-Each run flies the loop of config/orbit.yaml for 70 s in one mode, with all disturbances, and breaks one thing
-at a random time for a random span (coils and bridges to the end), at the wire. Beside the catalogue there are
-conditions: an element set a week old, none at all, a wall clock wrong from the start on. Judged are: whether
-an event of its own told of the fault; whether at the end the body does again what its mode is for; the
-current of coils that were driven blind, sensor by sensor (readings, field, attitude); and for how long they
-were driven by an attitude that was further off than five of its claimed deviations and 0.1 deg. A fault of
-an unused part (a coil that is not driven, a camera that rests) is not exercised. `refly(seed, number)` flies
-one flight again.
+Each run flies the loop of config/orbit.yaml for 100 s in one mode, with all disturbances, and breaks one
+thing at a random time for a random span (coils and bridges to the end), at the wire. Beside the catalogue
+there are conditions: an element set a week old, none at all, a wall clock wrong from the start on. Judged
+are: whether an event of its own told of the fault; whether at the end the body does again what its mode is
+for; the current of coils that were driven blind, sensor by sensor (readings, field, attitude); and for how
+long they were driven by an attitude that was further off than five of its claimed deviations and 0.1 deg. A
+fault of an unused part (a coil that is not driven, a camera that rests) is not exercised. `refly(seed,
+number)` flies one flight again.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def refly(seed: int, number: int) -> Result:
 def fly_with(
     kind: FaultKind, mode: str, entries: tuple[FaultEntry, ...], seed: int, elements: str = ""
 ) -> Result:
-    """Fly 70 s with faults of one begin and end, judged as of `kind`."""
+    """Fly with faults of one begin and end, judged as of `kind`."""
     config = config_for(mode, elements, replans=kind.device == "planner", wide_often=kind.device == "wide")
     at = entries[0].at or 0.0 if entries else 0.0
     span = entries[0].span if entries else None

@@ -2,13 +2,13 @@
 
 A 3U and the KnightCube. Cells `hold` start at nadir along the flight with nothing learned and fly two
 revolutions and more; the first one teaches the filter the residual dipole and the torques and is not judged.
-Cells `turn` start 30 to 180 deg off nadir, Sun or an inertial attitude, turning at 0.3 deg/s, and fly 100
-min: `arrived` counts bodies whose pointing axis comes within ARRIVED deg and stays there for the rest, half a
-revolution at least; `lost` is farther than LOST deg off at the end. The KnightCube's turn about that axis is
-cheap (WEIGHTS of `orbit_pointing_flight`), so only the error of three axes has it. `share` multiplies the
-torques that the coils can not cancel at once: drag, sunlight, and the turn of the principal axes; the
-residual dipole is always whole. Laws: `whole`; `plain` without feed-forward; `pd`, the magnetic
-proportional-derivative law (`orbit_pointing_flight`).
+Cells `day` are the same over a day, a quarter of the runs. Cells `turn` start 30 to 180 deg off nadir, Sun
+or an inertial attitude, turning at 0.3 deg/s, and fly 100 min: `arrived` counts bodies whose pointing axis
+comes within ARRIVED deg and stays there for the rest, half a revolution at least; `lost` is farther than
+LOST deg off at the end. The KnightCube's turn about that axis is cheap (WEIGHTS of `orbit_pointing_flight`),
+so only the error of three axes has it. `share` multiplies the torques that the coils can not cancel at once:
+drag, sunlight, and the turn of the principal axes; the residual dipole is always whole. Laws: `whole`;
+`plain` without feed-forward; `pd`, the magnetic proportional-derivative law (`orbit_pointing_flight`).
 """
 
 from __future__ import annotations
@@ -40,6 +40,9 @@ HOLDS = (
     ("knightcube", 0.3, "whole", 5.0),
 )
 """Craft, share, law, and deg rms wanted of issue 19."""
+DAYS = (("cubesat_3u", 1.0), ("knightcube", 0.3))
+"""Craft and share."""
+DAY = 86_400.0
 TURNS = tuple(
     (craft, share, law)
     for craft, share, laws in (
@@ -59,10 +62,13 @@ def cases(runs: int, seed: int) -> list[Case]:
         turn = float(np.random.default_rng([seed, run, 0x7E]).uniform(30.0, 180.0))
         target = list(TARGETS)[run % len(TARGETS)]
         for craft, share, law, _ in HOLDS:
-            same = {"craft": craft, "share": share, "law": law, "target": "nadir"}
+            same = {"kind": "hold", "craft": craft, "share": share, "law": law, "target": "nadir"}
             found.append(Case(f"hold/{craft}/{share}/{law}/{run}", (seed, run), same))
+        for craft, share in DAYS if 4 * run < max(runs, 4) else ():
+            same = {"kind": "day", "craft": craft, "share": share, "law": "whole", "target": "nadir"}
+            found.append(Case(f"day/{craft}/{share}/whole/{run}", (seed, run), same | {"seconds": DAY}))
         for craft, share, law in TURNS:
-            same = {"craft": craft, "share": share, "law": law, "target": target}
+            same = {"kind": "turn", "craft": craft, "share": share, "law": law, "target": target}
             start = {"turn_deg": turn, "speed_deg": SPIN}
             found.append(Case(f"turn/{craft}/{share}/{law}/{run}", (seed, run), same | start))
     return found
@@ -71,7 +77,7 @@ def cases(runs: int, seed: int) -> list[Case]:
 def run(case: Case) -> Result:
     """Fly the case."""
     wanted = case.parameters
-    turns = "turn_deg" in wanted
+    turns = wanted["kind"] == "turn"
     flight = PointingFlight(wanted, case.seed[0] * 100_003 + case.seed[1])
     seconds = wanted.get("seconds", 6_000.0 if turns else 2.5 * REVOLUTION)
     for cycle in range(round(seconds / CYCLE)):
@@ -138,9 +144,9 @@ def summarise(results: Sequence[Result], _: Path) -> Summary:
     return Summary("\n".join(lines) + "\n", facts)
 
 
-def _of(results: Sequence[Result], cell: tuple[Any, ...], turns: bool) -> list[Result]:
-    """Return the results of a cell."""
-    return [r for r in results if (r["craft"], r["share"], r["law"]) == cell and ("turn_deg" in r) is turns]
+def _of(results: Sequence[Result], *cell: Any) -> list[Result]:
+    """Return the results of a cell: its kind, craft, share and law."""
+    return [r for r in results if (r["kind"], r["craft"], r["share"], r["law"]) == cell]
 
 
 def _holds(results: Sequence[Result], facts: dict[str, Any]) -> list[str]:
@@ -159,9 +165,10 @@ def _holds(results: Sequence[Result], facts: dict[str, Any]) -> list[str]:
         "mW",
         "wanted",
     )
-    lines = [f"{'hold: craft, share, law':26}" + "".join(f"{head:>10}" for head in heads)]
-    for craft, share, law, wanted in HOLDS:
-        mine = _of(results, (craft, share, law), turns=False)
+    lines = [f"{'hold: craft, share, law':30}" + "".join(f"{head:>10}" for head in heads)]
+    held = [("hold", *cell) for cell in HOLDS] + [("day", *cell, "whole", None) for cell in DAYS]
+    for kind, craft, share, law, wanted in held:
+        mine = _of(results, kind, craft, share, law)
         judged = [r for r in mine if "rms" in r]
         if not judged:
             continue
@@ -180,9 +187,10 @@ def _holds(results: Sequence[Result], facts: dict[str, Any]) -> list[str]:
             "milliwatts": 1e3 * WATTS[craft] * float(np.median([r["mean_square"] for r in judged])),
             "wanted": wanted,
         }
-        facts[f"hold/{craft}/{share}/{law}"] = found
+        facts[f"{kind}/{craft}/{share}/{law}"] = found
         row = [f"{found[name]:10.3g}" for name in list(found)[2:11]]
-        counts = f"{f'{craft}, {share}, {law}':26}{found['runs']:10d}{found['lost']:10d}"
+        name = f"{craft}, {share}, {law}{', day' * (kind == 'day')}"
+        counts = f"{name:30}{found['runs']:10d}{found['lost']:10d}"
         lines.append(counts + "".join(row) + f"{wanted or '':>10}")
     return [
         *lines,
@@ -196,7 +204,7 @@ def _turns(results: Sequence[Result], facts: dict[str, Any]) -> list[str]:
     heads = ("runs", "lost", "arrived", "median", "worst", "end", "mW")
     lines = [f"{'turn: craft, share, law':26}" + "".join(f"{head:>10}" for head in heads)]
     for cell in TURNS:
-        mine = _of(results, cell, turns=True)
+        mine = _of(results, "turn", *cell)
         if not mine:
             continue
         times = [r["arrived"] for r in mine if r["arrived"] is not None]

@@ -1,7 +1,8 @@
 """One flight of campaign `orbit-pointing`: a craft with its filter, its planner's job and its law.
 
-The tables are those of the planner worker (`pointing_job`), made again each REPLAN s, where the body leaves
-its path, and where it was astray and has been held still (`flight.gnc.control.three_axes.astray`). The coils
+The tables are those of the planner worker (`pointing_job`): a slew from far off, as in the loop, then the
+pointing law's, made again each REPLAN s, where the body leaves its path, and where it was astray and has been
+held still (`flight.gnc.control.three_axes.astray`). The coils
 pause a tenth of each two seconds for the magnetometer; star attitudes come each 10 s, two seconds late.
 Beside the law stands the magnetic proportional-derivative law: what of the torque -J (w^2 turn + 2 w rate)
 lies across the field (Lovera & Astolfi 2004, Automatica 40(8)).
@@ -9,6 +10,7 @@ lies across the field (Lovera & Astolfi 2004, Automatica 40(8)).
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +20,7 @@ from flight.gnc.control.three_axes.astray import Astray, damping_dipole
 from flight.gnc.control.three_axes.pointing import PointingLaw
 from flight.gnc.control.three_axes.pointing_job import PointingJob
 from flight.gnc.control.three_axes.pointing_table import PointingTable, PointingWeights
+from flight.gnc.control.three_axes.slew_table import SlewWish
 from flight.gnc.earth.disturbance import pressures
 from flight.gnc.earth.ephemeris import Ephemeris
 from flight.gnc.earth.orbit_knowledge import OrbitState
@@ -41,11 +44,16 @@ from tests.studies.campaigns.free_flight import (
     FIX_SIGMA,
     GYRO_NOISE,
     SECOND,
+    STILL,
+    WATTS,
     FreeFlight,
 )
 
 CYCLE, PAUSE = 2.0, 0.2
 """s."""
+SAMPLES = 4
+"""Of the magnetometer in a pause of the coils."""
+COIL_ERROR = FreeFilterSettings().coil_error
 STARS_EVERY, REPLAN, AGAIN, AHEAD = 10.0, 600.0, 10.0, 900.0
 """s."""
 COAST = 12.0
@@ -64,6 +72,10 @@ WEIGHTS = {
     ),
     "cubesat_3u": PointingWeights(turn=np.radians(1.0), rate=1.0, dipole=1.5e-3),
 }
+SLEW = {"knightcube": 300.0, "cubesat_3u": 900.0}
+"""s of a slew, as the configurations have it."""
+CAMERA: FloatArray = np.array([0.0, -1.0, 0.0])
+"""Body axis of the star camera; no cone is kept here."""
 TORQUE = {"knightcube": (1e-9, 2e-12), "cubesat_3u": (3e-9, 5e-12)}
 """N m and N m per sqrt(s), as the configurations have them: what the filter expects of each shape."""
 BANDWIDTH = {"knightcube": 4e-3, "cubesat_3u": 4e-3}
@@ -85,8 +97,12 @@ class PointingFlight:
         self._target = target if isinstance(target, PointingTarget) else TARGETS[target]
         orbit = wanted.get("orbit", "sso")
         self.notes: list[list[float]] = []
+        share = wanted["share"]
         noises = Disturbances(
-            drag=wanted["share"], solar_pressure=wanted["share"], principal_turn_deg=3.0 * wanted["share"]
+            drag=share,
+            solar_pressure=share,
+            principal_turn_deg=3.0 * share,
+            **(STILL if wanted.get("still") else {}),
         )
         held = FreeFlight(wanted["craft"], seed, orbit, TipOff(rate=(0.0, 0.0, 0.0)), noises)
         held.advance(0)
@@ -96,11 +112,11 @@ class PointingFlight:
         gyro = self._gyro(flight.motion.rate, 1.0)
         self._filter.start(flight.attitude(STAR_SIGMA), STAR_SIGMA**2 * np.eye(3), gyro)
         self._law: PointingLaw | None = None
-        self._begun, self._ahead_begun = 0.0, -AHEAD
+        self._begun, self._ahead_begun, self._arrives = 0.0, -AHEAD, 0.0
         self._ahead: Ephemeris = held.ephemeris(0.0)
         self._stars: FloatArray | None = None
         self._astray = Astray()
-        self._rate_then, self._turn = np.zeros(3), np.zeros(3)
+        self._turn: FloatArray = np.zeros(3)
 
     def _release(self, held: FreeFlight) -> TipOff:
         """Return the release: at the law's attitude and rate, or turned and turning at random."""
@@ -124,37 +140,44 @@ class PointingFlight:
         if time - self._ahead_begun >= AHEAD:
             self._ahead, self._ahead_begun = flight.ephemeris(AHEAD + 60.0), time
         self._astray.see(float(np.linalg.norm(self._turn)), float(np.linalg.norm(found.rate)), time)
-        astray = (self._astray.ready or self._astray.leaving) and time - self._begun >= AGAIN
-        if (
-            self._wanted["law"] != "pd"
-            and time >= COAST
-            and (self._law is None or astray or time - self._begun >= self._wanted.get("replan", REPLAN))
-        ):
+        if self._wanted["law"] != "pd" and time >= COAST and self._is_due(time):
             self._plan(time)
         around = self._around(time)
         flight.act(np.zeros(3))
         before = flight.motion.rate
         flight.advance(round((time + PAUSE) * SECOND))
         found.advance(PAUSE, np.zeros(3), around)
-        noise = (FIELD_NOISE**2 + (3e-8) ** 2) * np.eye(3)
-        found.field(flight.field(), around.field, noise)
+        rest = found.acceleration
+        found.field(flight.field(SAMPLES), self._field_at(time + PAUSE), FIELD_NOISE**2 / SAMPLES * np.eye(3))
         dipole = self._command(time + PAUSE, around)
         flight.act(dipole)
-        acting = flight.motion.rate
+        acting, began = flight.motion.rate, found.rate
         flight.advance(round((time + CYCLE) * SECOND))
         found.advance(CYCLE - PAUSE, dipole, around)
         # The mean over the cycle, compared with the rate at its end.
-        mean = 0.5 * PAUSE / CYCLE * (before + acting) + 0.5 * (1.0 - PAUSE / CYCLE) * (
-            acting + flight.motion.rate
-        )
-        slope = (found.rate - self._rate_then) / CYCLE
-        found.gyro(self._gyro(mean, CYCLE), GYRO_NOISE**2 / CYCLE * np.eye(3), 0.5 * CYCLE * slope)
+        mean = _mean(before, acting, flight.motion.rate)
+        change = found.rate - _mean(began - PAUSE * rest, began, found.rate)
+        spread = COIL_ERROR**2 * float(change @ change) + GYRO_NOISE**2 / CYCLE
+        found.gyro(self._gyro(mean, CYCLE), spread * np.eye(3), change, 0.5 * CYCLE)
         self._see_stars(time + CYCLE)
+
+    def _is_due(self, time: float) -> bool:
+        """Return whether a plan is due: not in a slew, unless the body left it and was held still."""
+        since = time - self._begun
+        if self._law is None or (self._astray.ready and since >= AGAIN):
+            return True
+        if time < self._arrives:
+            return False
+        arrived = self._arrives > self._begun
+        return (
+            arrived
+            or (self._astray.leaving and since >= AGAIN)
+            or since >= self._wanted.get("replan", REPLAN)
+        )
 
     def _command(self, time: float, around: Around) -> FloatArray:
         """Return the dipole (3,) A m^2 until the end of the cycle."""
         found, flight = self._filter, self.flight
-        self._rate_then = found.rate
         law = self._wanted["law"]
         if time < COAST:
             return np.zeros(3)
@@ -209,7 +232,15 @@ class PointingFlight:
         self.notes.append([time, *turn, known, nees, unknown, truth.sunlit, square])
 
     def _plan(self, time: float) -> None:
-        self._fly(pointing_job.run(self._job()), time)
+        on_path = self._law is not None and self._astray.since is None
+        table = pointing_job.run(self._job() if on_path else replace(self._job(), slew=self._wish(time)))
+        self._fly(table, time)
+        self._arrives = time if table.slew is None else time + pointing_job.LEAD + table.slew.horizon
+
+    def _wish(self, time: float) -> SlewWish:
+        """Return how a slew is wanted at a time."""
+        craft, lit = self._wanted["craft"], self._around(time).sunlit
+        return SlewWish(SLEW[craft], np.full(3, WATTS[craft]), self._filter.residual_dipole(lit), CAMERA)
 
     def _fly(self, table: PointingTable, time: float) -> None:
         """Fly a table from now on if it is finite, as the flight does. Raises LookupError without any."""
@@ -245,6 +276,10 @@ class PointingFlight:
         lit = float(ahead.sunlit_at(at)[0])
         return Around(ahead.field_at(at)[0], ahead.position_at(at)[0], pressures(ahead, at), lit)
 
+    def _field_at(self, time: float) -> FloatArray:
+        """Return the model's field (3,) T of a time, ICRS."""
+        return np.asarray(self._ahead.field_at(np.array([time - self._ahead_begun]))[0])
+
     def _see_stars(self, time: float) -> None:
         """Give the filter the attitude that was exposed a cycle ago; expose the next."""
         if self._stars is not None and time % STARS_EVERY < CYCLE:
@@ -255,3 +290,9 @@ class PointingFlight:
         flight = self.flight
         noise = GYRO_NOISE / np.sqrt(seconds) * flight.generator.standard_normal(3)
         return np.asarray(rate + flight.gyro_bias + noise)
+
+
+def _mean(before: FloatArray, acting: FloatArray, after: FloatArray) -> FloatArray:
+    """Return the mean rate (3,) of a cycle from those at begin, end of the pause, and end."""
+    pause = 0.5 * PAUSE / CYCLE
+    return np.asarray(pause * (before + acting) + (0.5 - pause) * (acting + after))

@@ -16,7 +16,6 @@ import numpy as np
 
 from flight.gnc.control.three_axes import pointing_job
 from flight.gnc.control.three_axes.pointing_table import PointingTable, table_along
-from flight.gnc.control.three_axes.slew_table import SlewWish
 from flight.gnc.estimation.free_motion import Around
 from flight.gnc.guidance.three_axes.attitude_law import References, references
 from flight.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
@@ -44,7 +43,6 @@ KNOT = 2.0
 """s, of the eigen-axis law's table."""
 TAIL = 300.0
 """s that its gains look at past the end."""
-_CAMERA: FloatArray = np.array([0.0, -1.0, 0.0])
 
 
 class SlewFlight(PointingFlight):
@@ -96,9 +94,7 @@ class SlewFlight(PointingFlight):
     def _begin(self, time: float) -> SlewPath:
         """Begin the slew; return the planned path."""
         job, found = self._job(), self._filter
-        lit = float(self._ahead.sunlit_at(np.array([time - self._ahead_begun]))[0])
-        watts = np.full(3, WATTS[self._wanted["craft"]])
-        wish = SlewWish(self.horizon, watts, found.residual_dipole(lit), _CAMERA)
+        wish = replace(self._wish(time), seconds=self.horizon)
         sizes = job.sizes * (self._slews_by != "blind")
         table = pointing_job.run(replace(job, slew=wish, sizes=sizes))
         if table.slew is None:
@@ -140,7 +136,6 @@ class SlewFlight(PointingFlight):
             return super()._command(time, around)
         assert self._about is not None
         found, flight = self._filter, self.flight
-        self._rate_then = found.rate
         now, pace = self._about.at(time - self._from[0]), BANDWIDTH / self.horizon
         field, inertia = attitude_matrix(found.quaternion) @ around.field, flight.inertia
         turn = to_rotation_vector(multiply(found.quaternion, conjugate(now.quaternion)))

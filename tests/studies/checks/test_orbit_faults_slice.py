@@ -15,8 +15,8 @@ from ground.telemetry.reader import Run
 from sim_hal.faults.catalogue import CATALOGUE
 from sim_hal.settings import FaultEntry
 from tests.scenario.flights import fly
+from tests.studies.campaigns import orbit_fault_flights, orbit_faults
 from tests.studies.campaigns import orbit_fault_judgement as judgement
-from tests.studies.campaigns import orbit_faults
 from tests.studies.campaigns.fault_table import part_of
 from tests.studies.campaigns.orbit_fault_flights import (
     MODES,
@@ -100,13 +100,32 @@ def test_elements_of_a_week_ago_are_as_far_off_as_told() -> None:
     assert old.at(date).sigma == pytest.approx(1500.0 + 7.0 * 1500.0, rel=0.05)
 
 
+def refly(monkeypatch: pytest.MonkeyPatch, seed: int, number: int, seconds: float) -> dict[str, Any]:
+    """Fly a flight of the campaign again, for so long."""
+    monkeypatch.undo()
+    for module in (orbit_faults, orbit_fault_flights, judgement):
+        monkeypatch.setattr(module, "DURATION", seconds)
+    return orbit_faults.refly(seed, number)
+
+
 def test_false_pictures_from_the_start_do_not_lead_the_estimate_astray_for_good(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Number 97 of seed 3: they taught a bias of 0.5 deg/s, from which each attitude began again in vain."""
-    monkeypatch.undo()
-    found = orbit_faults.refly(3, 97)
+    found = refly(monkeypatch, 3, 97, 70.0)
     assert found["fault"] == "wide: wrong"
     assert found["event"] == "wide-false"
     assert found["works"]
     assert found["beyond_s"] == 0.0
+
+
+def test_the_brake_goes_on_by_a_unit_that_began_anew_at_another_phase(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Number 0 of seed 4: its samples came a millisecond before the commands.
+
+    The brake took none of them, and braked half a minute by what it predicted, 2.5 deg/s off.
+    """
+    found = refly(monkeypatch, 4, 0, 56.0)
+    assert found["fault"] == "imu: off"
+    assert found["works"]

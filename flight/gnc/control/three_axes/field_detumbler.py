@@ -7,7 +7,8 @@ brakes in the field expected ahead: that of the orbit where the attitude is know
 turned on at its present speed. Unlike B-dot the law cannot get stuck with the spin along the field: the plan
 holds what lies along the field until the field has turned. One sample starts nothing: the coils wait until
 `TRUSTED` samples in a row agree with the filter's prediction and the rate across the field is known to
-`BOUNDED`. Until then the coils are off, so that no pause is waited for.
+`BOUNDED`. Until then the coils are off, so that no pause is waited for. They wait again where no sample was
+accepted for `UNHEARD` periods: a unit that began anew may be heard, and yet none of its fields be of use.
 
 In the least time a spin along the field is first made faster, across the field. `gentle` and `spin_up` bound
 that: at the bound no dipole is commanded that makes the body faster. A bound at the rate of the begin costs
@@ -40,6 +41,10 @@ TRUSTED = 4
 """Samples in a row that agree, before the coils act."""
 BOUNDED = 0.02
 """rad/s, largest standard deviation of the rate across the field with which the coils begin to act."""
+UNHEARD = 2
+"""Periods without an accepted sample, after which the coils wait for samples that agree."""
+OLDEST_NS = 100_000_000
+"""Of a sample, behind the last command: the body's rate carries its field on to that."""
 INSTANTS = 150
 DENSER = 1.5
 """Power of the instants: of 1,500 s the first step is a second, the last 15."""
@@ -111,7 +116,7 @@ class FieldDetumbler:
 
     def begin(self, now_ns: int) -> None:
         """Begin the first pause with no knowledge of the field."""
-        self._begun_ns = self._time_ns = now_ns
+        self._begun_ns = self._time_ns = self._commanded_ns = now_ns
         self._dipole = _NO_DIPOLE
         self._plan: MomentumPlan | None = None
         self._planned_ns = now_ns
@@ -119,6 +124,7 @@ class FieldDetumbler:
         self._agreed = 0
         self._bounded = False
         self._driven_ns = now_ns  # until now another mode may have driven the coils
+        self._heard_ns = now_ns
         self._fastest = math.inf
         self._filter.restart()
 
@@ -134,36 +140,43 @@ class FieldDetumbler:
     def sample(self, time_ns: int, field: FloatArray, rate: FloatArray | None = None) -> None:
         """Accept a field (3,) T measured at `time_ns`; ignored unless the coils were off and settled.
 
-        `rate` (3,) rad/s is a gyro's of the same time.
+        `rate` (3,) rad/s is a gyro's of the same time. A command may have been given since.
         """
-        if not self.listens(time_ns) or time_ns < self._time_ns:
+        age_ns = self._time_ns - time_ns
+        if not self.listens(time_ns) or age_ns > OLDEST_NS:
             return
-        self._advance(time_ns)
+        if age_ns < 0:
+            self._advance(time_ns)
         starts = self._filter.restarts
-        accepted = self._filter.measure(field)
+        accepted = self._filter.measure(field, max(age_ns, 0) * _SECOND)
+        if accepted:
+            self._heard_ns = time_ns
         if accepted and self._filter.started:
             self._agreed += 1
             if rate is not None and self._agreed >= TRUSTED:
                 self._filter.measure_rate(rate)
             if not self._bounded:
                 self._bounded = self._agreed >= TRUSTED and self._sigma_across() < BOUNDED
-        elif not accepted and (not self.trusted or self._filter.restarts != starts):
-            self._agreed, self._bounded = 0, False
-            self._plan = None
+        if self._filter.restarts != starts or (not accepted and not self.trusted):
+            self._distrust()
 
     def dipole(self, now_ns: int) -> FloatArray:
         """Return the dipole (3,) A m^2 now: zero while the field is measured or the rate is not known."""
-        self._advance(max(now_ns, self._time_ns))
         schedule = self._schedule
+        if self._filter.started:  # before that, time passes from sample to sample
+            self._advance(max(now_ns, self._time_ns))
+        if self.trusted and now_ns - self._heard_ns > UNHEARD * schedule.period_ns:
+            self._distrust()
         phase_ns = (now_ns - self._begun_ns) % schedule.period_ns
         acting = phase_ns >= schedule.settle_ns + schedule.measure_ns
+        self._commanded_ns = now_ns
         self.acts(self._braking_dipole(now_ns) if acting and self.trusted else _NO_DIPOLE)
         return self._dipole
 
     def acts(self, dipole: FloatArray) -> None:
         """Take a dipole (3,) A m^2 that acts instead of the commanded one until the next command."""
         if self._dipole.any() or dipole.any():
-            self._driven_ns = self._time_ns
+            self._driven_ns = self._commanded_ns
         self._dipole = dipole
 
     @property
@@ -199,6 +212,11 @@ class FieldDetumbler:
         across = np.eye(3) - np.outer(field, field) / float(field @ field)
         spread = across @ self._filter.covariance[RATE, RATE] @ across
         return math.sqrt(float(np.linalg.eigvalsh(spread)[-1]))
+
+    def _distrust(self) -> None:
+        """Let the coils wait until samples agree."""
+        self._agreed, self._bounded = 0, False
+        self._plan = None
 
     def _advance(self, time_ns: int) -> None:
         self._filter.advance(self._dipole, (time_ns - self._time_ns) * _SECOND)

@@ -46,6 +46,8 @@ EXCESS = 3e-5
 """rad/s beyond the largest rate that cost as much as the turn that costs one."""
 SHARES = (1.0, 0.4, 0.15)
 """Of what a sweep found, tried in turn."""
+RUN_AWAY = 100.0
+"""rad/s: a motion this fast is not followed farther."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,11 +215,9 @@ def _first(expected: Expected, rest: Motion, gains: Gains) -> Motion:
     revolutions in a step.
     """
     nothing = Gains(np.zeros_like(gains.gain), np.zeros_like(gains.steady))
-    with np.errstate(over="ignore", invalid="ignore"):
-        for tried in (gains, nothing):
-            first = fly(expected, rest, tried, 1.0)
-            if np.isfinite(first.rate).all() and np.isfinite(first.quaternion).all():
-                return first
+    for tried in (gains, nothing):
+        if (first := fly(expected, rest, tried, 1.0)) is not None:
+            return first
     fastest = math.degrees(float(np.linalg.norm(rest.rate[0])))
     raise PlanningError(f"no path: from {fastest:.1f} deg/s on the body turns by too much in a step")
 
@@ -230,8 +230,8 @@ def _bettered(expected: Expected, motion: Motion, criterion: Criterion, price: f
         gains, before = _swept(expected, motion, criterion, price), cost
         for share in SHARES:
             tried = fly(expected, motion, gains, share)
-            found = _cost(expected, tried, criterion, price)
-            if found < cost:
+            found = math.inf if tried is None else _cost(expected, tried, criterion, price)
+            if tried is not None and found < cost:
                 motion, cost = tried, found
                 break
         if before - cost < enough * before:
@@ -239,8 +239,11 @@ def _bettered(expected: Expected, motion: Motion, criterion: Criterion, price: f
     return motion
 
 
-def fly(expected: Expected, motion: Motion, gains: Gains, share: float) -> Motion:
-    """Return the motion from the same begin with a share of the change that was found, and feedback."""
+def fly(expected: Expected, motion: Motion, gains: Gains, share: float) -> Motion | None:
+    """Return the motion from the same begin with a share of the change that was found, and feedback.
+
+    None where it runs away: far from `motion` the torques along the field, which have no limit, drive it out.
+    """
     count, step = len(motion.control), expected.step
     quaternion, rate, flown = np.empty((count + 1, 4)), np.empty((count + 1, 3)), np.empty((count, 4))
     quaternion[0], rate[0] = q, w = motion.quaternion[0], motion.rate[0]
@@ -250,11 +253,13 @@ def fly(expected: Expected, motion: Motion, gains: Gains, share: float) -> Motio
         u = changed[k] - gains.gain[k] @ np.concatenate([turn, w - motion.rate[k]])
         u[:3] = np.clip(u[:3], -expected.limit, expected.limit)
         middle = w + 0.5 * step * expected.acceleration(k, q, w, u)
+        if not np.abs([w, middle]).max() < RUN_AWAY:  # nor is what is no number
+            return None
         half = multiply(from_rotation_vector(0.5 * step * w), q)
         w = w + step * expected.acceleration(k, half, middle, u)
         q = multiply(from_rotation_vector(step * middle), q)
         quaternion[k + 1], rate[k + 1], flown[k] = q, w, u
-    return Motion(quaternion, rate, flown)
+    return Motion(quaternion, rate, flown) if np.abs(w).max() < RUN_AWAY else None
 
 
 def _swept(

@@ -69,7 +69,8 @@ class Sampling:
     """Error bounds of a reading of a chopped current that changes within the reading's window.
 
     Attributes:
-        scatter: relative error caused by chopping.
+        scatter: error caused by chopping, of a bridge's current or of what lacks to its full current,
+            whichever is smaller: a bridge that is fully on is not chopped.
         range_share: error of the mean, as a fraction of the range in the window.
     """
 
@@ -85,21 +86,30 @@ MEAN = Sampling(0.02, 0.25)
 
 @dataclass(frozen=True, slots=True)
 class Predicted:
-    """A reading in A, and the prediction of each axis (rows) under each variant: mean and slack (3, v) A."""
+    """A reading in A, and the prediction of each axis (rows) under each variant (3, v), A.
+
+    `mean` of the window, `slack`, and `chopped`, the error by chopping. A `clipped` reading may be smaller
+    than the current.
+    """
 
     current: float
     mean: FloatArray
     slack: FloatArray
-    scatter: float
+    chopped: FloatArray
+    clipped: bool = False
 
 
-def predict(current: float, commands: FloatArray, bounds: Bounds, sampling: Sampling) -> Predicted:
+def predict(
+    current: float, commands: FloatArray, bounds: Bounds, sampling: Sampling, clipped: bool = False
+) -> Predicted:
     """Predict the current of each variant under the commands (k, 3) A of a reading's window."""
-    drawn = supply_currents(commands.T, np.array(bounds.full_current)[:, None])
+    full = np.array(bounds.full_current)[:, None]
+    drawn = supply_currents(commands.T, full)
     count = len(commands)
+    chopped = sampling.scatter * np.minimum(drawn, full[:, None] - drawn).clip(0.0).sum(axis=2) / count
     slack = bounds.uncertainty * ((drawn != 0.0).sum(axis=2) / count)
     slack += sampling.range_share * (drawn.max(axis=2) - drawn.min(axis=2))
-    return Predicted(current, drawn.sum(axis=2) / count, slack, sampling.scatter)
+    return Predicted(current, drawn.sum(axis=2) / count, slack, chopped, clipped)
 
 
 def supply_currents(commands: FloatArray, full: FloatArray) -> FloatArray:
@@ -129,9 +139,10 @@ def fits(
     variants: list[CoilFault | None] = [known.get(number) for number in range(3)]
     if axis is not None:
         variants[axis] = fault
-    current, scatter = np.array([(one.current, one.scatter) for one in evidence]).T
+    current = np.array([one.current for one in evidence])
     means, slacks = np.array([one.mean for one in evidence]), np.array([one.slack for one in evidence])
-    mean, own = np.zeros(len(evidence)), np.zeros(len(evidence))
+    chops = np.array([one.chopped for one in evidence])
+    mean, own, chopped, own_chopped = np.zeros((4, len(evidence)))
     slack: FloatArray = np.full(len(evidence), bounds.noise)
     free = 0.0  # current that axes of unknown state may add
     for number, variant in enumerate(variants):
@@ -141,15 +152,17 @@ def fits(
         place = PLACE.get(variant, 0)
         slack += slacks[:, number, place]
         if variant is CoilFault.SHORTED:
-            own = means[:, number, place]
+            own, own_chopped = means[:, number, place], chops[:, number, place]
         else:
             mean += means[:, number, place]
-    explained = _scales(bounds.gain) * mean
-    spare: FloatArray = slack + scatter * explained
+            chopped += chops[:, number, place]
+    scales = _scales(bounds.gain)
+    explained, spare = scales * mean, slack + scales * chopped
     if own.any():
         explained = explained + _SHORTED_FACTORS * own
-        spare = slack + scatter * explained + _SHORTED_SLACK * _SHORTED_FACTORS * own
-    inside = (current >= explained - spare) & (current <= explained + spare + free)
+        spare = spare + _SHORTED_FACTORS * (own_chopped + _SHORTED_SLACK * own)
+    clipped = np.array([one.clipped for one in evidence])
+    inside = (clipped | (current >= explained - spare)) & (current <= explained + spare + free)
     misses = len(evidence) - int(inside.sum(axis=2).max())
     return misses <= _OUTLIERS * len(evidence)
 

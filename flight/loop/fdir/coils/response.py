@@ -38,7 +38,8 @@ class ResponseSettings:
         torsion, damping: 1/s^2 and 1/s, prior standard deviations about each free axis (thread or drag).
         sure: standard deviation below which a gain is used.
         persistence: fits in a row that must agree.
-        lowest_sound, highest_reversed: bounds of a healthy and of a reversed coil's gain.
+        lowest_sound, highest_feeble, highest_reversed: bounds of the gain of a healthy coil, of one without
+            torque, and of a reversed one.
         memory_ns: how long the residual accelerations are kept.
         settle_ns: how long the coils must have been at rest for the field to be the Earth's; None where
             theirs is small beside it.
@@ -56,6 +57,7 @@ class ResponseSettings:
     sure: float = 0.25
     persistence: int = 4
     lowest_sound: float = 0.6
+    highest_feeble: float = 0.4
     highest_reversed: float = -0.5
     memory_ns: int = 20_000_000_000
     settle_ns: int | None = None
@@ -67,6 +69,8 @@ _REACH_NS = 3_000_000_000
 _LEAST_CHANGE = 4.0e-3
 """rad/s^2: smaller changes cannot be detected."""
 _GAIN_PRIOR = 10.0
+_FELT, _SIGMAS = 0.7, 2.5
+"""A coil without torque has a gain that is lower than this by so many deviations."""
 
 
 class CoilResponse:
@@ -91,6 +95,7 @@ class CoilResponse:
         self._last_ns = 0
         self._wrong_for = [0, 0, 0]
         self._sound_for = [0, 0, 0]
+        self._feeble_for = [0, 0, 0]
         self.gain: FloatArray = np.ones(3)
         self.sigma: FloatArray = np.full(3, np.inf)
         self.reset()
@@ -110,6 +115,7 @@ class CoilResponse:
         self._remainders: deque[tuple[int, FloatArray, FloatArray, FloatArray]] = deque()
         self._wrong_for = [0, 0, 0]
         self._sound_for = [0, 0, 0]
+        self._feeble_for = [0, 0, 0]
         self.sigma = np.full(3, np.inf)
 
     def commanded(self, time_ns: int, currents: tuple[float, ...]) -> None:
@@ -165,6 +171,10 @@ class CoilResponse:
     def reversed_axes(self) -> list[int]:
         """Return the axes whose gain was reversed in the last `persistence` fits."""
         return [axis for axis in range(3) if self._wrong_for[axis] >= self._settings.persistence]
+
+    def feeble_axes(self) -> list[int]:
+        """Return the axes whose torque the body did not feel, or felt reversed, in those fits."""
+        return [axis for axis in range(3) if self._feeble_for[axis] >= self._settings.persistence]
 
     def is_healthy(self, axis: int) -> bool:
         """Return whether the gain of an axis was healthy in the last `persistence` fits."""
@@ -260,6 +270,9 @@ class CoilResponse:
         pairs = zip(self.gain.tolist(), self.sigma.tolist(), strict=True)
         for number, (gain, sigma) in enumerate(pairs):
             wrong = gain + 3.0 * sigma < 0.0 and gain < settings.highest_reversed
-            sound = sigma < settings.sure and gain > settings.lowest_sound
+            unfelt = gain + _SIGMAS * sigma < _FELT and gain < settings.highest_feeble
+            feeble = wrong or (sigma < settings.sure and unfelt)
             self._wrong_for[number] = self._wrong_for[number] + 1 if wrong else 0
+            self._feeble_for[number] = self._feeble_for[number] + 1 if feeble else 0
+            sound = sigma < settings.sure and gain > settings.lowest_sound
             self._sound_for[number] = self._sound_for[number] + 1 if sound else 0

@@ -34,6 +34,7 @@ class CoilWatchSettings:
         probe_current: A, of the wave that distinguishes faults of axes at rest.
         probe_half_ns: half the wave's period.
         response: the body's response to the coils; None where the motion is not used.
+        slow: the same over longer bins, which show currents that the monitor can not tell from none.
     """
 
     full_current: tuple[float, float, float]
@@ -47,3 +48,4 @@ class CoilWatchSettings:
     probe_current: float = 0.04
     probe_half_ns: int = 800_000_000
     response: ResponseSettings | None = None
+    slow: ResponseSettings | None = None

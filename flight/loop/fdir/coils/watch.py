@@ -10,7 +10,8 @@ the prediction of each hypothesis (healthy; each axis open, shorted, either leg 
 `flight.loop.fdir.coils.hypotheses`). There is a verdict when `healthy` is rejected and the hypotheses that
 explain the readings since then all name one axis; between axes that are not driven, a small wave on each in
 turn decides. A reversed coil is found from the angular acceleration (`flight.loop.fdir.coils.response`),
-which also distinguishes a wrong monitor from a broken coil. Uncommanded current is handled faster, in every
+which also distinguishes a wrong monitor from a broken coil; over longer bins it raises a suspicion where a
+current too small for the monitor makes no torque. Uncommanded current is handled faster, in every
 mode: `flight.loop.fdir.coils.stuck_leg` brakes the axes at rest; during its search there is no other verdict.
 The bounds are the thesis's 3.5 mA on each coil's current (Sease 2013 ch. 5), the resistance's error, and the
 18 % error of a single conversion of the chopped current (`hal.drivers.ina219`).
@@ -88,6 +89,8 @@ class CoilWatch:
         self._evidence: deque[Predicted] = deque(maxlen=_MOST_EVIDENCE)
         self._probe = Probe(settings.probe_current, settings.probe_half_ns)
         self._response = None if settings.response is None else CoilResponse(settings.response)
+        self._slow = None if settings.slow is None else CoilResponse(settings.slow)
+        self._unfelt = ""  # which coil's torque the body does not feel
         self._verdicts: dict[int, CoilVerdict] = {}
         self._looked_ns = 0
         self._leg = StuckLeg(_STUCK_EXCESS * min(settings.full_current))
@@ -108,7 +111,7 @@ class CoilWatch:
     @property
     def suspicion(self) -> str:
         """Why a coil is suspected; empty while the readings fit a healthy circuit."""
-        return self._leg.suspicion or self._strangeness
+        return self._leg.suspicion or self._strangeness or self._unfelt
 
     @property
     def braked(self) -> Axes:
@@ -141,25 +144,34 @@ class CoilWatch:
         # Without readings, a rest or a brake would never end.
         if self._leg.is_searching and time_ns - self._looked_ns > self._settings.window_ns:
             self._leg.reset()
-        if self._response is not None:
-            self._response.commanded(time_ns if written_ns is None else written_ns, values)
+        for response in self._responses:
+            response.commanded(time_ns if written_ns is None else written_ns, values)
 
     def observe_motion(self, time_ns: int, rate: FloatArray, field: FloatArray) -> None:
         """Add a sample of the body rate (3,) rad/s and the magnetic field (3,) T, body axes."""
-        if self._response is None or not self._response.observe_motion(time_ns, rate, field):
-            return
-        for axis in self._response.reversed_axes():
+        for response in self._responses:
+            if response.observe_motion(time_ns, rate, field):
+                self._judge_motion(response, time_ns)
+
+    def _judge_motion(self, response: CoilResponse, now_ns: int) -> None:
+        """Give a verdict on an axis that turns the body the wrong way; suspect one that does not turn it."""
+        for axis in response.reversed_axes():
             # An uncommanded current turns the body too.
-            if axis not in self._verdicts and not self.suspicion:
-                self._give(axis, CoilFault.REVERSED, time_ns, self._response.text(axis))
+            if axis not in self._verdicts and not (self._leg.suspicion or self._strangeness):
+                self._give(axis, CoilFault.REVERSED, now_ns, response.text(axis))
+        if response is self._slow:
+            axes = [axis for axis in response.feeble_axes() if axis not in self._verdicts]
+            # Several at once: then rather the gyro or the field is wrong.
+            self._unfelt = f"coil {AXES[axes[0]]}: {response.text(axes[0])}" if len(axes) == 1 else ""
 
     def interrupted(self, now_ns: int) -> None:
         """Discard the evidence until now: the coil currents of that time are unknown."""
         self._fresh = 0
         self._leg.reset()
         self._reset()
-        if self._response is not None:
-            self._response.interrupted(now_ns)
+        self._unfelt = ""
+        for response in self._responses:
+            response.interrupted(now_ns)
 
     def measured(self, reading: PowerReading) -> None:
         """Add a reading of the monitor; a repeated reading is ignored."""
@@ -194,6 +206,10 @@ class CoilWatch:
     def monitor_doubted(self) -> str:
         """Why the monitor, not a coil, is doubted; empty while the monitor is trusted."""
         return self._witness.doubt
+
+    @property
+    def _responses(self) -> list[CoilResponse]:
+        return [response for response in (self._response, self._slow) if response is not None]
 
     @property
     def _settle_ns(self) -> int:
@@ -231,7 +247,13 @@ class CoilWatch:
         if begin_ns >= self._unmixed_ns:
             windows.append((reading.current, begin_ns, MEAN))
         return [
-            predict(current, self._commands.window(since_ns, reading.time_ns), self._bounds, sampling)
+            predict(
+                current,
+                self._commands.window(since_ns, reading.time_ns),
+                self._bounds,
+                sampling,
+                reading.clipped,
+            )
             for current, since_ns, sampling in windows
         ]
 

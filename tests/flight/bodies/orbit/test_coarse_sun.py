@@ -51,7 +51,6 @@ class Lit:
             dipole_limit=0.1,
             gyro_noise=1e-4,
             field_noise=1e-7,
-            field_error=5e-8,
             unknown_psd=1e-8,
             settle_ns=0,
             history_ns=12 * SECOND_NS,
@@ -61,6 +60,7 @@ class Lit:
         self.feed = CoarseSunFeed(strings, ROUND_NS, self.filter, cast(Surroundings, self))
         self.wrong: list[str | None] = []
         self.magnet: FloatArray = np.zeros(3)
+        self.begin_ns = 0  # when stars begin the filter
 
     def at(self, _: int) -> Around:
         nothing = Pressures(np.zeros((1, 3)), np.zeros((1, 3)))
@@ -85,6 +85,9 @@ class Lit:
                 np.zeros(3),
             )
             self.filter.accept(ImuReading(*reading))
+            if time_ns == self.begin_ns:
+                then_ns = time_ns - step_ns // 2
+                self.filter.begin(AttitudeMeasurement(then_ns, self.attitude, 1e-4 * np.eye(3)))
             if time_ns % ROUND_NS == 0:
                 currents = MODEL.currents(POSITION, 1.5e11 * SUN, body, self._generator)
                 if dead is not None:
@@ -115,6 +118,16 @@ def test_a_star_attitude_that_contradicts_a_coarse_one_replaces_it_at_once() -> 
     lit.filter.measure_late([AttitudeMeasurement(then, seen, 1e-9 * np.eye(3))], lambda _: None)
     assert lit.filter.restarts == 1
     assert lit.filter.knowledge is Knowledge.FINE
+
+
+def test_a_filter_that_began_after_a_reading_of_the_strings_is_kept() -> None:
+    """Stars begin it again a moment after the reading that is judged next, at 15.25 s."""
+    lit = Lit(1)
+    lit.begin_ns = 15_400_000_000
+    lit.fly(16)
+    assert lit.filter.restarts == 1
+    found = lit.filter.at(lit.filter.measured_ns)
+    assert np.sqrt(np.diag(found.covariance)[TURN]).max() < 0.02, "not that of the strings"
 
 
 @pytest.mark.parametrize("rank", range(3))

@@ -14,7 +14,7 @@ from flight.bodies.orbit.learned import (
     start_from,
 )
 from flight.gnc.estimation.free_filter import FreeFilter, SlowStates
-from flight.gnc.estimation.free_motion import DIPOLE, GYRO, SUNLIT
+from flight.gnc.estimation.free_motion import DIPOLE, GYRO, SLOW, SUNLIT
 from flight.gnc.estimation.free_settings import FreeFilterSettings
 from flight.gnc.math.arrays import FloatArray
 from flight.loop.state.content import Learned, StoredState
@@ -84,7 +84,7 @@ def test_the_filter_starts_from_them_and_a_contradiction_takes_their_claim_away(
     found.start(still, sure, gyro)
     assert np.allclose(found.gyro_bias, 0.5e-3)
     assert np.allclose(found.rate, gyro - 0.5e-3)
-    assert np.allclose(found.covariance[6:, 6:], prior.covariance)
+    assert np.allclose(found.covariance[SLOW, SLOW], prior.covariance)
     found.start(still, sure, gyro, doubted=True)
-    assert np.allclose(np.diag(found.covariance)[6:], START**2)
+    assert np.allclose(np.diag(found.covariance)[SLOW], START**2)
     assert np.allclose(found.gyro_bias, 0.5e-3), "as a guess it stays"

@@ -47,7 +47,6 @@ class Still:
             dipole_limit=0.1,
             gyro_noise=1e-4,
             field_noise=1e-7,
-            field_error=5e-8,
             unknown_psd=1e-8,
             settle_ns=0,
             history_ns=12 * SECOND_NS,

@@ -81,6 +81,27 @@ def test_a_spin_along_the_field_shows_no_rate_but_claims_no_knowledge_of_it() ->
     assert along @ spread @ along > 100.0 * (across @ spread @ across)
 
 
+def test_what_a_false_gyro_taught_is_forgotten_once_it_speaks_true() -> None:
+    """A body at rest in a field that does not turn: nothing but the gyro shows what turns along the field."""
+    found, rng = FieldRate(settings(inertia=1e-3 * np.eye(3))), np.random.default_rng(3)
+    false = 0.05 * FIELD / np.linalg.norm(FIELD)
+
+    def feed(gyro: FloatArray, samples: int) -> None:
+        for _ in range(samples):
+            found.advance(np.zeros(3), 0.2)
+            found.measure(FIELD + NOISE * rng.standard_normal(3))
+            found.measure_rate(gyro)
+
+    def missed() -> float:
+        return float(found.rate @ np.linalg.solve(found.covariance[RATE, RATE], found.rate))
+
+    feed(false, 30)
+    assert missed() > 100.0, "the field can not contradict it"
+    feed(np.zeros(3), 30)
+    assert found.restarts == 1
+    assert missed() < 16.3
+
+
 def test_one_spiked_sample_is_refused_and_a_change_of_the_world_begins_again() -> None:
     found, last = follow(np.radians([3.0, -4.0, 5.0]), INERTIA, 30.0)
     before = found.rate

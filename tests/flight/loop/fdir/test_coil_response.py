@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from flight.gnc.math.arrays import FloatArray
 from flight.loop.fdir.coils.response import CoilResponse, ResponseSettings
+from flight.loop.fdir.coils.watch import CoilWatch, CoilWatchSettings
 
 FIELD = np.array([0.0, 0.0, 60e-6])
 INERTIA, DIPOLE = 0.02, 60.0
@@ -74,24 +76,28 @@ def test_samples_that_come_in_a_burst_are_those_of_the_commands_of_their_time() 
 class Orbiting:
     """A tumbling 1U in 37 uT with coils on and off; at the magnetometer their field is twice the Earth's."""
 
-    def __init__(self, signs: FloatArray) -> None:
-        self.signs, self.rate = signs, np.array([0.08, -0.1, 0.07])
-        self.response = CoilResponse(
-            ResponseSettings(
-                INERTIAS, 0.65, 2.8e-4, bin_samples=16, bins=40, model_error=2e-4, torsion=1e-6, damping=1e-4,
-                settle_ns=100_000_000,
-            )
+    def __init__(self, signs: FloatArray, speed: float = 1.0) -> None:
+        self.signs, self.rate = signs, speed * np.array([0.08, -0.1, 0.07])
+        settings = ResponseSettings(
+            INERTIAS, 0.65, 2.8e-4, bin_samples=16, bins=40, model_error=2e-4, torsion=1e-6, damping=1e-4,
+            settle_ns=100_000_000,
         )  # fmt: skip
+        self.response = CoilResponse(settings)
+        slow = replace(settings, bin_samples=80, bins=20, model_error=3e-5)
+        self.watch = CoilWatch(CoilWatchSettings((0.148, 0.148, 0.148), slow=slow))
         self._noise = np.random.default_rng(4)
         self._field: FloatArray = np.array([1e-5, -2e-5, 3e-5])
 
-    def fly(self, seconds: float) -> None:
-        """Fly with coils that pause for 0.2 s of each second."""
+    def fly(self, seconds: float, weak: bool = False) -> None:
+        """Fly with coils that pause for 0.2 s of each second; `weak`: currents that no monitor can judge."""
         for cycle in range(round(40 * seconds)):
-            now_ns, within = cycle * TICK_NS, cycle % 40
-            wanted = 0.14 * np.sign([math.sin(0.7 * cycle / 40), math.cos(0.5 * cycle / 40), 1.0])
+            now_ns, within, time = cycle * TICK_NS, cycle % 40, cycle / 40
+            wanted = 0.14 * np.sign([math.sin(0.7 * time), math.cos(0.5 * time), 1.0])
+            if weak:
+                wanted = 0.014 * np.sin([0.2 * time, 0.13 * time + 1.0, 0.17 * time + 2.0])
             currents = wanted if within >= 8 else np.zeros(3)
             self.response.commanded(now_ns, tuple(currents.tolist()))
+            self.watch.commanded(now_ns, currents)
             for _ in range(5):
                 torque = np.cross(0.65 * self.signs * currents, self._field)
                 self.rate = self.rate + 5e-3 * np.linalg.solve(
@@ -101,6 +107,7 @@ class Orbiting:
             seen = self._field + 5e-4 * self.signs * currents
             noise = 2.8e-4 * self._noise.standard_normal(3)
             self.response.observe_motion(now_ns + TICK_NS, self.rate + noise, seen)
+            self.watch.observe_motion(now_ns + TICK_NS, self.rate + noise, seen)
 
 
 INERTIAS = np.diag([1.10e-3, 1.05e-3, 0.99e-3])
@@ -117,3 +124,25 @@ def test_of_a_free_body_a_reversed_coil_is_found_though_its_field_swamps_the_mag
     broken = Orbiting(signs)
     broken.fly(60.0)
     assert broken.response.reversed_axes() == [axis]
+
+
+@pytest.mark.parametrize("gain", [0.0, -1.0])
+@pytest.mark.parametrize("axis", range(3))
+def test_a_coil_that_makes_no_torque_is_suspected_at_currents_too_small_for_the_monitor(
+    axis: int, gain: float
+) -> None:
+    signs = np.ones(3)
+    signs[axis] = gain
+    broken = Orbiting(signs, speed=0.02)
+    broken.fly(110.0, weak=True)
+    told = broken.watch.suspicion or broken.watch.verdicts[0].text
+    assert told.startswith(f"coil {'xyz'[axis]}")
+
+
+@pytest.mark.parametrize("gain", [0.0, 1.0])
+def test_no_coil_is_suspected_of_a_sound_body_nor_where_none_seems_to_turn_it(gain: float) -> None:
+    """In the second case rather the gyro or the field is false."""
+    body = Orbiting(np.full(3, gain), speed=0.02)
+    body.fly(120.0, weak=True)
+    assert body.watch.suspicion == ""
+    assert body.watch.verdicts == ()

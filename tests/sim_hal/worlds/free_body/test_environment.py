@@ -12,7 +12,7 @@ from sim_hal.worlds import geomagnetism, sun
 from sim_hal.worlds.free_body.atmosphere import log_density
 from sim_hal.worlds.free_body.body import elements, julian_date
 from sim_hal.worlds.free_body.environment import RING_CURRENT, Environment, air_flow
-from sim_hal.worlds.free_body.section import OrbitSection
+from sim_hal.worlds.free_body.section import Disturbances, OrbitSection
 from sim_hal.worlds.orbit import propagate
 
 DATE = julian_date("2026-03-20T12:00:00Z")
@@ -20,7 +20,8 @@ ORBIT = OrbitSection(local_time=12.0)
 
 
 def make(seed: int = 1, ring_current: float = 0.0) -> Environment:
-    return Environment(elements(ORBIT, DATE), DATE, np.random.default_rng(seed), ring_current)
+    multiples = Disturbances(ring_current=ring_current)
+    return Environment(elements(ORBIT, DATE), DATE, np.random.default_rng(seed), multiples)
 
 
 def test_between_knots_position_velocity_field_and_sun_are_the_models() -> None:
@@ -77,6 +78,17 @@ def test_the_air_is_denser_by_day_and_falls_off_with_height() -> None:
     density = np.exp(log_density(np.array([apex, -apex, apex * (radius + 100e3) / radius]), sun_there))
     assert density[0] / density[1] == pytest.approx(4.0)
     assert density[0] / density[2] == pytest.approx(6.967e-13 / 1.454e-13)
+
+
+def test_without_bulge_and_walks_the_air_is_the_same_on_all_sides_and_the_dipole_stays() -> None:
+    still = Environment(
+        elements(ORBIT, DATE), DATE, np.random.default_rng(2), Disturbances(day_bulge=0.0, walks=0.0)
+    )
+    found = [still.at(time) for time in range(0, 5_700, 300)]
+    heights = [np.linalg.norm(one.position) for one in found]
+    densities = [one.density for one in found]
+    assert np.corrcoef(heights, np.log(densities))[0, 1] < -0.999
+    assert all(one.walk == (0.0, 0.0, 0.0) for one in found)
 
 
 def test_the_air_turns_with_the_earth() -> None:

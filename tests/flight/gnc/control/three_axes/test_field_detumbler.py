@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 
 from flight.gnc.control.detumble import WindowSchedule
-from flight.gnc.control.three_axes.field_detumbler import BOUNDED, TRUSTED, FieldBraking, FieldDetumbler
+from flight.gnc.control.three_axes.field_detumbler import (
+    BOUNDED,
+    TRUSTED,
+    UNHEARD,
+    FieldBraking,
+    FieldDetumbler,
+)
 from flight.gnc.errors import UsageError
 from flight.gnc.estimation.field_rate import FieldRateSettings
 from flight.gnc.math.arrays import FloatArray
@@ -35,10 +41,11 @@ def fly(
     spikes: float = 0.0,
     gyro: Callable[[FloatArray], FloatArray] | None = None,
     sooner: float = 1.0,
+    late: float = 0.0,
 ) -> FloatArray:
     """Return the speed (n,) rad/s of each cycle; `gyro` makes its reading of the rate.
 
-    The field turns by `sooner` times what it does in orbit.
+    The field turns by `sooner` times what it does in orbit; a sample is `late` s older than the last command.
     """
     law, rng = detumbler(), np.random.default_rng(4)
     speeds = []
@@ -52,11 +59,12 @@ def fly(
             @ attitude_matrix(from_rotation_vector(sooner * TURN * cycle * dt)).T
             @ FIELD
         )
-        sample = field + OWN_FIELD * dipole + 1e-7 * rng.standard_normal(3)
+        past = attitude_matrix(from_rotation_vector(-late * rate)) @ field
+        sample = past + OWN_FIELD * dipole + 1e-7 * rng.standard_normal(3)
         if rng.uniform() < spikes:
             sample = sample + 1e-4 * rng.standard_normal(3)
         law.dipole(now_ns)
-        law.sample(now_ns, sample, None if gyro is None else gyro(rate))
+        law.sample(now_ns - round(1e9 * late), sample, None if gyro is None else gyro(rate))
         dipole = law.dipole(now_ns)
         assert np.abs(dipole).max() <= LIMIT * (1.0 + 1e-12)
         momentum = INERTIA @ rate
@@ -100,6 +108,36 @@ def test_with_a_gyro_a_fast_spin_along_the_field_is_stopped_soon_at_twice_its_ra
 def test_a_gyro_that_is_stuck_does_not_mislead() -> None:
     speeds = fly(np.array([0.1, 0.05, 0.03]), 200.0, gyro=lambda _: np.zeros(3))
     assert speeds[-1] < 0.5 * speeds[0]
+
+
+@pytest.mark.parametrize("late", [0.001, 0.04])
+def test_samples_older_than_the_last_command_brake_as_well(late: float) -> None:
+    """What lies along the field is first spun up across it, as the field turns."""
+    speeds = fly(np.array([0.1, 0.05, 0.03]), 240.0, late=late)
+    assert speeds[-1] < math.radians(0.5)
+
+
+def test_coils_wait_where_no_sample_is_accepted_any_more() -> None:
+    """The unit is heard, but its fields are of no use: nothing is braked by what is merely predicted."""
+    law = detumbler()
+    law.begin(0)
+
+    def acts(begin_ns: int, end_ns: int, good: float) -> bool:
+        """Return whether the coils acted while the body turned by 0.1 rad/s across the field."""
+        acted = False
+        for now_ns in range(begin_ns, end_ns, 25_000_000):
+            turned = attitude_matrix(from_rotation_vector(np.array([1e-10 * now_ns, 0.0, 0.0]))) @ FIELD
+            law.sample(now_ns, good * turned)
+            acted |= bool(law.dipole(now_ns).any())
+        return acted
+
+    quiet_ns = (2 + UNHEARD) * SCHEDULE.period_ns
+    assert acts(0, 2 * SCHEDULE.period_ns, 1.0)
+    assert acts(2 * SCHEDULE.period_ns, quiet_ns, math.nan), (
+        "two pauses without a sample do not stop the brake"
+    )
+    assert not acts(quiet_ns, quiet_ns + 10 * SCHEDULE.period_ns, math.nan)
+    assert acts(quiet_ns + 10 * SCHEDULE.period_ns, quiet_ns + 15 * SCHEDULE.period_ns, 1.0)
 
 
 def test_a_spin_of_a_turn_in_two_seconds_is_braked() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from flight.gnc.control.three_axes.pointing_course import best_course
-from flight.gnc.control.three_axes.pointing_path import Expected, Motion
+from flight.gnc.control.three_axes.pointing_path import RUN_AWAY, Expected, Gains, Motion, fly
 from flight.gnc.control.three_axes.pointing_sweep import linearised
 from flight.gnc.control.three_axes.pointing_table import PointingWeights, prices
 from flight.gnc.earth.disturbance import pressures
@@ -151,3 +151,24 @@ def test_a_begin_off_the_law_is_led_into_it() -> None:
     assert found is not None
     np.testing.assert_allclose(to_rotation_vector(found[0].quaternion[0]), to_rotation_vector(q), atol=1e-12)
     assert off_axis(found[0])[KEPT:].max() < 3.0
+
+
+def test_a_motion_that_runs_away_is_none_without_a_warning() -> None:
+    """Gains that drive the body out by torques along the field: faster by orders with each step."""
+    ahead = expected().until(61)
+    rest = Motion(ahead.wanted.quaternion, ahead.wanted.rate, np.zeros((60, 4)))
+    gain = np.zeros((60, 4, 6))
+    nothing = Gains(gain, np.zeros((60, 4, 1)))
+    still = fly(ahead, rest, nothing, 1.0)
+    assert still is not None
+    assert np.abs(still.rate).max() < 0.01
+    for push in (1e2, 1e6, 1e150, 1e300):
+        steady = np.zeros((60, 4, 1))
+        steady[:, 3] = push * 1e-3
+        with np.errstate(all="raise"):
+            assert fly(ahead, rest, Gains(gain, steady), 1.0) is None
+    steady = np.zeros((60, 4, 1))
+    steady[0, 3] = 1e-4
+    fast = fly(ahead, rest, Gains(gain, steady), 1.0)
+    assert fast is not None, "a motion of several revolutions a step is followed"
+    assert 2.0 * np.pi < 10.0 * np.abs(fast.rate).max() < 10.0 * RUN_AWAY
