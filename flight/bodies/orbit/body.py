@@ -278,6 +278,7 @@ def _detumbler(config: OrbitConfig, filter_: OrbitFilter, surroundings: Surround
         replan=section.replan,
         gentle=section.gentle,
         spin_up=section.spin_up,
+        slow=section.low_rate,
     )
     expected = expected_field(filter_, surroundings, braking.instants)
     return FieldDetumbler(WindowSchedule(settle_ns, measure_ns, act_ns), braking, settings, expected)

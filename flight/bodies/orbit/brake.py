@@ -9,7 +9,7 @@ import numpy as np
 from flight.bodies.orbit.filter import OrbitFilter
 from flight.bodies.orbit.surroundings import Surroundings
 from flight.gnc.control.three_axes.field_detumbler import FieldDetumbler
-from flight.gnc.earth.dipole_field import dipole_field_ahead
+from flight.gnc.earth.field_ahead import FieldAhead
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import attitude_matrix
 from flight.loop.control_output import CoilCommand
@@ -52,12 +52,13 @@ def expected_field(
 
     It gives None while attitude or orbit are not known.
     """
+    field = FieldAhead()
 
     def expected(now_ns: int) -> FloatArray | None:
-        state, around = surroundings.state(now_ns), surroundings.at(now_ns)
-        if state is None or around is None or not filter_.started:
+        state = surroundings.state(now_ns)
+        if state is None or surroundings.at(now_ns) is None or not filter_.started:
             return None
-        ahead = dipole_field_ahead(state, around.field, instants)
+        ahead = field.along(state, instants)
         return np.asarray(ahead @ attitude_matrix(filter_.at(now_ns).quaternion).T)
 
     return expected

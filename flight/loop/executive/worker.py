@@ -18,7 +18,7 @@ import time
 from typing import Any
 
 from flight.gnc.errors import FlightError
-from flight.loop.executive.memory import give_back
+from flight.loop.executive.memory import give_back, lean_numpy
 from flight.loop.executive.messages import SLAB_BYTES, message_length, pack_values, unpack_trusted
 
 _PR_SET_PDEATHSIG = 1  # prctl(2)
@@ -76,6 +76,7 @@ def main(arguments: list[str]) -> None:
     os.nice(5)  # the control loop comes first
     if cores:
         os.sched_setaffinity(0, map(int, cores.split(",")))
+    lean_numpy()
     home = importlib.import_module(module)
     getattr(home, "prepare", _nothing)()
     function = getattr(home, name)

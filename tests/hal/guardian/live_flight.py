@@ -39,8 +39,8 @@ held = ctypes.PyDLL(None)  # unlike CDLL, keeps the interpreter's lock
 signal.signal({int(SLEEPS)}, lambda *_: time.sleep({HANG_S}))
 signal.signal({int(SPINS)}, lambda *_: held.usleep({round(1e6 * HANG_S)}))
 from flight.app.cli import main
-raise SystemExit(main())
 """
+_MAIN = "raise SystemExit(main())"
 
 
 def write_config(folder: Path) -> Path:
@@ -58,8 +58,15 @@ class LiveFlight:
     """One running flight process and what hangs on it."""
 
     def __init__(
-        self, folder: Path, config: Path, notifications: socket.socket, duration: float, *more: str
+        self,
+        folder: Path,
+        config: Path,
+        notifications: socket.socket,
+        duration: float,
+        *more: str,
+        before: str = "",
     ) -> None:
+        """Start it; `before` is a line of Python that its process runs first."""
         self._notifications = notifications
         self.folder = folder / "run"
         words = [
@@ -74,7 +81,7 @@ class LiveFlight:
         ]
         self.begun_ns = time.monotonic_ns()
         self.process = subprocess.Popen(
-            [sys.executable, "-c", FLIGHT, *words],
+            [sys.executable, "-c", f"{FLIGHT}{before}\n{_MAIN}", *words],
             cwd=ROOT,
             env={**os.environ, "NOTIFY_SOCKET": notifications.getsockname(), "WATCHDOG_USEC": "2000000"},
             stdout=subprocess.DEVNULL,
@@ -162,7 +169,7 @@ def live_flight(folder: Path, duration: float = 60.0, *more: str) -> Iterator[Li
 
 
 class CoilTruth:
-    """What coil x really carried, on the machine's monotonic clock."""
+    """What the coils really carried, on the machine's monotonic clock; `current` (n,) A is that of coil x."""
 
     def __init__(self, folder: Path, devices: Path | None = None) -> None:
         """Read the run in `folder`; the truth of devices with a folder of their own is moved there."""
@@ -195,6 +202,7 @@ class CoilTruth:
         return float(self.time_ns[first] - act_ns) * 1e-9
 
     def driven_after(self, act_ns: int) -> float:
-        """Return how long after an act, in s, the coil was first driven."""
-        driven = np.flatnonzero((self.time_ns >= act_ns) & (self.current != 0.0))
+        """Return how long after an act, in s, a coil was first driven."""
+        any_current = np.any(self.run["truth"]["current"] != 0.0, axis=1)
+        driven = np.flatnonzero((self.time_ns >= act_ns) & any_current)
         return float(self.time_ns[driven[0]] - act_ns) * 1e-9 if len(driven) else float("inf")

@@ -3,7 +3,8 @@
 The step demonstration flies in real time on emulated devices in processes of their own, as a board flies on
 its devices: planner and vision have work without pause, the guardian watches. With `--orbit` the KnightCube
 of `config/orbit.yaml` flies in its place, at nadir from the begin; its planner has the shortest period that
-the configuration allows, 10 s, and the wide cameras work as they fly. Beside it a bare absolute-sleep loop at
+the configuration allows, 10 s, and the wide cameras work as they fly; with `--busy` each worker does its
+last job again until the next one comes, so that none is ever idle. Beside it a bare absolute-sleep loop at
 the same rate (`tests.studies.bench.bare_loop`) measures the machine's own stalls, and the kernel the time
 that a virtual machine's host takes; a working loop meets such stalls more often than a sleeping loop. Where
 SCHED_FIFO is allowed the flight is flown twice, with it and without. Run it alone on two cores. The slope of
@@ -28,6 +29,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from statistics import median
 
 import yaml
 
@@ -52,12 +54,15 @@ PRIORITY = 50
 """Of the bare loop under SCHED_FIFO: that of the flight's control thread."""
 
 ORBIT = ROOT / "config" / "orbit.yaml"
+SHARED_LOOKS = 9
+"""How often it is looked at what the flight shares with other processes."""
 SHORTEST_REPLAN = 10.0
 """s between the pointing's plans: the least that the schema allows."""
 AT_NADIR = {"attitude": [0.096, 0.701, 0.185, -0.682], "rate": [0.0, -1.1e-3, 0.0]}
 """The release: along the flight, the star camera at the sky, so that all work from the first minute on."""
 
 _PR_CAPBSET_READ, _PR_CAPBSET_DROP, _CAP_SYS_NICE = 23, 24, 23  # linux/prctl.h, linux/capability.h
+_KEPT_BUSY = "from tests.studies.bench.busy_jobs import keep_busy; keep_busy()"
 _NO_BYTECODE, _BYTECODE = "PYTHONDONTWRITEBYTECODE", "PYTHONPYCACHEPREFIX"
 _IMPORTED = (
     "flight.app.flight",
@@ -73,7 +78,12 @@ _ROLES = {
     "flight.gnc.vision.frame_job": "vision",
     "flight.gnc.vision.wide_job": "wide",
     "hal.guardian": "guardian",
+    "tests.studies.bench.busy_jobs:plan_testbed": "planner",
+    "tests.studies.bench.busy_jobs:plan_orbit": "planner",
+    "tests.studies.bench.busy_jobs:see ": "vision",
+    "tests.studies.bench.busy_jobs:see_wide": "wide",
 }
+"""By what stands in a process's command line."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +96,7 @@ class Load:
     warm_up: float = 60.0
     look_period: float = 0.5
     orbit: bool = False
+    busy: bool = False
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -129,6 +140,7 @@ def _load(arguments: Sequence[str]) -> tuple[Load, argparse.Namespace]:
         "--scheduling", choices=["fifo", "ordinary", "both"], default="both", help="default %(default)s"
     )
     parser.add_argument("--orbit", action="store_true", help="fly the satellite, not the step demonstration")
+    parser.add_argument("--busy", action="store_true", help="no worker is ever idle")
     parser.add_argument("--out", type=Path, metavar="DIR", help="write executive.json and lateness.png")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args(arguments)
@@ -141,8 +153,8 @@ def _load(arguments: Sequence[str]) -> tuple[Load, argparse.Namespace]:
     for name, period in (("camera", options.camera_period), ("replan", options.replan_period)):
         if not 0.0 < period < 10.0:
             parser.error(f"--{name}-period {period:g}: must lie between 0 and 10 s")
-    load = Load(duration, options.camera_period, options.replan_period, warm_up, orbit=options.orbit)
-    return load, options
+    periods = options.camera_period, options.replan_period
+    return Load(duration, *periods, warm_up, orbit=options.orbit, busy=options.busy), options
 
 
 def _schedulings(wanted: str) -> list[str]:
@@ -199,7 +211,7 @@ def _compiled() -> Iterator[None]:
         before = {name: os.environ.pop(name, None) for name in (_NO_BYTECODE, _BYTECODE)}
         os.environ[_BYTECODE] = folder
         try:
-            modules = ", ".join((*_IMPORTED, *_ROLES))
+            modules = ", ".join((*_IMPORTED, *(role for role in _ROLES if ":" not in role)))
             subprocess.run([sys.executable, "-c", f"import {modules}"], cwd=ROOT, check=True)
             yield
         finally:
@@ -224,7 +236,7 @@ def fly(folder: Path, load: Load, fifo: bool) -> Flown:
         stack.enter_context(answering("sim_hal", "serve", str(config), *outputs))
         notifications = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
         notifications.bind(str(folder / "notify"))
-        flight = _started(folder, config, notifications, load.duration, facts, fifo)
+        flight = _started(folder, config, notifications, load, facts, fifo)
         stack.callback(flight.end)
         ready_ns = flight.wait_for("READY=1")
         busy = process_watch.look({"control": flight.process.pid}).processor["control"]
@@ -239,18 +251,20 @@ def fly(folder: Path, load: Load, fifo: bool) -> Flown:
 
 def _watch(flight: LiveFlight, notifications: socket.socket, load: Load) -> Watched:
     """Watch the flight to its end, reading the service manager's end of the socket."""
-    alone = None
-    enough = time.monotonic() + 0.5 * (load.duration + load.warm_up)
+    shared: list[float] = []
+    due = time.monotonic() + 0.5 * (load.duration + load.warm_up)
     with closing(ProcessWatch(lambda: members(flight), load.look_period)) as watch:
         while flight.process.poll() is None:
             if select.select([notifications], [], [], 0.5)[0]:
                 notifications.recv(4096)
-            if alone is None and time.monotonic() > enough:
+            if len(shared) < SHARED_LOOKS and time.monotonic() > due:
+                due += load.look_period
                 with suppress(OSError, LookupError, ValueError):  # one of them has just ended: again then
                     present = members(flight)
-                    shared = sum(process_watch.look(present).memory.values())
-                    alone = process_watch.unshared(present) - shared
-    return Watched(watch.looks, alone or 0.0)
+                    held = sum(process_watch.look(present).memory.values())
+                    shared.append(process_watch.unshared(present) - held)
+    # A job that begins or ends between the two looks would count as shared.
+    return Watched(watch.looks, max(0.0, median(shared)) if shared else 0.0)
 
 
 def members(flight: LiveFlight) -> dict[str, int]:
@@ -263,7 +277,7 @@ def members(flight: LiveFlight) -> dict[str, int]:
 
 
 def _started(
-    folder: Path, config: Path, notifications: socket.socket, duration: float, facts: Path, fifo: bool
+    folder: Path, config: Path, notifications: socket.socket, load: Load, facts: Path, fifo: bool
 ) -> LiveFlight:
     """Start the flight beside its devices, without a right to SCHED_FIFO when it is not to have it."""
     started: list[LiveFlight] = []
@@ -272,7 +286,8 @@ def _started(
         if not fifo:
             # Of this thread alone, and of what it starts.
             ctypes.CDLL(None).prctl(_PR_CAPBSET_DROP, _CAP_SYS_NICE, 0, 0, 0)
-        started.append(LiveFlight(folder, config, notifications, duration, "--devices", str(facts)))
+        words = folder, config, notifications, load.duration, "--devices", str(facts)
+        started.append(LiveFlight(*words, before=_KEPT_BUSY if load.busy else ""))
         if not fifo:
             resource.prlimit(started[0].process.pid, resource.RLIMIT_RTPRIO, (0, 0))
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from flight.link.telemetry.packets import to_text
 from ground.telemetry.reader import Run
@@ -88,6 +89,8 @@ def evaluate(
         "scheduling": _scheduling(run),
         "slots": len(flight.lateness),
         "slips": int(control["slips"]),
+        "slips_computed": int(np.count_nonzero(flight.lost[: int(control["cycles"] + control["slips"])])),
+        "closest_s": float(np.diff(starts_ns).min()) * 1e-9,
         "lost": int(np.count_nonzero(flight.lost)),
         "lost_at_s": [round(float(slot) * PERIOD_NS * 1e-9, 3) for slot in np.flatnonzero(flight.lost)],
         "lost_by_bare_loop": int(np.count_nonzero(machine.lost)),
@@ -111,6 +114,7 @@ def evaluate(
     }
     zero_s = zero_ns * 1e-9
     figures |= _of_processes(watched, zero_s + warm_up, zero_s + max(warm_up, SLOPE_FROM))
+    figures |= waits(watched.looks, starts_ns * 1e-9, cycles["execution"])
     return Flown(figures, flight, machine)
 
 
@@ -176,6 +180,20 @@ def judged_slope(seconds: list[float], levels: list[float]) -> tuple[float, floa
     return slope_per_hour(seconds, levels)
 
 
+def waits(looks: list[Look], starts: npt.NDArray[Any], execution: npt.NDArray[Any]) -> Figures:
+    """Return for how much of the time the control thread waited, from the first look to the last.
+
+    `queued`: ready, but the machine gave it no processor. `blocked`: in a cycle, with neither processor nor
+    queue, as a cycle that waits for a worker or a disk would be; a lower bound, and independent of the load.
+    """
+    first, last = looks[0], looks[-1]
+    on, queued = np.subtract(last.turns["control"], first.turns["control"])
+    inside = (starts >= first.time) & (starts + execution <= last.time)
+    span = last.time - first.time
+    blocked = max(0.0, float(execution[inside].sum()) - float(on + queued))
+    return {"queued": float(queued) / span, "blocked": blocked / span}
+
+
 def _share(looks: list[Look], name: str) -> float:
     """Return the share of a core that a process took; a replaced process counts with its successors."""
     spent = np.diff([look.processor[name] for look in looks])
@@ -221,6 +239,8 @@ def table(figures: Figures, name: str) -> str:
         f"{figures['lost_with_bare_loop']} with the bare loop, which lost {figures['lost_by_bare_loop']}, "
         f"{figures['lost_while_stolen']} while the host took what makes a slot lost, from whichever core; "
         f"{figures['lost_unexplained']} with neither",
+        f"control thread ready without a processor {figures['queued']:.1%} of the time, blocked in cycles "
+        f"{figures['blocked']:.1%}; cycles {1e3 * figures['closest_s']:.1f} ms apart at least",
         f"overruns {figures['overruns']}; taken by the host {figures['stolen_s']:.1f} s, as much as makes a "
         f"slot lost in {figures['slots_stolen_from']} slots",
         f"processor time until READY {figures['processor_until_ready_s']:.2f} s",

@@ -7,6 +7,7 @@ the watched ones would hold if they were alone.
 
 from __future__ import annotations
 
+import math
 import os
 import subprocess
 import sys
@@ -26,13 +27,15 @@ _TICKS = os.sysconf("SC_CLK_TCK")
 class Look:
     """One look: monotonic time in s; by name, processor seconds since start and proportional set in bytes.
 
-    `own` is the part of that which is no file's: other processes that come and go do not change it.
+    `own` is the part of that which is no file's: other processes that come and go do not change it. `turns`
+    is of each main thread since its start: on a processor, and ready but waiting for one, s.
     """
 
     time: float
     processor: dict[str, float]
     memory: dict[str, float]
     own: dict[str, float]
+    turns: dict[str, tuple[float, float]]
 
 
 class ProcessWatch:
@@ -68,6 +71,7 @@ def look(processes: Mapping[str, int]) -> Look:
         {name: _processor(process) for name, process in processes.items()},
         {name: parts["Pss:"] for name, parts in sets.items()},
         {name: parts["Pss:"] - parts["Pss_File:"] for name, parts in sets.items()},
+        {name: _turns(process) for name, process in processes.items()},
     )
 
 
@@ -140,6 +144,15 @@ def _processor(process: int) -> float:
     # The name, in brackets, may hold anything; user and system time are words 14 and 15 of all (proc(5)).
     words = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
     return (int(words[11]) + int(words[12])) / _TICKS
+
+
+def _turns(process: int) -> tuple[float, float]:
+    """Return how long the main thread was on a processor, and waited for one, s; NaN where not counted."""
+    try:
+        words = Path(f"/proc/{process}/task/{process}/schedstat").read_text().split()
+    except FileNotFoundError:  # a kernel that does not count it
+        return math.nan, math.nan
+    return 1e-9 * int(words[0]), 1e-9 * int(words[1])
 
 
 def _proportional(process: int) -> dict[str, float]:

@@ -23,11 +23,12 @@ def test_a_tumbling_knightcube_stops_and_the_table_says_when(tmp_path: Path) -> 
 
 
 def test_the_magnetometer_alone_knows_the_rate_that_the_coils_brake() -> None:
-    wanted = {**CASE, "law": "magnetometer", "speed": 0.1, "longest": 40.0, "spikes": 0.05}
+    """What lies along the field is first spun up across it; some samples are spiked."""
+    wanted = {**CASE, "law": "magnetometer", "speed": 0.1, "longest": 240.0, "spikes": 0.05}
     result = detumble.run(Case("m", (20_261_123, 1), wanted))
-    assert result["lost"], "40 s are too short"
+    assert not result["lost"]
     assert result["square"] > 0.0
-    assert result["rate"] < 0.25, "what lies along the field is first spun up across it"
+    assert result["fastest_deg"] < 30.0
 
 
 def test_a_body_that_did_not_stop_is_counted_as_lost(tmp_path: Path) -> None:

@@ -1,12 +1,16 @@
 """The momentum plan: the dipole that stops a body in the least time, with the field predicted ahead.
 
 In inertial axes the angular momentum obeys h' = m x B: the body's inertia and attitude do not enter. By
-Pontryagin's principle the dipole of least time has its limit's length and the direction of -B x y with one
-constant vector y; with a smooth limit it is m = -B x y, cut at the limit. Over a horizon it removes W y, W
-the integral of the weighted B^2 I - B B^T, where the weight of an instant is the share of -B x y that the
-limit lets pass. Weight and y follow from each other by iteration; the horizon is the shortest whose plan
-removes h. A field that keeps its direction cannot remove the momentum along itself: the plan then waits for
-the field to turn, and uses how it turns.
+Pontryagin's principle the dipole of least time has its limit's length L and the direction of -B x y with one
+constant vector y. A time T suffices for all but a rest r of the momentum exactly where, for every y,
+
+    h . y <= L integral of |B x y| over T + r |y|,
+
+so T is the least time at which the worst y meets it, and that y is the plan. The worst y has A(y) y along h,
+A the integral of L (B^2 I - B B^T) / |B x y| plus r / |y|, and is found by iterating that: least squares,
+reweighted. A field that keeps its direction cannot remove the momentum along itself: the plan then makes
+momentum across it, which the field's turn carries along. Without a rest the last of what lies along a field
+that hardly turns would take all of the time.
 """
 
 from __future__ import annotations
@@ -21,55 +25,58 @@ from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.directions import cross_product
 
 ITERATIONS = 12
-MISSING = 0.04
-"""A plan may leave this share of the momentum: it is made again long before its end."""
 LIMIT_GAIN = 1.4
 """Mean reach of three coils over the limit of one, in a body that turns; were all saturated, 1.5."""
-STEEP = 4.0
-"""Raises the dipole of a long plan before it is cut: the least time takes coils at their limits."""
-FINENESS = 30
-"""The horizon is found within a thirtieth."""
+STEEP = 12.0
+"""Times the mean of |B x y| at which a coil is at its limit: least time takes all at theirs, but noise in B
+would switch them where B x y is small."""
+FLAT = 0.02
+"""Of the largest |B x y|, what the smaller ones count as: the weights stay finite."""
+FINENESS = 60
+"""The horizon is found within a sixtieth."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MomentumPlan:
-    """A plan: `costate` (3,) A m^2/T, inertial axes, and the `horizon`, s, at whose end the body stands.
+    """A plan: `costate` (3,) A m^2/T, inertial axes, and the `horizon`, s, at whose end the body is at rest.
 
-    `ends`: whether the horizon is the shortest there is, so that the coils need not be at their limits.
+    The dipole -B x costate has the coils' limit at a small part of its mean over the plan; zero at rest.
     """
 
     costate: FloatArray
     horizon: float
-    ends: bool = False
-
-    @property
-    def braking(self) -> FloatArray:
-        """The costate (3,) to brake by now."""
-        return self.costate if self.ends else STEEP * self.costate
 
 
-def momentum_plan(momentum: FloatArray, field: FloatArray, step: float, limit: float) -> MomentumPlan:
-    """Return the plan that removes `momentum` (3,) N m s in the least time.
+def momentum_plan(
+    momentum: FloatArray, field: FloatArray, times: FloatArray, limit: float, rest: float
+) -> MomentumPlan:
+    """Return the plan that removes `momentum` (3,) N m s but for `rest` N m s in the least time.
 
-    `field` (n, 3) T is the predicted field from now on, every `step` s, both in inertial axes; `limit` A m^2
-    is of each coil. When n steps do not suffice, the plan removes what it can and its horizon is n steps.
+    `field` (n, 3) T is the predicted field at `times` (n,) s from now on, in the momentum's inertial axes;
+    `limit` A m^2 is of each coil. When all times do not suffice, the plan removes what it can and its
+    horizon is their span.
     Raises UsageError for a field of fewer than three instants.
     """
     if len(field) < 3:
         raise UsageError(f"a momentum plan needs the field at three instants, not {len(field)}")
+    size = math.sqrt(float(momentum @ momentum))
+    if size <= rest:
+        return MomentumPlan(np.zeros(3), 0.0)
+    spans = np.diff(times, append=2.0 * times[-1] - times[-2])
     square = np.einsum("ni,ni->n", field, field)
-    effect = (square[:, None, None] * np.eye(3) - field[:, :, None] * field[:, None, :]) * step
-    reach = LIMIT_GAIN * limit
+    effect = square[:, None, None] * np.eye(3) - field[:, :, None] * field[:, None, :]
+    ahead = _Ahead(field, effect * spans[:, None, None], LIMIT_GAIN * limit, rest)
     short, long = 2, len(field)
-    costate, _ = _cut_plan(momentum, field, effect, reach)
-    while long - short > max(1, short // FINENESS):
+    costate = ahead.worst(momentum, long, momentum / size)
+    while long - short > 1 and times[long - 1] - times[short - 1] > times[short - 1] / FINENESS:
         middle = (short + long) // 2
-        found, missing = _cut_plan(momentum, field[:middle], effect[:middle], reach)
-        if missing < MISSING:
-            costate, long = found, middle
-        else:
+        found = ahead.worst(momentum, middle, costate)
+        if float(momentum @ found) > float(found @ ahead.matrix(found, middle) @ found):
             short = middle
-    return MomentumPlan(costate, long * step, long <= 3)
+        else:
+            costate, long = found, middle
+    mean = float(ahead.across(costate, long) @ spans[:long]) / float(spans[:long].sum())
+    return MomentumPlan(costate * (STEEP * limit / mean), float(times[long - 1] + spans[long - 1]))
 
 
 def braking_dipole(costate: FloatArray, field: FloatArray, limit: float) -> FloatArray:
@@ -94,8 +101,8 @@ def without_gain(dipole: FloatArray, field: FloatArray, rate: FloatArray, invers
     return left if largest <= before else left * (before / largest)
 
 
-def turning_field(field: FloatArray, change: FloatArray, step: float, instants: int) -> FloatArray:
-    """Return the field (n, 3) T, every `step` s from now on, that turns as it does now.
+def turning_field(field: FloatArray, change: FloatArray, times: FloatArray) -> FloatArray:
+    """Return the field (n, 3) T at `times` (n,) s from now on, that turns as it does now.
 
     `field` (3,) T and its `change` (3,) T/s with respect to the stars; its strength is kept.
     """
@@ -104,27 +111,53 @@ def turning_field(field: FloatArray, change: FloatArray, step: float, instants: 
     across = change - along * float(along @ change)
     speed = math.sqrt(float(across @ across)) / strength
     if speed == 0.0:
-        return np.broadcast_to(field, (instants, 3)).copy()
-    angle = (speed * step) * np.arange(instants)[:, None]
+        return np.broadcast_to(field, (len(times), 3)).copy()
+    angle = speed * times[:, None]
     return np.asarray(strength * np.cos(angle) * along + np.sin(angle) * across / speed)
 
 
-def _cut_plan(
-    momentum: FloatArray, field: FloatArray, effect: FloatArray, limit: float
-) -> tuple[FloatArray, float]:
-    """Return the costate over one horizon, and the share of the momentum that it leaves."""
-    weight = np.ones(len(field))
-    costate = np.zeros(3)
-    for _ in range(ITERATIONS):
-        costate = _solved(np.tensordot(weight, effect, 1), momentum)
-        wanted = np.cross(field, costate)
-        weight = 1.0 / np.maximum(1.0, np.sqrt(np.einsum("ni,ni->n", wanted, wanted)) / limit)
-    left = np.tensordot(weight, effect, 1) @ costate - momentum
-    size = float(momentum @ momentum)
-    return costate, math.sqrt(float(left @ left) / size) if size > 0.0 else 0.0
+def turned_to(fields: FloatArray, field: FloatArray) -> FloatArray:
+    """Return `fields` (n, 3) turned by the least angle that brings the first to where `field` (3,) points.
+
+    What is measured now is better known than what is predicted by a coarse attitude.
+    """
+    first = fields[0] / math.sqrt(float(fields[0] @ fields[0]))
+    wanted = field / math.sqrt(float(field @ field))
+    middle = first + wanted
+    square = float(middle @ middle)
+    if square < 1.0:  # by more than 120 deg: no such prediction is worth to be turned
+        return fields
+    # Two reflections: across the middle, which swaps the two, and back across `wanted`.
+    halves = 2.0 * np.outer(middle, middle) / square - np.eye(3)
+    back = 2.0 * np.outer(wanted, wanted) - np.eye(3)
+    return np.asarray(fields @ (back @ halves).T)
 
 
-def _solved(matrix: FloatArray, vector: FloatArray) -> FloatArray:
-    """Return the solution; what lies along a field that hardly turns is out of reach and stays finite."""
-    least = 1e-6 * float(np.trace(matrix))
-    return np.asarray(np.linalg.solve(matrix + least * np.eye(3), vector))
+@dataclass(frozen=True, slots=True, eq=False)
+class _Ahead:
+    """The field (n, 3) and its `effect` (n, 3, 3) on the momentum; the dipole's reach, and the rest."""
+
+    field: FloatArray
+    effect: FloatArray
+    reach: float
+    rest: float
+
+    def across(self, y: FloatArray, count: int) -> FloatArray:
+        """Return |B x y| (count,), nowhere zero."""
+        found = np.cross(self.field[:count], y)
+        across = np.sqrt(np.einsum("ni,ni->n", found, found))
+        strength = math.sqrt(float(self.field[0] @ self.field[0]))
+        return np.asarray(np.maximum(across, FLAT * max(float(across.max()), FLAT * strength)))
+
+    def matrix(self, y: FloatArray, count: int) -> FloatArray:
+        """Return A(y) (3, 3) of `count` instants and a unit vector."""
+        weight = self.reach / self.across(y, count)
+        return np.asarray(np.tensordot(weight, self.effect[:count], 1) + self.rest * np.eye(3))
+
+    def worst(self, momentum: FloatArray, count: int, guess: FloatArray) -> FloatArray:
+        """Return the unit vector (3,) whose momentum is the hardest to remove in `count` instants."""
+        y = guess
+        for _ in range(ITERATIONS):
+            found = np.linalg.solve(self.matrix(y, count), momentum)
+            y = np.asarray(found / math.sqrt(float(found @ found)))
+        return y

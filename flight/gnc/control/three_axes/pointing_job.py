@@ -98,6 +98,11 @@ class PointingJob:
         return STEADY if self.sight is None else self.sight.span
 
 
+def prepare() -> None:
+    """Import what plans slews; the worker does so before its first job."""
+    from scipy.linalg import lapack  # noqa: F401, PLC0415 - the control process names the job, and needs none
+
+
 def run(job: PointingJob) -> PointingTable:
     """Return the table, its times in s after the origin; takes a second, two from far off.
 

@@ -2,7 +2,8 @@
 
 Each interval has the state (7) and the dipole (3) of its first node, the equation of its midpoint (7), the
 midpoint's state (7) and the equation of its end (7); the start's equations stand before all, the end's after
-all. So each equation touches its neighbours only, and LAPACK factors the band.
+all. So each equation touches its neighbours only, and LAPACK factors the band. It is imported where that is
+done, as the control process names the job but does not need it.
 """
 
 from __future__ import annotations
@@ -11,7 +12,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy.linalg.lapack import dgbtrf, dgbtrs
 
 from flight.gnc.errors import PlanningError
 from flight.gnc.math.arrays import FloatArray, IntArray
@@ -96,12 +96,16 @@ class Factors:
 
     def __init__(self, band: FloatArray) -> None:
         """Factor a `band` in its place. Raises PlanningError where it is singular."""
+        from scipy.linalg.lapack import dgbtrf  # noqa: PLC0415 - see the top
+
         self._factors, self._pivots, info = dgbtrf(band, _BAND, _BAND, overwrite_ab=1)
         if info:
             raise PlanningError("the equations of a slew are singular")
 
     def solve(self, right: FloatArray) -> FloatArray:
         """Return the solution (size,) of a right side (size,). Raises PlanningError without any."""
+        from scipy.linalg.lapack import dgbtrs  # noqa: PLC0415 - see the top
+
         found, _ = dgbtrs(self._factors, _BAND, _BAND, right[:, None], self._pivots)
         if not np.isfinite(found).all():
             raise PlanningError("the equations of a slew are singular")

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline
 
 from flight.gnc.guidance.three_axes.attitude_law import References
 from flight.gnc.math.arrays import FloatArray
+from flight.gnc.math.hermite import HermiteCubic
 from flight.gnc.math.quaternion import normalise
 
 
@@ -35,19 +35,19 @@ class SlewPath:
     def references(self, times: FloatArray) -> References:
         """Return the wanted motion at times (m,) s; outside the path that of its ends, at rest from there."""
         inside = np.clip(times, 0.0, self.horizon)
-        turning = CubicHermiteSpline(self.times, self.rate, self.acceleration)
+        turning = HermiteCubic(self.times, self.rate, self.acceleration)
         spin = np.concatenate([self.rate, np.zeros((len(self.times), 1))], axis=1)
         v, s = self.quaternion[:, :3], self.quaternion[:, 3:]
         slope = np.empty_like(self.quaternion)
         slope[:, :3] = 0.5 * (np.cross(v, spin[:, :3]) + s * spin[:, :3])
         slope[:, 3] = -0.5 * np.sum(v * spin[:, :3], axis=1)
-        attitude = normalise(CubicHermiteSpline(self.times, self.quaternion, slope)(inside))
+        attitude = normalise(HermiteCubic(self.times, self.quaternion, slope)(inside))
         flying = ((times >= 0.0) & (times <= self.horizon))[:, None]
         return References(
             np.asarray(times, dtype=float),
             attitude,
             np.where(flying, turning(inside), 0.0),
-            np.where(flying, turning(inside, 1), 0.0),
+            np.where(flying, turning.derivative(inside), 0.0),
         )
 
     def dipoles(self, times: FloatArray) -> FloatArray:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline
 
 from flight.gnc.guidance.three_axes.slew_cones import Kept
 from flight.gnc.guidance.three_axes.slew_limits import Limits
 from flight.gnc.guidance.three_axes.slew_program import FIRST_BARRIER, Descent, Point, Program
 from flight.gnc.guidance.three_axes.slew_task import SlewTask
 from flight.gnc.guidance.three_axes.slew_transcription import Trajectory, Transcription
+from flight.gnc.math.hermite import HermiteCubic
 
 WALK_BARRIER, LAST_BARRIER = 1e-5, 1e-8
 """Of a path that others begin from, and of one that is flown."""
@@ -131,7 +131,7 @@ def transferred(start: Found, equations: Transcription) -> Trajectory:
     if own.count == equations.count:
         return Trajectory(at.states, dipoles)
     share = np.linspace(0.0, 1.0, 2 * own.count + 1)
-    states = CubicHermiteSpline(share, at.states, own.motion.flow(at.states, at.all_dipoles()))
+    states = HermiteCubic(share, at.states, own.motion.flow(at.states, at.all_dipoles()))
     wanted = np.linspace(0.0, 1.0, 2 * equations.count + 1)
     parts = [np.interp(wanted[::2], share[::2], part) for part in dipoles.T]
-    return Trajectory(np.asarray(states(wanted)), np.stack(parts, axis=1))
+    return Trajectory(states(wanted), np.stack(parts, axis=1))

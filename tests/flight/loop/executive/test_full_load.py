@@ -1,6 +1,7 @@
 """The bench of the executive: its conclusions from known lateness, and a few seconds of a flight.
 
-The flight's bounds allow for a shared machine; a loop that waits for its workers, or bursts, exceeds them.
+What the flight is judged by does not depend on the load of the machine: the kernel says for how long the
+control thread had no processor. Its lateness is judged only where the machine was calm.
 """
 
 from __future__ import annotations
@@ -18,16 +19,30 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from flight.app import opening
+from flight.app.composition.workers import workers
 from flight.loop.executive.jobs import Worker
 from flight.loop.executive.supervisor import ProcessRunner
+from flight.schema import reader as configuration
 from hal.buses.clock import SystemClock
-from tests.studies.bench import bare_loop, process_watch
+from tests.hal.guardian.live_flight import ROOT
+from tests.studies.bench import bare_loop, busy_jobs, process_watch
 from tests.studies.bench.executive import Load, fly
-from tests.studies.bench.executive_figures import ASKED, PERIOD_NS, SLOPE_SPAN, judged_slope, misses, table
+from tests.studies.bench.executive_figures import (
+    ASKED,
+    PERIOD_NS,
+    SLOPE_SPAN,
+    judged_slope,
+    misses,
+    table,
+    waits,
+)
 from tests.studies.bench.lateness import Grid, on_grid, robbed, slope_per_hour, stalled
-from tests.studies.bench.process_watch import MIB
+from tests.studies.bench.process_watch import MIB, Look
 
 FIRST = 1000
+CALM = 0.05
+"""Share of the time that the control thread is ready without a processor; beyond it the machine is busy."""
 _IN_TIME = np.full(12, 100_000)
 _kept: list[npt.NDArray[np.float64]] = []
 
@@ -151,6 +166,18 @@ def test_a_slope_is_given_from_minutes_on_and_not_before() -> None:
     assert np.isnan(judged_slope(seconds[:-4].tolist(), levels[:-4].tolist())).all()
 
 
+def test_a_cycle_that_waits_is_blocked_and_one_without_a_processor_is_queued() -> None:
+    """Cycles of 20 ms for 4 s, of which 2 ms are work: the rest is a worker's time, or the machine's."""
+    starts, execution = np.arange(0.0, 4.0, 0.025), np.full(160, 0.02)
+
+    def found(on: float, queued: float) -> dict[str, Any]:
+        looks = [Look(t, {}, {}, {}, {"control": (t * on, t * queued)}) for t in (0.0, 4.0)]
+        return waits(looks, starts, execution)
+
+    assert found(0.08, 0.0) == pytest.approx({"queued": 0.0, "blocked": 0.72}, abs=0.01)
+    assert found(0.08, 0.8) == pytest.approx({"queued": 0.8, "blocked": 0.0}, abs=0.01)
+
+
 def fill_and_free(_: Any) -> tuple[int, float]:
     """Allocate 48 MiB in pieces and free all but the last: the heap cannot shrink, as after a frame.
 
@@ -179,23 +206,67 @@ def test_a_worker_gives_back_what_a_job_took_once_its_result_is_sent() -> None:
     assert rest <= held - 40 * MIB
 
 
+runs: list[Any] = []
+
+
+def run(job: Any) -> int:
+    """Note a job: this module stands for a worker's."""
+    runs.append(job)
+    time.sleep(0.001)
+    return len(runs)
+
+
+def test_a_busy_worker_does_its_last_job_again_until_the_next_one_comes() -> None:
+    runs.clear()
+    again = busy_jobs.Again()
+    assert again(__name__, "first") == 1
+    deadline = time.monotonic() + 20.0
+    while runs.count("first") < 3 and time.monotonic() < deadline:
+        time.sleep(0.005)
+    again(__name__, "second")
+    while runs[-1] != "second" and time.monotonic() < deadline:
+        time.sleep(0.005)
+    begun = runs.index("second")
+    while runs.count("second") < 3 and time.monotonic() < deadline:
+        time.sleep(0.005)
+    again.rest()
+    assert begun >= 3
+    assert set(runs[begun:]) == {"second"}
+    assert runs.count("second") >= 3
+
+
+@pytest.mark.parametrize("name", ["orbit.yaml", "step_demo.yaml"])
+def test_every_worker_of_a_flight_is_kept_busy(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("flight.app.opening.workers", workers)  # restores it at the end
+    busy_jobs.keep_busy()
+    config = configuration.load(ROOT / "config" / name)
+    made, plain = opening.workers(config), workers(config)  # type: ignore[attr-defined]  # one of its imports
+    assert [worker.name for worker in made] == [worker.name for worker in plain]
+    assert len(made) >= 2
+    for busy, worker in zip(made, plain, strict=True):
+        assert busy.function is busy_jobs.BUSY[worker.function.__module__]
+
+
 @pytest.mark.slow
 def test_four_seconds_of_flight_keep_the_grid_with_planner_and_vision_at_work(tmp_path: Path) -> None:
     flown = fly(tmp_path, Load(4.0, camera_period=1.0, replan_period=0.25, warm_up=0.0), fifo=False)
     figures = flown.figures
-    assert figures["slots"] == pytest.approx(160, abs=30)
-    # Counted by the loop and computed from its times; only the first includes slots after the last cycle.
-    assert figures["slips"] == pytest.approx(figures["lost"], abs=12)
-    # A loop that waits for its workers loses most slots; a loop on a shared machine, some.
-    assert figures["lost_beyond_machine"] < 0.4 * figures["slots"]
-    assert figures["lateness_s"]["p50"] < 0.5e-9 * PERIOD_NS
-    assert figures["execution_s"]["p50"] < 1e-9 * PERIOD_NS
-    assert figures["jobs"]["planner"]["done"] >= 3
+    assert figures["slots"] >= 130
+    assert figures["slips"] == pytest.approx(figures["slips_computed"], abs=1)
+    # A late cycle is never followed by a burst, and none waits for a worker, however busy the machine is.
+    assert figures["closest_s"] >= 0.499e-9 * PERIOD_NS
+    assert figures["blocked"] < 0.1
     assert figures["processor_control"] < 0.8
     assert {"control", "guardian", "planner", "vision"} == figures["memory_mib"].keys()
     assert 40.0 < figures["memory_median_mib"] < 300.0
     assert figures["memory_alone_max_mib"] >= figures["memory_max_mib"]
-    assert 0.0 < figures["ready_s"] < figures["first_command_s"] < 30.0
+    assert 0.0 < figures["ready_s"] < figures["first_command_s"]
+    if figures["queued"] < CALM:
+        assert figures["jobs"]["planner"]["done"] >= 3
+        assert figures["lost_beyond_machine"] < 0.4 * figures["slots"]
+        assert figures["lateness_s"]["p50"] < 0.5e-9 * PERIOD_NS
+        assert figures["execution_s"]["p50"] < 1e-9 * PERIOD_NS
+        assert figures["first_command_s"] < 30.0
     # The same flight with half a core more, and with one more lost cycle, would fail.
     assert "processor_control" in misses(figures | {"processor_control": 0.36})
     assert "lost_beyond_machine" in misses(figures | {"lost_beyond_machine": 1})

@@ -11,6 +11,7 @@ import pytest
 _LIGHT = """
 import sys
 import flight.app.flight, flight.app.cli.run, flight.link.commands.channel
+import flight.bodies.orbit.body, flight.bodies.testbed.body
 import sim_hal.faults.host, sim_hal.serving.remote
 sys.stdout.write(" ".join(sorted(name for name in sys.modules if name.partition(".")[0] == "scipy")))
 """
@@ -20,6 +21,16 @@ from flight.gnc.vision import frame_job
 before = "flight.gnc.vision.streaks.maximum_likelihood.estimate" in sys.modules
 frame_job.prepare()
 sys.stdout.write(f"{before} {'flight.gnc.vision.streaks.maximum_likelihood.estimate' in sys.modules}")
+"""
+_WORKERS = """
+import sys
+from flight.loop.executive.memory import lean_numpy
+if sys.argv[1] == "lean":
+    lean_numpy()
+import numpy as np, scipy.ndimage, scipy.linalg, scipy.sparse.csgraph, scipy.special
+held = [name for name in ("numpy.f2py", "numpy.ma", "numpy.testing") if name in sys.modules]
+assert scipy.ndimage.label(np.ones(3))[1] == 1 and np.ma.ones(3).sum() == 3.0
+sys.stdout.write(" ".join(held))
 """
 _FRAMES = """
 import gc, sys
@@ -76,8 +87,13 @@ def _said(code: str, *words: str) -> str:
     return done.stdout
 
 
-def test_the_control_process_names_the_vision_job_without_scipy() -> None:
+def test_the_control_process_names_the_workers_jobs_without_scipy() -> None:
     assert _said(_LIGHT) == ""
+
+
+def test_a_worker_leaves_out_the_parts_of_numpy_that_scipy_would_import() -> None:
+    assert "numpy.f2py" in _said(_WORKERS, "as it comes")
+    assert _said(_WORKERS, "lean") == ""
 
 
 def test_a_worker_holds_the_estimators_before_its_first_job() -> None:

@@ -7,26 +7,27 @@ import pytest
 
 from flight.gnc.control.three_axes.momentum import (
     LIMIT_GAIN,
-    MISSING,
     braking_dipole,
     momentum_plan,
+    turned_to,
     turning_field,
     without_gain,
 )
 from flight.gnc.errors import UsageError
 from flight.gnc.math.arrays import FloatArray
 
-STEP, LIMIT = 5.0, 0.1
-FIELD = turning_field(np.array([0.0, 0.0, 4e-5]), np.array([4e-5 * 0.0022, 0.0, 0.0]), STEP, 400)
+STEP, LIMIT, REST = 5.0, 0.1, 1e-5
+TIMES = np.arange(0.0, 400.0 * STEP, STEP)
+FIELD = turning_field(np.array([0.0, 0.0, 4e-5]), np.array([4e-5 * 0.0022, 0.0, 0.0]), TIMES)
 """T: it turns by two turns in 95 min, as in a polar orbit."""
 
 
-def left(momentum: FloatArray, field: FloatArray, costate: FloatArray, horizon: float) -> float:
-    """Return the share of the momentum that is left when the dipole's length is cut at the plan's limit."""
+def left(momentum: FloatArray, costate: FloatArray, horizon: float) -> float:
+    """Return the share of the momentum that is left by a dipole of the limit's length along the plan."""
     now = momentum.copy()
-    for there in field[: round(horizon / STEP)]:
+    for there in FIELD[: round(horizon / STEP)]:
         dipole = -np.cross(there, costate)
-        dipole *= min(1.0, LIMIT_GAIN * LIMIT / float(np.linalg.norm(dipole)))
+        dipole *= LIMIT_GAIN * LIMIT / max(float(np.linalg.norm(dipole)), 1e-2 * LIMIT)
         now += STEP * np.cross(dipole, there)
     return float(np.linalg.norm(now) / np.linalg.norm(momentum))
 
@@ -50,20 +51,40 @@ def test_the_plan_removes_the_momentum_in_nearly_the_least_time(
     direction: tuple[float, float, float],
 ) -> None:
     momentum = 1e-3 * np.array(direction)
-    plan = momentum_plan(momentum, FIELD, STEP, LIMIT)
-    assert left(momentum, FIELD, plan.costate, plan.horizon) < 0.06
+    plan = momentum_plan(momentum, FIELD, TIMES, LIMIT, REST)
+    assert left(momentum, plan.costate, plan.horizon) < 0.06
     least = least_time(momentum, FIELD)
-    assert (1.0 - MISSING) * least - STEP <= plan.horizon < 1.25 * least + 2.0 * STEP
+    assert 0.98 * least - STEP <= plan.horizon < 1.02 * least + STEP
 
 
 def test_momentum_along_the_field_waits_for_the_field_to_turn() -> None:
-    along = momentum_plan(np.array([0.0, 0.0, 1e-3]), FIELD, STEP, LIMIT)
-    across = momentum_plan(np.array([1e-3, 0.0, 0.0]), FIELD, STEP, LIMIT)
+    along = momentum_plan(np.array([0.0, 0.0, 1e-3]), FIELD, TIMES, LIMIT, REST)
+    across = momentum_plan(np.array([1e-3, 0.0, 0.0]), FIELD, TIMES, LIMIT, REST)
     assert along.horizon > 1.2 * across.horizon
     still = np.broadcast_to(FIELD[0], FIELD.shape)
-    stuck = momentum_plan(np.array([0.0, 0.0, 1e-3]), still, STEP, LIMIT)
+    stuck = momentum_plan(np.array([0.0, 0.0, 1e-3]), still, TIMES, LIMIT, REST)
     assert stuck.horizon == STEP * len(FIELD)
     assert np.all(np.isfinite(stuck.costate))
+
+
+def test_what_the_rest_allows_is_not_waited_for() -> None:
+    """A tenth of the momentum lies along the field, which takes longer to turn than the others to stop."""
+    momentum = np.array([1e-4, 0.0, 1e-5])
+    exact, allowed = (momentum_plan(momentum, FIELD, TIMES, LIMIT, rest) for rest in (1e-7, 1.2e-5))
+    assert allowed.horizon < 0.6 * exact.horizon
+
+
+def test_the_field_ahead_begins_as_it_is_measured() -> None:
+    rng = np.random.default_rng(5)
+    for _ in range(20):
+        ahead = rng.standard_normal((9, 3))
+        field = ahead[0] + 0.5 * rng.standard_normal(3)
+        turned = turned_to(ahead, field)
+        np.testing.assert_allclose(turned @ turned.T, ahead @ ahead.T, atol=1e-12)  # a rotation
+        assert np.linalg.det(turned[1:4]) == pytest.approx(np.linalg.det(ahead[1:4]))
+        if ahead[0] @ field > 0.0:
+            along = field / np.linalg.norm(field) * np.linalg.norm(ahead[0])
+            np.testing.assert_allclose(turned[0], along, atol=1e-12)
 
 
 def test_the_dipole_never_adds_energy_to_what_the_plan_brakes_and_keeps_each_limit() -> None:
@@ -77,17 +98,19 @@ def test_the_dipole_never_adds_energy_to_what_the_plan_brakes_and_keeps_each_lim
 
 def test_the_field_turned_ahead_keeps_its_strength_and_begins_with_its_change() -> None:
     field, change = np.array([1e-5, -2e-5, 3e-5]), np.array([3e-8, 2e-8, 5e-8])
-    ahead = turning_field(field, change, 1.0, 50)
+    ahead = turning_field(field, change, np.arange(50.0))
     np.testing.assert_allclose(np.linalg.norm(ahead, axis=1), np.linalg.norm(field), rtol=1e-12)
     across = change - field * float(field @ change) / float(field @ field)
     np.testing.assert_allclose(ahead[1] - ahead[0], across, rtol=0.01, atol=1e-10)
-    np.testing.assert_array_equal(turning_field(field, np.zeros(3), 1.0, 3), np.tile(field, (3, 1)))
+    np.testing.assert_array_equal(turning_field(field, np.zeros(3), np.arange(3.0)), np.tile(field, (3, 1)))
 
 
 def test_a_field_of_two_instants_is_refused_and_no_momentum_needs_no_dipole() -> None:
     with pytest.raises(UsageError, match="three instants"):
-        momentum_plan(np.ones(3), FIELD[:2], STEP, LIMIT)
-    np.testing.assert_array_equal(momentum_plan(np.zeros(3), FIELD, STEP, LIMIT).costate, np.zeros(3))
+        momentum_plan(np.ones(3), FIELD[:2], TIMES[:2], LIMIT, REST)
+    rest = momentum_plan(np.zeros(3), FIELD, TIMES, LIMIT, REST)
+    assert not rest.costate.any()
+    assert rest.horizon == 0.0
 
 
 def test_without_gain_no_torque_makes_the_body_faster_and_what_brakes_it_stays() -> None:
