@@ -93,9 +93,6 @@ class CoilResponse:
         self._commands: deque[tuple[int, tuple[float, ...]]] = deque([(0, (0.0, 0.0, 0.0))])
         self._known_ns = 0
         self._last_ns = 0
-        self._wrong_for = [0, 0, 0]
-        self._sound_for = [0, 0, 0]
-        self._feeble_for = [0, 0, 0]
         self.gain: FloatArray = np.ones(3)
         self.sigma: FloatArray = np.full(3, np.inf)
         self.reset()
