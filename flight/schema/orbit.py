@@ -52,8 +52,8 @@ class OrbitEstimation(Estimation, frozen=True, kw_only=True):
     """The filter of a satellite in orbit (`flight.gnc.estimation.free_filter`).
 
     `bias_walk` rad/s per sqrt(s), of the gyro's bias; `field_noise` T of an axis of a sample of the
-    magnetometer; `field_error` T of an axis of the field's model. `torque_start` N m, of each shape of the
-    torques of drag, sunlight and what is constant, before any is learned; `torque_walk` N m per sqrt(s). Of a
+    magnetometer; `field_error` T of an axis of the field's model. `torque_start` N m, of
+    drag at 500 km, twice that of sunlight, before any is learned; `torque_walk` N m per sqrt(s). Of a
     light craft they are smaller: what is taken for a torque along the field is planned for an hour ahead.
     Since the last boot the gyro's bias may have `changed` by 10 deg/h, the dipole by a twentieth.
     """

@@ -1,14 +1,13 @@
-"""A slew in the loop: handed over to pointing without a jump, and broken off where the body leaves its path."""
+"""A slew in the loop: handed over to pointing without a jump; a body that leaves its path is held still."""
 
 from __future__ import annotations
 
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from flight.gnc.control.three_axes import astray
-from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import angle_between, from_rotation_vector, multiply
 from flight.link.modes import Mode
 from flight.link.telemetry.packets import to_text
@@ -70,11 +69,11 @@ def at(run: Run, name: str) -> list[float]:
     return [float(event["time_ns"]) * 1e-9 for event in run["event"] if to_text(event["name"]) == name]
 
 
-def part(run: Run, since: float, until: float) -> FloatArray:
+def part(run: Run, since: float, until: float) -> Any:
     """Return the attitude packets of an interval."""
     packets = run["attitude"]
     times = packets["time_ns"] * 1e-9
-    return np.asarray(packets[(times >= since) & (times < until)])
+    return packets[(times >= since) & (times < until)]
 
 
 def test_a_slew_is_handed_over_to_pointing_without_a_jump(slewed: Run) -> None:
