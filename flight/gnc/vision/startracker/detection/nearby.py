@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from flight.gnc.math.arrays import BoolArray, FloatArray, Image, IntArray
@@ -52,9 +50,8 @@ def measure_near(
     half = int(np.ceil(settings.search_radius)) + _RIM
     whole = np.zeros(len(asked))
     # Saturated pixels are light too in the search for the peak.
-    windows = cut(pixels, np.rint(predicted[asked]).astype(np.int64), half, whole, whole, np.inf)
-    if trail is not None:
-        windows = replace(windows, trail=trail[asked])
+    path = None if trail is None else trail[asked]
+    windows = cut(pixels, np.rint(predicted[asked]).astype(np.int64), half, whole, whole, np.inf, path)
     targets, number = _peaks_near(pixels, windows, predicted[asked], ceiling, settings)
     if not len(targets):
         return Detections.none(settings.psf_sigma or np.nan)
