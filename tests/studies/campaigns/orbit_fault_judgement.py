@@ -182,19 +182,22 @@ def _is_string_lit(flown: Run, at: float, end: float) -> bool:
 def works(flown: Run, mode: str) -> bool:
     """Return whether at the flight's end the body does what its mode is for.
 
-    It brakes, and where the spin packet tells knows its rate; or it is fine and, where it points, steers.
+    It brakes, and where the spin packet tells knows its rate, or is slow; or it is fine and, where it points,
+    steers.
     """
     truth, known = flown["truth"], flown["navigation"]["knowledge"]
     last = seconds(truth) > DURATION - LAST
     acts = bool((np.abs(truth["current"][last]) > ACTS).any())
     if mode == "safe":
         return acts
+    now = Mode(int(flown["mode"]["mode"][-1])) if len(flown["mode"]) else Mode.DETUMBLE
     if mode == "detumble":
-        return acts and _rate_off(flown) < RATE_OFF
+        slow = float(np.linalg.norm(truth["rate"][-1])) < RATE_OFF
+        return slow if now is not Mode.DETUMBLE else acts and _rate_off(flown) < RATE_OFF
     fine = bool(known[-1] == FINE)
     if mode == "acquire":
         return fine
-    return fine and acts and Mode(int(flown["mode"]["mode"][-1])) in POINTING
+    return fine and acts and now in POINTING
 
 
 def _rate_off(flown: Run) -> float:
