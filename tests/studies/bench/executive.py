@@ -197,7 +197,7 @@ def full_load(load: Load) -> str:
         tree["pointing"]["replan_period"] = SHORTEST_REPLAN
         tree["targets"] = [{"at": 0.0, "point": "nadir", "roll_deg": 0.0}]
         tree["simulation"]["free_body"]["release"] = AT_NADIR
-        # They are of the simulated day, the host's clock is of today: the receiver alone gives time and place.
+        # Of the simulated day, where the clock is the host's: the receiver alone gives time and place.
         del tree["elements"]
         return yaml.safe_dump(tree, sort_keys=False)
     tree = yaml.safe_load(TEXT)
