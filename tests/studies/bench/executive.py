@@ -197,6 +197,8 @@ def full_load(load: Load) -> str:
         tree["pointing"]["replan_period"] = SHORTEST_REPLAN
         tree["targets"] = [{"at": 0.0, "point": "nadir", "roll_deg": 0.0}]
         tree["simulation"]["free_body"]["release"] = AT_NADIR
+        # Of the simulated day, where the clock is the host's: the receiver alone gives time and place.
+        del tree["elements"]
         return yaml.safe_dump(tree, sort_keys=False)
     tree = yaml.safe_load(TEXT)
     tree["camera"] |= {"period": period, "exposure": min(tree["camera"]["exposure"], 0.75 * period)}

@@ -156,7 +156,7 @@ class FieldDetumbler:
             if rate is not None and self._agreed >= TRUSTED:
                 self._filter.measure_rate(rate)
             if not self._bounded:
-                self._bounded = self._agreed >= TRUSTED and self._sigma_across() < BOUNDED
+                self._bounded = self._agreed >= TRUSTED and _sigma_across(self._filter) < BOUNDED
         if self._filter.restarts != starts or (not accepted and not self.trusted):
             self._distrust()
 
@@ -206,13 +206,6 @@ class FieldDetumbler:
         """How often samples contradicted the filter until it began again: a spin beyond the sampling does."""
         return self._filter.restarts
 
-    def _sigma_across(self) -> float:
-        """Return the standard deviation of the rate across the field, the worst direction, rad/s."""
-        field = self._filter.field
-        across = np.eye(3) - np.outer(field, field) / float(field @ field)
-        spread = across @ self._filter.covariance[RATE, RATE] @ across
-        return math.sqrt(float(np.linalg.eigvalsh(spread)[-1]))
-
     def _distrust(self) -> None:
         """Let the coils wait until samples agree."""
         self._agreed, self._bounded = 0, False
@@ -255,3 +248,11 @@ class FieldDetumbler:
             ahead = turned_to(expected, found.field)
         share = self._schedule.act_ns / self._schedule.period_ns
         return momentum_plan(found.momentum, ahead, times, share * self._braking.limit, self._rest)
+
+
+def _sigma_across(found: FieldRate) -> float:
+    """Return the standard deviation of the rate across the field, in the worst direction, rad/s."""
+    field = found.field
+    across = np.eye(3) - np.outer(field, field) / float(field @ field)
+    spread = across @ found.covariance[RATE, RATE] @ across
+    return math.sqrt(float(np.linalg.eigvalsh(spread)[-1]))

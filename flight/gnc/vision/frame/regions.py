@@ -58,8 +58,8 @@ def _joined(one: IntArray, other: IntArray, count: int) -> tuple[IntArray, int]:
     """Return the number (count,) of the group of each of `count` items, and how many groups there are.
 
     Pairs (m,) join them; groups are numbered in the order of their first items. Each item points to a smaller
-    one of its group, by shorter and shorter ways (Shiloach and Vishkin 1982). For this alone scipy.sparse would
-    take 12 MiB of the vision worker.
+    one of its group, by shorter and shorter ways (Shiloach and Vishkin 1982). For this alone scipy.sparse
+    would take 12 MiB of the vision worker.
     """
     root = np.arange(count)
     while True:

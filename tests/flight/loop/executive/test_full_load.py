@@ -9,6 +9,7 @@ from __future__ import annotations
 import ctypes
 import mmap
 import os
+import sys
 import time
 from array import array
 from contextlib import closing
@@ -204,6 +205,23 @@ def test_a_worker_gives_back_what_a_job_took_once_its_result_is_sent() -> None:
             time.sleep(0.01)
             rest = process_watch.look({"filler": process}).memory["filler"]
     assert rest <= held - 40 * MIB
+
+
+def heavy_parts(_: Any) -> list[str]:
+    """Import scipy and return which parts of numpy it brought that no job uses."""
+    import scipy.linalg  # noqa: F401, PLC0415 - in the worker's process
+
+    return [name for name in ("numpy.f2py", "numpy.ma", "numpy.testing") if name in sys.modules]
+
+
+def test_a_worker_holds_no_parts_of_numpy_that_no_job_uses() -> None:
+    with closing(ProcessRunner(SystemClock(), [Worker("lean", heavy_parts, 0, 20_000_000_000)])) as runner:
+        deadline = time.monotonic() + 20.0
+        assert runner.submit("lean", None)
+        while not (results := runner.collect()) and time.monotonic() < deadline:
+            time.sleep(0.005)
+    assert results[0].value is not None
+    assert list(results[0].value) == []
 
 
 runs: list[Any] = []
