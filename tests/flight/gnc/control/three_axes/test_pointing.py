@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -153,3 +155,20 @@ def test_uneven_times_and_a_path_without_preview_are_refused() -> None:
 def test_a_body_that_no_step_can_follow_is_refused_and_gives_no_path_that_is_not_finite() -> None:
     with pytest.raises(PlanningError, match="too much in a step"):
         table_from(np.zeros(3), np.array([0.5, 0.4, 0.0]), 30, until=1_000.0)
+
+
+def test_a_path_is_flown_up_to_where_it_turns_too_fast_unless_that_is_soon() -> None:
+    table = table_from(np.zeros(3), np.zeros(3), 30)
+    limit = 2.0 * table.fastest
+    assert table.below(limit) is table
+
+    def with_spike(place: int) -> PointingTable | None:
+        rate = table.path.rate.copy()
+        rate[place] = [limit, 0.0, 0.0]
+        return replace(table, path=replace(table.path, rate=rate)).below(limit)
+
+    at_the_end = with_spike(30)
+    assert at_the_end is not None
+    assert (len(at_the_end.dipole), len(at_the_end.path.times)) == (29, 30)
+    assert at_the_end.fastest < limit
+    assert with_spike(5) is None
