@@ -158,10 +158,11 @@ class OrbitFilter:
         """Start from an attitude; return False where no step was taken at its time.
 
         `doubted`: the estimate was contradicted, so what it claims to have learned is not that well known.
+        An attitude that is no number starts nothing.
         """
         self._close()
         place = self._replay.place(attitude.time_ns)
-        if place is None:
+        if place is None or not np.isfinite([*attitude.quaternion, *attitude.covariance.flat]).all():
             return False
         self.restarts += self._free.started
         self._replay.start(attitude, place, doubted)

@@ -159,6 +159,16 @@ def test_after_some_attitudes_that_contradict_it_the_filter_begins_again() -> No
     assert flown.error() == pytest.approx(0.1, abs=5e-3)
 
 
+def test_attitudes_that_are_no_numbers_never_begin_it_again() -> None:
+    """As a vision worker that fails may send them: the control task then failed for good."""
+    flown = acquired()
+    for _ in range(2 * REFUSALS_TO_RESTART):
+        flown.fly(2.0)
+        assert not flown.see(10 * PERIOD_NS, np.full(3, np.nan))
+    assert flown.filter.restarts == 0
+    assert flown.error() < 1e-3
+
+
 def test_a_rate_from_streaks_is_used() -> None:
     flown = acquired()
     flown.fly(1.0)
