@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from flight.bodies.orbit.field_doubt import FieldDoubt
 from flight.bodies.orbit.filter import OrbitFilter
 from flight.bodies.orbit.surroundings import Surroundings
 from flight.gnc.control.three_axes.field_detumbler import FieldDetumbler
@@ -22,18 +23,23 @@ class FieldBrake:
         """Take n A of each coil, m^2."""
         self.detumbler = detumbler
         self._dipole_per_ampere = dipole_per_ampere
+        self._doubt = FieldDoubt()
 
     def begin(self, now_ns: int) -> None:
         """Begin with no knowledge of the field."""
         self.detumbler.begin(now_ns)
 
     def sample(self, time_ns: int, field: FloatArray, rate: FloatArray) -> None:
-        """Accept a field (3,) T and the gyro's rate (3,) rad/s measured at `time_ns`."""
-        self.detumbler.sample(time_ns, field, rate)
+        """Accept a field (3,) T and the gyro's rate (3,) rad/s measured at `time_ns`; none that is stuck."""
+        if self._doubt.sees(field):
+            self.detumbler.sample(time_ns, field, rate)
 
     def command(self, now_ns: int) -> CoilCommand:
-        """Return the command now."""
+        """Return the command now: zero where the magnetometer is stuck."""
         dipole = self.detumbler.dipole(now_ns)
+        if self._doubt.stuck:
+            dipole = np.zeros(3)
+            self.detumbler.acts(dipole)
         return CoilCommand(dipole, dipole / self._dipole_per_ampere)
 
     def sent(self, currents: FloatArray) -> None:

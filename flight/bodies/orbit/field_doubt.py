@@ -15,14 +15,19 @@ class FieldDoubt:
         self._last: list[float] = []
         self._same = 0
 
+    @property
+    def stuck(self) -> bool:
+        """Whether the field has been the same for `STUCK` readings."""
+        return self._same >= STUCK
+
     def sees(self, field: FloatArray) -> bool:
         """Take the field (3,) of a reading; return whether it may be used: it is not stuck."""
         values = field.tolist()
         self._same, self._last = (self._same + 1 if values == self._last else 0), values
-        return self._same < STUCK
+        return not self.stuck
 
     def text(self, refused: int) -> str:
         """Return why the magnetometer is not believed, empty while it is; `refused` fields in a row were."""
-        if self._same >= STUCK:
+        if self.stuck:
             return "the magnetometer gives the same field in every reading"
         return f"{refused} fields in a row contradict the estimate" if refused >= CONTRADICTED else ""

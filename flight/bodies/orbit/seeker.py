@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import numpy as np
+
+from flight.bodies.orbit.field_doubt import FieldDoubt
 from flight.gnc.control.three_axes.sun_seeker import SunSeeker
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.vision.sun_sensor.strings import SolarStrings, coarse_sun
@@ -20,6 +23,7 @@ class StringSeeker:
         """Take n A of each coil, m^2."""
         self._seeker, self._strings = seeker, strings
         self._dipole_per_ampere = dipole_per_ampere
+        self._doubt = FieldDoubt()
         self._events = log
         self._found: bool | None = None
         self._reason = "the strings give no readings"
@@ -36,11 +40,12 @@ class StringSeeker:
             self._seeker.see(reading.time_ns, found.direction)
 
     def sample(self, time_ns: int, field: FloatArray, rate: FloatArray) -> None:
-        """Accept a field (3,) T and the gyro's rate (3,) rad/s measured at `time_ns`."""
-        self._seeker.sample(time_ns, field, rate)
+        """Accept a field (3,) T and the gyro's rate (3,) rad/s measured at `time_ns`; none that is stuck."""
+        if self._doubt.sees(field):
+            self._seeker.sample(time_ns, field, rate)
 
     def command(self, now_ns: int) -> CoilCommand:
-        """Return the command now; without a Sun it only holds the body still."""
+        """Return the command now; without a Sun it only holds the body still, by a stuck field nothing."""
         found = self._seeker.sun is not None
         if found is not self._found:
             self._found = found
@@ -49,6 +54,9 @@ class StringSeeker:
             else:
                 self._events.report(events.SUN_MISSED, now_ns, self._reason)
         dipole = self._seeker.dipole(now_ns)
+        if self._doubt.stuck:
+            dipole = np.zeros(3)
+            self._seeker.acts(dipole)
         return CoilCommand(dipole, dipole / self._dipole_per_ampere)
 
     def sent(self, currents: FloatArray) -> None:

@@ -34,14 +34,14 @@ class Seen:
     def _tell(self, kind: EventKind, _time_ns: int, _held: int, text: str) -> None:
         self.told.append((kind.name, text))
 
-    def fly(self, begin: int, end: int, currents: FloatArray | None) -> bool:
+    def fly(self, begin: int, end: int, currents: FloatArray | None, noise: float = 1e-9) -> bool:
         """Let seconds pass with readings of the strings; return whether the coils acted in the last."""
         acted = False
         for tenth in range(10 * begin + 1, 10 * end):
             now_ns = tenth * SECOND_NS // 10
             if currents is not None and tenth % 10 == 0:
                 self.seeker.see(StringReading(now_ns, currents))
-            self.seeker.sample(now_ns, FIELD, np.zeros(3))
+            self.seeker.sample(now_ns, FIELD + noise * (tenth % 2), np.zeros(3))
             command = self.seeker.command(now_ns)
             acted = (acted and tenth < 10 * end - 20) or bool(command.currents.any())
             np.testing.assert_allclose(command.currents * 0.648, command.dipole)
@@ -53,6 +53,13 @@ def test_it_says_that_the_sun_is_found_and_turns_to_it() -> None:
     assert seen.fly(0, 6, np.maximum(np.concatenate([SUN, -SUN]), 0.0))
     assert [name for name, _ in seen.told] == ["sun-missed", "sun-found"]
     assert seen.told[0][1] == "the strings give no readings"
+
+
+def test_by_a_field_that_is_stuck_it_does_nothing_until_the_field_lives_again() -> None:
+    seen, lit = Seen(), np.maximum(np.concatenate([SUN, -SUN]), 0.0)
+    assert seen.fly(0, 6, lit)
+    assert not seen.fly(6, 12, lit, noise=0.0)
+    assert seen.fly(12, 18, lit)
 
 
 def test_in_the_dark_it_says_why_and_no_current_flows_in_a_body_that_does_not_turn() -> None:
