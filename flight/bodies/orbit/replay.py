@@ -22,6 +22,8 @@ from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import attitude_matrix, conjugate, from_rotation_vector, multiply
 from hal.interfaces.wires import SECOND_NS
 
+FORGOTTEN_NS = 10_000_000_000
+"""After this time without a gyro that contradicts the commanded dipoles these are tried again."""
 _LONGEST = 2.0
 _EYE: FloatArray = np.eye(3)
 
@@ -59,7 +61,8 @@ class StepReplay:
     Attributes:
         free: the estimate at the end of the newest step.
         refused_gyros: how many steps in a row had a gyro that contradicts the motion.
-        contradicted: how many steps with a dipole, in a row, had a gyro that contradicts it.
+        contradicted: how many steps with a dipole, in a row, had a gyro that contradicts it; forgotten after
+            `FORGOTTEN_NS`, as coils that rest on it would never show the contrary.
         refused_fields: how many fields in a row contradicted the estimate.
     """
 
@@ -70,6 +73,7 @@ class StepReplay:
         self.refused_gyros = 0
         self.refused_fields = 0
         self.contradicted = 0
+        self._refused_ns = 0
 
     def add(self, step: Step) -> None:
         """Add the newest step and forget those beyond the history; take it if there is an estimate."""
@@ -85,10 +89,11 @@ class StepReplay:
         What the coils did otherwise may have begun in the step before: its gyro shows only half of it.
         """
         steps, refused = self.steps, self.refused_gyros > 0
+        now_ns = steps[-1].end_ns
         if refused:
-            self.contradicted += 1
-        elif steps[-1].dipole.any():  # a pause between two commands says nothing of them
-            self.contradicted = 0
+            self.contradicted, self._refused_ns = self.contradicted + 1, now_ns
+        elif steps[-1].dipole.any() or now_ns - self._refused_ns >= FORGOTTEN_NS:
+            self.contradicted = 0  # a pause between two commands says nothing of them
         if refused and not steps[-1].doubt:
             first = max(len(steps) - 2, 0)
             for k in range(first, len(steps)):

@@ -60,19 +60,20 @@ class Flown:
         self.attitude, self.rate, self.time_ns = IDENTITY, SPIN, 0
         self.attitudes = {0: IDENTITY}
         self._pulses = pulses
-        self.broken = False  # no coil carries what it is told
+        self.carries = 1.0  # times what it is told: what a coil carries
+        self.rests = False  # no coil is told anything
         self.field: FloatArray | None = None  # what the magnetometer repeats
         self.magnet: FloatArray = np.zeros(3)  # T, added to the field
 
     def fly(self, seconds: float) -> None:
         """Fly on; with pulses the coils act for 0.8 s of each second."""
         for _ in range(round(seconds * SECOND_NS / PERIOD_NS)):
-            acts = self._pulses and self.time_ns % SECOND_NS >= 200_000_000
+            acts = self._pulses and not self.rests and self.time_ns % SECOND_NS >= 200_000_000
             dipole = np.array([DIPOLE if acts else 0.0, 0.0, 0.0])
             self.filter.command(self.time_ns, dipole)
             for _ in range(5):
                 shown = attitude_matrix(self.attitude) @ FIELD
-                carried = np.zeros(3) if self.broken else dipole
+                carried = self.carries * dipole
                 torque = np.cross(carried, shown) - np.cross(self.rate, INERTIA @ self.rate)
                 change = np.linalg.solve(INERTIA, torque) * 5e-3
                 turn = 5e-3 * (self.rate + 0.5 * change)
@@ -200,12 +201,25 @@ def test_the_mean_dipole_is_that_on_the_wire() -> None:
 def test_where_the_coils_do_otherwise_than_told_the_attitude_stays_within_its_claim() -> None:
     """A coil carries nothing from the middle of a step on; the gyro tells."""
     flown = acquired(pulses=True)
-    flown.broken = True
+    flown.carries = 0.0
     flown.fly(7.5)
     found = flown.filter.at(flown.time_ns)
 
     error = to_rotation_vector(multiply(found.quaternion, conjugate(flown.attitude)))
     assert (np.abs(error) < 5.0 * np.sqrt(np.diag(found.covariance)[TURN])).all()
+
+
+def test_commands_that_were_doubted_are_tried_again_after_a_rest() -> None:
+    """The coils rest while they are doubted, and would never show that they obey again."""
+    flown = acquired(pulses=True)
+    flown.carries = -3.0
+    flown.fly(6.0)
+    assert flown.filter.doubts_commands
+    flown.carries, flown.rests = 1.0, True
+    flown.fly(5.0)
+    assert flown.filter.doubts_commands
+    flown.fly(8.0)
+    assert not flown.filter.doubts_commands
 
 
 def test_a_magnetometer_that_repeats_its_value_or_is_false_is_doubted_and_left_out() -> None:
