@@ -16,11 +16,13 @@ import json
 import os
 import socket
 import threading
+import time
 from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
-_ANSWER_S = 0.1
+_ANSWER_S, _FIRST_ANSWER_S, _FIRST_S = 0.1, 5.0, 2.0
+"""How long an answer may take, and in the first seconds of a connection: its server may still be starting."""
 
 
 def pack(message: Any) -> bytes:
@@ -45,7 +47,8 @@ class Link:
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self._line = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        self._line.settimeout(_ANSWER_S)
+        self._line.settimeout(_FIRST_ANSWER_S)
+        self._patient_until: float | None = time.monotonic() + _FIRST_S
         try:
             self._line.connect(os.fspath(path))
         except OSError:
@@ -61,6 +64,9 @@ class Link:
 
     def send(self, name: str, *arguments: Any) -> int:
         """Send a request; return its number."""
+        if self._patient_until is not None and time.monotonic() > self._patient_until:
+            self._patient_until = None
+            self._line.settimeout(_ANSWER_S)
         number = next(self._numbers)
         self._line.sendall(pack([number, name, *arguments]))
         return number

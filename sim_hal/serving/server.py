@@ -270,7 +270,7 @@ def _describe(frame: Frame) -> list[Any]:
 
 
 def _renderer_pool(config: Config, section: Simulation) -> ProcessPoolExecutor | None:
-    """Start the rendering process, which loads the sky at once, without waiting for it."""
+    """Start the rendering process, and wait until it has its sky, so that a flight starts undisturbed."""
     if config.camera is None and not config.wide_cameras:
         return None
     pool = ProcessPoolExecutor(
@@ -279,5 +279,5 @@ def _renderer_pool(config: Config, section: Simulation) -> ProcessPoolExecutor |
         initializer=_prepare_renderer,
         initargs=(config.camera, section.sky, section.seed),
     )
-    pool.submit(os.getpid)
+    pool.submit(os.getpid).result()
     return pool
