@@ -82,6 +82,10 @@ class LinuxI2cBus:
             self.close()
             raise Refused(self.name, "the adapter cannot do I2C block transfers; choose another bus")
 
+    def write_byte(self, address: int, value: int) -> None:
+        """Write one byte without a register."""
+        self._transact(address, lambda bus: bus.write_byte(address, value))
+
     def read_byte_data(self, address: int, register: int) -> int:
         """Read one byte."""
         return self._transact(address, lambda bus: bus.read_byte_data(address, register))

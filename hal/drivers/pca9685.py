@@ -21,9 +21,15 @@ PRE_SCALE = 0xFE
 
 RESTART = 0x80
 AUTO_INCREMENT = 0x20
+EXTERNAL_CLOCK = 0x40  # sticky: only a reset clears it
 SLEEP = 0x10
 TOTEM_POLE = 0x04
 FULL = 0x10  # bit 4 of an ON_H or OFF_H register: the whole period
+
+GENERAL_CALL = 0x00
+"""The address of all parts on a bus."""
+SOFTWARE_RESET = 0x06
+"""The byte that, sent to the general call, returns a part to its power-on state (NXP data sheet, 7.6)."""
 
 CHANNELS = 16
 COUNTS = 4096
@@ -78,11 +84,17 @@ class Pca9685:
     def configure(self) -> None:
         """Set the chip up with every output off, and read the set-up back.
 
-        All outputs go off first: a chip that a dead process left running must not drive a coil meanwhile.
-        Raises NotResponding, or Refused when a register does not keep its value.
+        All outputs go off first: a chip that a dead process left running must not drive a coil meanwhile. A
+        chip that an upset has given an outer clock is reset, and with it each part of the bus that obeys the
+        general call: PWM chips rest then, an ADS1115 begins its next conversion anew. Raises NotResponding,
+        or Refused when a register does not keep its value.
         """
         self.all_off()
-        asleep = self._read(MODE1) & ~RESTART | SLEEP
+        mode = self._read(MODE1)
+        if mode & EXTERNAL_CLOCK:
+            self._reset_all()
+            mode = self._read(MODE1)
+        asleep = mode & ~RESTART | SLEEP
         self._write(MODE1, asleep)
         self._write(PRE_SCALE, self._prescale)  # writable only while the chip sleeps
         self._write(MODE1, AUTO_INCREMENT)
@@ -146,6 +158,12 @@ class Pca9685:
     def _write(self, register: int, value: int) -> None:
         try:
             self._bus.write_byte_data(self._address, register, value)
+        except OSError as error:
+            raise self._silent(error) from error
+
+    def _reset_all(self) -> None:
+        try:
+            self._bus.write_byte(GENERAL_CALL, SOFTWARE_RESET)
         except OSError as error:
             raise self._silent(error) from error
 

@@ -92,6 +92,9 @@ class I2cBus(Protocol):
     not answer, and always returns within the bus's time-out. Safe to call from several threads.
     """
 
+    def write_byte(self, address: int, value: int) -> None:
+        """Write one byte without a register, as to the general call address 0."""
+
     def read_byte_data(self, address: int, register: int) -> int:
         """Read one byte."""
 

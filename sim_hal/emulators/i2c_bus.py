@@ -90,6 +90,10 @@ class EmulatedI2cBus:
 
         return uncover
 
+    def write_byte(self, address: int, value: int) -> None:
+        """Write one byte without a register."""
+        self.send(address, bytes((value,)))
+
     def read_byte_data(self, address: int, register: int) -> int:
         """Read one byte."""
         return self._read(address, register, 1)[0]

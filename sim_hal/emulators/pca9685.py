@@ -13,7 +13,9 @@ from hal.drivers.pca9685 import (
     AUTO_INCREMENT,
     CHANNELS,
     COUNTS,
+    EXTERNAL_CLOCK,
     FULL,
+    GENERAL_CALL,
     LED0_ON_L,
     MODE1,
     MODE2,
@@ -22,16 +24,15 @@ from hal.drivers.pca9685 import (
     PRE_SCALE,
     RESTART,
     SLEEP,
+    SOFTWARE_RESET,
 )
 
 _ALL_LED_ON_L = 0xFA
 _TEST_MODE = 0xFF
 _LED_END = LED0_ON_L + 4 * CHANNELS
-_EXTERNAL_CLOCK = 0x40
 _ALL_CALL = 0x01
 _INVERT = 0x10
 _UPDATE_ON_ACK = 0x08
-_SOFTWARE_RESET = b"\x06"
 _ALL_CHANNELS = (1 << CHANNELS) - 1
 # Registers SUBADR1..3 and ALLCALLADR, and the MODE1 bit that enables each address.
 _EXTRA_ADDRESSES = ((0x02, 0x08), (0x03, 0x04), (0x04, 0x02), (0x05, _ALL_CALL))
@@ -107,7 +108,7 @@ class EmulatedPca9685:
     def frequency(self) -> float:
         """The PWM frequency in Hz, 0 while the oscillator is off."""
         # No clock is wired to the EXTCLK pin.
-        if self._registers[MODE1] & (SLEEP | _EXTERNAL_CLOCK):
+        if self._registers[MODE1] & (SLEEP | EXTERNAL_CLOCK):
             return 0.0
         return OSCILLATOR_HZ / (COUNTS * (self._registers[PRE_SCALE] + 1))
 
@@ -135,8 +136,8 @@ class EmulatedPca9685:
 
     def write(self, address: int, data: bytes) -> None:
         """Accept the bytes of one write."""
-        if address == 0:
-            if data == _SOFTWARE_RESET:
+        if address == GENERAL_CALL:
+            if data == bytes((SOFTWARE_RESET,)):
                 self._power_on()
                 self._stop(_ALL_CHANNELS)
             return
@@ -177,7 +178,7 @@ class EmulatedPca9685:
         registers = self._registers
         base = LED0_ON_L + 4 * channel
         off_high = registers[base + 3]
-        if off_high & FULL or registers[MODE1] & (SLEEP | _EXTERNAL_CLOCK) or self._halted >> channel & 1:
+        if off_high & FULL or registers[MODE1] & (SLEEP | EXTERNAL_CLOCK) or self._halted >> channel & 1:
             return 0, 0
         on_high = registers[base + 1]
         if on_high & FULL:
@@ -221,8 +222,8 @@ class EmulatedPca9685:
     def _store_mode1(self, value: int) -> None:
         before = self._registers[MODE1]
         # EXTCLK can be set only while asleep, and only a reset clears it.
-        external = before & _EXTERNAL_CLOCK or value & before << 2 & _EXTERNAL_CLOCK
-        self._registers[MODE1] = value & ~(RESTART | _EXTERNAL_CLOCK) | external
+        external = before & EXTERNAL_CLOCK or value & before << 2 & EXTERNAL_CLOCK
+        self._registers[MODE1] = value & ~(RESTART | EXTERNAL_CLOCK) | external
         if value & SLEEP and not before & SLEEP:
             running = sum(
                 1 << channel
@@ -246,7 +247,7 @@ class EmulatedPca9685:
             self._pointer = 0 if following in {_LED_END, _TEST_MODE} else following & 0xFF
 
     def _find_addresses(self) -> None:
-        self._addresses = {0, self.address} | {
+        self._addresses = {GENERAL_CALL, self.address} | {
             self._registers[register] >> 1
             for register, enabled in _EXTRA_ADDRESSES
             if self._registers[MODE1] & enabled

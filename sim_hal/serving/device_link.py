@@ -112,6 +112,10 @@ class RemoteI2cBus:
             raise OSError(result, text)
         return result
 
+    def write_byte(self, address: int, value: int) -> None:
+        """Write one byte without a register."""
+        self.call("write_byte", address, value)
+
     def read_byte_data(self, address: int, register: int) -> int:
         """Read one byte."""
         return int(self.call("read_byte_data", address, register))

@@ -222,6 +222,7 @@ class DeviceServer:
                 camera.trigger(exposure_ns)
 
         return {
+            "write_byte": lambda _, *a: bus.write_byte(*a),
             "read_byte_data": lambda _, *a: bus.read_byte_data(*a),
             "write_byte_data": lambda _, *a: bus.write_byte_data(*a),
             "read_i2c_block_data": lambda _, *a: bus.read_i2c_block_data(*a),

@@ -77,6 +77,21 @@ def test_a_reading_is_the_current_to_a_step_of_the_converter_and_no_older_than_i
     np.testing.assert_allclose(reading.currents, exact, atol=0.51 * STEP / 2.0 + 2e-3 * exact.max())
 
 
+def test_a_reset_of_the_whole_bus_costs_a_round_and_no_more() -> None:
+    """The cure of a PWM chip with an outer clock resets the converters too."""
+    flown = bench()
+    flown.wait(2.1)
+    before = flown.driver.latest()
+    flown.bus.write_byte(0x00, 0x06)
+    flown.wait(1.3)
+    after = flown.driver.latest()
+    assert before is not None
+    assert after is not None
+    assert flown.driver.error() == ""
+    assert after.time_ns - before.time_ns > SECOND_NS // 2
+    assert flown.clock.now_ns() - after.time_ns <= SECOND_NS // 2
+
+
 def test_dead_frozen_and_wrong_strings_look_as_they_do_on_a_satellite() -> None:
     flown = bench()
     flown.wait(1.2)

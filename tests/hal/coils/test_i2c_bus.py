@@ -23,6 +23,13 @@ def test_bytes_and_blocks_come_back_as_written(rig: Rig) -> None:
     assert rig.bus.read_i2c_block_data(INA, 0x00, 2) == [0x39, 0x9F]
 
 
+def test_a_byte_without_a_register_reaches_all_parts_by_the_general_call(rig: Rig) -> None:
+    rig.bus.write_byte_data(PCA, 0x06, 7)
+    rig.bus.write_byte(0x00, 0x06)
+    assert rig.bus.read_byte_data(PCA, 0x06) == 0, "0x06 is the PCA9685's software reset"
+    assert rig.bus.read_i2c_block_data(INA, 0x00, 2) == [0x39, 0x9F]
+
+
 @pytest.mark.parametrize("length", [0, 33])
 def test_a_block_is_1_to_32_bytes(rig: Rig, length: int) -> None:
     with pytest.raises(ValueError, match="1 to 32"):

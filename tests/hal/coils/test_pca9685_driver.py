@@ -133,9 +133,24 @@ def test_another_part_at_the_address_is_refused_with_the_cure(rig: Rig) -> None:
         Pca9685(rig.bus, INA, rig.clock).configure()
 
 
-def test_an_external_clock_that_only_a_power_cycle_clears_is_refused(rig: Rig) -> None:
-    rig.bus.write_byte_data(PCA, 0x00, 0x11)
-    rig.bus.write_byte_data(PCA, 0x00, 0x51)
+def test_an_outer_clock_that_an_upset_has_chosen_is_cleared_by_a_software_reset(rig: Rig) -> None:
+    """The bit is sticky: no write clears it. Nothing is driven on the way."""
+    rig.pca.configure()
+    rig.wire.chip.flip(0x00, 6)
+    rig.pca.write_channels(0, [FULL_ON])
+    seen: list[float] = []
+    rig.wire.chip.on_stop = lambda written: seen.append(rig.wire.chip.duty(0))
+    assert not rig.pca.is_configured()
+    rig.pca.configure()
+    assert rig.pca.is_configured()
+    assert rig.wire.chip.frequency == pytest.approx(50.03, abs=0.01)
+    assert set(seen) == {0.0}
+    assert rig.wire.chip.violations == set()
+
+
+def test_a_clock_bit_that_no_reset_clears_is_refused(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    rig.wire.chip.flip(0x00, 6)
+    monkeypatch.setattr(rig.bus, "write_byte", lambda address, value: None)
     with pytest.raises(Refused, match="power cycle"):
         rig.pca.configure()
 

@@ -139,6 +139,10 @@ class _Nonsense:
         self._kept: dict[tuple[int, int], list[int]] = {}
         self._honest, self._failing = float(draw.random()), 0.3 * float(draw.random()) ** 2
 
+    def write_byte(self, address: int, value: int) -> None:
+        """Write one byte without a register."""
+        self._fail()
+
     def read_byte_data(self, address: int, register: int) -> int:
         """Read one byte."""
         return self.read_i2c_block_data(address, register, 1)[0]
