@@ -53,6 +53,7 @@ class OrbitFilter:
         self._open: OpenStep | None = None
         self._doubt = FieldDoubt()
         self._refused_attitudes = 0
+        self._placed_ns = 0  # time of the last attitude that was used
         self.restarts = 0
 
     @property
@@ -133,11 +134,7 @@ class OrbitFilter:
 
     def mark_unknown(self, since_ns: int) -> None:
         """Treat the currents recorded since then as unknown, and take the steps since again."""
-        steps = self._steps
-        first = next((k for k, step in enumerate(steps) if step.end_ns > since_ns), len(steps))
-        for k in range(first, len(steps)):
-            steps[k].doubt = self._settings.dipole_limit
-        self._replay.take_again(first)
+        self._replay.doubt_since(since_ns)
 
     def accept(self, reading: ImuReading) -> bool:
         """Accept a reading; return whether there is an estimate with which the gyro agrees."""
@@ -166,7 +163,7 @@ class OrbitFilter:
             return False
         self.restarts += self._free.started
         self._replay.start(attitude, place, doubted)
-        self._refused_attitudes = 0
+        self._refused_attitudes, self._placed_ns = 0, attitude.time_ns
         return True
 
     def measure_late(self, late: Sequence[Measurement], applied: Callable[[list[bool]], None]) -> None:
@@ -181,6 +178,9 @@ class OrbitFilter:
                 if k is not None and id(m) in known:
                     self._steps[k].late = sorted([*self._steps[k].late, m], key=lambda other: other.time_ns)
             used = self._replay.take_again(min(inside))
+            for m in late:
+                if id(m) in known - used and self._contradicts(m):
+                    used = self._replay.make_room(m, self._placed_ns)
             taken = [id(m) in used for m in late]
         applied(taken)
         for m, was in zip(late, taken, strict=True):
@@ -249,9 +249,17 @@ class OrbitFilter:
         self._replay.add(step)
         self._replay.follow_gyro()
 
+    def _contradicts(self, refused: Measurement) -> bool:
+        """Return whether a refused measurement is an attitude better known than a fine estimate."""
+        if not isinstance(refused, AttitudeMeasurement) or self.knowledge is not Knowledge.FINE:
+            return False
+        return math.sqrt(float(refused.covariance.diagonal().max())) < self._free.worst_sigma
+
     def _judge(self, attitude: AttitudeMeasurement, used: bool) -> None:
         """Begin again after too many attitudes that contradict the estimate; a coarse one yields at once."""
         self._refused_attitudes = 0 if used else self._refused_attitudes + 1
+        if used:
+            self._placed_ns = attitude.time_ns
         patience = REFUSALS_TO_RESTART if self.knowledge is Knowledge.FINE else 1
         if self._refused_attitudes >= patience:
             self.begin(attitude, doubted=True)

@@ -100,6 +100,27 @@ class StepReplay:
                 steps[k].doubt = self._settings.dipole_limit
             self.take_again(first)
 
+    def doubt_since(self, since_ns: int) -> set[int]:
+        """Take the steps since then again with unknown dipoles; return what was used."""
+        steps = self.steps
+        first = next((k for k, step in enumerate(steps) if step.end_ns > since_ns), len(steps))
+        for k in range(first, len(steps)):
+            steps[k].doubt = self._settings.dipole_limit
+        return self.take_again(first)
+
+    def make_room(self, refused: AttitudeMeasurement, since_ns: int) -> set[int]:
+        """Doubt the dipoles since then for a refused attitude, if it is used then; return what is used.
+
+        Coils that do otherwise than told, too little for a gyro's mean to show, lead an attitude astray.
+        """
+        doubts = [step.doubt for step in self.steps]
+        used = self.doubt_since(min(since_ns, refused.time_ns))
+        if id(refused) in used:
+            return used
+        for step, doubt in zip(self.steps, doubts, strict=True):
+            step.doubt = doubt
+        return self.take_again(0)
+
     def start(self, attitude: AttitudeMeasurement, place: int, doubted: bool) -> None:
         """Start from an attitude in step number `place`; the estimates before it are forgotten.
 

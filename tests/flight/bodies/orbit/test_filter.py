@@ -209,6 +209,21 @@ def test_where_the_coils_do_otherwise_than_told_the_attitude_stays_within_its_cl
     assert (np.abs(error) < 5.0 * np.sqrt(np.diag(found.covariance)[TURN])).all()
 
 
+def test_stars_that_contradict_what_the_coils_were_told_are_used_and_widen_the_claim() -> None:
+    """A coil carries a third of what it is told: too little for one gyro's mean, 7 sigma after ten seconds.
+
+    The stars were refused then, and the attitude led astray until the third.
+    """
+    flown = acquired(pulses=True)
+    flown.carries = 0.3
+    for _ in range(2):
+        flown.fly(5.0)
+        assert flown.see(52 * PERIOD_NS)
+    assert flown.filter.refused == 1
+    assert flown.error() < 3.0 * flown.filter.worst_sigma
+    assert flown.filter.restarts == 0
+
+
 def test_commands_that_were_doubted_are_tried_again_after_a_rest() -> None:
     """The coils rest while they are doubted, and would never show that they obey again."""
     flown = acquired(pulses=True)
