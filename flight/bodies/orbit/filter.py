@@ -179,7 +179,7 @@ class OrbitFilter:
                     self._steps[k].late = sorted([*self._steps[k].late, m], key=lambda other: other.time_ns)
             used = self._replay.take_again(min(inside))
             for m in late:
-                if id(m) in known - used and self._contradicts(m):
+                if isinstance(m, AttitudeMeasurement) and id(m) in known - used and self._should_yield(m):
                     used = self._replay.make_room(m, self._placed_ns)
             taken = [id(m) in used for m in late]
         applied(taken)
@@ -249,11 +249,10 @@ class OrbitFilter:
         self._replay.add(step)
         self._replay.follow_gyro()
 
-    def _contradicts(self, refused: Measurement) -> bool:
-        """Return whether a refused measurement is an attitude better known than a fine estimate."""
-        if not isinstance(refused, AttitudeMeasurement) or self.knowledge is not Knowledge.FINE:
-            return False
-        return math.sqrt(float(refused.covariance.diagonal().max())) < self._free.worst_sigma
+    def _should_yield(self, refused: AttitudeMeasurement) -> bool:
+        """Return whether a refused attitude is better known than a fine estimate."""
+        known = math.sqrt(float(refused.covariance.diagonal().max()))
+        return self.knowledge is Knowledge.FINE and known < self._free.worst_sigma
 
     def _judge(self, attitude: AttitudeMeasurement, used: bool) -> None:
         """Begin again after too many attitudes that contradict the estimate; a coarse one yields at once."""
