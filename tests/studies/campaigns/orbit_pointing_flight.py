@@ -68,7 +68,7 @@ TARGETS = {
 }
 WEIGHTS = {
     "knightcube": PointingWeights(
-        turn=np.radians(1.0), rate=1.0, dipole=3e-4, roll=np.radians(10.0), axis=AXES.pointing
+        turn=np.radians(1.0), rate=1.0, dipole=3e-4, roll=np.radians(30.0), axis=AXES.pointing
     ),
     "cubesat_3u": PointingWeights(turn=np.radians(1.0), rate=1.0, dipole=1.5e-3),
 }
