@@ -5,7 +5,7 @@ revolutions and more; the first one teaches the filter the residual dipole and t
 Cells `day` are the same over a day, a quarter of the runs. Cells `turn` start 30 to 180 deg off nadir, Sun
 or an inertial attitude, turning at 0.3 deg/s, and fly 100 min: `arrived` counts bodies whose pointing axis
 comes within ARRIVED deg and stays there for the rest, half a revolution at least; `lost` is farther than
-LOST deg off at the end. The KnightCube's turn about that axis is cheap (WEIGHTS of `orbit_pointing_flight`),
+LOST deg off at the end. A turn about that axis is cheap (WEIGHTS of `orbit_pointing_flight`),
 so only the error of three axes has it. `share` multiplies the torques that the coils can not cancel at once:
 drag, sunlight, and the turn of the principal axes; the residual dipole is always whole. Laws: `whole`;
 `plain` without feed-forward; `pd`, the magnetic proportional-derivative law (`orbit_pointing_flight`).

@@ -70,7 +70,9 @@ WEIGHTS = {
     "knightcube": PointingWeights(
         turn=np.radians(1.0), rate=1.0, dipole=3e-4, roll=np.radians(30.0), axis=AXES.pointing
     ),
-    "cubesat_3u": PointingWeights(turn=np.radians(1.0), rate=1.0, dipole=1.5e-3),
+    "cubesat_3u": PointingWeights(
+        turn=np.radians(1.0), rate=1.0, dipole=1.5e-3, roll=np.radians(3.0), axis=AXES.pointing
+    ),
 }
 SLEW = {"knightcube": 300.0, "cubesat_3u": 900.0}
 """s of a slew, as the configurations have it."""
