@@ -7,9 +7,11 @@ where it was; whoever runs which case, and in which order, changes nothing.
 
 from __future__ import annotations
 
+import ctypes
 import importlib.util
 import json
 import os
+import signal
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import closing
@@ -21,6 +23,8 @@ from typing import Any
 from flight.gnc.errors import FlightError, UsageError
 from tests.studies.campaigns import cluster
 from tests.studies.campaigns.progress import Progress
+
+_PR_SET_PDEATHSIG = 1  # prctl(2)
 
 Result = dict[str, Any]
 Parameters = dict[str, Any]
@@ -150,7 +154,8 @@ def _here(workers: int | None, campaign: Campaign, cases: Sequence[Case]) -> Res
     """Run cases on this machine's cores; yield them as they come."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    with ProcessPoolExecutor(workers or os.cpu_count(), mp_context=get_context("spawn")) as pool:
+    count, context = workers or os.cpu_count(), get_context("spawn")
+    with ProcessPoolExecutor(count, context, initializer=_end_with_the_campaign) as pool:
         keys = {pool.submit(campaign.run, case): case.key for case in cases}
         try:
             for future in as_completed(keys):
@@ -159,6 +164,11 @@ def _here(workers: int | None, campaign: Campaign, cases: Sequence[Case]) -> Res
             # Ctrl-C: what has come is on disk, what has not begun need not begin.
             pool.shutdown(wait=False, cancel_futures=True)
             raise
+
+
+def _end_with_the_campaign() -> None:
+    """Ask the kernel to end this worker with its campaign, which may be killed."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
 
 
 def _on_cluster(address: str, campaign: Campaign, cases: Sequence[Case], bar: Progress | None) -> Results:

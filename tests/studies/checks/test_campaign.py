@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,6 +13,7 @@ import numpy as np
 import pytest
 
 from flight.gnc.errors import UsageError
+from tests.hal.guardian.states import state, wait_until
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, fly, fly_here
 
 
@@ -24,6 +29,12 @@ def draw(case: Case) -> Result:
 def summarise(results: Sequence[Result], out: Path) -> Summary:
     total = sum(result["value"] for result in results)
     return Summary(f"total {total:.3f}\n", {"total": total, "runs": len(results)})
+
+
+def wait(case: Case) -> Result:
+    Path(case.parameters["log"]).write_text(str(os.getpid()))
+    time.sleep(300.0)
+    return {}
 
 
 TOY = Campaign("toy", "adds draws", cases, draw, summarise, 6)
@@ -64,3 +75,19 @@ def test_the_folder_of_another_campaign_is_refused(tmp_path: Path) -> None:
     fly(TOY, 0, 3, tmp_path)
     with pytest.raises(UsageError, match="give another folder"):
         fly(TOY, 0, 4, tmp_path)
+
+
+@pytest.mark.slow
+def test_a_campaign_that_is_killed_leaves_no_worker_behind(tmp_path: Path) -> None:
+    log = tmp_path / "worker"
+    code = (
+        "import sys; from pathlib import Path; from tests.studies.checks import test_campaign as t;"
+        "one = lambda runs, seed: [t.Case('0', (1,), {'log': sys.argv[1]})];"
+        "t.fly(t.Campaign('waits', '', one, t.wait, t.summarise, 1), 1, 1, Path(sys.argv[2]), workers=1)"
+    )
+    command = [sys.executable, "-c", code, str(log), str(tmp_path / "out")]
+    with subprocess.Popen(command, cwd=Path(__file__).parents[3]) as campaign:
+        wait_until(lambda: log.exists() and log.read_text() != "")
+        campaign.kill()
+    worker = int(log.read_text())
+    wait_until(lambda: state(worker) in {"", "Z"})
