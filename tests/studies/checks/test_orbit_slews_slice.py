@@ -24,3 +24,11 @@ def test_a_body_that_was_held_at_one_attitude_knows_enough_of_the_air_to_slew() 
     path = orbit_slews.run(Case("path", (7, 5), parameters))
     assert path["off"] <= orbit_slews.WANTED["cubesat_3u"]
     assert path["heat"] <= 1.3 * path["optimum"]
+
+
+def test_what_torques_do_that_are_learned_on_the_way_is_gone_at_the_end() -> None:
+    """The second slew of seed 8 of the 3U, 45 deg in 938 s at 420 km: 0.73 deg off without a dear end."""
+    parameters = {"craft": "cubesat_3u", "orbit": "iss", "law": "path", "share": 0.3}
+    path = orbit_slews.run(Case("path", (8, 1), parameters))
+    assert path["off"] <= 0.5 * orbit_slews.WANTED["cubesat_3u"]
+    assert path["heat"] <= 1.3 * path["optimum"]

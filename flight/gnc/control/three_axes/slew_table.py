@@ -2,8 +2,9 @@
 
 The slew is planned by `slew_plan` with the torques that the filter estimates. Its dipoles are flown as
 planned: a criterion that weighs turn against dipole would leave the path of least heat. The gains are those
-of linear-quadratic tracking along slew and law, with the field of the revolution ahead, and tell by how much
-the dipole changes where the torques are estimated otherwise than planned.
+of linear-quadratic tracking along slew and law, with the field of the revolution ahead; an error at the end
+of the slew is the dearest. They tell by how much the dipole changes where the torques are estimated otherwise
+than planned.
 """
 
 from __future__ import annotations
@@ -46,6 +47,9 @@ FINE = 5
 """Parts of a step of pointing: a slewing body turns farther in one."""
 TAIL = 300.0
 """s of the law after a slew that its gains look at."""
+END = 2_000.0
+"""s on the way, for which an error costs what it costs at a slew's end: torques are not known well before it,
+and what they have done meanwhile is to be gone by then."""
 _SLOWER, _MOST_SLOWER, _TRIALS = 1.05, 1.5, 5
 """A slew that turns too fast is planned over a time longer by the excess and this, so much, so often."""
 
@@ -218,7 +222,8 @@ def _tracking(
     affine = linear.by_torque @ shape
     state, price = prices(replace(weights, roll=None), step)
     control = np.full((steps, 3), price / STIFFER**2)
-    nothing = np.zeros(affine.shape)
-    cost = Cost(np.broadcast_to(state, (steps, 6, 6)), control, nothing, nothing[:, :3])
+    nothing, states = np.zeros(affine.shape), np.repeat(state[None], steps, axis=0)
+    states[count] *= END / step
+    cost = Cost(states, control, nothing, nothing[:, :3])
     gain, steady, _ = sweep(linear, affine, cost, ToGo(state, nothing[0]))
     return gain[:count], steady[:count]

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from flight.gnc.control.three_axes import slew_table as slew_tables
 from flight.gnc.control.three_axes.pointing import PointingLaw
 from flight.gnc.control.three_axes.pointing_table import Ahead, PointingTable
 from flight.gnc.control.three_axes.slew_table import FINE, SlewBegin, SlewWish, slew, slew_table
@@ -12,6 +16,7 @@ from flight.gnc.earth.disturbance import pressures
 from flight.gnc.guidance.three_axes.attitude_law import references
 from flight.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 from flight.gnc.guidance.three_axes.target_law import BodyAxes
+from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import angle_between, attitude_matrix, from_rotation_vector, multiply
 from tests.flight.gnc.control.three_axes.test_pointing import (
     INERTIA,
@@ -44,32 +49,62 @@ BEGIN = SlewBegin(
 )
 
 
-@pytest.fixture(scope="module")
-def table() -> PointingTable:
-    path = slew(BEGIN, WISH, NADIR, AXES, ORBIT, np.inf)
+def planned(sizes: FloatArray) -> PointingTable:
+    """Plan with torques of these sizes (9,) N m."""
+    begin = replace(BEGIN, sizes=sizes)
+    path = slew(begin, WISH, NADIR, AXES, ORBIT, np.inf)
     assert path is not None
     field, position = ORBIT.field_at(TIMES), ORBIT.position_at(TIMES)
-    expected = Ahead(WANTED, WANTED, field, position, pressures(ORBIT, TIMES), SIZE)
-    return slew_table(BEGIN, path, RESIDUAL, NADIR, AXES, ORBIT, expected, WEIGHTS)
+    expected = Ahead(WANTED, WANTED, field, position, pressures(ORBIT, TIMES), sizes)
+    return slew_table(begin, path, RESIDUAL, NADIR, AXES, ORBIT, expected, WEIGHTS)
 
 
-def test_flown_under_torques_and_a_dipole_it_ends_in_its_target_and_stays(table: PointingTable) -> None:
-    assert table.slew is not None
+@pytest.fixture(scope="module")
+def table() -> PointingTable:
+    return planned(SIZE)
+
+
+def flown(table: PointingTable, sizes: Callable[[float], FloatArray]) -> list[float]:
+    """Return how far off the law, deg, a body under `SIZE` and `RESIDUAL` is after each step.
+
+    `sizes` gives what is estimated of the torques at a time, s.
+    """
     law, step = PointingLaw(table, LIMIT), STEP / FINE
     q, w = BEGIN.quaternion, BEGIN.rate
     off = []
     for time in table.path.times[:-1].tolist():
         at = np.array([time])
         field = attitude_matrix(q) @ ORBIT.field_at(at)[0]
-        dipole = law.command(time, q, w, field, RESIDUAL, SIZE).dipole
+        dipole = law.command(time, q, w, field, RESIDUAL, sizes(time)).dipole
         for part in range(2):
             at = np.array([time + 0.5 * step * part])
             q, w = pushed(q, w, attitude_matrix(q), at, dipole + RESIDUAL, 0.5 * step)
-        off.append(np.degrees(angle_between(q, law.wanted(time + step).quaternion)))
-    arrived = round(table.slew.horizon / step)
+        off.append(float(np.degrees(angle_between(q, law.wanted(time + step).quaternion))))
+    return off
+
+
+def test_flown_under_torques_and_a_dipole_it_ends_in_its_target_and_stays(table: PointingTable) -> None:
+    assert table.slew is not None
+    off = flown(table, lambda _: SIZE)
+    arrived = round(table.slew.horizon * FINE / STEP)
     assert off[0] > 50.0
     assert off[arrived] < 0.3
     assert max(off[arrived : arrived + 30]) < 1.0
+
+
+def test_what_torques_not_known_at_the_begin_have_done_is_led_back_by_the_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    believed, ends = -9.0 * SIZE, []
+    for end in (slew_tables.END, STEP / FINE):
+        monkeypatch.setattr(slew_tables, "END", end)
+        table = planned(believed)
+        assert table.slew is not None
+        learned = 0.35 * table.slew.horizon
+        off = flown(table, lambda time, at=learned: SIZE if time > at else believed)  # type: ignore[misc]
+        ends.append(off[round(table.slew.horizon * FINE / STEP) - 1])
+    assert ends[0] < 2.0, "deg: the field of this orbit turns least"
+    assert ends[0] < 0.65 * ends[1], "where the end is as dear as any other time"
 
 
 def test_path_and_gains_go_on_after_the_slew_without_a_jump(table: PointingTable) -> None:
