@@ -1,12 +1,12 @@
 """Shapes of the torques that turn a satellite besides its coils: constant, of the air, of sunlight.
 
-The sizes are unknown and estimated; the shapes follow from the orbit. Air presses against the flight, four
-times as hard below the day's bulge as by night (Montenbruck & Gill 2000, 3.5.2: cos^4 of half the angle from
-an apex 30 deg behind the Sun); light presses away from the Sun. Each torque is c x d: c a constant of the
-body, N m (force by arm of the centre of pressure), d the direction in body axes by the strength and by the
-area that is shown to it. The areas are those of the box that has the body's moments of inertia when its mass
-is even: a long body meets three times as much air across as along. What is constant in body axes stands for
-the rest.
+The sizes are unknown and estimated; the shapes follow from the orbit. Air, which turns with the Earth,
+presses against the flight through it, four times as hard below the day's bulge as by night (Montenbruck &
+Gill 2000, 3.5.2: cos^4 of half the angle from an apex 30 deg behind the Sun); light presses away from the
+Sun. Each torque is c x d: c a constant of the body, N m (force by arm of the centre of pressure), d the
+direction in body axes by the strength and by the area that is shown to it. The areas are those of the box that has the
+body's moments of inertia when its mass is even: a long body meets three times as much air across as along.
+What is constant in body axes stands for the rest.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy as np
 
 from flight.gnc.earth.ephemeris import Ephemeris
 from flight.gnc.earth.figure import EARTH_RADIUS
+from flight.gnc.earth.orientation import ROTATION_RATE
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.directions import cross_matrices
 
@@ -64,7 +65,9 @@ def pressures(ephemeris: Ephemeris, times: FloatArray) -> Pressures:
     density = (_NIGHT + (_DAY - _NIGHT) * (0.5 + 0.5 * facing) ** 2) * np.exp(
         (_HEIGHT - distance) / _SCALE_HEIGHT
     )
-    flight = velocity / np.linalg.norm(velocity, axis=1, keepdims=True)
+    # The air turns with the Earth.
+    through = velocity - np.cross([0.0, 0.0, ROTATION_RATE], position)
+    flight = through / np.linalg.norm(through, axis=1, keepdims=True)
     return Pressures(density[:, None] * flight, ephemeris.sunlit_at(times)[:, None] * sun)
 
 
