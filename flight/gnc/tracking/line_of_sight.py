@@ -10,12 +10,9 @@ Both fall about the Earth: the gravity gradient at the observer's place, where t
 acceleration of one against the other but for terms of the distance over the orbit's radius.
 
 Process noise: the tides of two low orbits, which turn with the line, are taken for white accelerations of
-density `Motion.wander`, and what the gradient leaves of them for those of `Motion.left`. That grows with the
-distance, which bearings do not give; but a line that turns fast is to a near object, as two orbits have
-speeds of some km/s against each other: beyond `Motion.near` the distance is taken to fall with the rate.
-
-The range's part also follows what is no straight line, as an object on a great circle at a constant rate,
-whose s would change by rate^2: a density of (`Motion.bend` rate^2)^2 / rate.
+density `Motion.wander`, and what the gradient leaves of them for those of `Motion.left`. The range's part
+also follows what is no straight line, as an object on a great circle at a constant rate, whose s would change
+by rate^2: a density of (`Motion.bend` rate^2)^2 / rate.
 """
 
 from __future__ import annotations
@@ -40,7 +37,6 @@ class Motion:
             density is the one whose errors of place and rate are as large as their covariance says in passes
             of 0.05 to 0.6 deg/s at up to 5,000 km.
         left: 1/s^3, the same where the gravity gradient is known, from the same passes.
-        near: rad/s, the line's rate beyond which that falls with its square.
         bend: part of rate^2 by which the closing rate changes otherwise than on a straight line.
     """
 
@@ -48,7 +44,6 @@ class Motion:
     closing: float = 0.01
     wander: float = 1.6e-12
     left: float = 4e-13
-    near: float = 2.1e-3
     bend: float = 0.3
 
 
@@ -166,7 +161,7 @@ def _noise(state: LineOfSight, step: float, motion: Motion, known: bool) -> Floa
     """Return the covariance (6, 6) of white accelerations over `step` s; `known`: the gradient is."""
     along = np.outer(state.direction, state.direction)
     rate = float(np.linalg.norm(state.rate))
-    wander = motion.left * min(1.0, motion.near / max(rate, 1e-12)) ** 2 if known else motion.wander
+    wander = motion.left if known else motion.wander
     density = wander * np.eye(3) + motion.bend**2 * rate**3 * along
     return np.block(
         [[density * step**3 / 3.0, density * step**2 / 2.0], [density * step**2 / 2.0, density * step]]
