@@ -143,7 +143,9 @@ def light(
         weight = np.full(place.shape[:2], 1.0) * sky.electrons[some, None] * (2.0 * room / count)
         if delay:
             late = times - delay * (place[..., 1] - 0.5 * (pinhole.rows - 1))
-            weight *= np.abs(late) <= 0.5
+            # Of the first and the last point of a path the part that is exposed: else stars of some rows
+            # would all be off by part of the way to the next point.
+            weight *= np.clip((0.5 - np.abs(late)) * count / (2.0 * room) + 0.5, 0.0, 1.0)
         if optics.scintillation:
             knots = rng.normal(1.0, optics.scintillation, (len(place), 24)).clip(0.0)
             share = np.linspace(0.0, 23.0, count)

@@ -95,7 +95,9 @@ class ObjectAim:
         track = self._track()
         if track is None:
             place = self._searched(job.quaternion)
-            return replace(job, axes=axes, slew=None, sight=Sight(place, np.zeros(3), 0.0))
+            # Another axis would make it cheap to turn the boresight away.
+            weights = replace(job.weights, roll=ROLL, axis=boresight)
+            return replace(job, axes=axes, weights=weights, slew=None, sight=Sight(place, np.zeros(3), 0.0))
         line = track.line
         weights = replace(job.weights, dipole=EFFORT * self._limit, roll=ROLL, rate=RATE, axis=boresight)
         since = (line.time_ns - job.origin_ns) / SECOND_NS

@@ -39,6 +39,7 @@ from tests.studies.campaigns.safe_sun import SAFE_SUN
 from tests.studies.campaigns.soak import SOAK
 from tests.studies.campaigns.start import START
 from tests.studies.campaigns.step_robust import STEP_ROBUST
+from tests.studies.campaigns.streaked import STREAKED
 from tests.studies.campaigns.streaks import STREAKS, STREAKS_THESIS
 from tests.studies.campaigns.worlds import WORLD_COMPARISON
 
@@ -51,6 +52,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         MISMATCH,
         VIBRATION,
         RESTING,
+        STREAKED,
         RATE_CHANGE,
         ROLLING_SHUTTER,
         RSO_SLEW,

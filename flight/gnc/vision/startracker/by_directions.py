@@ -23,12 +23,15 @@ def attitude_by(
     reference: FloatArray,
     camera: CameraModel,
     fit: ImageFit,
+    late: FloatArray,
 ) -> AttitudeFix:
     """Return a solver's attitude from the stars at `points` (n, 2) px that agree in an image fit.
 
-    `covariance` (n, 2, 2) px^2 and `reference` (n, 3) are theirs, `camera` is that of the fit's start. Raises
-    AttitudeError.
+    `covariance` (n, 2, 2) px^2, `reference` (n, 3) and `late` (n, 2) are theirs, `camera` is that of the
+    fit's start. Raises AttitudeError.
     """
+    if len(late):
+        points = points - fit.delay * late
     seen = bent(stretched(camera.unit_vectors(points), fit.scale), fit.bend)[fit.agree]
     pixels = np.sqrt(0.5 * np.trace(covariance[fit.agree], axis1=1, axis2=2))
     # A pixel off the boresight is seen shorter: by cos^2 along the radius and cos across it.

@@ -7,12 +7,18 @@ disagree by more than chance allows, given the scatter of the majority, are foun
 bound the pull of any star, and are excluded.
 
 The tilt, decentring and distortion of a lens that is not exact are fitted too, held by what is known of it or
-is usual of lenses (`lens_bend`): what the stars leave open of them is in the attitude's covariance.
+is usual of lenses (`lens_bend`): what the stars leave open of them is in the attitude's covariance. So is a
+shutter that rolls otherwise than described: it displaces each star along its motion, by its row.
+
+Streaks unlike the model err by px, bright ones as much as faint ones: where they scatter beyond their noise,
+a variance common to all is added to it, so large that the squares are as many as their degrees of freedom
+(Mandel & Paule 1970, Analytical Chemistry 42(11)). Else the brightest, whose noise is least, would decide
+alone, and claim too much.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -35,6 +41,29 @@ _MEDIAN = 2.0 * float(np.log(2.0))
 _PULL = 1.5
 _HUBER_ROUNDS = 10
 _LEAST_AGREEING = 4
+# Newton's steps to the common variance, from below; they end where the squares exceed by less.
+_SCATTER_ROUNDS, _EXPLAINED = 12, 1.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Unknowns:
+    """What may be wrong beside the attitude, and is fitted with it.
+
+    Attributes:
+        scale: whether the focal length may be.
+        bend: (6,) information about the lens's bend; (0,): it has none.
+        late: (n, 2) px by which a standard deviation of the shutter's line time displaces each star; (0, 2):
+            the line time is exact.
+        scatter: whether the places may have a common variance beside their own.
+    """
+
+    scale: bool = False
+    bend: FloatArray = field(default_factory=lambda: np.zeros(0))
+    late: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    scatter: bool = False
+
+
+_NONE = Unknowns()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,6 +75,7 @@ class ImageFit:
         scale: factor of the tangents x/z, y/z; 1 when it was held.
         scale_sigma: relative standard deviation of the scale; 0 when it was held.
         bend: (6,) of the lens (`lens_bend`); zeros when it has none.
+        delay: of the shutter beside the described one, in its standard deviations.
         squares: (n,) squared error of each star over its covariance, of two degrees of freedom.
         agree: (n,) whether the star was used.
     """
@@ -54,6 +84,7 @@ class ImageFit:
     scale: float
     scale_sigma: float
     bend: FloatArray
+    delay: float
     squares: FloatArray
     agree: BoolArray
 
@@ -64,8 +95,7 @@ def fit_in_image(
     reference: FloatArray,
     camera: CameraModel,
     start: FloatArray,
-    free_scale: bool = False,
-    known: FloatArray | None = None,
+    unknowns: Unknowns = _NONE,
 ) -> ImageFit:
     """Return the attitude that puts stars at `reference` (n, 3) to `points` (n, 2) px.
 
@@ -75,102 +105,128 @@ def fit_in_image(
         reference: (n, 3) unit vectors.
         camera: with its lens.
         start: (4,) an attitude near the answer, reference into camera.
-        free_scale: whether the focal length may be wrong.
-        known: (6,) information about the lens's bend, which is fitted too; (0,) or None: it has none.
+        unknowns: what is fitted beside the attitude.
 
     Raises AttitudeError when the stars do not determine the parameters.
     """
-    observed = camera.unit_vectors(points)
-    held = np.zeros(0) if known is None else known
-    seen = _Seen(observed, _whitener(points, observed, covariance, camera), reference, free_scale, held)
+    seen = _Seen(camera.unit_vectors(points), _slopes(points, camera), covariance, reference, unknowns)
     pose = seen.fitted(_Pose(attitude_matrix(start), 1.0), np.ones(len(points)))
     squares, agree = seen.squares(pose), np.ones(len(points), dtype=np.bool_)
     if squares.max() > _FARTHEST:
         pose, agree = _without_outliers(seen, pose, squares)
         squares = seen.squares(pose)
+    if unknowns.scatter:
+        seen, pose = _scattered(seen, pose, agree)
+        squares = seen.squares(pose)
     inverse = pose.covariance * inflation(squares[agree], seen.parameters(pose))
     turn = np.ascontiguousarray(inverse[:3, :3], dtype=np.float64)
     fix = AttitudeFix(from_matrix(pose.matrix), turn, 0.5 * float(squares[agree].sum()))
-    return ImageFit(
-        fix, pose.scale, float(np.sqrt(inverse[3, 3])) if free_scale else 0.0, pose.bend, squares, agree
-    )
+    scale_sigma = float(np.sqrt(inverse[3, 3])) if unknowns.scale else 0.0
+    return ImageFit(fix, pose.scale, scale_sigma, pose.bend, pose.delay, squares, agree)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Pose:
-    """Attitude (3, 3), scale, bend (6,), and the covariance that weights of stars give them."""
+    """Attitude (3, 3), scale, bend (6,), delay, and the covariance that weights of stars give them."""
 
     matrix: FloatArray
     scale: float
     bend: FloatArray = field(default_factory=lambda: np.zeros(BENDS))
+    delay: float = 0.0
     covariance: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Seen:
-    """Stars seen at `observed` (n, 3) with `whitener` (n, 2, 3), at `reference` (n, 3) in the sky.
+    """Stars seen at `observed` (n, 3), at `reference` (n, 3) in the sky.
 
-    `known` (6,): information about the lens's bend before any star is seen; (0,): the lens has none.
+    `slopes` (n, 3, 2) are d(direction)/d(place), `covariance` (n, 2, 2) px^2 is of the places.
     """
 
     observed: FloatArray
-    whitener: FloatArray
+    slopes: FloatArray
+    covariance: FloatArray
     reference: FloatArray
-    free_scale: bool
-    known: FloatArray
+    unknowns: Unknowns
+    whitener: FloatArray = field(init=False)
+    late: FloatArray = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "whitener", _whitener(self.slopes, self.covariance))
+        late = self.unknowns.late
+        late = np.einsum("nij,nj->ni", self.slopes, late) if len(late) else np.zeros((0, 3))
+        object.__setattr__(self, "late", late)
 
     @property
-    def lens(self) -> IntArray:
-        """The places of the lens's bend among the parameters, after the turn and ln scale."""
-        return 3 + int(self.free_scale) + np.arange(len(self.known))
+    def before(self) -> FloatArray:
+        """The information about the last parameters, bend and delay, before any star is seen."""
+        return np.append(self.unknowns.bend, np.ones(min(len(self.late), 1)))
+
+    @property
+    def camera(self) -> IntArray:
+        """The places of bend and delay among the parameters, after the turn and ln scale."""
+        return 3 + int(self.unknowns.scale) + np.arange(len(self.before))
 
     def parameters(self, pose: _Pose) -> float:
-        """Return how many parameters the stars gave: of the bend only as much as was not known before."""
-        before = self.known * np.diagonal(pose.covariance)[self.lens]
+        """Return how many parameters the stars gave: of bend and delay only what was not known before."""
+        before = self.before * np.diagonal(pose.covariance)[self.camera]
         return len(pose.covariance) - float(before.sum())
 
     def fitted(self, start: _Pose, weight: FloatArray) -> _Pose:
         """Return the least of the squares times `weight` (n,)."""
         whitener = self.whitener * np.sqrt(weight)[:, None, None]
-        matrix, scale, bend = start.matrix, start.scale, start.bend
+        matrix, scale, known, bends = start.matrix, start.scale, self.before, len(self.unknowns.bend)
+        held = np.append(start.bend[:bends], np.full(len(known) - bends, start.delay))
         for _ in range(_MOST_STEPS):
-            seen, predicted = self.directions(scale, bend), self.reference @ matrix.T
+            pose = self._pose(matrix, scale, held)
+            seen, predicted = self.directions(pose), self.reference @ matrix.T
             residual = np.einsum("nij,nj->ni", whitener, seen - predicted).ravel()
             flat = self._slope(whitener, seen, predicted)
             normal, gradient = flat.T @ flat, flat.T @ residual
-            normal[self.lens, self.lens] += self.known
-            gradient[self.lens] += self.known * bend[: len(self.known)]
+            normal[self.camera, self.camera] += known
+            gradient[self.camera] += known * held
             try:
                 inverse = np.linalg.inv(normal)
             except np.linalg.LinAlgError as error:
                 raise AttitudeError(f"{len(weight)} stars in one place fix no attitude") from error
             step = -inverse @ gradient
-            if not np.all(np.abs(step[: 3 + int(self.free_scale)]) < 1.0):
+            if not np.all(np.abs(step[: 3 + int(self.unknowns.scale)]) < 1.0):
                 raise AttitudeError(f"{len(weight)} stars do not agree on an attitude")
             matrix = turned(matrix, step[:3])
-            scale *= float(np.exp(step[3])) if self.free_scale else 1.0
-            bend = bend + step[self.lens] if len(self.known) else bend
+            scale *= float(np.exp(step[3])) if self.unknowns.scale else 1.0
+            held = held + step[self.camera]
             if np.abs(step).max() < _SETTLED:
                 break
-        return _Pose(matrix, scale, bend, np.asarray(inverse, dtype=np.float64))
+        return replace(self._pose(matrix, scale, held), covariance=np.asarray(inverse, dtype=np.float64))
+
+    def _pose(self, matrix: FloatArray, scale: float, held: FloatArray) -> _Pose:
+        """Return a pose with the bend and the delay that are `held` (0, 1, 6 or 7,)."""
+        bends = len(self.unknowns.bend)
+        return _Pose(matrix, scale, np.pad(held[:bends], (0, BENDS - bends)), float(held[bends:].sum()))
 
     def _slope(self, whitener: FloatArray, seen: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Return d(whitened residuals)/d(turn, ln scale, bend), (2n, 3 to 10)."""
+        """Return d(whitened residuals)/d(turn, ln scale, bend, delay), (2n, 3 to 11)."""
         slopes = [-whitener @ cross_matrices(predicted)]
-        if self.free_scale:
+        if self.unknowns.scale:
             slopes.append(whitener @ scale_slope(seen)[:, :, None])
-        if len(self.known):
+        if len(self.unknowns.bend):
             slopes.append(whitener @ bend_slope(seen))
+        if len(self.late):
+            slopes.append(-whitener @ self.late[:, :, None])
         return np.concatenate(slopes, axis=2).reshape(2 * len(seen), -1)
 
-    def directions(self, scale: float, bend: FloatArray) -> FloatArray:
-        """Return the unit vectors (n, 3) seen through a lens of this scale and bend (6,)."""
-        return bent(stretched(self.observed, scale), bend)
+    def directions(self, pose: _Pose) -> FloatArray:
+        """Return the unit vectors (n, 3) seen, at mid-exposure, through the lens of a pose."""
+        seen = bent(stretched(self.observed, pose.scale), pose.bend)
+        return seen - pose.delay * self.late if len(self.late) else seen
 
     def squares(self, pose: _Pose) -> FloatArray:
         """Return each star's squared error over its covariance (n,)."""
-        missed = self.directions(pose.scale, pose.bend) - self.reference @ pose.matrix.T
-        return np.asarray(np.sum(np.einsum("nij,nj->ni", self.whitener, missed) ** 2, axis=1))
+        return np.asarray(np.sum(np.einsum("nij,nj->ni", self.whitener, self.missed(pose)) ** 2, axis=1))
+
+    def missed(self, pose: _Pose) -> FloatArray:
+        """Return by how much (n, 3) each star is seen away from where a pose puts it."""
+        return self.directions(pose) - self.reference @ pose.matrix.T
 
 
 def _without_outliers(seen: _Seen, pose: _Pose, squares: FloatArray) -> tuple[_Pose, BoolArray]:
@@ -192,18 +248,33 @@ def _agreeing(squares: FloatArray) -> BoolArray:
     return agree if enough else np.ones(len(squares), dtype=np.bool_)
 
 
-def _whitener(
-    points: FloatArray, observed: FloatArray, covariance: FloatArray, camera: CameraModel
-) -> FloatArray:
+def _scattered(seen: _Seen, pose: _Pose, agree: BoolArray) -> tuple[_Seen, _Pose]:
+    """Return stars and fit with the variance that stars which `agree` (n,) share beside their own."""
+    weight, own, variance = agree.astype(np.float64), seen.covariance, 0.0
+    for _ in range(_SCATTER_ROUNDS):
+        root = np.linalg.cholesky(seen.covariance[agree])
+        missed = np.einsum("nij,nj->ni", seen.whitener, seen.missed(pose))[agree]
+        excess = float(np.sum(missed**2)) - (2 * len(missed) - seen.parameters(pose))
+        if excess <= _EXPLAINED or len(missed) <= _LEAST_AGREEING:
+            break
+        # d(squares)/d(variance), the pose held: it is where they are least.
+        variance += excess / float(np.sum(np.linalg.solve(root.swapaxes(1, 2), missed[..., None]) ** 2))
+        seen = replace(seen, covariance=own + variance * np.eye(2))
+        pose = seen.fitted(pose, weight)
+    return seen, pose
+
+
+def _slopes(points: FloatArray, camera: CameraModel) -> FloatArray:
+    """Return d(direction)/d(place) (n, 3, 2) at points (n, 2) px."""
+    moved = [
+        camera.unit_vectors(points + offset) - camera.unit_vectors(points - offset)
+        for offset in _STEP_PX * np.eye(2)
+    ]
+    return np.stack(moved, axis=-1) / (2.0 * _STEP_PX)
+
+
+def _whitener(slopes: FloatArray, covariance: FloatArray) -> FloatArray:
     """Return matrices (n, 2, 3) that turn an error of a direction into two of variance one."""
-    slopes = np.stack(
-        [
-            camera.unit_vectors(points + offset) - camera.unit_vectors(points - offset)
-            for offset in _STEP_PX * np.eye(2)
-        ],
-        axis=-1,
-    ) / (2.0 * _STEP_PX)
-    root = np.linalg.cholesky(covariance)
-    spread = slopes @ root
+    spread = slopes @ np.linalg.cholesky(covariance)
     # The pseudo-inverse: the third direction, along the line of sight, carries no error.
     return np.asarray(np.linalg.inv(np.swapaxes(spread, -1, -2) @ spread) @ np.swapaxes(spread, -1, -2))

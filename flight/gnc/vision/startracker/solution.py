@@ -36,9 +36,11 @@ class FrameSolution:
         kind: what the frame shows.
         points: (n, 2) px at mid-exposure of the points taken for stars, brightest first.
         covariance: (n, 2, 2) px^2.
+        late: (n, 2) px by which one standard deviation of the shutter's line time displaces the points;
+            (0, 2) where it is exact.
         camera: with the focal length fitted to the stars, if it was free.
         star: (n,) numbers of guide stars, -1 for none.
-        expected: (n, 2) px, where the attitude puts the guide star; NaN for none.
+        expected: (n, 2) px, where attitude, lens and shutter put the guide star; NaN for none.
         fix: attitude, ICRS to camera, and its covariance; the smaller scalar part is not negative.
         scale_sigma: relative standard deviation of the focal length; 0 where it was given.
         bend: (6,) of a lens that is not exact, as the stars show it (`lens_bend`), else zeros.
@@ -55,6 +57,7 @@ class FrameSolution:
     camera: CameraModel
     points: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
     covariance: FloatArray = field(default_factory=lambda: np.empty((0, 2, 2)))
+    late: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
     star: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     expected: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
     fix: AttitudeFix | None = None

@@ -32,7 +32,7 @@ from flight.gnc.vision.startracker.identification.identification import Identifi
 from flight.gnc.vision.startracker.identification.lost_in_space import IdentificationSettings, identify
 from flight.gnc.vision.startracker.identification.tracking import track
 from flight.gnc.vision.startracker.identification.verification import expected_stars
-from flight.gnc.vision.startracker.image_fit import fit_in_image
+from flight.gnc.vision.startracker.image_fit import Unknowns, fit_in_image
 from flight.gnc.vision.startracker.index.sky_index import SkyIndex
 from flight.gnc.vision.startracker.lens_bend import known_bend, usual_bend
 from flight.gnc.vision.startracker.mid_exposure import timing_covariance
@@ -59,6 +59,8 @@ _UNTOLD_LENS_PX = 0.25
 _LEAST_SIGNIFICANCE = 5.0
 # px, standard deviation from which a star has no place: both ends of its streak may lie outside of the frame.
 _PLACELESS_PX = 5.0
+# Chi-square of 3, exceeded by chance once in 100,000: an attitude farther from the prior is another's.
+_NEAR = 25.9
 # Tracking looks for this number of stars, within PRIOR_SIGMAS of the prior.
 _LOOKED_FOR = 30
 PRIOR_SIGMAS = 4.0
@@ -166,7 +168,12 @@ def solve_motion(
     chosen = chosen[np.argsort(-motion.flux[chosen], kind="stable")]
     if not len(chosen):
         return seen
-    seen = replace(seen, points=motion.stars[chosen], covariance=motion.star_covariance[chosen])
+    seen = replace(
+        seen,
+        points=motion.stars[chosen],
+        covariance=motion.star_covariance[chosen],
+        late=motion.late(chosen, camera.centre[1]),
+    )
     solution = _identify(seen, motion.flux[chosen], scale, sky, settings, prior)
     if solution.fix is None:
         return solution
@@ -218,22 +225,22 @@ def solve_near(
     seen = FrameSolution(
         SolveStatus.NO_STARS, "", FrameKind.POINTS, camera, points, found.covariance, tracked=True
     )
+    if trails is not None and trails.delay_sigma:
+        seen = replace(seen, late=trails.delay_sigma * late)
     near = track(star_field(seen, found.flux, scale), sky, prior.quaternion, prior.sigma)
     if near.status is not Status.IDENTIFIED:
         return None
     solution = _shape_unknown(_with_attitude(seen, near, sky, settings), found, settings)
-    if trails is None or not trails.delay_sigma or not late.any():
-        return solution
-    other = _with_attitude(replace(seen, points=points + trails.delay_sigma * late), near, sky, settings)
-    return _with_doubt(solution, other)
+    return solution if _agrees(solution, prior) else None
 
 
-def _with_doubt(solution: FrameSolution, other: FrameSolution) -> FrameSolution:
-    """Return a solution that may as well be `other`, of places that are a standard deviation off alike."""
-    if solution.fix is None or other.fix is None:
-        return solution
-    off = to_rotation_vector(multiply(other.fix.quaternion, conjugate(solution.fix.quaternion)))
-    return solution.wider(np.outer(off, off))
+def _agrees(solution: FrameSolution, prior: AttitudePrior) -> bool:
+    """Return whether an attitude found near the prior is near it: it was tested against chance only there."""
+    if solution.fix is None:
+        return True
+    off = to_rotation_vector(multiply(solution.fix.quaternion, conjugate(prior.quaternion)))
+    known = solution.fix.covariance + prior.sigma**2 * np.eye(3)
+    return bool(off @ np.linalg.solve(known, off) < _NEAR)
 
 
 def _shape_unknown(solution: FrameSolution, found: Detections, settings: SolveSettings) -> FrameSolution:
@@ -262,7 +269,9 @@ def _identify(
     if prior is not None:
         near = track(stars, sky, prior.quaternion, prior.sigma)
         if near.status is Status.IDENTIFIED:
-            return _with_attitude(replace(seen, tracked=True), near, sky, settings)
+            solution = _with_attitude(replace(seen, tracked=True), near, sky, settings)
+            if _agrees(solution, prior):
+                return solution
     if settings.method is not None:
         return _with_attitude(seen, settings.method(stars, sky), sky, settings)
     options = settings.identification
@@ -287,6 +296,7 @@ def _mirrored(seen: FrameSolution) -> FrameSolution:
         points=axis + turned * seen.points,
         expected=axis + turned * seen.expected if len(seen.expected) else seen.expected,
         covariance=seen.covariance * np.outer(turned, turned),
+        late=turned * seen.late,
     )
 
 
@@ -320,19 +330,13 @@ def _with_attitude(
     known = _known_bend(camera, settings, free_scale, free_lens)
     least = _COLOUR_PX if settings.lens is not None and not len(known) else _LEAST_SIGMA_PX
     covariance = seen.covariance[chosen] + least**2 * np.eye(2)
+    places, late = seen.points[chosen], seen.late[chosen] if len(seen.late) else seen.late
+    unknowns = Unknowns(free_scale, known, late, seen.kind is FrameKind.STREAKS)
     try:
-        fit = fit_in_image(
-            seen.points[chosen],
-            covariance,
-            reference,
-            camera,
-            found.fix.quaternion,
-            free_scale,
-            known,
-        )
+        fit = fit_in_image(places, covariance, reference, camera, found.fix.quaternion, unknowns)
         fix = fit.fix
         if settings.attitude is not None:
-            fix = attitude_by(settings.attitude, seen.points[chosen], covariance, reference, camera, fit)
+            fix = attitude_by(settings.attitude, places, covariance, reference, camera, fit, late)
     except AttitudeError as error:
         return replace(seen, status=SolveStatus.AMBIGUOUS, reason=str(error))
     camera = camera.rescaled(1.0 / fit.scale)
@@ -342,6 +346,8 @@ def _with_attitude(
         fix = replace(fix, covariance=fix.covariance + lens_floor(camera))
     expected = np.full_like(seen.points, np.nan)
     expected[chosen] = SkyMap(camera, fix.quaternion, fit.bend).pixels(reference)
+    if len(late):
+        expected[chosen] += fit.delay * late
     return replace(
         seen,
         status=SolveStatus.SOLVED,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -165,6 +165,20 @@ def test_where_it_is_looked_for_is_what_was_ordered_else_where_the_camera_looks(
     flown.aim.aim(PointingTarget(Goal.NADIR))
     assert flown.aim.directed(job) is job
     assert not flown.aim.seeks
+
+
+def test_the_boresight_stays_where_an_object_is_looked_for_whatever_axis_the_body_points() -> None:
+    """The best course of weights that make a turn about +z cheap would lead up to 7 deg away."""
+    rng = np.random.default_rng(3)
+    for attitude in rng.normal(size=(5, 4)):
+        spin = 3.5e-4 * np.array([0.4, -0.5, 0.8])
+        flown = Chase(*CUBE, 0.0, 0.0, attitude / np.linalg.norm(attitude), np.eye(3)[0], spin)
+        flown.aim.aim(OBJECT)
+        axis = np.array([0.0, 0.0, 1.0])
+        weights = PointingWeights(turn=0.0175, rate=1.0, dipole=3e-4, fastest=0.014, roll=0.1745, axis=axis)
+        table = run(flown.aim.directed(replace(flown._job(0), weights=weights)))
+        shown = attitude_matrix(table.path.quaternion).transpose(0, 2, 1) @ BORESIGHT
+        assert np.degrees(np.arccos(np.clip(shown @ flown.first, -1.0, 1.0))).max() < 2.5
 
 
 def test_of_two_objects_the_brighter_is_followed_to_its_end() -> None:

@@ -90,9 +90,9 @@ def estimate_motion(
         return MotionResult(unusable, checksum, exposure)
     read = read_frame(pixels, pinhole, saturation, settings)
     binning, blobs = read.binning, read.blobs
-    settings = binning.settings(settings)
-    camera = _exposed_camera(read, exposure, settings, prior_course)
-    seen = MotionResult(StreakStatus.FAILED, checksum, exposure, hot_pixels=read.frame.hot_pixels)
+    camera = _exposed_camera(read, exposure, binning.settings(settings), prior_course)
+    hot, unsure = read.frame.hot_pixels, settings.line_time_sigma
+    seen = MotionResult(StreakStatus.FAILED, checksum, exposure, hot_pixels=hot, line_time_sigma=unsure)
     if len(blobs) < settings.least_stars:
         return replace(seen, status=StreakStatus.TOO_FEW)
     answer = None if _resting(blobs) else _in_time(camera, seen, blobs, prior_rate, prior_sigma, prior_course)

@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Self
 
-from flight.gnc.math.arrays import FloatArray
+import numpy as np
+
+from flight.gnc.math.arrays import FloatArray, IntArray
 from flight.gnc.math.quaternion import from_rotation_vector
 from flight.gnc.vision.streaks.maximum_likelihood.course import Course
 from flight.gnc.vision.streaks.maximum_likelihood.settings import RateModel
@@ -32,6 +34,7 @@ class MotionResult(FrameMotion):
         acceleration: (3,) rad/s^2 if fitted, else None.
         reason: of a missing rate, in a line; empty with a rate.
         course: the known course that the fit took for the rest of the motion; None without one.
+        line_time_sigma: s, by how much the shutter's line time may differ from the one that was fitted.
     """
 
     stars: FloatArray = field(default_factory=no_rows(2))
@@ -49,6 +52,7 @@ class MotionResult(FrameMotion):
     acceleration: FloatArray | None = None
     reason: str = ""
     course: Course | None = None
+    line_time_sigma: float = 0.0
 
     @property
     def start_to_end(self) -> FloatArray | None:
@@ -57,6 +61,17 @@ class MotionResult(FrameMotion):
         By the mean rate where it changes: exact about a fixed axis.
         """
         return None if self.rate is None else from_rotation_vector(self.rate * self.exposure)
+
+    def late(self, chosen: IntArray, middle_row: float) -> FloatArray:
+        """Return by how many px (m, 2) a standard deviation of the line time displaces `chosen` (m,) stars.
+
+        Each is exposed later by its row's distance from `middle_row`; (0, 2) where the line time is exact.
+        """
+        if not self.line_time_sigma:
+            return np.empty((0, 2))
+        start, end = self.endpoints[chosen].swapaxes(0, 1)
+        delay = self.line_time_sigma / self.exposure * (self.stars[chosen, 1:] - middle_row)
+        return np.asarray((end - start) * delay)
 
     def reversed(self) -> Self:
         """Return the same motion in the other direction of time; the change of the rate keeps its sign."""

@@ -15,7 +15,7 @@ from flight.gnc.math.quaternion import (
     multiply,
     to_rotation_vector,
 )
-from flight.gnc.vision.startracker.image_fit import ImageFit, fit_in_image
+from flight.gnc.vision.startracker.image_fit import ImageFit, Unknowns, fit_in_image
 from tests.studies.bench.untold_lens import drawn
 
 _CAMERA = Pinhole.from_field_of_view(1024, 1024, float(np.deg2rad(12.0)))
@@ -43,7 +43,7 @@ def _fit(
     seen: FloatArray, covariance: FloatArray, reference: FloatArray, free_scale: bool = False
 ) -> ImageFit:
     start = multiply(from_rotation_vector(np.array([1e-3, -2e-3, 3e-3])), _ATTITUDE)
-    return fit_in_image(seen, covariance, reference, _CAMERA, start, free_scale)
+    return fit_in_image(seen, covariance, reference, _CAMERA, start, Unknowns(free_scale))
 
 
 def _error(found: ImageFit) -> FloatArray:
@@ -156,3 +156,62 @@ def test_a_lens_that_nobody_gave_is_fitted_and_its_doubt_is_in_the_covariance() 
     assert np.mean(squares) < 1.0
     # A fit of the focal length alone is 0.7 px off.
     assert np.sqrt(np.mean(np.square(off))) < 0.2
+
+
+def test_a_shutter_that_nobody_described_is_fitted_and_its_doubt_is_in_the_covariance() -> None:
+    """Monte Carlo of 200 fields of 12 stars that move by 1 px a frame's height of delay, one deviation."""
+    rng = np.random.default_rng(6)
+    known, unknown, delays = 0.0, 0.0, 0.0
+    for _ in range(_TRIALS):
+        points, covariance = rng.uniform(50.0, 970.0, (12, 2)), np.tile(1e-4 * np.eye(2), (12, 1, 1))
+        velocity = rng.normal(size=2)
+        late = velocity / np.linalg.norm(velocity) * (points[:, 1:] - _CAMERA.centre[1]) / _CAMERA.rows
+        reference, delay = _reference(points), rng.normal()
+        seen = points + delay * late + 0.01 * rng.standard_normal((12, 2))
+        found = fit_in_image(seen, covariance, reference, _CAMERA, _ATTITUDE, Unknowns(late=late))
+        error, without = _error(found), _fit(seen, covariance, reference)
+        known += float(error @ np.linalg.solve(found.fix.covariance, error))
+        error = _error(without)
+        unknown += float(error @ np.linalg.solve(without.fix.covariance, error))
+        delays += (found.delay - delay) ** 2
+    assert _LOW < known / (3.0 * _TRIALS) < _HIGH
+    assert unknown > 2.0 * known
+    assert delays / _TRIALS < 0.02**2
+
+
+def test_bright_streaks_that_err_by_as_much_as_faint_ones_claim_no_more_than_they_know() -> None:
+    """Monte Carlo of 200 fields: all err by 0.05 px, which is ten times the noise of the brightest."""
+    rng = np.random.default_rng(7)
+    known, unknown, off, without = 0.0, 0.0, 0.0, 0.0
+    for _ in range(_TRIALS):
+        points, sigma = rng.uniform(50.0, 970.0, (20, 2)), np.geomspace(0.005, 0.2, 20)
+        covariance, reference = sigma[:, None, None] ** 2 * np.eye(2), _reference(points)
+        seen = points + np.hypot(sigma, 0.05)[:, None] * rng.standard_normal((20, 2))
+        found = fit_in_image(seen, covariance, reference, _CAMERA, _ATTITUDE, Unknowns(scatter=True))
+        error, other = _error(found), _fit(seen, covariance, reference)
+        known += float(error @ np.linalg.solve(found.fix.covariance, error))
+        off += float(np.sum(error[:2] ** 2))
+        error = _error(other)
+        unknown += float(error @ np.linalg.solve(other.fix.covariance, error))
+        without += float(np.sum(error[:2] ** 2))
+    # A share of the brightest is left out before: the variance of those left is a little too small.
+    assert known / (3.0 * _TRIALS) < 2.3
+    assert unknown > 4.0 * known
+    assert off < 0.7 * without
+
+
+def test_streaks_that_err_as_their_noise_says_lose_little_by_the_question() -> None:
+    rng = np.random.default_rng(8)
+    known, ratio = 0.0, []
+    for _ in range(_TRIALS):
+        points, covariance = _streaks(rng, 20)
+        reference = _reference(points)
+        seen = points + np.einsum("nij,nj->ni", np.linalg.cholesky(covariance), rng.standard_normal((20, 2)))
+        found = fit_in_image(seen, covariance, reference, _CAMERA, _ATTITUDE, Unknowns(scatter=True))
+        error = _error(found)
+        known += float(error @ np.linalg.solve(found.fix.covariance, error))
+        claim = np.trace(_fit(seen, covariance, reference).fix.covariance)
+        ratio.append(float(np.trace(found.fix.covariance) / claim))
+    assert _LOW < known / (3.0 * _TRIALS) < _HIGH
+    assert np.median(ratio) < 1.05
+    assert np.mean(ratio) < 1.7

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from flight.gnc.camera.images import read_image
+from flight.gnc.camera.pinhole import Pinhole
 from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import (
     angle_between,
@@ -18,8 +19,9 @@ from flight.gnc.math.quaternion import (
     to_rotation_vector,
 )
 from flight.gnc.vision.frame_job import solve_frame
+from flight.gnc.vision.startracker.detection import FrameKind
 from flight.gnc.vision.startracker.solution import FrameSolution, SolveStatus
-from flight.gnc.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings
+from flight.gnc.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings, solve_places
 from tests.flight.gnc.vision.startracker.frames import NARROW, SkyFrame, sky, sky_frame
 from tests.studies.attitude_errors import attitude_error
 from tests.studies.bench.sky import ARCSECONDS, photograph
@@ -97,6 +99,26 @@ def test_a_wrong_prior_costs_time_but_no_truth() -> None:
     assert found.status is SolveStatus.SOLVED
     assert not found.tracked
     assert _mismatch(found, frame.attitude) < _CHI_SQUARE_3_DOF_1E_5
+
+
+def test_an_attitude_far_from_its_prior_is_not_taken_for_the_one_there() -> None:
+    """The brightest place is 1.2 px off, by a star beside it: four agree on a roll of 30 prior sigmas."""
+    camera, sigma = Pinhole.from_field_of_view(512, 512, float(np.radians(20.0))), 1e-4
+    prior = np.array([-0.40584763582055994, 0.7184116261147981, 0.029066639845090374, 0.5642052484779536])
+    x = np.array([277.82, 104.81, 59.83, 6.82, 172.6, 204.45, 18.86, 173.75, 340.37, 466.16, 119.75])
+    y = np.array([202.35, 419.96, 312.28, 245.56, 504.17, 115.91, 357.28, 459.79, 357.14, 498.42, 53.05])
+    error = np.array([0.027, 0.044, 0.055, 0.065, 0.11, 0.12, 0.13, 0.16, 0.2, 0.24, 0.29])
+    found = solve_places(
+        np.stack([x, y], axis=1),
+        error[:, None, None] ** 2 * np.eye(2),
+        FrameKind.STREAKS,
+        camera,
+        (1.0, 1.0),
+        sky(),
+        SolveSettings(),
+        AttitudePrior(prior, sigma),
+    )
+    assert found.fix is None or angle_between(found.fix.quaternion, prior) < 6.0 * sigma
 
 
 def test_noise_alone_shows_no_star() -> None:
