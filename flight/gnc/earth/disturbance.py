@@ -4,9 +4,9 @@ The sizes are unknown and estimated; the shapes follow from the orbit. Air, whic
 presses against the flight through it, four times as hard below the day's bulge as by night (Montenbruck &
 Gill 2000, 3.5.2: cos^4 of half the angle from an apex 30 deg behind the Sun); light presses away from the
 Sun. Each torque is c x d: c a constant of the body, N m (force by arm of the centre of pressure), d the
-direction in body axes by the strength and by the area that is shown to it. The areas are those of the box that has the
-body's moments of inertia when its mass is even: a long body meets three times as much air across as along.
-What is constant in body axes stands for the rest.
+direction in body axes by the strength and by the area that is shown to it. The areas are those of the box
+that has the body's moments of inertia when its mass is even: a long body meets three times as much air across
+as along. What is constant in body axes stands for the rest.
 """
 
 from __future__ import annotations
