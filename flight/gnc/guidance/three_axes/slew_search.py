@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from itertools import zip_longest
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from flight.gnc.guidance.three_axes.slew_prey import guesses
 from flight.gnc.guidance.three_axes.slew_program import Descent
 from flight.gnc.guidance.three_axes.slew_solver import Found, Solver
 from flight.gnc.guidance.three_axes.slew_task import HORIZON_RANGE, LEAST_TIME, SlewTask
-from flight.gnc.guidance.three_axes.slew_transcription import Trajectory, Transcription
+from flight.gnc.guidance.three_axes.slew_transcription import Trajectory
 from flight.gnc.guidance.three_axes.slew_walk import ENOUGH, LONGER, Walker
 from flight.gnc.math.arrays import FloatArray
 
@@ -104,7 +103,7 @@ class Search:
         """Yield relaxed paths over a horizon, a few at a time; add to what is put off."""
         batch: list[Found] = []
         solver, least = self.solver, self.solver.steps + _PATIENCE
-        for guess in self._guesses(solver.equations(horizon, self._coarse))[:_MOST_TRIED]:
+        for guess in self._guesses(horizon)[:_MOST_TRIED]:
             self.tried += 1
             descent = solver.descent(solver.equations(horizon, self._coarse), guess)
             if solver.steps > least and not batch:
@@ -133,15 +132,13 @@ class Search:
             if found is not None:
                 yield [found]
 
-    def _guesses(self, equations: Transcription) -> list[Trajectory]:
-        """Return guesses: of each way round those that lack least first, the ways in turn."""
-        ways = []
-        made = guesses(equations.motion, self._task.craft, equations.start, equations.end, equations.around)
-        for way in made:
-            lacks = [float(np.abs(equations.remainders(guess)[0][:, 11:]).sum()) for guess in way]
-            ways.append(sorted(zip(lacks, way, strict=True), key=lambda pair: pair[0]))
-        turns = (sorted(filter(None, turn), key=lambda pair: pair[0]) for turn in zip_longest(*ways))
-        return [guess for turn in turns for _, guess in turn]
+    def _guesses(self, horizon: float) -> list[Trajectory]:
+        """Return guesses over a horizon, the promising ones first."""
+        equations, craft = self.solver.equations(horizon, self._coarse), self._task.craft
+        kept = self.solver.kept(equations)
+        return guesses(
+            equations.motion, craft, equations.start, equations.end, equations.around, kept, horizon
+        )
 
     def _cheapest(self, batch: list[Found]) -> list[Found]:
         """Return paths within the limits over the asked horizon, the cheapest first."""

@@ -72,7 +72,7 @@ class Solver:
 
     def is_kept(self, found: Found) -> bool:
         """Return whether a relaxed path keeps it."""
-        kept = self._kept(found.equations).values(found.at.states[1:, :4])
+        kept = self.kept(found.equations).values(found.at.states[1:, :4])
         return self.peak(found) <= 1.0 and bool(np.all(kept >= 0.0))
 
     def equations(self, scale: float, count: int) -> Transcription:
@@ -88,7 +88,7 @@ class Solver:
     def descent(self, equations: Transcription, guess: Trajectory, last: float = WALK_BARRIER) -> Descent:
         """Return the way from a guess to a path that keeps the cones, without the dipoles' limit."""
         equations.weights = self._full / max(equations.cost(guess), 1e-9)
-        return Descent(Program(equations, Limits(equations, None, self._kept(equations))), guess, last=last)
+        return Descent(Program(equations, Limits(equations, None, self.kept(equations))), guess, last=last)
 
     def limited(self, start: Found, count: int, time: float, last: float) -> Found | None:
         """Return the path within all limits on `count` intervals over `time` s, from one near it."""
@@ -100,7 +100,7 @@ class Solver:
         near = same and time == start.horizon and self.peak(start) < 1.0
         if not near and (last == LAST_BARRIER or self.peak(start) > 1.0):
             at = Trajectory(at.states, np.clip(at.dipoles, -0.98 * self._limit, 0.98 * self._limit))
-        program = Program(equations, Limits(equations, self._limit, self._kept(equations)))
+        program = Program(equations, Limits(equations, self._limit, self.kept(equations)))
         descent = Descent(program, at, price, WALK_BARRIER if near else FIRST_BARRIER, last)
         found = self.found(descent, _LOOK)
         if found is None and descent.lack < _HOPEFUL:
@@ -116,7 +116,8 @@ class Solver:
             return None
         return Found(program, point)
 
-    def _kept(self, equations: Transcription) -> Kept:
+    def kept(self, equations: Transcription) -> Kept:
+        """Return the cones at the points of equations but the first."""
         wider = self.extra if self.extra.shape[1] == 2 * equations.count else 0.0
         return Kept(self._task.cones, np.asarray(wider), equations.times[1:])
 
