@@ -28,6 +28,9 @@ _DENSE = 8
 _ROOM = math.radians(0.002)
 """rad, that a path keeps off a cone at those places: between them it comes nearer by less."""
 
+_OVER = 1.001
+"""Of the dipoles' limit, that the closing of a path may lead to."""
+
 
 class SlewStatus(StrEnum):
     """Whether the asked horizon was kept."""
@@ -72,7 +75,7 @@ def plan_slew(task: SlewTask) -> SlewPlan:
 
 
 def _first(task: SlewTask, search: Search, paths: Iterator[Found]) -> SlewPlan | None:
-    """Return the plan of the first path that keeps the cones between the nodes, too; None without one."""
+    """Return the plan of the first path that keeps limits and cones when flown, too; None without one."""
     for path in paths:
         found: Found | None = path
         while found is not None:
@@ -80,9 +83,12 @@ def _first(task: SlewTask, search: Search, paths: Iterator[Found]) -> SlewPlan |
             if plan is None:
                 break
             depths = _depths(task, plan.path)
-            if not depths.any():
+            if plan.peak > _OVER:
+                found = search.eased(found, plan.peak)
+            elif depths.any():
+                found = search.widened(found, depths)
+            else:
                 return plan
-            found = search.widened(found, depths)
     return None
 
 

@@ -221,7 +221,12 @@ class Descent:
     @property
     def lack(self) -> float:
         """The sum of all violations; zero from where the barriers have begun to fall."""
-        return 0.0 if 0.0 < self._barrier < self._first else sum(self.program.lack(self.point))
+        return 0.0 if 0.0 < self._barrier < self._first else self.missed
+
+    @property
+    def missed(self) -> float:
+        """The sum of all violations."""
+        return sum(self.program.lack(self.point))
 
     def run(self, most: int) -> Point | None:
         """Return the optimum found within `most` more steps, None when there is none."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from flight.gnc.guidance.three_axes.slew_prey import guesses
 from flight.gnc.guidance.three_axes.slew_program import Descent
-from flight.gnc.guidance.three_axes.slew_solver import Found, Solver
+from flight.gnc.guidance.three_axes.slew_solver import MET, Found, Solver
 from flight.gnc.guidance.three_axes.slew_task import HORIZON_RANGE, LEAST_TIME, SlewTask
 from flight.gnc.guidance.three_axes.slew_transcription import Trajectory
 from flight.gnc.guidance.three_axes.slew_walk import ENOUGH, LONGER, Walker
@@ -38,7 +38,7 @@ guesses, seed 41 of the bench `orbit_slews`)."""
 _PATIENCE = 120
 """Newton steps without a path, after which the other guesses over a horizon are put off."""
 _WIDENED = 4
-"""Times at most that cones are widened for a path."""
+"""Times at most that cones are widened, and dipoles eased, for a path."""
 
 
 class Search:
@@ -79,9 +79,14 @@ class Search:
         self._widened += 1
         return self._walker.widened(found, depths) if self._widened <= _WIDENED else None
 
+    def eased(self, found: Found, peak: float) -> Found | None:
+        """Return a path near one whose dipoles, flown, take `peak` of their limit; None without one."""
+        self._widened += 1
+        return self._walker.eased(found, peak) if self._widened <= _WIDENED else None
+
     def _fresh(self, found: Found) -> Found:
-        """Return a path whose cones are not widened."""
-        self._widened = 0
+        """Return a path whose cones are not widened, within the whole limit."""
+        self._widened, self.solver.share = 0, 1.0
         self.solver.extra = np.zeros_like(self.solver.extra)
         return found
 
@@ -112,7 +117,7 @@ class Search:
             found = solver.found(descent, _LOOK)
             for steps, lack in self._further:
                 if found is None and descent.lack < lack:
-                    found = solver.found(descent, steps)
+                    found = solver.found(descent, steps, MET)
             if found is not None:
                 batch.append(found)
             elif not descent.is_over:
@@ -128,7 +133,7 @@ class Search:
         for descent in sorted(put_off, key=lambda descent: descent.lack):
             if self.solver.steps > self._budget:
                 break
-            found = self.solver.found(descent, self._further[-1][0])
+            found = self.solver.found(descent, self._further[-1][0], MET)
             if found is not None:
                 yield [found]
 

@@ -15,8 +15,9 @@ ENOUGH = 3
 """Relaxed paths of which the best is taken."""
 LONGER = 1.0, 1.4, 2.0, 2.8
 """Times a horizon that does not suffice."""
-_FIRST_STEP, _COARSE_STEP, _LAST_STEP = 1.2, 1.02, 1.004
-"""Ratios of horizons on the walk to a shorter one; from the second on the grid is the fine one."""
+_COARSE_STEPS, _FINE_STEPS, _STRETCHED_STEPS = (1.2, 1.02), (1.02, 1.004), (1.02, 1.015)
+"""Ratios of horizons on the walk to a shorter one, the first and the last: on the coarse grid, on the fine one,
+and there where a slew is only to be stretched."""
 _CROSSED = 1.3
 """Times the depth to which a path crosses a cone between the points, the cone is widened there."""
 _BEYOND = math.radians(0.02)
@@ -60,7 +61,7 @@ class Walker:
                 continue
             if self._task.cones:
                 begun = self._finer(begun, begun.horizon, WALK_BARRIER) or begun
-            ended = self._walked(begun, least, price, _COARSE_STEP)
+            ended = self._walked(begun, least, price, _COARSE_STEPS)
             if best is None or self._value(ended, price) < self._value(best, price):
                 best = ended
             if best.horizon <= least or self._solver.steps > self._budget:
@@ -89,14 +90,26 @@ class Walker:
         self._solver.extra = self._solver.extra + both
         return self._solver.limited(found, found.equations.count, found.horizon, LAST_BARRIER)
 
+    def eased(self, found: Found, peak: float) -> Found | None:
+        """Return a path near one with dipoles smaller by `peak`, None without one.
+
+        A horizon that is not asked is longer by what makes the same way take so much less.
+        """
+        task, time = self._task, found.horizon
+        if task.time_price is not None or time > task.horizon * (1.0 + 1e-6):
+            time = min(time * math.sqrt(peak), task.longest)
+        self._solver.share /= peak
+        return self._solver.limited(found, found.equations.count, time, LAST_BARRIER)
+
     def _refined(self, best: Found, least: float, price: float) -> Found | None:
         """Return the best path on the fine grid, by a walk that begins with a coarse one."""
-        times = best.horizon * np.array([1.0, _COARSE_STEP, _COARSE_STEP**5])
+        times = best.horizon * np.array([1.0, 1.02, 1.1])
         longer = (self._finer(best, float(time), WALK_BARRIER) for time in times)
         fine = next(filter(None, longer), None)
         if fine is None:
             return None
-        fine = self._walked(fine, least, price, _LAST_STEP)
+        ratios = _STRETCHED_STEPS if self._task.time_price is None else _FINE_STEPS
+        fine = self._walked(fine, least, price, ratios)
         return self._solver.limited(fine, self._task.nodes, fine.horizon, LAST_BARRIER) or fine
 
     def _finer(self, coarse: Found, time: float, last: float) -> Found | None:
@@ -108,11 +121,11 @@ class Walker:
             fine = None if middle is None else solver.limited(middle, nodes, time, last)
         return fine
 
-    def _walked(self, best: Found, least: float, price: float, last: float) -> Found:
-        """Return the best path on a walk to shorter horizons, to a ratio `last` of one without a better."""
-        failed = 0.0
+    def _walked(self, best: Found, least: float, price: float, ratios: tuple[float, float]) -> Found:
+        """Return the best path on a walk to shorter horizons, to the last ratio of one without a better."""
+        (first, last), failed = ratios, 0.0
         while best.horizon > max(least, last * failed):
-            time = max(best.horizon / _FIRST_STEP, least, math.sqrt(best.horizon * failed))
+            time = max(best.horizon / first, least, math.sqrt(best.horizon * failed))
             further = self._over(best, time)
             if further is not None and self._value(further, price) < self._value(best, price):
                 best = further
