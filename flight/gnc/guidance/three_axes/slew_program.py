@@ -80,9 +80,13 @@ class Program:
         self.steps = 0
 
     def factors(self, point: Point) -> Factors:
-        """Return the factors of the equations of optimality at a point. Raises PlanningError."""
-        stiff = self._limits.stiffness(point.at, point.dual / point.slack, point.dual)
-        return Factors(self.equations.band(point.linear, point.price, *stiff))
+        """Return the factors that lead to the least change that mends equations. Raises PlanningError.
+
+        With the curvature of the equations in them, the way to a flat optimum's other side would be one, too.
+        """
+        states, heavy = self._limits.stiffness(point.at, point.dual / point.slack, np.zeros_like(point.dual))
+        stiff = states + _DAMPED * _EYE7, heavy + _DAMPED
+        return Factors(self.equations.band(point.linear, np.zeros_like(point.price), *stiff))
 
     def begin(self, guess: Trajectory, price: FloatArray | None, barrier: float) -> Point:
         """Return a guess as an iterate of Newton's method."""

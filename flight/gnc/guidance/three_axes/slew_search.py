@@ -16,22 +16,22 @@ import numpy as np
 from flight.gnc.guidance.three_axes.slew_prey import guesses
 from flight.gnc.guidance.three_axes.slew_program import Descent
 from flight.gnc.guidance.three_axes.slew_solver import MET, Found, Solver
-from flight.gnc.guidance.three_axes.slew_task import HORIZON_RANGE, LEAST_TIME, SlewTask
+from flight.gnc.guidance.three_axes.slew_task import HORIZON_RANGE, LEAST_TIME, SlewTask, in_the_way
 from flight.gnc.guidance.three_axes.slew_transcription import Trajectory
 from flight.gnc.guidance.three_axes.slew_walk import ENOUGH, LONGER, Walker
 from flight.gnc.math.arrays import FloatArray
 
-GRIDS, GRIDS_WITH_CONES = ((10, 1000),), ((12, 600), (16, 500))
-"""Searches, one after the other: intervals, and Newton steps after which nothing else is begun with.
-
-A thousand steps take about a second and a half. On ten intervals, what goes round cones is far from what
-does on the fine grid; half of the slews with cones for which twelve lead to none are found on sixteen.
-"""
+GRIDS, GRIDS_WITH_CONES = ((10, 5000),), ((12, 3500), (16, 3500))
+"""Searches, one after the other: intervals, and the work, Newton steps times intervals, after which no other guess
+is begun with. A thousand take about a tenth of a second. On ten intervals, what goes round cones is far from
+what does on the fine grid."""
+_WALKS = 1.8
+"""Times the work of a search, after which a walk ends with what it has."""
 _MOST_TRIED = 16
 """Guesses over one horizon."""
 _LOOK = 8
 """Newton steps of every guess."""
-_FURTHER, _FURTHER_WITH_CONES = ((17, 1.5),), ((12, 1.0), (30, 0.6))
+_FURTHER, _FURTHER_WITH_CONES = ((17, 1.5),), ((12, 1.0), (20, 0.4))
 """How many more it is given, one after the other, where its equations lack less in all; else it is put off.
 Four of five that lead to a path lack less than 1.5 after eight, three of four that do not lack more (320
 guesses, seed 41 of the bench `orbit_slews`)."""
@@ -45,10 +45,10 @@ class Search:
     """The search of one task; `tried` guesses."""
 
     def __init__(self, task: SlewTask, coarse: int, budget: int) -> None:
-        """Search on `coarse` intervals; after `budget` Newton steps nothing else is begun with."""
+        """Search on `coarse` intervals; after a `budget` of work nothing else is begun with."""
         self._task, self._budget = task, budget
         self.solver = Solver(task)
-        self._walker = Walker(task, self.solver, budget)
+        self._walker = Walker(task, self.solver, _WALKS * budget)
         self._coarse = min(task.nodes, coarse)
         self._further = _FURTHER_WITH_CONES if task.cones else _FURTHER
         self._widened = 0
@@ -98,7 +98,7 @@ class Search:
         put_off: list[Descent] = []
         for longer in LONGER:
             horizon = min(longer * self._task.horizon, self._task.longest)
-            if self.solver.steps < self._budget:
+            if self.solver.work < self._budget and in_the_way(self._task, horizon) is None:
                 yield self._relaxed(horizon, put_off)
             if horizon == self._task.longest:
                 break
@@ -131,7 +131,7 @@ class Search:
     def _late(self, put_off: list[Descent]) -> Iterator[list[Found]]:
         """Yield relaxed paths from guesses that were put off, those that lack least first."""
         for descent in sorted(put_off, key=lambda descent: descent.lack):
-            if self.solver.steps > self._budget:
+            if self.solver.work > self._budget:
                 break
             found = self.solver.found(descent, self._further[-1][0], MET)
             if found is not None:
@@ -150,7 +150,7 @@ class Search:
         kept: list[Found] = []
         energy = self.solver.energy
         for start in self._walker.distinct([start for start in batch if start.horizon <= self._task.horizon]):
-            if (kept and energy(start) >= min(map(energy, kept))) or self.solver.steps > self._budget:
+            if (kept and energy(start) >= min(map(energy, kept))) or self.solver.work > self._budget:
                 break
             if any(math.isclose(energy(start), known, rel_tol=1e-4) for known in self._known):
                 continue  # it led nowhere before

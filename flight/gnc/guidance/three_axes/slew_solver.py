@@ -15,9 +15,9 @@ from flight.gnc.math.hermite import HermiteCubic
 
 WALK_BARRIER, LAST_BARRIER = 1e-5, 1e-8
 """Of a path that others begin from, and of one that is flown."""
-MET = 1e-3
-"""Sum of all violations below which a path that others begin from is one, though no optimum yet: many come to
-their optimum slowly."""
+MET, _FLOWN_MET = 1e-2, 1e-4
+"""Sum of all violations below which a path that others begin from is one, though no optimum yet, and at last one
+that is flown: many come to their optimum slowly."""
 _STEPS_FREE = 25
 """Newton steps of a path without the dipoles' limit."""
 _LOOKS = (12, 1.2), (8, 0.2), (40, 0.0)
@@ -52,7 +52,7 @@ class Solver:
     """Solves for one task; `unit` A m^2 is that of its dipoles.
 
     `extra` (cones, 2 nodes) rad is added to its cones at the points of the fine grid; `share` of the dipoles'
-    limit is used.
+    limit is used. `steps` are Newton's so far, `work` those times the intervals.
     """
 
     def __init__(self, task: SlewTask) -> None:
@@ -62,7 +62,7 @@ class Solver:
         self._full = task.craft.weights / float(task.craft.weights @ self._limit**2)
         self.extra = np.zeros((len(task.cones), 2 * task.nodes))
         self.share = 1.0
-        self.steps = 0
+        self.steps = self.work = 0
 
     def energy(self, found: Found) -> float:
         """Return the heat of a path, J."""
@@ -108,8 +108,8 @@ class Solver:
         program = Program(equations, Limits(equations, limit, self.kept(equations)))
         descent = Descent(program, at, price, WALK_BARRIER if near else FIRST_BARRIER, last)
         for look, (steps, lack) in enumerate(_LOOKS):
-            is_enough = look == len(_LOOKS) - 1 or (look and last == WALK_BARRIER)
-            found = self.found(descent, steps, MET if is_enough else 0.0)
+            enough = MET if look and last == WALK_BARRIER else _FLOWN_MET * (look == len(_LOOKS) - 1)
+            found = self.found(descent, steps, enough)
             if found is not None or descent.lack >= lack:
                 return found
         return None
@@ -124,6 +124,7 @@ class Solver:
         if point is None and descent.missed < enough:
             point = descent.point
         self.steps += program.steps - before
+        self.work += (program.steps - before) * program.equations.count
         if point is None or not program.equations.end.is_met(point.at.states[-1, :4]):
             return None
         return Found(program, point)

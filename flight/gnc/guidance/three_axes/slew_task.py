@@ -86,6 +86,15 @@ def check(task: SlewTask) -> None:
             raise PlanningError(f"the end lies within the cone of the {cone.name}")
 
 
+def in_the_way(task: SlewTask, horizon: float) -> Cone | None:
+    """Return a cone within which a slew over `horizon` s would end, by its whole attitude; None without."""
+    end = task.end(horizon)
+    if not isinstance(end, Whole):
+        return None
+    shown, time = end.quaternion[None], np.array([horizon])
+    return next((cone for cone in task.cones if float(cone.clearance(shown, time)[0]) < 0.0), None)
+
+
 def _is_deep_inside(end: Whole, cone: Cone, time: float) -> bool:
     """Return whether an end at rest lies far within a cone."""
     inside = float(cone.clearance(end.quaternion[None], np.array([time]))[0])

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from flight.gnc.guidance.three_axes.slew_solver import LAST_BARRIER, WALK_BARRIER, Found, Solver, transferred
-from flight.gnc.guidance.three_axes.slew_task import SlewTask
+from flight.gnc.guidance.three_axes.slew_task import SlewTask, in_the_way
 from flight.gnc.math.arrays import FloatArray
 
 ENOUGH = 3
@@ -24,6 +24,8 @@ _BEYOND = math.radians(0.02)
 """rad, by which it is widened besides."""
 _BETWEEN = 16
 """Intervals of a path from which the fine grid is reached where it is not from the coarse one."""
+_LOST, _EASED_STEP = 1.5, 1.03
+"""Of the limit, beyond which a path is lost when flown; and how much longer one beyond the limit takes."""
 _PEAK = 0.9
 """Of the limit: the dipole of the slew at which the walk begins."""
 
@@ -31,8 +33,8 @@ _PEAK = 0.9
 class Walker:
     """Walks of one task."""
 
-    def __init__(self, task: SlewTask, solver: Solver, budget: int) -> None:
-        """After `budget` Newton steps no other walk is begun."""
+    def __init__(self, task: SlewTask, solver: Solver, budget: float) -> None:
+        """After a `budget` of work no other step of a walk is begun."""
         self._task, self._solver, self._budget = task, solver, budget
 
     def within(self, start: Found) -> Found | None:
@@ -64,7 +66,7 @@ class Walker:
             ended = self._walked(begun, least, price, _COARSE_STEPS)
             if best is None or self._value(ended, price) < self._value(best, price):
                 best = ended
-            if best.horizon <= least or self._solver.steps > self._budget:
+            if best.horizon <= least or self._solver.work > self._budget:
                 break
         return None if best is None else self._refined(best, least, price)
 
@@ -91,15 +93,22 @@ class Walker:
         return self._solver.limited(found, found.equations.count, found.horizon, LAST_BARRIER)
 
     def eased(self, found: Found, peak: float) -> Found | None:
-        """Return a path near one with dipoles smaller by `peak`, None without one.
+        """Return a path near one whose dipoles take `peak` of their limit when flown, None without one.
 
-        A horizon that is not asked is longer by what makes the same way take so much less.
+        It uses less of the limit, or takes longer where that leads to none or the horizon is not asked.
         """
-        task, time = self._task, found.horizon
-        if task.time_price is not None or time > task.horizon * (1.0 + 1e-6):
-            time = min(time * math.sqrt(peak), task.longest)
-        self._solver.share /= peak
-        return self._solver.limited(found, found.equations.count, time, LAST_BARRIER)
+        task, solver, time = self._task, self._solver, found.horizon
+        if peak > _LOST:
+            return None
+        solver.share /= peak
+        if task.time_price is None and time <= task.horizon * (1.0 + 1e-6):
+            eased = solver.limited(found, task.nodes, time, LAST_BARRIER)
+            if eased is not None:
+                return eased
+        time *= _EASED_STEP * math.sqrt(peak)
+        if time > task.longest or in_the_way(task, time) is not None:
+            return None
+        return solver.limited(found, task.nodes, time, LAST_BARRIER)
 
     def _refined(self, best: Found, least: float, price: float) -> Found | None:
         """Return the best path on the fine grid, by a walk that begins with a coarse one."""
@@ -124,7 +133,7 @@ class Walker:
     def _walked(self, best: Found, least: float, price: float, ratios: tuple[float, float]) -> Found:
         """Return the best path on a walk to shorter horizons, to the last ratio of one without a better."""
         (first, last), failed = ratios, 0.0
-        while best.horizon > max(least, last * failed):
+        while best.horizon > max(least, last * failed) and self._solver.work < self._budget:
             time = max(best.horizon / first, least, math.sqrt(best.horizon * failed))
             further = self._over(best, time)
             if further is not None and self._value(further, price) < self._value(best, price):
@@ -143,7 +152,8 @@ class Walker:
         times = [time, start.horizon] if time < start.horizon else [longer * time for longer in LONGER]
         if start.horizon == self._task.horizon and self._task.time_price is None and start.horizon in times:
             times.remove(start.horizon)  # it was tried
-        return [each for each in times if each <= self._task.longest]
+        task = self._task
+        return [each for each in times if each <= task.longest and in_the_way(task, each) is None]
 
     def _value(self, found: Found, price: float) -> float:
         """Return what a path costs, J; s where time alone counts."""
