@@ -20,7 +20,7 @@ from flight.gnc.guidance.three_axes.slew_closing import closed
 from flight.gnc.guidance.three_axes.slew_path import SlewPath
 from flight.gnc.guidance.three_axes.slew_search import GRIDS, GRIDS_WITH_CONES, Search
 from flight.gnc.guidance.three_axes.slew_solver import Found
-from flight.gnc.guidance.three_axes.slew_task import SlewTask, check
+from flight.gnc.guidance.three_axes.slew_task import SlewTask, check, in_the_way
 from flight.gnc.math.arrays import FloatArray
 
 _DENSE = 8
@@ -30,6 +30,9 @@ _ROOM = math.radians(0.002)
 
 _OVER = 1.001
 """Of the dipoles' limit, that the closing of a path may lead to."""
+
+_ENDS = 9
+"""Horizons of a refused slew, at whose ends cones are looked for."""
 
 
 class SlewStatus(StrEnum):
@@ -61,10 +64,19 @@ class SlewPlan:
     steps: int
 
 
-def plan_slew(task: SlewTask) -> SlewPlan:
-    """Return the best plan found. Raises PlanningError with the reason when there is none."""
+def plan_slew(task: SlewTask, near: SlewPath | None = None) -> SlewPlan:
+    """Return the best plan found. Raises PlanningError with the reason when there is none.
+
+    `near` is the path of a task that is nearly the same, over the same horizon: the plan near it is taken.
+    """
     check(task)
     tried = 0
+    if near is not None:
+        search = Search(task, *GRIDS[0])
+        found = search.solver.again(near)
+        plan = None if found is None else _first(task, search, iter([found]))
+        if plan is not None:
+            return plan
     for coarse, budget in GRIDS_WITH_CONES if task.cones else GRIDS:
         search = Search(task, coarse, budget)
         plan = _first(task, search, search.paths())
@@ -96,6 +108,12 @@ def _refusal(task: SlewTask, tried: int) -> str:
     """Return why a task is refused, and what may help."""
     text = f"no slew within the dipole's limit{' and outside the cones' * bool(task.cones)} was found"
     text += f" over {task.horizon:g} to {task.longest:g} s, from {tried} guesses"
+    ends = np.linspace(task.horizon, task.longest, _ENDS)
+    found = [(end, cone) for end in ends.tolist() if (cone := in_the_way(task, end)) is not None]
+    if found:
+        first, cone = found[0]
+        share = "one" if len(found) == 1 else "all" if len(found) == _ENDS else "many"
+        text += f", and of these {share} from {first:.0f} s on end within the cone of the {cone.name}"
     return f"{text}: a longer time or another begin may do"
 
 

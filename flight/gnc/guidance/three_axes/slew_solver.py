@@ -8,19 +8,21 @@ import numpy as np
 
 from flight.gnc.guidance.three_axes.slew_cones import Kept
 from flight.gnc.guidance.three_axes.slew_limits import Limits
+from flight.gnc.guidance.three_axes.slew_path import SlewPath
 from flight.gnc.guidance.three_axes.slew_program import FIRST_BARRIER, Descent, Point, Program
 from flight.gnc.guidance.three_axes.slew_task import SlewTask
 from flight.gnc.guidance.three_axes.slew_transcription import Trajectory, Transcription
+from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.hermite import HermiteCubic
 
 WALK_BARRIER, LAST_BARRIER = 1e-5, 1e-8
 """Of a path that others begin from, and of one that is flown."""
-MET, _FLOWN_MET = 1e-2, 1e-4
+MET, _FLOWN_MET = 1e-2, 3e-3
 """Sum of all violations below which a path that others begin from is one, though no optimum yet, and at last one
-that is flown: many come to their optimum slowly."""
+that is flown: many come to their optimum slowly. What is missed is mended by the closing."""
 _STEPS_FREE = 25
 """Newton steps of a path without the dipoles' limit."""
-_LOOKS = (12, 1.2), (8, 0.2), (40, 0.0)
+_LOOKS = (12, 1.2), (8, 0.2), (30, 0.0)
 """Newton steps within limits, one after the other, and from which lack on a way is left after them: half of
 those that lead nowhere are after the first, one in twenty of the others is."""
 
@@ -105,14 +107,35 @@ class Solver:
         near = same and time == start.horizon and self.peak(start) < self.share
         if not near and (last == LAST_BARRIER or self.peak(start) > self.share):
             at = Trajectory(at.states, np.clip(at.dipoles, -0.98 * limit, 0.98 * limit))
-        program = Program(equations, Limits(equations, limit, self.kept(equations)))
-        descent = Descent(program, at, price, WALK_BARRIER if near else FIRST_BARRIER, last)
+        return self._led(equations, at, price, (WALK_BARRIER if near else FIRST_BARRIER, last))
+
+    def again(self, path: SlewPath) -> Found | None:
+        """Return the path within all limits near one of a task that is nearly the same."""
+        equations = self.equations(path.horizon, (len(path.times) - 1) // 2)
+        states = np.concatenate([path.quaternion, path.horizon * path.rate], axis=1)
+        at = Trajectory(states, path.dipole[::2] / self.unit)
+        equations.weights = self._full / max(equations.cost(at), 1e-9)
+        return self._led(equations, at, None, (WALK_BARRIER, LAST_BARRIER))
+
+    def _led(
+        self,
+        equations: Transcription,
+        at: Trajectory,
+        price: FloatArray | None,
+        barriers: tuple[float, float],
+    ) -> Found | None:
+        """Return the path within all limits that a trajectory leads to; barriers fall from first to last."""
+        limits = Limits(equations, self.share * self._limit, self.kept(equations))
+        descent = Descent(Program(equations, limits), at, price, *barriers)
+        found = None
         for look, (steps, lack) in enumerate(_LOOKS):
-            enough = MET if look and last == WALK_BARRIER else _FLOWN_MET * (look == len(_LOOKS) - 1)
+            enough = _FLOWN_MET * (look == len(_LOOKS) - 1)
+            if look and barriers[1] == WALK_BARRIER:
+                enough = MET
             found = self.found(descent, steps, enough)
             if found is not None or descent.lack >= lack:
-                return found
-        return None
+                break
+        return found
 
     def found(self, descent: Descent, most: int, enough: float = 0.0) -> Found | None:
         """Return the path that at most so many steps more lead to.

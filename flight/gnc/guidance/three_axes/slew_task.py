@@ -79,8 +79,9 @@ def check(task: SlewTask) -> None:
         raise PlanningError(f"a price of time of {task.time_price} W: it must be positive")
     end = task.end(task.horizon)
     for cone in task.cones:
-        if float(cone.clearance(task.quaternion[None], np.zeros(1))[0]) < 0.0:
-            raise PlanningError(f"the start lies within the cone of the {cone.name}")
+        inside = -math.degrees(float(cone.clearance(task.quaternion[None], np.zeros(1))[0]))
+        if inside > 0.0:
+            raise PlanningError(f"the start lies within the cone of the {cone.name}, by {inside:.1f} deg")
         # The cones move by some degrees over a slew: deep inside, no other horizon helps.
         if isinstance(end, Whole) and _is_deep_inside(end, cone, task.horizon):
             raise PlanningError(f"the end lies within the cone of the {cone.name}")

@@ -16,8 +16,8 @@ ENOUGH = 3
 LONGER = 1.0, 1.4, 2.0, 2.8
 """Times a horizon that does not suffice."""
 _COARSE_STEPS, _FINE_STEPS, _STRETCHED_STEPS = (1.2, 1.02), (1.02, 1.004), (1.02, 1.015)
-"""Ratios of horizons on the walk to a shorter one, the first and the last: on the coarse grid, on the fine one,
-and there where a slew is only to be stretched."""
+"""Ratios of horizons on the walk to a shorter one, the first and the last: on the coarse grid, on the fine
+one, and there where a slew is only to be stretched."""
 _CROSSED = 1.3
 """Times the depth to which a path crosses a cone between the points, the cone is widened there."""
 _BEYOND = math.radians(0.02)
