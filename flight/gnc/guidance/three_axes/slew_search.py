@@ -21,10 +21,10 @@ from flight.gnc.guidance.three_axes.slew_transcription import Trajectory
 from flight.gnc.guidance.three_axes.slew_walk import ENOUGH, LONGER, Walker
 from flight.gnc.math.arrays import FloatArray
 
-GRIDS, GRIDS_WITH_CONES = ((10, 5000),), ((12, 3500), (16, 3500))
-"""Searches, one after the other: intervals, and the work, Newton steps times intervals, after which no other guess
-is begun with. A thousand take about a tenth of a second. On ten intervals, what goes round cones is far from
-what does on the fine grid."""
+GRIDS, GRIDS_WITH_CONES = ((10, 5000),), ((12, 3500), (16, 3000))
+"""Searches, one after the other: intervals, and the work, Newton steps times intervals, after which no other
+guess is begun with. A thousand take about a tenth of a second. On ten intervals, what goes round cones is far
+from what does on the fine grid."""
 _WALKS = 1.8
 """Times the work of a search, after which a walk ends with what it has."""
 _MOST_TRIED = 16

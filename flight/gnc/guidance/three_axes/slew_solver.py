@@ -18,11 +18,11 @@ from flight.gnc.math.hermite import HermiteCubic
 WALK_BARRIER, LAST_BARRIER = 1e-5, 1e-8
 """Of a path that others begin from, and of one that is flown."""
 MET, _FLOWN_MET = 1e-2, 3e-3
-"""Sum of all violations below which a path that others begin from is one, though no optimum yet, and at last one
-that is flown: many come to their optimum slowly. What is missed is mended by the closing."""
+"""Sum of all violations below which a path that others begin from is one, though no optimum yet, and at last
+one that is flown: many come to their optimum slowly. What is missed is mended by the closing."""
 _STEPS_FREE = 25
 """Newton steps of a path without the dipoles' limit."""
-_LOOKS = (12, 1.2), (8, 0.2), (30, 0.0)
+_LOOKS = (12, 1.2), (8, 0.2), (40, 0.0)
 """Newton steps within limits, one after the other, and from which lack on a way is left after them: half of
 those that lead nowhere are after the first, one in twenty of the others is."""
 

@@ -36,6 +36,7 @@ class Walker:
     def __init__(self, task: SlewTask, solver: Solver, budget: float) -> None:
         """After a `budget` of work no other step of a walk is begun."""
         self._task, self._solver, self._budget = task, solver, budget
+        self._lost: set[tuple[float, float, float]] = set()  # coarse paths that led to no fine one
 
     def within(self, start: Found) -> Found | None:
         """Return the path within the limits, on the fine grid, near a coarse one without."""
@@ -124,10 +125,15 @@ class Walker:
     def _finer(self, coarse: Found, time: float, last: float) -> Found | None:
         """Return a coarse path on the fine grid, over `time` s."""
         nodes, solver = self._task.nodes, self._solver
+        key = (coarse.horizon, solver.energy(coarse), time)
+        if key in self._lost:
+            return None
         fine = solver.limited(coarse, nodes, time, last)
         if fine is None and nodes > _BETWEEN:
             middle = solver.limited(coarse, _BETWEEN, time, WALK_BARRIER)
             fine = None if middle is None else solver.limited(middle, nodes, time, last)
+        if fine is None:
+            self._lost.add(key)
         return fine
 
     def _walked(self, best: Found, least: float, price: float, ratios: tuple[float, float]) -> Found:
