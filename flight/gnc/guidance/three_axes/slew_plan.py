@@ -23,13 +23,15 @@ from flight.gnc.guidance.three_axes.slew_solver import Found
 from flight.gnc.guidance.three_axes.slew_task import SlewTask, check, in_the_way
 from flight.gnc.math.arrays import FloatArray
 
-_DENSE = 8
+_DENSE = 16
 """Places between two of a path's nodes and midpoints where cones are looked at."""
-_ROOM = math.radians(0.002)
+_ROOM = math.radians(0.005)
 """rad, that a path keeps off a cone at those places: between them it comes nearer by less."""
 
 _OVER = 1.001
 """Of the dipoles' limit, that the closing of a path may lead to."""
+_ASTRAY = 1.05
+"""By how much a path that no integrator leads along is eased."""
 
 _ENDS = 9
 """Horizons of a refused slew, at whose ends cones are looked for."""
@@ -93,7 +95,8 @@ def _first(task: SlewTask, search: Search, paths: Iterator[Found]) -> SlewPlan |
         while found is not None:
             plan = _plan(task, search, found)
             if plan is None:
-                break
+                found = search.eased(found, _ASTRAY)
+                continue
             depths = _depths(task, plan.path)
             if plan.peak > _OVER:
                 found = search.eased(found, plan.peak)
