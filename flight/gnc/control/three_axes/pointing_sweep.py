@@ -85,19 +85,45 @@ def linearised(
     of each `pressed`: a constant (3,) of the body, N m, and the direction (n, 3) ICRS, with which it makes a
     torque.
     """
-    turned = attitude_matrix(references.quaternion)
-    shown = np.einsum("nij,nj->ni", turned, field)
-    flow, missing = _flow(references, inertia, np.einsum("nij,nj->ni", turned, position))
-    inverse = np.linalg.inv(inertia)
-    if dipole is not None:
-        flow[:, 3:, :3] += inverse @ cross_matrices(dipole) @ cross_matrices(shown)
-    for constant, direction in pressed:
-        met = cross_matrices(np.einsum("nij,nj->ni", turned, direction))
-        flow[:, 3:, :3] += inverse @ cross_matrices(constant[None]) @ met
+    rate, inverse = references.rate, np.linalg.inv(inertia)
+    slopes, shown, up = acceleration_slopes(
+        references.quaternion, rate, inertia, field, position, dipole, pressed
+    )
+    flow = np.zeros((len(rate), 6, 6))
+    flow[:, :3, :3], flow[:, :3, 3:], flow[:, 3:] = -cross_matrices(rate), _EYE3, slopes
     dt = float(references.times[1] - references.times[0])
     transition, pushed = _discrete(flow, dt)
     by_torque = pushed @ inverse
+    momentum = rate @ inertia.T
+    missing = references.acceleration @ inertia.T + np.cross(rate, momentum) - _gradient(inertia, up)[0]
     return Linear(transition, -by_torque @ cross_matrices(shown), by_torque, missing, shown)
+
+
+def acceleration_slopes(
+    quaternion: FloatArray,
+    rate: FloatArray,
+    inertia: FloatArray,
+    field: FloatArray,
+    position: FloatArray,
+    dipole: FloatArray | None = None,
+    pressed: Sequence[tuple[FloatArray, FloatArray]] = (),
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return how the accelerations change with turn and rate (n, 3, 6), and field and place in body axes.
+
+    Of attitudes (n, 4) and rates (n, 3) rad/s; the rest as in `linearised`.
+    """
+    turned, inverse = attitude_matrix(quaternion), np.linalg.inv(inertia)
+    shown, up = (np.einsum("nij,nj->ni", turned, vectors) for vectors in (field, position))
+    slopes = np.empty((len(rate), 3, 6))
+    by_turn = _gradient(inertia, up)[1]
+    if dipole is not None:
+        by_turn = by_turn + cross_matrices(dipole) @ cross_matrices(shown)
+    for constant, direction in pressed:
+        met = cross_matrices(np.einsum("nij,nj->ni", turned, direction))
+        by_turn = by_turn + cross_matrices(constant[None]) @ met
+    slopes[:, :, :3] = inverse @ by_turn
+    slopes[:, :, 3:] = inverse @ (cross_matrices(rate @ inertia.T) - cross_matrices(rate) @ inertia)
+    return slopes, shown, up
 
 
 def sweep(linear: Linear, affine: FloatArray, cost: Cost, end: ToGo) -> tuple[FloatArray, FloatArray, ToGo]:
@@ -124,25 +150,15 @@ def sweep(linear: Linear, affine: FloatArray, cost: Cost, end: ToGo) -> tuple[Fl
     return gain, steady, ToGo(square, slope)
 
 
-def _flow(references: References, inertia: FloatArray, position: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the errors' flow (n, 6, 6), and the reference's torque (n, 3); `position` is in its axes."""
-    rate = references.rate
-    momentum = rate @ inertia.T
-    turning = cross_matrices(rate)
-    radius = np.linalg.norm(position, axis=1)
-    down = -position / radius[:, None]
+def _gradient(inertia: FloatArray, up: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return gravity's torque (n, 3) and how it changes with the turn (n, 3, 3); `up` (n, 3) m, body axes."""
+    radius = np.linalg.norm(up, axis=1)
+    down = -up / radius[:, None]
     strength = 3.0 * GRAVITATIONAL_PARAMETER / radius**3
     stiff = down @ inertia.T
-    gradient = strength[:, None] * np.cross(down, stiff)
     crossed = cross_matrices(down)
     stiffness = strength[:, None, None] * ((crossed @ inertia - cross_matrices(stiff)) @ crossed)
-    inverse = np.linalg.inv(inertia)
-    flow = np.zeros((len(rate), 6, 6))
-    flow[:, :3, :3] = -turning
-    flow[:, :3, 3:] = _EYE3
-    flow[:, 3:, :3] = inverse @ stiffness
-    flow[:, 3:, 3:] = inverse @ (cross_matrices(momentum) - turning @ inertia)
-    return flow, references.acceleration @ inertia.T + np.cross(rate, momentum) - gradient
+    return strength[:, None] * np.cross(down, stiff), stiffness
 
 
 def _discrete(flow: FloatArray, dt: float) -> tuple[FloatArray, FloatArray]:

@@ -9,6 +9,7 @@ import pytest
 
 from flight.gnc.control.three_axes.pointing_course import best_course
 from flight.gnc.control.three_axes.pointing_path import RUN_AWAY, Expected, Gains, Motion, fly
+from flight.gnc.control.three_axes.pointing_step import carried, derivative, missed
 from flight.gnc.control.three_axes.pointing_sweep import linearised
 from flight.gnc.control.three_axes.pointing_table import PointingWeights, prices
 from flight.gnc.earth.disturbance import pressures
@@ -17,6 +18,7 @@ from flight.gnc.math.arrays import FloatArray
 from flight.gnc.math.quaternion import (
     angle_between,
     attitude_matrix,
+    conjugate,
     from_rotation_vector,
     multiply,
     to_rotation_vector,
@@ -32,6 +34,8 @@ SIZES = np.array([0.0, 2e-10, 0.0, -1e-10, 1e-9, 2e-9, 3e-10, 0.0, 2e-10])
 """N m: of a KnightCube whose mass centre is 6 mm off the middle, of a seed of `orbit-pointing`."""
 DEAR = PointingWeights(turn=np.radians(1.0), rate=1.0, dipole=3e-4)
 CHEAP = replace(DEAR, roll=np.radians(10.0), axis=Z)
+BULGED = np.array([4.6e-11, 8.9e-11, -1.1e-10, 3.9e-9, 1.7e-9, 2.35e-9, 3.6e-10, 4.0e-10, 2.2e-10])
+"""N m, of another seed, in which a KnightCube was lost."""
 KEPT = 180
 
 
@@ -151,6 +155,47 @@ def test_a_begin_off_the_law_is_led_into_it() -> None:
     assert found is not None
     np.testing.assert_allclose(to_rotation_vector(found[0].quaternion[0]), to_rotation_vector(q), atol=1e-12)
     assert off_axis(found[0])[KEPT:].max() < 3.0
+
+
+@pytest.mark.parametrize("roll", [60.0, -100.0])
+def test_a_begin_far_about_the_axis_leads_to_a_motion_that_the_body_flies(roll: float) -> None:
+    """Whole steps by the derivative of the continuous motion ended in motions 40 deg off, or in none."""
+    ahead = expected(BULGED)
+    q = multiply(from_rotation_vector(np.radians([1.0, -1.0, roll])), ahead.wanted.quaternion[0])
+    begun = ahead.wanted.until(KEPT + 1)
+    begun = replace(begun, quaternion=np.concatenate([q[None], begun.quaternion[1:]]))
+    found = best_course(ahead, begun, *prices(CHEAP, STEP), 0.01)
+    assert found is not None
+    assert off_axis(found[0]).max() < 25.0
+    lack = np.abs(missed(ahead, found[0])).sum(axis=0)
+    assert lack[:3].max() < np.radians(0.1)
+    assert lack[3:].max() < 1e-5
+
+
+def test_the_derivative_of_a_step_is_exact(rolling: Motion) -> None:
+    """By differences, of a body that turns by 2 deg/s: 20 deg in a step."""
+    ahead, size = expected(), 1e-6
+    spun = Motion(rolling.quaternion, rolling.rate + np.array([0.02, -0.02, 0.02]), rolling.control)
+    linear = derivative(ahead, spun)
+    for axis in range(9):
+        turn, rate, dipole = size * np.eye(9)[axis].reshape(3, 3)
+        ends = [
+            carried(
+                ahead,
+                Motion(
+                    multiply(from_rotation_vector(np.tile(way * turn, (len(spun.rate), 1))), spun.quaternion),
+                    spun.rate + way * rate,
+                    spun.control + way * dipole,
+                ),
+            )
+            for way in (1.0, -1.0)
+        ]
+        turned = to_rotation_vector(multiply(ends[0][0], conjugate(ends[1][0])))
+        slope = np.concatenate([turned, ends[0][1] - ends[1][1]], axis=1) / (2.0 * size)
+        wanted = linear.transition[:, :, axis] if axis < 6 else linear.by_control[:, :, axis - 6]
+        for part in (slice(0, 3), slice(3, 6)):
+            largest = float(np.abs(wanted[:, part]).max())
+            np.testing.assert_allclose(slope[:, part], wanted[:, part], atol=1e-5 * largest)
 
 
 def test_a_motion_that_runs_away_is_none_without_a_warning() -> None:
