@@ -116,14 +116,17 @@ def slew(
         return found
     # What presses on the body depends on the areas that it shows along the path.
     pressed = along(ahead, first, box_areas(begin.inertia), found)
-    return _slow_enough(replace(task, along=pressed, horizon=found.horizon), fastest) or found
+    return _slow_enough(replace(task, along=pressed, horizon=found.horizon), fastest, found) or found
 
 
-def _slow_enough(task: SlewTask, fastest: float) -> SlewPath | None:
-    """Return the path of a task, over a longer time where it would turn too fast; None without one."""
+def _slow_enough(task: SlewTask, fastest: float, near: SlewPath | None = None) -> SlewPath | None:
+    """Return the path of a task, over a longer time where it would turn too fast; None without one.
+
+    `near` is the path of a task that is nearly the same.
+    """
     for _ in range(_TRIALS):
         try:
-            path = plan_slew(task).path
+            path = plan_slew(task, near).path
         except PlanningError:
             return None
         speed = float(np.linalg.norm(path.rate, axis=1).max())
@@ -132,7 +135,7 @@ def _slow_enough(task: SlewTask, fastest: float) -> SlewPath | None:
         longer = path.horizon * min(_SLOWER * speed / fastest, _MOST_SLOWER)
         if longer > LONGEST:
             return None
-        task = replace(task, horizon=longer)
+        task, near = replace(task, horizon=longer), None
     return None
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from flight.gnc.errors import PlanningError
 from flight.gnc.guidance.three_axes.slew_model import Along, Motion, SlewCraft
 from flight.gnc.guidance.three_axes.slew_program import Point, Program
 from flight.gnc.guidance.three_axes.slew_transcription import Trajectory
@@ -16,14 +17,15 @@ from flight.gnc.math.arrays import FloatArray
 
 _STEPS = 4
 """Runge-Kutta steps of an interval, an even number."""
-_ROUNDS = 3
+_ROUNDS, _CLOSED, _LOST = 6, 1e-7, 1e-4
+"""At most; what is missed at a node when it is closed, and when it cannot be: rad, half an angle."""
 
 
 def closed(craft: SlewCraft, unit: float, along: Along, program: Program, point: Point) -> Trajectory:
     """Return the trajectory near a solved `point` whose dipoles, integrated, lead through its states.
 
     `unit` A m^2 is that of the dipoles, `along` gives the surroundings. Raises PlanningError where the
-    equations at the point are singular.
+    equations at the point are singular, or do not lead there.
     """
     equations, at = program.equations, point.at
     place, count, scale = equations.layout, equations.count, equations.scale
@@ -31,16 +33,20 @@ def closed(craft: SlewCraft, unit: float, along: Along, program: Program, point:
     firsts = 2 * _STEPS * np.arange(count)
     motions = [Motion(craft, scale, unit, around.part(firsts + k)) for k in range(2 * _STEPS + 1)]
     factors = program.factors(point)
+    middles, ends = _integrated(motions, at, 1.0 / count)
     for _ in range(_ROUNDS):
-        middles, ends = _integrated(motions, at, 1.0 / count)
         missed = np.zeros(place.size)
         missed[place.equations[:, 7:]] = at.states[2::2] - ends
         missed[place.start], missed[place.end] = equations.ends_missed(at)
+        if float(np.abs(missed).max()) < _CLOSED:
+            break
         change = factors.solve(-missed)
-        states = at.states + change[place.states]
-        states[1::2] = middles + change[place.states[1::2]]
-        at = Trajectory(states, at.dipoles + change[place.dipoles])
-    states[1::2], _ = _integrated(motions, at, 1.0 / count)
+        at = Trajectory(at.states + change[place.states], at.dipoles + change[place.dipoles])
+        middles, ends = _integrated(motions, at, 1.0 / count)
+    if not float(np.abs(missed).max()) < _LOST:
+        raise PlanningError("what the path misses grows as it is mended")
+    states = at.states.copy()
+    states[1::2] = middles
     return Trajectory(states, at.dipoles)
 
 

@@ -49,9 +49,9 @@ class Kept:
         """(cones, n, 4, 4), the second derivative by the attitude."""
 
     def values(self, q: FloatArray) -> FloatArray:
-        """Return g (cones, n) at attitudes (n, 4)."""
-        return np.asarray(self._limits + 0.5 * np.sum(self.slopes(q) * q, axis=2))
+        """Return g (cones, n) at attitudes (n, 4); of many paths (m, 1, n, 4) (m, cones, n)."""
+        return np.asarray(self._limits + 0.5 * np.sum(self.slopes(q) * q, axis=-1))
 
     def slopes(self, q: FloatArray) -> FloatArray:
         """Return the derivative (cones, n, 4) by the attitude."""
-        return np.asarray((self.curvatures @ q[:, :, None])[..., 0])
+        return np.asarray((self.curvatures @ q[..., None])[..., 0])

@@ -20,13 +20,21 @@ from flight.gnc.guidance.three_axes.slew_closing import closed
 from flight.gnc.guidance.three_axes.slew_path import SlewPath
 from flight.gnc.guidance.three_axes.slew_search import GRIDS, GRIDS_WITH_CONES, Search
 from flight.gnc.guidance.three_axes.slew_solver import Found
-from flight.gnc.guidance.three_axes.slew_task import SlewTask, check
+from flight.gnc.guidance.three_axes.slew_task import SlewTask, check, in_the_way
 from flight.gnc.math.arrays import FloatArray
 
-_DENSE = 8
+_DENSE = 16
 """Places between two of a path's nodes and midpoints where cones are looked at."""
-_ROOM = math.radians(0.002)
+_ROOM = math.radians(0.005)
 """rad, that a path keeps off a cone at those places: between them it comes nearer by less."""
+
+_OVER = 1.001
+"""Of the dipoles' limit, that the closing of a path may lead to."""
+_ASTRAY = 1.05
+"""By how much a path that no integrator leads along is eased."""
+
+_ENDS = 9
+"""Horizons of a refused slew, at whose ends cones are looked for."""
 
 
 class SlewStatus(StrEnum):
@@ -58,10 +66,19 @@ class SlewPlan:
     steps: int
 
 
-def plan_slew(task: SlewTask) -> SlewPlan:
-    """Return the best plan found. Raises PlanningError with the reason when there is none."""
+def plan_slew(task: SlewTask, near: SlewPath | None = None) -> SlewPlan:
+    """Return the best plan found. Raises PlanningError with the reason when there is none.
+
+    `near` is the path of a task that is nearly the same, over the same horizon: the plan near it is taken.
+    """
     check(task)
     tried = 0
+    if near is not None:
+        search = Search(task, *GRIDS[0])
+        found = search.solver.again(near)
+        plan = None if found is None else _first(task, search, iter([found]))
+        if plan is not None:
+            return plan
     for coarse, budget in GRIDS_WITH_CONES if task.cones else GRIDS:
         search = Search(task, coarse, budget)
         plan = _first(task, search, search.paths())
@@ -72,17 +89,21 @@ def plan_slew(task: SlewTask) -> SlewPlan:
 
 
 def _first(task: SlewTask, search: Search, paths: Iterator[Found]) -> SlewPlan | None:
-    """Return the plan of the first path that keeps the cones between the nodes, too; None without one."""
+    """Return the plan of the first path that keeps limits and cones when flown, too; None without one."""
     for path in paths:
         found: Found | None = path
         while found is not None:
             plan = _plan(task, search, found)
             if plan is None:
-                break
+                found = search.eased(found, _ASTRAY)
+                continue
             depths = _depths(task, plan.path)
-            if not depths.any():
+            if plan.peak > _OVER:
+                found = search.eased(found, plan.peak)
+            elif depths.any():
+                found = search.widened(found, depths)
+            else:
                 return plan
-            found = search.widened(found, depths)
     return None
 
 
@@ -90,6 +111,12 @@ def _refusal(task: SlewTask, tried: int) -> str:
     """Return why a task is refused, and what may help."""
     text = f"no slew within the dipole's limit{' and outside the cones' * bool(task.cones)} was found"
     text += f" over {task.horizon:g} to {task.longest:g} s, from {tried} guesses"
+    ends = np.linspace(task.horizon, task.longest, _ENDS)
+    found = [(end, cone) for end in ends.tolist() if (cone := in_the_way(task, end)) is not None]
+    if found:
+        first, cone = found[0]
+        share = "one" if len(found) == 1 else "all" if len(found) == _ENDS else "many"
+        text += f", and of these {share} from {first:.0f} s on end within the cone of the {cone.name}"
     return f"{text}: a longer time or another begin may do"
 
 

@@ -80,9 +80,13 @@ class Program:
         self.steps = 0
 
     def factors(self, point: Point) -> Factors:
-        """Return the factors of the equations of optimality at a point. Raises PlanningError."""
-        stiff = self._limits.stiffness(point.at, point.dual / point.slack, point.dual)
-        return Factors(self.equations.band(point.linear, point.price, *stiff))
+        """Return the factors that lead to the least change that mends equations. Raises PlanningError.
+
+        With the curvature of the equations in them, the way to a flat optimum's other side would be one, too.
+        """
+        states, heavy = self._limits.stiffness(point.at, point.dual / point.slack, np.zeros_like(point.dual))
+        stiff = states + _DAMPED * _EYE7, heavy + _DAMPED
+        return Factors(self.equations.band(point.linear, np.zeros_like(point.price), *stiff))
 
     def begin(self, guess: Trajectory, price: FloatArray | None, barrier: float) -> Point:
         """Return a guess as an iterate of Newton's method."""
@@ -221,7 +225,12 @@ class Descent:
     @property
     def lack(self) -> float:
         """The sum of all violations; zero from where the barriers have begun to fall."""
-        return 0.0 if 0.0 < self._barrier < self._first else sum(self.program.lack(self.point))
+        return 0.0 if 0.0 < self._barrier < self._first else self.missed
+
+    @property
+    def missed(self) -> float:
+        """The sum of all violations."""
+        return sum(self.program.lack(self.point))
 
     def run(self, most: int) -> Point | None:
         """Return the optimum found within `most` more steps, None when there is none."""

@@ -79,11 +79,21 @@ def check(task: SlewTask) -> None:
         raise PlanningError(f"a price of time of {task.time_price} W: it must be positive")
     end = task.end(task.horizon)
     for cone in task.cones:
-        if float(cone.clearance(task.quaternion[None], np.zeros(1))[0]) < 0.0:
-            raise PlanningError(f"the start lies within the cone of the {cone.name}")
+        inside = -math.degrees(float(cone.clearance(task.quaternion[None], np.zeros(1))[0]))
+        if inside > 0.0:
+            raise PlanningError(f"the start lies within the cone of the {cone.name}, by {inside:.1f} deg")
         # The cones move by some degrees over a slew: deep inside, no other horizon helps.
         if isinstance(end, Whole) and _is_deep_inside(end, cone, task.horizon):
             raise PlanningError(f"the end lies within the cone of the {cone.name}")
+
+
+def in_the_way(task: SlewTask, horizon: float) -> Cone | None:
+    """Return a cone within which a slew over `horizon` s would end, by its whole attitude; None without."""
+    end = task.end(horizon)
+    if not isinstance(end, Whole):
+        return None
+    shown, time = end.quaternion[None], np.array([horizon])
+    return next((cone for cone in task.cones if float(cone.clearance(shown, time)[0]) < 0.0), None)
 
 
 def _is_deep_inside(end: Whole, cone: Cone, time: float) -> bool:

@@ -9,7 +9,7 @@ import pytest
 
 from flight.gnc.errors import PlanningError
 from flight.gnc.guidance.three_axes.slew_cones import Cone
-from flight.gnc.guidance.three_axes.slew_ends import Boresight
+from flight.gnc.guidance.three_axes.slew_ends import Boresight, Whole
 from flight.gnc.guidance.three_axes.slew_plan import SlewStatus, plan_slew
 from tests.flight.gnc.guidance.three_axes.recorded_slews import flown, matrix, off_degrees, problem, task_of
 from tests.studies.bench.orbit_slews import clearance, slews
@@ -73,6 +73,48 @@ def test_a_slew_that_the_first_ways_take_through_cones_is_led_around_them() -> N
     assert clearance(task, plan) >= 0.0
 
 
+@pytest.mark.parametrize(("seed", "case"), [(43, 18), (43, 40), (44, 44)])
+def test_slews_between_cones_that_need_a_way_of_their_own_are_planned(seed: int, case: int) -> None:
+    """Turns about the field led all guesses of the first two through cones, which were refused."""
+    *_, (_, task) = slews(case + 1, seed, True)
+    plan = plan_slew(task)
+    assert plan.peak <= 1.001
+    assert clearance(task, plan) >= 0.0
+    end = task.end(plan.horizon)
+    assert isinstance(end, Whole)
+    assert off_degrees(flown(plan, task)[:4], end.quaternion) <= 0.005
+
+
+def test_a_path_beyond_the_limit_when_flown_takes_longer() -> None:
+    """Case 27 of `bench orbit_slews --seed 44`: closed, its dipoles were 1.4 % over their limit."""
+    *_, (_, task) = slews(28, 44, False)
+    plan = plan_slew(task)
+    assert plan.status is SlewStatus.STRETCHED
+    assert plan.peak <= 1.001
+    assert plan.horizon < 1.2 * task.horizon
+
+
+def test_a_plan_near_that_of_nearly_the_same_task_takes_a_tenth_of_the_steps() -> None:
+    (_, task), *_ = slews(1, 43, True)
+    plan = plan_slew(task)
+    turned = replace(task, craft=replace(task.craft, torque=np.array([2e-9, -1e-9, 1e-9])))
+    again = plan_slew(turned, plan.path)
+    assert again.horizon == pytest.approx(task.horizon)
+    assert again.steps < 30
+    assert again.energy < 1.05 * plan_slew(turned).energy
+    assert clearance(turned, again) >= 0.0
+
+
+def test_a_refusal_says_what_the_ends_lie_in() -> None:
+    case = problem("E-cube-3u-sso-y90-300")
+    task = task_of(case, 20.0, longest=60.0, nodes=8)
+    axis = np.array([1.0, 0.0, 0.0])
+    there = matrix(task.end(20.0).quaternion)[0]  # type: ignore[union-attr]
+    cone = Cone("Moon", axis, lambda times: np.tile(there, (len(times), 1)), 0.05)
+    with pytest.raises(PlanningError, match="all from 20 s on end within the cone of the Moon"):
+        plan_slew(replace(task, cones=(cone,)))
+
+
 def test_tasks_that_no_path_can_fulfil_are_refused_with_the_reason() -> None:
     case = problem("E-cube-3u-sso-y90-300")
     task = task_of(case, 300.0)
@@ -86,7 +128,7 @@ def test_tasks_that_no_path_can_fulfil_are_refused_with_the_reason() -> None:
         (replace(task, quaternion=2.0 * task.quaternion), "length must be 1"),
         (replace(task, rate=np.array([0.0, np.nan, 0.0])), "finite"),
         (replace(task, longest=100.0), "longest"),
-        (replace(task, cones=(cone,)), "cone of the Moon"),
+        (replace(task, cones=(cone,)), "cone of the Moon, by 5.7 deg"),
         (replace(task, horizon=20.0, longest=24.0, nodes=8), "no slew within"),
     ):
         with pytest.raises(PlanningError, match=reason):
