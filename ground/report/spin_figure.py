@@ -1,4 +1,4 @@
-"""The picture of a satellite's detumbling: rate, field and dipole over time."""
+"""The picture of a satellite's detumbling: rate, field and dipole while it was braked and a while longer."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from ground.report.signals import seconds
 from ground.telemetry.reader import Run
 
 SIZE = (10.9, 9.4)
+MARGIN = 0.2
+"""Of the time from the first braking to the end of the last, shown before and after."""
 AXES = ("x", "y", "z")
 
 
@@ -47,8 +49,15 @@ def _rate(ax: Axes, run: Run) -> None:
     label = "gyro" if source == "imu" else source
     ax.semilogy(time, np.degrees(speed), color=panels.BLUE, linewidth=1.2, label=label, zorder=3)
     end = float(time[-1]) if len(time) else 0.0
-    for k, (begin, stop, _) in enumerate(braked(run, end)):
+    spans = [(begin, stop) for begin, stop, _ in braked(run, end)]
+    for k, (begin, stop) in enumerate(spans):
         ax.axvspan(begin, stop, color=panels.GREY, alpha=0.12, linewidth=0, label="" if k else "braked")
+    if spans:
+        margin = MARGIN * (spans[-1][1] - spans[0][0])
+        first, last = max(spans[0][0] - margin, 0.0), spans[-1][1] + margin
+        ax.set_xlim(first, last)
+        shown = (time >= first) & (time <= last)
+        time, speed = time[shown], speed[shown]
     ax.set_ylim(bottom=max(1e-3, 0.5 * float(np.degrees(speed[speed > 0.0].min()))) if speed.any() else 1e-3)
 
 

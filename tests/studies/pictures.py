@@ -36,9 +36,6 @@ from flight.schema.testbed import as_testbed
 from ground.pictures.horizon import draw_horizon
 from ground.pictures.sky_picture import draw_solution
 from ground.report import draw, draw_path
-from ground.report.figures import DPI
-from ground.report.knowledge_figure import knowledge_figure
-from ground.report.spin_figure import spin_figure
 from ground.telemetry.reader import read_run
 from sim_hal.assembly import StarRenderer
 from sim_hal.earth_camera import render as render_earth
@@ -55,6 +52,7 @@ RATE = 0.03
 ORION_DEG = 84.0, -2.0, 15.0
 """Right ascension, declination and roll of the solved picture."""
 HORIZON_SEEDS = 2, 4, 6
+_OF_TESTBED, _IN_ORBIT = ("overview", "paths"), ("spin", "knowledge", "pointing")
 
 
 def main() -> int:
@@ -64,23 +62,19 @@ def main() -> int:
     folder: Path = parser.parse_args().out
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as place:
-        run_folder = Path(place) / "run"
-        fly(RunRequest(CONFIG, run_folder))
-        drawn = {path.name: path for path in draw(read_run(run_folder), Path(place) / "figures")}
-        for name in ("overview.png", "paths.png"):
-            (folder / name).write_bytes(drawn[name].read_bytes())
-        fly(RunRequest(ORBIT, Path(place) / "orbit"))
-        in_orbit = read_run(Path(place) / "orbit")
-        for name, figure in (("spin", spin_figure(in_orbit)), ("knowledge", knowledge_figure(in_orbit))):
-            assert figure is not None
-            figure.savefig(folder / f"{name}.png", dpi=DPI, facecolor="white")
+        for flown, names in ((CONFIG, _OF_TESTBED), (ORBIT, _IN_ORBIT)):
+            run_folder = Path(place) / flown.stem
+            fly(RunRequest(flown, run_folder))
+            drawn = {path.stem: path for path in draw(read_run(run_folder), run_folder / "figures")}
+            for name in names:
+                (folder / f"{name}.png").write_bytes(drawn[name].read_bytes())
     config = as_testbed(configuration.load(CONFIG))
     plant = plant_of(config)
     draw_path(plan(plant, 0.4, 0.015, -0.3, 0.0, 10.0), plant, folder / "path.png")
     _draw_frame(folder / "frame.png")
     _draw_solved(folder / "solved.png")
     _draw_horizons(folder / "horizons.png")
-    for name in ("overview", "paths", "spin", "knowledge", "path", "frame", "solved", "horizons"):
+    for name in (*_OF_TESTBED, *_IN_ORBIT, "path", "frame", "solved", "horizons"):
         sys.stdout.write(f"{folder / name}.png\n")
     return 0
 
