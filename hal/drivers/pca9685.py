@@ -86,8 +86,8 @@ class Pca9685:
 
         All outputs go off first: a chip that a dead process left running must not drive a coil meanwhile. A
         chip that an upset has given an outer clock is reset, and with it each part of the bus that obeys the
-        general call: PWM chips rest then, an ADS1115 begins its next conversion anew. Raises NotResponding,
-        or Refused when a register does not keep its value.
+        general call: PWM chips rest then, an ADS1115 loses its conversion. Raises NotResponding, or Refused
+        when a register does not keep its value.
         """
         self.all_off()
         mode = self._read(MODE1)

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from hal.drivers.pca9685 import GENERAL_CALL, SOFTWARE_RESET
-
 CONVERSION, CONFIG = 0x00, 0x01
+_GENERAL_CALL, _RESET = 0x00, b"\x06"
 POWER_ON_CONFIG = 0x8583
 _START = 0x8000
 _SINGLE_SHOT = 0x0100
@@ -41,15 +40,15 @@ class EmulatedAds1115:
 
     def answers(self, address: int) -> bool:
         """Return whether the part acknowledges this address: its own and the general call."""
-        return address in {GENERAL_CALL, self.address}
+        return address in {_GENERAL_CALL, self.address}
 
     def write(self, address: int, data: bytes) -> None:
         """Take the register pointer, and a word for Config; thresholds are not modelled.
 
         The reset by general call is the power-on state (9.5.1.2).
         """
-        if address == GENERAL_CALL:
-            if data == bytes((SOFTWARE_RESET,)):
+        if address == _GENERAL_CALL:
+            if data == _RESET:
                 self.brown_out()
             return
         self._complete()

@@ -111,7 +111,7 @@ class StepReplay:
     def make_room(self, refused: AttitudeMeasurement, since_ns: int) -> set[int]:
         """Doubt the dipoles since then for a refused attitude, if it is used then; return what is used.
 
-        Coils that do otherwise than told, too little for a gyro's mean to show, lead an attitude astray.
+        Coils that depart from their commands by less than the gyro shows would lead the attitude astray.
         """
         doubts = [step.doubt for step in self.steps]
         used = self.doubt_since(min(since_ns, refused.time_ns))

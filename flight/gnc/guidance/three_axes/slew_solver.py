@@ -138,7 +138,7 @@ class Solver:
         return found
 
     def found(self, descent: Descent, most: int, enough: float = 0.0) -> Found | None:
-        """Return the path that at most so many steps more lead to.
+        """Return the path found within `most` more steps, None without one.
 
         It need not be an optimum where the violations sum to less than is `enough`.
         """

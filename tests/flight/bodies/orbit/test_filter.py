@@ -60,8 +60,8 @@ class Flown:
         self.attitude, self.rate, self.time_ns = IDENTITY, SPIN, 0
         self.attitudes = {0: IDENTITY}
         self._pulses = pulses
-        self.carries = 1.0  # times what it is told: what a coil carries
-        self.rests = False  # no coil is told anything
+        self.carries = 1.0  # the coils' dipole over the commanded one
+        self.rests = False  # no dipole is commanded
         self.field: FloatArray | None = None  # what the magnetometer repeats
         self.magnet: FloatArray = np.zeros(3)  # T, added to the field
 
@@ -209,8 +209,8 @@ def test_where_the_coils_do_otherwise_than_told_the_attitude_stays_within_its_cl
     assert (np.abs(error) < 5.0 * np.sqrt(np.diag(found.covariance)[TURN])).all()
 
 
-def test_stars_that_contradict_what_the_coils_were_told_are_used_and_widen_the_claim() -> None:
-    """A coil carries a third of what it is told: too little for one gyro's mean, 7 sigma after ten seconds.
+def test_stars_that_contradict_the_commanded_dipole_are_used_and_widen_the_claim() -> None:
+    """A coil makes a third of the commanded dipole: too little for the gyro, 7 sigma after ten seconds.
 
     The stars were refused then, and the attitude led astray until the third.
     """
