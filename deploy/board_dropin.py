@@ -15,12 +15,12 @@ from collections.abc import Sequence
 from ipaddress import IPv4Network
 from pathlib import Path
 
-from flight.gnc.errors import UsageError
 from flight.schema.devices import V4l2Device
 from flight.schema.peers import LOOPBACK, peer_networks
 from flight.schema.reader import load
 from flight.schema.sections import Config
 from hal.buses.i2c_bus import device_file
+from knightcube.errors import UsageError
 
 SERIAL, VIDEO, I2C = ("ttyUSB", "ttyACM"), ("video4linux",), ()
 """Driver classes of the devices that may be plugged in after the start, by kind."""

@@ -24,7 +24,7 @@ from releases import MANIFEST, linked, manifest_text
 SOURCE = "source"
 """File of a release with the digest of all that it was built from."""
 SELF_TEST_S = 10
-_PARTS = ("flight", "hal", "sim_hal", "deploy", "config/step_demo.yaml", "pyproject.toml")
+_PARTS = ("knightcube", "flight", "hal", "sim_hal", "deploy", "config/step_demo.yaml", "pyproject.toml")
 _BOARD_LOCK = "deploy/requirements.lock"
 _NOT_BUILT = shutil.ignore_patterns(".*", "build", "runs", "tests", "*.egg-info", "__pycache__")
 

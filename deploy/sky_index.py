@@ -18,7 +18,7 @@ def main(words: list[str]) -> None:
     tracker = camera.star_tracker if camera is not None else None
     if tracker is None or tracker.index is not None:
         return
-    from flight.gnc.vision.startracker.index.build import PATH, ensure_default_index  # noqa: PLC0415
+    from knightcube.vision.startracker.index.build import PATH, ensure_default_index  # noqa: PLC0415
 
     if PATH.exists():
         return

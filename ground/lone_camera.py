@@ -13,13 +13,13 @@ from flight.app.linux import linux_camera
 from flight.app.request import RunRequest
 from flight.app.requested_config import requested_config
 from flight.app.simulated import simulated_camera
-from flight.gnc.errors import UsageError
-from flight.gnc.math.arrays import FloatArray
 from flight.schema.devices import Camera
 from flight.schema.errors import ConfigError
 from hal.buses.clock import SystemClock
 from hal.interfaces.devices import FrameSource
 from hal.interfaces.wires import Clock
+from knightcube.astro.arrays import FloatArray
+from knightcube.errors import UsageError
 
 
 @dataclass(frozen=True, slots=True)

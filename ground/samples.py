@@ -14,15 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.camera.images import write_picture
-from flight.gnc.camera.pinhole import Pinhole
-from flight.gnc.catalogue import load
-from flight.gnc.earth.figure import SEMI_MAJOR_AXIS
-from flight.gnc.earth.sun import ASTRONOMICAL_UNIT
-from flight.gnc.math.arrays import FloatArray, Image
-from flight.gnc.math.quaternion import attitude_matrix, from_matrix, from_rotation_vector, multiply
-from flight.gnc.vision.startracker.pointing import Pointing
 from ground.truth import sky_truth
+from knightcube.astro.arrays import FloatArray, Image
+from knightcube.astro.catalogue import load
+from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS
+from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
+from knightcube.astro.quaternion import attitude_matrix, from_matrix, from_rotation_vector, multiply
+from knightcube.vision.camera.images import write_picture
+from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.startracker.pointing import Pointing
 from sim_hal import earth_camera, star_camera
 
 PIXELS, FIELD_DEG = 768, 15.0

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.errors import UsageError
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.vision.startracker.pointing import Pointing
+from knightcube.astro.arrays import FloatArray
+from knightcube.errors import UsageError
+from knightcube.vision.startracker.pointing import Pointing
 
 
 def sky_truth(rate: FloatArray, exposure: float, attitude: FloatArray, focal_length: float) -> dict[str, Any]:

@@ -12,13 +12,13 @@ import argparse
 from collections.abc import Mapping
 from pathlib import Path
 
-from flight.gnc.errors import UsageError
 from flight.link.files.entity import FOREIGN, SATELLITE
 from flight.link.files.packets import DOWN, UP, VERSION
 from flight.link.files.pdu import SEGMENT_BYTES
 from flight.link.telemetry.packets import HEADER_BYTES, SECONDARY_BYTES
 from ground.link.gateway import ADDRESS
 from ground.xtce import EPOCH, SPACE, document
+from knightcube.errors import UsageError
 
 INSTANCE = SPACE.lower()
 HTTP_PORT = 8090

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flight.gnc.catalogue import load
-from flight.gnc.math.arrays import FloatArray, Image
 from flight.schema.devices import Camera
 from flight.schema.sections import Config
+from knightcube.astro.arrays import FloatArray, Image
+from knightcube.astro.catalogue import load
 from sim_hal.coil_assembly import assemble_coils
 from sim_hal.emulators.device import EmulatedDevice, SerialEnd
 from sim_hal.emulators.i2c_bus import EmulatedI2cBus

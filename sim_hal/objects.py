@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flight.gnc.earth.figure import GRAVITATIONAL_PARAMETER
-from flight.gnc.earth.sun import DAY, SPEED_OF_LIGHT, earth_velocity
-from flight.gnc.math.arrays import FloatArray
 from flight.schema.errors import ConfigError
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.figure import GRAVITATIONAL_PARAMETER
+from knightcube.astro.earth.sun import DAY, SPEED_OF_LIGHT, earth_velocity
 from sim_hal.settings import LineOfSight, ObjectState, SkyObject, Tumble
 from sim_hal.worlds.surroundings import OrbitingWorld, orbiting
 from sim_hal.worlds.world import World

@@ -7,8 +7,8 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from flight.gnc.math.arrays import Image
 from flight.schema.sections import Config
+from knightcube.astro.arrays import Image
 from sim_hal.emulators.star_camera import EmulatedStarCamera
 
 if TYPE_CHECKING:  # they take half a second to import, and the testbed has none

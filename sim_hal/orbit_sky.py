@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flight.gnc.camera.pinhole import Pinhole
-from flight.gnc.earth.figure import EARTH_RADIUS
-from flight.gnc.earth.sun import SPEED_OF_LIGHT, earth_velocity
-from flight.gnc.math import quaternion
-from flight.gnc.math.arrays import BoolArray, FloatArray, Image
 from flight.schema.devices import Camera
+from knightcube.astro import quaternion
+from knightcube.astro.arrays import BoolArray, FloatArray, Image
+from knightcube.astro.earth.figure import EARTH_RADIUS
+from knightcube.astro.earth.sun import SPEED_OF_LIGHT, earth_velocity
+from knightcube.vision.camera.pinhole import Pinhole
 from sim_hal.emulators.star_camera import Expose
 from sim_hal.worlds.surroundings import OrbitingWorld, Surroundings
 

@@ -9,9 +9,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector, multiply
 from flight.schema.sections import Config
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
 from sim_hal.assembly import StarRenderer, inline_exposure
 from sim_hal.clock import SimClock
 from sim_hal.emulators.star_camera import EmulatedStarCamera

@@ -11,8 +11,6 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from flight.gnc.errors import UsageError
-from flight.gnc.math.arrays import FloatArray
 from flight.schema import reader as configuration
 from flight.schema.errors import ConfigError
 from flight.schema.sections import Config
@@ -20,6 +18,8 @@ from hal.guardian.client import CoilReach
 from hal.interfaces.devices import FrameSource
 from hal.interfaces.rig import Rig
 from hal.interfaces.wires import SECOND_NS, Clock
+from knightcube.astro.arrays import FloatArray
+from knightcube.errors import UsageError
 from sim_hal import lockstep
 from sim_hal.clock import SimClock
 from sim_hal.faults import grammar

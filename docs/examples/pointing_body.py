@@ -30,11 +30,6 @@ from flight.bodies.testbed.body import (
 )
 from flight.bodies.testbed.feed import UnitFeed
 from flight.bodies.testbed.plant_model import angular_acceleration_psd_of, plant_of
-from flight.gnc.estimation.estimate import Estimate
-from flight.gnc.estimation.measurements import MeanRateMeasurement
-from flight.gnc.guidance.three_axes.pointing_target import PointingTarget
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import about_axis_y, attitude_matrix, conjugate, multiply, to_rotation_vector
 from flight.link import events
 from flight.link.modes import ORBITAL, Mode
 from flight.loop.body import Body, BodyKind
@@ -46,6 +41,11 @@ from flight.loop.state.content import Learned
 from flight.schema.sections import Config
 from flight.schema.testbed import TestbedConfig, as_testbed
 from ground.telemetry.reader import read_run
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import about_axis_y, attitude_matrix, conjugate, multiply, to_rotation_vector
+from knightcube.gnc.estimation.estimate import Estimate
+from knightcube.gnc.estimation.measurements import MeanRateMeasurement
+from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget
 
 DUE_NS = 60_000_000_000
 """After this time a target should have been reached."""

@@ -6,8 +6,6 @@ from contextlib import ExitStack, nullcontext, suppress
 
 import numpy as np
 
-from flight.gnc.math.frames import NED_TO_TESTBED, attitude_map
-from flight.gnc.math.quaternion import attitude_matrix
 from flight.loop.services import Devices
 from flight.schema.errors import ConfigError
 from flight.schema.sections import Config
@@ -21,6 +19,8 @@ from hal.drivers.vn100.driver import Vn100, Vn100Settings
 from hal.interfaces.errors import DeviceError, OutOfRange
 from hal.interfaces.rig import Rig
 from hal.interfaces.wires import SECOND_NS
+from knightcube.astro.frames import NED_TO_TESTBED, attitude_map
+from knightcube.astro.quaternion import attitude_matrix
 
 
 def open_devices(config: Config, rig: Rig, stack: ExitStack, patient: bool) -> Devices:

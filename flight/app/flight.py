@@ -23,7 +23,6 @@ from flight.app.request import RunRequest, RunResult
 from flight.app.requested_config import requested_config
 from flight.app.run_folder import begin_folder
 from flight.app.simulated import injected_faults, simulated_rig
-from flight.gnc.errors import UsageError
 from flight.link import events
 from flight.link.telemetry.log import FlightLog
 from flight.loop.flight_loop import FlightLoop
@@ -34,6 +33,7 @@ from flight.schema import reader as configuration
 from flight.schema.document import read_text
 from flight.schema.sections import Config
 from hal.interfaces.rig import Rig
+from knightcube.errors import UsageError
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,8 +12,6 @@ from flight.app.composition.workers import workers
 from flight.app.devices import open_devices
 from flight.app.run_folder import open_log
 from flight.app.watchers import start_guardian, supervise
-from flight.gnc.vision import kept_frames
-from flight.gnc.vision.startracker.index.build import ensure_default_index
 from flight.link.commands.channel import Channel, open_udp, open_unix
 from flight.link.telemetry.log import FlightLog
 from flight.link.telemetry.recorder import Recorder
@@ -27,6 +25,8 @@ from flight.schema.errors import ConfigError
 from flight.schema.sections import Config
 from hal.buses.real_time import worker_cores
 from hal.interfaces.rig import Rig
+from knightcube.vision import kept_frames
+from knightcube.vision.startracker.index.build import ensure_default_index
 
 
 def open_flight(

@@ -15,12 +15,12 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
 from typing import TypeVar
 
-from flight.gnc.errors import FlightError
 from flight.schema.errors import UnreadConfigError
 from hal.buses.clock import SystemClock
 from hal.buses.service_manager import ServiceManager
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.wires import SECOND_NS, Clock
+from knightcube.errors import FlightError
 
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.2, 30.0
 _MEAL_NS = 200_000_000

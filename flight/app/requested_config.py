@@ -6,10 +6,10 @@ import numpy as np
 
 from flight.app.request import RunRequest
 from flight.app.simulated import corrupted_text
-from flight.gnc.errors import UsageError
 from flight.schema import reader as configuration
 from flight.schema.document import read_text
 from flight.schema.sections import Config
+from knightcube.errors import UsageError
 
 
 def requested_config(request: RunRequest, text: str | None = None) -> tuple[str, Config]:

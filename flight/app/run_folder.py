@@ -8,13 +8,13 @@ from pathlib import Path
 
 from flight.app.request import RunRequest
 from flight.app.utc_label import utc_text
-from flight.gnc.errors import UsageError
 from flight.link.telemetry.archive import DISK_TROUBLE, begin_run, find_runs
 from flight.link.telemetry.log import FlightLog
 from flight.link.telemetry.segments import open_segment
 from flight.schema.sections import Config
 from hal.interfaces.rig import Rig
 from hal.interfaces.wires import SECOND_NS
+from knightcube.errors import UsageError
 
 _NEWEST = 4
 """Runs that are asked for the number of their boot."""

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flight.app.request import RunRequest
-from flight.gnc.math.arrays import FloatArray
 from flight.schema.sections import Config
 from hal.interfaces.rig import Rig
+from knightcube.astro.arrays import FloatArray
 
 if TYPE_CHECKING:
     from sim_hal.rig import PosedCamera, SimulationRequest

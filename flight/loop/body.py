@@ -11,13 +11,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from flight.gnc.earth.orbit_knowledge import OrbitState
-from flight.gnc.estimation.estimate import Estimate, Knowledge
-from flight.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement, Measurement
-from flight.gnc.guidance.three_axes.pointing_target import PointingTarget
-from flight.gnc.math.arrays import FloatArray, IntArray
-from flight.gnc.tracking.tracker import Track
-from flight.gnc.vision.wide_job import WideFound, WideJob
 from flight.link.modes import Mode
 from flight.loop.control_output import CoilCommand, ControlOutput, Target
 from flight.loop.executive.jobs import JobResult
@@ -28,6 +21,13 @@ from flight.loop.state.content import Learned
 from flight.loop.state.learning import learned_of
 from flight.schema.sections import Config
 from hal.interfaces.readings import Frame, GpsReading, ImuReading, StringReading
+from knightcube.astro.arrays import FloatArray, IntArray
+from knightcube.astro.earth.orbit_knowledge import OrbitState
+from knightcube.gnc.estimation.estimate import Estimate, Knowledge
+from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement, Measurement
+from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget
+from knightcube.gnc.tracking.tracker import Track
+from knightcube.vision.wide_job import WideFound, WideJob
 
 PLANNER = "planner"
 """The planner worker's name."""

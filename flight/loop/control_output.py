@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Protocol
 
-from flight.gnc.estimation.estimate import Estimate
-from flight.gnc.math.arrays import FloatArray
 from flight.link.modes import Mode
 from flight.loop.executive.rate_group import Cycle
 from hal.interfaces.readings import CoilState
+from knightcube.astro.arrays import FloatArray
+from knightcube.gnc.estimation.estimate import Estimate
 
 COMMANDED = 1000
 """Commanded slews are numbered from here on."""

@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from flight.gnc.guidance.three_axes.pointing_target import ROLLS, Goal, PointingTarget
 from flight.schema.values import Quaternion, Section
+from knightcube.gnc.guidance.three_axes.pointing_target import ROLLS, Goal, PointingTarget
 
 GoalName = Literal["nadir", "velocity", "sun", "inertial", "ground", "object"]
 OWN = {

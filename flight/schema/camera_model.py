@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 
-from flight.gnc.camera.knowledge import CameraKnowledge
-from flight.gnc.camera.lens import CameraModel, Lens
-from flight.gnc.camera.pinhole import Pinhole
-from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from flight.schema.devices import Camera
 from flight.schema.orbit_devices import WideCamera
+from knightcube.vision.camera.knowledge import CameraKnowledge
+from knightcube.vision.camera.lens import CameraModel, Lens
+from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 
 
 def camera_model(camera: Camera | WideCamera) -> CameraModel:

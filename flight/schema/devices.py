@@ -6,7 +6,6 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from flight.gnc.camera.knowledge import CameraKnowledge
 from flight.schema.values import (
     Address,
     Bus,
@@ -18,6 +17,7 @@ from flight.schema.values import (
     Section,
     Sign,
 )
+from knightcube.vision.camera.knowledge import CameraKnowledge
 
 
 class InertialUnit(Section, frozen=True, kw_only=True):

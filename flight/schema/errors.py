@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from flight.gnc.errors import InputError
+from knightcube.errors import InputError
 
 
 class ConfigError(InputError):

@@ -7,12 +7,12 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from flight.gnc.guidance.three_axes.pointing_target import PointingTarget
 from flight.schema.aim import Aim, GoalName
 from flight.schema.errors import ConfigError
 from flight.schema.orbit_devices import Normal
 from flight.schema.sections import Config, Detumble, Estimation
 from flight.schema.values import NotNegative, Positive, Section
+from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget
 
 LEAST_FIELD, LARGEST_FIELD = 5e-6, 2e-4
 """T: the Earth's field in a low orbit is 1.5e-5 to 6.5e-5; acting coils add or take as much."""
@@ -32,7 +32,7 @@ class Craft(Section, frozen=True, kw_only=True):
 
 
 class FieldDetumble(Detumble, frozen=True, kw_only=True):
-    """Detumbling by the momentum plan in the measured field (`flight.gnc.control.three_axes`).
+    """Detumbling by the momentum plan in the measured field (`knightcube.gnc.control.three_axes`).
 
     `field_noise` T of an axis of a sample, constant errors of the magnetometer included; `torque_noise`
     rad/s per sqrt(s), from torques that are not modelled. Times in s: the plan looks `horizon` ahead and is
@@ -49,7 +49,7 @@ class FieldDetumble(Detumble, frozen=True, kw_only=True):
 
 
 class OrbitEstimation(Estimation, frozen=True, kw_only=True):
-    """The filter of a satellite in orbit (`flight.gnc.estimation.free_filter`).
+    """The filter of a satellite in orbit (`knightcube.gnc.estimation.free_filter`).
 
     `bias_walk` rad/s per sqrt(s), of the gyro's bias; `field_noise` T of an axis of a sample of the
     magnetometer; `field_error` T of an axis of the field's model. `torque_start` N m, of
@@ -82,7 +82,7 @@ class ExclusionCones(Section, frozen=True, kw_only=True):
 
 
 class PointingSection(Section, frozen=True, kw_only=True):
-    """How a satellite points (`flight.gnc.control.three_axes`).
+    """How a satellite points (`knightcube.gnc.control.three_axes`).
 
     `axis` of the body points; a given roll is measured from `across`, normal to it. `turn` rad, `rate` rad/s
     and `dipole` A m^2 are the errors and the dipole that cost the same, as does `roll` rad of a turn about

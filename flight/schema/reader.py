@@ -10,7 +10,6 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from flight.gnc.errors import UsageError
 from flight.schema.consistency import check_consistency
 from flight.schema.conversion import convert
 from flight.schema.devices import Camera
@@ -19,6 +18,7 @@ from flight.schema.errors import ConfigError
 from flight.schema.orbit import OrbitConfig
 from flight.schema.sections import Config
 from flight.schema.testbed import TestbedConfig, as_testbed
+from knightcube.errors import UsageError
 
 T = TypeVar("T")
 S = TypeVar("S", bound=msgspec.Struct)

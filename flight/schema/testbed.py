@@ -31,7 +31,7 @@ class ThreadEstimation(Estimation, frozen=True, kw_only=True):
 
 
 class BdotDetumble(Detumble, frozen=True, kw_only=True):
-    """Detumbling by B-dot (`flight.gnc.control.detumble`).
+    """Detumbling by B-dot (`knightcube.gnc.control.detumble`).
 
     `share` of the rate is to go in each window, as far as the coils can. Where the field's direction turns by
     `field_turn` rad/s the share follows from that; zero where it stands, as on the testbed.

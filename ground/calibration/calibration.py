@@ -17,10 +17,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.attitude.solvers import solve
-from flight.gnc.attitude.wahba import AttitudeError
-from flight.gnc.camera.lens import CameraModel, Lens, LensError
-from flight.gnc.math.arrays import BoolArray, FloatArray
 from ground.calibration.lens_fit import (
     PARAMETER_COUNT,
     CalibrationError,
@@ -31,6 +27,10 @@ from ground.calibration.lens_fit import (
     residuals,
     step,
 )
+from knightcube.astro.arrays import BoolArray, FloatArray
+from knightcube.astro.attitude.solvers import solve
+from knightcube.astro.attitude.wahba import AttitudeError
+from knightcube.vision.camera.lens import CameraModel, Lens, LensError
 
 PARAMETERS = ("focal_length", "centre_x", "centre_y", "k1", "k2")
 _ROBUST_STEPS = 20

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.camera.lens import Lens
-from flight.gnc.errors import FlightError
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
+from knightcube.errors import FlightError
+from knightcube.vision.camera.lens import Lens
 
 # Focal length px, centre x and y px, k1, k2.
 PARAMETER_COUNT = 5

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.camera.lens import CameraModel
-from flight.gnc.math.arrays import FloatArray
 from ground.calibration.calibration import Calibration, calibrate
 from ground.calibration.lens_fit import MatchedFrame
 from ground.calibration.terms import FixedTerms, fit_terms
+from knightcube.astro.arrays import FloatArray
+from knightcube.vision.camera.lens import CameraModel
 
 # Part of its matches that a frame of the lens has believed.
 _BELIEVED_PART = 0.5

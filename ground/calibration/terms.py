@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.camera.lens import CameraModel, Lens
 from ground.calibration.calibration import DETERMINED, Calibration, LensPrior, calibrate
 from ground.calibration.lens_fit import MatchedFrame, parameters_of
+from knightcube.vision.camera.lens import CameraModel, Lens
 
 _HELD = {"k2": 1e-7, "k1": 1e-7, "centre": 1e-3}
 """Each term that may go, in this order; the prior's standard deviation that holds it, px for the centre."""

@@ -13,22 +13,22 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.camera.images import read_image
-from flight.gnc.camera.lens import CameraModel
-from flight.gnc.errors import UsageError
-from flight.gnc.math.arrays import Image
-from flight.gnc.vision.frame_job import solve_frame
-from flight.gnc.vision.startracker.identification.lost_in_space import IdentificationSettings
-from flight.gnc.vision.startracker.index.build import default_index
-from flight.gnc.vision.startracker.index.sky_index import SkyIndex
-from flight.gnc.vision.startracker.solution import FrameSolution
-from flight.gnc.vision.startracker.solve import SolveSettings
 from ground.calibration.calibration import PARAMETERS
 from ground.calibration.lens_fit import MatchedFrame
 from ground.calibration.selection import LEAST_STARS, Selected, calibrate_one_lens
 from ground.calibration.terms import FixedTerms, LeftOut
 from ground.commands.options import check_size, positive, write_new
 from ground.commands.solve import lens_of_field
+from knightcube.astro.arrays import Image
+from knightcube.errors import UsageError
+from knightcube.vision.camera.images import read_image
+from knightcube.vision.camera.lens import CameraModel
+from knightcube.vision.frame_job import solve_frame
+from knightcube.vision.startracker.identification.lost_in_space import IdentificationSettings
+from knightcube.vision.startracker.index.build import default_index
+from knightcube.vision.startracker.index.sky_index import SkyIndex
+from knightcube.vision.startracker.solution import FrameSolution
+from knightcube.vision.startracker.solve import SolveSettings
 
 _ROUNDS = 3
 _LEAST_SIGMA_PX = 0.02

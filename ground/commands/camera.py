@@ -12,9 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from flight.gnc.camera.images import write_picture
-from flight.gnc.errors import UsageError
-from flight.gnc.math.arrays import FloatArray
 from flight.schema.camera_model import camera_model
 from flight.schema.carried import config_path
 from flight.schema.devices import Camera
@@ -24,6 +21,9 @@ from hal.interfaces.devices import FrameSource
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.readings import Frame
 from hal.interfaces.wires import Clock
+from knightcube.astro.arrays import FloatArray
+from knightcube.errors import UsageError
+from knightcube.vision.camera.images import write_picture
 
 if TYPE_CHECKING:
     from ground.lone_camera import LoneCamera

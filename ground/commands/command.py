@@ -13,8 +13,6 @@ from dataclasses import replace
 from pathlib import Path
 
 from flight.app.utc_label import utc_ns
-from flight.gnc.errors import FlightError, UsageError
-from flight.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 from flight.link.commands.codec import CommandPacker, command_of
 from flight.link.commands.definitions import COMMANDS, LAYOUTS, PING, POINT, SAFE
 from flight.link.commands.errors import CommandError
@@ -32,6 +30,8 @@ from ground.link.commanding import change_key, obeyed
 from ground.link.commanding import command as send
 from ground.link.options import add_link_options, terminal_of
 from ground.telemetry.scanner import decode
+from knightcube.errors import FlightError, UsageError
+from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 
 _DIRECTIVES = ("play", "stop-playback", "new-key", "schedule", "unschedule", "list-schedule")
 

@@ -10,11 +10,11 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flight.gnc.errors import FlightError, UsageError
-from flight.gnc.vision import kept_frames
 from flight.link.telemetry.archive import find_runs
 from ground.link.options import add_link_options, terminal_of
 from ground.watch.tail import LogTail
+from knightcube.errors import FlightError, UsageError
+from knightcube.vision import kept_frames
 
 if TYPE_CHECKING:
     from ground.console.server import Console

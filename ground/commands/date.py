@@ -6,7 +6,7 @@ import argparse
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
-from flight.gnc.earth.sun import DAY, J2000
+from knightcube.astro.earth.sun import DAY, J2000
 
 
 @dataclass(frozen=True, slots=True)

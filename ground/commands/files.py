@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 from flight.app.ending_signals import EndingSignals
-from flight.gnc.errors import FlightError, UsageError
 from flight.link.files.entity import Progress
 from flight.link.files.store import Store, files_folder
 from flight.link.process.directives import Directive
@@ -23,6 +22,7 @@ from flight.link.security.associations import COMMAND_SPIS
 from ground.link.files import FileSession, failed, sum_of
 from ground.link.options import add_link_options, terminal_of
 from ground.link.terminal import Terminal
+from knightcube.errors import FlightError, UsageError
 
 _RATE = 20_000.0
 _SILENCE_S = 60.0

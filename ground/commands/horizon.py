@@ -10,21 +10,21 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.camera.images import grey_stretch, write_picture
-from flight.gnc.camera.lens import CameraModel
-from flight.gnc.camera.pinhole import Pinhole
-from flight.gnc.errors import UsageError
-from flight.gnc.math.arrays import Image
-from flight.gnc.vision.horizon.knowledge import LEAST_ALTITUDE, HorizonKnowledge
-from flight.gnc.vision.horizon.nadir import find_nadir
-from flight.gnc.vision.horizon.response import LogarithmicResponse
-from flight.gnc.vision.horizon.settings import EdgeSettings, HorizonSettings
-from flight.gnc.vision.horizon.solution import HorizonSolution, NadirMeasurement
 from flight.schema import reader as configuration
 from flight.schema.camera_model import camera_model
 from ground.commands import paper_horizon
 from ground.commands.options import add_field, add_output, add_picture, positive, read_picture
 from ground.pictures.horizon import draw_horizon
+from knightcube.astro.arrays import Image
+from knightcube.errors import UsageError
+from knightcube.vision.camera.images import grey_stretch, write_picture
+from knightcube.vision.camera.lens import CameraModel
+from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.horizon.knowledge import LEAST_ALTITUDE, HorizonKnowledge
+from knightcube.vision.horizon.nadir import find_nadir
+from knightcube.vision.horizon.response import LogarithmicResponse
+from knightcube.vision.horizon.settings import EdgeSettings, HorizonSettings
+from knightcube.vision.horizon.solution import HorizonSolution, NadirMeasurement
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

@@ -12,7 +12,6 @@ from typing import Any
 
 from flight.app.cli.run import progress_on, seed_number
 from flight.app.request import RunRequest
-from flight.gnc.errors import UsageError
 from flight.schema import reader as configuration
 from flight.schema.carried import config_path
 from flight.schema.testbed import TestbedConfig
@@ -31,6 +30,7 @@ from ground.identification.preparation import (
 from ground.identification.record import Record, read_record
 from ground.identification.scale import AbsolutePlant, absolute
 from ground.telemetry.reader import read_run
+from knightcube.errors import UsageError
 
 _ABSOLUTE_UNITS = {
     "inertia": "kg m^2",

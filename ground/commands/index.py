@@ -9,13 +9,13 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from flight.gnc.errors import UsageError
-from flight.gnc.vision.startracker.index.build import DEFAULT, IndexSettings, build
-from flight.gnc.vision.startracker.index.sky_index import save
 from flight.schema import reader as configuration
 from flight.schema.camera_model import camera_model
 from ground.commands.options import add_field
 from ground.commands.solve import field_of_view
+from knightcube.errors import UsageError
+from knightcube.vision.startracker.index.build import DEFAULT, IndexSettings, build
+from knightcube.vision.startracker.index.sky_index import save
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

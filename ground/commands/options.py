@@ -8,11 +8,11 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
-from flight.gnc.camera.images import read_image, read_raw
-from flight.gnc.errors import UsageError
-from flight.gnc.math.arrays import Image
-from flight.gnc.vision.startracker.detection.sky import LEAST_SIDE
 from flight.schema.carried import config_path
+from knightcube.astro.arrays import Image
+from knightcube.errors import UsageError
+from knightcube.vision.camera.images import read_image, read_raw
+from knightcube.vision.startracker.detection.sky import LEAST_SIDE
 
 _RAW = re.compile(r"([0-9]+)x([0-9]+)x(8|16)")
 

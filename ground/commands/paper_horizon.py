@@ -12,21 +12,21 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.camera.images import grey_stretch, read_image, write_picture
-from flight.gnc.camera.lens import CameraModel
-from flight.gnc.errors import UsageError
-from flight.gnc.math.arrays import FloatArray, Image
-from flight.gnc.vision.horizon.graphic_method import GraphicMethodError, LevelCamera, graphic_nadir
-from flight.gnc.vision.horizon.scanned_circle import (
+from ground.commands.options import check_size, finite
+from ground.pictures.horizon import draw_circle
+from knightcube.astro.arrays import FloatArray, Image
+from knightcube.errors import UsageError
+from knightcube.reference.horizon.graphic_method import GraphicMethodError, LevelCamera, graphic_nadir
+from knightcube.reference.horizon.scanned_circle import (
     LINES,
     NoHorizonError,
     ScannedHorizon,
     circle_nadir,
     scan_horizon,
 )
-from flight.gnc.vision.horizon.vector_method import carried_nadir
-from ground.commands.options import check_size, finite
-from ground.pictures.horizon import draw_circle
+from knightcube.vision.camera.images import grey_stretch, read_image, write_picture
+from knightcube.vision.camera.lens import CameraModel
+from knightcube.vision.horizon.vector_method import carried_nadir
 
 METHODS = ("circle", "graphic", "vector")
 

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from flight.app.utc_label import utc_ns
-from flight.gnc.errors import FlightError, UsageError
 from flight.link.commands.codec import CommandPacker
 from flight.link.commands.values import Command, DumpParameters, LoadParameters, shown
 from flight.link.parameters import FIELDS, KEYS, crc_of, problem_of
@@ -27,6 +26,7 @@ from ground.commands.command import exchange
 from ground.link.options import add_link_options, terminal_of
 from ground.link.terminal import report_of
 from ground.telemetry.scanner import decode
+from knightcube.errors import FlightError, UsageError
 
 _ORIGINS = {field.name: dict(field.states) for field in PARAMETERS.fields if field.name in {"table", "kept"}}
 

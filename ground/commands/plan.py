@@ -11,15 +11,15 @@ from pathlib import Path
 import numpy as np
 
 from flight.bodies.testbed.plant_model import plant_of
-from flight.gnc.errors import UsageError
-from flight.gnc.guidance.one_axis.limits import Q2_LIMIT
-from flight.gnc.guidance.one_axis.path_cost import PathCost
-from flight.gnc.guidance.one_axis.plant import SingleAxisPlant
-from flight.gnc.guidance.one_axis.vmc import FASTEST, HORIZON_RANGE, NODES, NODES_RANGE, Plan, plan
 from flight.schema import reader as configuration
 from flight.schema.carried import config_path
 from ground.commands import plan_orbit
 from ground.commands.options import finite, positive
+from knightcube.errors import UsageError
+from knightcube.gnc.guidance.one_axis.limits import Q2_LIMIT
+from knightcube.gnc.guidance.one_axis.path_cost import PathCost
+from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
+from knightcube.gnc.guidance.one_axis.vmc import FASTEST, HORIZON_RANGE, NODES, NODES_RANGE, Plan, plan
 
 _DEFAULT_CONFIG = "step_demo"
 _ONLY = ("from_rate", "to_rate", "horizon", "cost", "config")

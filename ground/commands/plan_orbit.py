@@ -11,23 +11,23 @@ from datetime import UTC, datetime, timedelta
 
 import numpy as np
 
-from flight.gnc.earth.ephemeris import predict
-from flight.gnc.earth.orbit_knowledge import TwoLineElements
-from flight.gnc.earth.sun import DAY
-from flight.gnc.errors import UsageError
-from flight.gnc.guidance.three_axes.pointing_target import NUMBERS, Goal, PointingTarget
-from flight.gnc.guidance.three_axes.slew_ends import Boresight
-from flight.gnc.guidance.three_axes.slew_model import SlewCraft
-from flight.gnc.guidance.three_axes.slew_order import LEAD, OrderedSlew, SlewOrder, plan_order
-from flight.gnc.guidance.three_axes.slew_plan import SlewStatus
-from flight.gnc.guidance.three_axes.slew_task import HORIZON_RANGE, LEAST_TIME, NODES
-from flight.gnc.guidance.three_axes.target_law import BodyAxes
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import angle_between, attitude_matrix, conjugate, multiply
 from flight.schema import reader as configuration
 from flight.schema.carried import config_path
 from flight.schema.orbit import OrbitConfig, as_orbit
 from ground.commands.options import finite, positive
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.ephemeris import predict
+from knightcube.astro.earth.orbit_knowledge import TwoLineElements
+from knightcube.astro.earth.sun import DAY
+from knightcube.astro.quaternion import angle_between, attitude_matrix, conjugate, multiply
+from knightcube.errors import UsageError
+from knightcube.gnc.guidance.three_axes.pointing_target import NUMBERS, Goal, PointingTarget
+from knightcube.gnc.guidance.three_axes.slew_ends import Boresight
+from knightcube.gnc.guidance.three_axes.slew_model import SlewCraft
+from knightcube.gnc.guidance.three_axes.slew_order import LEAD, OrderedSlew, SlewOrder, plan_order
+from knightcube.gnc.guidance.three_axes.slew_plan import SlewStatus
+from knightcube.gnc.guidance.three_axes.slew_task import HORIZON_RANGE, LEAST_TIME, NODES
+from knightcube.gnc.guidance.three_axes.target_law import BodyAxes
 
 BODIES = ("sun", "earth", "moon")
 STRETCH = 3.0

@@ -11,24 +11,24 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.camera.images import grey_stretch, write_picture
-from flight.gnc.camera.pinhole import Pinhole
-from flight.gnc.errors import UsageError
-from flight.gnc.math.arrays import FloatArray, Image
-from flight.gnc.vision.objects.detect import detect
-from flight.gnc.vision.objects.report import SpaceObject
-from flight.gnc.vision.objects.settings import ObjectSettings
-from flight.gnc.vision.streaks.corners.settings import DETECTOR_NAMES, StreakSettings
-from flight.gnc.vision.streaks.corners.streak_rate import estimate_rate
-from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion
-from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
-from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
-from flight.gnc.vision.streaks.streak_result import StreakResult, StreakStatus
 from flight.schema import reader as configuration
 from flight.schema.camera_model import camera_model, likelihood_settings
 from flight.schema.devices import Camera
 from ground.commands.options import add_field, add_output, add_picture, finite, positive, read_picture
 from ground.pictures.overlay import draw_marks
+from knightcube.astro.arrays import FloatArray, Image
+from knightcube.errors import UsageError
+from knightcube.vision.camera.images import grey_stretch, write_picture
+from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.objects.detect import detect
+from knightcube.vision.objects.report import SpaceObject
+from knightcube.vision.objects.settings import ObjectSettings
+from knightcube.vision.streaks.corners.settings import DETECTOR_NAMES, StreakSettings
+from knightcube.vision.streaks.corners.streak_rate import estimate_rate
+from knightcube.vision.streaks.maximum_likelihood.estimate import estimate_motion
+from knightcube.vision.streaks.maximum_likelihood.result import MotionResult
+from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from knightcube.vision.streaks.streak_result import StreakResult, StreakStatus
 
 LIKELIHOOD = "likelihood"
 

@@ -7,12 +7,12 @@ import json
 import sys
 from pathlib import Path
 
-from flight.gnc.errors import UsageError
 from flight.link.telemetry.archive import find_runs
 from ground import report as reporting
 from ground.report.archive import format_archive, summarise_archive
 from ground.report.comparison import compare, format_comparison
 from ground.telemetry.reader import read_run
+from knightcube.errors import UsageError
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

@@ -10,8 +10,8 @@ from typing import Any
 
 from flight.app.cli import PROGRAM
 from flight.app.cli.run import seed_number
-from flight.gnc.errors import UsageError
 from ground.truth import write_truth
+from knightcube.errors import UsageError
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

@@ -13,25 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.attitude.solvers import SOLVERS
-from flight.gnc.camera.images import grey_stretch, write_picture
-from flight.gnc.camera.lens import CameraModel
-from flight.gnc.camera.pinhole import Pinhole
-from flight.gnc.catalogue.names import PROPER_NAMES
-from flight.gnc.earth.sun import earth_velocity
-from flight.gnc.errors import UsageError
-from flight.gnc.math.arrays import Image
-from flight.gnc.vision.frame_job import solve_frame
-from flight.gnc.vision.startracker.classical.methods import DEFAULT_METHOD, METHODS, method_of
-from flight.gnc.vision.startracker.detection import DetectionSettings
-from flight.gnc.vision.startracker.detection.settings import CENTROIDS
-from flight.gnc.vision.startracker.index import sky_index
-from flight.gnc.vision.startracker.index.build import default_index
-from flight.gnc.vision.startracker.index.sky_index import SkyIndex
-from flight.gnc.vision.startracker.pointing import Pointing
-from flight.gnc.vision.startracker.solution import FrameSolution
-from flight.gnc.vision.startracker.solve import RatePrior, SolveSettings
-from flight.gnc.vision.streaks.streak_result import StreakStatus
 from flight.schema import reader as configuration
 from flight.schema.camera_model import camera_model, likelihood_settings
 from flight.schema.devices import Camera
@@ -49,6 +30,25 @@ from ground.pictures.sky_picture import draw_solution
 from ground.sky.bodies import bodies_in
 from ground.sky.facts import sky_facts, sky_text
 from ground.sky.world_coordinates import header_text
+from knightcube.astro.arrays import Image
+from knightcube.astro.attitude.solvers import SOLVERS
+from knightcube.astro.catalogue.names import PROPER_NAMES
+from knightcube.astro.earth.sun import earth_velocity
+from knightcube.errors import UsageError
+from knightcube.reference.star_identification.methods import DEFAULT_METHOD, METHODS, method_of
+from knightcube.vision.camera.images import grey_stretch, write_picture
+from knightcube.vision.camera.lens import CameraModel
+from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.frame_job import solve_frame
+from knightcube.vision.startracker.detection import DetectionSettings
+from knightcube.vision.startracker.detection.settings import CENTROIDS
+from knightcube.vision.startracker.index import sky_index
+from knightcube.vision.startracker.index.build import default_index
+from knightcube.vision.startracker.index.sky_index import SkyIndex
+from knightcube.vision.startracker.pointing import Pointing
+from knightcube.vision.startracker.solution import FrameSolution
+from knightcube.vision.startracker.solve import RatePrior, SolveSettings
+from knightcube.vision.streaks.streak_result import StreakStatus
 
 ARCSECONDS = math.degrees(1.0) * 3600.0
 UNKNOWN_DEG = 4.0, 60.0

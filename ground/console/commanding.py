@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from flight.app.utc_label import utc_ns
-from flight.gnc.errors import FlightError, UsageError
 from flight.link.commands import codec
 from flight.link.commands.definitions import LAYOUTS, LOAD_PARAMETERS
 from flight.link.commands.errors import CommandError
@@ -19,6 +18,7 @@ from flight.link.telemetry.packets import Layout, Packer, TelemetryError
 from ground.commands.command import exchange
 from ground.console.instant import values
 from ground.telemetry.scanner import decode
+from knightcube.errors import FlightError, UsageError
 
 Object = dict[str, Any]
 Send = Callable[[bytes], Object]

@@ -12,11 +12,11 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from flight.gnc.errors import FlightError, UsageError
 from flight.link.telemetry.segments import find_segments
 from flight.schema.document import read_text
 from flight.schema.reader import parse
 from flight.schema.sections import Commands
+from knightcube.errors import FlightError, UsageError
 
 _START_S, _END_S = 60.0, 15.0
 _FRAMES = 60

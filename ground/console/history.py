@@ -15,8 +15,8 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
-from flight.gnc.math.arrays import FloatArray
 from flight.link.telemetry.packets import LAYOUTS, Layout, PacketArray
+from knightcube.astro.arrays import FloatArray
 
 _FIRST_CAPACITY = 1024
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from flight.gnc.math.arrays import Image
-from flight.gnc.vision.kept_frames import facts_of
+from knightcube.astro.arrays import Image
+from knightcube.vision.kept_frames import facts_of
 
 _LARGEST = 640
 """px of a picture's side: what the page has room for."""

@@ -8,7 +8,6 @@ import time
 import numpy as np
 
 from flight.app.utc_label import utc_ns
-from flight.gnc.errors import FlightError
 from flight.link.commands.codec import CommandPacker
 from flight.link.commands.values import Ping
 from flight.link.process.directives import LIST
@@ -20,6 +19,7 @@ from ground.console.commanding import Object
 from ground.link.commanding import obeyed
 from ground.link.terminal import Terminal, report_of
 from ground.telemetry.scanner import scan
+from knightcube.errors import FlightError
 
 _LISTEN_S = 0.02
 _ASK_AFTER_S = 2.0

@@ -14,7 +14,6 @@ from typing import Any, Protocol, TypeVar
 
 from aiohttp import WSMsgType, web
 
-from flight.gnc.errors import FlightError, UsageError
 from flight.link.telemetry.link_definitions import LINK, TRANSFER, VERIFICATION
 from flight.link.telemetry.packets import LAYOUTS, PacketArray, TelemetryError
 from ground.console.commanding import Commanding
@@ -24,6 +23,7 @@ from ground.console.instant import Instant
 from ground.console.kept_frames import FrameFolder
 from ground.console.surroundings import Surroundings
 from ground.documentation import command_table, database
+from knightcube.errors import FlightError, UsageError
 
 PAGE = Path(__file__).parent / "page"
 PUSH_S = 0.1

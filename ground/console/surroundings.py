@@ -12,14 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.earth.geomagnetism import GeomagneticError, field
-from flight.gnc.earth.orbit_knowledge import OrbitError, OrbitState, TwoLineElements
-from flight.gnc.earth.orientation import celestial_to_terrestrial, geodetic, terrestrial_time
-from flight.gnc.earth.shadow import sunlit_share
-from flight.gnc.earth.sun import DAY, earth_from_sun
-from flight.gnc.errors import FlightError
-from flight.gnc.math.arrays import FloatArray
 from flight.schema.reader import load
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.geomagnetism import GeomagneticError, field
+from knightcube.astro.earth.orbit_knowledge import OrbitError, OrbitState, TwoLineElements
+from knightcube.astro.earth.orientation import celestial_to_terrestrial, geodetic, terrestrial_time
+from knightcube.astro.earth.shadow import sunlit_share
+from knightcube.astro.earth.sun import DAY, earth_from_sun
+from knightcube.errors import FlightError
 
 Object = dict[str, Any]
 _UNIX_EPOCH = 2_440_587.5

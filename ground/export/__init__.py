@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from flight.gnc.errors import UsageError
 from ground.export.csv_files import write_csv
 from ground.export.database import write_database
 from ground.export.parquet import write_parquet
 from ground.telemetry.reader import Run
+from knightcube.errors import UsageError
 
 FORMATS = {"csv": "csv", "parquet": "parquet", "sqlite": "run.sqlite"}
 """Each format with its usual place in the folder of a run: a folder of files, or the one file."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from pathlib import Path
 
-from flight.gnc.errors import UsageError
 from ground.export.tracking_data import ORIGINATOR, ccsds_date
 from ground.orbits.from_run import ObjectOrbit
+from knightcube.errors import UsageError
 
 _AXES = ("X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT")
 

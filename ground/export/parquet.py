@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from flight.gnc.errors import UsageError
 from ground.export.columns import tables
 from ground.telemetry.reader import Run
+from knightcube.errors import UsageError
 
 
 def write_parquet(run: Run, folder: Path) -> list[Path]:

@@ -14,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
-from flight.gnc.errors import UsageError
-from flight.gnc.math.arrays import FloatArray
 from flight.link.telemetry.packets import PacketArray
 from ground.telemetry.reader import Run
+from knightcube.astro.arrays import FloatArray
+from knightcube.errors import UsageError
 
 _ARCSECONDS = math.degrees(3600.0)
 ORIGINATOR = "KNIGHTCUBE"

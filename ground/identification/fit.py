@@ -18,10 +18,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import gammaincc
 
-from flight.gnc.math.arrays import FloatArray
 from ground.identification.constants import NAMES, Constants, Noise
 from ground.identification.innovations import Innovations, innovations
 from ground.identification.record import IdentificationError, Record
+from knightcube.astro.arrays import FloatArray
 
 PRIOR_SIGMA = Constants(
     gain=math.inf, torsion=math.inf, damping=math.inf, disturbance=1.0, bias=0.1, delay=0.02

@@ -22,10 +22,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray, IntArray
 from ground.identification.constants import NAMES, Constants, Noise
 from ground.identification.record import Record
 from ground.identification.timeline import Timeline
+from knightcube.astro.arrays import FloatArray, IntArray
 
 _BIAS, _DELAY = NAMES.index("bias"), NAMES.index("delay")
 _Pair = tuple[float, float]

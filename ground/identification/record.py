@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.errors import FlightError, UsageError
-from flight.gnc.math.arrays import BoolArray, FloatArray
 from flight.link.telemetry.packets import PacketArray
 from ground.telemetry.reader import Run
+from knightcube.astro.arrays import BoolArray, FloatArray
+from knightcube.errors import FlightError, UsageError
 
 LEAST_SAMPLES = 200
 _AT_LIMIT = 0.97

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
 from ground.identification.constants import NAMES
 from ground.identification.fit import Fit
 from ground.identification.record import FieldMeasurement
+from knightcube.astro.arrays import FloatArray
 
 _MOTION = tuple(NAMES.index(name) for name in ("gain", "torsion", "damping"))
 _TIE = np.array([-1.0, 1.0, 1.0, -1.0, 0.0, 0.0])  # on ln J, ln n A, ln B, ln g, kappa, delta
@@ -63,7 +63,7 @@ class Known:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AbsolutePlant:
-    """The constants of `flight.gnc.guidance.one_axis.plant` with their errors.
+    """The constants of `knightcube.gnc.guidance.one_axis.plant` with their errors.
 
     Attributes:
         inertia, dipole, field: kg m^2, m^2, T.

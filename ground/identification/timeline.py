@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray, IntArray
 from ground.identification.record import Record
+from knightcube.astro.arrays import FloatArray, IntArray
 
 LONGEST_STEP = 0.025
 _CLIPPED_VARIANCE = 100.0

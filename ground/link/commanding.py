@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 from flight.app.utc_label import utc_ns
-from flight.gnc.errors import FlightError, UsageError
 from flight.link.commands.codec import CommandPacker
 from flight.link.commands.values import Ping
 from flight.link.frames import telecommand
@@ -15,6 +14,7 @@ from flight.link.process.verification import Report, Stage
 from flight.link.security.associations import COMMAND_SPIS, Association, Vault
 from flight.link.security.gate import NEXT, Sealer, new_key
 from ground.link.terminal import Terminal
+from knightcube.errors import FlightError, UsageError
 
 Show = Callable[[Report], object]
 

@@ -11,7 +11,6 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from flight.app.utc_label import utc_ns
-from flight.gnc.errors import FlightError
 from flight.link.files.checksum import CRC32
 from flight.link.files.entity import GROUND, LONGEST_FILE, NOBODY, SATELLITE, Entity, Progress
 from flight.link.files.packets import DOWN, UP, UnitPacker, is_unit, unit_of
@@ -26,6 +25,7 @@ from flight.link.security.sdls import OVERHEAD_BYTES
 from flight.link.telemetry.link_definitions import TRANSFER, VERIFICATION
 from flight.link.telemetry.packets import CRC_BYTES, LAYOUTS, to_text
 from ground.link.terminal import Terminal, report_of
+from knightcube.errors import FlightError
 
 _BLOCK = 64
 """Counters reserved at once: another process's command in between costs what is left of them."""

@@ -15,7 +15,6 @@ from collections.abc import Callable
 from ipaddress import IPv4Address
 
 from flight.app.utc_label import utc_ns
-from flight.gnc.errors import UsageError
 from flight.link.commands.codec import CommandPacker
 from flight.link.commands.values import Ping
 from flight.link.files.packets import UP, is_unit
@@ -24,6 +23,7 @@ from flight.link.telemetry.link_definitions import VERIFICATION
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, LAYOUTS, crc16
 from ground.link.terminal import Terminal, report_of
 from ground.xtce import TELECOMMANDS
+from knightcube.errors import UsageError
 
 ADDRESS = "127.0.0.1:5013"
 

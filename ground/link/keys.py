@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from flight.gnc.errors import UsageError
 from flight.link.security.associations import COMMAND_SPIS, COPIES, TELEMETRY_SPIS, Association, Vault
 from flight.link.security.gate import new_key
+from knightcube.errors import UsageError
 
 ENDS = ("satellite", "ground")
 _PRIVATE = 0o700

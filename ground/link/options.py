@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from flight.gnc.errors import UsageError
 from ground.link.terminal import DEFAULTS, Terminal, TerminalSettings, open_terminal
+from knightcube.errors import UsageError
 
 
 def add_link_options(parser: argparse.ArgumentParser, way: argparse._MutuallyExclusiveGroup) -> None:

@@ -14,7 +14,6 @@ from typing import Protocol
 
 import serial
 
-from flight.gnc.errors import FlightError, UsageError
 from flight.link.frames import telecommand, telemetry
 from flight.link.frames.stream import SYNC, FrameStream, telemetry_stream
 from flight.link.frames.telemetry import PacketAssembler
@@ -26,6 +25,7 @@ from flight.link.security.sdls import OVERHEAD_BYTES
 from flight.link.telemetry.link_definitions import VERIFICATION
 from flight.link.telemetry.packets import CRC_BYTES, LAYOUTS, to_text
 from flight.schema.sections import Link
+from knightcube.errors import FlightError, UsageError
 
 DEFAULTS = Link(keys="-")
 """Spacecraft and length of frames where nobody says otherwise."""

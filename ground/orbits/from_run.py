@@ -7,13 +7,13 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from flight.gnc.earth.orientation import terrestrial_time
-from flight.gnc.earth.sun import DAY, earth_velocity
-from flight.gnc.errors import UsageError
-from flight.gnc.tracking.first_orbit import LEAST_SIGHTINGS, ArcError, Bearings, FirstOrbit, first_orbit
-from flight.gnc.tracking.free_fall import smoothed
 from flight.link.telemetry.packets import PacketArray
 from ground.telemetry.reader import Run
+from knightcube.astro.earth.orientation import terrestrial_time
+from knightcube.astro.earth.sun import DAY, earth_velocity
+from knightcube.errors import UsageError
+from knightcube.gnc.tracking.first_orbit import LEAST_SIGHTINGS, ArcError, Bearings, FirstOrbit, first_orbit
+from knightcube.gnc.tracking.free_fall import smoothed
 
 _UNIX_EPOCH = 2_440_587.5
 

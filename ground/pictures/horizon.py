@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from flight.gnc.camera.lens import CameraModel
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.vision.horizon.illumination import limb_rays
-from flight.gnc.vision.horizon.limb_equation import View
-from flight.gnc.vision.horizon.scanned_circle import ScannedHorizon
-from flight.gnc.vision.horizon.solution import HorizonSolution
 from ground.pictures.overlay import STREAK, UNUSED, draw_ring, outlined
+from knightcube.astro.arrays import FloatArray
+from knightcube.reference.horizon.scanned_circle import ScannedHorizon
+from knightcube.vision.camera.lens import CameraModel
+from knightcube.vision.horizon.illumination import limb_rays
+from knightcube.vision.horizon.limb_equation import View
+from knightcube.vision.horizon.solution import HorizonSolution
 
 _RADIUS = 5.0
 _DOT = 0.0

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import binary_dilation
 
-from flight.gnc.math.arrays import BoolArray, FloatArray
+from knightcube.astro.arrays import BoolArray, FloatArray
 
 Colour = tuple[int, int, int]
 

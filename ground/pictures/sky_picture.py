@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from flight.gnc.camera.images import EXTRA
-from flight.gnc.catalogue.names import PROPER_NAMES
-from flight.gnc.errors import UsageError
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import attitude_matrix
-from flight.gnc.vision.startracker.index.sky_index import SkyIndex
-from flight.gnc.vision.startracker.pointing import Pointing
-from flight.gnc.vision.startracker.solution import FrameSolution
 from ground.pictures.overlay import OBJECT, STREAK, UNUSED, Colour, draw_ring, outlined
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.catalogue.names import PROPER_NAMES
+from knightcube.astro.quaternion import attitude_matrix
+from knightcube.errors import UsageError
+from knightcube.vision.camera.images import EXTRA
+from knightcube.vision.startracker.index.sky_index import SkyIndex
+from knightcube.vision.startracker.pointing import Pointing
+from knightcube.vision.startracker.solution import FrameSolution
 
 if TYPE_CHECKING:
     from PIL import ImageDraw

@@ -7,17 +7,17 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flight.gnc.errors import UsageError
 from ground.report.summary import summarise
 from ground.report.text import format_report
 from ground.telemetry.reader import Run
+from knightcube.errors import UsageError
 
 if TYPE_CHECKING:
-    from flight.gnc.guidance.one_axis.plant import SingleAxisPlant
-    from flight.gnc.guidance.one_axis.vmc import Plan
-    from flight.gnc.guidance.three_axes.slew_order import OrderedSlew, SlewOrder
     from ground.identification.fit import Fit
     from ground.identification.record import Record
+    from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
+    from knightcube.gnc.guidance.one_axis.vmc import Plan
+    from knightcube.gnc.guidance.three_axes.slew_order import OrderedSlew, SlewOrder
 
 __all__ = ["draw", "draw_both", "draw_fit", "draw_path", "draw_slew", "format_report", "summarise"]
 

@@ -6,12 +6,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from flight.gnc.errors import UsageError
 from flight.link import events
 from flight.link.telemetry.archive import find_runs
 from flight.link.telemetry.packets import to_text
 from ground.report.text import number, table
 from ground.telemetry.reader import Run, read_run
+from knightcube.errors import UsageError
 
 Object = dict[str, Any]
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from flight.gnc.math.arrays import FloatArray
 from ground.report import panels
 from ground.report.scene import Scene
 from ground.report.signals import seconds
+from knightcube.astro.arrays import FloatArray
 
 SIZE = (10.9, 12.0)
 _TURNS = np.radians(20.0)

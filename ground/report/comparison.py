@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from flight.gnc.errors import UsageError
 from flight.schema.document import read_document, read_text
 from ground.report.text import ARCSECONDS, number, table
+from knightcube.errors import UsageError
 
 Object = dict[str, Any]
 _MISSING = object()

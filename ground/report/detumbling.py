@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
 from flight.link.modes import Mode
 from flight.link.telemetry.packets import PacketArray
 from ground.report.signals import seconds
 from ground.telemetry.reader import Run
+from knightcube.astro.arrays import FloatArray
 
 Object = dict[str, Any]
 

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import conjugate, multiply, to_rotation_vector
 from ground.report.signals import seconds, true_rows
 from ground.telemetry.reader import Run
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import conjugate, multiply, to_rotation_vector
 
 Object = dict[str, Any]
 LOST, COARSE, FINE = 0, 1, 2

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
 from ground.telemetry.reader import Run
+from knightcube.astro.arrays import FloatArray
 
 Object = dict[str, Any]
 

@@ -8,10 +8,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from flight.gnc.math.arrays import FloatArray
 from ground.report import panels
 from ground.report.objects import speeds_of, tracks_of
 from ground.telemetry.reader import Run
+from knightcube.astro.arrays import FloatArray
 
 SIZE = (11.0, 7.6)
 COLOURS = (panels.BLUE, panels.ORANGE, panels.GREEN, panels.PURPLE)

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
 from flight.link.modes import STEERING, Mode
 from flight.link.telemetry.packets import PacketArray, to_text
 from flight.loop.fdir.facts import FACTS
 from flight.loop.fdir.streams import StreamState
 from ground.report.signals import seconds
 from ground.telemetry.reader import Run
+from knightcube.astro.arrays import FloatArray
 
 Object = dict[str, Any]
 

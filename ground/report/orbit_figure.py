@@ -6,8 +6,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import attitude_matrix
 from flight.link import events
 from flight.link.modes import Mode
 from flight.link.telemetry.packets import to_text
@@ -16,6 +14,8 @@ from ground.report.pointing import pointing_errors
 from ground.report.scene import Scene
 from ground.report.signals import seconds, true_rows
 from ground.telemetry.reader import Run
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import attitude_matrix
 
 SIZE = (10.9, 14.0)
 AXES = ("x", "y", "z")

@@ -11,11 +11,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator
 
-from flight.gnc.math.arrays import FloatArray
 from flight.link.telemetry.definitions import MAX_NODES
 from ground.report import performance as limits
 from ground.report.scene import Scene, planned_path, streak_rates
 from ground.report.signals import seconds
+from knightcube.astro.arrays import FloatArray
 
 BLACK, GREY = "#222222", "#8a8a8a"
 BLUE, ORANGE, GREEN, VERMILLION, PURPLE, SKY = (

@@ -12,8 +12,8 @@ from ground.report import panels
 from ground.report.figures import DPI, OVERVIEW
 
 if TYPE_CHECKING:  # the planner brings the optimiser with it, which a picture does not need
-    from flight.gnc.guidance.one_axis.plant import SingleAxisPlant
-    from flight.gnc.guidance.one_axis.vmc import Plan
+    from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
+    from knightcube.gnc.guidance.one_axis.vmc import Plan
 
 
 def path_figure(plan: Plan, plant: SingleAxisPlant) -> Figure:

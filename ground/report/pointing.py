@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import conjugate, multiply, to_rotation_vector
 from flight.link import events
 from flight.link.modes import POINTING
 from flight.link.telemetry.packets import to_text
 from ground.report.signals import CoilPower, seconds, true_rows
 from ground.telemetry.reader import Run
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import conjugate, multiply, to_rotation_vector
 
 Object = dict[str, Any]
 SETTLED_AFTER = 600.0

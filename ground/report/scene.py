@@ -7,13 +7,13 @@ from functools import cached_property
 
 import numpy as np
 
-from flight.gnc.guidance.lgl import lgl_rule
-from flight.gnc.math.arrays import FloatArray
 from flight.link.telemetry.packets import PacketArray
 from ground.report import performance as limits
 from ground.report.sensing import covariance_matrices, mean_rates, with_rate
 from ground.report.signals import Attitude, CoilPower, coil_power, estimated_attitude, seconds, true_attitude
 from ground.telemetry.reader import Run
+from knightcube.astro.arrays import FloatArray
+from knightcube.gnc.guidance.lgl import lgl_rule
 
 
 @dataclass(frozen=True)

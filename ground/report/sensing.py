@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import conjugate, multiply, normalise, to_rotation_vector
 from flight.link.telemetry.packets import PacketArray, to_text
 from ground.report.signals import seconds
 from ground.telemetry.reader import Run
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import conjugate, multiply, normalise, to_rotation_vector
 
 Object = dict[str, Any]
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray, IntArray
 from flight.link.telemetry.packets import PacketArray
 from ground.telemetry.reader import Run
+from knightcube.astro.arrays import FloatArray, IntArray
 
 
 @dataclass(frozen=True)

@@ -11,14 +11,14 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from flight.gnc.guidance.three_axes.slew_cones import Cone
-from flight.gnc.guidance.three_axes.slew_model import shown
-from flight.gnc.guidance.three_axes.slew_order import OrderedSlew, SlewOrder
-from flight.gnc.guidance.three_axes.slew_plan import SlewStatus
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import attitude_matrix
 from ground.report import panels
 from ground.report.figures import DPI
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import attitude_matrix
+from knightcube.gnc.guidance.three_axes.slew_cones import Cone
+from knightcube.gnc.guidance.three_axes.slew_model import shown
+from knightcube.gnc.guidance.three_axes.slew_order import OrderedSlew, SlewOrder
+from knightcube.gnc.guidance.three_axes.slew_plan import SlewStatus
 
 SIZE = (10.9, 12.6)
 _CONES = {"Sun": panels.ORANGE, "Earth": panels.GREEN, "Moon": panels.GREY}

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
 from flight.link.telemetry.packets import to_text
 from flight.schema import reader
 from flight.schema.errors import ConfigError
@@ -36,6 +35,7 @@ from ground.report.requirements import judge, required
 from ground.report.sensing import estimate_errors, failed_frames, star_attitudes, streaks
 from ground.report.signals import Attitude, coil_power, estimated_attitude, seconds, true_attitude
 from ground.telemetry.reader import Run
+from knightcube.astro.arrays import FloatArray
 
 Object = dict[str, Any]
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from flight.gnc.earth.orientation import celestial_to_terrestrial, geodetic
 from ground.report import panels
 from ground.report.orbit_figure import DARK
 from ground.report.signals import seconds
 from ground.telemetry.reader import Run
+from knightcube.astro.earth.orientation import celestial_to_terrestrial, geodetic
 
 SIZE = (10.9, 5.8)
 EVERY_S = 10.0

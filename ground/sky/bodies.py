@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import erfa
 import numpy as np
 
-from flight.gnc.earth.sun import ASTRONOMICAL_UNIT, DAY, earth_from_sun
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.vision.startracker.sky_map import SkyMap
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, DAY, earth_from_sun
+from knightcube.vision.startracker.sky_map import SkyMap
 
 PLANETS = {"Mercury": 1, "Venus": 2, "Mars": 4, "Jupiter": 5, "Saturn": 6, "Uranus": 7, "Neptune": 8}
 _LIGHT_DAY_PER_UNIT = ASTRONOMICAL_UNIT / 299_792_458.0 / DAY

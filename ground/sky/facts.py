@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.vision.startracker.sky_map import SkyMap
 from ground.sky.bodies import Body
 from ground.sky.world_coordinates import world_coordinates
+from knightcube.astro.arrays import FloatArray
+from knightcube.vision.startracker.sky_map import SkyMap
 
 # px: axis and middle of the picture are named apart beyond it.
 _SAME_PX = 0.1

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.vision.startracker.sky_map import SkyMap
+from knightcube.astro.arrays import FloatArray
+from knightcube.vision.startracker.sky_map import SkyMap
 
 # Odd: a radial distortion has no even terms, and a cubic leaves 2" of one of 1 % at the corner of 18 deg.
 _ORDER = 5

@@ -8,13 +8,13 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from flight.app.utc_label import utc_ns
-from flight.gnc.errors import FlightError, UsageError
 from flight.link.commands.codec import CommandPacker
 from flight.link.commands.values import Ping
 from flight.link.telemetry.definitions import COMMAND, EVENT
 from flight.link.telemetry.packets import PacketArray, TelemetryError
 from ground.commands.command import exchange
 from ground.telemetry.scanner import decode
+from knightcube.errors import FlightError, UsageError
 
 _TIMEOUT_S = 2.0
 

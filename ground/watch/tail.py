@@ -5,10 +5,10 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from flight.gnc.errors import UsageError
 from flight.link.telemetry.packets import PacketArray
 from flight.link.telemetry.segments import find_segments
 from ground.telemetry.scanner import scan
+from knightcube.errors import UsageError
 
 _STEM = "flight"
 

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.math.quaternion import angle_between
 from flight.link import events
 from flight.link.telemetry.form import States
 from flight.link.telemetry.packets import PacketArray, to_text
 from flight.link.telemetry.states import MODES
+from knightcube.astro.quaternion import angle_between
 
 STREAMS = ("imu", "field", "coils", "power", "camera")
 KEPT_EVENTS = 200

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from scipy.ndimage import map_coordinates
 from scipy.special import ndtri
 
-from flight.gnc.math.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray
 
 Float32Array = npt.NDArray[np.float32]
 

@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import erfcx
 
-from flight.gnc.earth.figure import SEMI_MAJOR_AXIS
 from hal.interfaces.errors import check_limits
+from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS
 
 Float32Array = npt.NDArray[np.float32]
 

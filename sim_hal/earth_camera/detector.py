@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from flight.gnc.math.arrays import Image, IntArray
+from knightcube.astro.arrays import Image, IntArray
 from sim_hal.earth_camera.model import EarthCameraModel
 
 Float32Array = npt.NDArray[np.float32]

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import binary_dilation
 
-from flight.gnc.math.arrays import FloatArray, Image
+from knightcube.astro.arrays import FloatArray, Image
 from sim_hal.earth_camera.detector import counts
 from sim_hal.earth_camera.model import EarthCameraModel, pixel_rays
 from sim_hal.earth_camera.optics import blurred

@@ -9,10 +9,10 @@ from typing import Any, Literal, Self
 
 import numpy as np
 
-from flight.gnc.camera.lens import CameraModel, Lens
-from flight.gnc.camera.pinhole import Pinhole
-from flight.gnc.math.arrays import FloatArray
 from hal.interfaces.errors import OutOfRange, check_limits
+from knightcube.astro.arrays import FloatArray
+from knightcube.vision.camera.lens import CameraModel, Lens
+from knightcube.vision.camera.pinhole import Pinhole
 
 DEVICE = "Earth camera model"
 
@@ -119,8 +119,8 @@ class EarthCameraModel:
         """Return the camera of Meller et al.: 512 x 512, 8 bits, logarithmic over six decades, 67 deg.
 
         `field_of_view` rad is the undistorted one, edge to edge; `k1`, `k2` and the axis's pixel `centre` are
-        those of `flight.gnc.camera.lens.Lens`; `numbers` are other attributes, `response="linear"` among
-        them.
+        those of `knightcube.vision.camera.lens.Lens`; `numbers` are other attributes, `response="linear"`
+        among them.
         """
         rows, columns = int(numbers.get("rows", 512)), int(numbers.get("columns", 512))
         ideal = Pinhole.from_field_of_view(columns, rows, field_of_view)

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from flight.gnc.earth.figure import semi_axes
-from flight.gnc.earth.sun import ASTRONOMICAL_UNIT
-from flight.gnc.math.arrays import BoolArray, FloatArray
+from knightcube.astro.arrays import BoolArray, FloatArray
+from knightcube.astro.earth.figure import semi_axes
+from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
 from sim_hal.earth_camera.albedo import albedo
 from sim_hal.earth_camera.scene import EarthScene
 

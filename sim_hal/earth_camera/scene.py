@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from flight.gnc.earth.figure import semi_axes
-from flight.gnc.math import quaternion
-from flight.gnc.math.arrays import FloatArray
 from hal.interfaces.errors import OutOfRange
+from knightcube.astro import quaternion
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.figure import semi_axes
 from sim_hal.earth_camera.atmosphere import Atmosphere
 
 DEVICE = "Earth scene"

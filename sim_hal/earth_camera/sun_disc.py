@@ -8,10 +8,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import gaussian_filter
 
-from flight.gnc.camera.lens import CameraModel
-from flight.gnc.earth.sun import SUN_RADIUS
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.directions import tangent_basis
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.directions import tangent_basis
+from knightcube.astro.earth.sun import SUN_RADIUS
+from knightcube.vision.camera.lens import CameraModel
 from sim_hal.earth_camera.model import EarthCameraModel, pixel_rays
 from sim_hal.earth_camera.radiance import look
 from sim_hal.earth_camera.scene import EarthScene

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.earth.figure import semi_axes
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.directions import tangent_basis
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.directions import tangent_basis
+from knightcube.astro.earth.figure import semi_axes
 from sim_hal.earth_camera.model import EarthCameraModel
 from sim_hal.earth_camera.scene import EarthScene
 from sim_hal.earth_camera.sun_disc import towards_sun

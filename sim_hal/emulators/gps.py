@@ -13,8 +13,6 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from flight.gnc.earth.orientation import ROTATION_RATE, celestial_to_terrestrial, geodetic, north_east_down
-from flight.gnc.math.arrays import FloatArray
 from hal.drivers.ublox.codec import (
     ACK_ACK,
     ACK_NAK,
@@ -31,6 +29,13 @@ from hal.drivers.ublox.codec import (
     frame,
 )
 from hal.interfaces.wires import SECOND_NS
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.orientation import (
+    ROTATION_RATE,
+    celestial_to_terrestrial,
+    geodetic,
+    north_east_down,
+)
 from sim_hal.emulators.device import NEVER, SerialEnd
 from sim_hal.worlds.surroundings import OrbitingWorld
 

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray, Image
-from flight.gnc.math.quaternion import multiply
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.readings import Frame
+from knightcube.astro.arrays import FloatArray, Image
+from knightcube.astro.quaternion import multiply
 from sim_hal.emulators.device import NEVER
 from sim_hal.worlds.motion import Motion
 

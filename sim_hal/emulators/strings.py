@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from flight.gnc.math import quaternion
-from flight.gnc.math.arrays import FloatArray
 from hal.drivers.ads1115 import StringWiring
+from knightcube.astro import quaternion
+from knightcube.astro.arrays import FloatArray
 from sim_hal.emulators.ads1115 import EmulatedAds1115
 from sim_hal.worlds import sun
 from sim_hal.worlds.solar_strings import SolarStringsModel

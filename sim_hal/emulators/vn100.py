@@ -14,9 +14,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.frames import NED_TO_TESTBED
-from flight.gnc.math.quaternion import IDENTITY
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.frames import NED_TO_TESTBED
+from knightcube.astro.quaternion import IDENTITY
 from sim_hal.emulators.device import NEVER, SerialEnd
 from sim_hal.emulators.vn100_attitude import AttitudeCommands
 from sim_hal.emulators.vn100_commands import CommandInterface, UnitActions

@@ -14,8 +14,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import from_rotation_vector, multiply, normalise
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import from_rotation_vector, multiply, normalise
 from sim_hal.emulators.vn100_registers import (
     FILTER_STARTUP_BIAS,
     GYRO_STARTUP_BIAS,

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray
 from sim_hal.emulators.vn100_sensors import Measured
 from sim_hal.worlds.motion import STANDARD_GRAVITY
 

@@ -14,8 +14,8 @@ from typing import Literal
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import attitude_matrix, conjugate, from_rotation_vector, multiply, normalise
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import attitude_matrix, conjugate, from_rotation_vector, multiply, normalise
 from sim_hal.worlds.motion import STANDARD_GRAVITY, Motion
 
 IMU_RATE_HZ = 800

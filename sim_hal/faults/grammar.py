@@ -12,7 +12,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from flight.gnc.errors import UsageError
+from knightcube.errors import UsageError
 from sim_hal.faults.catalogue import CATALOGUE
 from sim_hal.faults.kinds import FaultKind, Where
 from sim_hal.settings import FaultEntry

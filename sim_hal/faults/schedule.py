@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from flight.gnc.errors import UsageError
 from flight.schema.sections import Config
+from knightcube.errors import UsageError
 from sim_hal.faults.bench import Bench, Lift
 from sim_hal.faults.grammar import ScheduledFault, schedule
 from sim_hal.faults.kinds import Where

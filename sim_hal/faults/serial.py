@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from flight.gnc.math.quaternion import from_rotation_vector, multiply
+from knightcube.astro.quaternion import from_rotation_vector, multiply
 from sim_hal.emulators.serial_line import LineFaults
 from sim_hal.emulators.vn100_registers import BAUD_RATES, UnitError
 from sim_hal.emulators.vn100_sensors import GAUSS_PER_TESLA, Measured

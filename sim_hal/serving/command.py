@@ -10,9 +10,9 @@ from pathlib import Path
 
 import msgspec
 
-from flight.gnc.errors import UsageError
 from flight.schema import reader as configuration
 from flight.schema.carried import config_path, names
+from knightcube.errors import UsageError
 from sim_hal.serving.server import DeviceServer
 from sim_hal.settings import Simulation
 

@@ -21,11 +21,11 @@ from types import FrameType
 
 import numpy as np
 
-from flight.gnc.errors import UsageError
 from flight.schema import reader as configuration
 from flight.schema.carried import config_path, names
 from hal.buses.clock import SystemClock
 from hal.interfaces.wires import SECOND_NS
+from knightcube.errors import UsageError
 from sim_hal.coil_assembly import CoilHardware, assemble_coils
 from sim_hal.serving.i2c_server import I2cServer
 from sim_hal.serving.options import positive, seed

@@ -8,7 +8,7 @@ import shutil
 import subprocess
 from pathlib import Path
 
-from flight.gnc.errors import UsageError
+from knightcube.errors import UsageError
 
 SOURCE = Path(__file__).with_name("i2c_preload.c")
 _FLAGS = ("-shared", "-fPIC", "-O2", "-w")

@@ -18,13 +18,13 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.errors import UsageError
 from hal.buses.clock import SystemClock
 from hal.buses.exclusive import hold
 from hal.buses.serial_port import PySerialPort
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.readings import Frame
 from hal.interfaces.wires import Wires
+from knightcube.errors import UsageError
 from sim_hal.serving.device_link import Link, RemoteI2cBus
 
 PATIENCE_S = 5.0

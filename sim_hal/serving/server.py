@@ -20,13 +20,13 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
-from flight.gnc.math.arrays import FloatArray, Image
 from flight.link.telemetry.log import FlightLog
 from flight.schema.devices import Camera
 from flight.schema.sections import Config
 from hal.buses.clock import SystemClock
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.readings import Frame
+from knightcube.astro.arrays import FloatArray, Image
 from sim_hal.assembly import Hardware, StarRenderer, assemble, fault_generator, line_generator
 from sim_hal.emulators.pty_line import PtyLine
 from sim_hal.emulators.star_camera import EmulatedStarCamera

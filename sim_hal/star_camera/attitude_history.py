@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.math import quaternion
-from flight.gnc.math.arrays import FloatArray
 from hal.interfaces.errors import OutOfRange
+from knightcube.astro import quaternion
+from knightcube.astro.arrays import FloatArray
 
 DEVICE = "star camera model"
 GREATEST_TURN = 0.5 * np.pi

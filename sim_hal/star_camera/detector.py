@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtri
 
-from flight.gnc.math.arrays import Image
+from knightcube.astro.arrays import Image
 from sim_hal.star_camera.model import StarCameraModel
 from sim_hal.star_camera.point_spread import Float32Array
 

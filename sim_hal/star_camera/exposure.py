@@ -15,8 +15,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from flight.gnc.camera.pinhole import Pinhole
-from flight.gnc.math.arrays import BoolArray, FloatArray, IntArray
+from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
+from knightcube.vision.camera.pinhole import Pinhole
 from sim_hal.star_camera.point_spread import Float32Array, PointSpread
 
 Vectors = Callable[[FloatArray], FloatArray]

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from flight.gnc.camera.pinhole import Pinhole
-from flight.gnc.math.arrays import FloatArray, Image, IntArray
+from knightcube.astro.arrays import FloatArray, Image, IntArray
+from knightcube.vision.camera.pinhole import Pinhole
 from sim_hal.star_camera import detector
 from sim_hal.star_camera.attitude_history import AttitudeHistory
 from sim_hal.star_camera.exposure import Vectors, expose

@@ -9,9 +9,9 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from flight.gnc.camera.pinhole import Pinhole
-from flight.gnc.math.arrays import FloatArray
 from hal.interfaces.errors import OutOfRange, check_limits
+from knightcube.astro.arrays import FloatArray
+from knightcube.vision.camera.pinhole import Pinhole
 
 DEVICE = "star camera model"
 

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr
 
-from flight.gnc.math.arrays import FloatArray, IntArray
+from knightcube.astro.arrays import FloatArray, IntArray
 
 Float32Array = npt.NDArray[np.float32]
 

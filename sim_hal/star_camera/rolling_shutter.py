@@ -14,9 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.camera.pinhole import Pinhole
-from flight.gnc.math.arrays import FloatArray, IntArray
 from hal.interfaces.errors import OutOfRange
+from knightcube.astro.arrays import FloatArray, IntArray
+from knightcube.vision.camera.pinhole import Pinhole
 from sim_hal.star_camera.exposure import Span, add_patches, path_lengths, spans, touches
 from sim_hal.star_camera.model import DEVICE
 from sim_hal.star_camera.point_spread import Float32Array, PointSpread

@@ -19,10 +19,10 @@ from typing import Protocol
 
 import numpy as np
 
-from flight.gnc.earth.shadow import Shadow, sunlit_share
-from flight.gnc.earth.sun import DAY
-from flight.gnc.math.arrays import FloatArray
 from hal.interfaces.errors import OutOfRange
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.shadow import Shadow, sunlit_share
+from knightcube.astro.earth.sun import DAY
 from sim_hal.star_camera import SourceTrack
 from sim_hal.worlds import sun
 from sim_hal.worlds.exclusion import hidden_by_earth

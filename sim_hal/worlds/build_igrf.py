@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from flight.gnc.errors import UsageError
+from knightcube.errors import UsageError
 from sim_hal.worlds.geomagnetism import DEGREE, TABLE
 
 WHEEL_MEMBER = "ppigrf/IGRF14.shc"

@@ -13,9 +13,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
 from flight.schema.errors import ConfigError
 from flight.schema.testbed import as_testbed
+from knightcube.astro.arrays import FloatArray
 from sim_hal.settings import CageTruth
 from sim_hal.worlds.free_body.body import elements, julian_date
 from sim_hal.worlds.free_body.environment import Environment

@@ -12,9 +12,9 @@ from enum import Enum
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
 from hal.drivers.coil_settings import CoilSettings, CoilWiring
 from hal.drivers.pca9685 import COUNTS
+from knightcube.astro.arrays import FloatArray
 from sim_hal.emulators.pca9685 import EmulatedPca9685
 from sim_hal.worlds.chopped_supply import Bridge, ChoppedSupply, Chopping, Pulse
 

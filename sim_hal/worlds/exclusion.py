@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from flight.gnc.camera.pinhole import Pinhole
-from flight.gnc.earth.figure import EARTH_RADIUS
-from flight.gnc.earth.sun import SUN_RADIUS
-from flight.gnc.math import quaternion
-from flight.gnc.math.arrays import BoolArray, FloatArray
+from knightcube.astro import quaternion
+from knightcube.astro.arrays import BoolArray, FloatArray
+from knightcube.astro.earth.figure import EARTH_RADIUS
+from knightcube.astro.earth.sun import SUN_RADIUS
+from knightcube.vision.camera.pinhole import Pinhole
 
 
 def boresights(attitudes: FloatArray, mounting: FloatArray = quaternion.IDENTITY) -> FloatArray:

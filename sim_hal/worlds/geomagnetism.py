@@ -2,8 +2,8 @@
 
 Spherical harmonics of degree 13 (Alken et al. 2021, Earth Planets Space 73:49, eq. 1; coefficients of 2024,
 doi 10.5281/zenodo.14012302), linear in time between epochs. The flight software uses another model
-(`flight.gnc.earth.geomagnetism`), so the two differ as a model differs from the world, except for the ring
-current and the ionosphere; `ring_current` gives the larger of these.
+(`knightcube.astro.earth.geomagnetism`), so the two differ as a model differs from the world, except for the
+ring current and the ionosphere; `ring_current` gives the larger of these.
 
 The table `igrf.npz` holds whole hundredths of a nanotesla; `sim_hal.worlds.build_igrf` makes it from the file
 that the package ppigrf ships. Not ppigrf itself, which was measured: the fields agree within 0.06 nT, but one
@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from flight.gnc.earth.orientation import celestial_to_terrestrial, julian_epoch, north_east_down
-from flight.gnc.math.arrays import FloatArray
 from hal.interfaces.errors import OutOfRange
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.orientation import celestial_to_terrestrial, julian_epoch, north_east_down
 
 TABLE = Path(__file__).with_name("igrf.npz")
 DEGREE = 13

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import about_axis_y
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import about_axis_y
 
 STANDARD_GRAVITY = 9.80665
 

@@ -13,9 +13,9 @@ from typing import Protocol
 import numpy as np
 from scipy.integrate import OdeSolution, solve_ivp
 
-from flight.gnc.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER, J2
-from flight.gnc.math.arrays import FloatArray
 from hal.interfaces.errors import OutOfRange
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER, J2
 
 DEVICE = "orbit"
 _TOLERANCE = 1e-12

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.earth.figure import EARTH_RADIUS
-from flight.gnc.earth.shadow import sunlit_share
-from flight.gnc.earth.sun import ASTRONOMICAL_UNIT
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.directions import tangent_basis
 from hal.interfaces.errors import check_limits
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.directions import tangent_basis
+from knightcube.astro.earth.figure import EARTH_RADIUS
+from knightcube.astro.earth.shadow import sunlit_share
+from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
 
 DEVICE = "solar strings"
 _RINGS, _SPOKES = 16, 32

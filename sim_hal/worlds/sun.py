@@ -14,8 +14,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from flight.gnc.earth.sun import ASTRONOMICAL_UNIT, J2000
-from flight.gnc.math.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, J2000
 
 _PRECESSION = 1.3972 / 36_525.0
 """deg a day, of the equinox along the ecliptic."""

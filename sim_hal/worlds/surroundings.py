@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol, runtime_checkable
 
-from flight.gnc.math.arrays import FloatArray
 from flight.schema.errors import ConfigError
+from knightcube.astro.arrays import FloatArray
 from sim_hal.worlds.world import World, WorldTruth
 
 Floats = tuple[float, float, float]

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
 from flight.schema.errors import ConfigError
 from flight.schema.testbed import TestbedConfig, as_testbed
+from knightcube.astro.arrays import FloatArray
 from sim_hal.settings import Simulation
 from sim_hal.worlds.motion import Motion, about_thread
 from sim_hal.worlds.world import WorldInputs, WorldTruth

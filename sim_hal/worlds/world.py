@@ -11,9 +11,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
-from flight.gnc.math.arrays import FloatArray
 from flight.schema.errors import ConfigError
 from flight.schema.sections import Config
+from knightcube.astro.arrays import FloatArray
 from sim_hal.settings import Simulation
 from sim_hal.worlds.motion import Motion
 

@@ -18,7 +18,7 @@ pytestmark = [
     pytest.mark.skipif(shutil.which("systemctl") is None, reason="systemctl is missing: install systemd"),
 ]
 
-_SOURCES = ("flight", "hal", "sim_hal", "ground", "deploy", "config")
+_SOURCES = ("knightcube", "flight", "hal", "sim_hal", "ground", "deploy", "config")
 _FILES = ("pyproject.toml", "requirements.lock", "README.md")
 
 

@@ -30,7 +30,7 @@ def run(words: list[str], tree: Path, status: int = 0) -> subprocess.CompletedPr
 
 def patched(name: str, folder: Path) -> Path:
     """Return a copy of the packages with `name`.diff applied."""
-    for package in ("flight", "hal", "sim_hal", "ground", "config"):
+    for package in ("knightcube", "flight", "hal", "sim_hal", "ground", "config"):
         shutil.copytree(ROOT / package, folder / package, ignore=shutil.ignore_patterns("__pycache__"))
     words = ["git", "apply", "-C1", "--unidiff-zero", str(EXAMPLES / f"{name}.diff")]
     environment = {**os.environ, "GIT_CEILING_DIRECTORIES": str(folder.parent)}

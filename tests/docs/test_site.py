@@ -15,7 +15,7 @@ def test_every_module_stands_in_the_api_reference() -> None:
         for page in (ROOT / "docs" / "reference").glob("*.md")
         for name in re.findall(r"^::: ([\w.]+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
     }
-    for package in ("flight", "hal", "sim_hal", "ground"):
+    for package in ("knightcube", "flight", "hal", "sim_hal", "ground"):
         for path in (ROOT / package).rglob("*.py"):
             parts = path.relative_to(ROOT).with_suffix("").parts
             if parts[-1].startswith("__"):

@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
 from flight.link.modes import Mode
 from flight.link.telemetry.packets import to_text
 from flight.schema import reader as configuration
 from flight.schema.sections import Commands, CommandStep
 from flight.schema.testbed import TestbedConfig
 from ground.telemetry.reader import Run
+from knightcube.astro.arrays import FloatArray
 from sim_hal.settings import Release, Simulation
 from tests.scenario.flights import demo_config, demo_world
 

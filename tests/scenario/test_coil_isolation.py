@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import attitude_matrix
 from flight.link.modes import Mode
 from flight.link.telemetry.packets import to_text
 from flight.loop.fdir.resources import ResourceSample
 from flight.schema.reader import replace
 from flight.schema.sections import Modes
 from ground.telemetry.reader import Run
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import attitude_matrix
 from sim_hal.settings import FaultEntry
 from tests.scenario.flights import Rigged, demo_config, demo_world, event_names, fly
 from tests.scenario.mode_flights import modes_of

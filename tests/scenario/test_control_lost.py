@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.gnc.math.quaternion import from_rotation_vector, multiply
 from flight.schema import reader as configuration
 from flight.schema.testbed import Step, TestbedConfig
 from ground import report
 from ground.telemetry.reader import Run
+from knightcube.astro.quaternion import from_rotation_vector, multiply
 from sim_hal.emulators.serial_line import SOUND, LineFaults
 from sim_hal.emulators.vn100_sensors import Measured
 from tests.scenario.flights import Rigged, demo_config, event_names, fly, thesis_config

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.gnc.math.arrays import FloatArray
 from flight.schema.reader import replace
 from ground.telemetry.reader import Run
+from knightcube.astro.arrays import FloatArray
 from sim_hal.emulators.serial_line import SOUND, LineFaults
 from sim_hal.settings import FaultEntry
 from tests.scenario.flights import Rigged, demo_config, demo_world, event_names, fly

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flight.gnc.estimation.attitude_filter import AttitudeFilter
 from flight.link.modes import Mode
 from flight.link.telemetry.packets import to_text
 from flight.loop.state.keeper import Notices, StateKeeper
 from flight.loop.state.store import StateStore
 from flight.schema import reader as configuration
 from flight.schema.testbed import Step
+from knightcube.gnc.estimation.attitude_filter import AttitudeFilter
 from sim_hal.clock import SimClock
 from sim_hal.emulators.serial_line import SOUND, LineFaults
 from tests.scenario.flights import Rigged, demo_config, event_names, fly

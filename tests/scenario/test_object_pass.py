@@ -14,13 +14,13 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline
 
-from flight.gnc.earth.sun import SPEED_OF_LIGHT, earth_velocity
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import attitude_matrix
 from flight.schema import reader as configuration
 from flight.schema.orbit import as_orbit
 from ground.export.tracking_data import write_tracking_data
 from ground.telemetry.reader import Run
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.sun import SPEED_OF_LIGHT, earth_velocity
+from knightcube.astro.quaternion import attitude_matrix
 from sim_hal.settings import FaultEntry, Simulation
 from tests.scenario.flights import event_names, fly
 from tests.studies.campaigns.first_orbits import flow

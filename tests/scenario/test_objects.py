@@ -8,9 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.gnc.errors import UsageError
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import attitude_matrix
 from flight.schema import reader as configuration
 from flight.schema.devices import ObjectTracking
 from ground.export.tracking_data import write_tracking_data
@@ -19,6 +16,9 @@ from ground.report.objects_figure import objects_figure
 from ground.report.summary import summarise
 from ground.report.text import format_report
 from ground.telemetry.reader import Run
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import attitude_matrix
+from knightcube.errors import UsageError
 from sim_hal.settings import LineOfSight, SkyObject
 from tests.scenario.flights import demo_config, demo_world, event_names, fly
 

@@ -7,8 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.gnc.errors import UsageError
-from flight.gnc.math.arrays import FloatArray
 from flight.link.modes import Mode
 from flight.link.telemetry.packets import to_text
 from flight.schema import reader as configuration
@@ -17,6 +15,8 @@ from flight.schema.orbit import OrbitConfig, as_orbit
 from flight.schema.sections import Commands, CommandStep
 from ground.report import format_report, summarise
 from ground.telemetry.reader import Run
+from knightcube.astro.arrays import FloatArray
+from knightcube.errors import UsageError
 from sim_hal.faults.schedule import check
 from sim_hal.settings import FaultEntry, Simulation
 from tests.scenario.flights import CONFIG, event_names, fly

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.gnc.math import quaternion
 from flight.schema import reader as configuration
 from flight.schema.orbit import OrbitConfig
 from ground.report import format_report, summarise
 from ground.report.knowledge import FINE, AttitudeErrors, attitude_errors
 from ground.telemetry.reader import Run
+from knightcube.astro import quaternion
 from sim_hal.settings import FaultEntry, Simulation
 from sim_hal.worlds.free_body.body import FreeBody
 from tests.scenario.flights import event_names, fly

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flight.gnc.math.quaternion import angle_between
 from flight.link.modes import Mode
 from flight.link.telemetry.packets import to_text
 from flight.schema import reader as configuration
 from flight.schema.orbit import TargetStep
 from flight.schema.sections import Commands, CommandStep
 from ground.telemetry.reader import Run
+from knightcube.astro.quaternion import angle_between
 from tests.scenario.flights import event_names, fly
 from tests.scenario.mode_flights import modes_of
 from tests.scenario.test_orbit_navigation import navigating, skyward

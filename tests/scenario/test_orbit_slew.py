@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flight.gnc.control.three_axes import astray
-from flight.gnc.math.quaternion import angle_between, from_rotation_vector, multiply
 from flight.link.modes import Mode
 from flight.link.telemetry.packets import to_text
 from flight.schema import reader as configuration
 from flight.schema.orbit import OrbitConfig, TargetStep
 from ground.telemetry.reader import Run
+from knightcube.astro.quaternion import angle_between, from_rotation_vector, multiply
+from knightcube.gnc.control.three_axes import astray
 from sim_hal.settings import FaultEntry, Simulation
 from tests.scenario.flights import event_names, fly
 from tests.scenario.mode_flights import modes_of

@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 
 from flight.bodies.testbed import body as testbed
-from flight.gnc.errors import PlanningError
-from flight.gnc.guidance.one_axis import job as plan_job
-from flight.gnc.guidance.one_axis.job import PlanJob
-from flight.gnc.guidance.one_axis.path import PolynomialPath
-from flight.gnc.guidance.one_axis.vmc import Plan
-from flight.gnc.guidance.one_axis.vmc import plan as make_plan
 from flight.link.telemetry.packets import to_text
 from flight.schema import reader as configuration
 from flight.schema.testbed import Step, TestbedConfig
+from knightcube.errors import PlanningError
+from knightcube.gnc.guidance.one_axis import job as plan_job
+from knightcube.gnc.guidance.one_axis.job import PlanJob
+from knightcube.gnc.guidance.one_axis.path import PolynomialPath
+from knightcube.gnc.guidance.one_axis.vmc import Plan
+from knightcube.gnc.guidance.one_axis.vmc import plan as make_plan
 from tests.scenario.flights import demo_config, event_names, fly, thesis_config
 
 DURATION = 24.0

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flight.gnc.math.arrays import BoolArray, FloatArray
-from flight.gnc.math.quaternion import attitude_matrix
 from flight.link.telemetry.packets import to_text
 from flight.schema import reader as configuration
 from flight.schema.camera_model import camera_model
 from ground.telemetry.reader import Run
+from knightcube.astro.arrays import BoolArray, FloatArray
+from knightcube.astro.quaternion import attitude_matrix
 from tests.scenario.flights import fly
 from tests.studies.bench import slew_frames
 

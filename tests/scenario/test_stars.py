@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import conjugate, from_rotation_vector, multiply, to_rotation_vector
 from flight.schema import reader as configuration
 from ground.telemetry.reader import Run
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import conjugate, from_rotation_vector, multiply, to_rotation_vector
 from sim_hal.emulators.serial_line import SOUND, LineFaults
 from tests.scenario.flights import Rigged, demo_config, event_names, fly
 

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flight.gnc.guidance.one_axis.plant import angle_of
-from flight.gnc.math.arrays import FloatArray
 from flight.schema import reader as configuration
 from flight.schema.testbed import Step, TestbedConfig
 from ground.telemetry.reader import Run
+from knightcube.astro.arrays import FloatArray
+from knightcube.gnc.guidance.one_axis.plant import angle_of
 from tests.scenario.flights import Rigged, demo_config, event_names, fly, thesis_config
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import angle_between, attitude_matrix, conjugate, multiply
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import angle_between, attitude_matrix, conjugate, multiply
 
 
 def field_fraction(rate: FloatArray, exposure: float, field_of_view: float) -> float:

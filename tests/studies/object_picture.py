@@ -13,13 +13,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from flight.gnc.camera.images import grey_stretch
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector, multiply
 from flight.schema import reader as configuration
 from flight.schema.orbit import as_orbit
 from ground.report.figures import DPI
 from ground.telemetry.reader import Run, read_run
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
+from knightcube.vision.camera.images import grey_stretch
 from sim_hal.assembly import StarRenderer
 from sim_hal.settings import Sky
 from sim_hal.star_camera import SourceTrack

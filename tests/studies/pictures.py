@@ -16,20 +16,6 @@ from matplotlib.figure import Figure
 from flight.app.flight import fly
 from flight.app.request import RunRequest
 from flight.bodies.testbed.plant_model import plant_of
-from flight.gnc import catalogue
-from flight.gnc.camera.images import grey_stretch, write_picture
-from flight.gnc.guidance.one_axis.vmc import plan
-from flight.gnc.math.quaternion import about_axis_y, from_rotation_vector, multiply
-from flight.gnc.vision.frame_job import solve_frame
-from flight.gnc.vision.horizon.nadir import find_nadir
-from flight.gnc.vision.horizon.solution import HorizonStatus
-from flight.gnc.vision.startracker.index.build import default_index
-from flight.gnc.vision.startracker.pointing import Pointing
-from flight.gnc.vision.startracker.solution import SolveStatus
-from flight.gnc.vision.startracker.solve import SolveSettings
-from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion
-from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
-from flight.gnc.vision.streaks.streak_result import StreakStatus
 from flight.schema import reader as configuration
 from flight.schema.camera_model import camera_model
 from flight.schema.testbed import as_testbed
@@ -37,6 +23,20 @@ from ground.pictures.horizon import draw_horizon
 from ground.pictures.sky_picture import draw_solution
 from ground.report import draw, draw_path
 from ground.telemetry.reader import read_run
+from knightcube.astro import catalogue
+from knightcube.astro.quaternion import about_axis_y, from_rotation_vector, multiply
+from knightcube.gnc.guidance.one_axis.vmc import plan
+from knightcube.vision.camera.images import grey_stretch, write_picture
+from knightcube.vision.frame_job import solve_frame
+from knightcube.vision.horizon.nadir import find_nadir
+from knightcube.vision.horizon.solution import HorizonStatus
+from knightcube.vision.startracker.index.build import default_index
+from knightcube.vision.startracker.pointing import Pointing
+from knightcube.vision.startracker.solution import SolveStatus
+from knightcube.vision.startracker.solve import SolveSettings
+from knightcube.vision.streaks.maximum_likelihood.estimate import estimate_motion
+from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from knightcube.vision.streaks.streak_result import StreakStatus
 from sim_hal.assembly import StarRenderer
 from sim_hal.earth_camera import render as render_earth
 from sim_hal.settings import Sky

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtr
 
-from flight.gnc.math.arrays import BoolArray, FloatArray, Image, IntArray
-from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
+from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
+from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
 from sim_hal.star_camera import StarCameraModel, detector
 from tests.studies.campaigns.scenes import catalogue
 

@@ -15,15 +15,15 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from flight.gnc import catalogue
-from flight.gnc.camera.pinhole import Pinhole
-from flight.gnc.math.arrays import FloatArray, Image
-from flight.gnc.vision.objects.rso_indicators import lengths, olae_residuals, slopes, star_ends
-from flight.gnc.vision.streaks.corners.detectors import cornerness
-from flight.gnc.vision.streaks.corners.grouping import centre_of_rotation
-from flight.gnc.vision.streaks.corners.settings import DETECTOR_NAMES, StreakSettings
-from flight.gnc.vision.streaks.corners.streak_rate import estimate_rate
-from flight.gnc.vision.streaks.corners.streaks import measure_streaks, segment_frame
+from knightcube.astro import catalogue
+from knightcube.astro.arrays import FloatArray, Image
+from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.objects.rso_indicators import lengths, olae_residuals, slopes, star_ends
+from knightcube.vision.streaks.corners.detectors import cornerness
+from knightcube.vision.streaks.corners.grouping import centre_of_rotation
+from knightcube.vision.streaks.corners.settings import DETECTOR_NAMES, StreakSettings
+from knightcube.vision.streaks.corners.streak_rate import estimate_rate
+from knightcube.vision.streaks.corners.streaks import measure_streaks, segment_frame
 from sim_hal.star_camera import StarCameraModel
 from tests.studies.campaigns.rso import EXPOSURE, draw_sky
 from tests.studies.campaigns.scenes import FIELD, YEAR, slew

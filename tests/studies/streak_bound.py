@@ -17,9 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtr
 
-from flight.gnc.camera.pinhole import Pinhole
-from flight.gnc.math.arrays import FloatArray, IntArray
-from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion, paths, sensitivities
+from knightcube.astro.arrays import FloatArray, IntArray
+from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.streaks.maximum_likelihood.motion import Motion, paths, sensitivities
 
 # Parameters of one star's information: turn (3), point spread, then position (2), electrons, background.
 _SHARED = 4

@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy import fft
 
-from flight.gnc.camera.pinhole import Pinhole
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import attitude_matrix
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import attitude_matrix
+from knightcube.vision.camera.pinhole import Pinhole
 
 Cells = npt.NDArray[np.floating[Any]]
 """Light (rows, columns) on a grid of cells."""

@@ -20,12 +20,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import minimize
 
-from flight.gnc.control.one_axis.adaptive import AdaptiveController, AdaptiveSettings
-from flight.gnc.control.one_axis.controller import Controller
-from flight.gnc.control.one_axis.pid import PidController, PidGains
-from flight.gnc.guidance.one_axis.path import Sample
-from flight.gnc.guidance.one_axis.plant import angle_of
-from tests.flight.gnc.control.closed_loop import BELIEVED, PERIOD
+from knightcube.gnc.control.one_axis.controller import Controller
+from knightcube.gnc.guidance.one_axis.path import Sample
+from knightcube.gnc.guidance.one_axis.plant import angle_of
+from knightcube.reference.control.adaptive import AdaptiveController, AdaptiveSettings
+from knightcube.reference.control.pid import PidController, PidGains
+from tests.knightcube.gnc.control.closed_loop import BELIEVED, PERIOD
 
 TRUE = replace(BELIEVED, stiffness=1e-5, damping=2e-6)
 RELEASE = (angle_of(0.2), -0.1)

@@ -16,8 +16,8 @@ from pathlib import Path
 
 from flight import __version__
 from flight.app.cli.outlet import outlast_readers
-from flight.gnc.errors import FlightError, UsageError
 from hal.interfaces.errors import DeviceError
+from knightcube.errors import FlightError, UsageError
 
 COMMANDS = {
     "run": "fly a configuration",

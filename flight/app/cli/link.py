@@ -12,7 +12,6 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 
 from flight.app.accepted_config import accepted_config
-from flight.gnc.errors import UsageError
 from flight.link.process.archive_reader import LogFollower
 from flight.link.process.control_line import ControlLine
 from flight.link.process.lines import Line, SerialLine, TcpLine, UdpLine
@@ -25,6 +24,7 @@ from flight.schema.reader import parse
 from flight.schema.sections import Link
 from hal.buses.clock import SystemClock
 from hal.buses.serial_port import PySerialPort
+from knightcube.errors import UsageError
 
 _NICE = 10
 

@@ -13,9 +13,9 @@ from typing import TextIO
 
 from flight.app.cli.summary import summary_facts, summary_text
 from flight.app.request import RunRequest
-from flight.gnc.errors import FlightError
 from flight.loop.progress import Progress
 from flight.schema.carried import config_path, names
+from knightcube.errors import FlightError
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

@@ -9,17 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-from flight.gnc.camera.exposure import Exposures
-from flight.gnc.camera.knowledge import CameraKnowledge
-from flight.gnc.tracking.tracker import TrackSettings
-from flight.gnc.vision.frame_job import TrackerSettings
-from flight.gnc.vision.kept_frames import KeptFrames
-from flight.gnc.vision.objects.sighted import SightSettings
-from flight.gnc.vision.startracker.detection import DetectionSettings
-from flight.gnc.vision.startracker.identification.lost_in_space import IdentificationSettings
-from flight.gnc.vision.startracker.solve import SolveSettings
-from flight.gnc.vision.streaks.corners.settings import StreakSettings
-from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from flight.loop.body import Body
 from flight.loop.tasks.frame_measurements import ImagingSettings
 from flight.loop.tasks.navigation import NavigationSettings
@@ -29,6 +18,17 @@ from flight.schema.devices import Camera, ObjectTracking
 from flight.schema.orbit_devices import WideCamera
 from flight.schema.sections import Config
 from hal.interfaces.wires import SECOND_NS
+from knightcube.gnc.tracking.tracker import TrackSettings
+from knightcube.vision.camera.exposure import Exposures
+from knightcube.vision.camera.knowledge import CameraKnowledge
+from knightcube.vision.frame_job import TrackerSettings
+from knightcube.vision.kept_frames import KeptFrames
+from knightcube.vision.objects.sighted import SightSettings
+from knightcube.vision.startracker.detection import DetectionSettings
+from knightcube.vision.startracker.identification.lost_in_space import IdentificationSettings
+from knightcube.vision.startracker.solve import SolveSettings
+from knightcube.vision.streaks.corners.settings import StreakSettings
+from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 
 
 def navigation_settings(config: Config) -> NavigationSettings:

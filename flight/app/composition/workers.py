@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from flight.app.composition.bodies import body_kind
-from flight.gnc.vision import frame_job, wide_job
 from flight.loop.body import PLANNER, Planner
 from flight.loop.executive.jobs import Worker
 from flight.loop.fdir.progress import WorkerWatch
@@ -13,6 +12,7 @@ from flight.loop.tasks.imaging import Imaging
 from flight.loop.tasks.wide_imaging import WideImaging
 from flight.schema.sections import Config, Executive
 from hal.interfaces.wires import SECOND_NS
+from knightcube.vision import frame_job, wide_job
 
 
 def workers(config: Config, planner_latency_ns: int = 0, vision_latency_ns: int = 0) -> list[Worker]:

@@ -26,22 +26,6 @@ from flight.bodies.orbit.targets import PointingTargets
 from flight.bodies.orbit.tracker import PointingTracker
 from flight.bodies.orbit.view import OrbitView
 from flight.bodies.orbit.wide_feed import wide_feed_of
-from flight.gnc.control.detumble import WindowSchedule
-from flight.gnc.control.three_axes import pointing_job
-from flight.gnc.control.three_axes.field_detumbler import FieldBraking, FieldDetumbler
-from flight.gnc.control.three_axes.pointing_table import PointingWeights
-from flight.gnc.control.three_axes.slew_table import SlewWish
-from flight.gnc.control.three_axes.sun_seeker import Seeking, SunSeeker
-from flight.gnc.earth.orbit_knowledge import TwoLineElements
-from flight.gnc.errors import UsageError
-from flight.gnc.estimation.estimate import Estimate
-from flight.gnc.estimation.field_rate import FieldRateSettings
-from flight.gnc.estimation.free_settings import FreeFilterSettings
-from flight.gnc.guidance.three_axes.pointing_target import PointingTarget
-from flight.gnc.guidance.three_axes.target_law import BodyAxes
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import attitude_matrix
-from flight.gnc.vision.sun_sensor.strings import SolarStrings
 from flight.link.modes import Mode
 from flight.loop.body import Body, BodyKind
 from flight.loop.fdir.coils.response import ResponseSettings
@@ -55,6 +39,22 @@ from flight.schema.orbit_devices import SolarStrings as StringsSection
 from flight.schema.sections import Config
 from hal.interfaces.readings import StringReading
 from hal.interfaces.wires import SECOND_NS
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.orbit_knowledge import TwoLineElements
+from knightcube.astro.quaternion import attitude_matrix
+from knightcube.errors import UsageError
+from knightcube.gnc.control.detumble import WindowSchedule
+from knightcube.gnc.control.three_axes import pointing_job
+from knightcube.gnc.control.three_axes.field_detumbler import FieldBraking, FieldDetumbler
+from knightcube.gnc.control.three_axes.pointing_table import PointingWeights
+from knightcube.gnc.control.three_axes.slew_table import SlewWish
+from knightcube.gnc.control.three_axes.sun_seeker import Seeking, SunSeeker
+from knightcube.gnc.estimation.estimate import Estimate
+from knightcube.gnc.estimation.field_rate import FieldRateSettings
+from knightcube.gnc.estimation.free_settings import FreeFilterSettings
+from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget
+from knightcube.gnc.guidance.three_axes.target_law import BodyAxes
+from knightcube.vision.sun.strings import SolarStrings
 
 _BELOW = 0.8
 """Of the rate at which the body would be braked again: what a path may take, the rest is for its errors."""

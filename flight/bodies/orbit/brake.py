@@ -9,11 +9,11 @@ import numpy as np
 from flight.bodies.orbit.field_doubt import FieldDoubt
 from flight.bodies.orbit.filter import OrbitFilter
 from flight.bodies.orbit.surroundings import Surroundings
-from flight.gnc.control.three_axes.field_detumbler import FieldDetumbler
-from flight.gnc.earth.field_ahead import FieldAhead
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import attitude_matrix
 from flight.loop.control_output import CoilCommand
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.field_ahead import FieldAhead
+from knightcube.astro.quaternion import attitude_matrix
+from knightcube.gnc.control.three_axes.field_detumbler import FieldDetumbler
 
 
 class FieldBrake:

@@ -6,15 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.estimation import estimate as form
-from flight.gnc.estimation import free_motion as states
-from flight.gnc.estimation.estimate import FIELD_BIAS, Estimate
-from flight.gnc.estimation.free_filter import FreeFilter, FreeMemory
-from flight.gnc.estimation.free_motion import Around
-from flight.gnc.estimation.rigid_body import Parameters
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.directions import cross_product
-from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector, multiply
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.directions import cross_product
+from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
+from knightcube.gnc.estimation import estimate as form
+from knightcube.gnc.estimation import free_motion as states
+from knightcube.gnc.estimation.estimate import FIELD_BIAS, Estimate
+from knightcube.gnc.estimation.free_filter import FreeFilter, FreeMemory
+from knightcube.gnc.estimation.free_motion import Around
+from knightcube.gnc.estimation.rigid_body import Parameters
 
 _FROM = np.r_[states.TURN, states.RATE, states.GYRO, states.MAGNET]
 _TO = np.r_[form.TURN, form.RATE, form.BIAS, form.FIELD_BIAS]

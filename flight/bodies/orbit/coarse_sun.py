@@ -11,20 +11,20 @@ import numpy as np
 
 from flight.bodies.orbit.filter import OrbitFilter
 from flight.bodies.orbit.surroundings import Surroundings
-from flight.gnc.attitude.determination.field_and_strings import FieldAndStrings, Sky, StringFix
-from flight.gnc.estimation.estimate import TURN, Knowledge
-from flight.gnc.estimation.free_motion import Around
-from flight.gnc.estimation.measurements import AttitudeMeasurement, DirectionMeasurement
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import (
+from hal.interfaces.readings import StringReading
+from hal.interfaces.wires import SECOND_NS
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import (
     attitude_matrix,
     conjugate,
     multiply,
     to_rotation_vector,
 )
-from flight.gnc.vision.sun_sensor.strings import SolarStrings
-from hal.interfaces.readings import StringReading
-from hal.interfaces.wires import SECOND_NS
+from knightcube.gnc.estimation.estimate import TURN, Knowledge
+from knightcube.gnc.estimation.free_motion import Around
+from knightcube.gnc.estimation.measurements import AttitudeMeasurement, DirectionMeasurement
+from knightcube.vision.sun.field_and_strings import FieldAndStrings, Sky, StringFix
+from knightcube.vision.sun.strings import SolarStrings
 
 PERIOD_NS = 5 * SECOND_NS
 """Between readings that are judged: more often they say nothing new."""

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from flight.bodies.orbit.filter import OrbitFilter
-from flight.gnc.estimation.measurements import AttitudeMeasurement
 from flight.loop.body import Agreement
 from hal.interfaces.readings import ImuReading
+from knightcube.gnc.estimation.measurements import AttitudeMeasurement
 
 
 class OrbitFeed:

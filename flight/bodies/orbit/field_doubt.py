@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from flight.gnc.math.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray
 
 STUCK, CONTRADICTED = 20, 4
 """Readings in a row with the same field, whose noise never repeats; fields that contradict the estimate."""

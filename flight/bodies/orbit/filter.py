@@ -17,17 +17,17 @@ from flight.bodies.orbit.carried import CarriedOn
 from flight.bodies.orbit.field_doubt import FieldDoubt
 from flight.bodies.orbit.replay import OrbitFilterSettings, StepReplay
 from flight.bodies.orbit.steps import DipoleHistory, OpenStep
-from flight.gnc.estimation.estimate import Estimate, Knowledge
-from flight.gnc.estimation.free_filter import SlowStates
-from flight.gnc.estimation.free_motion import Around
-from flight.gnc.estimation.measurements import (
+from hal.interfaces.readings import ImuReading
+from hal.interfaces.wires import SECOND_NS
+from knightcube.astro.arrays import FloatArray, IntArray
+from knightcube.gnc.estimation.estimate import Estimate, Knowledge
+from knightcube.gnc.estimation.free_filter import SlowStates
+from knightcube.gnc.estimation.free_motion import Around
+from knightcube.gnc.estimation.measurements import (
     AttitudeMeasurement,
     FieldMeasurement,
     Measurement,
 )
-from flight.gnc.math.arrays import FloatArray, IntArray
-from hal.interfaces.readings import ImuReading
-from hal.interfaces.wires import SECOND_NS
 
 REFUSALS_TO_RESTART = 3
 """Attitudes in a row that contradict the estimate: the estimate is wrong."""
@@ -108,7 +108,7 @@ class OrbitFilter:
 
     @property
     def torque_sizes(self) -> FloatArray:
-        """The sizes (9,) N m of the torques (`flight.gnc.earth.disturbance`)."""
+        """The sizes (9,) N m of the torques (`knightcube.astro.earth.disturbance`)."""
         return self._free.torque_sizes
 
     @property

@@ -13,11 +13,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from flight.gnc.estimation.free_filter import SlowStates
-from flight.gnc.estimation.free_motion import AXES, DIPOLE, GYRO, MAGNET, SUNLIT, TORQUES
-from flight.gnc.estimation.free_settings import BELIEVED, FreeFilterSettings
-from flight.gnc.math.arrays import IntArray
 from flight.loop.state.content import Learned
+from knightcube.astro.arrays import IntArray
+from knightcube.gnc.estimation.free_filter import SlowStates
+from knightcube.gnc.estimation.free_motion import AXES, DIPOLE, GYRO, MAGNET, SUNLIT, TORQUES
+from knightcube.gnc.estimation.free_settings import BELIEVED, FreeFilterSettings
 
 ERRORS, SOURCES, LEARNED_AT = "attitude-errors", "attitude-torques", "learned-at"
 UNKNOWN_AGE = 86_400.0

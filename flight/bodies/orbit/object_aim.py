@@ -13,16 +13,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flight.gnc.control.three_axes.pointing_job import PointingJob, Sight
-from flight.gnc.control.three_axes.pointing_table import PointingTable
-from flight.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
-from flight.gnc.guidance.three_axes.target_law import BodyAxes
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import attitude_matrix
-from flight.gnc.tracking.tracker import Track
 from flight.link import events
 from flight.loop.fdir.event_log import EventLog
 from hal.interfaces.wires import SECOND_NS
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import attitude_matrix
+from knightcube.gnc.control.three_axes.pointing_job import PointingJob, Sight
+from knightcube.gnc.control.three_axes.pointing_table import PointingTable
+from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from knightcube.gnc.guidance.three_axes.target_law import BodyAxes
+from knightcube.gnc.tracking.tracker import Track
 
 EFFORT = 0.25
 """Of the coils' limit: the dipole that costs as much as the error of pointing that costs one."""

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.control.three_axes.astray import Astray
-from flight.gnc.control.three_axes.pointing import PointingLaw
-from flight.gnc.control.three_axes.pointing_table import PointingTable
-from flight.gnc.guidance.three_axes.attitude_law import Reference
-from flight.gnc.guidance.three_axes.pointing_target import PointingTarget
-from flight.gnc.math.arrays import FloatArray
 from hal.interfaces.wires import SECOND_NS
+from knightcube.astro.arrays import FloatArray
+from knightcube.gnc.control.three_axes.astray import Astray
+from knightcube.gnc.control.three_axes.pointing import PointingLaw
+from knightcube.gnc.control.three_axes.pointing_table import PointingTable
+from knightcube.gnc.guidance.three_axes.attitude_law import Reference
+from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget
 
 
 @dataclass(frozen=True, slots=True, eq=False)

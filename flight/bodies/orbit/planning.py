@@ -16,19 +16,19 @@ from flight.bodies.orbit.object_aim import ObjectAim
 from flight.bodies.orbit.paths import PointingPaths
 from flight.bodies.orbit.surroundings import Surroundings
 from flight.bodies.orbit.targets import target_of
-from flight.gnc.control.three_axes.pointing_job import STEADY, PointingJob
-from flight.gnc.control.three_axes.pointing_table import PointingWeights
-from flight.gnc.control.three_axes.slew_table import SlewWish
-from flight.gnc.estimation.estimate import Estimate
-from flight.gnc.guidance.three_axes.pointing_target import PointingTarget
-from flight.gnc.guidance.three_axes.target_law import BodyAxes
-from flight.gnc.math.arrays import FloatArray
 from flight.link import events
 from flight.loop.body import PLANNER
 from flight.loop.control_output import Target
 from flight.loop.executive.jobs import JobResult
 from flight.loop.executive.rate_group import Cycle
 from flight.loop.services import Services
+from knightcube.astro.arrays import FloatArray
+from knightcube.gnc.control.three_axes.pointing_job import STEADY, PointingJob
+from knightcube.gnc.control.three_axes.pointing_table import PointingWeights
+from knightcube.gnc.control.three_axes.slew_table import SlewWish
+from knightcube.gnc.estimation.estimate import Estimate
+from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget
+from knightcube.gnc.guidance.three_axes.target_law import BodyAxes
 
 AGAIN_NS = 10_000_000_000
 """After a plan that failed, or while no orbit is known, the next is asked for after this time."""

@@ -9,18 +9,18 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from flight.bodies.orbit.steps import Step
-from flight.gnc.estimation.free_filter import FreeFilter, SlowStates
-from flight.gnc.estimation.free_settings import FreeFilterSettings
-from flight.gnc.estimation.measurements import (
+from hal.interfaces.wires import SECOND_NS
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import attitude_matrix, conjugate, from_rotation_vector, multiply
+from knightcube.gnc.estimation.free_filter import FreeFilter, SlowStates
+from knightcube.gnc.estimation.free_settings import FreeFilterSettings
+from knightcube.gnc.estimation.measurements import (
     AttitudeMeasurement,
     DirectionMeasurement,
     FieldMeasurement,
     MeanRateMeasurement,
     Measurement,
 )
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import attitude_matrix, conjugate, from_rotation_vector, multiply
-from hal.interfaces.wires import SECOND_NS
 
 FORGOTTEN_NS = 10_000_000_000
 """After this time without a gyro that contradicts the commanded dipoles these are tried again."""

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from flight.bodies.orbit.field_doubt import FieldDoubt
-from flight.gnc.control.three_axes.sun_seeker import SunSeeker
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.vision.sun_sensor.strings import SolarStrings, coarse_sun
 from flight.link import events
 from flight.loop.control_output import CoilCommand
 from flight.loop.fdir.event_log import EventLog
 from hal.interfaces.readings import StringReading
+from knightcube.astro.arrays import FloatArray
+from knightcube.gnc.control.three_axes.sun_seeker import SunSeeker
+from knightcube.vision.sun.strings import SolarStrings, coarse_sun
 
 
 class StringSeeker:

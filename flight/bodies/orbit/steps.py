@@ -12,12 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.estimation.free_filter import FreeMemory
-from flight.gnc.estimation.free_motion import Around
-from flight.gnc.estimation.measurements import Measurement
-from flight.gnc.math.arrays import FloatArray
 from hal.interfaces.readings import ImuReading
 from hal.interfaces.wires import SECOND_NS
+from knightcube.astro.arrays import FloatArray
+from knightcube.gnc.estimation.free_filter import FreeMemory
+from knightcube.gnc.estimation.free_motion import Around
+from knightcube.gnc.estimation.measurements import Measurement
 
 Floats = tuple[float, float, float]
 _NOTHING: Floats = (0.0, 0.0, 0.0)

@@ -11,16 +11,16 @@ import math
 
 import numpy as np
 
-from flight.gnc.earth.disturbance import Pressures, pressures
-from flight.gnc.earth.ephemeris import STEP, Ephemeris, predict
-from flight.gnc.earth.geomagnetism import GeomagneticError
-from flight.gnc.earth.orbit_knowledge import GpsFix, OrbitError, OrbitState, TwoLineElements
-from flight.gnc.earth.orientation import terrestrial_time
-from flight.gnc.earth.sun import DAY, earth_velocity
-from flight.gnc.estimation.free_motion import Around
-from flight.gnc.math.arrays import FloatArray
 from hal.interfaces.readings import GpsReading
 from hal.interfaces.wires import SECOND_NS, Clock
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.disturbance import Pressures, pressures
+from knightcube.astro.earth.ephemeris import STEP, Ephemeris, predict
+from knightcube.astro.earth.geomagnetism import GeomagneticError
+from knightcube.astro.earth.orbit_knowledge import GpsFix, OrbitError, OrbitState, TwoLineElements
+from knightcube.astro.earth.orientation import terrestrial_time
+from knightcube.astro.earth.sun import DAY, earth_velocity
+from knightcube.gnc.estimation.free_motion import Around
 
 AHEAD, BEHIND = 2.0 * STEP, STEP
 """s, of the short prediction, after and before the time that it was made for."""

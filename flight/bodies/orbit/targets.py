@@ -9,12 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from flight.bodies.orbit.paths import PointingPaths
-from flight.gnc.errors import UsageError
-from flight.gnc.estimation.estimate import Estimate
-from flight.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import angle_between
 from flight.loop.control_output import COMMANDED, KEPT, Target
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import angle_between
+from knightcube.errors import UsageError
+from knightcube.gnc.estimation.estimate import Estimate
+from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,6 @@
 """The tracker of a satellite: the pointing law along its path, and the pauses of the coils.
 
-Far off its path the body is held still instead (`flight.gnc.control.three_axes.astray`).
+Far off its path the body is held still instead (`knightcube.gnc.control.three_axes.astray`).
 
 The coils pause at the begin of each window, so that the magnetometer is read without their field; then one
 dipole, computed at the pause's end, is held. It is raised by what the pause takes from its mean.
@@ -13,12 +13,12 @@ import numpy as np
 from flight.bodies.orbit.filter import OrbitFilter
 from flight.bodies.orbit.paths import PathPoint
 from flight.bodies.orbit.surroundings import Surroundings
-from flight.gnc.control.detumble import WindowSchedule
-from flight.gnc.control.three_axes.astray import damping_dipole
-from flight.gnc.estimation.estimate import Estimate
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import attitude_matrix
 from flight.loop.control_output import CoilCommand
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import attitude_matrix
+from knightcube.gnc.control.detumble import WindowSchedule
+from knightcube.gnc.control.three_axes.astray import damping_dipole
+from knightcube.gnc.estimation.estimate import Estimate
 
 _NOTHING: FloatArray = np.zeros(3)
 

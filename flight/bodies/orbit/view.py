@@ -10,14 +10,14 @@ import numpy as np
 from flight.bodies.orbit.brake import FieldBrake
 from flight.bodies.orbit.filter import OrbitFilter
 from flight.bodies.orbit.surroundings import Surroundings
-from flight.gnc.estimation.estimate import Knowledge
-from flight.gnc.estimation.measurements import MeanRateMeasurement
 from flight.link import events
 from flight.link.modes import Mode
 from flight.link.telemetry.orbit_definitions import NAVIGATION, SPIN
 from flight.loop.control_output import ControlOutput, Target
 from flight.loop.fdir import facts
 from flight.loop.services import Services
+from knightcube.gnc.estimation.estimate import Knowledge
+from knightcube.gnc.estimation.measurements import MeanRateMeasurement
 
 SPIN_EVERY = 10
 """Control cycles from one spin packet to the next."""

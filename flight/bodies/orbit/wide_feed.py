@@ -15,23 +15,23 @@ import numpy as np
 from flight.bodies.orbit.coarse_sun import CoarseSunFeed
 from flight.bodies.orbit.filter import OrbitFilter
 from flight.bodies.orbit.surroundings import Surroundings
-from flight.gnc.attitude.determination.single_frame import Sight, field_sight, optimum
-from flight.gnc.attitude.wahba import AttitudeError
-from flight.gnc.camera.mounted import MountedCamera
-from flight.gnc.estimation.estimate import TURN, Knowledge
-from flight.gnc.estimation.measurements import AttitudeMeasurement, DirectionMeasurement
-from flight.gnc.math import chi_square
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.directions import tangent_basis
-from flight.gnc.math.quaternion import attitude_matrix
-from flight.gnc.vision.horizon.knowledge import HorizonKnowledge, RoughAttitude, SensedDirection
-from flight.gnc.vision.horizon.response import LogarithmicResponse
-from flight.gnc.vision.sun_sensor.strings import SolarStrings
-from flight.gnc.vision.wide_job import Sighted, WideFound, WideJob
 from flight.schema.camera_model import camera_model
 from flight.schema.orbit_devices import WideCamera
 from hal.interfaces.readings import Frame
 from hal.interfaces.wires import SECOND_NS
+from knightcube.astro import chi_square
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.attitude.wahba import AttitudeError
+from knightcube.astro.directions import tangent_basis
+from knightcube.astro.quaternion import attitude_matrix
+from knightcube.gnc.attitude.single_frame import Sight, field_sight, optimum
+from knightcube.gnc.estimation.estimate import TURN, Knowledge
+from knightcube.gnc.estimation.measurements import AttitudeMeasurement, DirectionMeasurement
+from knightcube.vision.camera.mounted import MountedCamera
+from knightcube.vision.horizon.knowledge import HorizonKnowledge, RoughAttitude, SensedDirection
+from knightcube.vision.horizon.response import LogarithmicResponse
+from knightcube.vision.sun.strings import SolarStrings
+from knightcube.vision.wide_job import Sighted, WideFound, WideJob
 
 START_SIGMA = math.radians(15.0)
 """rad, of the worst axis, to which an attitude starts the filter: less says where the Earth is, no more."""

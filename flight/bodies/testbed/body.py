@@ -18,18 +18,6 @@ from flight.bodies.testbed.targets import ThreadTargets, TimedStep
 from flight.bodies.testbed.thread_estimate import ThreadReader
 from flight.bodies.testbed.tracker import ThreadTracker, controller_of
 from flight.bodies.testbed.view import ThreadView
-from flight.gnc.control.detumble import Braking, Detumbler, WindowSchedule, share_in_turning_field
-from flight.gnc.estimation.attitude_filter import AttitudeFilter
-from flight.gnc.estimation.estimate import Estimate
-from flight.gnc.estimation.filter_settings import FilterSettings, slow_prior
-from flight.gnc.estimation.rigid_body import Parameters, RigidBody
-from flight.gnc.guidance.one_axis import job as plan_job
-from flight.gnc.guidance.one_axis.guidance import AcceptanceRules, Guidance
-from flight.gnc.guidance.one_axis.path_cost import PathCost
-from flight.gnc.guidance.one_axis.plant import SingleAxisPlant
-from flight.gnc.guidance.one_axis.vmc import NODES
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import about_axis_y, attitude_matrix
 from flight.link.modes import ORBITAL, Mode
 from flight.loop.body import Body, BodyKind, Tracker
 from flight.loop.fdir.coils.response import ResponseSettings
@@ -40,6 +28,18 @@ from flight.loop.state.learning import start_from
 from flight.schema.sections import Config
 from flight.schema.testbed import TestbedConfig, as_testbed
 from hal.interfaces.wires import SECOND_NS
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import about_axis_y, attitude_matrix
+from knightcube.gnc.control.detumble import Braking, Detumbler, WindowSchedule, share_in_turning_field
+from knightcube.gnc.estimation.attitude_filter import AttitudeFilter
+from knightcube.gnc.estimation.estimate import Estimate
+from knightcube.gnc.estimation.filter_settings import FilterSettings, slow_prior
+from knightcube.gnc.estimation.rigid_body import Parameters, RigidBody
+from knightcube.gnc.guidance.one_axis import job as plan_job
+from knightcube.gnc.guidance.one_axis.guidance import AcceptanceRules, Guidance
+from knightcube.gnc.guidance.one_axis.path_cost import PathCost
+from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
+from knightcube.gnc.guidance.one_axis.vmc import NODES
 
 _THREAD_AXIS = np.array([0.0, 1.0, 0.0])
 

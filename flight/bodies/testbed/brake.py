@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from flight.gnc.control.detumble import Detumbler
-from flight.gnc.math.arrays import FloatArray
 from flight.loop.control_output import CoilCommand
+from knightcube.astro.arrays import FloatArray
+from knightcube.gnc.control.detumble import Detumbler
 
 
 class BdotBrake:

@@ -18,25 +18,25 @@ import math
 import numpy as np
 
 from flight.bodies.testbed.thread_estimate import ThreadReader
-from flight.gnc.earth.ephemeris import Ephemeris, predict
-from flight.gnc.earth.geomagnetism import GeomagneticError, field
-from flight.gnc.earth.orbit_knowledge import OrbitError, TwoLineElements
-from flight.gnc.earth.sun import DAY
-from flight.gnc.errors import UsageError
-from flight.gnc.estimation.attitude_filter import AttitudeFilter
-from flight.gnc.estimation.estimate import Estimate
-from flight.gnc.estimation.filter_settings import FilterSettings
-from flight.gnc.estimation.rigid_body import RigidBody
-from flight.gnc.estimation.slow_prior import SlowPrior
-from flight.gnc.guidance.one_axis.path import Sample
-from flight.gnc.guidance.one_axis.plant import SingleAxisPlant
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import about_axis_y, attitude_matrix
 from flight.loop.body import Tracker
 from flight.loop.control_output import CoilCommand
 from flight.schema.errors import ConfigError
 from flight.schema.testbed import Cage
 from hal.interfaces.wires import SECOND_NS, Clock
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.ephemeris import Ephemeris, predict
+from knightcube.astro.earth.geomagnetism import GeomagneticError, field
+from knightcube.astro.earth.orbit_knowledge import OrbitError, TwoLineElements
+from knightcube.astro.earth.sun import DAY
+from knightcube.astro.quaternion import about_axis_y, attitude_matrix
+from knightcube.errors import UsageError
+from knightcube.gnc.estimation.attitude_filter import AttitudeFilter
+from knightcube.gnc.estimation.estimate import Estimate
+from knightcube.gnc.estimation.filter_settings import FilterSettings
+from knightcube.gnc.estimation.rigid_body import RigidBody
+from knightcube.gnc.estimation.slow_prior import SlowPrior
+from knightcube.gnc.guidance.one_axis.path import Sample
+from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
 
 AHEAD = 20.0
 """s, predicted at once, in a millisecond or two."""

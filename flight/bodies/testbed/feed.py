@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from flight.gnc.estimation.attitude_filter import AttitudeFilter
-from flight.gnc.estimation.measurements import AttitudeMeasurement, RateMeasurement
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import angle_about_axis_y
 from flight.loop.body import Agreement
 from flight.schema.devices import InertialUnit
 from hal.interfaces.readings import ImuReading
 from hal.interfaces.wires import SECOND_NS
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import angle_about_axis_y
+from knightcube.gnc.estimation.attitude_filter import AttitudeFilter
+from knightcube.gnc.estimation.measurements import AttitudeMeasurement, RateMeasurement
 
 
 class UnitFeed:

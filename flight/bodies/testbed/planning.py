@@ -15,13 +15,6 @@ from enum import StrEnum
 
 from flight.bodies.testbed.thread_estimate import ThreadEstimate, ThreadReader
 from flight.bodies.testbed.thread_law import ThreadLaw, law_of
-from flight.gnc.estimation.estimate import Estimate
-from flight.gnc.guidance.one_axis.guidance import Guidance
-from flight.gnc.guidance.one_axis.job import PlanJob
-from flight.gnc.guidance.one_axis.path import FARTHEST
-from flight.gnc.guidance.one_axis.path_cost import PathCost
-from flight.gnc.guidance.one_axis.plant import SingleAxisPlant, angle_of, q2_of
-from flight.gnc.guidance.one_axis.vmc import Plan, PlanStatus
 from flight.link import events
 from flight.link.telemetry.definitions import MAX_NODES, PLAN
 from flight.loop.body import PLANNER
@@ -29,6 +22,13 @@ from flight.loop.control_output import Target
 from flight.loop.executive.jobs import JobResult
 from flight.loop.executive.rate_group import Cycle
 from flight.loop.services import Services
+from knightcube.gnc.estimation.estimate import Estimate
+from knightcube.gnc.guidance.one_axis.guidance import Guidance
+from knightcube.gnc.guidance.one_axis.job import PlanJob
+from knightcube.gnc.guidance.one_axis.path import FARTHEST
+from knightcube.gnc.guidance.one_axis.path_cost import PathCost
+from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant, angle_of, q2_of
+from knightcube.gnc.guidance.one_axis.vmc import Plan, PlanStatus
 
 _AGAIN_NS = 1_000_000_000
 

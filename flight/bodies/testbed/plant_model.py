@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from flight.gnc.guidance.one_axis.plant import SingleAxisPlant
 from flight.schema.testbed import TestbedConfig
+from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
 
 
 def plant_of(config: TestbedConfig) -> SingleAxisPlant:

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 from flight.bodies.testbed.planning import Planning
 from flight.bodies.testbed.thread_estimate import ThreadReader
 from flight.bodies.testbed.thread_law import ThreadLaw, law_of
-from flight.gnc.errors import UsageError
-from flight.gnc.estimation.estimate import Estimate
-from flight.gnc.guidance.one_axis.guidance import Guidance
-from flight.gnc.guidance.one_axis.limits import Q2_LIMIT
-from flight.gnc.guidance.one_axis.plant import angle_of
-from flight.gnc.guidance.three_axes.pointing_target import PointingTarget
 from flight.loop.control_output import COMMANDED, KEPT, Target
+from knightcube.errors import UsageError
+from knightcube.gnc.estimation.estimate import Estimate
+from knightcube.gnc.guidance.one_axis.guidance import Guidance
+from knightcube.gnc.guidance.one_axis.limits import Q2_LIMIT
+from knightcube.gnc.guidance.one_axis.plant import angle_of
+from knightcube.gnc.guidance.three_axes.pointing_target import PointingTarget
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.estimation.estimate import PARAMETERS, Estimate
-from flight.gnc.estimation.rigid_body import NOMINAL, Parameters
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import angle_about_axis_y
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import angle_about_axis_y
+from knightcube.gnc.estimation.estimate import PARAMETERS, Estimate
+from knightcube.gnc.estimation.rigid_body import NOMINAL, Parameters
 
 LEAST_GAIN, MOST_GAIN = 0.5, 2.0
 """Limits of the estimated coil gain: beyond them the filter has not converged."""

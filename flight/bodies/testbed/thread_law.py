@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from flight.gnc.guidance.one_axis.plant import angle_of
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import about_axis_y
 from flight.loop.control_output import Target
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import about_axis_y
+from knightcube.gnc.guidance.one_axis.plant import angle_of
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from flight.bodies.testbed.thread_estimate import ThreadReader
-from flight.gnc.control.one_axis.adaptive import AdaptiveController, AdaptiveSettings
-from flight.gnc.control.one_axis.controller import Controller
-from flight.gnc.control.one_axis.excitation import ExcitationController, ExcitationSettings
-from flight.gnc.control.one_axis.lq_tracker import LqTracker
-from flight.gnc.control.one_axis.pid import PidController, PidGains
-from flight.gnc.estimation.estimate import Estimate
-from flight.gnc.guidance.one_axis.path import Sample
-from flight.gnc.guidance.one_axis.plant import SingleAxisPlant
 from flight.loop.control_output import CoilCommand
 from flight.schema.testbed import Control, Identification
+from knightcube.gnc.control.one_axis.controller import Controller
+from knightcube.gnc.control.one_axis.excitation import ExcitationController, ExcitationSettings
+from knightcube.gnc.control.one_axis.lq_tracker import LqTracker
+from knightcube.gnc.estimation.estimate import Estimate
+from knightcube.gnc.guidance.one_axis.path import Sample
+from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
+from knightcube.reference.control.adaptive import AdaptiveController, AdaptiveSettings
+from knightcube.reference.control.pid import PidController, PidGains
 
 
 def controller_of(

@@ -8,11 +8,11 @@ from collections.abc import Mapping
 from flight.bodies.testbed.planning import Planning
 from flight.bodies.testbed.thread_estimate import ThreadReader
 from flight.bodies.testbed.thread_law import law_of
-from flight.gnc.estimation.measurements import MeanRateMeasurement
 from flight.link import events
 from flight.link.telemetry.definitions import CONTROL, TARGET
 from flight.loop.control_output import KEPT, ControlOutput, Target
 from flight.loop.services import Services
+from knightcube.gnc.estimation.measurements import MeanRateMeasurement
 
 
 class ThreadView:

@@ -14,9 +14,9 @@ from ipaddress import IPv4Address, IPv4Network
 from pathlib import Path
 from typing import Any, Protocol
 
-from flight.gnc.errors import UsageError
 from flight.link.commands.admission import admit
 from flight.link.commands.codec import IDENTIFIERS, LONGEST
+from knightcube.errors import UsageError
 
 AT_MOST = 16
 """Datagrams taken at once: a flood costs its senders, not the loop."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from flight.gnc.errors import FlightError
+from knightcube.errors import FlightError
 
 
 class CommandError(FlightError):

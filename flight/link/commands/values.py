@@ -7,8 +7,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from flight.gnc.errors import UsageError
-from flight.gnc.guidance.three_axes.pointing_target import NUMBERS, Goal, PointingTarget
 from flight.link.commands.definitions import (
     CLEAR,
     DUMP_PARAMETERS,
@@ -23,6 +21,8 @@ from flight.link.commands.errors import CommandError
 from flight.link.modes import Mode
 from flight.link.parameters import FIELDS, KEYS, crc_of
 from flight.link.telemetry.form import Packet
+from knightcube.errors import UsageError
+from knightcube.gnc.guidance.three_axes.pointing_target import NUMBERS, Goal, PointingTarget
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import msgspec
 
-from flight.gnc.errors import UsageError
 from flight.link.files.pdu import (
     Ack,
     Code,
@@ -32,6 +31,7 @@ from flight.link.files.pdu import (
 from flight.link.files.receiver import Accept, Receiver
 from flight.link.files.sender import Sender, answer_to
 from flight.link.files.store import Ending, FileError, Incoming, Outgoing, Store, problem_of_name
+from knightcube.errors import UsageError
 
 SATELLITE, GROUND, FOREIGN = 1, 2, 3
 """Entities: the satellite, our ground, and a ground station of others (`ground.yamcs`)."""

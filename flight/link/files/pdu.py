@@ -10,7 +10,7 @@ import struct
 from dataclasses import dataclass
 from enum import IntEnum
 
-from flight.gnc.errors import FlightError
+from knightcube.errors import FlightError
 
 SEGMENT_BYTES = 900
 """Of a file in one unit: with its headers it fits into a telecommand frame."""

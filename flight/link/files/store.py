@@ -17,8 +17,8 @@ from typing import Annotated, TypeVar
 import msgspec
 from msgspec import Meta
 
-from flight.gnc.errors import FlightError, UsageError
 from flight.link.files.pdu import HIGHEST_NUMBER, Transaction
+from knightcube.errors import FlightError, UsageError
 
 LONGEST_NAME = 96
 """Bytes of a file's name, with the zero that ends it in a command."""

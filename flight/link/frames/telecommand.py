@@ -9,8 +9,8 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 
-from flight.gnc.errors import FlightError
 from flight.link.telemetry.packets import CRC_BYTES, crc16
+from knightcube.errors import FlightError
 
 HEADER = struct.Struct(">HHB")
 LONGEST_FRAME = 1024

@@ -16,7 +16,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from flight.gnc.errors import UsageError
 from flight.link.commands.errors import CommandError
 from flight.link.files.checksum import CRC32, MODULAR
 from flight.link.files.entity import FOREIGN, LONGEST_FILE, SATELLITE, Entity, Origin, Progress
@@ -33,6 +32,7 @@ from flight.link.process.file_directives import (
     UseFile,
 )
 from flight.link.process.verification import Report, Request, Stage
+from knightcube.errors import UsageError
 
 KINDS = ("configuration", "elements", "catalogue", "release")
 """Folders of the files that come up."""

@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from ipaddress import IPv4Address, IPv4Network
 from typing import Any, Protocol
 
-from flight.gnc.errors import UsageError
 from flight.link.frames.stream import SYNC, FrameStream, telecommand_stream
 from flight.link.frames.telecommand import LONGEST_FRAME
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.wires import SerialPort
+from knightcube.errors import UsageError
 
 AT_MOST = 512
 """Frames taken of a line at once: a flood costs its senders, not the telemetry."""

@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from flight.gnc.errors import FlightError
 from flight.link.commands import codec
 from flight.link.commands.codec import CommandPacker
 from flight.link.commands.errors import CommandError
@@ -36,6 +35,7 @@ from flight.link.telemetry.form import Packet
 from flight.link.telemetry.link_definitions import LINK, TRANSFER, VERIFICATION
 from flight.link.telemetry.packets import Packer
 from hal.interfaces.wires import SECOND_NS, Clock
+from knightcube.errors import FlightError
 
 TURN_NS = SECOND_NS // 50
 _BUSY_NS = SECOND_NS // 250

@@ -13,8 +13,8 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from flight.gnc.errors import FlightError
 from flight.link.security.associations import COPIES, overwrite
+from knightcube.errors import FlightError
 
 MOST_ENTRIES = 32
 LONGEST_COMMAND = 96

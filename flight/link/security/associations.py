@@ -20,9 +20,9 @@ from pathlib import Path
 
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
-from flight.gnc.errors import FlightError, UsageError
 from flight.link.security.sdls import KEY_BYTES
 from flight.link.telemetry.segments import make_lasting
+from knightcube.errors import FlightError, UsageError
 
 COMMAND_SPIS = (1, 2)
 """Of commands: the usual one and its reserve."""

@@ -15,11 +15,11 @@ from enum import Enum
 
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
-from flight.gnc.errors import FlightError
 from flight.link.frames.telecommand import FrameError
 from flight.link.security.associations import COPIES, HIGHEST_COUNTER, Association, Vault
 from flight.link.security.sdls import KEY_BYTES, counter_of, protect, spi_of, unprotect
 from flight.link.telemetry.packets import crc16
+from knightcube.errors import FlightError
 
 WINDOW = 65_536
 """How far ahead of the highest accepted counter a command's may be; telemetry shows that counter."""

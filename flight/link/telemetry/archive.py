@@ -17,8 +17,8 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
-from flight.gnc.errors import UsageError
 from flight.link.telemetry.segments import make_lasting
+from knightcube.errors import UsageError
 
 MOST_RUNS = 1000
 """A board that crashes at every start makes many runs of a few kilobytes: they are bounded by number too."""

@@ -14,9 +14,9 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-from flight.gnc.errors import UsageError
 from flight.link.telemetry.segments import SegmentFile, SegmentStore, find_segments, open_segment
 from hal.interfaces.wires import Clock
+from knightcube.errors import UsageError
 
 _HUNG_DISK_S = 5.0
 _RETRY_NS = 1_000_000_000

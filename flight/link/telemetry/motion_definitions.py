@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from flight.gnc.guidance.one_axis.limits import Q2_LIMIT
 from flight.link.telemetry.form import Field, Limits, Packet, counter
 from flight.link.telemetry.states import MODES, NO_YES, STEERING
+from knightcube.gnc.guidance.one_axis.limits import Q2_LIMIT
 
 MAX_NODES = 40
 """Room for the nodes of a path."""

@@ -24,9 +24,9 @@ from spacepackets.ccsds.spacepacket import (  # type: ignore[import-untyped]  # 
     SequenceFlags,
 )
 
-from flight.gnc.errors import FlightError
 from flight.link.telemetry.definitions import PACKETS
 from flight.link.telemetry.form import Field, Packet
+from knightcube.errors import FlightError
 
 PacketArray = npt.NDArray[np.void]
 

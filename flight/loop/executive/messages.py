@@ -14,8 +14,8 @@ import zlib
 from collections.abc import Sequence
 from typing import Any
 
-from flight.gnc.errors import FlightError
 from flight.loop.executive import values
+from knightcube.errors import FlightError
 
 SLAB_BYTES = 64 * 1024 * 1024
 """Shared memory for a job's arrays: only address space until used."""

@@ -15,7 +15,6 @@ from collections.abc import Set
 from contextlib import suppress
 from typing import Any
 
-from flight.gnc.errors import FlightError
 from flight.loop.executive.jobs import Outcome, Worker
 from flight.loop.executive.messages import (
     LONGEST_BYTES,
@@ -24,6 +23,7 @@ from flight.loop.executive.messages import (
     pack_trusted,
     unpack_values,
 )
+from knightcube.errors import FlightError
 
 Answer = tuple[Outcome, Any, str, int]
 """Outcome, value, error and execution time in ns of a job."""

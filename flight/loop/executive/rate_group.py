@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from flight.gnc.errors import FlightError
+from knightcube.errors import FlightError
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from flight.gnc.errors import FlightError
+from knightcube.errors import FlightError
 
 Array = npt.NDArray[Any]
 _PLAIN = (bool, int, float, str, bytes, type(None))

@@ -17,9 +17,9 @@ import sys
 import time
 from typing import Any
 
-from flight.gnc.errors import FlightError
 from flight.loop.executive.memory import give_back, lean_numpy
 from flight.loop.executive.messages import SLAB_BYTES, message_length, pack_values, unpack_trusted
+from knightcube.errors import FlightError
 
 _PR_SET_PDEATHSIG = 1  # prctl(2)
 

@@ -10,11 +10,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from flight.gnc.errors import FlightError
 from flight.link import events
 from flight.link.events import EventKind, Reaction
 from flight.link.modes import STEERING, Mode
 from flight.loop.fdir.event_log import EventLog
+from knightcube.errors import FlightError
 
 EVERYWHERE = frozenset(Mode)
 _DRIVEN = STEERING | {Mode.DETUMBLE}

@@ -12,7 +12,7 @@ from collections import deque
 
 import numpy as np
 
-from flight.gnc.math.arrays import Image
+from knightcube.astro.arrays import Image
 
 _ROWS = 32
 _FRAMES = 4

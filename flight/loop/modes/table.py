@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from enum import Enum
 
-from flight.gnc.errors import FlightError
 from flight.link.modes import Mode
 from flight.loop.modes.triggers import COMMANDS, KNOWN, SAFING, STARTS, Trigger
+from knightcube.errors import FlightError
 
 
 class Answer(Enum):

@@ -13,12 +13,12 @@ from collections.abc import Mapping
 import msgspec
 import numpy as np
 
-from flight.gnc.estimation.estimate import BIAS, FIELD_BIAS, LATENCY, PARAMETERS, Estimate
-from flight.gnc.estimation.rigid_body import Parameters
-from flight.gnc.estimation.slow_prior import SlowPrior
-from flight.gnc.math.arrays import FloatArray
 from flight.loop.state.content import Learned
 from flight.schema.sections import Config
+from knightcube.astro.arrays import FloatArray
+from knightcube.gnc.estimation.estimate import BIAS, FIELD_BIAS, LATENCY, PARAMETERS, Estimate
+from knightcube.gnc.estimation.rigid_body import Parameters
+from knightcube.gnc.estimation.slow_prior import SlowPrior
 
 GYRO_BIAS, PLANT, IMU_LATENCY, MAGNETOMETER_BIAS = "gyro-bias", "plant", "imu-latency", "magnetometer-bias"
 

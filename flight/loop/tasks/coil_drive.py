@@ -11,8 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.control.allocation import allocate
-from flight.gnc.math.arrays import FloatArray
 from flight.link import events
 from flight.loop.fdir import facts
 from flight.loop.fdir.coils.stuck_leg import NONE, Axes
@@ -20,6 +18,8 @@ from flight.loop.fdir.coils.watch import CoilVerdict, CoilWatch
 from flight.loop.services import Services
 from hal.interfaces.devices import PowerMonitor, TorqueCoils
 from hal.interfaces.readings import CoilState, ImuReading
+from knightcube.astro.arrays import FloatArray
+from knightcube.gnc.control.allocation import allocate
 
 _BROKEN = (facts.COIL_X_BROKEN, facts.COIL_Y_BROKEN, facts.COIL_Z_BROKEN)
 

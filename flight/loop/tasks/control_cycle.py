@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.estimation.estimate import RATE, TURN, Estimate
 from flight.link.modes import STEERING, Mode
 from flight.link.telemetry.definitions import ATTITUDE
 from flight.loop.body import PLANNER, Body
@@ -27,6 +26,7 @@ from flight.loop.tasks.performance import PerformanceObserver
 from flight.loop.tasks.steering import Steering
 from flight.loop.tasks.wide_imaging import WideImaging
 from hal.interfaces.readings import ImuReading
+from knightcube.gnc.estimation.estimate import RATE, TURN, Estimate
 
 ATTITUDE_EVERY = 4
 """Control cycles from one attitude packet to the next."""

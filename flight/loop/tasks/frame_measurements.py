@@ -8,24 +8,24 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flight.gnc.camera.exposure import Exposures
-from flight.gnc.camera.lens import CameraModel
-from flight.gnc.estimation.estimate import RATE, TURN, Estimate, Knowledge
-from flight.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
-from flight.gnc.vision.frame_job import Found, FrameFound, FrameJob, TrackerSettings
-from flight.gnc.vision.kept_frames import KeptFrames
-from flight.gnc.vision.objects.sighted import SightSettings
-from flight.gnc.vision.startracker.mid_exposure import NODES, middle_covariance, weighting_of
-from flight.gnc.vision.startracker.solve import AttitudePrior, RatePrior
-from flight.gnc.vision.streaks.corners.settings import StreakSettings
-from flight.gnc.vision.streaks.maximum_likelihood.course import Course
-from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
-from flight.gnc.vision.streaks.streak_result import StreakStatus
 from flight.loop.tasks.navigation import Navigation
 from hal.interfaces.readings import Frame
 from hal.interfaces.wires import SECOND_NS
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
+from knightcube.gnc.estimation.estimate import RATE, TURN, Estimate, Knowledge
+from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement
+from knightcube.vision.camera.exposure import Exposures
+from knightcube.vision.camera.lens import CameraModel
+from knightcube.vision.frame_job import Found, FrameFound, FrameJob, TrackerSettings
+from knightcube.vision.kept_frames import KeptFrames
+from knightcube.vision.objects.sighted import SightSettings
+from knightcube.vision.startracker.mid_exposure import NODES, middle_covariance, weighting_of
+from knightcube.vision.startracker.solve import AttitudePrior, RatePrior
+from knightcube.vision.streaks.corners.settings import StreakSettings
+from knightcube.vision.streaks.maximum_likelihood.course import Course
+from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from knightcube.vision.streaks.streak_result import StreakStatus
 
 # rad, of the mounting between the camera and the inertial unit that the estimate is of.
 _LEAST_PRIOR_SIGMA = 5e-4

@@ -6,17 +6,17 @@ import math
 
 import numpy as np
 
-from flight.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.vision.frame_job import Found, FrameFound
-from flight.gnc.vision.startracker.solution import FrameSolution, SolveStatus
-from flight.gnc.vision.streaks.streak_result import StreakStatus
 from flight.link import events
 from flight.link.telemetry.definitions import STARS, STREAK
 from flight.loop.body import BodyView
 from flight.loop.services import Services
 from flight.loop.tasks.frame_measurements import FrameMeasurer, middle_ns
 from hal.interfaces.readings import Frame
+from knightcube.astro.arrays import FloatArray
+from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement
+from knightcube.vision.frame_job import Found, FrameFound
+from knightcube.vision.startracker.solution import FrameSolution, SolveStatus
+from knightcube.vision.streaks.streak_result import StreakStatus
 
 _MANY_STARS = 12
 """A frame with at least this many unmatched detections does not show the sky: its pixels are invalid."""

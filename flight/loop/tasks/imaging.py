@@ -6,10 +6,6 @@ sky.
 
 from __future__ import annotations
 
-from flight.gnc.estimation.estimate import Knowledge
-from flight.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement
-from flight.gnc.vision.frame_job import FrameFound
-from flight.gnc.vision.streaks.streak_result import StreakStatus
 from flight.link import events
 from flight.loop.body import BodyView
 from flight.loop.executive.jobs import JobResult
@@ -24,6 +20,10 @@ from flight.loop.tasks.object_tracking import ObjectTracking
 from hal.interfaces.devices import FrameSource
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.readings import Frame
+from knightcube.gnc.estimation.estimate import Knowledge
+from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement
+from knightcube.vision.frame_job import FrameFound
+from knightcube.vision.streaks.streak_result import StreakStatus
 
 WORKER = "vision"
 

@@ -9,9 +9,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from flight.gnc.errors import UsageError
-from flight.gnc.estimation.estimate import Estimate
-from flight.gnc.guidance.three_axes.pointing_target import SUN, PointingTarget
 from flight.link import events
 from flight.link.events import EventKind, Reaction
 from flight.link.modes import ORBITAL, POINTING, STEERING, Mode
@@ -30,6 +27,9 @@ from flight.loop.tasks.pointing_watch import PointingWatch
 from flight.loop.tasks.steering import Steering
 from flight.schema.errors import ConfigError
 from flight.schema.sections import Modes
+from knightcube.errors import UsageError
+from knightcube.gnc.estimation.estimate import Estimate
+from knightcube.gnc.guidance.three_axes.pointing_target import SUN, PointingTarget
 
 SAFING_REACTIONS = {
     Reaction.SAFE: Trigger.REACT_SAFE,

@@ -10,9 +10,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from flight.gnc.estimation.estimate import Estimate
-from flight.gnc.estimation.measurements import AttitudeMeasurement, Measurement
-from flight.gnc.math.arrays import FloatArray, IntArray
 from flight.link import events
 from flight.link.telemetry.definitions import IMU
 from flight.loop.body import Body
@@ -22,6 +19,9 @@ from flight.loop.services import Services
 from hal.interfaces.devices import InertialUnit
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.readings import CoilState, ImuLink, ImuReading
+from knightcube.astro.arrays import FloatArray, IntArray
+from knightcube.gnc.estimation.estimate import Estimate
+from knightcube.gnc.estimation.measurements import AttitudeMeasurement, Measurement
 
 _AT_A_TIME = 16
 """Measurements applied again per cycle: takes a few ms, so that a second of them takes a few cycles."""

@@ -6,15 +6,15 @@ import math
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.tracking.sightings import Sightings
-from flight.gnc.tracking.tracker import Track, Tracker, TrackSettings
-from flight.gnc.vision.objects.sighted import Sighted
 from flight.link import events
 from flight.link.telemetry.definitions import SIGHTINGS, TRACK
 from flight.link.telemetry.vision_definitions import MOST_SIGHTINGS
 from flight.loop.body import Body
 from flight.loop.services import Services
+from knightcube.astro.arrays import FloatArray
+from knightcube.gnc.tracking.sightings import Sightings
+from knightcube.gnc.tracking.tracker import Track, Tracker, TrackSettings
+from knightcube.vision.objects.sighted import Sighted
 
 _UNKNOWN = [math.nan] * 3
 

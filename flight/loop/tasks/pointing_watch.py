@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from flight.gnc.estimation.estimate import Estimate
 from flight.loop.body import Targets
 from flight.loop.fdir import facts
 from flight.loop.fdir.facts import Facts
 from flight.loop.fdir.hold_timer import HoldTimer
 from flight.schema.sections import Modes
+from knightcube.gnc.estimation.estimate import Estimate
 
 
 class PointingWatch:

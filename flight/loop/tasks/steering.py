@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.estimation.estimate import Estimate
-from flight.gnc.math.arrays import FloatArray
 from flight.loop.body import Body, Brake
 from flight.loop.control_output import CoilCommand, Steered, SteeringState
 from flight.loop.fdir import facts
 from flight.loop.services import Services
 from flight.loop.tasks.coil_drive import CoilDrive
 from hal.interfaces.readings import ImuReading
+from knightcube.astro.arrays import FloatArray
+from knightcube.gnc.estimation.estimate import Estimate
 
 _NO_DIPOLE: FloatArray = np.zeros(3)
 

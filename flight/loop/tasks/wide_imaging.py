@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from flight.gnc.vision.wide_job import WideFound
 from flight.link import events
 from flight.link.telemetry.orbit_definitions import DIRECTIONS
 from flight.loop.body import WideSight
@@ -20,6 +19,7 @@ from flight.loop.services import Services
 from hal.interfaces.devices import FrameSource
 from hal.interfaces.errors import DeviceError
 from hal.interfaces.readings import Frame
+from knightcube.vision.wide_job import WideFound
 
 WORKER = "wide"
 _SPARSE = 8

@@ -2,7 +2,7 @@
 
 Attitude: the unit sends (q0, q1, q2, q3), scalar last, a Hamilton quaternion that rotates body into NED;
 by our convention the same four numbers rotate NED into the sensor. Two constant linear maps of the settings
-convert it to the mission's reference frame and the body's axes (`flight.gnc.math.frames.attitude_map`).
+convert it to the mission's reference frame and the body's axes (`knightcube.astro.frames.attitude_map`).
 """
 
 from __future__ import annotations

@@ -29,10 +29,10 @@ from Basilisk.simulation import (
 )
 from Basilisk.utilities import SimulationBaseClass
 
-from flight.gnc.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER, J2
-from flight.gnc.earth.orientation import celestial_to_terrestrial
-from flight.gnc.math import quaternion
-from flight.gnc.math.arrays import FloatArray
+from knightcube.astro import quaternion
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER, J2
+from knightcube.astro.earth.orientation import celestial_to_terrestrial
 from sim_hal.worlds import sun
 from sim_hal.worlds.basilisk import STEP_NS
 from sim_hal.worlds.free_body.craft import TrueCraft

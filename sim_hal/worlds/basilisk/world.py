@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from flight.gnc.earth.sun import ASTRONOMICAL_UNIT, DAY
-from flight.gnc.math import quaternion
-from flight.gnc.math.arrays import FloatArray
 from flight.schema.errors import ConfigError
 from hal.interfaces.wires import SECOND_NS
+from knightcube.astro import quaternion
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, DAY
 from sim_hal.emulators.device import NEVER
 from sim_hal.worlds import sun
 from sim_hal.worlds.basilisk import STEP_NS

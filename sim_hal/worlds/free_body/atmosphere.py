@@ -11,8 +11,8 @@ import math
 
 import numpy as np
 
-from flight.gnc.earth.figure import EARTH_RADIUS
-from flight.gnc.math.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.figure import EARTH_RADIUS
 
 _PROFILE = np.array(
     [

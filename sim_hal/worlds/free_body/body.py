@@ -14,12 +14,12 @@ from datetime import datetime
 
 import numpy as np
 
-from flight.gnc.earth.figure import EARTH_RADIUS
-from flight.gnc.earth.sun import DAY
-from flight.gnc.math import quaternion
-from flight.gnc.math.arrays import FloatArray
 from flight.schema.errors import ConfigError
 from hal.interfaces.wires import SECOND_NS
+from knightcube.astro import quaternion
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.figure import EARTH_RADIUS
+from knightcube.astro.earth.sun import DAY
 from sim_hal.emulators.device import NEVER
 from sim_hal.worlds import sun
 from sim_hal.worlds.free_body.craft import CRAFTS, build

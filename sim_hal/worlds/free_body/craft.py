@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.math import quaternion
-from flight.gnc.math.arrays import FloatArray
+from knightcube.astro import quaternion
+from knightcube.astro.arrays import FloatArray
 from sim_hal.worlds.free_body.section import CraftSection, Disturbances
 
 CRAFTS = {

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from flight.gnc.earth.orientation import ROTATION_RATE
-from flight.gnc.earth.shadow import sunlit_share
-from flight.gnc.earth.sun import ASTRONOMICAL_UNIT, DAY
-from flight.gnc.math.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.orientation import ROTATION_RATE
+from knightcube.astro.earth.shadow import sunlit_share
+from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, DAY
 from sim_hal.worlds import geomagnetism, sun
 from sim_hal.worlds.free_body.atmosphere import log_density
 from sim_hal.worlds.free_body.section import Disturbances

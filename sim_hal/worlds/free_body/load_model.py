@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from flight.gnc.earth.figure import GRAVITATIONAL_PARAMETER
+from knightcube.astro.earth.figure import GRAVITATIONAL_PARAMETER
 from sim_hal.worlds.free_body import pressure
 from sim_hal.worlds.free_body.craft import TrueCraft
 from sim_hal.worlds.free_body.environment import air_flow

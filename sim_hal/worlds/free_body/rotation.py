@@ -1,8 +1,9 @@
 """The rotation of a rigid body in its principal axes, by classical Runge-Kutta in plain floats.
 
-Euler's equations and the kinematics of `flight.gnc.math.quaternion`, with the torques that turn with the body
-within a step evaluated in every stage: a dipole in the field, and the gravity gradient (Wertz 1978, 17.28).
-At |w| dt = 0.01 a step is true to 1e-13 rad. Plain floats: numpy costs ten times as much for three of them.
+Euler's equations and the kinematics of `knightcube.astro.quaternion`, with the torques that turn with the
+body within a step evaluated in every stage: a dipole in the field, and the gravity gradient (Wertz 1978,
+17.28). At |w| dt = 0.01 a step is true to 1e-13 rad. Plain floats: numpy costs ten times as much for three of
+them.
 """
 
 from __future__ import annotations
@@ -105,7 +106,7 @@ def _moved(state: State, slope: State, dt: float) -> State:
 
 
 def matrix(q1: float, q2: float, q3: float, q4: float) -> Matrix:
-    """Return the attitude matrix of a quaternion, row by row (`flight.gnc.math.quaternion`, as floats)."""
+    """Return the attitude matrix of a quaternion, row by row (`knightcube.astro.quaternion`, as floats)."""
     r11, r22, r33, r44 = q1 * q1, q2 * q2, q3 * q3, q4 * q4
     r12, r13, r14, r23, r24, r34 = q1 * q2, q1 * q3, q1 * q4, q2 * q3, q2 * q4, q3 * q4
     return (

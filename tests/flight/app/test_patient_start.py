@@ -13,12 +13,12 @@ from flight.app import patient_start
 from flight.app.cli import main
 from flight.app.patient_start import Patience, StoppedError, patiently, pauses
 from flight.app.request import RunRequest
-from flight.gnc.errors import UsageError
 from flight.link.telemetry.packets import to_text
 from flight.loop.state.store import StateStore
 from flight.schema.errors import ConfigError, UnreadConfigError
 from ground.telemetry.reader import read_run
 from hal.interfaces.errors import NotResponding
+from knightcube.errors import UsageError
 from tests.hal.guardian.live_flight import write_config
 from tests.manual_clock import ManualClock
 

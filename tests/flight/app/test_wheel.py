@@ -31,7 +31,7 @@ def test_the_repository_s_folder_is_the_one_source_of_the_carried_configurations
 def environment(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a virtual environment of the wheel alone; other packages are those of this environment."""
     place = tmp_path_factory.mktemp("wheel")
-    for name in ("flight", "ground", "hal", "sim_hal", "config"):
+    for name in ("knightcube", "flight", "ground", "hal", "sim_hal", "config"):
         leave = shutil.ignore_patterns("__pycache__")
         shutil.copytree(ROOT / name, place / "source" / name, symlinks=True, ignore=leave)
     for name in ("pyproject.toml", "README.md", "LICENSE"):

@@ -8,15 +8,15 @@ from dataclasses import replace
 import numpy as np
 
 from flight.bodies.testbed.body import TESTBED
-from flight.gnc.estimation.estimate import Estimate
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import conjugate, multiply, to_rotation_vector
 from flight.loop.body import Body, BodyKind
 from flight.loop.control_output import CoilCommand, Reference
 from flight.loop.services import Services
 from flight.loop.state.content import Learned
 from flight.schema.sections import Config
 from flight.schema.testbed import as_testbed
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import conjugate, multiply, to_rotation_vector
+from knightcube.gnc.estimation.estimate import Estimate
 
 STIFFNESS, DAMPING = 4e-4, 1e-3
 """N m/rad and N m s/rad."""

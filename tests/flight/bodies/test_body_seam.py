@@ -9,13 +9,13 @@ import pytest
 from msgspec import structs
 
 from flight.app.composition.bodies import body_kind
-from flight.gnc.guidance.one_axis.limits import Q2_LIMIT
-from flight.gnc.math.quaternion import about_axis_y, angle_about_axis_y
 from flight.loop.tasks.control_cycle import ATTITUDE_EVERY
 from flight.schema import reader
 from flight.schema.errors import ConfigError
 from flight.schema.testbed import as_testbed
 from ground.telemetry.reader import Run
+from knightcube.astro.quaternion import about_axis_y, angle_about_axis_y
+from knightcube.gnc.guidance.one_axis.limits import Q2_LIMIT
 from tests.scenario.flights import CONFIG, demo_config, fly
 
 DIPOLE_PER_AMPERE = 80 * 0.0081

@@ -10,15 +10,15 @@ import pytest
 from flight.bodies.testbed.cage import CageField, CageTracker, local_frame
 from flight.bodies.testbed.plant_model import plant_of
 from flight.bodies.testbed.thread_estimate import ThreadEstimate
-from flight.gnc.guidance.one_axis.path import Sample
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import about_axis_y, attitude_matrix
 from flight.loop.control_output import CoilCommand
 from flight.schema import reader as configuration
 from flight.schema.carried import config_path
 from flight.schema.errors import ConfigError
 from flight.schema.testbed import Cage, TestbedConfig, as_testbed
 from hal.interfaces.wires import SECOND_NS
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import about_axis_y, attitude_matrix
+from knightcube.gnc.guidance.one_axis.path import Sample
 from sim_hal.clock import SimClock
 from sim_hal.lockstep import utc_ns
 from sim_hal.settings import Simulation

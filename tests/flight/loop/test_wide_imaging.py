@@ -8,7 +8,6 @@ from typing import Any, cast
 
 import numpy as np
 
-from flight.gnc.vision.wide_job import Sighted, WideFound, WideJob
 from flight.link import events
 from flight.loop.executive.jobs import JobResult
 from flight.loop.fdir import facts
@@ -17,6 +16,7 @@ from flight.loop.tasks.wide_imaging import WORKER, WideImaging, WideSettings
 from hal.interfaces.errors import NotResponding
 from hal.interfaces.readings import Frame
 from hal.interfaces.wires import SECOND_NS
+from knightcube.vision.wide_job import Sighted, WideFound, WideJob
 
 SETTINGS = WideSettings((5_000_000, 5_000_000), 5 * SECOND_NS, 60 * SECOND_NS, 2 * SECOND_NS, 120 * SECOND_NS)
 

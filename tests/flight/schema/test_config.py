@@ -11,8 +11,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flight.gnc.camera.knowledge import EXACT
-from flight.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 from flight.link.commands.values import Point
 from flight.loop.tasks.commanding import command_of
 from flight.schema import reader
@@ -21,6 +19,8 @@ from flight.schema.document import read_document, to_yaml
 from flight.schema.errors import ConfigError
 from flight.schema.orbit import as_orbit
 from flight.schema.testbed import as_testbed
+from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from knightcube.vision.camera.knowledge import EXACT
 from sim_hal.assembly import camera_model
 from sim_hal.settings import Simulation
 

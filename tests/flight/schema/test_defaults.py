@@ -15,6 +15,7 @@ import numpy as np
 
 import flight
 import hal
+import knightcube
 import sim_hal
 from flight.schema import devices, orbit, orbit_devices, sections, testbed
 from hal.interfaces.wires import SECOND_NS
@@ -78,7 +79,7 @@ def _settings() -> dict[str, type]:
     """Return every settings class of what flies and what it flies against, by name."""
     return {
         name: kind
-        for package in (flight, hal, sim_hal)
+        for package in (knightcube, flight, hal, sim_hal)
         for module in _modules(package)
         for name, kind in inspect.getmembers(module, inspect.isclass)
         if name.endswith("Settings") and dataclasses.is_dataclass(kind)

@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from flight.gnc.camera.lens import Lens
-from flight.gnc.camera.pinhole import Pinhole
-from flight.gnc.math.arrays import FloatArray
 from ground.calibration.terms import FixedTerms, fit_terms
-from tests.flight.gnc.vision.startracker.test_calibration import _begun, _frames, _lens
+from knightcube.astro.arrays import FloatArray
+from knightcube.vision.camera.lens import Lens
+from knightcube.vision.camera.pinhole import Pinhole
+from tests.knightcube.vision.startracker.test_calibration import _begun, _frames, _lens
 
 
 def _errors(found: FixedTerms, truth: Lens, begun: Pinhole) -> dict[str, float]:

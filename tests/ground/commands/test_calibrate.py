@@ -11,8 +11,8 @@ import pytest
 pillow = pytest.importorskip("PIL.Image", reason="needs the extra `images`")
 
 from flight.schema.reader import load_camera  # noqa: E402
-from tests.flight.gnc.vision.startracker.frames import NARROW, sky_frame  # noqa: E402
 from tests.ground.commands.in_process import command  # noqa: E402
+from tests.knightcube.vision.startracker.frames import NARROW, sky_frame  # noqa: E402
 
 
 @pytest.fixture(scope="module")

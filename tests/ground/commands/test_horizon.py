@@ -11,7 +11,7 @@ import pytest
 
 pillow = pytest.importorskip("PIL.Image", reason="needs the extra `images`")
 
-from flight.gnc.math.quaternion import from_rotation_vector, multiply  # noqa: E402
+from knightcube.astro.quaternion import from_rotation_vector, multiply  # noqa: E402
 from sim_hal.earth_camera import EarthCameraModel, nadir, render  # noqa: E402
 from tests.ground.commands.in_process import command  # noqa: E402
 from tests.sim_hal.earth_camera.scenes import limb_scene  # noqa: E402

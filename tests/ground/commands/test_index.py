@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.gnc.vision.startracker.identification.identification import Status
-from flight.gnc.vision.startracker.identification.lost_in_space import identify
-from flight.gnc.vision.startracker.index.sky_index import load
+from knightcube.vision.startracker.identification.identification import Status
+from knightcube.vision.startracker.identification.lost_in_space import identify
+from knightcube.vision.startracker.index.sky_index import load
 from tests.ground.commands.in_process import command
 from tests.studies.bench.star_lists import ListKind, draw
 

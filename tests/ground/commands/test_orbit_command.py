@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flight.gnc.errors import UsageError
 from flight.link.telemetry.packets import LAYOUTS
 from ground.commands import orbit as command
 from ground.orbits.from_run import orbits_of
+from knightcube.errors import UsageError
 from tests.studies.campaigns import first_orbits as passes
 
 UTC_NS = 1_774_008_000_000_000_000

@@ -8,14 +8,14 @@ import math
 import numpy as np
 import pytest
 
-from flight.gnc.earth.orientation import celestial_to_terrestrial, geodetic
-from flight.gnc.guidance.three_axes.target_law import BodyAxes, law_of
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import attitude_matrix
 from flight.link.commands.codec import CommandPacker, unpack
 from flight.link.commands.values import Point
 from ground.commands import command
-from tests.flight.gnc.guidance.three_axes.orbits import JULIAN_DATE, circular
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.orientation import celestial_to_terrestrial, geodetic
+from knightcube.astro.quaternion import attitude_matrix
+from knightcube.gnc.guidance.three_axes.target_law import BodyAxes, law_of
+from tests.knightcube.gnc.guidance.three_axes.orbits import JULIAN_DATE, circular
 
 ORBIT = circular(700.0)
 TIME = np.array([300.0])

@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip("PIL.Image", reason="needs the extra `images`")
 
-from flight.gnc.math.quaternion import angle_between
+from knightcube.astro.quaternion import angle_between
 from tests.ground.commands.in_process import command
 from tests.ground.commands.test_commands import DEMO
 

@@ -11,17 +11,17 @@ import pytest
 
 pillow = pytest.importorskip("PIL.Image", reason="needs the extra `images`")
 
-from flight.gnc.attitude.solvers import SOLVERS  # noqa: E402
-from flight.gnc.math.quaternion import (  # noqa: E402
+from knightcube.astro.attitude.solvers import SOLVERS  # noqa: E402
+from knightcube.astro.quaternion import (  # noqa: E402
     angle_between,
     conjugate,
     multiply,
     to_rotation_vector,
 )
-from flight.gnc.vision.startracker.detection.settings import CENTROIDS  # noqa: E402
-from flight.gnc.vision.startracker.pointing import Pointing  # noqa: E402
-from tests.flight.gnc.vision.startracker.frames import SkyFrame, sky_frame  # noqa: E402
+from knightcube.vision.startracker.detection.settings import CENTROIDS  # noqa: E402
+from knightcube.vision.startracker.pointing import Pointing  # noqa: E402
 from tests.ground.commands.in_process import command  # noqa: E402
+from tests.knightcube.vision.startracker.frames import SkyFrame, sky_frame  # noqa: E402
 
 
 def _written(frame: SkyFrame, path: Path) -> Path:

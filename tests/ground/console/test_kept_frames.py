@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.gnc.math.arrays import Image
-from flight.gnc.vision.kept_frames import portable_grey_map
 from ground.console.kept_frames import FrameFolder, binned, pixels_of, png, stretched
+from knightcube.astro.arrays import Image
+from knightcube.vision.kept_frames import portable_grey_map
 
 FACTS = {"exposure_s": 0.2, "star_points": [[3.0, 4.5]], "object_points": [], "rate_rad_s": None}
 

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from flight.gnc.errors import FlightError, UsageError
 from flight.link.commands.codec import CommandPacker
 from flight.link.commands.values import ChangeMode
 from flight.link.modes import Mode
@@ -16,6 +15,7 @@ from ground.console import link_feed
 from ground.console.commanding import Commanding
 from ground.console.link_feed import LinkFeed
 from ground.xtce import TELECOMMANDS
+from knightcube.errors import FlightError, UsageError
 from tests.flight.link.process.both_ends import BothEnds
 
 

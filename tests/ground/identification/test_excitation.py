@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from flight.bodies.testbed.plant_model import plant_of
-from flight.gnc.control.one_axis.excitation import ExcitationController, manoeuvres
-from flight.gnc.errors import UsageError
-from flight.gnc.guidance.one_axis.path import Sample
+from knightcube.errors import UsageError
+from knightcube.gnc.control.one_axis.excitation import ExcitationController, manoeuvres
+from knightcube.gnc.guidance.one_axis.path import Sample
 from tests.ground.identification.conftest import Identified
 from tests.ground.identification.worlds import PERIOD, World, believed, drawn, fly_bare, usual_excitation
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from flight.gnc.math.arrays import FloatArray
 from ground.identification.constants import NAMES, Constants, Noise
 from ground.identification.innovations import innovations
 from ground.identification.record import Record
 from ground.identification.timeline import Timeline
+from knightcube.astro.arrays import FloatArray
 from tests.ground.identification.conftest import Identified
 
 TRUE = Constants(gain=0.28, torsion=0.0095, damping=0.002, disturbance=1e-3, bias=2e-4, delay=0.006)

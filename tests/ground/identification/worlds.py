@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 
 from flight.bodies.testbed.plant_model import plant_of
-from flight.gnc.control.one_axis.excitation import ExcitationController, ExcitationSettings
-from flight.gnc.guidance.one_axis.path import Sample
-from flight.gnc.math.arrays import FloatArray
 from flight.schema import reader as configuration
 from flight.schema.testbed import Identification, TestbedConfig
 from ground.identification.constants import Constants
 from ground.identification.preparation import excitation_config
 from ground.identification.record import FieldMeasurement, Record, read_record
 from ground.identification.scale import AbsolutePlant
+from knightcube.astro.arrays import FloatArray
+from knightcube.gnc.control.one_axis.excitation import ExcitationController, ExcitationSettings
+from knightcube.gnc.guidance.one_axis.path import Sample
 from sim_hal.settings import ImuNoise, Simulation, Thread, Truth
 from sim_hal.worlds.testbed import Testbed, TestbedModel
 from tests.scenario import flights

@@ -7,12 +7,12 @@ import numpy.typing as npt
 import pytest
 from scipy.ndimage import binary_dilation
 
-from flight.gnc.vision.frame_job import solve_frame
-from flight.gnc.vision.startracker.index.build import default_index
-from flight.gnc.vision.startracker.solve import SolveSettings
 from ground.pictures.overlay import draw_marks
 from ground.pictures.sky_picture import draw_solution
-from tests.flight.gnc.vision.startracker.frames import NARROW, sky_frame
+from knightcube.vision.frame_job import solve_frame
+from knightcube.vision.startracker.index.build import default_index
+from knightcube.vision.startracker.solve import SolveSettings
+from tests.knightcube.vision.startracker.frames import NARROW, sky_frame
 
 pytest.importorskip("PIL.Image", reason="needs the extra `images`")
 Picture = npt.NDArray[np.uint8]

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.gnc.errors import UsageError
 from ground.report import draw
 from ground.telemetry.reader import read_run
+from knightcube.errors import UsageError
 from tests.ground.report.synthetic import CURRENT, Recipe, make_run
 
 pytest.importorskip("matplotlib", reason="pictures need the extra 'plots'")

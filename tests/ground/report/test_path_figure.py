@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from flight.bodies.testbed.plant_model import plant_of
-from flight.gnc.errors import UsageError
-from flight.gnc.guidance.one_axis.vmc import plan
 from flight.schema import reader as configuration
 from flight.schema.testbed import as_testbed
 from ground.report import draw_path
+from knightcube.errors import UsageError
+from knightcube.gnc.guidance.one_axis.vmc import plan
 
 pytest.importorskip("matplotlib", reason="pictures need the extra 'plots'")
 from matplotlib.image import imread

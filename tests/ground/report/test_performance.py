@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from flight.gnc.math.arrays import FloatArray
 from ground.report.performance import Command, commands, interrupted, placed, response
+from knightcube.astro.arrays import FloatArray
 from tests.ground.report.synthetic import second_order
 
 STEP = Command(index=1, time=100.0, start=-0.3, target=-0.2, duration=100.0)

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.gnc.math.quaternion import from_rotation_vector, multiply
 from flight.link import events
 from flight.link.modes import Mode
 from flight.link.telemetry import definitions as table
@@ -17,6 +16,7 @@ from flight.link.telemetry.orbit_definitions import ORBIT_TRUTH, SPIN
 from flight.link.telemetry.packets import Packer
 from ground.report import draw, summarise
 from ground.telemetry.reader import read_run
+from knightcube.astro.quaternion import from_rotation_vector, multiply
 from tests.manual_clock import ManualClock
 from tests.scenario.flights import CONFIG
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flight.gnc.camera.lens import Lens
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import attitude_matrix, normalise
-from flight.gnc.vision.startracker.sky_map import SkyMap
 from ground.sky.world_coordinates import header_text
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import attitude_matrix, normalise
+from knightcube.vision.camera.lens import Lens
+from knightcube.vision.startracker.sky_map import SkyMap
 from tests.studies.campaigns.scenes import catalogue
 
 fits = pytest.importorskip("astropy.io.fits", reason="astropy is of the extra `test`")

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from flight.gnc.errors import UsageError
 from flight.link.telemetry.log import FlightLog
 from ground.telemetry.reader import read_run
+from knightcube.errors import UsageError
 from tests.flight.link.telemetry.samples import timing_packets
 from tests.ground.report.synthetic import Recipe, make_run
 from tests.manual_clock import ManualClock

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.gnc.errors import UsageError
 from flight.link.telemetry.segments import find_segments
 from ground.telemetry.reader import read_run
 from ground.watch.tail import LogTail
+from knightcube.errors import UsageError
 from tests.ground.report.synthetic import Recipe, make_run
 
 

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.gnc.math.arrays import FloatArray, Image
 from hal.buses.clock import SystemClock
 from hal.drivers import aravis_camera
 from hal.drivers.aravis_camera import AravisCamera, AravisSettings
@@ -22,6 +21,7 @@ from hal.interfaces.devices import FrameSource
 from hal.interfaces.errors import Refused
 from hal.interfaces.readings import Frame
 from hal.interfaces.wires import Clock
+from knightcube.astro.arrays import FloatArray, Image
 from sim_hal.emulators.star_camera import EmulatedStarCamera
 from sim_hal.worlds.motion import Motion
 from tests.hal.cameras.ioctl_camera import IoctlCamera

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from flight.app.cli import main
-from flight.gnc.camera.images import read_image
 from flight.schema import reader as configuration
 from flight.schema.devices import AravisDevice, V4l2Device
 from flight.schema.errors import ConfigError
+from knightcube.vision.camera.images import read_image
 from tests.hal.cameras.ioctl_camera import IoctlCamera
 from tests.hal.cameras.rig import kernel_in
 from tests.manual_clock import ManualClock

@@ -10,13 +10,13 @@ import pytest
 import serial
 from pyubx2 import UBXReader
 
-from flight.gnc.earth.orbit_knowledge import GpsFix
-from flight.gnc.earth.sun import DAY
 from hal.buses.clock import SystemClock
 from hal.drivers.ublox.codec import CFG_MSG, NAV_PVT, Pvt, frame
 from hal.drivers.ublox.receiver import UbloxReceiver, reading_of
 from hal.interfaces.errors import NotResponding, OutOfRange
 from hal.interfaces.wires import SECOND_NS
+from knightcube.astro.earth.orbit_knowledge import GpsFix
+from knightcube.astro.earth.sun import DAY
 from sim_hal.emulators.gps import EmulatedGps, GpsErrors
 from sim_hal.emulators.pty_line import PtyLine
 from sim_hal.emulators.serial_line import LineFaults

@@ -18,9 +18,9 @@ from hypothesis import strategies as st
 
 from flight.app.flight import fly
 from flight.app.request import RunRequest
-from flight.gnc.errors import UsageError
 from hal.buses.exclusive import hold
 from hal.interfaces.errors import NotResponding
+from knightcube.errors import UsageError
 from sim_hal.serving.device_link import Inbox, RemoteI2cBus, open_bus, pack
 from tests.scenario.flights import CONFIG
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flight.gnc.math.frames import NED_TO_TESTBED, attitude_map
-from flight.gnc.math.quaternion import IDENTITY
 from hal.drivers.vn100.driver import Vn100, Vn100Settings
 from hal.interfaces.readings import ImuReading
+from knightcube.astro.frames import NED_TO_TESTBED, attitude_map
+from knightcube.astro.quaternion import IDENTITY
 from sim_hal.clock import SimClock
 from sim_hal.emulators.serial_line import SerialLine
 from sim_hal.emulators.vn100 import Vn100Emulator, Vn100EmulatorSettings

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flight.gnc.math.frames import NED_TO_TESTBED
-from flight.gnc.math.quaternion import attitude_matrix
 from hal.drivers.vn100.ascii import AsciiLine, build, error_meaning, measurement, parse
 from hal.drivers.vn100.codec import BinaryPacket, crc16, layout_of
 from hal.drivers.vn100.stream import StreamParser
+from knightcube.astro.frames import NED_TO_TESTBED
+from knightcube.astro.quaternion import attitude_matrix
 
 DATA = Path(__file__).resolve().parents[3].parent / "shared" / "data" / "vn100_packets.json"
 needs_data = pytest.mark.skipif(not DATA.exists(), reason=f"published packets not here: {DATA.name}")

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flight.gnc.math.quaternion import attitude_matrix
 from hal.drivers.vn100.ascii import AsciiLine, Sentence, build
 from hal.drivers.vn100.codec import FIELDS, BinaryPacket
 from hal.drivers.vn100.stream import StreamParser
+from knightcube.astro.quaternion import attitude_matrix
 from sim_hal.emulators.device import NEVER
 from sim_hal.emulators.serial_line import SerialLine
 from sim_hal.emulators.vn100 import Vn100Emulator, Vn100EmulatorSettings

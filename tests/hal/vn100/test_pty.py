@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.gnc.math.quaternion import angle_about_axis_y
 from hal.buses.clock import SystemClock
 from hal.buses.serial_port import PySerialPort
 from hal.drivers.vn100.driver import Vn100
 from hal.interfaces.errors import CorruptData, NotResponding
 from hal.interfaces.readings import ImuReading
+from knightcube.astro.quaternion import angle_about_axis_y
 from tests.hal.vn100.bench_line import MISSION
 
 COMMAND = [sys.executable, "-m", "sim_hal", "emulate", "vn100"]

@@ -7,10 +7,10 @@ from typing import Literal
 
 import numpy as np
 
-from flight.gnc.earth.figure import SEMI_MAJOR_AXIS
-from flight.gnc.earth.sun import ASTRONOMICAL_UNIT
-from flight.gnc.math import quaternion
-from flight.gnc.math.arrays import FloatArray
+from knightcube.astro import quaternion
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS
+from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
 from sim_hal.earth_camera import EarthCameraModel, EarthScene, limb_truth
 from sim_hal.earth_camera.sun_disc import visible_share
 from sim_hal.earth_camera.truth import limb_directions, sun_point

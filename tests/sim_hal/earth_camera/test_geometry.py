@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from flight.gnc.earth.figure import SEMI_MAJOR_AXIS, SEMI_MINOR_AXIS, semi_axes
-from flight.gnc.math import quaternion
-from flight.gnc.math.arrays import FloatArray
 from hal.interfaces.errors import OutOfRange
+from knightcube.astro import quaternion
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS, SEMI_MINOR_AXIS, semi_axes
 from sim_hal.earth_camera import APPARENT_LIMB_HEIGHT, EarthCameraModel, EarthScene, limb_truth, nadir
 from sim_hal.earth_camera.image import expected_radiance
 from sim_hal.earth_camera.model import pixel_rays

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from flight.gnc.earth.figure import SEMI_MAJOR_AXIS
-from flight.gnc.earth.sun import ASTRONOMICAL_UNIT
-from flight.gnc.math.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS
+from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
 from sim_hal.earth_camera import APPARENT_LIMB_HEIGHT, Atmosphere, EarthCameraModel, EarthScene, limb_truth
 from sim_hal.earth_camera.albedo import CLOUD, CLOUD_SHARE, LAND_SHARE, OCEAN, albedo
 from sim_hal.earth_camera.image import expected_radiance

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flight.gnc.earth.figure import SEMI_MAJOR_AXIS
-from flight.gnc.earth.sun import ASTRONOMICAL_UNIT, SUN_RADIUS
-from flight.gnc.math.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS
+from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, SUN_RADIUS
 from sim_hal.earth_camera import EarthCameraModel, EarthScene, render, sun_direction, sun_point
 from sim_hal.earth_camera.image import expected_radiance
 from sim_hal.earth_camera.model import pixel_rays

@@ -10,8 +10,6 @@ import numpy as np
 
 from flight.app.devices import coil_settings, unit_settings
 from flight.app.mission_time import next_whole_second
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import angle_about_axis_y
 from flight.loop.fdir.coils.response import ResponseSettings
 from flight.loop.fdir.coils.watch import CoilWatch, CoilWatchSettings
 from flight.schema import reader as configuration
@@ -21,6 +19,8 @@ from hal.drivers.ina219 import Ina219
 from hal.drivers.pca9685 import Pca9685
 from hal.drivers.vn100.driver import Vn100
 from hal.interfaces.readings import ImuReading
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import angle_about_axis_y
 from sim_hal import lockstep
 from sim_hal.clock import SimClock
 from sim_hal.settings import FaultEntry

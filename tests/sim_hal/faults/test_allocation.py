@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flight.gnc.control.allocation import allocate
-from flight.gnc.errors import FlightError
-from flight.gnc.math.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray
+from knightcube.errors import FlightError
+from knightcube.gnc.control.allocation import allocate
 
 DIPOLE = 0.648
 LIMITS = np.full(3, 0.148)

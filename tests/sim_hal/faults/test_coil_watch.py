@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flight.gnc.math.arrays import FloatArray
 from flight.loop.fdir.coils.hypotheses import (
     MEAN,
     NEWEST,
@@ -22,6 +21,7 @@ from flight.loop.fdir.coils.hypotheses import (
 from flight.loop.fdir.coils.stuck_leg import NONE, StuckLeg, Supplied
 from flight.loop.fdir.coils.watch import CoilWatch, CoilWatchSettings
 from hal.interfaces.readings import ImuReading, PowerReading
+from knightcube.astro.arrays import FloatArray
 from tests.sim_hal.faults.coil_bench import hold, observe
 
 TARGET = -0.6

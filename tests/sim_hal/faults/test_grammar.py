@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from flight.app.cli import main
-from flight.gnc.errors import UsageError
 from flight.schema import reader as configuration
 from flight.schema.errors import ConfigError
+from knightcube.errors import UsageError
 from sim_hal.faults.catalogue import CATALOGUE, listing
 from sim_hal.faults.grammar import entries, parse, schedule
 from sim_hal.faults.kinds import FaultKind

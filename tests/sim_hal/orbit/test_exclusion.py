@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flight.gnc.camera.pinhole import Pinhole
-from flight.gnc.earth.figure import EARTH_RADIUS
-from flight.gnc.earth.sun import ASTRONOMICAL_UNIT
-from flight.gnc.math import quaternion
-from flight.gnc.math.arrays import FloatArray
+from knightcube.astro import quaternion
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.figure import EARTH_RADIUS
+from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
+from knightcube.vision.camera.pinhole import Pinhole
 from sim_hal.worlds.exclusion import boresights, earth_in_field, hidden_by_earth, in_field, sun_in_field
 
 HALF = np.radians(10.0)

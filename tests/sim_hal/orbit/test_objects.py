@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.gnc.camera.pinhole import Pinhole
-from flight.gnc.earth.sun import SPEED_OF_LIGHT, earth_velocity
-from flight.gnc.math.arrays import FloatArray, Image
-from flight.gnc.math.quaternion import attitude_matrix
 from flight.schema.carried import config_path
 from flight.schema.errors import ConfigError
 from flight.schema.reader import load, simulation_section
 from flight.schema.sections import Config
+from knightcube.astro.arrays import FloatArray, Image
+from knightcube.astro.earth.sun import SPEED_OF_LIGHT, earth_velocity
+from knightcube.astro.quaternion import attitude_matrix
+from knightcube.vision.camera.pinhole import Pinhole
 from sim_hal.clock import SimClock
 from sim_hal.objects import Objects
 from sim_hal.posed_camera import posed_camera

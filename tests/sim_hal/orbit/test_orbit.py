@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
-from flight.gnc.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER, J2
-from flight.gnc.math.arrays import FloatArray
 from hal.interfaces.errors import OutOfRange
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER, J2
 from sim_hal.worlds.orbit import KeplerianElements, Orbit, propagate
 
 VALLADO = KeplerianElements(

@@ -8,12 +8,12 @@ from functools import cache
 import numpy as np
 import pytest
 
-from flight.gnc.earth.figure import EARTH_RADIUS
-from flight.gnc.earth.shadow import sunlit_share
-from flight.gnc.earth.sun import DAY
-from flight.gnc.math import quaternion
-from flight.gnc.math.arrays import FloatArray
 from hal.interfaces.errors import OutOfRange
+from knightcube.astro import quaternion
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.figure import EARTH_RADIUS
+from knightcube.astro.earth.shadow import sunlit_share
+from knightcube.astro.earth.sun import DAY
 from sim_hal.star_camera import StarCameraModel, expected_electrons
 from sim_hal.star_camera.rso import TRACK_ERROR, ResidentSpaceObject, directions, source_tracks
 from sim_hal.worlds import sun

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flight.gnc.earth.figure import EARTH_RADIUS
-from flight.gnc.earth.shadow import sunlit_share
-from flight.gnc.earth.sun import ASTRONOMICAL_UNIT, SUN_RADIUS
-from flight.gnc.math.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.figure import EARTH_RADIUS
+from knightcube.astro.earth.shadow import sunlit_share
+from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, SUN_RADIUS
 
 SUN = np.array([ASTRONOMICAL_UNIT, 0.0, 0.0])
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flight.gnc.earth.sun import ASTRONOMICAL_UNIT, DAY, J2000
+from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, DAY, J2000
 from sim_hal.worlds import sun
 
 ARCSECOND = np.radians(1.0 / 3600.0)

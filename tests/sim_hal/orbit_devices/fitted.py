@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from flight.gnc.math import quaternion
-from flight.gnc.math.arrays import FloatArray
 from flight.schema import reader
 from flight.schema.orbit_devices import Gps, SolarString, SolarStrings, WideCamera
 from flight.schema.testbed import TestbedConfig
+from knightcube.astro import quaternion
+from knightcube.astro.arrays import FloatArray
 from sim_hal.settings import Simulation
 from sim_hal.worlds.free_body.body import FreeBody
 from sim_hal.worlds.free_body.section import FreeBodySection, OrbitSection, TipOff

@@ -9,13 +9,6 @@ import numpy as np
 import pytest
 
 from flight.app.devices import open_gps, open_strings
-from flight.gnc.camera.pinhole import Pinhole
-from flight.gnc.camera.pixel_access import ArrayPixels
-from flight.gnc.earth.figure import EARTH_RADIUS
-from flight.gnc.math import quaternion
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.vision.sun_sensor.direction import find_sun
-from flight.gnc.vision.sun_sensor.settings import SunSettings
 from flight.schema import reader
 from flight.schema.errors import ConfigError
 from ground.telemetry.scanner import scan
@@ -23,6 +16,13 @@ from hal.interfaces.errors import NotResponding
 from hal.interfaces.readings import Frame, GpsReading
 from hal.interfaces.rig import Rig
 from hal.interfaces.wires import SECOND_NS
+from knightcube.astro import quaternion
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.figure import EARTH_RADIUS
+from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.pixel_access import ArrayPixels
+from knightcube.vision.sun.direction import find_sun
+from knightcube.vision.sun.settings import SunSettings
 from sim_hal import lockstep
 from sim_hal.clock import SimClock
 from sim_hal.faults.grammar import parse

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flight.gnc.math import quaternion
-from flight.gnc.math.arrays import FloatArray
 from flight.schema import reader
+from knightcube.astro import quaternion
+from knightcube.astro.arrays import FloatArray
 from sim_hal import lockstep
 from sim_hal.clock import SimClock
 from sim_hal.emulators.vn100_sensors import Measured

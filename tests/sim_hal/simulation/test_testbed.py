@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import about_axis_y, attitude_matrix
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import about_axis_y, attitude_matrix
 from sim_hal.worlds.testbed import Testbed, TestbedModel
 
 SECOND = 1_000_000_000

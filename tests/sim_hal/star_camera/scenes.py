@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import erf
 
-from flight.gnc.math import quaternion
-from flight.gnc.math.arrays import FloatArray
+from knightcube.astro import quaternion
+from knightcube.astro.arrays import FloatArray
 from sim_hal.star_camera import StarCameraModel
 
 POINTING = quaternion.normalise(np.array([0.3, -0.5, 0.7, 0.2]))

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from flight.gnc.math.arrays import FloatArray, Image
 from hal.interfaces.errors import OutOfRange
+from knightcube.astro.arrays import FloatArray, Image
 from sim_hal.star_camera import StarCameraModel, expected_electrons, render, scatter_hot_pixels
 from sim_hal.star_camera.detector import counts
 from tests.sim_hal.star_camera.scenes import at_pixels, still, turning

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flight.gnc.math import quaternion
-from flight.gnc.math.arrays import FloatArray
 from hal.interfaces.errors import OutOfRange
+from knightcube.astro import quaternion
+from knightcube.astro.arrays import FloatArray
 from sim_hal.star_camera import SourceTrack, StarCameraModel, expected_electrons, render
 from tests.sim_hal.star_camera.scenes import POINTING, at_pixels, centroid, integrated_by_brute_force, turning
 

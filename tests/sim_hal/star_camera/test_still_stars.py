@@ -11,9 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flight.gnc import catalogue
-from flight.gnc.math import quaternion
 from hal.interfaces.errors import OutOfRange
+from knightcube.astro import catalogue, quaternion
 from sim_hal.star_camera import StarCameraModel, expected_electrons
 from tests.sim_hal.star_camera.scenes import POINTING, at_pixels, centroid, integrated_by_brute_force, still
 
@@ -178,5 +177,7 @@ def test_stars_and_attitudes_that_cannot_be_are_refused() -> None:
 
 
 def test_no_plotting_library_is_imported() -> None:
-    code = "import sys, sim_hal.star_camera, flight.gnc.catalogue; sys.exit('matplotlib' in sys.modules)"
+    code = (
+        "import sys, sim_hal.star_camera, knightcube.astro.catalogue; sys.exit('matplotlib' in sys.modules)"
+    )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

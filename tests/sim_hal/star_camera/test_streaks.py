@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flight.gnc.math import quaternion
-from flight.gnc.math.arrays import FloatArray
+from knightcube.astro import quaternion
+from knightcube.astro.arrays import FloatArray
 from sim_hal.star_camera import SourceTrack, StarCameraModel, expected_electrons
 from sim_hal.star_camera.attitude_history import AttitudeHistory
 from tests.sim_hal.star_camera.scenes import POINTING, at_pixels, centroid, integrated_by_brute_force, turning

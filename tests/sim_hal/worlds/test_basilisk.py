@@ -8,10 +8,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from flight.gnc.math import quaternion
-from flight.gnc.math.arrays import FloatArray
 from flight.schema import reader
 from flight.schema.errors import ConfigError
+from knightcube.astro import quaternion
+from knightcube.astro.arrays import FloatArray
 from sim_hal.worlds.basilisk.world import BasiliskWorld, make
 from sim_hal.worlds.free_body.body import CoilPower, FreeBody
 from sim_hal.worlds.free_body.section import Disturbances, FreeBodySection, OrbitSection

@@ -20,12 +20,12 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flight.gnc.attitude import singular_values
-from flight.gnc.attitude.solvers import DEFAULT, SOLVERS
-from flight.gnc.attitude.wahba import information, sightings
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import angle_between, conjugate, multiply, to_rotation_vector
-from tests.flight.gnc.attitude.sights import Sight, sight
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.attitude import singular_values
+from knightcube.astro.attitude.solvers import DEFAULT, SOLVERS
+from knightcube.astro.attitude.wahba import information, sightings
+from knightcube.astro.quaternion import angle_between, conjugate, multiply, to_rotation_vector
+from tests.knightcube.astro.attitude.sights import Sight, sight
 
 _SEED = 20_412
 _SIGMA = np.radians(5.0 / 3600.0)

@@ -69,29 +69,29 @@ _again = Again()
 
 def plan_testbed(job: Any) -> Any:
     """Plan for the testbed."""
-    return _again("flight.gnc.guidance.one_axis.job", job)
+    return _again("knightcube.gnc.guidance.one_axis.job", job)
 
 
 def plan_orbit(job: Any) -> Any:
     """Plan for the satellite."""
-    return _again("flight.gnc.control.three_axes.pointing_job", job)
+    return _again("knightcube.gnc.control.three_axes.pointing_job", job)
 
 
 def see(job: Any) -> Any:
     """Work on a star camera's frame."""
-    return _again("flight.gnc.vision.frame_job", job)
+    return _again("knightcube.vision.frame_job", job)
 
 
 def see_wide(job: Any) -> Any:
     """Work on the wide cameras' frames."""
-    return _again("flight.gnc.vision.wide_job", job)
+    return _again("knightcube.vision.wide_job", job)
 
 
 BUSY: dict[str, Callable[[Any], Any]] = {
-    "flight.gnc.guidance.one_axis.job": plan_testbed,
-    "flight.gnc.control.three_axes.pointing_job": plan_orbit,
-    "flight.gnc.vision.frame_job": see,
-    "flight.gnc.vision.wide_job": see_wide,
+    "knightcube.gnc.guidance.one_axis.job": plan_testbed,
+    "knightcube.gnc.control.three_axes.pointing_job": plan_orbit,
+    "knightcube.vision.frame_job": see,
+    "knightcube.vision.wide_job": see_wide,
 }
 """By the module of the job that is done again."""
 

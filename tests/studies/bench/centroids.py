@@ -18,9 +18,9 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from scipy.special import ndtr
 
-from flight.gnc.math.arrays import FloatArray, Image, IntArray
-from flight.gnc.vision.startracker.detection import Detections, DetectionSettings, detect, measure_near
-from flight.gnc.vision.startracker.detection.settings import CENTROIDS, Method
+from knightcube.astro.arrays import FloatArray, Image, IntArray
+from knightcube.vision.startracker.detection import Detections, DetectionSettings, detect, measure_near
+from knightcube.vision.startracker.detection.settings import CENTROIDS, Method
 from sim_hal.star_camera import StarCameraModel, render
 from tests.sim_hal.star_camera.scenes import at_pixels, still
 

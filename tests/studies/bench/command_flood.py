@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 
 from flight.app.utc_label import utc_ns
-from flight.gnc.errors import FlightError
 from flight.link.commands.codec import CommandPacker
 from flight.link.commands.values import Ping
 from ground.commands.command import exchange
+from knightcube.errors import FlightError
 from tests.scenario.flights import CONFIG
 from tests.studies.bench.flooded_flight import flood, free_port, lateness, process, wait_for
 

@@ -18,14 +18,14 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.errors import FlightError
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import from_rotation_vector
-from flight.gnc.vision.startracker.two_ends import attitudes_of_ends
-from flight.gnc.vision.streaks.corners.rate_fit import RotationFit, fit_rotation
-from flight.gnc.vision.streaks.corners.settings import DETECTOR_NAMES, DetectorName, StreakSettings
-from flight.gnc.vision.streaks.corners.streaks import Segmented, measure_streaks, segment_frame
-from tests.flight.gnc.vision.streaks.frames import (
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import from_rotation_vector
+from knightcube.errors import FlightError
+from knightcube.vision.startracker.two_ends import attitudes_of_ends
+from knightcube.vision.streaks.corners.rate_fit import RotationFit, fit_rotation
+from knightcube.vision.streaks.corners.settings import DETECTOR_NAMES, DetectorName, StreakSettings
+from knightcube.vision.streaks.corners.streaks import Segmented, measure_streaks, segment_frame
+from tests.knightcube.vision.streaks.frames import (
     Camera,
     expose,
     random_stars,

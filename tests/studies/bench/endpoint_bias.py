@@ -19,10 +19,10 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.math.arrays import BoolArray, FloatArray
-from flight.gnc.vision.streaks.corners.settings import DETECTOR_NAMES, DetectorName, StreakSettings
-from flight.gnc.vision.streaks.corners.streaks import measure_streaks, segment_frame
-from tests.flight.gnc.vision.streaks.frames import (
+from knightcube.astro.arrays import BoolArray, FloatArray
+from knightcube.vision.streaks.corners.settings import DETECTOR_NAMES, DetectorName, StreakSettings
+from knightcube.vision.streaks.corners.streaks import measure_streaks, segment_frame
+from tests.knightcube.vision.streaks.frames import (
     Camera,
     expose,
     random_stars,

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.math.arrays import BoolArray, FloatArray, IntArray
-from flight.gnc.math.quaternion import normalise
+from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
+from knightcube.astro.quaternion import normalise
 from sim_hal.star_camera import StarCameraModel
-from tests.flight.gnc.vision.maximum_likelihood.scenes import turn_of
+from tests.knightcube.vision.streaks.maximum_likelihood.scenes import turn_of
 from tests.studies.bench.streaks import estimated
 from tests.studies.campaigns.scenes import FIELD, Scene, exposed
 

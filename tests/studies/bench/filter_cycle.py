@@ -13,9 +13,9 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 
-from flight.gnc.estimation.attitude_filter import AttitudeFilter
-from flight.gnc.estimation.estimate import Estimate
-from tests.flight.gnc.estimation.flights import FREE, SETTINGS, SUSPENDED, Flight, fly
+from knightcube.gnc.estimation.attitude_filter import AttitudeFilter
+from knightcube.gnc.estimation.estimate import Estimate
+from tests.knightcube.gnc.estimation.flights import FREE, SETTINGS, SUSPENDED, Flight, fly
 from tests.studies.campaigns.consistency_worlds import CYCLE_NS
 
 _COMMANDED_NS = 10_000_000

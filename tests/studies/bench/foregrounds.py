@@ -20,13 +20,13 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.camera.images import read_image
-from flight.gnc.math.arrays import FloatArray, Image
-from flight.gnc.math.quaternion import attitude_matrix
-from flight.gnc.vision.frame_job import solve_frame
-from flight.gnc.vision.startracker.solve import SolveSettings
-from tests.flight.gnc.vision.startracker.frames import sky, sky_frame
-from tests.flight.gnc.vision.startracker.spoilers import SPOILERS, spoilt
+from knightcube.astro.arrays import FloatArray, Image
+from knightcube.astro.quaternion import attitude_matrix
+from knightcube.vision.camera.images import read_image
+from knightcube.vision.frame_job import solve_frame
+from knightcube.vision.startracker.solve import SolveSettings
+from tests.knightcube.vision.startracker.frames import sky, sky_frame
+from tests.knightcube.vision.startracker.spoilers import SPOILERS, spoilt
 from tests.studies.bench.sky import (
     FIELD_SHARE,
     NARROW_DEG,

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from flight.gnc.errors import UsageError
+from knightcube.errors import UsageError
 from tests.hal.guardian import live_flight
 from tests.studies.bench.executive import Load, fifo_allowed, fly
 

@@ -17,11 +17,11 @@ from typing import TypeVar
 
 import numpy as np
 
-from flight.gnc.camera.pixel_access import ArrayPixels
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.vision.horizon.edges import find_edges
-from flight.gnc.vision.horizon.nadir import find_nadir
-from flight.gnc.vision.horizon.observation import observe
+from knightcube.astro.arrays import FloatArray
+from knightcube.vision.camera.pixel_access import ArrayPixels
+from knightcube.vision.horizon.edges import find_edges
+from knightcube.vision.horizon.nadir import find_nadir
+from knightcube.vision.horizon.observation import observe
 from sim_hal.earth_camera import nadir, render
 from tests.sim_hal.earth_camera.scenes import random_scene
 from tests.studies.campaigns.nadir import VIEWS, camera_model, coarse_knowledge, finder_settings

@@ -17,16 +17,16 @@ import time
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.vision.startracker.catalogue_refit import refit_with_catalogue
-from flight.gnc.vision.startracker.index.build import default_index
-from flight.gnc.vision.startracker.solve import SolveSettings, solve_motion
-from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion
-from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion, positions
-from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
-from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from knightcube.astro.arrays import FloatArray
+from knightcube.vision.startracker.catalogue_refit import refit_with_catalogue
+from knightcube.vision.startracker.index.build import default_index
+from knightcube.vision.startracker.solve import SolveSettings, solve_motion
+from knightcube.vision.streaks.maximum_likelihood.estimate import estimate_motion
+from knightcube.vision.streaks.maximum_likelihood.motion import Motion, positions
+from knightcube.vision.streaks.maximum_likelihood.result import MotionResult
+from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from sim_hal.star_camera import render
-from tests.flight.gnc.vision.maximum_likelihood.scenes import (
+from tests.knightcube.vision.streaks.maximum_likelihood.scenes import (
     CAMERA,
     SATURATION,
     Scene,

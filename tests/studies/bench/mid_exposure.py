@@ -8,7 +8,7 @@ allows, the worst first: light of fainter stars hides in some streaks. `agreed` 
 
 `flight` is the star tracker's own answer to the same fit, told roughly where the camera looks, and
 `known sky` its answer after the second fit, with the light of unseen stars taken out
-(`flight.gnc.vision.startracker.catalogue_refit`); the rates of both fits are held against their bound too.
+(`knightcube.vision.startracker.catalogue_refit`); the rates of both fits are held against their bound too.
 
 The bound: all pixels of the brightest stars, whose directions are known and whose light and background are
 not, the turn, the width of the point spread and the attitude common to all (Fisher information as in
@@ -22,19 +22,19 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.attitude import esoq2
-from flight.gnc.camera.pinhole import Pinhole
-from flight.gnc.errors import FlightError
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.directions import cross_matrices
-from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector, multiply
-from flight.gnc.vision.startracker.catalogue_refit import refit_with_catalogue
-from flight.gnc.vision.startracker.index.build import default_index
-from flight.gnc.vision.startracker.solution import FrameSolution
-from flight.gnc.vision.startracker.solve import AttitudePrior, SolveSettings, solve_motion
-from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion
-from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
-from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.attitude import esoq2
+from knightcube.astro.directions import cross_matrices
+from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
+from knightcube.errors import FlightError
+from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.startracker.catalogue_refit import refit_with_catalogue
+from knightcube.vision.startracker.index.build import default_index
+from knightcube.vision.startracker.solution import FrameSolution
+from knightcube.vision.startracker.solve import AttitudePrior, SolveSettings, solve_motion
+from knightcube.vision.streaks.maximum_likelihood.motion import Motion
+from knightcube.vision.streaks.maximum_likelihood.result import MotionResult
+from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from sim_hal.star_camera import StarCameraModel
 from tests.studies.attitude_errors import attitude_error, error_in_pixels
 from tests.studies.bench.streaks import estimated, scenes

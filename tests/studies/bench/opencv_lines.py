@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
-from flight.gnc.math.arrays import BoolArray, FloatArray, Image
-from flight.gnc.vision.frame.background import estimate_background
+from knightcube.astro.arrays import BoolArray, FloatArray, Image
+from knightcube.vision.frame.background import estimate_background
 
 _WHITE_SIGMAS = 16.0
 _MASK_SIGMAS = 4.0

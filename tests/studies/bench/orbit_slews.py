@@ -21,23 +21,23 @@ from unittest.mock import patch
 
 import numpy as np
 
-from flight.gnc.control.three_axes import pointing_job
-from flight.gnc.control.three_axes.pointing_job import PointingJob
-from flight.gnc.control.three_axes.slew_table import RESERVE, SlewWish, slew
-from flight.gnc.earth.ephemeris import Ephemeris, predict
-from flight.gnc.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER
-from flight.gnc.earth.orbit_knowledge import OrbitState
-from flight.gnc.errors import PlanningError
-from flight.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
-from flight.gnc.guidance.three_axes.slew_ends import EndLaw, Whole
-from flight.gnc.guidance.three_axes.slew_model import SlewCraft
-from flight.gnc.guidance.three_axes.slew_path import SlewPath
-from flight.gnc.guidance.three_axes.slew_plan import SlewPlan, SlewStatus, plan_slew
-from flight.gnc.guidance.three_axes.slew_sky import along, cones
-from flight.gnc.guidance.three_axes.slew_task import LEAST_TIME, SlewTask
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import from_rotation_vector, multiply, normalise
-from tests.flight.gnc.guidance.three_axes.recorded_slews import (
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.ephemeris import Ephemeris, predict
+from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER
+from knightcube.astro.earth.orbit_knowledge import OrbitState
+from knightcube.astro.quaternion import from_rotation_vector, multiply, normalise
+from knightcube.errors import PlanningError
+from knightcube.gnc.control.three_axes import pointing_job
+from knightcube.gnc.control.three_axes.pointing_job import PointingJob
+from knightcube.gnc.control.three_axes.slew_table import RESERVE, SlewWish, slew
+from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from knightcube.gnc.guidance.three_axes.slew_ends import EndLaw, Whole
+from knightcube.gnc.guidance.three_axes.slew_model import SlewCraft
+from knightcube.gnc.guidance.three_axes.slew_path import SlewPath
+from knightcube.gnc.guidance.three_axes.slew_plan import SlewPlan, SlewStatus, plan_slew
+from knightcube.gnc.guidance.three_axes.slew_sky import along, cones
+from knightcube.gnc.guidance.three_axes.slew_task import LEAST_TIME, SlewTask
+from tests.knightcube.gnc.guidance.three_axes.recorded_slews import (
     FILE,
     flown,
     matrix,

@@ -1,8 +1,8 @@
 """Measure the planner against the optimum: `python -m tests.studies.bench plan [--runs N] [--picture PNG]`.
 
 Random slews over the testbed's range, with thread, disturbance and moving ends
-(tests.flight.gnc.guidance.problems), in two sets: horizons of 1.1 to 2.5 times the shortest feasible one, and
-too short ones, which are stretched.
+(tests.knightcube.gnc.guidance.problems), in two sets: horizons of 1.1 to 2.5 times the shortest feasible one,
+and too short ones, which are stretched.
 Solve times are of this process's processor time; cost is compared with the collocation oracle at the same
 horizon; limits are watched on 4001 points of the path.
 """
@@ -18,11 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.errors import PlanningError
-from flight.gnc.guidance.one_axis.limits import Q2_LIMIT
-from flight.gnc.guidance.one_axis.vmc import Plan, PlanStatus
-from tests.flight.gnc.guidance.oracle import solve
-from tests.flight.gnc.guidance.problems import STEPS, THESIS, Problem, feasible_problems
+from knightcube.errors import PlanningError
+from knightcube.gnc.guidance.one_axis.limits import Q2_LIMIT
+from knightcube.gnc.guidance.one_axis.vmc import Plan, PlanStatus
+from tests.knightcube.gnc.guidance.oracle import solve
+from tests.knightcube.gnc.guidance.problems import STEPS, THESIS, Problem, feasible_problems
 
 FEASIBLE = (1.1, 2.5)
 TOO_SHORT = (0.6, 0.99)

@@ -17,16 +17,16 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.math.arrays import BoolArray, FloatArray, Image
-from flight.gnc.vision.objects.detect import detect
-from flight.gnc.vision.objects.report import ObjectReport
-from flight.gnc.vision.objects.rso_indicators import INDICATORS
-from flight.gnc.vision.objects.settings import ObjectSettings
-from flight.gnc.vision.streaks.corners.settings import DETECTOR_NAMES, StreakSettings
-from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion
-from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
-from tests.flight.gnc.vision.streaks.frames import rate_at, star_camera, true_endpoints
-from tests.flight.gnc.vision.streaks.space_objects import frame_with, motion_across, object_path, star_field
+from knightcube.astro.arrays import BoolArray, FloatArray, Image
+from knightcube.vision.objects.detect import detect
+from knightcube.vision.objects.report import ObjectReport
+from knightcube.vision.objects.rso_indicators import INDICATORS
+from knightcube.vision.objects.settings import ObjectSettings
+from knightcube.vision.streaks.corners.settings import DETECTOR_NAMES, StreakSettings
+from knightcube.vision.streaks.maximum_likelihood.estimate import estimate_motion
+from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from tests.knightcube.vision.objects.space_objects import frame_with, motion_across, object_path, star_field
+from tests.knightcube.vision.streaks.frames import rate_at, star_camera, true_endpoints
 
 _SEED = 173_205
 _EXPOSURE = 1.0

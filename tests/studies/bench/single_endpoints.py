@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion, paths, sensitivities
-from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
+from knightcube.astro.arrays import FloatArray
+from knightcube.vision.streaks.maximum_likelihood.motion import Motion, paths, sensitivities
+from knightcube.vision.streaks.maximum_likelihood.result import MotionResult
 from sim_hal.star_camera import StarCameraModel, render
-from tests.flight.gnc.vision.maximum_likelihood.scenes import turn_of
+from tests.knightcube.vision.streaks.maximum_likelihood.scenes import turn_of
 from tests.sim_hal.star_camera.scenes import at_pixels, turning
 from tests.studies.bench.streaks import estimated
 from tests.studies.campaigns.scenes import FIELD, noise_floor

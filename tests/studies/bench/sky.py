@@ -24,15 +24,15 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.camera.images import read_image
-from flight.gnc.camera.pinhole import Pinhole
-from flight.gnc.math.arrays import FloatArray, Image
-from flight.gnc.math.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
-from flight.gnc.vision.frame_job import solve_frame
-from flight.gnc.vision.startracker.pointing import Pointing
-from flight.gnc.vision.startracker.solution import FrameSolution
-from flight.gnc.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings
-from tests.flight.gnc.vision.startracker.frames import NARROW, SkyFrame, sky, sky_frame
+from knightcube.astro.arrays import FloatArray, Image
+from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply, to_rotation_vector
+from knightcube.vision.camera.images import read_image
+from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.frame_job import solve_frame
+from knightcube.vision.startracker.pointing import Pointing
+from knightcube.vision.startracker.solution import FrameSolution
+from knightcube.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings
+from tests.knightcube.vision.startracker.frames import NARROW, SkyFrame, sky, sky_frame
 from tests.studies.bench.star_peers import PEERS
 from tests.studies.bench.starid import Answer, peer_answers
 

@@ -17,8 +17,6 @@ from pathlib import Path
 import numpy as np
 
 from flight.bodies.orbit.body import ORBIT
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import from_rotation_vector, multiply
 from flight.link.telemetry.packets import to_text
 from flight.loop.body import Body, BodyKind
 from flight.loop.services import Services
@@ -27,6 +25,8 @@ from flight.schema import reader as configuration
 from flight.schema.orbit import OrbitConfig, TargetStep, as_orbit
 from flight.schema.sections import Config
 from ground.telemetry.reader import Run
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import from_rotation_vector, multiply
 from sim_hal.settings import Simulation
 from tests.scenario.flights import fly
 from tests.scenario.test_orbit_navigation import skyward

@@ -17,13 +17,13 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from flight.gnc.attitude.solvers import SOLVERS
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import conjugate, multiply, normalise, to_rotation_vector
-from flight.gnc.vision.startracker.detection import DetectionSettings, detect
-from flight.gnc.vision.startracker.detection.settings import CENTROIDS, Method
-from flight.gnc.vision.startracker.index.build import default_index
-from flight.gnc.vision.startracker.solve import SolveSettings, solve_points
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.attitude.solvers import SOLVERS
+from knightcube.astro.quaternion import conjugate, multiply, normalise, to_rotation_vector
+from knightcube.vision.startracker.detection import DetectionSettings, detect
+from knightcube.vision.startracker.detection.settings import CENTROIDS, Method
+from knightcube.vision.startracker.index.build import default_index
+from knightcube.vision.startracker.solve import SolveSettings, solve_points
 from sim_hal.star_camera import StarCameraModel
 from tests.studies.campaigns.scenes import YEAR, exposed
 

@@ -13,9 +13,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from flight.gnc import catalogue
-from flight.gnc.math import quaternion
-from flight.gnc.math.arrays import FloatArray
+from knightcube.astro import catalogue, quaternion
+from knightcube.astro.arrays import FloatArray
 from sim_hal.star_camera import StarCameraModel, expected_electrons, render
 from sim_hal.star_camera.detector import counts
 

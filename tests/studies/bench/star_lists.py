@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flight.gnc.camera.pinhole import Pinhole
-from flight.gnc.math.arrays import FloatArray, IntArray
-from flight.gnc.math.quaternion import attitude_matrix, normalise
-from flight.gnc.vision.startracker.identification.field import StarField
-from flight.gnc.vision.startracker.index.guide_stars import GuideStars
+from knightcube.astro.arrays import FloatArray, IntArray
+from knightcube.astro.quaternion import attitude_matrix, normalise
+from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.startracker.identification.field import StarField
+from knightcube.vision.startracker.index.guide_stars import GuideStars
 
 PIXELS = 1024
 

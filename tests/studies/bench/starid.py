@@ -26,13 +26,13 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import attitude_matrix
-from flight.gnc.vision.startracker.identification.identification import Status
-from flight.gnc.vision.startracker.identification.lost_in_space import identify
-from flight.gnc.vision.startracker.identification.refinement import refine
-from flight.gnc.vision.startracker.index.build import default_index
-from flight.gnc.vision.startracker.index.sky_index import SkyIndex
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import attitude_matrix
+from knightcube.vision.startracker.identification.identification import Status
+from knightcube.vision.startracker.identification.lost_in_space import identify
+from knightcube.vision.startracker.identification.refinement import refine
+from knightcube.vision.startracker.index.build import default_index
+from knightcube.vision.startracker.index.sky_index import SkyIndex
 from tests.studies.bench.star_lists import PIXELS, ListKind, StarList, configurations, draw, draw_random
 
 _SEED = 271_828
@@ -166,9 +166,9 @@ def memory_of_index() -> float:
     """Return by how many megabytes a process grows that loads the index and identifies a list."""
     script = (
         "import resource, numpy as np\n"
-        "from flight.gnc.vision.startracker.index.build import default_index\n"
-        "from flight.gnc.vision.startracker.identification.field import StarField\n"
-        "from flight.gnc.vision.startracker.identification.lost_in_space import identify\n"
+        "from knightcube.vision.startracker.index.build import default_index\n"
+        "from knightcube.vision.startracker.identification.field import StarField\n"
+        "from knightcube.vision.startracker.identification.lost_in_space import identify\n"
         "def now(): return int(open('/proc/self/statm').read().split()[1]) * resource.getpagesize() / 2**20\n"
         "before = now()\n"
         "sky = default_index()\n"

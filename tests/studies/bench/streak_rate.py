@@ -13,13 +13,13 @@ import time
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray, Image
-from flight.gnc.vision.streaks.corners.rate_fit import fit_rotation
-from flight.gnc.vision.streaks.corners.settings import StreakSettings
-from flight.gnc.vision.streaks.corners.streak_rate import estimate_rate
-from flight.gnc.vision.streaks.corners.streaks import measure_streaks, segment_frame
-from flight.gnc.vision.streaks.streak_result import StreakStatus
-from tests.flight.gnc.vision.streaks.frames import Camera, rate_at, star_camera, star_frame
+from knightcube.astro.arrays import FloatArray, Image
+from knightcube.vision.streaks.corners.rate_fit import fit_rotation
+from knightcube.vision.streaks.corners.settings import StreakSettings
+from knightcube.vision.streaks.corners.streak_rate import estimate_rate
+from knightcube.vision.streaks.corners.streaks import measure_streaks, segment_frame
+from knightcube.vision.streaks.streak_result import StreakStatus
+from tests.knightcube.vision.streaks.frames import Camera, rate_at, star_camera, star_frame
 
 _SEED = 27_182
 _EXPOSURE = 1.0

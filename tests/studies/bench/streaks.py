@@ -2,7 +2,7 @@
 
 `python -m tests.studies.bench streaks`: the maximum-likelihood estimator, the thesis's pipeline with each of
 its four detectors, and OpenCV's line segment detector and Hough transform with the thesis's robust rotation
-fit (`flight.gnc.vision.streaks.corners.rate_fit`) behind them, their constant endpoint bias measured on other
+fit (`knightcube.vision.streaks.corners.rate_fit`) behind them, their constant endpoint bias measured on other
 frames and taken off as the four detectors' is. Frames of the real sky, theta uniform over the range asked
 for, a turn in percent of
 the field (3.28). Errors are rms over the frames that gave a rate; a ratio is the rms of error over
@@ -25,15 +25,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from flight.gnc.camera.knowledge import EXACT
-from flight.gnc.math.arrays import FloatArray, Image
-from flight.gnc.vision.streaks.corners import streak_rate
-from flight.gnc.vision.streaks.corners.endpoints import chord_outward, extend
-from flight.gnc.vision.streaks.corners.rate_fit import RotationFit, fit_rotation
-from flight.gnc.vision.streaks.corners.settings import DETECTOR_NAMES, DetectorName, StreakSettings
-from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion
-from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
-from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from knightcube.astro.arrays import FloatArray, Image
+from knightcube.vision.camera.knowledge import EXACT
+from knightcube.vision.streaks.corners import streak_rate
+from knightcube.vision.streaks.corners.endpoints import chord_outward, extend
+from knightcube.vision.streaks.corners.rate_fit import RotationFit, fit_rotation
+from knightcube.vision.streaks.corners.settings import DETECTOR_NAMES, DetectorName, StreakSettings
+from knightcube.vision.streaks.maximum_likelihood.estimate import estimate_motion
+from knightcube.vision.streaks.maximum_likelihood.result import MotionResult
+from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from sim_hal.star_camera import StarCameraModel
 from tests.studies.bench.stage_clock import REST, WHOLE, clocked
 from tests.studies.campaigns import streaks as campaign
@@ -80,7 +80,7 @@ def estimated(pixels: Image, rate: FloatArray, exposure: float, camera: StarCame
 
 def by_likelihood(scene: Scene, camera: StarCameraModel) -> Sighting:
     """Return what the maximum-likelihood estimator sees."""
-    with clocked(_module_of(estimate_motion), "flight.gnc.vision.streaks") as stages:
+    with clocked(_module_of(estimate_motion), "knightcube.vision.streaks") as stages:
         found = estimated(scene.pixels, scene.rate, scene.exposure, camera)
     ends = np.concatenate([found.endpoints, found.faint_endpoints])
     return Sighting(found.rate, found.covariance, ends, stages)
@@ -89,7 +89,7 @@ def by_likelihood(scene: Scene, camera: StarCameraModel) -> Sighting:
 def by_corners(detector: DetectorName, scene: Scene, camera: StarCameraModel) -> Sighting:
     """Return what the thesis's pipeline sees with one of its detectors."""
     settings = StreakSettings.of(detector, saturation=float(camera.highest_count), gain=camera.gain)
-    with clocked(_module_of(streak_rate.estimate_rate), "flight.gnc.vision.streaks") as stages:
+    with clocked(_module_of(streak_rate.estimate_rate), "knightcube.vision.streaks") as stages:
         found = streak_rate.estimate_rate(
             scene.pixels, camera.pinhole, scene.exposure, settings, scene.rate, 0.0
         )

@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from flight.gnc.camera.pixel_access import ArrayPixels
-from flight.gnc.vision.sun_sensor.direction import find_sun
-from flight.gnc.vision.sun_sensor.settings import LINEAR, SunSettings
+from knightcube.vision.camera.pixel_access import ArrayPixels
+from knightcube.vision.sun.direction import find_sun
+from knightcube.vision.sun.settings import LINEAR, SunSettings
 from sim_hal.earth_camera import EarthCameraModel, EarthScene, render, sun_direction, sun_point
 from tests.sim_hal.earth_camera.scenes import random_scene, random_sun_scene
 

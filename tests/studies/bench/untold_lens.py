@@ -21,11 +21,9 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc import catalogue
-from flight.gnc.camera.images import read_image
-from flight.gnc.camera.lens import Lens
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import (
+from knightcube.astro import catalogue
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import (
     attitude_matrix,
     conjugate,
     from_matrix,
@@ -33,11 +31,13 @@ from flight.gnc.math.quaternion import (
     normalise,
     to_rotation_vector,
 )
-from flight.gnc.vision.frame_job import solve_frame
-from flight.gnc.vision.startracker.detection import FrameKind
-from flight.gnc.vision.startracker.solution import FrameSolution
-from flight.gnc.vision.startracker.solve import SolveSettings, lens_floor, solve_places
-from tests.flight.gnc.vision.startracker.frames import EPOCH, sky
+from knightcube.vision.camera.images import read_image
+from knightcube.vision.camera.lens import Lens
+from knightcube.vision.frame_job import solve_frame
+from knightcube.vision.startracker.detection import FrameKind
+from knightcube.vision.startracker.solution import FrameSolution
+from knightcube.vision.startracker.solve import SolveSettings, lens_floor, solve_places
+from tests.knightcube.vision.startracker.frames import EPOCH, sky
 from tests.studies.bench.sky import FIELD_SHARE, PHOTOGRAPHS, angle_arcsec, believed, centre_of
 
 _SEED = 14_005

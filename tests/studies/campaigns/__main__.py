@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from flight.gnc.errors import UsageError
+from knightcube.errors import UsageError
 from tests.studies.campaigns.campaign import Campaign, CampaignError, fly
 from tests.studies.campaigns.registry import CAMPAIGNS
 

@@ -20,7 +20,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from flight.gnc.errors import FlightError, UsageError
+from knightcube.errors import FlightError, UsageError
 from tests.studies.campaigns import cluster
 from tests.studies.campaigns.progress import Progress
 

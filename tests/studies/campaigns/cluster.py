@@ -20,7 +20,7 @@ from concurrent.futures import CancelledError
 from pathlib import Path
 from typing import Any
 
-PACKAGES = ("flight", "ground", "hal", "sim_hal", "tests")
+PACKAGES = ("knightcube", "flight", "ground", "hal", "sim_hal", "tests")
 FOLDERS = (*PACKAGES, "config")
 _ROOT = Path(__file__).parents[3]
 _PLUGIN = "knightcube-code"
@@ -135,7 +135,7 @@ def finished(
 
 def _client(address: str) -> Any:
     """Connect to a scheduler that has a worker. Raises UsageError."""
-    from flight.gnc.errors import UsageError  # noqa: PLC0415 - see the module's text
+    from knightcube.errors import UsageError  # noqa: PLC0415 - see the module's text
 
     try:
         client = importlib.import_module("distributed").Client(address, timeout=CONNECT_S)

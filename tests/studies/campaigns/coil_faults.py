@@ -17,13 +17,13 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
 from flight.link import events
 from flight.link.telemetry.packets import to_text
 from flight.schema import reader as configuration
 from flight.schema.sections import Commands, CommandStep, Config, Modes
 from ground.telemetry.reader import Run
 from hal.interfaces.wires import SECOND_NS
+from knightcube.astro.arrays import FloatArray
 from sim_hal.faults.catalogue import CATALOGUE
 from sim_hal.settings import FaultEntry
 from tests.scenario.flights import demo_config, demo_world, fly

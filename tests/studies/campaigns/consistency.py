@@ -21,12 +21,12 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from flight.gnc.estimation.attitude_filter import AttitudeFilter
-from flight.gnc.estimation.estimate import Estimate
-from flight.gnc.estimation.measurements import Measurement
-from flight.gnc.estimation.rigid_body import RigidBody
-from flight.gnc.math.arrays import FloatArray, IntArray
-from flight.gnc.math.quaternion import conjugate, multiply, to_rotation_vector
+from knightcube.astro.arrays import FloatArray, IntArray
+from knightcube.astro.quaternion import conjugate, multiply, to_rotation_vector
+from knightcube.gnc.estimation.attitude_filter import AttitudeFilter
+from knightcube.gnc.estimation.estimate import Estimate
+from knightcube.gnc.estimation.measurements import Measurement
+from knightcube.gnc.estimation.rigid_body import RigidBody
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.consistency_instruments import Camera, Pilot, Unit
 from tests.studies.campaigns.consistency_worlds import (

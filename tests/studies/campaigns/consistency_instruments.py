@@ -9,16 +9,16 @@ from __future__ import annotations
 import numpy as np
 
 from flight.bodies.testbed.thread_estimate import about_thread
-from flight.gnc.estimation.estimate import Estimate
-from flight.gnc.estimation.measurements import (
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.frames import NED_TO_TESTBED, attitude_map
+from knightcube.astro.quaternion import IDENTITY, from_rotation_vector, multiply
+from knightcube.gnc.estimation.estimate import Estimate
+from knightcube.gnc.estimation.measurements import (
     AttitudeMeasurement,
     MeanRateMeasurement,
     Measurement,
     RateMeasurement,
 )
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.frames import NED_TO_TESTBED, attitude_map
-from flight.gnc.math.quaternion import IDENTITY, from_rotation_vector, multiply
 from sim_hal.emulators.vn100_sensors import NoiseProfile, Sensors
 from sim_hal.worlds.motion import Motion
 from tests.studies.campaigns.consistency_worlds import CYCLE_NS, DIPOLE, INERTIA, TESTBED_FIELD, World

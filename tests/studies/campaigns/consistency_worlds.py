@@ -12,10 +12,10 @@ from typing import Protocol
 
 import numpy as np
 
-from flight.gnc.estimation.filter_settings import FilterSettings
-from flight.gnc.estimation.rigid_body import Parameters
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import about_axis_y, normalise
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import about_axis_y, normalise
+from knightcube.gnc.estimation.filter_settings import FilterSettings
+from knightcube.gnc.estimation.rigid_body import Parameters
 from sim_hal.worlds.testbed import Testbed, TestbedModel
 
 CYCLE_NS = 25_000_000

@@ -12,8 +12,8 @@ Two powers are given: R I^2 of the mean current, the thesis's cost, and V |I|, w
 from their supply of 3.4 V.
 
 The floor is the clairvoyant optimum: the whole plant known, each target reached at rest 10 s after its
-command and held, by direct collocation (tests.flight.gnc.guidance.oracle). What reaches its targets later may
-lie below.
+command and held, by direct collocation (tests.knightcube.gnc.guidance.oracle). What reaches its targets later
+may lie below.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.guidance.one_axis.plant import SingleAxisPlant, angle_of
 from flight.schema import reader as configuration
 from flight.schema.testbed import PidGains, TestbedConfig
 from ground import report
+from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant, angle_of
 from sim_hal.settings import Simulation
-from tests.flight.gnc.guidance.oracle import Slew, solve
+from tests.knightcube.gnc.guidance.oracle import Slew, solve
 from tests.scenario.flights import demo_config, demo_world, fly, thesis_config
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 

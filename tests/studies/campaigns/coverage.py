@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.attitude.determination.references import sun_from
-from flight.gnc.earth.shadow import sunlit_share
-from flight.gnc.earth.sun import ASTRONOMICAL_UNIT
-from flight.gnc.math.arrays import BoolArray, FloatArray
-from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector, normalise
+from knightcube.astro.arrays import BoolArray, FloatArray
+from knightcube.astro.earth.shadow import sunlit_share
+from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
+from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, normalise
+from knightcube.gnc.attitude.references import sun_from
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.orbit_geometry import (
     SUITES,

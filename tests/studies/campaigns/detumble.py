@@ -16,14 +16,14 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.control.detumble import WindowSchedule
-from flight.gnc.control.three_axes.field_detumbler import FieldBraking, FieldDetumbler
-from flight.gnc.earth.ephemeris import predict
-from flight.gnc.earth.field_ahead import FieldAhead
-from flight.gnc.earth.orbit_knowledge import OrbitState
-from flight.gnc.estimation.field_rate import FieldRateSettings
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import attitude_matrix
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.ephemeris import predict
+from knightcube.astro.earth.field_ahead import FieldAhead
+from knightcube.astro.earth.orbit_knowledge import OrbitState
+from knightcube.astro.quaternion import attitude_matrix
+from knightcube.gnc.control.detumble import WindowSchedule
+from knightcube.gnc.control.three_axes.field_detumbler import FieldBraking, FieldDetumbler
+from knightcube.gnc.estimation.field_rate import FieldRateSettings
 from sim_hal.worlds.free_body.section import Disturbances, TipOff
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.detumble_bound import SATURATED, least_time

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray
 
 SATURATED = 1.5
 """Mean over all attitudes of the sum of a unit vector's components, by size."""

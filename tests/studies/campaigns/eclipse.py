@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 
 from flight.bodies.orbit.body import filter_settings
-from flight.gnc.estimation.free_filter import FreeFilter
-from flight.gnc.estimation.free_motion import TURN
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import conjugate, multiply, to_rotation_vector
 from flight.schema import reader as configuration
 from flight.schema.orbit import as_orbit
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import conjugate, multiply, to_rotation_vector
+from knightcube.gnc.estimation.free_filter import FreeFilter
+from knightcube.gnc.estimation.free_motion import TURN
 from tests.scenario.flights import CONFIG
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.eclipse_loop import CRAFT, LAST, SETTLED, fly_loop, judged

@@ -14,16 +14,16 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.earth.ephemeris import predict
-from flight.gnc.earth.figure import GRAVITATIONAL_PARAMETER, SEMI_MAJOR_AXIS
-from flight.gnc.earth.orbit_knowledge import OrbitState
-from flight.gnc.math import quaternion
-from flight.gnc.math.arrays import FloatArray
 from flight.schema import reader as configuration
 from flight.schema.orbit import OrbitConfig, TargetStep, as_orbit
 from ground.report.knowledge import attitude_errors, dipole_errors
 from ground.report.signals import seconds
 from ground.telemetry.reader import Run
+from knightcube.astro import quaternion
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.ephemeris import predict
+from knightcube.astro.earth.figure import GRAVITATIONAL_PARAMETER, SEMI_MAJOR_AXIS
+from knightcube.astro.earth.orbit_knowledge import OrbitState
 from sim_hal.settings import FaultEntry, Simulation
 from sim_hal.worlds.free_body.body import FreeBody
 from sim_hal.worlds.free_body.section import FreeBodySection, TipOff

@@ -24,12 +24,12 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from flight.gnc.camera.knowledge import EXACT
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion
-from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
-from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
-from flight.gnc.vision.streaks.streak_result import StreakStatus
+from knightcube.astro.arrays import FloatArray
+from knightcube.vision.camera.knowledge import EXACT
+from knightcube.vision.streaks.maximum_likelihood.estimate import estimate_motion
+from knightcube.vision.streaks.maximum_likelihood.result import MotionResult
+from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from knightcube.vision.streaks.streak_result import StreakStatus
 from sim_hal.star_camera import StarCameraModel
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.scenes import FIELD, Scene, slew, usable

@@ -16,12 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.camera.lens import CameraModel
-from flight.gnc.camera.pinhole import Pinhole
-from flight.gnc.math.arrays import Image
-from flight.gnc.vision.horizon.knowledge import HorizonKnowledge
-from flight.gnc.vision.horizon.nadir import find_nadir
-from flight.gnc.vision.horizon.settings import HorizonSettings
+from knightcube.astro.arrays import Image
+from knightcube.vision.camera.lens import CameraModel
+from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.horizon.knowledge import HorizonKnowledge
+from knightcube.vision.horizon.nadir import find_nadir
+from knightcube.vision.horizon.settings import HorizonSettings
 from sim_hal.earth_camera import EarthCameraModel, EarthScene, limb_truth, nadir, render
 from sim_hal.earth_camera.truth import sun_point
 from tests.sim_hal.earth_camera.scenes import random_scene

@@ -19,10 +19,10 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.errors import UsageError
 from flight.link.modes import Mode
 from flight.link.telemetry.packets import LONGEST_PACKET
 from ground.telemetry.reader import Run, read_run
+from knightcube.errors import UsageError
 from sim_hal.serving.device_link import RemoteI2cBus
 from tests.hal.guardian.campaign import lives
 from tests.hal.guardian.live_flight import devices_running

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.tracking.first_orbit import ArcError, Bearings, first_orbit
+from knightcube.astro.arrays import FloatArray
+from knightcube.gnc.tracking.first_orbit import ArcError, Bearings, first_orbit
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 
 SIGMA = float(0.1 * np.radians(20.0) / 1024)

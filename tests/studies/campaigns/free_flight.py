@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from flight.gnc.earth.ephemeris import Ephemeris, predict
-from flight.gnc.earth.orbit_knowledge import OrbitState
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector, multiply
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.ephemeris import Ephemeris, predict
+from knightcube.astro.earth.orbit_knowledge import OrbitState
+from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
 from sim_hal.worlds.free_body.body import FreeBody
 from sim_hal.worlds.free_body.craft import CRAFTS
 from sim_hal.worlds.free_body.section import Disturbances, FreeBodySection, OrbitSection, TipOff

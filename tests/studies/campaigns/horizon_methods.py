@@ -18,18 +18,18 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.camera.mounted import MountedCamera
-from flight.gnc.earth.figure import SEMI_MAJOR_AXIS
-from flight.gnc.earth.sun import ASTRONOMICAL_UNIT
-from flight.gnc.math.arrays import FloatArray, Image
-from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector, multiply
-from flight.gnc.vision.horizon.ellipsoid import MEAN_RADIUS
-from flight.gnc.vision.horizon.graphic_method import GraphicMethodError, LevelCamera, graphic_nadir
-from flight.gnc.vision.horizon.knowledge import HorizonKnowledge, SensedDirection
-from flight.gnc.vision.horizon.nadir import find_nadir
-from flight.gnc.vision.horizon.scanned_circle import NoHorizonError, circle_nadir, scan_horizon
-from flight.gnc.vision.horizon.several_cameras import nadir_of_cameras
-from flight.gnc.vision.horizon.vector_method import carried_nadir
+from knightcube.astro.arrays import FloatArray, Image
+from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS
+from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
+from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply
+from knightcube.reference.horizon.graphic_method import GraphicMethodError, LevelCamera, graphic_nadir
+from knightcube.reference.horizon.scanned_circle import NoHorizonError, circle_nadir, scan_horizon
+from knightcube.vision.camera.mounted import MountedCamera
+from knightcube.vision.horizon.ellipsoid import MEAN_RADIUS
+from knightcube.vision.horizon.knowledge import HorizonKnowledge, SensedDirection
+from knightcube.vision.horizon.nadir import find_nadir
+from knightcube.vision.horizon.several_cameras import nadir_of_cameras
+from knightcube.vision.horizon.vector_method import carried_nadir
 from sim_hal.earth_camera import EarthCameraModel, EarthScene, limb_truth, render
 from tests.sim_hal.earth_camera.scenes import DAY, NIGHT, pointing, random_direction
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from flight.gnc.camera.knowledge import UNSTATED, CameraKnowledge
-from flight.gnc.math.arrays import FloatArray, Image
+from knightcube.astro.arrays import FloatArray, Image
+from knightcube.vision.camera.knowledge import UNSTATED, CameraKnowledge
 from tests.studies.supersampled import Optics, coma, disc, gaussian, halo, moffat
 
 Stage = Callable[[FloatArray, np.random.Generator], FloatArray]

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from flight.gnc.math.arrays import BoolArray, FloatArray, Image
+from knightcube.astro.arrays import BoolArray, FloatArray, Image
 
 Size = tuple[int, int]
 Maker = Callable[[Size, np.random.Generator], FloatArray]

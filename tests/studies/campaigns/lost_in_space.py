@@ -19,16 +19,16 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import attitude_matrix
-from flight.gnc.vision.startracker.classical import rate_matching
-from flight.gnc.vision.startracker.classical.known_sky import KnownSky
-from flight.gnc.vision.startracker.classical.methods import METHODS
-from flight.gnc.vision.startracker.classical.rate_matching import Motion
-from flight.gnc.vision.startracker.identification.field import StarField
-from flight.gnc.vision.startracker.identification.identification import Identification, Status
-from flight.gnc.vision.startracker.index.build import default_index
-from flight.gnc.vision.startracker.index.pair_table import angles
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import attitude_matrix
+from knightcube.reference.star_identification import rate_matching
+from knightcube.reference.star_identification.known_sky import KnownSky
+from knightcube.reference.star_identification.methods import METHODS
+from knightcube.reference.star_identification.pair_table import angles
+from knightcube.reference.star_identification.rate_matching import Motion
+from knightcube.vision.startracker.identification.field import StarField
+from knightcube.vision.startracker.identification.identification import Identification, Status
+from knightcube.vision.startracker.index.build import default_index
 from tests.studies.bench.star_lists import PIXELS, ListKind, StarList, draw
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 

@@ -18,17 +18,17 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray, Image, IntArray
-from flight.gnc.math.quaternion import (
+from knightcube.astro.arrays import FloatArray, Image, IntArray
+from knightcube.astro.quaternion import (
     attitude_matrix,
     from_rotation_vector,
     multiply,
     normalise,
     to_rotation_vector,
 )
-from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion
-from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
-from flight.gnc.vision.streaks.streak_result import StreakStatus
+from knightcube.vision.streaks.maximum_likelihood.estimate import estimate_motion
+from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from knightcube.vision.streaks.streak_result import StreakStatus
 from sim_hal.star_camera import StarCameraModel
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.imperfections import IMPERFECTIONS, Imperfection

@@ -22,13 +22,13 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector
-from flight.gnc.vision.horizon.knowledge import HorizonKnowledge, SensedDirection
-from flight.gnc.vision.horizon.nadir import find_nadir
-from flight.gnc.vision.horizon.response import LogarithmicResponse
-from flight.gnc.vision.horizon.settings import EdgeSettings, HorizonSettings
-from flight.gnc.vision.horizon.solution import HorizonStatus
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
+from knightcube.vision.horizon.knowledge import HorizonKnowledge, SensedDirection
+from knightcube.vision.horizon.nadir import find_nadir
+from knightcube.vision.horizon.response import LogarithmicResponse
+from knightcube.vision.horizon.settings import EdgeSettings, HorizonSettings
+from knightcube.vision.horizon.solution import HorizonStatus
 from sim_hal.earth_camera import EarthCameraModel, EarthScene, nadir, render
 from sim_hal.earth_camera.atmosphere import Atmosphere
 from tests.sim_hal.earth_camera.scenes import random_direction, random_scene

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import linprog
 from scipy.sparse import csr_array, lil_array
 
-from flight.gnc.math.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray
 
 _SIDES = 16
 """Of the polygons about the circles of deviation and authority; the authority's lies outside the circle."""

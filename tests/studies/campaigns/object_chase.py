@@ -15,17 +15,17 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from flight.bodies.orbit.object_aim import ObjectAim, Sensor
-from flight.gnc.control.three_axes import pointing_job
-from flight.gnc.control.three_axes.pointing_job import PointingJob
-from flight.gnc.control.three_axes.pointing_table import PointingTable
-from flight.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.directions import tangent_basis
-from flight.gnc.math.quaternion import attitude_matrix, from_matrix, from_rotation_vector
-from flight.gnc.tracking.sightings import Sightings
-from flight.gnc.tracking.tracker import Tracker, TrackSettings
 from flight.link.events import EventKind
 from flight.loop.fdir.event_log import EventLog
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.directions import tangent_basis
+from knightcube.astro.quaternion import attitude_matrix, from_matrix, from_rotation_vector
+from knightcube.gnc.control.three_axes import pointing_job
+from knightcube.gnc.control.three_axes.pointing_job import PointingJob
+from knightcube.gnc.control.three_axes.pointing_table import PointingTable
+from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from knightcube.gnc.tracking.sightings import Sightings
+from knightcube.gnc.tracking.tracker import Tracker, TrackSettings
 from sim_hal.worlds.free_body.section import TipOff
 from tests.studies.campaigns.first_orbits import circular, flow
 from tests.studies.campaigns.free_flight import FreeFlight

@@ -17,28 +17,28 @@ from pathlib import Path
 
 import numpy as np
 
-from flight.gnc.camera.knowledge import EXACT
-from flight.gnc.camera.pinhole import Pinhole
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.directions import tangent_basis
-from flight.gnc.math.quaternion import (
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.directions import tangent_basis
+from knightcube.astro.quaternion import (
     attitude_matrix,
     from_matrix,
     from_rotation_vector,
     multiply,
 )
-from flight.gnc.tracking.line_of_sight import LineOfSight
-from flight.gnc.tracking.sightings import Sightings
-from flight.gnc.tracking.tracker import Tracker, TrackSettings
-from flight.gnc.vision.frame_job import FrameJob, TrackerSettings
-from flight.gnc.vision.frame_job import run as look
-from flight.gnc.vision.objects.sighted import Sighted, SightSettings
-from flight.gnc.vision.startracker.detection import DetectionSettings
-from flight.gnc.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings
-from flight.gnc.vision.streaks.maximum_likelihood.motion import Motion
-from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from knightcube.gnc.tracking.line_of_sight import LineOfSight
+from knightcube.gnc.tracking.sightings import Sightings
+from knightcube.gnc.tracking.tracker import Tracker, TrackSettings
+from knightcube.vision.camera.knowledge import EXACT
+from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.frame_job import FrameJob, TrackerSettings
+from knightcube.vision.frame_job import run as look
+from knightcube.vision.objects.sighted import Sighted, SightSettings
+from knightcube.vision.startracker.detection import DetectionSettings
+from knightcube.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings
+from knightcube.vision.streaks.maximum_likelihood.motion import Motion
+from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from sim_hal.star_camera import SourceTrack, StarCameraModel, render
-from tests.flight.gnc.tracking.passes import Pass, a_pass
+from tests.knightcube.gnc.tracking.passes import Pass, a_pass
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.scenes import catalogue
 from tests.studies.streak_bound import star_information

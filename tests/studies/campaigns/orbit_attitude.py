@@ -1,7 +1,7 @@
 """Campaign `orbit-attitude`: attitude, sigma and NEES of the flight filter over one orbit with eclipse.
 
 Each run is one revolution from sunrise to sunrise (`orbit_world`) through
-`flight.gnc.attitude.determination`; its last 36 minutes are dark. Variants lose a sensor for good after ten
+`knightcube.gnc.attitude`; its last 36 minutes are dark. Variants lose a sensor for good after ten
 minutes, or all cameras; one has worse gyros.
 NEES is of attitude and gyro bias, six errors, over independent runs; 1 is honest.
 """
@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.attitude.determination.direction_filter import AttitudeDetermination, DeterminationSettings
-from flight.gnc.earth.geomagnetism import field as believed_field
-from flight.gnc.estimation.estimate import BIAS, TURN, Estimate
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import conjugate, multiply
-from flight.gnc.math.quaternion import to_rotation_vector as rotation_vector
 from flight.schema.reader import replace
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.geomagnetism import field as believed_field
+from knightcube.astro.quaternion import conjugate, multiply
+from knightcube.astro.quaternion import to_rotation_vector as rotation_vector
+from knightcube.gnc.attitude.direction_filter import AttitudeDetermination, DeterminationSettings
+from knightcube.gnc.estimation.estimate import BIAS, TURN, Estimate
 from tests.studies.campaigns import orbit_world
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.orbit_attitude_figures import WHENS, draw, line_of, variant_facts

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray
 from tests.studies.campaigns.campaign import Result
 from tests.studies.campaigns.consistency import band
 

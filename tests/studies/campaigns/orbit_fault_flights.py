@@ -14,11 +14,11 @@ import numpy as np
 from sgp4.api import WGS72, Satrec
 from sgp4.exporter import export_tle
 
-from flight.gnc.earth.orbit_knowledge import TwoLineElements
-from flight.gnc.math import quaternion
-from flight.gnc.math.arrays import FloatArray
 from flight.schema import reader as configuration
 from flight.schema.orbit import OrbitConfig, TargetStep, as_orbit
+from knightcube.astro import quaternion
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.orbit_knowledge import TwoLineElements
 from sim_hal.settings import FaultEntry, Simulation
 from sim_hal.worlds.free_body.body import FreeBody
 from sim_hal.worlds.surroundings import Surroundings

@@ -6,14 +6,14 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from flight.gnc.math.arrays import BoolArray
-from flight.gnc.math.quaternion import attitude_matrix
 from flight.link.events import EVENTS, EventKind, Severity
 from flight.link.modes import POINTING, Mode
 from flight.link.telemetry.packets import to_text
 from ground.report.knowledge import FINE, LOST, attitude_errors
 from ground.report.signals import seconds
 from ground.telemetry.reader import Run
+from knightcube.astro.arrays import BoolArray
+from knightcube.astro.quaternion import attitude_matrix
 from sim_hal.faults.kinds import FaultKind
 from tests.studies.campaigns.campaign import Result
 from tests.studies.campaigns.fault_judgement import GAIN_ERROR, OFF_SURELY

@@ -24,21 +24,21 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.attitude.determination.direction_filter import AttitudeDetermination, Report, begin
-from flight.gnc.attitude.determination.single_frame import Sight
-from flight.gnc.camera.mounted import MountedCamera
-from flight.gnc.earth.geomagnetism import field as believed_field
-from flight.gnc.earth.sun import ASTRONOMICAL_UNIT
-from flight.gnc.math.arrays import FloatArray, Image
-from flight.gnc.math.quaternion import attitude_matrix, conjugate, multiply, normalise, to_rotation_vector
-from flight.gnc.vision.horizon.cameras import cameras_by_limb
-from flight.gnc.vision.horizon.ellipsoid import MEAN_RADIUS
-from flight.gnc.vision.horizon.filled_camera import coarse_nadir, light_seen
-from flight.gnc.vision.horizon.knowledge import HorizonKnowledge, RoughAttitude, SensedDirection
-from flight.gnc.vision.horizon.several_cameras import nadir_of_cameras
-from flight.gnc.vision.sun_sensor.settings import SunSettings
-from flight.gnc.vision.sun_sensor.several_cameras import SunOfCameras, sun_of_cameras
-from flight.gnc.vision.sun_sensor.strings import CoarseSun, SolarStrings, coarse_sun
+from knightcube.astro.arrays import FloatArray, Image
+from knightcube.astro.earth.geomagnetism import field as believed_field
+from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
+from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply, normalise, to_rotation_vector
+from knightcube.gnc.attitude.direction_filter import AttitudeDetermination, Report, begin
+from knightcube.gnc.attitude.single_frame import Sight
+from knightcube.vision.camera.mounted import MountedCamera
+from knightcube.vision.horizon.cameras import cameras_by_limb
+from knightcube.vision.horizon.ellipsoid import MEAN_RADIUS
+from knightcube.vision.horizon.filled_camera import coarse_nadir, light_seen
+from knightcube.vision.horizon.knowledge import HorizonKnowledge, RoughAttitude, SensedDirection
+from knightcube.vision.horizon.several_cameras import nadir_of_cameras
+from knightcube.vision.sun.settings import SunSettings
+from knightcube.vision.sun.several_cameras import SunOfCameras, sun_of_cameras
+from knightcube.vision.sun.strings import CoarseSun, SolarStrings, coarse_sun
 from sim_hal.earth_camera import EarthScene, render
 from sim_hal.worlds.solar_strings import SolarStringsModel
 from tests.studies.campaigns import orbit_world

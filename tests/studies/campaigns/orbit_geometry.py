@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from flight.gnc.earth.figure import EARTH_RADIUS
-from flight.gnc.math.arrays import BoolArray, FloatArray
+from knightcube.astro.arrays import BoolArray, FloatArray
+from knightcube.astro.earth.figure import EARTH_RADIUS
 from sim_hal.worlds.orbit import KeplerianElements, propagate
 from tests.studies.campaigns import sensor_suite
 from tests.studies.campaigns.sensor_suite import SensorSuite, WideCamera

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.free_flight import WATTS
 from tests.studies.campaigns.orbit_pointing_flight import CYCLE, TARGETS, PointingFlight

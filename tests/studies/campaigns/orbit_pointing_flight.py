@@ -2,7 +2,7 @@
 
 The tables are those of the planner worker (`pointing_job`): a slew from far off, as in the loop, then the
 pointing law's, made again each REPLAN s, where the body leaves its path, and where it was astray and has been
-held still (`flight.gnc.control.three_axes.astray`). The coils
+held still (`knightcube.gnc.control.three_axes.astray`). The coils
 pause a tenth of each two seconds for the magnetometer; star attitudes come each 10 s, two seconds late.
 Beside the law stands the magnetic proportional-derivative law: what of the torque -J (w^2 turn + 2 w rate)
 lies across the field (Lovera & Astolfi 2004, Automatica 40(8)).
@@ -15,29 +15,29 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.control.three_axes import pointing_job
-from flight.gnc.control.three_axes.astray import Astray, damping_dipole
-from flight.gnc.control.three_axes.pointing import PointingLaw
-from flight.gnc.control.three_axes.pointing_job import PointingJob
-from flight.gnc.control.three_axes.pointing_table import PointingTable, PointingWeights
-from flight.gnc.control.three_axes.slew_table import SlewWish
-from flight.gnc.earth.disturbance import pressures
-from flight.gnc.earth.ephemeris import Ephemeris
-from flight.gnc.earth.orbit_knowledge import OrbitState
-from flight.gnc.estimation.free_filter import FreeFilter
-from flight.gnc.estimation.free_motion import GYRO, TURN, Around
-from flight.gnc.estimation.free_settings import FreeFilterSettings
-from flight.gnc.guidance.three_axes.attitude_law import references
-from flight.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
-from flight.gnc.guidance.three_axes.target_law import BodyAxes, law_of
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import (
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.disturbance import pressures
+from knightcube.astro.earth.ephemeris import Ephemeris
+from knightcube.astro.earth.orbit_knowledge import OrbitState
+from knightcube.astro.quaternion import (
     attitude_matrix,
     conjugate,
     from_rotation_vector,
     multiply,
     to_rotation_vector,
 )
+from knightcube.gnc.control.three_axes import pointing_job
+from knightcube.gnc.control.three_axes.astray import Astray, damping_dipole
+from knightcube.gnc.control.three_axes.pointing import PointingLaw
+from knightcube.gnc.control.three_axes.pointing_job import PointingJob
+from knightcube.gnc.control.three_axes.pointing_table import PointingTable, PointingWeights
+from knightcube.gnc.control.three_axes.slew_table import SlewWish
+from knightcube.gnc.estimation.free_filter import FreeFilter
+from knightcube.gnc.estimation.free_motion import GYRO, TURN, Around
+from knightcube.gnc.estimation.free_settings import FreeFilterSettings
+from knightcube.gnc.guidance.three_axes.attitude_law import references
+from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from knightcube.gnc.guidance.three_axes.target_law import BodyAxes, law_of
 from sim_hal.worlds.free_body.section import Disturbances, TipOff
 from tests.studies.campaigns.free_flight import (
     FIELD_NOISE,

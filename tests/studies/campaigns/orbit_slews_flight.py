@@ -14,14 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.control.three_axes import pointing_job
-from flight.gnc.control.three_axes.pointing_table import PointingTable, table_along
-from flight.gnc.estimation.free_motion import Around
-from flight.gnc.guidance.three_axes.attitude_law import References, references
-from flight.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
-from flight.gnc.guidance.three_axes.slew_path import SlewPath
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import (
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import (
     angle_between,
     attitude_matrix,
     conjugate,
@@ -30,6 +24,12 @@ from flight.gnc.math.quaternion import (
     normalise,
     to_rotation_vector,
 )
+from knightcube.gnc.control.three_axes import pointing_job
+from knightcube.gnc.control.three_axes.pointing_table import PointingTable, table_along
+from knightcube.gnc.estimation.free_motion import Around
+from knightcube.gnc.guidance.three_axes.attitude_law import References, references
+from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from knightcube.gnc.guidance.three_axes.slew_path import SlewPath
 from tests.studies.campaigns.free_flight import WATTS
 from tests.studies.campaigns.orbit_pointing_flight import CYCLE, PAUSE, PointingFlight
 

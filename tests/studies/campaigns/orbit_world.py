@@ -14,12 +14,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.attitude.determination.references import sun_from
-from flight.gnc.earth.shadow import sunlit_share
-from flight.gnc.earth.sun import ASTRONOMICAL_UNIT
-from flight.gnc.math.arrays import BoolArray, FloatArray
-from flight.gnc.math.quaternion import attitude_matrix, conjugate, from_matrix, from_rotation_vector, multiply
-from flight.gnc.math.quaternion import to_rotation_vector as rotation_vector
+from knightcube.astro.arrays import BoolArray, FloatArray
+from knightcube.astro.earth.shadow import sunlit_share
+from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT
+from knightcube.astro.quaternion import (
+    attitude_matrix,
+    conjugate,
+    from_matrix,
+    from_rotation_vector,
+    multiply,
+)
+from knightcube.astro.quaternion import to_rotation_vector as rotation_vector
+from knightcube.gnc.attitude.references import sun_from
 from sim_hal.worlds import geomagnetism
 from tests.studies.campaigns.orbit_geometry import (
     Pass,

@@ -18,11 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion
-from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from knightcube.astro.arrays import FloatArray
+from knightcube.vision.streaks.maximum_likelihood.estimate import estimate_motion
+from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from sim_hal.star_camera import StarCameraModel
-from tests.flight.gnc.vision.maximum_likelihood.scenes import turn_of
+from tests.knightcube.vision.streaks.maximum_likelihood.scenes import turn_of
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.scenes import FIELD
 from tests.studies.row_exposure import row_scene

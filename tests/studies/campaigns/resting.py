@@ -16,9 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.camera.knowledge import EXACT, CameraKnowledge
-from flight.gnc.math.arrays import FloatArray, Image
-from flight.gnc.math.quaternion import (
+from knightcube.astro.arrays import FloatArray, Image
+from knightcube.astro.quaternion import (
     attitude_matrix,
     conjugate,
     from_rotation_vector,
@@ -26,11 +25,12 @@ from flight.gnc.math.quaternion import (
     normalise,
     to_rotation_vector,
 )
-from flight.gnc.vision.frame_job import FrameJob, TrackerSettings
-from flight.gnc.vision.frame_job import run as look
-from flight.gnc.vision.startracker.detection import DetectionSettings
-from flight.gnc.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings
-from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from knightcube.vision.camera.knowledge import EXACT, CameraKnowledge
+from knightcube.vision.frame_job import FrameJob, TrackerSettings
+from knightcube.vision.frame_job import run as look
+from knightcube.vision.startracker.detection import DetectionSettings
+from knightcube.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings
+from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
 from sim_hal.star_camera import StarCameraModel
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.imperfections import IMPERFECTIONS, Imperfection

@@ -16,17 +16,17 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.camera.knowledge import EXACT
-from flight.gnc.math.arrays import FloatArray, Image
-from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
-from flight.gnc.vision.objects.detect import detect
-from flight.gnc.vision.objects.report import ObjectReport
-from flight.gnc.vision.objects.settings import ObjectSettings
-from flight.gnc.vision.streaks.corners.settings import StreakSettings
-from flight.gnc.vision.streaks.corners.streak_rate import estimate_rate
-from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion
-from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
-from flight.gnc.vision.streaks.streak_result import StreakStatus
+from knightcube.astro.arrays import FloatArray, Image
+from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
+from knightcube.vision.camera.knowledge import EXACT
+from knightcube.vision.objects.detect import detect
+from knightcube.vision.objects.report import ObjectReport
+from knightcube.vision.objects.settings import ObjectSettings
+from knightcube.vision.streaks.corners.settings import StreakSettings
+from knightcube.vision.streaks.corners.streak_rate import estimate_rate
+from knightcube.vision.streaks.maximum_likelihood.estimate import estimate_motion
+from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from knightcube.vision.streaks.streak_result import StreakStatus
 from sim_hal.star_camera import SourceTrack, StarCameraModel, render
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 from tests.studies.campaigns.rso_pictures import draw_detection_rate, draw_frames

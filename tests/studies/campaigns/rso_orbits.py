@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.math.arrays import BoolArray, FloatArray, Image
-from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector
-from flight.gnc.vision.objects.report import ObjectReport
+from knightcube.astro.arrays import BoolArray, FloatArray, Image
+from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
+from knightcube.vision.objects.report import ObjectReport
 from sim_hal.star_camera import StarCameraModel, render
 from sim_hal.star_camera.rso import source_tracks
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray, Image
-from flight.gnc.vision.objects.report import ObjectReport
+from knightcube.astro.arrays import FloatArray, Image
+from knightcube.vision.objects.report import ObjectReport
 
 Shown = tuple[str, Image, ObjectReport | None, FloatArray]
 """A title, a frame, what was found in it, and where the object is: ends (2, 2) px."""

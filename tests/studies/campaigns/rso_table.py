@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray
 
 
 @dataclass(frozen=True, slots=True)

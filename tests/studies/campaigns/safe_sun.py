@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.control.three_axes.sun_seeker import Seeking, SunSeeker
-from flight.gnc.earth.shadow import sunlit_share
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import attitude_matrix
-from flight.gnc.vision.sun_sensor.strings import SolarStrings, coarse_sun
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.shadow import sunlit_share
+from knightcube.astro.quaternion import attitude_matrix
+from knightcube.gnc.control.three_axes.sun_seeker import Seeking, SunSeeker
+from knightcube.vision.sun.strings import SolarStrings, coarse_sun
 from sim_hal.worlds import sun
 from sim_hal.worlds.free_body.section import Disturbances, TipOff
 from sim_hal.worlds.solar_strings import SolarStringsModel

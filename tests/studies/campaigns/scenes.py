@@ -7,9 +7,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from flight.gnc.catalogue import StarCatalogue, load
-from flight.gnc.math.arrays import FloatArray, Image
-from flight.gnc.math.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
+from knightcube.astro.arrays import FloatArray, Image
+from knightcube.astro.catalogue import StarCatalogue, load
+from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
 from sim_hal.star_camera import StarCameraModel, render
 
 FIELD = float(np.deg2rad(20.0))

@@ -13,12 +13,12 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta
 
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import attitude_matrix
 from flight.schema.conversion import convert
 from flight.schema.document import read_document, read_text
 from flight.schema.errors import ConfigError
 from flight.schema.values import NotNegative, Positive, Quaternion, Section
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import attitude_matrix
 
 _UNIT_TOLERANCE = 1e-6
 

@@ -32,7 +32,7 @@ from pathlib import Path
 
 from flight.app.accepted_config import sum_file
 from flight.app.kept_configs import FlownConfig
-from flight.gnc.errors import UsageError
+from knightcube.errors import UsageError
 from tests.hal.guardian.live_flight import ROOT, devices_running, write_config
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary
 

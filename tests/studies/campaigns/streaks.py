@@ -15,15 +15,15 @@ from typing import Any
 
 import numpy as np
 
-from flight.gnc.camera.knowledge import EXACT
-from flight.gnc.errors import FlightError
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.vision.startracker.two_ends import attitudes_of_ends
-from flight.gnc.vision.streaks.corners.settings import DETECTOR_NAMES, StreakSettings
-from flight.gnc.vision.streaks.corners.streak_rate import estimate_rate
-from flight.gnc.vision.streaks.maximum_likelihood.estimate import estimate_motion
-from flight.gnc.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
-from flight.gnc.vision.streaks.streak_result import StreakStatus
+from knightcube.astro.arrays import FloatArray
+from knightcube.errors import FlightError
+from knightcube.vision.camera.knowledge import EXACT
+from knightcube.vision.startracker.two_ends import attitudes_of_ends
+from knightcube.vision.streaks.corners.settings import DETECTOR_NAMES, StreakSettings
+from knightcube.vision.streaks.corners.streak_rate import estimate_rate
+from knightcube.vision.streaks.maximum_likelihood.estimate import estimate_motion
+from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from knightcube.vision.streaks.streak_result import StreakStatus
 from sim_hal.star_camera import StarCameraModel
 from tests.studies.attitude_errors import attitude_error, error_in_pixels
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary

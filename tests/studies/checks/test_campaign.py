@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.gnc.errors import UsageError
+from knightcube.errors import UsageError
 from tests.hal.guardian.states import state, wait_until
 from tests.studies.campaigns.campaign import Campaign, Case, Result, Summary, fly, fly_here
 

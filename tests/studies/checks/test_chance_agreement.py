@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flight.gnc.vision.streaks.corners.settings import DetectorName, StreakSettings
-from flight.gnc.vision.streaks.corners.streak_rate import estimate_rate
-from flight.gnc.vision.streaks.streak_result import StreakStatus
+from knightcube.vision.streaks.corners.settings import DetectorName, StreakSettings
+from knightcube.vision.streaks.corners.streak_rate import estimate_rate
+from knightcube.vision.streaks.streak_result import StreakStatus
 from sim_hal.star_camera import StarCameraModel
 from tests.studies.campaigns.scenes import FIELD, slew
 from tests.studies.campaigns.streaks import EXPOSURE

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.gnc.errors import UsageError
+from knightcube.errors import UsageError
 from tests.studies.campaigns import cluster as cluster_code
 from tests.studies.campaigns.campaign import Campaign, CampaignError, Case, Result, Summary, fly, fly_here
 
@@ -151,6 +151,6 @@ def test_the_archive_is_the_same_for_the_same_files_and_holds_what_is_imported()
     sent = cluster_code.archive_of(root)
     assert sent == cluster_code.archive_of(root)
     names = set(zipfile.ZipFile(io.BytesIO(sent)).namelist())
-    assert {"flight/gnc/catalogue/hipparcos.npz", "config/step_demo.yaml"} <= names
+    assert {"knightcube/astro/catalogue/hipparcos.npz", "config/step_demo.yaml"} <= names
     assert {"flight/schema/configurations/step_demo.yaml", "tests/studies/checks/test_cluster.py"} <= names
     assert not any("__pycache__" in name for name in names)

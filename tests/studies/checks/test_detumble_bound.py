@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flight.gnc.math.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray
 from tests.studies.campaigns.detumble_bound import least_time
 
 STEP, REACH, STRENGTH = 5.0, 0.1, 4e-5

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.gnc.estimation.free_motion import Around
-from flight.gnc.math.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray
+from knightcube.gnc.estimation.free_motion import Around
 from tests.studies.campaigns import eclipse
 from tests.studies.campaigns.campaign import Case
 from tests.studies.campaigns.orbit_pointing_flight import CYCLE

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.gnc.vision.streaks.maximum_likelihood.result import MotionResult
-from flight.gnc.vision.streaks.streak_result import StreakStatus
+from knightcube.vision.streaks.maximum_likelihood.result import MotionResult
+from knightcube.vision.streaks.streak_result import StreakStatus
 from sim_hal.star_camera import StarCameraModel
 from tests.studies.campaigns import failures
 from tests.studies.campaigns.campaign import Case, Result, fly_here

@@ -14,7 +14,7 @@ CONTRACT = """
 [[tool.importlinter.contracts]]
 name = "floors"
 type = "layers"
-layers = ["ground", "flight.app", "sim_hal | flight.gnc", "hal"]
+layers = ["ground", "flight.app", "sim_hal | flight.loop", "hal"]
 """
 
 
@@ -24,9 +24,9 @@ def small_house(root: Path, **more: str) -> Path:
         "flight/__init__": "__version__ = '1'",
         "flight/__main__": "from flight.app import run",
         "flight/app/__init__": "",
-        "flight/app/run": "from flight.gnc.turn import turn\nimport hal.bus",
-        "flight/gnc/__init__": "",
-        "flight/gnc/turn": "from flight import __version__\ndef turn() -> int:\n    return 1",
+        "flight/app/run": "from flight.loop.turn import turn\nimport hal.bus",
+        "flight/loop/__init__": "",
+        "flight/loop/turn": "from flight import __version__\ndef turn() -> int:\n    return 1",
         "ground/__init__": "",
         "ground/report": "def load():\n    from flight.app import run\n    return run",
         "hal/__init__": "",
@@ -42,22 +42,22 @@ def small_house(root: Path, **more: str) -> Path:
 
 def test_rooms_and_floors_follow_from_the_imports(tmp_path: Path) -> None:
     house = draw(small_house(tmp_path))
-    assert house.floors == {"ground": 2, "flight.app": 1, "flight.gnc": 0, "hal": 0}
-    assert house.rooms["flight.app"] == {"flight.gnc", "hal"}
+    assert house.floors == {"ground": 2, "flight.app": 1, "flight.loop": 0, "hal": 0}
+    assert house.rooms["flight.app"] == {"flight.loop", "hal"}
     assert (house.back, house.circles) == ([], [])
     assert all(bar.met for bar in house.shape)
 
 
 def test_an_import_against_the_floors_is_an_arrow_back_and_closes_a_circle(tmp_path: Path) -> None:
-    house = draw(small_house(tmp_path, flight__gnc__turn="def turn():\n    from ..app.run import x"))
-    assert house.back == ["flight.gnc.turn -> flight.app.run"]
-    assert house.circles == [["flight.app", "flight.gnc"], ["flight.app.run", "flight.gnc.turn"]]
+    house = draw(small_house(tmp_path, flight__loop__turn="def turn():\n    from ..app.run import x"))
+    assert house.back == ["flight.loop.turn -> flight.app.run"]
+    assert house.circles == [["flight.app", "flight.loop"], ["flight.app.run", "flight.loop.turn"]]
     assert [bar.met for bar in house.shape] == [True, True, False, False]
 
 
 def test_siblings_on_one_floor_may_not_import_each_other(tmp_path: Path) -> None:
-    house = draw(small_house(tmp_path, sim_hal__world="import flight.gnc.turn"))
-    assert house.back == ["sim_hal.world -> flight.gnc.turn"]
+    house = draw(small_house(tmp_path, sim_hal__world="import flight.loop.turn"))
+    assert house.back == ["sim_hal.world -> flight.loop.turn"]
 
 
 def test_a_module_named_in_a_literal_import_module_counts(tmp_path: Path) -> None:
@@ -102,4 +102,4 @@ def test_the_command_prints_one_object_and_its_status_says_whether_all_limits_ar
     status = main(["--json"])
     printed = json.loads(capsys.readouterr().out)
     assert status == int(not all(figure["met"] for figure in printed["figures"]))
-    assert set(printed["floors"]) >= {"ground", "flight.app", "flight.gnc", "hal", "sim_hal"}
+    assert set(printed["floors"]) >= {"ground", "flight.app", "flight.loop", "hal", "sim_hal"}

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.gnc.vision.startracker.classical.methods import METHODS
-from flight.gnc.vision.startracker.identification.identification import Identification, Status
-from flight.gnc.vision.startracker.identification.verification import nothing
+from knightcube.reference.star_identification.methods import METHODS
+from knightcube.vision.startracker.identification.identification import Identification, Status
+from knightcube.vision.startracker.identification.verification import nothing
 from tests.studies.bench.star_lists import ListKind, draw
 from tests.studies.campaigns import lost_in_space
 from tests.studies.campaigns.campaign import Case, Result

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.gnc.camera.knowledge import EXACT
-from flight.gnc.camera.pinhole import Pinhole
-from flight.gnc.math.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray
+from knightcube.vision.camera.knowledge import EXACT
+from knightcube.vision.camera.pinhole import Pinhole
 from tests.studies.campaigns import mismatch
 from tests.studies.campaigns.campaign import Case, Result
 from tests.studies.campaigns.imperfections import IMPERFECTIONS

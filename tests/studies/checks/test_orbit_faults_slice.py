@@ -8,10 +8,10 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from flight.gnc.earth.orbit_knowledge import TwoLineElements
 from flight.link.events import EVENTS, Severity
 from flight.schema import reader as configuration
 from ground.telemetry.reader import Run
+from knightcube.astro.earth.orbit_knowledge import TwoLineElements
 from sim_hal.faults.catalogue import CATALOGUE
 from sim_hal.settings import FaultEntry
 from tests.scenario.flights import fly

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.gnc.math.quaternion import attitude_matrix
+from knightcube.astro.quaternion import attitude_matrix
 from tests.studies.campaigns import coverage, orbit_attitude, orbit_attitude_figures, orbit_world
 from tests.studies.campaigns.campaign import Case, Result
 from tests.studies.campaigns.consistency import band

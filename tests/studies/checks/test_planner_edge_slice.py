@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from flight.gnc.guidance.one_axis.vmc import PlanStatus
-from tests.flight.gnc.guidance.problems import Problem
+from knightcube.gnc.guidance.one_axis.vmc import PlanStatus
+from tests.knightcube.gnc.guidance.problems import Problem
 from tests.studies.campaigns.planner_edge import PLANT, cases, run, verdict
 
 

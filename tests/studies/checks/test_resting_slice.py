@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from flight.gnc.math.chi_square import bound
+from knightcube.astro.chi_square import bound
 from tests.studies.campaigns.campaign import Case
 from tests.studies.campaigns.resting import RESTING, TRAILS, run
 

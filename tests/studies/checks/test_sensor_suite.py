@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.gnc.math.arrays import FloatArray
 from flight.schema.errors import ConfigError
+from knightcube.astro.arrays import FloatArray
 from tests.studies.campaigns import sensor_suite
 from tests.studies.campaigns.orbit_geometry import SUITES, suite
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from flight.gnc.attitude.solvers import OPTIMAL, SOLVERS
-from flight.gnc.vision.startracker.detection.settings import CENTROIDS
+from knightcube.astro.attitude.solvers import OPTIMAL, SOLVERS
+from knightcube.vision.startracker.detection.settings import CENTROIDS
 from tests.studies.bench.solve_methods import compare
 
 

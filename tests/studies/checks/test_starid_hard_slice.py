@@ -7,10 +7,10 @@ import json
 import numpy as np
 import pytest
 
-from flight.gnc.vision.startracker.identification.identification import Identification, Status
-from flight.gnc.vision.startracker.identification.lost_in_space import identify
-from flight.gnc.vision.startracker.identification.verification import nothing
-from flight.gnc.vision.startracker.index.build import default_index
+from knightcube.vision.startracker.identification.identification import Identification, Status
+from knightcube.vision.startracker.identification.lost_in_space import identify
+from knightcube.vision.startracker.identification.verification import nothing
+from knightcube.vision.startracker.index.build import default_index
 from tests.studies.bench import starid_hard
 from tests.studies.bench.star_lists import ListKind, draw
 from tests.studies.bench.starid_hard import drawn_list, hardships, measured

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from flight.gnc.control.one_axis.pid import PidController, PidGains
-from tests.flight.gnc.control.closed_loop import BELIEVED, PERIOD
+from knightcube.reference.control.pid import PidController, PidGains
+from tests.knightcube.gnc.control.closed_loop import BELIEVED, PERIOD
 from tests.studies.campaigns import controllers
 from tests.studies.tune_controllers import OVERSHOOT, SETTLED_S, fly
 

@@ -32,12 +32,12 @@ from flight.app import cli
 from flight.app import flight as flown
 from flight.app.request import RunRequest, RunResult
 from flight.app.requested_config import requested_config
-from flight.gnc.errors import UsageError
 from flight.link.telemetry.segments import SUFFIX
 from ground import samples
 from ground.commands import COMMANDS as GROUND_COMMANDS
 from ground.commands import camera as camera_command
 from ground.watch.socket import answers
+from knightcube.errors import UsageError
 from sim_hal.faults.catalogue import CATALOGUE
 from tests.studies.fuzz.furnishings import Listener, answer, furnish
 from tests.studies.fuzz.harness import Finding

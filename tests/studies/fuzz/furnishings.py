@@ -24,9 +24,9 @@ from flight.link.modes import Mode
 from flight.link.telemetry.definitions import COMMAND
 from flight.link.telemetry.packets import Packer
 from sim_hal.star_camera import StarCameraModel
-from tests.flight.gnc.camera.test_fits import _file
-from tests.flight.gnc.vision.startracker.frames import sky_frame
 from tests.ground.report.synthetic import Recipe, make_run
+from tests.knightcube.vision.camera.test_fits import _file
+from tests.knightcube.vision.startracker.frames import sky_frame
 from tests.studies.campaigns.scenes import slew
 
 ROOT = Path(__file__).resolve().parents[3]

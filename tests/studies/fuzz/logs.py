@@ -18,11 +18,11 @@ from collections import Counter
 from pathlib import Path
 from unittest import mock
 
-from flight.gnc.errors import UsageError
 from flight.link.telemetry.packets import LAYOUTS
 from ground import report as reporting
 from ground.telemetry.reader import Run, read_run
 from ground.telemetry.scanner import ScanResult, scan
+from knightcube.errors import UsageError
 from tests.ground.report.synthetic import Recipe, make_run
 from tests.studies.fuzz.harness import Finding
 from tests.studies.fuzz.mutation import Draw, chance, damage, integer

@@ -23,14 +23,14 @@ from flight.app.accepted_config import accepted_config, sum_file
 from flight.app.kept_configs import FOLDER as FLOWN
 from flight.app.kept_configs import kept_configs
 from flight.app.release import TRIALS, Release
-from flight.gnc.earth.orbit_knowledge import OrbitError, TwoLineElements
-from flight.gnc.errors import UsageError
 from flight.link.process.timetable import Timetable
 from flight.link.security.associations import COPIES, Association, Vault
 from flight.link.security.associations import encode as sealed
 from flight.loop.state.content import Learned, StoredState, UncleanShutdown
 from flight.loop.state.store import decode, encode
 from flight.schema.errors import ConfigError
+from knightcube.astro.earth.orbit_knowledge import OrbitError, TwoLineElements
+from knightcube.errors import UsageError
 from tests.studies.fuzz.configurations import FOLDER as CONFIGURATIONS
 from tests.studies.fuzz.door import Door, DoorTarget, Files
 from tests.studies.fuzz.harness import Finding

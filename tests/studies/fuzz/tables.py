@@ -12,10 +12,10 @@ import zlib
 import numpy as np
 from PIL import Image as pillow
 
-from flight.gnc import catalogue
-from flight.gnc.camera.images import read_image
-from flight.gnc.errors import InputError, UsageError
-from flight.gnc.vision.startracker.index import table_file
+from knightcube.astro import catalogue
+from knightcube.errors import InputError, UsageError
+from knightcube.vision.camera.images import read_image
+from knightcube.vision.startracker.index import table_file
 from tests.studies.fuzz.door import Door, DoorTarget, Files
 from tests.studies.fuzz.harness import Finding
 from tests.studies.fuzz.stored_files import Folder

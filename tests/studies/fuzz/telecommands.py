@@ -10,8 +10,6 @@ from collections import Counter
 
 import numpy as np
 
-from flight.gnc.guidance.one_axis.limits import Q2_LIMIT
-from flight.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 from flight.link.commands.codec import CommandPacker, check, unpack
 from flight.link.commands.errors import CommandError
 from flight.link.commands.values import (
@@ -26,6 +24,8 @@ from flight.link.commands.values import (
 )
 from flight.link.modes import COMMANDABLE, Mode
 from flight.link.parameters import FIELDS
+from knightcube.gnc.guidance.one_axis.limits import Q2_LIMIT
+from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 from tests.studies.fuzz.harness import Finding
 from tests.studies.fuzz.logs import ccitt, hostile
 from tests.studies.fuzz.mutation import Draw, chance, damage, integer

@@ -16,9 +16,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from flight.gnc.errors import FlightError
-from flight.gnc.vision.frame_job import FrameFound
-from flight.gnc.vision.streaks.streak_result import StreakResult, StreakStatus
 from flight.link.frames.stream import SYNC, telecommand_stream, telemetry_stream
 from flight.link.frames.telecommand import LONGEST_FRAME, TelecommandHeader, close_frame
 from flight.link.frames.telemetry import MasterCount, PacketAssembler, TelemetryFramer, open_frame
@@ -29,6 +26,9 @@ from hal.drivers.pca9685 import Pca9685
 from hal.drivers.ublox.codec import NAV_PVT, Pvt, StreamParser, frame, unpack_pvt
 from hal.drivers.ublox.receiver import reading_of
 from hal.interfaces.errors import DeviceError, OutOfRange
+from knightcube.errors import FlightError
+from knightcube.vision.frame_job import FrameFound
+from knightcube.vision.streaks.streak_result import StreakResult, StreakStatus
 from tests.manual_clock import ManualClock
 from tests.studies.fuzz.door import Door, DoorTarget, Files
 from tests.studies.fuzz.harness import Finding

@@ -1,6 +1,6 @@
 """Draws the house from the code's own imports and sizes: `python -m tests.studies.house`.
 
-With `--reached` it also flies, and reports the lines of `flight/` outside `gnc` that the flights reach.
+With `--reached` it also flies, and reports the lines of `flight/` that the flights reach.
 """
 
 from __future__ import annotations
@@ -144,7 +144,7 @@ def _parser() -> argparse.ArgumentParser:
         description="Draw rooms, floors, arrows and sizes from the source; check them against their limits.",
     )
     parser.add_argument(
-        "--reached", action="store_true", help="also fly, and count the lines of flight/ outside gnc reached"
+        "--reached", action="store_true", help="also fly, and count the lines of flight/ reached"
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     return parser

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-PRODUCT = ("flight", "ground", "hal", "sim_hal")
+PRODUCT = ("knightcube", "flight", "ground", "hal", "sim_hal")
 _NO_ROOM = ("flight", "flight.__init__")  # only the version
 _DOOR = {"flight.__main__": "flight.app"}  # `python -m flight`
 Graph = Mapping[str, frozenset[str]]

@@ -1,4 +1,4 @@
-"""Which lines of `flight/` outside `gnc` the flights reach, measured by coverage.py in every process.
+"""Which lines of `flight/` the flights reach, measured by coverage.py in every process.
 
 The flights: the step demonstration's first 110 s in lock-step (two targets); the first 30 s as
 the thesis flies it; 12 s of the demonstration in real time with workers, guardian and devices in processes of
@@ -70,7 +70,6 @@ _WRONG = (
 _SETTINGS = """
 [run]
 source = {root}/flight
-omit = {root}/flight/gnc/*
 data_file = {folder}/data
 parallel = true
 patch = subprocess, _exit
@@ -213,8 +212,6 @@ def _analyse(root: Path, settings: Path) -> Iterator[FileReach]:
     coverage.combine()
     coverage.load()
     for path in sorted((root / "flight").rglob("*.py")):
-        if (root / "flight" / "gnc") in path.parents:
-            continue
         _, statements, _, missing, _ = coverage.analysis2(str(path))
         if statements:
             yield FileReach(str(path.relative_to(root)), len(statements), len(statements) - len(missing))

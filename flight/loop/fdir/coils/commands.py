@@ -7,10 +7,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
 from flight.loop.fdir.coils.hypotheses import NEWEST, Bounds, CoilFault
 from flight.loop.fdir.coils.stuck_leg import NONE, Axes, Supplied
 from hal.interfaces.readings import PowerReading
+from knightcube.astro.arrays import FloatArray
 
 _SAMPLES_NS = 25_000_000
 _NOTED_LATE_NS = 25_000_000

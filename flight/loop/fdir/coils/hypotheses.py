@@ -13,7 +13,7 @@ from functools import cache
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray
 
 
 class CoilFault(Enum):

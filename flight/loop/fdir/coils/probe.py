@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
+from knightcube.astro.arrays import FloatArray
 
 
 class Probe:

@@ -19,8 +19,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.directions import cross_matrices
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.directions import cross_matrices
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,7 +25,6 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from flight.gnc.math.arrays import FloatArray
 from flight.loop.fdir.coils.brake_proof import BrakeProof
 from flight.loop.fdir.coils.commands import CoilCommands
 from flight.loop.fdir.coils.hypotheses import (
@@ -45,6 +44,7 @@ from flight.loop.fdir.coils.response import CoilResponse
 from flight.loop.fdir.coils.stuck_leg import NONE, Axes, StuckLeg
 from flight.loop.fdir.coils.verdict import CoilVerdict, CoilWatchSettings
 from hal.interfaces.readings import PowerReading
+from knightcube.astro.arrays import FloatArray
 
 __all__ = ["CoilFault", "CoilVerdict", "CoilWatch", "CoilWatchSettings"]
 
@@ -105,7 +105,7 @@ class CoilWatch:
 
     @property
     def available(self) -> BoolArray:
-        """(3,) which axes may be used, for `flight.gnc.control.allocation`."""
+        """(3,) which axes may be used, for `knightcube.gnc.control.allocation`."""
         return np.array([axis not in self._verdicts for axis in range(3)])
 
     @property

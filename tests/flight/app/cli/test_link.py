@@ -20,7 +20,6 @@ from pathlib import Path
 import pytest
 
 from flight.app.cli import main
-from flight.gnc.errors import UsageError
 from flight.link.commands.channel import open_unix
 from flight.link.commands.codec import CommandPacker
 from flight.link.commands.definitions import PING
@@ -42,6 +41,7 @@ from ground.link.terminal import (
     report_of,
 )
 from ground.xtce import TELECOMMANDS
+from knightcube.errors import UsageError
 from tests.scenario.flights import CONFIG
 
 ROOT = Path(__file__).resolve().parents[4]

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from flight.bodies.orbit.paths import PointingPaths
-from flight.gnc.control.three_axes.astray import FAR, SLOW
-from flight.gnc.control.three_axes.pointing_table import PointingTable, table_along
-from flight.gnc.guidance.three_axes.attitude_law import references
-from flight.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 from hal.interfaces.wires import SECOND_NS
-from tests.flight.gnc.control.three_axes.test_pointing import INERTIA, LAW, LIMIT, ORBIT, STEP, WEIGHTS
+from knightcube.gnc.control.three_axes.astray import FAR, SLOW
+from knightcube.gnc.control.three_axes.pointing_table import PointingTable, table_along
+from knightcube.gnc.guidance.three_axes.attitude_law import references
+from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from tests.knightcube.gnc.control.three_axes.test_pointing import INERTIA, LAW, LIMIT, ORBIT, STEP, WEIGHTS
 
 NADIR = PointingTarget(Goal.NADIR, roll=0.0)
 NEAR, AWAY = np.array([0.5 * FAR, 0.0, 0.0]), np.array([0.0, 1.2 * FAR, 0.0])

@@ -11,12 +11,11 @@ from flight.bodies.orbit.coarse_sun import CoarseSunFeed
 from flight.bodies.orbit.filter import OrbitFilter
 from flight.bodies.orbit.replay import OrbitFilterSettings
 from flight.bodies.orbit.surroundings import Surroundings
-from flight.gnc.earth.disturbance import Pressures
-from flight.gnc.estimation.estimate import TURN, Knowledge
-from flight.gnc.estimation.free_motion import Around
-from flight.gnc.estimation.measurements import AttitudeMeasurement
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import (
+from hal.interfaces.readings import ImuReading, StringReading
+from hal.interfaces.wires import SECOND_NS
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.disturbance import Pressures
+from knightcube.astro.quaternion import (
     angle_between,
     attitude_matrix,
     conjugate,
@@ -25,9 +24,10 @@ from flight.gnc.math.quaternion import (
     normalise,
     to_rotation_vector,
 )
-from flight.gnc.vision.sun_sensor.strings import SolarStrings
-from hal.interfaces.readings import ImuReading, StringReading
-from hal.interfaces.wires import SECOND_NS
+from knightcube.gnc.estimation.estimate import TURN, Knowledge
+from knightcube.gnc.estimation.free_motion import Around
+from knightcube.gnc.estimation.measurements import AttitudeMeasurement
+from knightcube.vision.sun.strings import SolarStrings
 from sim_hal.worlds.solar_strings import SolarStringsModel
 
 FIELD = np.array([1e-5, 2e-5, 3e-5])

@@ -8,12 +8,11 @@ import pytest
 from flight.bodies.orbit.filter import REFUSALS_TO_RESTART, OrbitFilter
 from flight.bodies.orbit.replay import OrbitFilterSettings
 from flight.bodies.orbit.steps import DipoleHistory
-from flight.gnc.earth.disturbance import Pressures
-from flight.gnc.estimation.estimate import RATE, TURN, Knowledge
-from flight.gnc.estimation.free_motion import Around
-from flight.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import (
+from hal.interfaces.readings import ImuReading
+from hal.interfaces.wires import SECOND_NS
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.disturbance import Pressures
+from knightcube.astro.quaternion import (
     IDENTITY,
     angle_between,
     attitude_matrix,
@@ -22,8 +21,9 @@ from flight.gnc.math.quaternion import (
     multiply,
     to_rotation_vector,
 )
-from hal.interfaces.readings import ImuReading
-from hal.interfaces.wires import SECOND_NS
+from knightcube.gnc.estimation.estimate import RATE, TURN, Knowledge
+from knightcube.gnc.estimation.free_motion import Around
+from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement
 
 PERIOD_NS = SECOND_NS // 40
 INERTIA = np.diag([1.1e-3, 1.05e-3, 0.99e-3])

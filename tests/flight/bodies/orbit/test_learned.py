@@ -13,12 +13,12 @@ from flight.bodies.orbit.learned import (
     learned_of,
     start_from,
 )
-from flight.gnc.estimation.free_filter import FreeFilter, SlowStates
-from flight.gnc.estimation.free_motion import DIPOLE, GYRO, SLOW, SUNLIT
-from flight.gnc.estimation.free_settings import FreeFilterSettings
-from flight.gnc.math.arrays import FloatArray
 from flight.loop.state.content import Learned, StoredState
 from flight.loop.state.store import decode, encode
+from knightcube.astro.arrays import FloatArray
+from knightcube.gnc.estimation.free_filter import FreeFilter, SlowStates
+from knightcube.gnc.estimation.free_motion import DIPOLE, GYRO, SLOW, SUNLIT
+from knightcube.gnc.estimation.free_settings import FreeFilterSettings
 
 SETTINGS = FreeFilterSettings()
 START, WALK = SETTINGS.of_slow(0), SETTINGS.of_slow(1)

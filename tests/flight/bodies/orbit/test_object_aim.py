@@ -7,21 +7,21 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from flight.bodies.orbit.object_aim import ObjectAim, Sensor
-from flight.gnc.control.three_axes.pointing import PointingLaw
-from flight.gnc.control.three_axes.pointing_job import LEAD, PointingJob, run
-from flight.gnc.control.three_axes.pointing_table import PointingWeights
-from flight.gnc.earth.ephemeris import predict
-from flight.gnc.earth.orbit_knowledge import OrbitState
-from flight.gnc.guidance.three_axes.attitude_law import following, references
-from flight.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
-from flight.gnc.guidance.three_axes.target_law import BodyAxes
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import attitude_matrix, from_matrix, from_rotation_vector, multiply
-from flight.gnc.tracking.tracker import Tracker, TrackSettings
 from flight.link.events import EventKind
 from flight.loop.fdir.event_log import EventLog
 from hal.interfaces.wires import SECOND_NS
-from tests.flight.gnc.tracking.passes import PIXEL, sightings
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.ephemeris import predict
+from knightcube.astro.earth.orbit_knowledge import OrbitState
+from knightcube.astro.quaternion import attitude_matrix, from_matrix, from_rotation_vector, multiply
+from knightcube.gnc.control.three_axes.pointing import PointingLaw
+from knightcube.gnc.control.three_axes.pointing_job import LEAD, PointingJob, run
+from knightcube.gnc.control.three_axes.pointing_table import PointingWeights
+from knightcube.gnc.guidance.three_axes.attitude_law import following, references
+from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from knightcube.gnc.guidance.three_axes.target_law import BodyAxes
+from knightcube.gnc.tracking.tracker import Tracker, TrackSettings
+from tests.knightcube.gnc.tracking.passes import PIXEL, sightings
 
 BORESIGHT = np.array([0.0, -1.0, 0.0])
 SENSOR = Sensor(BORESIGHT, np.radians(10.0))

@@ -13,16 +13,16 @@ from flight.bodies.orbit.object_aim import ObjectAim
 from flight.bodies.orbit.paths import PointingPaths
 from flight.bodies.orbit.planning import PlannedCraft, PointingPlanner
 from flight.bodies.orbit.targets import PointingLawOf
-from flight.gnc.control.three_axes.astray import LEAVING
-from flight.gnc.control.three_axes.pointing_job import PointingJob
-from flight.gnc.control.three_axes.slew_table import SlewWish
-from flight.gnc.guidance.three_axes.attitude_law import References
-from flight.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
-from flight.gnc.guidance.three_axes.target_law import BodyAxes
 from flight.loop.control_output import Target
 from hal.interfaces.wires import SECOND_NS
+from knightcube.gnc.control.three_axes.astray import LEAVING
+from knightcube.gnc.control.three_axes.pointing_job import PointingJob
+from knightcube.gnc.control.three_axes.slew_table import SlewWish
+from knightcube.gnc.guidance.three_axes.attitude_law import References
+from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
+from knightcube.gnc.guidance.three_axes.target_law import BodyAxes
 from tests.flight.bodies.orbit.test_astray_body import AWAY, NADIR, STILL, table
-from tests.flight.gnc.control.three_axes.test_pointing import INERTIA, LIMIT, ORBIT, WEIGHTS, X, Z
+from tests.knightcube.gnc.control.three_axes.test_pointing import INERTIA, LIMIT, ORBIT, WEIGHTS, X, Z
 
 assert table  # a fixture
 RESIDUAL = np.array([1e-3, 0.0, 0.0])

@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from flight.bodies.orbit.seeker import StringSeeker
-from flight.gnc.control.detumble import WindowSchedule
-from flight.gnc.control.three_axes.sun_seeker import Seeking, SunSeeker
-from flight.gnc.estimation.carried_sun import MEMORY
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.vision.sun_sensor.strings import SolarStrings
 from flight.link.events import EventKind
 from flight.loop.fdir.event_log import EventLog
 from hal.interfaces.readings import StringReading
 from hal.interfaces.wires import SECOND_NS
+from knightcube.astro.arrays import FloatArray
+from knightcube.gnc.control.detumble import WindowSchedule
+from knightcube.gnc.control.three_axes.sun_seeker import Seeking, SunSeeker
+from knightcube.gnc.estimation.carried_sun import MEMORY
+from knightcube.vision.sun.strings import SolarStrings
 
 SUN = np.array([0.36, 0.48, 0.8])
 FIELD = np.array([2e-5, 0.0, 3e-5])

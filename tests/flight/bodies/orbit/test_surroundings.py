@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from flight.bodies.orbit.surroundings import CONTRADICTED, GPS_DELAY_NS, Surroundings
-from flight.gnc.earth.geomagnetism import field
-from flight.gnc.earth.orbit_knowledge import TwoLineElements
-from flight.gnc.earth.orientation import ROTATION_RATE, celestial_to_terrestrial
-from flight.gnc.math.arrays import FloatArray
 from flight.schema import reader as configuration
 from flight.schema.orbit import as_orbit
 from hal.interfaces.readings import GpsReading
 from hal.interfaces.wires import SECOND_NS
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.geomagnetism import field
+from knightcube.astro.earth.orbit_knowledge import TwoLineElements
+from knightcube.astro.earth.orientation import ROTATION_RATE, celestial_to_terrestrial
 from sim_hal.clock import SimClock
 from tests.scenario.flights import CONFIG
 

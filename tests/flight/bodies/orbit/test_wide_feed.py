@@ -10,23 +10,23 @@ from flight.bodies.orbit.filter import OrbitFilter
 from flight.bodies.orbit.replay import OrbitFilterSettings
 from flight.bodies.orbit.surroundings import Surroundings
 from flight.bodies.orbit.wide_feed import CONTRADICTED, WideFeed
-from flight.gnc.camera.mounted import MountedCamera
-from flight.gnc.camera.pinhole import Pinhole
-from flight.gnc.earth.disturbance import Pressures
-from flight.gnc.estimation.estimate import Knowledge
-from flight.gnc.estimation.free_motion import Around
-from flight.gnc.estimation.measurements import AttitudeMeasurement
-from flight.gnc.math.arrays import FloatArray
-from flight.gnc.math.quaternion import (
+from hal.interfaces.readings import Frame, ImuReading
+from hal.interfaces.wires import SECOND_NS
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.disturbance import Pressures
+from knightcube.astro.quaternion import (
     angle_between,
     attitude_matrix,
     from_rotation_vector,
     multiply,
     normalise,
 )
-from flight.gnc.vision.wide_job import Sighted, WideFound
-from hal.interfaces.readings import Frame, ImuReading
-from hal.interfaces.wires import SECOND_NS
+from knightcube.gnc.estimation.estimate import Knowledge
+from knightcube.gnc.estimation.free_motion import Around
+from knightcube.gnc.estimation.measurements import AttitudeMeasurement
+from knightcube.vision.camera.mounted import MountedCamera
+from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.wide_job import Sighted, WideFound
 
 FIELD = np.array([1e-5, 2e-5, 3e-5])
 POSITION = np.array([4e6, -4e6, 3.9e6])

@@ -17,7 +17,6 @@ from pathlib import Path
 import pytest
 
 from flight.app.cli import main
-from flight.gnc.errors import FlightError, UsageError
 from flight.link.commands.channel import AT_MOST, Channel, DatagramChannel, open_udp, open_unix
 from flight.link.commands.codec import IDENTIFIERS, LONGEST, CommandPacker, unpack
 from flight.link.commands.values import ChangeMode, Command, Ping, Slew
@@ -25,6 +24,7 @@ from flight.link.modes import Mode
 from flight.link.telemetry.definitions import COMMAND
 from flight.link.telemetry.packets import Packer
 from ground.commands.command import exchange
+from knightcube.errors import FlightError, UsageError
 
 
 @pytest.fixture

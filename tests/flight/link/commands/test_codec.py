@@ -10,8 +10,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flight.gnc.errors import UsageError
-from flight.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 from flight.link.commands.codec import CommandPacker, unpack
 from flight.link.commands.definitions import COMMANDS, LAYOUTS
 from flight.link.commands.errors import CommandError
@@ -29,6 +27,8 @@ from flight.link.modes import Mode
 from flight.link.parameters import FIELDS
 from flight.link.telemetry.packets import LAYOUTS as TELEMETRY
 from flight.link.telemetry.packets import crc16
+from knightcube.errors import UsageError
+from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 
 PLAIN_MODES = [Mode.SAFE, Mode.DETUMBLE, Mode.HOLD, Mode.TESTBED_DEMO]
 

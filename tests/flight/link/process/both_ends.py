@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from flight.gnc.errors import UsageError
 from flight.link.commands.channel import open_unix
 from flight.link.modes import Mode
 from flight.link.process.archive_reader import LogFollower
@@ -20,6 +19,7 @@ from flight.link.telemetry.packets import LAYOUTS, Packer, PacketArray
 from flight.link.telemetry.segments import SegmentStore
 from ground.link.keys import make_keys
 from ground.link.terminal import Terminal, TerminalSettings, report_of
+from knightcube.errors import UsageError
 from tests.manual_clock import ManualClock
 
 SETTINGS = TerminalSettings(frame_bytes=512)

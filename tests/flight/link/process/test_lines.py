@@ -9,10 +9,10 @@ from ipaddress import IPv4Network
 
 import pytest
 
-from flight.gnc.errors import UsageError
 from flight.link.frames.stream import SYNC
 from flight.link.frames.telecommand import TelecommandHeader, close_frame
 from flight.link.process.lines import AT_MOST, TcpLine, UdpLine
+from knightcube.errors import UsageError
 
 FRAME = close_frame(TelecommandHeader(1, 0, 0).pack(11) + b"data")
 ELSEWHERE = [IPv4Network("192.0.2.0/24")]

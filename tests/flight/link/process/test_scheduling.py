@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from flight.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 from flight.link.commands.codec import unpack
 from flight.link.commands.errors import CommandError
 from flight.link.commands.values import ChangeMode, Ping, Point, Slew
@@ -18,6 +17,7 @@ from flight.link.process import directives, timetable
 from flight.link.process.directives import Deletion, Directive, Listing, Scheduled
 from flight.link.process.timetable import MOST_ENTRIES, Timetable, TimetableError
 from flight.link.security.associations import overwrite
+from knightcube.gnc.guidance.three_axes.pointing_target import Goal, PointingTarget
 from tests.flight.link.process.both_ends import BothEnds
 
 

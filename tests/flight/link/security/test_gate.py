@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
-from flight.gnc.errors import FlightError, UsageError
 from flight.link.frames.telecommand import close_frame
 from flight.link.security.associations import COPIES, Vault, decode
 from flight.link.security.gate import WINDOW, Gate, Refusal, RefusedError
+from knightcube.errors import FlightError, UsageError
 from tests.flight.link.security.vaults import Ground, gate, vault
 
 KEYS = {1: bytes(range(32)), 2: bytes(range(32, 64))}

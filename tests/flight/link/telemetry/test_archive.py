@@ -9,8 +9,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from flight.gnc.errors import UsageError
 from flight.link.telemetry.archive import LEAST_FREE_BYTES, MOST_RUNS, begin_run, find_runs
+from knightcube.errors import UsageError
 
 
 def fill(folder: Path, size: int) -> None:

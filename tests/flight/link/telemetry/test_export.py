@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.gnc.errors import UsageError
 from flight.link.telemetry.definitions import EVENT, HOUSEKEEPING, RUN
 from flight.link.telemetry.log import FlightLog
 from flight.link.telemetry.packets import Packer
 from ground.export import export
 from ground.telemetry.reader import Run, read_run
+from knightcube.errors import UsageError
 from tests.ground.commands.in_process import command
 from tests.ground.report.synthetic import Recipe, make_run
 from tests.manual_clock import ManualClock

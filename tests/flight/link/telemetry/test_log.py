@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from flight.gnc.errors import UsageError
 from flight.link.telemetry.log import FlightLog
 from flight.link.telemetry.segments import find_segments
 from ground.telemetry.scanner import scan
 from hal.buses.clock import SystemClock
+from knightcube.errors import UsageError
 from tests.flight.link.telemetry.samples import timing_packets
 from tests.flight.link.telemetry.small_disk import content
 from tests.manual_clock import ManualClock

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from flight.gnc.errors import UsageError
 from flight.link.telemetry.log import FlightLog
 from flight.link.telemetry.segments import SegmentFile, open_segment
 from ground.telemetry.scanner import scan
+from knightcube.errors import UsageError
 from tests.flight.link.telemetry.samples import timing_packets
 from tests.flight.link.telemetry.small_disk import SmallDisk, SmallDiskFile, content
 from tests.manual_clock import ManualClock

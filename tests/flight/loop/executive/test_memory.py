@@ -17,10 +17,10 @@ sys.stdout.write(" ".join(sorted(name for name in sys.modules if name.partition(
 """
 _WORKING = """
 import sys
-from flight.gnc.vision import frame_job
-before = "flight.gnc.vision.streaks.maximum_likelihood.estimate" in sys.modules
+from knightcube.vision import frame_job
+before = "knightcube.vision.streaks.maximum_likelihood.estimate" in sys.modules
 frame_job.prepare()
-sys.stdout.write(f"{before} {'flight.gnc.vision.streaks.maximum_likelihood.estimate' in sys.modules}")
+sys.stdout.write(f"{before} {'knightcube.vision.streaks.maximum_likelihood.estimate' in sys.modules}")
 """
 _WORKERS = """
 import sys

@@ -15,12 +15,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flight.gnc.camera.lens import Lens
-from flight.gnc.errors import FlightError
-from flight.gnc.vision.startracker.detection.detections import Quality
-from flight.gnc.vision.streaks.streak_result import StreakStatus
 from flight.loop.executive import values
 from flight.loop.executive.messages import message_length, pack_values, unpack_values
+from knightcube.errors import FlightError
+from knightcube.vision.camera.lens import Lens
+from knightcube.vision.startracker.detection.detections import Quality
+from knightcube.vision.streaks.streak_result import StreakStatus
 from tests.flight.loop.executive.passing import passed, slab
 
 LENS = Lens(1024, 768, 500.0, (511.5, 383.5))
@@ -87,12 +87,12 @@ HARMFUL: tuple[Any, ...] = (
     ["fields", "subprocess:Popen", ["true"]],
     ["fields", "builtins:eval", ["1"]],
     ["fields", "os:system", ["true"]],
-    ["fields", "flight.gnc.camera.lens:Lens", [1]],
+    ["fields", "knightcube.vision.camera.lens:Lens", [1]],
     ["fields", "no.such.module:Thing", []],
-    ["enum", "flight.gnc.camera.lens:Lens", "x"],
-    ["enum", "flight.gnc.vision.streaks.streak_result:StreakStatus", "NONE_OF_THEM"],
-    ["enum", "flight.gnc.vision.startracker.detection.detections:Quality", 1],
-    ["flag", "flight.gnc.vision.streaks.streak_result:StreakStatus", 1],
+    ["enum", "knightcube.vision.camera.lens:Lens", "x"],
+    ["enum", "knightcube.vision.streaks.streak_result:StreakStatus", "NONE_OF_THEM"],
+    ["enum", "knightcube.vision.startracker.detection.detections:Quality", 1],
+    ["flag", "knightcube.vision.streaks.streak_result:StreakStatus", 1],
     ["array", "|O", [1]], ["array", "<f8", [1 << 62, 1 << 62]], ["array", "<f8", [-1]], ["array", "<f8", [2]],
     ["array", "<f8", [1] * 33], ["array", "<f8", [1.0]], ["array", "|b1", [8]], ["scalar", "<f8", [1]],
     ["array", "<M8[ns]", [1]], ["list", 1], ["dict", [[1]]], ["set", [["list", []]]], ["what"], [], {"a": 1},

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flight.gnc.errors import FlightError
 from flight.loop.executive.rate_group import Cycle, RateGroup
+from knightcube.errors import FlightError
 
 PERIOD = 25_000_000
 

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flight.gnc.math.arrays import FloatArray
 from flight.loop.fdir.coils.response import CoilResponse, ResponseSettings
 from flight.loop.fdir.coils.watch import CoilWatch, CoilWatchSettings
+from knightcube.astro.arrays import FloatArray
 
 FIELD = np.array([0.0, 0.0, 60e-6])
 INERTIA, DIPOLE = 0.02, 60.0

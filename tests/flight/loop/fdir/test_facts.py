@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import pytest
 
-from flight.gnc.errors import FlightError
 from flight.link import events
 from flight.link.events import EventKind
 from flight.link.modes import Mode
@@ -15,6 +14,7 @@ from flight.loop.fdir.event_log import EventLog
 from flight.loop.fdir.facts import FACTS, Facts, check
 from flight.loop.modes.triggers import Trigger
 from flight.loop.tasks.mode_control import SAFING_REACTIONS, modes_moved_by
+from knightcube.errors import FlightError
 
 
 class EventRecord:

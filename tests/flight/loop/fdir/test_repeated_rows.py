@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flight.gnc.math.arrays import Image
 from flight.loop.fdir.repeated_rows import RepeatedRows
+from knightcube.astro.arrays import Image
 
 RNG = np.random.default_rng(8)
 

@@ -6,11 +6,11 @@ from itertools import product
 
 import pytest
 
-from flight.gnc.errors import FlightError
 from flight.link.modes import Mode
 from flight.loop.modes.machine import Change, ModeMachine
 from flight.loop.modes.table import TRANSITIONS, Answer, Row, Table, check
 from flight.loop.modes.triggers import COMMANDS, SAFING, STARTS, Trigger
+from knightcube.errors import FlightError
 
 UNSAFE = [mode for mode in Mode if mode is not Mode.SAFE]
 Broken = dict[Mode, dict[Trigger, Mode | Answer]]

@@ -7,19 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.gnc.estimation.attitude_filter import AttitudeFilter
-from flight.gnc.estimation.estimate import PARAMETERS, Estimate
-from flight.gnc.estimation.filter_settings import slow_prior
-from flight.gnc.estimation.rigid_body import Parameters
-from flight.gnc.math.arrays import FloatArray
 from flight.link import events
 from flight.loop.state.content import Learned
 from flight.loop.state.keeper import Notices, StateKeeper
 from flight.loop.state.learning import GYRO_BIAS, IMU_LATENCY, PLANT, digest_of, learned_of, start_from
 from flight.loop.state.store import StateStore
 from flight.schema import reader as configuration
-from tests.flight.gnc.estimation.flights import SETTINGS, SUSPENDED, Flight, fly, follow
+from knightcube.astro.arrays import FloatArray
+from knightcube.gnc.estimation.attitude_filter import AttitudeFilter
+from knightcube.gnc.estimation.estimate import PARAMETERS, Estimate
+from knightcube.gnc.estimation.filter_settings import slow_prior
+from knightcube.gnc.estimation.rigid_body import Parameters
 from tests.flight.loop.state.disk import Disk
+from tests.knightcube.gnc.estimation.flights import SETTINGS, SUSPENDED, Flight, fly, follow
 from tests.manual_clock import ManualClock
 from tests.scenario import flights
 from tests.studies.campaigns.consistency_worlds import CYCLE_NS

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flight.gnc.earth.figure import EARTH_RADIUS
-from flight.gnc.earth.shadow import sunlit_share
-from flight.gnc.earth.sun import ASTRONOMICAL_UNIT, DAY
+from knightcube.astro.earth.figure import EARTH_RADIUS
+from knightcube.astro.earth.shadow import sunlit_share
+from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, DAY
 from sim_hal.worlds import geomagnetism, sun
 from sim_hal.worlds.free_body.atmosphere import log_density
 from sim_hal.worlds.free_body.body import elements, julian_date

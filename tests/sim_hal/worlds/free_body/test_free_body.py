@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flight.gnc.math import quaternion
-from flight.gnc.math.arrays import FloatArray
 from flight.schema import reader
 from flight.schema.errors import ConfigError
+from knightcube.astro import quaternion
+from knightcube.astro.arrays import FloatArray
 from sim_hal.settings import Simulation
 from sim_hal.worlds.free_body import pressure
 from sim_hal.worlds.free_body.body import FreeBody

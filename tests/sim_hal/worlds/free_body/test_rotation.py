@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from flight.gnc.earth.figure import GRAVITATIONAL_PARAMETER
-from flight.gnc.math import quaternion
-from flight.gnc.math.arrays import FloatArray
+from knightcube.astro import quaternion
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.figure import GRAVITATIONAL_PARAMETER
 from sim_hal.worlds.free_body.body import FreeBody
 from sim_hal.worlds.free_body.rotation import Loads, Rotation, State
 from sim_hal.worlds.free_body.section import Disturbances, FreeBodySection, TipOff

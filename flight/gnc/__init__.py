@@ -1,4 +1,0 @@
-"""Guidance, navigation and control: pure functions and small classes.
-
-Nothing here knows a clock, a configuration, a device or a socket.
-"""

@@ -1,0 +1,151 @@
+"""The satellite's position and velocity in ICRS, from the last GPS fix or from two-line elements.
+
+A fix is propagated by Newton's law with the Earth's oblateness J2, in Runge-Kutta steps of at most 30 s.
+Two-line elements use SGP4 (Vallado, Crawford, Hujsak and Kelso, AIAA 2006-6753), accurate to one to three km
+near their epoch.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from sgp4.api import SGP4_ERRORS, Satrec
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER, J2
+from knightcube.astro.earth.orientation import (
+    ROTATION_RATE,
+    celestial_to_terrestrial,
+    mean_equator_to_celestial,
+)
+from knightcube.astro.earth.sun import DAY
+from knightcube.errors import FlightError, UsageError
+
+_LONGEST_STEP = 30.0
+
+
+class OrbitError(FlightError):
+    """No orbit is known at this time: it has decayed, or the fix is too old."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OrbitState:
+    """Position (3,) m and velocity (3,) m/s, ICRS, at a Julian date UTC; `sigma` m is of each axis."""
+
+    julian_date: float
+    position: FloatArray
+    velocity: FloatArray
+    sigma: float
+
+    @property
+    def nadir(self) -> FloatArray:
+        """The direction (3,) of the Earth's centre."""
+        return np.asarray(-self.position / np.linalg.norm(self.position))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GpsFix:
+    """A GPS receiver's fix, ITRS axes: position (3,) m, velocity (3,) m/s with respect to the ground.
+
+    `sigma` m is of the position, `velocity_sigma` m/s of the velocity; the fix is not used after
+    `longest_age` s.
+    """
+
+    julian_date: float
+    position: FloatArray
+    velocity: FloatArray
+    sigma: float = 10.0
+    velocity_sigma: float = 0.1
+    longest_age: float = 1500.0
+
+    def __post_init__(self) -> None:
+        """Raise OrbitError for values that no receiver in orbit would send."""
+        numbers = np.array([self.julian_date, *self.position, *self.velocity])
+        if numbers.shape != (7,) or not np.all(np.isfinite(numbers)):
+            raise OrbitError(f"fix at {self.julian_date}: position and velocity must be (3,) and finite")
+        if np.linalg.norm(self.position) < 0.98 * EARTH_RADIUS:
+            raise OrbitError(f"fix at {self.julian_date}: {self.position} m is within the Earth")
+
+    def at(self, julian_date: float) -> OrbitState:
+        """Return the state propagated to a Julian date UTC. Raises OrbitError for an old fix."""
+        age = (julian_date - self.julian_date) * DAY
+        if not abs(age) <= self.longest_age:
+            raise OrbitError(f"the last fix is {age:.0f} s old: none is of use after {self.longest_age:g} s")
+        to_ground = celestial_to_terrestrial(self.julian_date)
+        with_ground = self.velocity + np.cross([0.0, 0.0, ROTATION_RATE], self.position)
+        state = np.concatenate([self.position @ to_ground, with_ground @ to_ground])
+        carried = carried_on(state, age)
+        # Along the orbit an error of velocity grows three times as fast as in free space.
+        sigma = math.hypot(self.sigma, 3.0 * age * self.velocity_sigma)
+        return OrbitState(julian_date, carried[:3], carried[3:], sigma)
+
+
+class TwoLineElements:
+    """A two-line element set; `sigma` m of an axis grows by `growth` m a day from its epoch."""
+
+    def __init__(self, first: str, second: str, sigma: float = 1500.0, growth: float = 1500.0) -> None:
+        """Read the two lines. Raises UsageError for invalid lines and elements of no orbit."""
+        for number, line in (("1", first), ("2", second)):
+            _check_line(number, line)
+        self._satellite = Satrec.twoline2rv(first.rstrip(), second.rstrip())
+        if not 1.0 <= self._satellite.epochdays < 367.0:
+            # SGP4 steps from the epoch of a resonant orbit in half days: one of 1e12 days never ends.
+            raise UsageError(f"{first.rstrip()!r}: its epoch's day of the year must be from 1 to 366")
+        code, *place = self._satellite.sgp4_tsince(0.0)
+        if code or not np.all(np.isfinite(place)):
+            reason = SGP4_ERRORS[code] if code else "a column holds no number"
+            raise UsageError(
+                f"{second.rstrip()!r}: these elements describe no orbit at their epoch: {reason}"
+            )
+        self._sigma, self._growth = sigma, growth
+
+    def at(self, julian_date: float) -> OrbitState:
+        """Return the state at a Julian date UTC. Raises OrbitError where SGP4 fails."""
+        whole = math.floor(julian_date)
+        code, position, velocity = self._satellite.sgp4(whole, julian_date - whole)
+        if code:
+            raise OrbitError(f"SGP4 at {julian_date}: {SGP4_ERRORS[code]}")
+        turn = mean_equator_to_celestial(julian_date)
+        age = abs(julian_date - self._satellite.jdsatepoch - self._satellite.jdsatepochF)
+        sigma = self._sigma + self._growth * age
+        return OrbitState(
+            julian_date, 1e3 * (turn @ np.array(position)), 1e3 * (turn @ np.array(velocity)), sigma
+        )
+
+
+def carried_on(state: FloatArray, duration: float) -> FloatArray:
+    """Return position and velocity (6,), m and m/s, after `duration` s, by classical Runge-Kutta."""
+    steps = max(1, math.ceil(abs(duration) / _LONGEST_STEP))
+    dt = duration / steps
+    for _ in range(steps):
+        k1 = _flow(state)
+        k2 = _flow(state + 0.5 * dt * k1)
+        k3 = _flow(state + 0.5 * dt * k2)
+        k4 = _flow(state + dt * k3)
+        state = state + dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+    return state
+
+
+def _flow(state: FloatArray) -> FloatArray:
+    """Return velocity and acceleration (6,) under a spherical Earth and J2 (Sease 2.14)."""
+    position = state[:3]
+    squared = float(position @ position)
+    pull = -GRAVITATIONAL_PARAMETER / squared**1.5
+    flat = 1.5 * J2 * EARTH_RADIUS**2 / squared
+    tilt = 5.0 * float(position[2]) ** 2 / squared
+    scale = pull * np.array([1.0 + flat * (1.0 - tilt), 1.0 + flat * (1.0 - tilt), 1.0 + flat * (3.0 - tilt)])
+    return np.concatenate([state[3:], scale * position])
+
+
+def _check_line(number: str, line: str) -> None:
+    """Raise UsageError unless `line` is that line of a two-line element set."""
+    line = line.rstrip()
+    if len(line) != 69 or not line.startswith(f"{number} "):
+        raise UsageError(f"{line!r}: line {number} of a two-line element set has 69 columns and begins so")
+    if not (line.isascii() and line.isprintable()):
+        raise UsageError(f"{line!r}: a two-line element set is of printable ASCII characters")
+    total = sum(int(c) if c.isdigit() else c == "-" for c in line[:68]) % 10
+    if str(total) != line[68]:
+        raise UsageError(f"{line!r}: checksum {line[68]}, its columns add up to {total}")

@@ -1,0 +1,86 @@
+"""The Earth's orientation: rotations between ICRS (GCRS, the stars) and ITRS (the ground).
+
+IAU 2006/2000B through ERFA, to a milliarcsecond of the pole. UT1 is assumed equal to UTC unless given (they
+differ by at most 0.9 s, 13" of rotation), polar motion (0.3") zero. Julian dates are UTC; TT is 69.184 s
+ahead of UTC since 2017. A Julian date as a float resolves 40 us, 0.3 m along a low orbit.
+"""
+
+from __future__ import annotations
+
+import erfa
+import numpy as np
+import numpy.typing as npt
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.sun import DAY, J2000
+
+TT_MINUS_UTC = 69.184
+"""s: 32.184 and 37 leap seconds (IERS Bulletin C 52 and since)."""
+ROTATION_RATE = 7.292115e-5
+"""rad/s, of the Earth (WGS 84)."""
+JULIAN_YEAR = 365.25
+"""days."""
+
+
+def terrestrial_time(julian_date: npt.ArrayLike) -> FloatArray:
+    """Return the Julian date TT (...) of a Julian date UTC (...)."""
+    return np.asarray(np.asarray(julian_date, dtype=float) + TT_MINUS_UTC / DAY)
+
+
+def julian_epoch(julian_date: npt.ArrayLike) -> FloatArray:
+    """Return the year (...), such as 2026.89, of a Julian date (...)."""
+    return np.asarray(2000.0 + (np.asarray(julian_date, dtype=float) - J2000) / JULIAN_YEAR)
+
+
+def celestial_to_terrestrial(julian_date: npt.ArrayLike, ut1_minus_utc: float = 0.0) -> FloatArray:
+    """Return the matrices (..., 3, 3) that take vectors from ICRS to ITRS at Julian dates UTC (...)."""
+    date = np.asarray(julian_date, dtype=float)
+    # TT and UT1 in two parts, whole and fraction, as ERFA recommends.
+    whole = np.floor(date)
+    day = date - whole
+    return np.asarray(
+        erfa.c2t00b(whole, day + TT_MINUS_UTC / DAY, whole, day + ut1_minus_utc / DAY, 0.0, 0.0), dtype=float
+    )
+
+
+def mean_equator_to_celestial(julian_date: npt.ArrayLike, ut1_minus_utc: float = 0.0) -> FloatArray:
+    """Return the matrices (..., 3, 3) that take vectors from TEME, the frame of SGP4, to ICRS.
+
+    Through ITRS: TEME differs from it by the mean sidereal time of 1982 alone (Vallado, Crawford,
+    Hujsak and Kelso, Revisiting Spacetrack Report #3, AIAA 2006-6753, appendix C).
+    """
+    date = np.asarray(julian_date, dtype=float)
+    whole = np.floor(date)
+    sidereal = np.asarray(erfa.gmst82(whole, date - whole + ut1_minus_utc / DAY), dtype=float)
+    cosine, sine = np.cos(sidereal), np.sin(sidereal)
+    zero, one = np.zeros_like(cosine), np.ones_like(cosine)
+    turn = np.stack(
+        [
+            np.stack([cosine, sine, zero], axis=-1),
+            np.stack([-sine, cosine, zero], axis=-1),
+            np.stack([zero, zero, one], axis=-1),
+        ],
+        axis=-2,
+    )
+    to_ground = celestial_to_terrestrial(date, ut1_minus_utc)
+    return np.asarray(np.swapaxes(to_ground, -1, -2) @ turn)
+
+
+def geodetic(position: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return longitude (...) and geodetic latitude (...), rad, and height (...), m, over WGS 84.
+
+    `position` (..., 3) m is in ITRS.
+    """
+    longitude, latitude, height = erfa.gc2gd(1, np.asarray(position, dtype=float))
+    return np.asarray(longitude), np.asarray(latitude), np.asarray(height)
+
+
+def north_east_down(longitude: npt.ArrayLike, latitude: npt.ArrayLike) -> FloatArray:
+    """Return the matrices (..., 3, 3) whose rows are north, east and down in ITRS.
+
+    Geodetic latitude gives those of the ellipsoid, geocentric latitude those of the sphere.
+    """
+    along, up = np.asarray(longitude, dtype=float), np.asarray(latitude, dtype=float)
+    ca, sa, cu, su = np.cos(along), np.sin(along), np.cos(up), np.sin(up)
+    rows = [[-su * ca, -su * sa, cu], [-sa, ca, np.zeros_like(ca)], [-cu * ca, -cu * sa, -su]]
+    return np.stack([np.stack(np.broadcast_arrays(*row), axis=-1) for row in rows], axis=-2)

@@ -1,0 +1,1 @@
+"""Estimation, guidance, control, and the tracking of objects."""

@@ -1,0 +1,274 @@
+"""Attitude determination of Fig. 3: gyros propagate the attitude, directions correct attitude and bias.
+
+The filter is the flight application's MEKF (`knightcube.gnc.estimation`) for a body free in orbit. It starts
+from the first directions that fix an attitude well enough and agree; then each measurement of Sun, nadir and
+field is used at its own time, alone or not. The magnetometer's bias is estimated beside the gyros' (with the
+field model's error, which changes as slowly): the estimate from sunlight is used in eclipse.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from scipy.special import chdtri
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.attitude.wahba import AttitudeError, AttitudeFix
+from knightcube.gnc.attitude.single_frame import Sight, field_sight, optimum
+from knightcube.gnc.estimation.attitude_filter import AttitudeFilter
+from knightcube.gnc.estimation.estimate import FIELD_BIAS, TURN, Estimate
+from knightcube.gnc.estimation.filter_settings import FilterSettings
+from knightcube.gnc.estimation.measurements import (
+    AttitudeMeasurement,
+    DirectionMeasurement,
+    FieldMeasurement,
+    RateMeasurement,
+)
+from knightcube.gnc.estimation.rigid_body import RigidBody
+
+FIELD = "field"
+_UNIT_TOLERANCE = 1e-6
+_HISTORY_NS = 6_000_000_000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DeterminationSettings:
+    """Sensor noise, body and limits.
+
+    Attributes:
+        inertia: (3, 3) kg m^2, body axes.
+        rate_sigma: rad/s of a gyro sample.
+        bias_start, bias_walk: rad/s and rad/s per sqrt(s), of the gyros.
+        field_sigma: T of a magnetometer sample.
+        field_bias_start, field_bias_walk: T and T per sqrt(s), of the magnetometer, hard iron and model.
+        disturbance_start, disturbance_walk: rad/s^2 and per sqrt(s), of all torques over the inertia.
+        start_sigma: rad, largest sigma of the worst axis to start.
+        start_age: s, largest age of directions to start from.
+        lost_sigma: rad, a worse estimate is discarded because linearisation no longer holds.
+        fresh: s, a sensor without accepted measurements for longer is not in use.
+        gate_sigma: a measurement less likely than this many sigma is rejected.
+        longest_step: s, of the filter.
+    """
+
+    inertia: FloatArray
+    rate_sigma: float
+    bias_start: float
+    bias_walk: float
+    field_sigma: float
+    field_bias_start: float
+    field_bias_walk: float
+    disturbance_start: float
+    disturbance_walk: float
+    start_sigma: float = math.radians(5.0)
+    start_age: float = 2.0
+    lost_sigma: float = math.radians(6.0)
+    fresh: float = 5.0
+    gate_sigma: float = 5.0
+    longest_step: float = 0.5
+
+
+class Status(Enum):
+    """The sensors on which the attitude is based."""
+
+    ACQUIRING = "acquiring"
+    """No attitude: no directions yet that fix one."""
+    OBSERVED = "observed"
+    """At least two directions are in use, with or without the field."""
+    AIDED = "aided"
+    """One direction is in use: the turn about it drifts with the gyros until the direction moves."""
+    COASTING = "coasting"
+    """Gyros alone."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Report:
+    """The attitude at `time_ns` and its accuracy.
+
+    Attributes:
+        estimate: None while acquiring.
+        sigma: (3,) rad about the body's axes, infinite while acquiring.
+        in_use: the sensors with recent accepted measurements, without the gyros.
+    """
+
+    time_ns: int
+    status: Status
+    estimate: Estimate | None
+    sigma: FloatArray
+    in_use: frozenset[str]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Waiting:
+    """A direction measured before there was an attitude."""
+
+    time_ns: int
+    sight: Sight
+
+
+class AttitudeDetermination:
+    """Owns the filter, or the directions from which it will start.
+
+    Attributes:
+        refused: how many measurements of each sensor did not pass their gate.
+        starts: how often the filter started.
+        nis: normalised innovation squared of the last measurement, NaN without one.
+    """
+
+    def __init__(self, settings: DeterminationSettings) -> None:
+        self._settings = settings
+        self._body = RigidBody(settings.inertia, 0.0, np.zeros(3))
+        self._filter = self._new_filter()
+        self._waiting: dict[str, _Waiting] = {}
+        self._taken_ns: dict[str, int] = {}
+        self._rate: RateMeasurement | None = None
+        self.refused: dict[str, int] = {}
+        self.starts = 0
+        self.nis = math.nan
+
+    def rate(self, time_ns: int, rate: FloatArray) -> None:
+        """Accept the gyros' rate (3,) rad/s, body axes."""
+        self.nis = math.nan
+        if not np.all(np.isfinite(rate)):
+            return
+        self._rate = RateMeasurement(time_ns, rate, self._settings.rate_sigma**2 * np.eye(3))
+        if self._filter.started:
+            self._ingest("gyro", self._rate)
+
+    def direction(
+        self, sensor: str, time_ns: int, observed: FloatArray, reference: FloatArray, covariance: FloatArray
+    ) -> None:
+        """Accept a direction: unit vectors (3,) in body and inertial axes, covariance (3, 3) rad^2, body.
+
+        `sensor` is any name except that of the field.
+        """
+        self.nis = math.nan
+        if not (_is_unit(observed) and _is_unit(reference) and np.all(np.isfinite(covariance))):
+            self._refuse(sensor)
+        elif self._filter.started:
+            self._ingest(sensor, DirectionMeasurement(time_ns, observed, reference, covariance))
+        else:
+            self._wait(sensor, time_ns, Sight(observed, reference, covariance))
+
+    def field(self, time_ns: int, field: FloatArray, reference: FloatArray) -> None:
+        """Accept the magnetometer's field (3,) T, body axes, and the model's `reference` (3,) T."""
+        self.nis = math.nan
+        settings = self._settings
+        if not (np.all(np.isfinite(field)) and np.all(np.isfinite(reference))):
+            self._refuse(FIELD)
+        elif self._filter.started:
+            covariance = settings.field_sigma**2 * np.eye(3)
+            self._ingest(FIELD, FieldMeasurement(time_ns, field, reference, covariance))
+        else:
+            # The bias enters the first attitude, and again the next sample as if independent: twice the
+            # bias's sigma keeps the attitude's weight right.
+            spread = settings.field_sigma**2 + (2.0 * settings.field_bias_start) ** 2
+            try:
+                self._wait(FIELD, time_ns, field_sight(field, reference, spread * np.eye(3)))
+            except AttitudeError:
+                self._refuse(FIELD)
+
+    def report(self, time_ns: int) -> Report:
+        """Return the attitude at `time_ns` and its accuracy; discards an estimate that is too uncertain."""
+        fresh_ns = round(self._settings.fresh * 1e9)
+        in_use = frozenset(name for name, then in self._taken_ns.items() if time_ns - then <= fresh_ns)
+        estimate = self._filter.at(time_ns) if self._filter.started else None
+        if estimate is not None:
+            sigma = np.sqrt(np.diag(estimate.covariance)[TURN])
+            if float(np.max(sigma)) < self._settings.lost_sigma:
+                return Report(time_ns, _status(in_use), estimate, sigma, in_use)
+            self._filter = self._new_filter()
+        return Report(time_ns, Status.ACQUIRING, None, np.full(3, np.inf), in_use)
+
+    def _ingest(
+        self, sensor: str, measurement: RateMeasurement | DirectionMeasurement | FieldMeasurement
+    ) -> None:
+        if self._filter.measure(measurement):
+            if sensor != "gyro":
+                self._taken_ns[sensor] = max(measurement.time_ns, self._taken_ns.get(sensor, 0))
+        else:
+            self._refuse(sensor)
+        self.nis = self._filter.nis
+
+    def _refuse(self, sensor: str) -> None:
+        self.refused[sensor] = self.refused.get(sensor, 0) + 1
+
+    def _wait(self, sensor: str, time_ns: int, sight: Sight) -> None:
+        """Keep a direction, and start if the directions at hand fix an attitude."""
+        self._waiting[sensor] = _Waiting(time_ns, sight)
+        oldest_ns = time_ns - round(self._settings.start_age * 1e9)
+        self._waiting = {name: w for name, w in self._waiting.items() if w.time_ns >= oldest_ns}
+        if self._rate is None or self._rate.time_ns < oldest_ns or len(self._waiting) < 2:
+            return
+        fix = begin([self._moved(waiting, time_ns) for waiting in self._waiting.values()])
+        if fix is None or float(np.max(np.diag(fix.covariance))) > self._settings.start_sigma**2:
+            return
+        attitude = AttitudeMeasurement(time_ns, fix.quaternion, fix.covariance)
+        self._filter = self._new_filter()
+        self._filter.start(attitude, self._rate)
+        self._taken_ns = {name: w.time_ns for name, w in self._waiting.items()}
+        self._waiting = {}
+        self.starts += 1
+
+    def _moved(self, waiting: _Waiting, time_ns: int) -> Sight:
+        """Return a direction at `time_ns`, its covariance enlarged by the possible turn of the body since."""
+        assert self._rate is not None
+        rate = float(np.linalg.norm(self._rate.rate)) + 3.0 * self._settings.bias_start
+        turned = rate * (time_ns - waiting.time_ns) * 1e-9
+        sight = waiting.sight
+        return Sight(sight.observed, sight.reference, sight.covariance + turned**2 * np.eye(3))
+
+    def _new_filter(self) -> AttitudeFilter:
+        settings = self._settings
+        return AttitudeFilter(
+            self._body,
+            FilterSettings(
+                current_noise=0.0,
+                control_period=1.0,
+                disturbance_walk=settings.disturbance_walk,
+                disturbance_start=settings.disturbance_start,
+                bias_walk=settings.bias_walk,
+                bias_start=settings.bias_start,
+                torsion_start=0.0,
+                damping_start=0.0,
+                gain_start=0.0,
+                latency_start=0.0,
+                latency_walk=0.0,
+                field_bias_start=settings.field_bias_start,
+                field_bias_walk=settings.field_bias_walk,
+                gate_sigma=settings.gate_sigma,
+                history_ns=_HISTORY_NS,
+                longest_step=settings.longest_step,
+            ),
+        )
+
+
+def begin(sights: Sequence[Sight], improbable: float = 1e-4) -> AttitudeFix | None:
+    """Return the attitude that directions fix, None when they fix none or contradict each other.
+
+    Their angles to each other must be those of their references: a chi-square of 2 n - 3 degrees of freedom.
+    """
+    try:
+        fix = optimum(sights)
+    except (AttitudeError, np.linalg.LinAlgError):
+        return None
+    return fix if 2.0 * fix.loss <= float(chdtri(2 * len(sights) - 3, improbable)) else None
+
+
+def field_bias(estimate: Estimate) -> tuple[FloatArray, FloatArray]:
+    """Return the magnetometer's bias, (3,) T body axes, and its sigmas (3,)."""
+    return estimate.field_bias, np.sqrt(np.diag(estimate.covariance)[FIELD_BIAS])
+
+
+def _status(in_use: frozenset[str]) -> Status:
+    if len(in_use) >= 2:
+        return Status.OBSERVED
+    return Status.AIDED if in_use else Status.COASTING
+
+
+def _is_unit(vector: FloatArray) -> bool:
+    # A NaN fails the comparison too.
+    return vector.shape == (3,) and abs(float(np.linalg.norm(vector)) - 1.0) <= _UNIT_TOLERANCE

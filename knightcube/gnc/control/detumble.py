@@ -1,0 +1,194 @@
+"""Detumbling by the magnetometer alone: B-dot, with the field measured while the coils are off.
+
+The coils' own field swamps the magnetometer, so time is divided into windows: the coils are off and settle,
+the field is averaged, then the coils act on the means of two windows in a row. In body axes a constant field
+changes by B' = -w x B, which gives the rate across the field, w_p = B' x B / B^2. The dipole moment
+m = (k / B^2) w_p x B brakes that rate: its torque m x B is -k w_p for any direction of the field, with no
+component along it (B-dot: Wertz 1978, 18.3; Avanzini and Giulietti 2012, J. Guid. Control Dyn. 35(4)). The
+gain follows from the window: while the coils act, k w_p removes `share` of J w_p, J the smallest moment of
+inertia. Between windows the field is propagated with the last rate, so that a fast body is braked, not
+accelerated. The rate is right while the body turns by less than half a turn from window to window.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
+from knightcube.errors import UsageError
+from knightcube.gnc.estimation.field_rate import rate_across
+
+MOST_SHARE = 0.5
+_SECOND = 1e-9
+_REACHED_NS = 50_000_000
+"""Two control cycles: so late a command may reach the coils."""
+_NO_CURRENT: FloatArray = np.zeros(3)
+
+
+@dataclass(frozen=True, slots=True)
+class WindowSchedule:
+    """The phases of one window: coils off to settle, off to measure, then on; all in ns."""
+
+    settle_ns: int
+    measure_ns: int
+    act_ns: int
+
+    def __post_init__(self) -> None:
+        """Raise UsageError for a window without time to measure or to act."""
+        if self.settle_ns < 0 or self.measure_ns <= 0 or self.act_ns <= 0:
+            raise UsageError(f"detumble window {self}: measuring and acting need time")
+
+    @property
+    def period_ns(self) -> int:
+        """Time from window to window, ns."""
+        return self.settle_ns + self.measure_ns + self.act_ns
+
+    def calm(self, begin_ns: int, length_ns: int) -> int:
+        """Return when, from `begin_ns` on, the coils leave so long a time without a step.
+
+        Windows are counted from time zero. It is `begin_ns` where neither pause nor action is long enough.
+        """
+        phase_ns, pause_ns = begin_ns % self.period_ns, self.settle_ns + self.measure_ns
+        later_ns = self.period_ns + pause_ns
+        parts = (0, pause_ns), (pause_ns, self.period_ns), (self.period_ns, later_ns)
+        for first_ns, last_ns in (*parts, (later_ns, 2 * self.period_ns)):
+            from_ns = max(phase_ns, first_ns + _REACHED_NS)
+            if from_ns + length_ns <= last_ns:
+                return begin_ns - phase_ns + from_ns
+        return begin_ns
+
+
+@dataclass(frozen=True, slots=True)
+class Braking:
+    """The law's constants.
+
+    Attributes:
+        inertia: smallest principal moment, kg m^2.
+        dipole_per_ampere: n A of each coil, m^2.
+        current_limit: of each coil, A.
+        share: fraction of the rate across the field to remove in one window, below 1.
+    """
+
+    inertia: float
+    dipole_per_ampere: float
+    current_limit: float
+    share: float
+
+    def __post_init__(self) -> None:
+        """Raise UsageError for constants that do not brake."""
+        for name in ("inertia", "dipole_per_ampere", "current_limit", "share"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise UsageError(f"detumble {name} is {value}: it must be finite and positive")
+        if self.share >= 1.0:
+            raise UsageError(
+                f"detumble share is {self.share}: from 1 on the rate would change sign each window"
+            )
+
+
+def share_in_turning_field(turn: float, schedule: WindowSchedule) -> float:
+    """Return the best `share` for a body free in three axes in a field that turns by `turn` rad/s.
+
+    The rate along the field can be braked only as the field turns; with more gain than k = 2 Omega J the spin
+    aligns with the field and stays (Avanzini and Giulietti 2012). In an orbit the field turns about twice
+    per revolution.
+    """
+    return min(2.0 * turn * schedule.period_ns * _SECOND, MOST_SHARE)
+
+
+def braking_current(braking: Braking, rate: FloatArray, field: FloatArray, act_time: float) -> FloatArray:
+    """Return currents (3,) A that brake `rate` (3,) rad/s across `field` (3,) T, acting for `act_time` s.
+
+    All three are scaled by one factor when a coil would exceed its limit, to preserve the direction.
+    """
+    square = float(field @ field)
+    if square == 0.0:
+        return np.zeros(3)
+    gain = braking.share * braking.inertia / (act_time * square)
+    current = np.cross(rate, field) * (gain / braking.dipole_per_ampere)
+    largest = float(np.abs(current).max())
+    return current * min(1.0, braking.current_limit / largest) if largest > 0.0 else current
+
+
+class Detumbler:
+    """Runs the windows: takes each magnetometer sample and returns currents each cycle."""
+
+    def __init__(self, schedule: WindowSchedule, braking: Braking) -> None:
+        self._schedule = schedule
+        self._braking = braking
+        self._begun_ns = 0
+        self._samples: list[tuple[int, FloatArray]] = []
+        self._window = self._closed = -1
+        self._before: tuple[int, FloatArray] | None = None
+        self._field: tuple[int, FloatArray] | None = None
+        self._rate: FloatArray | None = None
+
+    def begin(self, now_ns: int) -> None:
+        """Begin the first window with no knowledge of the field."""
+        self._begun_ns = now_ns
+        self._samples.clear()
+        self._window = self._closed = -1
+        self._before = self._field = self._rate = None
+
+    def listens(self, time_ns: int) -> bool:
+        """Return whether the coils were off and settled at `time_ns`."""
+        schedule = self._schedule
+        phase_ns = (time_ns - self._begun_ns) % schedule.period_ns
+        inside = schedule.settle_ns <= phase_ns < schedule.settle_ns + schedule.measure_ns
+        return time_ns >= self._begun_ns and inside
+
+    def sample(self, time_ns: int, field: FloatArray) -> None:
+        """Accept a field (3,) T measured at `time_ns`; ignored unless the coils were off and settled."""
+        if not self.listens(time_ns):
+            return
+        window = (time_ns - self._begun_ns) // self._schedule.period_ns
+        if window <= self._closed:
+            return  # too late: its window is closed
+        if window != self._window:
+            self._samples.clear()
+            self._window = window
+        self._samples.append((time_ns, field))
+
+    def current(self, now_ns: int) -> FloatArray:
+        """Return the currents (3,) A now: zero while the field is measured or the rate is not known."""
+        schedule = self._schedule
+        phase_ns = (now_ns - self._begun_ns) % schedule.period_ns
+        if phase_ns < schedule.settle_ns + schedule.measure_ns:
+            return _NO_CURRENT
+        self._close_window()
+        window = (now_ns - self._begun_ns) // schedule.period_ns
+        field = self.field(now_ns)
+        if self._rate is None or field is None or window != self._closed:
+            return _NO_CURRENT  # no field measured in this window, and an older one is out of date
+        return braking_current(self._braking, self._rate, field, schedule.act_ns * _SECOND)
+
+    def field(self, now_ns: int) -> FloatArray | None:
+        """Return the field (3,) T in body axes, propagated to `now_ns`; None before a rate is known."""
+        if self._rate is None or self._field is None:
+            return None
+        since = (now_ns - self._field[0]) * _SECOND
+        return np.asarray(attitude_matrix(from_rotation_vector(self._rate * since)) @ self._field[1])
+
+    @property
+    def rate(self) -> FloatArray | None:
+        """The rate (3,) across the field from the last two windows, rad/s; None before."""
+        return self._rate
+
+    def _close_window(self) -> None:
+        """Average the window's samples, and derive the rate from this and the previous window's field."""
+        if not self._samples:
+            return
+        time_ns = round(sum(time for time, _ in self._samples) / len(self._samples))
+        field = np.mean([field for _, field in self._samples], axis=0)
+        self._samples.clear()
+        self._closed = self._window
+        self._before, self._field = self._field, (time_ns, field)
+        self._rate = None
+        if self._before is not None:
+            span_ns = time_ns - self._before[0]
+            if span_ns < 2 * self._schedule.period_ns:  # otherwise a window was missed
+                self._rate = rate_across(self._before[1], field, span_ns * _SECOND)

@@ -1,0 +1,123 @@
+"""The LQ tracker: feedback linearisation of the attitude error, then a linear-quadratic regulator.
+
+Sease 2013, 5.16-5.32. With p the path and q the body, 5.17-5.20 give e = sin(theta_p - theta) exactly
+(5.21), and 5.24-5.27 corrected are
+
+    e'  = cos(d) (theta_p' - w)
+    e'' = cos(d) (theta_p'' - w') - sin(d) (theta_p' - w)^2,     d = theta_p - theta.
+
+e'' = v is solved for w' and the plant model gives the current; v = -K (e', e) with K from the Riccati
+equation.
+
+Two things go beyond the thesis; `as_in_thesis` restores its loop. First, the estimated disturbance is fed
+forward: the estimator integrates the acceleration that the model did not predict, so that a constant torque
+leaves no offset, and it knows the current that was written, limits included, so that nothing winds up while
+the coil saturates. Second, an error is reduced no faster than the coil can brake: at the rate s e,
+s = K_e / K_e', up to a distance, and beyond it at sqrt(2 A |e| - (A / s)^2), from which constant braking A
+leads to that distance (the proximate time-optimal servo, Workman 1987, here with a continuous slope too).
+A linear law overshoots there.
+
+e is monotone in d only up to 90 degrees. Beyond `largest_error` d is clamped, its sign kept, so that the
+demand stays bounded and does not weaken as sin(d) falls again.
+"""
+
+from __future__ import annotations
+
+import math
+
+from knightcube.errors import UsageError
+from knightcube.gnc.control.one_axis.controller import CoilCommand, attitude_error
+from knightcube.gnc.guidance.one_axis.path import Sample
+from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
+
+LARGEST_ERROR = 1.0
+LEAST_AUTHORITY = 0.05
+
+_BRAKING_SHARE = 0.8
+_LEAST_BRAKING = 0.05
+
+
+class LqTracker:
+    """Computes commands from gains and a plant model; has no state.
+
+    Attributes:
+        error_gain, rate_gain: K on e in 1/s^2 and on e' in 1/s.
+    """
+
+    def __init__(
+        self,
+        plant: SingleAxisPlant,
+        state_weight: float,
+        input_weight: float,
+        largest_error: float = LARGEST_ERROR,
+        least_authority: float = LEAST_AUTHORITY,
+        as_in_thesis: bool = False,
+    ) -> None:
+        """Solve the Riccati equation for Q = state_weight I and R = input_weight (5.28-5.32).
+
+        `largest_error` is in rad, below pi/2; `least_authority` bounds |cos(theta)|; `as_in_thesis` leaves
+        out disturbance and braking. Raises UsageError when a value is outside its range.
+        """
+        for name, value in (("Q", state_weight), ("R", input_weight)):
+            if not (math.isfinite(value) and value > 0.0):
+                raise UsageError(f"LQ weight {name} is {value}: it must be finite and positive")
+        if not 0.0 < largest_error < 0.5 * math.pi:
+            raise UsageError(f"largest_error is {largest_error} rad: it must lie between 0 and pi/2")
+        if not 0.0 < least_authority < 1.0:
+            raise UsageError(f"least_authority is {least_authority}: it must lie between 0 and 1")
+        self._plant = plant
+        self._largest_error = largest_error
+        self._least_authority = least_authority
+        self._as_in_thesis = as_in_thesis
+        self._strength = plant.torque_constant * plant.current_limit / plant.inertia
+        self.rate_gain, self.error_gain = lq_gains(state_weight, input_weight)
+
+    def command(self, wanted: Sample, angle: float, rate: float, disturbance: float = 0.0) -> CoilCommand:
+        """Return the command at `angle` rad, `rate` rad/s under `disturbance` rad/s^2, all estimated.
+
+        Raises UsageError when an input is not finite.
+        """
+        error = attitude_error(wanted, angle, rate, disturbance)
+        if abs(math.cos(angle)) < self._least_authority:
+            return CoilCommand.without_authority(error)
+        held = abs(error) > self._largest_error
+        used = math.copysign(self._largest_error, error) if held else error
+        sine, cosine = math.sin(used), math.cos(used)
+        lag = wanted.rate - rate
+        if self._as_in_thesis:
+            v = -(self.rate_gain * cosine * lag + self.error_gain * sine)
+            acceleration = wanted.acceleration - (v + sine * lag * lag) / cosine
+        else:
+            approach = self._approach(sine, self._braking(wanted.angle, angle, disturbance))
+            v = -self.rate_gain * (cosine * lag + approach)
+            acceleration = wanted.acceleration - (v + sine * lag * lag) / cosine - disturbance
+        demanded = self._plant.current(angle, rate, acceleration)
+        return CoilCommand.within(self._plant.current_limit, demanded, error, held)
+
+    def _braking(self, wanted_angle: float, angle: float, disturbance: float) -> float:
+        """Return the deceleration available between here and the path, rad/s^2."""
+        authority = max(min(math.cos(angle), math.cos(wanted_angle)), 0.0)
+        taken = abs(disturbance - self._plant.stiffness * angle / self._plant.inertia)
+        return max(_BRAKING_SHARE * self._strength * authority - taken, _LEAST_BRAKING * self._strength)
+
+    def _approach(self, error: float, braking: float) -> float:
+        """Return the rate at which to reduce `error`, 1/s, with its sign."""
+        slope = self.error_gain / self.rate_gain
+        reach = braking / slope
+        if abs(error) * slope <= reach:
+            return slope * error
+        return math.copysign(math.sqrt(2.0 * braking * abs(error) - reach * reach), error)
+
+    def reset(self) -> None:
+        """Do nothing: the tracker has no state."""
+
+
+def lq_gains(state_weight: float, input_weight: float) -> tuple[float, float]:
+    """Return K, on e' in 1/s and on e in 1/s^2, for Q = state_weight I and R = input_weight (5.28-5.32).
+
+    The plant e'' = v is a double integrator, whose Riccati equation has the solution, with w = Q / R,
+    K_e = sqrt(w) and K_e' = sqrt(w + 2 K_e). A general solver would take 0.2 s at start.
+    """
+    weight = state_weight / input_weight
+    error_gain = math.sqrt(weight)
+    return math.sqrt(weight + 2.0 * error_gain), error_gain

@@ -1,0 +1,258 @@
+"""Detumbling of a free satellite by its magnetometer, with gyro and attitude where they are known.
+
+The coils' own field swamps the magnetometer, so the coils pause: off to settle, off to measure, then on. From
+the samples of the pauses a filter follows the body's whole rate and how the field turns among the stars
+(`knightcube.gnc.estimation.field_rate`); a gyro tells it the rate along the field at once. The momentum plan
+brakes in the field expected ahead: that of the orbit where the attitude is known, else the measured one,
+turned on at its present speed. Unlike B-dot the law cannot get stuck with the spin along the field: the plan
+holds what lies along the field until the field has turned. One sample starts nothing: the coils wait until
+`TRUSTED` samples in a row agree with the filter's prediction and the rate across the field is known to
+`BOUNDED`. Until then the coils are off, so that no pause is waited for. They wait again where no sample was
+accepted for `UNHEARD` periods: a unit that began anew may be heard, and yet none of its fields be of use.
+
+In the least time a spin along the field is first made faster, across the field. `gentle` and `spin_up` bound
+that: at the bound no dipole is commanded that makes the body faster. A bound at the rate of the begin costs
+time: such a spin is then stopped only once the field has turned by a right angle.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply
+from knightcube.errors import UsageError
+from knightcube.gnc.control.detumble import WindowSchedule
+from knightcube.gnc.control.three_axes.momentum import (
+    MomentumPlan,
+    braking_dipole,
+    momentum_plan,
+    turned_to,
+    turning_field,
+    without_gain,
+)
+from knightcube.gnc.estimation.field_rate import RATE, FieldRate, FieldRateSettings
+
+TRUSTED = 4
+"""Samples in a row that agree, before the coils act."""
+BOUNDED = 0.02
+"""rad/s, largest standard deviation of the rate across the field with which the coils begin to act."""
+UNHEARD = 2
+"""Periods without an accepted sample, after which the coils wait for samples that agree."""
+OLDEST_NS = 100_000_000
+"""Of a sample, behind the last command: the body's rate carries its field on to that."""
+INSTANTS = 150
+DENSER = 1.5
+"""Power of the instants: of 1,500 s the first step is a second, the last 15."""
+LEFT = 0.7
+"""Of a slow body's momentum that a plan may leave."""
+FEW, SOON = 4.0, 5.0
+"""Times that, and s: so little, of which no more than that lies along the field, is braked in this time."""
+KNOWN = 2e-3
+"""rad/s, standard deviation of the rate's worst axis from which on it is bounded."""
+_SECOND = 1e-9
+_NO_DIPOLE: FloatArray = np.zeros(3)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FieldBraking:
+    """The law's constants.
+
+    Attributes:
+        limit: A m^2 of each coil.
+        horizon: s, how far the field is turned ahead; a quarter of an orbit.
+        replan: s, between plans.
+        gentle: rad/s; a body braked from below is never made faster than it was when the braking began.
+        spin_up: times its first rate that a faster body may reach.
+        slow: rad/s; a body that turns by less is slow, and the braking over.
+    """
+
+    limit: float
+    horizon: float = 1500.0
+    replan: float = 5.0
+    gentle: float = 0.052
+    spin_up: float = 2.0
+    slow: float = 8.7e-3
+
+    def __post_init__(self) -> None:
+        """Raise UsageError for constants that do not brake."""
+        for name in ("limit", "horizon", "replan", "gentle", "spin_up", "slow"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise UsageError(f"detumbling {name} is {value}: it must be finite and positive")
+
+    @property
+    def instants(self) -> FloatArray:
+        """The times (n,) s from a plan on at which it needs the field: denser at the begin."""
+        return np.asarray(self.horizon * (np.arange(INSTANTS) / INSTANTS) ** DENSER, dtype=float)
+
+
+class FieldDetumbler:
+    """Runs the pauses: takes each magnetometer sample and returns the dipole each cycle, in order of time."""
+
+    def __init__(
+        self,
+        schedule: WindowSchedule,
+        braking: FieldBraking,
+        settings: FieldRateSettings,
+        expected: Callable[[int], FloatArray | None] = lambda _: None,
+    ) -> None:
+        """Take the law's constants, and `expected`, the field (n, 3) T at `braking.instants` after a time.
+
+        It is in the body axes of that time; None while attitude or orbit are not known.
+        """
+        self._schedule = schedule
+        self._braking = braking
+        self._expected = expected
+        self._filter = FieldRate(settings)
+        # What is left may lie along any axis.
+        moment = float(np.mean(np.linalg.eigvalsh(settings.inertia) ** -2.0)) ** -0.5
+        self._rest = LEFT * braking.slow * moment
+        self.begin(0)
+
+    def begin(self, now_ns: int) -> None:
+        """Begin the first pause with no knowledge of the field."""
+        self._begun_ns = self._time_ns = self._commanded_ns = now_ns
+        self._dipole = _NO_DIPOLE
+        self._plan: MomentumPlan | None = None
+        self._planned_ns = now_ns
+        self._planned_turn = _NO_DIPOLE
+        self._agreed = 0
+        self._bounded = False
+        self._driven_ns = now_ns  # until now another mode may have driven the coils
+        self._heard_ns = now_ns
+        self._fastest = math.inf
+        self._filter.restart()
+
+    def listens(self, time_ns: int) -> bool:
+        """Return whether the coils were off and settled at `time_ns`: in a pause, or until all is trusted."""
+        schedule = self._schedule
+        if not self.trusted and time_ns - self._driven_ns >= schedule.settle_ns:
+            return True
+        phase_ns = (time_ns - self._begun_ns) % schedule.period_ns
+        inside = schedule.settle_ns <= phase_ns < schedule.settle_ns + schedule.measure_ns
+        return time_ns >= self._begun_ns and inside
+
+    def sample(self, time_ns: int, field: FloatArray, rate: FloatArray | None = None) -> None:
+        """Accept a field (3,) T measured at `time_ns`; ignored unless the coils were off and settled.
+
+        `rate` (3,) rad/s is a gyro's of the same time. A command may have been given since.
+        """
+        age_ns = self._time_ns - time_ns
+        if not self.listens(time_ns) or age_ns > OLDEST_NS:
+            return
+        if age_ns < 0:
+            self._advance(time_ns)
+        starts = self._filter.restarts
+        accepted = self._filter.measure(field, max(age_ns, 0) * _SECOND)
+        if accepted:
+            self._heard_ns = time_ns
+        if accepted and self._filter.started:
+            self._agreed += 1
+            if rate is not None and self._agreed >= TRUSTED:
+                self._filter.measure_rate(rate)
+            if not self._bounded:
+                self._bounded = self._agreed >= TRUSTED and _sigma_across(self._filter) < BOUNDED
+        if self._filter.restarts != starts or (not accepted and not self.trusted):
+            self._distrust()
+
+    def dipole(self, now_ns: int) -> FloatArray:
+        """Return the dipole (3,) A m^2 now: zero while the field is measured or the rate is not known."""
+        schedule = self._schedule
+        if self._filter.started:  # before that, time passes from sample to sample
+            self._advance(max(now_ns, self._time_ns))
+        if self.trusted and now_ns - self._heard_ns > UNHEARD * schedule.period_ns:
+            self._distrust()
+        phase_ns = (now_ns - self._begun_ns) % schedule.period_ns
+        acting = phase_ns >= schedule.settle_ns + schedule.measure_ns
+        self._commanded_ns = now_ns
+        self.acts(self._braking_dipole(now_ns) if acting and self.trusted else _NO_DIPOLE)
+        return self._dipole
+
+    def acts(self, dipole: FloatArray) -> None:
+        """Take a dipole (3,) A m^2 that acts instead of the commanded one until the next command."""
+        if self._dipole.any() or dipole.any():
+            self._driven_ns = self._commanded_ns
+        self._dipole = dipole
+
+    @property
+    def trusted(self) -> bool:
+        """Whether enough samples agreed, and the rate is bounded."""
+        return self._bounded
+
+    @property
+    def rate(self) -> FloatArray | None:
+        """The body's rate (3,) rad/s; None before it is known."""
+        return self._filter.rate if self.trusted else None
+
+    @property
+    def field(self) -> FloatArray | None:
+        """The field (3,) T in body axes at the last time; None before it is known."""
+        return self._filter.field if self.trusted else None
+
+    @property
+    def rate_sigma(self) -> float:
+        """Standard deviation of the rate's worst axis, rad/s; infinite before it is known."""
+        if not self.trusted:
+            return math.inf
+        return math.sqrt(float(np.linalg.eigvalsh(self._filter.covariance[RATE, RATE])[-1]))
+
+    @property
+    def restarts(self) -> int:
+        """How often samples contradicted the filter until it began again: a spin beyond the sampling does."""
+        return self._filter.restarts
+
+    def _distrust(self) -> None:
+        """Let the coils wait until samples agree."""
+        self._agreed, self._bounded = 0, False
+        self._plan = None
+
+    def _advance(self, time_ns: int) -> None:
+        self._filter.advance(self._dipole, (time_ns - self._time_ns) * _SECOND)
+        self._time_ns = time_ns
+
+    def _braking_dipole(self, now_ns: int) -> FloatArray:
+        found, braking = self._filter, self._braking
+        dipole = braking_dipole(self._costate(now_ns), found.field, braking.limit)
+        rate = found.rate
+        speed = math.sqrt(float(rate @ rate))
+        if math.isinf(self._fastest) and self.rate_sigma < KNOWN:
+            self._fastest = speed * (braking.spin_up if speed > braking.gentle else 1.0)
+        return without_gain(dipole, found.field, rate, found.inverse) if speed >= self._fastest else dipole
+
+    def _costate(self, now_ns: int) -> FloatArray:
+        """Return the costate (3,) A m^2/T to brake by now, in body axes."""
+        found = self._filter
+        field, momentum = found.field, found.momentum
+        square, along = float(field @ field), float(momentum @ field)
+        little = float(momentum @ momentum) <= (FEW * self._rest) ** 2
+        if little and along * along <= square * self._rest**2:
+            return np.asarray(momentum / (square * SOON))
+        if self._plan is None or (now_ns - self._planned_ns) * _SECOND >= self._braking.replan:
+            self._plan, self._planned_ns, self._planned_turn = self._planned(now_ns), now_ns, found.turn
+        # The plan is fixed among the stars: into the body's axes of now.
+        since = attitude_matrix(multiply(found.turn, conjugate(self._planned_turn)))
+        return np.asarray(since @ self._plan.costate)
+
+    def _planned(self, now_ns: int) -> MomentumPlan:
+        """Return a plan in the body's axes of now."""
+        found, times = self._filter, self._braking.instants
+        expected = self._expected(now_ns)
+        if expected is None:
+            ahead = turning_field(found.field, found.change, times)
+        else:
+            ahead = turned_to(expected, found.field)
+        share = self._schedule.act_ns / self._schedule.period_ns
+        return momentum_plan(found.momentum, ahead, times, share * self._braking.limit, self._rest)
+
+
+def _sigma_across(found: FieldRate) -> float:
+    """Return the standard deviation of the rate across the field, in the worst direction, rad/s."""
+    field = found.field
+    across = np.eye(3) - np.outer(field, field) / float(field @ field)
+    spread = across @ found.covariance[RATE, RATE] @ across
+    return math.sqrt(float(np.linalg.eigvalsh(spread)[-1]))

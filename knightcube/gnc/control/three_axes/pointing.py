@@ -1,0 +1,101 @@
+"""The pointing law: from an estimate and a table of gains to a dipole."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import (
+    attitude_matrix,
+    conjugate,
+    from_rotation_vector,
+    multiply,
+    to_rotation_vector,
+)
+from knightcube.gnc.control.three_axes.pointing_table import PointingTable
+from knightcube.gnc.guidance.three_axes.attitude_law import Reference
+
+LARGEST_TURN = math.radians(20.0)
+"""rad: a larger error is cut to this, its direction kept; the law is linear in small turns."""
+LARGEST_RATE = math.radians(1.0)
+"""rad/s, likewise."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointingCommand:
+    """A command.
+
+    Attributes:
+        dipole: (3,) A m^2, within the limit.
+        turn: (3,) rad, of the body against the reference.
+        rate: (3,) rad/s, likewise.
+    """
+
+    dipole: FloatArray
+    turn: FloatArray
+    rate: FloatArray
+
+
+class PointingLaw:
+    """Computes dipoles from a table; has no state but the table."""
+
+    def __init__(self, table: PointingTable, limit: float) -> None:
+        """`limit` A m^2 of each coil."""
+        self._table = table
+        self._limit = limit
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """The first and last time of the table, s; the last revolution's gains have less preview."""
+        times = self._table.path.times
+        return float(times[0]), float(times[-1])
+
+    def reference(self, time: float) -> Reference:
+        """Return the path at a time, s, within the table's; at its ends that of the end."""
+        return self._table.path.at(time)
+
+    def wanted(self, time: float) -> Reference:
+        """Return the attitude law likewise."""
+        return self._table.wanted.at(time)
+
+    def command(
+        self,
+        time: float,
+        quaternion: FloatArray,
+        rate: FloatArray,
+        field: FloatArray,
+        residual_dipole: FloatArray,
+        sizes: FloatArray,
+    ) -> PointingCommand:
+        """Return the command at `time` s for an attitude (4,) and a rate (3,) rad/s.
+
+        `field` (3,) T is in body axes. `residual_dipole` (3,) A m^2 and `sizes` (n,) of the torques are the
+        estimated disturbances: the dipole is cancelled at once, the torques as the field allows.
+        """
+        wanted = self.reference(time)
+        turn = to_rotation_vector(multiply(quaternion, conjugate(wanted.quaternion)))
+        # Both in the body's axes: at a large turn they differ from the reference's.
+        missed = rate - attitude_matrix(from_rotation_vector(turn)) @ wanted.rate
+        cut_turn, cut_rate = _cut(turn, LARGEST_TURN), _cut(missed, LARGEST_RATE)
+        # The table's rate error is the difference of components: without the reference's turned by the error.
+        error = np.concatenate([cut_turn, cut_rate - np.cross(cut_turn, wanted.rate)])
+        k, table = self._table.path.place(time)[0], self._table
+        beyond = sizes - table.sizes
+        pull = table.gain[k] @ error - table.dipole[k] + table.torque_part[k] @ beyond
+        # What lies along the field makes no torque.
+        dipole = field * (float(field @ pull) / float(field @ field)) - pull - residual_dipole
+        return PointingCommand(_limited(dipole, self._limit), turn, missed)
+
+
+def _cut(vector: FloatArray, longest: float) -> FloatArray:
+    length = math.sqrt(float(vector @ vector))
+    return vector if length <= longest else vector * (longest / length)
+
+
+def _limited(dipole: FloatArray, limit: float) -> FloatArray:
+    """Return the dipole, scaled as a whole to the limit of the coils, which keeps its torque's direction."""
+    largest = float(np.abs(dipole).max())
+    return dipole if largest <= limit else dipole * (limit / largest)

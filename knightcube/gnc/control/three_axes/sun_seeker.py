@@ -1,0 +1,174 @@
+"""Turns an axis of the body to the Sun by solar strings, gyro and magnetometer alone: no attitude is needed.
+
+In body axes the Sun's direction s and the field B are measured, and carried on between measurements by the
+gyro. The wanted torque J (w^2 e - 2 z w rate), e the turn from the axis to the Sun, can be made only across
+the field (Lovera & Astolfi 2004, Automatica 40(8)). So the part along the field is taken from it by a torque
+about the Sun, which turns the axis off the Sun least: wherever the field is not normal to the Sun, both axes
+that matter are steered at once, and the body rolls. The faster the roll, the less is asked of it.
+
+A Sun that is not seen is carried on through an eclipse (`knightcube.gnc.estimation.carried_sun`); without one
+the body is only held still. The residual dipole, a light body's largest torque, is learned and cancelled
+(`knightcube.gnc.estimation.residual_dipole`). The coils pause while the field is measured. One field starts
+nothing: two pauses in a row must agree.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.directions import cross_product
+from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
+from knightcube.gnc.control.detumble import WindowSchedule
+from knightcube.gnc.estimation.carried_sun import CarriedSun
+from knightcube.gnc.estimation.residual_dipole import ResidualDipole
+
+AGREES = 0.2
+"""Share of the field by which two pauses may differ, the turn between them taken out."""
+ROLL = 150.0
+"""By how much a torque about the Sun is cheaper than another."""
+FASTEST, FASTEST_ACROSS = 0.0165, 0.010
+"""rad/s in all, and across the Sun: a faster body is only held still; less than what the mode brakes."""
+FASTEST_ROLL = 0.0105
+"""rad/s about the Sun, from which on it is not cheaper."""
+BANDWIDTH, DAMPING, SHARE = 0.0105, 0.65, 0.6
+"""w, rad/s, and z of the law; a radian off the Sun takes `SHARE` of the coils' torque at most."""
+RESIDUAL = 0.05
+"""Share of the coils' limit that a residual dipole may have."""
+_FIELD = 3e-5
+"""T, in a low orbit."""
+_SECOND = 1e-9
+_NO_DIPOLE: FloatArray = np.zeros(3)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Seeking:
+    """The law's constants.
+
+    Attributes:
+        inertia: (3,) kg m^2 of the body axes.
+        axis: (3,) body axis that turns to the Sun.
+        limit: A m^2 of each coil.
+    """
+
+    inertia: FloatArray
+    axis: FloatArray
+    limit: float
+
+    @property
+    def speed(self) -> float:
+        """The law's w, rad/s."""
+        return min(BANDWIDTH, math.sqrt(SHARE * self.limit * _FIELD / float(self.inertia.max())))
+
+
+class SunSeeker:
+    """Owns the knowledge of Sun and field.
+
+    Takes each reading of the inertial unit and each Sun; returns the dipole each cycle, in order of time.
+    """
+
+    def __init__(self, schedule: WindowSchedule, seeking: Seeking) -> None:
+        self._schedule, self._seeking = schedule, seeking
+        self._carried = CarriedSun()
+        self._residual = ResidualDipole(seeking.inertia, RESIDUAL * seeking.limit)
+        self.begin(0)
+
+    def begin(self, now_ns: int) -> None:
+        """Begin the first pause with no knowledge of the field."""
+        self._begun_ns = self._time_ns = now_ns
+        self._field: FloatArray | None = None
+        self._agrees = False
+        self._rate = self._acts = _NO_DIPOLE
+        self._samples: list[FloatArray] = []
+        self._residual.restart()
+
+    @property
+    def field(self) -> FloatArray | None:
+        """The field (3,) T in body axes at the last reading; None before it is known."""
+        return self._field
+
+    @property
+    def sun(self) -> FloatArray | None:
+        """The Sun's direction (3,) in body axes at the last reading; None where it is not known."""
+        return self._carried.direction
+
+    def see(self, time_ns: int, sun: FloatArray) -> None:
+        """Accept the direction (3,) of the Sun, body axes, of a time just past."""
+        self._carried.see(time_ns, sun)
+
+    def acts(self, dipole: FloatArray) -> None:
+        """Take a dipole (3,) A m^2 that acts instead of the commanded one until the next command."""
+        self._acts = dipole
+
+    def sample(self, time_ns: int, field: FloatArray, rate: FloatArray) -> None:
+        """Accept a field (3,) T, of use in pauses alone, and a gyro's rate (3,) rad/s, both of `time_ns`."""
+        if time_ns <= self._time_ns or not np.all(np.isfinite(np.concatenate([field, rate]))):
+            return
+        rate = rate - self._carried.bias
+        seconds = (time_ns - self._time_ns) * _SECOND
+        turned = attitude_matrix(from_rotation_vector(seconds * rate))
+        self._time_ns, self._rate = time_ns, rate
+        self._carried.turn(time_ns, turned)
+        if self._field is not None:
+            self._field = turned @ self._field
+            self._residual.follow(seconds, rate, self._field, self._acts)
+        schedule = self._schedule
+        phase_ns = (time_ns - self._begun_ns) % schedule.period_ns
+        if schedule.settle_ns <= phase_ns < schedule.settle_ns + schedule.measure_ns:
+            self._samples = [*(turned @ sample for sample in self._samples), field]
+        elif self._samples:
+            self._close(turned)
+
+    def dipole(self, now_ns: int) -> FloatArray:
+        """Return the dipole (3,) A m^2 now: zero while the field is measured or not known."""
+        schedule, seeking, field = self._schedule, self._seeking, self._field
+        phase_ns = (now_ns - self._begun_ns) % schedule.period_ns
+        if phase_ns < schedule.settle_ns + schedule.measure_ns or field is None or not self._agrees:
+            self._acts = _NO_DIPOLE
+            return _NO_DIPOLE
+        dipole = cross_product(field, self._torque(field)) / float(field @ field) - self._residual.dipole
+        largest = float(np.abs(dipole).max())
+        self._acts = dipole if largest <= seeking.limit else dipole * (seeking.limit / largest)
+        return self._acts
+
+    def _torque(self, field: FloatArray) -> FloatArray:
+        """Return the wanted torque (3,) N m in a field (3,) T, across it once the body turns to the Sun."""
+        seeking, sun, rate = self._seeking, self._carried.direction, self._rate
+        speed = seeking.speed
+        torque: FloatArray = -2.0 * DAMPING * speed * seeking.inertia * rate
+        if sun is None:
+            return torque
+        square, roll = float(rate @ rate), float(rate @ sun)
+        if square > FASTEST**2 or square - roll**2 > FASTEST_ACROSS**2:
+            return torque
+        torque = torque + speed**2 * seeking.inertia * _turn(seeking.axis, sun)
+        # What the coils can not make along the field they make up about the Sun, where it does least.
+        cheap = 1.0 + (ROLL - 1.0) * math.exp(-((roll / FASTEST_ROLL) ** 2))
+        spread = field + (cheap - 1.0) * float(sun @ field) * sun
+        return torque - spread * (float(field @ torque) / float(field @ spread))
+
+    def _close(self, turned: FloatArray) -> None:
+        """End a pause: the median of its samples is the field, whatever one of them says."""
+        found = np.median([turned @ sample for sample in self._samples], axis=0)
+        self._samples = []
+        strength = math.sqrt(float(found @ found))
+        if strength == 0.0:
+            self._field, self._agrees = None, False
+            return
+        before = self._field
+        self._agrees = before is not None and float(np.linalg.norm(found - before)) < AGREES * strength
+        self._field = found
+
+
+def _turn(axis: FloatArray, sun: FloatArray) -> FloatArray:
+    """Return the rotation vector (3,), a radian at most, that turns an axis to the Sun, both unit vectors."""
+    across = cross_product(axis, sun)
+    sine = math.sqrt(float(across @ across))
+    cosine = float(axis @ sun)
+    if sine < 1e-6:
+        other = cross_product(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
+        return _NO_DIPOLE if cosine > 0.0 else other / math.sqrt(float(other @ other))
+    return across * (min(1.0, math.atan2(sine, cosine)) / sine)

@@ -1,0 +1,226 @@
+"""Guidance about one axis: accepts or rejects plans, follows the last accepted path, then holds its end.
+
+A plan is rejected, with its reason, when it is late, not finite, beyond the limits, out of order, for another
+target, or does not start at the estimated state. A rejected plan changes nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+import numpy as np
+
+from knightcube.errors import UsageError
+from knightcube.gnc.guidance.one_axis.limits import Q2_LIMIT
+from knightcube.gnc.guidance.one_axis.path import PolynomialPath, Sample
+from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant, q2_of
+from knightcube.gnc.guidance.one_axis.vmc import Plan
+
+_CHECKED_POINTS = 600
+_SAME = 1e-6
+"""Largest difference between a path's end and the target, in q2 and in rad/s."""
+
+
+class GuidanceState(StrEnum):
+    """What `Guidance.sample` returns: a path under way, a held attitude, or nothing yet."""
+
+    NONE = "none"
+    FOLLOWING = "following"
+    HOLDING = "holding"
+
+
+@dataclass(frozen=True, slots=True)
+class AcceptanceRules:
+    """The limits that a plan must keep to be accepted.
+
+    Attributes:
+        late_after: s from its origin to its arrival.
+        angle_tolerance: rad, rate_tolerance: rad/s, between its start and the estimate at its origin.
+        q2_limit: bound of |q2|; an overshoot of 1e-3 of it is accepted.
+        current_excess: largest relative excess over the plant's current limit anywhere on the path.
+    """
+
+    late_after: float
+    angle_tolerance: float = 0.05
+    rate_tolerance: float = 0.02
+    q2_limit: float = Q2_LIMIT
+    current_excess: float = 1e-3
+
+    def __post_init__(self) -> None:
+        """Raise UsageError for a limit that is not positive and finite."""
+        for name in ("late_after", "angle_tolerance", "rate_tolerance", "q2_limit", "current_excess"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise UsageError(f"guidance {name} is {value}: it must be finite and positive")
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Whether a plan was accepted; `reason` says why not and is empty otherwise."""
+
+    accepted: bool
+    reason: str = ""
+
+
+class Guidance:
+    """Owns the path being followed and the current target."""
+
+    def __init__(self, plant: SingleAxisPlant, rules: AcceptanceRules, arrives: bool = True) -> None:
+        """Plan for `plant` and its limits; `arrives` says that paths end at the target and hold it.
+
+        On a receding horizon (`arrives` false) a path that ends means that later plans are missing.
+        """
+        self._plant = plant
+        self._rules = rules
+        self._arrives = arrives
+        self._path: PolynomialPath | None = None
+        self._planned_ns: int | None = None
+        self._target_q2: float | None = None
+        self._target_rate = 0.0
+        self._aimed_ns = 0
+
+    @property
+    def target_q2(self) -> float | None:
+        """The target attitude as q2; None before the first target."""
+        return self._target_q2
+
+    @property
+    def path(self) -> PolynomialPath | None:
+        """The path being followed or held; None without one."""
+        return self._path
+
+    def aim(self, target_q2: float, target_rate: float = 0.0, now_ns: int = 0) -> None:
+        """Set the target attitude and its rate in rad/s; the present path is followed until a new plan comes.
+
+        Raises UsageError when a value is not finite or q2 is beyond its limit.
+        """
+        if not abs(target_q2) <= self._rules.q2_limit:  # NaN compares false
+            raise UsageError(f"target q2 is {target_q2}: it must lie within +-{self._rules.q2_limit}")
+        if not math.isfinite(target_rate):
+            raise UsageError(f"target rate is {target_rate}: it must be finite")
+        self._target_q2 = target_q2
+        self._target_rate = target_rate
+        self._aimed_ns = now_ns
+
+    def hold(self, angle: float, now_ns: int) -> None:
+        """Hold `angle` rad from now on; plans made earlier than now are then out of order.
+
+        Raises UsageError when the angle is not finite.
+        """
+        if not math.isfinite(angle):
+            raise UsageError(f"the angle to hold is {angle}: it must be finite")
+        self._path = PolynomialPath.holding(angle, now_ns)
+        self._planned_ns = now_ns - 1
+
+    def release(self) -> None:
+        """Drop the path; there is none until the next accepted plan or hold."""
+        self._path = None
+        self._planned_ns = None
+
+    def offer(
+        self,
+        plan: Plan,
+        origin_ns: int,
+        now_ns: int,
+        estimate_angle: float,
+        estimate_rate: float,
+        disturbance: float = 0.0,
+    ) -> Verdict:
+        """Follow `plan` from `origin_ns` if it keeps the rules.
+
+        The estimates are in rad and rad/s at its origin; the current limit is checked under `disturbance`
+        in rad/s^2.
+        """
+        reason = (
+            self._untimely(origin_ns, now_ns)
+            or self._unwanted(plan)
+            or self._unflyable(plan.path, replace(self._plant, disturbance=disturbance))
+            or self._displaced(plan.path, estimate_angle, estimate_rate)
+        )
+        if reason:
+            return Verdict(False, reason)
+        self._path = plan.path.starting_at(origin_ns)
+        self._planned_ns = origin_ns
+        return Verdict(True)
+
+    def sample(self, now_ns: int) -> Sample | None:
+        """Return the commanded motion now; None without a path."""
+        return None if self._path is None else self._path.sample(now_ns)
+
+    def state(self, now_ns: int) -> GuidanceState:
+        """Return whether a path is being followed or its end held now."""
+        if self._path is None:
+            return GuidanceState.NONE
+        return GuidanceState.HOLDING if self._path.has_ended(now_ns) else GuidanceState.FOLLOWING
+
+    def is_following(self, now_ns: int) -> bool:
+        """Return whether a path is under way, rather than its end held."""
+        return self.state(now_ns) is GuidanceState.FOLLOWING
+
+    def is_adrift(self, now_ns: int) -> bool:
+        """Return whether an attitude other than the target is held because no plan came in time."""
+        if self._path is None or not self._path.has_ended(now_ns):
+            return False
+        if not self._arrives:
+            return True
+        waited = (now_ns - self._aimed_ns) * 1e-9
+        return not self._reaches_target(self._path) and waited > self._rules.late_after
+
+    def remains(self, now_ns: int) -> PolynomialPath | None:
+        """Return the path under way to the target, its origin relative to `now_ns`; None without one."""
+        path = self._path
+        if path is None or path.has_ended(now_ns) or not self._reaches_target(path):
+            return None
+        return path.starting_at(path.origin_ns - now_ns)
+
+    def _reaches_target(self, path: PolynomialPath) -> bool:
+        if self._target_q2 is None:
+            return False
+        near = abs(q2_of(path.end_angle) - self._target_q2) <= _SAME
+        return near and abs(path.end_rate - self._target_rate) <= _SAME
+
+    def _untimely(self, origin_ns: int, now_ns: int) -> str:
+        age = (now_ns - origin_ns) * 1e-9
+        if age < 0.0:
+            return f"its origin lies {-age:.3f} s in the future"
+        if age > self._rules.late_after:
+            return f"late: {age:.3f} s after its origin, {self._rules.late_after} s allowed"
+        if self._planned_ns is not None and origin_ns <= self._planned_ns:
+            return "out of order: the path being flown is not older"
+        return ""
+
+    def _unwanted(self, plan: Plan) -> str:
+        if self._target_q2 is None:
+            return "no target is wanted"
+        if not (abs(plan.target_q2 - self._target_q2) <= _SAME and self._reaches_target(plan.path)):
+            ends = f"q2 {q2_of(plan.path.end_angle):.4f} at {plan.path.end_rate:.4f} rad/s"
+            return f"it ends at {ends}, wanted is {self._target_q2:.4f} at {self._target_rate:.4f} rad/s"
+        return ""
+
+    def _unflyable(self, path: PolynomialPath, plant: SingleAxisPlant) -> str:
+        if not (math.isfinite(path.horizon) and path.horizon > 0.0):
+            return f"not finite: its horizon is {path.horizon} s"
+        # Just inside the end: at the end itself the hold has begun.
+        times = path.horizon * np.linspace(0.0, 1.0 - 1e-12, _CHECKED_POINTS)
+        angle, rate, acceleration = path.motion(times)
+        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+            current = plant.currents(angle, rate, acceleration)
+            peak_q2 = float(np.abs(np.sin(0.5 * angle)).max())
+        peak = float(np.abs(current).max())
+        if not (math.isfinite(peak) and math.isfinite(peak_q2)):
+            return "not finite somewhere along the path"
+        if peak > plant.current_limit * (1.0 + self._rules.current_excess):
+            return f"needs {peak:.4f} A, the limit is {plant.current_limit} A"
+        if peak_q2 > self._rules.q2_limit * (1.0 + 1e-3):
+            return f"reaches |q2| {peak_q2:.4f}, the limit is {self._rules.q2_limit}"
+        return ""
+
+    def _displaced(self, path: PolynomialPath, angle: float, rate: float) -> str:
+        start = path.sample(path.origin_ns)
+        if not abs(start.angle - angle) <= self._rules.angle_tolerance:
+            return f"starts at {start.angle:.4f} rad, the body was at {angle:.4f} rad"
+        if not abs(start.rate - rate) <= self._rules.rate_tolerance:
+            return f"starts at {start.rate:.4f} rad/s, the body moved at {rate:.4f} rad/s"
+        return ""

@@ -1,0 +1,140 @@
+"""A path in time, sampled by the tracker at 40 Hz.
+
+q2 is one polynomial in time, as the planner computed it; angle, rate and acceleration follow from q2 exactly
+(Sease 5.9; 5.13 corrected), so the current between nodes is the one that the planner limited.
+After its end a path holds its last attitude, or coasts at its end rate as far as the coil has authority.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.polynomial import chebyshev
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import about_axis_y
+from knightcube.gnc.guidance.lgl import lgl_rule
+from knightcube.gnc.guidance.one_axis.limits import Q2_LIMIT
+from knightcube.gnc.guidance.one_axis.plant import acceleration_of, angle_of, motion_of, rate_of
+
+FARTHEST = angle_of(Q2_LIMIT)
+"""rad: the largest angle of a coast."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """The commanded motion at one time: theta in rad, theta' in rad/s, theta'' in rad/s^2."""
+
+    angle: float
+    rate: float
+    acceleration: float
+
+    @property
+    def quaternion(self) -> FloatArray:
+        """The attitude (4,) that the angle about body y is."""
+        return about_axis_y(self.angle)
+
+    @property
+    def body_rate(self) -> FloatArray:
+        """The rate (3,), rad/s, body axes."""
+        return np.array([0.0, self.rate, 0.0])
+
+
+@dataclass(frozen=True, slots=True)
+class PolynomialPath:
+    """A path that starts at `origin_ns` and lasts `horizon` s.
+
+    Attributes:
+        origin_ns: monotonic time of its start.
+        horizon: s; zero for a held attitude.
+        series: Chebyshev coefficients of (q2, q2' in 1/s, q2'' in 1/s^2), highest degree first.
+        end_angle: theta in rad at the horizon.
+        end_rate: theta' in rad/s kept after the horizon; zero holds the end.
+    """
+
+    origin_ns: int
+    horizon: float
+    series: tuple[tuple[float, float, float], ...]
+    end_angle: float
+    end_rate: float = 0.0
+
+    @classmethod
+    def through(
+        cls, node_q2: FloatArray, horizon: float, origin_ns: int = 0, end_rate: float = 0.0
+    ) -> PolynomialPath:
+        """Return the polynomial path through q2 (N,) on the N Legendre-Gauss-Lobatto nodes of `horizon` s.
+
+        The path coasts at `end_rate` rad/s after the horizon.
+        """
+        count = node_q2.size
+        columns = np.zeros((count, 3))
+        columns[:, 0] = _chebyshev_fit(count) @ node_q2
+        columns[:-1, 1] = chebyshev.chebder(columns[:, 0], scl=2.0 / horizon)
+        columns[:-2, 2] = chebyshev.chebder(columns[:-1, 1], scl=2.0 / horizon)
+        series = tuple((q2, rate, acceleration) for q2, rate, acceleration in columns[::-1].tolist())
+        return cls(origin_ns, horizon, series, angle_of(float(node_q2[-1])), end_rate)
+
+    @classmethod
+    def holding(cls, angle: float, origin_ns: int = 0) -> PolynomialPath:
+        """Return the path that holds `angle` rad without end."""
+        return cls(origin_ns, 0.0, (), angle)
+
+    def starting_at(self, origin_ns: int) -> PolynomialPath:
+        """Return the same path, starting at `origin_ns`."""
+        return replace(self, origin_ns=origin_ns)
+
+    def has_ended(self, now_ns: int) -> bool:
+        """Return whether the horizon has passed at `now_ns`."""
+        return (now_ns - self.origin_ns) * 1e-9 >= self.horizon
+
+    def sample(self, now_ns: int) -> Sample:
+        """Return the commanded motion at `now_ns`: the start before the origin, a coast after the end."""
+        elapsed = (now_ns - self.origin_ns) * 1e-9
+        if elapsed >= self.horizon:
+            return self._coast(elapsed - self.horizon)
+        s = 2.0 * max(elapsed, 0.0) / self.horizon - 1.0
+        # Clenshaw's recurrence on three series at once; floats are faster than numpy arrays of twenty
+        # elements.
+        twice = 2.0 * s
+        a1 = a2 = b1 = b2 = c1 = c2 = 0.0
+        for a, b, c in self.series[:-1]:
+            a1, a2 = a + twice * a1 - a2, a1
+            b1, b2 = b + twice * b1 - b2, b1
+            c1, c2 = c + twice * c1 - c2, c1
+        a, b, c = self.series[-1]
+        q2, q2_rate, q2_acceleration = a + s * a1 - a2, b + s * b1 - b2, c + s * c1 - c2
+        return Sample(angle_of(q2), rate_of(q2, q2_rate), acceleration_of(q2, q2_rate, q2_acceleration))
+
+    def motion(self, times: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return theta, theta', theta'' (n,) at `times` (n,) s after the origin, NaN where |q2| > 1."""
+        coasted = self.end_angle + self.end_rate * (times - self.horizon)
+        farthest = max(FARTHEST, abs(self.end_angle))
+        angle = np.clip(coasted, -farthest, farthest)
+        rate = np.where(angle == coasted, self.end_rate, 0.0)
+        acceleration = np.zeros(times.shape)
+        under_way = times < self.horizon
+        if under_way.any():
+            s = 2.0 * np.maximum(times[under_way], 0.0) / self.horizon - 1.0
+            columns = np.array(self.series[::-1])
+            with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+                q2, q2_rate, q2_acceleration = chebyshev.chebval(s, columns)
+                moving = motion_of(q2, q2_rate, q2_acceleration)
+            angle[under_way], rate[under_way], acceleration[under_way] = moving
+        return angle, rate, acceleration
+
+    def _coast(self, since: float) -> Sample:
+        """Return the motion `since` s after the horizon."""
+        angle = self.end_angle + self.end_rate * since
+        farthest = max(FARTHEST, abs(self.end_angle))
+        if abs(angle) > farthest:
+            return Sample(math.copysign(farthest, angle), 0.0, 0.0)
+        return Sample(angle, self.end_rate, 0.0)
+
+
+@lru_cache(maxsize=8)
+def _chebyshev_fit(count: int) -> FloatArray:
+    """Return the matrix (N, N) from values on N nodes to Chebyshev coefficients."""
+    return np.asarray(np.linalg.inv(chebyshev.chebvander(lgl_rule(count).nodes, count - 1)), dtype=float)

@@ -1,0 +1,319 @@
+"""The programs of virtual motion camouflage, on NLopt's SLSQP with exact gradients (Sease 5.8, 5.14).
+
+Two programs share cost and limits: least energy at a fixed horizon, and least energy plus price times
+horizon. The limits hold at every time, not only on the nodes: they are imposed at the points of a dense grid
+where the previous solution exceeded them, until no point does (the exchange method of semi-infinite
+programming).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import nlopt
+import numpy as np
+
+from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
+from knightcube.gnc.guidance.one_axis.path_cost import PathCost
+from knightcube.gnc.guidance.one_axis.plant import (
+    SQUARE_Q2_WITHOUT_AUTHORITY,
+    SingleAxisPlant,
+    current_and_slopes,
+)
+from knightcube.gnc.guidance.one_axis.vmc_family import Family, Observed, time_scale
+
+LIMIT_TOLERANCE = 3e-4
+"""Largest relative excess over a limit on the dense grid; leaves room under 1e-3 between its points."""
+
+IMPOSED_MARGIN = 2e-4
+"""Relative margin by which a limit is tightened where imposed, so that peaks between those points keep it
+too; without the margin the exchanges converge slowly."""
+
+# NLopt 2.11 has a runtime_error of its own, older bindings raise Python's.
+_SOLVER_STOPS = (nlopt.RoundoffLimited, RuntimeError, getattr(nlopt, "runtime_error", RuntimeError))
+_CONVERGED = (nlopt.SUCCESS, nlopt.FTOL_REACHED, nlopt.XTOL_REACHED)
+_EXCHANGES = 10
+_EVALUATIONS = 300
+_FREE_TOLERANCE = 1e-5
+_IMPOSE_ABOVE = 0.5
+_IMPOSE_EVERY = 16
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """One point of a program: the path's parameters (N - 4,) and its horizon in s."""
+
+    parameters: FloatArray
+    horizon: float
+
+
+@dataclass(frozen=True, slots=True)
+class FreeHorizon:
+    """A horizon to be optimised between `least` and `greatest` s, at `price` W per second."""
+
+    least: float
+    greatest: float
+    price: float
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Imposed limits (m,): dense grid point, sign, and which limit, that of q2 or of the current."""
+
+    index: IntArray
+    sign: FloatArray
+    is_q2: BoolArray
+
+    @classmethod
+    def at(cls, chosen: BoolArray, ratios: FloatArray) -> Limits:
+        """Return limits at `chosen` (2, dense), signed as `ratios` (2, dense), current then q2."""
+        row, index = np.nonzero(chosen)
+        return cls(index, np.sign(ratios[row, index]), row == 1)
+
+
+class Program:
+    """One plant, one family of paths between two states, and their cost and limits.
+
+    Attributes:
+        family: whitened around the prey at the given horizon.
+        evaluations: of the cost, over all solutions.
+    """
+
+    def __init__(
+        self,
+        plant: SingleAxisPlant,
+        family: Family,
+        q2_limit: float,
+        horizon: float,
+        cost: PathCost,
+    ) -> None:
+        self._plant = plant
+        self._cost = cost
+        # The ends are given: one at the limit itself leaves no room for the margin.
+        self._q2_limit = max(q2_limit, (1.0 + IMPOSED_MARGIN) * family.farthest_end)
+        # An iterate may pass the singularity; q2 is clamped beyond its limit so that the current stays
+        # finite.
+        self._q2_cap = 0.5 * (q2_limit + math.sqrt(SQUARE_Q2_WITHOUT_AUTHORITY))
+        self._weights = 0.5 * family.grid.cost_weights
+        self._bang = plant.resistance * plant.current_limit**2
+        self.family = self._whitened(family, horizon)
+        self._cost_points = self.family.observed(family.grid.cost)
+        self.evaluations = 0
+
+    @property
+    def current_limit(self) -> float:
+        """The plant's current limit, A."""
+        return self._plant.current_limit
+
+    @property
+    def bang_power(self) -> float:
+        """R Imax^2, W: the coil's power at its current limit."""
+        return self._bang
+
+    def prey(self, horizon: float) -> Trial:
+        """Return the prey path itself over `horizon` s: every path control parameter one."""
+        return Trial(np.zeros(self.family.size), horizon)
+
+    def _whitened(self, family: Family, horizon: float) -> Family:
+        """Return the family whose Gauss-Newton Hessian of the energy at the prey is the unit matrix.
+
+        SLSQP starts from the unit matrix, so its first step is the Gauss-Newton step.
+        """
+        observed = family.observed(family.grid.cost)
+        prey = observed.trajectory(np.zeros(family.size), horizon)
+        _, slopes = self._current(prey, horizon)
+        root_weights = np.sqrt(2.0 * self._plant.resistance * horizon * self._weights)
+        jacobian = root_weights[:, None] * _contract(slopes, observed.basis)
+        return family.remixed(np.linalg.inv(np.linalg.qr(jacobian, mode="r")))
+
+    def _current(self, trajectory: FloatArray, horizon: float) -> tuple[FloatArray, FloatArray]:
+        """Return the current (m,) and its slopes (3, m) by q2 and its s-derivatives."""
+        q2 = trajectory[0]
+        held = np.minimum(np.maximum(q2, -self._q2_cap), self._q2_cap)
+        current, *slopes = current_and_slopes(self._plant, held, trajectory[1], trajectory[2])
+        stacked = np.array(slopes)
+        stacked[0] *= held == q2
+        stacked *= time_scale(horizon)
+        return current, stacked
+
+    def energy(self, trial: Trial) -> tuple[float, FloatArray, float]:
+        """Return the integral of the cost's power in J, its gradient (N - 4,), and d/dT.
+
+        For heat that is 5.8 without the 1/2 of 5.1.
+        """
+        points, horizon = self._cost_points, trial.horizon
+        trajectory = points.trajectory(trial.parameters, horizon)
+        current, slopes = self._current(trajectory, horizon)
+        power, by_current = self._cost.smooth(self._plant, current)
+        energy = horizon * float(self._weights @ power)
+        pull = (horizon * self._weights * by_current) * slopes
+        gradient = pull.ravel() @ points.basis.reshape(-1, points.basis.shape[2])
+        by_horizon = energy / horizon + float(np.sum(pull * points.aging(trajectory, horizon)))
+        return energy, gradient, by_horizon
+
+    def spent(self, trial: Trial, cost: PathCost) -> float:
+        """Return the integral of a power along a path, J."""
+        trajectory = self._cost_points.trajectory(trial.parameters, trial.horizon)
+        power = cost.power(self._plant, self._current(trajectory, trial.horizon)[0])
+        return trial.horizon * float(self._weights @ power)
+
+    def excess(
+        self, limits: Limits, points: Observed, trial: Trial
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return limit ratios minus one (m,), gradients (m, N - 4) and d/dT (m,) at `points` (m)."""
+        trajectory = points.trajectory(trial.parameters, trial.horizon)
+        current, slopes = self._current(trajectory, trial.horizon)
+        value = np.where(limits.is_q2, trajectory[0] / self._q2_limit, current / self._plant.current_limit)
+        slopes /= self._plant.current_limit
+        slopes[:, limits.is_q2] = np.array([[1.0 / self._q2_limit], [0.0], [0.0]])
+        slopes *= limits.sign
+        aged = np.sum(slopes * points.aging(trajectory, trial.horizon), axis=0)
+        return limits.sign * value - 1.0, _contract(slopes, points.basis), aged
+
+    def ratios(self, trial: Trial) -> FloatArray:
+        """Return current and q2 over their limits on the dense grid, signed (2, dense)."""
+        nodes = self.family.nodes(trial.parameters, trial.horizon)
+        trajectory = time_scale(trial.horizon) * (self.family.grid.dense.matrices @ nodes)
+        current, _ = self._current(trajectory, trial.horizon)
+        return np.stack([current / self._plant.current_limit, trajectory[0] / self._q2_limit])
+
+    def beside_prey(self, apart: FloatArray, horizon: float) -> Trial:
+        """Return the path that differs by `apart` (N,) from the prey on the nodes; its ends stay the same."""
+        return Trial(np.asarray(np.linalg.solve(self.family.basis[2:-2], apart[2:-2]), dtype=float), horizon)
+
+    def from_prey(self, trial: Trial) -> FloatArray:
+        """Return the difference (N,) of a path from its prey on the nodes, as `beside_prey` takes it."""
+        return np.asarray(self.family.basis @ trial.parameters)
+
+    def unlimited(self, start: Trial) -> Trial | None:
+        """Return the least-energy path over the horizon of `start` without limits; None if none is found."""
+        trial, converged = self._minimise(start, None, None)
+        if converged:
+            return trial
+        # NLopt reports a problem that starts at its optimum as limited by rounding. The whitened gradient
+        # distinguishes that from a failure: half its square is the energy still to be saved.
+        _, gradient, _ = self.energy(trial)
+        return trial if 0.5 * float(gradient @ gradient) <= self._energy_tolerance(trial.horizon) else None
+
+    def limited(self, start: Trial, free: FreeHorizon | None = None) -> Trial | None:
+        """Return the least-energy path within the limits, from `start`; None when none was found.
+
+        With `free` the horizon is free and its price is added to the energy.
+        """
+        ratios = self.ratios(start)
+        every = np.arange(ratios.shape[1]) % _IMPOSE_EVERY == _IMPOSE_EVERY // 2
+        chosen = (np.abs(ratios) > _IMPOSE_ABOVE) & every | _peaks(ratios)
+        trial = start
+        for _ in range(_EXCHANGES):
+            limits = Limits.at(chosen, ratios)
+            trial, converged = self._minimise(trial, limits, free)
+            latest = self.ratios(trial)
+            worst = float(np.abs(latest).max())
+            if worst <= 1.0 + LIMIT_TOLERANCE:
+                return trial if converged else None
+            if not math.isfinite(worst) or np.any(np.abs(latest[chosen]) > 1.0 + LIMIT_TOLERANCE):
+                return None  # exceeded although imposed
+            added = _peaks(latest) & ~chosen
+            ratios = np.where(added, latest, ratios)
+            chosen = chosen | added
+        return None
+
+    def _energy_tolerance(self, horizon: float) -> float:
+        """Return the tolerance on energy, J: 1e-8 of the energy at the current limit over the horizon."""
+        return 1e-8 * self._bang * horizon
+
+    def _minimise(self, start: Trial, limits: Limits | None, free: FreeHorizon | None) -> tuple[Trial, bool]:
+        """Run SLSQP once from `start`; return where it ended, and whether it converged."""
+        variables = _Variables(start, self.family.size, free)
+        size, price = variables.size, variables.price
+        last = variables.first
+
+        def objective(x: FloatArray, gradient: FloatArray) -> float:
+            nonlocal last
+            last = x.copy()
+            self.evaluations += 1
+            trial = variables.trial(x)
+            energy, by_parameters, by_horizon = self.energy(trial)
+            if gradient.size:
+                gradient[:size] = by_parameters
+                if free:
+                    gradient[size] = variables.root * trial.horizon * (by_horizon + price)
+            return energy + price * trial.horizon
+
+        solver = nlopt.opt(nlopt.LD_SLSQP, last.size)
+        solver.set_min_objective(objective)
+        # A part of 1e-5 of a free horizon's objective is a horizon to 0.01 % or better.
+        origin = variables.origin
+        solver.set_ftol_abs(_FREE_TOLERANCE * price * origin if free else self._energy_tolerance(origin))
+        solver.set_maxeval(_EVALUATIONS)
+        variables.bound(solver)
+        if limits is not None and limits.index.size:
+            self._impose(solver, limits, variables)
+        try:
+            found = np.asarray(solver.optimize(last))
+        except _SOLVER_STOPS:
+            # Trivial and infeasible problems end so: the line search has shrunk onto the last point.
+            return variables.trial(last), False
+        return variables.trial(found), solver.last_optimize_result() in _CONVERGED
+
+    def _impose(self, solver: nlopt.opt, limits: Limits, variables: _Variables) -> None:
+        points = self.family.observed(self.family.grid.dense.take(limits.index))
+        size = variables.size
+
+        def constraints(result: FloatArray, x: FloatArray, gradient: FloatArray) -> None:
+            trial = variables.trial(x)
+            value, by_parameters, by_horizon = self.excess(limits, points, trial)
+            result[:] = value + IMPOSED_MARGIN
+            if gradient.size:
+                gradient[:, :size] = by_parameters
+                if variables.free:
+                    gradient[:, size] = variables.root * trial.horizon * by_horizon
+
+        solver.add_inequality_mconstraint(constraints, np.full(limits.index.size, 1e-6))
+
+
+class _Variables:
+    """What the optimiser varies: the path's parameters and, where the horizon is free, its logarithm.
+
+    The logarithm log(T/T0) is scaled so that the price of time has, like the whitened energy, a curvature of
+    about one.
+
+    Attributes:
+        first: where the optimiser begins.
+        root: the scale of the logarithm; zero for a fixed horizon.
+    """
+
+    def __init__(self, start: Trial, size: int, free: FreeHorizon | None) -> None:
+        self.size, self.origin, self.free = size, start.horizon, free
+        self.price = free.price if free else 0.0
+        self.root = 1.0 / math.sqrt(free.price * self.origin) if free else 0.0
+        self.first = np.append(start.parameters, 0.0) if free else start.parameters
+
+    def trial(self, x: FloatArray) -> Trial:
+        """Return the trial of the variables."""
+        horizon = self.origin * math.exp(self.root * x[self.size]) if self.free else self.origin
+        return Trial(x[: self.size].copy(), horizon)
+
+    def bound(self, solver: nlopt.opt) -> None:
+        """Keep a free horizon within its bounds."""
+        if self.free is not None:
+            bounds = self.free.least, self.free.greatest
+            low, high = (math.log(bound / self.origin) / self.root for bound in bounds)
+            solver.set_lower_bounds(np.append(np.full(self.size, -np.inf), low))
+            solver.set_upper_bounds(np.append(np.full(self.size, np.inf), high))
+            self.first[self.size] = min(max(0.0, low), high)
+
+
+def _contract(slopes: FloatArray, basis: FloatArray) -> FloatArray:
+    """Return d/dy (m, n) from slopes (3, m) by q2 and its s-derivatives and their d/dy (3, m, n)."""
+    return np.asarray((slopes[:, :, None] * basis).sum(axis=0))
+
+
+def _peaks(ratios: FloatArray) -> BoolArray:
+    """Return where (2, m) |ratios| (2, m) has a local maximum above one along its rows."""
+    size = np.abs(ratios)
+    peak = size > 1.0
+    peak[:, 1:] &= size[:, 1:] >= size[:, :-1]
+    peak[:, :-1] &= size[:, :-1] >= size[:, 1:]
+    return np.asarray(peak)

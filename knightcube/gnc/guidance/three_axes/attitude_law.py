@@ -1,0 +1,292 @@
+"""Attitude laws: which attitude is wanted at each time, from two directions.
+
+A law turns one body axis to a first direction exactly, and a second body axis as near to a second direction
+as the first allows (TRIAD: Black 1964). Directions are inertial, the orbit's own (nadir, velocity, normal),
+the Sun's, or a place on the ground. For a free roll the second direction is taken from the attitude at the
+start, fixed in inertial axes or in the orbit's, whichever the first direction belongs to, so that nothing
+turns about the first.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import erfa
+import numpy as np
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.ephemeris import Ephemeris
+from knightcube.astro.earth.orientation import celestial_to_terrestrial
+from knightcube.astro.earth.sun import DAY
+from knightcube.astro.quaternion import (
+    attitude_matrix,
+    conjugate,
+    from_matrix,
+    from_rotation_vector,
+    multiply,
+    to_rotation_vector,
+)
+from knightcube.errors import UsageError
+
+Direction = Callable[[Ephemeris, FloatArray], FloatArray]
+"""Gives unit vectors (n, 3), ICRS, at times (n,) s of an ephemeris."""
+DIFFERENCE = 1.0
+"""s, of the central differences for rate and acceleration."""
+LEAST_SINE = 1e-3
+"""Between the two directions: nearer to parallel they fix no attitude."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reference:
+    """The wanted attitude (4,), rate (3,) rad/s and acceleration (3,) rad/s^2 at one time, in its axes."""
+
+    quaternion: FloatArray
+    rate: FloatArray
+    acceleration: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class References:
+    """The wanted motion at even `times` (n,) s: attitudes (n, 4), rates (n, 3), accelerations (n, 3).
+
+    Rates, rad/s, and accelerations, rad/s^2, are in the axes of the wanted attitude.
+    """
+
+    times: FloatArray
+    quaternion: FloatArray
+    rate: FloatArray
+    acceleration: FloatArray
+
+    def place(self, time: float) -> tuple[int, float]:
+        """Return the instant before a time, s, and the share of the step since; the ends stand still."""
+        begin, step = float(self.times[0]), float(self.times[1] - self.times[0])
+        place = (time - begin) / step
+        k = min(max(math.floor(place), 0), len(self.times) - 2)
+        return k, min(max(place - k, 0.0), 1.0)
+
+    def at(self, time: float) -> Reference:
+        """Return the wanted motion at a time, s, within the times; at the ends that of the end."""
+        k, share = self.place(time)
+        near = k + round(share)
+        since = (share - round(share)) * float(self.times[1] - self.times[0])
+        rate, acceleration = self.rate[near], self.acceleration[near]
+        turned = from_rotation_vector(since * rate + 0.5 * since * since * acceleration)
+        return Reference(
+            multiply(turned, self.quaternion[near]),
+            (1.0 - share) * self.rate[k] + share * self.rate[k + 1],
+            (1.0 - share) * self.acceleration[k] + share * self.acceleration[k + 1],
+        )
+
+    def until(self, count: int) -> References:
+        """Return the first `count` instants."""
+        return self._part(slice(count))
+
+    def since(self, place: int) -> References:
+        """Return the instants from `place` on."""
+        return self._part(slice(place, None))
+
+    def _part(self, part: slice) -> References:
+        return References(self.times[part], self.quaternion[part], self.rate[part], self.acceleration[part])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AttitudeLaw:
+    """Body `axis` (3,) to the direction `first`, body axis `across` (3,) as near as may be to `second`."""
+
+    axis: FloatArray
+    first: Direction
+    across: FloatArray
+    second: Direction
+
+    def attitudes(self, ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
+        """Return the wanted attitudes (n, 4) at times (n,) s. Raises UsageError for parallel directions."""
+        wanted = _frames(self.first(ephemeris, times), self.second(ephemeris, times))
+        body = _frames(self.axis[None], self.across[None])[0]
+        return np.array([from_matrix(body.T @ frame) for frame in wanted])
+
+
+Attitudes = Callable[[Ephemeris, FloatArray], FloatArray]
+"""Gives wanted attitudes (n, 4) at times (n,) s of an ephemeris: of an `AttitudeLaw`, or an `approach`."""
+
+
+def references(attitudes: Attitudes, ephemeris: Ephemeris, times: FloatArray) -> References:
+    """Return attitude, rate and acceleration at times (n,) s, by central differences over a second."""
+    before, now, after = (attitudes(ephemeris, times + shift) for shift in (-DIFFERENCE, 0.0, DIFFERENCE))
+    back = to_rotation_vector(multiply(before, conjugate(now)))
+    ahead = to_rotation_vector(multiply(after, conjugate(now)))
+    return References(times, now, (ahead - back) / (2.0 * DIFFERENCE), (ahead + back) / DIFFERENCE**2)
+
+
+def nadir(ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
+    """Return the directions (n, 3) of the Earth's centre."""
+    return _unit(-ephemeris.position_at(times))
+
+
+def velocity(ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
+    """Return the directions (n, 3) of flight with respect to the stars."""
+    return _unit(ephemeris.velocity_at(times))
+
+
+def orbit_normal(ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
+    """Return the directions (n, 3) of the orbit's angular momentum."""
+    return _unit(np.cross(ephemeris.position_at(times), ephemeris.velocity_at(times)))
+
+
+def sun(ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
+    """Return the directions (n, 3) of the Sun."""
+    return ephemeris.sun_at(times)
+
+
+def inertial(vector: FloatArray) -> Direction:
+    """Return the law of a direction (3,) fixed among the stars."""
+    fixed = _unit(np.asarray(vector, dtype=float))
+
+    def at(_: Ephemeris, times: FloatArray) -> FloatArray:
+        return np.broadcast_to(fixed, (len(times), 3))
+
+    return at
+
+
+def orbital(vector: FloatArray) -> Direction:
+    """Return the law of a direction (3,) fixed in the orbit's axes: flight, against the normal, nadir."""
+    fixed = _unit(np.asarray(vector, dtype=float))
+
+    def at(ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
+        return np.asarray(fixed @ _orbital_axes(ephemeris, times))
+
+    return at
+
+
+def ground(latitude: float, longitude: float, height: float = 0.0) -> Direction:
+    """Return the law of a place on the ground: geodetic latitude and longitude, rad, height m over WGS 84."""
+    if not (abs(latitude) <= 0.5 * np.pi and np.isfinite(longitude) and np.isfinite(height)):
+        raise UsageError(f"no place: latitude {latitude}, longitude {longitude} rad, height {height} m")
+    place = np.asarray(erfa.gd2gc(1, longitude, latitude, height))
+
+    def at(ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
+        to_ground = celestial_to_terrestrial(ephemeris.julian_date + np.asarray(times) / DAY)
+        return _unit(place @ to_ground - ephemeris.position_at(times))
+
+    return at
+
+
+def free_roll(
+    axis: FloatArray, first: Direction, quaternion: FloatArray, ephemeris: Ephemeris, time: float
+) -> AttitudeLaw:
+    """Return the law that turns `axis` (3,) to `first` with the roll that the attitude (4,) at `time` s has.
+
+    The roll is held against the stars when the direction stands still among them, otherwise against the
+    orbit.
+    """
+    across = _any_across(axis)
+    shown = attitude_matrix(quaternion).T @ across
+    when = np.array([time])
+    wanted = first(ephemeris, when)[0]
+    # Shortest way: the second direction turns with the axis from where it points to where it shall point.
+    shown = _turned(attitude_matrix(quaternion).T @ axis, wanted, shown)
+    moved = float(np.linalg.norm(first(ephemeris, when + 10.0)[0] - wanted))
+    if moved < 1e-4:
+        return AttitudeLaw(axis, first, across, inertial(shown))
+    return AttitudeLaw(axis, first, across, orbital(_orbital_axes(ephemeris, when)[0] @ shown))
+
+
+def passing(direction: FloatArray, velocity: FloatArray, since: float) -> Direction:
+    """Return the law of an object in `direction` (3,) at `since` s that moves on a straight line.
+
+    `velocity` (3,) 1/s is that of its place relative to ours, over its distance; zero: it stands still.
+    """
+
+    def at(_: Ephemeris, times: FloatArray) -> FloatArray:
+        return _unit(direction + (np.asarray(times) - since)[:, None] * velocity)
+
+    return at
+
+
+def following(
+    axis: FloatArray, direction: FloatArray, velocity: FloatArray, since: float, quaternion: FloatArray
+) -> AttitudeLaw:
+    """Return the law that turns `axis` (3,) to a `passing` object, and turns nothing about `axis`.
+
+    Its roll is that of the attitude (4,) after the shortest turn to `direction`.
+    """
+    shown = attitude_matrix(quaternion)
+    normal = np.cross(direction, velocity)
+    size = float(np.linalg.norm(normal))
+    now = shown.T @ axis
+    normal = normal / size if size > 1e-9 else _turned(now, direction, shown.T @ _any_across(axis))
+    across = shown @ _turned(direction, now, normal)
+    return AttitudeLaw(axis, passing(direction, velocity, since), across, inertial(normal))
+
+
+def approach(
+    attitudes: Attitudes, quaternion: FloatArray, rate: FloatArray, begin: float, end: float
+) -> Attitudes:
+    """Return the way from an attitude (4,) and a body rate (3,) rad/s at `begin` s into a law at `end` s.
+
+    The turn that is left falls as a quintic that starts with the body's own rate and ends at rest in the law.
+    """
+    if not end > begin:
+        raise UsageError(f"an approach from {begin} to {end} s takes no time")
+
+    def at(ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
+        wanted = attitudes(ephemeris, times)
+        start = attitudes(ephemeris, begin + np.array([-DIFFERENCE, 0.0, DIFFERENCE]))
+        left = to_rotation_vector(multiply(quaternion, conjugate(start[1])))
+        law_rate = to_rotation_vector(multiply(start[2], conjugate(start[0]))) / (2.0 * DIFFERENCE)
+        shown = attitude_matrix(from_rotation_vector(left)) @ law_rate
+        # Before the begin the polynomial goes on: the differences at the begin need both sides.
+        share = np.minimum((np.asarray(times) - begin) / (end - begin), 1.0)[:, None]
+        rest = 1.0 - share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+        drift = (end - begin) * share * (1.0 - share) ** 3 * (1.0 + 3.0 * share)
+        turn = rest * left + drift * _before_turn(left, rate - shown)
+        return multiply(from_rotation_vector(turn), wanted)
+
+    return at
+
+
+def _before_turn(turn: FloatArray, rate: FloatArray) -> FloatArray:
+    """Return the change (3,) of a rotation vector `turn` (3,) whose body turns at `rate` (3,), body axes.
+
+    The inverse of the left Jacobian of the rotation group, with the signs of this house's quaternions.
+    """
+    angle = float(np.linalg.norm(turn))
+    second = 1.0 / 12.0 if angle < 1e-2 else (1.0 - 0.5 * angle / np.tan(0.5 * angle)) / angle**2
+    crossed = np.cross(turn, rate)
+    return np.asarray(rate + 0.5 * crossed + second * np.cross(turn, crossed))
+
+
+def _orbital_axes(ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
+    """Return rows (n, 3, 3): along the flight, against the orbit's normal, nadir."""
+    down, right = nadir(ephemeris, times), -orbit_normal(ephemeris, times)
+    return np.stack([np.cross(right, down), right, down], axis=1)
+
+
+def _turned(start: FloatArray, end: FloatArray, vector: FloatArray) -> FloatArray:
+    """Return `vector` (3,) turned as the shortest rotation turns unit vector `start` into `end`."""
+    axis = np.cross(start, end)
+    cosine = float(start @ end)
+    if cosine < -1.0 + 1e-9:  # opposite: any axis across turns it, this one leaves the vector
+        return vector
+    return np.asarray(cosine * vector + np.cross(axis, vector) + axis * (axis @ vector) / (1.0 + cosine))
+
+
+def _any_across(axis: FloatArray) -> FloatArray:
+    """Return the coordinate direction (3,) farthest from `axis`, made normal to it."""
+    unit = np.eye(3)[int(np.argmin(np.abs(axis)))]
+    return _unit(unit - axis * float(axis @ unit))
+
+
+def _frames(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return right-handed frames (n, 3, 3) as rows, from unit vectors (n, 3)."""
+    normal = np.cross(first, second)
+    sine = np.linalg.norm(normal, axis=1, keepdims=True)
+    if float(np.min(sine)) < LEAST_SINE:
+        raise UsageError("an attitude law's two directions are parallel: they fix no roll")
+    normal = normal / sine
+    return np.stack([first, normal, np.cross(first, normal)], axis=1)
+
+
+def _unit(vector: FloatArray) -> FloatArray:
+    return np.asarray(vector / np.linalg.norm(vector, axis=-1, keepdims=True))

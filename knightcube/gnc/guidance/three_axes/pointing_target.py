@@ -1,0 +1,99 @@
+"""Pointing targets: the goals that a configuration or a command can give a satellite.
+
+A target is a plain value that configurations, packets and jobs carry; `target_law` makes its attitude law.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import IntEnum
+
+from knightcube.errors import UsageError
+
+_LENGTH = 1e-3
+"""A commanded quaternion may miss the unit length by this."""
+
+
+class Goal(IntEnum):
+    """What to point at; the values are those of the command packet."""
+
+    NADIR = 0
+    VELOCITY = 1
+    SUN = 2
+    INERTIAL = 3
+    GROUND = 4
+    OBJECT = 5
+
+    @property
+    def label(self) -> str:
+        """The goal's name for people, configurations and commands."""
+        return self.name.lower()
+
+    @classmethod
+    def named(cls, label: str) -> Goal:
+        """Return the goal of a label. Raises UsageError for a word that is none."""
+        for goal in cls:
+            if goal.label == label:
+                return goal
+        raise UsageError(f"{label!r} is no goal: {', '.join(goal.label for goal in cls)}")
+
+
+NUMBERS = {Goal.INERTIAL: (4,), Goal.GROUND: (2,), Goal.OBJECT: (0, 2)}
+"""How many numbers a goal takes, where it takes any; the most last."""
+ROLLS = {
+    Goal.INERTIAL: "an inertial attitude has its roll in its quaternion",
+    Goal.OBJECT: "an object is followed with a free roll",
+}
+"""Why a goal takes no roll, where it takes none."""
+
+
+@dataclass(frozen=True, slots=True)
+class PointingTarget:
+    """A goal with its numbers.
+
+    Attributes:
+        numbers: INERTIAL: the attitude (4,), ICRS into body; GROUND: latitude and longitude, rad; OBJECT:
+            right ascension and declination, rad, where it is looked for, empty where the camera looks
+            already; else empty.
+        roll: rad about the pointing axis; None leaves it free. Not every goal has one (`ROLLS`).
+    """
+
+    goal: Goal
+    numbers: tuple[float, ...] = ()
+    roll: float | None = None
+
+    def __post_init__(self) -> None:
+        """Raise UsageError for values that no satellite can point by."""
+        wanted = NUMBERS.get(self.goal, (0,))
+        if len(self.numbers) not in wanted:
+            counts = " or ".join(map(str, wanted))
+            raise UsageError(f"{self.goal.label} takes {counts} numbers, not {len(self.numbers)}")
+        if not all(map(math.isfinite, (*self.numbers, self.roll or 0.0))):
+            raise UsageError(f"{self.goal.label}: numbers and roll must be finite")
+        if self.goal is Goal.INERTIAL:
+            length = math.hypot(*self.numbers)
+            if abs(length - 1.0) > _LENGTH:
+                raise UsageError(f"a quaternion of length {length:.6g}: it must have length 1")
+        if self.roll is not None and self.goal in ROLLS:
+            raise UsageError(ROLLS[self.goal])
+        if self.goal is Goal.GROUND and not abs(self.numbers[0]) <= 0.5 * math.pi:
+            raise UsageError(f"latitude {math.degrees(self.numbers[0]):g} deg is beyond a pole")
+        if self.goal is Goal.OBJECT and self.numbers and not abs(self.numbers[1]) <= 0.5 * math.pi:
+            raise UsageError(f"declination {math.degrees(self.numbers[1]):g} deg is beyond a pole")
+
+    @property
+    def text(self) -> str:
+        """The target as text, for events."""
+        text = self.goal.label
+        if self.goal is Goal.GROUND:
+            text += " {:.4f} {:.4f} deg".format(*map(math.degrees, self.numbers))
+        elif self.goal is Goal.INERTIAL:
+            return text + " {:.4f} {:.4f} {:.4f} {:.4f}".format(*self.numbers)
+        elif self.goal is Goal.OBJECT:
+            place = " near RA {:.4f}, Dec {:.4f} deg"
+            return text + (place.format(*map(math.degrees, self.numbers)) if self.numbers else "")
+        return text + (", roll free" if self.roll is None else f", roll {math.degrees(self.roll):g} deg")
+
+
+SUN = PointingTarget(Goal.SUN)

@@ -1,0 +1,260 @@
+"""A first orbit of an object from directions alone, seen from a known orbit: all sightings at once.
+
+The unknowns are the direction, the velocity over the distance, and the logarithm of the distance, at the
+middle of the arc. Sightings of a pass give the first five well and the distance badly: free fall beside the
+observer looks alike at every distance but for the bend of gravity. So the distance is scanned (as over the
+admissible region of Milani et al., Celestial Mechanics 90, 2004). For each the other five are fitted by
+Gauss-Newton; then the best is refined in all six. The interval of distances whose chi-square is within 95 %
+of the best says whether the arc suffices. Gauss's method has the same distance with the noise of three
+sightings.
+
+Forces: a spherical Earth and J2. Directions are those in which a star at rest would be: the light's way
+shifts an object by its velocity about the Sun.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from knightcube.astro.arrays import BoolArray, FloatArray
+from knightcube.astro.chi_square import bound
+from knightcube.astro.directions import tangent_basis
+from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER
+from knightcube.astro.earth.sun import SPEED_OF_LIGHT
+from knightcube.errors import FlightError
+from knightcube.gnc.tracking.free_fall import around
+
+LEAST_SIGHTINGS = 6
+RATIO = 1.5
+"""Of the ends of the interval of distances: a wider one determines no orbit."""
+GROUND_CLEARANCE = 80e3
+"""m: an orbit that comes nearer does not last."""
+_NEAREST, _FARTHEST, _GRID = 1e3, 6e7, 90
+"""m of the scan, and its distances, in even logarithms."""
+_DEGREES_95 = 3.841
+"""Chi-square of one degree that is exceeded by 5 %."""
+_STEPS = np.array([1e-6, 1e-6, 1e-7, 1e-7, 1e-6, 1e-4])
+"""Of the central differences: rad, rad, 1/s, 1/s, 1/s, logarithm."""
+_LONGEST = np.array([0.05, 0.05, 0.02, 0.02, 0.02])
+"""Of a step, likewise: hypotheses that fit nothing must not run away."""
+_ROUNDS, _FINAL_ROUNDS = 6, 20
+_MISFIT = 1e-6
+"""Chance of a fit as bad by noise alone: worse is no free fall, or errors that are not as stated."""
+
+
+class ArcError(FlightError):
+    """Sightings that determine no orbit; says why, with numbers."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bearings:
+    """Directions from a known orbit.
+
+    Attributes:
+        times: (n,) s, rising.
+        directions: (n, 3) unit vectors, ICRS.
+        sigma: (n,) rad, along an axis.
+        observer: (n, 6) m and m/s, ICRS about the Earth's centre.
+        earth: (3,) m/s of the Earth about the Sun.
+    """
+
+    times: FloatArray
+    directions: FloatArray
+    sigma: FloatArray
+    observer: FloatArray
+    earth: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FirstOrbit:
+    """An orbit at `time` s.
+
+    Attributes:
+        state: (6,) m and m/s, ICRS.
+        covariance: (6, 6), the observer's own error not included.
+        distance: m from the observer at that time, and the ends of the interval that holds it by 95 %.
+        lasts: whether it is bound to the Earth and clear of it. One that is not has others in the interval
+            that are.
+        chi_square: of the sightings, with `degrees` of freedom.
+    """
+
+    time: float
+    state: FloatArray
+    covariance: FloatArray
+    distance: float
+    interval: tuple[float, float]
+    lasts: bool
+    chi_square: float
+    degrees: int
+
+
+def first_orbit(seen: Bearings) -> FirstOrbit:
+    """Return the orbit of an object. Raises ArcError where the sightings determine none."""
+    count = len(seen.times)
+    if count < LEAST_SIGHTINGS:
+        raise ArcError(f"{count} sightings: an orbit needs {LEAST_SIGHTINGS} or more")
+    fit = _Fit(seen)
+    logarithms = np.linspace(math.log(_NEAREST), math.log(_FARTHEST), _GRID)
+    inner, _ = _within(logarithms, fit.chi_square(fit.scan(logarithms)))
+    step = logarithms[1] - logarithms[0]
+    logarithms = np.linspace(inner[0] - step, inner[1] + step, _GRID)
+    tried = fit.scan(logarithms)
+    chi_square = fit.chi_square(tried)
+    _, (low, high) = _within(logarithms, chi_square)
+    possible = fit.admissible(tried) & (logarithms >= low) & (logarithms <= high)
+    if high - low > math.log(RATIO):
+        span = float(seen.times[-1] - seen.times[0])
+        raise ArcError(_too_short(span, (low, high), logarithms[possible]))
+    unknowns, covariance = fit.refine(tried[int(np.argmin(chi_square))])
+    least = float(fit.chi_square(unknowns[None])[0])
+    degrees = 2 * count - 6
+    if least > bound(_MISFIT, degrees):
+        raise ArcError(f"no free fall fits the sightings: chi-square {least:.0f} with {degrees} degrees")
+    if not possible.any():
+        near, far = 1e-3 * np.exp([low, high])
+        raise ArcError(f"at {near:.4g} to {far:.4g} km no orbit is bound to the Earth and clear of it")
+    state = fit.states(unknowns[None])[0]
+    jacobian = fit.state_jacobian(unknowns)
+    spread = jacobian @ covariance @ jacobian.T
+    return FirstOrbit(
+        fit.time,
+        state,
+        0.5 * (spread + spread.T),
+        math.exp(unknowns[5]),
+        (math.exp(low), math.exp(high)),
+        bool(fit.admissible(unknowns[None])[0]),
+        least,
+        degrees,
+    )
+
+
+def _within(
+    logarithms: FloatArray, chi_square: FloatArray
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return where chi-square is within `_DEGREES_95` of its least: the outermost tried, and the ends."""
+    excess = chi_square - chi_square.min() - _DEGREES_95
+    first, last = (int(place) for place in np.flatnonzero(excess < 0.0)[[0, -1]])
+    ends = []
+    for place, outer in ((first, first - 1), (last, last + 1)):
+        end = float(logarithms[place])
+        if 0 <= outer < len(logarithms):
+            share = excess[place] / (excess[place] - excess[outer])
+            end += float(share * (logarithms[outer] - logarithms[place]))
+        ends.append(end)
+    return (float(logarithms[first]), float(logarithms[last])), (ends[0], ends[1])
+
+
+def _too_short(arc: float, interval: tuple[float, float], lasting: FloatArray) -> str:
+    """Return why an arc, s, does not suffice; `lasting`: logarithms of distances of lasting orbits."""
+    low, high = (1e-3 * math.exp(end) for end in interval)
+    text = f"the arc of {arc:.0f} s is too short: by 95 % the distance may be {low:.3g} to {high:.3g} km"
+    if len(lasting):
+        low, high = (1e-3 * math.exp(end) for end in (lasting.min(), lasting.max()))
+        text += f", {low:.3g} to {high:.3g} of orbits that last"
+    return text + f"; an orbit is given where the ends are within a factor of {RATIO:g}"
+
+
+class _Fit:
+    """The least squares of some sightings; unknowns (k, 6) of k hypotheses at once."""
+
+    def __init__(self, seen: Bearings) -> None:
+        self._seen = seen
+        self._middle = len(seen.times) // 2
+        self.time = float(seen.times[self._middle])
+        self._axis = seen.directions[self._middle]
+        self._basis = tangent_basis(self._axis)
+        self._across = np.array([tangent_basis(direction) for direction in seen.directions])
+
+    def states(self, unknowns: FloatArray) -> FloatArray:
+        """Return the states (k, 6) at the middle."""
+        place = self._axis + unknowns[:, :2] @ self._basis
+        place = place / np.linalg.norm(place, axis=1, keepdims=True)
+        moved = unknowns[:, 2:4] @ self._basis + unknowns[:, 4:5] * self._axis
+        return np.asarray(
+            self._seen.observer[self._middle]
+            + np.exp(unknowns[:, 5:6]) * np.concatenate([place, moved], axis=1)
+        )
+
+    def residuals(self, unknowns: FloatArray) -> FloatArray:
+        """Return the residuals (k, 2 n) over their standard deviations."""
+        seen, middle = self._seen, self._middle
+        start = self.states(unknowns)
+        states = around(start, seen.times, middle)
+        way = states[..., :3] - seen.observer[:, None, :3]
+        distance = np.linalg.norm(way, axis=2, keepdims=True)
+        way = way - distance * (states[..., 3:] + seen.earth) / SPEED_OF_LIGHT
+        way /= np.linalg.norm(way, axis=2, keepdims=True)
+        off = np.einsum("nij,nkj->kni", self._across, way)
+        # Behind the camera the offset would be small again.
+        facing = np.einsum("nj,nkj->kn", seen.directions, way)
+        off = off / np.maximum(facing, 1e-3)[:, :, None]
+        return np.asarray((off / seen.sigma[:, None]).reshape(len(unknowns), -1))
+
+    def chi_square(self, unknowns: FloatArray) -> FloatArray:
+        """Return chi-square (k,)."""
+        return np.asarray(np.sum(self.residuals(unknowns) ** 2, axis=1))
+
+    def admissible(self, unknowns: FloatArray) -> BoolArray:
+        """Return which hypotheses (k,) are orbits that last."""
+        states = self.states(unknowns)
+        place, motion = states[:, :3], states[:, 3:]
+        radius = np.linalg.norm(place, axis=1)
+        energy = 0.5 * np.sum(motion**2, axis=1) - GRAVITATIONAL_PARAMETER / radius
+        turn = np.sum(np.cross(place, motion) ** 2, axis=1) / GRAVITATIONAL_PARAMETER
+        size = -0.5 * GRAVITATIONAL_PARAMETER / np.where(energy < 0.0, energy, -1.0)
+        eccentricity = np.sqrt(np.maximum(1.0 - turn / size, 0.0))
+        clear = size * (1.0 - eccentricity) > EARTH_RADIUS + GROUND_CLEARANCE
+        return np.asarray((energy < 0.0) & clear)
+
+    def scan(self, logarithms: FloatArray) -> FloatArray:
+        """Return the best unknowns (k, 6) at each logarithm (k,) of the distance."""
+        unknowns = np.zeros((len(logarithms), 6))
+        unknowns[:, 5] = logarithms
+        times = self._seen.times - self.time
+        # Straight and even at first: the mean motion of the direction.
+        weights = (times - times.mean()) / np.sum((times - times.mean()) ** 2)
+        unknowns[:, 2:4] = (weights @ self._seen.directions) @ self._basis.T
+        for _ in range(_ROUNDS):
+            residual, jacobian = self._linear(unknowns)
+            step = _solved(residual, jacobian[:, :, :5])[0]
+            unknowns[:, :5] -= np.clip(step, -_LONGEST, _LONGEST)
+        return unknowns
+
+    def refine(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the best unknowns (6,) near some, and their covariance (6, 6)."""
+        covariance = np.eye(6)
+        for _ in range(_FINAL_ROUNDS):
+            residual, jacobian = self._linear(unknowns[None])
+            (step,), (covariance,) = _solved(residual, jacobian)
+            # A logarithm that jumps is beyond what is linear.
+            unknowns = unknowns - step * min(1.0, 0.3 / max(abs(float(step[5])), 1e-12))
+            if abs(float(step[5])) < 1e-4 * math.sqrt(float(covariance[5, 5])):
+                break
+        return unknowns, covariance
+
+    def state_jacobian(self, unknowns: FloatArray) -> FloatArray:
+        """Return (6, 6), the state by the unknowns (6,)."""
+        shifts = np.diag(_STEPS)
+        ahead, behind = self.states(unknowns + shifts), self.states(unknowns - shifts)
+        return np.asarray(((ahead - behind) / (2.0 * _STEPS[:, None])).T)
+
+    def _linear(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return residuals (k, m) and their derivatives (k, m, 6)."""
+        shifts = np.concatenate([np.zeros((1, 6)), np.diag(_STEPS), -np.diag(_STEPS)])
+        many = (unknowns[None] + shifts[:, None]).reshape(-1, 6)
+        found = self.residuals(many).reshape(13, len(unknowns), -1)
+        slope = (found[1:7] - found[7:]) / (2.0 * _STEPS[:, None, None])
+        return found[0], np.moveaxis(slope, 0, 2)
+
+
+def _solved(residual: FloatArray, jacobian: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return Gauss-Newton steps (k, p) and covariances (k, p, p)."""
+    normal = np.swapaxes(jacobian, 1, 2) @ jacobian
+    size = np.sqrt(np.maximum(np.einsum("kii->ki", normal), 1e-300))
+    scaled = normal / size[:, :, None] / size[:, None, :]
+    inverse = np.linalg.pinv(scaled, rcond=1e-14, hermitian=True) / size[:, :, None] / size[:, None, :]
+    pull = np.einsum("kmp,km->kp", jacobian, residual)
+    return np.einsum("kpq,kq->kp", inverse, pull), inverse

@@ -1,0 +1,1 @@
+"""The sources' other methods, kept to compare with the ones in use."""

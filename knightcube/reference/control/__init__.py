@@ -1,0 +1,1 @@
+"""Controllers of one axis to compare with the tracker: PID and adaptive."""

@@ -1,0 +1,109 @@
+"""An adaptive controller, for comparison (Sease 2013, ch. 5: 0.66 W on the testbed).
+
+Slotine and Li 1991, 8.5: with the composite error s = e' + l e and a_r = theta_m'' + l e' the current
+
+    I cos(theta) = p . Y + g s,     Y = (a_r, theta, w, -1),     p' = G Y s
+
+tracks for any inertia, stiffness, damping and constant torque in p (each over the torque constant).
+theta_m follows the target through a critically damped model of second order, so that the body can follow a
+step of the target. p is adapted only while the coil does not saturate and |s| exceeds the level of noise, and
+is bounded, because noise alone would make it drift.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.errors import UsageError
+from knightcube.gnc.control.one_axis.controller import CoilCommand, attitude_error
+from knightcube.gnc.guidance.one_axis.path import Sample
+from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
+
+_LEAST_AUTHORITY = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class AdaptiveSettings:
+    """Settings of the adaptive controller.
+
+    Attributes:
+        bandwidth: l in rad/s; also the gain on s, in s^-1.
+        adaptation: rate of adaptation of p: its gain over the square of each parameter's range, s/rad^2.
+        reference_bandwidth: of the reference model, rad/s; None follows the commanded motion directly.
+        dead_zone: rad/s; p is not adapted while |s| is below.
+    """
+
+    bandwidth: float
+    adaptation: float
+    reference_bandwidth: float | None
+    dead_zone: float = 1e-3
+
+    def __post_init__(self) -> None:
+        """Raise UsageError for values that are not finite and positive."""
+        for name in ("bandwidth", "adaptation", "reference_bandwidth", "dead_zone"):
+            value = getattr(self, name)
+            if value is not None and not (math.isfinite(value) and value > 0.0):
+                raise UsageError(f"adaptive {name} is {value}: it must be finite and positive")
+
+
+class AdaptiveController:
+    """Owns the parameters p (4,) in A s^2, A, A s and A, and the reference model's state."""
+
+    def __init__(self, plant: SingleAxisPlant, period: float, settings: AdaptiveSettings) -> None:
+        """Begin with the plant's inertia, stiffness and damping; `period` in s between commands.
+
+        Raises UsageError when the period is not positive.
+        """
+        if not (math.isfinite(period) and period > 0.0):
+            raise UsageError(f"adaptive period is {period}: it must be finite and positive")
+        self._settings = settings
+        self._period = period
+        self._limit = plant.current_limit
+        inertia = plant.inertia / plant.torque_constant
+        self._gain = inertia * settings.bandwidth
+        begin = np.array([plant.inertia, plant.stiffness, plant.damping, 0.0]) / plant.torque_constant
+        # Half the coil's strength at one radian, and at one radian in five seconds.
+        self._range = np.array([0.5 * inertia, 0.5 * self._limit, 2.5 * self._limit, 0.5 * self._limit])
+        self._low = np.maximum(begin - self._range, [0.5 * inertia, 0.0, 0.0, -np.inf])
+        self._high = begin + self._range
+        self.parameters: FloatArray = begin
+        self._model: tuple[float, float] | None = None
+
+    def command(self, wanted: Sample, angle: float, rate: float, disturbance: float = 0.0) -> CoilCommand:
+        """Return the command at `angle` rad and `rate` rad/s; an estimated disturbance is not used.
+
+        Raises UsageError when an input is not finite.
+        """
+        error = attitude_error(wanted, angle, rate, disturbance)
+        cosine = math.cos(angle)
+        if abs(cosine) < _LEAST_AUTHORITY:
+            return CoilCommand.without_authority(error)
+        model = self._follow(wanted, angle, rate)
+        lead, lag = math.remainder(model.angle - angle, 2.0 * math.pi), model.rate - rate
+        slide = lag + self._settings.bandwidth * lead
+        regressor = np.array([model.acceleration + self._settings.bandwidth * lag, angle, rate, -1.0])
+        demanded = (float(self.parameters @ regressor) + self._gain * slide) / cosine
+        made = CoilCommand.within(self._limit, demanded, error)
+        if not made.saturated and abs(slide) > self._settings.dead_zone:
+            learnt = self._settings.adaptation * self._range**2 * regressor * slide
+            self.parameters = np.clip(self.parameters + self._period * learnt, self._low, self._high)
+        return made
+
+    def reset(self) -> None:
+        """Restart the reference model from the body's state at the next command; p is kept."""
+        self._model = None
+
+    def _follow(self, wanted: Sample, angle: float, rate: float) -> Sample:
+        """Return the reference model's motion and propagate the model by one period."""
+        w = self._settings.reference_bandwidth
+        if w is None:
+            return wanted
+        at, moving = self._model if self._model is not None else (angle, rate)
+        acceleration = w * w * (wanted.angle - at) + 2.0 * w * (wanted.rate - moving)
+        dt = self._period
+        self._model = (at + dt * moving + 0.5 * dt * dt * acceleration, moving + dt * acceleration)
+        return Sample(at, moving, acceleration)

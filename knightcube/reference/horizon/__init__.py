@@ -1,0 +1,1 @@
+"""The nadir methods of Meller et al. that fit a circle."""

@@ -1,0 +1,189 @@
+"""Reads image files as arrays (PNG, TIFF, JPEG and BMP through Pillow, FITS by `fits`); writes pictures.
+
+    pixels = read_image(Path("night.fits"))      # (rows, columns), the counts as they stand in the file
+    pixels = read_raw(Path("night.raw"), columns=1280, rows=960, bits=16)      # bare pixels
+    write_picture(Path("found.png"), grey_stretch(pixels))
+
+Row 0 is the file's first row. FITS viewers show it at the bottom, others at the top; confusing them mirrors
+the sky. The orientation in a photograph's EXIF data is ignored.
+"""
+
+from __future__ import annotations
+
+import struct
+import sys
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from knightcube.astro.arrays import Image
+from knightcube.errors import UsageError
+from knightcube.vision.camera import fits
+
+if TYPE_CHECKING:
+    from PIL.Image import Image as Picture
+
+FORMATS = ("PNG", "TIFF", "JPEG", "BMP")
+EXTRA = "pip install 'knightcube-flight[images]'"
+
+PHOTOMETRIC_INTERPRETATION, WHITE_IS_ZERO = 262, 0
+"""TIFF 6.0, section 8."""
+GREY_MODES = {"L": np.uint8, "1": np.uint8, "I;16": np.uint16, "I;16L": np.uint16, "I;16B": np.uint16}
+"""Pillow's names of grey pixels that are whole numbers of 8 or 16 bits."""
+COLOUR_MODES = ("LA", "La", "P", "PA", "RGB", "RGBA", "RGBa", "RGBX", "CMYK", "YCbCr", "LAB", "HSV")
+
+_LUMINANCE = np.array([0.299, 0.587, 0.114])
+"""Of red, green and blue: ITU-R BT.601."""
+_NATIVE_SWAPPED = "B" if sys.byteorder == "little" else "L"
+# Pillow keeps the high byte of 16-bit colour. Given the other order of bytes, it keeps the low one.
+_OTHER_BYTES = {
+    f"{colour};16{order}": f"{colour};16{other}"
+    for colour in ("RGB", "RGBA", "RGBX")
+    for order, other in (("B", "L"), ("L", "B"), ("N", _NATIVE_SWAPPED))
+}
+
+
+def read_image(path: Path) -> Image:
+    """Return the image (rows, columns): uint8 or uint16, from FITS also signed, 32-bit or floating.
+
+    The content decides the format, not the name. Colour becomes luminance (ITU-R BT.601). Raises UsageError
+    when the file is missing, damaged or none of these, or has pixels that are not finite.
+    """
+    try:
+        with path.open("rb") as file:
+            beginning = file.read(len(fits.SIGNATURE))
+            file.seek(0)
+            content = file.read() if beginning == fits.SIGNATURE else b""
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read: {error.strerror or error}") from error
+    return fits.primary_image(content, str(path)) if content else _through_pillow(path)
+
+
+def read_raw(path: Path, columns: int, rows: int, bits: int) -> Image:
+    """Return the image (rows, columns) of a file of bare pixels, row by row: 8 bits, or 16 little-endian.
+
+    Any header before the pixels is skipped: the file's last bytes count.
+    Raises UsageError when the file is missing or too short.
+    """
+    kind = np.dtype("<u2") if bits == 16 else np.dtype("u1")
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read: {error.strerror or error}") from error
+    wanted = columns * rows * kind.itemsize
+    if len(content) < wanted:
+        raise UsageError(
+            f"{path}: {len(content)} bytes, but {columns} x {rows} pixels of {bits} bits are {wanted}"
+        )
+    pixels = np.frombuffer(content, kind, columns * rows, len(content) - wanted)
+    return pixels.reshape(rows, columns).astype(kind.newbyteorder("="))
+
+
+def grey_stretch(image: Image, low: float = 1.0, high: float = 99.7) -> npt.NDArray[np.uint8]:
+    """Return a grey picture (rows, columns, 3), red, green, blue, to draw on.
+
+    The `low`th percentile of the pixels becomes black and the `high`th white. Raises UsageError unless
+    0 <= low < high <= 100.
+    """
+    if not 0.0 <= low < high <= 100.0:
+        raise UsageError(f"percentiles {low} and {high}: give 0 <= low < high <= 100")
+    black, white = np.percentile(image, [low, high])
+    scale = 255.0 / (white - black) if white > black else 0.0
+    grey = np.clip((np.asarray(image, dtype=float) - black) * scale, 0.0, 255.0)
+    return np.repeat(np.rint(grey).astype(np.uint8)[..., None], 3, axis=-1)
+
+
+def write_picture(path: Path, picture: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> None:
+    """Write a PNG: colours (rows, columns, 3), or grey counts (rows, columns) of 8 or 16 bits as they are.
+
+    Raises UsageError when it cannot be written.
+    """
+    try:
+        from PIL import Image as pillow  # noqa: PLC0415 - an extra, and only for files
+    except ImportError as error:
+        raise UsageError(f"{path}: a PNG needs Pillow: {EXTRA}") from error
+    try:
+        pillow.fromarray(picture).save(path, format="PNG")
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def _through_pillow(path: Path) -> Image:
+    try:
+        from PIL import Image as pillow  # noqa: PLC0415
+        from PIL import UnidentifiedImageError  # noqa: PLC0415
+    except ImportError as error:
+        raise UsageError(f"{path}: {', '.join(FORMATS)} need Pillow: {EXTRA}") from error
+    try:
+        # Its warnings concern metadata, which is not used here; damaged pixels raise.
+        with warnings.catch_warnings(action="ignore"), pillow.open(path, formats=FORMATS) as picture:
+            _check_kept(path, picture)
+            if _is_deep(picture):
+                high = _colours(picture)
+                with pillow.open(path, formats=FORMATS) as again:
+                    again.tile = [tile._replace(args=_low_bytes(tile.args)) for tile in again.tile]
+                    return _luminance(256.0 * high + _colours(again))
+            picture.load()
+            return _grey(path, picture)
+    except UnidentifiedImageError as error:
+        raise UsageError(f"{path}: is no {', '.join(FORMATS)} or FITS image: convert it to one") from error
+    except pillow.DecompressionBombError as error:
+        raise UsageError(f"{path}: has too many pixels: {error}") from error
+    # What Pillow's readers raise on damaged files.
+    except (OSError, SyntaxError, ValueError, TypeError, LookupError, ArithmeticError, struct.error) as error:
+        raise UsageError(f"{path}: is damaged: {error}") from error
+
+
+def _check_kept(path: Path, picture: Picture) -> None:
+    """Raise UsageError for images that Pillow would misread: 16-bit colour cut to 8, inverted grey."""
+    deep = any(";16" in _raw_mode(tile[3]) for tile in getattr(picture, "tile", ()))
+    if picture.mode in COLOUR_MODES and deep and not _is_deep(picture):
+        raise UsageError(f"{path}: its 16-bit colour is not read: convert it to 16-bit grey")
+    interpretation = getattr(picture, "tag_v2", {}).get(PHOTOMETRIC_INTERPRETATION)
+    if picture.mode.startswith("I") and interpretation == WHITE_IS_ZERO:
+        raise UsageError(f"{path}: its zero is white: convert it to a TIFF whose zero is black")
+
+
+def _raw_mode(args: object) -> str:
+    """Return how Pillow unpacks a tile: the first of its decoder's arguments."""
+    return str(args[0]) if isinstance(args, tuple) and args else str(args)
+
+
+def _is_deep(picture: Picture) -> bool:
+    """Return whether it holds red, green and blue of 16 bits, of which Pillow keeps the high ones."""
+    modes = {_raw_mode(tile[3]) for tile in getattr(picture, "tile", ())}
+    return len(modes) == 1 and modes <= _OTHER_BYTES.keys()
+
+
+def _low_bytes(args: Any) -> Any:
+    """Return the decoder's arguments that take the other byte of each pair."""
+    other = _OTHER_BYTES[_raw_mode(args)]
+    return (other, *args[1:]) if isinstance(args, tuple) else other
+
+
+def _colours(picture: Picture) -> npt.NDArray[np.float64]:
+    return np.asarray(picture.convert("RGB"), dtype=np.float64)
+
+
+def _luminance(colours: npt.NDArray[np.float64]) -> npt.NDArray[np.uint16]:
+    """Return the luminance (rows, columns) of colours (rows, columns, 3) of 16 bits."""
+    return np.asarray(np.rint(colours @ _LUMINANCE), dtype=np.uint16)
+
+
+def _grey(path: Path, picture: Picture) -> Image:
+    mode = picture.mode
+    if mode in COLOUR_MODES:
+        # Through RGB: Pillow has no direct way from all of them. Transparency is dropped.
+        return np.asarray(picture.convert("RGB").convert("L"))
+    if mode in GREY_MODES:
+        grey = picture.convert("L") if mode == "1" else picture
+        return np.asarray(grey).astype(GREY_MODES[mode])
+    if mode == "I":
+        # 32 bits, but often of numbers that fit into 16.
+        pixels = np.asarray(picture)
+        if pixels.min() >= 0 and pixels.max() <= np.iinfo(np.uint16).max:
+            return pixels.astype(np.uint16)
+    raise UsageError(f"{path}: has pixels of kind {mode!r}: convert it to 8 or 16 bit grey")

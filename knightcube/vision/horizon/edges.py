@@ -1,0 +1,299 @@
+"""Edges along scan lines to a fraction of a pixel: the steepest place, at the scale of the edge itself.
+
+Lines are read, normalised, made binary and filtered as in Meller 3.1, in both directions; every change is
+then refined: the signal's slope, smoothed by a Gaussian, has its peak where the limb's brightness falls
+fastest. The scale is doubled as long as the edge outgrows it (Lindeberg 1998, Int. J. Comput. Vision 30,
+117), so that a limb of one pixel and one of a hundred are both found where they are steepest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from functools import lru_cache
+
+import numpy as np
+
+from knightcube.astro.arrays import BoolArray, FloatArray, IntArray
+from knightcube.vision.camera.pixel_access import PixelAccess
+from knightcube.vision.horizon.binary_edges import run_filtered
+from knightcube.vision.horizon.response import light_of
+from knightcube.vision.horizon.settings import EdgeSettings
+
+_SCALES = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
+"""px, standard deviations of the Gaussian."""
+_REACH = 3.0
+"""Scales: distance from the change of the binary line within which the steepest place is searched."""
+_TAIL = 3.5
+"""Scales: where the Gaussian is cut off."""
+_OUTGROWN = 1.4
+"""A doubled scale that gains more did not cover the edge: its spread is 1.4 scales."""
+_MARGIN = 4.0
+"""px: edges nearer to the border are ignored; some detectors have a black frame."""
+_FLOOR, _SHARE = 0.1, 0.05
+"""px and scales: error of an edge's place before the fit measures the scatter."""
+_SAMPLES = 2048
+_STEP_TO_SIGMA = 1.4826 / 2.0**0.5
+"""Median of absolute differences of two pixels to one pixel's standard deviation, of normal noise."""
+_STANDS_OUT = 6.0
+"""Standard deviations of the dark; brighter pixels are lit."""
+_LEAST_LIT = 16
+"""Samples: fewer lit ones are a hot pixel or a star."""
+_PROFILE: IntArray = np.arange(-9, 6)
+"""px from an edge towards the bright side: the samples that are kept."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanLines:
+    """The lines that were read: light along columns and rows.
+
+    Attributes:
+        columns, rows: the indices of the lines.
+        column_bright, row_bright: (n, m) the lines made binary and filtered.
+        space: px between them.
+        levels: average light of the dark and of the bright, and the dark's noise.
+    """
+
+    columns: IntArray
+    rows: IntArray
+    column_bright: BoolArray
+    row_bright: BoolArray
+    space: float
+    levels: tuple[float, float, float]
+
+    @property
+    def pixels(self) -> int:
+        """The number of pixels read."""
+        return self.column_bright.size + self.row_bright.size
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Nearby:
+    """A part of the picture to be read more closely: its `box` (2, 2) px, least and greatest x, y.
+
+    `levels` are those of the whole picture, see `ScanLines`.
+    """
+
+    box: FloatArray
+    levels: tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Edges:
+    """Places where a scan line changes from dark to bright.
+
+    Attributes:
+        points: (n, 2) px.
+        towards: (n, 2) unit steps along the line to the bright side.
+        scale: (n,) px, the Gaussian's that found it.
+        contrast: (n,) the step's height over high - low.
+        sigma: (n,) px along the line, before a fit.
+        background: (n,) light on the dark side: next to the limb and the terminator there is none, next to a
+            coast or a cloud there is.
+        profile: (n, m) light along the line from dark to bright, about the pixel nearest to the point; NaN
+            beyond the picture.
+    """
+
+    points: FloatArray
+    towards: FloatArray
+    scale: FloatArray
+    contrast: FloatArray
+    sigma: FloatArray
+    background: FloatArray
+    profile: FloatArray
+
+    @property
+    def profile_steps(self) -> FloatArray:
+        """Where the profile's samples lie (n, m), px from the point towards the bright side."""
+        # A line's place times the direction: its rounding is the pixel nearest to the edge.
+        place = np.sum(self.points * self.towards, axis=1)
+        return np.asarray((np.rint(place) - place)[:, None] + _PROFILE)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def chosen(self, which: BoolArray | IntArray) -> Edges:
+        """Return the edges `which`, flags (n,) or indices."""
+        return Edges(*(getattr(self, each.name)[which] for each in fields(self)))
+
+
+def find_edges(
+    access: PixelAccess, settings: EdgeSettings, near: Nearby | None = None
+) -> tuple[Edges, ScanLines]:
+    """Return the edges on evenly spaced columns and rows, and these lines; no other pixel is read.
+
+    `near` restricts the lines to those that cross a part of the picture.
+    """
+    columns, rows = _places(access.columns, settings.lines), _places(access.rows, settings.lines)
+    if near is not None:
+        columns, rows = (_within(x, near.box[:, axis]) for axis, x in enumerate((columns, rows)))
+    space = max(1.0, max(access.columns, access.rows) / settings.lines)
+    light = [
+        light_of(access.read_columns(columns), settings.response),
+        light_of(access.read_rows(rows), settings.response),
+    ]
+    low, high, noise = near.levels if near is not None else _levels(light)
+    level = low + max(settings.threshold * (high - low), _STANDS_OUT * noise)
+    bright = [run_filtered(lines > level, settings.run) for lines in light]
+    lines = ScanLines(columns, rows, bright[0], bright[1], space, (low, high, noise))
+    if not high > low or not len(columns) + len(rows):
+        return _NOTHING, lines
+    edges = _line_edges(light, bright, (columns, rows), high - low, settings.contrast)
+    most = settings.most * settings.lines
+    if len(edges) > most:
+        edges = edges.chosen(np.argsort(edges.background, kind="stable")[:most])
+    return edges, lines
+
+
+def _within(places: IntArray, ends: FloatArray) -> IntArray:
+    return np.asarray(places[(places >= ends[0]) & (places <= ends[1])])
+
+
+def _places(size: int, lines: int) -> IntArray:
+    """Return the indices of `lines` evenly spaced lines of `size`, half a space from the border."""
+    lines = min(lines, size)
+    return np.asarray((np.arange(lines) + 0.5) * size / lines, dtype=int)
+
+
+def _levels(light: list[FloatArray]) -> tuple[float, float, float]:
+    """Return the average light of the dark and of the bright, and the dark's noise; equal where all is dark.
+
+    Pixels above the dark's noise are bright; their median excludes the Sun's disc and hot pixels.
+    """
+    samples, steps = (np.concatenate(each) for each in zip(*map(_samples, light), strict=True))
+    order = np.sort(samples)
+    least, most = float(order[len(order) // 50]), float(order[-1 - len(order) // 200])
+    dark = np.abs(steps[samples <= least + 0.1 * (most - least)])
+    middle = len(dark) // 2
+    noise = float(np.partition(dark, middle)[middle]) * _STEP_TO_SIGMA
+    # The least of fifty lies two deviations low.
+    low = least + 2.0 * noise
+    lit = order[np.searchsorted(order, low + max(_STANDS_OUT * noise, 0.05 * (most - low)), "right") :]
+    if len(lit) < _LEAST_LIT or most <= low:
+        return low, low, noise
+    return low, float(lit[len(lit) // 2]), noise
+
+
+def _samples(lines: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return some of the lines' pixels, and their differences from the next pixel on the line."""
+    pace = max(1, lines.size // _SAMPLES)
+    here = lines[:, :-1].ravel()[::pace]
+    return here, lines[:, 1:].ravel()[::pace] - here
+
+
+_NONE: FloatArray = np.zeros(0)
+_NOTHING = Edges(np.zeros((0, 2)), np.zeros((0, 2)), _NONE, _NONE, _NONE, _NONE, np.zeros((0, len(_PROFILE))))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Changes:
+    """Where binary lines change, columns and rows as one row of pixels after another.
+
+    Attributes:
+        light: (s,) of all lines.
+        first: (k,) index of the pixel with which the change's line begins.
+        length: (k,) px of that line.
+        start: (k,) px along it, the change's pixel on the bright side.
+        step: (k,) 1 or -1, to the bright side.
+    """
+
+    light: FloatArray
+    first: IntArray
+    length: IntArray
+    start: IntArray
+    step: IntArray
+
+    def along(self, which: IntArray | slice, index: IntArray) -> FloatArray:
+        """Return the light (k, m) of the lines of those changes at places (k, m) along them."""
+        last = self.length[which, None] - 1
+        return np.asarray(self.light[self.first[which, None] + np.minimum(np.maximum(index, 0), last)])
+
+
+def _line_edges(
+    light: list[FloatArray],
+    bright: list[BoolArray],
+    places: tuple[IntArray, IntArray],
+    span: float,
+    least: float,
+) -> Edges:
+    """Return the edges of columns and rows (n, m) each, that lie at `places` (n,)."""
+    parts, read = [], 0
+    for direction, binary in enumerate(bright):
+        line, before = np.nonzero(binary[:, 1:] != binary[:, :-1])
+        size, same = binary.shape[1], np.ones(len(line), dtype=int)
+        numbers = read + line * size, size * same, before, binary[line, before + 1], places[direction][line]
+        parts.append((*numbers, direction * same))
+        read += binary.size
+    begin, length, at, rising, other, axis = (np.concatenate(each) for each in zip(*parts, strict=True))
+    step = np.where(rising, 1, -1)
+    changes = _Changes(np.concatenate([each.ravel() for each in light]), begin, length, at + rising, step)
+    offset, scale, height = _refined(changes, least * span)
+    place = changes.start + step * offset
+    margin = np.maximum(_MARGIN, 0.5 * scale)
+    kept = np.flatnonzero((height > least * span) & (place > margin) & (place < length - 1 - margin))
+    place, scale, height = place[kept], scale[kept], height[kept] / span
+    step, other, axis, last = step[kept], other[kept], axis[kept], length[kept] - 1
+    count = np.arange(len(kept))
+    points, towards = np.empty((len(kept), 2)), np.zeros((len(kept), 2))
+    # On a column, axis 0, the place is y.
+    points[count, axis], points[count, 1 - axis], towards[count, 1 - axis] = other, place, step
+    index = np.rint(place).astype(int)[:, None] + step[:, None] * _PROFILE
+    profile = changes.along(kept, index)
+    profile[(index < 0) | (index > last[:, None])] = np.nan
+    behind: IntArray = np.rint(place - step * (_REACH * scale + 4.0)).astype(int)
+    background = changes.along(kept, behind[:, None])[:, 0]
+    return Edges(points, towards, scale, height, _FLOOR + _SHARE * scale, background, profile)
+
+
+def _refined(changes: _Changes, weak: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return offsets (k,) px from each start towards the bright, scales (k,), heights of the steps (k,).
+
+    A step lower than `weak` is not an edge.
+    """
+    count = len(changes.start)
+    offset, height = np.zeros(count), np.zeros(count)
+    scale = np.ones(count)
+    open_ = np.arange(count)
+    largest = changes.length / (4.0 * (_REACH + _TAIL))
+    for size in _SCALES:
+        if size > 1.0:
+            open_ = open_[largest[open_] >= size]
+        if not len(open_):
+            break
+        place, peak = _steepest(changes, open_, size)
+        # Noise steeper than a wide edge is at a small scale must not end the search there.
+        before = height[open_]
+        gains = (peak > _OUTGROWN * before) | ((before < weak) & (peak > before))
+        open_ = open_[gains]
+        offset[open_], height[open_], scale[open_] = place[gains], peak[gains], size
+    return offset, scale, height
+
+
+def _steepest(changes: _Changes, which: IntArray, size: float) -> tuple[FloatArray, FloatArray]:
+    """Return where (k,) each line is steepest near its start, and the height of a sharp step as steep."""
+    window, slope, reach = _slope(size)
+    index = changes.start[which, None] + changes.step[which, None] * window
+    slopes = changes.along(which, index) @ slope
+    best = np.minimum(np.maximum(np.argmax(slopes, axis=1), 1), slopes.shape[1] - 2)
+    k = np.arange(len(which))
+    left, middle, right = slopes[k, best - 1], slopes[k, best], slopes[k, best + 1]
+    bend = np.minimum(left - 2.0 * middle + right, -1e-300)
+    shift = np.minimum(np.maximum(0.5 * (left - right) / bend, -1.0), 1.0)
+    return best - reach + shift, middle
+
+
+@lru_cache(maxsize=16)
+def _slope(size: float) -> tuple[IntArray, FloatArray, int]:
+    """Return offsets (w,) px, the matrix (w, p) from light there to slopes at places about 0, their reach.
+
+    A sharp unit step has the slope 1 at every scale.
+    """
+    half, reach = int(np.ceil(_TAIL * size)), int(np.ceil(_REACH * size)) + 1
+    x: FloatArray = np.arange(-half, half + 1, dtype=float)
+    kernel = x * np.exp(-0.5 * (x / size) ** 2)
+    # A step between two pixels: the sum over one side.
+    kernel = kernel / np.sum(kernel[x > 0])
+    window = np.arange(-reach - half, reach + half + 1)
+    matrix = np.zeros((len(window), 2 * reach + 1))
+    for place in range(2 * reach + 1):
+        matrix[place : place + len(kernel), place] = kernel
+    return window, matrix, reach

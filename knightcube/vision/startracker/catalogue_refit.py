@@ -1,0 +1,279 @@
+"""Refits the streaks of an identified frame with all stars of the catalogue, the unseen ones too.
+
+In long streaks most stars are below the noise of a pixel, yet their light overlaps the bright streaks and
+shifts them; close pairs are taken for one star. Once a frame is identified, the catalogue gives the places of
+all stars and, scaled by the light of those found, their brightness. The light of stars too faint, or too near
+to a brighter star, to be fitted is subtracted from the frame, with the uncertainty of the catalogue's
+magnitudes for the camera's colours; the others are fitted from their true places. Objects found that are not
+in the catalogue are fitted but do not affect the motion.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from knightcube.astro.arrays import BoolArray, FloatArray, Image, IntArray
+from knightcube.astro.quaternion import attitude_matrix
+from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.startracker.aberration import apparent
+from knightcube.vision.startracker.index.sky_index import SkyIndex
+from knightcube.vision.startracker.sky_map import SkyMap
+from knightcube.vision.startracker.solution import FrameSolution, SolveStatus
+from knightcube.vision.startracker.solve import AttitudePrior, SolveSettings, solve_motion
+from knightcube.vision.streaks.maximum_likelihood.chains import apart, circles, close_by
+from knightcube.vision.streaks.maximum_likelihood.exposed_frame import ExposedFrame, expose_frame
+from knightcube.vision.streaks.maximum_likelihood.iteration import ExposedCamera
+from knightcube.vision.streaks.maximum_likelihood.joint_fit import joint_fit
+from knightcube.vision.streaks.maximum_likelihood.motion import Motion, positions
+from knightcube.vision.streaks.maximum_likelihood.normal_equations import light_of
+from knightcube.vision.streaks.maximum_likelihood.result import MotionResult
+from knightcube.vision.streaks.maximum_likelihood.result_of_fit import with_rate, with_stars
+from knightcube.vision.streaks.maximum_likelihood.scene import Scene, path_lengths
+from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from knightcube.vision.streaks.maximum_likelihood.shutter import Shutter
+from knightcube.vision.streaks.maximum_likelihood.wholeness import Wholeness
+from knightcube.vision.streaks.streak_result import StreakStatus
+
+# Reaches: streaks closer than this to a bright one overlap its pixels.
+_NEAR = 1.4
+# px: closer stars are not fitted separately.
+_TWIN = 2.0
+# A found star is a catalogue star that is within this distance, px, and has at least this share of its light.
+_SAME, _ALIKE = 5.0, 0.3
+# So many px beside the streak of such a star, and along it, a found star is a piece of that streak.
+_BESIDE = 2.5
+# Relative error of a star's light as the catalogue predicts it.
+_LIGHT_ERROR = 0.15
+# Stars whose pixels are held at a time while their light is subtracted.
+_AT_ONCE = 25
+# Instants at which a star is tested to be in the frame.
+_INSTANTS = 9
+# Pixels that the second fit looks at, in those of the first: places of faint stars are wanted, too.
+_ROOM = 1.7
+# Chi-square of 3, exceeded by chance once in 100,000: two rates farther apart are different motions.
+_ONE_MOTION = 25.9
+# px: added to the uncertainty of the previous attitude.
+_PRIOR_PX = 1.0
+
+
+def refit_with_catalogue(
+    pixels: Image,
+    solution: FrameSolution,
+    sky: SkyIndex,
+    settings: SolveSettings,
+    likelihood: LikelihoodSettings,
+) -> FrameSolution:
+    """Return `solution` with motion and attitude refitted; unchanged if the refit fails.
+
+    Args:
+        pixels: (rows, columns), the solved frame.
+        solution: of a frame of streaks; one whose scale was fitted is returned unchanged.
+        sky: the guide stars.
+        settings: with which it was solved.
+        likelihood: settings of the streaks' fit.
+    """
+    motion, fix = solution.motion, solution.fix
+    if motion is None or fix is None or solution.status is not SolveStatus.SOLVED or solution.scale_sigma:
+        return solution
+    again = refit_motion(pixels, motion, solution, sky, settings, likelihood)
+    if again is None:
+        return solution
+    sigma = np.sqrt(np.linalg.eigvalsh(fix.covariance)[-1]) + _PRIOR_PX / solution.camera.focal_length
+    prior = AttitudePrior(fix.quaternion, float(sigma))
+    better = solve_motion(again, solution.camera, (1.0, 1.0), sky, settings, prior)
+    if better.status is not SolveStatus.SOLVED or not better.tracked:
+        return solution
+    return replace(better, tracked=solution.tracked, log10_false_alarm=solution.log10_false_alarm)
+
+
+def refit_motion(
+    pixels: Image,
+    motion: MotionResult,
+    solution: FrameSolution,
+    sky: SkyIndex,
+    settings: SolveSettings,
+    likelihood: LikelihoodSettings,
+) -> MotionResult | None:
+    """Return `motion` refitted with all stars known; None if that fails or gives another rate."""
+    # Under a rolling shutter an ambiguous rate lies between two motions: there is none to start from.
+    between = likelihood.delay_per_row > 0.0 and motion.status is not StreakStatus.RATE
+    if motion.rate is None or motion.covariance is None or between:
+        return None
+    pinhole, exposure = solution.camera.ideal, motion.exposure
+    course = _course_of(motion, motion.rate)
+    most = likelihood.most_stars + likelihood.most_neighbours + likelihood.most_faint
+    known = _known_stars(motion, solution, sky, settings, course, most)
+    if known is None:
+        return None
+    camera = ExposedCamera(
+        expose_frame(pixels, likelihood.saturation, likelihood.gain),
+        pinhole,
+        Shutter(likelihood.delay_per_row / exposure, pinhole.centre[1]),
+        likelihood,
+        motion.psf_sigma,
+        motion.rate_model == "accelerating",
+    )
+    scene, hidden = _scenes(camera, course, known, motion)
+    camera = replace(camera, frame=_without(camera, hidden))
+    done = joint_fit(camera, scene, _ROOM)
+    if done is None:
+        return None
+    # What there was no room for is known from the catalogue: no fit of fewer streaks is better for it.
+    done = replace(done, hidden=None)
+    refit = with_rate(with_stars(motion, camera, done), camera, done, Wholeness.WHOLE)
+    if refit.status is not StreakStatus.AMBIGUOUS or refit.rate is None or refit.covariance is None:
+        return None
+    assumed = np.zeros((3, 3)) if motion.course is None else motion.course.covariance(exposure)
+    covariance = refit.covariance + assumed
+    apart = refit.rate - motion.rate
+    if not apart @ np.linalg.solve(motion.covariance + covariance, apart) < _ONE_MOTION:
+        return None
+    left = _elsewhere(motion.faint_endpoints, refit.endpoints)
+    return replace(
+        refit,
+        status=motion.status,
+        covariance=covariance,
+        faint_endpoints=motion.faint_endpoints[left],
+        faint_flux=motion.faint_flux[left],
+        faint_significance=motion.faint_significance[left],
+    )
+
+
+def _course_of(motion: MotionResult, rate: FloatArray) -> Motion:
+    """Return the course over the exposure by the mean `rate` (3,) rad/s and what else `motion` has found."""
+    exposure = motion.exposure
+    growth = np.zeros(3) if motion.acceleration is None else motion.acceleration * exposure**2
+    shape = np.zeros((0, 3)) if motion.course is None else motion.course.terms[2:]
+    return Motion.between(rate * exposure, growth, shape)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Known:
+    """Stars of the catalogue: `places` (n, 2) px at mid-exposure, `light` (n,) counts over the exposure.
+
+    `inside` (n,) is the part of the path that lies in the frame.
+    """
+
+    places: FloatArray
+    light: FloatArray
+    inside: FloatArray
+
+    @classmethod
+    def seen(
+        cls, pinhole: Pinhole, course: Motion, places: FloatArray, light: FloatArray, most: int
+    ) -> _Known:
+        """Return at most `most` of stars (n, 2), (n,) that are in the frame, the most light in it first."""
+        n = len(places)
+        time = np.tile(np.linspace(-0.5, 0.5, _INSTANTS), n)
+        there = positions(pinhole, course, np.repeat(places, _INSTANTS, axis=0), time)
+        inside = pinhole.contains(there).reshape(n, _INSTANTS).mean(axis=1)
+        order = np.argsort(-light * inside, kind="stable")
+        order = order[inside[order] > 0.0][:most]
+        return cls(places[order], light[order], inside[order])
+
+    def twins(self) -> BoolArray:
+        """Return which have a brighter star too near to be fitted separately."""
+        order = np.argsort(self.places[:, 0], kind="stable")
+        fainter = np.zeros(len(order), dtype=np.bool_)
+        for places_on in range(1, len(order)):
+            one, two = order[:-places_on], order[places_on:]
+            gap = self.places[two] - self.places[one]
+            if not (gap[:, 0] < _TWIN).any():
+                break
+            close = np.hypot(gap[:, 0], gap[:, 1]) < _TWIN
+            fainter[np.maximum(one, two)[close]] = True
+        return fainter
+
+
+def _known_stars(
+    motion: MotionResult,
+    solution: FrameSolution,
+    sky: SkyIndex,
+    settings: SolveSettings,
+    course: Motion,
+    most: int,
+) -> _Known | None:
+    """Return the stars in the frame; None if no fitted star was identified, which scales their light."""
+    matched = solution.matched
+    apart = np.linalg.norm(solution.points[matched, None] - motion.stars, axis=-1)
+    fitted = apart.argmin(axis=1)
+    used = motion.used[fitted]
+    if solution.fix is None or not used.any():
+        return None
+    magnitude = sky.stars.magnitude
+    zero = np.median(np.log10(motion.flux[fitted[used]]) + 0.4 * magnitude[solution.star[matched[used]]])
+    pinhole, matrix = solution.camera.ideal, attitude_matrix(solution.fix.quaternion)
+    reach = min(pinhole.half_diagonal + 0.5 * float(np.linalg.norm(course.whole)), 0.5 * np.pi)
+    near = np.flatnonzero(matrix[2].astype(np.float32) @ sky.coarse > np.cos(reach))
+    direction = sky.stars.direction[near]
+    if settings.velocity is not None:
+        direction = apparent(direction, settings.velocity)
+    places = SkyMap(solution.camera, solution.fix.quaternion, solution.bend).pixels(direction)
+    return _Known.seen(pinhole, course, places, 10.0 ** (float(zero) - 0.4 * magnitude[near]), most)
+
+
+def _scenes(
+    camera: ExposedCamera, course: Motion, known: _Known, motion: MotionResult
+) -> tuple[Scene, Scene]:
+    """Return the stars to be fitted, the brightest trusted, and those whose light is only subtracted."""
+    settings = camera.settings
+    width = float(np.sqrt(motion.psf_sigma**2 + 1.0 / 12.0))
+    leading = np.arange(len(known.light)) < settings.most_stars
+    room = _NEAR * settings.reach * width
+    near = leading | close_by(camera.pinhole, course, known.places, known.places[leading], room)
+    twin = known.twins()
+    path = path_lengths(camera.pinhole, course, known.places) + 2.0 * np.sqrt(np.pi) * width
+    light = known.light * known.inside
+    floor = float(np.median(camera.frame.floor)) * 2.0 * np.sqrt(np.pi) * width * path * known.inside
+    seen = light > settings.faint_sigmas * np.sqrt(floor + light / camera.frame.gain)
+    fitted = np.flatnonzero(near & (leading | seen) & ~twin)[: settings.most_stars + settings.most_neighbours]
+    hidden = near.copy()
+    hidden[fitted] = False
+    foreign = _foreign(camera.pinhole, course, motion, known)
+    scene = _scene(course, width, known.places[fitted], known.light[fitted], leading[fitted])
+    return scene.with_stars(motion.stars[foreign], motion.flux[foreign]), _scene(
+        course, width, known.places[hidden], known.light[hidden], leading[hidden]
+    )
+
+
+def _scene(course: Motion, width: float, places: FloatArray, light: FloatArray, trusted: BoolArray) -> Scene:
+    return Scene(course, width, places, light, np.zeros(len(light)), trusted)
+
+
+def _foreign(pinhole: Pinhole, course: Motion, motion: MotionResult, known: _Known) -> IntArray:
+    """Return which stars found are not in the catalogue: it has no such light at their place.
+
+    Nor on their streak: the first fit may have made two stars of a bright one, one behind the other.
+    """
+    near = np.linalg.norm(motion.stars[:, None] - known.places, axis=2) < _SAME
+    polar, azimuth = circles(pinhole, course, motion.stars)
+    known_polar, known_azimuth = circles(pinhole, course, known.places)
+    beside = np.abs(polar[:, None] - known_polar) * pinhole.focal_length < _BESIDE
+    near |= beside & (apart(azimuth, known_azimuth) < float(np.linalg.norm(course.whole)))
+    alike = known.light > _ALIKE * motion.flux[:, None]
+    return np.flatnonzero(~(near & alike).any(axis=1))
+
+
+def _elsewhere(faint: FloatArray, ends: FloatArray) -> BoolArray:
+    """Return which streaks (n, 2, 2) px are none of those with `ends` (m, 2, 2)."""
+    worst = np.linalg.norm(faint[:, None] - ends, axis=-1).max(axis=-1)
+    return np.asarray((worst > _SAME).all(axis=1))
+
+
+def _without(camera: ExposedCamera, hidden: Scene) -> ExposedFrame:
+    """Return the frame less the light of `hidden` stars, and as much noisier as that is uncertain."""
+    frame = camera.frame
+    if not len(hidden.light):
+        return frame
+    light = np.zeros_like(frame.signal)
+    for begin in range(0, len(hidden.light), _AT_ONCE):
+        some = hidden.select(np.arange(begin, min(begin + _AT_ONCE, len(hidden.light))))
+        windows = camera.windows(some)
+        light[windows.pixels] += light_of(camera.pinhole, camera.shutter, some, windows)
+    signal = frame.signal - light
+    light *= np.float32(_LIGHT_ERROR)
+    light *= light
+    light += frame.floor
+    return replace(frame, signal=signal, floor=light)

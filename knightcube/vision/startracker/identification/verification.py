@@ -1,0 +1,288 @@
+"""Verification: counts the stars of the field that a candidate attitude matches and rules out chance.
+
+The guide stars predicted in the field are compared with the observed ones; coincident stars refine attitude
+and scale, repeatedly, until the same stars match. The significance of the match does not depend on how the
+candidate was found: it is the expected number of equal or better matches in the whole sky if the stars were
+random (`chance`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from knightcube.astro.arrays import FloatArray, IntArray
+from knightcube.astro.quaternion import attitude_matrix
+from knightcube.vision.startracker.identification.chance import Chance
+from knightcube.vision.startracker.identification.distortion import DistortedFit, fit_with_distortion
+from knightcube.vision.startracker.identification.field import StarField
+from knightcube.vision.startracker.identification.identification import Identification, Status
+from knightcube.vision.startracker.identification.refinement import (
+    Refinement,
+    inflation,
+    refine,
+    stretched,
+)
+from knightcube.vision.startracker.index.sky_index import SkyIndex
+
+
+@dataclass(frozen=True, slots=True)
+class VerificationSettings:
+    """When a candidate is accepted.
+
+    Attributes:
+        log10_false_alarm: limit of the expected number of chance matches in the whole sky.
+        gates: half widths within which a star matches, in its sigmas; the gate with the least chance is used.
+            The wide ones serve a lens with distortion, or sigmas that are too small.
+        least_matches: of stars, for acceptance.
+        rounds: of matching and refining.
+        most: number of the brightest observed stars that decide; all are matched in the end.
+    """
+
+    log10_false_alarm: float = -4.5
+    gates: tuple[float, ...] = (3.5, 8.0, 20.0)
+    least_matches: int = 4
+    rounds: int = 5
+    most: int = 64
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Matching:
+    """Observed stars (k,), the guide stars (k,) that they match, and the significance."""
+
+    observed: IntArray
+    star: IntArray
+    log10_chance: float
+
+
+# Share of the bright expected stars that match: with less a distorted lens is supposed.
+_FEW_MISSED = 0.8
+# An answer is refused if more than this share of the bright expected stars is missed with an unmatched star
+# within this share of the corner's tangent, beyond chance: the lens is fitted wrongly there. A foreground
+# hides stars and puts none beside them.
+_MOST_DISPLACED, _DISPLACED_BY = 0.15, 0.04
+# A candidate that begins more than this, in powers of ten, above the limit is given up.
+_HOPELESS = 7.0
+
+
+def verify(
+    field: StarField,
+    sky: SkyIndex,
+    attitude: FloatArray,
+    scale: float,
+    searched: float = 1.0,
+    settings: VerificationSettings = VerificationSettings(),
+) -> Identification:
+    """Return the whole field's identification if the candidate holds, NO_MATCH if it may be chance.
+
+    Args:
+        field: the observed stars.
+        sky: the guide stars.
+        attitude: (4,) of the candidate, ICRS to camera, within some sigmas of the answer.
+        scale: of the candidate.
+        searched: share of all attitudes that candidates were taken from: 1 if lost in space.
+        settings: when a candidate is accepted.
+    """
+    return verify_matrix(field, sky, attitude_matrix(attitude), scale, searched, settings)
+
+
+def verify_matrix(
+    field: StarField,
+    sky: SkyIndex,
+    matrix: FloatArray,
+    scale: float,
+    searched: float = 1.0,
+    settings: VerificationSettings = VerificationSettings(),
+) -> Identification:
+    """Do as `verify` with the attitude matrix (3, 3)."""
+    expected = expected_stars(sky, matrix, _half_width(field, scale), int(1.3 * len(field)) + 8)
+    deciding = field if len(field) <= settings.most else field.subset(np.arange(settings.most))
+    start = Refinement(matrix, scale, np.empty((0, 0)), np.empty(0))
+    decided = _settle(deciding, sky, expected, start, searched, settings)
+    if decided is None:
+        return nothing(field)
+    matching, refined = decided
+    if matching.log10_chance > settings.log10_false_alarm:
+        return nothing(field)
+    if deciding is not field:
+        expected = expected_stars(
+            sky, refined.matrix, _half_width(field, refined.scale), int(1.3 * len(field)) + 8
+        )
+        decided = _settle(field, sky, expected, refined, searched, settings)
+        if decided is None:
+            return nothing(field)
+        matching, refined = decided
+    # A calibrated lens has no distortion left; another has it where stars are missed or scatter.
+    if field.scale[1] > field.scale[0] and (
+        _share_of_bright(expected, matching.star) < _FEW_MISSED
+        or inflation(refined.squares, len(refined.covariance)) > 1.0
+    ):
+        return _distorted(field, sky, matching, refined)
+    return _identified(field, matching, refined.widened())
+
+
+def _distorted(field: StarField, sky: SkyIndex, matching: _Matching, refined: Refinement) -> Identification:
+    """Return the identification with distortion fitted; NO_MATCH if bright stars are seen out of place."""
+    width = _half_width(field, refined.scale)
+    expected = expected_stars(sky, refined.matrix, width, int(1.3 * len(field)) + 8)
+    found = fit_with_distortion(field, sky, expected, matching.observed, matching.star, refined)
+    if found is None or _share_displaced(field, sky, expected, found) > _MOST_DISPLACED:
+        return nothing(field)
+    grown = _Matching(found.observed, found.star, matching.log10_chance)
+    answer = _identified(field, grown, found.refined)
+    return replace(answer, distortion=found.distortion, from_lens=found.from_lens)
+
+
+def _share_of_bright(expected: npt.NDArray[np.intp], star: npt.NDArray[np.integer[Any]]) -> float:
+    """Return how many of the bright expected stars match."""
+    matched = _bright_matched(expected, star)
+    return float(np.mean(matched)) if len(matched) else 0.0
+
+
+def _bright_matched(
+    expected: npt.NDArray[np.intp], star: npt.NDArray[np.integer[Any]]
+) -> npt.NDArray[np.bool_]:
+    """Return which of the expected stars match, of those as bright as the brighter half of `star`."""
+    matched = np.isin(expected, star)
+    places = np.flatnonzero(matched)
+    return matched[: places[(len(places) - 1) // 2] + 1] if len(places) else matched[:0]
+
+
+def _share_displaced(
+    field: StarField, sky: SkyIndex, expected: npt.NDArray[np.intp], found: DistortedFit
+) -> float:
+    """Return how many of the bright expected stars are missed with an unmatched star near, less chance."""
+    matched = _bright_matched(expected, found.star)
+    missed = sky.stars.direction[expected[: len(matched)][~matched]]
+    unmatched = np.delete(found.seen, found.observed, axis=0)
+    if not len(missed) or not len(unmatched):
+        return 0.0
+    across, down = _half_width(field, found.refined.scale)
+    radius = _DISPLACED_BY * math.hypot(across, down)
+    nearest = (unmatched @ (found.refined.matrix @ missed.T)).max(axis=0)
+    near = np.count_nonzero(2.0 - 2.0 * nearest < radius**2)
+    chance = len(missed) * min(1.0, len(unmatched) * math.pi * radius**2 / (4.0 * across * down))
+    return float(near - chance) / len(matched)
+
+
+def nothing(field: StarField, status: Status = Status.NO_MATCH) -> Identification:
+    """Return an identification without stars."""
+    return Identification(status, np.full(len(field), -1))
+
+
+def expected_stars(
+    sky: SkyIndex, matrix: FloatArray, half_width: tuple[float, float], count: int
+) -> npt.NDArray[np.intp]:
+    """Return the numbers of the `count` brightest guide stars in the field, the brightest first."""
+    across, down = half_width
+    cosine = 1.0 / math.sqrt(1.0 + across * across + down * down)
+    # Of twice as many as the whole sky should hold for `count` here: the Milky Way is denser, the poles less.
+    brightest = int(math.pi / (across * down) * 2.0 * (count + 5.0))
+    near = np.flatnonzero(matrix[2].astype(np.float32) @ sky.coarse[:, :brightest] > cosine)
+    x, y, z = matrix @ sky.stars.direction[near].T
+    inside = (np.abs(x) <= across * z) & (np.abs(y) <= down * z)
+    return np.asarray(near[inside][:count])
+
+
+def _half_width(field: StarField, scale: float) -> tuple[float, float]:
+    return field.half_width[0] * scale, field.half_width[1] * scale
+
+
+def _settle(
+    field: StarField,
+    sky: SkyIndex,
+    expected: npt.NDArray[np.intp],
+    start: Refinement,
+    searched: float,
+    settings: VerificationSettings,
+) -> tuple[_Matching, Refinement] | None:
+    """Return matched stars and the refinement of `start` by them, once both agree; None if they do not."""
+    refined, previous = start, None
+    for _ in range(settings.rounds):
+        matching = _match(field, sky, expected, refined, searched, settings)
+        if matching is None or (
+            previous is None and matching.log10_chance > settings.log10_false_alarm + _HOPELESS
+        ):
+            return None
+        if previous is not None and np.array_equal(previous.observed, matching.observed):
+            return matching, refined
+        previous = matching
+        found = refine(
+            field.direction[matching.observed],
+            sky.stars.direction[matching.star],
+            field.sigma[matching.observed],
+            refined.matrix,
+            refined.scale,
+            field.scale[1] > field.scale[0],
+        )
+        if found is None or not _plausible(found, field):
+            return None
+        refined = found
+    return (previous, refined) if previous is not None else None
+
+
+def _match(
+    field: StarField,
+    sky: SkyIndex,
+    expected: npt.NDArray[np.intp],
+    at: Refinement,
+    searched: float,
+    settings: VerificationSettings,
+) -> _Matching | None:
+    """Return which observed stars have an expected one within a gate, for the most significant gate."""
+    if len(expected) < settings.least_matches:
+        return None
+    cosines = stretched(field.direction, at.scale) @ (at.matrix @ sky.stars.direction[expected].T)
+    nearest = cosines.argmax(axis=1)
+    rows = np.arange(len(nearest))
+    variance = (field.sigma * at.scale) ** 2
+    squared = 2.0 * (1.0 - cosines[rows, nearest]) / variance
+    squared[cosines.argmax(axis=0)[nearest] != rows] = np.inf
+    area = 4.0 * field.half_width[0] * field.half_width[1] * at.scale**2
+    chance = Chance(
+        len(field),
+        float(variance.mean()) / area,
+        4.0 * math.pi / area * searched,
+        math.log(field.scale[1] / field.scale[0]),
+        len(settings.gates),
+        settings.least_matches,
+        settings.log10_false_alarm,
+    )
+    best: _Matching | None = None
+    matched = settings.least_matches - 1
+    for gate in settings.gates:
+        within = np.flatnonzero(squared <= gate * gate)
+        # A wider gate about the same stars is less significant.
+        if len(within) <= matched:
+            continue
+        matched = len(within)
+        value = chance.log10(gate, within.tolist(), nearest[within].tolist())
+        if best is None or value < best.log10_chance:
+            best = _Matching(within, expected[nearest[within]], value)
+    return best
+
+
+def _plausible(refined: Refinement, field: StarField) -> bool:
+    """Return whether the scale found lies in the lens's range, within five of its sigmas."""
+    lowest, highest = field.scale
+    if lowest == highest:
+        return True
+    slack = math.exp(5.0 * refined.scale_sigma)
+    return lowest / slack <= refined.scale <= highest * slack
+
+
+def _identified(field: StarField, matching: _Matching, refined: Refinement) -> Identification:
+    star = np.full(len(field), -1)
+    star[matching.observed] = matching.star
+    return Identification(
+        Status.IDENTIFIED,
+        star,
+        refined.fix(),
+        refined.scale,
+        refined.scale_sigma * refined.scale,
+        matching.log10_chance,
+    )

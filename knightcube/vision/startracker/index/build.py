@@ -1,0 +1,153 @@
+"""Make the sky index: python -m knightcube.vision.startracker.index.build [--output FILE].
+
+The default index is made on first use, in some seconds, and kept in the cache folder: $XDG_CACHE_HOME, or
+~/.cache, /knightcube. On board the installer makes it, and the configuration names its path.
+`python -m flight index --camera CONFIG` makes one for a mission's camera.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from knightcube.astro import catalogue
+from knightcube.errors import InputError, UsageError
+from knightcube.vision.startracker.index.guide_stars import GuideStars, choose_guide_stars
+from knightcube.vision.startracker.index.sky_index import PATH, SkyIndex, load, save
+from knightcube.vision.startracker.index.triangle_index import build as build_triangles
+
+
+@dataclass(frozen=True, slots=True)
+class IndexSettings:
+    """Contents of the index.
+
+    Attributes:
+        faintest: V of the faintest guide star.
+        epoch: Julian year of the directions; `SkyIndex.at` moves them to another.
+        resolution: rad, below which two stars are seen as one.
+        smallest, largest: rad, longest sides of the triangles.
+        density: number of stars that count as bright within 2.5 deg of a triangle of that size; larger for
+            larger ones, so that every octave of size has about as many triangles.
+        few: brightest stars of any circle whose triangles are in the index.
+    """
+
+    faintest: float = 8.5
+    epoch: float = 2026.5
+    resolution: float = float(np.deg2rad(40.0 / 3600.0))
+    smallest: float = float(np.deg2rad(1.5))
+    largest: float = float(np.deg2rad(25.0))
+    density: float = 7.5
+    few: int = 5
+
+    @classmethod
+    def of_field(cls, fov: float, pixel: float | None = None) -> IndexSettings:
+        """Return the settings for a camera of `fov` rad across, its pixels `pixel` rad wide if given.
+
+        Raises UsageError for a field below 2 or above 120 deg.
+        """
+        if not _NARROWEST <= fov <= _WIDEST:
+            raise UsageError(f"a field of {np.rad2deg(fov):g} deg: an index serves 2 to 120 deg")
+        longest = min(fov, DEFAULT.largest)
+        resolution = DEFAULT.resolution if pixel is None else _RESOLVED_PIXELS * pixel
+        return cls(smallest=_SMALLEST_SHARE * longest, largest=longest, resolution=resolution)
+
+
+_NARROWEST, _WIDEST = float(np.deg2rad(2.0)), float(np.deg2rad(120.0))
+# Of the largest triangle of a field: the smallest; and pixels between two stars that are seen as two.
+_SMALLEST_SHARE = 0.2
+_RESOLVED_PIXELS = 2.5
+_MOST_STARS = 1 << 16
+DEFAULT = IndexSettings()
+_BANDS_PER_OCTAVE = 2.5
+_REFERENCE_SIZE = float(np.deg2rad(2.5))
+
+
+def build(settings: IndexSettings = DEFAULT) -> SkyIndex:
+    """Return the index of the catalogue's stars. Raises UsageError for too many or too few of them."""
+    stars = catalogue.load()
+    guide_stars = choose_guide_stars(stars, settings.faintest, settings.epoch, settings.resolution)
+    if not 3 <= len(guide_stars) <= _MOST_STARS:
+        raise UsageError(
+            f"{len(guide_stars)} stars to V {settings.faintest:g}: an index holds 3 to {_MOST_STARS}"
+        )
+    count = round(_BANDS_PER_OCTAVE * np.log2(settings.largest / settings.smallest))
+    sizes = np.geomspace(settings.smallest, settings.largest, count + 1)
+    middle = np.sqrt(sizes[1:] * sizes[:-1])
+    ranks = np.round(settings.density * (middle / _REFERENCE_SIZE) ** (2.0 / 3.0)).astype(np.int64)
+    triangles = build_triangles(guide_stars.direction, 2.0 * np.sin(0.5 * sizes), ranks, settings.few)
+    return SkyIndex(guide_stars, proper_motion(guide_stars), triangles)
+
+
+def proper_motion(stars: GuideStars) -> npt.NDArray[np.float32]:
+    """Return the change (n, 3) float32, rad/yr, of guide stars: that of the star whose number each bears."""
+    source = catalogue.load()
+    order = np.argsort(source.hip)
+    place = order[np.searchsorted(source.hip, stars.hip, sorter=order)]
+    moved = source.directions_at(stars.epoch + 1.0)[place] - source.directions_at(stars.epoch)[place]
+    return np.asarray(moved, dtype=np.float32)
+
+
+def ensure_default_index() -> None:
+    """Make the default index now if it is missing, so that no flight waits for it."""
+    if not PATH.exists():
+        default_index()
+
+
+@cache
+def default_index() -> SkyIndex:
+    """Return the default index, read once a process; made and kept in the cache folder if missing."""
+    path = PATH
+    try:
+        return load(path)
+    except InputError:
+        sys.stderr.write(f"making the index of the sky, once, for {path} ...\n")
+    sky = build()
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save(sky, path)
+    except OSError as error:
+        sys.stderr.write(f"{path}: cannot be kept: {error.strerror or error}\n")
+        return sky
+    return load(path)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Write the index; 0 when done, 2 for wrong use."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--output", type=Path, default=PATH, help="file (default %(default)s)")
+    parser.add_argument(
+        "--epoch", type=float, default=DEFAULT.epoch, help="Julian year (default %(default)s)"
+    )
+    parser.add_argument("--faintest", type=float, default=DEFAULT.faintest, help="V (default %(default)s)")
+    parser.add_argument("--fov", type=float, metavar="DEG", help="of a mission's camera (default: 4 to 60)")
+    options = parser.parse_args(arguments)
+    begin = time.monotonic()
+    try:
+        settings = DEFAULT if options.fov is None else IndexSettings.of_field(np.deg2rad(options.fov))
+        sky = build(replace(settings, faintest=options.faintest, epoch=options.epoch))
+        options.output.parent.mkdir(parents=True, exist_ok=True)
+        save(sky, options.output)
+    except (UsageError, ValueError) as error:
+        sys.stderr.write(f"{error}\n")
+        return 2
+    except OSError as error:
+        sys.stderr.write(f"{options.output}: cannot be written: {error.strerror or error}\n")
+        return 2
+    megabytes = options.output.stat().st_size / 1e6
+    sys.stdout.write(
+        f"{options.output}: {len(sky.stars)} stars, {len(sky.triangles)} triangles, {megabytes:.1f} MB,"
+        f" {time.monotonic() - begin:.1f} s\n"
+    )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,52 @@
+"""Directions as a star camera would see them, and the attitude that they fix, worked out with more digits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, normalise
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sight:
+    """Directions (n, 3) seen and true, errors (n,) rad, and the true attitude (4,)."""
+
+    observed: FloatArray
+    reference: FloatArray
+    sigma: FloatArray
+    quaternion: FloatArray
+
+
+def unit(vectors: FloatArray) -> FloatArray:
+    """Return the vectors (..., 3) at unit length."""
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+
+
+def sight(
+    rng: np.random.Generator,
+    n: int,
+    half_field: float | None,
+    sigma: float,
+    angle: float | None = None,
+) -> Sight:
+    """Return n stars within `half_field` rad of a random boresight, or all over the sky.
+
+    `sigma` is about the rad by which each is seen off; `angle` rad the rotation, about a random axis, drawn
+    evenly from all rotations when None.
+    """
+    drawn = rng.normal(size=(n, 3))
+    if half_field is not None:
+        boresight = unit(rng.normal(size=3))
+        reach = half_field * np.sqrt(rng.uniform(size=(n, 1)))
+        drawn = boresight + reach * unit(np.cross(boresight, drawn))
+    reference = unit(drawn)
+    quaternion = normalise(rng.normal(size=4))
+    if angle is not None:
+        quaternion = from_rotation_vector(angle * unit(quaternion[:3]))
+    errors = sigma * rng.uniform(0.3, 3.0, n)
+    noise = errors[:, None] * rng.normal(size=(n, 3))
+    observed = unit(reference @ attitude_matrix(quaternion).T + noise)
+    return Sight(observed, reference, errors, quaternion)

@@ -1,0 +1,270 @@
+"""All attitude solvers: with one another, with scipy, with their covariances, and where attitudes end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.attitude import davenport, esoq2, foam, predictive, quest, singular_values
+from knightcube.astro.attitude.profile import davenport_matrix, largest_eigenvalue
+from knightcube.astro.attitude.solvers import DEFAULT, OPTIMAL, SOLVERS, solve
+from knightcube.astro.attitude.wahba import AttitudeError, AttitudeFix, information, profile_matrix
+from knightcube.astro.quaternion import (
+    IDENTITY,
+    angle_between,
+    attitude_matrix,
+    conjugate,
+    from_rotation_vector,
+    multiply,
+    to_rotation_vector,
+)
+from tests.knightcube.astro.attitude.sights import Sight, sight, unit
+
+_ALL = sorted(SOLVERS)
+_RAW: dict[str, Callable[[FloatArray], FloatArray]] = {
+    "davenport": davenport.optimal_quaternion,
+    "esoq2": esoq2.optimal_quaternion,
+    "foam": foam.optimal_quaternion,
+    "quest": quest.optimal_quaternion,
+    "svd": singular_values.optimal_quaternion,
+}
+_FIELD = 0.0524  # rad, half of a 6 deg field
+
+
+def _by(name: str, seen: Sight) -> AttitudeFix:
+    return SOLVERS[name](seen.observed, seen.reference, seen.sigma)
+
+
+def _error(fix: AttitudeFix, quaternion: FloatArray) -> FloatArray:
+    return to_rotation_vector(multiply(fix.quaternion, conjugate(quaternion)))
+
+
+def _least_eigenvalue(seen: Sight) -> float:
+    """Return the least eigenvalue of the information, as a part of the sum of weights."""
+    return float(np.linalg.eigvalsh(information(seen.observed, seen.sigma))[0] / np.sum(seen.sigma**-2.0))
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    n=st.integers(2, 30),
+    half_field=st.one_of(st.none(), st.floats(0.02, 0.5)),
+    sigma=st.floats(1e-7, 1e-3),
+    angle=st.one_of(st.none(), st.floats(0.0, 1e-6), st.floats(np.pi - 1e-6, np.pi)),
+)
+def test_all_optimal_solvers_agree_to_a_tenth_of_a_nanoradian(
+    seed: int, n: int, half_field: float | None, sigma: float, angle: float | None
+) -> None:
+    seen = sight(np.random.default_rng(seed), n, half_field, sigma, angle)
+    if _least_eigenvalue(seen) < (30.0 * sigma) ** 2:
+        return  # Stars that their own errors may bring together or apart share no attitude to agree upon.
+    fixes = {name: _by(name, seen) for name in OPTIMAL}
+    for fix in fixes.values():
+        assert angle_between(fix.quaternion, fixes[DEFAULT].quaternion) < 1e-10
+        assert fix.loss == pytest.approx(fixes[DEFAULT].loss, rel=1e-6, abs=1e-9)
+        assert fix.quaternion[3] >= 0.0
+        assert np.linalg.norm(fix.quaternion) == pytest.approx(1.0, abs=1e-14)
+
+
+@pytest.mark.parametrize("name", sorted(_RAW))
+@pytest.mark.parametrize("angle", [None, 0.0, 1e-9, np.pi - 1e-9, np.pi])
+@pytest.mark.parametrize(("n", "half_field"), [(20, None), (20, _FIELD), (2, None), (2, _FIELD)])
+def test_a_solver_loses_no_more_than_the_profile_matrix_has_lost(
+    name: str, angle: float | None, n: int, half_field: float | None
+) -> None:
+    """Before it is settled: rounding over the gap between K's eigenvalues, against numpy's eigenvector."""
+    rng = np.random.default_rng([61, n])
+    for _ in range(20):
+        seen = sight(rng, n, half_field, 1e-5, angle)
+        weights = seen.sigma**-2.0
+        profile = profile_matrix(seen.observed, seen.reference, weights / weights.sum())
+        values, vectors = np.linalg.eigh(davenport_matrix(profile))
+        apart = angle_between(_RAW[name](profile), vectors[:, 3])
+        assert apart < 1e-13 / (values[3] - values[2])
+
+
+@given(seed=st.integers(0, 2**32 - 1), n=st.integers(3, 10))
+def test_the_polynomials_root_is_the_largest_eigenvalue(seed: int, n: int) -> None:
+    rng = np.random.default_rng(seed)
+    profile = profile_matrix(
+        unit(rng.normal(size=(n, 3))), unit(rng.normal(size=(n, 3))), np.full(n, 1.0 / n)
+    )
+    values = np.linalg.eigvalsh(davenport_matrix(profile))
+    # A simple root's error is rounding over the slope; of two that are close it is rounding's own root.
+    slope = np.prod(values[3] - values[:3])
+    assert largest_eigenvalue(profile) == pytest.approx(values[3], abs=min(1e-6, 1e-14 / slope))
+
+
+@pytest.mark.parametrize("name", _ALL)
+def test_directions_without_noise_give_the_true_attitude(name: str) -> None:
+    rng = np.random.default_rng(62)
+    for angle in (None, 0.0, 1e-9, 1.0, np.pi - 1e-9, np.pi):
+        for n, half_field in ((2, None), (2, _FIELD), (20, _FIELD)):
+            true = sight(rng, n, half_field, 1e-5, angle)
+            exact = true.reference @ attitude_matrix(true.quaternion).T
+            fix = SOLVERS[name](unit(exact), true.reference, true.sigma)
+            # A direction is rounded by 1e-16; the turn about the boresight is that over the separation.
+            assert angle_between(fix.quaternion, true.quaternion) < 1e-15 / np.sqrt(_least_eigenvalue(true))
+
+
+@pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0), (-1, 1, 1)])
+@pytest.mark.parametrize("name", _ALL)
+def test_half_a_turn_about_any_axis_is_no_special_case(name: str, axis: tuple[int, int, int]) -> None:
+    """The boresight about which stars are gathered may be the axis, and may be thrown backwards."""
+    q = from_rotation_vector(np.pi * unit(np.array(axis, dtype=float)))
+    drawn = np.random.default_rng(63).normal(size=(6, 3)) * [_FIELD, _FIELD, 0.0]
+    reference = unit(np.array([0.0, 0.0, 1.0]) + drawn)
+    fix = SOLVERS[name](reference @ attitude_matrix(q).T, reference, np.full(6, 1e-5))
+    assert angle_between(fix.quaternion, q) < 1e-13
+
+
+def test_the_default_is_scipys_solution() -> None:
+    rng = np.random.default_rng(64)
+    for _ in range(50):
+        seen = sight(rng, 20, _FIELD, 1e-5)
+        rotation, root_loss = Rotation.align_vectors(seen.observed, seen.reference, weights=seen.sigma**-2.0)
+        fix = solve(seen.observed, seen.reference, seen.sigma)
+        # scipy's quaternion turns vectors, ours turns axes: conjugate.
+        assert angle_between(fix.quaternion, conjugate(rotation.as_quat())) < 1e-10
+        # scipy's loss is a difference of numbers 1e11 times as large.
+        assert fix.loss == pytest.approx(0.5 * root_loss**2, rel=1e-3)
+
+
+def test_two_close_stars_are_settled_to_the_digits_that_their_directions_have() -> None:
+    """B alone leaves 1e-8 rad of the turn about two stars 1e-4 rad apart; two stars fix it in closed form."""
+    rng = np.random.default_rng(65)
+    for _ in range(20):
+        seen = sight(rng, 2, None, 1e-9)
+        tiny = unit(seen.reference[:1] + np.array([np.zeros(3), 1e-4 * unit(rng.normal(size=3))]))
+        observed = unit(tiny @ attitude_matrix(seen.quaternion).T)
+        for name in OPTIMAL:
+            fix = SOLVERS[name](observed, tiny, np.full(2, 1e-5))
+            assert angle_between(fix.quaternion, seen.quaternion) < 3e-11
+
+
+@pytest.mark.parametrize("name", _ALL)
+@pytest.mark.parametrize(("n", "half_field"), [(2, _FIELD), (6, None), (20, _FIELD)])
+def test_errors_are_as_large_as_the_covariance_says(name: str, n: int, half_field: float | None) -> None:
+    rng = np.random.default_rng([66, n])
+    runs, total, losses = 120, 0.0, 0.0
+    for _ in range(runs):
+        seen = sight(rng, n, half_field, 1e-5)
+        # Two stars nearly in one place have errors that no covariance describes.
+        while _least_eigenvalue(seen) < 1e-5:
+            seen = sight(rng, n, half_field, 1e-5)
+        fix = _by(name, seen)
+        error = _error(fix, seen.quaternion)
+        total += float(error @ np.linalg.solve(fix.covariance, error))
+        losses += 2.0 * fix.loss
+    low, high = chi2.ppf([1e-4, 1.0 - 1e-4], 3 * runs)
+    assert low < total < high
+    if name in OPTIMAL:
+        low, high = chi2.ppf([1e-4, 1.0 - 1e-4], (2 * n - 3) * runs)
+        assert low < losses < high
+
+
+@pytest.mark.parametrize("name", ["olae", "triad"])
+def test_what_is_not_optimal_is_off_the_optimum_by_the_difference_of_the_covariances(name: str) -> None:
+    """An efficient estimate is uncorrelated with its difference from any other, so the variances subtract."""
+    rng = np.random.default_rng(67)
+    runs, ratios, worse = 400, [], []
+    for _ in range(runs):
+        seen = sight(rng, 8, None, 1e-5)
+        fix, best = _by(name, seen), _by(DEFAULT, seen)
+        excess = fix.covariance - best.covariance
+        # Both are formed from directions that are 1e-5 off.
+        assert np.linalg.eigvalsh(excess)[0] > -1e-4 * np.trace(best.covariance)
+        apart = _error(fix, best.quaternion)
+        ratios.append(float(apart @ apart / np.trace(excess)))
+        worse.append(np.trace(fix.covariance) / np.trace(best.covariance))
+        assert fix.loss >= best.loss * (1.0 - 1e-9)
+    # The squared length's variance is at most twice its mean squared.
+    assert np.mean(ratios) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / runs))
+    assert np.median(worse) > 1.001
+
+
+def test_triads_covariance_is_the_optimal_one_when_its_anchor_is_exact() -> None:
+    seen = sight(np.random.default_rng(68), 2, None, 1e-5)
+    sigma = np.array([1e-7, 1e-4])
+    triad = SOLVERS["triad"](seen.observed, seen.reference, sigma)
+    best = solve(seen.observed, seen.reference, sigma).covariance
+    assert np.allclose(triad.covariance, best, rtol=0.0, atol=1e-5 * np.trace(best))
+
+
+def test_the_solver_that_tracks_needs_no_more_than_the_attitude_before() -> None:
+    rng = np.random.default_rng(69)
+    for _ in range(20):
+        seen = sight(rng, 10, _FIELD, 1e-5)
+        before = multiply(from_rotation_vector(0.02 * unit(rng.normal(size=3))), seen.quaternion)
+        found = predictive.follow(before, seen.observed, seen.reference, seen.sigma)
+        assert angle_between(found.quaternion, _by(DEFAULT, seen).quaternion) < 1e-12
+
+
+@pytest.mark.parametrize("name", sorted(OPTIMAL))
+def test_directions_that_share_no_attitude_give_the_least_loss_or_none(name: str) -> None:
+    rng = np.random.default_rng(70)
+    found = 0
+    for _ in range(60):
+        observed, reference = unit(rng.normal(size=(5, 3))), unit(rng.normal(size=(5, 3)))
+        sigma = rng.uniform(0.5, 2.0, 5)
+        try:
+            fix = SOLVERS[name](observed, reference, sigma)
+        except AttitudeError:
+            continue
+        found += 1
+        weights = sigma**-2.0
+        vectors = np.linalg.eigh(davenport_matrix(profile_matrix(observed, reference, weights)))[1]
+        assert angle_between(fix.quaternion, vectors[:, 3]) < 1e-10
+    assert found >= (50 if name == "predictive" else 60)
+
+
+@pytest.mark.parametrize("name", _ALL)
+def test_a_field_seen_backwards_has_no_attitude(name: str) -> None:
+    """Of three axes each seen reversed, half a turn about any axis is as good as about any other."""
+    axes = np.eye(3)
+    if name in OPTIMAL:
+        with pytest.raises(AttitudeError):
+            SOLVERS[name](-axes, axes, np.full(3, 1e-5))
+    else:
+        # Those that take part of the data at its word say by their loss that the rest denies it.
+        try:
+            fix = SOLVERS[name](-axes, axes, np.full(3, 1e-5))
+        except AttitudeError:
+            return
+        assert fix.loss > 1e9
+
+
+@pytest.mark.parametrize("name", _ALL)
+def test_directions_that_fix_no_attitude_are_refused(name: str) -> None:
+    star, other = unit(np.array([0.1, 0.2, 1.0])), unit(np.array([0.3, 0.0, 1.0]))
+    apart = np.array([star, other])
+    for line in ([star, star], [star, -star], [star, unit(star + np.array([1e-7, 0.0, 0.0]))], [star]):
+        with pytest.raises(AttitudeError, match="on one line"):
+            SOLVERS[name](np.array(line), apart[: len(line)], np.full(len(line), 1e-5))
+        with pytest.raises(AttitudeError, match="on one line"):
+            SOLVERS[name](apart[: len(line)], np.array(line), np.full(len(line), 1e-5))
+    with pytest.raises(AttitudeError, match="0 observed"):
+        SOLVERS[name](np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
+
+
+@pytest.mark.parametrize("name", _ALL)
+def test_what_is_no_direction_or_no_error_is_refused(name: str) -> None:
+    good, sigma = np.eye(3), np.full(3, 1e-5)
+    for wrong in (2.0 * good, np.where(good == 1.0, np.nan, good), np.where(good == 1.0, np.inf, good)):
+        with pytest.raises(AttitudeError, match="observed directions must be"):
+            SOLVERS[name](wrong, good, sigma)
+        with pytest.raises(AttitudeError, match="reference directions must be"):
+            SOLVERS[name](good, wrong, sigma)
+    for bad in (0.0, -1.0, np.inf, np.nan):
+        with pytest.raises(AttitudeError, match="finite and positive"):
+            SOLVERS[name](good, good, np.array([1e-5, bad, 1e-5]))
+    with pytest.raises(AttitudeError, match=r"\(n, 3\)"):
+        SOLVERS[name](good[:2], good, sigma)
+    assert angle_between(SOLVERS[name](good, good, sigma).quaternion, IDENTITY) < 1e-15

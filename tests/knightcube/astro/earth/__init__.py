@@ -1,0 +1,1 @@
+"""Tests of the Earth, its field and orbits around it."""

@@ -1,0 +1,164 @@
+"""Where the satellite is: against published SGP4 states, another integrator, and the Earth's own turn."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.figure import EARTH_RADIUS
+from knightcube.astro.earth.orbit_knowledge import GpsFix, OrbitError, OrbitState, TwoLineElements
+from knightcube.astro.earth.orientation import (
+    ROTATION_RATE,
+    celestial_to_terrestrial,
+    geodetic,
+    mean_equator_to_celestial,
+    north_east_down,
+    terrestrial_time,
+)
+from knightcube.errors import UsageError
+from knightcube.gnc.attitude.references import references, sun_from
+from sim_hal.worlds import sun
+from sim_hal.worlds.orbit import KeplerianElements, propagate
+
+DATE = 2_461_365.8
+# Vallado et al., AIAA 2006-6753, the verification set: satellite 00005.
+FIRST = "1 00005U 58002B   00179.78495062  .00000023  00000-0  28098-4 0  4753"
+SECOND = "2 00005  34.2682 348.7242 1859667 331.7664  19.3264 10.82419157413667"
+
+
+def test_two_line_elements_give_the_published_state() -> None:
+    """At epoch (2000 June 27, 18:50:19.733568 UTC), TEME, km and km/s: SGP4-VER's first line of 00005."""
+    epoch = 2_451_722.5 + 0.78495062
+    state = TwoLineElements(FIRST, SECOND).at(epoch)
+    to_teme = mean_equator_to_celestial(epoch).T
+    np.testing.assert_allclose(
+        1e-3 * to_teme @ state.position, (7022.46529266, -1400.08296755, 0.03995155), atol=0.02
+    )
+    np.testing.assert_allclose(
+        1e-3 * to_teme @ state.velocity, (1.893841015, 6.405893759, 4.534807250), atol=2e-5
+    )
+
+
+def test_the_frame_of_sgp4_is_turned_into_the_frame_of_the_stars_as_published() -> None:
+    """Vallado, Fundamentals of Astrodynamics, Example 3-15: 2004 April 6, 07:51:28.386009 UTC, to 40 m.
+
+    UT1 - UTC is -0.4399619 s; the polar motion that is left out here is 10 m.
+    """
+    date = 2_453_101.5 + (7.0 * 3600.0 + 51.0 * 60.0 + 28.386009) / 86_400.0
+    teme = 1e3 * np.array([5094.18016210, 6127.64465950, 6380.34453270])
+    celestial = 1e3 * np.array([5102.508958, 6123.011401, 6378.136928])
+    np.testing.assert_allclose(mean_equator_to_celestial(date, -0.4399619) @ teme, celestial, atol=40.0)
+    terrestrial = 1e3 * np.array([-1033.4793830, 7901.2952754, 6380.3565958])
+    found = celestial_to_terrestrial(date, -0.4399619) @ celestial
+    # TT is 64.184 s ahead of UTC in 2004, not 69.184: precession and nutation do not notice.
+    np.testing.assert_allclose(found, terrestrial, atol=40.0)
+
+
+def test_the_ground_turns_once_in_a_sidereal_day() -> None:
+    turn = celestial_to_terrestrial(DATE + 10.0 / 86_400.0) @ celestial_to_terrestrial(DATE).T
+    rate = np.array([turn[1, 2] - turn[2, 1], turn[2, 0] - turn[0, 2], turn[0, 1] - turn[1, 0]]) / 20.0
+    np.testing.assert_allclose(rate, (0.0, 0.0, ROTATION_RATE), atol=1e-9)
+
+
+def test_many_dates_give_what_each_gives_alone() -> None:
+    dates = DATE + np.array([0.0, 0.3, 100.0])
+    for make in (celestial_to_terrestrial, mean_equator_to_celestial):
+        for date, found in zip(dates, make(dates), strict=True):
+            np.testing.assert_array_equal(make(date), found)
+
+
+def test_down_is_towards_the_ground() -> None:
+    place = np.array([[4e6, 3e6, 5e6]])
+    longitude, latitude, height = geodetic(place)
+    axes = north_east_down(longitude, latitude)[0]
+    _, _, lower = geodetic(place + 1000.0 * axes[2])
+    assert float(height[0] - lower[0]) == pytest.approx(1000.0, abs=1e-6)
+    assert axes[0] @ (0.0, 0.0, 1.0) > 0.0
+    assert np.linalg.det(axes) == pytest.approx(1.0)
+
+
+def fix_of(state: FloatArray, date: float, **spread: float) -> GpsFix:
+    """Return the fix that a receiver would give of an inertial state (6,)."""
+    turn = celestial_to_terrestrial(date)
+    ground = turn @ state[:3]
+    return GpsFix(date, ground, turn @ state[3:] - np.cross([0.0, 0.0, ROTATION_RATE], ground), **spread)
+
+
+def test_a_fix_carried_on_is_where_another_integrator_has_the_satellite() -> None:
+    """Dormand and Prince's order 8 in sim_hal, 20 minutes on: to 20 m and 0.02 m/s."""
+    elements = KeplerianElements(
+        semi_major_axis=EARTH_RADIUS + 380e3, eccentricity=0.002, inclination=0.9, ascending_node=1.0
+    )
+    begin, end = propagate(elements, 1300.0).states_at(np.array([0.0, 1200.0]))
+    found = fix_of(begin, DATE).at(DATE + 1200.0 / 86_400.0)
+    # A Julian date's digit is 40 us: 0.3 m.
+    np.testing.assert_allclose(found.position, end[:3], atol=20.0)
+    np.testing.assert_allclose(found.velocity, end[3:], atol=0.02)
+    assert found.sigma > 100.0
+    assert found.nadir @ end[:3] < 0.0
+
+
+def test_an_old_fix_and_one_within_the_earth_are_refused() -> None:
+    state = np.array([6.8e6, 0.0, 0.0, 0.0, 7.6e3, 0.0])
+    with pytest.raises(OrbitError, match="the last fix is 2000 s old"):
+        fix_of(state, DATE).at(DATE + 2000.0 / 86_400.0)
+    with pytest.raises(OrbitError, match="within the Earth"):
+        GpsFix(DATE, np.array([1e6, 0.0, 0.0]), np.zeros(3))
+    with pytest.raises(OrbitError, match="finite"):
+        GpsFix(DATE, np.array([np.nan, 0.0, 0.0]), np.zeros(3))
+
+
+def test_lines_that_are_no_elements_are_refused() -> None:
+    with pytest.raises(UsageError, match="69 columns"):
+        TwoLineElements(FIRST[:-3], SECOND)
+    with pytest.raises(UsageError, match="checksum 4, its columns add up to 3"):
+        TwoLineElements(FIRST[:-1] + "4", SECOND)
+    with pytest.raises(UsageError, match="line 2"):
+        TwoLineElements(FIRST, FIRST)
+
+
+@pytest.mark.parametrize("day", ["000.50000000", "367.00000000", "999999999999"])
+def test_an_epoch_on_no_day_of_the_year_is_refused(day: str) -> None:
+    """In an orbit of half a day a place 1e12 days from the epoch is found in half days, and so never."""
+    first = FIRST[:20] + day + FIRST[32:]
+    high = SECOND[:26] + "7000000" + SECOND[33:52] + " 2.00000000" + SECOND[63:]
+    with pytest.raises(UsageError, match="day of the year must be from 1 to 366"):
+        TwoLineElements(_summed(first), _summed(high))
+
+
+def _summed(line: str) -> str:
+    """Return a line whose last column is its checksum."""
+    return line[:68] + str(sum(int(c) if c.isdigit() else c == "-" for c in line[:68]) % 10)
+
+
+def test_a_decayed_orbit_is_reported() -> None:
+    """The verification set's 28872, which SGP4 lets fall within 50 minutes of its epoch."""
+    first = "1 28872U 05037B   05333.02012661  .25992681  00000-0  24476-3 0  1534"
+    second = "2 28872  96.4736 157.9986 0303955 244.0492 110.6523 16.46015938 10708"
+    with pytest.raises(OrbitError, match="SGP4"):
+        TwoLineElements(first, second).at(2_453_703.5 + 0.02012661 + 2.0)
+
+
+def test_the_sun_is_where_the_almanac_has_it_and_leans_into_the_motion() -> None:
+    """`sim_hal.worlds.sun` is good to 42"; aberration by the satellite's own 7.6 km/s is 5.2"."""
+    for date in np.linspace(2_460_700.5, 2_462_400.5, 40):
+        apparent, distance = sun_from(date, np.zeros(3), np.zeros(3))
+        almanac = sun.position(terrestrial_time(date))
+        assert (
+            np.degrees(np.linalg.norm(np.cross(apparent, almanac / np.linalg.norm(almanac)))) < 45.0 / 3600.0
+        )
+        assert distance == pytest.approx(float(np.linalg.norm(almanac)), rel=1e-4)
+    across = np.cross(apparent, [0.0, 0.0, 1.0])
+    across /= np.linalg.norm(across)
+    leant, _ = sun_from(date, np.zeros(3), 7.6e3 * across)
+    assert (leant - apparent) @ across == pytest.approx(7.6e3 / 299_792_458.0, rel=1e-3)
+
+
+def test_references_are_what_an_orbit_state_sees() -> None:
+    state = OrbitState(DATE, np.array([6.8e6, 0.0, 0.0]), np.array([0.0, 7.6e3, 0.0]), 680.0)
+    seen = references(state)
+    np.testing.assert_allclose(seen.nadir, (-1.0, 0.0, 0.0), atol=1e-12)
+    assert seen.nadir_sigma == pytest.approx(1e-4)
+    assert 2e-5 < np.linalg.norm(seen.field) < 5e-5
+    assert np.degrees(seen.sun_radius) == pytest.approx(0.267, abs=0.005)

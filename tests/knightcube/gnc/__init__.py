@@ -1,0 +1,1 @@
+"""Tests of guidance, navigation and control."""

@@ -1,0 +1,253 @@
+"""Fig. 3 as a whole: it starts when it can, goes on without lost sensors, and reports its accuracy."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import (
+    angle_between,
+    attitude_matrix,
+    conjugate,
+    from_rotation_vector,
+    multiply,
+)
+from knightcube.astro.quaternion import to_rotation_vector as rotation_vector
+from knightcube.gnc.attitude.direction_filter import (
+    AttitudeDetermination,
+    Report,
+    Status,
+    field_bias,
+)
+from knightcube.gnc.estimation.estimate import BIAS, TURN
+from tests.studies.campaigns.orbit_attitude import settings_of
+from tests.studies.campaigns.orbit_geometry import suite
+
+SETTINGS = settings_of(suite("uw"))
+SECOND = 1_000_000_000
+SIGMA = np.radians(0.02)
+SUN: FloatArray = np.array([0.6, -0.48, 0.64])
+NADIR: FloatArray = np.array([0.0, 0.8, 0.6])
+FIELD: FloatArray = np.array([1e-5, 2.5e-5, -1e-5])
+RATE: FloatArray = np.array([2e-4, -1.1e-3, 4e-4])
+START: FloatArray = np.array([0.1, 0.7, -0.1, 0.7]) / 1.0
+ALL = frozenset({"sun", "nadir", "field"})
+
+
+class Sky:
+    """A body that turns at a constant rate under a Sun, an Earth and a field that stand still."""
+
+    def __init__(self, seed: int = 1) -> None:
+        self._rng = np.random.default_rng(seed)
+        self.bias = np.array([2e-3, -1e-3, 3e-3])
+        self.hard_iron = np.array([3e-7, -2e-7, 1e-7])
+
+    def attitude(self, seconds: float) -> FloatArray:
+        return multiply(from_rotation_vector(RATE * seconds), START / np.linalg.norm(START))
+
+    def show(
+        self, estimator: AttitudeDetermination, seconds: float, sensors: frozenset[str], gyro: bool = True
+    ) -> None:
+        """Give the filter what these sensors see."""
+        now_ns = round(seconds * SECOND)
+        turn = attitude_matrix(self.attitude(seconds))
+        if gyro:
+            noise = SETTINGS.rate_sigma * self._rng.standard_normal(3)
+            estimator.rate(now_ns - SECOND // 4, RATE + self.bias + noise)
+        for name, reference in (("sun", SUN), ("nadir", NADIR)):
+            if name in sensors:
+                seen = turn @ reference + SIGMA * self._rng.standard_normal(3)
+                estimator.direction(
+                    name, now_ns, seen / np.linalg.norm(seen), reference, SIGMA**2 * np.eye(3)
+                )
+        if "field" in sensors and seconds % 1.0 == 0.0:
+            noise = SETTINGS.field_sigma * self._rng.standard_normal(3)
+            estimator.field(now_ns, turn @ FIELD + self.hard_iron + noise, FIELD)
+
+    def fly(
+        self,
+        estimator: AttitudeDetermination,
+        begin: float,
+        end: float,
+        sensors: frozenset[str],
+        gyro: bool = True,
+    ) -> Report:
+        """Show the sensors twice a second, and return the report at the end."""
+        for half in range(round(2 * begin), round(2 * end)):
+            self.show(estimator, 0.5 * half, sensors, gyro)
+        return estimator.report(round((end - 0.5) * SECOND))
+
+    def errors(self, report: Report) -> FloatArray:
+        """Return the attitude's error over its sigma, (3,)."""
+        assert report.estimate is not None
+        truth = self.attitude(report.time_ns / SECOND)
+        return rotation_vector(multiply(truth, conjugate(report.estimate.quaternion))) / report.sigma
+
+
+def begun(sensors: frozenset[str] = ALL, seconds: float = 60.0) -> tuple[Sky, AttitudeDetermination]:
+    """Return a sky and what has watched it for a while."""
+    sky, estimator = Sky(), AttitudeDetermination(SETTINGS)
+    sky.fly(estimator, 0.0, seconds, sensors)
+    return sky, estimator
+
+
+def test_one_direction_begins_nothing_and_two_begin_at_once() -> None:
+    sky, estimator = Sky(), AttitudeDetermination(SETTINGS)
+    report = sky.fly(estimator, 0.0, 10.0, frozenset({"sun"}))
+    assert (report.status, report.estimate, estimator.starts) == (Status.ACQUIRING, None, 0)
+    assert np.all(np.isinf(report.sigma))
+    report = sky.fly(estimator, 10.0, 10.5, frozenset({"nadir"}))
+    assert (report.status, estimator.starts) == (Status.OBSERVED, 1)
+    assert np.all(np.abs(sky.errors(report)) < 4.0)
+    assert np.degrees(np.max(report.sigma)) < 1.0
+
+
+@pytest.mark.parametrize("pair", [{"sun", "nadir"}, {"sun", "field"}, {"nadir", "field"}])
+def test_any_two_of_three_begin_honestly(pair: set[str]) -> None:
+    """NEES of the first attitude and of that 15 s later, 24 seeds: in the 99.9 % band of 3 x 24."""
+    for seconds in (1.5, 15.0):
+        total = 0.0
+        for seed in range(24):
+            sky, estimator = Sky(seed), AttitudeDetermination(SETTINGS)
+            # Every satellite has a hard iron and a bias of its own.
+            rng = np.random.default_rng(1000 + seed)
+            sky.hard_iron = SETTINGS.field_bias_start * rng.standard_normal(3)
+            sky.bias = SETTINGS.bias_start * rng.standard_normal(3)
+            report = sky.fly(estimator, 0.0, seconds, frozenset(pair))
+            assert report.estimate is not None
+            truth = sky.attitude(report.time_ns / SECOND)
+            off = rotation_vector(multiply(truth, conjugate(report.estimate.quaternion)))
+            total += float(off @ np.linalg.solve(report.estimate.covariance[TURN, TURN], off))
+        low, high = chi2.ppf([0.0005, 0.9995], 3 * 24)
+        assert low < total < high
+
+
+def test_directions_that_contradict_each_other_begin_nothing() -> None:
+    """The Sun taken for where it is not: the angle to nadir is off by 3 deg, each is good to 0.02."""
+    sky, estimator = Sky(), AttitudeDetermination(SETTINGS)
+    estimator.rate(0, RATE)
+    turn = attitude_matrix(sky.attitude(0.0))
+    wrong = attitude_matrix(from_rotation_vector(np.radians(3.0) * np.cross(SUN, NADIR))) @ SUN
+    estimator.direction("sun", 0, turn @ wrong, SUN, SIGMA**2 * np.eye(3))
+    estimator.direction("nadir", 0, turn @ NADIR, NADIR, SIGMA**2 * np.eye(3))
+    assert estimator.report(0).status is Status.ACQUIRING
+    estimator.direction("sun", 0, turn @ SUN, SUN, SIGMA**2 * np.eye(3))
+    assert estimator.report(0).status is Status.OBSERVED
+
+
+def test_directions_that_are_too_old_or_too_close_begin_nothing() -> None:
+    sky, estimator = Sky(), AttitudeDetermination(SETTINGS)
+    sky.show(estimator, 0.0, frozenset({"sun"}))
+    sky.show(estimator, 3.0, frozenset({"nadir"}))
+    assert estimator.starts == 0
+    estimator = AttitudeDetermination(SETTINGS)
+    estimator.rate(0, RATE)
+    turn = attitude_matrix(sky.attitude(0.0))
+    close = SUN + 1e-3 * np.cross(SUN, NADIR)
+    for name, reference in (("sun", SUN), ("nadir", close / np.linalg.norm(close))):
+        estimator.direction(name, 0, turn @ reference, reference, SIGMA**2 * np.eye(3))
+    assert estimator.starts == 0
+
+
+def test_what_is_not_finite_or_no_direction_is_refused() -> None:
+    sky, estimator = begun()
+    before = estimator.report(60 * SECOND)
+    for bad in (np.full(3, np.nan), np.array([2.0, 0.0, 0.0]), np.zeros(3)):
+        estimator.direction("sun", 60 * SECOND, bad, SUN, SIGMA**2 * np.eye(3))
+    estimator.field(60 * SECOND, np.full(3, np.inf), FIELD)
+    estimator.rate(60 * SECOND, np.full(3, np.nan))
+    assert estimator.refused == {"sun": 3, "field": 1}
+    after = estimator.report(60 * SECOND)
+    assert before.estimate is not None
+    assert after.estimate is not None
+    np.testing.assert_array_equal(after.estimate.quaternion, before.estimate.quaternion)
+    assert sky.bias.shape == (3,)
+
+
+@pytest.mark.parametrize(
+    ("left", "status"),
+    [
+        ({"nadir", "field"}, Status.OBSERVED),
+        ({"sun"}, Status.AIDED),
+        ({"field"}, Status.AIDED),
+        (set(), Status.COASTING),
+    ],
+)
+def test_without_what_is_lost_it_goes_on_and_says_how_well(left: set[str], status: Status) -> None:
+    sky, estimator = begun(seconds=120.0)
+    before = estimator.report(round(119.5 * SECOND))
+    report = sky.fly(estimator, 120.0, 420.0, frozenset(left))
+    assert (report.status, report.in_use) == (status, frozenset(left))
+    assert np.all(np.abs(sky.errors(report)) < 4.0)
+    if status is Status.COASTING:
+        assert np.all(report.sigma > 5.0 * before.sigma)
+    elif status is Status.AIDED and "sun" in left:
+        # Across the Sun it stays what it was, about it it drifts.
+        assert report.estimate is not None
+        about = attitude_matrix(report.estimate.quaternion) @ SUN
+        spread = report.estimate.covariance[TURN, TURN]
+        along = float(about @ spread @ about)
+        assert along > 20.0 * 0.5 * float(np.trace(spread) - along)
+    assert np.max(np.degrees(report.sigma)) < 2.0
+
+
+def test_what_comes_back_is_taken_in_again() -> None:
+    sky, estimator = begun()
+    sky.fly(estimator, 60.0, 360.0, frozenset())
+    report = sky.fly(estimator, 360.0, 400.0, ALL)
+    assert (report.status, report.in_use, estimator.starts) == (Status.OBSERVED, ALL, 1)
+    assert np.max(np.degrees(report.sigma)) < 0.02
+    assert not estimator.refused
+
+
+def test_without_gyros_the_body_s_own_inertia_carries_the_attitude() -> None:
+    sky, estimator = begun(seconds=120.0)
+    report = sky.fly(estimator, 120.0, 240.0, ALL, gyro=False)
+    assert np.all(np.abs(sky.errors(report)) < 4.0)
+    assert np.max(np.degrees(report.sigma)) < 0.05
+
+
+def test_both_biases_are_found_and_so_is_how_well() -> None:
+    sky, estimator = begun(seconds=240.0)
+    report = estimator.report(240 * SECOND)
+    assert report.estimate is not None
+    spread = report.estimate.covariance[BIAS, BIAS]
+    off = report.estimate.bias - sky.bias
+    assert off @ np.linalg.solve(spread, off) < 16.3
+    assert np.sqrt(np.max(np.diag(spread))) < 2e-5
+    found, sigma = field_bias(report.estimate)
+    assert np.all(np.abs(found - sky.hard_iron) < 4.0 * sigma)
+    assert np.max(sigma) < 3e-8
+
+
+def test_a_worthless_estimate_is_discarded_and_determination_restarts() -> None:
+    sky, estimator = begun()
+    restless = AttitudeDetermination(replace(SETTINGS, lost_sigma=np.radians(0.1)))
+    sky.fly(restless, 0.0, 60.0, ALL)
+    report = sky.fly(restless, 60.0, 500.0, frozenset())
+    assert (report.status, report.estimate) == (Status.ACQUIRING, None)
+    report = sky.fly(restless, 500.0, 502.0, ALL)
+    assert restless.starts == 2
+    assert np.all(np.abs(sky.errors(report)) < 4.0)
+    assert estimator.starts == 1
+
+
+def test_sensors_that_all_show_another_attitude_are_believed_in_the_end() -> None:
+    """The filter, not the sky, is wrong: a body that was turned by hand while nothing looked."""
+    sky, estimator = begun(seconds=30.0)
+    turned = from_rotation_vector(np.array([0.0, 0.5, 0.0]))
+    for half in range(60, 240):
+        now_ns = half * SECOND // 2
+        truth = multiply(turned, sky.attitude(0.5 * half))
+        estimator.rate(now_ns, RATE + sky.bias)
+        for name, reference in (("sun", SUN), ("nadir", NADIR)):
+            seen = attitude_matrix(truth) @ reference
+            estimator.direction(name, now_ns, seen, reference, SIGMA**2 * np.eye(3))
+    assert estimator.starts == 2
+    report = estimator.report(240 * SECOND // 2)
+    assert report.estimate is not None
+    assert float(angle_between(report.estimate.quaternion, multiply(turned, sky.attitude(120.0)))) < 1e-3

@@ -1,0 +1,318 @@
+"""The filter puts late measurements where they belong, refuses outliers, and finds biases and threads."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flight.bodies.testbed.thread_estimate import about_thread
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import about_axis_y, angle_between, conjugate, from_rotation_vector, multiply
+from knightcube.astro.quaternion import to_rotation_vector as rotation_vector
+from knightcube.gnc.estimation.attitude_filter import AttitudeFilter
+from knightcube.gnc.estimation.estimate import BIAS, PARAMETERS, RATE, TURN, Estimate
+from knightcube.gnc.estimation.measurements import AttitudeMeasurement, MeanRateMeasurement, RateMeasurement
+from knightcube.gnc.estimation.rigid_body import Parameters
+from tests.knightcube.gnc.estimation.flights import (
+    FREE,
+    RATE_COVARIANCE,
+    RATE_SIGMA,
+    SETTINGS,
+    SUSPENDED,
+    TURN_COVARIANCE,
+    Flight,
+    begin,
+    fly,
+    follow,
+)
+from tests.pace import ordinary_seconds
+from tests.studies.campaigns.consistency_worlds import CYCLE_NS
+
+BOTH = pytest.mark.parametrize("suspended", [True, False], ids=["suspended", "free"])
+SECOND = 1_000_000_000
+
+
+def exposure(flight: Flight, first: int, last: int, covariance: FloatArray) -> MeanRateMeasurement:
+    """Return the true mean rate between two cycles."""
+    turn = multiply(flight.attitudes[last], conjugate(flight.attitudes[first]))
+    rate = rotation_vector(turn) / ((last - first) * CYCLE_NS * 1e-9)
+    return MeanRateMeasurement(first * CYCLE_NS, last * CYCLE_NS, rate, covariance)
+
+
+def assert_same(a: Estimate, b: Estimate) -> None:
+    assert float(angle_between(a.quaternion, b.quaternion)) < 1e-11
+    np.testing.assert_allclose(a.rate, b.rate, atol=1e-12)
+    np.testing.assert_allclose(a.bias, b.bias, atol=1e-12)
+    np.testing.assert_allclose(a.disturbance, b.disturbance, atol=1e-12)
+    np.testing.assert_allclose(a.covariance, b.covariance, rtol=1e-6, atol=1e-15)
+
+
+@BOTH
+def test_late_measurements_give_what_they_would_have_given_in_time(suspended: bool) -> None:
+    """A mean rate and a star attitude in the middle of its exposure, in all orders of arrival."""
+    flight = fly(1, 100, suspended)
+    mean = exposure(flight, 40, 60, 1e-10 * np.eye(3))
+    off = multiply(from_rotation_vector(np.full(3, 1e-5)), flight.attitudes[50])
+    star = AttitudeMeasurement(50 * CYCLE_NS, off, 1e-10 * np.eye(3))
+    in_time = begin(flight, suspended)
+    follow(in_time, flight, 1, 51)
+    assert in_time.measure(star)
+    follow(in_time, flight, 51, 61)
+    assert in_time.measure(mean)
+    follow(in_time, flight, 61)
+    for order in ((mean, star), (star, mean)):
+        late = begin(flight, suspended)
+        follow(late, flight)
+        assert all([late.measure(measurement) for measurement in order])
+        assert_same(late.at(100 * CYCLE_NS), in_time.at(100 * CYCLE_NS))
+
+
+@BOTH
+def test_exposures_may_overlap(suspended: bool) -> None:
+    flight = fly(2, 100, suspended)
+    first = exposure(flight, 30, 60, 1e-9 * np.eye(3))
+    second = exposure(flight, 50, 80, 1e-9 * np.eye(3))
+    estimates = []
+    for order in ((first, second), (second, first)):
+        filter_ = begin(flight, suspended)
+        follow(filter_, flight)
+        assert all([filter_.measure(measurement) for measurement in order])
+        estimates.append(filter_.at(100 * CYCLE_NS))
+    assert_same(*estimates)
+    plain = begin(flight, suspended)
+    follow(plain, flight)
+    assert estimates[0].covariance[4, 4] < plain.at(100 * CYCLE_NS).covariance[4, 4]
+
+
+@BOTH
+def test_the_gyros_bias_is_found_within_three_sigma(suspended: bool) -> None:
+    """A bias of a milliradian a second, to 2 % of that in 20 s of attitudes and rates alone."""
+    flight = fly(3, 800, suspended)
+    filter_ = begin(flight, suspended)
+    follow(filter_, flight)
+    last = filter_.at(799 * CYCLE_NS)
+    axes = [1] if suspended else [0, 1, 2]
+    sigma = np.sqrt(np.diag(last.covariance)[BIAS])[axes]
+    assert np.all(sigma < 2e-5)
+    assert np.all(np.abs(last.bias - flight.bias)[axes] < 3.0 * sigma)
+
+
+def test_thread_and_coil_are_found_and_distinguished_from_a_steady_torque() -> None:
+    """All within three sigma after 30 s; torsion and gain ten times better known than before."""
+    flight = fly(4, 1200, True)
+    filter_ = begin(flight, True)
+    follow(filter_, flight)
+    last = filter_.at(1199 * CYCLE_NS)
+    sigma = np.sqrt(np.diag(last.covariance)[PARAMETERS])
+    assert sigma[0] < 0.1 * SETTINGS.torsion_start
+    assert sigma[1] < SETTINGS.damping_start
+    assert sigma[2] < 0.1 * SETTINGS.gain_start
+    assert np.all(np.abs(np.array(last.parameters) - flight.parameters) < 3.0 * sigma)
+
+
+def test_about_the_thread_the_disturbance_is_what_the_believed_plant_leaves_out() -> None:
+    """The current by which each belief would hold the body is the true one."""
+    flight = fly(5, 400, True)
+    filter_ = begin(flight, True)
+    follow(filter_, flight)
+    last = filter_.at(400 * CYCLE_NS)
+    true = last.parameters
+    pull = true.torsion * about_thread(last).angle + true.damping * last.rate[1] - last.disturbance[1]
+    for believed in (Parameters(), Parameters(0.01, 2e-3, 1.2), true):
+        there = about_thread(last, believed)
+        against = believed.torsion * there.angle + believed.damping * there.rate - there.disturbance
+        assert against / believed.gain == pytest.approx(pull / true.gain, abs=1e-15)
+        assert np.linalg.eigvalsh(there.covariance)[0] > 0.0
+    assert about_thread(last).q2 == pytest.approx(abs(last.quaternion[1]) * np.sign(about_thread(last).angle))
+    own = about_thread(last, last.parameters)
+    assert own.rate == last.rate[1]
+    assert own.covariance[1, 1] == last.covariance[4, 4]
+
+
+def test_suspended_nothing_but_the_turn_about_the_thread_moves() -> None:
+    """Whatever the measurements say of the other axes, a swing of the thread is no turn about it."""
+    flight = fly(6, 60, True)
+    filter_ = begin(flight, True)
+    follow(filter_, flight)
+    filter_.measure(exposure(flight, 10, 50, 1e-8 * (np.eye(3) + 0.5)))
+    last = filter_.at(60 * CYCLE_NS)
+    others = [0, 2, 3, 5, 6, 8, 9, 11]
+    assert last.quaternion[[0, 2]].tolist() == [0.0, 0.0]
+    assert not last.rate[[0, 2]].any()
+    assert not last.bias[[0, 2]].any()
+    assert not last.covariance[others].any()
+
+
+@BOTH
+def test_a_drop_out_widens_the_covariance_and_is_recovered_from(suspended: bool) -> None:
+    """Three seconds of silence: sigma grows on and on, the error stays within four, then all is as before."""
+    flight = fly(7, 500, suspended)
+    filter_ = begin(flight, suspended)
+    follow(filter_, flight, 1, 200)
+    before = filter_.at(199 * CYCLE_NS)
+    for cycle in range(200, 320):
+        filter_.command(cycle * CYCLE_NS, flight.commands[cycle], flight.fields[cycle])
+    sigmas = []
+    for cycle in (200, 240, 280, 319):
+        estimate = filter_.at(cycle * CYCLE_NS)
+        error = rotation_vector(multiply(flight.attitudes[cycle], conjugate(estimate.quaternion)))
+        sigma = np.sqrt(np.diag(estimate.covariance)[TURN])
+        assert np.all(np.abs(error) <= 4.0 * sigma + 1e-15)
+        assert estimate.measured_ns == 199 * CYCLE_NS
+        sigmas.append(sigma[1])
+    assert np.all(np.diff(sigmas) > 0.0)
+    follow(filter_, flight, 320)
+    assert filter_.refused == 0
+    assert filter_.at(499 * CYCLE_NS).covariance[1, 1] < 1.1 * before.covariance[1, 1]
+
+
+@BOTH
+def test_an_outlier_is_refused_and_the_next_good_one_is_not(suspended: bool) -> None:
+    flight = fly(8, 100, suspended)
+    filter_ = begin(flight, suspended)
+    follow(filter_, flight, 1, 80)
+    attitude, rate = flight.samples[80]
+    turned = multiply(from_rotation_vector(np.array([0.0, 0.02, 0.0])), attitude.quaternion)
+    assert not filter_.measure(replace(attitude, quaternion=turned))
+    assert filter_.nis > 25.0
+    assert not filter_.measure(replace(rate, rate=rate.rate + 3e-3))
+    assert not filter_.measure(replace(rate, rate=np.full(3, math.nan)))
+    assert filter_.refused == 3
+    follow(filter_, flight, 80)
+    assert (filter_.refused, filter_.restarts) == (3, 0)
+
+
+def test_the_gate_knows_its_degrees_of_freedom() -> None:
+    """Of honest Gaussian measurements a gate of 2 sigma refuses 4.55 % suspended and free (99.9 % band)."""
+    for suspended in (True, False):
+        flight = fly(9, 1000, suspended)
+        filter_ = begin(flight, suspended, replace(SETTINGS, gate_sigma=2.0))
+        follow(filter_, flight)
+        assert 60 < filter_.refused < 125  # 2000 measurements, those refused narrow the rest a little
+        assert filter_.restarts == 0
+
+
+def test_when_attitudes_disagree_for_a_second_the_filter_restarts() -> None:
+    """Even while the gyro agrees: attitudes and rates are counted apart."""
+    flight = fly(10, 100, False)
+    filter_ = begin(flight, False)
+    follow(filter_, flight, 1, 50)
+    for cycle in range(50, 90):
+        assert filter_.started
+        attitude, rate = flight.samples[cycle]
+        turned = multiply(from_rotation_vector(np.array([0.5, 0.0, 0.0])), attitude.quaternion)
+        filter_.measure(replace(attitude, quaternion=turned))
+        if filter_.started:
+            assert filter_.measure(rate)
+    assert not filter_.started
+    assert filter_.restarts == 1
+    assert not filter_.measure(flight.samples[90][0])
+    filter_.start(*flight.samples[90])
+    follow(filter_, flight, 91)
+    assert filter_.refused == 40
+
+
+def test_a_start_on_a_sample_from_before_the_release_is_given_up_at_once() -> None:
+    """A late line sends samples of the held body first; three rates that all disagree outweigh the first."""
+    flight = fly(16, 40, True)
+    thrown = RateMeasurement(0, np.array([0.0, 0.3, 0.0]), RATE_COVARIANCE)
+    filter_ = AttitudeFilter(SUSPENDED, SETTINGS)
+    filter_.start(flight.samples[0][0], thrown)
+    for cycle in range(1, 5):
+        attitude, rate = flight.samples[cycle]
+        if filter_.started:
+            filter_.measure(attitude)
+            filter_.measure(rate)
+        else:
+            filter_.start(attitude, rate)
+    assert filter_.restarts == 1
+    follow(filter_, flight, 5)
+    last = filter_.at(39 * CYCLE_NS)
+    assert abs(last.rate[1] - flight.rates[39][1]) < 4.0 * np.sqrt(last.covariance[RATE, RATE][1, 1])
+
+
+def test_a_camera_that_is_wrong_for_ever_restarts_nothing() -> None:
+    flight = fly(11, 200, False)
+    filter_ = begin(flight, False)
+    follow(filter_, flight, 1, 20)
+    for cycle in range(20, 200, 3):
+        follow(filter_, flight, cycle, cycle + 3)
+        wrong = exposure(flight, cycle - 2, cycle, 1e-10 * np.eye(3))
+        assert not filter_.measure(replace(wrong, rate=wrong.rate + 0.1))
+    assert (filter_.refused, filter_.restarts) == (60, 0)
+
+
+def test_a_measurement_older_than_all_it_remembers_is_late_and_not_wrong() -> None:
+    flight = fly(12, 20, False)
+    filter_ = AttitudeFilter(FREE, SETTINGS)
+    filter_.start(*flight.samples[10])
+    for _ in range(50):
+        assert not filter_.measure(flight.samples[9][0])
+        assert not filter_.measure(exposure(flight, 5, 15, RATE_COVARIANCE))
+    assert (filter_.late, filter_.refused, filter_.restarts) == (100, 0, 0)
+    assert math.isnan(filter_.nis)
+    assert filter_.started
+
+
+def test_at_the_start_the_rate_is_only_as_good_as_the_gyros_bias() -> None:
+    filter_ = AttitudeFilter(FREE, SETTINGS)
+    filter_.start(
+        AttitudeMeasurement(0, about_axis_y(0.3), TURN_COVARIANCE),
+        RateMeasurement(0, np.array([0.1, 0.2, 0.3]), RATE_COVARIANCE),
+    )
+    covariance = filter_.at(0).covariance
+    total = covariance[RATE, RATE] + 2.0 * covariance[RATE, BIAS] + covariance[BIAS, BIAS]
+    np.testing.assert_allclose(total, RATE_COVARIANCE, atol=1e-20)
+    assert covariance[3, 3] == pytest.approx(SETTINGS.bias_start**2 + RATE_SIGMA**2)
+
+
+def test_the_past_is_remembered_and_what_lies_before_is_unknown() -> None:
+    flight = fly(13, 60, False)
+    filter_, half_way = begin(flight, False), begin(flight, False)
+    follow(filter_, flight)
+    follow(half_way, flight, 1, 31)
+    past = filter_.past(30 * CYCLE_NS)
+    assert past is not None
+    assert_same(past, half_way.at(30 * CYCLE_NS))
+    assert filter_.past(-1) is None
+
+
+def test_memory_stays_bounded_over_a_long_flight() -> None:
+    filter_ = AttitudeFilter(SUSPENDED, replace(SETTINGS, history_ns=SECOND))
+    attitude = AttitudeMeasurement(0, about_axis_y(0.0), TURN_COVARIANCE)
+    filter_.start(attitude, RateMeasurement(0, np.zeros(3), RATE_COVARIANCE))
+    for cycle in range(1, 1000):
+        filter_.measure(replace(attitude, time_ns=cycle * CYCLE_NS))
+        filter_.command(cycle * CYCLE_NS, np.array([1e-6 * cycle, 0.0, 0.0]))
+    assert len(filter_._history) < 100
+    assert len(filter_._commands) < 120
+
+
+def test_an_attitude_that_wraps_round_is_a_small_innovation() -> None:
+    filter_ = AttitudeFilter(SUSPENDED, SETTINGS)
+    attitude = AttitudeMeasurement(0, about_axis_y(math.pi - 0.001), TURN_COVARIANCE)
+    filter_.start(attitude, RateMeasurement(0, np.zeros(3), RATE_COVARIANCE))
+    round_ = AttitudeMeasurement(CYCLE_NS, about_axis_y(-math.pi + 0.001), TURN_COVARIANCE)
+    assert filter_.measure(round_)
+    assert filter_.nis < 1.0
+
+
+@BOTH
+def test_a_cycle_and_a_replay_fit_into_the_40_hz_loop(suspended: bool) -> None:
+    """Mean of a cycle under 0.5 ms, a replay of 1.6 s under 20 ms of CPU; asserted at twice that."""
+    flight = fly(14, 400, suspended)
+    filter_ = begin(flight, suspended)
+
+    def cycles() -> None:
+        for cycle in range(1, 400):
+            follow(filter_, flight, cycle, cycle + 1)
+            filter_.at(cycle * CYCLE_NS + 2_000_000)
+
+    assert ordinary_seconds(cycles, 1) / 399 < 1e-3
+    mean = exposure(flight, 336, 376, 1e-9 * np.eye(3))
+    accepted = []
+    assert ordinary_seconds(lambda: accepted.append(filter_.measure(mean)), 1) < 40e-3
+    assert accepted == [True]

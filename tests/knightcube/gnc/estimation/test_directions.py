@@ -1,0 +1,187 @@
+"""Directions and fields in the filter: each gives its own information only, late or in time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import angle_between, attitude_matrix, from_rotation_vector, multiply
+from knightcube.gnc.attitude.single_frame import Sight, optimum
+from knightcube.gnc.estimation.attitude_filter import AttitudeFilter
+from knightcube.gnc.estimation.estimate import FIELD_BIAS, TURN
+from knightcube.gnc.estimation.innovation import innovation
+from knightcube.gnc.estimation.measurements import DirectionMeasurement, FieldMeasurement, Measurement
+from knightcube.gnc.estimation.mekf import correct, normalised_square
+from knightcube.gnc.estimation.state import SIZE, State
+from tests.knightcube.gnc.estimation.flights import FREE, SETTINGS, SUSPENDED, begin, fly, follow
+from tests.knightcube.gnc.estimation.test_mekf import STATE, moved
+from tests.studies.campaigns.consistency_worlds import CYCLE_NS
+
+SIGMA = 1e-3
+REFERENCE: FloatArray = np.array([0.6, -0.48, 0.64])
+OTHER: FloatArray = np.array([0.0, 0.8, 0.6])
+FIELD: FloatArray = np.array([2e-5, -1e-5, 3e-5])
+
+
+def direction(
+    quaternion: FloatArray, reference: FloatArray = REFERENCE, time_ns: int = 0, off: float = 0.0
+) -> DirectionMeasurement:
+    """Return what a body at `quaternion` sees, turned by `off` rad about its axis x."""
+    turned = multiply(from_rotation_vector(np.array([off, 0.0, 0.0])), quaternion)
+    return DirectionMeasurement(time_ns, attitude_matrix(turned) @ reference, reference, SIGMA**2 * np.eye(3))
+
+
+def as_array(state: State) -> FloatArray:
+    return np.array(state.quaternion)
+
+
+def field(quaternion: FloatArray) -> FieldMeasurement:
+    """Return what a magnetometer without a bias reads."""
+    return FieldMeasurement(0, attitude_matrix(quaternion) @ FIELD, FIELD, 1e-16 * np.eye(3))
+
+
+MEASUREMENTS: list[tuple[str, Callable[[], Measurement]]] = [
+    ("direction", lambda: direction(as_array(STATE))),
+    (
+        "field",
+        lambda: FieldMeasurement(0, attitude_matrix(as_array(STATE)) @ FIELD, FIELD, 1e-16 * np.eye(3)),
+    ),
+]
+
+
+@pytest.mark.parametrize(("name", "make"), MEASUREMENTS)
+def test_rows_are_how_the_innovation_answers_to_each_error(
+    name: str, make: Callable[[], Measurement]
+) -> None:
+    """Central differences of the innovation of a state that is off: minus the rows."""
+    seen = make()
+    rows = innovation(STATE, seen, False).rows
+    assert np.abs(rows).max() > (0.5 if name == "direction" else 1e-5)
+    step = 1e-6
+    for column in range(SIZE):
+        bump = step * np.eye(SIZE)[column]
+        up, down = (np.array(innovation(moved(STATE, sign * bump), seen, False).value) for sign in (1, -1))
+        scale = 1.0 if name == "direction" else 4e-5
+        # Across the direction expected: the plane moves with it, in the second order.
+        np.testing.assert_allclose((down - up) / (2.0 * step), rows[:, column], atol=2e-6 * scale)
+
+
+def test_a_direction_says_nothing_of_the_turn_about_itself() -> None:
+    seen = direction(as_array(STATE), off=1e-4)
+    found = innovation(STATE, seen, False)
+    covariance = np.eye(SIZE)
+    state, narrowed = correct(STATE, covariance, found, normalised_square(found, covariance)[1])
+    along = attitude_matrix(as_array(state)) @ REFERENCE
+    np.testing.assert_allclose(along, seen.observed, atol=1e-6)
+    assert along @ narrowed[TURN, TURN] @ along == pytest.approx(1.0, abs=1e-3)
+    across = np.trace(narrowed[TURN, TURN]) - along @ narrowed[TURN, TURN] @ along
+    assert across == pytest.approx(2.0 * SIGMA**2, rel=0.01)
+
+
+def test_what_a_covariance_holds_along_the_direction_does_not_count() -> None:
+    seen = direction(as_array(STATE), off=0.002)
+    wide = replace(seen, covariance=seen.covariance + np.outer(seen.observed, seen.observed))
+    covariance = 1e-4 * np.eye(SIZE)
+    squares = [
+        normalised_square(innovation(STATE, measurement, False), covariance)[0]
+        for measurement in (seen, wide)
+    ]
+    assert squares[0] > 0.01
+    # The plane is across the expected direction, 2 mrad off: its square remains.
+    assert squares[1] == pytest.approx(squares[0], rel=0.05)
+
+
+def test_two_directions_give_the_optimal_attitude_of_one_moment() -> None:
+    """From a prior that knows next to nothing, against least squares on the two directions."""
+    rng = np.random.default_rng(4)
+    truth = multiply(from_rotation_vector(np.array([0.01, -0.02, 0.015])), as_array(STATE))
+    state, covariance = STATE, np.eye(SIZE)
+    seen = []
+    for reference in (REFERENCE, OTHER):
+        exact = direction(truth, reference)
+        noisy = exact.observed + SIGMA * rng.standard_normal(3)
+        seen.append(replace(exact, observed=noisy / np.linalg.norm(noisy)))
+    for _ in range(2):  # the second time from where the first has led: least squares is iterated too
+        covariance = np.eye(SIZE)
+        for measurement in seen:
+            found = innovation(state, measurement, False)
+            state, covariance = correct(state, covariance, found, normalised_square(found, covariance)[1])
+    fix = optimum([Sight(m.observed, m.reference, m.covariance) for m in seen])
+    assert float(angle_between(as_array(state), fix.quaternion)) < 2e-2 * SIGMA
+    np.testing.assert_allclose(covariance[TURN, TURN], fix.covariance, atol=0.02 * SIGMA**2)
+
+
+@pytest.mark.parametrize("suspended", [True, False], ids=["suspended", "free"])
+def test_late_directions_and_fields_give_what_they_would_have_given_in_time(suspended: bool) -> None:
+    flight = fly(2, 80, suspended)
+    settings = replace(SETTINGS, field_bias_start=1e-7, field_bias_walk=1e-9)
+    seen = direction(flight.attitudes[40], time_ns=40 * CYCLE_NS, off=0.0)
+    there = attitude_matrix(flight.attitudes[50]) @ FIELD
+    measured = FieldMeasurement(50 * CYCLE_NS, there, FIELD, 1e-14 * np.eye(3))
+    in_time = begin(flight, suspended, settings)
+    follow(in_time, flight, 1, 41)
+    assert in_time.measure(seen)
+    follow(in_time, flight, 41, 51)
+    assert in_time.measure(measured)
+    follow(in_time, flight, 51)
+    late = begin(flight, suspended, settings)
+    follow(late, flight)
+    assert late.measure(measured)
+    assert late.measure(seen)
+    one, other = (filter_.at(80 * CYCLE_NS) for filter_ in (in_time, late))
+    assert float(angle_between(one.quaternion, other.quaternion)) < 1e-11
+    np.testing.assert_allclose(one.covariance, other.covariance, rtol=1e-6, atol=1e-15)
+    np.testing.assert_allclose(one.field_bias, other.field_bias, atol=1e-15)
+    if suspended:
+        assert one.quaternion[[0, 2]] == pytest.approx([0.0, 0.0], abs=1e-15)
+
+
+def test_a_wrong_direction_does_not_pass_the_gate_and_a_right_one_does() -> None:
+    flight = fly(3, 40, False)
+    filter_ = begin(flight, False)
+    follow(filter_, flight)
+    before = filter_.at(39 * CYCLE_NS)
+    assert not filter_.measure(direction(flight.attitudes[39], time_ns=39 * CYCLE_NS, off=0.1))
+    assert not filter_.measure(
+        replace(direction(flight.attitudes[39], time_ns=39 * CYCLE_NS), observed=np.full(3, np.nan))
+    )
+    np.testing.assert_array_equal(filter_.at(39 * CYCLE_NS).quaternion, before.quaternion)
+    assert filter_.measure(direction(flight.attitudes[39], time_ns=39 * CYCLE_NS))
+    assert filter_.refused == 2
+
+
+def test_the_bias_of_the_magnetometer_is_found_while_the_attitude_is_known() -> None:
+    """300 nT of hard iron, 20 nT of noise, 100 readings of a body that tumbles: to 2 nT, and it says so."""
+    rng = np.random.default_rng(6)
+    flight = fly(4, 400, False)
+    filter_ = AttitudeFilter(FREE, replace(SETTINGS, field_bias_start=5e-7))
+    filter_.start(*flight.samples[0])
+    bias = np.array([3e-7, -2e-7, 1e-7])
+    for cycle in range(1, 400):
+        for sample in flight.samples[cycle]:
+            filter_.measure(sample)
+        if cycle % 4 == 0:
+            noise = 2e-8 * rng.standard_normal(3)
+            measured = attitude_matrix(flight.attitudes[cycle]) @ FIELD + bias + noise
+            filter_.measure(FieldMeasurement(cycle * CYCLE_NS, measured, FIELD, 4e-16 * np.eye(3)))
+        filter_.command(cycle * CYCLE_NS, flight.commands[cycle], flight.fields[cycle])
+    estimate = filter_.at(399 * CYCLE_NS)
+    sigma = np.sqrt(np.diag(estimate.covariance)[FIELD_BIAS])
+    assert np.all(sigma < 8e-9)
+    error = estimate.field_bias - bias
+    assert error @ np.linalg.solve(estimate.covariance[FIELD_BIAS, FIELD_BIAS], error) < 16.3  # 99.9 %
+
+
+def test_without_a_bias_of_the_magnetometer_none_is_estimated() -> None:
+    flight = fly(5, 20, True)
+    filter_ = AttitudeFilter(SUSPENDED, SETTINGS)
+    filter_.start(*flight.samples[0])
+    measured = attitude_matrix(flight.attitudes[0]) @ FIELD + 1e-9
+    assert filter_.measure(FieldMeasurement(0, measured, FIELD, 1e-16 * np.eye(3)))
+    estimate = filter_.at(CYCLE_NS)
+    np.testing.assert_array_equal(estimate.field_bias, np.zeros(3))
+    assert not np.any(estimate.covariance[FIELD_BIAS])

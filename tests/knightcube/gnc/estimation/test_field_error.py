@@ -1,0 +1,96 @@
+"""The field is off its model: the filter learns by how much, with stars, and claims its attitude by it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from knightcube.astro.earth.disturbance import Pressures
+from knightcube.astro.quaternion import (
+    IDENTITY,
+    attitude_matrix,
+    conjugate,
+    from_rotation_vector,
+    multiply,
+    to_rotation_vector,
+)
+from knightcube.gnc.estimation.estimate import Knowledge
+from knightcube.gnc.estimation.free_filter import LEAST_FIELD, FreeFilter
+from knightcube.gnc.estimation.free_motion import TURN, Around
+from knightcube.gnc.estimation.free_settings import FreeFilterSettings
+
+INERTIA = np.diag([0.0066, 0.0333, 0.0333])
+STEP, NOISE, STAR, GYRO = 2.0, 5e-8, 5e-5, 4e-5
+IRON = np.array([2e-7, -1e-7, 1e-7])
+SETTINGS = FreeFilterSettings()
+
+
+class Sky:
+    """A body at rest in a field that turns and is off its model by a Gauss-Markov process of `sigma` T."""
+
+    def __init__(self, sigma: float, seed: int) -> None:
+        self.rng = np.random.default_rng(seed)
+        self.sigma, self.time = sigma, 0.0
+        self.error = sigma * self.rng.standard_normal(3)
+        self.filter = FreeFilter(INERTIA, SETTINGS)
+        self.filter.start(IDENTITY, STAR**2 * np.eye(3), np.zeros(3))
+
+    def fly(self, seconds: float, *, stars: bool) -> None:
+        kept = math.exp(-STEP / SETTINGS.field_memory)
+        for k in range(round(seconds / STEP)):
+            self.time += STEP
+            turned = attitude_matrix(from_rotation_vector(np.array([0.0, 2.2e-3 * self.time, 0.0])))
+            nothing = Pressures(np.zeros((1, 3)), np.zeros((1, 3)))
+            here = Around(turned.T @ np.array([1e-5, 2e-5, 3e-5]), np.array([7e9, 0.0, 0.0]), nothing, 0.0)
+            drawn = self.rng.standard_normal((4, 3))
+            self.error = kept * self.error + self.sigma * math.sqrt(1.0 - kept**2) * drawn[0]
+            self.filter.advance(STEP, np.zeros(3), here)
+            self.filter.gyro(GYRO * drawn[1], GYRO**2 * np.eye(3))
+            seen = here.field + IRON + self.error + NOISE * drawn[2]
+            self.filter.field(seen, here.field, NOISE**2 * np.eye(3))
+            if stars and k % 5 == 0:
+                self.filter.attitude(from_rotation_vector(STAR * drawn[3]), STAR**2 * np.eye(3))
+
+
+@pytest.mark.parametrize("sigma", [1e-8, 5e-8, 1.5e-7])
+def test_its_size_is_learned_with_stars(sigma: float) -> None:
+    sky = Sky(sigma, 4)
+    sky.fly(6_000.0, stars=True)
+    assert 0.5 * sigma < sky.filter.field_error < 1.6 * sigma + 2.0 * LEAST_FIELD
+    assert sky.filter.refused == 0
+
+
+def test_without_an_attitude_that_is_fine_nothing_is_learned_of_it() -> None:
+    sky = Sky(3e-7, 4)
+    sky.filter.start(IDENTITY, np.radians(2.0) ** 2 * np.eye(3), np.zeros(3))
+    while sky.filter.knowledge is Knowledge.COARSE and sky.time < 1_000.0:
+        assert sky.filter.field_error == SETTINGS.field
+        sky.fly(STEP, stars=False)
+    assert sky.time > 100.0
+
+
+def test_a_contradicted_estimate_expects_the_error_of_the_start_again() -> None:
+    sky = Sky(1e-8, 4)
+    sky.fly(4_000.0, stars=True)
+    learned = sky.filter.field_error
+    sky.filter.start(IDENTITY, STAR**2 * np.eye(3), np.zeros(3))
+    assert sky.filter.field_error == learned < SETTINGS.field
+    sky.filter.start(IDENTITY, STAR**2 * np.eye(3), np.zeros(3), doubted=True)
+    assert sky.filter.field_error == SETTINGS.field
+
+
+@pytest.mark.parametrize("sigma", [1e-8, 5e-8])
+def test_without_stars_the_attitude_is_off_by_what_is_claimed(sigma: float) -> None:
+    nees, claims = [], []
+    for seed in range(5):
+        sky = Sky(sigma, seed)
+        sky.fly(3_000.0, stars=True)
+        sky.fly(1_000.0, stars=False)
+        off = to_rotation_vector(multiply(IDENTITY, conjugate(sky.filter.quaternion)))
+        covariance = sky.filter.covariance[TURN, TURN]
+        nees.append(float(off @ np.linalg.solve(covariance, off)) / 3.0)
+        claims.append(math.sqrt(covariance.trace()))
+    assert np.mean(nees) < 2.5, "99.9 % of a chi-square of 15 over 15"
+    assert max(claims) < np.radians(0.6)

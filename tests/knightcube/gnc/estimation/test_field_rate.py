@@ -1,0 +1,123 @@
+"""Rate from the magnetometer alone: right for a body that tumbles, honest, and able to begin again."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import attitude_matrix, derivative, from_rotation_vector
+from knightcube.gnc.estimation.field_rate import AXES, RATE, FieldRate, FieldRateSettings
+
+INERTIA = np.diag([0.0066, 0.0333, 0.0333])
+FIELD, TURN = np.array([1e-5, 2e-5, 3e-5]), np.array([0.0, 1.5e-3, -1.5e-3])
+NOISE = 1e-7
+DIPOLE = np.array([0.05, -0.1, 0.02])
+
+
+def settings(inertia: FloatArray = INERTIA) -> FieldRateSettings:
+    return FieldRateSettings(inertia=inertia, field_sigma=NOISE, torque_walk=1e-5)
+
+
+def tumbling(rate: FloatArray, inertia: FloatArray, times: FloatArray, dipole: FloatArray) -> FloatArray:
+    """Return rate and field (n, 6) in body axes, by an integrator that knows nothing of the filter's."""
+
+    def flow(time: float, state: FloatArray) -> FloatArray:
+        w = state[4:]
+        field = attitude_matrix(state[:4]) @ attitude_matrix(from_rotation_vector(TURN * time)).T @ FIELD
+        torque = np.cross(dipole, field) - np.cross(w, inertia @ w)
+        return np.concatenate([derivative(state[:4], w), np.linalg.solve(inertia, torque)])
+
+    start = np.concatenate([[0.0, 0.0, 0.0, 1.0], rate])
+    found = solve_ivp(flow, (0.0, times[-1]), start, t_eval=times, rtol=1e-9, atol=1e-12).y.T
+    rows = []
+    for time, state in zip(times, found, strict=True):
+        inertial = attitude_matrix(from_rotation_vector(TURN * time)).T @ FIELD
+        rows.append(np.concatenate([state[4:], attitude_matrix(state[:4]) @ inertial]))
+    return np.array(rows)
+
+
+def follow(
+    rate: FloatArray, truth: FloatArray, seconds: float, seed: int = 1
+) -> tuple[FieldRate, FloatArray]:
+    """Feed a filter a sample each 0.2 s; return the filter and the last true state."""
+    times = np.arange(0.0, seconds, 0.2)
+    states = tumbling(rate, truth, times, DIPOLE)
+    rng, found = np.random.default_rng(seed), FieldRate(settings())
+    for state in states:
+        found.advance(DIPOLE, 0.2)
+        found.measure(state[3:] + NOISE * rng.standard_normal(3))
+    return found, states[-1]
+
+
+@pytest.mark.parametrize("degrees", [(6.0, -5.0, 6.0), (-50.0, 3.0, 10.0)])
+def test_all_three_components_of_the_rate_are_found_and_the_claim_is_honest(degrees: FloatArray) -> None:
+    found, last = follow(np.radians(degrees), INERTIA, 60.0)
+    error = found.rate - last[:3]
+    assert float(error @ np.linalg.solve(found.covariance[RATE, RATE], error)) < 16.3  # one in a thousand
+    assert np.linalg.norm(error) < 0.04 * np.linalg.norm(last[:3])
+    assert found.restarts == 0
+
+
+def test_principal_axes_that_are_turned_are_found_from_the_spin() -> None:
+    turned = attitude_matrix(from_rotation_vector(np.array([0.0, 0.03, -0.02])))
+    inertia = turned.T @ INERTIA @ turned
+    found, last = follow(np.radians([10.0, 1.0, -1.0]), inertia, 100.0)
+    believed = INERTIA @ found.rate
+    true = inertia @ last[:3]
+    assert np.linalg.norm(found.momentum - true) < 0.5 * np.linalg.norm(believed - true)
+    assert np.all(np.sqrt(np.diag(found.covariance)[AXES])[1:] < 0.015)
+
+
+def test_a_spin_along_the_field_shows_no_rate_but_claims_no_knowledge_of_it() -> None:
+    """In a field that does not turn nobody can see it."""
+    found, rng = FieldRate(settings(inertia=1e-3 * np.eye(3))), np.random.default_rng(3)
+    for _ in range(50):
+        found.advance(np.zeros(3), 0.2)
+        found.measure(FIELD + NOISE * rng.standard_normal(3))
+    along, across = FIELD / np.linalg.norm(FIELD), np.array([0.0, 3.0, -2.0]) / np.sqrt(13.0)
+    spread = found.covariance[RATE, RATE]
+    assert along @ spread @ along > 100.0 * (across @ spread @ across)
+
+
+def test_what_a_false_gyro_taught_is_forgotten_once_it_speaks_true() -> None:
+    """A body at rest in a field that does not turn: nothing but the gyro shows what turns along the field."""
+    found, rng = FieldRate(settings(inertia=1e-3 * np.eye(3))), np.random.default_rng(3)
+    false = 0.05 * FIELD / np.linalg.norm(FIELD)
+
+    def feed(gyro: FloatArray, samples: int) -> None:
+        for _ in range(samples):
+            found.advance(np.zeros(3), 0.2)
+            found.measure(FIELD + NOISE * rng.standard_normal(3))
+            found.measure_rate(gyro)
+
+    def missed() -> float:
+        return float(found.rate @ np.linalg.solve(found.covariance[RATE, RATE], found.rate))
+
+    feed(false, 30)
+    assert missed() > 100.0, "the field can not contradict it"
+    feed(np.zeros(3), 30)
+    assert found.restarts == 1
+    assert missed() < 16.3
+
+
+def test_one_spiked_sample_is_refused_and_a_change_of_the_world_begins_again() -> None:
+    found, last = follow(np.radians([3.0, -4.0, 5.0]), INERTIA, 30.0)
+    before = found.rate
+    assert not found.measure(found.field + 1e-5)
+    assert not found.measure(np.array([np.nan, 0.0, 0.0]))
+    np.testing.assert_array_equal(found.rate, before)
+    for _ in range(settings().refusals):
+        found.advance(np.zeros(3), 0.2)
+        found.measure(-last[3:])
+    assert found.restarts == 1
+    assert not found.started
+
+
+def test_two_samples_too_far_apart_start_nothing() -> None:
+    found = FieldRate(settings())
+    for _ in range(4):
+        found.advance(np.zeros(3), 1.0)
+        found.measure(FIELD)
+    assert not found.started

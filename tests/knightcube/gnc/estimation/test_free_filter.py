@@ -1,0 +1,130 @@
+"""The filter of a free satellite: honest, learns the dipole, takes late attitudes at their own time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.disturbance import Pressures
+from knightcube.astro.quaternion import (
+    IDENTITY,
+    angle_between,
+    attitude_matrix,
+    conjugate,
+    from_rotation_vector,
+    multiply,
+    to_rotation_vector,
+)
+from knightcube.gnc.estimation.estimate import Knowledge
+from knightcube.gnc.estimation.free_filter import FreeFilter
+from knightcube.gnc.estimation.free_motion import DIPOLE, GYRO, RATE, STATES, TURN, Around
+from knightcube.gnc.estimation.free_settings import FreeFilterSettings
+
+INERTIA = np.diag([0.0066, 0.0333, 0.0333])
+STAR, GYRO_SIGMA = 5e-5, 5e-5
+RESIDUAL, BIAS = np.array([6e-4, -3e-4, 4e-4]), np.array([4e-4, -5e-4, 3e-4])
+POSITION = np.array([6.878e6, 0.0, 0.0])
+
+
+def around(time: float) -> Around:
+    """Return a field that turns by two turns in 95 min; no air, no light, a gradient of nothing."""
+    turned = attitude_matrix(from_rotation_vector(np.array([0.0, 2.2e-3 * time, 0.0])))
+    nothing = Pressures(np.zeros((1, 3)), np.zeros((1, 3)))
+    return Around(turned.T @ np.array([1e-5, 2e-5, 3e-5]), 1e3 * POSITION, nothing, 0.0)
+
+
+def fly(seconds: int, seed: int, age: float = 0.0) -> tuple[FreeFilter, FloatArray, FloatArray]:
+    """Return the filter, the true attitude and rate after `seconds` of drift, stars each 10 s."""
+    rng = np.random.default_rng(seed)
+    found = FreeFilter(INERTIA, FreeFilterSettings())
+    q, w = IDENTITY, np.array([1e-3, -5e-4, 8e-4])
+    attitudes = [q]
+    start = multiply(from_rotation_vector(STAR * rng.standard_normal(3)), q)
+    found.start(start, STAR**2 * np.eye(3), w + BIAS + GYRO_SIGMA * rng.standard_normal(3))
+    for second in range(1, seconds + 1):
+        here = around(second - 0.5)
+        torque = np.cross(RESIDUAL, attitude_matrix(q) @ here.field) - np.cross(w, INERTIA @ w)
+        q = multiply(from_rotation_vector(w + 0.5 * np.linalg.solve(INERTIA, torque)), q)
+        w = w + np.linalg.solve(INERTIA, torque)
+        attitudes.append(q)
+        found.advance(1.0, np.zeros(3), here)
+        found.gyro(w + BIAS + GYRO_SIGMA * rng.standard_normal(3), GYRO_SIGMA**2 * np.eye(3))
+        if second % 10 == 0:
+            seen = attitudes[second - round(age)]
+            error = from_rotation_vector(STAR * rng.standard_normal(3))
+            found.attitude(multiply(error, seen), STAR**2 * np.eye(3), age)
+    return found, q, w
+
+
+def errors(found: FreeFilter, q: FloatArray, w: FloatArray) -> FloatArray:
+    """Return the errors (9,) of attitude, rate and gyro bias."""
+    turn = to_rotation_vector(multiply(q, conjugate(found.quaternion)))
+    return np.concatenate([turn, w - found.rate, BIAS - found.gyro_bias])
+
+
+def test_the_claim_is_honest_over_independent_flights() -> None:
+    nees = []
+    for seed in range(4):
+        found, q, w = fly(120, seed)
+        error = errors(found, q, w)
+        nees.append(float(error @ np.linalg.solve(found.covariance[:9, :9], error)))
+        assert found.refused == 0
+    assert 3.0 < np.mean(nees) < 16.0, "nine errors, four flights: 99.9 % of a chi-square of 36 over 4"
+
+
+def test_it_learns_the_residual_dipole_and_says_how_well() -> None:
+    found, _, _ = fly(400, 1)
+    missing = found.residual_dipole(0.0) - RESIDUAL
+    sigma = np.sqrt(np.diag(found.covariance)[DIPOLE])
+    assert np.linalg.norm(missing) < 0.3 * np.linalg.norm(RESIDUAL)
+    assert np.all(np.abs(missing) < 4.0 * sigma)
+
+
+def test_late_attitudes_serve_as_well_as_timely_ones() -> None:
+    timely, late = (fly(120, 3, age) for age in (0.0, 3.0))
+    assert late[0].refused == 0
+    assert angle_between(late[0].quaternion, late[1]) < 4.0 * STAR
+    sigmas = [np.sqrt(np.diag(found.covariance)[TURN]).max() for found, _, _ in (timely, late)]
+    assert sigmas[1] == pytest.approx(sigmas[0], rel=0.2)
+
+
+def test_two_directions_make_a_coarse_attitude_fine_and_a_false_one_is_refused() -> None:
+    found = FreeFilter(INERTIA, FreeFilterSettings())
+    assert found.knowledge.value == "lost"
+    true = from_rotation_vector(np.array([0.3, -0.2, 0.5]))
+    sigma = np.radians(2.0)
+    found.start(
+        multiply(from_rotation_vector(0.5 * sigma * np.ones(3)), true), sigma**2 * np.eye(3), np.zeros(3)
+    )
+    assert found.knowledge is Knowledge.COARSE
+    precise = 1e-4**2 * np.eye(3)
+    for reference in np.eye(3)[:2]:
+        for _ in range(2):  # the first is off by a degree: linear in small turns only
+            assert found.direction(attitude_matrix(true) @ reference, reference, precise) or found.refused
+    assert found.knowledge.value == "fine"
+    assert angle_between(found.quaternion, true) < 2e-3
+    before = found.quaternion
+    assert not found.direction(np.array([0.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0]), precise)
+    assert not found.attitude(np.full(4, np.nan), precise)
+    np.testing.assert_array_equal(found.quaternion, before)
+
+
+def test_the_magnetometer_s_bias_is_told_from_the_attitude_by_the_stars() -> None:
+    found, q, _ = fly(60, 5)
+    bias = np.array([2e-7, -1e-7, 3e-7])
+    here = around(60.0)
+    for _ in range(20):
+        found.field(attitude_matrix(q) @ here.field + bias, here.field, 1e-8**2 * np.eye(3))
+    np.testing.assert_allclose(found.magnet_bias, bias, atol=2e-8)
+
+
+def test_a_new_start_keeps_what_was_learned_of_the_slow_states() -> None:
+    found, q, w = fly(120, 2)
+    dipole, sigma = found.residual_dipole(0.0), np.diag(found.covariance)[DIPOLE]
+    found.start(q, STAR**2 * np.eye(3), w + BIAS)
+    np.testing.assert_array_equal(found.residual_dipole(0.0), dipole)
+    np.testing.assert_array_equal(np.diag(found.covariance)[DIPOLE], sigma)
+    assert np.all(found.covariance[RATE, GYRO].diagonal() < 0.0)
+    assert np.linalg.eigvalsh(found.covariance)[0] > -1e-18 * STATES
+    assert np.linalg.norm(found.rate - w) < 1e-4

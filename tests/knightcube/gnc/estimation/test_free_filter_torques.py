@@ -1,0 +1,146 @@
+"""The filter of a free satellite among torques that it does not know: of its axes, of its coils' currents."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.earth.disturbance import Pressures
+from knightcube.astro.quaternion import (
+    IDENTITY,
+    attitude_matrix,
+    conjugate,
+    from_rotation_vector,
+    multiply,
+    to_rotation_vector,
+)
+from knightcube.gnc.estimation.free_filter import FreeFilter, SlowStates
+from knightcube.gnc.estimation.free_motion import AXES, GYRO, RATE, TURN, Around
+from knightcube.gnc.estimation.free_settings import BELIEVED, FreeFilterSettings
+
+INERTIA = np.diag([0.0066, 0.0333, 0.0333])
+BIAS = np.array([4e-5, -3e-5, 2e-5])
+AXES_TURN = np.array([0.004, 0.012, -0.010])
+GYRO_SIGMA, STAR = 4.4e-5, 5e-5
+CYCLES = 40
+"""Of the coils, a second."""
+FIELD = np.array([1e-5, 2e-5, 3e-5])
+NOTHING = Pressures(np.zeros((1, 3)), np.zeros((1, 3)))
+AROUND = Around(FIELD, np.array([6.878e9, 0.0, 0.0]), NOTHING, 0.0)
+
+
+class Craft:
+    """A rigid body whose principal axes are turned, with gyros that have a bias."""
+
+    def __init__(self, turn: FloatArray, rate: FloatArray, seed: int) -> None:
+        self.rng = np.random.default_rng(seed)
+        rotation = attitude_matrix(from_rotation_vector(turn)).T
+        self._inertia = rotation @ INERTIA @ rotation.T
+        self.quaternion, self.rate = IDENTITY, rate
+
+    def second(self, dipole: FloatArray, noise: float) -> FloatArray:
+        """Fly a second under a dipole (3,) A m^2 with `noise` A m^2 of each cycle; return the gyro's mean."""
+        dt, rates = 1.0 / CYCLES, []
+        for _ in range(CYCLES):
+            torque = np.cross(
+                dipole + noise * self.rng.standard_normal(3), attitude_matrix(self.quaternion) @ FIELD
+            )
+            middle = self.rate + 0.5 * dt * self._acceleration(self.rate, torque)
+            self.quaternion = multiply(from_rotation_vector(dt * middle), self.quaternion)
+            self.rate = self.rate + dt * self._acceleration(middle, torque)
+            rates.append(middle)
+        return np.asarray(np.mean(rates, axis=0) + BIAS + GYRO_SIGMA * self.rng.standard_normal(3))
+
+    def _acceleration(self, rate: FloatArray, torque: FloatArray) -> FloatArray:
+        return np.asarray(np.linalg.solve(self._inertia, torque - np.cross(rate, self._inertia @ rate)))
+
+    def seen(self, sigma: float) -> FloatArray:
+        """Return the attitude with an error of `sigma` rad an axis."""
+        return multiply(from_rotation_vector(sigma * self.rng.standard_normal(3)), self.quaternion)
+
+
+def errors(found: FreeFilter, craft: Craft) -> FloatArray:
+    """Return the errors (9,) of attitude, rate and gyro bias."""
+    turn = to_rotation_vector(multiply(craft.quaternion, conjugate(found.quaternion)))
+    return np.concatenate([turn, craft.rate - found.rate, BIAS - found.gyro_bias])
+
+
+def fly(craft: Craft, found: FreeFilter, seconds: int, dipole: FloatArray, noise: float) -> None:
+    """Fly with a gyro each second and stars each ten."""
+    for second in range(1, seconds + 1):
+        mean = craft.second(dipole, noise)
+        found.advance(1.0, dipole, AROUND)
+        found.gyro(mean, GYRO_SIGMA**2 * np.eye(3), 0.5 * found.acceleration, 0.5)
+        if second % 10 == 0:
+            found.attitude(craft.seen(STAR), STAR**2 * np.eye(3))
+
+
+def started(craft: Craft, settings: FreeFilterSettings) -> FreeFilter:
+    """Return a filter with a star's attitude and one sample of the gyro."""
+    found = FreeFilter(INERTIA, settings)
+    gyro = craft.rate + BIAS + GYRO_SIGMA * craft.rng.standard_normal(3)
+    found.start(craft.seen(STAR), STAR**2 * np.eye(3), gyro)
+    return found
+
+
+def test_a_turn_of_the_principal_axes_is_no_bias_of_the_gyros() -> None:
+    craft = Craft(AXES_TURN, np.array([0.14, 0.06, -0.05]), 1)
+    found = started(craft, FreeFilterSettings())
+    fly(craft, found, 90, np.zeros(3), 0.0)
+    error, sigma = errors(found, craft), np.sqrt(np.diag(found.covariance))
+    assert found.refused == 0
+    assert np.abs(error[GYRO]).max() < 1e-4, "a filter that knows no axes learns 1e-3"
+    assert np.all(np.abs(error) < 4.5 * sigma[:9])
+    assert np.abs(AXES_TURN - found.axes_turn)[1:].max() < 0.002, (
+        "about x, that of symmetry, nothing shows it"
+    )
+    assert sigma[AXES][1:].max() < 0.005
+
+
+def test_currents_that_scatter_in_each_cycle_are_in_the_claim() -> None:
+    noise = 2.7e-3
+    honest = FreeFilterSettings(coil_noise=noise / np.sqrt(CYCLES), dipole=(1e-6, 0.0), sunlit=(1e-6, 0.0))
+    nees = {}
+    for settings in (honest, dataclasses.replace(honest, coil_noise=0.0)):
+        squares = []
+        for seed in range(6):
+            craft = Craft(np.zeros(3), np.array([0.0, -1.1e-3, 0.0]), seed)
+            found = started(craft, settings)
+            fly(craft, found, 60, np.array([1e-4, 0.0, 1e-4]), noise)
+            pick = np.r_[TURN, RATE]
+            error = errors(found, craft)[:6]
+            squares.append(error @ np.linalg.solve(found.covariance[np.ix_(pick, pick)], error) / 6.0)
+        nees[settings.coil_noise] = float(np.mean(squares))
+    assert 0.5 < nees[honest.coil_noise] < 1.7, "36 errors: 99.9 % of a chi-square over 36"
+    assert nees[0.0] > 1.7
+
+
+def test_what_a_contradicted_estimate_has_learned_is_not_claimed_any_more() -> None:
+    craft = Craft(np.zeros(3), np.zeros(3), 2)
+    found = started(craft, FreeFilterSettings())
+    fly(craft, found, 40, np.zeros(3), 0.0)
+    learned = np.sqrt(np.diag(found.covariance))[GYRO]
+    bias = found.gyro_bias
+    found.start(craft.quaternion, STAR**2 * np.eye(3), craft.rate + BIAS)
+    assert np.allclose(np.sqrt(np.diag(found.covariance))[GYRO], learned)
+    found.start(craft.quaternion, STAR**2 * np.eye(3), craft.rate + BIAS, doubted=True)
+    assert np.allclose(np.sqrt(np.diag(found.covariance))[GYRO], 1e-3)
+    assert np.allclose(found.gyro_bias, bias)
+
+
+def test_a_contradicted_estimate_forgets_a_bias_that_no_gyro_has() -> None:
+    """False directions had taught it. Kept as a guess, it led each new start astray until the next star."""
+    craft, settings = Craft(np.zeros(3), np.zeros(3), 4), FreeFilterSettings()
+    taught, known = np.zeros(24), np.diag(settings.of_slow(0) ** 2)
+    taught[0], known[0, 0] = 2.0 * BELIEVED * settings.gyro[0], 1e-12
+    found = FreeFilter(INERTIA, settings, SlowStates(taught, known))
+    found.start(craft.quaternion, STAR**2 * np.eye(3), craft.rate + BIAS)
+    fly(craft, found, 10, np.zeros(3), 0.0)
+    assert found.refused, "the next star contradicts it"
+    found.start(craft.quaternion, STAR**2 * np.eye(3), craft.rate + BIAS, doubted=True)
+    found.refused = 0
+    fly(craft, found, 30, np.zeros(3), 0.0)
+    assert found.refused == 0
+    assert np.abs(found.gyro_bias - BIAS).max() < 3e-5

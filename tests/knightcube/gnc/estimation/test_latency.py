@@ -1,0 +1,110 @@
+"""Samples that are older than they say: their age is found, and the estimate does not lag behind the body."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from knightcube.astro.quaternion import angle_about_axis_y
+from knightcube.gnc.estimation.attitude_filter import AttitudeFilter
+from knightcube.gnc.estimation.estimate import LATENCY, Estimate
+from knightcube.gnc.estimation.filter_settings import FilterSettings
+from knightcube.gnc.estimation.latency import LONGEST_LATENCY, motion
+from knightcube.gnc.estimation.measurements import RateMeasurement
+from tests.knightcube.gnc.estimation.flights import RATE_COVARIANCE, SETTINGS, SUSPENDED, Flight, fly
+from tests.studies.campaigns.consistency_worlds import CYCLE_NS
+
+SWING = 0.14
+"""A, about the coils' limit: a slew shows the age, a hold does not."""
+ESTIMATING = replace(SETTINGS, latency_start=0.05)
+
+
+def follow_late(flight: Flight, late: int, settings: FilterSettings) -> tuple[AttitudeFilter, Estimate]:
+    """Give a filter samples stamped `late` cycles after they were taken; return it and its last estimate."""
+    filter_ = AttitudeFilter(SUSPENDED, settings)
+    for cycle in range(late, len(flight.samples)):
+        age = filter_.latency if settings.latency_start else None
+        stamped = cycle * CYCLE_NS - round(1e9 * (age or 0.0))
+        attitude, rate = flight.samples[cycle - late]
+        attitude = replace(attitude, time_ns=stamped, latency=age)
+        rate = replace(rate, time_ns=stamped, latency=age)
+        if filter_.started:
+            filter_.measure(attitude)
+            filter_.measure(rate)
+        else:
+            filter_.start(attitude, rate)
+        filter_.command(cycle * CYCLE_NS, flight.commands[cycle])
+    return filter_, filter_.at((len(flight.samples) - 1) * CYCLE_NS)
+
+
+def sigmas(flight: Flight, last: Estimate) -> float:
+    """Return by how many of its own sigmas the estimated turn is off."""
+    error = angle_about_axis_y(flight.attitudes[-1]) - angle_about_axis_y(last.quaternion)
+    return float(abs(error) / np.sqrt(last.covariance[1, 1]))
+
+
+@pytest.mark.parametrize("late", [0, 2, 3])
+def test_the_age_is_found_and_made_up_for(late: int) -> None:
+    """After 20 s it is known to 12 ms, honestly; held for new, two cycles put the turn ten sigma off."""
+    flight = fly(32, 800, True, SWING)
+    filter_, last = follow_late(flight, late, ESTIMATING)
+    sigma = float(np.sqrt(last.covariance[LATENCY, LATENCY]))
+    assert sigma < 12e-3
+    assert abs(last.latency - 0.025 * late) < 3.0 * sigma
+    assert sigmas(flight, last) < 3.0
+    assert filter_.refused == 0
+    if late:
+        assert sigmas(flight, follow_late(flight, late, SETTINGS)[1]) > 10.0
+
+
+def test_the_error_of_the_age_is_as_large_as_the_filter_says() -> None:
+    """The mean square over ten flights, in sigmas, within the 99.9 % band of chi-square of ten degrees."""
+    squares = []
+    for seed in range(20, 30):
+        _, last = follow_late(fly(seed, 300, True, SWING), 1, ESTIMATING)
+        squares.append((last.latency - 0.025) ** 2 / last.covariance[LATENCY, LATENCY])
+    assert 1.265 < sum(squares) < 31.42
+
+
+def test_a_rate_alone_does_not_show_the_age() -> None:
+    flight = fly(12, 400, True, SWING)
+    filter_, _ = follow_late(flight, 1, ESTIMATING)
+    now_ns, age = 400 * CYCLE_NS, filter_.latency
+    before = filter_.at(now_ns)
+    fast = before.rate + before.bias + np.array([0.0, 4e-4, 0.0])
+    assert filter_.measure(RateMeasurement(now_ns - round(1e9 * age), fast, RATE_COVARIANCE, age))
+    after = filter_.at(now_ns)
+    assert after.rate[1] > before.rate[1] + 1e-5
+    assert after.latency == before.latency
+    assert after.covariance[LATENCY, LATENCY] == pytest.approx(before.covariance[LATENCY, LATENCY], rel=1e-12)
+
+
+def test_no_age_is_taken_that_is_none() -> None:
+    """Before the start nothing is known; beyond its bounds it is not believed."""
+    filter_ = AttitudeFilter(SUSPENDED, ESTIMATING)
+    assert filter_.latency == 0.0
+    flight = fly(13, 400, True)
+    early, _ = follow_late(flight, 0, ESTIMATING)
+    assert 0.0 <= early.latency <= LONGEST_LATENCY
+
+
+def test_a_command_that_begins_within_the_doubt_is_noise() -> None:
+    """Half the step of the acceleration times one sigma of the age; without a step there is none."""
+    state = AttitudeFilter(SUSPENDED, ESTIMATING)
+    flight = fly(14, 1, True)
+    state.start(*flight.samples[0])
+    now = state.at(0)
+    quaternion = tuple(now.quaternion.tolist())
+    off, on = (
+        SUSPENDED.accelerate(quaternion, (0.0, 0.0, 0.0), now.parameters, SUSPENDED.torquing(currents))
+        for currents in (np.zeros(3), np.array([0.1, 0.0, 0.0]))
+    )
+    covariance = np.zeros((16, 16))
+    covariance[LATENCY, LATENCY] = 0.01**2
+    found = motion(off, on, (0.0, 0.0, 0.0), covariance)
+    step = on.acceleration[1]
+    assert found.acceleration[1] == pytest.approx(0.5 * step)
+    assert found.uncertainty[1, 1] == pytest.approx((0.01 * 0.5 * step) ** 2)
+    assert not motion(on, on, (0.0, 0.0, 0.0), covariance).uncertainty.any()

@@ -1,0 +1,100 @@
+"""The filter's body obeys Euler and the single-axis plant; its derivatives are those of its acceleration."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from knightcube.astro import quaternion
+from knightcube.astro.arrays import FloatArray
+from knightcube.errors import UsageError
+from knightcube.gnc.estimation.rigid_body import Parameters, RigidBody
+from knightcube.gnc.estimation.turn import Quaternion, Vector, compose, exponential
+from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant
+from tests.knightcube.gnc.estimation.flights import FREE
+from tests.studies.campaigns.consistency_worlds import DIPOLE, INERTIA, TESTBED_FIELD
+
+SKEWED: FloatArray = np.array([[1.1, 0.05, -0.03], [0.05, 1.05, 0.02], [-0.03, 0.02, 0.99]]) * 1e-3
+Q: Quaternion = compose(exponential(0.4, -0.7, 0.2), exponential(0.1, 0.3, 1.1))
+RATE: Vector = (0.3, -0.2, 0.5)
+CURRENTS: FloatArray = np.array([0.1, -0.05, 0.12])
+FIELD: FloatArray = np.array([1e-4, -2e-4, 4e-4])
+
+
+def acceleration(body: RigidBody, q: Quaternion, rate: Vector, currents: FloatArray) -> FloatArray:
+    return np.array(body.linearise(q, rate, body.parameters, body.torquing(currents), 0.0).acceleration)
+
+
+@given(st.floats(-1.5, 1.5), st.floats(-1.0, 1.0), st.floats(-0.15, 0.15))
+def test_suspended_it_accelerates_as_the_single_axis_plant(angle: float, rate: float, amps: float) -> None:
+    body = RigidBody(INERTIA, DIPOLE, TESTBED_FIELD, suspended=True, stiffness=1e-5, damping=2e-6)
+    plant = SingleAxisPlant(float(INERTIA[1, 1]), DIPOLE * 4.5e-4, 23.0, 0.148, 1e-5, 2e-6)
+    x, y, z = acceleration(body, exponential(0.0, angle, 0.0), (0.0, rate, 0.0), np.array([amps, 0.1, 0.0]))
+    assert (x, z) == (0.0, 0.0)
+    assert y == pytest.approx(plant.acceleration(angle, rate, amps), abs=1e-14)
+
+
+def test_free_it_obeys_eulers_equation() -> None:
+    body = RigidBody(SKEWED, DIPOLE, FIELD)
+    field_body = quaternion.attitude_matrix(np.array(Q)) @ FIELD
+    torque = np.cross(DIPOLE * CURRENTS, field_body) - np.cross(RATE, SKEWED @ RATE)
+    expected = np.linalg.solve(SKEWED, torque)
+    np.testing.assert_allclose(acceleration(body, Q, RATE, CURRENTS), expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("suspended", [False, True])
+def test_its_derivatives_are_those_of_its_acceleration(suspended: bool) -> None:
+    thread = {"stiffness": 1e-5, "damping": 2e-6} if suspended else {}
+    body = RigidBody(SKEWED, DIPOLE, FIELD, suspended, **thread)
+    # A turn that is not about the thread changes the twist otherwise: off the thread there is no truth.
+    q = exponential(0.0, 0.7, 0.0) if suspended else Q
+    model = body.linearise(q, RATE, body.parameters, body.torquing(CURRENTS), 0.0)
+    step = 1e-6
+    for axis in [1] if suspended else range(3):
+        bump = step * np.eye(3)[axis]
+        turned = acceleration(body, compose(exponential(*bump), q), RATE, CURRENTS)
+        back = acceleration(body, compose(exponential(*-bump), q), RATE, CURRENTS)
+        np.testing.assert_allclose(model.by_turn[:, axis], (turned - back) / (2 * step), atol=1e-8)
+        up, down = np.array(RATE) + bump, np.array(RATE) - bump
+        faster = acceleration(body, q, (up[0], up[1], up[2]), CURRENTS)
+        slower = acceleration(body, q, (down[0], down[1], down[2]), CURRENTS)
+        np.testing.assert_allclose(model.by_rate[:, axis], (faster - slower) / (2 * step), atol=1e-8)
+        more = acceleration(body, q, RATE, CURRENTS + bump) - acceleration(body, q, RATE, CURRENTS)
+        np.testing.assert_allclose(model.by_current[:, axis], more / step, atol=1e-8)
+
+
+def test_the_thread_pulls_back_in_proportion_to_the_turn_and_to_the_rate() -> None:
+    body = RigidBody(INERTIA, DIPOLE, TESTBED_FIELD, suspended=True)
+    hung, rate = exponential(0.0, 0.4, 0.0), (0.0, 0.5, 0.0)
+    model = body.linearise(hung, rate, Parameters(0.01, 0.002), body.torquing(np.zeros(3)), 0.0)
+    assert model.acceleration[1] == pytest.approx(-0.004 - 0.001)
+    assert model.by_parameters[1] == pytest.approx((-0.4, -0.5, 0.0))
+
+
+def test_a_command_may_bring_its_own_field() -> None:
+    there = FREE.torquing(CURRENTS, FIELD)
+    assert there.field == tuple(FIELD)
+    assert FREE.torquing(CURRENTS).field == tuple(TESTBED_FIELD)
+    assert FREE.torquing(np.array([0.1, 0.0, -0.1])).driven == (True, False, True)
+
+
+@pytest.mark.parametrize(
+    ("inertia", "changes"),
+    [
+        (-INERTIA, {}),
+        (INERTIA + np.diag([1e-4, 0.0], 1), {}),
+        (np.eye(2), {}),
+        (INERTIA, {"dipole_per_ampere": math.nan}),
+        (INERTIA, {"field": np.array([0.0, math.inf, 0.0])}),
+        (INERTIA, {"stiffness": -1.0, "suspended": True}),
+        (INERTIA, {"stiffness": 1e-5}),
+    ],
+)
+def test_it_refuses_what_no_body_has(inertia: FloatArray, changes: dict[str, float]) -> None:
+    arguments = {"dipole_per_ampere": DIPOLE, "field": TESTBED_FIELD} | changes
+    with pytest.raises(UsageError):
+        RigidBody(inertia, **arguments)  # type: ignore[arg-type]  # a table of mistakes

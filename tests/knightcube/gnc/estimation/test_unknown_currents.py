@@ -1,0 +1,105 @@
+"""While the coil currents are unknown the filter follows its measurements, and learns nothing false."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import angle_about_axis_y
+from knightcube.gnc.estimation.attitude_filter import AttitudeFilter
+from knightcube.gnc.estimation.commands import CommandHistory
+from knightcube.gnc.estimation.measurements import RateMeasurement
+from tests.knightcube.gnc.estimation.flights import SETTINGS, SUSPENDED, Flight, begin, fly, follow
+from tests.studies.campaigns.consistency_worlds import CYCLE_NS
+
+STUCK, FOUND, FREE_AGAIN, END = 400, 420, 600, 800
+"""Cycles: the chip keeps its registers, half a second later that is found, then it obeys again."""
+LIMIT = 0.148
+
+
+@pytest.fixture(scope="module")
+def flown() -> Flight:
+    """Return a flight in which the chip keeps a large current in its registers for five seconds."""
+
+    def keep(cycle: int, wanted: FloatArray) -> FloatArray:
+        return np.array([LIMIT, 0.0, 0.0]) if STUCK <= cycle < FREE_AGAIN else wanted
+
+    return fly(5, END, suspended=True, driven=keep)
+
+
+def filtered(flown: Flight, reported: bool, until: int = END) -> AttitudeFilter:
+    """Return the filter after the flight; the loop may report from `FOUND` on that the chip does not obey."""
+    filter_ = begin(flown, True, dataclasses.replace(SETTINGS, unknown_current=LIMIT, gate_sigma=15.0))
+    follow(filter_, flown, 1, min(FOUND, until))
+    if reported:
+        filter_.mark_unknown((STUCK - 4) * CYCLE_NS)
+    for cycle in range(FOUND, until):
+        filter_.catch_up(16)
+        for sample in flown.samples[cycle]:
+            filter_.measure(sample)
+        known = not reported or cycle >= FREE_AGAIN
+        filter_.command(cycle * CYCLE_NS, flown.commands[cycle], flown.fields[cycle], known=known)
+    return filter_
+
+
+def errors(filter_: AttitudeFilter, flown: Flight) -> FloatArray:
+    """Return the errors of angle, rate and gain over their sigmas, at the last cycle."""
+    estimate = filter_.at((END - 1) * CYCLE_NS)
+    sigma = np.sqrt(np.diag(estimate.covariance))
+    found = np.array([angle_about_axis_y(estimate.quaternion), estimate.rate[1], estimate.parameters.gain])
+    true = [angle_about_axis_y(flown.attitudes[-1]), flown.rates[-1, 1], flown.parameters.gain]
+    return np.asarray(np.abs(found - true) / sigma[[1, 4, 14]])
+
+
+@pytest.mark.parametrize("reported", [True, False])
+def test_reported_or_not_the_filter_refuses_nothing_and_stays_consistent(
+    flown: Flight, reported: bool
+) -> None:
+    filter_ = filtered(flown, reported)
+    assert (filter_.refused, filter_.restarts) == (0, 0)
+    assert errors(filter_, flown).max() < 4.0
+
+
+def test_a_chip_that_does_not_obey_is_noticed_within_a_quarter_of_a_second(flown: Flight) -> None:
+    assert not filtered(flown, reported=False, until=STUCK).doubts_commands
+    assert filtered(flown, reported=False, until=STUCK + 10).doubts_commands
+
+
+def test_the_commands_are_trusted_again_once_the_body_follows_them(flown: Flight) -> None:
+    assert filtered(flown, reported=False, until=FREE_AGAIN).doubts_commands
+    assert not filtered(flown, reported=False).doubts_commands
+
+
+def test_a_gyro_that_jumps_further_than_any_current_pushes_raises_no_doubt(flown: Flight) -> None:
+    filter_ = filtered(flown, reported=False, until=STUCK)
+    for cycle in range(STUCK, STUCK + 20):
+        for sample in flown.samples[cycle]:
+            if isinstance(sample, RateMeasurement):
+                filter_.measure(dataclasses.replace(sample, rate=sample.rate + 0.1))
+            else:
+                filter_.measure(sample)
+        filter_.command(cycle * CYCLE_NS, flown.commands[cycle], flown.fields[cycle])
+    assert filter_.refused > 0
+    assert not filter_.doubts_commands
+
+
+def test_a_doubt_reaches_back_to_its_time_and_no_further() -> None:
+    history = CommandHistory(SUSPENDED, 6_000_000_000)
+    for second in range(5):
+        history.record(second * 1_000_000_000, np.array([0.01 * second, 0.0, 0.0]), None)
+    history.mark_unknown(2_500_000_000)
+    assert [(history.at(t).dipole[0] > 0.0, history.at(t).known) for t in (1_000_000_000, 2_499_999_999)] == [
+        (True, True),
+        (True, True),
+    ]
+    assert history.at(2_400_000_000).dipole == history.at(2_600_000_000).dipole
+    assert not any(history.at(t).known for t in (2_500_000_000, 3_000_000_000, 9_000_000_000))
+
+
+def test_a_doubt_before_anything_was_noted_or_measured_does_nothing() -> None:
+    filter_ = AttitudeFilter(SUSPENDED, SETTINGS)
+    filter_.mark_unknown(0)
+    assert not filter_.started

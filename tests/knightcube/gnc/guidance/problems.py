@@ -1,0 +1,147 @@
+"""The KnightCube's plant and the slews that the guidance tests plan."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from knightcube.gnc.guidance.one_axis.plant import SingleAxisPlant, angle_of
+from knightcube.gnc.guidance.one_axis.vmc import Plan, plan
+from tests.knightcube.gnc.guidance.oracle import Slew
+from tests.knightcube.gnc.guidance.shortest import shortest_time
+
+KNIGHTCUBE = SingleAxisPlant(1.05e-3, 80 * 0.0081 * 4.5e-4, 23.0, 0.148)
+OPTIMUM_FILE = Path(__file__).resolve().parents[4].parent / "shared" / "data" / "optimum.json"
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Boundary states (q2, rad/s) and horizon (s) of one slew of one plant."""
+
+    plant: SingleAxisPlant
+    start_q2: float
+    start_rate: float
+    end_q2: float
+    end_rate: float
+    horizon: float
+
+    def planned(self, **options: Any) -> Plan:
+        """Return the planner's answer."""
+        states = self.start_q2, self.start_rate, self.end_q2, self.end_rate
+        return plan(self.plant, *states, self.horizon, **options)
+
+    def slew(self, horizon: float) -> Slew:
+        """Return the same slew for the oracle, over `horizon` s."""
+        plant = self.plant
+        return Slew(
+            angle_of(self.start_q2),
+            self.start_rate,
+            angle_of(self.end_q2),
+            self.end_rate,
+            horizon,
+            plant.inertia,
+            plant.torque_constant,
+            plant.resistance,
+            plant.current_limit,
+            plant.stiffness,
+            plant.damping,
+            plant.disturbance,
+        )
+
+
+@dataclass(frozen=True)
+class KnownOptimum:
+    """A problem of the data file with its optimum: J, and the shortest feasible horizon in s."""
+
+    problem: Problem
+    energy: float
+    shortest: float
+
+
+THESIS = Problem(KNIGHTCUBE, 0.4, 0.015, -0.3, 0.0, 10.0)
+STEPS = [
+    Problem(KNIGHTCUBE, start, 0.0, start + 0.1, 0.0, 10.0)
+    for start in np.round(np.arange(-0.3, 0.25, 0.1), 1).tolist()
+]
+
+
+def known_optima() -> list[KnownOptimum]:
+    """Return the 20 problems of the data file; skips the test when it is missing."""
+    if not OPTIMUM_FILE.exists():
+        pytest.skip(f"{OPTIMUM_FILE.name}: the shared data folder is not beside the repository")
+    content = json.loads(OPTIMUM_FILE.read_text())
+    numbers = content["parameters"]
+    torque_constant = numbers["turns"] * numbers["area_m2"] * numbers["field_T"]
+    return [
+        KnownOptimum(
+            Problem(
+                SingleAxisPlant(
+                    numbers["inertia_kgm2"],
+                    torque_constant,
+                    numbers["resistance_ohm"],
+                    numbers["current_limit_A"],
+                    entry["thread_stiffness"],
+                    entry["thread_damping"],
+                ),
+                entry["q2_initial"],
+                entry["omega_initial"],
+                entry["q2_final"],
+                entry["omega_final"],
+                entry["horizon_s"],
+            ),
+            entry["energy_J"],
+            entry["shortest_s"],
+        )
+        for entry in content["problems"]
+    ]
+
+
+def random_problems(count: int, seed: int, horizons: tuple[float, float] = (6.0, 20.0)) -> list[Problem]:
+    """Return slews drawn over the testbed's range, a third of them on a thread."""
+    rng = np.random.default_rng(seed)
+    problems = []
+    for _ in range(count):
+        stiffness = float(rng.choice([0.0, 1e-5, 2e-5]))
+        plant = SingleAxisPlant(
+            KNIGHTCUBE.inertia,
+            KNIGHTCUBE.torque_constant,
+            KNIGHTCUBE.resistance,
+            KNIGHTCUBE.current_limit,
+            stiffness,
+            2e-6 if stiffness else 0.0,
+        )
+        start_q2, end_q2 = rng.uniform(-0.45, 0.45, 2).tolist()
+        start_rate = float(rng.normal(0.0, 0.02))
+        problems.append(Problem(plant, start_q2, start_rate, end_q2, 0.0, float(rng.uniform(*horizons))))
+    return problems
+
+
+def feasible_problems(
+    count: int, seed: int, share: tuple[float, float] = (1.1, 2.5)
+) -> list[tuple[Problem, float]]:
+    """Return slews whose horizon is `share` of the shortest feasible one, and that shortest horizon in s.
+
+    A third each without and with two threads, a disturbance on half, a moving end on half.
+    """
+    rng = np.random.default_rng(seed)
+    problems: list[tuple[Problem, float]] = []
+    while len(problems) < count:
+        stiffness = float(rng.choice([0.0, 1e-5, 2e-5]))
+        disturbance = float(rng.choice([0.0, rng.normal(0.0, 2e-3)]))
+        plant = replace(
+            KNIGHTCUBE, stiffness=stiffness, damping=2e-6 if stiffness else 0.0, disturbance=disturbance
+        )
+        start_q2, end_q2 = rng.uniform(-0.45, 0.45, 2).tolist()
+        start_rate = float(rng.normal(0.0, 0.02))
+        end_rate = float(rng.choice([0.0, rng.normal(0.0, 0.01)]))
+        factor = float(rng.uniform(*share))
+        drawn = Problem(plant, start_q2, start_rate, end_q2, end_rate, 1.0)
+        shortest = shortest_time(drawn.slew(1.0))
+        if 1.0 < shortest < 20.0:  # a slew of less than a second is none
+            problems.append((replace(drawn, horizon=factor * shortest), shortest))
+    return problems

@@ -1,0 +1,110 @@
+"""Slews with known optima, and a model of the motion that shares no code with the planner.
+
+The file's problems, field series and optima were made by direct collocation elsewhere; its `model` is the
+equations that `flown` integrates.
+"""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.polynomial import chebyshev
+from scipy.integrate import solve_ivp
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.gnc.guidance.three_axes.slew_ends import Whole
+from knightcube.gnc.guidance.three_axes.slew_model import Along, Around, SlewCraft
+from knightcube.gnc.guidance.three_axes.slew_plan import SlewPlan
+from knightcube.gnc.guidance.three_axes.slew_task import SlewTask
+
+FILE = Path(__file__).resolve().parents[5].parent / "shared" / "data" / "optimum_orbit.json"
+
+
+@cache
+def recorded() -> dict[str, Any]:
+    """Return the file; skips the test where the file is missing."""
+    if not FILE.exists():
+        pytest.skip(f"no optima of slews at {FILE}")
+    content: dict[str, Any] = json.loads(FILE.read_text())
+    return content
+
+
+def problem(name: str) -> dict[str, Any]:
+    """Return the problem of a name."""
+    found: dict[str, Any] = next(one for one in recorded()["problems"] if one["name"] == name)
+    return found
+
+
+def matrix(q: FloatArray) -> FloatArray:
+    """Return the attitude matrix (3, 3) by Euler's formula, as textbooks print it."""
+    v, s = np.asarray(q[:3]), float(q[3])
+    cross = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+    return np.asarray((s * s - v @ v) * np.eye(3) + 2.0 * np.outer(v, v) - 2.0 * s * cross)
+
+
+def along_of(case: dict[str, Any]) -> Along:
+    """Return field and position of a problem over time."""
+    file = recorded()
+    orbit = file["orbit"][case["orbit"]]
+    radius = file["earth_radius"] + orbit["altitude"]
+    motion = float(np.sqrt(file["mu"] / radius**3))
+    tilt, node = np.radians([orbit["inclination_deg"], orbit["raan_deg"]])
+    rise = np.array([np.cos(node), np.sin(node), 0.0])
+    ahead = np.array([-np.sin(node) * np.cos(tilt), np.cos(node) * np.cos(tilt), np.sin(tilt)])
+    series = np.array(file["fields"][f"{case['orbit']}-{case['u0_deg']:g}"])
+
+    def along(times: FloatArray) -> Around:
+        argument = np.radians(case["u0_deg"]) + motion * times
+        position = radius * (np.outer(np.cos(argument), rise) + np.outer(np.sin(argument), ahead))
+        return Around(chebyshev.chebval(2.0 * times / file["window_s"] - 1.0, series).T, position)
+
+    return along
+
+
+def task_of(case: dict[str, Any], horizon: float, **options: Any) -> SlewTask:
+    """Return the planner's task of a problem over `horizon` s."""
+    craft = recorded()["craft"][case["craft"]]
+    end = Whole(np.array(case["qf"]), matrix(np.array(case["qf"])).T @ np.array(case["wf"]))
+    model = SlewCraft(
+        np.diag(craft["inertia"]),
+        np.full(3, craft["m_max"]),
+        np.full(3, craft["watt_per_Am2_squared"]),
+    )
+    options.setdefault("longest", 3.0 * horizon)
+    start = np.array(case["q0"]), np.array(case["w0"])
+    return SlewTask(model, along_of(case), *start, lambda _: end, horizon, **options)
+
+
+def flown(plan: SlewPlan, task: SlewTask) -> FloatArray:
+    """Return the state (7,) at the end when the plan's dipoles alone turn the body."""
+    inertia = task.craft.inertia
+    mu = recorded()["mu"]
+
+    def flow(time: float, x: FloatArray) -> FloatArray:
+        q, w, attitude = x[:4], x[4:], matrix(x[:4])
+        around = task.along(np.array([time]))
+        place = attitude @ around.position[0]
+        tide = 3.0 * mu / np.linalg.norm(place) ** 5 * np.cross(place, inertia @ place)
+        dipole = plan.path.dipoles(np.array([time]))[0]
+        torque = np.cross(dipole, attitude @ around.field[0]) + tide - np.cross(w, inertia @ w)
+        turning = 0.5 * (-np.cross(w, q[:3]) + q[3] * w)
+        return np.concatenate([turning, [-0.5 * w @ q[:3]], np.linalg.solve(inertia, torque)])
+
+    start = np.concatenate([task.quaternion, task.rate])
+    step = plan.horizon / task.nodes
+    return np.asarray(
+        solve_ivp(flow, (0.0, plan.horizon), start, method="DOP853", rtol=1e-8, atol=1e-10, max_step=step).y[
+            :, -1
+        ]
+    )
+
+
+def off_degrees(q: FloatArray, wanted: FloatArray) -> float:
+    """Return the angle between two attitudes (4,), deg."""
+    turn = matrix(q / np.linalg.norm(q)) @ matrix(wanted).T
+    return float(np.degrees(2.0 * np.arcsin(min(1.0, np.linalg.norm(turn - np.eye(3)) / np.sqrt(8.0)))))

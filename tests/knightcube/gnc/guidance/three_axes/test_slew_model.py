@@ -1,0 +1,55 @@
+"""The derivatives of a satellite's motion."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from knightcube.astro.earth.disturbance import Pressures, shapes
+from knightcube.astro.quaternion import attitude_matrix, normalise
+from knightcube.gnc.guidance.three_axes.slew_model import Around, Motion, SlewCraft, shown
+
+
+def test_slopes_and_curvature_are_those_of_central_differences() -> None:
+    rng = np.random.default_rng(1)
+    inertia = np.diag([0.0066, 0.0333, 0.0333]) + 1e-3
+    residual, sizes = 1e-3 * rng.normal(size=3), 1e-7 * rng.normal(size=9)
+    craft = SlewCraft(inertia, np.full(3, 0.2), np.ones(3), residual).facing(sizes)
+    point, pull = rng.normal(size=(4, 10)), rng.normal(size=(4, 7))
+    pressures = Pressures(rng.normal(size=(4, 3)), rng.normal(size=(4, 3)))
+    around = Around(3e-5 * rng.normal(size=(4, 3)), 4e6 * rng.normal(size=(4, 3)), pressures)
+    motion = Motion(craft, 300.0, 0.2, around)
+
+    def flow(z: np.ndarray) -> np.ndarray:
+        return motion.flow(z[:, :7], z[:, 7:])
+
+    def slopes(z: np.ndarray) -> np.ndarray:
+        return motion.slopes(z[:, :7], z[:, 7:])
+
+    curvature = motion.curvature(point[:, :7], point[:, 7:], pull)
+    for k in range(10):
+        shift = 1e-5 * np.eye(10)[k]
+        rise = (flow(point + shift) - flow(point - shift)) / 2e-5
+        np.testing.assert_allclose(slopes(point)[:, :, k], rise, rtol=1e-6, atol=1e-7)
+        bend = np.einsum("ni,nij->nj", pull, slopes(point + shift) - slopes(point - shift)) / 2e-5
+        np.testing.assert_allclose(curvature[:, :, k], bend, rtol=1e-6, atol=1e-6)
+
+
+def test_torques_of_air_and_light_are_those_that_the_filter_estimates() -> None:
+    rng = np.random.default_rng(3)
+    q, sizes = normalise(rng.normal(size=(5, 4))), 1e-7 * rng.normal(size=9)
+    inertia = np.diag([0.0066, 0.0333, 0.04])
+    craft = SlewCraft(inertia, np.full(3, 0.2), np.ones(3))
+    pressures = Pressures(rng.normal(size=(5, 3)), rng.normal(size=(5, 3)))
+    around = Around(3e-5 * rng.normal(size=(5, 3)), 7e6 * rng.normal(size=(5, 3)), pressures)
+    still, nothing = np.concatenate([q, np.zeros((5, 3))], axis=1), np.zeros((5, 3))
+    pushed = Motion(craft.facing(sizes), 1.0, 0.2, around).flow(still, nothing)
+    pushed = pushed - Motion(craft, 1.0, 0.2, around).flow(still, nothing)
+    expected = shapes(pressures, attitude_matrix(q)) @ sizes
+    np.testing.assert_allclose(pushed[:, 4:] @ inertia, expected, rtol=1e-9, atol=1e-18)
+
+
+def test_a_quadratic_form_shows_vectors_as_the_attitude_matrix_does() -> None:
+    rng = np.random.default_rng(2)
+    q, vector = normalise(rng.normal(size=(5, 4))), rng.normal(size=(5, 3))
+    expected = np.einsum("nij,nj->ni", attitude_matrix(q), vector)
+    np.testing.assert_allclose(shown(q, vector), expected, atol=1e-12)

@@ -1,0 +1,1 @@
+"""Tests of the controllers kept for comparison."""

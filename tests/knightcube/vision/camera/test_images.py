@@ -1,0 +1,260 @@
+"""Image files of every kind that is read, written by Pillow or by hand, and real photographs."""
+
+from __future__ import annotations
+
+import io
+import struct
+import sys
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from knightcube.astro.arrays import Image
+from knightcube.errors import UsageError
+from knightcube.vision.camera.images import grey_stretch, read_image, write_picture
+
+pillow = pytest.importorskip("PIL.Image", reason="Pillow, the extra `images`, is not installed")
+
+SKY = Path(__file__).resolve().parents[4].parent / "shared" / "data" / "sky"
+RNG = np.random.default_rng(11)
+EIGHT = RNG.integers(0, 256, (13, 21)).astype(np.uint8)
+SIXTEEN = RNG.integers(0, 65_536, (13, 21)).astype(np.uint16)
+
+
+def _tiff(pixels: Image, order: str, photometric: int = 1, channels: int = 1) -> bytes:
+    """Return an uncompressed 16-bit TIFF of `pixels` in byte order "<" or ">", as TIFF 6.0 has it."""
+    rows, columns = pixels.shape[:2]
+    body = pixels.astype(order + "u2").tobytes()
+    tags = [
+        (256, 3, 1, columns),
+        (257, 3, 1, rows),
+        (258, 3, 1, 16),
+        (259, 3, 1, 1),
+        (262, 3, 1, photometric),
+        (273, 4, 1, 8),
+        (277, 3, 1, channels),
+        (278, 3, 1, rows),
+        (279, 4, 1, len(body)),
+    ]
+    entries = b""
+    for tag, kind, count, value in tags:
+        # A short value stands in the first two of the four bytes.
+        form = "HHIHxx" if kind == 3 else "HHII"
+        entries += struct.pack(order + form, tag, kind, count, value)
+    mark = b"II" if order == "<" else b"MM"
+    start = struct.pack(order + "2sHI", mark, 42, 8 + len(body))
+    return start + body + struct.pack(order + "H", len(tags)) + entries + bytes(4)
+
+
+def _png(pixels: Image, colour_type: int, channels: int) -> bytes:
+    """Return a 16-bit PNG of `pixels` repeated over `channels`."""
+
+    def chunk(name: bytes, content: bytes) -> bytes:
+        check = zlib.crc32(name + content)
+        return struct.pack(">I", len(content)) + name + content + struct.pack(">I", check)
+
+    rows, columns = pixels.shape
+    lines = np.repeat(pixels.astype(">u2"), channels, axis=1)
+    raw = b"".join(b"\0" + line.tobytes() for line in lines)
+    head = struct.pack(">IIBBBBB", columns, rows, 16, colour_type, 0, 0, 0)
+    return (
+        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(raw)) + chunk(b"IEND", b"")
+    )
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.tiff"])
+@pytest.mark.parametrize("pixels", [EIGHT, SIXTEEN], ids=["8 bits", "16 bits"])
+def test_grey_pixels_come_back_as_they_were_written(tmp_path: Path, name: str, pixels: Image) -> None:
+    path = tmp_path / name
+    pillow.fromarray(pixels).save(path)
+    image = read_image(path)
+    assert image.dtype == pixels.dtype
+    assert np.array_equal(image, pixels)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_a_16_bit_tiff_is_right_in_either_byte_order(tmp_path: Path, order: str) -> None:
+    path = tmp_path / "a.tif"
+    path.write_bytes(_tiff(SIXTEEN, order))
+    image = read_image(path)
+    assert image.dtype == np.uint16
+    assert image.dtype.isnative
+    assert np.array_equal(image, SIXTEEN)
+
+
+def test_a_16_bit_png_made_by_hand_is_right(tmp_path: Path) -> None:
+    path = tmp_path / "a.png"
+    path.write_bytes(_png(SIXTEEN, 0, 1))
+    assert np.array_equal(read_image(path), SIXTEEN)
+
+
+def test_a_jpeg_is_read_to_its_compression(tmp_path: Path) -> None:
+    path = tmp_path / "a.jpg"
+    smooth = np.add.outer(np.arange(64), np.arange(64)).astype(np.uint8)
+    pillow.fromarray(smooth).save(path, quality=95)
+    image = read_image(path)
+    assert image.dtype == np.uint8
+    assert np.abs(image.astype(int) - smooth).max() <= 3
+
+
+@pytest.mark.parametrize(
+    ("mode", "name"), [("RGB", "a.png"), ("RGBA", "a.png"), ("RGB", "a.tif"), ("P", "a.png"), ("P", "a.tif")]
+)
+def test_colour_becomes_luminance(tmp_path: Path, mode: str, name: str) -> None:
+    """ITU-R BT.601: 0.299 R + 0.587 G + 0.114 B."""
+    colours = np.array([[[200, 0, 0], [0, 200, 0], [0, 0, 200], [10, 20, 30]]], dtype=np.uint8)
+    # Of four colours a palette keeps each.
+    pillow.fromarray(colours).convert(mode, palette=pillow.Palette.ADAPTIVE).save(tmp_path / name)
+    image = read_image(tmp_path / name)
+    assert image.dtype == np.uint8
+    expected = colours[0] @ np.array([0.299, 0.587, 0.114])
+    assert image[0] == pytest.approx(expected, abs=0.6)
+
+
+def test_what_is_transparent_keeps_its_brightness(tmp_path: Path) -> None:
+    picture = np.dstack([EIGHT, EIGHT, EIGHT, np.zeros_like(EIGHT)])
+    pillow.fromarray(picture).save(tmp_path / "a.png")
+    assert np.array_equal(read_image(tmp_path / "a.png"), EIGHT)
+
+
+def test_one_bit_becomes_black_and_white(tmp_path: Path) -> None:
+    pillow.fromarray(EIGHT > 127).save(tmp_path / "a.png")
+    assert np.array_equal(read_image(tmp_path / "a.png"), np.where(EIGHT > 127, 255, 0))
+
+
+@pytest.mark.parametrize(("colour_type", "channels"), [(2, 3), (6, 4)])
+def test_16_bit_colour_becomes_luminance_of_16_bits(tmp_path: Path, colour_type: int, channels: int) -> None:
+    """All channels the same: the luminance is each pixel's own count, its low byte too."""
+    path = tmp_path / "a.png"
+    path.write_bytes(_png(SIXTEEN, colour_type, channels))
+    found = read_image(path)
+    assert found.dtype == np.uint16
+    assert np.array_equal(found, SIXTEEN)
+
+
+def test_16_bit_grey_with_transparency_is_refused_rather_than_halved(tmp_path: Path) -> None:
+    path = tmp_path / "a.png"
+    path.write_bytes(_png(SIXTEEN, 4, 2))
+    with pytest.raises(UsageError, match="16-bit colour"):
+        read_image(path)
+
+
+def test_a_bitmap_is_read(tmp_path: Path) -> None:
+    pillow.fromarray(EIGHT).save(tmp_path / "a.bmp")
+    assert np.array_equal(read_image(tmp_path / "a.bmp"), EIGHT)
+
+
+def test_a_negative_is_refused_rather_than_taken_for_a_picture(tmp_path: Path) -> None:
+    path = tmp_path / "a.tif"
+    path.write_bytes(_tiff(SIXTEEN, "<", photometric=0))
+    with pytest.raises(UsageError, match="zero is white"):
+        read_image(path)
+
+
+def test_pixels_of_another_kind_are_refused(tmp_path: Path) -> None:
+    pillow.fromarray(EIGHT.astype(np.float32)).save(tmp_path / "a.tif")
+    with pytest.raises(UsageError, match="convert it to 8 or 16 bit grey"):
+        read_image(tmp_path / "a.tif")
+
+
+@pytest.mark.parametrize("content", [b"", b"GIF89a nothing", b"SIMPLE", bytes(5000)])
+def test_a_file_that_is_no_image_is_refused_in_one_line(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "a.png"
+    path.write_bytes(content)
+    with pytest.raises(UsageError, match="PNG, TIFF, JPEG, BMP or FITS") as caught:
+        read_image(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_gif_is_refused(tmp_path: Path) -> None:
+    pillow.fromarray(EIGHT).save(tmp_path / "a.gif")
+    with pytest.raises(UsageError, match="PNG, TIFF, JPEG, BMP or FITS"):
+        read_image(tmp_path / "a.gif")
+
+
+def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
+    for path in (tmp_path / "none.png", tmp_path):
+        with pytest.raises(UsageError, match="cannot be read"):
+            read_image(path)
+
+
+@pytest.mark.parametrize("kind", ["PNG", "TIFF", "JPEG"])
+def test_a_damaged_file_gives_an_image_or_one_clear_line(tmp_path: Path, kind: str) -> None:
+    written = io.BytesIO()
+    pillow.fromarray(EIGHT).save(written, kind)
+    path, rng, refused = tmp_path / "a", np.random.default_rng(6), 0
+    for trial in range(150):
+        content = bytearray(written.getvalue())
+        if trial % 2:
+            del content[int(rng.integers(1, len(content))) :]
+        else:
+            content[int(rng.integers(0, len(content)))] = int(rng.integers(0, 256))
+        path.write_bytes(bytes(content))
+        try:
+            assert read_image(path).ndim == 2
+        except UsageError:
+            refused += 1
+    assert refused > 60
+
+
+def test_without_pillow_a_picture_asks_for_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pillow.fromarray(EIGHT).save(tmp_path / "a.png")
+    monkeypatch.setitem(sys.modules, "PIL", None)
+    with pytest.raises(UsageError, match=r"knightcube-flight\[images\]"):
+        read_image(tmp_path / "a.png")
+    with pytest.raises(UsageError, match=r"knightcube-flight\[images\]"):
+        write_picture(tmp_path / "b.png", grey_stretch(EIGHT))
+
+
+def test_a_stretch_puts_the_percentiles_at_black_and_white() -> None:
+    image = np.arange(10_001, dtype=np.uint16).reshape(73, 137)
+    picture = grey_stretch(image, 10.0, 90.0)
+    assert picture.shape == (73, 137, 3)
+    assert picture.dtype == np.uint8
+    assert np.array_equal(picture[..., 0], picture[..., 2])
+    grey = picture[..., 0].reshape(-1)
+    assert grey[1000] == 0
+    assert grey[5000] in (127, 128)
+    assert grey[9000] == 255
+    assert np.all(np.diff(grey.astype(int)) >= 0)
+
+
+def test_a_frame_of_one_brightness_is_black() -> None:
+    assert grey_stretch(np.full((4, 5), 7)).max() == 0
+    with pytest.raises(UsageError, match="percentiles"):
+        grey_stretch(np.zeros((4, 5)), 99.0, 1.0)
+
+
+def test_a_picture_that_was_written_is_read_again(tmp_path: Path) -> None:
+    picture = grey_stretch(SIXTEEN)
+    picture[3, 4] = (255, 0, 0)
+    write_picture(tmp_path / "found.png", picture)
+    with pillow.open(tmp_path / "found.png") as again:
+        assert again.mode == "RGB"
+        assert np.array_equal(np.asarray(again), picture)
+    with pytest.raises(UsageError, match="cannot be written"):
+        write_picture(tmp_path / "no" / "found.png", picture)
+
+
+@pytest.mark.skipif(not SKY.is_dir(), reason="the photographs of shared/data/sky are not here")
+@pytest.mark.parametrize(
+    ("name", "shape", "kind"),
+    [
+        ("esa_alt40_azi45.tiff", (768, 1024), np.uint16),
+        ("may8_100ms_gain40_0.png", (1040, 1392), np.uint8),
+        ("orion2.jpg", (507, 507), np.uint8),
+        ("polar_05sec.jpg", (960, 1280), np.uint8),
+    ],
+)
+def test_photographs_of_the_sky_are_dark_with_bright_stars(
+    name: str, shape: tuple[int, int], kind: type
+) -> None:
+    image = read_image(SKY / name)
+    assert image.shape == shape
+    assert image.dtype == kind
+    # Bytes in the wrong order would make noise of the 16-bit frames: neighbours would not be alike.
+    assert np.median(image) < 0.25 * image.max()
+    smooth = np.abs(np.diff(image.astype(float), axis=1))
+    assert np.median(smooth) < 0.05 * image.max()

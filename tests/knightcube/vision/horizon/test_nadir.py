@@ -1,0 +1,259 @@
+"""Nadir from rendered frames: in daylight, by the terminator, without help, and when there is none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from knightcube.astro import quaternion
+from knightcube.astro.arrays import FloatArray, Image
+from knightcube.reference.horizon.circle import fit_circle
+from knightcube.vision.camera.images import read_image
+from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.camera.pixel_access import ArrayPixels
+from knightcube.vision.horizon.edges import find_edges
+from knightcube.vision.horizon.knowledge import HorizonKnowledge, RoughAttitude, SensedDirection
+from knightcube.vision.horizon.limb_profile import UNIT_DEPTH_HEIGHT, limb_light
+from knightcube.vision.horizon.nadir import find_nadir
+from knightcube.vision.horizon.settings import EdgeSettings, HorizonSettings
+from knightcube.vision.horizon.solution import HorizonSolution, HorizonStatus
+from sim_hal.earth_camera import Atmosphere, EarthScene, limb_truth, nadir, render
+from tests.sim_hal.earth_camera.scenes import limb_scene, random_scene
+from tests.studies.campaigns.campaign import Result, fly_here
+from tests.studies.campaigns.nadir import NADIR, camera_model, coarse_knowledge, finder_settings, summarise
+
+MODEL = camera_model()
+SETTINGS = finder_settings(MODEL)
+PHOTOGRAPH = Path(__file__).resolve().parents[5] / "shared/data/limb/opssat1_2020-08-16T062350.png"
+
+
+def _error_deg(found: HorizonSolution, scene: EarthScene) -> float:
+    assert found.nadir is not None, found.reason
+    return float(np.degrees(np.arccos(min(1.0, float(found.nadir.direction @ nadir(scene))))))
+
+
+@pytest.fixture(scope="module")
+def day() -> tuple[EarthScene, Image]:
+    """Return a sunlit limb across the middle, from 600 km above 45 deg north."""
+    generator = np.random.default_rng(1)
+    scene = limb_scene(zenith=np.array([1.0, 0.0, 1.0]), sun=np.array([1.0, 0.6, 0.5]), texture=3)
+    return scene, render(MODEL, scene, generator)
+
+
+def _gps(scene: EarthScene) -> HorizonKnowledge:
+    return HorizonKnowledge(position=scene.position, sun=scene.sun, pole=scene.pole)
+
+
+def test_the_airs_profile_is_the_simulators() -> None:
+    """Two independent ways to the optical depth: Chapman's function there, the sum along the ray here."""
+    air, _, _, _ = limb_light(np.array([[0.0, 10e3, UNIT_DEPTH_HEIGHT, 18.4e3, 40e3]]), np.array([500.0]))[
+        :, 0
+    ]
+    depth = Atmosphere().tangent_depth(np.array([0.0, 10e3, UNIT_DEPTH_HEIGHT, 18.4e3, 40e3], np.float32))
+    assert air[1:] == pytest.approx(1.0 - np.exp(-depth[1:]), abs=2e-3)
+    assert depth[2] == pytest.approx(1.0, rel=1e-3)
+
+
+def test_edges_lie_on_the_true_limb_to_a_fraction_of_a_pixel(day: tuple[EarthScene, Image]) -> None:
+    scene, frame = day
+    edges, _ = find_edges(ArrayPixels(frame), SETTINGS.edges)
+    truth = limb_truth(scene, MODEL, height=UNIT_DEPTH_HEIGHT).points
+    apart = np.min(np.linalg.norm(edges.points[:, None] - truth[None], axis=2), axis=1)
+    assert np.count_nonzero(apart < 0.7) > 25
+
+
+def test_only_the_scanned_lines_are_read(day: tuple[EarthScene, Image]) -> None:
+    pixels = ArrayPixels(day[1])
+    find_edges(pixels, EdgeSettings(lines=8))
+    assert pixels.pixels_read == 16 * 512
+
+
+def test_a_rough_attitude_gives_what_the_coarse_sensors_give(day: tuple[EarthScene, Image]) -> None:
+    scene, frame = day
+    tilted = quaternion.multiply(quaternion.from_rotation_vector(np.full(3, 0.02)), scene.attitude)
+    for help_ in (
+        {"attitude": RoughAttitude(tilted, 0.03)},
+        {"sensed": (SensedDirection(scene.camera_matrix @ scene.sun, scene.sun, 0.1),)},
+    ):
+        found = find_nadir(frame, MODEL.lens, replace(_gps(scene), **help_), SETTINGS)
+        assert found.status is HorizonStatus.FOUND
+        assert _error_deg(found, scene) < 0.05
+        assert found.nadir is not None
+        assert abs(found.nadir.altitude - 600e3) < 15e3
+        assert found.nadir.residual < 0.3
+
+
+def test_without_the_flattenings_direction_the_allowance_covers_the_error(
+    day: tuple[EarthScene, Image],
+) -> None:
+    """At 45 deg the ellipsoid tilts the horizon most."""
+    scene, frame = day
+    for knowledge in (_gps(scene), HorizonKnowledge(altitude=600e3)):
+        found = find_nadir(frame, MODEL.lens, knowledge, SETTINGS)
+        assert found.nadir is not None
+        assert _error_deg(found, scene) < 3.0 * np.degrees(found.nadir.sigma)
+        assert found.nadir.sigma > SETTINGS.sphere_sigma
+
+
+def test_an_unknown_altitude_is_fitted_with_its_spread(day: tuple[EarthScene, Image]) -> None:
+    scene, frame = day
+    found = find_nadir(frame, MODEL.lens, HorizonKnowledge(), SETTINGS)
+    assert found.nadir is not None
+    assert 10e3 < found.nadir.altitude_sigma < 300e3
+    assert abs(found.nadir.altitude - 600e3) < 4.0 * np.hypot(found.nadir.altitude_sigma, 20e3)
+    assert _error_deg(found, scene) < 4.0 * np.degrees(found.nadir.sigma)
+
+
+def test_a_coarse_sun_that_contradicts_the_horizon_makes_it_refused(day: tuple[EarthScene, Image]) -> None:
+    scene, frame = day
+    # Mirrored at nadir's cone no more: the Sun stands where it cannot.
+    wrong = SensedDirection(-(scene.camera_matrix @ scene.sun), scene.sun, np.radians(5.0))
+    found = find_nadir(frame, MODEL.lens, replace(_gps(scene), sensed=(wrong,)), SETTINGS)
+    assert found.status is HorizonStatus.REFUSED
+    assert "sigma off" in found.reason
+    assert found.nadir is None
+    assert len(found.candidates) >= 1
+
+
+def test_light_where_a_view_has_sky_makes_it_refused(day: tuple[EarthScene, Image]) -> None:
+    """Turned by half a turn in the file, told with the attitude of the picture that was not turned."""
+    scene, frame = day
+    found = find_nadir(
+        frame[::-1, ::-1],
+        MODEL.lens,
+        replace(_gps(scene), attitude=RoughAttitude(scene.attitude, 0.02)),
+        SETTINGS,
+    )
+    assert found.status is HorizonStatus.REFUSED
+
+
+def test_a_horizon_of_few_edges_is_read_more_closely_where_it_runs() -> None:
+    """A first look of 14 lines each way, then 42 in its place only; less is read, and more is known."""
+    generator = np.random.default_rng((3, 0, 1))
+    scene = random_scene(generator, MODEL, "sunlit", (400e3, 700e3))
+    frame = render(MODEL, scene, generator)
+    knowledge = coarse_knowledge(scene, generator)
+    few = EdgeSettings(lines=14, more_lines=42, response=SETTINGS.edges.response)
+    once = find_nadir(frame, MODEL.lens, knowledge, replace(SETTINGS, edges=few, enough_edges=8))
+    twice = find_nadir(frame, MODEL.lens, knowledge, replace(SETTINGS, edges=few, enough_edges=200))
+    assert once.nadir is not None
+    assert twice.nadir is not None
+    assert twice.nadir.used > 1.5 * once.nadir.used
+    assert twice.nadir.sigma < once.nadir.sigma
+    assert once.pixels_read < twice.pixels_read < once.pixels_read + 2 * 42 * 512
+    assert _error_deg(twice, scene) < 3.0 * np.degrees(twice.nadir.sigma)
+
+
+@pytest.mark.parametrize("level", [0.0, 90.0])
+def test_sky_alone_and_noise_alone_show_no_horizon(level: float) -> None:
+    frame = np.random.default_rng(2).normal(10.0 + level, 1.2, (512, 512)).clip(0, 255).astype(np.uint8)
+    found = find_nadir(frame, MODEL.lens, HorizonKnowledge(altitude=600e3), SETTINGS)
+    assert found.status is HorizonStatus.NO_HORIZON
+    assert found.nadir is None
+
+
+def test_a_band_between_two_equal_arcs_is_ambiguous_and_both_are_told() -> None:
+    """The paper's uniqueness problem (Fig. 14), made perfect: either rim may be limb, the other shadow."""
+    scene = limb_scene(1000e3, zenith=np.array([1.0, 0.2, 0.3]), sun=np.array([1.0, 0.3, 0.2]), dip=0.25)
+    frame = render(MODEL, scene, np.random.default_rng(4))
+    band = np.minimum(frame, frame[::-1])
+    found = find_nadir(band, MODEL.lens, HorizonKnowledge(altitude=1000e3), SETTINGS)
+    assert found.status is HorizonStatus.AMBIGUOUS
+    assert found.nadir is None
+    down = nadir(scene)
+    truths = [down, down * [1.0, -1.0, 1.0]]
+    nearest = [max(float(each.direction @ truth) for each in found.candidates) for truth in truths]
+    assert np.degrees(np.arccos(np.minimum(1.0, nearest))).max() < 0.5
+
+
+def test_the_terminator_is_told_from_the_limb() -> None:
+    """A crescent: the inner edge is as bright and as round as the outer, and stays out of the fit."""
+    generator = np.random.default_rng(31)
+    scene = random_scene(generator, MODEL, "terminator", (1200e3, 1800e3))
+    frame = render(MODEL, scene, generator)
+    found = find_nadir(frame, MODEL.lens, coarse_knowledge(scene, generator), SETTINGS)
+    assert found.status is HorizonStatus.FOUND
+    assert _error_deg(found, scene) < 0.15
+    truth = limb_truth(scene, MODEL, height=UNIT_DEPTH_HEIGHT).points
+    used: FloatArray = found.points[found.on_horizon]
+    assert np.min(np.linalg.norm(used[:, None] - truth[None], axis=2), axis=1).max() < 2.5
+
+
+@pytest.mark.parametrize(
+    ("wrong", "complaint"),
+    [
+        ({"position": np.array([np.nan, 0.0, 7e6])}, "finite"),
+        ({"position": np.array([0.0, 0.0, 7000.0])}, "inside the Earth"),
+        ({"altitude": -5.0}, "give metres"),
+        ({"altitude": 5e3}, "50000 at least"),
+        ({"sun": np.zeros(2)}, "finite"),
+    ],
+)
+def test_impossible_knowledge_is_refused(wrong: dict[str, object], complaint: str) -> None:
+    with pytest.raises(ValueError, match=complaint):
+        HorizonKnowledge(**wrong)  # type: ignore[arg-type]  # each key's own
+
+
+def test_a_photograph_from_orbit_is_fitted_to_less_than_half_a_pixel() -> None:
+    """OPS-SAT-1's picture, 27 lines; its own README tells of an independent fit of 0.44 px rms."""
+    if not PHOTOGRAPH.exists():
+        pytest.skip("needs ../shared/data/limb")
+    pixels = read_image(PHOTOGRAPH)
+    rows, columns = pixels.shape
+    camera = Pinhole.from_field_of_view(columns, rows, np.radians(12.8))
+    found = find_nadir(pixels, camera)
+    assert found.nadir is not None, found.reason
+    assert found.nadir.residual <= 0.5
+    assert found.nadir.used >= 20
+    # The sky is above: nadir is below the picture, and the limb rises to the right.
+    assert found.nadir.direction[1] > 0.9
+    circle = fit_circle(found.points[found.on_horizon])
+    assert circle.radius == pytest.approx(22_211.0, rel=0.2)
+    assert abs(found.nadir.altitude - 515e3) < 4.0 * found.nadir.altitude_sigma
+
+
+@pytest.fixture(scope="module")
+def slice_() -> list[Result]:
+    """Return two frames of each view, with each air, of the campaign `nadir`."""
+    return fly_here(NADIR, 2, 20_261_121)
+
+
+@pytest.mark.slow
+def test_a_slice_of_the_campaign_has_no_wrong_answer_and_honest_covariances(slice_: list[Result]) -> None:
+    """NEES of 2 a frame: eight make a chi-square of 16, below 40 in 99.92 % of all slices."""
+    assert {r["verdict"] for r in slice_} <= {"right", "refused", "ambiguous", "no-horizon"}
+    answers = [r for r in slice_ if r["nees"] is not None]
+    assert len(answers) >= 7
+    assert sum(r["nees"] for r in answers) < 40.0
+    for view, most in (("sunlit", 0.04), ("terminator", 0.1)):
+        errors = [r["error_deg"] for r in answers if (r["view"], r["air"]) == (view, "known")]
+        assert np.sqrt(np.mean(np.square(errors))) < most
+    assert not any(r["warnings"] for r in slice_)
+
+
+@pytest.mark.slow
+def test_the_summary_counts_what_is_wrong_and_what_is_refused(slice_: list[Result], tmp_path: Path) -> None:
+    wrong = {**slice_[0], "verdict": "wrong", "error_deg": 3.0, "nees": 900.0}
+    none = {**slice_[1], "verdict": "refused", "error_deg": None, "nees": None, "reason": "5 % of sky"}
+    summary = summarise([wrong, none, *slice_[2:]], tmp_path)
+    assert summary.facts["views"][0]["wrong"] == 1
+    assert summary.facts["views"][0]["refused"] == 1
+    assert summary.facts["views"][0]["worst_deg"] == 3.0
+    assert "5 % of sky" in summary.text
+
+
+def test_a_frame_that_is_not_the_cameras_is_refused(day: tuple[EarthScene, Image]) -> None:
+    with pytest.raises(ValueError, match="256 x 512 pixels, but the camera has 512 x 512"):
+        find_nadir(day[1][:, :256], MODEL.lens)
+    with pytest.raises(ValueError, match="not finite"):
+        find_nadir(np.full((512, 512), np.nan), MODEL.lens)
+
+
+def test_settings_that_cannot_be_are_refused() -> None:
+    for wrong in ({"lines": 1}, {"run": 4}, {"threshold": 1.5}, {"contrast": 0.0}):
+        with pytest.raises(Exception, match=next(iter(wrong))):
+            EdgeSettings(**wrong)
+    assert HorizonSettings().edges.lines == 32

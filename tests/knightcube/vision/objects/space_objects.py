@@ -1,0 +1,65 @@
+"""Objects that move among the stars, put into the simulated frames of `frames`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from knightcube.astro.arrays import FloatArray, Image
+from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
+from tests.knightcube.vision.streaks.frames import Camera, deposit, expose, random_stars, read_out
+
+_STEPS = 801
+
+
+def object_path(
+    camera: Camera, direction: FloatArray, motion: FloatArray, rotation: FloatArray
+) -> FloatArray:
+    """Return the pixels (801, 2) of an object that turns by `motion` (3,) rad among the stars.
+
+    `direction` (3,) is where it is at mid-exposure; motion equal to the camera's `rotation` (3,) keeps it
+    there.
+    """
+    time = np.linspace(-0.5, 0.5, _STEPS)[:, None]
+    among_stars = np.swapaxes(attitude_matrix(from_rotation_vector(time * motion)), 1, 2) @ direction
+    seen = attitude_matrix(from_rotation_vector(time * rotation))
+    return camera.pinhole.project(np.einsum("mij,mj->mi", seen, among_stars))
+
+
+def add_object(
+    image: FloatArray, camera: Camera, path: FloatArray, magnitude: float, exposure: float
+) -> None:
+    """Add the electrons of an object along `path` (m, 2) to `image` in place."""
+    electrons = camera.zero_magnitude * 10.0 ** (-0.4 * magnitude) * exposure
+    parts = np.array_split(path, 40)
+    for part in parts:
+        deposit(image, part, electrons * len(part) / len(path), camera.psf_sigma)
+
+
+def motion_across(direction: FloatArray, angle: float, towards: float) -> FloatArray:
+    """Return the turn (3,) that moves `direction` (3,) by `angle` rad along a great circle.
+
+    `towards` in rad is the way it goes in the image: 0 is along +x, pi/2 along +y.
+    """
+    step = np.array([np.cos(towards), np.sin(towards), 0.0])
+    axis = np.cross(direction, step)
+    return np.asarray(angle * axis / np.linalg.norm(axis))
+
+
+def star_field(camera: Camera, seed: int, faintest: float = 7.0) -> tuple[FloatArray, FloatArray]:
+    """Return the directions (n, 3) and magnitudes (n,) of the stars that `frame_with` shows."""
+    return random_stars(np.random.default_rng(seed), camera.pinhole, 0.05, faintest)
+
+
+def frame_with(
+    camera: Camera,
+    rotation: FloatArray,
+    exposure: float,
+    seed: int,
+    objects: list[tuple[FloatArray, float]],
+    faintest: float = 7.0,
+) -> Image:
+    """Return a random star field with objects (path, magnitude); the same for the same seed."""
+    image = expose(camera, *star_field(camera, seed, faintest), rotation, exposure)
+    for path, magnitude in objects:
+        add_object(image, camera, path, magnitude, exposure)
+    return read_out(camera, image, exposure, np.random.default_rng([seed, 1]))

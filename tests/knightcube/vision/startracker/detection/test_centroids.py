@@ -1,0 +1,59 @@
+"""The other centroids: where a star without noise is found, and how each pixel moves the result."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.vision.startracker.detection.centroids import METHODS
+from knightcube.vision.startracker.detection.point_spread import light
+
+PLACES = np.array([[0.0, 0.0], [0.3, -0.2], [-0.45, 0.4]])
+WIDTH = 0.9
+SKY = 4.0
+"""Variance of a pixel."""
+
+
+def _stars(flux: float) -> FloatArray:
+    return flux * light(PLACES, np.full(len(PLACES), WIDTH), 3)
+
+
+def _start(clean: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the centre of mass and its slopes, all zero: they must not be needed."""
+    step = np.arange(-3.0, 4.0)
+    total = clean.sum(axis=(1, 2))
+    x, y = clean.sum(axis=1) @ step / total, clean.sum(axis=2) @ step / total
+    return np.stack([x, y], axis=1), np.zeros((len(clean), 2, 7, 7))
+
+
+@pytest.mark.parametrize(("method", "limit"), [("weighted", 0.02), ("gaussian", 0.01), ("iterative", 0.01)])
+def test_a_star_without_noise_is_found_where_it_is(method: str, limit: float) -> None:
+    clean = _stars(5e4)
+    places, _ = METHODS[method](clean, clean + SKY, _start(clean), WIDTH)
+    assert np.abs(places - PLACES).max() < limit
+
+
+@pytest.mark.parametrize("method", sorted(METHODS))
+def test_the_slopes_are_those_of_finite_differences(method: str) -> None:
+    clean = _stars(5e4)
+    variance, start = clean + SKY, _start(clean)
+    _, slopes = METHODS[method](clean, variance, start, WIDTH)
+    step = 0.5
+    for row, column in ((3, 3), (2, 4), (4, 2), (3, 5)):
+        moved = []
+        for sign in (1.0, -1.0):
+            changed = clean.copy()
+            changed[:, row, column] += sign * step
+            moved.append(METHODS[method](changed, variance, start, WIDTH)[0])
+        numeric = (moved[0] - moved[1]) / (2.0 * step)
+        # The weights of the parabola's fit are held; they too follow the light, to the second order.
+        assert slopes[:, :, row, column] == pytest.approx(numeric, rel=0.15, abs=2e-8)
+
+
+def test_a_star_too_faint_for_a_parabola_keeps_its_centre_of_mass() -> None:
+    clean = _stars(20.0)
+    start = _start(clean)
+    places, slopes = METHODS["gaussian"](clean, np.full_like(clean, 100.0), start, WIDTH)
+    assert np.array_equal(places, start[0])
+    assert np.array_equal(slopes, start[1])

@@ -1,0 +1,218 @@
+"""The calibration of a lens: against lenses that were drawn, and against what the data cannot tell."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from ground.calibration.calibration import PARAMETERS, Calibration, LensPrior, calibrate
+from ground.calibration.lens_fit import CalibrationError, Fit, MatchedFrame, parameters_of, residuals, step
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import angle_between, attitude_matrix, normalise
+from knightcube.vision.camera.lens import Lens
+from knightcube.vision.camera.pinhole import Pinhole
+
+_OPEN = LensPrior(np.inf, np.inf, np.inf, np.inf)
+
+
+def _begun(field_deg: float = 20.0) -> Pinhole:
+    return Pinhole.from_field_of_view(1024, 1024, np.radians(field_deg))
+
+
+def _lens(rng: np.random.Generator, begun: Pinhole) -> Lens:
+    """Return a lens some 2 %, 10 px and, at the corners, several px off the one begun with."""
+    return Lens(
+        begun.columns,
+        begun.rows,
+        begun.focal_length * (1.0 + 0.02 * rng.normal()),
+        (begun.centre[0] + 10.0 * rng.normal(), begun.centre[1] + 10.0 * rng.normal()),
+        -0.1 + 0.05 * rng.normal(),
+        0.05 * rng.normal(),
+    )
+
+
+def _frames(
+    rng: np.random.Generator, lens: Lens, count: int, stars: int, wrong: float = 0.0, noise: float = 0.1
+) -> tuple[list[MatchedFrame], FloatArray]:
+    """Return frames at random attitudes (count, 4); a part `wrong` of all matches are exchanged stars."""
+    frames, attitudes = [], []
+    for _ in range(count):
+        attitude = normalise(rng.normal(size=4))
+        points = rng.uniform(0.0, 1023.0, (stars, 2))
+        directions = lens.unit_vectors(points) @ attitude_matrix(attitude)
+        sigma = noise * rng.uniform(0.5, 2.0, stars)
+        exchanged = np.flatnonzero(rng.uniform(size=stars) < wrong)
+        directions[exchanged] = directions[np.roll(exchanged, 1)]
+        frames.append(MatchedFrame(points + sigma[:, None] * rng.normal(size=(stars, 2)), sigma, directions))
+        attitudes.append(attitude)
+    return frames, np.array(attitudes)
+
+
+def _squared_error(found: Calibration, truth: Lens) -> float:
+    error = parameters_of(found.lens) - parameters_of(truth)
+    return float(error @ np.linalg.solve(found.covariance, error))
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.1, 0.3])
+def test_the_lens_is_found_as_well_as_the_covariance_says_wrong_matches_or_not(wrong: float) -> None:
+    rng = np.random.default_rng(81)
+    runs, errors, misfit, degrees = 12, 0.0, 0.0, 0
+    for _ in range(runs):
+        truth = _lens(rng, _begun())
+        frames, _ = _frames(rng, truth, 6, 25, wrong)
+        found = calibrate(frames, _begun())
+        assert found.undetermined == ()
+        assert found.rms_after < 0.25 < found.rms_before
+        errors += _squared_error(found, truth)
+        misfit += found.chi_square
+        degrees += found.degrees
+    low, high = chi2.ppf([1e-4, 1.0 - 1e-4], 5 * runs)
+    assert low < errors < high
+    low, high = chi2.ppf([1e-4, 1.0 - 1e-4], degrees)
+    assert low < misfit < high
+
+
+def test_without_a_prior_the_stars_alone_give_the_same_lens() -> None:
+    rng = np.random.default_rng(82)
+    truth = _lens(rng, _begun())
+    frames, attitudes = _frames(rng, truth, 10, 40)
+    found = calibrate(frames, _begun(), _OPEN)
+    assert _squared_error(found, truth) < chi2.ppf(0.9999, 5)
+    assert found.sigma["centre_x"] < 1.0
+    assert found.degrees == 10 * 40 * 2 - 5 - 30
+    # A turn of 0.1 px/sqrt(40) across; more about the boresight, and where the centre is off.
+    assert np.max(angle_between(found.attitudes, attitudes)) < 5.0 / truth.focal_length
+
+
+@pytest.mark.parametrize("noise", [1e-7, 1e-9, 1e-11], ids=["small", "smaller", "below rounding"])
+def test_without_noise_the_lens_is_exact(noise: float) -> None:
+    rng = np.random.default_rng(83)
+    truth = _lens(rng, _begun())
+    frames, _ = _frames(rng, truth, 3, 20, noise=noise)
+    found = calibrate(frames, _begun(), _OPEN)
+    assert parameters_of(found.lens) == pytest.approx(parameters_of(truth), rel=1e-6, abs=1e-6)
+    assert found.rms_after < 5e-7
+
+
+def test_which_matches_were_wrong_is_told() -> None:
+    rng = np.random.default_rng(84)
+    truth = _lens(rng, _begun())
+    frames, _ = _frames(rng, truth, 5, 30)
+    shifted = frames[2].points.copy()
+    shifted[[3, 17]] += [[4.0, 0.0], [0.0, -60.0]]
+    frames[2] = MatchedFrame(shifted, frames[2].sigma, frames[2].directions)
+    found = calibrate(frames, _begun())
+    assert found.rejected_count == 2
+    assert np.flatnonzero(~found.used[2]).tolist() == [3, 17]
+
+
+def test_a_lens_begun_with_far_off_is_found_too() -> None:
+    """Eight per cent of the focal length, and distortion of 40 px at the corners."""
+    rng = np.random.default_rng(85)
+    begun = _begun()
+    truth = Lens(1024, 1024, 1.08 * begun.focal_length, (540.0, 490.0), -1.0, 0.5)
+    frames, _ = _frames(rng, truth, 6, 30, wrong=0.1)
+    assert _squared_error(calibrate(frames, begun), truth) < chi2.ppf(0.9999, 5)
+
+
+def test_one_narrow_frame_leaves_the_centre_and_the_distortion_to_the_prior_and_says_so() -> None:
+    rng = np.random.default_rng(86)
+    begun = _begun(3.0)
+    frames, _ = _frames(rng, Lens.of(begun), 1, 15, noise=0.3)
+    found = calibrate(frames, begun)
+    assert set(found.undetermined) >= {"centre_x", "centre_y", "k2"}
+    assert "focal_length" not in found.undetermined
+    assert found.sigma["centre_x"] > 0.5 * LensPrior().centre
+    with pytest.raises(CalibrationError, match="give a prior"):
+        calibrate(frames, begun, _OPEN)
+
+
+def test_what_the_prior_leaves_is_as_uncertain_as_it_says() -> None:
+    """Lenses drawn from the prior, two narrow frames each: the whole error still matches the covariance."""
+    rng = np.random.default_rng(87)
+    prior = LensPrior(0.01, 8.0, 0.1, 0.2)
+    runs, errors = 40, 0.0
+    begun = _begun(8.0)
+    for _ in range(runs):
+        truth = Lens(
+            1024,
+            1024,
+            begun.focal_length * (1.0 + prior.focal_length * rng.normal()),
+            (511.5 + prior.centre * rng.normal(), 511.5 + prior.centre * rng.normal()),
+            prior.k1 * rng.normal(),
+            prior.k2 * rng.normal(),
+        )
+        errors += _squared_error(calibrate(_frames(rng, truth, 2, 15)[0], begun, prior), truth)
+    low, high = chi2.ppf([1e-4, 1.0 - 1e-4], 5 * runs)
+    assert low < errors < high
+
+
+def test_sigmas_that_are_too_small_are_made_up_for_in_the_covariance() -> None:
+    rng = np.random.default_rng(88)
+    runs, errors = 20, 0.0
+    for _ in range(runs):
+        truth = _lens(rng, _begun())
+        frames, _ = _frames(rng, truth, 6, 25)
+        boasting = [MatchedFrame(f.points, f.sigma / 4.0, f.directions) for f in frames]
+        found = calibrate(boasting, _begun())
+        assert found.chi_square / found.degrees == pytest.approx(16.0, rel=0.3)
+        errors += _squared_error(found, truth)
+    low, high = chi2.ppf([1e-4, 1.0 - 1e-4], 5 * runs)
+    assert low < errors < high
+
+
+def test_the_derivatives_are_those_of_the_projection() -> None:
+    """One step from nearby lands on the truth to the square of the distance, and so only with all of them."""
+    rng = np.random.default_rng(89)
+    truth = Lens(1024, 1024, 1500.0, (500.0, 530.0), -0.2, 0.3)
+    frames, attitudes = _frames(rng, truth, 2, 20, noise=1e-9)
+    exact = parameters_of(truth)
+    none = np.zeros(5)
+    for scale in (1e-3, 1e-4):
+        start = exact + scale * np.array([100.0, 50.0, -50.0, 0.3, 0.3])
+        turned = normalise(attitudes + scale * 0.1 * rng.normal(size=attitudes.shape))
+        after = step(frames, Fit(start, turned), [np.ones(20)] * 2, none, none).fit
+        left = np.abs(after.parameters - exact) / np.array([100.0, 50.0, 50.0, 0.3, 0.3])
+        assert np.max(left) < 20.0 * scale**2
+        assert np.max(np.abs(residuals(frames[0], Fit(exact, attitudes), 0))) < 6.0
+
+
+def test_frames_that_are_none_are_refused() -> None:
+    rng = np.random.default_rng(90)
+    (good,), _ = _frames(rng, Lens.of(_begun()), 1, 20)
+    points, sigma, directions = good.points, good.sigma, good.directions
+    nan = np.where(points > 500.0, np.nan, points)
+    for frames, says in (
+        ([], "no frames"),
+        ([good, MatchedFrame(points[:5], sigma, directions)], "frame 1: shapes"),
+        ([MatchedFrame(nan, sigma, directions)], "must be finite"),
+        ([MatchedFrame(points, 0.0 * sigma, directions)], "frame 0: sigma"),
+        ([MatchedFrame(points[:1], sigma[:1], directions[:1])], "frame 0: 1 observed"),
+    ):
+        with pytest.raises(CalibrationError, match=says):
+            calibrate(frames, _begun())
+    with pytest.raises(CalibrationError, match="must be positive"):
+        calibrate([good], _begun(), LensPrior(centre=0.0))
+    few = MatchedFrame(points[:3], sigma[:3], directions[:3])
+    with pytest.raises(CalibrationError, match=r"give a prior|nothing to judge"):
+        calibrate([few], _begun(), _OPEN)
+
+
+def test_matches_that_are_mostly_wrong_are_refused_or_fit_badly_on_record() -> None:
+    rng = np.random.default_rng(91)
+    truth = _lens(rng, _begun())
+    frames, _ = _frames(rng, truth, 4, 20, wrong=1.0)
+    try:
+        found = calibrate(frames, _begun())
+    except CalibrationError:
+        return
+    assert found.chi_square > 100.0 * found.degrees
+    assert found.sigma["focal_length"] > 1.0
+
+
+def test_each_sigma_has_its_parameters_name() -> None:
+    rng = np.random.default_rng(92)
+    found = calibrate(_frames(rng, _lens(rng, _begun()), 4, 20)[0], _begun())
+    assert tuple(found.sigma) == PARAMETERS
+    assert found.sigma["k2"] == pytest.approx(np.sqrt(found.covariance[4, 4]))

@@ -1,0 +1,217 @@
+"""The attitude from places whose errors differ along and across: as good as can be and as it says."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.attitude.wahba import AttitudeError
+from knightcube.astro.quaternion import (
+    attitude_matrix,
+    conjugate,
+    from_rotation_vector,
+    multiply,
+    to_rotation_vector,
+)
+from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.startracker.image_fit import ImageFit, Unknowns, fit_in_image
+from tests.studies.bench.untold_lens import drawn
+
+_CAMERA = Pinhole.from_field_of_view(1024, 1024, float(np.deg2rad(12.0)))
+_ATTITUDE = np.array([0.5, -0.5, 0.5, 0.5])
+_ALONG_PX, _ACROSS_PX = 2.0, 0.1
+_TRIALS = 200
+# Of a chi-square of 600 degrees of freedom: its quantiles at 1e-5, over 600.
+_LOW, _HIGH = 0.77, 1.27
+
+
+def _streaks(rng: np.random.Generator, count: int) -> tuple[FloatArray, FloatArray]:
+    """Return places (n, 2) px and covariances (n, 2, 2), long in a direction of each star's own."""
+    points = rng.uniform(50.0, 970.0, (count, 2))
+    angle = rng.uniform(0.0, np.pi, count)
+    axes = np.stack([np.cos(angle), np.sin(angle), -np.sin(angle), np.cos(angle)], axis=-1).reshape(-1, 2, 2)
+    variance = np.diag([_ALONG_PX**2, _ACROSS_PX**2])
+    return points, np.swapaxes(axes, -1, -2) @ variance @ axes
+
+
+def _reference(points: FloatArray) -> FloatArray:
+    return np.asarray(_CAMERA.unit_vectors(points) @ attitude_matrix(_ATTITUDE))
+
+
+def _fit(
+    seen: FloatArray, covariance: FloatArray, reference: FloatArray, free_scale: bool = False
+) -> ImageFit:
+    start = multiply(from_rotation_vector(np.array([1e-3, -2e-3, 3e-3])), _ATTITUDE)
+    return fit_in_image(seen, covariance, reference, _CAMERA, start, Unknowns(free_scale))
+
+
+def _error(found: ImageFit) -> FloatArray:
+    return to_rotation_vector(multiply(found.fix.quaternion, conjugate(_ATTITUDE)))
+
+
+@pytest.mark.parametrize("free_scale", [False, True])
+def test_places_without_error_give_attitude_and_scale_back(free_scale: bool) -> None:
+    """The believed focal length one part in a hundred wrong, where it is free."""
+    points, covariance = _streaks(np.random.default_rng(1), 10)
+    reference = _reference(points)
+    scale = 1.01 if free_scale else 1.0
+    centre = np.array(_CAMERA.centre)
+    found = _fit(centre + (points - centre) / scale, covariance, reference, free_scale)
+    assert np.linalg.norm(_error(found)) < 1e-9
+    assert found.scale == pytest.approx(scale, rel=1e-9)
+    assert found.squares.max() < 1e-9
+
+
+@pytest.mark.parametrize("free_scale", [False, True])
+def test_the_errors_scatter_as_the_covariance_says_and_less_than_with_round_ones(free_scale: bool) -> None:
+    """Monte Carlo of 200 fields of 12 stars; the round errors have the same mean variance."""
+    rng = np.random.default_rng(2)
+    mismatch, mine, rounds, scales = 0.0, 0.0, 0.0, 0.0
+    for _ in range(_TRIALS):
+        points, covariance = _streaks(rng, 12)
+        reference = _reference(points)
+        noise = np.einsum("nij,nj->ni", np.linalg.cholesky(covariance), rng.standard_normal((12, 2)))
+        found = _fit(points + noise, covariance, reference, free_scale)
+        error = _error(found)
+        mismatch += float(error @ np.linalg.solve(found.fix.covariance, error))
+        if free_scale:
+            scales += (np.log(found.scale) / found.scale_sigma) ** 2
+        even = 0.5 * np.trace(covariance, axis1=1, axis2=2)[:, None, None] * np.eye(2)
+        mine += float(error @ error)
+        away = _error(_fit(points + noise, even, reference, free_scale))
+        rounds += float(away @ away)
+    assert _LOW < mismatch / (3.0 * _TRIALS) < _HIGH
+    assert mine < 0.1 * rounds
+    if free_scale:
+        assert 0.6 < scales / _TRIALS < 1.55
+
+
+def test_stars_that_scatter_beyond_their_errors_widen_the_covariance() -> None:
+    rng = np.random.default_rng(3)
+    points, covariance = _streaks(rng, 12)
+    reference = _reference(points)
+    noise = np.einsum("nij,nj->ni", np.linalg.cholesky(covariance), rng.standard_normal((12, 2)))
+    sound = _fit(points + noise, covariance, reference)
+    wider = _fit(points + noise, covariance / 25.0, reference)
+    ratio = np.trace(wider.fix.covariance) / np.trace(sound.fix.covariance)
+    assert ratio == pytest.approx(float(wider.squares.sum()) / (2 * 12 - 3) / 25.0, rel=1e-3)
+    assert ratio > 0.3
+
+
+def test_stars_that_disagree_have_no_say_and_leave_the_errors_as_the_covariance_says() -> None:
+    """Two of 14 stars lie 6 px, sixty deviations across their streaks, from where they should."""
+    rng = np.random.default_rng(4)
+    mismatch = 0.0
+    for _ in range(_TRIALS):
+        points, covariance = _streaks(rng, 14)
+        reference = _reference(points)
+        noise = np.einsum("nij,nj->ni", np.linalg.cholesky(covariance), rng.standard_normal((14, 2)))
+        _, axes = np.linalg.eigh(covariance[:2])
+        noise[:2] += 6.0 * axes[:, :, 0]
+        found = _fit(points + noise, covariance, reference)
+        assert not found.agree[:2].any()
+        error = _error(found)
+        mismatch += float(error @ np.linalg.solve(found.fix.covariance, error))
+    assert _LOW < mismatch / (3.0 * _TRIALS) < _HIGH
+
+
+def test_where_too_few_would_be_left_all_keep_their_say_and_the_covariance_tells() -> None:
+    """One of four stars is wrong, but nobody could say which."""
+    rng = np.random.default_rng(5)
+    points, covariance = rng.uniform(50.0, 970.0, (4, 2)), np.tile(0.01 * np.eye(2), (4, 1, 1))
+    reference = _reference(points)
+    sound = _fit(points, covariance, reference)
+    points[0] += 6.0
+    found = _fit(points, covariance, reference)
+    assert found.agree.all()
+    error = _error(found)
+    assert np.trace(found.fix.covariance) > 100.0 * np.trace(sound.fix.covariance)
+    assert float(error @ np.linalg.solve(found.fix.covariance, error)) < 3.0 * 3.0
+
+
+def test_stars_in_one_direction_fix_no_attitude() -> None:
+    points = np.full((3, 2), 400.0)
+    with pytest.raises(AttitudeError):
+        _fit(points, np.tile(np.eye(2), (3, 1, 1)), _reference(points))
+
+
+def test_stars_that_belong_elsewhere_are_no_attitude() -> None:
+    """Two stars a right angle apart where the image shows them together: no turn brings them there."""
+    points = np.array([[500.0, 500.0], [520.0, 500.0]])
+    reference = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
+    with pytest.raises(AttitudeError):
+        _fit(points, np.tile(1e-4 * np.eye(2), (2, 1, 1)), reference)
+
+
+def test_a_lens_that_nobody_gave_is_fitted_and_its_doubt_is_in_the_covariance() -> None:
+    """Slices of the bench `untold_lens`: axis 25 px off the middle, distortion of 2 % at the corner."""
+    squares, off = [], []
+    for number in range(12):
+        found, truth = drawn("poor", number)
+        assert found.fix is not None
+        error = to_rotation_vector(multiply(found.fix.quaternion, conjugate(truth)))
+        squares.append(error @ np.linalg.solve(found.fix.covariance, error) / 3.0)
+        off.append(np.linalg.norm(error[:2]) * found.camera.focal_length)
+    assert np.mean(squares) < 1.0
+    # A fit of the focal length alone is 0.7 px off.
+    assert np.sqrt(np.mean(np.square(off))) < 0.2
+
+
+def test_a_shutter_that_nobody_described_is_fitted_and_its_doubt_is_in_the_covariance() -> None:
+    """Monte Carlo of 200 fields of 12 stars that move by 1 px a frame's height of delay, one deviation."""
+    rng = np.random.default_rng(6)
+    known, unknown, delays = 0.0, 0.0, 0.0
+    for _ in range(_TRIALS):
+        points, covariance = rng.uniform(50.0, 970.0, (12, 2)), np.tile(1e-4 * np.eye(2), (12, 1, 1))
+        velocity = rng.normal(size=2)
+        late = velocity / np.linalg.norm(velocity) * (points[:, 1:] - _CAMERA.centre[1]) / _CAMERA.rows
+        reference, delay = _reference(points), rng.normal()
+        seen = points + delay * late + 0.01 * rng.standard_normal((12, 2))
+        found = fit_in_image(seen, covariance, reference, _CAMERA, _ATTITUDE, Unknowns(late=late))
+        error, without = _error(found), _fit(seen, covariance, reference)
+        known += float(error @ np.linalg.solve(found.fix.covariance, error))
+        error = _error(without)
+        unknown += float(error @ np.linalg.solve(without.fix.covariance, error))
+        delays += (found.delay - delay) ** 2
+    assert _LOW < known / (3.0 * _TRIALS) < _HIGH
+    assert unknown > 2.0 * known
+    assert delays / _TRIALS < 0.02**2
+
+
+def test_bright_streaks_that_err_by_as_much_as_faint_ones_claim_no_more_than_they_know() -> None:
+    """Monte Carlo of 200 fields: all err by 0.05 px, which is ten times the noise of the brightest."""
+    rng = np.random.default_rng(7)
+    known, unknown, off, without = 0.0, 0.0, 0.0, 0.0
+    for _ in range(_TRIALS):
+        points, sigma = rng.uniform(50.0, 970.0, (20, 2)), np.geomspace(0.005, 0.2, 20)
+        covariance, reference = sigma[:, None, None] ** 2 * np.eye(2), _reference(points)
+        seen = points + np.hypot(sigma, 0.05)[:, None] * rng.standard_normal((20, 2))
+        found = fit_in_image(seen, covariance, reference, _CAMERA, _ATTITUDE, Unknowns(scatter=True))
+        error, other = _error(found), _fit(seen, covariance, reference)
+        known += float(error @ np.linalg.solve(found.fix.covariance, error))
+        off += float(np.sum(error[:2] ** 2))
+        error = _error(other)
+        unknown += float(error @ np.linalg.solve(other.fix.covariance, error))
+        without += float(np.sum(error[:2] ** 2))
+    # A share of the brightest is left out before: the variance of those left is a little too small.
+    assert known / (3.0 * _TRIALS) < 2.3
+    assert unknown > 4.0 * known
+    assert off < 0.7 * without
+
+
+def test_streaks_that_err_as_their_noise_says_lose_little_by_the_question() -> None:
+    rng = np.random.default_rng(8)
+    known, ratio = 0.0, []
+    for _ in range(_TRIALS):
+        points, covariance = _streaks(rng, 20)
+        reference = _reference(points)
+        seen = points + np.einsum("nij,nj->ni", np.linalg.cholesky(covariance), rng.standard_normal((20, 2)))
+        found = fit_in_image(seen, covariance, reference, _CAMERA, _ATTITUDE, Unknowns(scatter=True))
+        error = _error(found)
+        known += float(error @ np.linalg.solve(found.fix.covariance, error))
+        claim = np.trace(_fit(seen, covariance, reference).fix.covariance)
+        ratio.append(float(np.trace(found.fix.covariance) / claim))
+    assert _LOW < known / (3.0 * _TRIALS) < _HIGH
+    assert np.median(ratio) < 1.05
+    assert np.mean(ratio) < 1.7

@@ -1,0 +1,190 @@
+"""The index: its triangles against geometry, its file against damage."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from knightcube.astro import catalogue
+from knightcube.astro.quaternion import attitude_matrix, normalise
+from knightcube.errors import InputError
+from knightcube.vision.startracker.index import build as index_build
+from knightcube.vision.startracker.index.build import IndexSettings, default_index
+from knightcube.vision.startracker.index.sky_index import PATH, load, save
+from knightcube.vision.startracker.index.triangle_index import (
+    CELLS,
+    FINE,
+    LEAST_RATIO,
+    SIZE_BITS,
+    SIZE_UNIT,
+    TIE,
+    build,
+    reach,
+)
+from tests.pace import ordinary_seconds
+
+SMALL = IndexSettings(faintest=5.0, smallest=float(np.deg2rad(8.0)), density=4.0)
+
+
+def _strewn(count: int, seed: int = 1) -> np.ndarray:
+    vectors = np.random.default_rng(seed).standard_normal((count, 3))
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+
+
+def test_the_reach_of_a_star_is_the_distance_of_its_nth_brighter_neighbour() -> None:
+    direction = _strewn(400)
+    found = reach(direction, 5, 0.9)
+    for star in range(400):
+        brighter = np.sort(np.linalg.norm(direction[:star] - direction[star], axis=-1))
+        expected = brighter[4] if star >= 5 else 0.9
+        assert np.isclose(found[star], min(expected, 0.9)), star
+
+
+def test_the_triangles_are_those_of_enumeration() -> None:
+    direction = _strewn(60)
+    sizes, ranks = np.array([0.3, 0.5, 0.9]), np.array([4, 6])
+    found = {tuple(sorted(row)) for row in build(direction, sizes, ranks, 0).corners.tolist()}
+    expected = set()
+    limits = [reach(direction, rank, top) for rank, top in zip(ranks, sizes[1:], strict=True)]
+    for a in range(60):
+        for b in range(a + 1, 60):
+            for c in range(b + 1, 60):
+                side = [np.linalg.norm(direction[p] - direction[q]) for p, q in ((a, b), (b, c), (c, a))]
+                band = np.searchsorted(sizes, max(side), side="right") - 1
+                if not 0 <= band < 2 or min(side) < LEAST_RATIO * max(side):
+                    continue
+                if max(side) <= min(limits[band][[a, b, c]]) * (1.0 + TIE):
+                    expected.add((a, b, c))
+    assert found == expected
+
+
+def test_any_circle_has_triangles_of_its_brightest_stars_beside_a_cluster_too() -> None:
+    """A hundred stars brighter than all others, in a few degrees: ranks leave their neighbours out."""
+    near = np.array([0.0, 0.0, 1.0]) + 0.05 * _strewn(100, 2)
+    direction = np.concatenate([near / np.linalg.norm(near, axis=-1, keepdims=True), _strewn(3000)])
+    sizes, ranks = np.array([0.2, 0.3, 0.5]), np.array([4, 6])
+    centre = np.array([np.sin(0.3), 0.0, np.cos(0.3)])
+    inside = np.flatnonzero(np.linalg.norm(direction - centre, axis=-1) < 0.25)
+
+    def triangles(few: int) -> int:
+        corners = build(direction, sizes, ranks, few).corners
+        return int(np.isin(corners, inside).all(axis=1).sum())
+
+    assert triangles(0) < 5
+    assert triangles(5) >= 10
+
+
+def test_a_sky_turned_has_the_same_triangles() -> None:
+    """A star's reach is itself a side, to a neighbour: rounding has no say in which triangles end there."""
+    direction = _strewn(60)
+    sizes, ranks = np.array([0.3, 0.5, 0.9]), np.array([4, 6])
+    first = np.unique(np.sort(build(direction, sizes, ranks, 0).corners, axis=1), axis=0)
+    for quaternion in normalise(np.random.default_rng(4).standard_normal((6, 4))):
+        turned = direction @ attitude_matrix(quaternion).T
+        found = np.unique(np.sort(build(turned, sizes, ranks, 0).corners, axis=1), axis=0)
+        np.testing.assert_array_equal(found, first)
+
+
+def test_a_key_tells_the_shape_and_the_size_of_its_triangle() -> None:
+    sky = default_index()
+    some = np.random.default_rng(3).integers(0, len(sky.triangles), 500)
+    corners = sky.stars.direction[sky.triangles.corners[some].astype(int)]
+    sides = np.linalg.norm(corners[:, [1, 2, 0]] - corners[:, [2, 0, 1]], axis=-1)
+    assert np.all(np.diff(sides, axis=1) >= 0.0)
+    key = sky.triangles.key[some].astype(np.int64)
+    form = key >> SIZE_BITS
+    cells = np.stack([form // CELLS % CELLS, form % CELLS], axis=-1)
+    ratio = (cells + (sky.triangles.shape[some] + 0.5) / FINE) / CELLS
+    assert np.allclose(ratio, sides[:, :2] / sides[:, 2:], atol=1.0 / (CELLS * FINE))
+    assert np.allclose((key & ((1 << SIZE_BITS) - 1)) * SIZE_UNIT, sides[:, 2], atol=2.0 * SIZE_UNIT)
+    left = np.linalg.det(corners) > 0.0
+    assert np.array_equal(form // CELLS**2 == 1, left)
+    assert np.all(np.diff(sky.triangles.key.astype(np.int64)) >= 0)
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("sky") / "sky.index"
+    save(index_build.build(SMALL), path)
+    return path
+
+
+def test_a_file_gives_back_what_was_saved_and_the_same_stars_make_the_same_bytes(
+    stored: Path, tmp_path: Path
+) -> None:
+    again = tmp_path / "again.index"
+    sky = index_build.build(SMALL)
+    save(sky, again)
+    assert again.read_bytes() == stored.read_bytes()
+    back = load(stored)
+    assert np.array_equal(back.triangles.key, sky.triangles.key)
+    assert np.array_equal(back.triangles.corners, sky.triangles.corners)
+    assert np.abs(back.stars.direction - sky.stars.direction).max() < 1e-7
+    assert np.abs(back.stars.magnitude - sky.stars.magnitude).max() < 1e-3
+
+
+@pytest.mark.parametrize("place", [12, 200, -1])
+def test_a_flipped_bit_is_told_with_its_cure(stored: Path, tmp_path: Path, place: int) -> None:
+    damaged = bytearray(stored.read_bytes())
+    damaged[place] ^= 1
+    path = tmp_path / "damaged.index"
+    path.write_bytes(damaged)
+    with pytest.raises(InputError, match=r"damaged.*startracker\.index\.build"):
+        load(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"", "cannot|no sky index"),
+        (b"nonsense" * 20, "no sky index"),
+        (b"KCSKYIDX" + b"\x63" * 40, "version"),
+    ],
+    ids=["empty", "another-file", "another-version"],
+)
+def test_another_file_is_told_with_its_cure(tmp_path: Path, content: bytes, said: str) -> None:
+    path = tmp_path / "other.index"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=said):
+        load(path)
+    with pytest.raises(InputError, match="no sky index can be read"):
+        load(tmp_path / "missing.index")
+
+
+def test_a_truncated_file_is_refused(stored: Path, tmp_path: Path) -> None:
+    path = tmp_path / "short.index"
+    path.write_bytes(stored.read_bytes()[:-100])
+    with pytest.raises(InputError, match="damaged"):
+        load(path)
+
+
+def test_loading_the_whole_index_takes_less_than_50_ms() -> None:
+    default_index()
+    assert ordinary_seconds(lambda: load(PATH)) < 0.05
+
+
+def test_the_stars_move_to_another_epoch_by_their_proper_motion() -> None:
+    """Groombridge 1830, HIP 57939: 7.06 arcsec a year."""
+    sky = default_index()
+    (star,) = np.flatnonzero(sky.stars.hip == 57939)
+    later = sky.at(sky.stars.epoch + 10.0).stars.direction[star]
+    moved = np.rad2deg(np.linalg.norm(later - sky.stars.direction[star])) * 3600.0
+    assert abs(moved - 70.6) < 0.3
+    truth = catalogue.load()
+    (source,) = np.flatnonzero(truth.hip == 57939)
+    assert np.linalg.norm(truth.directions_at(sky.stars.epoch + 10.0)[source] - later) < 1e-6
+    with pytest.raises(ValueError, match="epoch"):
+        sky.at(float("nan"))
+
+
+def test_the_command_writes_an_index_and_says_what_it_holds(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "folder" / "small.index"
+    assert index_build.main(["--output", str(path), "--faintest", "4.5"]) == 0
+    assert "triangles" in capsys.readouterr().out
+    assert len(load(path).stars) > 500
+    assert index_build.main(["--output", "/proc/nowhere/x.index", "--faintest", "4.0"]) == 2
+    assert "cannot be written" in capsys.readouterr().err

@@ -1,0 +1,177 @@
+"""From a frame to an attitude: points, streaks, a prior, and frames that show nothing to be told by."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import (
+    angle_between,
+    conjugate,
+    from_rotation_vector,
+    multiply,
+    to_rotation_vector,
+)
+from knightcube.vision.camera.images import read_image
+from knightcube.vision.camera.pinhole import Pinhole
+from knightcube.vision.frame_job import solve_frame
+from knightcube.vision.startracker.detection import FrameKind
+from knightcube.vision.startracker.solution import FrameSolution, SolveStatus
+from knightcube.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings, solve_places
+from tests.knightcube.vision.startracker.frames import NARROW, SkyFrame, sky, sky_frame
+from tests.studies.attitude_errors import attitude_error
+from tests.studies.bench.sky import ARCSECONDS, photograph
+
+_KNOWN_TO_A_PERCENT = 0.99, 1.01
+_PHOTOGRAPHS = Path(__file__).parents[5] / "shared" / "data" / "sky"
+_CHI_SQUARE_3_DOF_1E_5 = 25.9
+
+
+def _solve(
+    frame: SkyFrame, prior: AttitudePrior | None = None, scale: tuple[float, float] = (1.0, 1.0)
+) -> FrameSolution:
+    rate = RatePrior(frame.rate, 1e-6)
+    # The simulated lens is perfect but for its focal length.
+    camera, settings = NARROW.pinhole, SolveSettings(untold_lens=False)
+    return solve_frame(frame.pixels, camera, scale, frame.exposure, sky(), settings, prior, rate)
+
+
+def _mismatch(found: FrameSolution, truth: FloatArray) -> float:
+    """Return the squared error of the attitude over its covariance."""
+    assert found.fix is not None
+    error = to_rotation_vector(multiply(found.fix.quaternion, conjugate(truth)))
+    return float(error @ np.linalg.solve(found.fix.covariance, error))
+
+
+@pytest.mark.parametrize("streak_px", [0.0, 40.0])
+def test_a_frame_is_solved_lost_in_space_within_its_own_covariance(streak_px: float) -> None:
+    frame = sky_frame(np.random.default_rng(11), streak_px, 0.1)
+    found = _solve(frame, scale=_KNOWN_TO_A_PERCENT)
+    assert found.status is SolveStatus.SOLVED
+    assert not found.tracked
+    assert _mismatch(found, frame.attitude) < _CHI_SQUARE_3_DOF_1E_5
+    _, across = attitude_error(found.fix.quaternion, frame.attitude)  # type: ignore[union-attr]  # solved
+    assert across * ARCSECONDS < (1.0 if streak_px == 0.0 else 8.0)
+    assert found.camera.focal_length == pytest.approx(NARROW.pinhole.focal_length, rel=1e-4)
+
+
+def test_a_calibrated_lens_is_kept_lost_in_space() -> None:
+    """The triangle that names the stars tells a scale of its own, up to a part in a thousand off."""
+    for seed in range(3):
+        found = _solve(sky_frame(np.random.default_rng([31, seed]), 40.0, 0.1))
+        assert found.status is SolveStatus.SOLVED
+        assert found.camera.focal_length == NARROW.pinhole.focal_length
+
+
+def test_a_streaked_frame_tells_the_rate_and_a_frame_at_rest_does_not() -> None:
+    streaked = sky_frame(np.random.default_rng(12), 40.0, 0.1)
+    motion = _solve(streaked).motion
+    assert motion is not None
+    assert motion.rate is not None
+    assert np.linalg.norm(motion.rate) == pytest.approx(np.linalg.norm(streaked.rate), rel=0.02)
+    assert _solve(sky_frame(np.random.default_rng(12), 0.0, 0.1)).motion is None
+
+
+def test_the_attitudes_of_many_frames_scatter_as_their_covariances_say() -> None:
+    """Twelve frames of three degrees of freedom: chi-square between its quantiles at 1e-4."""
+    frames = [sky_frame(np.random.default_rng([13, number]), 0.0, 0.1) for number in range(12)]
+    total = sum(_mismatch(_solve(frame, scale=_KNOWN_TO_A_PERCENT), frame.attitude) for frame in frames)
+    assert 11.9 < total < 76.4
+
+
+@pytest.mark.parametrize("streak_px", [0.0, 30.0])
+def test_a_right_prior_is_tracked_to_the_same_attitude(streak_px: float) -> None:
+    frame = sky_frame(np.random.default_rng(14), streak_px, 0.1)
+    off = multiply(from_rotation_vector(np.array([2e-4, -3e-4, 1e-4])), frame.attitude)
+    found = _solve(frame, AttitudePrior(off, 3e-4))
+    assert found.tracked
+    assert _mismatch(found, frame.attitude) < _CHI_SQUARE_3_DOF_1E_5
+
+
+def test_a_wrong_prior_costs_time_but_no_truth() -> None:
+    frame = sky_frame(np.random.default_rng(15), 0.0, 0.1)
+    elsewhere = multiply(from_rotation_vector(np.array([0.5, 0.0, 0.0])), frame.attitude)
+    found = _solve(frame, AttitudePrior(elsewhere, 3e-4))
+    assert found.status is SolveStatus.SOLVED
+    assert not found.tracked
+    assert _mismatch(found, frame.attitude) < _CHI_SQUARE_3_DOF_1E_5
+
+
+def test_an_attitude_far_from_its_prior_is_not_taken_for_the_one_there() -> None:
+    """The brightest place is 1.2 px off, by a star beside it: four agree on a roll of 30 prior sigmas."""
+    camera, sigma = Pinhole.from_field_of_view(512, 512, float(np.radians(20.0))), 1e-4
+    prior = np.array([-0.40584763582055994, 0.7184116261147981, 0.029066639845090374, 0.5642052484779536])
+    x = np.array([277.82, 104.81, 59.83, 6.82, 172.6, 204.45, 18.86, 173.75, 340.37, 466.16, 119.75])
+    y = np.array([202.35, 419.96, 312.28, 245.56, 504.17, 115.91, 357.28, 459.79, 357.14, 498.42, 53.05])
+    error = np.array([0.027, 0.044, 0.055, 0.065, 0.11, 0.12, 0.13, 0.16, 0.2, 0.24, 0.29])
+    found = solve_places(
+        np.stack([x, y], axis=1),
+        error[:, None, None] ** 2 * np.eye(2),
+        FrameKind.STREAKS,
+        camera,
+        (1.0, 1.0),
+        sky(),
+        SolveSettings(),
+        AttitudePrior(prior, sigma),
+    )
+    assert found.fix is None or angle_between(found.fix.quaternion, prior) < 6.0 * sigma
+
+
+def test_noise_alone_shows_no_star() -> None:
+    pixels = np.random.default_rng(16).normal(100.0, 10.0, (512, 512)).round().astype(np.uint16)
+    found = solve_frame(pixels, NARROW.pinhole, (1.0, 1.0), 0.1, sky(), SolveSettings())
+    assert found.status in {SolveStatus.NO_STARS, SolveStatus.TOO_FEW_STARS}
+    assert found.fix is None
+    assert found.reason
+
+
+def test_points_that_are_no_stars_are_refused_with_the_reason() -> None:
+    """A real frame's points, moved about at random: the same light, another sky."""
+    rng = np.random.default_rng(17)
+    pixels = rng.normal(100.0, 10.0, (1024, 1024))
+    rows, columns = np.mgrid[-4:5, -4:5]
+    spot = np.exp(-0.5 * (rows**2 + columns**2))
+    for row, column in rng.integers(10, 1010, (40, 2)):
+        pixels[row - 4 : row + 5, column - 4 : column + 5] += rng.uniform(100.0, 2000.0) * spot
+    found = solve_frame(
+        pixels.round().astype(np.uint16), NARROW.pinhole, (0.5, 2.0), 0.1, sky(), SolveSettings()
+    )
+    assert found.status is SolveStatus.NO_MATCH
+    assert "beyond chance" in found.reason
+
+
+@pytest.mark.skipif(not _PHOTOGRAPHS.is_dir(), reason="the photographs of ../shared/data/sky are not here")
+@pytest.mark.parametrize(
+    "name",
+    ["esa_alt40_azi45.tiff", "hale_bopp.jpg", "tree.jpg", "virgo.jpg", "polar_05sec.jpg",
+     "may8_50ms_gain40_0.png", "may8_100ms_gain12_3.png"],
+)  # fmt: skip
+def test_a_photograph_is_solved_to_a_minute_of_arc(name: str) -> None:
+    truth = json.loads((_PHOTOGRAPHS / "truth.json").read_text())[name]
+    result = photograph(_PHOTOGRAPHS, name, truth, known=True)
+    assert result.solved
+    assert result.arcsec < 60.0
+
+
+@pytest.mark.skipif(not _PHOTOGRAPHS.is_dir(), reason="the photographs of ../shared/data/sky are not here")
+def test_a_mirrored_photograph_is_solved_and_said_to_be_mirrored() -> None:
+    """The attitude is that of the picture as it should be; the places are those of the picture as it came."""
+    upright = read_image(_PHOTOGRAPHS / "esa_alt40_azi45.tiff")
+    camera = type(NARROW.pinhole)(upright.shape[1], upright.shape[0], 5110.0)
+    good, mirrored = (
+        solve_frame(np.ascontiguousarray(pixels), camera, (0.9, 1.1), 1.0, sky(), SolveSettings())
+        for pixels in (upright, upright[:, ::-1])
+    )
+    assert good.fix is not None
+    assert mirrored.fix is not None
+    assert (good.mirrored, mirrored.mirrored) == (False, True)
+    assert angle_between(good.fix.quaternion, mirrored.fix.quaternion) < 1e-4
+    matched = mirrored.matched
+    assert np.abs(mirrored.points[matched] - mirrored.expected[matched]).max() < 5.0
+    first = np.flatnonzero(good.star == mirrored.star[matched[0]])[0]
+    across = upright.shape[1] - 1.0 - good.points[first, 0]
+    assert mirrored.points[matched[0], 0] == pytest.approx(across, abs=0.5)

@@ -1,0 +1,159 @@
+"""The vision worker's job: whatever a frame shows, one answer of rate and attitude, none of them false."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from knightcube.astro.arrays import FloatArray
+from knightcube.astro.quaternion import angle_between, from_rotation_vector, multiply
+from knightcube.errors import InputError
+from knightcube.vision.frame_job import FrameFound, FrameJob, TrackerSettings, run
+from knightcube.vision.startracker.catalogue_refit import refit_with_catalogue
+from knightcube.vision.startracker.solution import FrameSolution, SolveStatus
+from knightcube.vision.startracker.solve import AttitudePrior, RatePrior, SolveSettings, solve_motion
+from knightcube.vision.streaks.corners.settings import StreakSettings
+from knightcube.vision.streaks.maximum_likelihood.result import MotionResult
+from knightcube.vision.streaks.maximum_likelihood.settings import LikelihoodSettings
+from knightcube.vision.streaks.streak_result import StreakResult, StreakStatus
+from tests.flight.loop.executive.passing import passed
+from tests.knightcube.vision.startracker.frames import NARROW, SkyFrame, sky, sky_frame
+
+_TRACKER = TrackerSettings(SolveSettings(), (1.0, 1.0))
+_ESTIMATORS = [LikelihoodSettings(saturation=65_535), StreakSettings()]
+# rad, whole angle: the turn about the boresight, ten times the worst, within a pixel at the frame's corner.
+_RIGHT = 1.0 / NARROW.pinhole.half_diagonal / NARROW.pinhole.focal_length
+
+
+@cache
+def _frame(streak_px: float) -> SkyFrame:
+    return sky_frame(np.random.default_rng(41), streak_px, 0.5)
+
+
+def _job(frame: SkyFrame, estimator: StreakSettings | LikelihoodSettings) -> FrameJob:
+    rate = RatePrior(frame.rate, 1e-5)
+    return FrameJob(frame.pixels, NARROW.pinhole, frame.exposure, estimator, _TRACKER, rate, None, None)
+
+
+def _prior(frame: SkyFrame) -> AttitudePrior:
+    return AttitudePrior(multiply(from_rotation_vector(np.array([2e-4, -1e-4, 1e-4])), frame.attitude), 3e-4)
+
+
+def _assert_right(solution: FrameSolution | None, truth: FloatArray) -> None:
+    assert solution is not None
+    assert solution.status is SolveStatus.SOLVED
+    assert solution.fix is not None
+    assert angle_between(solution.fix.quaternion, truth) < _RIGHT
+
+
+@pytest.mark.parametrize("estimator", _ESTIMATORS, ids=["likelihood", "harris"])
+@pytest.mark.parametrize("streak_px", [0.0, 40.0], ids=["at rest", "streaks"])
+@pytest.mark.parametrize("known", [False, True], ids=["lost", "prior"])
+def test_every_way_through_gives_the_right_attitude_and_says_whether_it_was_lost(
+    estimator: StreakSettings | LikelihoodSettings, streak_px: float, known: bool
+) -> None:
+    frame = _frame(streak_px)
+    found = run(replace(_job(frame, estimator), attitude_prior=_prior(frame) if known else None))
+    _assert_right(found.solution, frame.attitude)
+    assert found.solution is not None
+    assert found.solution.tracked is known
+    if streak_px:
+        assert found.motion.status is StreakStatus.RATE
+        assert found.motion.rate == pytest.approx(frame.rate, abs=0.05 * float(np.linalg.norm(frame.rate)))
+    else:
+        assert found.motion.status is StreakStatus.TOO_SHORT
+        assert found.motion.rate is None
+
+
+@pytest.mark.parametrize("estimator", _ESTIMATORS, ids=["likelihood", "harris"])
+def test_a_streaked_frame_without_a_known_rate_is_solved_all_the_same(
+    estimator: StreakSettings | LikelihoodSettings,
+) -> None:
+    """The direction of time is in doubt, the middle of the exposure is not."""
+    frame = _frame(40.0)
+    found = run(replace(_job(frame, estimator), rate_prior=None))
+    assert found.motion.status is StreakStatus.AMBIGUOUS
+    _assert_right(found.solution, frame.attitude)
+
+
+def test_a_wrong_prior_is_not_believed() -> None:
+    frame = _frame(0.0)
+    elsewhere = AttitudePrior(multiply(from_rotation_vector(np.array([0.3, 0.0, 0.0])), frame.attitude), 1e-3)
+    found = run(replace(_job(frame, LikelihoodSettings()), attitude_prior=elsewhere))
+    _assert_right(found.solution, frame.attitude)
+    assert found.solution is not None
+    assert not found.solution.tracked
+
+
+@pytest.mark.parametrize("estimator", _ESTIMATORS, ids=["likelihood", "harris"])
+@pytest.mark.parametrize(
+    ("level", "status"), [(0, StreakStatus.BLACK), (65_535, StreakStatus.SATURATED)], ids=["black", "white"]
+)
+def test_a_frame_that_shows_nothing_gives_neither(
+    estimator: StreakSettings | LikelihoodSettings, level: int, status: StreakStatus
+) -> None:
+    job = _job(_frame(0.0), estimator)
+    found = run(replace(job, pixels=np.full_like(job.pixels, level)))
+    assert found == FrameFound(found.motion, None)
+    assert found.motion.status is status
+
+
+@pytest.mark.parametrize("estimator", _ESTIMATORS, ids=["likelihood", "harris"])
+def test_the_same_pixels_again_are_a_frozen_camera_and_no_second_attitude(
+    estimator: StreakSettings | LikelihoodSettings,
+) -> None:
+    job = _job(_frame(0.0), estimator)
+    again = run(replace(job, previous_checksum=run(replace(job, tracker=None)).motion.checksum))
+    assert again.motion.status is StreakStatus.FROZEN
+    assert again.solution is None
+
+
+@pytest.mark.parametrize("estimator", _ESTIMATORS, ids=["likelihood", "harris"])
+def test_without_a_tracker_there_is_the_same_motion_and_no_attitude(
+    estimator: StreakSettings | LikelihoodSettings,
+) -> None:
+    frame = _frame(40.0)
+    found = run(replace(_job(frame, estimator), tracker=None))
+    assert found.solution is None
+    kind = MotionResult if isinstance(estimator, LikelihoodSettings) else StreakResult
+    assert isinstance(found.motion, kind)
+    assert found.motion.rate == pytest.approx(frame.rate, abs=0.05 * float(np.linalg.norm(frame.rate)))
+
+
+def test_the_stars_of_a_solved_frame_of_streaks_serve_a_second_fit() -> None:
+    job = _job(_frame(40.0), LikelihoodSettings(saturation=65_535))
+    first, found = run(replace(job, tracker=None)).motion, run(job)
+    assert isinstance(first, MotionResult)
+    assert isinstance(job.estimator, LikelihoodSettings)
+    solved = solve_motion(first, job.camera, _TRACKER.scale, sky(), _TRACKER.solve)
+    better = refit_with_catalogue(job.pixels, solved, sky(), _TRACKER.solve, job.estimator)
+    assert better.motion is not None
+    assert found.solution is not None
+    assert found.motion is found.solution.motion
+    assert found.motion.status is first.status
+    assert found.motion.rate is not None
+    assert better.motion.rate is not None
+    assert first.rate is not None
+    assert np.array_equal(found.motion.rate, better.motion.rate)
+    assert not np.array_equal(found.motion.rate, first.rate)
+    assert found.solution.fix is not None
+    assert better.fix is not None
+    assert np.array_equal(found.solution.fix.quaternion, better.fix.quaternion)
+
+
+def test_a_job_and_what_it_found_pass_between_processes() -> None:
+    job = pickle.loads(pickle.dumps(_job(_frame(0.0), LikelihoodSettings())))
+    found = passed(run(job))
+    _assert_right(found.solution, _frame(0.0).attitude)
+
+
+def test_an_index_that_is_missing_is_told_with_its_cure(tmp_path: Path) -> None:
+    job = _job(_frame(0.0), LikelihoodSettings())
+    tracker = replace(_TRACKER, index=tmp_path / "sky.index")
+    with pytest.raises(InputError, match=r"startracker\.index\.build"):
+        run(replace(job, tracker=tracker))
