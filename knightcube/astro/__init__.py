@@ -1,1 +1,1 @@
-"""Quaternions, directions, frames and array types."""
+"""Quaternions, directions and array types; attitude from directions, the Earth, and the star catalogue."""

@@ -1,1 +1,1 @@
-"""Estimation, guidance, control, and the tracking of objects."""
+"""Attitude, estimation, guidance, control, and the tracking of objects."""

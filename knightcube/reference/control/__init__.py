@@ -1,1 +1,1 @@
-"""Controllers of one axis to compare with the tracker: PID and adaptive."""
+"""Control about one axis: PID and adaptive control (Sease 2013, chapter 5)."""

@@ -1,1 +1,1 @@
-"""The nadir methods of Meller et al. that fit a circle."""
+"""Nadir by the circular horizon and by the Graphic Method (Meller et al., chapter 3)."""

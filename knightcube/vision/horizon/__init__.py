@@ -6,5 +6,5 @@
 `hypothesis`, fitted (`limb_equation`, `limb_fit`, `profile_fit`) and tested against prior knowledge
 (`azimuth`, `illumination`). `several_cameras` fits one limb to the pictures of all, `cameras` says which to
 read first, `filled_camera` gives a coarse nadir where no limb is in view. The paper's own:
-`binary_edges`, `circle`, `graphic_method`, `vector_method`.
+`binary_edges`, `vector_method`, and those of `knightcube.reference.horizon`.
 """

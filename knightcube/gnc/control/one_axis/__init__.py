@@ -1,1 +1,1 @@
-"""Control about one axis: LQ tracker, PID, adaptive control (Sease 2013, chapter 5)."""
+"""Control about one axis: the LQ tracker, and manoeuvres that excite the plant (Sease 2013, chapter 5)."""

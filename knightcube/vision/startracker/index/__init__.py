@@ -1,1 +1,1 @@
-"""The sky index: guide stars, their pairs and triangles, in memory-mapped files."""
+"""The sky index: guide stars and their triangles, in memory-mapped files."""
