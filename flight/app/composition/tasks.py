@@ -112,7 +112,7 @@ def _tasks(
     )
     watched = Watched(navigation, body.planner, imaging, devices.coils, devices.power, opened.log_error)
     commanded = bool(opened.channels or timeline)
-    parameters = Parameters(config, Adopters(modes.adopt, health.adopt), keeper, services)
+    parameters = Parameters(config, Adopters((modes.adopt, drive.adopt), health.adopt), keeper, services)
     obeying = Obeying(modes, drive, parameters)
     commanding = Commanding(obeying, timeline, opened.channels, services) if commanded else None
     positioning = _positioning(config, devices, body, services)

@@ -301,4 +301,5 @@ def _coil_watch(config: OrbitConfig) -> CoilWatch:
         settle_ns=settle_ns,
     )
     slow = replace(response, bin_samples=80, bins=20, model_error=3.0e-5)
-    return CoilWatch(CoilWatchSettings((x, y, z), response=response, slow=slow))
+    tumble = config.modes.tumble_rate
+    return CoilWatch(CoilWatchSettings((x, y, z), response=response, slow=slow, tumble_rate=tumble))

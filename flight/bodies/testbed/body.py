@@ -166,7 +166,8 @@ def coil_watch(config: TestbedConfig, plant: SingleAxisPlant) -> CoilWatch:
         config.inertial_unit.rate_noise,
         free=(False, True, False),
     )
-    return CoilWatch(CoilWatchSettings((x, y, z), response=response))
+    tumble = config.modes.tumble_rate
+    return CoilWatch(CoilWatchSettings((x, y, z), response=response, tumble_rate=tumble))
 
 
 def planning_settings(config: TestbedConfig) -> PlanningSettings:

@@ -16,9 +16,10 @@ from flight.loop.fdir import facts
 from flight.loop.fdir.coils.stuck_leg import NONE, Axes
 from flight.loop.fdir.coils.watch import CoilVerdict, CoilWatch
 from flight.loop.services import Services
+from flight.schema.sections import Modes
 from hal.interfaces.devices import PowerMonitor, TorqueCoils
 from hal.interfaces.readings import CoilState, ImuReading
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import BoolArray, FloatArray
 from knightcube.gnc.control.allocation import allocate
 
 _BROKEN = (facts.COIL_X_BROKEN, facts.COIL_Y_BROKEN, facts.COIL_Z_BROKEN)
@@ -81,7 +82,7 @@ class CoilDrive:
     @property
     def suspects(self) -> bool:
         """Whether a coil may carry another current than its command, no verdict being given yet."""
-        return bool(self._watch.suspicion)
+        return self._watch.doubts_currents
 
     def look(
         self, in_force: CoilState, readings: Sequence[ImuReading], now_ns: int, *, known: bool = True
@@ -108,6 +109,10 @@ class CoilDrive:
         self._facts.update(facts.COIL_SUSPECT, bool(watch.suspicion), now_ns, watch.suspicion)
         self._facts.update(facts.POWER_DOUBTED, bool(watch.monitor_doubted), now_ns, watch.monitor_doubted)
 
+    def adopt(self, modes: Modes) -> None:
+        """Go on with other bounds of the modes."""
+        self._watch.tumble_rate = modes.tumble_rate
+
     def isolate(self) -> None:
         """Exclude the axes that have a verdict: the reaction to `coil-broken`."""
         self.available = self._watch.available
@@ -122,8 +127,9 @@ class CoilDrive:
 
     def send(self, currents: FloatArray, field: Callable[[], FloatArray | None]) -> None:
         """Command currents (3,) A; `field` returns the field (3,) T in body axes, for a reallocation."""
-        if not all(self.available.tolist()) and currents.any():
-            currents = self._reallocated(currents, field())
+        usable = self.available & ~self._watch.resting
+        if not all(usable.tolist()) and currents.any():
+            currents = self._reallocated(currents, field(), usable)
         self.command = np.zeros(3) if self._watch.at_rest else currents + self._watch.probe
         self._coils.command(self.command)
 
@@ -138,14 +144,15 @@ class CoilDrive:
             self._coils.brake(axes)
             self._braked = axes
 
-    def _reallocated(self, currents: FloatArray, field: FloatArray | None) -> FloatArray:
-        """Return currents of the available axes that make the torque of `currents`."""
+    def _reallocated(self, currents: FloatArray, field: FloatArray | None, usable: BoolArray) -> FloatArray:
+        """Return currents of the `usable` axes (3,) that make the torque of `currents`."""
         if field is None:
-            return np.where(self.available, currents, 0.0)
+            return np.where(usable, currents, 0.0)
         dipole, limits = self._settings.dipole_per_ampere, self._settings.limits
         torque = np.cross(dipole * currents, field)
-        usable = self.available.astype(float)
-        return allocate(torque, field, dipole, limits, usable, self._settings.free_axis).currents
+        return allocate(
+            torque, field, dipole, limits, usable.astype(float), self._settings.free_axis
+        ).currents
 
     def _state(self, verdict: CoilVerdict, now_ns: int) -> None:
         self._facts.update(_BROKEN[verdict.axis], True, now_ns, verdict.text)

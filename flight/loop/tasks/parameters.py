@@ -6,7 +6,7 @@ within `PROVEN_NS` of a load, the next boot flies the table before (`flight.loop
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -30,7 +30,7 @@ PROVEN_NS = 60_000_000_000
 class Adopters:
     """Who goes on with other bounds of the modes and of health."""
 
-    modes: Callable[[Modes], None]
+    modes: Sequence[Callable[[Modes], None]]
     health: Callable[[Health], None]
 
 
@@ -109,7 +109,8 @@ class Parameters:
         except msgspec.ValidationError as error:
             return str(error)
         self._values = values
-        self._adopters.modes(modes)
+        for adopt in self._adopters.modes:
+            adopt(modes)
         self._adopters.health(health)
         return ""
 

@@ -42,7 +42,7 @@ class Answering:
         recorder = Recorder(Sink(), Sink())
         events = EventLog(recorder.event)
         services = Services(None, None, recorder, events, Facts(events), Streams(()))  # type: ignore[arg-type]  # no clock, no jobs
-        adopters = Adopters(self.modes.append, self.health.append)
+        adopters = Adopters((self.modes.append,), self.health.append)
         self.task = Parameters(demo_config(4.0), adopters, None, services)
         self.task.begin(0)
         self._recorder = recorder

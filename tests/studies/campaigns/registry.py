@@ -41,6 +41,7 @@ from tests.studies.campaigns.start import START
 from tests.studies.campaigns.step_robust import STEP_ROBUST
 from tests.studies.campaigns.streaked import STREAKED
 from tests.studies.campaigns.streaks import STREAKS, STREAKS_THESIS
+from tests.studies.campaigns.unlike_inertia import UNLIKE_INERTIA
 from tests.studies.campaigns.worlds import WORLD_COMPARISON
 
 CAMPAIGNS: dict[str, Campaign] = {
@@ -75,6 +76,7 @@ CAMPAIGNS: dict[str, Campaign] = {
         INSTALLER_KILL,
         PROCESS_KILL,
         COIL_FAULTS,
+        UNLIKE_INERTIA,
         SOAK,
         START,
         COVERAGE,

@@ -4,8 +4,13 @@ Rate and commanded rate change (the integral of J^-1 (m x B)) are averaged over 
 neighbouring bins are accelerations. Least squares over the last bins estimates each coil's gain, with a
 constant disturbance, a torsion and a damping of each free axis. Gain 1 is healthy, 0 is without torque, -1 is
 reversed. When the commands vary too little, the gain's standard deviation is large and no axis is judged.
-Of a free body the gyroscopic acceleration is taken off. Where the coils' field at the magnetometer is as
-large as the Earth's, the field of their last pause is turned with the body.
+A gain beyond `LARGEST_GAIN` is physically impossible: the model is wrong then, and no axis is judged.
+
+The gyroscopic acceleration of a free body exceeds the coils' hundredfold in a tumble, so that an inertia 2 %
+wrong makes healthy coils look reversed. The fit therefore subtracts the acceleration that the believed
+inertia makes, and estimates the error that remains by nuisance parameters
+(`knightcube.gnc.estimation.gyroscopic`). Where the coils' field at the magnetometer is as large as the
+Earth's, the field measured in their last pause is rotated with the body.
 
 The residual accelerations, with all coils assumed healthy, are kept longer: whether they changed when the
 supply current did distinguishes a broken coil from a wrong monitor (`observed_share`).
@@ -15,12 +20,18 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.directions import cross_matrices
+from knightcube.gnc.estimation.gyroscopic import (
+    BodyErrors,
+    coefficient_modes,
+    gyroscopic_coefficients,
+    rate_products,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +47,7 @@ class ResponseSettings:
         bins: differences of bins in the fit.
         model_error: rad/s^2 of a bin, by the delay between command and current, and its uncertainty.
         torsion, damping: 1/s^2 and 1/s, prior standard deviations about each free axis (thread or drag).
+        errors: largest errors of the inertia and of the gyro, of a body free about three axes.
         sure: standard deviation below which a gain is used.
         persistence: fits in a row that must agree.
         lowest_sound, highest_feeble, highest_reversed: bounds of the gain of a healthy coil, of one without
@@ -54,6 +66,7 @@ class ResponseSettings:
     model_error: float = 8.0e-4
     torsion: float = 0.03
     damping: float = 5.0e-3
+    errors: BodyErrors = field(default_factory=BodyErrors)
     sure: float = 0.25
     persistence: int = 4
     lowest_sound: float = 0.6
@@ -68,6 +81,8 @@ _REACH_NS = 3_000_000_000
 """For how long commands are kept: after a stall of the loop, samples arrive late and in a burst."""
 _LEAST_CHANGE = 4.0e-3
 """rad/s^2: smaller changes cannot be detected."""
+LARGEST_GAIN = 1.5
+"""Largest gain, of either sign, that a coil and the described body can have."""
 _GAIN_PRIOR = 10.0
 _FELT, _SIGMAS = 0.7, 2.5
 """A coil without torque has a gain that is lower than this by so many deviations."""
@@ -78,6 +93,7 @@ class CoilResponse:
 
     Attributes:
         gain, sigma: (3,) newest fit; sigma is infinite before the first.
+        fastest: largest body rate within the newest fit, rad/s.
     """
 
     def __init__(self, settings: ResponseSettings) -> None:
@@ -86,10 +102,17 @@ class CoilResponse:
         self._free = np.flatnonzero(settings.free)
         self._mask: FloatArray = np.array(settings.free, dtype=float)[:, None]
         count = len(self._free)
-        # Each free axis has its own torsion and damping: parameters 3 .. 3 + f, 3 + f .. 3 + 2 f.
+        # The gyroscopic acceleration (3, 6) per rate product, and the changes (k, 3, 6) that its errors make.
+        self._gyroscopic: FloatArray = np.zeros((3, 6))
+        self._modes: FloatArray = np.zeros((0, 3, 6))
+        if count == 3:
+            self._gyroscopic = gyroscopic_coefficients(settings.inertia)
+            self._modes = coefficient_modes(settings.inertia, settings.errors)
+        # Parameters: three gains, a torsion and a damping of each free axis, and a weight of each mode.
         spreads = [_GAIN_PRIOR] * 3 + [settings.torsion] * count + [settings.damping] * count
+        spreads += [1.0] * len(self._modes)
         self._prior: FloatArray = np.diag(1.0 / np.array(spreads) ** 2)
-        self._expected: FloatArray = self._prior @ np.array([1.0] * 3 + [0.0] * (2 * count))
+        self._expected: FloatArray = self._prior[:, :3].sum(axis=1)
         self._commands: deque[tuple[int, tuple[float, ...]]] = deque([(0, (0.0, 0.0, 0.0))])
         self._known_ns = 0
         self._last_ns = 0
@@ -102,14 +125,19 @@ class CoilResponse:
         self._asked: FloatArray = np.zeros((3, 3))
         # Time and time since the sample before, s; rate and field (3,); currents (3,).
         self._samples: list[tuple[int, float, FloatArray, FloatArray, tuple[float, ...]]] = []
-        self._previous: tuple[float, FloatArray, FloatArray] | None = None
+        self._previous: tuple[float, FloatArray, FloatArray, FloatArray] | None = None
         self._turned: FloatArray = np.zeros(3)
-        self._spun: FloatArray = np.zeros(3)  # rad/s, the integral of the gyroscopic acceleration
+        self._spun: FloatArray = np.zeros(6)  # rad^2/s, the integrals of the rate products
         self._quiet_field: FloatArray | None = None
-        # Of each free axis (f, 6): accelerations by the coils (3), observed, mean rate and angle of the bin.
+        # Of each free axis (f, 6 + k): accelerations by the coils (3), observed, mean rate and angle of the
+        # bin, accelerations by the k modes.
         self._rows: deque[FloatArray] = deque(maxlen=self._settings.bins)
-        # Time; commanded accelerations of each coil and those per ampere (3, 3); residual (3,).
-        self._remainders: deque[tuple[int, FloatArray, FloatArray, FloatArray]] = deque()
+        self._speeds: deque[float] = deque(maxlen=self._settings.bins)
+        self.fastest = 0.0
+        self._weights: FloatArray = np.zeros(len(self._modes))  # of the modes, in the newest fit
+        # Time; commanded accelerations of each coil and those per ampere (3, 3); residual (3,); the modes'
+        # accelerations (3, k).
+        self._remainders: deque[tuple[int, FloatArray, FloatArray, FloatArray, FloatArray]] = deque()
         self._wrong_for = [0, 0, 0]
         self._sound_for = [0, 0, 0]
         self._feeble_for = [0, 0, 0]
@@ -184,7 +212,7 @@ class CoilResponse:
         `since_ns` are compared with those after `settled_ns`. None if the change is too small to be observed,
         NaN if there are too few residuals.
         """
-        before = [row[3] for row in self._remainders if row[0] < since_ns]
+        before = [row[3] - row[4] @ self._weights for row in self._remainders if row[0] < since_ns]
         after = [row for row in self._remainders if row[0] >= settled_ns]
         if len(before) < 3 or len(after) < 3:
             return math.nan
@@ -192,12 +220,13 @@ class CoilResponse:
         size = float(expected @ expected)
         if size < _LEAST_CHANGE**2:
             return None
-        change = np.mean([row[3] for row in after], axis=0) - np.mean(before[-10:], axis=0)
+        residuals = [row[3] - row[4] @ self._weights for row in after]
+        change = np.mean(residuals, axis=0) - np.mean(before[-10:], axis=0)
         return float(change @ expected) / size
 
     def text(self, axis: int) -> str:
         """Return the gain in words."""
-        return f"the body feels {self.gain[axis]:+.2f} +- {self.sigma[axis]:.2f} of its torque"
+        return f"the motion shows {self.gain[axis]:+.2f} +- {self.sigma[axis]:.2f} of its torque"
 
     def _close_bin(self) -> bool:
         times, spans, rates, fields, currents = zip(*self._samples, strict=True)
@@ -211,22 +240,28 @@ class CoilResponse:
         self._asked = integral[-1]
         middle = sum(times) / count * 1e-9
         turning = np.array(rates)
-        rate, asked = turning.sum(axis=0) / count, integral.sum(axis=0) / count
-        if len(self._free) == 3:
-            rate = rate - self._gyroscopic(turning, spans)
-        before, self._previous = self._previous, (middle, rate, asked)
+        products = rate_products(turning) * np.array(spans)[:, None]
+        products[0] += self._spun
+        spinning = np.cumsum(products, axis=0)
+        self._spun = spinning[-1]
+        rate, asked, spun = (part.sum(axis=0) / count for part in (turning, integral, spinning))
+        before, self._previous = self._previous, (middle, rate, asked, spun)
         if before is None:
             return False
         span = middle - before[0]
         mean_rate = 0.5 * (rate + before[1])
         self._turned = self._turned + mean_rate * span
-        row = np.empty((3, 6))
-        row[:, :3], row[:, 3] = (asked - before[2]).T / span, (rate - before[1]) / span
-        row[:, 4], row[:, 5] = mean_rate, self._turned
+        spin = (spun - before[3]) / span
+        row = np.empty((3, 6 + len(self._modes)))
+        row[:, :3] = (asked - before[2]).T / span
+        row[:, 3] = (rate - before[1]) / span - self._gyroscopic @ spin
+        row[:, 4], row[:, 5], row[:, 6:] = mean_rate, self._turned, (self._modes @ spin).T
         self._rows.append(row[self._free])
+        self._speeds.append(math.sqrt(float(np.square(turning).sum(axis=1).max())))
         row *= self._mask
         remainder = row[:, 3] - row[:, :3].sum(axis=1)
-        self._remainders.append((self._last_ns, row[:, :3], per_ampere[-1].T * self._mask, remainder))
+        per_ampere = per_ampere[-1].T * self._mask
+        self._remainders.append((self._last_ns, row[:, :3], per_ampere, remainder, row[:, 6:]))
         while self._remainders[0][0] < self._last_ns - self._settings.memory_ns:
             self._remainders.popleft()
         if len(self._rows) < self._settings.bins // 2:
@@ -234,26 +269,17 @@ class CoilResponse:
         self._fit(span)
         return True
 
-    def _gyroscopic(self, rates: FloatArray, spans: tuple[float, ...]) -> FloatArray:
-        """Return the mean (3,) over a bin of the rate that the free body's spin has made since the reset."""
-        momentum = rates @ self._settings.inertia
-        made = np.cross(momentum, rates) @ np.linalg.inv(self._settings.inertia) * np.array(spans)[:, None]
-        made[0] += self._spun
-        integral = np.cumsum(made, axis=0)
-        self._spun = integral[-1]
-        return np.asarray(integral.sum(axis=0) / len(spans))
-
     def _fit(self, span: float) -> None:
         rows = np.array(self._rows)
         # A constant disturbance about each free axis drops out with the means.
         rows -= rows.sum(axis=0) / len(rows)
         count = len(self._free)
-        inputs = np.zeros((len(rows), count, 3 + 2 * count))
-        inputs[:, :, :3] = rows[:, :, :3]
+        inputs = np.zeros((len(rows), count, len(self._prior)))
+        inputs[:, :, :3], inputs[:, :, 3 + 2 * count :] = rows[:, :, :3], rows[:, :, 6:]
         for place in range(count):
             inputs[:, place, 3 + place] = -rows[:, place, 5]
             inputs[:, place, 3 + count + place] = -rows[:, place, 4]
-        matrix, outputs = inputs.reshape(-1, 3 + 2 * count), rows[:, :, 3].reshape(-1)
+        matrix, outputs = inputs.reshape(-1, len(self._prior)), rows[:, :, 3].reshape(-1)
         settings = self._settings
         floor = settings.rate_noise * np.sqrt(2.0 / settings.bin_samples) / span + settings.model_error
         weight = 1.0 / floor**2
@@ -264,12 +290,17 @@ class CoilResponse:
         spread = max(1.0, float(residual @ residual) * weight / freedom)
         self.gain = found[:3]
         self.sigma = np.sqrt(spread * covariance.diagonal()[:3])
+        self.fastest = max(self._speeds)
+        self._weights = found[3 + 2 * count :]
+        # The model is wrong if a gain is certainly impossible.
+        possible = bool((np.abs(self.gain) - 3.0 * self.sigma < LARGEST_GAIN).all())
         pairs = zip(self.gain.tolist(), self.sigma.tolist(), strict=True)
         for number, (gain, sigma) in enumerate(pairs):
-            wrong = gain + 3.0 * sigma < 0.0 and gain < settings.highest_reversed
+            judged = possible and abs(gain) <= LARGEST_GAIN
+            wrong = judged and gain + 3.0 * sigma < 0.0 and gain < settings.highest_reversed
             unfelt = gain + _SIGMAS * sigma < _FELT and gain < settings.highest_feeble
-            feeble = wrong or (sigma < settings.sure and unfelt)
+            feeble = wrong or (judged and sigma < settings.sure and unfelt)
+            sound = judged and sigma < settings.sure and gain > settings.lowest_sound
             self._wrong_for[number] = self._wrong_for[number] + 1 if wrong else 0
             self._feeble_for[number] = self._feeble_for[number] + 1 if feeble else 0
-            sound = sigma < settings.sure and gain > settings.lowest_sound
             self._sound_for[number] = self._sound_for[number] + 1 if sound else 0

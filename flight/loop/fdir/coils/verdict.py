@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from flight.loop.fdir.coils.hypotheses import CoilFault
@@ -35,6 +36,7 @@ class CoilWatchSettings:
         probe_half_ns: half the wave's period.
         response: the body's response to the coils; None where the motion is not used.
         slow: the same over longer bins, which show currents that the monitor can not tell from none.
+        tumble_rate: rad/s; a coil that looks reversed while the body turns faster rests until it is slower.
     """
 
     full_current: tuple[float, float, float]
@@ -49,3 +51,4 @@ class CoilWatchSettings:
     probe_half_ns: int = 800_000_000
     response: ResponseSettings | None = None
     slow: ResponseSettings | None = None
+    tumble_rate: float = math.inf

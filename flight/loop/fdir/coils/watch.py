@@ -13,6 +13,12 @@ turn decides. A reversed coil is found from the angular acceleration (`flight.lo
 which also distinguishes a wrong monitor from a broken coil; over longer bins it raises a suspicion where a
 current too small for the monitor makes no torque. Uncommanded current is handled faster, in every
 mode: `flight.loop.fdir.coils.stuck_leg` brakes the axes at rest; during its search there is no other verdict.
+
+A reversed coil draws the current of a healthy one, so that the monitor cannot confirm the verdict, and in a
+tumble the motion depends on the inertia more than on the coils. A coil that looks reversed in a tumble is
+therefore not isolated: it rests, and is tried and judged again once the body is slower than `tumble_rate`, or
+after ten minutes.
+
 The bounds are the thesis's 3.5 mA on each coil's current (Sease 2013 ch. 5), the resistance's error, and the
 18 % error of a single conversion of the chopped current (`hal.drivers.ina219`).
 """
@@ -62,16 +68,22 @@ _READING_NS = 200_000_000
 _MOST_EVIDENCE = 40
 _IN_DOUBT = 5
 """Readings after which a verdict may leave the kind of fault open."""
+_LONGEST_REST_NS = 600_000_000_000
+"""Rest of a coil that looks reversed in a tumble; then it is tried again, however fast the body is."""
 
 
 class CoilWatch:
     """Judges the coils by the commands and readings of the last seconds.
 
     Longer than 200 lines because all methods share the state of one suspicion, from detection to verdict.
+
+    Attributes:
+        tumble_rate: rad/s, above which no coil is isolated by the motion alone.
     """
 
     def __init__(self, settings: CoilWatchSettings) -> None:
         self._settings = settings
+        self.tumble_rate = settings.tumble_rate
         self._bounds = Bounds(
             settings.full_current,
             settings.current_uncertainty,
@@ -92,6 +104,7 @@ class CoilWatch:
         self._slow = None if settings.slow is None else CoilResponse(settings.slow)
         self._unfelt = ""  # which coil's torque the body does not feel
         self._verdicts: dict[int, CoilVerdict] = {}
+        self._rests: dict[int, tuple[int, str]] = {}  # of an axis that rests: since when, and why
         self._looked_ns = 0
         self._leg = StuckLeg(_STUCK_EXCESS * min(settings.full_current))
         self._proof = BrakeProof()
@@ -109,8 +122,24 @@ class CoilWatch:
         return np.array([axis not in self._verdicts for axis in range(3)])
 
     @property
+    def resting(self) -> BoolArray:
+        """(3,) which axes are not to be driven for now, because they look reversed in a tumble."""
+        return np.array([axis in self._rests for axis in range(3)])
+
+    @property
     def suspicion(self) -> str:
         """Why a coil is suspected; empty while the readings fit a healthy circuit."""
+        rests = "; ".join(why for _, why in self._rests.values())
+        return self._unknown or rests
+
+    @property
+    def doubts_currents(self) -> bool:
+        """Whether a coil may carry another current than its command; a coil that rests carries none."""
+        return bool(self._unknown)
+
+    @property
+    def _unknown(self) -> str:
+        """Why a coil may carry another current than its command."""
         return self._leg.suspicion or self._strangeness or self._unfelt
 
     @property
@@ -132,6 +161,7 @@ class CoilWatch:
     def forget(self, axis: int) -> None:
         """Trust an axis again, by command; a lasting fault will be found again."""
         self._verdicts.pop(axis, None)
+        self._rests.pop(axis, None)
         self._proof.discard(axis)
         self.interrupted(self._commands.newest_ns if self._commands else 0)
 
@@ -149,20 +179,39 @@ class CoilWatch:
 
     def observe_motion(self, time_ns: int, rate: FloatArray, field: FloatArray) -> None:
         """Add a sample of the body rate (3,) rad/s and the magnetic field (3,) T, body axes."""
+        if self._rests:
+            self._end_rests(time_ns, float(np.sqrt(rate @ rate)))
         for response in self._responses:
             if response.observe_motion(time_ns, rate, field):
                 self._judge_motion(response, time_ns)
 
     def _judge_motion(self, response: CoilResponse, now_ns: int) -> None:
-        """Give a verdict on an axis that turns the body the wrong way; suspect one that does not turn it."""
+        """Give a verdict on an axis that turns the body the wrong way; suspect one that does not turn it.
+
+        In a tumble there is no verdict: the axis rests.
+        """
         for axis in response.reversed_axes():
             # An uncommanded current turns the body too.
-            if axis not in self._verdicts and not (self._leg.suspicion or self._strangeness):
+            if axis in self._verdicts or axis in self._rests or self._leg.suspicion or self._strangeness:
+                continue
+            if response.fastest <= self.tumble_rate:
                 self._give(axis, CoilFault.REVERSED, now_ns, response.text(axis))
+            else:
+                why = f"coil {AXES[axis]}: {response.text(axis)}; it rests while the body tumbles"
+                self._rests[axis] = now_ns, why
         if response is self._slow:
-            axes = [axis for axis in response.feeble_axes() if axis not in self._verdicts]
+            known = self._verdicts.keys() | self._rests.keys()
+            axes = [axis for axis in response.feeble_axes() if axis not in known]
             # Several at once: then rather the gyro or the field is wrong.
             self._unfelt = f"coil {AXES[axes[0]]}: {response.text(axes[0])}" if len(axes) == 1 else ""
+
+    def _end_rests(self, now_ns: int, speed: float) -> None:
+        """Try the resting axes again, on new evidence, once the body is slow or the rest has lasted long."""
+        oldest_ns = min(since_ns for since_ns, _ in self._rests.values())
+        if speed <= self.tumble_rate or now_ns - oldest_ns > _LONGEST_REST_NS:
+            self._rests.clear()
+            for response in self._responses:
+                response.reset()
 
     def interrupted(self, now_ns: int) -> None:
         """Discard the evidence until now: the coil currents of that time are unknown."""
@@ -307,7 +356,7 @@ class CoilWatch:
             self._reset()  # too small to be confirmed by the motion: it may be the monitor
             return
         if self._is_contradicted(axis, fault):
-            why = f"{self._strangeness}; yet the body feels no change of coil {AXES[axis]}"
+            why = f"{self._strangeness}; yet the motion shows no change of coil {AXES[axis]}"
             self._witness.doubt_monitor(why, now_ns)
         else:
             self._give(axis, fault, now_ns, self._strangeness)

@@ -76,7 +76,7 @@ def test_samples_that_come_in_a_burst_are_those_of_the_commands_of_their_time() 
 class Orbiting:
     """A tumbling 1U in 37 uT with coils on and off; at the magnetometer their field is twice the Earth's."""
 
-    def __init__(self, signs: FloatArray, speed: float = 1.0) -> None:
+    def __init__(self, signs: FloatArray, speed: float = 1.0, tumble_rate: float = math.inf) -> None:
         self.signs, self.rate = signs, speed * np.array([0.08, -0.1, 0.07])
         settings = ResponseSettings(
             INERTIAS, 0.65, 2.8e-4, bin_samples=16, bins=40, model_error=2e-4, torsion=1e-6, damping=1e-4,
@@ -84,7 +84,7 @@ class Orbiting:
         )  # fmt: skip
         self.response = CoilResponse(settings)
         slow = replace(settings, bin_samples=80, bins=20, model_error=3e-5)
-        self.watch = CoilWatch(CoilWatchSettings((0.148, 0.148, 0.148), slow=slow))
+        self.watch = CoilWatch(CoilWatchSettings((0.148, 0.148, 0.148), slow=slow, tumble_rate=tumble_rate))
         self._noise = np.random.default_rng(4)
         self._field: FloatArray = np.array([1e-5, -2e-5, 3e-5])
 
@@ -97,6 +97,7 @@ class Orbiting:
                 wanted = 0.014 * np.sin([0.2 * time, 0.13 * time + 1.0, 0.17 * time + 2.0])
             currents = wanted if within >= 8 else np.zeros(3)
             self.response.commanded(now_ns, tuple(currents.tolist()))
+            currents = np.where(self.watch.resting, 0.0, currents)
             self.watch.commanded(now_ns, currents)
             for _ in range(5):
                 torque = np.cross(0.65 * self.signs * currents, self._field)
@@ -146,3 +147,33 @@ def test_no_coil_is_suspected_of_a_sound_body_nor_where_none_seems_to_turn_it(ga
     body.fly(120.0, weak=True)
     assert body.watch.suspicion == ""
     assert body.watch.verdicts == ()
+
+
+def test_a_gain_that_no_coil_can_have_gives_no_verdict() -> None:
+    body = Orbiting(np.array([-2.5, 1.0, 1.0]))
+    body.fly(60.0)
+    assert body.response.gain[0] < -1.5
+    assert body.response.reversed_axes() == []
+    assert body.response.feeble_axes() == []
+    assert not any(body.response.is_healthy(axis) for axis in range(3)), "the model is wrong for all axes"
+
+
+def test_a_coil_that_looks_reversed_in_a_tumble_rests_and_is_judged_when_the_body_is_slow() -> None:
+    body = Orbiting(np.array([-1.0, 1.0, 1.0]), tumble_rate=0.01)
+    body.fly(60.0)
+    assert body.watch.available.all()
+    assert body.watch.resting.tolist() == [True, False, False]
+    assert body.watch.suspicion.startswith("coil x")
+    assert not body.watch.doubts_currents, "a resting coil carries no current"
+    body.watch.tumble_rate = 10.0  # as if the body were slow
+    body.fly(1.0)
+    assert not body.watch.resting.any()
+    body.fly(60.0)
+    assert [verdict.axis for verdict in body.watch.verdicts] == [0]
+
+
+def test_a_rest_ends_after_ten_minutes_however_fast_the_body_is() -> None:
+    body = Orbiting(np.array([-1.0, 1.0, 1.0]), tumble_rate=0.01)
+    body.fly(60.0)
+    body.watch.observe_motion(700_000_000_000, np.full(3, 0.1), np.full(3, 3e-5))
+    assert not body.watch.resting.any()

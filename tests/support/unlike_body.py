@@ -1,0 +1,70 @@
+"""Flights whose true body differs from the configured one, and what their coil monitor said."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from flight.link import events
+from flight.link.telemetry.packets import to_text
+from flight.schema import reader as configuration
+from flight.schema.orbit import OrbitConfig, as_orbit
+from ground.telemetry.reader import Run
+from hal.interfaces.wires import SECOND_NS
+from sim_hal.settings import FaultEntry, Simulation
+from sim_hal.worlds.free_body.craft import CRAFTS
+from sim_hal.worlds.free_body.section import CraftSection
+from tests.scenario.flights import CONFIG
+
+
+def configured(name: str) -> tuple[OrbitConfig, Simulation]:
+    """Return a configuration of config/ and its simulated world."""
+    path = CONFIG.parent / f"{name}.yaml"
+    section = configuration.simulation_section(path.read_text(encoding="utf-8"), str(path), Simulation)
+    assert section is not None
+    return as_orbit(configuration.load(path)), section
+
+
+def without_cameras(config: OrbitConfig, duration: float) -> OrbitConfig:
+    """Return the configuration without cameras, which a tumble does not use."""
+    return configuration.replace(config, duration=duration, camera=None, wide_cameras=())
+
+
+def with_other_body(
+    world: Simulation, moments: Sequence[float], axes_deg: float, seed: int, fault: str = ""
+) -> Simulation:
+    """Return a world whose body has other principal moments (3,) kg m^2 and axes, and perhaps a fault."""
+    body = world.free_body
+    assert body is not None
+    craft = CRAFTS[body.craft] if isinstance(body.craft, str) else body.craft
+    assert isinstance(craft, CraftSection)
+    x, y, z = moments
+    body = configuration.replace(
+        body,
+        craft=configuration.replace(craft, inertia=(x, y, z)),
+        disturbances=configuration.replace(body.disturbances, principal_turn_deg=axes_deg),
+    )
+    entries = (FaultEntry(fault=fault, at=0.0),) if fault else ()
+    return configuration.replace(world, seed=seed, free_body=body, faults=entries)
+
+
+def coil_judgement(flown: Run, broken: str) -> dict[str, Any]:
+    """Return which axes were isolated, and when the `broken` one ("" for none) was named and isolated, s."""
+    isolated: dict[str, float] = {}
+    named: dict[str, float] = {}
+    kinds = {events.COIL_BROKEN.name: isolated, events.COIL_SUSPECT.name: named}
+    for event in flown["event"]:
+        text = to_text(event["text"])
+        found = kinds.get(to_text(event["name"]))
+        if found is not None and text.startswith("coil "):
+            found.setdefault(text[5], float(event["time_ns"]) / SECOND_NS)
+    return {
+        "healthy_isolated": sorted(axis for axis in isolated if axis != broken),
+        "healthy_suspected": sorted(axis for axis in named if axis != broken),
+        "isolated_s": isolated.get(broken),
+        "named_s": min((one[broken] for one in (isolated, named) if broken in one), default=None),
+        "speed_deg_s": math.degrees(float(np.linalg.norm(flown["attitude"]["rate"][-1]))),
+    }
