@@ -15,7 +15,7 @@ help:           ## list the targets
 # Python compiles a module when it first imports it, and keeps that: most of what is installed is never imported.
 $(READY): pyproject.toml requirements.lock
 	$(PYTHON) -m venv $(VENV)
-	$(VENV)/bin/pip install --quiet --no-compile --constraint requirements.lock --editable '.[plots,images,test,docs,interop]'
+	$(VENV)/bin/pip install --quiet --no-compile --config-settings editable_mode=compat --constraint requirements.lock --editable '.[plots,images,test,docs,interop]'
 	@touch $@
 
 demo: $(READY)  ## fly the 700 s step demonstration on simulated hardware and print its report
