@@ -31,7 +31,7 @@ FLOWN: tuple[tuple[Flight, tuple[str, ...]], ...] = (
     (Flight("thesis", "config/step_thesis.yaml", 30), ()),
     (Flight("realtime", _DEMO, 12), ("--realtime",)),
     (Flight("orbit", "config/orbit.yaml", 320), ()),
-    *((flight, ()) for flight in FLIGHTS if flight.faults),
+    *((flight, ()) for flight in FLIGHTS if flight.faults and not flight.changes),
     (Flight("bridge", _DEMO, 60, ("bridge-x: a-high @ 12 for 20", "pwm: stuck @ 45 for 3")), ()),
     (
         Flight(
@@ -191,7 +191,7 @@ class _Flights:
         return path
 
     def _start(self, flight: Flight, *more: str) -> subprocess.Popen[bytes]:
-        return self._run("run", *flight.arguments, *more)
+        return self._run("run", flight.config, *flight.options, *more)
 
     def _run(self, *arguments: str) -> subprocess.Popen[bytes]:
         words = ["-m", "coverage", "run", f"--rcfile={self.settings}", "-m", "flight"]

@@ -1,15 +1,20 @@
-"""Compares two logs packet by packet, each read with the packet table of the software that wrote it.
+"""Compares the logs of two revisions' flights packet by packet, and their answers value by value.
 
+Each log is read with the packet table of the software that wrote it.
 Packets whose APID the old table does not have are counted as added and left out; sequence counts are kept per
 APID, so they do not disturb the others. A packet whose definition only had fields appended, with a higher
 version, is compared in the fields that the old one has. All else must be equal byte for byte, in the same
 order. Three labels of the RUN packet are not compared: UTC, the software's version, and the checksum of the
 configuration's text, in which a comment may change.
+
+Of the answers these labels and the figures of the machine's time are left out; keys that only the new answer
+has are counted as added. Texts that differ pass when the table of renamed texts leads from the old to the new.
 """
 
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from itertools import zip_longest
@@ -21,21 +26,33 @@ import numpy as np
 from flight.link.telemetry.form import Field, Packet
 from flight.link.telemetry.packets import CRC_BYTES, HEADER_BYTES, Layout, compile_layouts, to_text
 from flight.link.telemetry.segments import find_segments
+from tests.studies.same_bytes.answers import ANSWERS_FILE
 from tests.studies.same_bytes.flights import TABLE_FILE
+from tests.studies.same_bytes.texts import Texts
 
 STEMS = ("flight", "truth")
 LABELS = {"run": ("utc_ns", "software", "config_crc")}
+# Keys of answers that are not compared: the labels, and figures of the machine's time.
+UNCOMPARED = frozenset({*LABELS["run"], "elapsed_s", "execution_s", "processor_s", "seconds", "solved_s"})
 _APID_BITS = 0x7FF
 Table = Mapping[int, Layout]
+_NONE = object()  # no such value
+_SHORT = 100  # characters of a value that are shown
 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """The first place where two logs differ; `time` is mission time in s, of the old packet if any."""
+    """The first place where two logs or answers differ.
+
+    Attributes:
+        log: flight, truth or answers.
+        packet: of a log, its name; of the answers, the command.
+        time: mission time of the old packet if any, s; None in answers.
+    """
 
     log: str
     packet: str
-    time: float
+    time: float | None
     field: str
     old: str
     new: str
@@ -43,16 +60,16 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What the comparison of one flight found.
+    """What the comparison of one flight or one group of answers found.
 
     Attributes:
-        compared: packets compared.
-        added: packets that only the new log has, by name.
+        compared: packets, and values of answers, compared.
+        added: packets and keys of answers that only the new side has, by name.
         extended: packets of which the new definition has more fields.
         difference: the first difference, None when there is none.
     """
 
-    flight: str
+    name: str
     compared: int
     added: dict[str, int]
     extended: int
@@ -63,31 +80,88 @@ class Verdict:
         return {**asdict(self), "equal": self.difference is None}
 
 
-def compare(flight: str, old: Path, new: Path) -> Verdict:
+def compare(name: str, old: Path, new: Path, texts: Texts) -> Verdict:
+    """Compare the logs, if the folders hold a flight, and the answers in two folders."""
+    logs = compare_logs(name, old, new, texts) if (old / TABLE_FILE).is_file() else None
+    answers = compare_answers(name, old, new, texts) if (old / ANSWERS_FILE).is_file() else None
+    if logs is None or answers is None:
+        return logs or answers or Verdict(name, 0, {}, 0, None)
+    return Verdict(
+        name,
+        logs.compared + answers.compared,
+        logs.added | answers.added,
+        logs.extended,
+        logs.difference or answers.difference,
+    )
+
+
+def compare_answers(name: str, old: Path, new: Path, texts: Texts) -> Verdict:
+    """Compare the answers in two folders."""
+    first, second = (json.loads((folder / ANSWERS_FILE).read_text(encoding="utf-8")) for folder in (old, new))
+    pairs = list(_pairs((), first, second, texts))
+    added = Counter(f"key {place[-1]}" for place, a, _ in pairs if a is _NONE)
+    compared = [pair for pair in pairs if pair[1] is not _NONE]
+    difference = next(
+        (
+            Difference("answers", place[0], None, ".".join(place[1:]), _short(a), _short(b))
+            for place, a, b in compared
+            if repr(a) != repr(b)
+        ),
+        None,
+    )
+    return Verdict(name, len(compared), dict(added), 0, difference)
+
+
+def _pairs(
+    place: tuple[str, ...], a: Any, b: Any, texts: Texts
+) -> Iterator[tuple[tuple[str, ...], Any, Any]]:
+    """Yield each place of two answers with the old value and the new; _NONE where one has no such place."""
+    if isinstance(a, dict) and isinstance(b, dict):
+        names = {key: key if key in b else texts.renamed(key) for key in a}
+        for key, name in names.items():
+            if key not in UNCOMPARED:
+                yield from _pairs((*place, key), a[key], b.get(name, _NONE), texts)
+        for key in b.keys() - names.values() - UNCOMPARED:
+            yield (*place, key), _NONE, b[key]
+    elif isinstance(a, list) and isinstance(b, list):
+        yield (*place, "length"), len(a), len(b)
+        for number, (first, second) in enumerate(zip(a, b, strict=False)):
+            yield from _pairs((*place, str(number)), first, second, texts)
+    elif isinstance(a, str) and isinstance(b, str) and texts.renamed(a) == b:
+        yield place, b, b
+    else:
+        yield place, a, b
+
+
+def _short(value: Any) -> str:
+    """Return a value as text of one line at most."""
+    text = repr(value)
+    return text if len(text) <= _SHORT else f"{text[:_SHORT]}..."
+
+
+def compare_logs(name: str, old: Path, new: Path, texts: Texts) -> Verdict:
     """Compare the logs in two folders."""
     old_table, new_table = read_table(old), read_table(new)
     compared = extended = 0
-    added: dict[str, int] = {}
+    added: Counter[str] = Counter()
     difference = None
     for stem in STEMS:
         kept = []
         for packet in split(read_log(new, stem)):
-            apid = _apid(packet)
-            if apid in old_table:
+            if _apid(packet) in old_table:
                 kept.append(packet)
             else:
-                name = new_table[apid].packet.name if apid in new_table else f"APID {apid:#x}"
-                added[name] = added.get(name, 0) + 1
+                added[_name(packet, new_table)] += 1
         for a, b in zip_longest(split(read_log(old, stem)), kept):
             if a is None or b is None:
                 difference = difference or _one_ended(stem, a, b, old_table, new_table)
                 break
             compared += 1
-            same, longer = _same(a, b, old_table, new_table)
+            same, longer = _same(a, b, old_table, new_table, texts)
             extended += longer
             if not same and difference is None:
-                difference = _explain(stem, a, b, old_table, new_table)
-    return Verdict(flight, compared, added, extended, difference)
+                difference = _explain(stem, a, b, old_table, new_table, texts)
+    return Verdict(name, compared, dict(added), extended, difference)
 
 
 def read_table(folder: Path) -> dict[int, Layout]:
@@ -116,7 +190,7 @@ def _apid(packet: bytes) -> int:
     return int.from_bytes(packet[:2], "big") & _APID_BITS
 
 
-def _same(a: bytes, b: bytes, old: Table, new: Table) -> tuple[bool, bool]:
+def _same(a: bytes, b: bytes, old: Table, new: Table, texts: Texts) -> tuple[bool, bool]:
     """Return whether two packets are equal but for labels, and whether the new one only has more fields."""
     if a == b:
         return True, False
@@ -126,7 +200,19 @@ def _same(a: bytes, b: bytes, old: Table, new: Table) -> tuple[bool, bool]:
     longer = _extends(first, second)
     if len(a) != first.length or len(b) != second.length or not (longer or len(a) == len(b)):
         return False, False
-    return _core(a, first, longer) == _core(b, first, longer), longer
+    return _core(_renamed(a, b, first, texts), first, longer) == _core(b, first, longer), longer
+
+
+def _renamed(a: bytes, b: bytes, layout: Layout, texts: Texts) -> bytes:
+    """Return the old packet with the texts that differ from the new packet's as the new one words them."""
+    raw = bytearray(a)
+    for field in layout.packet.fields:
+        begin, size = layout.offsets[field.name], layout.dtype[field.name].itemsize
+        place = slice(begin, begin + size)
+        if field.kind.startswith("S") and field.count == 1 and a[place] != b[place]:
+            text = texts.renamed(to_text(a[place])).encode()
+            raw[place] = text[: size - 1].decode("utf-8", "ignore").encode().ljust(size, b"\0")
+    return bytes(raw)
 
 
 def _extends(first: Layout, second: Layout) -> bool:
@@ -153,7 +239,7 @@ def _core(packet: bytes, layout: Layout, longer: bool) -> bytes:
     return bytes(raw)
 
 
-def _explain(stem: str, a: bytes, b: bytes, old: Table, new: Table) -> Difference:
+def _explain(stem: str, a: bytes, b: bytes, old: Table, new: Table, texts: Texts) -> Difference:
     """Return the first field in which two packets differ."""
     first, second = old.get(_apid(a)), new.get(_apid(b))
     time = _time(a)
@@ -165,7 +251,7 @@ def _explain(stem: str, a: bytes, b: bytes, old: Table, new: Table) -> Differenc
         return Difference(stem, name, time, "definition", _brief(kinds[0]), _brief(kinds[1]))
     if len(a) != first.length or len(b) != second.length:
         return Difference(stem, name, time, "length", str(len(a)), str(len(b)))
-    one, two = first.array(a)[0], second.array(b)[0]
+    one, two = first.array(_renamed(a, b, first, texts))[0], second.array(b)[0]
     labels = LABELS.get(name, ())
     for field in first.offsets:
         if field not in labels and one[field].tobytes() != two[field].tobytes():
