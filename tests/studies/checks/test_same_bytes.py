@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import shutil
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -11,16 +13,12 @@ import pytest
 from flight.link.telemetry.definitions import EVENT, IMU, RUN, TARGET
 from flight.link.telemetry.form import Field, Packet
 from flight.link.telemetry.packets import Packer, compile_layouts
-from tests.studies.same_bytes.__main__ import main
+from tests.studies.same_bytes.__main__ import main, run_all, table
+from tests.studies.same_bytes.answers import ANSWERS_FILE, PICTURES, Answers, ask, photographs
+from tests.studies.same_bytes.checkout import CheckoutError, check_out, resolve
 from tests.studies.same_bytes.comparison import Verdict, compare
-from tests.studies.same_bytes.flights import (
-    FLIGHTS,
-    TABLE_FILE,
-    FlightError,
-    check_out,
-    packet_table,
-    resolve,
-)
+from tests.studies.same_bytes.flights import FLIGHTS, TABLE_FILE, packet_table
+from tests.studies.same_bytes.texts import Texts
 
 OLD = (RUN, IMU, TARGET)
 RUN_VALUES: dict[str, object] = {
@@ -62,7 +60,7 @@ class Writer:
         self._packets.append(self._packer.pack(packet, time_ns, values))
 
     def close(self) -> Path:
-        self.folder.mkdir()
+        self.folder.mkdir(parents=True)
         (self.folder / "flight-0001.ccsds").write_bytes(b"".join(self._packets))
         (self.folder / TABLE_FILE).write_text(json.dumps([asdict(packet) for packet in self.table]))
         return self.folder
@@ -100,7 +98,34 @@ def new_log(
 
 
 def verdict(folder: Path, **changes: object) -> Verdict:
-    return compare("synthetic", old_log(folder / "old"), new_log(folder / "new", **changes))  # type: ignore[arg-type]  # names of new_log's own arguments
+    new = new_log(folder / "new", **changes)  # type: ignore[arg-type]  # names of new_log's own arguments
+    return compare("synthetic", old_log(folder / "old"), new, Texts())
+
+
+def event_logs(folder: Path, old: str, new: str) -> tuple[Path, Path]:
+    """Write two logs of one event each, with an old text and a new one."""
+    folders = []
+    for name, text in (("old", old), ("new", new)):
+        writer = Writer(folder / name, (EVENT,))
+        writer.add(EVENT, 0, {"code": 1, "severity": 0, "suppressed": 0, "name": "gap", "text": text})
+        folders.append(writer.close())
+    return folders[0], folders[1]
+
+
+def answer_folders(folder: Path, old: object, new: object) -> tuple[Path, Path]:
+    """Write two folders of answers to one command."""
+    for name, answer in (("old", old), ("new", new)):
+        (folder / name).mkdir(parents=True)
+        (folder / name / ANSWERS_FILE).write_text(json.dumps({"solve it.png": answer}))
+    return folder / "old", folder / "new"
+
+
+def fake_checkout(folder: Path, main: str) -> Path:
+    """Write a checkout of which `python -m flight` is the given code; `arguments` are its words."""
+    (folder / "flight").mkdir(parents=True)
+    (folder / "flight/__init__.py").touch()
+    (folder / "flight/__main__.py").write_text(f"import json, sys\narguments = sys.argv[1:]\n{main}\n")
+    return folder
 
 
 def test_equal_logs_are_equal(tmp_path: Path) -> None:
@@ -128,7 +153,7 @@ def test_a_log_that_ends_early_is_found(tmp_path: Path) -> None:
     log = new / "flight-0001.ccsds"
     whole = log.read_bytes()
     log.write_bytes(whole[: -compile_layouts(OLD)["target"].length])
-    first = compare("synthetic", old, new).difference
+    first = compare("synthetic", old, new, Texts()).difference
     assert first is not None
     assert (first.old, first.new) == ("target", "end of log")
 
@@ -171,11 +196,146 @@ def test_reworded_meanings_make_no_difference(tmp_path: Path) -> None:
     assert verdict(tmp_path, table=(reworded, IMU, TARGET), run={"utc_ns": 9}).difference is None
 
 
-def test_seven_flights_are_compared() -> None:
-    assert len(FLIGHTS) == 7
-    assert {flight.config for flight in FLIGHTS if flight.duration is None} == {
-        "config/step_demo.yaml",
-        "config/step_thesis.yaml",
+def test_a_renamed_text_that_is_not_in_the_table_is_found(tmp_path: Path) -> None:
+    first = compare(
+        "x", *event_logs(tmp_path, "camera 3: no frame", "no frame from camera 3"), Texts()
+    ).difference
+    assert first is not None
+    assert (first.packet, first.field) == ("event", "text")
+    assert (first.old, first.new) == ("'camera 3: no frame'", "'no frame from camera 3'")
+
+
+def test_the_table_of_renamed_texts_is_applied_to_logs(tmp_path: Path) -> None:
+    texts = Texts([{"old": "camera {n}: no {what}", "new": "no {what} from camera {n}"}])
+    same = event_logs(tmp_path / "same", "camera 3: no frame", "no frame from camera 3")
+    other = event_logs(tmp_path / "other", "camera 3: no frame", "no frame from camera 4")
+    kept = event_logs(tmp_path / "kept", "camera 3: no frame", "camera 3: no frame")
+    assert compare("x", *same, texts).difference is None
+    assert compare("x", *other, texts).difference is not None
+    assert compare("x", *kept, texts).difference is None
+
+
+def test_a_new_text_that_its_field_cuts_is_equal(tmp_path: Path) -> None:
+    long = "no frame " + "of the camera " * 20
+    texts = Texts([{"old": "no frame", "new": long}])
+    assert compare("x", *event_logs(tmp_path, "no frame", long), texts).difference is None
+
+
+def test_renamed_texts_are_applied_in_their_order() -> None:
+    texts = Texts([{"old": "a {x}", "new": "b {x}"}, {"old": "b {x}", "new": "c {x} of {x}"}])
+    assert texts.renamed("a 1") == "c 1 of 1"
+    assert texts.renamed("b (2)") == "c (2) of (2)"
+    assert texts.renamed("d 1") == "d 1"
+
+
+@pytest.mark.parametrize("pair", [{"old": "a"}, {"old": "a", "new": "b {x}"}, "a"])
+def test_a_wrong_entry_of_the_table_is_refused(pair: dict[str, str]) -> None:
+    with pytest.raises(ValueError, match="renamed text"):
+        Texts([pair])
+
+
+def test_the_committed_table_can_be_read() -> None:
+    assert Texts.read().renamed("a text of nobody") == "a text of nobody"
+
+
+ANSWER = {"status": 0, "output": {"status": "solved", "roll_deg": 20.5, "seconds": 0.1, "stars": [1, None]}}
+
+
+@pytest.mark.parametrize(
+    ("change", "field", "values"),
+    [
+        ({"roll_deg": 20.500000000000004}, "output.roll_deg", ("20.5", "20.500000000000004")),
+        ({"stars": [1, 2]}, "output.stars.1", ("None", "2")),
+        ({"stars": [1]}, "output.stars.length", ("2", "1")),
+        ({"status": "resolved"}, "output.status", ("'solved'", "'resolved'")),
+        ({"status": None}, "output.status", ("'solved'", "None")),
+    ],
+)
+def test_a_changed_value_of_an_answer_is_found(
+    tmp_path: Path, change: dict[str, object], field: str, values: tuple[str, str]
+) -> None:
+    new = {"status": 0, "output": {**ANSWER["output"], **change}}  # type: ignore[dict-item]  # it is a mapping
+    first = compare("x", *answer_folders(tmp_path, ANSWER, new), Texts()).difference
+    assert first is not None
+    assert (first.log, first.packet, first.field) == ("answers", "solve it.png", field)
+    assert (first.old, first.new) == values
+
+
+def test_a_missing_key_of_an_answer_is_found_and_an_added_one_counted(tmp_path: Path) -> None:
+    old, new = {"roll_deg": 1.0, "status": "solved"}, {"roll_deg": 1.0, "stars": 3}
+    found = compare("x", *answer_folders(tmp_path, old, new), Texts())
+    assert found.difference is not None
+    assert found.difference.field == "status"
+    assert found.added == {"key stars": 1}
+
+
+def test_times_of_the_machine_make_no_difference(tmp_path: Path) -> None:
+    new = {"status": 0, "output": {**ANSWER["output"], "seconds": 0.2}}  # type: ignore[dict-item]  # it is a mapping
+    found = compare("x", *answer_folders(tmp_path, ANSWER, new), Texts())
+    assert found.difference is None
+    assert found.compared == 6
+
+
+def test_the_table_of_renamed_texts_is_applied_to_answers(tmp_path: Path) -> None:
+    old, new = (
+        {"reason": "no star is seen", "error": ["a: b"]},
+        {"why": "no star was found", "error": ["b of a"]},
+    )
+    folders = answer_folders(tmp_path, old, new)
+    pairs = [
+        {"old": "reason", "new": "why"},
+        {"old": "no star is seen", "new": "no star was found"},
+        {"old": "{x}: {y}", "new": "{y} of {x}"},
+    ]
+    assert compare("x", *folders, Texts(pairs)).difference is None
+    for number in range(3):
+        assert compare("x", *folders, Texts(pairs[:number] + pairs[number + 1 :])).difference is not None
+
+
+def test_the_answers_of_a_checkout_are_recorded(tmp_path: Path) -> None:
+    checkout = fake_checkout(
+        tmp_path / "checkout",
+        "if arguments[0] == 'wrong':\n    sys.stderr.write('flight: wrong\\n')\n    sys.exit(2)\n"
+        "open('x.png', 'w').write('picture')\nprint(json.dumps(arguments))",
+    )
+    work = tmp_path / "work"
+    work.mkdir()
+    ask(checkout, Answers("x", ("plan --to 'a b'", "wrong")), work)
+    assert json.loads((work / ANSWERS_FILE).read_text()) == {
+        "plan --to 'a b'": {"status": 0, "output": ["plan", "--to", "a b", "--json"], "error": []},
+        "wrong": {"status": 2, "output": [], "error": ["flight: wrong"]},
+        "x.png": hashlib.sha256(b"picture").hexdigest(),
+    }
+
+
+def test_photographs_are_asked_about_where_there_are_any(tmp_path: Path) -> None:
+    assert photographs(tmp_path) is None
+    (tmp_path / "sky").mkdir()
+    for name in ("a.png", "README.md"):
+        (tmp_path / "sky" / name).touch()
+    assert photographs(tmp_path) == Answers("photographs", ("solve photographs/sky/a.png",))
+
+
+def test_a_run_that_fails_in_this_checkout_is_a_difference_and_the_others_are_compared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    good = "open('limb.png', 'w').write('x')\nprint(json.dumps(arguments))"
+    old = fake_checkout(tmp_path / "old", good)
+    new = fake_checkout(tmp_path / "new", f"if arguments[0] == 'plan':\n    raise KeyError('lost')\n{good}")
+    monkeypatch.setattr("tests.studies.same_bytes.__main__.repository", lambda: new)
+    monkeypatch.setattr(
+        "tests.studies.same_bytes.__main__.check_out", lambda _, folder: shutil.copytree(old, folder)
+    )
+    runs = [Answers("plan", ("plan",)), PICTURES]
+    verdicts = run_all("0" * 40, runs, tmp_path / "keep", tmp_path / "cache", refresh=False)
+    assert [verdict.difference is None for verdict in verdicts] == [False, True]
+    assert "KeyError: 'lost'" in table("0" * 40, verdicts)
+
+
+def test_the_flights_are_of_testbed_and_orbit() -> None:
+    assert len(FLIGHTS) == 10
+    assert {Path(flight.config).stem for flight in FLIGHTS} == {
+        *("step_demo", "step_thesis", "orbit", "orbit_3u", "orbit_object"),
     }
 
 
@@ -197,19 +357,22 @@ def test_the_packet_table_is_the_checkouts_own_in_the_old_layout_too(tmp_path: P
 
 
 @pytest.mark.slow
-def test_a_short_flight_of_the_last_commit_repeats_itself(
+def test_a_short_flight_and_the_plans_of_the_last_commit_repeat_themselves(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Both sides are check-outs of HEAD, so that changes not yet committed do not matter."""
     try:
         commit = resolve("HEAD")
-    except FlightError as error:
+    except CheckoutError as error:
         pytest.skip(f"not a git checkout: {error}")
     checkout = tmp_path / "checkout"
     check_out(commit, checkout)
     monkeypatch.setattr("tests.studies.same_bytes.__main__.repository", lambda: checkout)
-    status = main(["--against", "HEAD", "--only", "short", "--cache", str(tmp_path / "cache"), "--json"])
+    status = main(
+        ["--against", "HEAD", "--only", "short", "plan", "--cache", str(tmp_path / "cache"), "--json"]
+    )
     printed = json.loads(capsys.readouterr().out)
-    assert [flight["flight"] for flight in printed["flights"]] == ["short"]
+    assert [run["name"] for run in printed["runs"]] == ["short", "plan"]
     assert status == 0, printed
-    assert printed["flights"][0]["compared"] > 900
+    assert printed["runs"][0]["compared"] > 900
+    assert printed["runs"][1]["compared"] > 500

@@ -8,7 +8,7 @@ order. Three labels of the RUN packet are not compared: UTC, the software's vers
 configuration's text, in which a comment may change.
 
 Of the answers these labels and the figures of the machine's time are left out; keys that only the new answer
-has are counted as added. Texts that differ pass when the table of renamed texts leads from the old to the new.
+has are counted as added. Texts that differ pass when the table of renamed texts makes the new from the old.
 """
 
 from __future__ import annotations

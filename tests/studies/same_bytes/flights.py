@@ -91,7 +91,7 @@ FLIGHTS: tuple[Flight, ...] = (
         ("bus: nack @ 12 for 4", "pwm: brown-out @ 25", "monitor: bits @ 30 for 10", "bus: hang @ 48 for 3"),
     ),
     # A KnightCube at 0.6 deg/s: rates from streaks, braked, attitude acquired, slews within cones to Sun and
-    # nadir, the Earth in some star frames, Sun and limb in the wide cameras; GPS and one of them fail for a while.
+    # nadir, the Earth in star frames, Sun and limb in the wide cameras. GPS and a camera fail for a time.
     Flight(
         "orbit",
         "config/orbit.yaml",
