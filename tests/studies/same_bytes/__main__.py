@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import shutil
 import sys
 import tempfile
@@ -25,15 +26,13 @@ from tests.studies.same_bytes.texts import Texts
 AT_ONCE = 2  # runs
 Run = Flight | Answers
 """A flight or a group of answers."""
-SETS: dict[str, tuple[Run, ...]] = {"flights": FLIGHTS, "answers": GROUPS}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run, compare, print; return 0 when all is equal, 1 when not, 2 for wrong use."""
-    runs = {run.name: (run,) for run in (*FLIGHTS, SHORT, *GROUPS)}
     real = photographs()
-    sets = {name: (*group, real) if name == "answers" and real else group for name, group in SETS.items()}
-    choices = {**runs, **({real.name: (real,)} if real else {}), **sets}
+    sets: dict[str, tuple[Run, ...]] = {"flights": FLIGHTS, "answers": (*GROUPS, real) if real else GROUPS}
+    choices = sets | {run.name: (run,) for run in (*sets["flights"], SHORT, *sets["answers"])}
     options = _parser(list(choices)).parse_args(arguments)
     if real is None:
         sys.stderr.write(f"same_bytes: no photographs in {PHOTOGRAPHS}: they are left out\n")
@@ -82,7 +81,7 @@ def run_all(commit: str, runs: Sequence[Run], keep: Path, cache: Path, refresh: 
 
 def _timed(checkout: Path, run: Run, out: Path, pictures: Path) -> None:
     """Run, and print how long it took. Raises CheckoutError when it fails; `out` then does not exist."""
-    work = out.with_name(out.name + ".part")
+    work = out.with_name(f"{out.name}.{os.getpid()}.part")  # several processes may share the cache
     shutil.rmtree(work, ignore_errors=True)
     work.parent.mkdir(parents=True, exist_ok=True)
     begin = time.monotonic()

@@ -45,9 +45,9 @@ class Difference:
     """The first place where two logs or answers differ.
 
     Attributes:
-        log: flight, truth or answers.
-        packet: of a log, its name; of the answers, the command.
-        time: mission time of the old packet if any, s; None in answers.
+        log: flight or truth; answers; run, when a run failed.
+        packet: of a log, its name; of the answers, the command; of a run, its name.
+        time: mission time of the old packet if any, s; None where there is no packet.
     """
 
     log: str

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -114,12 +115,14 @@ def fly(checkout: Path, flight: Flight, folder: Path) -> None:
     Raises CheckoutError when the flight does not end well.
     """
     config = checkout / flight.config
-    if flight.changes:
-        values = _merged(yaml.safe_load(config.read_text(encoding="utf-8")), yaml.safe_load(flight.changes))
-        config = folder.with_name(f"{folder.name}.yaml")
-        config.write_text(yaml.safe_dump(values), encoding="utf-8")
-    arguments = (str(config), *flight.options, "--out", str(folder), "--json")
-    run_python(checkout, "-m", "flight", "run", *arguments)
+    with tempfile.TemporaryDirectory(prefix="same-bytes-") as temporary:
+        if flight.changes:
+            values = yaml.safe_load(config.read_text(encoding="utf-8"))
+            config = Path(temporary) / config.name
+            text = yaml.safe_dump(_merged(values, yaml.safe_load(flight.changes)))
+            config.write_text(text, encoding="utf-8")
+        arguments = (str(config), *flight.options, "--out", str(folder), "--json")
+        run_python(checkout, "-m", "flight", "run", *arguments)
     (folder / TABLE_FILE).write_text(packet_table(checkout), encoding="utf-8")
     ask(checkout, Answers(flight.name, flight.questions), folder)
 
