@@ -70,7 +70,7 @@ PICTURES = Answers(
 )
 GROUPS: tuple[Answers, ...] = (
     PICTURES,
-    Answers(  # lost in space, by each method of identification, attitude and centroids; lens calibration
+    Answers(  # lost in space, by each method of identification, attitude, centroids; index; lens calibration
         "stars",
         (
             "solve pictures/stars.png",
@@ -92,6 +92,8 @@ GROUPS: tuple[Answers, ...] = (
                 for centroid in ("window", "weighted", "gaussian", "iterative")
             ),
             "solve pictures/limb.png",
+            "index --fov 15 --faintest 5.5 --out mission.index",
+            f"{_STARS} --index mission.index --wcs stars.fits",
             f"calibrate {' '.join(_NIGHTS)} --fov 15",
         ),
     ),
@@ -99,6 +101,7 @@ GROUPS: tuple[Answers, ...] = (
         "streaks",
         (
             _STREAKS,
+            f"{_STREAKS} --prior 0.035 -0.02 0.015 --line-time 3e-5",
             f"{_STREAKS} --prior 0.035 -0.02 0.015",
             "rate pictures/turn.png --camera step_demo --exposure 0.3 --prior 0.05 -0.02 0.01",
             "rate pictures/stars.png --fov 15 --exposure 0.4",
